@@ -1,0 +1,1 @@
+"""Learn Hamiltonian dynamics with structured kernels."""

@@ -1,0 +1,109 @@
+"""What the public functions require of their arguments, said before any long computation.
+
+Shapes, dtypes and configuration are known while tracing and raise at once. Values are checked
+on the host when they are concrete; under `jax.jit` the same check becomes `equinox.error_if`
+on the value that is returned, so it must be used by the caller.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+
+def is_concrete(*values: object) -> bool:
+    """Whether no leaf of `values` is a tracer, so that Python may branch on them."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def value(
+    x: Array,
+    bad: Bool[Array, "..."],
+    message: str | Callable[[], str],
+    error: type[Exception] = ValueError,
+) -> Array:
+    """Return `x`, or fail where `bad` holds: `error` on concrete values, at run time under jit."""
+    bad = jnp.any(bad)
+    if not is_concrete(bad):
+        return eqx.error_if(x, bad, message if isinstance(message, str) else message())
+    if bad:
+        raise error(message if isinstance(message, str) else message())
+    return x
+
+
+def floating(x: ArrayLike, name: str) -> Array:
+    """`x` as a JAX array of real floats: integers and booleans become the default float."""
+    array = jnp.asarray(x)
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        return array
+    if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
+        return array.astype(float)
+    raise TypeError(
+        f"{name} has dtype {array.dtype}; real numbers are needed. "
+        f"Pass floats or integers (for complex data, stack real and imaginary parts)."
+    )
+
+
+def positive(x: ArrayLike, name: str) -> Array:
+    """`x` as a float array whose every entry is finite and larger than zero."""
+    array = floating(x, name)
+    return value(
+        array,
+        ~((array > 0) & jnp.isfinite(array)),
+        lambda: f"{name} must be positive and finite, got {array}.",
+    )
+
+
+def finite(x: Array, name: str) -> Array:
+    """`x`, in which every entry must be finite."""
+
+    def message() -> str:
+        if not is_concrete(x):
+            return f"{name} contains NaN or inf: remove or repair those points first."
+        rows = jnp.flatnonzero(~jnp.isfinite(x).all(axis=tuple(range(1, x.ndim))))
+        shown = ", ".join(str(int(row)) for row in rows[:5])
+        more = f" and {rows.size - 5} more" if rows.size > 5 else ""
+        return f"{name} contains NaN or inf in row {shown}{more}: remove or repair those points."
+
+    return value(x, ~jnp.isfinite(x), message)
+
+
+def points(X: ArrayLike, name: str = "X") -> Float[Array, "N n"]:
+    """States as a float array of shape (N, n) with N ≥ 1; their values are not looked at."""
+    array = floating(X, name)
+    if array.ndim != 2:
+        hint = (
+            f" One state per row: `{name}[:, None]` for N states of one coordinate, "
+            f"`{name}[None]` for one state."
+            if array.ndim == 1
+            else f" Join trajectories with `{name}.reshape(-1, {name}.shape[-1])`."
+            if array.ndim > 2
+            else ""
+        )
+        raise ValueError(f"{name} has shape {array.shape}; it must be (N, n).{hint}")
+    if 0 in array.shape:
+        raise ValueError(f"{name} has shape {array.shape}: at least one point is needed.")
+    return array
+
+
+def data(X: ArrayLike, Y: ArrayLike) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
+    """States and velocities: two finite float arrays of one shape (N, n) and one dtype."""
+    X, Y = points(X, "X"), points(Y, "Y")
+    if X.shape != Y.shape:
+        raise ValueError(
+            f"X has shape {X.shape} and Y has shape {Y.shape}: they must be equal, "
+            "one velocity Y[i] for each state X[i]."
+        )
+    dtype = jnp.result_type(X, Y)
+    return finite(X.astype(dtype), "X"), finite(Y.astype(dtype), "Y")
+
+
+def point(x: ArrayLike, n: int, name: str = "x") -> Float[Array, " n"]:
+    """One state of `n` coordinates; for many, the caller is pointed to `jax.vmap`."""
+    array = floating(x, name)
+    if array.shape != (n,):
+        hint = " Use `jax.vmap(...)` for a batch of states." if array.ndim > 1 else ""
+        raise ValueError(f"{name} has shape {array.shape}; one state of shape ({n},) is needed.{hint}")
+    return array
