@@ -10,12 +10,13 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 
 def is_concrete(*values: object) -> bool:
     """Whether no leaf of `values` is a tracer, so that Python may branch on them."""
-    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
 def value(
@@ -37,7 +38,7 @@ def floating(x: ArrayLike, name: str) -> Array:
     """`x` as a JAX array of real floats: integers and booleans become the default float."""
     array = jnp.asarray(x)
     if jnp.issubdtype(array.dtype, jnp.floating):
-        return array
+        return array.astype(array.dtype)  # no weak type: a Python float must not recompile
     if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
         return array.astype(float)
     raise TypeError(
@@ -54,6 +55,13 @@ def positive(x: ArrayLike, name: str) -> Array:
         ~((array > 0) & jnp.isfinite(array)),
         lambda: f"{name} must be positive and finite, got {array}.",
     )
+
+
+def positive_scalar(x: ArrayLike, name: str) -> Float[Array, ""]:
+    """`x` as a positive float array of shape ()."""
+    if jnp.shape(x) != ():
+        raise ValueError(f"{name} has shape {jnp.shape(x)}; one number is needed.")
+    return positive(x, name)
 
 
 def finite(x: Array, name: str) -> Array:
@@ -105,5 +113,7 @@ def point(x: ArrayLike, n: int, name: str = "x") -> Float[Array, " n"]:
     array = floating(x, name)
     if array.shape != (n,):
         hint = " Use `jax.vmap(...)` for a batch of states." if array.ndim > 1 else ""
-        raise ValueError(f"{name} has shape {array.shape}; one state of shape ({n},) is needed.{hint}")
+        raise ValueError(
+            f"{name} has shape {array.shape}; one state of shape ({n},) is needed.{hint}"
+        )
     return array

@@ -1,0 +1,150 @@
+"""Learned vector fields."""
+
+import abc
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from hamkernel import _require as require
+from hamkernel._gram import expansion, potential
+from hamkernel._structured import AbstractMatrixKernel, Sum
+
+Scalar = Callable[[Float[Array, " n"]], Float[Array, ""]]
+
+
+class AbstractField(eqx.Module):
+    """A learned vector field x -> f(x), one state of shape (n,) per call.
+
+    It is a PyTree and a pure function: `jax.jit(field)`, `jax.vmap(field)(X)`, `jax.jacfwd(field)`
+    and `jax.export` work on it.
+    """
+
+    kernel: eqx.AbstractVar[AbstractMatrixKernel]
+    offset: eqx.AbstractVar[Float[Array, ""]]
+
+    def __hash__(self) -> int:
+        # jax.jit(field) hashes the function it compiles; arrays have no hash, their shapes do.
+        leaves = jax.tree.leaves(eqx.filter(self, eqx.is_array))
+        return hash((type(self), tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)))
+
+    @property
+    @abc.abstractmethod
+    def dimension(self) -> int:
+        """n, the number of coordinates of a state."""
+
+    @abc.abstractmethod
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The velocity f(x)."""
+
+    @abc.abstractmethod
+    def unanchored_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+        """The potential with the constant that the representer gives it."""
+
+    @property
+    def potential(self) -> Scalar:
+        """The function u with f = B∇u, x (n,) -> (), with the constant set by `anchored`.
+
+        Raises:
+            AttributeError: the structure has no potential (with the reason).
+        """
+        jax.eval_shape(self.unanchored_potential, jnp.zeros(self.dimension, self.offset.dtype))
+        return lambda x: self.unanchored_potential(x) + self.offset
+
+    @property
+    def hamiltonian(self) -> Scalar:
+        """The learned Hamiltonian H with f = J∇H, x (n,) -> ().
+
+        Velocities determine H up to a constant: see `anchored`.
+
+        Raises:
+            AttributeError: the field is not Hamiltonian by construction (with the reason).
+        """
+        if not self.kernel.symplectic:
+            raise AttributeError(
+                f"a field of the kernel {type(self.kernel).__name__} is not Hamiltonian by "
+                "construction, so it has no learned Hamiltonian. Use Symplectic(k); for a sum "
+                "that contains one ask the part, field.part(0).hamiltonian(x); for CurlFree see "
+                "field.potential(x)."
+            )
+        return self.potential
+
+    @property
+    def is_separable(self) -> bool:
+        """Whether H(q, p) = T(p) + U(q) follows from the kernel, as explicit integrators need.
+
+        True for a symplectic kernel whose scalar kernels are sums of `Select`s, each on q alone
+        or on p alone.
+        """
+        n = self.dimension
+        q, p = frozenset(range(n // 2)), frozenset(range(n // 2, n))
+        return self.kernel.symplectic and all(
+            support <= q or support <= p
+            for k in self.kernel.scalar_kernels
+            for support in k.supports(n)
+        )
+
+
+class KernelField(AbstractField):
+    """f(x) = Σⱼ K(x, zⱼ) aⱼ, the minimiser of the regularised least squares.
+
+    Evaluating f or its potential costs O(M n) for M points.
+
+    Attributes:
+        kernel: K.
+        points: zⱼ, shape (M, n): the data, or the landmarks of a low-rank solver.
+        coefficients: aⱼ, shape (M, n).
+        residual: yᵢ − f(xᵢ) at the training data, shape (N, n).
+        norm: ‖f‖ in the RKHS of K, shape ().
+        regularization: the λ of the fit, shape ().
+        offset: the constant in the potential, shape ().
+    """
+
+    kernel: AbstractMatrixKernel
+    points: Float[Array, "M n"]
+    coefficients: Float[Array, "M n"]
+    residual: Float[Array, "N n"]
+    norm: Float[Array, ""]
+    regularization: Float[Array, ""]
+    offset: Float[Array, ""]
+
+    @property
+    def dimension(self) -> int:
+        return self.points.shape[1]
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        x = self._state(x)
+        return expansion(self.kernel, x, self.points, self.coefficients)
+
+    def unanchored_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+        x = self._state(x)
+        return potential(self.kernel, x, self.points, self.coefficients)
+
+    def _state(self, x: ArrayLike) -> Float[Array, " n"]:
+        return require.point(x, self.dimension).astype(self.points.dtype)
+
+    def anchored(self, x0: ArrayLike, value: ArrayLike = 0.0) -> "KernelField":
+        """The same field with the constant of its potential set so that u(x₀) = value.
+
+        Args:
+            x0: a state, shape (n,), for example the equilibrium.
+            value: the potential there, in units of energy.
+        """
+        offset = jnp.asarray(value, self.offset.dtype) - self.unanchored_potential(jnp.asarray(x0))
+        return eqx.tree_at(lambda field: field.offset, self, offset)
+
+    def part(self, which: int | str) -> "KernelField":
+        """The field of one term of a sum of kernels, by position or name.
+
+        The parts add up to the field. Its `residual` and `norm` are those of the whole fit.
+
+        Raises:
+            KeyError: there is no such part (with the choices).
+        """
+        if isinstance(self.kernel, Sum):
+            return eqx.tree_at(lambda f: f.kernel, self, self.kernel.part(which))
+        if which == 0:
+            return self
+        raise KeyError(f"no part {which!r}: {type(self.kernel).__name__} is not a sum.")

@@ -1,0 +1,58 @@
+"""`fit`: from data to a learned field."""
+
+import warnings
+
+import jax.numpy as jnp
+from jaxtyping import ArrayLike, Float
+
+from hamkernel import _require as require
+from hamkernel._field import AbstractField
+from hamkernel._gram import matrix_kernel
+from hamkernel._solve import AbstractSolver, Cholesky
+from hamkernel._structured import AbstractMatrixKernel
+
+
+def fit(
+    K: AbstractMatrixKernel,
+    X: Float[ArrayLike, "N n"],
+    Y: Float[ArrayLike, "N n"],
+    regularization: ArrayLike = 1e-4,
+    *,
+    solver: AbstractSolver | None = None,
+) -> AbstractField:
+    """Learn the field f in the RKHS of K that minimises (1/N) Σᵢ‖f(xᵢ) − yᵢ‖² + λ‖f‖².
+
+    By the representer theorem f(x) = Σⱼ K(x, xⱼ) aⱼ with (G + NλI) a = y. Nothing else is added
+    to the diagonal. Read as a Gaussian process, Nλ is the variance of the noise on Y.
+
+    Args:
+        K: a matrix-valued kernel, for example `Odd(Symplectic(Gaussian(3.0)))`.
+        X: states, shape (N, n).
+        Y: measured velocities, shape (N, n), in units of X per unit of time.
+        regularization: λ > 0, in squared units of Y over those of the kernel.
+        solver: `Cholesky()` if None.
+
+    Returns:
+        The learned field. Works under jit, vmap and grad, with respect to every argument; new
+        values of hyperparameters or λ do not recompile.
+
+    Raises:
+        TypeError: K is not matrix-valued. ValueError: a shape does not fit, the data is empty or
+            not finite, n is not allowed by the structure, or λ is not positive. RuntimeError: the
+            ridge is too small for this Gram (the text says what to do).
+
+    Source: Smith & Egeland (2023), eq. (vector_valued_regular_least_squares_a_equation), where
+        "Nλ a_j" should read "Nλ a_i".
+    """
+    K = matrix_kernel(K)
+    X, Y = require.data(X, Y)
+    K.check_dimension(X.shape[1])
+    regularization = require.positive_scalar(regularization, "regularization").astype(X.dtype)
+    if X.dtype == jnp.float32:
+        warnings.warn(
+            "fitting in float32: expect three digits, and a failed factorisation for a ridge "
+            "below about 1e-6 of the Gram. For float64 run "
+            "jax.config.update('jax_enable_x64', True) first and pass float64 data.",
+            stacklevel=2,
+        )
+    return (solver or Cholesky()).fit(K, X, Y, regularization)

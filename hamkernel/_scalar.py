@@ -1,0 +1,210 @@
+"""Scalar kernels on one pair of points, k(x, z) -> (), and their algebra.
+
+A kernel is written once, for one pair. `jax.vmap` makes the Gram matrix, and automatic
+differentiation makes every structured kernel from it, so a kernel should be written with
+*products* of its arguments: `x @ z` under two vmaps becomes one matrix product, while
+`jnp.sum((x - z) ** 2)` becomes an (N, M, n) array and runs many times slower.
+"""
+
+import abc
+import enum
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from hamkernel import _require as require
+
+
+class Invariance(enum.Flag):
+    """What a kernel knows of itself; it decides which cheap forms are allowed.
+
+    REFLECTION: k(−x, −z) = k(x, z). TRANSLATION: k(x + c, z + c) = k(x, z), which for a
+    symmetric real kernel implies REFLECTION. A sum or product has what all its terms have.
+    """
+
+    NONE = 0
+    REFLECTION = 1
+    TRANSLATION = 3
+
+
+class AbstractScalarKernel(eqx.Module):
+    """A positive definite function k(x, z) -> () of two points of shape (n,).
+
+    Every inexact array leaf is an unconstrained real and is trained by `hamkernel.tune`;
+    a positive hyperparameter θ is stored as `log_θ` and read through the property `θ`.
+    """
+
+    @abc.abstractmethod
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        """k(x, z) for one pair of points."""
+
+    @property
+    @abc.abstractmethod
+    def invariance(self) -> Invariance:
+        """The transformations of both arguments that leave k unchanged."""
+
+    @abc.abstractmethod
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        """For each term of an additive kernel, the coordinates that it depends on."""
+
+    def __add__(self, other: Any) -> "ScalarSum":
+        if not callable(other):
+            return NotImplemented
+        return ScalarSum(_terms(ScalarSum, self) + _terms(ScalarSum, as_scalar_kernel(other)))
+
+    def __radd__(self, other: Any) -> "AbstractScalarKernel":
+        if isinstance(other, int | float) and other == 0:
+            return self  # so that the built-in sum(kernels) works
+        return as_scalar_kernel(other) + self if callable(other) else NotImplemented
+
+    def __mul__(self, other: Any) -> "AbstractScalarKernel":
+        if callable(other):
+            other = as_scalar_kernel(other)
+            return ScalarProduct(_terms(ScalarProduct, self) + _terms(ScalarProduct, other))
+        return Scaled(self, other)
+
+    def __rmul__(self, other: Any) -> "AbstractScalarKernel":
+        return as_scalar_kernel(other) * self if callable(other) else Scaled(self, other)
+
+
+def _terms(
+    cls: "type[ScalarSum] | type[ScalarProduct]", kernel: AbstractScalarKernel
+) -> tuple[AbstractScalarKernel, ...]:
+    """The terms of `kernel` if it is a `cls`, so that (a + b) + c is one sum of three."""
+    return kernel.terms if isinstance(kernel, cls) else (kernel,)
+
+
+class ScalarSum(AbstractScalarKernel):
+    """k₁(x, z) + k₂(x, z) + …"""  # noqa: D415
+
+    terms: tuple[AbstractScalarKernel, ...]
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        return sum((k(x, z) for k in self.terms[1:]), start=self.terms[0](x, z))
+
+    @property
+    def invariance(self) -> Invariance:
+        return _common_invariance(self.terms)
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        return tuple(support for k in self.terms for support in k.supports(n))
+
+
+class ScalarProduct(AbstractScalarKernel):
+    """k₁(x, z) k₂(x, z) …"""  # noqa: D415
+
+    terms: tuple[AbstractScalarKernel, ...]
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        return math.prod((k(x, z) for k in self.terms[1:]), start=self.terms[0](x, z))
+
+    @property
+    def invariance(self) -> Invariance:
+        return _common_invariance(self.terms)
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        first, *rest = (k.supports(n) for k in self.terms)
+        for factor in rest:  # expand the product of the sums
+            first = tuple(a | b for a in first for b in factor)
+        return first
+
+
+def _common_invariance(terms: tuple[AbstractScalarKernel, ...]) -> Invariance:
+    common = Invariance.TRANSLATION
+    for kernel in terms:
+        common &= kernel.invariance
+    return common
+
+
+class Scaled(AbstractScalarKernel):
+    """c k(x, z) with c > 0; made by `2.0 * k`."""
+
+    kernel: AbstractScalarKernel
+    log_scale: Float[Array, ""]
+
+    def __init__(self, kernel: AbstractScalarKernel, scale: ArrayLike):
+        self.kernel = kernel
+        self.log_scale = jnp.log(require.positive_scalar(scale, "the scale of a kernel"))
+
+    @property
+    def scale(self) -> Float[Array, ""]:
+        return jnp.exp(self.log_scale)
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        value = self.kernel(x, z)
+        return self.scale.astype(value.dtype) * value
+
+    @property
+    def invariance(self) -> Invariance:
+        return self.kernel.invariance
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        return self.kernel.supports(n)
+
+
+class UserKernel(AbstractScalarKernel):
+    """Any callable (x, z) -> scalar: a function, an Equinox module, another library's kernel.
+
+    Array leaves of a module are trained like those of the built-in kernels. Nothing is assumed
+    of the callable: it is taken to depend on every coordinate and to have no invariance.
+    """
+
+    fn: Callable[..., Any]
+
+    def __init__(self, fn: Callable[..., Any]):
+        # tinygp's objects give a whole Gram matrix when called and one entry by `evaluate`.
+        fn = getattr(fn, "evaluate", fn)
+        self.fn = as_pytree(fn)
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        value = self.fn(x, z)
+        if jnp.shape(value) != ():
+            raise ValueError(
+                f"the kernel {_name(self.fn)} returned an array of shape {jnp.shape(value)} for "
+                f"two points of shape {jnp.shape(x)}; a scalar is needed. Write the kernel for "
+                "one pair of points, k(x, z) -> (): the library adds the vmap."
+            )
+        return jnp.asarray(value)
+
+    @property
+    def invariance(self) -> Invariance:
+        return Invariance.NONE
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        return (frozenset(range(n)),)
+
+
+def as_pytree(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """`fn` as a PyTree; a bare function would be a leaf, which `jax.jit` refuses."""
+    return fn if isinstance(fn, eqx.Module) else jax.tree_util.Partial(fn)  # pyright: ignore
+
+
+def _name(fn: Callable[..., Any]) -> str:
+    fn = getattr(fn, "func", fn)
+    return getattr(fn, "__name__", type(fn).__name__)
+
+
+def as_scalar_kernel(k: Any) -> AbstractScalarKernel:
+    """`k` itself if it is one of ours, else the callable wrapped as a `UserKernel`.
+
+    Raises:
+        TypeError: `k` is not callable, or is a matrix-valued kernel.
+    """
+    if isinstance(k, AbstractScalarKernel):
+        return k
+    if isinstance(k, type) or not callable(k):
+        raise TypeError(
+            f"a scalar kernel is needed, a callable (x, z) -> scalar; got {k!r}. "
+            "For a built-in one write, for example, hk.Gaussian(lengthscale=1.0)."
+        )
+    if getattr(k, "matrix_valued", False):
+        raise TypeError(
+            f"a scalar kernel is needed; got the matrix-valued {type(k).__name__}. "
+            "Structures are not nested: add them with +, or pass the scalar kernel inside."
+        )
+    return UserKernel(k)

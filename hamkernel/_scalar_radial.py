@@ -1,0 +1,197 @@
+"""Kernels of the scaled distance, k(x, z) = φ(s) with s = ‖(x − z)/ℓ‖².
+
+A structured kernel meets every point with itself, so the second derivatives of k at x = z must
+be exact. They are when φ is differentiated with respect to s, the SQUARED distance, in which a
+smooth kernel is smooth: ∂x ∂zᵀ k = −2φ′(s) I/ℓ² − 4φ″(s) ddᵀ with d = (x − z)/ℓ². A kernel
+written with the distance √s gives NaN there, or, after the usual repairs, a wrong block.
+"""
+
+import abc
+import functools
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from hamkernel import _require as require
+from hamkernel._scalar import AbstractScalarKernel, Invariance
+
+
+def squared_distance(x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+    """‖x − z‖² as x·x + z·z − 2 x·z, which under two vmaps is one matrix product.
+
+    What lies below the rounding of the product form is zero: on the Gram's diagonal its noise of
+    one unit in the last place would be a distance of 1e-8, which Matérn-3/2 can feel. Only the
+    value is cut; derivatives are those of the exact expression.
+    """
+    squares = x @ x + z @ z
+    s = squares - 2 * (x @ z)
+    noise = 8 * jnp.finfo(s.dtype).eps * squares
+    return s - jax.lax.stop_gradient(jnp.where(s < noise, s, jnp.zeros_like(s)))
+
+
+class AbstractRadialKernel(AbstractScalarKernel):
+    """k(x, z) = φ(‖(x − z)/ℓ‖²), ℓ a number or one lengthscale per coordinate."""
+
+    log_lengthscale: eqx.AbstractVar[Float[Array, "..."]]
+
+    @abc.abstractmethod
+    def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
+        """φ(s), smooth at s = 0 as often as the kernel may be differentiated."""
+
+    @property
+    def lengthscale(self) -> Float[Array, "..."]:
+        return jnp.exp(self.log_lengthscale)
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        return self.profile(
+            squared_distance(divided(x, self.lengthscale), divided(z, self.lengthscale))
+        )
+
+    @property
+    def invariance(self) -> Invariance:
+        return Invariance.TRANSLATION
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        return (frozenset(range(n)),)
+
+
+def divided(x: Float[Array, " n"], lengthscale: Float[Array, "..."]) -> Float[Array, " n"]:
+    """x/ℓ in the dtype of x."""
+    x = jnp.asarray(x)
+    if lengthscale.ndim and lengthscale.shape != x.shape:
+        raise ValueError(
+            f"the kernel has {lengthscale.size} lengthscales and the point has shape {x.shape}: "
+            "give one lengthscale, or one for each coordinate that the kernel sees."
+        )
+    return x / lengthscale.astype(x.dtype)
+
+
+def log_lengthscale(lengthscale: ArrayLike) -> Float[Array, "..."]:
+    """The stored form of a lengthscale, which must be () or (n,) and positive."""
+    array = require.positive(lengthscale, "lengthscale")
+    if array.ndim > 1:
+        raise ValueError(
+            f"lengthscale has shape {array.shape}; it must be a number or a vector (n,)."
+        )
+    return jnp.log(array)
+
+
+class Gaussian(AbstractRadialKernel):
+    """The Gaussian kernel, k(x, z) = exp(−‖(x − z)/ℓ‖²/2).
+
+    Args:
+        lengthscale: ℓ > 0, the paper's σ, in the units of the states; a number, or an array
+            (n,) with one for each coordinate.
+
+    Raises:
+        ValueError: a lengthscale is not positive and finite.
+
+    Source: Smith & Egeland (2023), eq. (scalar_gaussian_kernel).
+    """
+
+    log_lengthscale: Float[Array, "..."]
+
+    def __init__(self, lengthscale: ArrayLike = 1.0):
+        self.log_lengthscale = log_lengthscale(lengthscale)
+
+    def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
+        return jnp.exp(-0.5 * s)
+
+
+class Matern(AbstractRadialKernel):
+    """The Matérn kernel of half-integer smoothness ν = p + 1/2, p ≥ 1.
+
+    k(x, z) = p!/(2p)! e^(−r) Σᵢ (p + i)!/(i! (p − i)!) (2r)^(p − i), with r² = 2ν ‖(x − z)/ℓ‖².
+
+    Args:
+        nu: 1.5, 2.5, 3.5, …; fixed, not trained. A field of this kernel is differentiable
+            ⌈ν⌉ − 2 times, so 2.5 is the roughest whose flow has a continuous Jacobian.
+        lengthscale: ℓ > 0 in the units of the states; a number, or an array (n,).
+
+    Raises:
+        ValueError: `nu` is 1/2, whose second derivative at x = z does not exist, or no
+            half-integer; a lengthscale is not positive and finite.
+
+    Source: Rasmussen & Williams (2006), eq. 4.16.
+    """
+
+    log_lengthscale: Float[Array, "..."]
+    nu: float = eqx.field(static=True)
+
+    def __init__(self, nu: float = 2.5, lengthscale: ArrayLike = 1.0):
+        nu = float(nu)
+        if nu == 0.5:
+            raise ValueError(
+                "Matern(nu=0.5) is not differentiable at x = z, so its structured kernels do not "
+                "exist: their blocks are the second derivatives of k. Use nu=1.5 or larger."
+            )
+        if nu < 0.5 or nu - math.floor(nu) != 0.5:
+            raise ValueError(f"Matern needs nu = 1.5, 2.5, 3.5, ...; got {nu}.")
+        self.log_lengthscale = log_lengthscale(lengthscale)
+        self.nu = nu
+
+    def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
+        return _matern(round(self.nu - 0.5), 2 * self.nu * s)
+
+
+# With ψ_p(t) the Matérn function of order p + 1/2 at r = √t, the identity
+# d/dr [r^ν K_ν(r)] = −r^ν K_{ν−1}(r) (DLMF 10.29.4) gives  ψ_p′(t) = −ψ_{p−1}(t) / (4p − 2):
+# the derivative of a Matérn function is a smoother multiple of the next rougher one, so a
+# custom_jvp that calls itself is exact to every order and never divides by the distance. Only
+# the last, ψ_0 = e^(−r), has a derivative that grows like 1/r. It multiplies components of
+# x − z that vanish faster, so the value 0 at r = 0 gives the limit of the whole expression.
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _matern(p: int, t: Float[Array, ""]) -> Float[Array, ""]:
+    r = jnp.sqrt(jnp.maximum(t, jnp.zeros_like(t)))
+    polynomial = jnp.zeros_like(t)
+    for i in range(p + 1):  # Horner's scheme in 2r, the highest power first
+        polynomial = polynomial * (2 * r) + math.comb(p, i) * math.perm(p + i, i) / 1.0
+    return polynomial * jnp.exp(-r) * (math.factorial(p) / math.factorial(2 * p))
+
+
+@_matern.defjvp
+def _matern_jvp(p, primals, tangents):
+    (t,), (dt,) = primals, tangents
+    slope = _matern(p - 1, t) / -(4 * p - 2) if p > 0 else _rough_slope(t)
+    return _matern(p, t), slope * dt
+
+
+def _rough_slope(t: Float[Array, ""]) -> Float[Array, ""]:
+    """d/dt e^(−√t) = −e^(−√t)/(2√t), and 0 in place of −∞ at t = 0."""
+    apart = t > 0
+    r = jnp.sqrt(jnp.where(apart, t, jnp.ones_like(t)))
+    return jnp.where(apart, -jnp.exp(-r) / (2 * r), jnp.zeros_like(t))
+
+
+class RationalQuadratic(AbstractRadialKernel):
+    """The rational quadratic kernel, k(x, z) = (1 + ‖(x − z)/ℓ‖²/(2α))^(−α).
+
+    A mixture of Gaussians of many lengthscales; α → ∞ gives the Gaussian.
+
+    Args:
+        alpha: α > 0, dimensionless.
+        lengthscale: ℓ > 0 in the units of the states; a number, or an array (n,).
+
+    Raises:
+        ValueError: a hyperparameter is not positive and finite.
+
+    Source: Rasmussen & Williams (2006), eq. 4.19.
+    """
+
+    log_alpha: Float[Array, ""]
+    log_lengthscale: Float[Array, "..."]
+
+    def __init__(self, alpha: ArrayLike = 1.0, lengthscale: ArrayLike = 1.0):
+        self.log_alpha = jnp.log(require.positive_scalar(alpha, "alpha"))
+        self.log_lengthscale = log_lengthscale(lengthscale)
+
+    @property
+    def alpha(self) -> Float[Array, ""]:
+        return jnp.exp(self.log_alpha)
+
+    def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
+        alpha = self.alpha.astype(s.dtype)
+        return jnp.exp(-alpha * jnp.log1p(s / (2 * alpha)))

@@ -1,0 +1,166 @@
+"""Scalar kernels on transformed points: warped, selected, and averaged over a group."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hamkernel._scalar import (
+    AbstractScalarKernel,
+    Invariance,
+    ScalarSum,
+    Scaled,
+    as_pytree,
+    as_scalar_kernel,
+)
+
+
+class Warp(AbstractScalarKernel):
+    """k(fn(x), fn(z)): a kernel on warped coordinates, such as an angle as (cos, sin).
+
+    Args:
+        kernel: a scalar kernel on the warped coordinates, shape (m,).
+        fn: a smooth map (n,) -> (m,); the array leaves of an Equinox module are trained.
+
+    Example: `Warp(Gaussian(1.0), lambda x: jnp.array([jnp.cos(x[0]), jnp.sin(x[0]), x[1]]))`
+    for a state (angle, momentum) on a cylinder.
+    """
+
+    kernel: AbstractScalarKernel
+    fn: Callable[[Float[Array, " n"]], Float[Array, " m"]]
+
+    def __init__(self, kernel: Any, fn: Callable[[Array], Array]):
+        if not callable(fn):
+            raise TypeError(f"Warp needs a callable (n,) -> (m,), got {fn!r}.")
+        self.kernel = as_scalar_kernel(kernel)
+        self.fn = as_pytree(fn)
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        return self.kernel(self._warped(x), self._warped(z))
+
+    def _warped(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        warped = self.fn(x)
+        if jnp.ndim(warped) != 1:
+            raise ValueError(
+                f"the map of Warp returned shape {jnp.shape(warped)} for a point of shape "
+                f"{jnp.shape(x)}; a vector (m,) is needed. Return, for example, jnp.array([...])."
+            )
+        return warped
+
+    @property
+    def invariance(self) -> Invariance:
+        return Invariance.NONE
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        return (frozenset(range(n)),)
+
+
+class Select(AbstractScalarKernel):
+    """k(x[dims], z[dims]): a kernel on some of the coordinates.
+
+    `Select(k, (0, 1)) + Select(k, (2, 3))` is the kernel of H(q, p) = U(q) + T(p) for two
+    degrees of freedom.
+
+    Args:
+        kernel: a scalar kernel on len(dims) coordinates.
+        dims: distinct coordinates, integers ≥ 0.
+    """
+
+    kernel: AbstractScalarKernel
+    dims: tuple[int, ...] = eqx.field(static=True)
+
+    def __init__(self, kernel: Any, dims: Any):
+        dims = (dims,) if isinstance(dims, int) else tuple(int(d) for d in dims)
+        if not dims or min(dims) < 0 or len(set(dims)) < len(dims):
+            raise ValueError(f"Select needs distinct coordinates, integers >= 0; got {dims}.")
+        self.kernel = as_scalar_kernel(kernel)
+        self.dims = dims
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        return self.kernel(self._selected(x), self._selected(z))
+
+    def _selected(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        if max(self.dims) >= x.shape[0]:
+            raise ValueError(
+                f"Select has coordinates {self.dims} and the point has {x.shape[0]}: "
+                "coordinates are counted from 0."
+            )
+        # Slices, not a gather: their derivative is a pad, which XLA fuses into its neighbours.
+        return jnp.concatenate([x[d : d + 1] for d in self.dims])
+
+    @property
+    def invariance(self) -> Invariance:
+        return self.kernel.invariance
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        inner = self.kernel.supports(len(self.dims))
+        return tuple(frozenset(self.dims[i] for i in support) for support in inner)
+
+
+class Symmetrised(AbstractScalarKernel):
+    """The mean of k over a finite group of linear maps.
+
+    k_G(x, z) is the mean over g and h of χ(g) χ(h) k(gx, hz), and its functions obey
+    u(gx) = χ(g) u(x). This mean over both arguments is symmetric and positive for EVERY k. Where
+    k(gx, gz) = k(x, z) one side is enough, k_G(x, z) = mean over g of χ(g) k(x, gz); without that
+    property the one-sided mean is not even symmetric.
+
+    Args:
+        kernel: the scalar kernel k.
+        maps: the linear maps g of the group, each (n,) -> (n,).
+        characters: χ(g) = ±1 for each map.
+        one_sided: whether k(gx, gz) = k(x, z) is known to hold for all g.
+
+    Source: Krejník & Tyutin (2012) for the odd kernel k(x, z) − k(−x, z); the two-sided mean is
+    the projection of the feature map onto the functions with the symmetry.
+    """
+
+    kernel: AbstractScalarKernel
+    maps: tuple[Callable[[Array], Array], ...] = eqx.field(static=True)
+    characters: tuple[float, ...] = eqx.field(static=True)
+    one_sided: bool = eqx.field(static=True)
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        group = tuple(zip(self.maps, self.characters, strict=True))
+        left = group[:1] if self.one_sided else group
+        pairs = [(g, h, a * b) for g, a in left for h, b in group]
+        values = [sign * self.kernel(g(x), h(z)) for g, h, sign in pairs]
+        return sum(values[1:], start=values[0]) / len(values)
+
+    @property
+    def invariance(self) -> Invariance:
+        return Invariance.REFLECTION & self.kernel.invariance
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        return (frozenset(range(n)),)
+
+
+def identity(x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The neutral element of every group of maps."""
+    return x
+
+
+def reflection(x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """The map x -> −x."""
+    return -x
+
+
+def with_parity(kernel: AbstractScalarKernel, parity: int) -> AbstractScalarKernel:
+    """The kernel of the even (parity +1) or odd (−1) functions of the RKHS of `kernel`.
+
+    The group is {1, −1}. A sum is symmetrised term by term, so that its terms stay visible.
+    """
+    if isinstance(kernel, ScalarSum):
+        return ScalarSum(tuple(with_parity(k, parity) for k in kernel.terms))
+    if isinstance(kernel, Scaled):
+        return eqx.tree_at(lambda s: s.kernel, kernel, with_parity(kernel.kernel, parity))
+    if isinstance(kernel, Select):
+        return eqx.tree_at(lambda s: s.kernel, kernel, with_parity(kernel.kernel, parity))
+    return Symmetrised(
+        kernel,
+        maps=(identity, reflection),
+        characters=(1.0, float(parity)),
+        one_sided=Invariance.REFLECTION in kernel.invariance,
+    )
