@@ -1,0 +1,86 @@
+"""Which points cross-validation holds out together."""
+
+from typing import Literal
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from hamkernel import _require as require
+
+Folds = int | Literal["loo"] | Int[ArrayLike, " N"]
+
+
+class Partition:
+    """N points in F folds: what `folds` means, as a static argument of compiled functions.
+
+    Attributes:
+        members: the points of each fold, shape (F, S); the rows of smaller folds end in N,
+            which is no point.
+        weights: 1 / (F |fold of i|) for each point, so that `weights @ squares` is the mean over
+            folds of the mean over points, shape (N,).
+    """
+
+    def __init__(self, N: int, folds: Folds):
+        self.labels = _labels(N, folds)
+        names, index, sizes = np.unique(self.labels, return_inverse=True, return_counts=True)
+        if len(names) < 2:
+            raise ValueError(
+                f"cross-validation needs at least two folds, and these {N} points are in one. "
+                "Give each point the label of its trajectory, a number of folds, or 'loo'."
+            )
+        self.members = np.full((len(names), sizes.max()), N)
+        for row, name, size in zip(self.members, names, sizes, strict=True):
+            row[:size] = np.flatnonzero(self.labels == name)
+        self.weights = 1.0 / (len(names) * sizes[index])
+
+    def __hash__(self) -> int:
+        return hash(self.labels.tobytes())
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Partition) and np.array_equal(self.labels, other.labels)
+
+    def gather(self, W: Float[Array, "R Nn"]) -> Float[Array, "R F Sn"]:
+        """The columns of W that belong to each fold; zero columns in the padding."""
+        N, F = len(self.labels), len(self.members)
+        by_point = W.reshape(len(W), N, -1)
+        if not np.array_equal(self.members.reshape(-1), np.arange(N)):
+            by_point = jnp.take(
+                by_point, self.members.reshape(-1), axis=1, mode="fill", fill_value=0
+            )
+        return by_point.reshape(len(W), F, -1)
+
+    def padding_identity(self, blocks: Float[Array, "F Sn Sn"]) -> Float[Array, "F Sn Sn"]:
+        """Ones on the diagonal where a fold has no point, zeros elsewhere."""
+        empty = self.members == len(self.labels)
+        empty = np.repeat(empty, blocks.shape[1] // empty.shape[1], axis=1)
+        return jnp.asarray(empty[:, :, None] * np.eye(blocks.shape[1]), blocks.dtype)
+
+
+def _labels(N: int, folds: Folds) -> Int[np.ndarray, " N"]:
+    """One integer for each point, the same within a fold."""
+    if isinstance(folds, str):
+        if folds != "loo":
+            raise ValueError(f"folds must be a number, 'loo' or an array of labels; got {folds!r}.")
+        return np.arange(N)
+    if not require.is_concrete(folds):
+        raise TypeError(
+            "folds is traced: the labels decide the shapes of the computation, so they must be "
+            "concrete. Close over them, or mark the argument static under jax.jit."
+        )
+    array = np.asarray(folds)
+    if not np.issubdtype(array.dtype, np.integer):
+        raise ValueError(
+            f"folds must be a number, 'loo' or an array of integer labels; got dtype {array.dtype}."
+        )
+    if array.ndim == 0:
+        if not 2 <= array <= N:
+            raise ValueError(f"folds must be between 2 and the number of points, {N}; got {folds}.")
+        parts = np.array_split(np.arange(N), int(array))
+        return np.repeat(np.arange(len(parts)), [len(part) for part in parts])
+    if array.shape != (N,):
+        raise ValueError(
+            f"folds has shape {array.shape}; one integer label for each of the {N} points is "
+            "needed, shape (N,), or a number of folds, or 'loo'."
+        )
+    return array.astype(np.int64)

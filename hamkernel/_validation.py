@@ -1,0 +1,288 @@
+"""Validation losses in closed form, each at the price of one Cholesky factorisation.
+
+Write A = G + ridge I and a = A⁻¹y for the system with ALL points, and let S be the rows of a
+held-out fold. Eliminating the other rows from A a = y by block inversion gives the residual that
+a fit WITHOUT S would have on S,
+
+    r_S = y_S − f₋S(X_S) = (C_SS)⁻¹ a_S,    C = A⁻¹,
+
+so no fold is ever refitted. With the factor A = LLᵀ and W = L⁻¹ one has C_SS = W_SᵀW_S, where
+W_S holds the columns S of W, and C itself is not needed.
+
+The derivatives are written down as well, since differentiating the factorisation costs several
+times its price. From dC = −C dA C, and with v_S = (C_SS)⁻¹ r̄_S for a cotangent r̄,
+
+    r̄·dr = Σ_S v_Sᵀ[(dC y)_S − dC_SS r_S]   so   Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − (C v) aᵀ.
+
+Source: for scalar outputs and single points, Rasmussen & Williams (2006), section 5.4.2; for
+folds, Ginsbourger & Schärer (2021), arXiv:2101.03108.
+"""
+
+import functools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from hamkernel import _require as require
+from hamkernel._folds import Folds, Partition
+from hamkernel._gram import assemble, matrix_kernel
+from hamkernel._structured import AbstractMatrixKernel
+
+
+def cross_validation_loss(
+    K: AbstractMatrixKernel,
+    X: Float[ArrayLike, "N n"],
+    Y: Float[ArrayLike, "N n"],
+    regularization: ArrayLike,
+    folds: Folds = 5,
+) -> Float[Array, ""]:
+    """The mean over folds of the mean squared error of a fit that has not seen the fold.
+
+    The mean squared error is itself the mean over the fold's points and components. Exact: equal
+    to refitting without each fold, with the ridge that such a fit has, (N − N/F) λ for F folds.
+    With folds of unequal size every refit has this same ridge, that of the average fold.
+
+    Args:
+        K: a matrix-valued kernel.
+        X: states, shape (N, n).
+        Y: measured velocities, shape (N, n).
+        regularization: λ > 0.
+        folds: a number of folds, made of consecutive points as equal in size as possible; "loo"
+            for one point per fold; or an integer label for each point, shape (N,), to hold out,
+            say, one trajectory at a time. A fold always holds out whole points: leaving out
+            single components would leak their siblings. Labels must be concrete under jit.
+
+    Returns:
+        The loss, in squared units of Y; inf where the matrix is not positive definite to
+        rounding. Differentiable, vmappable, compiled once per shape. O((N n)³) time, at most
+        three matrices of (N n)² numbers.
+
+    Raises:
+        TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization.
+    """
+    K, X, Y, regularization = _checked(K, X, Y, regularization)
+    return _loss(K, X, Y, regularization, Partition(len(X), folds))
+
+
+def cross_validation_residuals(
+    K: AbstractMatrixKernel,
+    X: Float[ArrayLike, "N n"],
+    Y: Float[ArrayLike, "N n"],
+    regularization: ArrayLike,
+    folds: Folds = 5,
+) -> Float[Array, "N n"]:
+    """The residual yᵢ − f(xᵢ) of each point under the fit that has not seen its fold.
+
+    Args and errors are those of `cross_validation_loss`, which is their mean square.
+
+    Returns:
+        Shape (N, n), in units of Y; inf where the matrix is not positive definite to rounding.
+    """
+    K, X, Y, regularization = _checked(K, X, Y, regularization)
+    return _residuals(K, X, Y, regularization, Partition(len(X), folds))
+
+
+def generalized_cross_validation(
+    K: AbstractMatrixKernel,
+    X: Float[ArrayLike, "N n"],
+    Y: Float[ArrayLike, "N n"],
+    regularization: ArrayLike,
+) -> Float[Array, ""]:
+    """Generalised cross-validation: the training error over the squared share of free residuals.
+
+    With the smoother y -> Sy, S = G A⁻¹, and D = N n rows, it is (‖y − Sy‖²/D) / (tr(I − S)/D)²
+    = D ‖a‖² / (tr A⁻¹)². It needs no folds and does not depend on the order of the data, and is
+    leave-one-out with every leverage replaced by the mean one. For independent noise.
+
+    Args:
+        K: a matrix-valued kernel.
+        X: states, shape (N, n).
+        Y: measured velocities, shape (N, n).
+        regularization: λ > 0.
+
+    Returns:
+        The loss, in squared units of Y; inf where the factorisation fails.
+
+    Raises:
+        TypeError: K is not matrix-valued. ValueError: bad data or regularization.
+
+    Source: Golub, Heath & Wahba (1979), Technometrics 21.
+    """
+    K, X, Y, regularization = _checked(K, X, Y, regularization)
+    return _generalized(K, X, Y, regularization)
+
+
+def log_marginal_likelihood(
+    K: AbstractMatrixKernel,
+    X: Float[ArrayLike, "N n"],
+    Y: Float[ArrayLike, "N n"],
+    regularization: ArrayLike,
+) -> Float[Array, ""]:
+    """The log density of Y under f ~ GP(0, K) and independent noise of variance Nλ.
+
+    −½ yᵀA⁻¹y − ½ log det A − ½ N n log 2π with A = G + NλI. The best objective when the model is
+    believed (the truth resembles a draw of the prior); cross-validation trusts it less.
+
+    Args:
+        K: a matrix-valued kernel.
+        X: states, shape (N, n).
+        Y: measured velocities, shape (N, n).
+        regularization: λ > 0; the noise variance is Nλ.
+
+    Returns:
+        The log density; −inf where the factorisation fails.
+
+    Raises:
+        TypeError: K is not matrix-valued. ValueError: bad data or regularization.
+
+    Source: Rasmussen & Williams (2006), eq. 2.30.
+    """
+    K, X, Y, regularization = _checked(K, X, Y, regularization)
+    return _log_likelihood(K, X, Y, regularization)
+
+
+def _checked(K, X, Y, regularization):
+    K = matrix_kernel(K)
+    X, Y = require.data(X, Y)
+    K.check_dimension(X.shape[1])
+    regularization = require.positive_scalar(regularization, "regularization")
+    return K, X, Y, regularization.astype(X.dtype)
+
+
+@eqx.filter_jit
+def _loss(K, X, Y, regularization, partition):
+    squares = jnp.mean(_residuals(K, X, Y, regularization, partition) ** 2, axis=1)
+    return jnp.asarray(partition.weights, squares.dtype) @ squares
+
+
+@eqx.filter_jit
+def _residuals(K, X: Array, Y: Array, regularization: Array, partition: Partition) -> Array:
+    N, n = X.shape
+    A = _regularised(K, X, (N - N / len(partition.members)) * regularization)
+    r = held_out(A, Y.reshape(N * n), partition).reshape(*partition.members.shape, n)
+    return jnp.zeros_like(Y).at[partition.members].set(r, mode="drop")  # the padding is dropped
+
+
+@eqx.filter_jit
+def _generalized(K, X, Y, regularization):
+    A = _regularised(K, X, len(X) * regularization)
+    squares, trace = free_residuals(A, Y.reshape(Y.size))
+    return squares * Y.size / trace**2
+
+
+@eqx.filter_jit
+def _log_likelihood(K, X, Y, regularization):
+    A = _regularised(K, X, len(X) * regularization)
+    return log_density(A, Y.reshape(Y.size))
+
+
+def _regularised(K, X: Array, ridge: Array) -> Float[Array, "D D"]:
+    G = assemble(K, X, X).reshape(X.size, X.size)
+    diagonal = jnp.arange(X.size)
+    return G.at[diagonal, diagonal].add(ridge)
+
+
+# What each loss needs of A and y, with its derivative.
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def held_out(
+    A: Float[Array, "D D"], y: Float[Array, " D"], partition: Partition
+) -> Float[Array, "F Sn"]:
+    """r_S = (C_SS)⁻¹ a_S for each fold, zero in the padding; inf where A has no factor."""
+    return _held_out_forward(A, y, partition)[0]
+
+
+def _held_out_forward(A, y, partition):
+    W = _inverse_factor(A)
+    a = W.T @ (W @ y)
+    W_S, a_S = partition.gather(W), partition.gather(a[None])[0]
+    blocks = jnp.einsum("dfi,dfj->fij", W_S, W_S)
+    blocks = blocks + partition.padding_identity(blocks)  # so that they can be solved with
+    factors = jax.lax.linalg.cholesky(blocks, symmetrize_input=False)
+    r = _solve_blocks(factors, a_S)
+    ok = jnp.isfinite(r).all()
+    return jnp.where(ok, r, jnp.full_like(r, jnp.inf)), (W, a, factors, r, ok)
+
+
+def _held_out_backward(partition, saved, r_bar):
+    W, a, factors, r, ok = saved
+    W_S = partition.gather(W)
+    v = _solve_blocks(factors, r_bar)
+    # C_:S v_S = Wᵀ(W_S v_S), one column for each fold.
+    P = W.T @ jnp.einsum("dfi,fi->df", W_S, v)
+    Q = W.T @ jnp.einsum("dfi,fi->df", W_S, r)
+    w = P.sum(axis=1)  # C v
+    return _or_zero(ok, P @ Q.T - w[:, None] * a[None, :], w)
+
+
+held_out.defvjp(_held_out_forward, _held_out_backward)
+
+
+@jax.custom_vjp
+def free_residuals(
+    A: Float[Array, "D D"], y: Float[Array, " D"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """‖A⁻¹y‖² and tr A⁻¹; inf and 1 where A has no factor."""
+    return _free_residuals_forward(A, y)[0]
+
+
+def _free_residuals_forward(A, y):
+    W = _inverse_factor(A)
+    a = W.T @ (W @ y)
+    squares, trace = a @ a, jnp.sum(W * W)
+    ok = jnp.isfinite(squares) & jnp.isfinite(trace)
+    value = jnp.where(ok, squares, jnp.inf), jnp.where(ok, trace, jnp.ones_like(trace))
+    return value, (W, a, ok)
+
+
+def _free_residuals_backward(saved, bars):
+    W, a, ok = saved
+    squares_bar, trace_bar = bars
+    C = W.T @ W
+    w = 2 * squares_bar * (C @ a)
+    return _or_zero(ok, -trace_bar * (C @ C) - w[:, None] * a[None, :], w)
+
+
+free_residuals.defvjp(_free_residuals_forward, _free_residuals_backward)
+
+
+@jax.custom_vjp
+def log_density(A: Float[Array, "D D"], y: Float[Array, " D"]) -> Float[Array, ""]:
+    """The log density of y under N(0, A); −inf where A has no factor."""
+    return _log_density_forward(A, y)[0]
+
+
+def _log_density_forward(A, y):
+    W = _inverse_factor(A)
+    whitened = W @ y
+    log_det = -2 * jnp.sum(jnp.log(jnp.diagonal(W)))
+    value = -0.5 * (whitened @ whitened + log_det + len(y) * jnp.log(2 * jnp.pi).astype(y.dtype))
+    ok = jnp.isfinite(value)
+    return jnp.where(ok, value, -jnp.inf), (W, W.T @ whitened, ok)
+
+
+def _log_density_backward(saved, bar):
+    W, a, ok = saved
+    return _or_zero(ok, 0.5 * bar * (a[:, None] * a[None, :] - W.T @ W), -bar * a)
+
+
+log_density.defvjp(_log_density_forward, _log_density_backward)
+
+
+def _inverse_factor(A: Float[Array, "D D"]) -> Float[Array, "D D"]:
+    """W = L⁻¹ with A = LLᵀ; NaN where A is not positive definite."""
+    L = jax.lax.linalg.cholesky(A, symmetrize_input=False)
+    identity = jnp.eye(len(A), dtype=A.dtype)
+    return jax.lax.linalg.triangular_solve(L, identity, left_side=True, lower=True)
+
+
+def _solve_blocks(factors: Float[Array, "F b b"], b: Float[Array, "F b"]) -> Float[Array, "F b"]:
+    return jax.scipy.linalg.cho_solve((factors, True), b[..., None])[..., 0]
+
+
+def _or_zero(ok: Bool[Array, ""], *arrays: Array) -> tuple[Array, ...]:
+    """Derivatives, zero in place of NaN where the value is infinite."""
+    return tuple(jnp.where(ok, array, jnp.zeros_like(array)) for array in arrays)
