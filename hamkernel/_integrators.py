@@ -1,0 +1,435 @@
+"""Symplectic integrators as Diffrax solvers, with constant steps chosen beforehand.
+
+A one-step map x₁ = Ψ_h(x₀) is symplectic if (∂Ψ)ᵀ J ∂Ψ = J. Then, but for terms exponentially small
+in 1/h, it follows the flow of a nearby Hamiltonian H + O(hᵖ): the error in H stays bounded instead
+of growing (HLW, IX.8). That holds for one fixed map, so for a CONSTANT step: a step chosen from
+the state makes a different map at every state, and the property is gone (HLW, VIII.1).
+
+Two families, both with x = (q, p) in one array of shape (n,):
+
+- Gauss collocation solves implicit equations and is symplectic for every Hamiltonian.
+- Splitting is explicit, and needs H = T(p) + U(q).
+
+Diffrax owns the loop over steps, what is saved and the gradients; Optimistix owns the loop of the
+implicit equations and their derivative by the implicit function theorem.
+
+Source: "HLW" below is Hairer, Lubich & Wanner, Geometric Numerical Integration, 2nd ed. (2006).
+"""
+
+from collections.abc import Callable
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from equinox import AbstractClassVar, AbstractVar
+from jaxtyping import Array, Bool, Float, Scalar
+
+_TRIPLE_JUMP = 1 / (2 - 2 ** (1 / 3))
+
+
+class _Step(eqx.Module):
+    """What one step from (t0, y0) to t1 needs: its signed size h and the field f(t, y)."""
+
+    terms: Any
+    args: Any
+    t0: Array
+    t1: Array
+    y0: Float[Array, " n"]
+    h: Float[Array, ""]
+
+    def __init__(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any):
+        if jax.tree.structure(y0) != jax.tree.structure(0) or jnp.ndim(y0) != 1:
+            raise ValueError(
+                f"A symplectic solver got a state of shape {jax.tree.map(jnp.shape, y0)}; it needs "
+                "one array of shape (n,). For a batch, use `jax.vmap` over the initial states."
+            )
+        self.terms, self.args = terms, args
+        self.t0, self.t1, self.y0 = jnp.asarray(t0), jnp.asarray(t1), jnp.asarray(y0)
+        # The control carries the direction of time; its dtype may be narrower than the state's.
+        self.h = jnp.asarray(terms.contr(t0, t1), self.y0.dtype)
+
+    def field(self, t: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.terms.vf(t, y, self.args)
+
+    def time(self, fraction: float | np.ndarray) -> Array:
+        return self.t0 + jnp.asarray(fraction, self.t0.dtype) * (self.t1 - self.t0)
+
+
+class AbstractSymplecticSolver(diffrax.AbstractSolver):
+    """A Diffrax solver whose step is a symplectic map for every constant step size.
+
+    It gives no error estimate, so Diffrax refuses it together with an adaptive step size.
+    """
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+    nominal_order: AbstractClassVar[int]
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Between steps, as `SaveAt(ts=...)` asks: linear at order 2, else cubic Hermite.
+
+        Neither is symplectic; make steps onto the times of interest, as `simulate` does.
+        """
+        if self.nominal_order == 2:
+            return diffrax.LocalLinearInterpolation
+        return diffrax.ThirdOrderHermitePolynomialInterpolation
+
+    def order(self, terms: Any) -> int:
+        """Return the order p: the error at a fixed time is O(hᵖ)."""
+        del terms
+        return self.nominal_order
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        """Return the vector field at one point."""
+        return terms.vf(t0, y0, args)
+
+    def _dense_info(self, step: _Step, y1: Float[Array, " n"]) -> dict[str, Array]:
+        info = {"y0": step.y0, "y1": y1}
+        if self.nominal_order > 2:  # XLA drops these two evaluations where nothing is interpolated.
+            info["k0"] = step.h * step.field(step.t0, step.y0)
+            info["k1"] = step.h * step.field(step.t1, y1)
+        return info
+
+
+class FixedPointToRounding(optx.AbstractFixedPointSolver):
+    """Iterate y ← f(y) until the increments are rounding errors.
+
+    Stops when the increment is at most `max(rtol, eps) · max|y| + atol`, or when it is below
+    √eps · max|y| and has not reached a new minimum for three iterations, which is where the
+    rounding errors of f itself (a kernel sum with large coefficients, say) end the descent. A loose
+    tolerance would leave an error of one sign in every step, and H would drift. Linear convergence,
+    no Jacobian: for small steps of a non-stiff field it is cheaper than Newton.
+
+    Source: HLW, VIII.6; Hairer, McLachlan & Razakarivony (2008), BIT 48, 231-243.
+    """
+
+    rtol: float = 0.0
+    atol: float = 0.0
+    norm: Callable[[Any], Scalar] = optx.max_norm
+
+    # Increments of an oscillation shrink every second iteration only, hence more than two.
+    patience: ClassVar[int] = 3
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        """Return (increment, smallest increment so far, iterations since then)."""
+        del fn, args, options, f_struct, aux_struct, tags
+        infinite = jnp.full_like(self.norm(y), jnp.inf)
+        return infinite, infinite, jnp.array(0)
+
+    def step(self, fn, y, args, options, state, tags):
+        """Apply f once."""
+        del options, tags
+        _, smallest, since = state
+        new, aux = fn(y, args)
+        increment = self.norm(new - y)
+        since = jnp.where(increment < smallest, 0, since + 1)
+        return new, (increment, jnp.minimum(increment, smallest), since), aux
+
+    def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
+        """Return whether the increments are rounding errors, or not finite."""
+        del fn, args, options, tags
+        increment, _, since = state
+        size = self.norm(y)
+        eps = float(jnp.finfo(size.dtype).eps)
+        done = increment <= max(self.rtol, eps) * size + self.atol
+        stalled = (since >= self.patience) & (increment <= eps**0.5 * size)
+        # The increment is infinite before the first iteration, and NaN once the field overflows.
+        lost = jnp.isnan(increment)
+        result = optx.RESULTS.where(
+            lost, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+        )
+        return done | stalled | lost, result
+
+    def postprocess(self, fn, y, aux, args, options, state, tags, result):
+        """Return the last iterate as it is."""
+        del fn, args, options, state, tags, result
+        return y, aux, {}
+
+
+class GaussTableau(NamedTuple):
+    """Butcher coefficients of s-stage Gauss collocation, and the extrapolation of its slopes."""
+
+    a: np.ndarray  # (s, s)
+    b: np.ndarray  # (s,)
+    c: np.ndarray  # (s,)
+    ahead: np.ndarray  # (s, s): slopes of one step ↦ guess for the next
+
+
+def _gauss(stages: int) -> GaussTableau:
+    """Collocation at the zeros c of the shifted Legendre polynomial (HLW II.1.3).
+
+    With ℓ_j the Lagrange polynomials at c: a_ij = ∫₀^{c_i} ℓ_j, b_j = ∫₀¹ ℓ_j. The polynomial
+    through the slopes of a step, evaluated at 1 + c, starts the iteration of the next (VIII.6.1).
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(stages)
+    c, b = (nodes + 1) / 2, weights / 2
+    powers = np.arange(stages)
+    to_coefficients = np.linalg.inv(c[:, None] ** powers)  # (s, s): values at c ↦ coefficients
+    a = (c[:, None] ** (powers + 1) / (powers + 1)) @ to_coefficients
+    ahead = (1 + c[:, None]) ** powers @ to_coefficients
+    return GaussTableau(a, b, c, ahead)
+
+
+class AbstractGauss(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
+    """Gauss collocation: k_i = f(t + c_i h, x + h Σ_j a_ij k_j), x₁ = x + h Σ_i b_i k_i.
+
+    Order 2s with s stages. Symplectic because b_i a_ij + b_j a_ji = b_i b_j (HLW VI.4), and
+    symmetric, Ψ_h⁻¹ = Ψ_{−h}, because the nodes are (V.2). The state carried between steps is the
+    last slopes, from which the next are guessed.
+    """
+
+    tableau: AbstractClassVar[GaussTableau]
+    root_finder: AbstractVar[Any]
+    root_find_max_steps: AbstractVar[int]
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Float[Array, "s n"]:
+        """Return the first guess of the stage slopes."""
+        step = _Step(terms, t0, t1, y0, args)
+        slope = step.field(t0, step.y0)
+        return jnp.broadcast_to(slope, (self.tableau.b.size, slope.size))
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> tuple[Float[Array, " n"], None, dict[str, Array], Float[Array, "s n"], diffrax.RESULTS]:
+        """Solve the stage equations to rounding and make one step."""
+        del made_jump  # The slopes of the last step are but a guess.
+        step = _Step(terms, t0, t1, y0, args)
+        tableau = jax.tree.map(lambda x: jnp.asarray(x, step.y0.dtype), self.tableau)
+        solution = optx.fixed_point(
+            _stage_slopes,
+            self.root_finder,
+            jax.lax.stop_gradient(tableau.ahead @ solver_state),
+            (step, step.time(self.tableau.c), tableau.a),
+            max_steps=self.root_find_max_steps,
+            throw=False,
+        )
+        y1 = step.y0 + step.h * (tableau.b @ solution.value)
+        result = diffrax.RESULTS.promote(solution.result)
+        return y1, None, self._dense_info(step, y1), solution.value, result
+
+
+def _stage_slopes(
+    k: Float[Array, "s n"], inputs: tuple[_Step, Float[Array, " s"], Float[Array, "s s"]]
+) -> Float[Array, "s n"]:
+    """The map whose fixed point are the slopes k of the stages."""
+    step, times, a = inputs
+    return jax.vmap(step.field)(times, step.y0[None] + step.h * (a @ k))
+
+
+class ImplicitMidpoint(AbstractGauss):
+    """Implicit midpoint rule, x₁ = x + h f((x + x₁)/2): Gauss collocation with one stage.
+
+    Order 2; symplectic for every Hamiltonian; symmetric, so time-reversible where the field is; it
+    conserves every quadratic invariant exactly (up to rounding). One evaluation per iteration.
+
+    Args:
+        root_finder: how the implicit equation is solved: an `optimistix` fixed-point solver or root
+            finder. The default needs h‖Df‖/2 well below 1; `optimistix.Newton(rtol, atol)` with
+            tolerances near rounding takes larger steps of stiffer fields.
+        root_find_max_steps: iterations after which a step is given up and the solve fails.
+
+    Raises:
+        ValueError: the state is not one array of shape (n,).
+        RuntimeError: the iteration did not converge; take a smaller step.
+
+    Source: HLW, I.1.2 and VI.3 (theorem 3.5).
+    """
+
+    nominal_order: ClassVar[int] = 2
+    tableau: ClassVar[GaussTableau] = _gauss(1)
+    root_finder: Any = FixedPointToRounding()
+    root_find_max_steps: int = 100
+
+
+class GaussLegendre4(AbstractGauss):
+    """Gauss collocation with two stages, c = 1/2 ∓ √3/6.
+
+    Order 4; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. The
+    formula is that of `AbstractGauss`; arguments and errors are those of `ImplicitMidpoint`.
+
+    Source: HLW, II.1.3 (table 1.1) and VI.4.
+    """
+
+    nominal_order: ClassVar[int] = 4
+    tableau: ClassVar[GaussTableau] = _gauss(2)
+    root_finder: Any = FixedPointToRounding()
+    root_find_max_steps: int = 100
+
+
+class GaussLegendre6(AbstractGauss):
+    """Gauss collocation with three stages, c = 1/2, 1/2 ∓ √15/10.
+
+    Order 6; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. The
+    formula is that of `AbstractGauss`; arguments and errors are those of `ImplicitMidpoint`.
+
+    Source: HLW, II.1.3 (table 1.1) and VI.4.
+    """
+
+    nominal_order: ClassVar[int] = 6
+    tableau: ClassVar[GaussTableau] = _gauss(3)
+    root_finder: Any = FixedPointToRounding()
+    root_find_max_steps: int = 100
+
+
+def is_separable(terms: Any) -> bool:
+    """Whether the field under a Diffrax term says of itself that H = T(p) + U(q)."""
+    while not hasattr(terms, "vector_field") and hasattr(terms, "term"):
+        terms = terms.term  # Diffrax wraps the user's term to set the direction of time.
+    return bool(getattr(getattr(terms, "vector_field", None), "is_separable", False))
+
+
+class AbstractSplitting(AbstractSymplecticSolver):
+    """Kick, drift, kick with h replaced by w_1 h, …, w_s h in turn (w = `weights`, Σ w = 1).
+
+    One such substep of size h, where q̇ = f_q depends on p alone and ṗ = f_p on q alone:
+
+        p½ = p + h/2 f_p(q),   q₁ = q + h f_q(p½),   p₁ = p½ + h/2 f_p(q₁)
+
+    For any other field this is not symplectic, nor even consistent with order 2, and nothing in its
+    output shows it. So the field must have an attribute `is_separable` that is True, or the caller
+    must say so by `assume_separable=True`. f is evaluated whole, twice in every substep; the state
+    carried between steps is f_p(q₁), with which the next step begins.
+    """
+
+    weights: AbstractClassVar[tuple[float, ...]]
+    assume_separable: AbstractVar[bool]
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Float[Array, " m"]:
+        """Return the force f_p at the start."""
+        step = _Step(terms, t0, t1, y0, args)
+        self._require_separable(terms, step.y0.size)
+        return step.field(t0, step.y0)[step.y0.size // 2 :]
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> tuple[Float[Array, " n"], None, dict[str, Array], Float[Array, " m"], diffrax.RESULTS]:
+        """Make one step of s kicks and s drifts."""
+        step = _Step(terms, t0, t1, y0, args)
+        self._require_separable(terms, step.y0.size)
+        q, p = jnp.split(step.y0, 2)
+        force = solver_state
+        if made_jump is not False:
+            fresh = self.init(terms, t0, t1, y0, args)
+            force = jnp.where(made_jump, fresh, force)
+        begin = 0.0
+        for weight in self.weights:
+            h = weight * step.h
+            p = p + h / 2 * force
+            velocity = step.field(step.time(begin + weight / 2), jnp.concatenate([q, p]))
+            q = q + h * velocity[: q.size]
+            begin += weight
+            force = step.field(step.time(begin), jnp.concatenate([q, p]))[q.size :]
+            p = p + h / 2 * force
+        y1 = jnp.concatenate([q, p])
+        return y1, None, self._dense_info(step, y1), force, diffrax.RESULTS.successful
+
+    def _require_separable(self, terms: Any, n: int) -> None:
+        name = type(self).__name__
+        if n % 2:
+            raise ValueError(f"{name} got {n} coordinates: x = (q, p) has an even number.")
+        if not (self.assume_separable or is_separable(terms)):
+            raise ValueError(
+                f"{name} needs a separable Hamiltonian H = T(p) + U(q), and this field cannot be "
+                "proved to have one: it has no attribute `is_separable` that is True. A learned H "
+                f"is in general not separable: use hk.ImplicitMidpoint() or hk.GaussLegendre4(). "
+                f"If you know that it is, say so with hk.{name}(assume_separable=True)."
+            )
+
+
+class StormerVerlet(AbstractSplitting):
+    """Störmer–Verlet (leapfrog, velocity Verlet): the kick–drift–kick of `AbstractSplitting`.
+
+    Order 2; symplectic if H = T(p) + U(q); symmetric, so time-reversible where the field is;
+    explicit, two evaluations per step.
+
+    Args:
+        assume_separable: take the caller's word for H = T(p) + U(q). False: the field must have an
+            attribute `is_separable` that is True.
+
+    Raises:
+        ValueError: the field is not known to be separable, n is odd, or the state is not (n,).
+
+    Source: HLW, I.1.4 and VI.3 (theorem 3.4).
+    """
+
+    nominal_order: ClassVar[int] = 2
+    weights: ClassVar[tuple[float, ...]] = (1.0,)
+    assume_separable: bool = False
+
+
+class Yoshida4(AbstractSplitting):
+    """Yoshida's triple jump: three `StormerVerlet` steps of sizes γh, (1 − 2γ)h, γh.
+
+    γ = 1/(2 − 2^{1/3}) ≈ 1.35, so the middle step runs backwards. Order 4; symplectic if
+    H = T(p) + U(q); symmetric; explicit, six evaluations per step. Arguments and errors are those
+    of `StormerVerlet`.
+
+    Source: Yoshida (1990), Phys. Lett. A 150, 262–268; HLW, II.4 (example 4.2).
+    """
+
+    nominal_order: ClassVar[int] = 4
+    weights: ClassVar[tuple[float, ...]] = (_TRIPLE_JUMP, 1 - 2 * _TRIPLE_JUMP, _TRIPLE_JUMP)
+    assume_separable: bool = False
+
+
+class EqualSteps(diffrax.AbstractSolver):
+    """One long step made of ⌈(t1 − t0)/dt⌉ equal steps of another solver.
+
+    With `diffrax.StepTo(ts)` every time in `ts` is the end of a step: nothing is interpolated, and
+    memory is that of the saved points. The steps between two times are all of one size, at most
+    `dt`, and do not depend on the state. The field must be autonomous: each long step starts at
+    time 0, so that a small step is not lost in the rounding of a large time.
+    """
+
+    solver: diffrax.AbstractSolver
+    dt: Float[Array, ""]
+    adjoint: diffrax.AbstractAdjoint
+    max_steps: int = eqx.field(static=True)
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+    def order(self, terms: Any) -> int | None:
+        """Return the order of the solver that makes the steps."""
+        return self.solver.order(terms)
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
+        """Return no state: every long step begins afresh."""
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        """Return the vector field at one point."""
+        return self.solver.func(terms, t0, y0, args)
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> tuple[Any, None, dict[str, Any], None, diffrax.RESULTS]:
+        """Make the equal steps."""
+        del solver_state, made_jump
+        span = t1 - t0
+        solution = diffrax.diffeqsolve(
+            terms,
+            self.solver,
+            jnp.zeros_like(span),
+            span,
+            span / equal_steps(span, self.dt),
+            y0,
+            args,
+            adjoint=self.adjoint,
+            max_steps=self.max_steps,
+            throw=False,
+        )
+        y1 = jax.tree.map(lambda y: y[-1], solution.ys)
+        return y1, None, {"y0": y0, "y1": y1}, None, solution.result
+
+
+def equal_steps(span: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:
+    """The number of equal steps of at most `dt` that fill `span`: whole, at least 1.
+
+    √eps of slack, for a span of 10 dt that rounding made a little longer is 10 steps and not 11.
+    """
+    slack = 1 - float(jnp.finfo(span.dtype).eps) ** 0.5
+    return jnp.maximum(jnp.ceil(span / jnp.asarray(dt, span.dtype) * slack), 1)

@@ -1,0 +1,248 @@
+"""Trajectories of any vector field, by Diffrax.
+
+Diffrax takes most of a second to import, so it loads when `simulate` is called and not with the
+package.
+"""
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from typing import TYPE_CHECKING, Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from hamkernel import _require as require
+
+if TYPE_CHECKING:
+    import diffrax
+
+# Bounds the loop where the number of steps is not known beforehand: some seconds of a cheap field.
+_MAX_STEPS = 2**20
+
+
+class _Autonomous(eqx.Module):
+    """The field as Diffrax calls it, f(t, x, args); it keeps what the field knows of itself."""
+
+    field: Callable[[Array], Array]
+
+    @property
+    def is_separable(self) -> bool:
+        return bool(getattr(self.field, "is_separable", False))
+
+    def __call__(self, t: Any, x: Float[Array, " n"], args: Any) -> Float[Array, " n"]:
+        del t, args
+        return self.field(x)
+
+
+def simulate(
+    field: Callable[[Float[Array, " n"]], Float[Array, " n"]],
+    x0: Float[ArrayLike, " n"],
+    ts: Float[ArrayLike, " T"],
+    solver: "diffrax.AbstractSolver | None" = None,
+    dt: float | Float[Array, ""] | None = None,
+    *,
+    rtol: float | None = None,
+    atol: float | None = None,
+    max_steps: int | None = None,
+    progress: bool = False,
+    adjoint: "diffrax.AbstractAdjoint | None" = None,
+    throw: bool = True,
+) -> "diffrax.Solution":
+    """Integrate ẋ = f(x) from x0 at time ts[0], and return the states at the times ts.
+
+    Without `dt` the step adapts to the tolerances. With `dt` every interval [ts[i], ts[i+1]] is cut
+    into the fewest equal steps of at most `dt`, so that each saved state is the end of a step and
+    none is interpolated. Symplectic solvers need this: they keep the energy error bounded because
+    every step is the same map, and a step chosen from the state is a different map each time.
+    With equally spaced `ts` all steps are of one size; unequal spacing changes the size (by at most
+    dt divided by the spacing) from interval to interval, still independently of the state.
+
+    Args:
+        field: x (n,) ↦ ẋ (n,), a function or a PyTree such as a fitted field or a system.
+        x0: initial state, shape (n,); for a batch, `jax.vmap` over it. It sets the dtype.
+        ts: times, shape (T,), T ≥ 2, strictly increasing, in the unit of time of the field.
+        solver: any Diffrax solver; `diffrax.Dopri8()` if None. Symplectic: `ImplicitMidpoint`,
+            `GaussLegendre4`, `GaussLegendre6` for every H; `StormerVerlet`, `Yoshida4` for
+            H = T(p) + U(q).
+        dt: the largest step; required by a symplectic solver.
+        rtol: relative tolerance of the adaptive step: 1e-10 if None, 1e-5 in float32.
+        atol: absolute tolerance, likewise, in the units of x.
+        max_steps: the most steps of the whole solve, or with `dt` between two saved times. If None,
+            enough where the number is known, else 2²⁰. It bounds the memory of gradients (as its
+            square root).
+        progress: show a progress bar (tqdm); with `dt` it moves at every saved time.
+        adjoint: how Diffrax differentiates; None is its default, which is reverse-mode only.
+        throw: raise if the solve fails. If False, look at `.result`.
+
+    Returns:
+        A `diffrax.Solution`: `.ts` (T,), `.ys` (T, n), `.stats["num_steps"]`.
+
+    Raises:
+        ValueError: a shape, time or value does not fit; a symplectic solver without `dt`; a solver
+            that cannot estimate its error without `dt`; a splitting of a field that is not known to
+            be separable.
+        TypeError: `solver` is not a Diffrax solver; the field changes the dtype.
+        RuntimeError: the solve failed: too many steps, the implicit equations of a step did not
+            converge, or the state overflowed. Usually the remedy is a smaller `dt`.
+    """
+    import diffrax
+
+    from hamkernel._integrators import EqualSteps, equal_steps
+
+    with _eager(x0):
+        x0 = _initial_state(x0)
+    with _eager(ts):
+        ts = _times(ts, x0.dtype)
+    if solver is None:
+        solver = diffrax.Dopri8()
+    _check_solver(solver, dt, rtol, atol)
+    _check_field(field, x0)
+    adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+
+    if dt is None:
+        counts = None
+        default = 1e-10 if x0.dtype == jnp.float64 else 1e-5
+        controller = diffrax.PIDController(
+            rtol=default if rtol is None else rtol, atol=default if atol is None else atol
+        )
+        saveat = diffrax.SaveAt(ts=ts)
+        max_steps = _MAX_STEPS if max_steps is None else max_steps
+    else:
+        with _eager(dt):
+            dt = _largest_step(dt)
+        with _eager(ts, dt):
+            counts = equal_steps(ts[1:] - ts[:-1], dt).astype(int)  # (T - 1,)
+            bound = _bound(counts) if max_steps is None else max_steps
+        solver = EqualSteps(solver, dt, adjoint, bound)
+        controller = diffrax.StepTo(ts)
+        saveat = diffrax.SaveAt(t0=True, steps=True)
+        max_steps = ts.size - 1
+
+    meter = diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter()
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(_Autonomous(field)),
+        solver,
+        ts[0],
+        ts[-1],
+        None,
+        x0,
+        saveat=saveat,
+        stepsize_controller=controller,
+        adjoint=adjoint,
+        max_steps=max_steps,
+        throw=throw,
+        progress_meter=meter,
+    )
+    if counts is not None:  # Diffrax counted the save intervals; the steps are inside them.
+        steps = {"num_steps": jnp.sum(counts), "num_accepted_steps": jnp.sum(counts)}
+        solution = eqx.tree_at(lambda s: s.stats, solution, {**solution.stats, **steps})
+    return _finite(solution) if throw else solution
+
+
+def _eager(*values: Any) -> AbstractContextManager[None]:
+    """Operations on constants happen at once, also under jit: they are checked and counted."""
+    if require.is_concrete(*values):
+        return jax.ensure_compile_time_eval()
+    return nullcontext()
+
+
+def _initial_state(x0: ArrayLike) -> Float[Array, " n"]:
+    x0 = require.floating(x0, "x0")
+    if x0.ndim != 1 or x0.size == 0:
+        hint = (
+            " For a batch, use `jax.vmap(lambda x: hk.simulate(field, x, ts).ys)(x0)`."
+            if x0.ndim > 1
+            else ""
+        )
+        raise ValueError(f"x0 has shape {x0.shape}; one state of shape (n,) is needed.{hint}")
+    return require.finite(x0, "x0")
+
+
+def _times(ts: ArrayLike, dtype: Any) -> Float[Array, " T"]:
+    ts = require.floating(ts, "ts")
+    if ts.ndim != 1 or ts.size < 2:
+        raise ValueError(
+            f"ts has shape {ts.shape}; at least two times in one dimension, shape (T,), are "
+            "needed: ts[0] is the time of x0, ts[1:] are the times to save at."
+        )
+    ts = require.finite(ts, "ts").astype(dtype)
+    return require.value(
+        ts,
+        ts[1:] <= ts[:-1],
+        f"ts must be strictly increasing, also after it is rounded to {ts.dtype}, the dtype of x0. "
+        "Sort the times and drop repeated ones; to go back in time integrate x -> -field(x).",
+    )
+
+
+def _check_field(field: Callable[[Array], Array], x0: Float[Array, " n"]) -> None:
+    if not callable(field):
+        raise TypeError(f"field is a {type(field).__name__}; a callable x (n,) -> (n,) is needed.")
+    out = eqx.filter_eval_shape(field, x0)
+    if jnp.shape(out) != x0.shape:
+        raise ValueError(
+            f"field maps a state of shape {x0.shape} to shape {jnp.shape(out)}; one velocity for "
+            "each coordinate is needed. Is x0 of the dimension the field was made for?"
+        )
+    if out.dtype != x0.dtype:
+        raise TypeError(
+            f"field maps {x0.dtype} to {out.dtype}; the solution has one dtype. "
+            f"Pass x0 as {out.dtype}, or cast the output of the field."
+        )
+
+
+def _check_solver(solver: Any, dt: Any, rtol: float | None, atol: float | None) -> None:
+    import diffrax
+
+    from hamkernel._integrators import AbstractSymplecticSolver
+
+    name = type(solver).__name__
+    if isinstance(solver, type) or not isinstance(solver, diffrax.AbstractSolver):
+        shown = solver.__name__ if isinstance(solver, type) else name
+        raise TypeError(f"solver is {shown}; an instance is needed, such as hk.ImplicitMidpoint().")
+    if isinstance(solver, diffrax.SemiImplicitEuler):
+        raise ValueError(
+            "SemiImplicitEuler takes two vector fields, one for q and one for p; simulate has one. "
+            "hk.StormerVerlet() is symplectic too, of order 2, and takes the whole field."
+        )
+    if dt is not None and not (rtol is None and atol is None):
+        raise ValueError("rtol and atol belong to adaptive steps, but dt sets constant ones.")
+    if dt is None and isinstance(solver, AbstractSymplecticSolver):
+        raise ValueError(
+            f"{name} is symplectic and needs a constant step: pass dt=... An adaptive step would "
+            "destroy symplecticity, since a step chosen from the state is a different map at every "
+            "state, and the energy would drift as with any other method. A tenth of the shortest "
+            "period or less is a start."
+        )
+    if dt is None and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+        raise ValueError(
+            f"{name} estimates no error, so the step cannot adapt to one: pass dt=... for constant "
+            "steps, or use a solver such as diffrax.Dopri8()."
+        )
+
+
+def _largest_step(dt: Any) -> Float[Array, ""]:
+    dt = require.positive(dt, "dt")
+    if dt.ndim:
+        raise ValueError(f"dt has shape {dt.shape}; one number is needed.")
+    return dt
+
+
+def _bound(counts: Int[Array, " T-1"]) -> int:
+    """A number of steps that no save interval exceeds, where the counts are known."""
+    if not require.is_concrete(counts):
+        return _MAX_STEPS
+    # A power of two, so that neighbouring values of dt share one compiled loop.
+    return 2 ** (int(counts.max()) - 1).bit_length()
+
+
+def _finite(solution: Any) -> Any:
+    ys = require.value(
+        solution.ys,
+        ~jnp.isfinite(solution.ys),
+        "The state overflowed or became NaN. The step is too large for the solver, or the field "
+        "has no solution over this time. Take a smaller dt, or a shorter time.",
+        RuntimeError,
+    )
+    return eqx.tree_at(lambda s: s.ys, solution, ys)

@@ -1,0 +1,298 @@
+"""Trajectories against SciPy, at times that are no multiples of the step, and every refusal."""
+
+import subprocess
+import sys
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+from hamkernel._integrators import (
+    GaussLegendre4,
+    GaussLegendre6,
+    ImplicitMidpoint,
+    StormerVerlet,
+    Yoshida4,
+    equal_steps,
+)
+from hamkernel._simulate import simulate
+
+SYMPLECTIC = [
+    ImplicitMidpoint(),
+    GaussLegendre4(),
+    GaussLegendre6(),
+    StormerVerlet(),
+    Yoshida4(),
+]
+START = jnp.array([1.5, 0.0])
+# Neither equally spaced nor multiples of any step used here.
+TIMES = np.array([0.0, 0.37, 1.0, 1.01, 2.718, 3.1416, 5.0])
+
+
+def name(solver):
+    return type(solver).__name__
+
+
+class Pendulum(eqx.Module):
+    """H = p²/2 − g cos q."""
+
+    gravity: float | jax.Array = 1.0
+    is_separable = True
+
+    def __call__(self, x):
+        return jnp.stack([x[1], -self.gravity * jnp.sin(x[0])])
+
+    def hamiltonian(self, x):
+        return x[..., 1] ** 2 / 2 - self.gravity * jnp.cos(x[..., 0])
+
+
+def states(*args, **options):
+    ys = simulate(*args, **options).ys
+    assert ys is not None
+    return ys
+
+
+def reference(times, start=START, **tolerances):
+    options = {"method": "DOP853", "rtol": 1e-13, "atol": 1e-13} | tolerances
+    return solve_ivp(
+        lambda t, x: [x[1], -np.sin(x[0])], (times[0], times[-1]), start, t_eval=times, **options
+    ).y.T
+
+
+def test_default_solver_agrees_with_scipy():
+    times = np.linspace(0, 20, 101)
+    solution = simulate(Pendulum(), START, times)
+    assert jnp.asarray(solution.ys).shape == (101, 2)
+    np.testing.assert_array_equal(solution.ts, times)
+    # 20 time units of local errors of 1e-10.
+    np.testing.assert_allclose(jnp.asarray(solution.ys), reference(times), atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    ("solver", "error"),
+    list(zip(SYMPLECTIC, [2e-3, 1e-6, 1e-9, 2e-3, 1e-5], strict=True)),
+    ids=lambda v: name(v) if isinstance(v, diffrax.AbstractSolver) else None,
+)
+def test_states_at_times_that_are_no_multiples_of_the_step(solver, error):
+    solution = simulate(Pendulum(), START, TIMES, solver, dt=0.05)
+    np.testing.assert_allclose(jnp.asarray(solution.ys), reference(TIMES), atol=error)
+    np.testing.assert_array_equal(jnp.asarray(solution.ys)[0], START)
+    # ⌈0.37/0.05⌉ + ⌈0.63/0.05⌉ + 1 + ⌈1.708/0.05⌉ + ⌈0.4236/0.05⌉ + ⌈1.8584/0.05⌉
+    assert solution.stats["num_steps"] == 8 + 13 + 1 + 35 + 9 + 38
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_multiples_of_the_step_need_no_extra_step_for_rounding(dtype):
+    spans = jnp.diff(jnp.linspace(0, 30, 301).astype(dtype))  # 0.1, give or take rounding
+    assert set(np.ceil(spans / dtype(0.01)).tolist()) == {10.0, 11.0}  # what must not happen
+    np.testing.assert_array_equal(equal_steps(spans, jnp.array(0.01)), 10.0)
+    np.testing.assert_array_equal(equal_steps(spans, jnp.array(0.0099)), 11.0)
+    np.testing.assert_array_equal(equal_steps(spans, jnp.array(7.0)), 1.0)
+
+
+def test_saved_states_are_steps_and_not_interpolations():
+    field, solver, energy = Pendulum(), GaussLegendre6(), Pendulum().hamiltonian(START)
+    ts = np.linspace(0, 10, 11)
+    coarse = states(field, START, ts, solver, dt=0.1, max_steps=16)
+    fine = states(field, START, ts / 10, solver, dt=0.1, max_steps=16)
+    # The same ten steps, saved at every step and at the tenth only.
+    np.testing.assert_allclose(fine[-1], coarse[1], atol=1e-14)
+    ours = states(field, START, ts, solver, dt=0.3, max_steps=16)
+    assert jnp.abs(field.hamiltonian(ours) - energy).max() < 1e-7
+    # Diffrax' own interpolation between constant steps shows what is avoided.
+    term = diffrax.ODETerm(lambda t, x, args: field(x))
+    saveat = diffrax.SaveAt(ts=jnp.asarray(ts))
+    theirs = diffrax.diffeqsolve(term, solver, 0.0, 10.0, 0.3, START, saveat=saveat).ys
+    assert jnp.abs(field.hamiltonian(theirs) - energy).max() > 1e-5
+
+
+@pytest.mark.parametrize("solver", [diffrax.Heun(), diffrax.Tsit5()], ids=name)
+def test_any_solver_takes_constant_steps(solver):
+    solution = simulate(Pendulum(), START, TIMES, solver, dt=0.01)
+    np.testing.assert_allclose(jnp.asarray(solution.ys), reference(TIMES), atol=1e-3)
+    assert solution.stats["num_steps"] == 37 + 63 + 1 + 171 + 43 + 186
+
+
+def drift_and_wobble(energy):
+    """Fitted change of the energy over the whole run, and the spread about that line."""
+    time = np.linspace(-0.5, 0.5, energy.size)
+    slope, offset = np.polyfit(time, energy, 1)
+    return abs(slope), np.std(energy - slope * time - offset)
+
+
+@pytest.mark.parametrize("solver", [*SYMPLECTIC, diffrax.Tsit5(), diffrax.Heun()], ids=name)
+def test_energy_wobbles_without_drift_over_1e5_steps_only_if_symplectic(solver):
+    field, dt, steps = Pendulum(), 0.2, 100_000
+    # Saved at an irrational fraction of the period, for every phase of the motion to occur.
+    ts = np.arange(0, steps + 1, 97) * dt
+    ys = states(field, START, ts, solver, dt, throw=False)
+    drift, wobble = drift_and_wobble(np.asarray(field.hamiltonian(ys)))
+    if solver in SYMPLECTIC:
+        # 1031 samples of a wobble fix the line to 12/√1031 of it: three standard errors.
+        assert drift < 3 * np.sqrt(12 / ts.size) * wobble + 1e-12
+    else:
+        assert drift > 2 * wobble
+
+
+def test_float32_in_is_float32_out():
+    for options in [{}, {"solver": GaussLegendre4(), "dt": 0.05}]:
+        ys = states(Pendulum(), START.astype(jnp.float32), TIMES, **options)
+        assert ys.dtype == jnp.float32
+        np.testing.assert_allclose(ys, reference(TIMES), atol=1e-4)
+
+
+def test_small_steps_survive_large_times_in_float32():
+    # Near t = 1e5 neighbouring float32 are 0.008 apart, about the step.
+    ts = 1e5 + np.linspace(0, 10, 11)
+    solution = simulate(Pendulum(), START.astype(jnp.float32), ts, GaussLegendre4(), dt=0.01)
+    assert solution.stats["num_steps"] == 1000
+    np.testing.assert_allclose(jnp.asarray(solution.ys), reference(ts - 1e5), atol=1e-4)
+
+
+@pytest.mark.parametrize("options", [{}, {"solver": ImplicitMidpoint(), "dt": 0.1}])
+def test_batch_by_vmap_is_the_loop(options):
+    starts = jnp.array([[0.3, 0.0], [1.0, 0.5], [2.5, -0.1]])
+
+    def run(x):
+        return states(Pendulum(), x, TIMES, **options)
+
+    loop = jnp.stack([run(x) for x in starts])
+    np.testing.assert_allclose(jax.jit(jax.vmap(run))(starts), loop, atol=1e-13)
+
+
+def test_jit_with_traced_times_and_step_changes_nothing():
+    def run(x, ts, dt):
+        return states(Pendulum(), x, ts, GaussLegendre4(), dt)
+
+    plain = run(START, TIMES, 0.05)
+    np.testing.assert_allclose(
+        jax.jit(run)(START, jnp.asarray(TIMES), jnp.array(0.05)), plain, atol=1e-14
+    )
+
+
+def test_a_new_start_field_or_step_does_not_compile_again():
+    @eqx.filter_jit
+    @eqx.debug.assert_max_traces(max_traces=1)
+    def run(field, x, ts, dt):
+        return states(field, x, ts, ImplicitMidpoint(), dt)
+
+    for g, dt in [(1.0, 0.1), (2.0, 0.05)]:
+        run(Pendulum(jnp.array(g)), START * g, jnp.asarray(TIMES) * g, jnp.array(dt))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{}, {"solver": ImplicitMidpoint(), "dt": 0.1}, {"solver": StormerVerlet(), "dt": 0.1}],
+    ids=["adaptive", "ImplicitMidpoint", "StormerVerlet"],
+)
+def test_gradient_of_a_rollout_is_the_central_difference(options):
+    @jax.jit
+    def loss(gravity, x0):
+        ys = states(Pendulum(gravity), x0, np.linspace(0, 3, 7), **options)
+        return jnp.sum(ys[:, 0] ** 2)
+
+    gravity, step = jnp.array(1.2), 1e-5
+    by_gravity, by_start = jax.jit(jax.grad(loss, (0, 1)))(gravity, START)
+    difference = (loss(gravity + step, START) - loss(gravity - step, START)) / (2 * step)
+    np.testing.assert_allclose(by_gravity, difference, rtol=1e-6)  # step² and eps/step
+    e = jnp.array([step, 0.0])
+    difference = (loss(gravity, START + e) - loss(gravity, START - e)) / (2 * step)
+    np.testing.assert_allclose(by_start[0], difference, rtol=1e-6)
+
+
+def test_flow_map_by_forward_mode_is_symplectic():
+    def end(x):
+        adjoint = diffrax.ForwardMode()
+        return states(Pendulum(), x, TIMES, GaussLegendre4(), 0.1, adjoint=adjoint)[-1]
+
+    # For n = 2 symplectic means of determinant one.
+    np.testing.assert_allclose(np.linalg.det(jax.jit(jax.jacfwd(end))(START)), 1.0, atol=1e-12)
+
+
+def test_a_symplectic_solver_without_step_is_refused():
+    for solver in SYMPLECTIC:
+        with pytest.raises(ValueError, match=r"needs a constant step.*destroy symplecticity"):
+            simulate(Pendulum(), START, TIMES, solver)
+
+
+def test_a_solver_without_error_estimate_needs_a_step():
+    with pytest.raises(ValueError, match="Euler estimates no error"):
+        simulate(Pendulum(), START, TIMES, diffrax.Euler())
+
+
+def test_splitting_of_a_bare_function_is_refused():
+    field = Pendulum()
+
+    def bare(x):
+        return field(x)
+
+    with pytest.raises(ValueError, match="cannot be proved"):
+        simulate(bare, START, TIMES, StormerVerlet(), dt=0.1)
+    ys = states(bare, START, TIMES, StormerVerlet(assume_separable=True), dt=0.1)
+    np.testing.assert_array_equal(ys, states(field, START, TIMES, StormerVerlet(), dt=0.1))
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "message"),
+    [
+        ({"x0": np.ones((3, 2))}, ValueError, r"shape \(3, 2\).*jax.vmap"),
+        ({"x0": np.ones(())}, ValueError, r"one state of shape \(n,\)"),
+        ({"x0": [np.nan, 0.0]}, ValueError, "x0 contains NaN"),
+        ({"x0": np.ones(3)}, ValueError, r"maps a state of shape \(3,\) to shape \(2,\)"),
+        ({"ts": [0.0]}, ValueError, "at least two times"),
+        ({"ts": np.ones((2, 2))}, ValueError, r"ts has shape \(2, 2\)"),
+        ({"ts": [0.0, 2.0, 1.0]}, ValueError, "strictly increasing"),
+        ({"ts": [0.0, 1.0, 1.0]}, ValueError, "strictly increasing"),
+        ({"ts": [0.0, np.inf]}, ValueError, "ts contains NaN or inf"),
+        ({"dt": 0.0}, ValueError, "dt must be positive"),
+        ({"dt": [0.1, 0.2]}, ValueError, r"dt has shape \(2,\)"),
+        ({"dt": 0.1, "rtol": 1e-3}, ValueError, "belong to adaptive steps"),
+        ({"solver": ImplicitMidpoint}, TypeError, "an instance is needed"),
+        ({"solver": "Tsit5"}, TypeError, "an instance is needed"),
+        ({"solver": diffrax.SemiImplicitEuler(), "dt": 0.1}, ValueError, "StormerVerlet"),
+        ({"field": 1.0}, TypeError, "a callable"),
+        ({"field": lambda x: x.astype(jnp.float32)}, TypeError, "maps float64 to float32"),
+    ],
+)
+def test_arguments_that_do_not_fit_are_refused(changes, error, message):
+    arguments = {"field": Pendulum(), "x0": START, "ts": TIMES} | changes
+    with pytest.raises(error, match=message):
+        simulate(**arguments)
+
+
+def test_bad_times_are_refused_under_jit_too():
+    with pytest.raises(Exception, match="strictly increasing"):
+        jax.jit(lambda ts: states(Pendulum(), START, ts))(jnp.array([0.0, 2.0, 1.0]))
+
+
+def test_failed_solves_raise_unless_told_not_to():
+    ts = np.array([0.0, 5.0])
+    with pytest.raises(RuntimeError, match="maximum number of solver steps"):
+        simulate(Pendulum(), START, ts, max_steps=3)
+    with pytest.raises(RuntimeError, match="maximum number of solver steps"):
+        simulate(Pendulum(), START, ts, Yoshida4(), dt=0.01, max_steps=100)
+    with pytest.raises(RuntimeError, match=r"maximum number|diverge"):
+        simulate(Pendulum(jnp.array(1e4)), START, ts, ImplicitMidpoint(), dt=0.5)
+    with pytest.raises(RuntimeError, match=r"overflowed.*smaller dt"):
+        simulate(lambda x: x**3, START, ts, diffrax.Euler(), dt=0.1)
+    quiet = simulate(Pendulum(), START, ts, max_steps=3, throw=False)
+    assert quiet.result == diffrax.RESULTS.max_steps_reached
+
+
+@pytest.mark.parametrize("options", [{}, {"solver": Yoshida4(), "dt": 0.1}])
+def test_progress_shows_a_bar_and_changes_nothing(options, capsys):
+    quiet = simulate(Pendulum(), START, TIMES, **options)
+    assert "%" not in capsys.readouterr().err
+    loud = simulate(Pendulum(), START, TIMES, progress=True, **options)
+    jax.effects_barrier()
+    assert "100.00%" in capsys.readouterr().err
+    np.testing.assert_array_equal(loud.ys, quiet.ys)
+
+
+def test_diffrax_loads_only_when_a_simulation_runs():
+    code = "import hamkernel._simulate, sys; assert 'diffrax' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True)
