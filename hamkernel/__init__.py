@@ -1,11 +1,16 @@
 """Learn Hamiltonian dynamics with structured kernels, by automatic differentiation in JAX."""
 
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from hamkernel import systems
 from hamkernel._field import KernelField
 from hamkernel._fit import fit
 from hamkernel._gram import gram
 from hamkernel._scalar_product import Periodic, Polynomial
 from hamkernel._scalar_radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._scalar_transform import Select, Warp
+from hamkernel._simulate import simulate
 from hamkernel._solve import Cholesky
 from hamkernel._structured import (
     CurlFree,
@@ -16,6 +21,22 @@ from hamkernel._structured import (
     Sum,
     Symplectic,
 )
+from hamkernel._tune import Tuned, tune
+from hamkernel._validation import (
+    cross_validation_loss,
+    cross_validation_residuals,
+    generalized_cross_validation,
+    log_marginal_likelihood,
+)
+
+if TYPE_CHECKING:
+    from hamkernel._integrators import (
+        GaussLegendre4,
+        GaussLegendre6,
+        ImplicitMidpoint,
+        StormerVerlet,
+        Yoshida4,
+    )
 
 __all__ = [  # noqa: RUF022 - in reading order
     # Scalar kernels.
@@ -39,4 +60,33 @@ __all__ = [  # noqa: RUF022 - in reading order
     "fit",
     "Cholesky",
     "KernelField",
+    # Hyperparameters.
+    "cross_validation_loss",
+    "cross_validation_residuals",
+    "generalized_cross_validation",
+    "log_marginal_likelihood",
+    "tune",
+    "Tuned",
+    # Simulation.
+    "simulate",
+    "ImplicitMidpoint",
+    "GaussLegendre4",
+    "GaussLegendre6",
+    "StormerVerlet",
+    "Yoshida4",
+    # Doors: example systems, pictures, the paper's experiments.
+    "systems",
+    "plot",
+    "paper",
 ]
+
+# Loaded when first asked for, so that `import hamkernel` loads neither diffrax nor matplotlib.
+_INTEGRATORS = ("ImplicitMidpoint", "GaussLegendre4", "GaussLegendre6", "StormerVerlet", "Yoshida4")
+
+
+def __getattr__(name: str) -> Any:
+    if name in _INTEGRATORS:
+        return getattr(importlib.import_module("hamkernel._integrators"), name)
+    if name in ("plot", "paper"):
+        return importlib.import_module(f"hamkernel.{name}")
+    raise AttributeError(f"module 'hamkernel' has no attribute {name!r}")

@@ -10,6 +10,7 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float
 
@@ -70,8 +71,8 @@ def finite(x: Array, name: str) -> Array:
     def message() -> str:
         if not is_concrete(x):
             return f"{name} contains NaN or inf: remove or repair those points first."
-        rows = jnp.flatnonzero(~jnp.isfinite(x).all(axis=tuple(range(1, x.ndim))))
-        shown = ", ".join(str(int(row)) for row in rows[:5])
+        rows = np.flatnonzero(~np.isfinite(x).reshape(len(x), -1).all(axis=1))
+        shown = ", ".join(str(row) for row in rows[:5])
         more = f" and {rows.size - 5} more" if rows.size > 5 else ""
         return f"{name} contains NaN or inf in row {shown}{more}: remove or repair those points."
 

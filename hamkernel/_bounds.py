@@ -1,0 +1,111 @@
+"""Where to look for hyperparameters: a box from the data.
+
+A lengthscale far below the distance between neighbours, or far above the extent of the data,
+changes nothing but rounding; an amplitude is compared with the scale of Y. Coordinates are those
+that the kernel sees: behind a `Select` or a `Warp` the data is transformed first.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from hamkernel._scalar import AbstractScalarKernel
+from hamkernel._scalar_transform import Select, Warp
+from hamkernel._structured import AbstractMatrixKernel
+
+
+@dataclasses.dataclass(frozen=True)
+class Hyperparameter:
+    """One trainable leaf of a kernel and the box to look for it in.
+
+    `low` and `high` have the shape of the leaf and are in its stored coordinates, which are
+    logarithms where `logarithmic` holds.
+    """
+
+    name: str
+    logarithmic: bool
+    low: np.ndarray
+    high: np.ndarray
+
+
+def hyperparameters(
+    K: AbstractMatrixKernel, X: Float[Array, "N n"], Y: Float[Array, "N n"]
+) -> list[Hyperparameter]:
+    """The trainable leaves of K, in the order of its leaves, with their boxes from the data."""
+    return list(_walk((), K, np.asarray(X), _amplitude(K, X, Y)))
+
+
+@eqx.filter_jit
+def gram_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
+    """The trace of the Gram, from its diagonal blocks alone."""
+    return jnp.sum(jax.vmap(lambda x: jnp.trace(K(x, x)))(X))
+
+
+def _amplitude(K: AbstractMatrixKernel, X: Array, Y: Array) -> float:
+    """The factor that gives K(x, x) the size of Y: mean Y² over the mean diagonal."""
+    ratio = float(jnp.mean(Y**2) / gram_trace(K, X) * X.size)
+    return ratio if np.isfinite(ratio) and ratio > 0 else 1.0
+
+
+def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterator[Hyperparameter]:
+    """Walk the kernel; X is the data in the coordinates that `node` sees."""
+    if isinstance(node, Select):
+        X = X[:, list(node.dims)]
+    children, _ = jax.tree_util.tree_flatten_with_path(node, is_leaf=lambda sub: sub is not node)
+    for key, child in children:
+        if eqx.is_inexact_array(child):
+            name = jax.tree_util.keystr((*path, *key)).removeprefix(".")
+            head, dot, last = name.rpartition(".")
+            low, high = _box(node, last, child, X, amplitude)
+            yield Hyperparameter(
+                # `terms[0].kernel.lengthscale` for the leaf `.terms[0].kernel.log_lengthscale`
+                name=head + dot + last.removeprefix("log_"),
+                logarithmic=last.startswith("log_"),
+                low=np.broadcast_to(low, child.shape),
+                high=np.broadcast_to(high, child.shape),
+            )
+        else:
+            seen = X
+            if isinstance(node, Warp) and isinstance(child, AbstractScalarKernel):
+                seen = np.asarray(jax.vmap(node.fn)(jnp.asarray(X)))
+            yield from _walk((*path, *key), child, seen, amplitude)
+
+
+def _box(
+    node: object, name: str, leaf: Array, X: np.ndarray, amplitude: float
+) -> tuple[ArrayLike, ArrayLike]:
+    """Bounds for the leaf `name` of `node`, in its stored coordinates."""
+    ours = isinstance(node, AbstractScalarKernel)
+    if ours and name == "log_lengthscale":
+        spacing, extent = _spacing_and_extent(X, per_coordinate=leaf.ndim > 0)
+        return np.log(0.3 * spacing), np.log(30 * extent)
+    if ours and name == "log_period":
+        spacing, extent = _spacing_and_extent(X, per_coordinate=leaf.ndim > 0)
+        return np.log(2 * spacing), np.log(10 * extent)
+    if ours and name == "log_scale":
+        return np.log(1e-5 * amplitude), np.log(1e5 * amplitude)
+    if ours and name == "log_offset":
+        square = np.mean(np.sum(X**2, axis=1)) or 1.0
+        return np.log(1e-4 * square), np.log(1e4 * square)
+    value = np.asarray(leaf)
+    if name.startswith("log_"):
+        return value - np.log(1e3), value + np.log(1e3)
+    reach = 10 * np.maximum(1.0, np.abs(value))  # a number of unknown meaning
+    return value - reach, value + reach
+
+
+def _spacing_and_extent(X: np.ndarray, per_coordinate: bool) -> tuple[np.ndarray, np.ndarray]:
+    """The typical distance of nearest neighbours and the extent of the data, 1 where it is 0.
+
+    The distance of N points in an extent L is taken as L / N: a fair lower bound in any dimension,
+    since points on a few trajectories lie close together along them.
+    """
+    ranges = np.ptp(X, axis=0)
+    extent = ranges if per_coordinate else np.asarray(np.linalg.norm(ranges))
+    extent = np.where(extent > 0, extent, 1.0)
+    return extent / max(len(X), 2), extent

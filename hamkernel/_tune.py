@@ -1,0 +1,284 @@
+"""Hyperparameters by following the gradient of a validation loss, inside a box, from many starts.
+
+Coordinates. Every hyperparameter h (a stored leaf, so usually a logarithm) lives in a box and is
+searched as h = low + (high − low)(1 + sin u)/2 over all real u, as MINUIT does: an unconstrained
+optimiser then respects the bounds and can rest on one, where a sigmoid would creep towards it.
+
+The ridge. λ is searched relative to the Gram. The residuals of a fit lose about ε tr(G)/(Nλ) of
+their digits, ε the rounding of the dtype, so Nλ ≥ 100 ε tr(G) is demanded at every point: what
+lies below is rounding noise and can look like a very good loss. This matters. A quadratic
+Hamiltonian is the flat limit of the Gaussian kernel, so the loss of an oscillator improves all
+the way along ℓ -> ∞, λ -> 0 until nothing is left of it but noise.
+"""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
+
+from hamkernel import _require as require
+from hamkernel._field import AbstractField
+from hamkernel._fit import fit
+from hamkernel._folds import Folds, Partition
+from hamkernel._gram import matrix_kernel
+from hamkernel._scalar import as_pytree
+from hamkernel._search_space import SearchSpace
+from hamkernel._solve import AbstractSolver
+from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._validation import (
+    generalized_loss,
+    log_likelihood,
+    log_marginal_likelihood,
+    partition_loss,
+)
+
+Objective = Callable[[AbstractMatrixKernel, Array, Array, Array], Float[Array, ""]]
+Criterion = Literal["cross_validation", "generalized_cross_validation", "marginal_likelihood"]
+
+
+class Tuned(eqx.Module):
+    """What `tune` found.
+
+    Attributes:
+        kernel: the kernel with its tuned hyperparameters.
+        regularization: the tuned λ, shape ().
+        loss: the objective there, shape (); for "marginal_likelihood" the NEGATIVE log density.
+        field: the fit to all data with them.
+        converged: whether the run that found the best point met the tolerances, shape ().
+        steps: the number of its optimiser steps, shape ().
+        at_bounds: the names of the hyperparameters that rest on a bound of the search box. The
+            data would have them further out: see "How to choose" in the README.
+        start_losses: the best loss of the run from each start, the caller's kernel first,
+            shape (starts,).
+        bounds: the box that was searched: for each name the lowest and highest value.
+    """
+
+    kernel: AbstractMatrixKernel
+    regularization: Float[Array, ""]
+    loss: Float[Array, ""]
+    field: AbstractField
+    converged: Bool[Array, ""]
+    steps: Int[Array, ""]
+    start_losses: Float[Array, " starts"]
+    at_bounds: tuple[str, ...] = eqx.field(static=True)
+    bounds: dict[str, tuple[Any, Any]] = eqx.field(static=True)
+
+
+def tune(
+    K: AbstractMatrixKernel,
+    X: Float[ArrayLike, "N n"],
+    Y: Float[ArrayLike, "N n"],
+    regularization: ArrayLike = 1e-3,
+    folds: Folds = 5,
+    *,
+    objective: Criterion | Objective = "cross_validation",
+    frozen: str | tuple[str, ...] = (),
+    bounds: dict[str, tuple[ArrayLike, ArrayLike]] | None = None,
+    starts: int = 4,
+    optimiser: optx.AbstractMinimiser | None = None,
+    max_steps: int = 64,
+    solver: AbstractSolver | None = None,
+    progress: bool = False,
+) -> Tuned:
+    """Tune every hyperparameter of K, and λ with them, by gradient descent on a validation loss.
+
+    The search starts from the given kernel and from `starts` − 1 further points, the best of a
+    space-filling design in the box; all run in one compiled call, and the best point that any of
+    them ever saw is returned. New data of the same shape does not recompile.
+
+    Args:
+        K: a matrix-valued kernel; every inexact array leaf is a hyperparameter.
+        X: states, shape (N, n).
+        Y: measured velocities, shape (N, n).
+        regularization: the first λ.
+        folds: as in `cross_validation_loss`; give trajectory labels for data from trajectories.
+        objective: "cross_validation", "generalized_cross_validation", "marginal_likelihood", or
+            a function (K, X, Y, regularization) -> () that is to be small.
+        frozen: names of hyperparameters to keep, such as "lengthscale", "regularization" or
+            "terms[0].scale". A name means every hyperparameter whose full name ends in it.
+        bounds: {name: (low, high)} in place of the box from the data, in the units of the
+            hyperparameter. A start outside the box is moved to its edge.
+        starts: the number of runs.
+        optimiser: an optimistix minimiser; BFGS with tolerance 1e-3 if None.
+        max_steps: the largest number of steps of one run.
+        solver: how the final field is fitted; see `fit`.
+        progress: print each step, through optimistix's own hook.
+
+    Returns:
+        A `Tuned`. NaN never comes out: points where the objective is not finite cannot win.
+
+    Raises:
+        TypeError: K is not matrix-valued, or a function is given that is to be large. ValueError:
+            bad data, folds, names, or bounds. RuntimeError: the objective is finite nowhere.
+
+    The flat limit. When λ rests on its lower bound and a lengthscale on its upper one, the data
+    asks for a polynomial: the fit is good and its hyperparameters mean little.
+    """
+    K = matrix_kernel(K)
+    X, Y = require.data(X, Y)
+    K.check_dimension(X.shape[1])
+    regularization = require.positive_scalar(regularization, "regularization").astype(X.dtype)
+    criterion = _criterion(objective, len(X), folds)
+    frozen = (frozen,) if isinstance(frozen, str) else tuple(frozen)
+    space = SearchSpace(K, X, Y, regularization, frozen, bounds or {})
+    if starts < 1:
+        raise ValueError(f"starts must be at least 1, got {starts}.")
+    if optimiser is None:
+        optimiser = _BFGS_VERBOSE if progress else _BFGS
+
+    runs = _search(space, criterion, X, Y, optx.BestSoFarMinimiser(optimiser), starts, max_steps)
+    values = np.asarray(runs.value)
+    if not (values < HUGE).any():
+        raise RuntimeError(
+            "the objective is not finite at any start. Likely causes, in order: a kernel that is "
+            "not positive definite or not finite (hk.check_kernel(k, X) tells); bounds in which "
+            "no fit succeeds (pass bounds={'regularization': (low, high)} with a larger low); an "
+            "objective of your own that returns NaN."
+        )
+    best = int(values.argmin())
+    kernel, regularization = _decode(space, runs.u[best], X)
+    return Tuned(
+        kernel=kernel,
+        regularization=regularization,
+        loss=criterion.loss(runs.value[best]),
+        field=fit(kernel, X, Y, regularization, solver=solver),
+        converged=runs.converged[best],
+        steps=runs.steps[best],
+        start_losses=criterion.loss(runs.value),
+        at_bounds=space.at_bounds(runs.u[best]),
+        bounds=space.box(kernel, X),
+    )
+
+
+# Made once: compiled functions are told apart by the functions inside these, too.
+_BFGS = optx.BFGS(rtol=1e-3, atol=1e-3)
+_BFGS_VERBOSE = optx.BFGS(rtol=1e-3, atol=1e-3, verbose=True)
+
+HUGE = 1e30  # stands for an objective that is not finite: BFGS backs away from it
+
+
+class _Criterion(eqx.Module):
+    """The function to minimise. Losses are searched by their logarithm, which has no scale."""
+
+    fn: Callable[..., Float[Array, ""]]
+    partition: Partition | None = eqx.field(static=True)
+    logarithmic: bool = eqx.field(static=True)
+
+    def value(self, K, X, Y, regularization) -> Float[Array, ""]:
+        extra = () if self.partition is None else (self.partition,)
+        value = self.fn(K, X, Y, regularization, *extra)
+        if self.logarithmic:
+            value = jnp.log(jnp.maximum(value, jnp.finfo(value.dtype).tiny))
+        return jnp.where(jnp.isfinite(value), value, HUGE)
+
+    def loss(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The caller's objective for a value of the search; inf where there was none."""
+        loss = jnp.exp(value) if self.logarithmic else value
+        return jnp.where(value < HUGE, loss, jnp.inf)
+
+
+def _criterion(objective: Criterion | Objective, N: int, folds: Folds) -> _Criterion:
+    partial = jax.tree_util.Partial
+    if objective == "cross_validation":
+        return _Criterion(partial(partition_loss), Partition(N, folds), logarithmic=True)
+    if objective == "generalized_cross_validation":
+        return _Criterion(partial(generalized_loss), None, logarithmic=True)
+    if objective == "marginal_likelihood":
+        return _Criterion(partial(_negative_log_likelihood), None, logarithmic=False)
+    if objective is log_marginal_likelihood:
+        raise TypeError(
+            "log_marginal_likelihood is to be large and an objective is to be small: pass "
+            "objective='marginal_likelihood'."
+        )
+    if not callable(objective):
+        raise ValueError(
+            "objective must be 'cross_validation', 'generalized_cross_validation', "
+            "'marginal_likelihood' or a function (K, X, Y, regularization) -> (); "
+            f"got {objective!r}."
+        )
+    return _Criterion(as_pytree(objective), None, logarithmic=False)
+
+
+def _negative_log_likelihood(K, X, Y, regularization):
+    return -log_likelihood(K, X, Y, regularization)
+
+
+class _Runs(eqx.Module):
+    """The best point of each run."""
+
+    u: Float[Array, "starts P"]
+    value: Float[Array, " starts"]
+    converged: Bool[Array, " starts"]
+    steps: Int[Array, " starts"]
+
+
+_decode = eqx.filter_jit(lambda space, u, X: space.decode(u, X))
+
+
+@eqx.filter_jit
+def _search(space, criterion, X, Y, optimiser, starts: int, max_steps: int) -> _Runs:
+    def value(u):
+        kernel, regularization = space.decode(u, X)
+        return criterion.value(kernel, X, Y, regularization)
+
+    # optimistix linearises forward and transposes; our derivatives are written backward.
+    @jax.custom_jvp
+    def differentiable(u):
+        return value(u)
+
+    @differentiable.defjvp
+    def _(primals, tangents):
+        value_at, slope = jax.value_and_grad(value)(*primals)
+        slope = jnp.where(jnp.isfinite(slope), slope, jnp.zeros_like(slope))
+        return value_at, slope @ tangents[0]
+
+    def run(u):
+        found = optx.minimise(
+            lambda u, _: differentiable(u), optimiser, u, max_steps=max_steps, throw=False
+        )
+        converged = found.result == optx.RESULTS.successful
+        return _Runs(found.value, value(found.value), converged, found.stats["num_steps"])
+
+    # Small problems are dominated by the overhead of each operation, so they share it.
+    together = X.size <= SMALL
+    u = space.encode_start(X)
+    if starts > 1:
+        design = _design(len(u), DESIGN_POINTS, X.dtype)
+        values = jax.lax.map(value, design, batch_size=DESIGN_POINTS if together else 1)
+        u = jnp.concatenate([u[None], _spread_out(design, values, starts - 1)])
+    else:
+        u = u[None]
+    return jax.lax.map(run, u, batch_size=starts if together else 1)
+
+
+SMALL = 128  # rows of the Gram up to which the runs are vmapped
+DESIGN_POINTS = 32
+
+
+def _design(P: int, count: int, dtype) -> Float[Array, "count P"]:
+    """A space-filling design in the box: the additive sequence of Roberts (2018), R_d."""
+    root = 2.0
+    for _ in range(64):  # the positive solution of root^(P + 1) = root + 1
+        root = (1 + root) ** (1 / (P + 1))
+    share = (0.5 + np.outer(np.arange(1, count + 1), root ** -np.arange(1.0, P + 1))) % 1.0
+    return jnp.asarray(np.arcsin(2 * share - 1), dtype)
+
+
+def _spread_out(
+    design: Float[Array, "count P"], values: Float[Array, " count"], count: int
+) -> Float[Array, "{count} P"]:
+    """The best points of the design that are not neighbours of a better one already taken."""
+    reach = 0.25 * np.sqrt(design.shape[1])  # of a box of side 1
+    shares = jnp.sin(design) / 2
+    taken = []
+    for _ in range(count):
+        best = jnp.argmin(values)
+        taken.append(design[best])
+        near = jnp.linalg.norm(shares - shares[best][None], axis=1) < reach
+        values = jnp.where(near, HUGE + values, values)
+    return jnp.stack(taken)
