@@ -1,0 +1,150 @@
+"""One kernel, fitted to the data of every noise seed and tested, in one compiled program."""
+
+from collections.abc import Callable
+from typing import cast
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Key
+
+from hamkernel._fit import fit
+from hamkernel._simulate import simulate
+from hamkernel._structured import AbstractMatrixKernel
+from hamkernel.paper._experiments import Experiment
+from hamkernel.systems import sample
+
+_TIMES = 200  # steps of the test trajectory
+_POINTS = 10_000  # where the odd error is sampled, as in the paper
+_POINTS_KEY = 2023  # the same points for every kernel and seed
+
+
+class Outcome(eqx.Module):
+    """The tests of one kernel on S seeds.
+
+    Attributes:
+        ts: times of the test trajectory [s], shape (T,).
+        true: the test trajectory of the true system, shape (T, n).
+        learned: that of each learned field, shape (S, T, n).
+        error: their distance, shape (S, T).
+        orbits: from the initial states of the data with the field of the first seed, over the
+            longer time of the phase portraits, shape (B, P, n).
+        true_orbits: the same with the true system.
+        quantities: numbers by name, each of shape (S,).
+    """
+
+    ts: Float[Array, " T"]
+    true: Float[Array, "T n"]
+    learned: Float[Array, "S T n"]
+    error: Float[Array, "S T"]
+    orbits: Float[Array, "B P n"]
+    true_orbits: Float[Array, "B P n"]
+    quantities: dict[str, Float[Array, " S"]]
+
+
+def datasets(
+    experiment: Experiment, keys: Key[Array, " S"]
+) -> tuple[Float[Array, "S N n"], Float[Array, "S N n"]]:
+    """Return states and velocities for each noise key, trajectory after trajectory.
+
+    Args:
+        experiment: what is sampled.
+        keys: one key per seed.
+    """
+    ts = experiment.step * jnp.arange(experiment.count, dtype=float)
+    x0 = jnp.asarray(experiment.initial_states)
+    return _datasets(experiment.system, x0, ts, jnp.asarray(experiment.noise), keys)
+
+
+@eqx.filter_jit
+def _datasets(system, x0, ts, noise, keys):
+    X, Y = jax.vmap(lambda key: sample(system, x0, ts, noise, noise, key=key))(keys)
+    S, _, _, n = X.shape  # (S, B, T, n)
+    return X.reshape(S, -1, n), Y.reshape(S, -1, n)  # (S, N, n)
+
+
+def evaluate(
+    experiment: Experiment,
+    kernel: AbstractMatrixKernel,
+    X: Float[Array, "S N n"],
+    Y: Float[Array, "S N n"],
+    regularization: ArrayLike,
+) -> Outcome:
+    """Fit `kernel` to every data set and test the learned fields.
+
+    The quantities are the mean and maximum of the trajectory error over the test horizon; mean and
+    variance of the odd error ‖f(x) + f(−x)‖ over the sampled points; and along the test
+    trajectory, mean and variance of the learned Hamiltonian on the learned trajectory (where the
+    kernel has one; with the constant that the representer gives it) and of the true Hamiltonian
+    on the true trajectory.
+
+    Args:
+        experiment: the system and its test.
+        kernel: the matrix-valued kernel.
+        X: states, shape (S, N, n), of `datasets`.
+        Y: velocities, shape (S, N, n).
+        regularization: of `fit`.
+
+    Raises:
+        RuntimeError: a fit or an integration failed.
+    """
+    (low_q, high_q), (low_p, high_p) = experiment.box
+    corner, opposite = jnp.asarray([max(low_q, 0.0), low_p]), jnp.asarray([high_q, high_p])
+    uniform = jax.random.uniform(jax.random.key(_POINTS_KEY), (_POINTS, 2))
+    step = experiment.horizon / _TIMES
+    steps = round(experiment.portrait_horizon / step)
+    return _evaluate(
+        kernel,
+        experiment.system,
+        X,
+        Y,
+        jnp.asarray(regularization, X.dtype),
+        jnp.asarray([experiment.test_state, *experiment.initial_states]),
+        step * jnp.arange(steps + 1, dtype=X.dtype),
+        corner[None] + uniform * (opposite - corner)[None],
+    )
+
+
+@eqx.filter_jit
+def _evaluate(kernel, system, X, Y, regularization, starts, ts, points) -> Outcome:
+    """`starts` (1 + B, n): the test state first; `ts` (P,): the test takes the first of them."""
+    true = _trajectories(system, starts, ts)
+    test = slice(_TIMES + 1)
+
+    def one_seed(X, Y):
+        field = fit(kernel, X, Y, regularization)
+        learned = _trajectories(field, starts, ts)
+        error = jnp.linalg.norm(learned[0, test] - true[0, test], axis=1)
+        values = jax.vmap(field)(points), jax.vmap(field)(-points)
+        odd_error = jnp.linalg.norm(values[0] + values[1], axis=1)
+        quantities = {
+            "trajectory_error_mean": error.mean(),
+            "trajectory_error_max": error.max(),
+            **_moments("odd_error", odd_error),
+            **_moments("true_hamiltonian", jax.vmap(system.hamiltonian)(true[0, test])),
+        }
+        if kernel.symplectic:
+            energy = jax.vmap(field.unanchored_potential)(learned[0, test])
+            quantities |= _moments("learned_hamiltonian", energy)
+        return learned, error, quantities
+
+    learned, error, quantities = jax.vmap(one_seed)(X, Y)
+    return Outcome(
+        ts=ts[test],
+        true=true[0, test],
+        learned=learned[:, 0, test],
+        error=error,
+        orbits=learned[0, 1:],
+        true_orbits=true[1:],
+        quantities=quantities,
+    )
+
+
+def _trajectories(
+    field: Callable[[Array], Array], starts: Float[Array, "B n"], ts: Float[Array, " P"]
+) -> Float[Array, "B P n"]:
+    return jax.vmap(lambda x0: cast(Array, simulate(field, x0, ts).ys))(starts)
+
+
+def _moments(name: str, values: Float[Array, " P"]) -> dict[str, Float[Array, ""]]:
+    return {f"{name}_mean": values.mean(), f"{name}_variance": values.var()}

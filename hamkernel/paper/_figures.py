@@ -1,0 +1,114 @@
+"""The paper's figures: phase portraits, and the test trajectory with its error."""
+
+import pathlib
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import numpy as np
+from matplotlib.figure import Figure
+from tqdm import tqdm
+
+from hamkernel import plot
+from hamkernel._field import AbstractField
+from hamkernel._fit import fit
+from hamkernel.paper._evaluate import Outcome, datasets
+from hamkernel.paper._experiments import READINGS, Experiment, experiments
+
+Models = Mapping[str, Outcome]
+
+_DPI = 150  # 1200 pixels over 8 inches: sharp at the 800 of a README
+
+
+def figures(
+    outcomes: Mapping[str, Mapping[str, Models]], out: pathlib.Path, progress: bool = True
+) -> list[pathlib.Path]:
+    """Write the figures of each experiment and reading, return their paths.
+
+    Args:
+        outcomes: by experiment, reading and model.
+        out: an existing folder.
+        progress: show a progress bar where the standard error is a terminal.
+    """
+    every = experiments()
+    runs = [
+        (name, reading, kind, draw)
+        for name, readings in outcomes.items()
+        for reading in readings
+        for kind, draw in {"portraits": portraits, "test_trajectory": tracking}.items()
+    ]
+    paths = []
+    for name, reading, kind, draw in tqdm(runs, "figures", disable=None if progress else True):
+        figure = draw(every[name], reading, outcomes[name][reading])
+        path = out / f"{name}_{reading.replace('*', '_')}_{kind}.png"
+        figure.savefig(path, dpi=_DPI)
+        paths.append(path)
+    return paths
+
+
+def portraits(experiment: Experiment, reading: str, models: Models) -> Figure:
+    """Return stream lines and trajectories of the true system, data and learned fields.
+
+    As figures 1 and 2 of the paper, with the data of noise seed 0.
+    """
+    X, Y = datasets(experiment, jax.random.key(0)[None])
+    true = models["separable"].true_orbits
+    panels = [
+        ("True system", experiment.system, {"true": true}, None),
+        ("Data set", experiment.system, {}, X[0]),
+    ]
+    for model in ("separable", "odd_symplectic"):
+        field = _field(experiment, reading, model, X[0], Y[0])
+        title = f"Learned, {model.replace('_', ' ')}"
+        panels.append((title, field, {model: models[model].orbits}, None))
+    figure = Figure(figsize=(8, 7.2), layout="constrained")
+    for ax, (title, field, curves, data) in zip(figure.subplots(2, 2).flat, panels, strict=True):
+        plot.phase_portrait(
+            field,
+            *experiment.box,
+            data,
+            curves or None,
+            ax,
+            title=title,
+            units=experiment.units,
+            show_legend=False,
+        )
+    figure.suptitle(_title(experiment, reading))
+    return figure
+
+
+def tracking(experiment: Experiment, reading: str, models: Models) -> Figure:
+    """Return the test trajectory of noise seed 0, and the error over time of all seeds."""
+    figure = Figure(figsize=(8, 3.7), layout="constrained")
+    left, right = figure.subplots(1, 2, width_ratios=(1, 1.45))
+    first = next(iter(models.values()))
+    curves = {"true": first.true, **{name: each.learned[0] for name, each in models.items()}}
+    plot.trajectories(
+        curves, left, units=experiment.units, title="Test trajectory, seed 0", show_legend=False
+    )
+    errors = {name: np.asarray(each.error) for name, each in models.items()}
+    seeds = len(first.error)
+    plot.trajectory_error(
+        first.ts,
+        errors,
+        right,
+        time_unit="s",
+        title=f"Error, median and 10 to 90 % of {seeds} seeds",
+        show_legend=False,
+    )
+    figure.legend(
+        *left.get_legend_handles_labels(), loc="outside lower center", ncols=4, frameon=False
+    )
+    figure.suptitle(_title(experiment, reading))
+    return figure
+
+
+def _field(experiment: Experiment, reading: str, model: str, X, Y) -> AbstractField:
+    chosen = experiment.models[model]
+    regularization = READINGS[reading](chosen.regularization, experiment.size)
+    return eqx.filter_jit(fit)(chosen.kernel, X, Y, regularization)
+
+
+def _title(experiment: Experiment, reading: str) -> str:
+    ridge = {"lambda": r"$G + \lambda I$", "N*lambda": r"$G + N\lambda I$"}
+    return f"{experiment.title}, {ridge.get(reading, reading)}"

@@ -1,0 +1,25 @@
+"""Pictures of fields, trajectories, energies and searches.
+
+Every function draws on the Matplotlib axes `ax`, makes them if they are None, and returns them.
+Several curves come as a mapping from names to arrays. A name in `COLORS` has the same colour in
+every picture; the colours can be told apart by colour-blind readers and in grey.
+"""
+
+from hamkernel.plot._contours import hamiltonian, loss_surface
+from hamkernel.plot._phase import phase_portrait, plane_slice, trajectories
+from hamkernel.plot._poincare import crossings, poincare_section
+from hamkernel.plot._style import COLORS
+from hamkernel.plot._time import energy_drift, trajectory_error
+
+__all__ = [
+    "COLORS",
+    "crossings",
+    "energy_drift",
+    "hamiltonian",
+    "loss_surface",
+    "phase_portrait",
+    "plane_slice",
+    "poincare_section",
+    "trajectories",
+    "trajectory_error",
+]

@@ -1,0 +1,134 @@
+"""Functions of two variables as contours."""
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+from matplotlib.axes import Axes
+from matplotlib.colors import LogNorm
+
+from hamkernel.plot._style import Limits, Units, axes, grid, label_plane, legend, on_points
+
+Scalar = Callable[[Float[Array, "2"]], Float[Array, ""]]
+
+
+def hamiltonian(
+    learned: Scalar,
+    true: Scalar,
+    xlim: Limits,
+    ylim: Limits,
+    ax: Sequence[Axes] | None = None,
+    *,
+    titles: tuple[str, str] = ("True $H$", "Learned $H$"),
+    units: Units | None = None,
+    energy_unit: str | None = None,
+    levels: int = 12,
+    resolution: int = 81,
+) -> tuple[Axes, Axes]:
+    """Draw the true and the learned Hamiltonian side by side, on the same contours.
+
+    Velocities determine H up to a constant: the learned one is shifted by the mean difference
+    over the grid, then both are drawn less the minimum of the true one.
+
+    Args:
+        learned: x (2,) -> (), such as `field.hamiltonian`.
+        true: x (2,) -> (), such as `system.hamiltonian`.
+        xlim: limits of q.
+        ylim: limits of p.
+        ax: two axes, for the true and the learned one; new ones if None.
+        titles: of the two axes.
+        units: of q and p.
+        energy_unit: of H.
+        levels: number of contours.
+        resolution: points on each axis of the grid.
+
+    Returns:
+        The two axes.
+    """
+    q, p, points = grid(xlim, ylim, resolution)
+    H, H_learned = (on_points(fn, points).reshape(len(p), len(q)) for fn in (true, learned))
+    H_learned = H_learned - np.mean(H_learned - H)
+    H, H_learned = H - H.min(), H_learned - H.min()
+    left, right = _pair() if ax is None else ax
+    steps = np.linspace(0, H.max(), levels + 1)
+    for panel, values, title in zip((left, right), (H, H_learned), titles, strict=True):
+        filled = panel.contourf(q, p, values, steps, cmap="cividis", extend="both")
+        panel.contour(q, p, values, steps, colors="white", linewidths=0.5)
+        label_plane(panel, (0, 1), 2, units)
+        panel.set_title(title)
+    right.set_ylabel("")
+    label = r"$H - \min H_\mathrm{true}$" + (f" [{energy_unit}]" if energy_unit else "")
+    left.figure.colorbar(filled, ax=[left, right], label=label)
+    return left, right
+
+
+def _pair() -> tuple[Axes, Axes]:
+    import matplotlib.pyplot as plt  # starts a backend, so only where a figure must be made
+
+    _, (left, right) = plt.subplots(1, 2, layout="constrained", figsize=(8, 3.6), sharey=True)
+    return left, right
+
+
+def loss_surface(
+    first: Float[ArrayLike, " A"],
+    second: Float[ArrayLike, " B"],
+    losses: Float[ArrayLike, "A B"],
+    path: Float[ArrayLike, "K 2"] | None = None,
+    ax: Axes | None = None,
+    *,
+    names: tuple[str, str] = (r"lengthscale $\sigma$", r"regularization $\lambda$"),
+    label: str = "cross-validation loss",
+    title: str | None = None,
+    levels: int = 16,
+) -> Axes:
+    """Draw a loss over two positive hyperparameters, and the path of an optimiser on it.
+
+    All three axes are logarithmic. Losses that are not finite and positive are left white.
+
+    Args:
+        first: values of the first hyperparameter, shape (A,).
+        second: values of the second, shape (B,).
+        losses: shape (A, B).
+        path: the optimiser's steps (first, second), shape (K, 2), from start to end.
+        ax: axes to draw on; new ones if None.
+        names: of the hyperparameters.
+        label: of the loss.
+        title: of the axes.
+        levels: number of contours.
+
+    Raises:
+        ValueError: the shapes do not fit, or no loss is finite and positive.
+    """
+    first, second, losses = np.asarray(first), np.asarray(second), np.asarray(losses)
+    if losses.shape != (len(first), len(second)):
+        raise ValueError(
+            f"losses has shape {losses.shape}; ({len(first)}, {len(second)}) is needed, one row "
+            "for each value of the first hyperparameter."
+        )
+    shown = np.ma.masked_where(~(np.isfinite(losses) & (losses > 0)), losses)
+    if shown.count() == 0:
+        raise ValueError("no loss is finite and positive, so there is nothing to draw.")
+    ax = axes(ax, figsize=(5.8, 4.4))
+    low, high = float(shown.min()), float(shown.max())
+    steps = np.geomspace(low, max(high, low * 1.001), levels + 1)
+    filled = ax.contourf(
+        first, second, shown.T, steps, norm=LogNorm(steps[0], steps[-1]), cmap="cividis"
+    )
+    ax.contour(first, second, shown.T, steps, colors="white", linewidths=0.4)
+    bar = ax.figure.colorbar(filled, ax=ax, label=label)
+    shown_steps = steps[:: max(1, levels // 5)].tolist()
+    bar.set_ticks(shown_steps, labels=[f"{step:.2g}" for step in shown_steps])
+    bar.ax.minorticks_off()
+    i, j = np.unravel_index(np.ma.argmin(shown), shown.shape)
+    best = {"ms": 13, "mec": "black", "mfc": "white", "mew": 0.8, "linestyle": "none", "zorder": 5}
+    ax.plot(first[i], second[j], "*", label="best of the grid", **best)
+    if path is not None:
+        path = np.asarray(path)
+        ax.plot(*path.T, "-o", color="#D55E00", ms=3.5, linewidth=1.5, label="optimiser", zorder=4)
+        ax.plot(*path[-1], "D", color="#D55E00", mec="black", ms=7, zorder=6, label="its end")
+    ax.set(xscale="log", yscale="log", xlabel=names[0], ylabel=names[1])
+    ax.set(xlim=(first.min(), first.max()), ylim=(second.min(), second.max()))
+    if title is not None:
+        ax.set_title(title)
+    legend(ax)
+    return ax

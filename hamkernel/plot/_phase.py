@@ -1,0 +1,194 @@
+"""Pictures in the plane of two coordinates."""
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+from matplotlib.axes import Axes
+
+from hamkernel.plot._style import (
+    DATA,
+    STREAM,
+    Limits,
+    Units,
+    axes,
+    grid,
+    label_plane,
+    legend,
+    line_styles,
+    named,
+    on_points,
+)
+
+# Each (T, n), or (B, T, n) for trajectories under one name.
+Curves = ArrayLike | Mapping[str, ArrayLike]
+
+
+def phase_portrait(
+    field: Callable[[Float[Array, "2"]], Float[Array, "2"]],
+    xlim: Limits,
+    ylim: Limits,
+    data: Float[ArrayLike, "N 2"] | None = None,
+    trajectories: Curves | None = None,
+    ax: Axes | None = None,
+    *,
+    title: str | None = None,
+    units: Units | None = None,
+    density: float = 0.9,
+    resolution: int = 41,
+    show_legend: bool = True,
+) -> Axes:
+    """Draw the stream lines of a field in the plane, trajectories over them, data on top.
+
+    Args:
+        field: x (2,) -> ẋ (2,), learned or true.
+        xlim: limits of q.
+        ylim: limits of p.
+        data: measured states, shape (N, 2).
+        trajectories: shape (T, 2) or (B, T, 2), or a mapping from names to such arrays. A dot
+            marks where each starts.
+        ax: axes to draw on; new ones if None.
+        title: of the axes.
+        units: of q and p.
+        density: of the stream lines.
+        resolution: points on each axis of the grid where the field is evaluated.
+        show_legend: whether named trajectories and data get a legend.
+
+    Raises:
+        ValueError: the field is not one in the plane.
+    """
+    q, p, points = grid(xlim, ylim, resolution)
+    velocities = on_points(field, points)
+    if velocities.shape != points.shape:
+        raise ValueError(
+            f"a phase portrait needs a field (2,) -> (2,), this one returns "
+            f"{velocities.shape[1:]}; plane_slice draws fields of more coordinates."
+        )
+    ax = axes(ax, figsize=(5.2, 4.6))
+    _stream(ax, q, p, velocities, density)
+    if trajectories is not None:
+        _curves(ax, named(trajectories), (0, 1))
+    if data is not None:
+        X = np.asarray(data)
+        ax.plot(*X.T, "o", color=DATA, mec="black", mew=0.6, ms=5, zorder=5, label="data")
+    return _finish(ax, (0, 1), 2, units, title, show_legend, xlim, ylim)
+
+
+def trajectories(
+    ys: Curves,
+    ax: Axes | None = None,
+    *,
+    dims: tuple[int, int] = (0, 1),
+    title: str | None = None,
+    units: Units | None = None,
+    show_legend: bool = True,
+) -> Axes:
+    """Draw trajectories in the plane of two coordinates, for example true and learned ones.
+
+    Args:
+        ys: shape (T, n) or (B, T, n), or a mapping from names to such arrays. A dot marks where
+            each starts.
+        ax: axes to draw on; new ones if None.
+        dims: the two coordinates, counted from 0.
+        title: of the axes.
+        units: of the two coordinates.
+        show_legend: whether named trajectories get a legend.
+    """
+    curves = named(ys)
+    ax = axes(ax, figsize=(4.6, 4.2))
+    _curves(ax, curves, dims)
+    n = next(iter(curves.values())).shape[-1]
+    return _finish(ax, dims, n, units, title, show_legend)
+
+
+def plane_slice(
+    fn: Callable[[Float[Array, " n"]], Array],
+    point: Float[ArrayLike, " n"],
+    dims: tuple[int, int],
+    xlim: Limits,
+    ylim: Limits,
+    ax: Axes | None = None,
+    *,
+    title: str | None = None,
+    units: Units | None = None,
+    levels: int = 15,
+    resolution: int = 61,
+) -> Axes:
+    """Draw a function of n coordinates on the plane through a point along two of them.
+
+    A scalar function, such as H, becomes filled contours less its minimum there; a field becomes
+    the stream lines of its two components in the plane, over its speed out of the plane.
+
+    Args:
+        fn: x (n,) -> () or (n,).
+        point: values of the other coordinates, shape (n,).
+        dims: the two coordinates that vary, counted from 0.
+        xlim: limits of the first.
+        ylim: limits of the second.
+        ax: axes to draw on; new ones if None.
+        title: of the axes.
+        units: of the two coordinates.
+        levels: number of contours.
+        resolution: points on each axis of the grid.
+
+    Raises:
+        ValueError: the function is neither scalar nor a field on n coordinates.
+    """
+    point = np.asarray(point, float)
+    x, y, plane = grid(xlim, ylim, resolution)
+    states = np.tile(point, (len(plane), 1))
+    states[:, list(dims)] = plane
+    values = on_points(fn, states)
+    if values.shape not in {(len(plane),), states.shape}:
+        raise ValueError(
+            f"plane_slice needs a function ({len(point)},) -> () or ({len(point)},), this one "
+            f"returns {values.shape[1:]}."
+        )
+    ax = axes(ax, figsize=(5.2, 4.3))
+    if values.ndim == 2:
+        _stream(ax, x, y, values[:, list(dims)], 0.9)
+        out = np.linalg.norm(np.delete(values, dims, axis=1), axis=1)
+        background, label = out, "speed out of the plane"
+    else:
+        background, label = values - values.min(), "$H - \\min H$"
+    shape = (resolution, resolution)
+    filled = ax.contourf(x, y, background.reshape(shape), levels, cmap="cividis", zorder=0)
+    if values.ndim == 1:
+        ax.contour(x, y, background.reshape(shape), levels, colors="white", linewidths=0.4)
+    ax.figure.colorbar(filled, ax=ax, label=label)
+    return _finish(ax, dims, len(point), units, title, False, xlim, ylim)
+
+
+def _stream(ax: Axes, x: np.ndarray, y: np.ndarray, velocities: np.ndarray, density: float) -> None:
+    u, v = np.moveaxis(velocities.reshape(len(y), len(x), 2), -1, 0)
+    ax.streamplot(x, y, u, v, color=STREAM, linewidth=0.7, arrowsize=0.7, density=density, zorder=1)
+
+
+def _curves(ax: Axes, curves: Mapping[str | None, np.ndarray], dims: tuple[int, int]) -> None:
+    for style, ys in zip(line_styles(curves), curves.values(), strict=True):
+        batch = ys if ys.ndim == 3 else ys[None]  # (B, T, n)
+        for i, y in enumerate(batch):
+            label = style["label"] if i == 0 else None
+            line: dict[str, Any] = {**style, "label": label, "zorder": 3}
+            ax.plot(y[:, dims[0]], y[:, dims[1]], **line)
+            ax.plot(*y[0, list(dims)], "o", color=style["color"], ms=4, zorder=4)
+
+
+def _finish(
+    ax: Axes,
+    dims: tuple[int, int],
+    n: int,
+    units: Units | None,
+    title: str | None,
+    show_legend: bool,
+    xlim: Limits | None = None,
+    ylim: Limits | None = None,
+) -> Axes:
+    label_plane(ax, dims, n, units)
+    ax.set(**{key: lim for key, lim in (("xlim", xlim), ("ylim", ylim)) if lim is not None})
+    if title is not None:
+        ax.set_title(title)
+    if show_legend:
+        legend(ax)
+    return ax

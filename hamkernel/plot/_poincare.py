@@ -1,0 +1,82 @@
+"""Poincaré sections."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from jaxtyping import ArrayLike, Float
+from matplotlib import colormaps
+from matplotlib.axes import Axes
+
+from hamkernel.plot._style import Units, axes, label_plane, legend, line_styles, named
+
+
+def crossings(
+    ys: Float[ArrayLike, "T n"], coordinate: int, value: float = 0.0, direction: int = 1
+) -> Float[np.ndarray, "M n"]:
+    """Return the points where a trajectory crosses the plane x[coordinate] = value.
+
+    Interpolated linearly between neighbouring states, so with an error of second order in their
+    distance: save the trajectory densely.
+
+    Args:
+        ys: states along one trajectory, shape (T, n).
+        coordinate: which coordinate has the value on the section, counted from 0.
+        value: of that coordinate.
+        direction: +1 for crossings from below, −1 from above, 0 for both.
+
+    Returns:
+        States, shape (M, n), in the order in which they are met; M may be 0.
+
+    Raises:
+        ValueError: ys is not one trajectory.
+    """
+    ys = np.asarray(ys)
+    if ys.ndim != 2:
+        raise ValueError(f"ys has shape {ys.shape}; one trajectory (T, n) is needed.")
+    height = ys[:, coordinate] - value
+    before, after = height[:-1], height[1:]
+    # A state exactly on the section counts as above it, so that no crossing is met twice.
+    up, down = (before < 0) & (after >= 0), (before >= 0) & (after < 0)
+    index = np.flatnonzero({1: up, -1: down, 0: up | down}[int(np.sign(direction))])
+    weight = (before[index] / (before[index] - after[index]))[:, None]
+    return (1 - weight) * ys[index] + weight * ys[index + 1]
+
+
+def poincare_section(
+    points: ArrayLike | Sequence[ArrayLike] | Mapping[str, ArrayLike],
+    dims: tuple[int, int],
+    ax: Axes | None = None,
+    *,
+    title: str | None = None,
+    units: Units | None = None,
+    size: float = 2.0,
+) -> Axes:
+    """Draw the points of a Poincaré section in the plane of two coordinates.
+
+    Args:
+        points: of one trajectory, shape (M, n); a list of such arrays, which get one colour each;
+            or a mapping from names to arrays, with a legend.
+        dims: the two coordinates, counted from 0.
+        ax: axes to draw on; new ones if None.
+        title: of the axes.
+        units: of the two coordinates.
+        size: of the dots, in points.
+    """
+    ax = axes(ax, figsize=(5.0, 4.6))
+    dots: dict[str, Any] = {"linestyle": "none", "marker": ".", "ms": size, "mew": 0}
+    if isinstance(points, list | tuple):
+        arrays = [np.asarray(group) for group in points]
+        shades = colormaps["viridis"](np.linspace(0, 0.9, len(arrays)))
+        styles = [{"color": shade} for shade in shades]
+    else:
+        groups = named(points)
+        styles = [{k: s[k] for k in ("color", "label")} for s in line_styles(groups)]
+        arrays = list(groups.values())
+    for style, array in zip(styles, arrays, strict=True):
+        ax.plot(array[:, dims[0]], array[:, dims[1]], **dots, **style)
+    label_plane(ax, dims, arrays[0].shape[-1], units)
+    if title is not None:
+        ax.set_title(title)
+    legend(ax, markerscale=4)
+    return ax

@@ -1,0 +1,118 @@
+"""Pictures over time."""
+
+from collections.abc import Mapping
+
+import numpy as np
+from jaxtyping import ArrayLike, Float
+from matplotlib.axes import Axes
+
+from hamkernel.plot._style import axes, legend, line_styles, named, with_unit
+
+# Each (T,), or (S, T) for several seeds.
+Series = ArrayLike | Mapping[str, ArrayLike]
+
+
+def trajectory_error(
+    ts: Float[ArrayLike, " T"],
+    errors: Series,
+    ax: Axes | None = None,
+    *,
+    log: bool = True,
+    quantiles: tuple[float, float] = (0.1, 0.9),
+    unit: str | None = None,
+    time_unit: str | None = None,
+    title: str | None = None,
+    show_legend: bool = True,
+) -> Axes:
+    """Draw the error of trajectories over time; of several seeds, the median and a band.
+
+    Args:
+        ts: times, shape (T,).
+        errors: ‖x_true(t) − x(t)‖, shape (T,) or (S, T), or a mapping from names to such arrays.
+        ax: axes to draw on; new ones if None.
+        log: logarithmic axis of the error. Zeros, such as the start, are left out.
+        quantiles: the band over seeds.
+        unit: of the error.
+        time_unit: of `ts`.
+        title: of the axes.
+        show_legend: whether named curves get a legend.
+    """
+    ax = axes(ax, figsize=(5.6, 3.8))
+    _bands(ax, ts, named(errors), quantiles, log)
+    ax.set_ylabel(with_unit("trajectory error", unit))
+    return _finish(ax, ts, time_unit, title, show_legend)
+
+
+def energy_drift(
+    ts: Float[ArrayLike, " T"],
+    energies: Series,
+    ax: Axes | None = None,
+    *,
+    relative: bool = False,
+    log: bool = False,
+    quantiles: tuple[float, float] = (0.1, 0.9),
+    unit: str | None = None,
+    time_unit: str | None = None,
+    title: str | None = None,
+    show_legend: bool = True,
+) -> Axes:
+    """Draw the change of the energy along trajectories, H(x(t)) − H(x(0)).
+
+    Args:
+        ts: times, shape (T,).
+        energies: H(x(t)), shape (T,) or (S, T), or a mapping from names to such arrays.
+        ax: axes to draw on; new ones if None.
+        relative: divide by |H(x(0))|.
+        log: draw the absolute change on a logarithmic axis. Zeros are left out.
+        quantiles: the band over seeds.
+        unit: of the energy; unused if `relative`.
+        time_unit: of `ts`.
+        title: of the axes.
+        show_legend: whether named curves get a legend.
+    """
+    changes = {}
+    for name, values in named(energies).items():
+        start = values[..., :1]
+        change = (values - start) / np.abs(start) if relative else values - start
+        changes[name] = np.abs(change) if log else change
+    ax = axes(ax, figsize=(5.6, 3.8))
+    _bands(ax, ts, changes, quantiles, log)
+    change = r"\Delta H / |H(0)|" if relative else r"\Delta H"
+    symbol = f"$|{change}|$" if log and not relative else f"${change}$"
+    ax.set_ylabel(with_unit(f"energy drift {symbol}", None if relative else unit))
+    return _finish(ax, ts, time_unit, title, show_legend)
+
+
+def _bands(
+    ax: Axes,
+    ts: ArrayLike,
+    series: Mapping[str | None, np.ndarray],
+    quantiles: tuple[float, float],
+    log: bool,
+) -> None:
+    ts = np.asarray(ts)
+    for style, values in zip(line_styles(series), series.values(), strict=True):
+        seeds = np.atleast_2d(values)  # (S, T)
+        low, median, high = np.quantile(seeds, [quantiles[0], 0.5, quantiles[1]], axis=0)
+        if log:
+            low, median, high = (np.where(v > 0, v, np.nan) for v in (low, median, high))
+        ax.plot(ts, median, **style)
+        if len(seeds) > 1:
+            ax.fill_between(ts, low, high, color=style["color"], alpha=0.2, linewidth=0)
+    if log:
+        ax.set_yscale("log")
+
+
+def _finish(
+    ax: Axes, ts: ArrayLike, time_unit: str | None, title: str | None, show_legend: bool
+) -> Axes:
+    ts = np.asarray(ts)
+    ax.set_xlabel(with_unit("time $t$", time_unit))
+    ax.set_xlim(ts[0], ts[-1])
+    ax.grid(True, color="0.9", linewidth=0.6)
+    ax.set_axisbelow(True)
+    if title is not None:
+        ax.set_title(title)
+    if show_legend:
+        legend(ax)
+    return ax
