@@ -8,6 +8,7 @@ differentiation makes every structured kernel from it, so a kernel should be wri
 
 import abc
 import enum
+import functools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -15,6 +16,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
@@ -181,7 +183,32 @@ class UserKernel(AbstractScalarKernel):
 
 def as_pytree(fn: Callable[..., Any]) -> Callable[..., Any]:
     """`fn` as a PyTree; a bare function would be a leaf, which `jax.jit` refuses."""
-    return fn if isinstance(fn, eqx.Module) else jax.tree_util.Partial(fn)  # pyright: ignore
+    if not jax.tree_util.all_leaves([fn]):
+        return fn
+    return Bound(fn) if isinstance(fn, functools.partial) else jax.tree_util.Partial(fn)
+
+
+class Bound(eqx.Module):
+    """A `functools.partial` whose arrays are leaves; what else it binds is static."""
+
+    func: Callable[..., Any]
+    arrays: tuple[Array | None, ...]
+    static: tuple[Any, ...] = eqx.field(static=True)
+    structure: Any = eqx.field(static=True)
+
+    def __init__(self, partial: "functools.partial[Any]"):
+        leaves, self.structure = jax.tree.flatten((partial.args, partial.keywords))
+        is_array = [isinstance(leaf, jax.Array | np.ndarray) for leaf in leaves]
+        pairs = list(zip(leaves, is_array, strict=True))
+        self.func = as_pytree(partial.func)
+        self.arrays = tuple(jnp.asarray(leaf) if array else None for leaf, array in pairs)
+        self.static = tuple(None if array else leaf for leaf, array in pairs)
+
+    def __call__(self, *points: Float[Array, " n"]) -> Any:
+        pairs = zip(self.arrays, self.static, strict=True)
+        leaves = [static if array is None else array for array, static in pairs]
+        args, keywords = jax.tree.unflatten(self.structure, leaves)
+        return self.func(*args, *points, **keywords)
 
 
 def _name(fn: Callable[..., Any]) -> str:
