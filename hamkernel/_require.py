@@ -54,7 +54,10 @@ def positive(x: ArrayLike, name: str) -> Array:
     return value(
         array,
         ~((array > 0) & jnp.isfinite(array)),
-        lambda: f"{name} must be positive and finite, got {array}.",
+        lambda: (
+            f"{name} must be positive and finite"
+            + (f", got {array}." if is_concrete(array) else ".")
+        ),
     )
 
 

@@ -128,7 +128,7 @@ class Matern(AbstractRadialKernel):
                 "Matern(nu=0.5) is not differentiable at x = z, so its structured kernels do not "
                 "exist: their blocks are the second derivatives of k. Use nu=1.5 or larger."
             )
-        if nu < 0.5 or nu - math.floor(nu) != 0.5:
+        if not (nu > 0.5 and nu % 1 == 0.5):  # refuses NaN and inf as well
             raise ValueError(f"Matern needs nu = 1.5, 2.5, 3.5, ...; got {nu}.")
         self.log_lengthscale = log_lengthscale(lengthscale)
         self.nu = nu

@@ -1,10 +1,12 @@
 """Scalar kernels on transformed points: warped, selected, and averaged over a group."""
 
+import operator
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel._scalar import (
@@ -72,7 +74,7 @@ class Select(AbstractScalarKernel):
     dims: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, kernel: Any, dims: Any):
-        dims = (dims,) if isinstance(dims, int) else tuple(int(d) for d in dims)
+        dims = tuple(operator.index(d) for d in np.atleast_1d(dims))
         if not dims or min(dims) < 0 or len(set(dims)) < len(dims):
             raise ValueError(f"Select needs distinct coordinates, integers >= 0; got {dims}.")
         self.kernel = as_scalar_kernel(kernel)
