@@ -3,11 +3,13 @@
 from collections.abc import Callable
 from typing import cast
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Key
 
+from hamkernel._field import KernelField
 from hamkernel._fit import fit
 from hamkernel._simulate import simulate
 from hamkernel._structured import AbstractMatrixKernel
@@ -25,21 +27,23 @@ class Outcome(eqx.Module):
     Attributes:
         ts: times of the test trajectory [s], shape (T,).
         true: the test trajectory of the true system, shape (T, n).
-        learned: that of each learned field, shape (S, T, n).
-        error: their distance, shape (S, T).
-        orbits: from the initial states of the data with the field of the first seed, over the
-            longer time of the phase portraits, shape (B, P, n).
-        true_orbits: the same with the true system.
+        true_orbits: from the initial states of the data, over the longer time of the phase
+            portraits, shape (B, P, n).
+        learned: the test trajectory of each learned field, shape (S, T, n).
+        error: its distance from the true one, shape (S, T).
         quantities: numbers by name, each of shape (S,).
+        field: the one learned from the first seed; its `points` are the states measured.
+        orbits: `true_orbits` with this field.
     """
 
     ts: Float[Array, " T"]
     true: Float[Array, "T n"]
+    true_orbits: Float[Array, "B P n"]
     learned: Float[Array, "S T n"]
     error: Float[Array, "S T"]
-    orbits: Float[Array, "B P n"]
-    true_orbits: Float[Array, "B P n"]
     quantities: dict[str, Float[Array, " S"]]
+    field: KernelField
+    orbits: Float[Array, "B P n"]
 
 
 def datasets(
@@ -92,31 +96,34 @@ def evaluate(
     corner, opposite = jnp.asarray([max(low_q, 0.0), low_p]), jnp.asarray([high_q, high_p])
     uniform = jax.random.uniform(jax.random.key(_POINTS_KEY), (_POINTS, 2))
     step = experiment.horizon / _TIMES
-    steps = round(experiment.portrait_horizon / step)
-    return _evaluate(
-        kernel,
-        experiment.system,
-        X,
-        Y,
-        jnp.asarray(regularization, X.dtype),
-        jnp.asarray([experiment.test_state, *experiment.initial_states]),
-        step * jnp.arange(steps + 1, dtype=X.dtype),
-        corner[None] + uniform * (opposite - corner)[None],
-    )
+    ts = step * jnp.arange(round(experiment.portrait_horizon / step) + 1, dtype=X.dtype)
+    starts = jnp.asarray([experiment.test_state, *experiment.initial_states])
+    true = _trajectories(experiment.system, starts, ts)
+    points = corner[None] + uniform * (opposite - corner)[None]
+    ridge = jnp.asarray(regularization, X.dtype)
+    return _evaluate(kernel, experiment.system, X, Y, ridge, ts, true, points)
 
 
 @eqx.filter_jit
-def _evaluate(kernel, system, X, Y, regularization, starts, ts, points) -> Outcome:
-    """`starts` (1 + B, n): the test state first; `ts` (P,): the test takes the first of them."""
-    true = _trajectories(system, starts, ts)
+def _trajectories(
+    field: Callable[[Array], Array], starts: Float[Array, "B n"], ts: Float[Array, " P"]
+) -> Float[Array, "B P n"]:
+    # Nothing is differentiated here, and a plain loop compiles faster than one with checkpoints.
+    adjoint = diffrax.ForwardMode()
+    return jax.vmap(lambda x0: cast(Array, simulate(field, x0, ts, adjoint=adjoint).ys))(starts)
+
+
+@eqx.filter_jit
+def _evaluate(kernel, system, X, Y, regularization, ts, true, points) -> Outcome:
+    """`true` (1 + B, P, n): the test trajectory, of which the test takes the start, and orbits."""
     test = slice(_TIMES + 1)
 
     def one_seed(X, Y):
         field = fit(kernel, X, Y, regularization)
-        learned = _trajectories(field, starts, ts)
+        learned = _trajectories(field, true[:, 0], ts)
         error = jnp.linalg.norm(learned[0, test] - true[0, test], axis=1)
-        values = jax.vmap(field)(points), jax.vmap(field)(-points)
-        odd_error = jnp.linalg.norm(values[0] + values[1], axis=1)
+        values = jax.vmap(field)(jnp.concatenate([points, -points]))
+        odd_error = jnp.linalg.norm(values[: len(points)] + values[len(points) :], axis=1)
         quantities = {
             "trajectory_error_mean": error.mean(),
             "trajectory_error_max": error.max(),
@@ -126,24 +133,19 @@ def _evaluate(kernel, system, X, Y, regularization, starts, ts, points) -> Outco
         if kernel.symplectic:
             energy = jax.vmap(field.unanchored_potential)(learned[0, test])
             quantities |= _moments("learned_hamiltonian", energy)
-        return learned, error, quantities
+        return field, learned, error, quantities
 
-    learned, error, quantities = jax.vmap(one_seed)(X, Y)
+    fields, learned, error, quantities = jax.vmap(one_seed)(X, Y)
     return Outcome(
         ts=ts[test],
         true=true[0, test],
+        true_orbits=true[1:],
         learned=learned[:, 0, test],
         error=error,
-        orbits=learned[0, 1:],
-        true_orbits=true[1:],
         quantities=quantities,
+        field=jax.tree.map(lambda leaf: leaf[0], fields),
+        orbits=learned[0, 1:],
     )
-
-
-def _trajectories(
-    field: Callable[[Array], Array], starts: Float[Array, "B n"], ts: Float[Array, " P"]
-) -> Float[Array, "B P n"]:
-    return jax.vmap(lambda x0: cast(Array, simulate(field, x0, ts).ys))(starts)
 
 
 def _moments(name: str, values: Float[Array, " P"]) -> dict[str, Float[Array, ""]]:

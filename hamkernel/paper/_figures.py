@@ -3,17 +3,13 @@
 import pathlib
 from collections.abc import Mapping
 
-import equinox as eqx
-import jax
 import numpy as np
 from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from hamkernel import plot
-from hamkernel._field import AbstractField
-from hamkernel._fit import fit
-from hamkernel.paper._evaluate import Outcome, datasets
-from hamkernel.paper._experiments import READINGS, Experiment, experiments
+from hamkernel.paper._evaluate import Outcome
+from hamkernel.paper._experiments import Experiment, experiments
 
 Models = Mapping[str, Outcome]
 
@@ -49,25 +45,23 @@ def figures(
 def portraits(experiment: Experiment, reading: str, models: Models) -> Figure:
     """Return stream lines and trajectories of the true system, data and learned fields.
 
-    As figures 1 and 2 of the paper, with the data of noise seed 0.
+    As figures 1 and 2 of the paper, with noise seed 0.
     """
-    X, Y = datasets(experiment, jax.random.key(0)[None])
-    true = models["separable"].true_orbits
+    separable = models["separable"]
     panels = [
-        ("True system", experiment.system, {"true": true}, None),
-        ("Data set", experiment.system, {}, X[0]),
+        ("True system", experiment.system, {"true": separable.true_orbits}, None),
+        ("Data set", experiment.system, None, separable.field.points),
     ]
-    for model in ("separable", "odd_symplectic"):
-        field = _field(experiment, reading, model, X[0], Y[0])
-        title = f"Learned, {model.replace('_', ' ')}"
-        panels.append((title, field, {model: models[model].orbits}, None))
+    for name in ("separable", "odd_symplectic"):
+        title = f"Learned, {name.replace('_', ' ')}"
+        panels.append((title, models[name].field, {name: models[name].orbits}, None))
     figure = Figure(figsize=(8, 7.2), layout="constrained")
     for ax, (title, field, curves, data) in zip(figure.subplots(2, 2).flat, panels, strict=True):
         plot.phase_portrait(
             field,
             *experiment.box,
             data,
-            curves or None,
+            curves,
             ax,
             title=title,
             units=experiment.units,
@@ -101,12 +95,6 @@ def tracking(experiment: Experiment, reading: str, models: Models) -> Figure:
     )
     figure.suptitle(_title(experiment, reading))
     return figure
-
-
-def _field(experiment: Experiment, reading: str, model: str, X, Y) -> AbstractField:
-    chosen = experiment.models[model]
-    regularization = READINGS[reading](chosen.regularization, experiment.size)
-    return eqx.filter_jit(fit)(chosen.kernel, X, Y, regularization)
 
 
 def _title(experiment: Experiment, reading: str) -> str:

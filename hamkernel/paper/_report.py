@@ -21,8 +21,8 @@ def report(results: Results, experiments: Experiments, seeds: int) -> str:
         seeds: how many noise seeds the results are over.
     """
     head = (
-        f"Smith & Egeland (2023) with {seeds} noise seeds: median [10 %, 90 %]; the published "
-        "numbers are of one seed.\n\n"
+        f"Smith & Egeland (2023) with {seeds} noise seeds: median [10 %, 90 %];\n"
+        "the published numbers are of one seed.\n\n"
         "Two readings of the regulariser: lambda solves (G + λI) a = y, N*lambda solves\n"
         "(G + NλI) a = y, which is what the paper's text says. Two masses of the pendulum: 0.5 is\n"
         "in the text, 1 follows from the true Hamiltonian in Table II. The symplectic kernel is\n"

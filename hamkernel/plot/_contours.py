@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
+from matplotlib.ticker import MaxNLocator
 
 from hamkernel.plot._style import Limits, Units, axes, grid, label_plane, legend, on_points
 
@@ -39,7 +40,7 @@ def hamiltonian(
         titles: of the two axes.
         units: of q and p.
         energy_unit: of H.
-        levels: number of contours.
+        levels: number of contours at most.
         resolution: points on each axis of the grid.
 
     Returns:
@@ -50,10 +51,10 @@ def hamiltonian(
     H_learned = H_learned - np.mean(H_learned - H)
     H, H_learned = H - H.min(), H_learned - H.min()
     left, right = _pair() if ax is None else ax
-    steps = np.linspace(0, H.max(), levels + 1)
+    steps = MaxNLocator(levels).tick_values(0, float(H.max()))
     for panel, values, title in zip((left, right), (H, H_learned), titles, strict=True):
         filled = panel.contourf(q, p, values, steps, cmap="cividis", extend="both")
-        panel.contour(q, p, values, steps, colors="white", linewidths=0.5)
+        panel.contour(q, p, values, steps[1:], colors="white", linewidths=0.5)
         label_plane(panel, (0, 1), 2, units)
         panel.set_title(title)
     right.set_ylabel("")
@@ -120,8 +121,8 @@ def loss_surface(
     bar.set_ticks(shown_steps, labels=[f"{step:.2g}" for step in shown_steps])
     bar.ax.minorticks_off()
     i, j = np.unravel_index(np.ma.argmin(shown), shown.shape)
-    best = {"ms": 13, "mec": "black", "mfc": "white", "mew": 0.8, "linestyle": "none", "zorder": 5}
-    ax.plot(first[i], second[j], "*", label="best of the grid", **best)
+    best = {"ms": 13, "mec": "black", "mfc": "white", "mew": 0.8, "linestyle": "none"}
+    ax.plot(first[i], second[j], "*", label="best of the grid", zorder=5, clip_on=False, **best)
     if path is not None:
         path = np.asarray(path)
         ax.plot(*path.T, "-o", color="#D55E00", ms=3.5, linewidth=1.5, label="optimiser", zorder=4)

@@ -1,7 +1,6 @@
 """Pictures in the plane of two coordinates."""
 
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -147,7 +146,7 @@ def plane_slice(
         )
     ax = axes(ax, figsize=(5.2, 4.3))
     if values.ndim == 2:
-        _stream(ax, x, y, values[:, list(dims)], 0.9)
+        _stream(ax, x, y, values[:, list(dims)], 0.9, "white")
         out = np.linalg.norm(np.delete(values, dims, axis=1), axis=1)
         background, label = out, "speed out of the plane"
     else:
@@ -160,9 +159,16 @@ def plane_slice(
     return _finish(ax, dims, len(point), units, title, False, xlim, ylim)
 
 
-def _stream(ax: Axes, x: np.ndarray, y: np.ndarray, velocities: np.ndarray, density: float) -> None:
+def _stream(
+    ax: Axes,
+    x: np.ndarray,
+    y: np.ndarray,
+    velocities: np.ndarray,
+    density: float,
+    color: str = STREAM,
+) -> None:
     u, v = np.moveaxis(velocities.reshape(len(y), len(x), 2), -1, 0)
-    ax.streamplot(x, y, u, v, color=STREAM, linewidth=0.7, arrowsize=0.7, density=density, zorder=1)
+    ax.streamplot(x, y, u, v, color=color, linewidth=0.7, arrowsize=0.7, density=density, zorder=1)
 
 
 def _curves(ax: Axes, curves: Mapping[str | None, np.ndarray], dims: tuple[int, int]) -> None:
@@ -170,8 +176,7 @@ def _curves(ax: Axes, curves: Mapping[str | None, np.ndarray], dims: tuple[int, 
         batch = ys if ys.ndim == 3 else ys[None]  # (B, T, n)
         for i, y in enumerate(batch):
             label = style["label"] if i == 0 else None
-            line: dict[str, Any] = {**style, "label": label, "zorder": 3}
-            ax.plot(y[:, dims[0]], y[:, dims[1]], **line)
+            ax.plot(y[:, dims[0]], y[:, dims[1]], **{**style, "label": label})
             ax.plot(*y[0, list(dims)], "o", color=style["color"], ms=4, zorder=4)
 
 

@@ -50,7 +50,7 @@ def poincare_section(
     *,
     title: str | None = None,
     units: Units | None = None,
-    size: float = 2.0,
+    size: float = 3.0,
 ) -> Axes:
     """Draw the points of a Poincaré section in the plane of two coordinates.
 

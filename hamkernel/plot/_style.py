@@ -44,7 +44,7 @@ def named(series: Any) -> dict[str | None, np.ndarray]:
 
 
 def line_styles(series: Mapping[str | None, Any]) -> Iterator[dict[str, Any]]:
-    """Colour, dashes, width and legend entry of each curve."""
+    """Colour, dashes, width, order and legend entry of each curve."""
     others = itertools.cycle(_OTHERS)
     for name in series:
         key = (name or "").lower().replace(" ", "_")
@@ -53,7 +53,9 @@ def line_styles(series: Mapping[str | None, Any]) -> Iterator[dict[str, Any]]:
             "color": color,
             "linestyle": _DASHES.get(key, "-"),
             "label": name and name.replace("_", " "),
-            "linewidth": 3.2 if key == "true" else 1.6,  # visible under a learned curve
+            # Wide, and below a learned curve that covers it.
+            "linewidth": 3.2 if key == "true" and len(series) > 1 else 1.6,
+            "zorder": 2.5 if key == "true" else 3,
         }
 
 

@@ -1,0 +1,238 @@
+"""Pictures: what is drawn, with which labels and colours, read back from the axes."""
+
+import subprocess
+import sys
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection
+from matplotlib.colors import to_hex
+
+from hamkernel import plot
+from hamkernel.systems import HarmonicOscillator, HenonHeiles
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    yield
+    plt.close("all")
+
+
+SYSTEM = HarmonicOscillator(mass=1.0, stiffness=1.0)
+TS = np.linspace(0, 2 * np.pi, 201)
+CIRCLE = np.stack([np.cos(TS), -np.sin(TS)], axis=1)  # the closed-form trajectory from (1, 0)
+LIMITS = ((-2.0, 2.0), (-1.5, 1.5))
+
+
+def labels(ax):
+    return {text.get_text() for text in ax.get_legend().get_texts()}
+
+
+def line(ax, label):
+    (found,) = [each for each in ax.lines if each.get_label() == label]
+    return found
+
+
+def points_of(ax, label):
+    return np.asarray(line(ax, label).get_xydata())
+
+
+def heights_of(ax, label):
+    return points_of(ax, label)[:, 1]
+
+
+def change_of_radius(ax):
+    """Of each stream line: the largest less the smallest distance from 0."""
+    (stream,) = [each for each in ax.collections if isinstance(each, LineCollection)]
+    lines = stream.get_segments()
+    assert len(lines) > 10
+    return [np.ptp(np.linalg.norm(points, axis=1)) for points in lines]
+
+
+def test_importing_the_package_loads_no_matplotlib():
+    code = "import sys, hamkernel; sys.exit('matplotlib' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_every_function_draws_on_the_axes_given():
+    grid, path = np.geomspace(0.1, 10, 5), np.array([[1.0, 1.0], [2.0, 0.5]])
+    losses = 1 + np.log(grid)[:, None] ** 2 + np.log(grid)[None] ** 2
+    draw = [
+        lambda ax: plot.phase_portrait(SYSTEM, *LIMITS, ax=ax),
+        lambda ax: plot.trajectories(CIRCLE, ax),
+        lambda ax: plot.trajectory_error(TS, TS, ax),
+        lambda ax: plot.energy_drift(TS, TS, ax),
+        lambda ax: plot.loss_surface(grid, grid, losses, path, ax),
+        lambda ax: plot.plane_slice(HenonHeiles().hamiltonian, np.zeros(4), (0, 1), *LIMITS, ax),
+        lambda ax: plot.poincare_section(CIRCLE, (0, 1), ax),
+    ]
+    for each in draw:
+        ax = plt.figure().add_subplot()
+        assert each(ax) is ax
+    pair = plt.figure().subplots(1, 2)
+    assert plot.hamiltonian(SYSTEM.hamiltonian, SYSTEM.hamiltonian, *LIMITS, pair) == tuple(pair)
+
+
+def test_phase_portrait_shows_stream_lines_trajectories_and_data():
+    data = CIRCLE[::20]
+    curves = {"true": np.stack([CIRCLE, 0.5 * CIRCLE]), "odd_symplectic": 0.9 * CIRCLE}
+    ax = plot.phase_portrait(SYSTEM, *LIMITS, data, curves, title="Portrait", units=("m", "kg m/s"))
+    assert labels(ax) == {"true", "odd symplectic", "data"}
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$q$ [m]", "$p$ [kg m/s]")
+    assert (ax.get_xlim(), ax.get_ylim()) == LIMITS
+    assert ax.get_title() == "Portrait"
+    np.testing.assert_array_equal(points_of(ax, "data"), data)
+    np.testing.assert_array_equal(points_of(ax, "odd symplectic"), 0.9 * CIRCLE)
+    # Two true trajectories under one name, and one learned; a dot where each starts.
+    assert sum(len(np.asarray(each.get_xydata())) == 1 for each in ax.lines) == 3
+    # Stream lines of a rotation are circles, as far as Matplotlib's steps of second order go.
+    assert max(change_of_radius(ax)) < 0.02
+
+
+def test_stream_lines_of_a_field_that_is_no_rotation_fail_the_same_check():
+    ax = plot.phase_portrait(lambda x: x, *LIMITS)
+    assert max(change_of_radius(ax)) > 0.2
+
+
+def test_a_phase_portrait_of_a_field_outside_the_plane_is_refused():
+    with pytest.raises(ValueError, match="plane_slice"):
+        plot.phase_portrait(lambda x: jnp.concatenate([x, x]), *LIMITS)
+
+
+def test_a_name_has_one_colour_in_every_picture():
+    names = ("true", "separable", "symplectic", "odd symplectic")
+    phase = plot.trajectories({name: CIRCLE for name in names})
+    time = plot.trajectory_error(TS, {name: TS for name in reversed(names)})
+    colors = [to_hex(line(phase, name).get_color()) for name in names]
+    assert colors == [to_hex(line(time, name).get_color()) for name in names]
+    assert len(set(colors)) == len(names)
+    assert colors[0] == plot.COLORS["true"]
+
+
+def test_trajectories_of_more_coordinates_name_the_two_that_are_drawn():
+    ys = np.random.default_rng(0).normal(size=(7, 6))
+    ax = plot.trajectories(ys, dims=(1, 5))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$q_{2}$", "$p_{3}$")
+    np.testing.assert_array_equal(ax.lines[0].get_xydata(), ys[:, [1, 5]])
+    assert ax.get_legend() is None
+
+
+def test_error_of_many_seeds_is_their_median_in_a_band_of_quantiles():
+    seeds = np.random.default_rng(0).lognormal(size=(11, len(TS)))
+    ax = plot.trajectory_error(TS, {"separable": seeds, "true": seeds[0]}, time_unit="s")
+    ranked = np.sort(seeds, axis=0)  # of 11 values, the quantiles are elements 1, 5 and 9
+    np.testing.assert_allclose(heights_of(ax, "separable"), ranked[5])
+    (band,) = ax.collections  # a single run has no band
+    (path,) = band.get_paths()
+    corners = {(x, y) for x, y in np.round(np.asarray(path.vertices), 9)}
+    for edge in (ranked[1], ranked[9]):
+        assert {(x, y) for x, y in np.round(np.stack([TS, edge], axis=1), 9)} <= corners
+    assert ax.get_yscale() == "log"
+    assert ax.get_xlabel() == "time $t$ [s]"
+    assert labels(ax) == {"separable", "true"}
+
+
+def test_an_error_of_zero_is_left_out_of_a_logarithmic_axis_and_kept_on_a_linear_one():
+    errors = TS.copy()
+    assert errors[0] == 0
+    ax = plot.trajectory_error(TS, {"a": errors})
+    assert np.isnan(heights_of(ax, "a")[0])
+    ax = plot.trajectory_error(TS, {"a": errors}, log=False)
+    assert heights_of(ax, "a")[0] == 0
+
+
+def test_energy_drift_is_the_change_since_the_start():
+    energy = 5.0 + 0.1 * TS
+    ax = plot.energy_drift(TS, {"a": energy}, unit="J")
+    np.testing.assert_allclose(heights_of(ax, "a"), 0.1 * TS, atol=1e-12)
+    assert ax.get_ylabel() == r"energy drift $\Delta H$ [J]"
+    relative = plot.energy_drift(TS, {"a": -energy}, relative=True)
+    np.testing.assert_allclose(heights_of(relative, "a"), -0.02 * TS, atol=1e-12)
+    logarithmic = plot.energy_drift(TS, {"a": -energy}, log=True)
+    np.testing.assert_allclose(heights_of(logarithmic, "a")[1:], 0.1 * TS[1:], rtol=1e-9)
+
+
+def contour_paths(ax):
+    return [np.asarray(path.vertices) for each in ax.collections for path in each.get_paths()]
+
+
+def test_a_constant_in_the_learned_hamiltonian_is_not_seen():
+    H = SYSTEM.hamiltonian
+    left, right = plot.hamiltonian(lambda x: H(x) - 108.5, H, *LIMITS, energy_unit="J")
+    for expected, drawn in zip(contour_paths(left), contour_paths(right), strict=True):
+        np.testing.assert_allclose(drawn, expected, atol=1e-6)
+    assert (left.get_title(), right.get_title()) == ("True $H$", "Learned $H$")
+    bar = left.figure.axes[-1]
+    assert bar.get_ylabel().endswith("[J]")
+
+
+def test_a_wrong_learned_hamiltonian_is_seen():
+    H = SYSTEM.hamiltonian
+    left, right = plot.hamiltonian(lambda x: H(x) * 1.5, H, *LIMITS)
+    pairs = zip(contour_paths(left), contour_paths(right), strict=True)
+    assert any(a.shape != b.shape or np.abs(a - b).max() > 0.01 for a, b in pairs)
+
+
+def test_loss_surface_marks_the_best_point_and_the_end_of_the_path():
+    first, second = np.geomspace(0.1, 100, 13), np.geomspace(1e-6, 1, 9)
+    losses = 1 + np.log(first / 2)[:, None] ** 2 + np.log(second / 1e-3)[None] ** 2
+    losses[0, 0], losses[0, 1] = np.nan, np.inf
+    path = np.geomspace([50, 0.5], [2, 1e-3], 6)
+    ax = plot.loss_surface(first, second, losses, path)
+    i, j = np.unravel_index(np.nanargmin(losses), losses.shape)
+    np.testing.assert_array_equal(points_of(ax, "best of the grid"), [[first[i], second[j]]])
+    np.testing.assert_array_equal(points_of(ax, "optimiser"), path)
+    np.testing.assert_array_equal(points_of(ax, "its end"), path[-1:])
+    assert (ax.get_xscale(), ax.get_yscale()) == ("log", "log")
+    assert labels(ax) == {"best of the grid", "optimiser", "its end"}
+    ax.figure.canvas.draw()
+
+
+def test_a_loss_surface_with_nothing_to_draw_or_transposed_is_refused():
+    first, second = np.geomspace(0.1, 1, 3), np.geomspace(0.1, 1, 4)
+    with pytest.raises(ValueError, match="nothing to draw"):
+        plot.loss_surface(first, second, np.full((3, 4), np.nan))
+    with pytest.raises(ValueError, match=r"\(3, 4\) is needed"):
+        plot.loss_surface(first, second, np.ones((4, 3)))
+
+
+def test_slices_of_a_hamiltonian_and_of_its_field_name_their_coordinates():
+    system, point = HenonHeiles(), np.array([0.1, 0.2, 0.3, 0.4])
+    ax = plot.plane_slice(system.hamiltonian, point, (0, 1), (-1, 1), (-1, 1))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$q_{1}$", "$q_{2}$")
+    assert ax.figure.axes[-1].get_ylabel() == r"$H - \min H$"
+    ax = plot.plane_slice(system, point, (0, 2), (-1, 1), (-1, 1))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$q_{1}$", "$p_{1}$")
+    with pytest.raises(ValueError, match="plane_slice needs"):
+        plot.plane_slice(lambda x: x[:3], point, (0, 1), (-1, 1), (-1, 1))
+
+
+def test_crossings_of_a_circle_are_where_the_closed_form_says():
+    ts = np.linspace(0, 20.3, 4001)
+    ys = np.stack([np.cos(ts), -np.sin(ts)], axis=1)
+    # cos t rises through 1/2 at t = 2πk − π/3; linear interpolation errs by h²/8 = 3e-6.
+    up = plot.crossings(ys, 0, 0.5)
+    np.testing.assert_allclose(up, np.tile([0.5, np.sqrt(0.75)], (3, 1)), atol=1e-5)
+    down = plot.crossings(ys, 0, 0.5, direction=-1)
+    np.testing.assert_allclose(down, np.tile([0.5, -np.sqrt(0.75)], (4, 1)), atol=1e-5)
+    assert len(plot.crossings(ys, 0, 0.5, direction=0)) == 7
+    assert plot.crossings(ys, 0, 2.0).shape == (0, 2)
+
+
+def test_a_state_on_the_section_is_one_crossing():
+    ys = np.array([[-1.0, 0.0], [0.0, 5.0], [1.0, 0.0]])
+    np.testing.assert_array_equal(plot.crossings(ys, 0, direction=0), [[0.0, 5.0]])
+    with pytest.raises(ValueError, match="one trajectory"):
+        plot.crossings(ys[None], 0)
+
+
+def test_poincare_section_gives_each_orbit_a_colour_and_named_ones_a_legend():
+    ys = np.random.default_rng(0).normal(size=(3, 50, 4))
+    ax = plot.poincare_section(list(ys), (1, 3))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$q_{2}$", "$p_{2}$")
+    assert len({to_hex(each.get_color()) for each in ax.lines}) == 3
+    np.testing.assert_array_equal(ax.lines[2].get_xydata(), ys[2][:, [1, 3]])
+    ax = plot.poincare_section({"true": ys[0], "learned": ys[1]}, (1, 3))
+    assert labels(ax) == {"true", "learned"}
