@@ -25,10 +25,13 @@ class AbstractField(eqx.Module):
     kernel: eqx.AbstractVar[AbstractMatrixKernel]
     offset: eqx.AbstractVar[Float[Array, ""]]
 
+    # jax.jit(field) looks up the function it compiles by hash and equality. Arrays have no hash and
+    # traced ones no equality, so here a field is equal to itself only.
     def __hash__(self) -> int:
-        # jax.jit(field) hashes the function it compiles; arrays have no hash, their shapes do.
-        leaves = jax.tree.leaves(eqx.filter(self, eqx.is_array))
-        return hash((type(self), tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)))
+        return id(self)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
 
     @property
     @abc.abstractmethod
@@ -50,7 +53,9 @@ class AbstractField(eqx.Module):
         Raises:
             AttributeError: the structure has no potential (with the reason).
         """
-        jax.eval_shape(self.unanchored_potential, jnp.zeros(self.dimension, self.offset.dtype))
+        # A lambda, because JAX would compare the bound method, and so its traced arrays.
+        state = jnp.zeros(self.dimension, self.offset.dtype)
+        jax.eval_shape(lambda x: self.unanchored_potential(x), state)
         return lambda x: self.unanchored_potential(x) + self.offset
 
     @property
@@ -132,6 +137,8 @@ class KernelField(AbstractField):
             x0: a state, shape (n,), for example the equilibrium.
             value: the potential there, in units of energy.
         """
+        if jnp.shape(value) != ():
+            raise ValueError(f"value has shape {jnp.shape(value)}; one number is needed.")
         offset = jnp.asarray(value, self.offset.dtype) - self.unanchored_potential(jnp.asarray(x0))
         return eqx.tree_at(lambda field: field.offset, self, offset)
 
