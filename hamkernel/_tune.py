@@ -53,8 +53,9 @@ class Tuned(eqx.Module):
         steps: the number of its optimiser steps, shape ().
         at_bounds: the names of the hyperparameters that rest on a bound of the search box. The
             data would have them further out: see "How to choose" in the README.
-        start_losses: the best loss of the run from each start, the caller's kernel first,
-            shape (starts,).
+        start_losses: the loss on all data at the end of the run from each start, shape (starts,):
+            in the order of the starts, the caller's kernel first, or, where the runs were made
+            on a subset, in ascending order of the loss before the best were finished.
         bounds: the box that was searched: for each name the lowest and highest value.
     """
 
@@ -79,7 +80,7 @@ def tune(
     objective: Criterion | Objective = "cross_validation",
     frozen: str | tuple[str, ...] = (),
     bounds: dict[str, tuple[ArrayLike, ArrayLike]] | None = None,
-    starts: int = 4,
+    starts: int = 16,
     optimiser: optx.AbstractMinimiser | None = None,
     max_steps: int = 64,
     solver: AbstractSolver | None = None,
@@ -88,8 +89,9 @@ def tune(
     """Tune every hyperparameter of K, and λ with them, by gradient descent on a validation loss.
 
     The search starts from the given kernel and from `starts` − 1 further points, the best of a
-    space-filling design in the box; all run in one compiled call, and the best point that any of
-    them ever saw is returned. New data of the same shape does not recompile.
+    space-filling design in the box. All run in one compiled call, on a subset of the points if
+    there are many; the best runs are then finished on all data, and the best point that any of
+    them saw is returned. New data of the same shape does not recompile.
 
     Args:
         K: a matrix-valued kernel; every inexact array leaf is a hyperparameter.
@@ -122,10 +124,10 @@ def tune(
     K = matrix_kernel(K)
     X, Y = require.data(X, Y)
     K.check_dimension(X.shape[1])
-    regularization = require.positive_scalar(regularization, "regularization").astype(X.dtype)
+    ridge = require.positive_scalar(regularization, "regularization").astype(X.dtype)
     criterion = _criterion(objective, len(X), folds)
     frozen = (frozen,) if isinstance(frozen, str) else tuple(frozen)
-    space = SearchSpace(K, X, Y, regularization, frozen, bounds or {})
+    space = SearchSpace(K, X, Y, ridge, frozen, bounds or {})
     if starts < 1:
         raise ValueError(f"starts must be at least 1, got {starts}.")
     if optimiser is None:
@@ -141,12 +143,12 @@ def tune(
             "objective of your own that returns NaN."
         )
     best = int(values.argmin())
-    kernel, regularization = _decode(space, runs.u[best], X)
+    kernel, ridge = _decode(space, runs.u[best], X)
     return Tuned(
         kernel=kernel,
-        regularization=regularization,
+        regularization=ridge,
         loss=criterion.loss(runs.value[best]),
-        field=fit(kernel, X, Y, regularization, solver=solver),
+        field=fit(kernel, X, Y, ridge, solver=solver),
         converged=runs.converged[best],
         steps=runs.steps[best],
         start_losses=criterion.loss(runs.value),
@@ -168,6 +170,7 @@ class _Criterion(eqx.Module):
     fn: Callable[..., Float[Array, ""]]
     partition: Partition | None = eqx.field(static=True)
     logarithmic: bool = eqx.field(static=True)
+    own: bool = eqx.field(static=True, default=False)  # the caller's: it may need all the data
 
     def value(self, K, X, Y, regularization) -> Float[Array, ""]:
         extra = () if self.partition is None else (self.partition,)
@@ -180,6 +183,22 @@ class _Criterion(eqx.Module):
         """The caller's objective for a value of the search; inf where there was none."""
         loss = jnp.exp(value) if self.logarithmic else value
         return jnp.where(value < HUGE, loss, jnp.inf)
+
+    def coarse_points(self, X: Float[Array, "N n"]) -> np.ndarray:
+        """The rows of the subset: spread evenly over the folds, and over the points of each."""
+        N, n = X.shape
+        if self.own or N * n <= COARSE_ROWS:
+            return np.arange(N)
+        labels = np.zeros(N) if self.partition is None else self.partition.labels
+        even = np.linspace(0, N - 1, COARSE_ROWS // n).round().astype(int)
+        return np.sort(np.argsort(labels, kind="stable")[even])
+
+    def on(self, rows: np.ndarray) -> "_Criterion":
+        """The same criterion for a subset of the points."""
+        if self.partition is None:
+            return self
+        partition = Partition(len(rows), self.partition.labels[rows])
+        return _Criterion(self.fn, partition, self.logarithmic, self.own)
 
 
 def _criterion(objective: Criterion | Objective, N: int, folds: Folds) -> _Criterion:
@@ -201,7 +220,7 @@ def _criterion(objective: Criterion | Objective, N: int, folds: Folds) -> _Crite
             "'marginal_likelihood' or a function (K, X, Y, regularization) -> (); "
             f"got {objective!r}."
         )
-    return _Criterion(as_pytree(objective), None, logarithmic=False)
+    return _Criterion(as_pytree(objective), None, logarithmic=False, own=True)
 
 
 def _negative_log_likelihood(K, X, Y, regularization):
@@ -222,42 +241,68 @@ _decode = eqx.filter_jit(lambda space, u, X: space.decode(u, X))
 
 @eqx.filter_jit
 def _search(space, criterion, X, Y, optimiser, starts: int, max_steps: int) -> _Runs:
-    def value(u):
-        kernel, regularization = space.decode(u, X)
-        return criterion.value(kernel, X, Y, regularization)
+    """The runs from all starts, coarse to fine.
+
+    The basins are found on a subset of the points, where an evaluation costs microseconds; the
+    best runs are then finished on all of them. Small data is its own subset.
+    """
+    rows = criterion.coarse_points(X)
+    X_coarse, Y_coarse = X[rows], Y[rows]
+    coarse = _Objective(space, criterion.on(rows), X_coarse, Y_coarse, len(X) / len(rows))
+    u = space.encode_start(X)[None]
+    if starts > 1:
+        design = _design(u.shape[1], DESIGN_POINTS, X.dtype)
+        values = jax.lax.map(coarse, design, batch_size=64)
+        u = jnp.concatenate([u, _spread_out(design, values, starts - 1)])
+    runs = jax.vmap(lambda u: _run(coarse, u, optimiser, max_steps))(u)
+    if len(rows) == len(X):
+        return runs
+    fine = _Objective(space, criterion, X, Y, 1.0)
+    runs = eqx.tree_at(lambda r: r.value, runs, jax.lax.map(fine, runs.u))
+    order = jnp.argsort(runs.value)
+    runs = jax.tree.map(lambda leaf: leaf[order], runs)
+    finished = jax.lax.map(lambda u: _run(fine, u, optimiser, max_steps), runs.u[:FINISHERS])
+    return jax.tree.map(lambda new, old: old.at[:FINISHERS].set(new), finished, runs)
+
+
+DESIGN_POINTS = 256  # in the box, from which the starts are chosen
+FINISHERS = 2  # runs that are finished on all points
+COARSE_ROWS = 128  # of the Gram of the subset
+
+
+class _Objective(eqx.Module):
+    """u -> value. `thinning` keeps the ridge Nλ of all points when X is a subset of them."""
+
+    space: SearchSpace
+    criterion: _Criterion
+    X: Float[Array, "N n"]
+    Y: Float[Array, "N n"]
+    thinning: float = eqx.field(static=True)
+
+    def __call__(self, u: Float[Array, " P"]) -> Float[Array, ""]:
+        kernel, regularization = self.space.decode(u, self.X)
+        return self.criterion.value(kernel, self.X, self.Y, self.thinning * regularization)
+
+
+def _run(objective: _Objective, u: Float[Array, " P"], optimiser, max_steps: int) -> _Runs:
+    """One run of the optimiser from u."""
 
     # optimistix linearises forward and transposes; our derivatives are written backward.
     @jax.custom_jvp
     def differentiable(u):
-        return value(u)
+        return objective(u)
 
     @differentiable.defjvp
     def _(primals, tangents):
-        value_at, slope = jax.value_and_grad(value)(*primals)
+        value, slope = jax.value_and_grad(objective)(*primals)
         slope = jnp.where(jnp.isfinite(slope), slope, jnp.zeros_like(slope))
-        return value_at, slope @ tangents[0]
+        return value, slope @ tangents[0]
 
-    def run(u):
-        found = optx.minimise(
-            lambda u, _: differentiable(u), optimiser, u, max_steps=max_steps, throw=False
-        )
-        converged = found.result == optx.RESULTS.successful
-        return _Runs(found.value, value(found.value), converged, found.stats["num_steps"])
-
-    # Small problems are dominated by the overhead of each operation, so they share it.
-    together = X.size <= SMALL
-    u = space.encode_start(X)
-    if starts > 1:
-        design = _design(len(u), DESIGN_POINTS, X.dtype)
-        values = jax.lax.map(value, design, batch_size=DESIGN_POINTS if together else 1)
-        u = jnp.concatenate([u[None], _spread_out(design, values, starts - 1)])
-    else:
-        u = u[None]
-    return jax.lax.map(run, u, batch_size=starts if together else 1)
-
-
-SMALL = 128  # rows of the Gram up to which the runs are vmapped
-DESIGN_POINTS = 32
+    found = optx.minimise(
+        lambda u, _: differentiable(u), optimiser, u, max_steps=max_steps, throw=False
+    )
+    converged = found.result == optx.RESULTS.successful
+    return _Runs(found.value, objective(found.value), converged, found.stats["num_steps"])
 
 
 def _design(P: int, count: int, dtype) -> Float[Array, "count P"]:
