@@ -37,14 +37,18 @@ def fit(
         values of hyperparameters or λ do not recompile.
 
     Raises:
-        TypeError: K is not matrix-valued. ValueError: a shape does not fit, the data is empty or
-            not finite, n is not allowed by the structure, or λ is not positive. RuntimeError: the
-            ridge is too small for this Gram (the text says what to do).
+        TypeError: K is not matrix-valued, `solver` is no solver, or the data is complex or in half
+            precision. ValueError: a shape does not fit, the data is empty or not finite, n is not
+            allowed by the structure, or λ is not positive. RuntimeError: the ridge is too small
+            for this Gram (the text says what to do).
 
     Source: Smith & Egeland (2023), eq. (vector_valued_regular_least_squares_a_equation), where
         "Nλ a_j" should read "Nλ a_i".
     """
     K = matrix_kernel(K)
+    solver = Cholesky() if solver is None else solver
+    if not isinstance(solver, AbstractSolver):
+        raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
     X, Y = require.data(X, Y)
     K.check_dimension(X.shape[1])
     regularization = require.positive_scalar(regularization, "regularization").astype(X.dtype)
@@ -55,4 +59,4 @@ def fit(
             "jax.config.update('jax_enable_x64', True) first and pass float64 data.",
             stacklevel=2,
         )
-    return (solver or Cholesky()).fit(K, X, Y, regularization)
+    return solver.fit(K, X, Y, regularization)

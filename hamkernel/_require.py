@@ -109,6 +109,8 @@ def data(X: ArrayLike, Y: ArrayLike) -> tuple[Float[Array, "N n"], Float[Array, 
             "one velocity Y[i] for each state X[i]."
         )
     dtype = jnp.result_type(X, Y)
+    if jnp.finfo(dtype).bits < 32:
+        raise TypeError(f"X and Y have dtype {dtype}: float32 or float64 is needed.")
     return finite(X.astype(dtype), "X"), finite(Y.astype(dtype), "Y")
 
 
