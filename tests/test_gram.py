@@ -1,0 +1,212 @@
+"""The Gram: its layout, symmetry and positivity, and the wrong constructions that lack them."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from kernels import BY_NAME, CASES, canonical
+
+import hamkernel as hk
+
+SYMMETRY = 1e-12  # relative: entries are computed twice, in two orders
+NEGATIVE = -1e-10  # smallest eigenvalue relative to the trace: rounding of the eigenvalues
+STRUCTURES = {
+    "separable": hk.Separable,
+    "curl_free": hk.CurlFree,
+    "symplectic": hk.Symplectic,
+    "divergence_free": hk.DivergenceFree,
+    "odd_symplectic": lambda k: hk.Odd(hk.Symplectic(k)),
+    "even_symplectic": lambda k: hk.Even(hk.Symplectic(k)),
+    "sum": lambda k: hk.CurlFree(k) + hk.DivergenceFree(hk.Gaussian(0.8)),
+}
+# Each structure with every kernel is for the slow tests: the rest of the product says little new.
+QUICK = {"symplectic", "odd_symplectic"}
+FEW = {"gaussian_ard", "partial", "function"}
+
+
+def states(N=6, n=4, seed=0):
+    return np.random.default_rng(seed).normal(size=(N, n))
+
+
+def crowded():
+    """States with a repeated one, and one so close that its distance is lost in rounding."""
+    X = states()
+    X[1], X[2] = X[0], X[0] + 1e-8
+    return X
+
+
+def square(K, X):
+    """The Gram as a matrix; each program runs once, so it is not worth compiling well."""
+    options = {"xla_backend_optimization_level": 0}
+    G = jax.jit(hk.gram, compiler_options=options)(K, X)
+    return np.asarray(G).reshape(X.size, X.size)
+
+
+def asymmetry(G):
+    return np.abs(G - G.T).max() / np.abs(G).max()
+
+
+def smallest(G):
+    """The smallest eigenvalue relative to the trace."""
+    return np.linalg.eigvalsh((G + G.T) / 2).min() / np.trace(G)
+
+
+@pytest.mark.parametrize(
+    ("structure", "case"),
+    [
+        pytest.param(
+            structure,
+            case,
+            id=f"{name}-{case}",
+            marks=[] if name in QUICK or case.name in FEW else [pytest.mark.slow],
+        )
+        for name, structure in STRUCTURES.items()
+        for case in CASES
+    ],
+)
+def test_gram_is_symmetric_and_positive_also_for_coincident_points(structure, case):
+    G = square(structure(case.make(4)), crowded())
+    assert asymmetry(G) < SYMMETRY
+    assert smallest(G) > NEGATIVE
+
+
+def test_minus_the_hessian_in_x_is_indefinite_for_a_polynomial():
+    k, X = BY_NAME["polynomial"].make(2), states(n=2)
+
+    def wrong(x, z):
+        return -jax.hessian(k)(x, z)
+
+    G = jax.vmap(jax.vmap(wrong, (None, 0), 1), (0, None))(X, X).reshape(X.size, X.size)
+    assert np.linalg.eigvalsh((G + G.T) / 2).min() < -0.1
+    assert smallest(square(hk.CurlFree(k), X)) > NEGATIVE
+
+
+def test_the_mean_over_one_argument_is_asymmetric_without_invariance():
+    k, X = BY_NAME["partial"].make(2), states(n=2)
+
+    def one_sided(x, z):
+        return (k(x, z) + k(-x, z)) / 2
+
+    assert asymmetry(square(hk.Symplectic(one_sided), X)) > 0.1
+    assert asymmetry(square(hk.Odd(hk.Symplectic(k)), X)) < SYMMETRY
+
+
+@pytest.mark.parametrize("name", ["gaussian", "polynomial"])
+def test_the_two_sided_mean_equals_the_one_sided_where_both_are_right(name):
+    k, X = BY_NAME[name].make(2), states(n=2)
+    cheap = square(hk.Odd(hk.Symplectic(k)), X)
+    # The same function as a user's callable, of which nothing is known.
+    safe = square(hk.Odd(hk.Symplectic(lambda x, z: k(x, z))), X)
+    np.testing.assert_allclose(cheap, safe, atol=1e-12 * np.abs(cheap).max())
+
+
+def gaussian_symplectic(x, z, sigma):
+    """The paper's eq. (symplectic_kernel_from_gaussian)."""
+    d, J = x - z, canonical(len(x))
+    block = np.eye(len(x)) - np.outer(d, d) / sigma**2
+    return np.exp(-d @ d / (2 * sigma**2)) / sigma**2 * J @ block @ J.T
+
+
+def test_axes_are_point_component_point_component():
+    X, Z, sigma = states(3), states(5, seed=1), 1.3
+    G = hk.gram(hk.Symplectic(hk.Gaussian(sigma)), X, Z)
+    assert G.shape == (3, 4, 5, 4)
+    for i, x in enumerate(X):
+        for j, z in enumerate(Z):
+            np.testing.assert_allclose(
+                G[i, :, j, :], gaussian_symplectic(x, z, sigma), atol=SYMMETRY
+            )
+
+
+def test_one_argument_is_the_gram_of_a_set_with_itself():
+    K, X, Z = hk.Odd(hk.Symplectic(BY_NAME["partial"].make(4))), states(3), states(5, seed=1)
+    np.testing.assert_array_equal(hk.gram(K, X), hk.gram(K, X, X))
+    transposed = hk.gram(K, Z, X).transpose(2, 3, 0, 1)
+    np.testing.assert_allclose(hk.gram(K, X, Z), transposed, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", ["gaussian", "matern2.5", "periodic"])
+def test_shift_invariant_kernels_do_not_feel_the_origin(name):
+    K, X = hk.Symplectic(BY_NAME[name].make(4)), states()
+    near, far = hk.gram(K, X), hk.gram(K, X + 1e6)
+    # The data itself is rounded to 1e-10 out there; the product form alone would lose 1e-4.
+    np.testing.assert_allclose(far, near, atol=1e-8)
+    single = hk.gram(K, (X + 1e3).astype(np.float32))
+    np.testing.assert_allclose(single, near, atol=1e-3)  # data rounded to 6e-5
+    polynomial = hk.Symplectic(hk.Polynomial(2))
+    assert np.abs(hk.gram(polynomial, X + 1.0) - hk.gram(polynomial, X)).max() > 1.0
+
+
+def test_gram_works_under_jit_vmap_and_grad():
+    X = states(3, 2)
+
+    def trace(lengthscale, X):
+        return jnp.einsum("iaia->", hk.gram(hk.Symplectic(hk.Gaussian(lengthscale)), X))
+
+    # tr K(x, x) = n/ℓ², and its derivative −2n/ℓ³.
+    ell = 1.7
+    np.testing.assert_allclose(jax.jit(trace)(ell, X), 3 * 2 / ell**2, rtol=1e-12)
+    np.testing.assert_allclose(jax.grad(trace)(ell, X), -2 * 3 * 2 / ell**3, rtol=1e-12)
+    np.testing.assert_allclose(jax.grad(trace, 1)(ell, X), 0.0, atol=1e-12)
+    several = jax.vmap(trace, in_axes=(0, None))(jnp.array([1.0, 2.0]), X)
+    np.testing.assert_allclose(several, [6.0, 1.5], rtol=1e-12)
+
+
+def test_new_hyperparameters_do_not_recompile():
+    traces = []
+
+    def k(x, z):
+        traces.append(None)
+        return jnp.exp(x @ z)
+
+    X, first = states(3, 2), None
+    for lengthscale in (0.5, 1.0, 2.0):
+        hk.gram(hk.Symplectic(lengthscale * hk.Warp(k, jnp.sin)), X)
+        first = first or len(traces)
+    assert first == len(traces) > 0
+    hk.gram(hk.Symplectic(1.0 * hk.Warp(k, jnp.sin)), states(4, 2))  # another shape: the control
+    assert len(traces) > first
+
+
+def test_float32_gives_float32_and_integers_give_floats():
+    K = hk.Symplectic(hk.Gaussian(1.3))
+    X = states(3, 2)
+    G = hk.gram(K, X.astype(np.float32))
+    assert G.dtype == jnp.float32
+    np.testing.assert_allclose(G, hk.gram(K, X), atol=1e-6)
+    integers = np.arange(6).reshape(3, 2)
+    np.testing.assert_array_equal(hk.gram(K, integers), hk.gram(K, integers.astype(float)))
+
+
+K = hk.Symplectic(hk.Gaussian())
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "match"),
+    [
+        (lambda: hk.gram(hk.Gaussian(), states()), TypeError, re.escape("hk.Symplectic(k), ")),  # pyright: ignore
+        (lambda: hk.gram(hk.Symplectic, states()), TypeError, "matrix-valued kernel is needed"),  # pyright: ignore
+        (lambda: hk.gram(K, states()[0]), ValueError, r"shape \(4,\); it must be \(N, n\).*None"),
+        (lambda: hk.gram(K, states()[None]), ValueError, r"reshape\(-1, X\.shape\[-1\]\)"),
+        (lambda: hk.gram(K, states(0)), ValueError, "at least one point"),
+        (lambda: hk.gram(K, states(n=3)), ValueError, "even dimension, got n = 3"),
+        (lambda: hk.gram(K, states(), states(n=2)), ValueError, "X has 4 coordinates and Z has 2"),
+        (lambda: hk.gram(K, states(), states()[0]), ValueError, r"Z has shape \(4,\)"),
+        (lambda: hk.gram(K, states() * 1j), TypeError, "complex128; real numbers are needed"),
+        (
+            lambda: hk.gram(hk.Symplectic(hk.Gaussian(np.ones(2))), states()),
+            ValueError,
+            "2 lengthscales",
+        ),
+        (
+            lambda: hk.gram(hk.Symplectic(lambda x, z: x * z), states()),
+            ValueError,
+            "a scalar is needed",
+        ),
+    ],
+)
+def test_gram_refuses(call, error, match):
+    with pytest.raises(error, match=match):
+        call()
