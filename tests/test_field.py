@@ -1,0 +1,277 @@
+"""Learned fields: derivatives at the data, potentials, parts, and the flow they generate."""
+
+import functools
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from kernels import BY_NAME, canonical
+
+import hamkernel as hk
+
+ROUNDING = 1e-10  # a field is a sum of some dozen terms of order one
+
+
+def states(N=6, n=2, seed=0):
+    return jnp.asarray(np.random.default_rng(seed).normal(size=(N, n)))
+
+
+def pendulum(x):
+    return jnp.stack([x[1], -jnp.sin(x[0])])
+
+
+@functools.cache
+def fitted(structure, kernel="gaussian", n=2, ridge=1e-3):
+    X = states(n=n)
+    Y = jnp.tanh(X[:, ::-1]) + 0.1 * states(n=n, seed=1)
+    field = hk.fit(structure(BY_NAME[kernel].make(n)), X, Y, ridge)
+    assert isinstance(field, hk.KernelField)
+    return field
+
+
+# Derivatives.
+
+
+@pytest.mark.parametrize(
+    "kernel", ["gaussian", "gaussian_ard", "matern2.5", "matern4.5", "periodic", "partial"]
+)
+@pytest.mark.parametrize("structure", [hk.Symplectic, hk.DivergenceFree])
+def test_the_jacobian_at_data_points_is_that_of_differences(structure, kernel):
+    field = fitted(structure, kernel)
+    jacobian = jax.jit(jax.vmap(jax.jacfwd(field)))(field.points)
+    values, step = jax.jit(jax.vmap(field)), 1e-6
+    columns = [
+        (values(field.points + step * e[None]) - values(field.points - step * e[None])) / (2 * step)
+        for e in jnp.eye(2)
+    ]
+    # Linear in the step for Matérn-5/2, times coefficients of order 10; else 1e-16 / step.
+    np.testing.assert_allclose(jacobian, jnp.stack(columns, axis=-1), atol=1e-4)
+
+
+def test_a_field_of_matern_three_halves_is_finite_at_data_points():
+    field = fitted(hk.Symplectic, "matern1.5")
+    near = jax.vmap(field)(field.points + 1e-9)
+    np.testing.assert_allclose(jax.vmap(field)(field.points), near, atol=1e-6)
+
+
+# Transformations.
+
+
+def test_a_field_is_a_function_for_jit_vmap_grad_and_map():
+    field = fitted(hk.Symplectic)
+    X = states(4, seed=2)
+    expected = jnp.stack([field(x) for x in X])
+    for values in (
+        jax.jit(jax.vmap(field))(X),
+        jax.vmap(jax.jit(field))(X),
+        jax.lax.map(field, X),
+        eqx.filter_jit(lambda field, X: jax.vmap(field)(X))(field, X),
+        jax.jit(lambda field, X: jax.vmap(jax.jit(field))(X))(field, X),
+        jax.vmap(jax.checkpoint(field))(X),
+    ):
+        np.testing.assert_allclose(values, expected, atol=ROUNDING)
+
+
+def test_two_fields_of_one_shape_are_not_taken_for_each_other():
+    field = fitted(hk.Symplectic)
+    other = eqx.tree_at(lambda f: f.coefficients, field, -field.coefficients)
+    x = states(1)[0]
+    np.testing.assert_allclose(jax.jit(field)(x), -jax.jit(other)(x), atol=ROUNDING)
+    assert field == field
+    assert field != other
+
+
+def test_potentials_work_where_the_field_is_traced():
+    field, X = fitted(hk.Symplectic), states(4, seed=2)
+    expected = jnp.stack([field.hamiltonian(x) for x in X])
+    np.testing.assert_allclose(jax.jit(jax.vmap(field.hamiltonian))(X), expected, atol=ROUNDING)
+
+    @jax.jit
+    def energies(field, X):
+        return jax.vmap(field.hamiltonian)(X)
+
+    np.testing.assert_allclose(energies(field, X), expected, atol=ROUNDING)
+
+    def fit_and_ask(Y):
+        return hk.fit(field.kernel, field.points, Y, field.regularization).hamiltonian(X[0])
+
+    Y = jax.vmap(field)(field.points) + field.residual
+    np.testing.assert_allclose(jax.jit(fit_and_ask)(Y), expected[0], atol=ROUNDING)
+    assert jnp.isfinite(jax.jit(jax.grad(fit_and_ask))(Y)).all()
+
+
+def test_a_field_can_be_exported():
+    field, x = fitted(hk.Symplectic), states(1)[0]
+    exported = jax.export.export(jax.jit(field))(jax.ShapeDtypeStruct(x.shape, x.dtype))
+    np.testing.assert_allclose(exported.call(x), field(x), atol=ROUNDING)
+
+
+# Potentials.
+
+
+def test_anchoring_sets_the_constant_and_nothing_else():
+    field, x, x0 = fitted(hk.Symplectic), states(1, seed=3)[0], jnp.array([0.1, 0.2])
+    anchored = field.anchored(x0, 3.0)
+    np.testing.assert_allclose(anchored.hamiltonian(x0), 3.0, rtol=ROUNDING)
+    np.testing.assert_allclose(
+        anchored.hamiltonian(x) - anchored.hamiltonian(x0),
+        field.hamiltonian(x) - field.hamiltonian(x0),
+        atol=ROUNDING,
+    )
+    np.testing.assert_array_equal(anchored(x), field(x))
+    np.testing.assert_allclose(anchored.anchored(x0).hamiltonian(x0), 0.0, atol=ROUNDING)
+    np.testing.assert_allclose(field.anchored([0, 1], 2).potential(jnp.array([0.0, 1.0])), 2.0)  # pyright: ignore
+
+
+def test_the_potential_of_a_curl_free_field_is_no_hamiltonian():
+    field = fitted(hk.CurlFree)
+    x = states(1)[0]
+    np.testing.assert_allclose(jax.grad(field.potential)(x), field(x), atol=ROUNDING)
+    with pytest.raises(AttributeError, match=r"CurlFree is not Hamiltonian.*field\.potential\(x\)"):
+        _ = field.hamiltonian
+
+
+def curl_free_plus_separable(k):
+    return hk.CurlFree(k) + hk.Separable(k)
+
+
+def symplectic_plus_separable(k):
+    return hk.Symplectic(k) + hk.Separable(k)
+
+
+@pytest.mark.parametrize(
+    ("structure", "reason"),
+    [
+        (hk.Separable, "components are independent"),
+        (hk.DivergenceFree, r"matrix potential.*stream function"),
+        (curl_free_plus_separable, r"CurlFree \+ Separable has no single potential.*part\(0\)"),
+    ],
+)
+def test_a_field_without_a_potential_says_why(structure, reason):
+    field = fitted(structure)
+    with pytest.raises(AttributeError, match=reason):
+        _ = field.potential
+    with pytest.raises(AttributeError, match=reason):
+        field.anchored(jnp.zeros(2))
+    assert not hasattr(field, "hamiltonian")
+    assert hasattr(fitted(hk.Symplectic), "hamiltonian")
+
+
+def test_the_hamiltonian_of_a_sum_is_asked_of_its_part():
+    field = fitted(symplectic_plus_separable)
+    with pytest.raises(AttributeError, match=r"ask the part, field\.part\(0\)\.hamiltonian\(x\)"):
+        _ = field.hamiltonian
+    part, x = field.part(0), states(1)[0]
+    slope = jax.grad(part.hamiltonian)(x)
+    np.testing.assert_allclose(part(x), canonical(2) @ slope, atol=ROUNDING)
+
+
+# Points of the wrong kind.
+
+
+@pytest.mark.parametrize("call", ["__call__", "hamiltonian", "potential", "anchored"])
+def test_one_state_at_a_time(call):
+    field = fitted(hk.Symplectic)
+    function = getattr(field, call)
+    with pytest.raises(ValueError, match=r"shape \(6, 2\); one state of shape \(2,\).*jax\.vmap"):
+        function(states())
+    with pytest.raises(ValueError, match=r"shape \(4,\); one state of shape \(2,\)"):
+        function(jnp.zeros(4))
+    with pytest.raises(TypeError, match="real numbers are needed"):
+        function(np.zeros(2) * 1j)
+
+
+def test_an_anchor_has_one_value():
+    with pytest.raises(ValueError, match=r"value has shape \(2,\); one number"):
+        fitted(hk.Symplectic).anchored(jnp.zeros(2), jnp.zeros(2))
+
+
+def test_states_may_be_integers_lists_or_float32():
+    field = fitted(hk.Symplectic)
+    expected = field(jnp.array([1.0, 2.0]))
+    for x in ([1, 2], np.array([1, 2]), np.array([1.0, 2.0], np.float32)):
+        np.testing.assert_array_equal(field(x), expected)  # pyright: ignore[reportArgumentType]
+
+
+# Separability.
+
+Q = hk.Select(hk.Gaussian(), 0)
+P = hk.Select(hk.Polynomial(2), 1)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "separable"),
+    [
+        (hk.Symplectic(Q + P), True),
+        (hk.Symplectic(2.0 * Q + 0.5 * P), True),
+        (hk.Odd(hk.Symplectic(Q + P)), True),
+        (hk.Symplectic(Q) + hk.Symplectic(P), True),
+        (hk.Symplectic(Q * P), False),
+        (hk.Symplectic(Q + hk.Gaussian()), False),
+        (hk.Symplectic(Q * hk.Gaussian() + P), False),
+        (hk.Symplectic(lambda x, z: Q(x, z) + P(x, z)), False),  # true, but not known
+        (hk.CurlFree(Q + P), False),
+        (hk.Symplectic(Q) + hk.Separable(P), False),
+    ],
+)
+def test_is_separable_follows_from_the_kernel(kernel, separable):
+    X = states()
+    field = hk.fit(kernel, X, jnp.sin(X), 1e-2)
+    assert field.is_separable == separable
+    if separable:  # ∂²H/∂q∂p = 0, which is the diagonal of Df for n = 2
+        Df = jax.vmap(jax.jacfwd(field))(X)
+        np.testing.assert_allclose(Df[:, [0, 1], [0, 1]], 0.0, atol=ROUNDING)
+
+
+# The flow.
+
+TOLERANCE = 1e-10
+
+
+def flow(field, time):
+    """x(0) ↦ x(time), differentiable in forward mode."""
+
+    def at(x0):
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(lambda t, x, args: field(x)),
+            diffrax.Dopri8(),
+            0.0,
+            time,
+            0.1,
+            x0,
+            stepsize_controller=diffrax.PIDController(rtol=TOLERANCE, atol=TOLERANCE),
+            adjoint=diffrax.ForwardMode(),
+        )
+        assert solution.ys is not None
+        return solution.ys[-1]
+
+    return jax.jit(at)
+
+
+def henon_heiles(x):
+    q1, q2, p1, p2 = x
+    return jnp.stack([p1, p2, -q1 - 2 * q1 * q2, -q2 - q1**2 + q2**2])
+
+
+@pytest.mark.parametrize(
+    ("system", "n"), [(pendulum, 2), (henon_heiles, 4)], ids=["pendulum", "henon_heiles"]
+)
+def test_the_learned_flow_is_symplectic_and_keeps_the_learned_energy(system, n):
+    X, x0, J = 0.5 * states(30, n), 0.2 * jnp.ones(n), canonical(n)
+    Y = jax.vmap(system)(X) + 0.02 * states(30, n, seed=1)
+
+    def symplecticity_defect(field):
+        Psi = np.asarray(jax.jacfwd(flow(field, 3.0))(x0))
+        return np.abs(Psi.T @ J @ Psi - J).max()
+
+    field = hk.fit(hk.Symplectic(hk.Gaussian(1.5)), X, Y, 1e-3)
+    # Local errors of 1e-10 over some ten steps, amplified by the flow.
+    assert symplecticity_defect(field) < 1e-7
+    energies = [field.hamiltonian(flow(field, time)(x0)) for time in (0.01, 1.0, 3.0)]
+    np.testing.assert_allclose(energies, field.hamiltonian(x0), atol=1e-7)
+    assert np.abs(flow(field, 1.0)(x0) - x0).max() > 0.1
+    for structure in (hk.Separable, hk.CurlFree):
+        assert symplecticity_defect(hk.fit(structure(hk.Gaussian(1.5)), X, Y, 1e-3)) > 1e-3

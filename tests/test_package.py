@@ -1,0 +1,175 @@
+"""The package as a whole: what an import loads, which file knows which, and what is public."""
+
+import ast
+import graphlib
+import inspect
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import hamkernel as hk
+
+PACKAGE = Path(hk.__file__).parent
+
+# The rooms in the order of the data: a file imports from its own room and those above it. A file
+# belongs to the room with the longest name that it starts with.
+ROOMS = [
+    {"_require"},
+    {"_scalar"},
+    {"_structured"},
+    {"_check", "_gram"},
+    {"_field"},
+    {"_solve"},
+    {"_fit"},
+    {"_folds", "_validation"},
+    {"_bounds", "_search_space", "_tune"},
+    {"_integrators", "_simulate", "_save", "systems"},
+    {"plot"},
+    {"paper"},
+    {"__init__", "__main__"},
+]
+RANK = {name: rank for rank, room in enumerate(ROOMS) for name in room}
+
+
+def run(code):
+    """What a fresh interpreter prints as JSON."""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    return json.loads(done.stdout)
+
+
+def test_importing_the_package_is_light_and_leaves_jax_alone():
+    loaded, before, after = run(
+        "import json, sys, jax\n"
+        "before = {name: str(value) for name, value in jax.config.values.items()}\n"
+        "import hamkernel\n"
+        "after = {name: str(value) for name, value in jax.config.values.items()}\n"
+        "print(json.dumps([sorted(sys.modules), before, after]))"
+    )
+    assert not {"matplotlib", "diffrax", "tqdm", "scipy.integrate", "pytest"} & set(loaded)
+    assert "hamkernel" in loaded
+    assert before == after
+    assert "jax_enable_x64" in before
+
+
+@pytest.mark.parametrize(
+    ("use", "module"), [("hk.ImplicitMidpoint", "diffrax"), ("hk.plot", "matplotlib")]
+)
+def test_what_is_heavy_loads_when_it_is_used(use, module):
+    code = "import hamkernel as hk, json, sys; {}; print(json.dumps({!r} in sys.modules))"
+    assert run(code.format(use, module))
+    assert not run(code.format("hk.fit", module))
+
+
+# The order of imports.
+
+
+def stem(path):
+    """The first name below the package: `_fit` for _fit.py, `paper` for paper/_evaluate.py."""
+    return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def imports(path):
+    """The files of this package that `path` names in an import, wherever in the file it is."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path} has a relative import"
+            below = [f"{node.module}.{alias.name}" for alias in node.names]
+            names = below if node.module == "hamkernel" else [node.module or ""]
+        else:
+            continue
+        found |= {name.split(".")[1] for name in names if name.startswith("hamkernel.")}
+    return found - {"__init__"}
+
+
+SOURCES = sorted(PACKAGE.rglob("*.py"))
+
+
+def room(name):
+    fitting = [known for known in RANK if name.startswith(known)]
+    assert fitting, f"{name} is in no room: give it a place in ROOMS"
+    return RANK[max(fitting, key=len)]
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def test_a_file_knows_only_files_before_it(path):
+    ahead = {name for name in imports(path) if room(name) > room(stem(path))}
+    assert not ahead, f"{path.name} imports {ahead}, which come later"
+
+
+def test_the_order_would_notice_an_import_backwards(tmp_path):
+    wrong = tmp_path / "_gram.py"
+    wrong.write_text(
+        "def f():\n    from hamkernel import fit, _tune\n    import hamkernel._solve\n"
+    )
+    assert imports(wrong) == {"fit", "_tune", "_solve"}
+    assert all(room(name) > room("_gram") for name in ("_tune", "_solve"))
+
+
+def test_no_two_files_import_each_other():
+    graph = {}
+    for path in SOURCES:
+        if stem(path) not in ("__init__", "__main__"):
+            graph.setdefault(stem(path), set()).update(imports(path) - {stem(path)})
+    assert list(graphlib.TopologicalSorter(graph).static_order())  # raises on a cycle
+
+
+FORBIDDEN = ("jax._src", "equinox.internal", "jaxopt", "cola")
+
+
+def test_no_private_imports_no_prints_and_no_configuration():
+    for path in SOURCES:
+        text = path.read_text()
+        program = stem(path) in ("__main__", "paper")  # may ask for float64, and talks
+        for name in FORBIDDEN:
+            assert f"import {name}" not in text, path
+            assert f"from {name}" not in text, path
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Call) and not program:
+                called = ast.unparse(node.func)
+                assert called not in ("print", "jax.config.update", "config.update"), path
+
+
+# What is public.
+
+
+def public():
+    return [(name, getattr(hk, name)) for name in hk.__all__]
+
+
+def test_every_public_name_exists_once():
+    assert len(set(hk.__all__)) == len(hk.__all__)
+    assert all(value is not None for _, value in public())
+    with pytest.raises(AttributeError, match="no attribute 'Gausian'"):
+        _ = hk.Gausian
+
+
+@pytest.mark.parametrize("name", hk.__all__)
+def test_every_public_name_is_documented(name):
+    thing = getattr(hk, name)
+    text = thing.__doc__
+    assert text
+    # A dataclass without a docstring gets its signature for one.
+    assert not text.startswith(f"{name}(")
+    elsewhere = re.search(r"(As|those of)\s+`", text)  # "Args and errors are those of `fit`."
+    if inspect.isfunction(thing) and not elsewhere:
+        for parameter in inspect.signature(thing).parameters:
+            assert f"{parameter}:" in text, f"{name} does not document {parameter}"
+
+
+@pytest.mark.parametrize("name", hk.__all__)
+def test_every_public_method_is_documented(name):
+    thing = getattr(hk, name)
+    if not inspect.isclass(thing):
+        return
+    for attribute, value in inspect.getmembers(thing):
+        if attribute.startswith("_") or not callable(value):
+            continue
+        if getattr(value, "__module__", "").startswith("hamkernel"):
+            assert inspect.getdoc(value), f"{name}.{attribute}"
