@@ -187,10 +187,11 @@ class _Criterion(eqx.Module):
     def coarse_points(self, X: Float[Array, "N n"]) -> np.ndarray:
         """The rows of the subset: spread evenly over the folds, and over the points of each."""
         N, n = X.shape
-        if self.own or N * n <= COARSE_ROWS:
+        if self.own or N * n <= SMALL_ROWS:
             return np.arange(N)
         labels = np.zeros(N) if self.partition is None else self.partition.labels
-        even = np.linspace(0, N - 1, COARSE_ROWS // n).round().astype(int)
+        count = max(COARSE_ROWS // n, 2)
+        even = np.linspace(0, N - 1, count).round().astype(int)
         return np.sort(np.argsort(labels, kind="stable")[even])
 
     def on(self, rows: np.ndarray) -> "_Criterion":
@@ -266,8 +267,9 @@ def _search(space, criterion, X, Y, optimiser, starts: int, max_steps: int) -> _
 
 
 DESIGN_POINTS = 256  # in the box, from which the starts are chosen
-FINISHERS = 2  # runs that are finished on all points
-COARSE_ROWS = 128  # of the Gram of the subset
+FINISHERS = 1  # runs that are finished on all points
+SMALL_ROWS = 128  # of the Gram, up to which every run is on all points
+COARSE_ROWS = 64  # of the Gram of the subset otherwise
 
 
 class _Objective(eqx.Module):
