@@ -90,7 +90,7 @@ class Periodic(AbstractScalarKernel):
         # Σ 2 sin²(θ/2)/ℓ² = Σ (1 − cos θ)/ℓ², and cos(a − b) is a product of features.
         return jnp.exp(self._features(x) @ (jnp.tile(weight, 2) * self._features(z)) - weight.sum())
 
-    def _features(self, x: Float[Array, " n"]) -> Float[Array, " 2n"]:
+    def _features(self, x: Float[Array, " n"]) -> Float[Array, " 2*n"]:
         angle = divided(2 * jnp.pi * x, self.period)
         return jnp.concatenate([jnp.cos(angle), jnp.sin(angle)])
 

@@ -173,3 +173,45 @@ def test_every_public_method_is_documented(name):
             continue
         if getattr(value, "__module__", "").startswith("hamkernel"):
             assert inspect.getdoc(value), f"{name}.{attribute}"
+
+
+# The annotations, executed: jaxtyping's import hook has to come before the first import.
+ANNOTATED = """
+import json, sys
+from jaxtyping import TypeCheckError, install_import_hook
+with install_import_hook("hamkernel", "beartype.beartype"):
+    import hamkernel as hk
+import jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_enable_x64", True)
+sys.path.insert(0, sys.argv[1])
+from kernels import CASES
+X = np.random.default_rng(0).normal(size=(3, 2))
+x, z = jnp.asarray(X[0]), jnp.asarray(X[1])
+for case in CASES:
+    hk.Symplectic(case.make(2))(x, z)
+k = CASES[0].make(2)
+K = hk.Symplectic(k)
+for structure in (K, hk.Separable(k), hk.CurlFree(k), hk.DivergenceFree(k), hk.Odd(K),
+                  hk.Even(K), hk.Sum(a=K, b=hk.Separable(k))):
+    field = hk.fit(structure, X, X, 1e-2)
+    field(x), jax.vmap(field)(jnp.asarray(X)), hk.gram(structure, X, X[:2]), field.is_separable
+hk.fit(K, X, X, 1e-2).anchored(x, 1.0).hamiltonian(x)
+hk.Sum(a=K, b=K).part("a")
+def refused(call):
+    try:
+        call()
+    except TypeCheckError:
+        return True
+    return False
+print(json.dumps([refused(lambda: k(X, X)), refused(lambda: K(x, jnp.zeros(3)))]))
+"""
+
+
+@pytest.mark.slow
+def test_annotations_hold_when_they_are_executed():
+    here = str(Path(__file__).parent)
+    done = subprocess.run(
+        [sys.executable, "-c", ANNOTATED, here], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert json.loads(done.stdout) == [True, True]  # wrong shapes, the control
