@@ -4,6 +4,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from hamkernel import systems
+from hamkernel._check import check_kernel
 from hamkernel._field import KernelField
 from hamkernel._fit import fit
 from hamkernel._gram import gram
@@ -30,13 +31,9 @@ from hamkernel._validation import (
 )
 
 if TYPE_CHECKING:
-    from hamkernel._integrators import (
-        GaussLegendre4,
-        GaussLegendre6,
-        ImplicitMidpoint,
-        StormerVerlet,
-        Yoshida4,
-    )
+    from hamkernel import paper, plot
+    from hamkernel._integrators_gauss import GaussLegendre4, GaussLegendre6, ImplicitMidpoint
+    from hamkernel._integrators_splitting import StormerVerlet, Yoshida4
 
 __all__ = [  # noqa: RUF022 - in reading order
     # Scalar kernels.
@@ -47,6 +44,7 @@ __all__ = [  # noqa: RUF022 - in reading order
     "Periodic",
     "Warp",
     "Select",
+    "check_kernel",
     # Structured kernels.
     "Separable",
     "CurlFree",
@@ -81,12 +79,22 @@ __all__ = [  # noqa: RUF022 - in reading order
 ]
 
 # Loaded when first asked for, so that `import hamkernel` loads neither diffrax nor matplotlib.
-_INTEGRATORS = ("ImplicitMidpoint", "GaussLegendre4", "GaussLegendre6", "StormerVerlet", "Yoshida4")
+_LAZY = {
+    "ImplicitMidpoint": "_integrators_gauss",
+    "GaussLegendre4": "_integrators_gauss",
+    "GaussLegendre6": "_integrators_gauss",
+    "StormerVerlet": "_integrators_splitting",
+    "Yoshida4": "_integrators_splitting",
+}
 
 
 def __getattr__(name: str) -> Any:
-    if name in _INTEGRATORS:
-        return getattr(importlib.import_module("hamkernel._integrators"), name)
+    if name in _LAZY:
+        return getattr(importlib.import_module(f"hamkernel.{_LAZY[name]}"), name)
     if name in ("plot", "paper"):
         return importlib.import_module(f"hamkernel.{name}")
     raise AttributeError(f"module 'hamkernel' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -1,7 +1,6 @@
 """The box of hyperparameters, as all real vectors u."""
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree

@@ -6,8 +6,9 @@ a fit WITHOUT S would have on S,
 
     r_S = y_S − f₋S(X_S) = (C_SS)⁻¹ a_S,    C = A⁻¹,
 
-so no fold is ever refitted. With the factor A = LLᵀ and W = L⁻¹ one has C_SS = W_SᵀW_S, where
-W_S holds the columns S of W, and C itself is not needed.
+so no fold is ever refitted. With the factor A = LLᵀ and U = L⁻ᵀ one has C_SS = U_S U_Sᵀ, where
+U_S holds the rows S of U, and C itself is not needed. (Rows, because those of a fold lie together
+in memory: the products over folds then need no copy of the matrix.)
 
 The derivatives are written down as well, since differentiating the factorisation costs several
 times its price. From dC = −C dA C, and with v_S = (C_SS)⁻¹ r̄_S for a cotangent r̄,
@@ -19,6 +20,7 @@ folds, Ginsbourger & Schärer (2021), arXiv:2101.03108.
 """
 
 import functools
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -162,8 +164,9 @@ def partition_loss(K, X, Y, regularization, partition):
 def _residuals(K, X: Array, Y: Array, regularization: Array, partition: Partition) -> Array:
     N, n = X.shape
     A = _regularised(K, X, (N - N / len(partition.members)) * regularization)
-    r = held_out(A, Y.reshape(N * n), partition).reshape(*partition.members.shape, n)
-    return jnp.zeros_like(Y).at[partition.members].set(r, mode="drop")  # the padding is dropped
+    r: Any = held_out(A, Y.reshape(N * n), partition)
+    by_point = r.reshape(*partition.members.shape, n)
+    return jnp.zeros_like(Y).at[partition.members].set(by_point, mode="drop")  # padding: dropped
 
 
 @eqx.filter_jit
@@ -229,24 +232,24 @@ def held_out(
 
 
 def _held_out_forward(A, y, partition):
-    W = _inverse_factor(A)
-    a = W.T @ (W @ y)
-    W_S, a_S = partition.gather(W), partition.gather(a[None])[0]
-    blocks = jnp.einsum("dfi,dfj->fij", W_S, W_S)
+    U = _inverse_factor(A)
+    a = U @ (U.T @ y)
+    U_S, a_S = partition.gather(U), partition.gather(a[:, None])[..., 0]
+    blocks = jnp.einsum("fid,fjd->fij", U_S, U_S)
     blocks = blocks + partition.padding_identity(blocks)  # so that they can be solved with
     factors = jax.lax.linalg.cholesky(blocks, symmetrize_input=False)
     r = _solve_blocks(factors, a_S)
     ok = jnp.isfinite(r).all()
-    return jnp.where(ok, r, jnp.full_like(r, jnp.inf)), (W, a, factors, r, ok)
+    return jnp.where(ok, r, jnp.full_like(r, jnp.inf)), (U, a, factors, r, ok)
 
 
 def _held_out_backward(partition, saved, r_bar):
-    W, a, factors, r, ok = saved
-    W_S = partition.gather(W)
+    U, a, factors, r, ok = saved
+    U_S = partition.gather(U)
     v = _solve_blocks(factors, r_bar)
-    # C_:S v_S = Wᵀ(W_S v_S), one column for each fold.
-    P = W.T @ jnp.einsum("dfi,fi->df", W_S, v)
-    Q = W.T @ jnp.einsum("dfi,fi->df", W_S, r)
+    # C_:S v_S = U(U_Sᵀ v_S), one column for each fold.
+    P = U @ jnp.einsum("fid,fi->df", U_S, v)
+    Q = U @ jnp.einsum("fid,fi->df", U_S, r)
     w = P.sum(axis=1)  # C v
     return _or_zero(ok, P @ Q.T - w[:, None] * a[None, :], w)
 
@@ -263,18 +266,18 @@ def free_residuals(
 
 
 def _free_residuals_forward(A, y):
-    W = _inverse_factor(A)
-    a = W.T @ (W @ y)
-    squares, trace = a @ a, jnp.sum(W * W)
+    U = _inverse_factor(A)
+    a = U @ (U.T @ y)
+    squares, trace = a @ a, jnp.sum(U * U)
     ok = jnp.isfinite(squares) & jnp.isfinite(trace)
     value = jnp.where(ok, squares, jnp.inf), jnp.where(ok, trace, jnp.ones_like(trace))
-    return value, (W, a, ok)
+    return value, (U, a, ok)
 
 
 def _free_residuals_backward(saved, bars):
-    W, a, ok = saved
+    U, a, ok = saved
     squares_bar, trace_bar = bars
-    C = W.T @ W
+    C = U @ U.T
     w = 2 * squares_bar * (C @ a)
     return _or_zero(ok, -trace_bar * (C @ C) - w[:, None] * a[None, :], w)
 
@@ -289,27 +292,28 @@ def log_density(A: Float[Array, "D D"], y: Float[Array, " D"]) -> Float[Array, "
 
 
 def _log_density_forward(A, y):
-    W = _inverse_factor(A)
-    whitened = W @ y
-    log_det = -2 * jnp.sum(jnp.log(jnp.diagonal(W)))
+    U = _inverse_factor(A)
+    whitened = U.T @ y
+    log_det = -2 * jnp.sum(jnp.log(jnp.diagonal(U)))
     value = -0.5 * (whitened @ whitened + log_det + len(y) * jnp.log(2 * jnp.pi).astype(y.dtype))
     ok = jnp.isfinite(value)
-    return jnp.where(ok, value, -jnp.inf), (W, W.T @ whitened, ok)
+    return jnp.where(ok, value, -jnp.inf), (U, U @ whitened, ok)
 
 
 def _log_density_backward(saved, bar):
-    W, a, ok = saved
-    return _or_zero(ok, 0.5 * bar * (a[:, None] * a[None, :] - W.T @ W), -bar * a)
+    U, a, ok = saved
+    return _or_zero(ok, 0.5 * bar * (a[:, None] * a[None, :] - U @ U.T), -bar * a)
 
 
 log_density.defvjp(_log_density_forward, _log_density_backward)
 
 
 def _inverse_factor(A: Float[Array, "D D"]) -> Float[Array, "D D"]:
-    """W = L⁻¹ with A = LLᵀ; NaN where A is not positive definite."""
+    """U = L⁻ᵀ with A = LLᵀ; NaN where A is not positive definite."""
     L = jax.lax.linalg.cholesky(A, symmetrize_input=False)
     identity = jnp.eye(len(A), dtype=A.dtype)
-    return jax.lax.linalg.triangular_solve(L, identity, left_side=True, lower=True)
+    # LAPACK works by columns, so the transpose of its answer is what JAX stores without a copy.
+    return jax.lax.linalg.triangular_solve(L, identity, left_side=True, lower=True).T
 
 
 def _solve_blocks(factors: Float[Array, "F b b"], b: Float[Array, "F b"]) -> Float[Array, "F b"]:

@@ -10,14 +10,13 @@ import pytest
 from jax.test_util import check_grads
 from scipy.integrate import solve_ivp
 
-from hamkernel._integrators import (
+from hamkernel._integrators_gauss import (
     FixedPointToRounding,
     GaussLegendre4,
     GaussLegendre6,
     ImplicitMidpoint,
-    StormerVerlet,
-    Yoshida4,
 )
+from hamkernel._integrators_splitting import StormerVerlet, Yoshida4
 
 GAUSS = [ImplicitMidpoint(), GaussLegendre4(), GaussLegendre6()]
 SPLITTING = [StormerVerlet(), Yoshida4()]

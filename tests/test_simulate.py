@@ -11,14 +11,9 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from hamkernel._integrators import (
-    GaussLegendre4,
-    GaussLegendre6,
-    ImplicitMidpoint,
-    StormerVerlet,
-    Yoshida4,
-    equal_steps,
-)
+from hamkernel._integrators import equal_steps
+from hamkernel._integrators_gauss import GaussLegendre4, GaussLegendre6, ImplicitMidpoint
+from hamkernel._integrators_splitting import StormerVerlet, Yoshida4
 from hamkernel._simulate import simulate
 
 SYMPLECTIC = [

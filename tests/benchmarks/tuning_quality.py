@@ -93,7 +93,7 @@ def _grid_losses(space, u, X, Y, partition):
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=4)
     seeds = parser.parse_args().seeds
     ratios = {}

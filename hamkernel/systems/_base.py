@@ -1,0 +1,89 @@
+"""What all systems share: the field that follows from H, and how parameters are stored."""
+
+import abc
+from collections.abc import Sequence
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from hamkernel import _require as require
+
+Numbers = ArrayLike | Sequence[ArrayLike]
+
+
+class AbstractHamiltonianSystem(eqx.Module):
+    """A Hamiltonian H(x), and the field J∇H that follows from it.
+
+    A final class whose H is T(p) + U(q) says so by `is_separable = True`: explicit symplectic
+    integrators ask for it.
+    """
+
+    is_separable: ClassVar[bool] = False
+
+    @abc.abstractmethod
+    def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        """Return the energy H(x) of one state, shape ()."""
+
+    def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+        """Return the velocity J∇H(x) = (∂H/∂p, −∂H/∂q) of one state, by automatic differentiation.
+
+        Args:
+            x: one state (q, p), shape (n,), n even; `jax.vmap(system)` takes many.
+
+        Returns:
+            The velocity (q̇, ṗ), shape (n,).
+
+        Raises:
+            ValueError: x is not one state, or not a state of this system.
+        """
+        x = require.floating(x, "x")
+        if x.ndim != 1 or x.shape[0] % 2:
+            hint = " Use `jax.vmap(system)` for a batch of states." if x.ndim > 1 else ""
+            raise ValueError(
+                f"x has shape {x.shape}; one state (q, p) of shape (n,), n even, is needed.{hint}"
+            )
+        dq, dp = jnp.split(jax.grad(self.hamiltonian)(x), 2)
+        return jnp.concatenate([dp, -dq])
+
+
+def shaped(x: Array, name: str, *shapes: tuple[int, ...]) -> Array:
+    """`x`, whose shape must be one of `shapes`."""
+    if x.shape not in shapes:
+        needed = " or ".join(map(str, shapes))
+        raise ValueError(f"{name} has shape {x.shape}; shape {needed} is needed.")
+    return x
+
+
+def log_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:
+    """The logarithm of a positive parameter, by default a scalar."""
+    array = require.positive(jnp.asarray(x), name)
+    return jnp.log(shaped(array, name, *(shapes or ((),))))
+
+
+def signed_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:
+    """A finite parameter of either sign, by default a scalar."""
+    array = shaped(require.floating(jnp.asarray(x), name), name, *(shapes or ((),)))
+    return finite(array, name)
+
+
+def finite(x: Array, name: str) -> Array:
+    """`x`, in which every entry must be finite."""
+    return require.value(x, ~jnp.isfinite(x), lambda: f"{name} must be finite, got {x}.")
+
+
+def count_of(x: Numbers, name: str) -> int:
+    """How many entries a list of masses or circulations has; at least two."""
+    shape = jnp.asarray(x).shape
+    if len(shape) != 1 or shape[0] < 2:
+        raise ValueError(f"{name} has shape {shape}; one number for each of two or more is needed.")
+    return shape[0]
+
+
+def squared_distances(positions: Float[Array, "bodies 2"]) -> tuple[np.ndarray, np.ndarray, Array]:
+    """Indices i < j of all pairs, and |r_i − r_j|² of each; a body never meets itself."""
+    i, j = np.triu_indices(positions.shape[0], k=1)
+    return i, j, jnp.sum((positions[i] - positions[j]) ** 2, axis=1)
