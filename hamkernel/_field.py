@@ -6,10 +6,11 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from hamkernel import _require as require
 from hamkernel._gram import expansion, potential
+from hamkernel._gram_operator import compiled_product
 from hamkernel._structured import AbstractMatrixKernel, Sum
 
 Scalar = Callable[[Float[Array, " n"]], Float[Array, ""]]
@@ -92,6 +93,27 @@ class AbstractField(eqx.Module):
         )
 
 
+class SolverInfo(eqx.Module):
+    """How a field was found. What does not apply to the solver is None.
+
+    Attributes:
+        solver: the name of the solver.
+        landmarks: the number of points that carry the field, shape ().
+        rank: of the low-rank Gram that was solved with, or that preconditioned, shape ().
+        truncation: trace(G − Ĝ)/(Nλ) for that low-rank Gram Ĝ of the training data, shape (). The
+            fitted values of Ĝ differ from those of G by at most this fraction of the residual.
+        iterations: of conjugate gradients, shape ().
+        relative_residual: ‖y − (G + NλI)a‖/‖y‖ of the coefficients, computed at the end, shape ().
+    """
+
+    solver: str = eqx.field(static=True)
+    landmarks: Int[Array, ""] | None = None
+    rank: Int[Array, ""] | None = None
+    truncation: Float[Array, ""] | None = None
+    iterations: Int[Array, ""] | None = None
+    relative_residual: Float[Array, ""] | None = None
+
+
 class KernelField(AbstractField):
     """f(x) = Σⱼ K(x, zⱼ) aⱼ, the minimiser of the regularised least squares.
 
@@ -105,6 +127,7 @@ class KernelField(AbstractField):
         norm: ‖f‖ in the RKHS of K, shape ().
         regularization: the λ of the fit, shape ().
         offset: the constant in the potential, shape ().
+        info: how the solver went.
     """
 
     kernel: AbstractMatrixKernel
@@ -114,6 +137,7 @@ class KernelField(AbstractField):
     norm: Float[Array, ""]
     regularization: Float[Array, ""]
     offset: Float[Array, ""]
+    info: SolverInfo | None = None
 
     @property
     def dimension(self) -> int:
@@ -122,6 +146,20 @@ class KernelField(AbstractField):
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         x = self._state(x)
         return expansion(self.kernel, x, self.points, self.coefficients)
+
+    def evaluate(self, X: ArrayLike) -> Float[Array, "N n"]:
+        """The velocities at many states, as `jax.vmap(field)(X)` but in O((N + M) n) memory.
+
+        Args:
+            X: states, shape (N, n).
+
+        Raises:
+            ValueError: the shape does not fit.
+        """
+        X = require.points(X, "X").astype(self.points.dtype)
+        if X.shape[1] != self.dimension:
+            raise ValueError(f"X has {X.shape[1]} coordinates and the field {self.dimension}.")
+        return compiled_product(self.kernel, X, self.points, self.coefficients)
 
     def unanchored_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         x = self._state(x)

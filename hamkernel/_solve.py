@@ -8,7 +8,7 @@ import lineax as lx
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._field import AbstractField, KernelField
+from hamkernel._field import AbstractField, KernelField, SolverInfo
 from hamkernel._gram import assemble
 from hamkernel._structured import AbstractMatrixKernel
 
@@ -60,6 +60,7 @@ class Cholesky(AbstractSolver):
             norm=norm,
             regularization=regularization,
             offset=jnp.zeros((), X.dtype),
+            info=SolverInfo("Cholesky"),
         )
 
 
