@@ -90,6 +90,9 @@ class Select(AbstractScalarKernel):
                 "coordinates are counted from 0."
             )
         # Slices, not a gather: their derivative is a pad, which XLA fuses into its neighbours.
+        first, last = self.dims[0], self.dims[-1]
+        if self.dims == tuple(range(first, last + 1)):
+            return x[first : last + 1]
         return jnp.concatenate([x[d : d + 1] for d in self.dims])
 
     @property
