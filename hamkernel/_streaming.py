@@ -28,7 +28,7 @@ class LeastSquares(eqx.Module):
             the corner the norm of what no w can fit.
     """
 
-    factor: Float[Array, "r+1 r+1"]
+    factor: Float[Array, "k k"]
 
     @staticmethod
     def empty(columns: int, dtype: jnp.dtype | type) -> "LeastSquares":
