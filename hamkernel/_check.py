@@ -18,7 +18,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Num
 
 from hamkernel import _require as require
 from hamkernel._check_limit import PROFILE, check_limit, near_blocks, neighbours_of
@@ -29,7 +29,7 @@ _NEAR_POINTS = 8  # points whose diagonal block is compared with its neighbours
 _GRAM_POINTS, _GRAM_ROWS = 64, 256  # caps on the Grams whose eigenvalues are taken
 
 
-def check_kernel(k: Callable[..., Any], points: Float[ArrayLike, "N n"]) -> None:
+def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     """Raise if the scalar kernel `k` is unfit for the structured kernels; return None if sound.
 
     Looked for, in this order: a result that is not one differentiable real number; NaN or inf in

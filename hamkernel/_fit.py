@@ -3,7 +3,7 @@
 import warnings
 
 import jax.numpy as jnp
-from jaxtyping import ArrayLike, Float
+from jaxtyping import ArrayLike, Num
 
 from hamkernel import _require as require
 from hamkernel._field import AbstractField
@@ -14,8 +14,8 @@ from hamkernel._structured import AbstractMatrixKernel
 
 def fit(
     K: AbstractMatrixKernel,
-    X: Float[ArrayLike, "N n"],
-    Y: Float[ArrayLike, "N n"],
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
     regularization: ArrayLike = 1e-4,
     *,
     solver: AbstractSolver | None = None,

@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._field import AbstractField
@@ -72,8 +72,8 @@ class Tuned(eqx.Module):
 
 def tune(
     K: AbstractMatrixKernel,
-    X: Float[ArrayLike, "N n"],
-    Y: Float[ArrayLike, "N n"],
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
     regularization: ArrayLike = 1e-3,
     folds: Folds = 5,
     *,
