@@ -1,0 +1,93 @@
+"""`save` and `load`: a learned field in one file, which is read without running anything in it."""
+
+import importlib.metadata
+import os
+import pathlib
+
+import jax
+import numpy as np
+
+from hamkernel import _require as require
+from hamkernel._field import AbstractField
+from hamkernel._save_bytes import FORMAT, VERSION, packed, unpacked, write
+from hamkernel._save_tree import CLASSES, Reader, encode, field_classes
+from hamkernel._structured import AbstractMatrixKernel
+
+
+def save(path: str | os.PathLike[str], field: AbstractField) -> None:
+    """Write a learned field to one file: kernel, hyperparameters, data, coefficients, version.
+
+    The file at `path` is replaced in one step, so that no reader ever sees half of it. A kernel of
+    your own (a function, the map of a `Warp`) is not written, only its arrays are: see `load`.
+
+    Args:
+        path: the file. The name is taken as it is; `.npz` fits, since NumPy can open the file.
+        field: what `fit` returned, or `tune(...).field`.
+
+    Raises:
+        TypeError: `field` is no field of this library, or holds something that cannot be stored.
+        ValueError: the call is inside `jax.jit`, where there are no numbers yet.
+        OSError: the file cannot be written; an older one at `path` is left as it was.
+    """
+    if not isinstance(field, AbstractField) or type(field).__name__ not in CLASSES:
+        raise TypeError(
+            f"save writes learned fields ({', '.join(field_classes())}), got "
+            f"{type(field).__name__}. For the result of tune pass tuned.field."
+        )
+    if not require.is_concrete(field):
+        raise ValueError("save writes numbers and cannot run under jax.jit, grad or vmap.")
+    arrays: list[np.ndarray] = []
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "hamkernel": _library_version(),
+        "field": encode(field, arrays, "field"),
+    }
+    write(pathlib.Path(path), packed(header, arrays))
+
+
+def load(path: str | os.PathLike[str], kernel: AbstractMatrixKernel | None = None) -> AbstractField:
+    """Read a field that `save` wrote: the same arrays bit by bit, so the same values of f.
+
+    Nothing in the file is executed. Built-in kernels restore by themselves. For a kernel of your
+    own the file has the arrays but not the code: pass the kernel as it was given to `fit`, with
+    any values of its hyperparameters, and those of the file are put in.
+
+    Args:
+        path: the file.
+        kernel: the matrix-valued kernel, needed if a part of it is your own code.
+
+    Returns:
+        The field, of the class that was saved.
+
+    Raises:
+        ValueError: the file is no such file, cut off, changed, of a newer version, or in float64
+            while JAX is not; or `kernel` is missing or is not the one that was saved.
+        TypeError: `kernel` is not matrix-valued. OSError: the file cannot be read.
+
+    Example: `field = hk.load("pendulum.npz", kernel=hk.Symplectic(hk.Warp(hk.Gaussian(), fn)))`
+    """
+    if kernel is not None and not isinstance(kernel, AbstractMatrixKernel):
+        raise TypeError(
+            f"kernel must be the matrix-valued kernel that was given to fit; got {kernel!r}."
+        )
+    source = str(path)
+    header, arrays = unpacked(pathlib.Path(path).read_bytes(), source)
+    reader = Reader(source, arrays)
+    field = reader.field(header["field"], kernel)
+    try:  # the parts fit each other: as many lengthscales as coordinates, and the like
+        jax.eval_shape(field, jax.ShapeDtypeStruct((field.dimension,), field.offset.dtype))
+    except Exception as error:  # a kernel of the user may raise anything
+        raise ValueError(
+            f"{source} holds a field that cannot be evaluated"
+            + (" with this kernel" if kernel is not None else "")
+            + f": {error}"
+        ) from error
+    return field
+
+
+def _library_version() -> str:
+    try:
+        return importlib.metadata.version("hamkernel")
+    except importlib.metadata.PackageNotFoundError:  # run from a folder, not installed
+        return "unknown"

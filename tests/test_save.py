@@ -1,0 +1,535 @@
+"""What `save` writes, `load` reads bit by bit; what is not such a file is refused and not run."""
+
+import copy
+import hashlib
+import io
+import json
+import os
+import pickle
+import subprocess
+import sys
+import zipfile
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hamkernel as hk
+from hamkernel._save import load, save
+from hamkernel._solve_features import RandomFeatures
+
+RNG = np.random.default_rng(5)
+X = RNG.normal(size=(6, 2))
+Y = RNG.normal(size=(6, 2))
+
+
+def on_cylinder(x):
+    return jnp.stack([jnp.cos(x[0]), jnp.sin(x[0]), x[1]])
+
+
+class Turned(eqx.Module):
+    """A user's kernel with arrays of its own."""
+
+    log_scale: jax.Array
+    angle: jax.Array
+
+    def __call__(self, x, z):
+        return jnp.exp(jnp.cos(self.angle) * (x @ z) / jnp.exp(2 * self.log_scale))
+
+
+def turned(scale=0.7, angle=0.2):
+    return Turned(jnp.log(jnp.asarray(scale)), jnp.asarray(angle))
+
+
+def cosine(x, z):
+    return jnp.exp(jnp.cos(x[0] - z[0]) + x[1] * z[1])
+
+
+BUILT_IN = {
+    "gaussian": hk.Symplectic(hk.Gaussian(1.3)),
+    "one lengthscale each": hk.Symplectic(hk.Gaussian(np.array([1.3, 0.4]))),
+    "matern": hk.CurlFree(hk.Matern(3.5, 2.0)),
+    "rational quadratic": hk.DivergenceFree(hk.RationalQuadratic(0.5, 2.0)),
+    "polynomial": hk.Symplectic(hk.Polynomial(3, 0.5) + hk.Gaussian()),
+    "periodic times scaled": hk.Separable(hk.Periodic(2.0, 1.1) * (3.0 * hk.Gaussian())),
+    "select": hk.Symplectic(hk.Select(hk.Gaussian(), 0) + 0.1 * hk.Select(hk.Matern(), [1])),
+    "odd": hk.Odd(hk.Symplectic(hk.Gaussian(2.0))),
+    "even of a polynomial": hk.Even(hk.Symplectic(hk.Polynomial(3))),
+    "sum with names": hk.Sum(
+        hk.Separable(hk.Gaussian()),
+        energy=hk.Odd(hk.Symplectic(hk.Gaussian())),
+        rest=hk.CurlFree(hk.Matern()),
+    ),
+}
+USERS = {  # as saved, and as given to load with other values
+    "function": (hk.Symplectic(cosine), hk.Symplectic(cosine)),
+    "module": (hk.Symplectic(turned()), hk.Symplectic(turned(2.0, 1.0))),
+    "warp": (
+        hk.Symplectic(hk.Warp(hk.Gaussian(0.6), on_cylinder)),
+        hk.Symplectic(hk.Warp(hk.Gaussian(), on_cylinder)),
+    ),
+    "odd of a warp": (
+        hk.Odd(hk.Symplectic(hk.Warp(hk.Gaussian(0.6), on_cylinder))),
+        hk.Odd(hk.Symplectic(hk.Warp(hk.Gaussian(), on_cylinder))),
+    ),
+    "sum with a built-in": (
+        hk.Sum(mine=hk.Symplectic(turned()), theirs=hk.CurlFree(hk.Gaussian(2.0))),
+        hk.Sum(mine=hk.Symplectic(turned(1.0)), theirs=hk.CurlFree(hk.Gaussian())),
+    ),
+}
+
+
+def fitted(K=None, regularization=1e-2):
+    field = hk.fit(K or hk.Symplectic(hk.Gaussian(1.3)), X, Y, regularization)
+    assert isinstance(field, hk.KernelField)
+    return field
+
+
+def same(a, b):
+    """Every array equal bit by bit, in a tree of the same classes and static fields."""
+    first, first_tree = jax.tree.flatten(a)
+    second, second_tree = jax.tree.flatten(b)
+    arrays = all(
+        x.dtype == y.dtype and np.asarray(x).tobytes() == np.asarray(y).tobytes()
+        for x, y in zip(first, second, strict=True)
+    )
+    return arrays and first_tree == second_tree
+
+
+@pytest.fixture
+def saved(tmp_path):
+    path = tmp_path / "field.npz"
+    save(path, fitted())
+    return path
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_built_in_kernels_restore_by_themselves(name, tmp_path):
+    field = fitted(BUILT_IN[name])
+    save(tmp_path / "f", field)
+    loaded = load(tmp_path / "f")
+    assert type(loaded) is type(field)
+    assert same(field, loaded)
+    x = jnp.array([0.3, -0.7])
+    np.testing.assert_array_equal(jax.jit(field)(x), jax.jit(loaded)(x))
+
+
+@pytest.mark.parametrize("name", BUILT_IN)
+def test_the_kernel_may_be_given_for_a_built_in_one_too(name, tmp_path):
+    field = fitted(BUILT_IN[name])
+    save(tmp_path / "f", field)
+    other = jax.tree.map(lambda leaf: leaf + 1, BUILT_IN[name])
+    assert same(field, load(tmp_path / "f", kernel=other))
+
+
+@pytest.mark.parametrize(
+    "K",
+    [
+        hk.Odd(hk.Symplectic(hk.Gaussian(1.3))),
+        hk.DivergenceFree(hk.Gaussian()) + hk.Separable(hk.Matern()),
+    ],
+    ids=["odd symplectic", "sum"],
+)
+def test_fields_in_random_features_restore(K, tmp_path):
+    field = hk.fit(K, X, Y, 1e-2, solver=RandomFeatures(20, jax.random.key(0)))
+    save(tmp_path / "f", field)
+    assert same(field, load(tmp_path / "f"))
+
+
+def test_a_field_without_stored_residuals_restores(tmp_path):
+    K = hk.Symplectic(hk.Gaussian(1.3))
+    field = RandomFeatures(20, jax.random.key(0)).fit_chunks(K, [(X, Y)], 1e-2)
+    save(tmp_path / "f", field)
+    assert same(field, load(tmp_path / "f"))
+
+
+@pytest.mark.parametrize("name", USERS)
+def test_a_kernel_of_the_user_is_given_and_gets_the_saved_arrays(name, tmp_path):
+    kernel, given = USERS[name]
+    field = fitted(kernel)
+    save(tmp_path / "f", field)
+    assert same(field, load(tmp_path / "f", kernel=given))
+
+
+@pytest.mark.parametrize("name", USERS)
+def test_a_kernel_of_the_user_is_asked_for(name, tmp_path):
+    save(tmp_path / "f", fitted(USERS[name][0]))
+    with pytest.raises(ValueError, match=r"code that is not in the file.*kernel=\.\.\."):
+        load(tmp_path / "f")
+
+
+@pytest.mark.parametrize(
+    ("kernel", "given", "message"),
+    [
+        (hk.Symplectic(turned()), hk.CurlFree(turned()), "Symplectic in the file and CurlFree"),
+        (hk.Symplectic(turned()), hk.Symplectic(cosine), "arrays"),
+        (hk.Symplectic(turned()), hk.Symplectic(hk.Gaussian()), "UserKernel in the file"),
+        (
+            hk.Symplectic(turned()),
+            hk.Symplectic(Turned(jnp.zeros(2), jnp.asarray(0.0))),
+            "arrays",
+        ),
+        (hk.CurlFree(hk.Matern(2.5)), hk.CurlFree(hk.Matern(1.5)), "2.5 in the file and 1.5"),
+        (
+            hk.Symplectic(hk.Gaussian() + turned()),
+            hk.Symplectic(hk.Gaussian() + turned() + turned()),
+            "2 terms in the file and 3",
+        ),
+    ],
+)
+def test_another_kernel_than_the_saved_one_is_refused(kernel, given, message, tmp_path):
+    save(tmp_path / "f", fitted(kernel))
+    with pytest.raises(ValueError, match=message):
+        load(tmp_path / "f", kernel=given)
+
+
+def test_kernel_must_be_matrix_valued(saved):
+    with pytest.raises(TypeError, match="matrix-valued"):
+        load(saved, kernel=hk.Gaussian())  # type: ignore[arg-type]
+
+
+def test_float32_stays_float32(tmp_path):
+    with pytest.warns(UserWarning, match="float32"):
+        field = hk.fit(
+            hk.Symplectic(hk.Gaussian(1.3)), X.astype("float32"), Y.astype("float32"), 1e-2
+        )
+    save(tmp_path / "f", field)
+    loaded = load(tmp_path / "f")
+    assert same(field, loaded)
+    assert loaded(jnp.zeros(2, "float32")).dtype == jnp.float32
+
+
+def test_what_the_field_was_anchored_to_and_fitted_with_is_kept(tmp_path):
+    field = fitted().anchored(jnp.zeros(2), 3.0)
+    save(tmp_path / "f", field)
+    loaded = load(tmp_path / "f")
+    assert isinstance(loaded, hk.KernelField)
+    np.testing.assert_allclose(loaded.hamiltonian(jnp.zeros(2)), 3.0, rtol=1e-14)
+    np.testing.assert_array_equal(loaded.points, X)
+    assert loaded.regularization == 1e-2
+
+
+def test_numpy_opens_the_file_without_pickle(saved):
+    with np.load(saved, allow_pickle=False) as archive:
+        header = json.loads(archive["header"].tobytes())
+        stored = [archive[name] for name in archive.files]
+    assert header["format"] == "hamkernel field"
+    assert header["hamkernel"]
+    assert any(array.shape == X.shape and (array == X).all() for array in stored)
+
+
+def test_another_process_evaluates_the_same_field(saved):
+    code = (
+        "import jax; jax.config.update('jax_enable_x64', True)\n"
+        "import sys, jax.numpy as jnp\n"
+        "from hamkernel._save import load\n"
+        "print(bytes(memoryview(jax.jit(load(sys.argv[1]))(jnp.array([0.3, -0.7])))).hex())"
+    )
+    command = [sys.executable, "-c", code, str(saved)]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    here = jax.jit(fitted())(jnp.array([0.3, -0.7]))
+    assert bytes.fromhex(done.stdout) == np.asarray(here).tobytes()
+
+
+def test_float64_is_refused_where_jax_would_cut_it(saved):
+    jax.config.update("jax_enable_x64", False)
+    try:
+        with pytest.raises(ValueError, match="jax_enable_x64"):
+            load(saved)
+    finally:
+        jax.config.update("jax_enable_x64", True)
+
+
+# Writing.
+
+
+def test_a_write_that_fails_leaves_the_old_file_and_no_other(saved, monkeypatch):
+    before = saved.read_bytes()
+    monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError("disk full")))
+    with pytest.raises(OSError, match="disk full"):
+        save(saved, fitted(hk.CurlFree(hk.Gaussian())))
+    assert saved.read_bytes() == before
+    assert list(saved.parent.iterdir()) == [saved]
+
+
+def test_saving_replaces_the_file_and_leaves_no_other(saved):
+    field = fitted(hk.CurlFree(hk.Gaussian()))
+    save(str(saved), field)
+    assert same(field, load(str(saved)))
+    assert list(saved.parent.iterdir()) == [saved]
+
+
+def test_only_fields_are_saved(tmp_path):
+    with pytest.raises(TypeError, match=r"KernelField.*tuned\.field"):
+        save(tmp_path / "f", hk.Symplectic(hk.Gaussian()))  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
+
+
+def test_what_cannot_be_stored_is_named(tmp_path):
+    field = eqx.tree_at(lambda f: f.norm, fitted(), jnp.asarray(1j))
+    with pytest.raises(TypeError, match=r"field\.norm has dtype complex128"):
+        save(tmp_path / "f", field)
+
+
+def test_saving_under_jit_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"under jax\.jit"):
+        eqx.filter_jit(lambda field: save(tmp_path / "f", field))(fitted())
+
+
+# Damaged, foreign and forged files. None of these may end in anything but a ValueError.
+
+
+def test_a_file_cut_at_any_length_is_refused(saved):
+    content = saved.read_bytes()
+    for length in range(len(content)):
+        saved.write_bytes(content[:length])
+        with pytest.raises(ValueError, match=r"hamkernel\.save"):
+            load(saved)
+
+
+def test_a_file_with_anything_appended_is_refused(saved):
+    saved.write_bytes(saved.read_bytes() + b"\n")
+    with pytest.raises(ValueError, match="cut off, was changed"):
+        load(saved)
+
+
+def test_any_changed_byte_is_found(saved):
+    content = saved.read_bytes()
+    for place in range(0, len(content), 3):
+        changed = bytearray(content)
+        changed[place] ^= 1 << RNG.integers(8)
+        saved.write_bytes(changed)
+        with pytest.raises(ValueError, match=r"hamkernel\.save"):
+            load(saved)
+
+
+@pytest.mark.parametrize("kind", ["empty", "text", "npy", "npz", "zip", "pickle", "objects"])
+def test_a_foreign_file_is_refused(kind, tmp_path):
+    path, buffer = tmp_path / "f", io.BytesIO()
+    if kind == "npy":
+        np.save(buffer, X)
+    elif kind == "npz":
+        np.savez(buffer, header=X, array_0=Y)
+    elif kind == "objects":
+        np.savez(buffer, header=np.array([Bomb(path)], object))
+    elif kind == "zip":
+        with zipfile.ZipFile(buffer, "w") as archive:
+            archive.writestr("../../etc/header.npy", "text")
+    elif kind == "pickle":
+        buffer.write(pickle.dumps(Bomb(path)))
+    elif kind == "text":
+        buffer.write(b"q,p\n0.0,1.0\n" * 20)
+    path.write_bytes(buffer.getvalue())
+    with pytest.raises(ValueError, match=r"hamkernel\.save"):
+        load(path)
+    assert not (tmp_path / "exploded").exists()
+
+
+def test_a_missing_file_is_an_os_error(tmp_path):
+    with pytest.raises(FileNotFoundError):
+        load(tmp_path / "nothing")
+
+
+class Bomb:
+    """Makes a file when it is unpickled."""
+
+    def __init__(self, path):
+        self.path = path.parent / "exploded"
+
+    def __reduce__(self):
+        return (self.path.touch, ())
+
+
+def parts(content):
+    """The header and the raw `.npy` parts of a file of `save`."""
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    header = np.load(io.BytesIO(entries.pop("header.npy"))).tobytes()
+    return json.loads(header), entries
+
+
+def npy(array, **options):
+    buffer = io.BytesIO()
+    np.save(buffer, array, **options)
+    return buffer.getvalue()
+
+
+def forge(path, header, entries, compression=zipfile.ZIP_STORED):
+    """Write a file with a right checksum, as a forger would who has read the source."""
+    text = header if isinstance(header, bytes) else json.dumps(header).encode()
+    entries = {"header.npy": npy(np.frombuffer(text, np.uint8)), **entries}
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", compression) as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+        archive.comment = b"0" * 64
+    content = buffer.getvalue()[:-64]
+    path.write_bytes(content + hashlib.sha256(content).hexdigest().encode())
+
+
+def test_a_forged_file_without_a_change_is_read(saved):
+    forge(saved, *parts(saved.read_bytes()))
+    assert same(fitted(), load(saved))
+
+
+def scalar(header):
+    return header["field"]["fields"]["kernel"]["fields"]["kernel"]
+
+
+FORGERIES = {
+    "a newer version": (lambda h: h.update(version=2), "version 2 of the format"),
+    "another format": (lambda h: h.update(format="x"), "not written by"),
+    "no field": (lambda h: h.pop("field"), "parts are missing"),
+    "an unknown class": (lambda h: scalar(h).update(module="os.system"), "unknown class"),
+    "a class that is no name": (lambda h: scalar(h).update(module=["Gaussian"]), "unknown class"),
+    "a kernel for a field": (lambda h: h.update(field=scalar(h)), "no learned field"),
+    "a field that is no node": (lambda h: h.update(field=[1]), "no learned field"),
+    "a field in a field": (lambda h: scalar(h).update(copy.deepcopy(h["field"])), "cannot have"),
+    "an unknown function": (
+        lambda h: scalar(h)["fields"].update(log_lengthscale={"function": "eval"}),
+        "unknown function",
+    ),
+    "a number for an array": (
+        lambda h: scalar(h)["fields"].update(log_lengthscale={"value": 1.0}),
+        "cannot have",
+    ),
+    "a missing field": (lambda h: scalar(h)["fields"].clear(), "has not the fields"),
+    "fields that are no object": (lambda h: scalar(h).update(fields=[]), "has not the fields"),
+    "an array that is not there": (
+        lambda h: scalar(h)["fields"].update(log_lengthscale={"array": 99}),
+        "not there",
+    ),
+    "an array by a negative index": (
+        lambda h: scalar(h)["fields"].update(log_lengthscale={"array": -1}),
+        "not there",
+    ),
+    "an array of another shape": (
+        lambda h: h["field"]["fields"].update(norm=h["field"]["fields"]["points"]),
+        "cannot have",
+    ),
+    "an unknown node": (lambda h: scalar(h).update(more=1), "no known kind of node"),
+    "a node without keys": (lambda h: scalar(h)["fields"].update(log_lengthscale={}), "no known"),
+    "code of a user": (
+        lambda h: scalar(h)["fields"].update(log_lengthscale={"user": "f", "arrays": []}),
+        "code that is not in the file",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", FORGERIES)
+def test_a_forged_header_is_refused(name, saved):
+    header, entries = parts(saved.read_bytes())
+    change, message = FORGERIES[name]
+    change(header)
+    forge(saved, header, entries)
+    with pytest.raises(ValueError, match=message):
+        load(saved)
+
+
+def replaced(entries, index, content):
+    return {**entries, f"array_{index}.npy": content}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (npy(np.array([{}], object), allow_pickle=True), "not allowed"),
+        (npy(np.array([1j])), "not allowed"),
+        (npy(np.array(["text"])), "not allowed"),
+        (npy(np.zeros(1, [("a", float)])), "not allowed"),
+        (npy(np.zeros((6, 2)))[:-8], "size that it claims"),
+        (npy(np.zeros((6, 2))).replace(b"(6, 2)", b"(9999999999999, 9)"[:6]), "not a valid file"),
+        (b"\x93NUMPY\x01\x00\x10\x00{'shape': (-1,)}", "not a valid file"),
+        (b"not an array", "not a valid file"),
+        (npy(np.zeros((5, 2))), "cannot have"),
+    ],
+    ids=["objects", "complex", "text", "records", "short", "shape", "keys", "no npy", "axis"],
+)
+def test_a_forged_array_is_refused(content, message, saved):
+    header, entries = parts(saved.read_bytes())
+    index = header["field"]["fields"]["points"]["array"]
+    forge(saved, header, replaced(entries, index, content))
+    with pytest.raises(ValueError, match=message):
+        load(saved)
+
+
+def test_a_claim_of_a_huge_array_allocates_nothing(saved):
+    header, entries = parts(saved.read_bytes())
+    buffer = io.BytesIO()
+    claim = {"shape": (2**40,), "fortran_order": False, "descr": "<f8"}
+    np.lib.format.write_array_header_1_0(buffer, claim)
+    forge(saved, header, replaced(entries, 0, buffer.getvalue()))
+    with pytest.raises(ValueError, match="size that it claims"):
+        load(saved)
+
+
+def test_a_compressed_bomb_is_refused(saved):
+    header, entries = parts(saved.read_bytes())
+    bomb = replaced(entries, 0, npy(np.zeros(10**6)))
+    forge(saved, header, bomb, zipfile.ZIP_DEFLATED)
+    with pytest.raises(ValueError, match="compressed"):
+        load(saved)
+
+
+@pytest.mark.parametrize("text", [b"", b"{", b"[1]", b"\xff", b"[" * 10**5, b'{"field": NaN}'])
+def test_a_header_that_is_no_header_is_refused(text, saved):
+    forge(saved, text, parts(saved.read_bytes())[1])
+    with pytest.raises(ValueError, match=r"hamkernel\.save"):
+        load(saved)
+
+
+def test_a_deep_tree_is_refused(saved):
+    header, entries = parts(saved.read_bytes())
+    fields = scalar(header)["fields"]
+    for _ in range(200):
+        fields["log_lengthscale"] = {"tuple": [fields["log_lengthscale"]]}
+    forge(saved, header, entries)
+    with pytest.raises(ValueError, match="deeper"):
+        load(saved)
+
+
+def test_missing_and_superfluous_arrays_are_refused(saved):
+    header, entries = parts(saved.read_bytes())
+    fewer = {name: content for name, content in entries.items() if name != "array_0.npy"}
+    for changed in (fewer, {**entries, f"array_{len(entries)}.npy": npy(X)}):
+        forge(saved, header, changed)
+        with pytest.raises(ValueError, match="not a valid file"):
+            load(saved)
+
+
+def test_parts_that_do_not_fit_each_other_are_refused(tmp_path):
+    save(tmp_path / "f", fitted(hk.Symplectic(hk.Gaussian(np.array([1.0, 2.0])))))
+    header, entries = parts((tmp_path / "f").read_bytes())
+    index = scalar(header)["fields"]["log_lengthscale"]["array"]
+    forge(tmp_path / "f", header, replaced(entries, index, npy(np.zeros(3))))
+    with pytest.raises(ValueError, match=r"cannot be evaluated.*3 lengthscales"):
+        load(tmp_path / "f")
+
+
+def nodes(tree):
+    """Every object and list of a JSON tree."""
+    yield tree
+    for child in tree.values() if isinstance(tree, dict) else tree:
+        if isinstance(child, dict | list):
+            yield from nodes(child)
+
+
+def test_a_header_with_any_value_exchanged_gives_a_field_or_a_value_error(tmp_path):
+    save(tmp_path / "f", fitted(BUILT_IN["sum with names"]))
+    content = (tmp_path / "f").read_bytes()
+    junk = [None, -1, 3, 1e300, "reflection", [], {}, [[]], {"value": None}, {"array": 0}]
+    refused = 0
+    for _ in range(150):
+        header, entries = parts(content)
+        inner = [node for node in nodes(header["field"]) if node]
+        node = inner[RNG.integers(len(inner))]
+        keys = list(node) if isinstance(node, dict) else range(len(node))
+        node[keys[RNG.integers(len(keys))]] = junk[RNG.integers(len(junk))]
+        forge(tmp_path / "f", header, entries)
+        try:
+            load(tmp_path / "f")
+        except ValueError:
+            refused += 1
+    assert refused > 75
