@@ -8,11 +8,14 @@ from hamkernel._check import check_kernel
 from hamkernel._field import KernelField
 from hamkernel._fit import fit
 from hamkernel._gram import gram
+from hamkernel._gram_operator import gram_operator
+from hamkernel._save import load, save
 from hamkernel._scalar_product import Periodic, Polynomial
 from hamkernel._scalar_radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._scalar_transform import Select, Warp
 from hamkernel._simulate import simulate
 from hamkernel._solve import Cholesky
+from hamkernel._solve_features import FeatureField, RandomFeatures
 from hamkernel._structured import (
     CurlFree,
     DivergenceFree,
@@ -56,8 +59,14 @@ __all__ = [  # noqa: RUF022 - in reading order
     # Learning.
     "gram",
     "fit",
-    "Cholesky",
     "KernelField",
+    "FeatureField",
+    "save",
+    "load",
+    # Fast and large: products without the Gram, and how `fit` finds the field.
+    "gram_operator",
+    "Cholesky",
+    "RandomFeatures",
     # Hyperparameters.
     "cross_validation_loss",
     "cross_validation_residuals",
