@@ -6,7 +6,7 @@ frequencies drawn from it k(x, z) ≈ Σ_r c_r cos(ω_r·(x − z)), to F^(−1/
 Frequencies are smooth functions of the hyperparameters and of base samples which depend on the key
 alone (reparametrisation), so that fits are differentiable and losses comparable between steps.
 
-Source: Rahimi & Recht (2007).
+Source: Rahimi & Recht (2007); Yu et al. (2016).
 """
 
 import functools
@@ -74,6 +74,20 @@ def _one(frequencies: Float[Array, "F n"], weights: Float[Array, " F"] | None = 
     return (Spectrum(frequencies, weights / F, parity=0),)
 
 
+def _normal(key: Key[Array, ""], count: int, n: int, dtype: Any) -> Float[Array, "F n"]:
+    """Standard normal vectors, independent but for directions orthogonal in blocks of n.
+
+    Each is normal, and the mean over a block has less variance (Yu et al. (2016), "Orthogonal
+    random features"): on the pendulum of the paper a quarter less error than by independent ones.
+    """
+    directions, lengths = jax.random.split(key)
+    blocks = -(-count // n)
+    Q, R = jnp.linalg.qr(jax.random.normal(directions, (blocks, n, n), dtype))
+    signs = jnp.sign(jnp.diagonal(R, axis1=1, axis2=2))  # without them Q is not uniform
+    rows = (Q * signs[:, None]).reshape(blocks * n, n)[:count]
+    return rows * jnp.linalg.norm(jax.random.normal(lengths, (count, n), dtype), axis=1)[:, None]
+
+
 def _over_lengthscale(base: Float[Array, "F n"], lengthscale: Float[Array, "..."]):
     return jax.vmap(divided, in_axes=(0, None))(base, lengthscale)
 
@@ -81,14 +95,14 @@ def _over_lengthscale(base: Float[Array, "F n"], lengthscale: Float[Array, "..."
 @spectra.register
 def _(k: Gaussian, n: int, count: int, key, dtype):
     """Normal with variance 1/ℓ²."""
-    return _one(_over_lengthscale(jax.random.normal(key, (count, n), dtype), k.lengthscale))
+    return _one(_over_lengthscale(_normal(key, count, n, dtype), k.lengthscale))
 
 
 @spectra.register
 def _(k: Matern, n: int, count: int, key, dtype):
     """Student's t with 2ν degrees of freedom and scale 1/ℓ: normal over √(χ²/2ν)."""
     normal, chi = jax.random.split(key)
-    base = jax.random.normal(normal, (count, n), dtype)
+    base = _normal(normal, count, n, dtype)
     half_square = jax.random.gamma(chi, k.nu, (count, 1), dtype)  # χ²_{2ν}/2
     return _one(_over_lengthscale(base * jnp.sqrt(k.nu / half_square), k.lengthscale))
 
@@ -97,7 +111,7 @@ def _(k: Matern, n: int, count: int, key, dtype):
 def _(k: RationalQuadratic, n: int, count: int, key, dtype):
     """(1 + s/2α)^(−α) is the mean of exp(−(g/α) s/2) over g ~ Gamma(α): normals of random width."""
     normal, mixture = jax.random.split(key)
-    base = jax.random.normal(normal, (count, n), dtype)
+    base = _normal(normal, count, n, dtype)
     alpha = k.alpha.astype(dtype)
     # Its logarithm: for small α the sample itself underflows, and √ has no derivative at 0.
     log_g = jax.random.loggamma(mixture, alpha, (count, 1), dtype)
@@ -188,7 +202,7 @@ def _(k: Symmetrised, n: int, count: int, key, dtype):
     parity = int(k.characters[-1])
     if k.maps != (identity, reflection) or any(s.parity == -parity for s in inner):
         raise TypeError(
-            "RandomFeatures knows only the reflection x -> -x, taken once: hk.Odd(K) or hk.Even(K). "
+            "RandomFeatures knows only the reflection x -> -x, once: hk.Odd(K) or hk.Even(K). "
             "For other groups use hk.Cholesky() or hk.Nystrom()."
         )
     return tuple(Spectrum(s.frequencies, s.weights, parity) for s in inner)
