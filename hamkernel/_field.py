@@ -2,6 +2,7 @@
 
 import abc
 from collections.abc import Callable
+from typing import Self
 
 import equinox as eqx
 import jax
@@ -47,6 +48,10 @@ class AbstractField(eqx.Module):
     def unanchored_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         """The potential with the constant that the representer gives it."""
 
+    @abc.abstractmethod
+    def evaluate(self, X: ArrayLike) -> Float[Array, "N n"]:
+        """The velocities at many states, as `jax.vmap(field)(X)` but with bounded memory."""
+
     @property
     def potential(self) -> Scalar:
         """The function u with f = B∇u, x (n,) -> (), with the constant set by `anchored`.
@@ -76,6 +81,21 @@ class AbstractField(eqx.Module):
                 "field.potential(x)."
             )
         return self.potential
+
+    def _state(self, x: ArrayLike) -> Float[Array, " n"]:
+        return require.point(x, self.dimension).astype(self.offset.dtype)
+
+    def anchored(self, x0: ArrayLike, value: ArrayLike = 0.0) -> Self:
+        """The same field with the constant of its potential set so that u(x₀) = value.
+
+        Args:
+            x0: a state, shape (n,), for example the equilibrium.
+            value: the potential there, in units of energy.
+        """
+        if jnp.shape(value) != ():
+            raise ValueError(f"value has shape {jnp.shape(value)}; one number is needed.")
+        offset = jnp.asarray(value, self.offset.dtype) - self.unanchored_potential(jnp.asarray(x0))
+        return eqx.tree_at(lambda field: field.offset, self, offset)
 
     @property
     def is_separable(self) -> bool:
@@ -164,21 +184,6 @@ class KernelField(AbstractField):
     def unanchored_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         x = self._state(x)
         return potential(self.kernel, x, self.points, self.coefficients)
-
-    def _state(self, x: ArrayLike) -> Float[Array, " n"]:
-        return require.point(x, self.dimension).astype(self.points.dtype)
-
-    def anchored(self, x0: ArrayLike, value: ArrayLike = 0.0) -> "KernelField":
-        """The same field with the constant of its potential set so that u(x₀) = value.
-
-        Args:
-            x0: a state, shape (n,), for example the equilibrium.
-            value: the potential there, in units of energy.
-        """
-        if jnp.shape(value) != ():
-            raise ValueError(f"value has shape {jnp.shape(value)}; one number is needed.")
-        offset = jnp.asarray(value, self.offset.dtype) - self.unanchored_potential(jnp.asarray(x0))
-        return eqx.tree_at(lambda field: field.offset, self, offset)
 
     def part(self, which: int | str) -> "KernelField":
         """The field of one term of a sum of kernels, by position or name.

@@ -74,21 +74,6 @@ class FeatureField(AbstractField):
         jax.eval_shape(self.kernel.potential, x, x[None], x[None])
         return self.features.potential(x, self.weights)
 
-    def _state(self, x: ArrayLike) -> Float[Array, " n"]:
-        return require.point(x, self.dimension).astype(self.weights.dtype)
-
-    def anchored(self, x0: ArrayLike, value: ArrayLike = 0.0) -> "FeatureField":
-        """The same field with the constant of its potential set so that u(x₀) = value.
-
-        Args:
-            x0: a state, shape (n,), for example the equilibrium.
-            value: the potential there, in units of energy.
-        """
-        if jnp.shape(value) != ():
-            raise ValueError(f"value has shape {jnp.shape(value)}; one number is needed.")
-        offset = jnp.asarray(value, self.offset.dtype) - self.unanchored_potential(jnp.asarray(x0))
-        return eqx.tree_at(lambda field: field.offset, self, offset)
-
     def part(self, which: int | str) -> "FeatureField":
         """The field of one term of a sum of kernels, by position or name.
 
