@@ -40,15 +40,15 @@ class Partition:
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Partition) and np.array_equal(self.labels, other.labels)
 
-    def gather(self, W: Float[Array, "R Nn"]) -> Float[Array, "R F Sn"]:
-        """The columns of W that belong to each fold; zero columns in the padding."""
-        N, F = len(self.labels), len(self.members)
-        by_point = W.reshape(len(W), N, -1)
+    def gather(self, U: Float[Array, "Nn C"]) -> Float[Array, "F Sn C"]:
+        """The rows of U that belong to each fold; zero rows in the padding."""
+        N, F, C = len(self.labels), len(self.members), U.shape[1]
+        by_point = U.reshape(N, -1, C)
         if not np.array_equal(self.members.reshape(-1), np.arange(N)):
             by_point = jnp.take(
-                by_point, self.members.reshape(-1), axis=1, mode="fill", fill_value=0
+                by_point, self.members.reshape(-1), axis=0, mode="fill", fill_value=0
             )
-        return by_point.reshape(len(W), F, -1)
+        return by_point.reshape(F, -1, C)
 
     def padding_identity(self, blocks: Float[Array, "F Sn Sn"]) -> Float[Array, "F Sn Sn"]:
         """Ones on the diagonal where a fold has no point, zeros elsewhere."""
