@@ -1,0 +1,160 @@
+"""The exact fit by conjugate gradients: products with the Gram only, O((N + m) n + r²) memory.
+
+The unknown is the residual of the fit, c = y − f(X) = Nλ a, so the system is (I + G/ρ) c = y with
+ρ = Nλ: both sides are in units of y. The preconditioner is the inverse for the low-rank Gram
+Ĝ = F Fᵀ of a Nyström fit,
+
+    (I + Ĝ/ρ)⁻¹ = I − F (FᵀF + ρI)⁻¹ Fᵀ,
+
+whose F = G_XS T is applied as a product with the Gram, so that it needs no memory of its own. If
+trace(G − Ĝ) ≤ τρ the condition is at most 1 + τ and the iterations do not depend on N.
+"""
+
+import math
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, Float
+
+from hamkernel import _require as require
+from hamkernel._field import KernelField, SolverInfo
+from hamkernel._gram_operator import product
+from hamkernel._solve import AbstractSolver
+from hamkernel._solve_nystrom import Nystrom, factor, normal_sums, whitening
+from hamkernel._structured import AbstractMatrixKernel
+
+
+class ConjugateGradient(AbstractSolver):
+    """The exact fit without the Gram: preconditioned conjugate gradients on its products.
+
+    For N where the dense Gram does not fit in memory, and kernels for which `Nystrom` alone is not
+    exact enough. Each iteration costs one product with the Gram, O(N² n). The result carries
+    `field.info.iterations` and `.relative_residual`, computed anew at the end.
+
+    Args:
+        tolerance: the largest ‖y − (G + NλI)a‖/‖y‖, dimensionless.
+        max_iterations: after which the solve has failed.
+        preconditioner: the low-rank Gram that preconditions. Its tolerance may be large, since the
+            condition is at most 1 + truncation; more landmarks mean fewer iterations.
+
+    Raises:
+        ValueError: an argument is not positive. RuntimeError, from `fit`: no convergence (the text
+            says what to do).
+
+    Source: Frangella, Tropp & Udell (2023) for the preconditioner; Díaz et al. (2023),
+        arXiv 2304.12465, for randomly pivoted Cholesky in it.
+    """
+
+    tolerance: float = eqx.field(static=True)
+    max_iterations: int = eqx.field(static=True)
+    preconditioner: Nystrom
+
+    def __init__(
+        self,
+        tolerance: float = 1e-8,
+        max_iterations: int = 100,
+        preconditioner: Nystrom | None = None,
+    ):
+        if not (tolerance > 0 and math.isfinite(tolerance)):
+            raise ValueError(f"tolerance must be positive and finite, got {tolerance}.")
+        if max_iterations < 1:
+            raise ValueError(f"max_iterations must be at least 1, got {max_iterations}.")
+        self.tolerance = float(tolerance)
+        self.max_iterations = max_iterations
+        small = Nystrom(tolerance=10.0, max_points=256)
+        self.preconditioner = small if preconditioner is None else preconditioner
+
+    def fit(
+        self,
+        K: AbstractMatrixKernel,
+        X: Float[Array, "N n"],
+        Y: Float[Array, "N n"],
+        regularization: Float[Array, ""],
+    ) -> KernelField:
+        landmarks = self.preconditioner.landmarks(K, X, regularization)
+        ridge = len(X) * regularization
+        C, iterations, values, left, truncation = _solve(
+            K, X, Y, ridge, landmarks, self.tolerance, self.max_iterations
+        )
+
+        def message() -> str:
+            reached = ""
+            if require.is_concrete(left, iterations, truncation):
+                reached = (
+                    f" after {int(iterations)} iterations: the relative residual is "
+                    f"{float(left):.1e} and the tolerance {self.tolerance:.1e}"
+                )
+                reached += (
+                    f" ({int(landmarks.count)} landmarks, truncation {float(truncation):.1e})"
+                )
+            return (
+                f"conjugate gradients did not converge{reached}. Raise the regularization; give "
+                "the preconditioner more landmarks, hk.ConjugateGradient(preconditioner="
+                "hk.Nystrom(tolerance=1.0, max_points=1000)); allow more with max_iterations or a "
+                "larger tolerance. In float32 a tolerance below 1e-5 is out of reach: "
+                "jax.config.update('jax_enable_x64', True). With 0 landmarks or a residual "
+                "that is NaN the kernel is at fault: hk.check_kernel(k, X) tells."
+            )
+
+        failed = ~(left <= self.tolerance) | (landmarks.count == 0)
+        C = require.value(C, failed, message, RuntimeError)
+        square = jnp.sum(C * values) / ridge
+        return KernelField(
+            kernel=K,
+            points=X,
+            coefficients=C / ridge,
+            residual=Y - values,
+            norm=jnp.sqrt(jnp.maximum(square, jnp.zeros_like(square))),  # ‖f‖² = aᵀGa
+            regularization=regularization,
+            offset=jnp.zeros((), X.dtype),
+            info=SolverInfo(
+                "ConjugateGradient",
+                landmarks=landmarks.count,
+                rank=landmarks.kept.sum(),
+                truncation=truncation,
+                iterations=iterations,
+                relative_residual=left,
+            ),
+        )
+
+
+@eqx.filter_jit
+def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations):
+    S = landmarks.points
+    # The preconditioner changes how fast the answer is found, not the answer.
+    K_, X_, S_, ridge_ = jax.lax.stop_gradient((K, X, S, ridge))
+    T = whitening(K_, landmarks)
+    total = normal_sums(K_, S_, T, X_, jnp.zeros_like(X_))
+    R = factor(total.square, ridge_)
+
+    def preconditioned(c):
+        moment = T.T @ product(K_, S_, X_, c).reshape(-1)
+        w = jax.scipy.linalg.cho_solve((R, True), moment)
+        return c - product(K_, X_, S_, (T @ w).reshape(S.shape))
+
+    def gram(c):
+        return product(K, X, X, c)
+
+    structure = jax.ShapeDtypeStruct(X.shape, X.dtype)
+    positive = lx.positive_semidefinite_tag
+    system = lx.FunctionLinearOperator(lambda c: c + gram(c) / ridge, structure, positive)
+    preconditioner = lx.FunctionLinearOperator(preconditioned, structure, positive)
+    # lineax asks of the change of c what it asks of the residual; both are in units of y. Half of
+    # the tolerance leaves room for what the recursion of the residual rounds off.
+    scale = jnp.linalg.norm(Y)
+    solver = lx.CG(
+        rtol=0.0,
+        atol=0.5 * tolerance * scale,
+        norm=jnp.linalg.norm,
+        stabilise_every=None,
+        max_steps=max_iterations,
+    )
+    options = {"preconditioner": preconditioner}
+    solution = lx.linear_solve(system, Y, solver, options=options, throw=False)
+    C = solution.value
+    values = gram(C) / ridge  # f(X)
+    left = jnp.linalg.norm(Y - C - values) / scale
+    truncation = jnp.maximum(total.trace - jnp.trace(total.square), 0 * ridge_) / ridge_
+    return C, solution.stats["num_steps"], values, left, truncation

@@ -1,0 +1,281 @@
+"""Solvers that never form the Gram, against the same algebra done densely in NumPy."""
+
+import warnings
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hamkernel as hk
+from hamkernel._solve_cg import ConjugateGradient
+from hamkernel._solve_landmarks import choose_landmarks
+from hamkernel._solve_nystrom import Nystrom
+
+K = hk.Symplectic(hk.Gaussian(1.5))
+RIDGE = 1e-4
+
+
+def data(N=150, n=2, seed=0, noise=0.01):
+    rng = np.random.default_rng(seed)
+    X = rng.uniform(-2, 2, size=(N, n))
+    q, p = X[:, : n // 2], X[:, n // 2 :]
+    velocity = np.concatenate([p, -np.sin(q) * (1 + q**2 / 4)], axis=1)
+    return X, velocity + noise * rng.normal(size=X.shape)
+
+
+def dense(K, X, Z=None):
+    Z = X if Z is None else Z
+    return np.asarray(hk.gram(K, X, Z)).reshape(np.size(X), np.size(Z))
+
+
+def exact(K, X, Y, regularization):
+    """Coefficients and fitted values of the dense system."""
+    G = dense(K, X)
+    a = np.linalg.solve(G + len(X) * regularization * np.eye(len(G)), Y.ravel())
+    return a.reshape(X.shape), (G @ a).reshape(X.shape)
+
+
+def fit(*arguments, **options) -> hk.KernelField:
+    field = hk.fit(*arguments, **options)
+    assert isinstance(field, hk.KernelField)
+    return field
+
+
+def info(field) -> Any:
+    return field.info
+
+
+def fitted(field, Y):
+    return Y - np.asarray(field.residual)
+
+
+def relative(a, b):
+    return np.linalg.norm(np.asarray(a) - b) / np.linalg.norm(b)
+
+
+# Nystrom.
+
+
+@pytest.mark.parametrize("name", ["symplectic", "odd", "sum", "divergence_free", "separable"])
+def test_nystrom_is_the_exact_fit_where_the_tolerance_is_small(name):
+    K = {
+        "symplectic": hk.Symplectic(hk.Gaussian(1.5)),
+        "odd": hk.Odd(hk.Symplectic(hk.Gaussian(1.5))),
+        "sum": hk.CurlFree(hk.Gaussian(2.0)) + hk.Symplectic(hk.Gaussian(1.5)),
+        "divergence_free": hk.DivergenceFree(hk.Gaussian(1.5)),
+        "separable": hk.Separable(hk.RationalQuadratic(1.0, 2.0)),
+    }[name]
+    X, Y = data()
+    field = fit(K, X, Y, RIDGE, solver=Nystrom(tolerance=1e-5))
+    _, values = exact(K, X, Y, RIDGE)
+    assert relative(fitted(field, Y), values) < 1e-7  # tolerance × noise
+    assert len(field.points) < len(X)
+    np.testing.assert_allclose(fitted(field, Y), field.evaluate(X), atol=1e-9)
+    kept = np.asarray(info(field).rank)
+    assert kept <= field.points.size
+
+
+@pytest.mark.parametrize("tolerance", [10.0, 0.1, 1e-3])
+def test_fitted_values_are_within_the_tolerance_times_the_residual(tolerance):
+    X, Y = data()
+    field = fit(K, X, Y, RIDGE, solver=Nystrom(tolerance=tolerance))
+    _, values = exact(K, X, Y, RIDGE)
+    off = np.linalg.norm(fitted(field, Y) - values) / np.linalg.norm(field.residual)
+    assert info(field).truncation <= tolerance
+    assert off <= info(field).truncation
+    if tolerance == 10.0:  # the bound is about something: few landmarks are not the exact fit
+        assert off > 1e-3
+
+
+def test_the_truncation_and_the_norm_are_those_of_numpy():
+    X, Y = data()
+    field = fit(K, X, Y, RIDGE, solver=Nystrom())
+    S, a = np.asarray(field.points), np.asarray(field.coefficients).ravel()
+    used = np.abs(a) > 0
+    C, G = dense(K, X, S)[:, used], dense(K, S)[np.ix_(used, used)]
+    F = np.linalg.solve(np.linalg.cholesky(G), C.T).T
+    ridge = len(X) * RIDGE
+    left = (np.trace(dense(K, X)) - np.sum(F**2)) / ridge
+    np.testing.assert_allclose(info(field).truncation, left, rtol=1e-6)
+    np.testing.assert_allclose(field.norm, np.sqrt(a[used] @ G @ a[used]), rtol=1e-8)
+    stacked = np.concatenate([F, np.sqrt(ridge) * np.eye(F.shape[1])])
+    w = np.linalg.lstsq(stacked, np.append(Y, np.zeros(F.shape[1])), rcond=None)[0]
+    np.testing.assert_allclose(fitted(field, Y).ravel(), F @ w, atol=1e-10)
+
+
+def test_a_larger_ridge_needs_fewer_landmarks():
+    X, Y = data(400)
+    counts = [
+        int(info(fit(K, X, Y, regularization, solver=Nystrom())).landmarks)
+        for regularization in (1e-2, 1e-4, 1e-6)
+    ]
+    assert counts[0] < counts[1] < counts[2] < 100
+
+
+def test_the_number_of_landmarks_is_near_the_best_rank():
+    X, _ = data(400)
+    left = 1e-5
+    chosen = choose_landmarks(K, jnp.asarray(X), jnp.asarray(left), 200, 400, jax.random.key(1))
+    eigenvalues = np.linalg.eigvalsh(dense(K, X))[::-1]
+    best = np.argmax(eigenvalues.sum() - np.cumsum(eigenvalues) < left * len(X))
+    assert best / 2 < int(chosen.kept.sum()) < 2 * best  # points have two columns each
+
+
+def test_repeated_and_mirrored_points_are_taken_once():
+    X, Y = data(40)
+    X, Y = np.concatenate([X, X, -X]), np.concatenate([Y, Y, -Y])
+    odd = hk.Odd(K)
+    field = fit(odd, X, Y, RIDGE, solver=Nystrom(tolerance=1e-4))
+    assert int(info(field).rank) <= 2 * 40
+    _, values = exact(odd, X, Y, RIDGE)
+    assert relative(fitted(field, Y), values) < 1e-6
+
+
+def test_no_digits_are_lost_to_normal_equations():
+    """At λ = 1e-11 the sums alone keep five digits; with the refinement the fit is that of QR."""
+    X, Y = data(300)
+    regularization = 1e-11
+    field = fit(K, X, Y, regularization, solver=Nystrom(tolerance=10.0))
+    S = np.asarray(field.points)
+    used = np.abs(np.asarray(field.coefficients).ravel()) > 0
+    C, G = dense(K, X, S)[:, used], dense(K, S)[np.ix_(used, used)]
+    F = np.linalg.solve(np.linalg.cholesky(G), C.T).T
+    ridge, r = len(X) * regularization, F.shape[1]
+    stacked = np.concatenate([F, np.sqrt(ridge) * np.eye(r)])
+    w = np.linalg.lstsq(stacked, np.append(Y, np.zeros(r)), rcond=None)[0]
+    assert relative(fitted(field, Y).ravel(), F @ w) < 1e-6
+    alpha = np.linalg.solve(C.T @ C + ridge * G, C.T @ Y.ravel())
+    assert relative(C @ alpha, F @ w) > 1e-5  # the normal equations in the coefficients
+
+
+def test_candidates_that_are_a_part_of_the_data_give_the_same_field():
+    X, Y = data(600)
+    field = fit(K, X, Y, RIDGE, solver=Nystrom(candidates=200, key=jax.random.key(5)))
+    _, values = exact(K, X, Y, RIDGE)
+    off = np.linalg.norm(fitted(field, Y) - values) / np.linalg.norm(field.residual)
+    assert off < info(field).truncation < 0.2
+    again = fit(K, X, Y, RIDGE, solver=Nystrom(candidates=200, key=jax.random.key(5)))
+    np.testing.assert_array_equal(field.coefficients, again.coefficients)
+    other = fit(K, X, Y, RIDGE, solver=Nystrom(candidates=200, key=jax.random.key(6)))
+    assert field.points.shape != other.points.shape or np.any(field.points != other.points)
+
+
+def test_nystrom_has_a_hamiltonian_and_a_field_that_is_its_flow():
+    X, Y = data()
+    field = fit(K, X, Y, RIDGE, solver=Nystrom())
+    x = jnp.array([0.3, -0.4])
+    q_slope, p_slope = jax.grad(field.hamiltonian)(x)
+    np.testing.assert_allclose(field(x), [p_slope, -q_slope], atol=1e-12)
+
+
+def test_nystrom_works_under_jit_and_its_gradient_is_that_of_finite_differences():
+    X, Y = data(40)
+    solver = Nystrom(tolerance=1e-3, max_points=40)
+
+    def loss(log_lengthscale):
+        K = hk.Symplectic(hk.Gaussian(jnp.exp(log_lengthscale)))
+        field = fit(K, X, Y, 1e-3, solver=solver)
+        return jnp.sum(field(jnp.array([0.2, 0.1])) ** 2) + jnp.sum(field.residual**2)
+
+    start, step = jnp.asarray(0.4), 1e-4
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        np.testing.assert_allclose(eqx.filter_jit(loss)(start), loss(start), rtol=1e-5)
+    slope = jax.jit(jax.grad(loss))(start)
+
+    def objective(log_lengthscale):  # the exact fit, which this tolerance stands for
+        K = hk.Symplectic(hk.Gaussian(jnp.exp(log_lengthscale)))
+        field = fit(K, X, Y, 1e-3)
+        return jnp.sum(field(jnp.array([0.2, 0.1])) ** 2) + jnp.sum(field.residual**2)
+
+    expected = (objective(start + step) - objective(start - step)) / (2 * step)
+    np.testing.assert_allclose(slope, expected, rtol=1e-3)
+
+
+def test_too_few_landmarks_are_said():
+    X, Y = data()
+    with pytest.warns(UserWarning, match=r"4 landmarks leave .* Raise max_points"):
+        field = fit(K, X, Y, RIDGE, solver=Nystrom(max_points=4))
+    assert info(field).truncation > 0.1
+    assert int(info(field).landmarks) == 4
+
+
+def test_nystrom_refuses_what_makes_no_sense():
+    with pytest.raises(ValueError, match="tolerance must be positive"):
+        Nystrom(tolerance=0.0)
+    with pytest.raises(ValueError, match="at least 1"):
+        Nystrom(max_points=0)
+
+
+def test_a_kernel_that_is_not_positive_is_refused():
+    X, Y = data(60)
+    for k in (lambda x, z: -jnp.exp(x @ z), lambda x, z: jnp.linalg.norm(x - z)):
+        with pytest.raises(RuntimeError, match="check_kernel"):
+            fit(hk.CurlFree(k), X, Y, RIDGE, solver=Nystrom())
+
+
+# Conjugate gradients.
+
+
+@pytest.mark.parametrize("name", ["symplectic", "odd", "rough"])
+def test_conjugate_gradients_find_the_exact_coefficients(name):
+    K = {
+        "symplectic": hk.Symplectic(hk.Gaussian(1.5)),
+        "odd": hk.Odd(hk.Symplectic(hk.Gaussian(1.5))),
+        "rough": hk.Symplectic(hk.Matern(1.5, 1.0)),
+    }[name]
+    X, Y = data(n=4)
+    field = fit(K, X, Y, RIDGE, solver=ConjugateGradient())
+    a, values = exact(K, X, Y, RIDGE)
+    assert relative(field.coefficients, a) < 1e-7
+    np.testing.assert_allclose(fitted(field, Y), values, atol=1e-7)
+    np.testing.assert_allclose(field.norm, np.sqrt(np.sum(a * values)), rtol=1e-6)
+    system = dense(K, X) + len(X) * RIDGE * np.eye(X.size)
+    left = np.linalg.norm(Y.ravel() - system @ np.asarray(field.coefficients).ravel())
+    np.testing.assert_allclose(
+        info(field).relative_residual, left / np.linalg.norm(Y), rtol=1e-3, atol=1e-14
+    )
+    assert info(field).relative_residual < 1e-8
+    assert 1 <= int(info(field).iterations) <= 30
+
+
+def test_landmarks_precondition():
+    X, Y = data(n=4)
+    counts = [
+        int(info(fit(K, X, Y, RIDGE, solver=ConjugateGradient(1e-6, 2000, p))).iterations)
+        for p in (Nystrom(10.0, 64), Nystrom(1e5, 1))
+    ]
+    assert counts[0] <= 15 < 2 * counts[0] < counts[1]
+
+
+def test_conjugate_gradients_that_do_not_converge_say_so():
+    X, Y = data()
+    solver = ConjugateGradient(1e-12, max_iterations=2, preconditioner=Nystrom(1e5, 1))
+    with pytest.raises(RuntimeError, match=r"converge after 2 iterations.*max_iterations"):
+        hk.fit(K, X, Y, RIDGE, solver=solver)
+    with pytest.raises(RuntimeError, match="did not converge"):
+        hk.fit(hk.CurlFree(lambda x, z: -jnp.exp(x @ z)), X, Y, RIDGE, solver=ConjugateGradient())
+
+
+def test_the_gradient_of_conjugate_gradients_is_that_of_cholesky():
+    X, Y = data(40)
+
+    def loss(log_lengthscale, solver):
+        K = hk.Symplectic(hk.Gaussian(jnp.exp(log_lengthscale)))
+        field = fit(K, X, Y, 1e-3, solver=solver)
+        return jnp.sum(field(jnp.array([0.2, 0.1])) ** 2)
+
+    start = jnp.asarray(0.4)
+    iterative = ConjugateGradient(1e-10, preconditioner=Nystrom(10.0, 16))
+    slope = jax.jit(jax.grad(lambda s: loss(s, iterative)))(start)
+    np.testing.assert_allclose(slope, jax.grad(lambda s: loss(s, hk.Cholesky()))(start), rtol=1e-6)
+
+
+def test_conjugate_gradients_refuse_what_makes_no_sense():
+    with pytest.raises(ValueError, match="tolerance must be positive"):
+        ConjugateGradient(tolerance=-1.0)
+    with pytest.raises(ValueError, match="at least 1"):
+        ConjugateGradient(max_iterations=0)
