@@ -15,7 +15,9 @@ from hamkernel._scalar_radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._scalar_transform import Select, Warp
 from hamkernel._simulate import simulate
 from hamkernel._solve import Cholesky
+from hamkernel._solve_cg import ConjugateGradient
 from hamkernel._solve_features import FeatureField, RandomFeatures
+from hamkernel._solve_nystrom import Nystrom
 from hamkernel._structured import (
     CurlFree,
     DivergenceFree,
@@ -66,6 +68,8 @@ __all__ = [  # noqa: RUF022 - in reading order
     # Fast and large: products without the Gram, and how `fit` finds the field.
     "gram_operator",
     "Cholesky",
+    "Nystrom",
+    "ConjugateGradient",
     "RandomFeatures",
     # Hyperparameters.
     "cross_validation_loss",
