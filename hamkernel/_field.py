@@ -188,13 +188,15 @@ class KernelField(AbstractField):
     def part(self, which: int | str) -> "KernelField":
         """The field of one term of a sum of kernels, by position or name.
 
-        The parts add up to the field. Its `residual` and `norm` are those of the whole fit.
+        The parts add up to the field; an anchor of the whole is not theirs. `residual` and `norm`
+        are those of the whole fit.
 
         Raises:
             KeyError: there is no such part (with the choices).
         """
         if isinstance(self.kernel, Sum):
-            return eqx.tree_at(lambda f: f.kernel, self, self.kernel.part(which))
+            parts = self.kernel.part(which), jnp.zeros_like(self.offset)
+            return eqx.tree_at(lambda f: (f.kernel, f.offset), self, parts)
         if which == 0:
             return self
         raise KeyError(f"no part {which!r}: {type(self.kernel).__name__} is not a sum.")

@@ -6,7 +6,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._scalar import AbstractScalarKernel, Invariance
-from hamkernel._scalar_radial import divided, log_lengthscale
+from hamkernel._scalar_radial import divided, log_lengthscale, one_point
 
 
 class Polynomial(AbstractScalarKernel):
@@ -39,7 +39,7 @@ class Polynomial(AbstractScalarKernel):
         return jnp.exp(self.log_offset)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
-        product = jnp.asarray(x) @ z
+        product = one_point(x) @ one_point(z)
         return (product + self.offset.astype(product.dtype)) ** self.degree
 
     @property
@@ -85,7 +85,7 @@ class Periodic(AbstractScalarKernel):
         return jnp.exp(self.log_lengthscale)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
-        x, z = jnp.asarray(x), jnp.asarray(z)
+        x, z = one_point(x), one_point(z)
         weight = divided(divided(jnp.ones_like(x), self.lengthscale), self.lengthscale)
         # Σ 2 sin²(θ/2)/ℓ² = Σ (1 − cos θ)/ℓ², and cos(a − b) is a product of features.
         return jnp.exp(self._features(x) @ (jnp.tile(weight, 2) * self._features(z)) - weight.sum())

@@ -58,9 +58,20 @@ class AbstractRadialKernel(AbstractScalarKernel):
         return (frozenset(range(n)),)
 
 
-def divided(x: Float[Array, " n"], lengthscale: Float[Array, "..."]) -> Float[Array, " n"]:
-    """x/ℓ in the dtype of x."""
+def one_point(x: ArrayLike) -> Float[Array, " n"]:
+    """`x` as an array; a batch of points would silently give a wrong number."""
     x = jnp.asarray(x)
+    if x.ndim != 1:
+        raise ValueError(
+            f"the point has shape {x.shape}; a kernel takes one pair of points of shape (n,). Use "
+            "jax.vmap for many, or hk.gram for a Gram."
+        )
+    return x
+
+
+def divided(x: Float[Array, " n"], lengthscale: Float[Array, "..."]) -> Float[Array, " n"]:
+    """x/ℓ in the dtype of x, for one point."""
+    x = one_point(x)
     if lengthscale.ndim and lengthscale.shape != x.shape:
         raise ValueError(
             f"the kernel has {lengthscale.size} lengthscales and the point has shape {x.shape}: "

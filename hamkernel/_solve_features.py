@@ -77,7 +77,8 @@ class FeatureField(AbstractField):
     def part(self, which: int | str) -> "FeatureField":
         """The field of one term of a sum of kernels, by position or name.
 
-        The parts add up to the field. `residual` and the norms are those of the whole fit.
+        The parts add up to the field; an anchor of the whole is not theirs. `residual` and the
+        norms are those of the whole fit.
 
         Raises:
             KeyError: there is no such part (with the choices).
@@ -88,9 +89,9 @@ class FeatureField(AbstractField):
             index %= len(names)
             weights = self.weights[self.features.slice(index)]
             return eqx.tree_at(
-                lambda f: (f.kernel, f.features, f.weights),
+                lambda f: (f.kernel, f.features, f.weights, f.offset),
                 self,
-                (term, self.features.terms[index], weights),
+                (term, self.features.terms[index], weights, jnp.zeros_like(self.offset)),
             )
         if which == 0:
             return self

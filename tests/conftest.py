@@ -1,4 +1,4 @@
-"""Every test runs in float64 with strict promotion, so that a silent change of dtype is an error."""
+"""Every test runs in float64 with strict promotion: a silent change of dtype is an error."""
 
 import os
 
@@ -9,6 +9,13 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _few_compiled_programs():
+    """Each module compiles thousands of programs, and each program maps memory: drop them."""
+    yield
+    jax.clear_caches()
 
 
 @pytest.fixture
