@@ -4,7 +4,10 @@ Bochner: k(x, z) = κ(x − z) is the mean of cos(ω·(x − z)) over its spectr
 frequencies drawn from it k(x, z) ≈ Σ_r c_r cos(ω_r·(x − z)), to F^(−1/2).
 
 Frequencies are smooth functions of the hyperparameters and of base samples which depend on the key
-alone (reparametrisation), so that fits are differentiable and losses comparable between steps.
+alone (reparametrisation), so that fits are differentiable and losses comparable between steps. Two
+hyperparameters change the law of the base samples, α of RationalQuadratic and the lengthscale of
+Periodic: there the derivative is that of the measure, right in the mean over keys, and not exactly
+the slope of the loss of one key.
 
 Source: Rahimi & Recht (2007); Yu et al. (2016).
 """
@@ -58,7 +61,8 @@ def spectra(
     Raises:
         TypeError: another kernel.
     """
-    name = getattr(getattr(k, "fn", None), "__name__", "")
+    fn = getattr(k, "fn", None)
+    name = getattr(getattr(fn, "func", fn), "__name__", "")
     raise TypeError(
         f"RandomFeatures cannot draw frequencies for {type(k).__name__}{name and f' ({name})'}: "
         "that takes a shift-invariant kernel with a known spectral density. Use Gaussian, Matern, "
