@@ -289,22 +289,33 @@ class _Objective(eqx.Module):
 def _run(objective: _Objective, u: Float[Array, " P"], optimiser, max_steps: int) -> _Runs:
     """One run of the optimiser from u."""
 
+    # optimistix starts its best loss in the default dtype, which float32 data must then meet.
+    default = jnp.result_type(float)
+
+    def in_default(v):
+        return objective(v.astype(u.dtype)).astype(default)
+
     # optimistix linearises forward and transposes; our derivatives are written backward.
     @jax.custom_jvp
-    def differentiable(u):
-        return objective(u)
+    def differentiable(v):
+        return in_default(v)
 
     @differentiable.defjvp
     def _(primals, tangents):
-        value, slope = jax.value_and_grad(objective)(*primals)
+        value, slope = jax.value_and_grad(in_default)(*primals)
         slope = jnp.where(jnp.isfinite(slope), slope, jnp.zeros_like(slope))
         return value, slope @ tangents[0]
 
     found = optx.minimise(
-        lambda u, _: differentiable(u), optimiser, u, max_steps=max_steps, throw=False
+        lambda v, _: differentiable(v),
+        optimiser,
+        u.astype(default),
+        max_steps=max_steps,
+        throw=False,
     )
     converged = found.result == optx.RESULTS.successful
-    return _Runs(found.value, objective(found.value), converged, found.stats["num_steps"])
+    best = found.value.astype(u.dtype)
+    return _Runs(best, objective(best), converged, found.stats["num_steps"])
 
 
 def _design(P: int, count: int, dtype) -> Float[Array, "count P"]:
@@ -320,7 +331,7 @@ def _spread_out(
     design: Float[Array, "count P"], values: Float[Array, " count"], count: int
 ) -> Float[Array, "{count} P"]:
     """The best points of the design that are not neighbours of a better one already taken."""
-    reach = 0.25 * np.sqrt(design.shape[1])  # of a box of side 1
+    reach = 0.25 * design.shape[1] ** 0.5  # of a box of side 1; a float has no dtype
     shares = jnp.sin(design) / 2
     taken = []
     for _ in range(count):

@@ -1,0 +1,413 @@
+"""`tune`: what it trains, keeps, reports and refuses; losses against explicit refits in NumPy."""
+
+import warnings
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+import pytest
+
+import hamkernel as hk
+
+N = 15
+SAME = 1e-8  # the same loss computed twice, at a condition of up to 1e6
+# The ridge may come down to 100 roundings of the Gram, where a loss keeps about two digits more
+# than the three asked for.
+FLOOR = 1e-3
+
+
+class Wave(eqx.Module):
+    """A user's kernel, cos(w·(x − z)): its own parameter has no bounds that we could know."""
+
+    w: jax.Array
+
+    def __call__(self, x, z):
+        return jnp.cos(self.w @ (x - z))
+
+
+def oscillator(seed: int = 0) -> tuple[jax.Array, jax.Array]:
+    """The paper's data: three trajectories of five points, noise 0.1."""
+    X, Y = hk.systems.sample(
+        hk.systems.HarmonicOscillator(),
+        jnp.array([[1.0, 0.0], [2.25, 0.0], [3.5, 0.0]]),
+        jnp.linspace(0.0, 1.0, 5),
+        0.1,
+        0.1,
+        key=jax.random.key(seed),
+    )
+    return X.reshape(N, 2), Y.reshape(N, 2)
+
+
+def scattered(seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A pendulum's field at random points, with noise 0.1."""
+    rng = np.random.default_rng(seed)
+    X = rng.uniform(-2.5, 2.5, size=(N, 2))
+    Y = np.stack([X[:, 1], -np.sin(X[:, 0])], axis=1)
+    return X, Y + 0.1 * rng.normal(size=Y.shape)
+
+
+def refit_loss(K, X, Y, regularization, folds: int = 5) -> float:
+    """Cross-validation by one solve for each of `folds` equal folds of consecutive points."""
+    X, Y = np.asarray(X), np.asarray(Y)
+    count, n = X.shape
+    G = np.asarray(hk.gram(K, X)).reshape(X.size, X.size)
+    losses = []
+    for out in np.arange(count).reshape(folds, -1):
+        held = np.isin(np.repeat(np.arange(count), n), out)
+        ridge = (count - len(out)) * float(regularization)
+        A = G[np.ix_(~held, ~held)] + ridge * np.eye(X.size - len(out) * n)
+        a = np.linalg.solve(A, Y.ravel()[~held])
+        losses.append(np.mean((Y.ravel()[held] - G[np.ix_(held, ~held)] @ a) ** 2))
+    return float(np.mean(losses))
+
+
+def gaussian(tuned: hk.Tuned) -> float:
+    """The lengthscale of a tuned Symplectic(Gaussian)."""
+    (leaf,) = jax.tree.leaves(eqx.filter(tuned.kernel, eqx.is_inexact_array))
+    return float(jnp.exp(leaf))
+
+
+SIMPLE = hk.Symplectic(hk.Gaussian(1.0))
+
+
+# What comes back.
+
+
+@pytest.fixture(scope="module")
+def rich():
+    """A kernel with leaves of every kind: per coordinate, a weight of a sum, a user's own."""
+    K = hk.Symplectic(2.0 * hk.Gaussian(np.array([0.4, 6.0]))) + hk.Separable(
+        Wave(jnp.array([0.3, 0.2]))
+    )
+    X, Y = scattered()
+    return K, X, Y, hk.tune(K, X, Y, 1e-1)
+
+
+def test_every_leaf_and_lambda_are_trained(rich):
+    K, _, _, tuned = rich
+    before, after = (
+        jax.tree.leaves(eqx.filter(k, eqx.is_inexact_array)) for k in (K, tuned.kernel)
+    )
+    assert len(before) == 3
+    for old, new in zip(before, after, strict=True):
+        assert new.shape == old.shape
+        assert np.all(np.abs(new - old) > 1e-3)
+    assert abs(tuned.regularization / 1e-1 - 1) > 1e-2
+    assert jax.tree.structure(tuned.kernel) == jax.tree.structure(K)
+
+
+def test_loss_is_that_of_explicit_refits_at_the_tuned_point(rich):
+    _, X, Y, tuned = rich
+    expected = refit_loss(tuned.kernel, X, Y, tuned.regularization)
+    np.testing.assert_allclose(tuned.loss, expected, rtol=FLOOR)
+
+
+def test_field_is_the_fit_to_all_data(rich):
+    _, X, Y, tuned = rich
+    field = hk.fit(tuned.kernel, X, Y, tuned.regularization)
+    assert isinstance(field, hk.KernelField)
+    assert isinstance(tuned.field, hk.KernelField)
+    np.testing.assert_allclose(tuned.field.coefficients, field.coefficients, rtol=SAME)
+    assert tuned.field(jnp.zeros(2)).shape == (2,)
+
+
+def test_tuned_point_is_no_worse_than_any_start_and_than_the_callers(rich):
+    K, X, Y, tuned = rich
+    assert tuned.start_losses.shape == (16,)
+    assert float(tuned.loss) == float(tuned.start_losses.min())
+    assert float(tuned.loss) <= refit_loss(K, X, Y, 1e-1)
+
+
+def test_result_says_how_the_search_went(rich):
+    _, _, _, tuned = rich
+    assert isinstance(tuned, hk.Tuned)
+    assert tuned.converged.shape == tuned.steps.shape == tuned.loss.shape == ()
+    assert 0 < int(tuned.steps) <= 64
+    names = {name.rpartition(".")[2] for name in tuned.bounds}
+    assert names == {"lengthscale", "scale", "w", "regularization"}
+    assert set(tuned.at_bounds) <= set(tuned.bounds)
+    for low, high in tuned.bounds.values():
+        assert np.isfinite([low, high]).all()
+        assert low < high
+
+
+def test_loss_of_a_good_start_never_gets_worse():
+    X, Y = scattered()
+    good = hk.tune(SIMPLE, X, Y)
+    again = hk.tune(good.kernel, X, Y, good.regularization)
+    assert float(again.loss) <= float(good.loss) * (1 + SAME)
+
+
+def test_a_single_start_descends_from_the_callers_point():
+    X, Y = scattered()
+    K = hk.Symplectic(hk.Gaussian(0.5))
+    tuned = hk.tune(K, X, Y, 1e-2, starts=1)
+    assert tuned.start_losses.shape == (1,)
+    assert float(tuned.loss) < 0.9 * refit_loss(K, X, Y, 1e-2)
+
+
+# Frozen, bounds, names.
+
+
+def test_frozen_hyperparameters_keep_their_values_to_the_last_bit():
+    X, Y = scattered()
+    tuned = hk.tune(SIMPLE, X, Y, 1e-1, frozen="lengthscale")
+    assert gaussian(tuned) == 1.0
+    assert abs(tuned.regularization / 1e-1 - 1) > 1e-2
+    assert set(tuned.bounds) == {"regularization"}
+    tuned = hk.tune(SIMPLE, X, Y, 1e-1, frozen=("regularization",))
+    np.testing.assert_allclose(tuned.regularization, 1e-1, rtol=1e-14)  # exp of its logarithm
+    assert abs(gaussian(tuned) - 1) > 1e-2
+
+
+def test_bounds_are_obeyed_and_reported_and_a_hyperparameter_at_one_is_named():
+    X, Y = scattered()
+    free = hk.tune(SIMPLE, X, Y)
+    best = gaussian(free)
+    assert "lengthscale" not in " ".join(free.at_bounds)
+    below = hk.tune(SIMPLE, X, Y, bounds={"lengthscale": (0.2, best / 2)})
+    assert 0.2 <= gaussian(below) <= best / 2
+    (name,) = (each for each in below.bounds if each.endswith("lengthscale"))
+    np.testing.assert_allclose(below.bounds[name], (0.2, best / 2))
+    assert name in below.at_bounds
+    assert float(below.loss) > float(free.loss)
+
+
+def test_bounds_of_lambda_are_obeyed():
+    X, Y = scattered()
+    tuned = hk.tune(SIMPLE, X, Y, bounds={"regularization": (0.5, 2.0)})
+    assert 0.5 <= tuned.regularization <= 2.0
+    np.testing.assert_allclose(tuned.bounds["regularization"], (0.5, 2.0))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frozen": "width"}, "no hyperparameter 'width'; this kernel has .*lengthscale"),
+        ({"bounds": {"width": (1, 2)}}, "no hyperparameter 'width'"),
+        ({"bounds": {"lengthscale": (2, 1)}}, "low < high"),
+        ({"bounds": {"lengthscale": (1, np.inf)}}, "finite"),
+        ({"bounds": {"lengthscale": (-1, 1)}}, "positive"),
+        ({"frozen": ("lengthscale", "regularization")}, "nothing to tune"),
+        ({"starts": 0}, "starts must be at least 1"),
+        ({"objective": "loo"}, "objective must be"),
+        ({"folds": 99}, "between 2 and the number of points"),
+        ({"regularization": 0.0}, "positive"),
+    ],
+)
+def test_bad_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
+        hk.tune(SIMPLE, *scattered(), **options)
+
+
+def test_kernels_without_structure_and_functions_to_maximise_are_refused():
+    with pytest.raises(TypeError, match="matrix-valued"):
+        hk.tune(hk.Gaussian(1.0), *scattered())  # pyright: ignore[reportArgumentType]
+    with pytest.raises(TypeError, match="marginal_likelihood"):
+        hk.tune(SIMPLE, *scattered(), objective=hk.log_marginal_likelihood)
+
+
+# Objectives and optimisers.
+
+
+@pytest.mark.parametrize("folds", ["loo", np.repeat([7, 3, 9], 5)], ids=["loo", "labels"])
+def test_folds_of_every_kind_are_tuned(folds):
+    X, Y = oscillator()
+    tuned = hk.tune(SIMPLE, X, Y, folds=folds)
+    expected = hk.cross_validation_loss(tuned.kernel, X, Y, tuned.regularization, folds)
+    np.testing.assert_allclose(tuned.loss, expected, rtol=FLOOR)
+
+
+@pytest.mark.parametrize(
+    ("name", "loss"),
+    [
+        ("generalized_cross_validation", hk.generalized_cross_validation),
+        ("marginal_likelihood", lambda *args: -hk.log_marginal_likelihood(*args)),
+    ],
+)
+def test_other_objectives_reach_a_stationary_point_below_the_start(name, loss):
+    X, Y = scattered()
+    tuned = hk.tune(SIMPLE, X, Y, 1e-1, objective=name)
+    best = float(loss(tuned.kernel, X, Y, tuned.regularization))
+    np.testing.assert_allclose(tuned.loss, best, rtol=FLOOR)
+    assert best < float(loss(SIMPLE, X, Y, 1e-1))
+    slack = FLOOR * abs(best)
+    for factor in (0.8, 1.25):  # neighbours are no better: the point is a minimum
+        other = hk.Symplectic(hk.Gaussian(factor * gaussian(tuned)))
+        assert float(loss(other, X, Y, tuned.regularization)) > best - slack
+        assert float(loss(tuned.kernel, X, Y, factor * tuned.regularization)) > best - slack
+
+
+def test_any_optimistix_minimiser_and_any_objective_will_do():
+    X, Y = scattered()
+
+    def objective(K, X, Y, regularization):
+        return hk.cross_validation_loss(K, X, Y, regularization, 5)
+
+    optimiser = optx.NelderMead(1e-6, 1e-6)
+    tuned = hk.tune(SIMPLE, X, Y, 1e-1, objective=objective, optimiser=optimiser, max_steps=200)
+    np.testing.assert_allclose(
+        tuned.loss, refit_loss(tuned.kernel, X, Y, tuned.regularization), rtol=FLOOR
+    )
+    # Without slopes the valley of the flat limit is not followed to its end: no equality here.
+    best = float(hk.tune(SIMPLE, X, Y, 1e-1).loss)
+    assert best * (1 - FLOOR) < float(tuned.loss) < 1.5 * best
+    assert float(tuned.loss) < 0.9 * refit_loss(SIMPLE, X, Y, 1e-1)
+
+
+def test_an_objective_that_is_nowhere_finite_is_an_error_that_says_what_to_change():
+    def objective(K, X, Y, regularization):
+        return jnp.nan * regularization
+
+    with pytest.raises(RuntimeError, match=r"not finite at any start(.|\n)*check_kernel"):
+        hk.tune(SIMPLE, *scattered(), objective=objective)
+
+
+def test_points_where_the_objective_is_nan_cannot_win():
+    X, Y = scattered()
+
+    def objective(K, X, Y, regularization):
+        loss = hk.generalized_cross_validation(K, X, Y, regularization)
+        return jnp.where(regularization < 1e-3, jnp.nan, loss)
+
+    tuned = hk.tune(SIMPLE, X, Y, 1e-1, objective=objective)
+    assert tuned.regularization >= 1e-3
+    assert np.isfinite(tuned.loss)
+
+
+# The flat limit, and odd data.
+
+
+def test_flat_limit_stops_where_float64_ends_and_its_loss_is_no_rounding_noise():
+    # A quadratic Hamiltonian is the limit ℓ -> ∞, λ -> 0 of the Gaussian.
+    for seed in range(4):
+        X, Y = oscillator(seed)
+        tuned = hk.tune(SIMPLE, X, Y)
+        low, _ = tuned.bounds["regularization"]
+        assert tuned.regularization >= low * (1 - 1e-9)
+        trace = np.trace(np.asarray(hk.gram(tuned.kernel, X)).reshape(30, 30))
+        assert N * tuned.regularization >= 99 * np.finfo(float).eps * trace
+        refit = refit_loss(tuned.kernel, X, Y, tuned.regularization)
+        np.testing.assert_allclose(tuned.loss, refit, rtol=FLOOR)
+        # The noise alone, on states and velocities, costs more than half of this.
+        assert tuned.loss > 0.5 * 0.1**2
+
+
+def test_without_a_floor_the_loss_is_rounding_noise():
+    # The negative control: far below the floor two exact formulas for one number disagree.
+    X, Y = oscillator()
+    K = hk.Symplectic(hk.Gaussian(100.0))
+    trace = np.trace(np.asarray(hk.gram(K, X)).reshape(30, 30))
+    ridge = 0.3 * np.finfo(float).eps * trace / N
+    loss = float(hk.cross_validation_loss(K, X, Y, ridge, 5))
+    assert not abs(loss / refit_loss(K, X, Y, ridge) - 1) < FLOOR
+
+
+def test_odd_data_gives_finite_results():
+    X, Y = scattered()
+    same = X.copy()
+    same[1] = same[0]
+    same[7] = same[6]
+    for points, velocities in [
+        (X, np.zeros_like(Y)),  # nothing to learn
+        (same, Y),  # points that coincide
+        (np.ones_like(X), Y),  # all of them
+        (1e6 + X, 1e-6 * Y),  # far away and slow
+    ]:
+        tuned = hk.tune(SIMPLE, points, velocities)
+        assert np.isfinite(tuned.loss)
+        assert np.isfinite(tuned.regularization)
+        assert np.isfinite(gaussian(tuned))
+        assert np.all(np.isfinite(jax.vmap(tuned.field)(jnp.asarray(points))))
+
+
+def test_two_points_are_enough():
+    X, Y = scattered()
+    tuned = hk.tune(SIMPLE, X[:2], Y[:2], folds="loo")
+    assert np.isfinite(tuned.loss)
+
+
+def test_float32_data_gives_float32_results():
+    X, Y = (np.asarray(each, np.float32) for each in scattered())
+    K = hk.Symplectic(hk.Gaussian(jnp.asarray(1.0, jnp.float32)))
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "fitting in float32")
+        tuned = hk.tune(K, X, Y)
+    assert isinstance(tuned.field, hk.KernelField)
+    for value in (tuned.loss, tuned.regularization, tuned.field.coefficients):
+        assert value.dtype == jnp.float32
+    double = hk.tune(SIMPLE, *(each.astype(float) for each in (X, Y)))
+    np.testing.assert_allclose(tuned.loss, double.loss, rtol=0.05)
+
+
+def test_new_data_of_the_same_shape_does_not_recompile():
+    traced = []
+
+    def kernel(x, z, log_width):
+        traced.append(0)
+        return jnp.exp(-jnp.sum((x - z) ** 2) * jnp.exp(-2 * log_width))
+
+    def run(seed, width):
+        k = jax.tree_util.Partial(kernel, log_width=jnp.log(width))
+        return hk.tune(hk.Symplectic(k), *scattered(seed), starts=1)
+
+    first = run(0, 1.0)
+    count = len(traced)
+    assert float(run(1, 2.0).loss) != float(first.loss)
+    assert len(traced) == count
+
+
+def test_data_that_is_searched_on_a_subset_is_finished_on_all_of_it():
+    rng = np.random.default_rng(0)
+    X = rng.uniform(-2.5, 2.5, size=(100, 2))
+    Y = np.stack([X[:, 1], -np.sin(X[:, 0])], axis=1) + 0.1 * rng.normal(size=X.shape)
+    tuned = hk.tune(SIMPLE, X, Y, 1e-1)
+    best = refit_loss(tuned.kernel, X, Y, tuned.regularization)
+    np.testing.assert_allclose(tuned.loss, best, rtol=FLOOR)
+    assert float(tuned.loss) == float(tuned.start_losses.min())
+    for factor in (0.8, 1.25):
+        other = hk.Symplectic(hk.Gaussian(factor * gaussian(tuned)))
+        assert refit_loss(other, X, Y, tuned.regularization) > best * (1 - FLOOR)
+        assert refit_loss(tuned.kernel, X, Y, factor * tuned.regularization) > best * (1 - FLOOR)
+
+
+# Planted truths.
+
+
+def prior_draw(K, X, noise: float, seed: int) -> np.ndarray:
+    """Velocities from the Gaussian process of K with noise of a standard deviation."""
+    G = np.asarray(hk.gram(K, X)).reshape(X.size, X.size)
+    rng = np.random.default_rng(seed)
+    values, vectors = np.linalg.eigh(G)
+    f = vectors @ (np.sqrt(np.maximum(values, 0)) * rng.normal(size=X.size))
+    return (f + noise * rng.normal(size=X.size)).reshape(X.shape)
+
+
+@pytest.mark.slow
+def test_marginal_likelihood_recovers_a_planted_lengthscale():
+    truth, errors = 1.3, []
+    K = hk.Symplectic(hk.Gaussian(truth))
+    for seed in range(20):
+        X = np.random.default_rng(100 + seed).uniform(-3, 3, size=(200, 2))
+        Y = prior_draw(K, X, 0.05, seed)
+        tuned = hk.tune(
+            hk.Symplectic(hk.Gaussian(4.0)), X, Y, 1e-2, objective="marginal_likelihood"
+        )
+        errors.append(abs(gaussian(tuned) / truth - 1))
+    assert np.median(errors) < 0.1
+
+
+@pytest.mark.slow
+def test_a_lengthscale_per_coordinate_switches_an_irrelevant_coordinate_off():
+    # H does not depend on q: K has no variation along it, so its lengthscale goes to its bound.
+    K = hk.Symplectic(hk.Gaussian(np.array([1e3, 1.0])))
+    X = np.random.default_rng(0).uniform(-3, 3, size=(60, 2))
+    Y = prior_draw(K, X, 0.05, 0)
+    start = hk.Symplectic(hk.Gaussian(np.array([1.0, 1.0])))
+    tuned = hk.tune(start, X, Y, 1e-2, objective="marginal_likelihood")
+    (leaf,) = jax.tree.leaves(eqx.filter(tuned.kernel, eqx.is_inexact_array))
+    irrelevant, relevant = np.exp(leaf)
+    assert irrelevant > 5 * 6  # several times the extent of the data
+    assert abs(relevant - 1) < 0.3
