@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+import hamkernel as hk
 from hamkernel import paper
 
 SEEDS = 25
@@ -28,6 +29,7 @@ QUANTITIES = {
     "true_hamiltonian_variance",
 }
 LEARNED = {"learned_hamiltonian_mean", "learned_hamiltonian_variance"}
+CHOSEN = {"lengthscale", "regularization", "loss", "seconds", "trajectory_error"}
 
 
 @pytest.fixture(scope="module")
@@ -55,13 +57,18 @@ def median(results, experiment, reading, model, quantity):
 def test_results_have_every_experiment_reading_model_quantity_and_spread(results):
     assert set(results) == {"harmonic_oscillator", "pendulum_m0.5", "pendulum_m1"}
     for readings in results.values():
-        assert set(readings) == {"lambda", "N*lambda"}
-        for models in readings.values():
+        assert set(readings) == {"lambda", "N*lambda", "tuned"}
+        for reading, models in readings.items():
             assert set(models) == {"separable", "symplectic", "odd_symplectic"}
             for model, quantities in models.items():
-                learned = set() if model == "separable" else LEARNED
-                assert set(quantities) == QUANTITIES | learned
-                for spread in quantities.values():
+                expected = QUANTITIES | (set() if model == "separable" else LEARNED)
+                assert set(quantities) == expected | (CHOSEN if reading == "tuned" else set())
+                spreads = [quantities[name] for name in expected]
+                if reading == "tuned":
+                    for name in CHOSEN:
+                        assert set(quantities[name]) == {"grid", "gradient"}
+                        spreads += quantities[name].values()
+                for spread in spreads:
                     assert set(spread) == SPREAD
                     assert spread["p10"] <= spread["median"] <= spread["p90"]
 
@@ -119,13 +126,33 @@ def test_separable_is_thirty_times_worse_on_the_pendulum_of_mass_one(results):
 
 def test_only_the_odd_kernel_is_odd_and_symplectic_fields_keep_their_hamiltonian(results):
     for readings in results.values():
-        for models in readings.values():
+        for reading in ("lambda", "N*lambda"):  # tuned ridges may be far smaller
+            models = readings[reading]
             assert models["odd_symplectic"]["odd_error_mean"]["p90"] < 1e-10  # rounding
             assert models["symplectic"]["odd_error_mean"]["p10"] > 0.1
             assert models["separable"]["odd_error_mean"]["p10"] > 0.1
             for model in ("symplectic", "odd_symplectic"):
                 # The integrator's tolerance is 1e-10 and H is of order 100.
                 assert models[model]["learned_hamiltonian_variance"]["p90"] < 1e-12
+
+
+def test_gradient_is_at_least_as_good_as_the_grid_in_the_median(results):
+    low = np.geomspace(0.3, 30.0, 30)
+    for readings in results.values():
+        for tuned in readings["tuned"].values():
+            # The grid has points between which a better one lies; a hundredth is for its box.
+            assert tuned["loss"]["gradient"]["median"] <= 1.01 * tuned["loss"]["grid"]["median"]
+            for spread in tuned["lengthscale"]["grid"].values():
+                assert low[0] <= spread <= low[-1]
+            error = tuned["trajectory_error"]["gradient"]["median"]
+            assert error == tuned["trajectory_error_mean"]["median"]
+
+
+def test_report_compares_grid_and_gradient(run):
+    text, _ = run
+    assert "Hyperparameters tuned on each of 20 seeds by 5-fold cross-validation" in text
+    assert text.count("gradient") >= 9
+    assert "Of 9 pairs of system and kernel the gradient finds the lower median loss in" in text
 
 
 def test_report_says_which_reading_fits_and_names_files_that_exist(run):
@@ -139,7 +166,8 @@ def test_report_says_which_reading_fits_and_names_files_that_exist(run):
 
 def test_figures_are_written_and_not_blank(run):
     figures = sorted(run[1].glob("*.png"))
-    assert len(figures) == 3 * 2 * 2  # experiments, readings, portraits and test trajectory
+    # Experiments, readings, portraits and test trajectory; and the loss surface of one.
+    assert len(figures) == 3 * 2 * 2 + 1
     for figure in figures:
         pixels = matplotlib.image.imread(figure)[..., :3]
         assert pixels.shape[1] >= 800
@@ -202,6 +230,31 @@ def test_an_outcome_agrees_with_the_closed_form_in_numpy_and_scipy():
         energy = np.mean([H(x) for x in solution.y.T])
         assert quantities["learned_hamiltonian_mean"] == pytest.approx(energy, rel=1e-6)
         assert quantities["true_hamiltonian_mean"] == pytest.approx(2.0, rel=1e-6)
+
+
+def test_grid_refits_are_the_closed_form_and_each_seed_takes_its_best_point():
+    pendulum = paper.experiments()["pendulum_m1"]
+    X, Y = paper.datasets(pendulum, jax.vmap(jax.random.key)(np.arange(2)))
+    compared = paper.compare(pendulum, "separable", X, Y)
+    sigmas, ridges = np.geomspace(0.3, 30.0, 30), np.geomspace(1e-10, 1.0, 25)
+    for i, j in [(3, 20), (15, 12), (29, 24)]:
+        K = hk.Separable(hk.Gaussian(sigmas[i]))
+        loss = hk.cross_validation_loss(K, X[0], Y[0], ridges[j], 5)
+        # Condition of the systems, up to 1e9, times rounding.
+        np.testing.assert_allclose(compared.surface[i, j], loss, rtol=1e-6)
+    assert compared.grid.loss[0] == np.nanmin(compared.surface)
+    for choice in (compared.grid, compared.gradient):
+        for seed in range(2):
+            K = hk.Separable(hk.Gaussian(choice.lengthscale[seed]))
+            ridge = choice.regularization[seed]
+            loss = hk.cross_validation_loss(K, X[seed], Y[seed], ridge, 5)
+            np.testing.assert_allclose(choice.loss[seed], loss, rtol=1e-3)
+            alone = paper.evaluate(pendulum, K, X[seed : seed + 1], Y[seed : seed + 1], ridge)
+            np.testing.assert_allclose(
+                choice.outcome.quantities["trajectory_error_mean"][seed],
+                alone.quantities["trajectory_error_mean"][0],
+                rtol=1e-4,
+            )
 
 
 def odd_symplectic(X, Y, scale, ridge):

@@ -2,7 +2,8 @@
 
 `python -m hamkernel` runs `reproduce` and prints its report. An `Experiment` is data alone: the
 system, how it is sampled, the kernels and what the paper publishes. `datasets` draws the data of
-many seeds, `evaluate` fits and tests one kernel on all of them in one compiled program.
+many seeds, `evaluate` fits and tests one kernel on all of them in one compiled program, `compare`
+tunes it on each by the paper's grid search and by `hamkernel.tune`.
 
 The paper leaves three things open, so they are run side by side or stated with the results:
 
@@ -17,13 +18,17 @@ from hamkernel.paper._evaluate import Outcome, datasets, evaluate
 from hamkernel.paper._experiments import READINGS, Experiment, Model, Published, experiments
 from hamkernel.paper._report import report
 from hamkernel.paper._reproduce import reproduce, summarise
+from hamkernel.paper._tuned import Choice, Comparison, compare
 
 __all__ = [
     "READINGS",
+    "Choice",
+    "Comparison",
     "Experiment",
     "Model",
     "Outcome",
     "Published",
+    "compare",
     "datasets",
     "evaluate",
     "experiments",

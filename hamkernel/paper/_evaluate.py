@@ -84,10 +84,11 @@ def evaluate(
 
     Args:
         experiment: the system and its test.
-        kernel: the matrix-valued kernel.
+        kernel: the matrix-valued kernel; where `regularization` has the shape (S,), one for each
+            data set, as leaves with a leading axis S.
         X: states, shape (S, N, n), of `datasets`.
         Y: velocities, shape (S, N, n).
-        regularization: of `fit`.
+        regularization: of `fit`, shape () for all data sets or (S,).
 
     Raises:
         RuntimeError: a fit or an integration failed.
@@ -117,8 +118,9 @@ def _trajectories(
 def _evaluate(kernel, system, X, Y, regularization, ts, true, points) -> Outcome:
     """`true` (1 + B, P, n): the test trajectory, of which the test takes the start, and orbits."""
     test = slice(_TIMES + 1)
+    own = 0 if regularization.ndim else None  # whether each data set has hyperparameters of its own
 
-    def one_seed(X, Y):
+    def one_seed(kernel, regularization, X, Y):
         field = fit(kernel, X, Y, regularization)
         learned = _trajectories(field, true[:, 0], ts)
         error = jnp.linalg.norm(learned[0, test] - true[0, test], axis=1)
@@ -137,7 +139,9 @@ def _evaluate(kernel, system, X, Y, regularization, ts, true, points) -> Outcome
         total = values[: len(points)] + values[len(points) :]  # f(x) + f(−x)
         return _moments("odd_error", jnp.linalg.norm(total, axis=1))
 
-    fields, learned, error, quantities = jax.vmap(one_seed)(X, Y)
+    fields, learned, error, quantities = jax.vmap(one_seed, (own, own, 0, 0))(
+        kernel, regularization, X, Y
+    )
     # One seed after the other: all at once, the many points would not fit into the caches.
     quantities |= jax.lax.map(odd_error, fields)
     return Outcome(

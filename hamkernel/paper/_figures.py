@@ -10,19 +10,25 @@ from tqdm import tqdm
 from hamkernel import plot
 from hamkernel.paper._evaluate import Outcome
 from hamkernel.paper._experiments import Experiment, experiments
+from hamkernel.paper._tuned import GRID, Comparison
 
 Models = Mapping[str, Outcome]
 
+_TUNED = "pendulum_m1"  # the experiment whose tuning is drawn
 _DPI = 150  # 1200 pixels over 8 inches: sharp at the 800 of a README
 
 
 def figures(
-    outcomes: Mapping[str, Mapping[str, Models]], out: pathlib.Path, progress: bool = True
+    outcomes: Mapping[str, Mapping[str, Models]],
+    comparisons: Mapping[str, Mapping[str, Comparison]],
+    out: pathlib.Path,
+    progress: bool = True,
 ) -> list[pathlib.Path]:
-    """Write the figures of each experiment and reading, return their paths.
+    """Write the figures of each experiment and reading, and one of tuning; return their paths.
 
     Args:
         outcomes: by experiment, reading and model.
+        comparisons: by experiment and model.
         out: an existing folder.
         progress: show a progress bar where the standard error is a terminal.
     """
@@ -39,7 +45,23 @@ def figures(
         path = out / f"{name}_{reading.replace('*', '_')}_{kind}.png"
         figure.savefig(path, dpi=_DPI)
         paths.append(path)
-    return paths
+    path = out / f"{_TUNED}_tuning.png"
+    tuning(every[_TUNED], comparisons[_TUNED]["odd_symplectic"]).savefig(path, dpi=_DPI)
+    return [*paths, path]
+
+
+def tuning(experiment: Experiment, comparison: Comparison) -> Figure:
+    """Return the cross-validation loss over (σ, λ), with the ends of both searches, seed 0."""
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    end = comparison.gradient.lengthscale[0], comparison.gradient.regularization[0]
+    plot.loss_surface(
+        *GRID,
+        comparison.surface,
+        np.array([end]),
+        figure.subplots(),
+        title=f"{experiment.title}, odd symplectic, seed 0",
+    )
+    return figure
 
 
 def portraits(experiment: Experiment, reading: str, models: Models) -> Figure:

@@ -7,14 +7,21 @@ from collections.abc import Mapping
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 from tqdm import tqdm
 
 from hamkernel.paper._evaluate import Outcome, datasets, evaluate
 from hamkernel.paper._experiments import READINGS, experiments
 from hamkernel.paper._report import Results, report
+from hamkernel.paper._tuned import Choice, Comparison, compare
 
 # experiment -> reading -> model -> its tests
 Outcomes = dict[str, dict[str, dict[str, Outcome]]]
+# experiment -> model -> both ways to tune it
+Comparisons = dict[str, dict[str, Comparison]]
+Data = Mapping[str, tuple[Float[Array, "S N n"], Float[Array, "S N n"]]]
+
+TUNED_SEEDS = 20  # of the seeds: enough for a median, and the whole run stays near a minute
 
 
 def reproduce(
@@ -23,6 +30,9 @@ def reproduce(
     """Run the paper's experiments, write `results.json` and the figures, return a report.
 
     Noise seed i is `jax.random.key(i)`, i = 0 … seeds − 1, the same for all kernels and readings.
+    The first 20 of them are also tuned, by grid search and by gradient.
+
+    The layout of `results.json` is that of `summarise`.
 
     Args:
         out: folder for the files, made if it is missing.
@@ -46,27 +56,27 @@ def reproduce(
         )
     out = pathlib.Path(out)
     out.mkdir(parents=True, exist_ok=True)
-    outcomes = _outcomes(seeds, progress)
-    results = summarise(outcomes)
+    keys = jax.vmap(jax.random.key)(np.arange(seeds))
+    data = {name: datasets(experiment, keys) for name, experiment in experiments().items()}
+    outcomes = _outcomes(data, progress)
+    comparisons = _comparisons(data, progress)
+    results = summarise(outcomes, comparisons)
     path = out / "results.json"
     path.write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")
-    return report(results, experiments(), seeds), [path, *figures(outcomes, out, progress)]
+    text = report(results, experiments(), seeds, min(seeds, TUNED_SEEDS))
+    return text, [path, *figures(outcomes, comparisons, out, progress)]
 
 
-def _outcomes(seeds: int, progress: bool) -> Outcomes:
+def _outcomes(data: Data, progress: bool) -> Outcomes:
     outcomes: Outcomes = {}
-    keys = jax.vmap(jax.random.key)(np.arange(seeds))
     runs = [
         (name, experiment, reading, model)
         for name, experiment in experiments().items()
         for reading in READINGS
         for model in experiment.models
     ]
-    data = {}
     bar = tqdm(runs, desc="fits and tests", disable=None if progress else True)
     for name, experiment, reading, model in bar:
-        if name not in data:
-            data[name] = datasets(experiment, keys)
         chosen = experiment.models[model]
         regularization = READINGS[reading](chosen.regularization, experiment.size)
         X, Y = data[name]
@@ -75,25 +85,62 @@ def _outcomes(seeds: int, progress: bool) -> Outcomes:
     return outcomes
 
 
-def summarise(outcomes: Mapping[str, Mapping[str, Mapping[str, Outcome]]]) -> Results:
+def _comparisons(data: Data, progress: bool) -> Comparisons:
+    runs = [(name, model) for name, each in experiments().items() for model in each.models]
+    comparisons: Comparisons = {}
+    for name, model in tqdm(runs, desc="tuning", disable=None if progress else True):
+        experiment = experiments()[name]
+        X, Y = (each[:TUNED_SEEDS] for each in data[name])
+        structure = experiment.models[model].structure
+        comparisons.setdefault(name, {})[model] = compare(experiment, structure, X, Y)
+    return comparisons
+
+
+def summarise(
+    outcomes: Mapping[str, Mapping[str, Mapping[str, Outcome]]],
+    comparisons: Mapping[str, Mapping[str, Comparison]] | None = None,
+) -> Results:
     """Return median, 10 % and 90 % quantile over the seeds of every quantity.
 
     Args:
         outcomes: by experiment, reading and model.
+        comparisons: by experiment and model.
+
+    Returns:
+        `[experiment][reading][model][quantity]["median" | "p10" | "p90"]`. With `comparisons` there
+        is a reading "tuned" with the same quantities for the hyperparameters of the gradient, and
+        besides `["tuned"][model][name]["grid" | "gradient"]["median" | "p10" | "p90"]` for the
+        names lengthscale, regularization, loss, seconds and trajectory_error.
     """
-    return {
+    results = {
         name: {
-            reading: {
-                model: {
-                    quantity: _spread(np.asarray(values))
-                    for quantity, values in outcome.quantities.items()
-                }
-                for model, outcome in models.items()
-            }
+            reading: {model: _spreads(outcome.quantities) for model, outcome in models.items()}
             for reading, models in readings.items()
         }
         for name, readings in outcomes.items()
     }
+    for name, models in (comparisons or {}).items():
+        results[name]["tuned"] = {model: _tuned(each) for model, each in models.items()}
+    return results
+
+
+def _tuned(comparison: Comparison) -> dict:
+    choices: dict[str, Choice] = {"grid": comparison.grid, "gradient": comparison.gradient}
+    both = {
+        "lengthscale": lambda choice: choice.lengthscale,
+        "regularization": lambda choice: choice.regularization,
+        "loss": lambda choice: choice.loss,
+        "seconds": lambda choice: choice.seconds,
+        "trajectory_error": lambda choice: choice.outcome.quantities["trajectory_error_mean"],
+    }
+    return _spreads(comparison.gradient.outcome.quantities) | {
+        name: {method: _spread(np.asarray(of(choice))) for method, choice in choices.items()}
+        for name, of in both.items()
+    }
+
+
+def _spreads(quantities: Mapping[str, ArrayLike]) -> dict[str, dict[str, float]]:
+    return {name: _spread(np.asarray(values)) for name, values in quantities.items()}
 
 
 def _spread(values: np.ndarray) -> dict[str, float]:
