@@ -8,7 +8,8 @@ from jaxtyping import ArrayLike, Num
 from hamkernel import _require as require
 from hamkernel._field import AbstractField
 from hamkernel._gram import matrix_kernel
-from hamkernel._solve import AbstractSolver, Cholesky
+from hamkernel._solve import AbstractSolver
+from hamkernel._solve_choice import chosen
 from hamkernel._structured import AbstractMatrixKernel
 
 
@@ -30,7 +31,9 @@ def fit(
         X: states, shape (N, n).
         Y: measured velocities, shape (N, n), in units of X per unit of time.
         regularization: λ > 0, in squared units of Y over those of the kernel.
-        solver: `Cholesky()` if None.
+        solver: if None, `Cholesky()` where its three matrices of (N n)² numbers take at most half
+            of the memory, else `ConjugateGradient()`; both are exact, and `field.info.solver` says
+            which it was. `Nystrom()` is faster, and approximate to a stated tolerance.
 
     Returns:
         The learned field. Works under jit, vmap and grad, with respect to every argument; new
@@ -39,15 +42,14 @@ def fit(
     Raises:
         TypeError: K is not matrix-valued, `solver` is no solver, or the data is complex or in half
             precision. ValueError: a shape does not fit, the data is empty or not finite, n is not
-            allowed by the structure, or λ is not positive. RuntimeError: the ridge is too small
-            for this Gram (the text says what to do).
+            allowed by the structure, λ is not positive, or a dense problem does not fit in memory.
+            RuntimeError: the ridge is too small for this Gram (the text says what to do).
 
     Source: Smith & Egeland (2023), eq. (vector_valued_regular_least_squares_a_equation), where
         "Nλ a_j" should read "Nλ a_i".
     """
     K = matrix_kernel(K)
-    solver = Cholesky() if solver is None else solver
-    if not isinstance(solver, AbstractSolver):
+    if not (solver is None or isinstance(solver, AbstractSolver)):
         raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
     X, Y = require.data(X, Y)
     K.check_dimension(X.shape[1])
@@ -59,4 +61,5 @@ def fit(
             "jax.config.update('jax_enable_x64', True) first and pass float64 data.",
             stacklevel=2,
         )
-    return solver.fit(K, X, Y, regularization)
+    N, n = X.shape
+    return chosen(solver, N, n, X.dtype).fit(K, X, Y, regularization)

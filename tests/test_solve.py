@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
+from hamkernel import _solve_choice
 from hamkernel._solve_cg import ConjugateGradient
 from hamkernel._solve_landmarks import choose_landmarks
 from hamkernel._solve_nystrom import Nystrom
@@ -279,3 +280,22 @@ def test_conjugate_gradients_refuse_what_makes_no_sense():
         ConjugateGradient(tolerance=-1.0)
     with pytest.raises(ValueError, match="at least 1"):
         ConjugateGradient(max_iterations=0)
+
+
+# The choice.
+
+
+def test_a_dense_fit_is_chosen_where_it_takes_half_of_the_memory(monkeypatch):
+    X, Y = data(20)
+    need = 3 * 40**2 * 8
+    monkeypatch.setattr(_solve_choice, "memory_bytes", lambda: 2 * need)
+    assert info(hk.fit(K, X, Y, RIDGE)).solver == "Cholesky"
+    monkeypatch.setattr(_solve_choice, "memory_bytes", lambda: 2 * need - 1)
+    assert info(hk.fit(K, X, Y, RIDGE)).solver == "ConjugateGradient"
+    assert info(hk.fit(K, X, Y, RIDGE, solver=hk.Cholesky())).solver == "Cholesky"
+
+
+def test_a_dense_fit_that_cannot_fit_is_refused_before_it_starts():
+    X = np.zeros((10_000_000, 2))
+    with pytest.raises(ValueError, match=r"needs 9.6e\+06 GB .* Use solver=hk.ConjugateGradient"):
+        hk.fit(K, X, X, RIDGE, solver=hk.Cholesky())

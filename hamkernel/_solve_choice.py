@@ -1,0 +1,53 @@
+"""Which solver a problem gets when none is named, and which dense problems are refused."""
+
+import os
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+
+from hamkernel._solve import AbstractSolver, Cholesky
+from hamkernel._solve_cg import ConjugateGradient
+
+# Matrices of the size of the Gram that a dense fit holds: Gram, Gram with ridge, factor.
+COPIES = 3
+_CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
+
+
+def dense_bytes(N: int, n: int, dtype: jnp.dtype) -> int:
+    """What a dense fit of N points with n coordinates needs, in bytes."""
+    return COPIES * (N * n) ** 2 * jnp.dtype(dtype).itemsize
+
+
+def memory_bytes() -> int | None:
+    """The memory of the default device, or of this machine or container; None if unknown."""
+    stats = jax.devices()[0].memory_stats() or {}
+    if "bytes_limit" in stats:
+        return stats["bytes_limit"]
+    try:
+        total = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError, OSError):  # not on every system
+        return None
+    limit = _CGROUP_LIMIT.read_text().strip() if _CGROUP_LIMIT.exists() else "max"
+    return min(total, int(limit)) if limit.isdigit() else total
+
+
+def chosen(solver: AbstractSolver | None, N: int, n: int, dtype: jnp.dtype) -> AbstractSolver:
+    """`solver`; if None, Cholesky where it takes at most half of the memory, else CG.
+
+    Raises:
+        ValueError: Cholesky was asked for and does not fit in memory.
+    """
+    needed, memory = dense_bytes(N, n, dtype), memory_bytes()
+    if solver is None:
+        fits = memory is None or needed <= memory / 2
+        tolerance = 1e-8 if dtype == jnp.float64 else 1e-5
+        return Cholesky() if fits else ConjugateGradient(tolerance)
+    if isinstance(solver, Cholesky) and memory is not None and needed > memory:
+        raise ValueError(
+            f"a dense fit of N = {N} points with n = {n} coordinates needs {needed / 1e9:.3g} GB "
+            f"({COPIES} matrices of {N * n} rows) and there are {memory / 1e9:.3g} GB. Use "
+            "solver=hk.ConjugateGradient(), which is exact, or solver=hk.Nystrom(), which is "
+            "faster and approximate to a stated tolerance."
+        )
+    return solver
