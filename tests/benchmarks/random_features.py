@@ -50,13 +50,13 @@ def pendulum(seeds):
     keys = jax.random.split(jax.random.key(1), seeds)
     X, Y = datasets(experiment, keys)
     ts, x0 = jnp.linspace(0, experiment.horizon, 101), jnp.asarray(experiment.test_state)
-    true = hk.simulate(experiment.system, x0, ts).ys
+    true = jnp.asarray(hk.simulate(experiment.system, x0, ts).ys)
 
     @jax.jit
     def errors(X, Y, key, ridge):
         fields = [hk.fit(KERNEL, X, Y, ridge, solver=s) for s in (None, RandomFeatures(500, key))]
         orbits = [hk.simulate(field, x0, ts).ys for field in fields]
-        return jnp.stack([jnp.linalg.norm(ys - true, axis=1).mean() for ys in orbits])
+        return jnp.stack([jnp.linalg.norm(jnp.asarray(ys) - true, axis=1).mean() for ys in orbits])
 
     for name, reading in READINGS.items():
         ridge = jnp.asarray(reading(1e-4, experiment.size))
@@ -94,7 +94,7 @@ def cost(largest, count=200, chunk=5000):
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description="Cost and accuracy of random features.")
     parser.add_argument("--points", type=int, default=20_000)
     parser.add_argument("--seeds", type=int, default=20)
     arguments = parser.parse_args()
