@@ -1,5 +1,7 @@
 """Validation losses against explicit refits, NumPy, SciPy and central differences."""
 
+from typing import Any, cast
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -156,7 +158,7 @@ def test_generalized_cross_validation_is_its_definition(structure, n):
 def test_log_marginal_likelihood_is_the_density_of_scipy_with_noise_variance_n_lambda(structure, n):
     X, Y = data(n)
     K = STRUCTURES[structure](hk.Gaussian(1.5))
-    normal = multivariate_normal(np.zeros(X.size), regularised(K, X, N * RIDGE))
+    normal = multivariate_normal(mean=np.zeros(X.size), cov=cast(Any, regularised(K, X, N * RIDGE)))
     value = hk.log_marginal_likelihood(K, X, Y, RIDGE)
     np.testing.assert_allclose(value, normal.logpdf(Y.ravel()), rtol=EXACT)
 
