@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any
 
 from hamkernel import systems
 from hamkernel._check import check_kernel
-from hamkernel._field import KernelField
+from hamkernel._field import KernelField, SolverInfo
 from hamkernel._fit import fit
 from hamkernel._gram import gram
 from hamkernel._gram_operator import gram_operator
@@ -16,7 +16,7 @@ from hamkernel._scalar_transform import Select, Warp
 from hamkernel._simulate import simulate
 from hamkernel._solve import Cholesky
 from hamkernel._solve_cg import ConjugateGradient
-from hamkernel._solve_features import FeatureField, RandomFeatures
+from hamkernel._solve_features import FeatureField, FeatureFit, RandomFeatures
 from hamkernel._solve_nystrom import Nystrom
 from hamkernel._structured import (
     CurlFree,
@@ -63,6 +63,8 @@ __all__ = [  # noqa: RUF022 - in reading order
     "fit",
     "KernelField",
     "FeatureField",
+    "FeatureFit",
+    "SolverInfo",
     "save",
     "load",
     # Fast and large: products without the Gram, and how `fit` finds the field.

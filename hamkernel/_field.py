@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable
-from typing import Self
+from typing import TypeVar
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ from hamkernel._gram import expansion, potential
 from hamkernel._gram_operator import compiled_product
 from hamkernel._structured import AbstractMatrixKernel, Sum
 
+Field = TypeVar("Field", bound="AbstractField")
 Scalar = Callable[[Float[Array, " n"]], Float[Array, ""]]
 
 
@@ -85,7 +86,7 @@ class AbstractField(eqx.Module):
     def _state(self, x: ArrayLike) -> Float[Array, " n"]:
         return require.point(x, self.dimension).astype(self.offset.dtype)
 
-    def anchored(self, x0: ArrayLike, value: ArrayLike = 0.0) -> Self:
+    def anchored(self: Field, x0: ArrayLike, value: ArrayLike = 0.0) -> Field:
         """The same field with the constant of its potential set so that u(x₀) = value.
 
         Args:

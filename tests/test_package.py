@@ -208,6 +208,7 @@ print(json.dumps([refused(lambda: k(X, X)), refused(lambda: K(x, jnp.zeros(3)))]
 
 
 @pytest.mark.slow
+@pytest.mark.ci
 def test_annotations_hold_when_they_are_executed():
     here = str(Path(__file__).parent)
     done = subprocess.run(

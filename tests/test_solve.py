@@ -172,6 +172,7 @@ def test_nystrom_has_a_hamiltonian_and_a_field_that_is_its_flow():
     np.testing.assert_allclose(field(x), [p_slope, -q_slope], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_nystrom_works_under_jit_and_its_gradient_is_that_of_finite_differences():
     X, Y = data(40)
     solver = Nystrom(tolerance=1e-3, max_points=40)
