@@ -288,7 +288,6 @@ class _Objective(eqx.Module):
 
 def _run(objective: _Objective, u: Float[Array, " P"], optimiser, max_steps: int) -> _Runs:
     """One run of the optimiser from u."""
-
     # optimistix starts its best loss in the default dtype, which float32 data must then meet.
     default = jnp.result_type(float)
 
