@@ -176,6 +176,7 @@ def grid_losses(
             ridge = (N - N / len(points)) * regularization
             return jnp.mean(jnp.stack([fold_loss(G, ridge, each) for each in points]))
 
-        return jax.vmap(loss)(ridges)
+        # One after the other: a batch of these factorisations was seen to stall on two cores.
+        return jax.lax.map(loss, ridges)
 
     return jax.lax.map(row, lengthscales)
