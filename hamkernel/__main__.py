@@ -16,6 +16,7 @@ def main() -> None:
     parser.add_argument(
         "--seeds", type=int, default=100, help="number of noise seeds (%(default)s)"
     )
+    parser.add_argument("--tune", action="store_true", help="also tune, which takes minutes")
     arguments = parser.parse_args()
     if arguments.seeds < 1:
         parser.error("--seeds must be at least 1")
@@ -23,7 +24,7 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)  # before any array is made
     from hamkernel.paper import reproduce
 
-    text, files = reproduce(arguments.out, arguments.seeds)
+    text, files = reproduce(arguments.out, arguments.seeds, tune=arguments.tune)
     print(text)
     print("\nWritten:", *(f"  {file}" for file in files), sep="\n")
 

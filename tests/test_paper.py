@@ -32,12 +32,26 @@ LEARNED = {"learned_hamiltonian_mean", "learned_hamiltonian_variance"}
 CHOSEN = {"lengthscale", "regularization", "loss", "seconds", "trajectory_error"}
 
 
+pytestmark = pytest.mark.slow  # the tuned experiment takes minutes
+
+
 @pytest.fixture(scope="module")
 def run(tmp_path_factory) -> tuple[str, pathlib.Path]:
     """What the program prints and the folder it fills; strict promotion, warnings as errors."""
     out = tmp_path_factory.mktemp("paper") / "results"
     strict = {"JAX_NUMPY_DTYPE_PROMOTION": "strict", "JAX_NUMPY_RANK_PROMOTION": "raise"}
-    command = ["-W", "error", "-m", "hamkernel", "--out", str(out), "--seeds", str(SEEDS)]
+    command = [
+        "-W",
+        "error",
+        "-m",
+        "hamkernel",
+        "--tune",
+        "--tune",
+        "--out",
+        str(out),
+        "--seeds",
+        str(SEEDS),
+    ]
     done = subprocess.run(
         [sys.executable, *command], env=os.environ | strict, capture_output=True, text=True
     )

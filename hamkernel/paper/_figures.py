@@ -45,6 +45,8 @@ def figures(
         path = out / f"{name}_{reading.replace('*', '_')}_{kind}.png"
         figure.savefig(path, dpi=_DPI)
         paths.append(path)
+    if not comparisons:
+        return paths
     path = out / f"{_TUNED}_tuning.png"
     tuning(every[_TUNED], comparisons[_TUNED]["odd_symplectic"]).savefig(path, dpi=_DPI)
     return [*paths, path]

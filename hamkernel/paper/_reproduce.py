@@ -25,7 +25,11 @@ TUNED_SEEDS = 20  # of the seeds: enough for a median, and the whole run stays n
 
 
 def reproduce(
-    out: str | pathlib.Path = "results", seeds: int = 100, *, progress: bool = True
+    out: str | pathlib.Path = "results",
+    seeds: int = 100,
+    *,
+    tune: bool = False,
+    progress: bool = True,
 ) -> tuple[str, list[pathlib.Path]]:
     """Run the paper's experiments, write `results.json` and the figures, return a report.
 
@@ -37,6 +41,7 @@ def reproduce(
     Args:
         out: folder for the files, made if it is missing.
         seeds: number of noise seeds, ≥ 1.
+        tune: also tune the hyperparameters, by grid and by gradient: minutes more.
         progress: show a progress bar where the standard error is a terminal.
 
     Returns:
@@ -59,11 +64,11 @@ def reproduce(
     keys = jax.vmap(jax.random.key)(np.arange(seeds))
     data = {name: datasets(experiment, keys) for name, experiment in experiments().items()}
     outcomes = _outcomes(data, progress)
-    comparisons = _comparisons(data, progress)
+    comparisons = _comparisons(data, progress) if tune else {}
     results = summarise(outcomes, comparisons)
     path = out / "results.json"
     path.write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")
-    text = report(results, experiments(), seeds, min(seeds, TUNED_SEEDS))
+    text = report(results, experiments(), seeds, min(seeds, TUNED_SEEDS) if tune else None)
     return text, [path, *figures(outcomes, comparisons, out, progress)]
 
 
