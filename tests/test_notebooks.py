@@ -58,7 +58,7 @@ def test_ends_in_asserts_on_its_claims(path):
 
 
 def marked(path):
-    marks = [] if path.stem in QUICK else [pytest.mark.slow, pytest.mark.ci]
+    marks = [] if path.stem in QUICK else [pytest.mark.slow]
     return pytest.param(path, marks=marks, id=path.stem)
 
 
