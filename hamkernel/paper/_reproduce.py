@@ -41,8 +41,7 @@ def reproduce(
     Args:
         out: folder for the files, made if it is missing.
         seeds: number of noise seeds, ≥ 1.
-        tune: also tune the hyperparameters. Adds minutes: a tuned field of a quadratic H lies in
-            the flat limit, and its rounding keeps the adaptive integrator from its tolerance.
+        tune: also tune the hyperparameters, which adds minutes.
         progress: show a progress bar where the standard error is a terminal.
 
     Returns:
