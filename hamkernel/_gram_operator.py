@@ -15,6 +15,7 @@ import lineax as lx
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
+from hamkernel._devices import Rows, as_given, rows_of, split, sum_of_columns
 from hamkernel._gram import centred, gram, matrix_kernel
 from hamkernel._structured import AbstractMatrixKernel
 
@@ -34,6 +35,9 @@ def gram_operator(
     the kernel, the points and the coefficients, and derivatives need no more memory than values.
 
     A learned field at many points is the same product: `field.evaluate(X)`.
+
+    Where the rows of X or Z are spread over a mesh of devices, each device keeps its own, and the
+    result is spread as X is.
 
     Args:
         K: a matrix-valued kernel.
@@ -56,7 +60,10 @@ def gram_operator(
     if Z is not None and X.shape[1] != Z.shape[1]:
         raise ValueError(f"X has {X.shape[1]} coordinates and Z has {Z.shape[1]}.")
     K.check_dimension(X.shape[1])
-    return GramOperator(K, X, Z)
+    X_rows = rows_of(X)
+    Z_rows = X_rows if Z is None else rows_of(Z)
+    Z = None if Z is None else split(Z_rows, Z)
+    return GramOperator(K, split(X_rows, X), Z, X_rows, Z_rows)
 
 
 class GramOperator(lx.AbstractLinearOperator):
@@ -65,6 +72,8 @@ class GramOperator(lx.AbstractLinearOperator):
     kernel: AbstractMatrixKernel
     X: Float[Array, "N n"]
     Z: Float[Array, "M n"] | None
+    X_rows: Rows | None = eqx.field(static=True, default=None)
+    Z_rows: Rows | None = eqx.field(static=True, default=None)
 
     @property
     def columns(self) -> Float[Array, "M n"]:
@@ -77,7 +86,10 @@ class GramOperator(lx.AbstractLinearOperator):
                 f"the vector has shape {jnp.shape(vector)}; one coefficient for each column of "
                 f"the Gram, shape {self.columns.shape}, is needed."
             )
-        return compiled_product(self.kernel, self.X, self.columns, jnp.asarray(vector))
+        vector = split(self.Z_rows, jnp.asarray(vector))
+        spread = self.X_rows, self.Z_rows
+        product = _compiled_product(self.kernel, self.X, self.columns, vector, *spread)
+        return as_given(self.X_rows, product)
 
     def as_matrix(self) -> Float[Array, "Nn Mn"]:
         """The dense Gram, O(N M n²) memory."""
@@ -85,7 +97,9 @@ class GramOperator(lx.AbstractLinearOperator):
 
     def transpose(self) -> "GramOperator":
         # K(x, z)ᵀ = K(z, x)
-        return self if self.Z is None else GramOperator(self.kernel, self.Z, self.X)
+        if self.Z is None:
+            return self
+        return GramOperator(self.kernel, self.Z, self.X, self.Z_rows, self.X_rows)
 
     def in_structure(self) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct(self.columns.shape, self.X.dtype)
@@ -99,8 +113,29 @@ def product(
     X: Float[Array, "N n"],
     Z: Float[Array, "M n"],
     A: Float[Array, "M n"],
+    X_rows: Rows | None = None,
+    Z_rows: Rows | None = None,
 ) -> Float[Array, "N n"]:
-    """Σⱼ K(xᵢ, zⱼ) aⱼ for all i, tile by tile."""
+    """Σⱼ K(xᵢ, zⱼ) aⱼ for all i, tile by tile, on the devices where the rows are."""
+    return sum_of_columns(_product, K, X, Z, A, X_rows, Z_rows)
+
+
+def compiled_product(
+    K: AbstractMatrixKernel,
+    X: Float[Array, "N n"],
+    Z: Float[Array, "M n"],
+    A: Float[Array, "M n"],
+) -> Float[Array, "N n"]:
+    """`product` for arrays that know where they are."""
+    X_rows, Z_rows = rows_of(X), rows_of(Z)
+    X, Z, A = split(X_rows, X), split(Z_rows, Z), split(Z_rows, A)
+    return as_given(X_rows, _compiled_product(K, X, Z, A, X_rows, Z_rows))
+
+
+_compiled_product = eqx.filter_jit(product)
+
+
+def _product(K, X, Z, A):
     X, Z = centred(K, X, Z)
     rows = tiles(X, X[:1], ROWS)
     columns = (tiles(Z, Z[:1], COLUMNS), tiles(A.astype(X.dtype), jnp.zeros_like(A[:1]), COLUMNS))
@@ -117,9 +152,6 @@ def product(
         return jax.lax.scan(add, jnp.zeros_like(x), columns)[0]
 
     return jax.lax.map(row, rows).reshape(-1, X.shape[1])[: len(X)]
-
-
-compiled_product = eqx.filter_jit(product)
 
 
 def tiles(

@@ -1,0 +1,151 @@
+"""Data whose rows lie on many devices, of one machine or of many.
+
+`jax.sharding` says where the rows are, and they stay there: each device runs the loops over its own
+rows, and what leaves it are sums. Only a product of all points with all points needs the rows of
+the others, which then travel around the ring of devices, one part at a time.
+
+The compiler would shard these loops by itself, but a loop over tiles of the rows makes it gather
+all rows on every device first. Hence `jax.shard_map` around the loops, and the compiler for the
+rest.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Float
+
+
+@dataclasses.dataclass(frozen=True)
+class Rows:
+    """The axes of a mesh of devices over which the rows of an array are spread."""
+
+    mesh: Mesh
+    axes: tuple[str, ...]
+    given: NamedSharding = dataclasses.field(compare=False)
+
+    @property
+    def count(self) -> int:
+        """The number of parts."""
+        return math.prod(self.mesh.shape[axis] for axis in self.axes)
+
+    @property
+    def spec(self) -> PartitionSpec:
+        return PartitionSpec(self.axes)
+
+    def whole(self, array: Array) -> Array:
+        """`array` with all rows on every device."""
+        return jax.device_put(array, NamedSharding(self.mesh, PartitionSpec()))
+
+    def sum(self, tree: Any) -> Any:
+        """The sum over the devices, inside of `on_each`."""
+        return jax.lax.psum(tree, self.axes)
+
+
+def rows_of(array: Array) -> Rows | None:
+    """How the rows of `array` are spread over devices; None if they are not, or under tracing.
+
+    A traced array does not say where it lies, so inside `jax.jit` the compiler shards the loops:
+    the results are right, but every device holds all rows.
+    """
+    sharding = None if isinstance(array, Tracer) else getattr(array, "sharding", None)
+    if not (isinstance(sharding, NamedSharding) and sharding.spec):
+        return None
+    first = sharding.spec[0]
+    axes = first if isinstance(first, tuple) else () if first is None else (first,)
+    mesh = sharding.mesh
+    if not isinstance(mesh, Mesh):  # an abstract one has no devices
+        return None
+    types = (AxisType.Auto,) * len(mesh.axis_names)
+    rows = Rows(Mesh(np.asarray(mesh.devices), mesh.axis_names, axis_types=types), axes, sharding)
+    return rows if rows.count > 1 else None
+
+
+def split(rows: Rows | None, array: Array) -> Array:
+    """`array` spread as `rows` says, on automatic axes, which leave the rest to the compiler."""
+    if rows is None:
+        return array
+    return jax.device_put(array, NamedSharding(rows.mesh, rows.spec))
+
+
+def as_given(rows: Rows | None, array: Array) -> Array:
+    """`array`, of one row for each given row, on the mesh that was given."""
+    if rows is None or isinstance(array, Tracer) or rows.given.mesh == rows.mesh:
+        return array
+    return jax.device_put(array, rows.given)
+
+
+def on_each(
+    rows: Rows, function: Callable[..., Any], whole: Any, *parts: Array, joined: bool
+) -> Any:
+    """`function(whole, *parts)` on each device, with its own rows of the parts.
+
+    Args:
+        rows: how the parts are spread.
+        function: its result has rows of its own, or is made the same on all devices by `rows.sum`.
+        whole: a PyTree, the same on all devices.
+        parts: arrays with rows.
+        joined: whether the results are rows to be put one after the other.
+    """
+    arrays, static = eqx.partition(whole, eqx.is_array)
+    # Untracked: a user's kernel may contain anything, and tracking asks every loop to say whether
+    # its start differs between devices. Derivatives are right either way.
+    mapped = jax.shard_map(
+        lambda arrays, *parts: function(eqx.combine(arrays, static), *parts),
+        mesh=rows.mesh,
+        in_specs=(PartitionSpec(), *(rows.spec for _ in parts)),
+        out_specs=rows.spec if joined else PartitionSpec(),
+        check_vma=False,
+    )
+    return mapped(arrays, *parts)
+
+
+def sum_of_columns(
+    product: Callable[..., Float[Array, "N n"]],
+    K: Any,
+    X: Float[Array, "N n"],
+    Z: Float[Array, "M n"],
+    A: Float[Array, "M n"],
+    X_rows: Rows | None,
+    Z_rows: Rows | None,
+) -> Float[Array, "N n"]:
+    """`product(K, X, Z, A)`, a sum over Z and A, where the rows of X, Z or both are spread.
+
+    Raises:
+        ValueError: X and Z are spread differently.
+    """
+    if X_rows is None and Z_rows is None:
+        return product(K, X, Z, A)
+    if Z_rows is None:
+        assert X_rows is not None
+        return on_each(X_rows, lambda w, x: product(w[0], x, *w[1:]), (K, Z, A), X, joined=True)
+    if X_rows is None:
+
+        def part(whole, z, a):
+            return Z_rows.sum(product(*whole, z, a))
+
+        return on_each(Z_rows, part, (K, X), Z, A, joined=False)
+    if (X_rows.mesh, X_rows.axes) != (Z_rows.mesh, Z_rows.axes):
+        raise ValueError(
+            f"X and Z are spread over devices differently: {X_rows.given} and {Z_rows.given}. "
+            "Put both on one mesh and the same axes, or one of them on every device."
+        )
+    ring = [(i, (i + 1) % X_rows.count) for i in range(X_rows.count)]
+
+    def around(K, x, z, a):
+        def step(carry, _):
+            total, columns = carry
+            total = total + product(K, x, *columns)
+            return (total, jax.lax.ppermute(columns, X_rows.axes, ring)), None
+
+        start = jnp.zeros_like(x), (z, a)
+        return jax.lax.scan(step, start, length=X_rows.count)[0][0]
+
+    return on_each(X_rows, around, K, X, Z, A, joined=True)
