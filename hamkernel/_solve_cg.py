@@ -19,10 +19,12 @@ import lineax as lx
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
+from hamkernel._devices import as_given, rows_of, split
 from hamkernel._field import KernelField, SolverInfo
 from hamkernel._gram_operator import product
 from hamkernel._solve import AbstractSolver
-from hamkernel._solve_nystrom import Nystrom, factor, normal_sums, whitening
+from hamkernel._solve_low_rank import factor, normal_sums, truncated, whitening
+from hamkernel._solve_nystrom import Nystrom
 from hamkernel._structured import AbstractMatrixKernel
 
 
@@ -75,8 +77,10 @@ class ConjugateGradient(AbstractSolver):
     ) -> KernelField:
         landmarks = self.preconditioner.landmarks(K, X, regularization)
         ridge = len(X) * regularization
+        spread = rows_of(X)
+        X, Y = split(spread, X), split(spread, Y)
         C, iterations, values, left, truncation = _solve(
-            K, X, Y, ridge, landmarks, self.tolerance, self.max_iterations
+            K, X, Y, ridge, landmarks, self.tolerance, self.max_iterations, spread
         )
 
         def message() -> str:
@@ -105,7 +109,7 @@ class ConjugateGradient(AbstractSolver):
             kernel=K,
             points=X,
             coefficients=C / ridge,
-            residual=Y - values,
+            residual=as_given(spread, Y - values),
             norm=jnp.sqrt(jnp.maximum(square, jnp.zeros_like(square))),  # ‖f‖² = aᵀGa
             regularization=regularization,
             offset=jnp.zeros((), X.dtype),
@@ -121,21 +125,21 @@ class ConjugateGradient(AbstractSolver):
 
 
 @eqx.filter_jit
-def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations):
+def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
     S = landmarks.points
     # The preconditioner changes how fast the answer is found, not the answer.
     K_, X_, S_, ridge_ = jax.lax.stop_gradient((K, X, S, ridge))
     T = whitening(K_, landmarks)
-    total = normal_sums(K_, S_, T, X_, jnp.zeros_like(X_))
+    total = normal_sums(K_, S_, T, X_, jnp.zeros_like(X_), spread)
     R = factor(total.square, ridge_)
 
     def preconditioned(c):
-        moment = T.T @ product(K_, S_, X_, c).reshape(-1)
+        moment = T.T @ product(K_, S_, X_, c, None, spread).reshape(-1)
         w = jax.scipy.linalg.cho_solve((R, True), moment)
-        return c - product(K_, X_, S_, (T @ w).reshape(S.shape))
+        return c - product(K_, X_, S_, (T @ w).reshape(S.shape), spread)
 
     def gram(c):
-        return product(K, X, X, c)
+        return product(K, X, X, c, spread, spread)
 
     structure = jax.ShapeDtypeStruct(X.shape, X.dtype)
     positive = lx.positive_semidefinite_tag
@@ -156,5 +160,5 @@ def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations):
     C = solution.value
     values = gram(C) / ridge  # f(X)
     left = jnp.linalg.norm(Y - C - values) / scale
-    truncation = jnp.maximum(total.trace - jnp.trace(total.square), 0 * ridge_) / ridge_
+    truncation = truncated(total.trace, jnp.trace(total.square), ridge_)
     return C, solution.stats["num_steps"], values, left, truncation

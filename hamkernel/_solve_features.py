@@ -1,7 +1,6 @@
 """Least squares in random Fourier features: any number of points, in memory that ignores it."""
 
 import operator
-from collections.abc import Iterable
 from typing import Any
 
 import equinox as eqx
@@ -10,10 +9,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
 from hamkernel import _require as require
+from hamkernel._devices import as_given, on_each, rows_of, split
 from hamkernel._features import AbstractFeatures, SumFeatures, features
 from hamkernel._field import AbstractField
 from hamkernel._gram import matrix_kernel
-from hamkernel._solve import AbstractSolver
+from hamkernel._solve_streaming import AbstractStreamingFit, AbstractStreamingSolver
 from hamkernel._streaming import LeastSquares, accumulate_data, ridge_regression, solve
 from hamkernel._structured import AbstractMatrixKernel, Sum
 
@@ -66,7 +66,8 @@ class FeatureField(AbstractField):
         X = require.points(X, "X").astype(self.weights.dtype)
         if X.shape[1] != self.dimension:
             raise ValueError(f"X has {X.shape[1]} coordinates and the field {self.dimension}.")
-        return _evaluate(self, X)
+        spread = rows_of(X)
+        return as_given(spread, _evaluate(self, split(spread, X), spread))
 
     def unanchored_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         x = self._state(x)
@@ -99,11 +100,13 @@ class FeatureField(AbstractField):
 
 
 @eqx.filter_jit
-def _evaluate(field, X):
+def _evaluate(field, X, spread):
+    if spread is not None:
+        return on_each(spread, lambda field, X: _evaluate(field, X, None), field, X, joined=True)
     return jax.lax.map(lambda x: field(x), X, batch_size=_BATCH)
 
 
-class RandomFeatures(AbstractSolver):
+class RandomFeatures(AbstractStreamingSolver[FeatureField]):
     """Ridge regression in random Fourier features: O(N n r²) time, O(r²) memory beside the data.
 
     Solves for the weights of r features by QR, tile by tile, never through the normal equations.
@@ -152,65 +155,43 @@ class RandomFeatures(AbstractSolver):
         Y: Float[Array, "N n"],
         regularization: Float[Array, ""],
     ) -> FeatureField:
-        return _fit(K, self, X, Y, regularization)
+        spread = rows_of(X)
+        field = _fit(K, self, split(spread, X), split(spread, Y), regularization, spread)
+        if spread is None:
+            return field
+        residual = as_given(spread, field.residual)
+        return eqx.tree_at(lambda f: f.residual, field, residual)
 
-    def start(self, K: AbstractMatrixKernel, n: int, dtype: Any = float) -> "FeatureFit":
+    def start(
+        self, K: AbstractMatrixKernel, sample: ArrayLike, regularization: ArrayLike = 1e-4
+    ) -> "FeatureFit":
         """A fit without data yet, to which chunks are added: see `FeatureFit`.
 
         Args:
             K: a matrix-valued kernel.
-            n: the number of coordinates of a state.
-            dtype: float32 or float64; the default float if not given.
+            sample: some states, shape (N, n). Only n and the dtype matter to these features.
+            regularization: not used; for the solvers that choose by it.
 
         Raises:
             TypeError: a kernel without a known spectral density. ValueError: n is not allowed by
                 the structure.
         """
         K = matrix_kernel(K)
+        sample = require.points(sample, "sample")
+        n, dtype = sample.shape[1], sample.dtype
         K.check_dimension(n)
-        basis = features(K, n, self.count, self.key, jnp.zeros((), dtype).dtype)
-        state = LeastSquares.empty(basis.columns, jnp.zeros((), dtype).dtype)
-        return FeatureFit(K, basis, state, jnp.zeros((), int), n)
-
-    def fit_chunks(
-        self,
-        K: AbstractMatrixKernel,
-        chunks: Iterable[tuple[ArrayLike, ArrayLike]],
-        regularization: ArrayLike = 1e-4,
-        progress: bool = False,
-    ) -> FeatureField:
-        """`hk.fit` to data that comes in chunks, in one pass and with memory for one chunk.
-
-        The field is that of one fit to all the data, to rounding. To add data later keep the
-        `FeatureFit` of `start` instead.
-
-        Args:
-            K: a matrix-valued kernel.
-            chunks: pairs (X, Y) of states and velocities, shape (Nᵢ, n) each: a generator, or
-                slices of memory-mapped files. Every new Nᵢ compiles anew: equal ones are fast.
-            regularization: λ > 0, as in `hk.fit`, with N the number of all points.
-            progress: show a progress bar where the standard error is a terminal.
-
-        Raises:
-            ValueError: there is no chunk, or as `hk.fit` for one of them. TypeError: as `hk.fit`.
-        """
-        from tqdm import tqdm  # so that importing the package does not load it
-
-        model = None
-        for X, Y in tqdm(chunks, "chunks", disable=None if progress else True):
-            X, Y = require.data(X, Y)
-            model = self.start(K, X.shape[1], X.dtype) if model is None else model
-            model = model.add(X, Y)
-        if model is None:
-            raise ValueError("fit_chunks needs at least one chunk (X, Y); the iterator was empty.")
-        return model.field(regularization)
+        basis = features(K, n, self.count, self.key, dtype)
+        state = LeastSquares.empty(basis.columns, dtype)
+        return FeatureFit(
+            kernel=K, features=basis, state=state, count=jnp.zeros((), int), dimension=n
+        )
 
 
 @eqx.filter_jit
-def _fit(K, solver, X, Y, regularization):
+def _fit(K, solver, X, Y, regularization, spread):
     basis = features(K, X.shape[1], solver.count, solver.key, X.dtype)
     ridge = len(X) * regularization
-    weights, residual, _ = ridge_regression(basis, basis.columns, X, Y, ridge)
+    weights, residual, _ = ridge_regression(basis, basis.columns, X, Y, ridge, spread)
     return _field(K, basis, weights, residual, jnp.linalg.norm(residual), regularization)
 
 
@@ -227,12 +208,12 @@ def _field(K, basis, weights, residual, residual_norm, regularization):
     )
 
 
-class FeatureFit(eqx.Module):
+class FeatureFit(AbstractStreamingFit[FeatureField]):
     """A fit in random features to the data added so far, made by `RandomFeatures.start`.
 
     It has a fixed size, (r + 1)² numbers. `add` returns a new one, and `field` solves for any λ:
 
-        model = hk.RandomFeatures(500, key).start(K, n=2).add(X, Y)
+        model = hk.RandomFeatures(500, key).start(K, X).add(X, Y)
         field = model.field(1e-4)
         better = model.add(X_new, Y_new).field(1e-4)
 
@@ -250,45 +231,17 @@ class FeatureFit(eqx.Module):
     count: Int[Array, ""]
     dimension: int = eqx.field(static=True)
 
-    def add(self, X: ArrayLike, Y: ArrayLike) -> "FeatureFit":
-        """The fit with more data.
+    def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "FeatureFit":
+        spread = rows_of(X)
+        X, Y = split(spread, X), split(spread, Y)
+        state = _accumulated(self.state, self.features, X, Y, spread)
+        return eqx.tree_at(lambda f: (f.state, f.count), self, (state, self.count + len(X)))
 
-        Args:
-            X: states, shape (N, n).
-            Y: measured velocities, shape (N, n).
-
-        Raises:
-            ValueError: a shape does not fit, or the data is not finite. TypeError: its dtype.
-        """
-        X, Y = require.data(X, Y)
-        if X.shape[1] != self.dimension:
-            raise ValueError(
-                f"the chunk has {X.shape[1]} coordinates and the fit {self.dimension}."
-            )
-        dtype = self.state.factor.dtype
-        return _added(self, X.astype(dtype), Y.astype(dtype))
-
-    def field(self, regularization: ArrayLike = 1e-4) -> FeatureField:
-        """The field learned from all data added so far; O(r³), and no pass over the data.
-
-        Args:
-            regularization: λ > 0, as in `hk.fit`.
-
-        Raises:
-            ValueError: λ is not positive, or no data was added.
-        """
-        dtype = self.state.factor.dtype
-        regularization = require.positive_scalar(regularization, "regularization").astype(dtype)
-        count = require.value(
-            self.count, self.count == 0, "no data yet: add(X, Y) before asking for the field."
-        )
+    def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
         return _solved(self, count, regularization)
 
 
-@eqx.filter_jit
-def _added(fit, X, Y):
-    state = accumulate_data(fit.state, fit.features, X, Y)
-    return eqx.tree_at(lambda f: (f.state, f.count), fit, (state, fit.count + len(X)))
+_accumulated = eqx.filter_jit(accumulate_data)
 
 
 @eqx.filter_jit

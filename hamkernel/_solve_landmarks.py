@@ -11,9 +11,11 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hamkernel import _require as require
+from hamkernel._devices import rows_of, split
 from hamkernel._gram import assemble
 from hamkernel._structured import AbstractMatrixKernel
 
@@ -64,8 +66,12 @@ def choose_landmarks(
     """
     K, X, left = jax.lax.stop_gradient((K, X, left))
     first, key = jax.random.split(key)
+    rows = rows_of(X)
+    X = split(rows, X)
     if len(X) > candidates:
-        X = X[jax.random.choice(first, len(X), (candidates,), replace=False)]
+        X = X[_spread(first, len(X), candidates)]
+    if rows is not None:
+        X = rows.whole(X)
     most = min(most, len(X))
     if not require.is_concrete(K, X, left, key):
         drawn = _draw(K, X, left, _empty(K, X, most, key), most)
@@ -78,6 +84,33 @@ def choose_landmarks(
     # A multiple of the block, so that similar fits share their compiled code.
     blocks = max(1, -(-int(drawn.count) // BLOCK))
     return _landmarks(X, drawn, min(size, blocks * BLOCK))
+
+
+def _spread(key, N: int, count: int) -> Int[Array, " count"]:
+    """A random index out of each of `count` equal parts of N, in O(count) memory."""
+    ends = np.arange(count + 1) * N // count
+    index: Int[Array, " count"] = jax.random.randint(key, (count,), ends[:-1], ends[1:])
+    return index
+
+
+@eqx.filter_jit
+def given_landmarks(K: AbstractMatrixKernel, S: Float[Array, "m n"]) -> Landmarks:
+    """All of S, with those columns that are independent of the columns before them.
+
+    O((m n)³) time. Nothing is differentiated, as in `choose_landmarks`.
+    """
+    K, S = jax.lax.stop_gradient((K, S))
+    rounding = _rounding(jax.vmap(lambda x: jnp.trace(K(x, x)))(S), S.size)
+    block = assemble(K, S, S).reshape(S.size, S.size)
+    _, kept = _factor(block, jnp.broadcast_to(rounding, len(S)), S.shape[1], rounding)
+    kept = kept.reshape(S.shape)
+    return Landmarks(points=S, kept=kept, count=kept.any(axis=1).sum())
+
+
+def _rounding(traces: Float[Array, " P"], columns: int) -> Float[Array, ""]:
+    """What is left of a pivot that should be zero."""
+    eps = jnp.finfo(traces.dtype).eps
+    return (10 * columns * eps * jnp.abs(traces).max()).astype(traces.dtype)
 
 
 class _Drawn(NamedTuple):
@@ -98,7 +131,6 @@ def _empty(K, X, size, key):
     P, n = X.shape
     size = size + BLOCK
     left = jax.vmap(lambda x: jnp.trace(K(x, x)))(X)
-    rounding = 10 * size * n * jnp.finfo(X.dtype).eps * jnp.abs(left).max()
     zero = jnp.zeros((), int)
     return _Drawn(
         count=zero,
@@ -106,7 +138,7 @@ def _empty(K, X, size, key):
         kept=jnp.zeros((size, n), bool),
         factor=jnp.zeros((size, n, P, n), X.dtype),
         left=left,
-        rounding=rounding.astype(X.dtype),
+        rounding=_rounding(left, size * n),
         key=key,
         rounds=zero,
     )
@@ -178,6 +210,11 @@ def _accepted(key, block, n, rounding):
     """
     before = jnp.diagonal(block).reshape(-1, n).sum(axis=1)
     thresholds = jnp.maximum(jax.random.uniform(key, before.shape, block.dtype) * before, rounding)
+    return _factor(block, thresholds, n, rounding)
+
+
+def _factor(block, thresholds, n, rounding):
+    """Cholesky of the points whose trace exceeds its threshold when their turn comes."""
 
     def column(c, carry):
         block, L, kept, chosen = carry

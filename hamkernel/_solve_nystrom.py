@@ -6,7 +6,8 @@ by tile and only the sums FᵀF and Fᵀy stay.
 
 The matrix FᵀF + NλI has the condition of G + NλI, not its square: these are no normal equations in
 α, which would lose twice the digits. What the sums round off is given back by one step of
-refinement with the residual of the data (Björck's corrected seminormal equations).
+refinement with the residual of the data (Björck's corrected seminormal equations). A stream is
+seen once, so there the rows of F go into a triangular factor instead (`_streaming.py`).
 """
 
 import math
@@ -16,21 +17,28 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 from hamkernel import _require as require
+from hamkernel._devices import as_given, rows_of, split
 from hamkernel._field import KernelField, SolverInfo
-from hamkernel._gram import assemble
-from hamkernel._gram_operator import product, tiles
-from hamkernel._solve import AbstractSolver
-from hamkernel._solve_landmarks import Landmarks, choose_landmarks, masked
+from hamkernel._gram import matrix_kernel
+from hamkernel._gram_operator import product
+from hamkernel._solve_landmarks import Landmarks, choose_landmarks, given_landmarks
+from hamkernel._solve_low_rank import (
+    LandmarkRows,
+    factor,
+    normal_sums,
+    singular,
+    truncated,
+    whitening,
+)
+from hamkernel._solve_streaming import AbstractStreamingFit, AbstractStreamingSolver
+from hamkernel._streaming import LeastSquares, accumulate_data, solve
 from hamkernel._structured import AbstractMatrixKernel
 
-# Numbers in the tile of the Gram that is held at once; see `_gram_operator`.
-TILE = 2**20
 
-
-class Nystrom(AbstractSolver):
+class Nystrom(AbstractStreamingSolver[KernelField]):
     """A low-rank fit: the field lives on a few landmarks, chosen from the data.
 
     Landmarks are drawn by randomly pivoted Cholesky until trace(G − Ĝ) ≤ tolerance · Nλ. Then the
@@ -47,12 +55,14 @@ class Nystrom(AbstractSolver):
         max_points: the largest number of landmarks m; memory 16 (m n)² bytes in float64.
         candidates: landmarks are chosen from the data, or from a random part of this size.
         key: for the draws; `jax.random.key(0)` if None, so that a fit can be repeated.
+        points: the landmarks, shape (m, n), if they are not to be chosen; columns of theirs that
+            depend on others are left out. `max_points`, `candidates` and `key` have no effect.
 
     Raises:
-        ValueError: an argument is not positive.
+        ValueError: an argument is not positive, or `points` is not of shape (m, n).
 
     Warns:
-        UserWarning: `max_points` landmarks do not reach the tolerance.
+        UserWarning: the landmarks do not reach the tolerance.
 
     Source: Chen, Epperly, Tropp & Webber (2023), arXiv 2207.06503; Björck (1987) for the solve.
     """
@@ -61,6 +71,7 @@ class Nystrom(AbstractSolver):
     max_points: int = eqx.field(static=True)
     candidates: int = eqx.field(static=True)
     key: PRNGKeyArray | None
+    points: Float[Array, "m n"] | None
 
     def __init__(
         self,
@@ -68,6 +79,7 @@ class Nystrom(AbstractSolver):
         max_points: int = 512,
         candidates: int = 4096,
         key: PRNGKeyArray | None = None,
+        points: ArrayLike | None = None,
     ):
         if not (tolerance > 0 and math.isfinite(tolerance)):
             raise ValueError(f"tolerance must be positive and finite, got {tolerance}.")
@@ -79,11 +91,18 @@ class Nystrom(AbstractSolver):
         self.max_points = max_points
         self.candidates = candidates
         self.key = key
+        self.points = None if points is None else require.points(points, "points")
 
     def landmarks(
         self, K: AbstractMatrixKernel, X: Float[Array, "N n"], regularization: Float[Array, ""]
     ) -> Landmarks:
-        """The points that reach the tolerance, or `max_points` of them."""
+        """The points given, or those that reach the tolerance, or `max_points` of them."""
+        if self.points is not None:
+            if self.points.shape[1] != X.shape[1]:
+                raise ValueError(
+                    f"the landmarks have {self.points.shape[1]} coordinates and X {X.shape[1]}."
+                )
+            return given_landmarks(K, self.points.astype(X.dtype))
         key = jax.random.key(0) if self.key is None else self.key
         left = self.tolerance * regularization
         return choose_landmarks(K, X, left, self.max_points, self.candidates, key)
@@ -96,118 +115,175 @@ class Nystrom(AbstractSolver):
         regularization: Float[Array, ""],
     ) -> KernelField:
         landmarks = self.landmarks(K, X, regularization)
-        A, residual, norm, truncation = _fit(K, X, Y, regularization, landmarks)
-        failed = ~jnp.isfinite(A).all() | (landmarks.count == 0)
-        A = require.value(A, failed, singular(X.dtype), RuntimeError)
-        self._warn_if_truncated(truncation, landmarks)
-        return KernelField(
-            kernel=K,
-            points=landmarks.points,
-            coefficients=A,
-            residual=residual,
-            norm=norm,
-            regularization=regularization,
-            offset=jnp.zeros((), X.dtype),
-            info=SolverInfo(
-                "Nystrom",
-                landmarks=landmarks.count,
-                rank=landmarks.kept.sum(),
-                truncation=truncation,
-            ),
-        )
+        spread = rows_of(X)
+        X, Y = split(spread, X), split(spread, Y)
+        solution = _fit(K, X, Y, regularization, landmarks, spread)
+        solution = solution._replace(residual=as_given(spread, solution.residual))
+        return _field(K, landmarks, solution, regularization, self.tolerance)
 
-    def _warn_if_truncated(self, truncation, landmarks):
-        if not require.is_concrete(truncation, landmarks):
-            return
-        # Twice: a random part of the data need not show all that the rest has.
-        if truncation > 2 * self.tolerance and int(landmarks.count) >= self.max_points:
-            warnings.warn(
-                f"{self.max_points} landmarks leave trace(G - Ĝ)/(N λ) = {float(truncation):.2g}, "
-                f"more than the tolerance {self.tolerance:.2g}. The field is the best one on these "
-                "landmarks, but may be far from the exact fit. Raise max_points, the tolerance or "
-                "the regularization; for a rough kernel or many dimensions take "
-                "hk.ConjugateGradient(), which is exact.",
-                stacklevel=4,
-            )
+    def start(
+        self, K: AbstractMatrixKernel, sample: ArrayLike, regularization: ArrayLike = 1e-4
+    ) -> "LandmarkFit":
+        """A fit without data yet, to which chunks are added: see `LandmarkFit`.
 
+        Args:
+            K: a matrix-valued kernel.
+            sample: states that look like all of the data, shape (N, n), from which the landmarks
+                are chosen now; later data does not move them. They are not added to the fit. The
+                first chunk does where chunks are alike; one trajectory out of many does not.
+            regularization: the smallest λ that will be asked for, since the tolerance is relative
+                to it.
 
-class Normal(NamedTuple):
-    """The sums over the data that the fit needs; sums of parts of the data add up."""
-
-    square: Float[Array, "r r"]  # FᵀF
-    moment: Float[Array, " r"]  # Fᵀy
-    trace: Float[Array, ""]  # trace G
-
-
-def whitening(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r r"]:
-    """T = L⁻ᵀ with L Lᵀ = G_SS on the kept columns, zero on the others."""
-    S, kept = landmarks.points, landmarks.kept.reshape(-1)
-    L = jnp.linalg.cholesky(masked(assemble(K, S, S).reshape(S.size, S.size), kept))
-    T = jax.scipy.linalg.solve_triangular(L, jnp.eye(S.size, dtype=S.dtype), lower=True).T
-    both = kept[:, None] & kept[None, :]
-    return jnp.where(both, T, jnp.zeros_like(T))
-
-
-def normal_sums(
-    K: AbstractMatrixKernel,
-    S: Float[Array, "m n"],
-    T: Float[Array, "r r"],
-    X: Float[Array, "N n"],
-    Y: Float[Array, "N n"],
-) -> Normal:
-    """The sums over all of X and Y, tile by tile."""
-    N, n = X.shape
-    rows = max(16, TILE // (S.size * n))
-    there = jnp.ones((N, 1), X.dtype)
-    none = jnp.zeros((1, n), X.dtype)
-    parts = (tiles(X, X[:1], rows), tiles(Y, none, rows), tiles(there, none[:, :1], rows))
-
-    @jax.checkpoint
-    def sums(x, y, weight):
-        F = (assemble(K, x, S) * weight[:, :, None, None]).reshape(x.size, S.size) @ T
-        trace = jax.vmap(lambda x: jnp.trace(K(x, x)))(x) @ weight[:, 0]
-        return Normal(F.T @ F, F.T @ y.reshape(-1), trace)
-
-    def add(total, part):
-        return jax.tree.map(jnp.add, total, sums(*part)), None
-
-    zero = Normal(jnp.zeros_like(T), jnp.zeros_like(T[0]), jnp.zeros((), T.dtype))
-    return jax.lax.scan(add, zero, parts)[0]
-
-
-def factor(square: Float[Array, "r r"], ridge: Float[Array, ""]) -> Float[Array, "r r"]:
-    """The lower Cholesky factor of FᵀF + ridge I; NaN where the ridge is below rounding."""
-    diagonal = jnp.arange(len(square))
-    return jnp.linalg.cholesky(square.at[diagonal, diagonal].add(ridge))
+        Raises:
+            ValueError: a shape does not fit, or λ is not positive. TypeError: K is not
+                matrix-valued.
+        """
+        K = matrix_kernel(K)
+        sample = require.points(sample, "sample")
+        sample = require.finite(sample, "sample")
+        K.check_dimension(sample.shape[1])
+        regularization = require.positive_scalar(regularization, "regularization")
+        landmarks = self.landmarks(K, sample, regularization.astype(sample.dtype))
+        return _start(K, landmarks, self.tolerance)
 
 
 @eqx.filter_jit
-def _fit(K, X, Y, regularization, landmarks):
+def _fit(K, X, Y, regularization, landmarks, spread):
     S, ridge = landmarks.points, len(X) * regularization
     T = whitening(K, landmarks)
-    total = normal_sums(K, S, T, X, Y)
+    total = normal_sums(K, S, T, X, Y, spread)
     R = factor(total.square, ridge)
 
     def step(w, residual):
         """One step of refinement, from w and y − F w."""
-        slope = T.T @ product(K, S, X, residual).reshape(-1) - ridge * w
+        slope = T.T @ product(K, S, X, residual, None, spread).reshape(-1) - ridge * w
         correction = jax.scipy.linalg.cho_solve((R, True), slope)
-        change = product(K, X, S, (T @ correction).reshape(S.shape))
+        change = product(K, X, S, (T @ correction).reshape(S.shape), spread)
         return w + correction, residual - change
 
     w = jax.scipy.linalg.cho_solve((R, True), total.moment)
     A = (T @ w).reshape(S.shape)
-    w, residual = step(w, Y - product(K, X, S, A))
-    truncation = jnp.maximum(total.trace - jnp.trace(total.square), 0 * ridge) / ridge
+    w, residual = step(w, Y - product(K, X, S, A, spread))
+    truncation = truncated(total.trace, jnp.trace(total.square), ridge)
     # ‖f‖² = αᵀ G_SS α = ‖w‖²
-    return (T @ w).reshape(S.shape), residual, jnp.linalg.norm(w), truncation
+    return _Solution((T @ w).reshape(S.shape), residual, jnp.linalg.norm(w), truncation)
 
 
-def singular(dtype: jnp.dtype) -> str:
-    """What to do when the factorisation of the low-rank system fails."""
-    return (
-        f"the low-rank system plus the ridge N * regularization is not positive definite to "
-        f"rounding in {dtype}. Likely causes, in order: the regularization is too small: raise "
-        "it; float32 where float64 is needed: jax.config.update('jax_enable_x64', True); a kernel "
-        "that is not positive definite or not finite: hk.check_kernel(k, X) tells."
+class _Solution(NamedTuple):
+    coefficients: Float[Array, "m n"]
+    residual: Float[Array, "N n"]
+    norm: Float[Array, ""]
+    truncation: Float[Array, ""]
+
+
+def _field(K, landmarks, solution, regularization, tolerance) -> KernelField:
+    A, dtype = solution.coefficients, landmarks.points.dtype
+    failed = ~jnp.isfinite(A).all() | (landmarks.count == 0)
+    A = require.value(A, failed, singular(dtype), RuntimeError)
+    _warn_if_truncated(solution.truncation, landmarks.count, tolerance)
+    return KernelField(
+        kernel=K,
+        points=landmarks.points,
+        coefficients=A,
+        residual=solution.residual,
+        norm=solution.norm,
+        regularization=regularization,
+        offset=jnp.zeros((), dtype),
+        info=SolverInfo(
+            "Nystrom",
+            landmarks=landmarks.count,
+            rank=landmarks.kept.sum(),
+            truncation=solution.truncation,
+        ),
     )
+
+
+def _warn_if_truncated(truncation, count, tolerance):
+    if not require.is_concrete(truncation, count):
+        return
+    # Twice: a random part of the data need not show all that the rest has.
+    if truncation > 2 * tolerance:
+        warnings.warn(
+            f"{int(count)} landmarks leave trace(G - Ĝ)/(N λ) = {float(truncation):.2g}, more than "
+            f"the tolerance {tolerance:.2g}. The field is the best one on these landmarks, but may "
+            "be far from the exact fit. Raise max_points, the tolerance or the regularization; let "
+            "landmarks be chosen from a sample that looks like all of the data (candidates, or "
+            "the sample of a stream); for a rough kernel or many dimensions take "
+            "hk.ConjugateGradient(), which is exact.",
+            stacklevel=5,
+        )
+
+
+class LandmarkFit(AbstractStreamingFit[KernelField]):
+    """A fit on landmarks to the data added so far, made by `Nystrom.start`.
+
+    It has a fixed size, (r + 1)² numbers. `add` returns a new one, and `field` solves for any λ:
+
+        model = hk.Nystrom().start(K, X, 1e-4).add(X, Y)
+        field = model.field(1e-4)
+        better = model.add(X_new, Y_new).field(1e-4)
+
+    `field.info.truncation` is that of all the data added: it shows whether the landmarks still do.
+
+    Attributes:
+        kernel: K.
+        landmarks: the points that carry the field.
+        whitening: T = L⁻ᵀ, which makes their kernels orthonormal.
+        state: the triangular factor of all rows.
+        trace: the trace of the Gram of the points added, shape ().
+        count: N, the number of points added, shape ().
+        tolerance: of the solver, for its warning.
+    """
+
+    kernel: AbstractMatrixKernel
+    landmarks: Landmarks
+    whitening: Float[Array, "r r"]
+    state: LeastSquares
+    trace: Float[Array, ""]
+    count: Int[Array, ""]
+    dimension: int = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True)
+
+    def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "LandmarkFit":
+        spread = rows_of(X)
+        return _added(self, split(spread, X), split(spread, Y), spread)
+
+    def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
+        solution = _solved(self, count, regularization)
+        return _field(self.kernel, self.landmarks, solution, regularization, self.tolerance)
+
+
+@eqx.filter_jit
+def _start(K, landmarks, tolerance):
+    S = landmarks.points
+    return LandmarkFit(
+        kernel=K,
+        landmarks=landmarks,
+        whitening=whitening(K, landmarks),
+        state=LeastSquares.empty(S.size, S.dtype),
+        trace=jnp.zeros((), S.dtype),
+        count=jnp.zeros((), int),
+        dimension=S.shape[1],
+        tolerance=tolerance,
+    )
+
+
+@eqx.filter_jit
+def _added(fit, X, Y, spread):
+    rows = LandmarkRows(fit.kernel, fit.landmarks.points, fit.whitening)
+    new = (
+        accumulate_data(fit.state, rows, X, Y, spread),
+        fit.trace + jax.vmap(lambda x: jnp.trace(fit.kernel(x, x)))(X).sum(),
+        fit.count + len(X),
+    )
+    return eqx.tree_at(lambda f: (f.state, f.trace, f.count), fit, new)
+
+
+@eqx.filter_jit
+def _solved(fit, count, regularization):
+    ridge = count.astype(regularization.dtype) * regularization
+    w, _ = solve(fit.state, ridge)
+    A = (fit.whitening @ w).reshape(fit.landmarks.points.shape)
+    unseen = jnp.zeros((0, fit.dimension), A.dtype)
+    covered = jnp.sum(fit.state.factor[:, :-1] ** 2)  # trace Ĝ = ‖F‖², which R has too
+    return _Solution(A, unseen, jnp.linalg.norm(w), truncated(fit.trace, covered, ridge))

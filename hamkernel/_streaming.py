@@ -15,6 +15,8 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
+from hamkernel._devices import Rows, on_each
+
 # A design gives the rows of some points at once: (t, n) -> (t, n, r), row (i, a) of a field's
 # component a at point i.
 Design = Callable[[Float[Array, "t n"]], Float[Array, "t n r"]]
@@ -69,9 +71,21 @@ def _with_ridge(state: LeastSquares, ridge: Float[Array, ""]):
 
 
 def accumulate_data(
-    state: LeastSquares, design: Design, X: Float[Array, "N n"], Y: Float[Array, "N n"]
+    state: LeastSquares,
+    design: Design,
+    X: Float[Array, "N n"],
+    Y: Float[Array, "N n"],
+    spread: Rows | None = None,
 ) -> LeastSquares:
-    """The state after the rows design(X) with targets Y, tile by tile."""
+    """The state after the rows design(X) with targets Y, tile by tile, where the rows are."""
+    if spread is not None:
+
+        def part(whole, X, Y):
+            state, design = whole
+            own = LeastSquares(jnp.zeros_like(state.factor))
+            return _with_all(spread, state, accumulate_data(own, design, X, Y))
+
+        return on_each(spread, part, (state, design), X, Y, joined=False)
 
     def step(state, tile):
         rows = design(tile[0])  # (t, n, r)
@@ -80,12 +94,27 @@ def accumulate_data(
     return _over_tiles(step, state, (X, Y), columns=len(state.factor) - 1)[0]
 
 
+def _with_all(spread: Rows, state: LeastSquares, own: LeastSquares) -> LeastSquares:
+    """The state after the rows of each device, of which it has its `own` factor.
+
+    One factor after the other, so that no device holds more than two, and all get the same.
+    """
+
+    def join(device, factor):
+        is_mine = jax.lax.axis_index(spread.axes) == device
+        theirs = spread.sum(jnp.where(is_mine, own.factor, jnp.zeros_like(factor)))
+        return jnp.linalg.qr(jnp.concatenate([factor, theirs]), mode="r")
+
+    return LeastSquares(jax.lax.fori_loop(0, spread.count, join, state.factor))
+
+
 def ridge_regression(
     design: Design,
     columns: int,
     X: Float[Array, "N n"],
     Y: Float[Array, "N n"],
     ridge: Float[Array, ""],
+    spread: Rows | None = None,
 ) -> tuple[Float[Array, " r"], Float[Array, "N n"], LeastSquares]:
     """The minimiser w of ‖Y − Φw‖² + ridge ‖w‖², the residual Y − Φw, and the state.
 
@@ -98,10 +127,11 @@ def ridge_regression(
         X: points.
         Y: targets.
         ridge: δ ≥ 0; with δ = 0 the columns of Φ must be independent.
+        spread: the devices over which points and targets are spread, if they are.
     """
     fixed, fixed_X, fixed_Y, fixed_ridge = _constant((design, X, Y, ridge))
     state = LeastSquares.empty(columns, X.dtype)
-    state = accumulate_data(state, fixed, fixed_X, fixed_Y)
+    state = accumulate_data(state, fixed, fixed_X, fixed_Y, spread)
     triangle, rotated = _with_ridge(state, fixed_ridge)
     w = _constant(solve_triangular(triangle, rotated))
     triangle, state = _constant(triangle), _constant(state)
@@ -110,20 +140,30 @@ def ridge_regression(
     # H⁻¹Φᵀy for every w, so that its derivatives are exact although w and R are held constant,
     # and no derivative of a QR is needed (it does not exist where R is singular).
     def times_H(v):
-        return ridge * v - _correlations(design, X, jnp.zeros_like(Y), v)
+        return ridge * v - _correlations(design, X, jnp.zeros_like(Y), v, spread)
 
     def times_inverse(_, v):
         return solve_triangular(triangle, solve_triangular(triangle, v, trans="T"))
 
-    slope = _correlations(design, X, Y, w) - ridge * w
+    slope = _correlations(design, X, Y, w, spread) - ridge * w
     w = w + jax.lax.custom_linear_solve(times_H, slope, times_inverse, symmetric=True)
-    return w, residual(design, X, Y, w), state
+    return w, residual(design, X, Y, w, spread), state
 
 
 def residual(
-    design: Design, X: Float[Array, "N n"], Y: Float[Array, "N n"], w: Float[Array, " r"]
+    design: Design,
+    X: Float[Array, "N n"],
+    Y: Float[Array, "N n"],
+    w: Float[Array, " r"],
+    spread: Rows | None = None,
 ) -> Float[Array, "N n"]:
-    """Y − Φw, tile by tile."""
+    """Y − Φw, tile by tile, where the rows are."""
+    if spread is not None:
+
+        def part(whole, X, Y):
+            return residual(whole[0], X, Y, whole[1])
+
+        return on_each(spread, part, (design, w), X, Y, joined=True)
 
     def step(_, tile):
         return None, tile[1] - design(tile[0]) @ w
@@ -131,7 +171,7 @@ def residual(
     return _over_tiles(step, None, (X, Y), columns=len(w))[1]
 
 
-def _correlations(design, X, Y, w) -> Float[Array, " r"]:
+def _correlations(design, X, Y, w, spread) -> Float[Array, " r"]:
     """Φᵀ(Y − Φw)."""
 
     def step(total, tile):

@@ -524,7 +524,7 @@ def test_many_tiles_are_one(key):
 def test_data_and_ridge_may_change_after_the_fit(key):
     X, Y = data(N=60, n=2)
     K, solver = hk.Symplectic(hk.Gaussian(1.3)), RandomFeatures(20, key)
-    model = solver.start(K, n=2).add(X[:40], Y[:40])
+    model = solver.start(K, X).add(X[:40], Y[:40])
     before = model.field(1e-2)
     expected = fit(K, X[:40], Y[:40], 1e-2, solver=solver)
     np.testing.assert_allclose(before(X[0]), expected(X[0]), atol=SOLVE)
@@ -583,39 +583,45 @@ def test_kernels_without_a_spectral_density_are_refused(k, what, key):
             "at least one chunk",
         ),
         (
-            lambda key: of_any(10, key).start(hk.Symplectic(hk.Gaussian(1.0)), 3),
+            lambda key: of_any(10, key).start(hk.Symplectic(hk.Gaussian(1.0)), points(n=3)),
             ValueError,
             "even dimension, got n = 3",
         ),
         (
-            lambda key: of_any(10, key).start(hk.CurlFree(hk.Gaussian(1.0)), 3).field(),
+            lambda key: of_any(10, key).start(hk.CurlFree(hk.Gaussian(1.0)), points(n=3)).field(),
             ValueError,
             "no data yet",
         ),
         (
             lambda key: (
-                RandomFeatures(10, key).start(hk.CurlFree(hk.Gaussian(1.0)), 3).add(*data())
+                RandomFeatures(10, key)
+                .start(hk.CurlFree(hk.Gaussian(1.0)), points(n=3))
+                .add(*data())
             ),
             ValueError,
             "the chunk has 4 coordinates and the fit 3",
         ),
         (
-            lambda key: of_any(10, key).start(hk.CurlFree(hk.Gaussian(np.array([1.0, 2.0]))), 3),
+            lambda key: of_any(10, key).start(
+                hk.CurlFree(hk.Gaussian(np.array([1.0, 2.0]))), points(n=3)
+            ),
             ValueError,
             "2 lengthscales",
         ),
         (
-            lambda key: of_any(10, key).start(hk.CurlFree(hk.Select(hk.Gaussian(1.0), 5)), 3),
+            lambda key: of_any(10, key).start(
+                hk.CurlFree(hk.Select(hk.Gaussian(1.0), 5)), points(n=3)
+            ),
             ValueError,
             "Select has coordinates (5,)",
         ),
         (
-            lambda key: of_any(10, key).start(hk.CurlFree(hk.Periodic(1.0, 0.01)), 3),
+            lambda key: of_any(10, key).start(hk.CurlFree(hk.Periodic(1.0, 0.01)), points(n=3)),
             ValueError,
             "at least 1/64",
         ),
         (
-            lambda key: of_any(10, key).start(hk.Gaussian(1.0), 3),
+            lambda key: of_any(10, key).start(hk.Gaussian(1.0), points(n=3)),
             TypeError,
             "matrix-valued kernel is needed",
         ),

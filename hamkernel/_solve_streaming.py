@@ -1,0 +1,130 @@
+"""Fits to data that comes in chunks: one pass, and memory that ignores the number of points.
+
+A low-rank solver that can do so compresses what it has seen to the triangular factor of its least
+squares (`_streaming.py`). More data changes the factor, and any λ is solved for from it.
+"""
+
+import abc
+from collections.abc import Iterable
+from typing import Generic, TypeVar
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, ArrayLike, Float, Int
+
+from hamkernel import _require as require
+from hamkernel._field import AbstractField
+from hamkernel._solve import AbstractSolver
+from hamkernel._streaming import LeastSquares
+from hamkernel._structured import AbstractMatrixKernel
+
+Fit = TypeVar("Fit", bound="AbstractStreamingFit")
+Learned = TypeVar("Learned", bound=AbstractField)
+
+
+class AbstractStreamingFit(eqx.Module, Generic[Learned]):
+    """A fit to the data added so far, made by `solver.start`.
+
+    It has a fixed size. `add` returns a new one, and `field` solves for any λ:
+
+        model = solver.start(K, X).add(X, Y)
+        field = model.field(1e-4)
+        better = model.add(X_new, Y_new).field(1e-4)
+
+    It is a PyTree, so that `jax.tree_util` and `equinox.tree_serialise_leaves` keep it for later.
+    """
+
+    kernel: eqx.AbstractVar[AbstractMatrixKernel]
+    state: eqx.AbstractVar[LeastSquares]
+    count: eqx.AbstractVar[Int[Array, ""]]
+    dimension: eqx.AbstractVar[int]
+
+    @abc.abstractmethod
+    def _added(self: Fit, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> Fit:
+        """`add` for data that has been checked."""
+
+    @abc.abstractmethod
+    def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> Learned:
+        """`field` for a λ that has been checked, and the number of points, which is not 0."""
+
+    def add(self: Fit, X: ArrayLike, Y: ArrayLike) -> Fit:
+        """The fit with more data.
+
+        Args:
+            X: states, shape (N, n).
+            Y: measured velocities, shape (N, n).
+
+        Raises:
+            ValueError: a shape does not fit, or the data is not finite. TypeError: its dtype.
+        """
+        X, Y = require.data(X, Y)
+        if X.shape[1] != self.dimension:
+            raise ValueError(
+                f"the chunk has {X.shape[1]} coordinates and the fit {self.dimension}."
+            )
+        dtype = self.state.factor.dtype
+        return self._added(X.astype(dtype), Y.astype(dtype))
+
+    def field(self, regularization: ArrayLike = 1e-4) -> Learned:
+        """The field learned from all data added so far; O(r³), and no pass over the data.
+
+        Args:
+            regularization: λ > 0, as in `hk.fit`, with N the number of points added so far.
+
+        Raises:
+            ValueError: λ is not positive, or no data was added.
+        """
+        dtype = self.state.factor.dtype
+        regularization = require.positive_scalar(regularization, "regularization").astype(dtype)
+        count = require.value(
+            self.count, self.count == 0, "no data yet: add(X, Y) before asking for the field."
+        )
+        return self._solved(count, regularization)
+
+
+class AbstractStreamingSolver(AbstractSolver, Generic[Learned]):
+    """A solver whose fit to all the data can be made from chunks of it."""
+
+    @abc.abstractmethod
+    def start(
+        self, K: AbstractMatrixKernel, sample: ArrayLike, regularization: ArrayLike = 1e-4
+    ) -> AbstractStreamingFit[Learned]:
+        """A fit without data yet, to which chunks are added."""
+
+    def fit_chunks(
+        self,
+        K: AbstractMatrixKernel,
+        chunks: Iterable[tuple[ArrayLike, ArrayLike]],
+        regularization: ArrayLike = 1e-4,
+        sample: ArrayLike | None = None,
+        progress: bool = False,
+    ) -> Learned:
+        """`hk.fit` to data that comes in chunks, in one pass and with memory for two chunks.
+
+        The field is that of one fit to all the data, to rounding. To add data later keep the fit
+        of `start` instead.
+
+        Args:
+            K: a matrix-valued kernel.
+            chunks: pairs (X, Y) of states and velocities, shape (Nᵢ, n) each: a generator, or
+                slices of memory-mapped files. Every new Nᵢ compiles anew: equal ones are fast.
+            regularization: λ > 0, as in `hk.fit`, with N the number of all points.
+            sample: states that look like all of the data, for `start`; the first chunk if None.
+            progress: show a progress bar where the standard error is a terminal.
+
+        Raises:
+            ValueError: there is no chunk, or as `hk.fit` for one of them. TypeError: as `hk.fit`.
+        """
+        from tqdm import tqdm  # so that importing the package does not load it
+
+        model = None
+        for X, Y in tqdm(chunks, "chunks", disable=None if progress else True):
+            X, Y = require.data(X, Y)
+            if model is None:
+                model = self.start(K, X if sample is None else sample, regularization)
+            # The next chunk is read while this one is added, and no further ones pile up.
+            jax.block_until_ready(model)
+            model = model.add(X, Y)
+        if model is None:
+            raise ValueError("fit_chunks needs at least one chunk (X, Y); the iterator was empty.")
+        return model.field(regularization)
