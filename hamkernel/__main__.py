@@ -16,7 +16,9 @@ def main() -> None:
     parser.add_argument(
         "--seeds", type=int, default=100, help="number of noise seeds (%(default)s)"
     )
-    parser.add_argument("--tune", action="store_true", help="also tune, which takes minutes")
+    parser.add_argument(
+        "--no-tune", dest="tune", action="store_false", help="the paper's hyperparameters alone"
+    )
     arguments = parser.parse_args()
     if arguments.seeds < 1:
         parser.error("--seeds must be at least 1")

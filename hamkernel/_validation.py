@@ -314,16 +314,19 @@ def _inverse_factor(A: Float[Array, "D D"]) -> Float[Array, "D D"]:
     """U = L⁻ᵀ with A = LLᵀ; NaN where A is not positive definite."""
     L = jax.lax.linalg.cholesky(A, symmetrize_input=False)
     identity = jnp.eye(len(A), dtype=A.dtype)
-    # LAPACK works by columns, so the transpose of its answer is what JAX stores without a copy.
-    # OpenBLAS wakes its threads from 1024 entries on, which on a busy machine was measured to take
-    # 500 times as long as the work: small matrices are solved in strips below that.
     D = len(A)
-    width = 1023 // D if D <= 64 else D
-    strips = [
-        jax.lax.linalg.triangular_solve(L, identity[:, i : i + width], left_side=True, lower=True)
-        for i in range(0, D, width)
-    ]
-    return jnp.concatenate(strips, axis=1).T
+    if D > 64:
+        # LAPACK works by columns: the transpose of its answer is what JAX stores without a copy.
+        return jax.lax.linalg.triangular_solve(L, identity, left_side=True, lower=True).T
+    # OpenBLAS wakes its threads from 1024 entries on, which on a busy machine was measured to take
+    # 500 times as long as the work: small matrices are solved in strips below that. One after the
+    # other: jaxlib 0.10.2 stalls forever when a batch of them runs beside another on two cores.
+    count = -(-D // (1023 // D))
+    width = -(-D // count)
+    columns = jnp.pad(identity, ((0, 0), (0, count * width - D))).reshape(D, count, width)
+    solve = functools.partial(jax.lax.linalg.triangular_solve, L, left_side=True, lower=True)
+    strips = jax.lax.map(solve, jnp.moveaxis(columns, 1, 0))  # (count, D, width)
+    return jnp.moveaxis(strips, 1, 2).reshape(count * width, D)[:D]
 
 
 def _solve_blocks(factors: Float[Array, "F b b"], b: Float[Array, "F b"]) -> Float[Array, "F b"]:

@@ -1,12 +1,14 @@
 """One kernel, fitted to the data of every noise seed and tested, in one compiled program."""
 
+import dataclasses
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
 from hamkernel._field import KernelField
@@ -19,6 +21,7 @@ from hamkernel.systems import sample
 _TIMES = 200  # steps of the test trajectory
 _POINTS = 10_000  # where the odd error is sampled, as in the paper
 _POINTS_KEY = 2023  # the same points for every kernel and seed
+_BATCH = 20  # seeds in one call of the compiled program, whatever their number
 
 
 class Outcome(eqx.Module):
@@ -73,6 +76,8 @@ def evaluate(
     X: Float[Array, "S N n"],
     Y: Float[Array, "S N n"],
     regularization: ArrayLike,
+    *,
+    tolerance: float = 1e-10,
 ) -> Outcome:
     """Fit `kernel` to every data set and test the learned fields.
 
@@ -89,6 +94,7 @@ def evaluate(
         X: states, shape (S, N, n), of `datasets`.
         Y: velocities, shape (S, N, n).
         regularization: of `fit`, shape () for all data sets or (S,).
+        tolerance: of the integrator, relative and absolute.
 
     Raises:
         RuntimeError: a fit or an integration failed.
@@ -99,30 +105,48 @@ def evaluate(
     step = experiment.horizon / _TIMES
     ts = step * jnp.arange(round(experiment.portrait_horizon / step) + 1, dtype=X.dtype)
     starts = jnp.asarray([experiment.test_state, *experiment.initial_states])
-    true = _trajectories(experiment.system, starts, ts)
+    accuracy = jnp.asarray(tolerance, X.dtype)
+    true = _trajectories(experiment.system, starts, ts, accuracy)
     points = corner[None] + uniform * (opposite - corner)[None]
     ridge = jnp.asarray(regularization, X.dtype)
-    return _evaluate(kernel, experiment.system, X, Y, ridge, ts, true, points)
+    if not ridge.ndim:  # the same hyperparameters for all data sets
+        kernel, ridge = jax.tree.map(lambda a: jnp.stack([a] * len(X)), (kernel, ridge))
+    batch = min(_BATCH, len(X))
+    outcomes = []
+    for start in range(0, len(X), batch):
+        # The last batch is filled up with the last seed, so that no other size is compiled.
+        rows = np.minimum(np.arange(start, start + batch), len(X) - 1)
+        K, x, y, delta = jax.tree.map(lambda a, rows=rows: a[rows], (kernel, X, Y, ridge))
+        tested = _evaluate(K, x, y, delta, experiment.system, ts, true, points, accuracy)
+        outcomes.append(tested)
+    first = outcomes[0]
+    learned, error, quantities = jax.tree.map(
+        lambda *parts: jnp.concatenate(parts)[: len(X)],
+        *((each.learned, each.error, each.quantities) for each in outcomes),
+    )
+    return dataclasses.replace(first, learned=learned, error=error, quantities=quantities)
 
 
 @eqx.filter_jit
 def _trajectories(
-    field: Callable[[Array], Array], starts: Float[Array, "B n"], ts: Float[Array, " P"]
+    field: Callable[[Array], Array],
+    starts: Float[Array, "B n"],
+    ts: Float[Array, " P"],
+    tolerance: Float[Array, ""],
 ) -> Float[Array, "B P n"]:
     # Nothing is differentiated here, and a plain loop compiles faster than one with checkpoints.
-    adjoint = diffrax.ForwardMode()
-    return jax.vmap(lambda x0: cast(Array, simulate(field, x0, ts, adjoint=adjoint).ys))(starts)
+    options: Any = dict(rtol=tolerance, atol=tolerance, adjoint=diffrax.ForwardMode())
+    return jax.vmap(lambda x0: cast(Array, simulate(field, x0, ts, **options).ys))(starts)
 
 
 @eqx.filter_jit
-def _evaluate(kernel, system, X, Y, regularization, ts, true, points) -> Outcome:
+def _evaluate(kernel, X, Y, regularization, system, ts, true, points, tolerance) -> Outcome:
     """`true` (1 + B, P, n): the test trajectory, of which the test takes the start, and orbits."""
     test = slice(_TIMES + 1)
-    own = 0 if regularization.ndim else None  # whether each data set has hyperparameters of its own
 
     def one_seed(kernel, regularization, X, Y):
         field = fit(kernel, X, Y, regularization)
-        learned = _trajectories(field, true[:, 0], ts)
+        learned = _trajectories(field, true[:, 0], ts, tolerance)
         error = jnp.linalg.norm(learned[0, test] - true[0, test], axis=1)
         quantities = {
             "trajectory_error_mean": error.mean(),
@@ -139,9 +163,7 @@ def _evaluate(kernel, system, X, Y, regularization, ts, true, points) -> Outcome
         total = values[: len(points)] + values[len(points) :]  # f(x) + f(−x)
         return _moments("odd_error", jnp.linalg.norm(total, axis=1))
 
-    fields, learned, error, quantities = jax.vmap(one_seed, (own, own, 0, 0))(
-        kernel, regularization, X, Y
-    )
+    fields, learned, error, quantities = jax.vmap(one_seed)(kernel, regularization, X, Y)
     # One seed after the other: all at once, the many points would not fit into the caches.
     quantities |= jax.lax.map(odd_error, fields)
     return Outcome(
