@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel._scalar import AbstractScalarKernel
-from hamkernel._scalar_transform import Select, Warp
+from hamkernel._scalar_transform import Select, Symmetrised, Warp
 from hamkernel._structured import AbstractMatrixKernel
 
 
@@ -44,6 +44,19 @@ def hyperparameters(
 def gram_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
     """The trace of the Gram, from its diagonal blocks alone."""
     return jnp.sum(jax.vmap(lambda x: jnp.trace(K(x, x)))(X))
+
+
+def cancelling_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
+    """The trace of the Gram before the terms of an odd or even kernel cancel: what rounds.
+
+    (k(x, z) − k(−x, z))/2 of a long lengthscale is the small difference of large numbers.
+    """
+
+    def is_mean(node: object) -> bool:
+        return isinstance(node, Symmetrised)
+
+    terms = jax.tree.map(lambda node: node.kernel if is_mean(node) else node, K, is_leaf=is_mean)
+    return jnp.maximum(gram_trace(terms, X), gram_trace(K, X))
 
 
 def _amplitude(K: AbstractMatrixKernel, X: Array, Y: Array) -> float:

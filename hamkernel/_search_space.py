@@ -6,7 +6,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float
 
-from hamkernel._bounds import gram_trace, hyperparameters
+from hamkernel._bounds import cancelling_trace, gram_trace, hyperparameters
 from hamkernel._structured import AbstractMatrixKernel
 
 RIDGE = "regularization"
@@ -88,9 +88,8 @@ class SearchSpace(eqx.Module):
         self, kernel: AbstractMatrixKernel, X: Float[Array, "N n"]
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """The bounds of log λ: from the rounding of the Gram to where the field is almost zero."""
-        trace = gram_trace(kernel, X)
-        low = ROUNDINGS * jnp.finfo(X.dtype).eps * trace / len(X)
-        high = 10 * trace / len(X)
+        low = ROUNDINGS * jnp.finfo(X.dtype).eps * cancelling_trace(kernel, X) / len(X)
+        high = jnp.maximum(10 * gram_trace(kernel, X) / len(X), 2 * low)
         if self.given_ridge is not None:
             low = jnp.maximum(low, self.given_ridge[0])
             high = jnp.maximum(self.given_ridge[1], low)

@@ -5,8 +5,9 @@ searched as h = low + (high − low)(1 + sin u)/2 over all real u, as MINUIT doe
 optimiser then respects the bounds and can rest on one, where a sigmoid would creep towards it.
 
 The ridge. λ is searched relative to the Gram. The residuals of a fit lose about ε tr(G)/(Nλ) of
-their digits, ε the rounding of the dtype, so Nλ ≥ 100 ε tr(G) is demanded at every point: what
-lies below is rounding noise and can look like a very good loss. This matters. A quadratic
+their digits, ε the rounding of the dtype, so Nλ ≥ 100 ε tr(G) is demanded at every point, with
+the G that was there before the terms of an odd or even kernel cancelled: what lies below is
+rounding noise and can look like a very good loss. This matters. A quadratic
 Hamiltonian is the flat limit of the Gaussian kernel, so the loss of an oscillator improves all
 the way along ℓ -> ∞, λ -> 0 until nothing is left of it but noise.
 """
