@@ -10,6 +10,7 @@ import pytest
 from jax.test_util import check_grads
 from scipy.integrate import solve_ivp
 
+import hamkernel as hk
 from hamkernel._integrators_gauss import (
     FixedPointToRounding,
     GaussLegendre4,
@@ -167,6 +168,17 @@ def test_gauss_coefficients_are_those_of_the_tables():
             [5 / 36 + r15 / 30, 2 / 9 + r15 / 15, 5 / 36],
         ],
         atol=ROUNDING,
+    )
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("solver", GAUSS, ids=name)
+def test_rounded_coefficients_are_symplectic_exactly(solver, dtype):
+    share = np.asarray(solver.tableau.share, dtype)
+    share = np.where(share < 0.5, 1 - share.T, share)  # as in every step
+    assert (share + share.T == 1).all()
+    np.testing.assert_allclose(
+        share * solver.tableau.b, solver.tableau.a, atol=10 * np.finfo(dtype).eps
     )
 
 
@@ -336,3 +348,67 @@ def test_diffrax_refuses_an_adaptive_step(solver):
     term = diffrax.ODETerm(Term(HenonHeiles()))
     with pytest.raises(RuntimeError, match=r"adaptive step sizes .* error estimates"):
         diffrax.diffeqsolve(term, solver, 0.0, 1.0, 0.1, START, stepsize_controller=controller)
+
+
+def energies(field, x0, solver, dt, steps):
+    """H(x(t)) / H(x(0)) at 1001 steps of the given number of them or a few more."""
+    stride = steps // 1000 + 1  # no divisor of a period: the motion is met in every phase
+    ts = np.arange(1001) * stride * dt
+    ys = jnp.asarray(hk.simulate(field, x0, ts, solver, dt).ys)
+    H = np.asarray(jax.vmap(field.hamiltonian)(ys))
+    return H / H[0]
+
+
+def drift_and_wobble(energy):
+    """Fitted change of the energy over the whole run, and the spread about that line."""
+    time = np.linspace(-0.5, 0.5, energy.size)
+    slope, offset = np.polyfit(time, energy, 1)
+    return abs(slope), np.std(energy - slope * time - offset)
+
+
+def significant(wobble, samples):
+    """Three standard errors of the fitted change, of samples of a wobble."""
+    return 3 * np.sqrt(12 / samples) * wobble
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [*GAUSS, *SPLITTING, diffrax.Tsit5()], ids=name)
+def test_energy_of_the_oscillator_over_1e5_periods_drifts_only_if_not_symplectic(solver):
+    oscillator, dt = hk.systems.HarmonicOscillator(mass=1.0, stiffness=1.0), 0.2
+    steps = int(1e5 * 2 * np.pi / dt)
+    energy = energies(oscillator, jnp.array([1.0, 0.5]), solver, dt, steps)
+    drift, wobble = drift_and_wobble(energy)
+    # Where H is conserved exactly there is no wobble, and rounding errors walk at random.
+    walk = 5 * np.finfo(float).eps * np.sqrt(steps)  # 2e-12
+    if solver in NOT_SYMPLECTIC:
+        assert drift > 1e-3
+        assert drift > 100 * wobble
+    else:
+        assert drift < significant(wobble, energy.size) + walk
+        assert np.abs(energy - 1).max() < (walk if solver in GAUSS else 0.01)
+
+
+def learned_pendulum(k):
+    pendulum = hk.systems.Pendulum(mass=1.0)
+    starts = np.array([[1.26, 0.0], [2.51, 0.0], [2.98, -4.0]])
+    X, Y = hk.systems.sample(
+        pendulum, starts, 0.1 * np.arange(8), 0.01, 0.01, key=jax.random.key(0)
+    )
+    field = hk.fit(hk.Odd(hk.Symplectic(k)), X.reshape(-1, 2), Y.reshape(-1, 2), 1e-5)
+    return field.anchored(jnp.zeros(2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("solver", [*GAUSS, *SPLITTING, diffrax.Tsit5()], ids=name)
+def test_energy_of_a_learned_pendulum_over_1e5_steps_drifts_only_if_not_symplectic(solver):
+    split = hk.Select(hk.Gaussian(3.0), 0) + hk.Select(hk.Gaussian(6.0), 1)
+    field = learned_pendulum(split if solver in SPLITTING else hk.Gaussian(3.0))
+    # 24 steps for each swing.
+    energy = energies(field, jnp.array([np.pi / 2, 0.0]), solver, 0.1, 100_000)
+    drift, wobble = drift_and_wobble(energy)
+    if solver in NOT_SYMPLECTIC:
+        assert drift > 1e-3
+        assert drift > 100 * wobble
+    else:
+        assert drift < significant(wobble, energy.size)
+        assert np.abs(energy - 1).max() < 0.05
