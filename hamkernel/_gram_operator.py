@@ -17,7 +17,7 @@ from jaxtyping import Array, ArrayLike, Float
 from hamkernel import _require as require
 from hamkernel._devices import Rows, as_given, rows_of, split, sum_of_columns
 from hamkernel._gram import centred, gram, matrix_kernel
-from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._structured import AbstractMatrixKernel, unfolded
 
 # Pairs in one tile, rows × columns: 250 × 1000 doubles are 2 MB. Measured on two cores between
 # 100 × 500 and 1000 × 4000, for Gaussian, odd and Matérn kernels with n = 4 and 20.
@@ -136,9 +136,10 @@ _compiled_product = eqx.filter_jit(product)
 
 
 def _product(K, X, Z, A):
+    K, Z, A = unfolded(K, Z, A.astype(X.dtype))
     X, Z = centred(K, X, Z)
     rows = tiles(X, X[:1], ROWS)
-    columns = (tiles(Z, Z[:1], COLUMNS), tiles(A.astype(X.dtype), jnp.zeros_like(A[:1]), COLUMNS))
+    columns = (tiles(Z, Z[:1], COLUMNS), tiles(A, jnp.zeros_like(A[:1]), COLUMNS))
 
     # Recomputed in the backward pass: otherwise it would keep every pair.
     @jax.checkpoint

@@ -169,3 +169,22 @@ def with_parity(kernel: AbstractScalarKernel, parity: int) -> AbstractScalarKern
         characters=(1.0, float(parity)),
         one_sided=Invariance.REFLECTION in kernel.invariance,
     )
+
+
+def parity_removed(
+    kernel: AbstractScalarKernel,
+) -> tuple[AbstractScalarKernel, float] | None:
+    """The k and the parity of which `kernel` is (k(x, z) + parity k(x, −z))/2, or None."""
+    if isinstance(kernel, Symmetrised):
+        simple = kernel.one_sided and kernel.maps == (identity, reflection)
+        return (kernel.kernel, kernel.characters[1]) if simple else None
+    if isinstance(kernel, Scaled | Select):
+        inner = parity_removed(kernel.kernel)
+        return inner and (eqx.tree_at(lambda s: s.kernel, kernel, inner[0]), inner[1])
+    if isinstance(kernel, ScalarSum):
+        found = [parity_removed(term) for term in kernel.terms]
+        known = [each for each in found if each is not None]
+        parities = {parity for _, parity in known}
+        if len(known) == len(found) and len(parities) == 1:
+            return ScalarSum(tuple(k for k, _ in known)), parities.pop()
+    return None

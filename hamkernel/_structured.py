@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel._scalar import AbstractScalarKernel, Invariance, as_scalar_kernel
-from hamkernel._scalar_transform import with_parity
+from hamkernel._scalar_transform import parity_removed, with_parity
 
 
 class AbstractMatrixKernel(eqx.Module):
@@ -356,6 +356,27 @@ class Sum(AbstractMatrixKernel):
                 + (f" and the names {named}." if named else ".")
             )
         return self.terms[index]
+
+
+def unfolded(
+    K: AbstractMatrixKernel, Z: Float[Array, "M n"], A: Float[Array, "M n"]
+) -> tuple[AbstractMatrixKernel, Float[Array, "L n"], Float[Array, "L n"]]:
+    """A kernel, points and coefficients with the expansion of K, Z, A, without its odd kernels.
+
+    An odd or even field Σⱼ ½[K₀(x, zⱼ) ± K₀(x, −zⱼ)] aⱼ is one of K₀ with twice the points. In a
+    sum over many pairs this is cheaper than the two terms at once, which fill the registers.
+    K, Z and A themselves where K is of another form.
+    """
+    if not isinstance(K, Separable | CurlFree | Symplectic | DivergenceFree):
+        return K, Z, A
+    simple = parity_removed(K.kernel)
+    if simple is None:
+        return K, Z, A
+    kernel, parity = simple
+    # A derivative of an even function is odd.
+    sign = parity if isinstance(K, Separable) else -parity
+    K = eqx.tree_at(lambda s: s.kernel, K, kernel)
+    return K, jnp.concatenate([Z, -Z]), jnp.concatenate([A, sign * A]) / 2
 
 
 def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
