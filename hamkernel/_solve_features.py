@@ -231,6 +231,10 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     count: Int[Array, ""]
     dimension: int = eqx.field(static=True)
 
+    @property
+    def dtype(self) -> jnp.dtype:
+        return self.state.factor.dtype
+
     def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "FeatureFit":
         spread = rows_of(X)
         X, Y = split(spread, X), split(spread, Y)

@@ -7,7 +7,6 @@ F are the field Σⱼ K(x, sⱼ) αⱼ with α = L⁻ᵀw, of norm ‖w‖.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -20,18 +19,6 @@ from hamkernel._structured import AbstractMatrixKernel
 
 # Numbers in the tile of the Gram that is held at once; see `_gram_operator`.
 TILE = 2**20
-
-
-class LandmarkRows(eqx.Module):
-    """The rows of F at some points, (t, n) -> (t, n, r)."""
-
-    kernel: AbstractMatrixKernel
-    points: Float[Array, "m n"]
-    whitening: Float[Array, "r r"]
-
-    def __call__(self, X: Float[Array, "t n"]) -> Float[Array, "t n r"]:
-        C = assemble(self.kernel, X, self.points)
-        return (C.reshape(X.size, -1) @ self.whitening).reshape(*X.shape, -1)
 
 
 class Normal(NamedTuple):

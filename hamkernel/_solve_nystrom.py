@@ -6,8 +6,11 @@ by tile and only the sums FᵀF and Fᵀy stay.
 
 The matrix FᵀF + NλI has the condition of G + NλI, not its square: these are no normal equations in
 α, which would lose twice the digits. What the sums round off is given back by one step of
-refinement with the residual of the data (Björck's corrected seminormal equations). A stream is
-seen once, so there the rows of F go into a triangular factor instead (`_streaming.py`).
+refinement with the residual of the data (Björck's corrected seminormal equations).
+
+A stream is seen once and leaves no residual. There the sums are over the rows of F R⁻¹, where
+RᵀR = FᵀF/N + λI on a sample of the data. In this basis the system is near the identity, so that
+its sums keep the digits: the error is that of R⁻¹, rounding over √λ, as with a QR of the rows.
 """
 
 import math
@@ -17,6 +20,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 from hamkernel import _require as require
@@ -26,7 +30,7 @@ from hamkernel._gram import matrix_kernel
 from hamkernel._gram_operator import product
 from hamkernel._solve_landmarks import Landmarks, choose_landmarks, given_landmarks
 from hamkernel._solve_low_rank import (
-    LandmarkRows,
+    Normal,
     factor,
     normal_sums,
     singular,
@@ -34,7 +38,6 @@ from hamkernel._solve_low_rank import (
     whitening,
 )
 from hamkernel._solve_streaming import AbstractStreamingFit, AbstractStreamingSolver
-from hamkernel._streaming import LeastSquares, accumulate_data, solve
 from hamkernel._structured import AbstractMatrixKernel
 
 
@@ -132,7 +135,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
                 are chosen now; later data does not move them. They are not added to the fit. The
                 first chunk does where chunks are alike; one trajectory out of many does not.
             regularization: the smallest λ that will be asked for, since the tolerance is relative
-                to it.
+                to it, and so are the digits that are kept: a smaller one loses some.
 
         Raises:
             ValueError: a shape does not fit, or λ is not positive. TypeError: K is not
@@ -143,8 +146,12 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         sample = require.finite(sample, "sample")
         K.check_dimension(sample.shape[1])
         regularization = require.positive_scalar(regularization, "regularization")
-        landmarks = self.landmarks(K, sample, regularization.astype(sample.dtype))
-        return _start(K, landmarks, self.tolerance)
+        regularization = regularization.astype(sample.dtype)
+        landmarks = self.landmarks(K, sample, regularization)
+        spread = rows_of(sample)
+        some = split(spread, sample)[:: -(-len(sample) // self.candidates)]
+        some = some if spread is None else spread.whole(some)
+        return _start(K, some, regularization, landmarks, self.tolerance)
 
 
 @eqx.filter_jit
@@ -217,7 +224,7 @@ def _warn_if_truncated(truncation, count, tolerance):
 class LandmarkFit(AbstractStreamingFit[KernelField]):
     """A fit on landmarks to the data added so far, made by `Nystrom.start`.
 
-    It has a fixed size, (r + 1)² numbers. `add` returns a new one, and `field` solves for any λ:
+    It has a fixed size, 3r² numbers. `add` returns a new one, and `field` solves for any λ:
 
         model = hk.Nystrom().start(K, X, 1e-4).add(X, Y)
         field = model.field(1e-4)
@@ -228,21 +235,26 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
     Attributes:
         kernel: K.
         landmarks: the points that carry the field.
-        whitening: T = L⁻ᵀ, which makes their kernels orthonormal.
-        state: the triangular factor of all rows.
-        trace: the trace of the Gram of the points added, shape ().
+        triangle: R, upper triangular, shape (r, r).
+        basis: L⁻ᵀR⁻¹, from weights in the basis of the sums to coefficients, shape (r, r).
+        sums: over the points added.
         count: N, the number of points added, shape ().
+        dimension: n, the number of coordinates of a state.
         tolerance: of the solver, for its warning.
     """
 
     kernel: AbstractMatrixKernel
     landmarks: Landmarks
-    whitening: Float[Array, "r r"]
-    state: LeastSquares
-    trace: Float[Array, ""]
+    triangle: Float[Array, "r r"]
+    basis: Float[Array, "r r"]
+    sums: Normal
     count: Int[Array, ""]
     dimension: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        return self.basis.dtype
 
     def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "LandmarkFit":
         spread = rows_of(X)
@@ -254,14 +266,18 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 
 
 @eqx.filter_jit
-def _start(K, landmarks, tolerance):
+def _start(K, sample, regularization, landmarks, tolerance):
     S = landmarks.points
+    T = whitening(K, landmarks)
+    zero = jnp.zeros_like(T)
+    square = normal_sums(K, S, T, sample, jnp.zeros_like(sample)).square / len(sample)
+    R = factor(square, regularization).T
     return LandmarkFit(
         kernel=K,
         landmarks=landmarks,
-        whitening=whitening(K, landmarks),
-        state=LeastSquares.empty(S.size, S.dtype),
-        trace=jnp.zeros((), S.dtype),
+        triangle=R,
+        basis=solve_triangular(R, T.T, trans="T").T,
+        sums=Normal(zero, zero[0], zero[0, 0]),
         count=jnp.zeros((), int),
         dimension=S.shape[1],
         tolerance=tolerance,
@@ -270,20 +286,22 @@ def _start(K, landmarks, tolerance):
 
 @eqx.filter_jit
 def _added(fit, X, Y, spread):
-    rows = LandmarkRows(fit.kernel, fit.landmarks.points, fit.whitening)
-    new = (
-        accumulate_data(fit.state, rows, X, Y, spread),
-        fit.trace + jax.vmap(lambda x: jnp.trace(fit.kernel(x, x)))(X).sum(),
-        fit.count + len(X),
-    )
-    return eqx.tree_at(lambda f: (f.state, f.trace, f.count), fit, new)
+    new = normal_sums(fit.kernel, fit.landmarks.points, fit.basis, X, Y, spread)
+    sums = jax.tree.map(jnp.add, fit.sums, new)
+    return eqx.tree_at(lambda f: (f.sums, f.count), fit, (sums, fit.count + len(X)))
 
 
 @eqx.filter_jit
 def _solved(fit, count, regularization):
-    ridge = count.astype(regularization.dtype) * regularization
-    w, _ = solve(fit.state, ridge)
-    A = (fit.whitening @ w).reshape(fit.landmarks.points.shape)
-    unseen = jnp.zeros((0, fit.dimension), A.dtype)
-    covered = jnp.sum(fit.state.factor[:, :-1] ** 2)  # trace Ĝ = ‖F‖², which R has too
-    return _Solution(A, unseen, jnp.linalg.norm(w), truncated(fit.trace, covered, ridge))
+    R, sums, ridge = fit.triangle, fit.sums, count.astype(regularization.dtype) * regularization
+    # ‖y − F R⁻¹v‖² + ridge ‖R⁻¹v‖²
+    inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype))
+    L = jnp.linalg.cholesky(sums.square + ridge * inverse.T @ inverse)
+    v = jax.scipy.linalg.cho_solve((L, True), sums.moment)
+    covered = jnp.trace(R.T @ sums.square @ R)  # trace FᵀF
+    return _Solution(
+        coefficients=(fit.basis @ v).reshape(fit.landmarks.points.shape),
+        residual=jnp.zeros((0, fit.dimension), v.dtype),
+        norm=jnp.linalg.norm(inverse @ v),
+        truncation=truncated(sums.trace, covered, ridge),
+    )

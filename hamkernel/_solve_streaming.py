@@ -1,7 +1,7 @@
 """Fits to data that comes in chunks: one pass, and memory that ignores the number of points.
 
-A low-rank solver that can do so compresses what it has seen to the triangular factor of its least
-squares (`_streaming.py`). More data changes the factor, and any λ is solved for from it.
+A low-rank solver that can do so compresses what it has seen to r² numbers for r columns. More data
+changes them, and any λ is solved for from them.
 """
 
 import abc
@@ -10,12 +10,12 @@ from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from hamkernel import _require as require
 from hamkernel._field import AbstractField
 from hamkernel._solve import AbstractSolver
-from hamkernel._streaming import LeastSquares
 from hamkernel._structured import AbstractMatrixKernel
 
 Fit = TypeVar("Fit", bound="AbstractStreamingFit")
@@ -35,9 +35,13 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
     """
 
     kernel: eqx.AbstractVar[AbstractMatrixKernel]
-    state: eqx.AbstractVar[LeastSquares]
     count: eqx.AbstractVar[Int[Array, ""]]
     dimension: eqx.AbstractVar[int]
+
+    @property
+    @abc.abstractmethod
+    def dtype(self) -> jnp.dtype:
+        """That of the fit, and of its fields."""
 
     @abc.abstractmethod
     def _added(self: Fit, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> Fit:
@@ -62,8 +66,7 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
             raise ValueError(
                 f"the chunk has {X.shape[1]} coordinates and the fit {self.dimension}."
             )
-        dtype = self.state.factor.dtype
-        return self._added(X.astype(dtype), Y.astype(dtype))
+        return self._added(X.astype(self.dtype), Y.astype(self.dtype))
 
     def field(self, regularization: ArrayLike = 1e-4) -> Learned:
         """The field learned from all data added so far; O(r³), and no pass over the data.
@@ -74,12 +77,11 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
         Raises:
             ValueError: λ is not positive, or no data was added.
         """
-        dtype = self.state.factor.dtype
-        regularization = require.positive_scalar(regularization, "regularization").astype(dtype)
+        regularization = require.positive_scalar(regularization, "regularization")
         count = require.value(
             self.count, self.count == 0, "no data yet: add(X, Y) before asking for the field."
         )
-        return self._solved(count, regularization)
+        return self._solved(count, regularization.astype(self.dtype))
 
 
 class AbstractStreamingSolver(AbstractSolver, Generic[Learned]):

@@ -171,8 +171,14 @@ def residual(
     return _over_tiles(step, None, (X, Y), columns=len(w))[1]
 
 
-def _correlations(design, X, Y, w, spread) -> Float[Array, " r"]:
+def _correlations(design, X, Y, w, spread: Rows | None) -> Float[Array, " r"]:
     """Φᵀ(Y − Φw)."""
+    if spread is not None:
+
+        def part(whole, X, Y):
+            return spread.sum(_correlations(whole[0], X, Y, whole[1], None))
+
+        return on_each(spread, part, (design, w), X, Y, joined=False)
 
     def step(total, tile):
         rows = design(tile[0])

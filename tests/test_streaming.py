@@ -171,8 +171,8 @@ def test_a_first_chunk_that_is_not_like_the_rest_is_said():
 def test_memory_mapped_files_and_a_shorter_last_chunk(tmp_path):
     np.save(tmp_path / "X.npy", X[:450])
     np.save(tmp_path / "Y.npy", Y[:450])
-    files = [np.load(tmp_path / f"{name}.npy", mmap_mode="r") for name in "XY"]
-    field = given(S).fit_chunks(K, chunks(*files, 200), RIDGE)
+    states, velocities = (np.load(tmp_path / f"{name}.npy", mmap_mode="r") for name in "XY")
+    field = given(S).fit_chunks(K, chunks(states, velocities, 200), RIDGE)
     whole = fit(K, X[:450], Y[:450], RIDGE, solver=given(S))
     assert relative(field.evaluate(NEW), whole.evaluate(NEW)) < ROUNDING
 
