@@ -9,14 +9,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int, Key
 
 from hamkernel import _require as require
+from hamkernel import _streaming_sums as streaming_sums
 from hamkernel._devices import as_given, on_each, rows_of, split
 from hamkernel._features import AbstractFeatures, SumFeatures, features
 from hamkernel._field import AbstractField
 from hamkernel._gram import matrix_kernel
-from hamkernel._solve_streaming import AbstractStreamingFit, AbstractStreamingSolver
-from hamkernel._streaming import LeastSquares, accumulate_data, ridge_regression, solve
+from hamkernel._solve_low_rank import singular
+from hamkernel._solve_streaming import AbstractStreamingFit, AbstractStreamingSolver, thinned
+from hamkernel._streaming import ridge_regression
+from hamkernel._streaming_sums import Sums
 from hamkernel._structured import AbstractMatrixKernel, Sum
 
+_SAMPLE = 4096  # points of a sample that are looked at
 _BATCH = 1024  # points evaluated at once: 8 MB of waves for 1000 features
 
 
@@ -32,7 +36,8 @@ class FeatureField(AbstractField):
         weights: w, shape (r,).
         residual: yᵢ − f(xᵢ) at the training data, shape (N, n); of shape (0, n) after a fit to a
             stream, which is not kept.
-        residual_norm: its norm over all the training data, shape ().
+        residual_norm: its norm over all the training data, shape (); after a fit to a stream good
+            to 1e-8 of the norm of all velocities.
         norm: ‖w‖, the norm of f in the RKHS of the approximate kernel, shape ().
         regularization: the λ of the fit, shape ().
         offset: the constant in the potential, shape ().
@@ -169,22 +174,21 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
 
         Args:
             K: a matrix-valued kernel.
-            sample: some states, shape (N, n). Only n and the dtype matter to these features.
-            regularization: not used; for the solvers that choose by it.
+            sample: states that look like all of the data, shape (N, n). The features do not depend
+                on them, only the rounding of the sums does. They are not added to the fit.
+            regularization: the smallest λ that will be asked for; a smaller one loses digits.
 
         Raises:
             TypeError: a kernel without a known spectral density. ValueError: n is not allowed by
-                the structure.
+                the structure, the sample is not finite, or λ is not positive.
         """
         K = matrix_kernel(K)
-        sample = require.points(sample, "sample")
-        n, dtype = sample.shape[1], sample.dtype
-        K.check_dimension(n)
-        basis = features(K, n, self.count, self.key, dtype)
-        state = LeastSquares.empty(basis.columns, dtype)
-        return FeatureFit(
-            kernel=K, features=basis, state=state, count=jnp.zeros((), int), dimension=n
-        )
+        sample = require.finite(require.points(sample, "sample"), "sample")
+        K.check_dimension(sample.shape[1])
+        regularization = require.positive_scalar(regularization, "regularization")
+        basis = features(K, sample.shape[1], self.count, self.key, sample.dtype)
+        sample = thinned(sample, _SAMPLE)
+        return _start(K, basis, sample, regularization.astype(sample.dtype))
 
 
 @eqx.filter_jit
@@ -211,7 +215,8 @@ def _field(K, basis, weights, residual, residual_norm, regularization):
 class FeatureFit(AbstractStreamingFit[FeatureField]):
     """A fit in random features to the data added so far, made by `RandomFeatures.start`.
 
-    It has a fixed size, (r + 1)² numbers. `add` returns a new one, and `field` solves for any λ:
+    It has a fixed size, 3r² numbers for r columns. `add` returns a new one, and `field` solves
+    for any λ:
 
         model = hk.RandomFeatures(500, key).start(K, X).add(X, Y)
         field = model.field(1e-4)
@@ -220,36 +225,52 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     Attributes:
         kernel: K.
         features: the features of K.
-        state: the triangular factor of all rows.
+        sums: what the least squares need of the points added.
         count: N, the number of points added, shape ().
         dimension: n, the number of coordinates of a state.
     """
 
     kernel: AbstractMatrixKernel
     features: AbstractFeatures
-    state: LeastSquares
+    sums: Sums
     count: Int[Array, ""]
     dimension: int = eqx.field(static=True)
 
     @property
     def dtype(self) -> jnp.dtype:
-        return self.state.factor.dtype
+        return self.sums.energy.dtype
 
     def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "FeatureFit":
         spread = rows_of(X)
         X, Y = split(spread, X), split(spread, Y)
-        state = _accumulated(self.state, self.features, X, Y, spread)
-        return eqx.tree_at(lambda f: (f.state, f.count), self, (state, self.count + len(X)))
+        sums = _added(self.sums, self.features, X, Y, spread)
+        return eqx.tree_at(lambda f: (f.sums, f.count), self, (sums, self.count + len(X)))
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
-        return _solved(self, count, regularization)
+        field = _solved(self, count, regularization)
+        failed = ~jnp.isfinite(field.weights).all()
+        weights = require.value(field.weights, failed, singular(self.dtype), RuntimeError)
+        return eqx.tree_at(lambda f: f.weights, field, weights)
 
 
-_accumulated = eqx.filter_jit(accumulate_data)
+@eqx.filter_jit
+def _start(K, basis, sample, regularization):
+    identity = jnp.eye(basis.columns, dtype=sample.dtype)
+    return FeatureFit(
+        kernel=K,
+        features=basis,
+        sums=streaming_sums.start(basis, identity, sample, regularization),
+        count=jnp.zeros((), int),
+        dimension=sample.shape[1],
+    )
+
+
+_added = eqx.filter_jit(streaming_sums.add)
 
 
 @eqx.filter_jit
 def _solved(fit, count, regularization):
-    weights, residual_norm = solve(fit.state, count.astype(regularization.dtype) * regularization)
+    ridge = count.astype(regularization.dtype) * regularization
+    weights, _, residual_norm = streaming_sums.solve(fit.sums, ridge)
     unseen = jnp.zeros((0, fit.dimension), weights.dtype)
     return _field(fit.kernel, fit.features, weights, unseen, residual_norm, regularization)

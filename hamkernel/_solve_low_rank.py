@@ -7,6 +7,7 @@ F are the field Σⱼ K(x, sⱼ) αⱼ with α = L⁻ᵀw, of norm ‖w‖.
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -19,6 +20,16 @@ from hamkernel._structured import AbstractMatrixKernel
 
 # Numbers in the tile of the Gram that is held at once; see `_gram_operator`.
 TILE = 2**20
+
+
+class Columns(eqx.Module):
+    """The columns of the Gram that belong to landmarks, at some points: (t, n) -> (t, n, r)."""
+
+    kernel: AbstractMatrixKernel
+    points: Float[Array, "m n"]
+
+    def __call__(self, X: Float[Array, "t n"]) -> Float[Array, "t n r"]:
+        return assemble(self.kernel, X, self.points).reshape(*X.shape, -1)
 
 
 class Normal(NamedTuple):

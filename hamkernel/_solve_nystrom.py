@@ -8,9 +8,7 @@ The matrix FᵀF + NλI has the condition of G + NλI, not its square: these are
 α, which would lose twice the digits. What the sums round off is given back by one step of
 refinement with the residual of the data (Björck's corrected seminormal equations).
 
-A stream is seen once and leaves no residual. There the sums are over the rows of F R⁻¹, where
-RᵀR = FᵀF/N + λI on a sample of the data. In this basis the system is near the identity, so that
-its sums keep the digits: the error is that of R⁻¹, rounding over √λ, as with a QR of the rows.
+A stream is seen once and leaves no residual; `_streaming_sums.py` says how its sums keep digits.
 """
 
 import math
@@ -20,24 +18,25 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
 
 from hamkernel import _require as require
+from hamkernel import _streaming_sums as streaming_sums
 from hamkernel._devices import as_given, rows_of, split
 from hamkernel._field import KernelField, SolverInfo
 from hamkernel._gram import matrix_kernel
 from hamkernel._gram_operator import product
 from hamkernel._solve_landmarks import Landmarks, choose_landmarks, given_landmarks
 from hamkernel._solve_low_rank import (
-    Normal,
+    Columns,
     factor,
     normal_sums,
     singular,
     truncated,
     whitening,
 )
-from hamkernel._solve_streaming import AbstractStreamingFit, AbstractStreamingSolver
+from hamkernel._solve_streaming import AbstractStreamingFit, AbstractStreamingSolver, thinned
+from hamkernel._streaming_sums import Sums
 from hamkernel._structured import AbstractMatrixKernel
 
 
@@ -148,9 +147,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         regularization = require.positive_scalar(regularization, "regularization")
         regularization = regularization.astype(sample.dtype)
         landmarks = self.landmarks(K, sample, regularization)
-        spread = rows_of(sample)
-        some = split(spread, sample)[:: -(-len(sample) // self.candidates)]
-        some = some if spread is None else spread.whole(some)
+        some = thinned(sample, self.candidates)
         return _start(K, some, regularization, landmarks, self.tolerance)
 
 
@@ -224,7 +221,8 @@ def _warn_if_truncated(truncation, count, tolerance):
 class LandmarkFit(AbstractStreamingFit[KernelField]):
     """A fit on landmarks to the data added so far, made by `Nystrom.start`.
 
-    It has a fixed size, 3r² numbers. `add` returns a new one, and `field` solves for any λ:
+    It has a fixed size, 3r² numbers for r columns. `add` returns a new one, and `field` solves
+    for any λ:
 
         model = hk.Nystrom().start(K, X, 1e-4).add(X, Y)
         field = model.field(1e-4)
@@ -235,9 +233,8 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
     Attributes:
         kernel: K.
         landmarks: the points that carry the field.
-        triangle: R, upper triangular, shape (r, r).
-        basis: L⁻ᵀR⁻¹, from weights in the basis of the sums to coefficients, shape (r, r).
-        sums: over the points added.
+        sums: what the least squares need of the points added.
+        trace: the trace of their Gram, shape ().
         count: N, the number of points added, shape ().
         dimension: n, the number of coordinates of a state.
         tolerance: of the solver, for its warning.
@@ -245,16 +242,15 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 
     kernel: AbstractMatrixKernel
     landmarks: Landmarks
-    triangle: Float[Array, "r r"]
-    basis: Float[Array, "r r"]
-    sums: Normal
+    sums: Sums
+    trace: Float[Array, ""]
     count: Int[Array, ""]
     dimension: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
 
     @property
     def dtype(self) -> jnp.dtype:
-        return self.basis.dtype
+        return self.trace.dtype
 
     def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "LandmarkFit":
         spread = rows_of(X)
@@ -269,15 +265,11 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 def _start(K, sample, regularization, landmarks, tolerance):
     S = landmarks.points
     T = whitening(K, landmarks)
-    zero = jnp.zeros_like(T)
-    square = normal_sums(K, S, T, sample, jnp.zeros_like(sample)).square / len(sample)
-    R = factor(square, regularization).T
     return LandmarkFit(
         kernel=K,
         landmarks=landmarks,
-        triangle=R,
-        basis=solve_triangular(R, T.T, trans="T").T,
-        sums=Normal(zero, zero[0], zero[0, 0]),
+        sums=streaming_sums.start(Columns(K, S), T, sample, regularization),
+        trace=jnp.zeros((), S.dtype),
         count=jnp.zeros((), int),
         dimension=S.shape[1],
         tolerance=tolerance,
@@ -286,22 +278,22 @@ def _start(K, sample, regularization, landmarks, tolerance):
 
 @eqx.filter_jit
 def _added(fit, X, Y, spread):
-    new = normal_sums(fit.kernel, fit.landmarks.points, fit.basis, X, Y, spread)
-    sums = jax.tree.map(jnp.add, fit.sums, new)
-    return eqx.tree_at(lambda f: (f.sums, f.count), fit, (sums, fit.count + len(X)))
+    K = fit.kernel
+    new = (
+        streaming_sums.add(fit.sums, Columns(K, fit.landmarks.points), X, Y, spread),
+        fit.trace + jax.vmap(lambda x: jnp.trace(K(x, x)))(X).sum(),
+        fit.count + len(X),
+    )
+    return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), fit, new)
 
 
 @eqx.filter_jit
 def _solved(fit, count, regularization):
-    R, sums, ridge = fit.triangle, fit.sums, count.astype(regularization.dtype) * regularization
-    # ‖y − F R⁻¹v‖² + ridge ‖R⁻¹v‖²
-    inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype))
-    L = jnp.linalg.cholesky(sums.square + ridge * inverse.T @ inverse)
-    v = jax.scipy.linalg.cho_solve((L, True), sums.moment)
-    covered = jnp.trace(R.T @ sums.square @ R)  # trace FᵀF
+    ridge = count.astype(regularization.dtype) * regularization
+    weights, norm, _ = streaming_sums.solve(fit.sums, ridge)
     return _Solution(
-        coefficients=(fit.basis @ v).reshape(fit.landmarks.points.shape),
-        residual=jnp.zeros((0, fit.dimension), v.dtype),
-        norm=jnp.linalg.norm(inverse @ v),
-        truncation=truncated(sums.trace, covered, ridge),
+        coefficients=weights.reshape(fit.landmarks.points.shape),
+        residual=jnp.zeros((0, fit.dimension), weights.dtype),
+        norm=norm,
+        truncation=truncated(fit.trace, streaming_sums.trace(fit.sums), ridge),
     )

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from hamkernel import _require as require
+from hamkernel._devices import rows_of, split
 from hamkernel._field import AbstractField
 from hamkernel._solve import AbstractSolver
 from hamkernel._structured import AbstractMatrixKernel
@@ -130,3 +131,10 @@ class AbstractStreamingSolver(AbstractSolver, Generic[Learned]):
         if model is None:
             raise ValueError("fit_chunks needs at least one chunk (X, Y); the iterator was empty.")
         return model.field(regularization)
+
+
+def thinned(sample: Float[Array, "N n"], most: int) -> Float[Array, "M n"]:
+    """Every k-th point, at most `most` of them, on every device."""
+    spread = rows_of(sample)
+    some = split(spread, sample)[:: -(-len(sample) // most)]
+    return some if spread is None else spread.whole(some)

@@ -91,7 +91,7 @@ def accumulate_data(
         rows = design(tile[0])  # (t, n, r)
         return accumulate(state, rows.reshape(-1, rows.shape[-1]), tile[1].reshape(-1)), None
 
-    return _over_tiles(step, state, (X, Y), columns=len(state.factor) - 1)[0]
+    return over_tiles(step, state, (X, Y), columns=len(state.factor) - 1)[0]
 
 
 def _with_all(spread: Rows, state: LeastSquares, own: LeastSquares) -> LeastSquares:
@@ -168,7 +168,7 @@ def residual(
     def step(_, tile):
         return None, tile[1] - design(tile[0]) @ w
 
-    return _over_tiles(step, None, (X, Y), columns=len(w))[1]
+    return over_tiles(step, None, (X, Y), columns=len(w))[1]
 
 
 def _correlations(design, X, Y, w, spread: Rows | None) -> Float[Array, " r"]:
@@ -184,10 +184,10 @@ def _correlations(design, X, Y, w, spread: Rows | None) -> Float[Array, " r"]:
         rows = design(tile[0])
         return total + jnp.einsum("inr,in->r", rows, tile[1] - rows @ w), None
 
-    return _over_tiles(step, jnp.zeros_like(w), (X, Y), columns=len(w))[0]
+    return over_tiles(step, jnp.zeros_like(w), (X, Y), columns=len(w))[0]
 
 
-def _over_tiles(step, carry, data: tuple[Array, Array], columns: int):
+def over_tiles(step, carry, data: tuple[Array, Array], columns: int):
     """`jax.lax.scan` of `step` over tiles of points, the last one shorter.
 
     A factorisation of a tile on top of R costs (tile rows + r) r², so tiles of 3r rows lose a
