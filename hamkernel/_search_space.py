@@ -11,6 +11,7 @@ from hamkernel._structured import AbstractMatrixKernel
 
 RIDGE = "regularization"
 ROUNDINGS = 100.0  # how far the ridge must stay above the rounding of the Gram
+LOW_RANK_ROUNDINGS = 2e4  # above the rounding at which `choose_landmarks` drops a column
 
 
 class SearchSpace(eqx.Module):
@@ -28,6 +29,7 @@ class SearchSpace(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     free: tuple[int, ...] = eqx.field(static=True)
+    roundings: float = eqx.field(static=True)
 
     def __init__(
         self,
@@ -37,7 +39,9 @@ class SearchSpace(eqx.Module):
         regularization: Float[Array, ""],
         frozen: tuple[str, ...],
         bounds: dict[str, tuple[ArrayLike, ArrayLike]],
+        roundings: float = ROUNDINGS,
     ):
+        self.roundings = roundings
         dtype = X.dtype
         params = hyperparameters(K, X, Y)
         sizes = [param.low.size for param in params]
@@ -88,7 +92,7 @@ class SearchSpace(eqx.Module):
         self, kernel: AbstractMatrixKernel, X: Float[Array, "N n"]
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """The bounds of log λ: from the rounding of the Gram to where the field is almost zero."""
-        low = ROUNDINGS * jnp.finfo(X.dtype).eps * cancelling_trace(kernel, X) / len(X)
+        low = self.roundings * jnp.finfo(X.dtype).eps * cancelling_trace(kernel, X) / len(X)
         high = jnp.maximum(10 * gram_trace(kernel, X) / len(X), 2 * low)
         if self.given_ridge is not None:
             low = jnp.maximum(low, self.given_ridge[0])

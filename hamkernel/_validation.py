@@ -183,30 +183,34 @@ def log_likelihood(K, X, Y, regularization):
 
 
 def _regularised(K, X: Array, ridge: Array) -> Float[Array, "D D"]:
-    G = _trainable_gram((K, X))
+    G = trained((K, X), _square_gram)
     diagonal = jnp.arange(X.size)
     return G.at[diagonal, diagonal].add(ridge)
+
+
+def _square_gram(K, X) -> Float[Array, "D D"]:
+    return assemble(K, X, X).reshape(X.size, X.size)
 
 
 # The derivative of <Ḡ, G> with respect to the few hyperparameters is taken FORWARD, one at a
 # time: each costs about one assembly. Backward through the pairs was measured at 6 to 60.
 @eqx.filter_custom_vjp
-def _trainable_gram(kernel_and_points):
-    K, X = kernel_and_points
-    return assemble(K, X, X).reshape(X.size, X.size)
+def trained(kernel_and_points, make):
+    """make(K, X), an array over pairs of points, cheap to differentiate with respect to K."""
+    return make(*kernel_and_points)
 
 
-@_trainable_gram.def_fwd
-def _(perturbed, kernel_and_points):
-    return _trainable_gram(kernel_and_points), None
+@trained.def_fwd
+def _(perturbed, kernel_and_points, make):
+    return trained(kernel_and_points, make), None
 
 
-@_trainable_gram.def_bwd
-def _(saved, G_bar, perturbed, kernel_and_points):
+@trained.def_bwd
+def _(saved, bar, perturbed, kernel_and_points, make):
     K, X = kernel_and_points
 
     def paired(K, X):
-        return jnp.vdot(G_bar, assemble(K, X, X).reshape(G_bar.shape))
+        return jnp.vdot(bar, make(K, X))
 
     params, static = eqx.partition(K, eqx.is_inexact_array)
     flat, unravel = ravel_pytree(params)

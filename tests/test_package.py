@@ -27,7 +27,7 @@ ROOMS = [
     {"_solve", "_streaming"},
     {"_fit"},
     {"_folds", "_validation"},
-    {"_bounds", "_search_space", "_tune"},
+    {"_bounds", "_objective", "_search", "_tune"},
     {"_integrators", "_simulate", "_save", "systems"},
     {"plot"},
     {"paper"},

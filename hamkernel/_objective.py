@@ -1,0 +1,144 @@
+"""What `tune` minimises: a validation loss of the dense or of the low-rank fit, or the caller's."""
+
+from collections.abc import Callable
+from typing import Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hamkernel._folds import Folds, Partition
+from hamkernel._scalar import as_pytree
+from hamkernel._solve_choice import memory_bytes
+from hamkernel._solve_features import RandomFeatures
+from hamkernel._solve_nystrom import Nystrom
+from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._validation import (
+    generalized_loss,
+    log_likelihood,
+    log_marginal_likelihood,
+    partition_loss,
+)
+from hamkernel._validation_low_rank import (
+    AbstractBasis,
+    LandmarkBasis,
+    WaveBasis,
+    low_rank_generalized_loss,
+    low_rank_log_likelihood,
+    low_rank_partition_loss,
+)
+
+Objective = Callable[[AbstractMatrixKernel, Array, Array, Array], Float[Array, ""]]
+Criterion = Literal["cross_validation", "generalized_cross_validation", "marginal_likelihood"]
+
+SMALL_ROWS = 128  # of the Gram, up to which every run is on all points
+COARSE_ROWS = 64  # of the Gram of the subset otherwise
+
+HUGE = 1e30  # stands for an objective that is not finite: BFGS backs away from it
+
+
+class SearchCriterion(eqx.Module):
+    """The function to minimise. Losses are searched by their logarithm, which has no scale."""
+
+    fn: Callable[..., Float[Array, ""]]
+    partition: Partition | None = eqx.field(static=True)
+    logarithmic: bool = eqx.field(static=True)
+    own: bool = eqx.field(static=True, default=False)  # the caller's: it may need all the data
+
+    def value(self, K, X, Y, regularization) -> Float[Array, ""]:
+        extra = () if self.partition is None else (self.partition,)
+        value = self.fn(K, X, Y, regularization, *extra)
+        if self.logarithmic:
+            value = jnp.log(jnp.maximum(value, jnp.finfo(value.dtype).tiny))
+        return jnp.where(jnp.isfinite(value), value, HUGE)
+
+    def loss(self, value: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The caller's objective for a value of the search; inf where there was none."""
+        loss = jnp.exp(value) if self.logarithmic else value
+        return jnp.where(value < HUGE, loss, jnp.inf)
+
+    def coarse_points(self, X: Float[Array, "N n"]) -> np.ndarray:
+        """The rows of the subset: spread evenly over the folds, and over the points of each."""
+        N, n = X.shape
+        if self.own or N * n <= SMALL_ROWS:
+            return np.arange(N)
+        labels = np.zeros(N) if self.partition is None else self.partition.labels
+        count = max(COARSE_ROWS // n, 2)
+        even = np.linspace(0, N - 1, count).round().astype(int)
+        return np.sort(np.argsort(labels, kind="stable")[even])
+
+    def with_basis(self, basis: AbstractBasis) -> "SearchCriterion":
+        """The same criterion of the low-rank fit in this basis."""
+        low_rank = {
+            partition_loss: low_rank_partition_loss,
+            generalized_loss: low_rank_generalized_loss,
+            _negative_log_likelihood: _negative_low_rank_log_likelihood,
+        }[self.fn.func]  # type: ignore[attr-defined]
+        fn = jax.tree_util.Partial(low_rank, basis)
+        return SearchCriterion(fn, self.partition, self.logarithmic)
+
+    def on(self, rows: np.ndarray) -> "SearchCriterion":
+        """The same criterion for a subset of the points."""
+        if self.partition is None:
+            return self
+        partition = Partition(len(rows), self.partition.labels[rows])
+        return SearchCriterion(self.fn, partition, self.logarithmic, self.own)
+
+
+def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> SearchCriterion:
+    partial = jax.tree_util.Partial
+    if objective == "cross_validation":
+        return SearchCriterion(partial(partition_loss), Partition(N, folds), logarithmic=True)
+    if objective == "generalized_cross_validation":
+        return SearchCriterion(partial(generalized_loss), None, logarithmic=True)
+    if objective == "marginal_likelihood":
+        return SearchCriterion(partial(_negative_log_likelihood), None, logarithmic=False)
+    if objective is log_marginal_likelihood:
+        raise TypeError(
+            "log_marginal_likelihood is to be large and an objective is to be small: pass "
+            "objective='marginal_likelihood'."
+        )
+    if not callable(objective):
+        raise ValueError(
+            "objective must be 'cross_validation', 'generalized_cross_validation', "
+            "'marginal_likelihood' or a function (K, X, Y, regularization) -> (); "
+            f"got {objective!r}."
+        )
+    return SearchCriterion(as_pytree(objective), None, logarithmic=False, own=True)
+
+
+def _negative_log_likelihood(K, X, Y, regularization):
+    return -log_likelihood(K, X, Y, regularization)
+
+
+def _negative_low_rank_log_likelihood(basis, K, X, Y, regularization):
+    return -low_rank_log_likelihood(basis, K, X, Y, regularization)
+
+
+def basis_of(solver, K, regularization, X) -> AbstractBasis:
+    """What the solver would take at the best kernel of the subset; it follows the kernel then."""
+    if isinstance(solver, RandomFeatures):
+        return WaveBasis(solver.key, solver.count)
+    landmarks = solver.landmarks(K, X, regularization)
+    return LandmarkBasis(landmarks.points)
+
+
+def check_memory(solver, criterion: SearchCriterion, rows: np.ndarray, X: Float[Array, "N n"]):
+    """Refuse a dense loss that does not fit, before the search for its basins."""
+    low_rank = isinstance(solver, Nystrom | RandomFeatures)
+    if low_rank or criterion.own or len(rows) == len(X):
+        return
+    N, n = X.shape
+    needed, memory = LOSS_COPIES * (N * n) ** 2 * X.dtype.itemsize, memory_bytes()
+    if memory is not None and needed > memory:
+        raise ValueError(
+            f"the loss of N = {N} points with n = {n} coordinates and its gradient need "
+            f"{needed / 1e9:.3g} GB ({LOSS_COPIES} matrices of {N * n} rows) and there are "
+            f"{memory / 1e9:.3g} GB. Use solver=hk.Nystrom() or hk.RandomFeatures(count, key), "
+            "whose loss is of low rank too, or tune on a part of the data."
+        )
+
+
+LOSS_COPIES = 7  # matrices of the size of the Gram that a loss with its gradient holds

@@ -1,0 +1,134 @@
+"""Runs of an optimiser from many starts, on a subset of the points and then on all of them."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+from hamkernel._objective import HUGE, SearchCriterion
+from hamkernel._search_space import SearchSpace
+
+
+class Runs(eqx.Module):
+    """The best point of each run."""
+
+    u: Float[Array, "starts P"]
+    value: Float[Array, " starts"]
+    converged: Bool[Array, " starts"]
+    steps: Int[Array, " starts"]
+
+
+decode = eqx.filter_jit(lambda space, u, X: space.decode(u, X))
+
+
+@eqx.filter_jit
+def search(space, criterion, X, Y, scale: float, optimiser, starts: int, max_steps: int) -> Runs:
+    """The runs from all starts on X and Y, all points or a part of them; those of a part sorted.
+
+    Args:
+        space: the search space.
+        criterion: of these points.
+        X: states.
+        Y: velocities.
+        scale: the number of all points over those in X; it keeps the ridge Nλ of all points.
+        optimiser: an optimistix minimiser.
+        starts: how many runs.
+        max_steps: the largest number of steps of each.
+    """
+    coarse = _Objective(space, criterion, X, Y, scale)
+    u = space.encode_start(X)[None]
+    if starts > 1:
+        design = _design(u.shape[1], DESIGN_POINTS, X.dtype)
+        values = jax.lax.map(coarse, design, batch_size=64)
+        u = jnp.concatenate([u, _spread_out(design, values, starts - 1)])
+    runs = jax.vmap(lambda u: _run(coarse, u, optimiser, max_steps))(u)
+    return runs if scale == 1 else _sorted(runs)
+
+
+@eqx.filter_jit
+def finish(space, criterion, X, Y, runs: Runs, optimiser, max_steps: int) -> Runs:
+    """The runs with their losses on all points, the best of them finished there."""
+    fine = _Objective(space, criterion, X, Y, 1.0)
+    runs = _sorted(eqx.tree_at(lambda r: r.value, runs, jax.lax.map(fine, runs.u)))
+    finished = jax.lax.map(lambda u: _run(fine, u, optimiser, max_steps), runs.u[:FINISHERS])
+    return jax.tree.map(lambda new, old: old.at[:FINISHERS].set(new), finished, runs)
+
+
+def _sorted(runs: Runs) -> Runs:
+    order = jnp.argsort(runs.value)
+    return jax.tree.map(lambda leaf: leaf[order], runs)
+
+
+DESIGN_POINTS = 256  # in the box, from which the starts are chosen
+FINISHERS = 1  # runs that are finished on all points
+
+
+class _Objective(eqx.Module):
+    """u -> value. `thinning` keeps the ridge Nλ of all points when X is a subset of them."""
+
+    space: SearchSpace
+    criterion: SearchCriterion
+    X: Float[Array, "N n"]
+    Y: Float[Array, "N n"]
+    thinning: float = eqx.field(static=True)
+
+    def __call__(self, u: Float[Array, " P"]) -> Float[Array, ""]:
+        kernel, regularization = self.space.decode(u, self.X)
+        return self.criterion.value(kernel, self.X, self.Y, self.thinning * regularization)
+
+
+def _run(objective: _Objective, u: Float[Array, " P"], optimiser, max_steps: int) -> Runs:
+    """One run of the optimiser from u."""
+    # optimistix starts its best loss in the default dtype, which float32 data must then meet.
+    default = jnp.result_type(float)
+
+    def in_default(v):
+        return objective(v.astype(u.dtype)).astype(default)
+
+    # optimistix linearises forward and transposes; our derivatives are written backward.
+    @jax.custom_jvp
+    def differentiable(v):
+        return in_default(v)
+
+    @differentiable.defjvp
+    def _(primals, tangents):
+        value, slope = jax.value_and_grad(in_default)(*primals)
+        slope = jnp.where(jnp.isfinite(slope), slope, jnp.zeros_like(slope))
+        return value, slope @ tangents[0]
+
+    found = optx.minimise(
+        lambda v, _: differentiable(v),
+        optimiser,
+        u.astype(default),
+        max_steps=max_steps,
+        throw=False,
+    )
+    converged = found.result == optx.RESULTS.successful
+    best = found.value.astype(u.dtype)
+    return Runs(best, objective(best), converged, found.stats["num_steps"])
+
+
+def _design(P: int, count: int, dtype) -> Float[Array, "count P"]:
+    """A space-filling design in the box: the additive sequence of Roberts (2018), R_d."""
+    root = 2.0
+    for _ in range(64):  # the positive solution of root^(P + 1) = root + 1
+        root = (1 + root) ** (1 / (P + 1))
+    share = (0.5 + np.outer(np.arange(1, count + 1), root ** -np.arange(1.0, P + 1))) % 1.0
+    return jnp.asarray(np.arcsin(2 * share - 1), dtype)
+
+
+def _spread_out(
+    design: Float[Array, "count P"], values: Float[Array, " count"], count: int
+) -> Float[Array, "{count} P"]:
+    """The best points of the design that are not neighbours of a better one already taken."""
+    reach = 0.25 * design.shape[1] ** 0.5  # of a box of side 1; a float has no dtype
+    shares = jnp.sin(design) / 2
+    taken = []
+    for _ in range(count):
+        best = jnp.argmin(values)
+        taken.append(design[best])
+        near = jnp.linalg.norm(shares - shares[best][None], axis=1) < reach
+        values = jnp.where(near, HUGE + values, values)
+    return jnp.stack(taken)

@@ -1,0 +1,170 @@
+"""Validation losses of low-rank fits, in closed form: O(N n r²) time, whatever the folds.
+
+Write Φ (N n, r) for the rows of the features at the data, Ĝ = ΦΦᵀ for the Gram that they stand
+for, δ for the ridge, and H_S = Φ_SᵀΦ_S, b_S = Φ_Sᵀy_S for the rows S of a fold. The fit without
+the fold has the weights (H − H_S + δI)⁻¹ (b − b_S): sums over folds, and one factorisation of
+size r for each of them. Where a fold has fewer rows than there are features, the inversion lemma
+gives the same residual from one factorisation of H + δI = RRᵀ and one of the size of the fold,
+
+    r_S = (I − VᵀV)⁻¹ (y_S − Vᵀ R⁻¹b),    V = R⁻¹Φ_Sᵀ,
+
+and the losses that look at all rows at once need H alone (Weinstein & Aronszajn).
+"""
+
+import abc
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jaxtyping import Array, Bool, Float, Key
+
+from hamkernel._features import features
+from hamkernel._folds import Partition
+from hamkernel._gram import assemble
+from hamkernel._solve_landmarks import Landmarks
+from hamkernel._solve_low_rank import whitening
+from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._validation import trained
+
+
+class AbstractBasis(eqx.Module):
+    """Features that follow the hyperparameters of a kernel, Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z)."""
+
+    @abc.abstractmethod
+    def rows(self, K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, "N n r"]:
+        """The features of K at the points."""
+
+
+class WaveBasis(AbstractBasis):
+    """Random Fourier features of one key: the frequencies scale with the kernel."""
+
+    key: Key[Array, ""]
+    count: int = eqx.field(static=True)
+
+    def rows(self, K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, "N n r"]:
+        return features(K, X.shape[1], self.count, self.key, X.dtype)(X)
+
+
+class LandmarkBasis(AbstractBasis):
+    """The kernel's columns at fixed points, made orthonormal in its RKHS."""
+
+    points: Float[Array, "m n"]
+
+    def rows(self, K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, "N n r"]:
+        S = self.points
+        kept = independent(assemble(K, S, S).reshape(S.size, S.size)).reshape(S.shape)
+        T = whitening(K, Landmarks(S, kept, jnp.asarray(len(S))))
+        return (assemble(K, X, S).reshape(X.size, S.size) @ T).reshape(*X.shape, S.size)
+
+
+def independent(G: Float[Array, "r r"]) -> Bool[Array, " r"]:
+    """The columns that are no combination of those before them, to rounding; no derivative."""
+    G = jax.lax.stop_gradient(G)
+    rounding = 10 * len(G) * jnp.finfo(G.dtype).eps * jnp.abs(jnp.diagonal(G)).max()
+
+    def column(c, carry):
+        left, kept = carry
+        pivot = left[c, c]
+        keep = pivot > rounding
+        v = jnp.where(keep, left[:, c] / jnp.sqrt(jnp.where(keep, pivot, 1.0)), 0.0)
+        return left - v[:, None] * v[None, :], kept.at[c].set(keep)
+
+    return jax.lax.fori_loop(0, len(G), column, (G, jnp.zeros(len(G), bool)))[1]
+
+
+def low_rank_partition_loss(
+    basis: AbstractBasis,
+    K: AbstractMatrixKernel,
+    X: Float[Array, "N n"],
+    Y: Float[Array, "N n"],
+    regularization: Float[Array, ""],
+    partition: Partition,
+) -> Float[Array, ""]:
+    """`cross_validation_loss` of the low-rank fit; inf where a factorisation fails."""
+    N = len(X)
+    rows = _rows(basis, K, X)
+    F, size = partition.members.shape
+    ridge = (N - N / F) * regularization
+    folds = partition.gather(rows)  # (F, S n, r), zero in the padding
+    y = partition.gather(Y.reshape(-1, 1))[..., 0]  # (F, S n)
+    few = folds.shape[1] <= rows.shape[1]
+    residuals = (_by_inversion if few else _by_downdating)(folds, y, ridge)
+    squares = jnp.mean(residuals.reshape(F, size, -1) ** 2, axis=2)  # (F, S)
+    weights = jnp.asarray(partition.weights, squares.dtype)
+    by_member = jnp.take(weights, partition.members, mode="fill", fill_value=0)
+    return _finite(jnp.sum(by_member * squares), jnp.inf)
+
+
+def _by_downdating(folds, y, ridge):
+    H = jnp.einsum("fsr,fst->frt", folds, folds)
+    b = jnp.einsum("fsr,fs->fr", folds, y)
+    identity = jnp.eye(H.shape[1], dtype=H.dtype)
+
+    def without(fold):
+        own, target, H_own, b_own = fold
+        R = jnp.linalg.cholesky(H.sum(axis=0) - H_own + ridge * identity)
+        return target - own @ cho_solve((R, True), b.sum(axis=0) - b_own)
+
+    # One after the other: a batch of factorisations would be one more copy of H.
+    return jax.lax.map(without, (folds, y, H, b))
+
+
+def _by_inversion(folds, y, ridge):
+    rows = folds.reshape(-1, folds.shape[2])
+    R = _factor(rows, ridge)
+    b = solve_triangular(R, rows.T @ y.reshape(-1), lower=True)
+    V = solve_triangular(R, rows.T, lower=True).T.reshape(folds.shape)  # (F, S n, r)
+    held_out = jnp.eye(folds.shape[1], dtype=y.dtype)[None] - jnp.einsum("fsr,ftr->fst", V, V)
+    return cho_solve((jnp.linalg.cholesky(held_out), True), (y - V @ b)[..., None])[..., 0]
+
+
+def low_rank_generalized_loss(
+    basis: AbstractBasis,
+    K: AbstractMatrixKernel,
+    X: Float[Array, "N n"],
+    Y: Float[Array, "N n"],
+    regularization: Float[Array, ""],
+) -> Float[Array, ""]:
+    """`generalized_cross_validation` of the low-rank fit; inf where a factorisation fails."""
+    misfit, _, R, rows, ridge = _fitted(basis, K, X, Y, regularization)
+    # tr(I − S) = D − r + δ tr (H + δI)⁻¹
+    inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype), lower=True)
+    free = Y.size - rows.shape[1] + ridge * jnp.sum(inverse**2)
+    return _finite(misfit @ misfit * Y.size / free**2, jnp.inf)
+
+
+def low_rank_log_likelihood(
+    basis: AbstractBasis,
+    K: AbstractMatrixKernel,
+    X: Float[Array, "N n"],
+    Y: Float[Array, "N n"],
+    regularization: Float[Array, ""],
+) -> Float[Array, ""]:
+    """`log_marginal_likelihood` of the low-rank prior; −inf where a factorisation fails."""
+    misfit, w, R, rows, ridge = _fitted(basis, K, X, Y, regularization)
+    # yᵀA⁻¹y = ‖y − Φw‖²/δ + ‖w‖², and det A = det(H + δI) δ^(D − r).
+    square = misfit @ misfit / ridge + w @ w
+    log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(R))) + (Y.size - rows.shape[1]) * jnp.log(ridge)
+    constant = Y.size * jnp.log(2 * jnp.pi).astype(Y.dtype)
+    return _finite(-0.5 * (square + log_det + constant), -jnp.inf)
+
+
+def _rows(basis, K, X) -> Float[Array, "Nn r"]:
+    return trained((K, X), basis.rows).reshape(X.size, -1)
+
+
+def _fitted(basis, K, X, Y, regularization):
+    rows, ridge, y = _rows(basis, K, X), len(X) * regularization, Y.reshape(-1)
+    R = _factor(rows, ridge)
+    w = cho_solve((R, True), rows.T @ y)
+    return y - rows @ w, w, R, rows, ridge
+
+
+def _factor(rows: Float[Array, "Nn r"], ridge: Float[Array, ""]) -> Float[Array, "r r"]:
+    identity = jnp.eye(rows.shape[1], dtype=rows.dtype)
+    return jnp.linalg.cholesky(rows.T @ rows + ridge * identity)
+
+
+def _finite(value: Float[Array, ""], otherwise: float) -> Float[Array, ""]:
+    return jnp.where(jnp.isfinite(value), value, otherwise)

@@ -1,0 +1,160 @@
+"""Low-rank validation losses against refits in NumPy, and `tune` with every solver."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.stats import multivariate_normal
+
+import hamkernel as hk
+from hamkernel._folds import Partition
+from hamkernel._validation_low_rank import (
+    LandmarkBasis,
+    WaveBasis,
+    independent,
+    low_rank_generalized_loss,
+    low_rank_log_likelihood,
+    low_rank_partition_loss,
+)
+
+N, n, RIDGE = 30, 2, 1e-3
+# Systems of condition 1e4.
+ROUNDING = 1e-9
+
+
+def data(N=N, seed=0):
+    rng = np.random.default_rng(seed)
+    X = rng.uniform(-2, 2, size=(N, n))
+    V = np.stack([X[:, 1], -np.sin(X[:, 0])], axis=1)
+    return X, V + 0.05 * rng.normal(size=V.shape)
+
+
+K = hk.Odd(hk.Symplectic(hk.Gaussian(1.2)))
+X, Y = map(jnp.asarray, data())
+BASES = {
+    "landmarks": LandmarkBasis(X[::5]),
+    "waves": WaveBasis(jax.random.key(3), 7),
+}
+FOLDS = {
+    "loo": "loo",
+    "5": 5,
+    "2": 2,  # folds with more rows than there are features
+    "labels": np.repeat(np.arange(6), 5),
+}
+
+
+def rows_of(basis):
+    return np.asarray(basis.rows(K, X)).reshape(N * n, -1)
+
+
+@pytest.mark.parametrize("folds", FOLDS)
+@pytest.mark.parametrize("basis", BASES)
+def test_the_loss_is_that_of_refits(basis, folds):
+    partition = Partition(N, FOLDS[folds])
+    rows, y = rows_of(BASES[basis]), np.asarray(Y).ravel()
+    names = np.unique(partition.labels)
+    ridge = (N - N / len(names)) * RIDGE
+    losses = []
+    for name in names:
+        out = np.repeat(partition.labels == name, n)
+        F, t = rows[~out], y[~out]
+        w = np.linalg.solve(F.T @ F + ridge * np.eye(F.shape[1]), F.T @ t)
+        losses.append(np.mean((y[out] - rows[out] @ w) ** 2))
+    loss = low_rank_partition_loss(BASES[basis], K, X, Y, jnp.asarray(RIDGE), partition)
+    np.testing.assert_allclose(loss, np.mean(losses), rtol=ROUNDING)
+    w = np.linalg.solve(rows.T @ rows + N * RIDGE * np.eye(rows.shape[1]), rows.T @ y)
+    assert abs(np.mean((y - rows @ w) ** 2) / loss - 1) > 0.05  # the training error is another
+
+
+@pytest.mark.parametrize("basis", BASES)
+def test_likelihood_and_gcv_are_those_of_the_low_rank_gram(basis):
+    rows, y = rows_of(BASES[basis]), np.asarray(Y).ravel()
+    A = rows @ rows.T + N * RIDGE * np.eye(N * n)
+    expected = multivariate_normal(np.zeros(N * n), A).logpdf(y)  # type: ignore[arg-type]
+    found = low_rank_log_likelihood(BASES[basis], K, X, Y, jnp.asarray(RIDGE))
+    np.testing.assert_allclose(found, expected, rtol=ROUNDING)
+    a, trace = np.linalg.solve(A, y), np.trace(np.linalg.inv(A))
+    found = low_rank_generalized_loss(BASES[basis], K, X, Y, jnp.asarray(RIDGE))
+    np.testing.assert_allclose(found, N * n * (a @ a) / trace**2, rtol=ROUNDING)
+
+
+def test_with_all_points_as_landmarks_it_is_the_dense_loss():
+    # A ridge far above what the columns left out as dependent carry.
+    partition = Partition(N, 5)
+    basis = LandmarkBasis(X)
+    found = low_rank_partition_loss(basis, K, X, Y, jnp.asarray(RIDGE), partition)
+    np.testing.assert_allclose(found, hk.cross_validation_loss(K, X, Y, RIDGE, 5), rtol=1e-7)
+    few = low_rank_partition_loss(LandmarkBasis(X[:2]), K, X, Y, jnp.asarray(RIDGE), partition)
+    assert abs(few / found - 1) > 0.1
+
+
+@pytest.mark.parametrize("basis", BASES)
+def test_gradients_are_those_of_finite_differences(basis):
+    partition = Partition(N, 5)
+
+    def loss(log_scale, log_ridge):
+        kernel = hk.Odd(hk.Symplectic(hk.Gaussian(jnp.exp(log_scale))))
+        return low_rank_partition_loss(BASES[basis], kernel, X, Y, jnp.exp(log_ridge), partition)
+
+    at = jnp.log(1.2), jnp.log(RIDGE)
+    slopes = jax.grad(loss, (0, 1))(*at)
+    h = 1e-5
+    for i, slope in enumerate(slopes):
+        up, down = (loss(*(v + s * h * (i == j) for j, v in enumerate(at))) for s in (1, -1))
+        np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-5)
+
+
+def test_dependent_columns_are_found():
+    rng = np.random.default_rng(1)
+    F = rng.normal(size=(6, 4))
+    F[3], F[5] = 2 * F[0], F[1] - F[2]
+    # Of six rows of rank four the rows 3 and 5 depend on those before them; 4 is the fourth.
+    np.testing.assert_array_equal(independent(jnp.asarray(F @ F.T)), [1, 1, 1, 0, 1, 0])
+
+
+def test_where_the_factorisation_fails_the_loss_is_infinite():
+    bad = hk.Symplectic(lambda x, z: -jnp.exp(-((x - z) @ (x - z))))
+    loss = low_rank_partition_loss(
+        LandmarkBasis(X[:3]), bad, X, np.nan * Y, jnp.asarray(1e-3), Partition(N, 3)
+    )
+    assert loss == np.inf
+
+
+SOLVERS = {
+    "nystrom": hk.Nystrom(),
+    "features": hk.RandomFeatures(200, jax.random.key(0)),
+}
+
+
+@pytest.mark.parametrize(
+    ("solver", "objective"),
+    [("nystrom", "cross_validation"), ("features", "marginal_likelihood")],
+)
+def test_tuning_with_low_rank_comes_to_the_optimum_of_the_dense_loss(solver, objective):
+    X, Y = data(120, seed=2)
+    start = hk.Symplectic(hk.Gaussian(0.4))
+    tuned = hk.tune(start, X, Y, 0.1, 5, objective=objective, solver=SOLVERS[solver])
+    dense = hk.tune(start, X, Y, 0.1, 5, objective=objective)
+
+    def value(t):
+        if objective == "cross_validation":
+            return float(hk.cross_validation_loss(t.kernel, X, Y, t.regularization, 5))
+        return -float(hk.log_marginal_likelihood(t.kernel, X, Y, t.regularization))
+
+    # The loss of a low-rank fit is another function, close to the dense one: 5 % of it, or of
+    # a log density of about a hundred.
+    assert value(tuned) <= value(dense) + 0.05 * abs(value(dense))
+    at_start = float(hk.cross_validation_loss(start, X, Y, 0.1, 5))
+    new = data(200, seed=5)[0]
+    truth = np.stack([new[:, 1], -np.sin(new[:, 0])], axis=1)
+    error = np.sqrt(np.mean((tuned.field.evaluate(new) - truth) ** 2))
+    assert error**2 < 0.1 * at_start
+    assert type(tuned.field) is type(hk.fit(start, X, Y, 0.1, solver=SOLVERS[solver]))
+
+
+def test_a_dense_loss_that_does_not_fit_is_refused_before_the_search(monkeypatch):
+    X, Y = data(120)
+    monkeypatch.setattr("hamkernel._objective.memory_bytes", lambda: 100_000)
+    with pytest.raises(ValueError, match=r"hk.Nystrom\(\)"):
+        hk.tune(K, X, Y, 1e-3, 5)
+    assert np.isfinite(hk.tune(K, X, Y, 1e-3, 5, starts=2, solver=hk.Nystrom()).loss)
