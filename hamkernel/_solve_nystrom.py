@@ -214,7 +214,7 @@ def _warn_if_truncated(truncation, count, tolerance):
             "landmarks be chosen from a sample that looks like all of the data (candidates, or "
             "the sample of a stream); for a rough kernel or many dimensions take "
             "hk.ConjugateGradient(), which is exact.",
-            stacklevel=5,
+            stacklevel=6,
         )
 
 

@@ -125,6 +125,23 @@ def test_digits_survive_a_small_ridge():
     assert relative(C @ alpha, values) > 10 * BASIS
 
 
+def test_sums_in_the_basis_of_a_sample_keep_the_digits_of_a_qr():
+    """At λ = 1e-13 the same sums in the basis that they come in lose four digits more."""
+    waves, regularization = hk.RandomFeatures(40, jax.random.key(0)), 1e-13
+    design: Any = fit(K, X[:1], Y[:1], RIDGE, solver=waves).features
+    rows = np.asarray(design(jnp.asarray(X))).reshape(X.size, -1)
+    values = rows @ least_squares(rows, Y, len(X) * regularization)
+
+    def off(start):
+        model = waves.start(K, X, start)
+        for x, y in chunks(X, Y, 200):
+            model = model.add(x, y)
+        return relative(np.asarray(model.field(regularization).evaluate(X)).ravel(), values)
+
+    assert off(regularization) < 1e-12
+    assert off(1e6) > 1e-10  # a multiple of the identity
+
+
 def test_data_and_ridge_may_change_after_the_fit():
     model = given(S).start(K, X).add(X[:200], Y[:200]).add(X[200:400], Y[200:400])
     before, after = model.field(1e-2), model.add(X[400:], Y[400:]).field(RIDGE)
