@@ -17,7 +17,7 @@ from hamkernel._simulate import simulate
 from hamkernel._solve import Cholesky
 from hamkernel._solve_cg import ConjugateGradient
 from hamkernel._solve_features import FeatureField, FeatureFit, RandomFeatures
-from hamkernel._solve_nystrom import Nystrom
+from hamkernel._solve_nystrom import LandmarkFit, Nystrom
 from hamkernel._structured import (
     CurlFree,
     DivergenceFree,
@@ -63,6 +63,7 @@ __all__ = [  # noqa: RUF022 - in reading order
     "fit",
     "KernelField",
     "FeatureField",
+    "LandmarkFit",
     "FeatureFit",
     "SolverInfo",
     "save",

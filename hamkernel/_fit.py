@@ -33,7 +33,9 @@ def fit(
         regularization: λ > 0, in squared units of Y over those of the kernel.
         solver: if None, `Cholesky()` where its three matrices of (N n)² numbers take at most half
             of the memory, else `ConjugateGradient()`; both are exact, and `field.info.solver` says
-            which it was. `Nystrom()` is faster, and approximate to a stated tolerance.
+            which it was. `Nystrom()` is faster, and approximate to a stated tolerance. Where the
+            rows of X are spread over a mesh of devices they stay there, with every solver but
+            `Cholesky()`, and None is `ConjugateGradient()`.
 
     Returns:
         The learned field. Works under jit, vmap and grad, with respect to every argument; new
@@ -61,5 +63,4 @@ def fit(
             "jax.config.update('jax_enable_x64', True) first and pass float64 data.",
             stacklevel=2,
         )
-    N, n = X.shape
-    return chosen(solver, N, n, X.dtype).fit(K, X, Y, regularization)
+    return chosen(solver, X).fit(K, X, Y, regularization)

@@ -5,7 +5,9 @@ from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+from jaxtyping import Array, Float
 
+from hamkernel._devices import rows_of
 from hamkernel._solve import AbstractSolver, Cholesky
 from hamkernel._solve_cg import ConjugateGradient
 
@@ -21,7 +23,7 @@ def dense_bytes(N: int, n: int, dtype: jnp.dtype) -> int:
 
 def memory_bytes() -> int | None:
     """The memory of the default device, or of this machine or container; None if unknown."""
-    stats = jax.devices()[0].memory_stats() or {}
+    stats = jax.local_devices()[0].memory_stats() or {}
     if "bytes_limit" in stats:
         return stats["bytes_limit"]
     try:
@@ -32,15 +34,18 @@ def memory_bytes() -> int | None:
     return min(total, int(limit)) if limit.isdigit() else total
 
 
-def chosen(solver: AbstractSolver | None, N: int, n: int, dtype: jnp.dtype) -> AbstractSolver:
+def chosen(solver: AbstractSolver | None, X: Float[Array, "N n"]) -> AbstractSolver:
     """`solver`; if None, Cholesky where it takes at most half of the memory, else CG.
+
+    Data that is spread over devices gets CG, which leaves it there.
 
     Raises:
         ValueError: Cholesky was asked for and does not fit in memory.
     """
+    (N, n), dtype = X.shape, X.dtype
     needed, memory = dense_bytes(N, n, dtype), memory_bytes()
     if solver is None:
-        fits = memory is None or needed <= memory / 2
+        fits = rows_of(X) is None and (memory is None or needed <= memory / 2)
         tolerance = 1e-8 if dtype == jnp.float64 else 1e-5
         return Cholesky() if fits else ConjugateGradient(tolerance)
     if isinstance(solver, Cholesky) and memory is not None and needed > memory:

@@ -249,6 +249,7 @@ print(json.dumps({
     "plane": compared(few, mesh(4, 2)),
     "explicit": compared(iterative, mesh(8, kind=AxisType.Explicit)),
     "explicit waves": compared(waves, mesh(8, kind=AxisType.Explicit)),
+    "default": hk.fit(K, *spread(mesh(8, kind=AxisType.Explicit), X, Y), 1e-4).info.solver,
     "streams": [streamed(few, m), streamed(waves, m)],
     "slope": off(slope(*spread(m, X, Y)), slope(jnp.asarray(X), jnp.asarray(Y))),
     "memory": {name: [memory(fit, mesh(d), 2**22) for d in (1, 8)] for name, fit in fits.items()},
@@ -265,6 +266,11 @@ def slow():
 @pytest.mark.parametrize("name", ["gradients", "chosen", "plane", "explicit", "explicit waves"])
 def test_every_solver_and_mesh_give_the_fit_of_one_device(slow, name):
     assert_same(dict(slow[name]), 20)
+
+
+@pytest.mark.slow
+def test_spread_data_gets_a_solver_that_leaves_it_where_it_is(slow):
+    assert slow["default"] == "ConjugateGradient"
 
 
 @pytest.mark.slow
@@ -307,6 +313,7 @@ result = {
     "nystrom": compared(few, m), "chosen": compared(hk.Nystrom(), m),
     "features": compared(waves, m), "gradients": compared(iterative, m),
     "explicit": compared(few, mesh(4, kind=AxisType.Explicit)),
+    "default": hk.fit(K, *spread(mesh(8, kind=AxisType.Explicit), X, Y), 1e-4).info.solver,
     "streams": [streamed(few, m), streamed(waves, m)],
 }
 print(json.dumps(result))
