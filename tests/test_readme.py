@@ -4,7 +4,10 @@ import re
 from pathlib import Path
 
 import jax
+import numpy as np
 import pytest
+
+import hamkernel as hk
 
 README = Path(__file__).parents[1] / "README.md"
 
@@ -32,3 +35,19 @@ def test_the_readme_has_the_two_commands_that_ci_runs():
     text = README.read_text()
     assert text.count("-m pytest") >= 1
     assert ".venv/bin/python -m hamkernel" in text
+
+
+def test_the_lines_for_large_data_give_the_field_of_the_exact_fit():
+    rng = np.random.default_rng(0)
+    X = rng.uniform(-2, 2, size=(400, 2))
+    Y = np.stack([X[:, 1], -np.sin(X[:, 0])], axis=1)
+    K = hk.Symplectic(hk.Gaussian(1.5))
+    data = {"X": X, "Y": Y, "X_new": X[:40], "Y_new": Y[:40]}
+    exact = hk.fit(K, X, Y, 1e-5).evaluate(X)
+    chunks = ((X[i : i + 100], Y[i : i + 100]) for i in range(0, 400, 100))
+    for block in python_blocks()[1:3]:
+        names = {"jax": jax, "hk": hk, "K": K, "chunks": chunks, **data}
+        exec(block, names)
+        # Landmarks to a tolerance of a tenth of the ridge; the last field has some points twice.
+        assert abs(names["field"].evaluate(X) - exact).max() < 1e-2
+    assert len(python_blocks()) == 3  # all blocks of the README are run
