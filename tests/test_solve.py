@@ -60,7 +60,13 @@ def relative(a, b):
 # Nystrom.
 
 
-@pytest.mark.parametrize("name", ["symplectic", "odd", "sum", "divergence_free", "separable"])
+def slow(*names):
+    return [pytest.param(name, marks=pytest.mark.slow) for name in names]
+
+
+@pytest.mark.parametrize(
+    "name", ["odd", *slow("symplectic", "sum", "divergence_free", "separable")]
+)
 def test_nystrom_is_the_exact_fit_where_the_tolerance_is_small(name):
     K = {
         "symplectic": hk.Symplectic(hk.Gaussian(1.5)),
@@ -222,7 +228,7 @@ def test_a_kernel_that_is_not_positive_is_refused():
 # Conjugate gradients.
 
 
-@pytest.mark.parametrize("name", ["symplectic", "odd", "rough"])
+@pytest.mark.parametrize("name", ["symplectic", *slow("odd", "rough")])
 def test_conjugate_gradients_find_the_exact_coefficients(name):
     K = {
         "symplectic": hk.Symplectic(hk.Gaussian(1.5)),
