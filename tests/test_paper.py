@@ -264,6 +264,7 @@ def test_an_outcome_agrees_with_the_closed_form_in_numpy_and_scipy():
         assert quantities["true_hamiltonian_mean"] == pytest.approx(2.0, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_grid_refits_are_the_closed_form_and_each_seed_takes_its_best_point():
     pendulum = paper.experiments()["pendulum_m1"]
     X, Y = paper.datasets(pendulum, jax.vmap(jax.random.key)(np.arange(2)))

@@ -268,6 +268,7 @@ def test_conjugate_gradients_that_do_not_converge_say_so():
         hk.fit(hk.CurlFree(lambda x, z: -jnp.exp(x @ z)), X, Y, RIDGE, solver=ConjugateGradient())
 
 
+@pytest.mark.slow
 def test_the_gradient_of_conjugate_gradients_is_that_of_cholesky():
     X, Y = data(40)
 

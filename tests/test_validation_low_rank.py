@@ -128,7 +128,10 @@ SOLVERS = {
 
 @pytest.mark.parametrize(
     ("solver", "objective"),
-    [("nystrom", "cross_validation"), ("features", "marginal_likelihood")],
+    [
+        pytest.param("nystrom", "cross_validation", marks=pytest.mark.slow),
+        ("features", "marginal_likelihood"),
+    ],
 )
 def test_tuning_with_low_rank_comes_to_the_optimum_of_the_dense_loss(solver, objective):
     X, Y = data(120, seed=2)
