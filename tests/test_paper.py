@@ -91,7 +91,6 @@ def test_results_have_every_experiment_reading_model_quantity_and_spread(results
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_results_have_the_tuned_hyperparameters_too(tuned_results, results):
     check_layout(tuned_results, {"lambda", "N*lambda", "tuned"})
     # The rest is that of the run without tuning, to the tolerance of the integrator.
@@ -165,7 +164,6 @@ def test_only_the_odd_kernel_is_odd_and_symplectic_fields_keep_their_hamiltonian
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_gradient_is_at_least_as_good_as_the_grid_in_the_median(tuned_results):
     low = np.geomspace(0.3, 30.0, 30)
     for readings in tuned_results.values():
@@ -179,7 +177,6 @@ def test_gradient_is_at_least_as_good_as_the_grid_in_the_median(tuned_results):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_report_compares_grid_and_gradient(tuned_run):
     text, out = tuned_run
     assert (out / "pendulum_m1_tuning.png").exists()
