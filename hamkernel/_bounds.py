@@ -46,8 +46,8 @@ def gram_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, 
     return jnp.sum(jax.vmap(lambda x: jnp.trace(K(x, x)))(X))
 
 
-def cancelling_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
-    """The trace of the Gram before the terms of an odd or even kernel cancel: what rounds.
+def traces(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, "2"]:
+    """The trace of the Gram, and before the terms of an odd or even kernel cancel: what rounds.
 
     (k(x, z) − k(−x, z))/2 of a long lengthscale is the small difference of large numbers.
     """
@@ -55,13 +55,16 @@ def cancelling_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[A
     def is_mean(node: object) -> bool:
         return isinstance(node, Symmetrised)
 
+    trace = gram_trace(K, X)
+    if not any(map(is_mean, jax.tree.leaves(K, is_leaf=is_mean))):
+        return jnp.stack([trace, trace])
     terms = jax.tree.map(lambda node: node.kernel if is_mean(node) else node, K, is_leaf=is_mean)
-    return jnp.maximum(gram_trace(terms, X), gram_trace(K, X))
+    return jnp.stack([trace, jnp.maximum(gram_trace(terms, X), trace)])
 
 
 def _amplitude(K: AbstractMatrixKernel, X: Array, Y: Array) -> float:
     """The factor that gives K(x, x) the size of Y: mean Y² over the mean diagonal."""
-    ratio = float(jnp.mean(Y**2) / gram_trace(K, X) * X.size)
+    ratio = float(np.mean(np.asarray(Y) ** 2) / gram_trace(K, X) * X.size)
     return ratio if np.isfinite(ratio) and ratio > 0 else 1.0
 
 

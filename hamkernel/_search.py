@@ -98,16 +98,32 @@ def _run(objective: _Objective, u: Float[Array, " P"], optimiser, max_steps: int
         slope = jnp.where(jnp.isfinite(slope), slope, jnp.zeros_like(slope))
         return value, slope @ tangents[0]
 
+    def with_value(v, _):
+        value = differentiable(v)
+        return value, value
+
     found = optx.minimise(
-        lambda v, _: differentiable(v),
+        with_value,
         optimiser,
         u.astype(default),
+        has_aux=True,
         max_steps=max_steps,
         throw=False,
     )
-    converged = found.result == optx.RESULTS.successful
     best = found.value.astype(u.dtype)
-    return Runs(best, objective(best), converged, found.stats["num_steps"])
+    # BFGS hands back the value at its last point. Others are wrapped, see `keeping_the_best`.
+    value = found.aux.astype(u.dtype) if isinstance(optimiser, optx.BFGS) else objective(best)
+    converged = found.result == optx.RESULTS.successful
+    return Runs(best, value, converged, found.stats["num_steps"])
+
+
+def keeping_the_best(optimiser: optx.AbstractMinimiser) -> optx.AbstractMinimiser:
+    """The optimiser, so that its last point is the best it has seen.
+
+    That of BFGS is: its line search accepts no other, and optimistix's wrapper would return the
+    point before it.
+    """
+    return optimiser if isinstance(optimiser, optx.BFGS) else optx.BestSoFarMinimiser(optimiser)
 
 
 def _design(P: int, count: int, dtype) -> Float[Array, "count P"]:

@@ -6,8 +6,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float
 
-from hamkernel._bounds import cancelling_trace, gram_trace, hyperparameters
+from hamkernel._bounds import hyperparameters, traces
 from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._trained import trained
 
 RIDGE = "regularization"
 ROUNDINGS = 100.0  # how far the ridge must stay above the rounding of the Gram
@@ -71,7 +72,7 @@ class SearchSpace(eqx.Module):
         self.kernel = K
         self.low, self.high = jnp.asarray(low, dtype), jnp.asarray(high, dtype)
         leaves, _ = ravel_pytree(eqx.filter(K, eqx.is_inexact_array))
-        self.start = jnp.append(leaves.astype(dtype), jnp.log(regularization))
+        self.start = jnp.asarray(np.append(leaves, np.log(regularization)), dtype)
 
     def decode(
         self, u: Float[Array, " P"], X: Float[Array, "N n"]
@@ -88,12 +89,14 @@ class SearchSpace(eqx.Module):
         low, high = self.ridge_box(kernel, X)
         return kernel, jnp.exp(low + (high - low) * moved[-1])
 
+    @eqx.filter_jit
     def ridge_box(
         self, kernel: AbstractMatrixKernel, X: Float[Array, "N n"]
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """The bounds of log λ: from the rounding of the Gram to where the field is almost zero."""
-        low = self.roundings * jnp.finfo(X.dtype).eps * cancelling_trace(kernel, X) / len(X)
-        high = jnp.maximum(10 * gram_trace(kernel, X) / len(X), 2 * low)
+        trace, cancelling = trained((kernel, X), traces)
+        low = self.roundings * jnp.finfo(X.dtype).eps * cancelling / len(X)
+        high = jnp.maximum(10 * trace / len(X), 2 * low)
         if self.given_ridge is not None:
             low = jnp.maximum(low, self.given_ridge[0])
             high = jnp.maximum(self.given_ridge[1], low)
@@ -116,8 +119,8 @@ class SearchSpace(eqx.Module):
     def box(self, kernel: AbstractMatrixKernel, X: Float[Array, "N n"]) -> dict[str, tuple]:
         """The bounds by name, in the units of the hyperparameters; those of λ for `kernel`."""
         ridge_low, ridge_high = self.ridge_box(kernel, X)
-        low = np.asarray(self.low.at[-1].set(ridge_low))
-        high = np.asarray(self.high.at[-1].set(ridge_high))
+        low, high = np.array(self.low), np.array(self.high)
+        low[-1], high[-1] = ridge_low, ridge_high
         return {
             self.names[i]: tuple(
                 float(np.exp(b[i]) if self.logarithmic[i] else b[i]) for b in (low, high)

@@ -15,6 +15,8 @@ the way along ℓ -> ∞, λ -> 0 until nothing is left of it but noise.
 from typing import Any
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
@@ -25,7 +27,7 @@ from hamkernel._fit import fit
 from hamkernel._folds import Folds
 from hamkernel._gram import matrix_kernel
 from hamkernel._objective import HUGE, Criterion, Objective, basis_of, check_memory, criterion_of
-from hamkernel._search import decode, finish, search
+from hamkernel._search import decode, finish, keeping_the_best, search
 from hamkernel._search_space import LOW_RANK_ROUNDINGS, ROUNDINGS, SearchSpace
 from hamkernel._solve import AbstractSolver
 from hamkernel._solve_features import RandomFeatures
@@ -130,7 +132,7 @@ def tune(
     if optimiser is None:
         optimiser = _BFGS_VERBOSE if progress else _BFGS
 
-    optimiser = optx.BestSoFarMinimiser(optimiser)
+    optimiser = keeping_the_best(optimiser)
     rows = criterion.coarse_points(X)
     check_memory(solver, criterion, rows, X)
     part = criterion.on(rows), X[rows], Y[rows], len(X) / len(rows)
@@ -141,7 +143,8 @@ def tune(
             kernel, ridge = decode(space, runs.u[0], X)
             fine = criterion.with_basis(basis_of(solver, kernel, ridge, X))
         runs = finish(space, fine, X, Y, runs, optimiser, max_steps)
-    values = np.asarray(runs.value)
+    runs = jax.tree.map(np.asarray, runs)  # NumPy compiles nothing
+    values = runs.value
     if not (values < HUGE).any():
         raise RuntimeError(
             "the objective is not finite at any start. Likely causes, in order: a kernel that is "
@@ -150,15 +153,16 @@ def tune(
             "objective of your own that returns NaN."
         )
     best = int(values.argmin())
-    kernel, ridge = decode(space, runs.u[best], X)
+    kernel, ridge = decode(space, jnp.asarray(runs.u[best]), X)
+    losses = criterion.losses(values)
     return Tuned(
         kernel=kernel,
         regularization=ridge,
-        loss=criterion.loss(runs.value[best]),
+        loss=losses[best],
         field=fit(kernel, X, Y, ridge, solver=solver),
-        converged=runs.converged[best],
-        steps=runs.steps[best],
-        start_losses=criterion.loss(runs.value),
+        converged=jnp.asarray(runs.converged[best]),
+        steps=jnp.asarray(runs.steps[best]),
+        start_losses=losses,
         at_bounds=space.at_bounds(runs.u[best]),
         bounds=space.box(kernel, X),
     )

@@ -6,9 +6,9 @@ a fit WITHOUT S would have on S,
 
     r_S = y_S − f₋S(X_S) = (C_SS)⁻¹ a_S,    C = A⁻¹,
 
-so no fold is ever refitted. With the factor A = LLᵀ and U = L⁻ᵀ one has C_SS = U_S U_Sᵀ, where
-U_S holds the rows S of U, and C itself is not needed. (Rows, because those of a fold lie together
-in memory: the products over folds then need no copy of the matrix.)
+so no fold is ever refitted. With A = LLᵀ and U = L⁻ᵀ one has C_SS = U_S U_Sᵀ, where U_S holds the
+rows S of U, and C itself is not needed. (Rows, because those of a fold lie together in memory: the
+products over folds then need no copy of the matrix.)
 
 The derivatives are written down as well, since differentiating the factorisation costs several
 times its price. From dC = −C dA C, and with v_S = (C_SS)⁻¹ r̄_S for a cotangent r̄,
@@ -25,13 +25,14 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from hamkernel import _require as require
 from hamkernel._folds import Folds, Partition
 from hamkernel._gram import assemble, matrix_kernel
+from hamkernel._inverse import inverse, inverse_factor
 from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._trained import trained
 
 
 def cross_validation_loss(
@@ -192,38 +193,6 @@ def _square_gram(K, X) -> Float[Array, "D D"]:
     return assemble(K, X, X).reshape(X.size, X.size)
 
 
-# The derivative of <Ḡ, G> with respect to the few hyperparameters is taken FORWARD, one at a
-# time: each costs about one assembly. Backward through the pairs was measured at 6 to 60.
-@eqx.filter_custom_vjp
-def trained(kernel_and_points, make):
-    """make(K, X), an array over pairs of points, cheap to differentiate with respect to K."""
-    return make(*kernel_and_points)
-
-
-@trained.def_fwd
-def _(perturbed, kernel_and_points, make):
-    return trained(kernel_and_points, make), None
-
-
-@trained.def_bwd
-def _(saved, bar, perturbed, kernel_and_points, make):
-    K, X = kernel_and_points
-
-    def paired(K, X):
-        return jnp.vdot(bar, make(K, X))
-
-    params, static = eqx.partition(K, eqx.is_inexact_array)
-    flat, unravel = ravel_pytree(params)
-
-    def slope(direction):
-        at = lambda flat: paired(eqx.combine(unravel(flat), static), X)  # noqa: E731
-        return jax.jvp(at, (flat,), (direction,))[1]
-
-    K_bar = unravel(jax.lax.map(slope, jnp.eye(flat.size, dtype=flat.dtype)))
-    X_bar = jax.grad(paired, argnums=1)(K, X) if perturbed[1] else None
-    return K_bar, X_bar
-
-
 # What each loss needs of A and y, with its derivative.
 
 
@@ -236,7 +205,7 @@ def held_out(
 
 
 def _held_out_forward(A, y, partition):
-    U = _inverse_factor(A)
+    U = inverse_factor(A)
     a = U @ (U.T @ y)
     U_S, a_S = partition.gather(U), partition.gather(a[:, None])[..., 0]
     blocks = jnp.einsum("fid,fjd->fij", U_S, U_S)
@@ -249,13 +218,15 @@ def _held_out_forward(A, y, partition):
 
 def _held_out_backward(partition, saved, r_bar):
     U, a, factors, r, ok = saved
-    U_S = partition.gather(U)
     v = _solve_blocks(factors, r_bar)
-    # C_:S v_S = U(U_Sᵀ v_S), one column for each fold.
-    P, Q = (jnp.einsum("fid,fi->df", U_S, each) for each in (v, r))
-    # Else XLA computes these sums again for every entry of the products: 10 times slower.
+    # C_:S v_S, one column for each fold: of C = UUᵀ or, if they are few, U(U_Sᵀ v_S) without it.
+    few = 6 * len(r) < len(U)
+    rows = partition.gather(U if few else inverse(U))
+    P, Q = (jnp.einsum("fid,fi->df", rows, each) for each in (v, r))
+    # Else XLA computes these sums again for every entry of the product: 10 times slower.
     P, Q = jax.lax.optimization_barrier((P, Q))
-    P, Q = U @ P, U @ Q
+    if few:
+        P, Q = U @ P, U @ Q
     w = P.sum(axis=1)  # C v
     return _or_zero(ok, P @ Q.T - w[:, None] * a[None, :], w)
 
@@ -272,7 +243,7 @@ def free_residuals(
 
 
 def _free_residuals_forward(A, y):
-    U = _inverse_factor(A)
+    U = inverse_factor(A)
     a = U @ (U.T @ y)
     squares, trace = a @ a, jnp.sum(U * U)
     ok = jnp.isfinite(squares) & jnp.isfinite(trace)
@@ -283,7 +254,7 @@ def _free_residuals_forward(A, y):
 def _free_residuals_backward(saved, bars):
     U, a, ok = saved
     squares_bar, trace_bar = bars
-    C = U @ U.T
+    C = inverse(U)
     w = 2 * squares_bar * (C @ a)
     return _or_zero(ok, -trace_bar * (C @ C) - w[:, None] * a[None, :], w)
 
@@ -298,7 +269,7 @@ def log_density(A: Float[Array, "D D"], y: Float[Array, " D"]) -> Float[Array, "
 
 
 def _log_density_forward(A, y):
-    U = _inverse_factor(A)
+    U = inverse_factor(A)
     whitened = U.T @ y
     log_det = -2 * jnp.sum(jnp.log(jnp.diagonal(U)))
     value = -0.5 * (whitened @ whitened + log_det + len(y) * jnp.log(2 * jnp.pi).astype(y.dtype))
@@ -308,29 +279,10 @@ def _log_density_forward(A, y):
 
 def _log_density_backward(saved, bar):
     U, a, ok = saved
-    return _or_zero(ok, 0.5 * bar * (a[:, None] * a[None, :] - U @ U.T), -bar * a)
+    return _or_zero(ok, 0.5 * bar * (a[:, None] * a[None, :] - inverse(U)), -bar * a)
 
 
 log_density.defvjp(_log_density_forward, _log_density_backward)
-
-
-def _inverse_factor(A: Float[Array, "D D"]) -> Float[Array, "D D"]:
-    """U = L⁻ᵀ with A = LLᵀ; NaN where A is not positive definite."""
-    L = jax.lax.linalg.cholesky(A, symmetrize_input=False)
-    identity = jnp.eye(len(A), dtype=A.dtype)
-    D = len(A)
-    if D > 64:
-        # LAPACK works by columns: the transpose of its answer is what JAX stores without a copy.
-        return jax.lax.linalg.triangular_solve(L, identity, left_side=True, lower=True).T
-    # OpenBLAS wakes its threads from 1024 entries on, which on a busy machine was measured to take
-    # 500 times as long as the work: small matrices are solved in strips below that. One after the
-    # other: jaxlib 0.10.2 stalls forever when a batch of them runs beside another on two cores.
-    count = -(-D // (1023 // D))
-    width = -(-D // count)
-    columns = jnp.pad(identity, ((0, 0), (0, count * width - D))).reshape(D, count, width)
-    solve = functools.partial(jax.lax.linalg.triangular_solve, L, left_side=True, lower=True)
-    strips = jax.lax.map(solve, jnp.moveaxis(columns, 1, 0))  # (count, D, width)
-    return jnp.moveaxis(strips, 1, 2).reshape(count * width, D)[:D]
 
 
 def _solve_blocks(factors: Float[Array, "F b b"], b: Float[Array, "F b"]) -> Float[Array, "F b"]:

@@ -25,7 +25,7 @@ from hamkernel._gram import assemble
 from hamkernel._solve_landmarks import Landmarks
 from hamkernel._solve_low_rank import whitening
 from hamkernel._structured import AbstractMatrixKernel
-from hamkernel._validation import trained
+from hamkernel._trained import trained
 
 
 class AbstractBasis(eqx.Module):
