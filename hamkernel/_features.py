@@ -93,8 +93,7 @@ class PotentialFeatures(AbstractFeatures):
         return len(self.waves.amplitudes)
 
     def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
-        on_columns = jax.vmap(self.structure.apply, in_axes=(None, 1), out_axes=1)
-        return on_columns(x, self.waves.gradients(x))
+        return self.structure.apply(x, self.waves.gradients(x))
 
     def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
         return self.structure.apply(x, self.waves.gradients(x) @ w)

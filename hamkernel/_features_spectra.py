@@ -133,9 +133,10 @@ def _(k: Periodic, n: int, count: int, key, dtype):
     Fourier transform, whose aliasing is below rounding for ℓ ≥ 1/64. An integer j has no
     derivative in ℓ; the weights p_j(ℓ)/p_j have the value 1 and the derivative of the measure.
     """
+    lengthscale = k.lengthscale.astype(dtype)
     lengthscale = require.value(
-        k.lengthscale.astype(dtype),
-        k.lengthscale < 1 / 64,
+        lengthscale,
+        require.on_host(lengthscale) < 1 / 64,
         "RandomFeatures of a Periodic kernel needs a lengthscale (dimensionless) of at least 1/64.",
     )
     zero = jnp.zeros(n, dtype)

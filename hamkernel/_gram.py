@@ -52,6 +52,7 @@ def assemble(
     return jax.vmap(over_columns, in_axes=(0, None))(X, Z)  # (N, n, M, n)
 
 
+@eqx.filter_jit
 def expansion(
     K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
 ) -> Float[Array, " n"]:
@@ -60,6 +61,7 @@ def expansion(
     return K.expansion(x, Z, A)
 
 
+@eqx.filter_jit
 def potential(
     K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
 ) -> Float[Array, ""]:

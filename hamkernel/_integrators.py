@@ -24,7 +24,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from equinox import AbstractClassVar
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 
 class Step(eqx.Module):
@@ -139,6 +139,12 @@ class EqualSteps(diffrax.AbstractSolver):
         )
         y1 = jax.tree.map(lambda y: y[-1], solution.ys)
         return y1, None, {"y0": y0, "y1": y1}, None, solution.result
+
+
+@jax.jit
+def step_counts(ts: Float[Array, " T"], dt: Float[Array, ""]) -> Int[Array, " T-1"]:
+    """The number of equal steps in each interval of ts."""
+    return equal_steps(ts[1:] - ts[:-1], dt).astype(int)
 
 
 def equal_steps(span: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:

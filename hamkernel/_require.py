@@ -1,11 +1,12 @@
 """What the public functions require of their arguments, said before any long computation.
 
 Shapes, dtypes and configuration are known while tracing and raise at once. Values are checked
-on the host when they are concrete; under `jax.jit` the same check becomes `equinox.error_if`
-on the value that is returned, so it must be used by the caller.
+by NumPy when they are concrete, for it compiles nothing; under `jax.jit` the same check becomes
+`equinox.error_if` on the value that is returned, so it must be used by the caller.
 """
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,14 +21,29 @@ def is_concrete(*values: object) -> bool:
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
 
 
+def on_host(x: Array) -> Any:
+    """`x` as a NumPy array, where it is concrete and on one device; else `x` itself."""
+    if is_concrete(x) and len(x.sharding.device_set) == 1:
+        return np.asarray(x)
+    return x
+
+
+def not_finite(x: Array) -> Any:
+    """Where `x` is NaN or infinite, for `value`."""
+    return ~(abs(on_host(x)) < np.inf)
+
+
 def value(
     x: Array,
-    bad: Bool[Array, "..."],
+    bad: Bool[ArrayLike, "..."],
     message: str | Callable[[], str],
     error: type[Exception] = ValueError,
 ) -> Array:
-    """Return `x`, or fail where `bad` holds: `error` on concrete values, at run time under jit."""
-    bad = jnp.any(bad)
+    """Return `x`, or fail where `bad` holds: `error` on concrete values, at run time under jit.
+
+    Computed with `on_host`, `bad` is known wherever it can be, also for constants under jit.
+    """
+    bad = bad.any()  # type: ignore[union-attr]
     if not is_concrete(bad):
         return eqx.error_if(x, bad, message if isinstance(message, str) else message())
     if bad:
@@ -37,6 +53,8 @@ def value(
 
 def floating(x: ArrayLike, name: str) -> Array:
     """`x` as a JAX array of real floats: integers and booleans become the default float."""
+    if isinstance(x, bool | int | float):
+        x = np.asarray(x, float)
     array = jnp.asarray(x)
     if jnp.issubdtype(array.dtype, jnp.floating):
         return array.astype(array.dtype)  # no weak type: a Python float must not recompile
@@ -51,9 +69,10 @@ def floating(x: ArrayLike, name: str) -> Array:
 def positive(x: ArrayLike, name: str) -> Array:
     """`x` as a float array whose every entry is finite and larger than zero."""
     array = floating(x, name)
+    seen = on_host(array)
     return value(
         array,
-        ~((array > 0) & jnp.isfinite(array)),
+        ~((seen > 0) & (seen < np.inf)),
         lambda: (
             f"{name} must be positive and finite"
             + (f", got {array}." if is_concrete(array) else ".")
@@ -79,7 +98,7 @@ def finite(x: Array, name: str) -> Array:
         more = f" and {rows.size - 5} more" if rows.size > 5 else ""
         return f"{name} contains NaN or inf in row {shown}{more}: remove or repair those points."
 
-    return value(x, ~jnp.isfinite(x), message)
+    return value(x, not_finite(x), message)
 
 
 def points(X: ArrayLike, name: str = "X") -> Float[Array, "N n"]:

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from hamkernel import _require as require
@@ -89,7 +90,7 @@ def simulate(
     """
     import diffrax
 
-    from hamkernel._integrators import EqualSteps, equal_steps
+    from hamkernel._integrators import EqualSteps, step_counts
 
     with _eager(x0):
         x0 = _initial_state(x0)
@@ -118,7 +119,7 @@ def simulate(
         with _eager(dt):
             dt = _largest_step(dt)
         with _eager(ts, dt):
-            counts = equal_steps(ts[1:] - ts[:-1], dt).astype(int)  # (T - 1,)
+            counts = step_counts(ts, dt)
             bound = _bound(counts) if max_steps is None else max_steps
         solver = EqualSteps(solver, dt, adjoint, bound)
         controller = diffrax.StepTo(ts)
@@ -141,7 +142,8 @@ def simulate(
         progress_meter=meter,
     )
     if counts is not None:  # Diffrax counted the save intervals; the steps are inside them.
-        steps = {"num_steps": jnp.sum(counts), "num_accepted_steps": jnp.sum(counts)}
+        total = require.on_host(counts).sum()
+        steps = {"num_steps": jnp.asarray(total), "num_accepted_steps": jnp.asarray(total)}
         solution = eqx.tree_at(lambda s: s.stats, solution, {**solution.stats, **steps})
     return _finite(solution) if throw else solution
 
@@ -173,9 +175,10 @@ def _times(ts: ArrayLike, dtype: Any) -> Float[Array, " T"]:
             "needed: ts[0] is the time of x0, ts[1:] are the times to save at."
         )
     ts = require.finite(ts, "ts").astype(dtype)
+    seen = require.on_host(ts)
     return require.value(
         ts,
-        ts[1:] <= ts[:-1],
+        seen[1:] <= seen[:-1],
         f"ts must be strictly increasing, also after it is rounded to {ts.dtype}, the dtype of x0. "
         "Sort the times and drop repeated ones; to go back in time integrate x -> -field(x).",
     )
@@ -239,13 +242,13 @@ def _bound(counts: Int[Array, " T-1"]) -> int:
     if not require.is_concrete(counts):
         return _MAX_STEPS
     # A power of two, so that neighbouring values of dt share one compiled loop.
-    return 2 ** (int(counts.max()) - 1).bit_length()
+    return 2 ** (int(np.max(counts)) - 1).bit_length()
 
 
 def _finite(solution: Any) -> Any:
     ys = require.value(
         solution.ys,
-        ~jnp.isfinite(solution.ys),
+        require.not_finite(solution.ys),
         "The state overflowed or became NaN. The step is too large for the solver, or the field "
         "has no solution over this time. Take a smaller dt, or a shorter time.",
         RuntimeError,

@@ -37,11 +37,11 @@ class Cholesky(AbstractSolver):
         Y: Float[Array, "N n"],
         regularization: Float[Array, ""],
     ) -> KernelField:
-        A, norm = _representer(K, X, Y, regularization)
-        ridge = len(X) * regularization
+        A, residual, norm = _representer(K, X, Y, regularization)
 
         def message() -> str:
-            number = f" = {float(ridge):.3g}" if require.is_concrete(ridge) else ""
+            known = require.is_concrete(regularization)
+            number = f" = {len(X) * float(regularization):.3g}" if known else ""
             return (
                 f"the Gram plus the ridge N * regularization{number} is not positive definite to "
                 f"rounding in {X.dtype}. Likely causes, in order: the regularization is too small "
@@ -51,12 +51,12 @@ class Cholesky(AbstractSolver):
                 "definite or not finite: hk.check_kernel(k, X) tells."
             )
 
-        A = require.value(A, ~jnp.isfinite(A), message, RuntimeError)
+        A = require.value(A, require.not_finite(A), message, RuntimeError)
         return KernelField(
             kernel=K,
             points=X,
             coefficients=A,
-            residual=ridge * A,  # y − G a = Nλ a
+            residual=residual,
             norm=norm,
             regularization=regularization,
             offset=jnp.zeros((), X.dtype),
@@ -66,13 +66,14 @@ class Cholesky(AbstractSolver):
 
 @eqx.filter_jit
 def _representer(K, X, Y, regularization):
-    """The coefficients, and the norm ‖f‖ with ‖f‖² = aᵀGa = aᵀ(y − Nλa)."""
+    """Coefficients, residual y − Ga = Nλa, and the norm ‖f‖ with ‖f‖² = aᵀGa = aᵀ(y − Nλa)."""
     N, n = X.shape
     G = assemble(K, X, X).reshape(N * n, N * n)
     ridge = N * regularization
     A = solve_positive(G, ridge, Y.reshape(N * n)).reshape(N, n)
-    square = jnp.sum(A * (Y - ridge * A))
-    return A, jnp.sqrt(jnp.maximum(square, jnp.zeros_like(square)))
+    residual = ridge * A
+    square = jnp.sum(A * (Y - residual))
+    return A, residual, jnp.sqrt(jnp.maximum(square, jnp.zeros_like(square)))
 
 
 def solve_positive(

@@ -57,7 +57,7 @@ class FeatureField(AbstractField):
         return self.residual.shape[1]
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self.features.field(self._state(x), self.weights)
+        return _field_at(self.features, self._state(x), self.weights)
 
     def evaluate(self, X: ArrayLike) -> Float[Array, "N n"]:
         """The velocities at many states, as `jax.vmap(field)(X)` but in O(N n + r) memory.
@@ -78,7 +78,7 @@ class FeatureField(AbstractField):
         x = self._state(x)
         # The kernel knows whether its fields have a potential, and says why not.
         jax.eval_shape(self.kernel.potential, x, x[None], x[None])
-        return self.features.potential(x, self.weights)
+        return _potential_at(self.features, x, self.weights)
 
     def part(self, which: int | str) -> "FeatureField":
         """The field of one term of a sum of kernels, by position or name.
@@ -102,6 +102,16 @@ class FeatureField(AbstractField):
         if which == 0:
             return self
         raise KeyError(f"no part {which!r}: {type(self.kernel).__name__} is not a sum.")
+
+
+@eqx.filter_jit
+def _field_at(features, x, weights):
+    return features.field(x, weights)
+
+
+@eqx.filter_jit
+def _potential_at(features, x, weights):
+    return features.potential(x, weights)
 
 
 @eqx.filter_jit
@@ -248,7 +258,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
         field = _solved(self, count, regularization)
-        failed = ~jnp.isfinite(field.weights).all()
+        failed = require.not_finite(field.weights)
         weights = require.value(field.weights, failed, singular(self.dtype), RuntimeError)
         return eqx.tree_at(lambda f: f.weights, field, weights)
 

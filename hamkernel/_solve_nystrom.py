@@ -182,7 +182,7 @@ class _Solution(NamedTuple):
 
 def _field(K, landmarks, solution, regularization, tolerance) -> KernelField:
     A, dtype = solution.coefficients, landmarks.points.dtype
-    failed = ~jnp.isfinite(A).all() | (landmarks.count == 0)
+    failed = require.not_finite(A).any() | (require.on_host(landmarks.count) == 0)
     A = require.value(A, failed, singular(dtype), RuntimeError)
     _warn_if_truncated(solution.truncation, landmarks.count, tolerance)
     return KernelField(

@@ -79,8 +79,9 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
             ValueError: λ is not positive, or no data was added.
         """
         regularization = require.positive_scalar(regularization, "regularization")
+        none = require.on_host(self.count) == 0
         count = require.value(
-            self.count, self.count == 0, "no data yet: add(X, Y) before asking for the field."
+            self.count, none, "no data yet: add(X, Y) before asking for the field."
         )
         return self._solved(count, regularization.astype(self.dtype))
 

@@ -46,8 +46,13 @@ class AbstractHamiltonianSystem(eqx.Module):
             raise ValueError(
                 f"x has shape {x.shape}; one state (q, p) of shape (n,), n even, is needed.{hint}"
             )
-        dq, dp = jnp.split(jax.grad(self.hamiltonian)(x), 2)
-        return jnp.concatenate([dp, -dq])
+        return _velocity(self, x)
+
+
+@eqx.filter_jit
+def _velocity(system: AbstractHamiltonianSystem, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    dq, dp = jnp.split(jax.grad(system.hamiltonian)(x), 2)
+    return jnp.concatenate([dp, -dq])
 
 
 def shaped(x: Array, name: str, *shapes: tuple[int, ...]) -> Array:
@@ -72,7 +77,7 @@ def signed_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:
 
 def finite(x: Array, name: str) -> Array:
     """`x`, in which every entry must be finite."""
-    return require.value(x, ~jnp.isfinite(x), lambda: f"{name} must be finite, got {x}.")
+    return require.value(x, require.not_finite(x), lambda: f"{name} must be finite, got {x}.")
 
 
 def count_of(x: Numbers, name: str) -> int:

@@ -218,7 +218,7 @@ class PointVortices(AbstractHamiltonianSystem):
         )
         self.circulations = require.value(
             array,
-            array == 0,
+            require.on_host(array) == 0,
             lambda: f"circulations must not be zero, got {array}: leave out vortices without one.",
         )
 

@@ -96,9 +96,10 @@ def _times(ts: ArrayLike, dtype: jnp.dtype) -> Float[Array, " T"]:
     ts = finite(ts, "ts")
     # The field does not depend on time. Counting from zero keeps late, dense times apart.
     elapsed = (ts - ts[0]).astype(dtype)
+    seen = require.on_host(elapsed)
     return require.value(
         elapsed,
-        jnp.diff(elapsed) <= 0,
+        seen[1:] <= seen[:-1],
         f"ts must be strictly increasing in {dtype}: sort it and drop repeated times.",
     )
 
@@ -110,9 +111,10 @@ def _noise_level(
     if key is None and not (require.is_concrete(level) and np.all(np.asarray(level) == 0)):
         raise ValueError(f"{name} needs randomness: pass `key=jax.random.key(...)`.")
     array = shaped(require.floating(level, name), name, (), states.shape[1:])
+    seen = require.on_host(array)
     array = require.value(
         array,
-        ~((array >= 0) & jnp.isfinite(array)),
+        ~((seen >= 0) & (seen < np.inf)),
         lambda: f"{name} is a standard deviation, finite and not negative; got {array}.",
     )
     return array.astype(states.dtype)
