@@ -26,7 +26,7 @@ ROOMS = [
     {"_field"},
     {"_solve", "_streaming"},
     {"_fit"},
-    {"_folds", "_validation"},
+    {"_folds", "_inverse", "_trained", "_validation"},
     {"_bounds", "_objective", "_search", "_tune"},
     {"_integrators", "_simulate", "_save", "systems"},
     {"plot"},
