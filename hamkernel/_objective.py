@@ -11,9 +11,8 @@ from jaxtyping import Array, Float
 
 from hamkernel._folds import Folds, Partition
 from hamkernel._scalar import as_pytree
-from hamkernel._solve_choice import memory_bytes
+from hamkernel._solve_choice import dense_bytes, memory_bytes
 from hamkernel._solve_features import RandomFeatures
-from hamkernel._solve_nystrom import Nystrom
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._validation import (
     generalized_loss,
@@ -126,13 +125,10 @@ def basis_of(solver, K, regularization, X) -> AbstractBasis:
     return LandmarkBasis(landmarks.points)
 
 
-def check_memory(solver, criterion: SearchCriterion, rows: np.ndarray, X: Float[Array, "N n"]):
+def check_memory(X: Float[Array, "N n"]) -> None:
     """Refuse a dense loss that does not fit, before the search for its basins."""
-    low_rank = isinstance(solver, Nystrom | RandomFeatures)
-    if low_rank or criterion.own or len(rows) == len(X):
-        return
     N, n = X.shape
-    needed, memory = LOSS_COPIES * (N * n) ** 2 * X.dtype.itemsize, memory_bytes()
+    needed, memory = dense_bytes(N, n, X.dtype, LOSS_COPIES), memory_bytes()
     if memory is not None and needed > memory:
         raise ValueError(
             f"the loss of N = {N} points with n = {n} coordinates and its gradient need "

@@ -16,9 +16,9 @@ COPIES = 3
 _CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
-def dense_bytes(N: int, n: int, dtype: jnp.dtype) -> int:
-    """What a dense fit of N points with n coordinates needs, in bytes."""
-    return COPIES * (N * n) ** 2 * jnp.dtype(dtype).itemsize
+def dense_bytes(N: int, n: int, dtype: jnp.dtype, copies: int = COPIES) -> int:
+    """Bytes in so many matrices of the size of the Gram of N points in ℝⁿ, by default for a fit."""
+    return copies * (N * n) ** 2 * jnp.dtype(dtype).itemsize
 
 
 def memory_bytes() -> int | None:

@@ -205,7 +205,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
 def _fit(K, solver, X, Y, regularization, spread):
     basis = features(K, X.shape[1], solver.count, solver.key, X.dtype)
     ridge = len(X) * regularization
-    weights, residual, _ = ridge_regression(basis, basis.columns, X, Y, ridge, spread)
+    weights, residual = ridge_regression(basis, basis.columns, X, Y, ridge, spread)
     return _field(K, basis, weights, residual, jnp.linalg.norm(residual), regularization)
 
 

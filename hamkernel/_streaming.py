@@ -1,4 +1,4 @@
-"""Linear least squares whose rows arrive in tiles: what low-rank solvers and streams share.
+"""Linear least squares whose rows are made in tiles and never stored.
 
 minimise ‖Φw − y‖² + δ‖w‖² for a tall Φ (m, r) that is never stored. The state is the triangular
 factor of [Φ y] alone: orthogonal transformations of the rows change no norm, so the factor of the
@@ -46,21 +46,6 @@ def accumulate(
     below = jnp.concatenate([rows, targets[:, None]], axis=1)
     stacked = jnp.concatenate([state.factor, below])
     return LeastSquares(jnp.linalg.qr(stacked, mode="r"))
-
-
-@eqx.filter_jit
-def solve(
-    state: LeastSquares, ridge: Float[Array, ""]
-) -> tuple[Float[Array, " r"], Float[Array, ""]]:
-    """The minimiser w of ‖Φw − y‖² + ridge ‖w‖², and ‖Φw − y‖.
-
-    By one more factorisation, of R above √ridge I. With ridge = 0 and dependent columns w is not
-    finite.
-    """
-    triangle, rotated = _with_ridge(state, ridge)
-    w = solve_triangular(triangle, rotated)
-    misfit = state.factor[:, -1] - state.factor[:, :-1] @ w
-    return w, jnp.linalg.norm(misfit)
 
 
 def _with_ridge(state: LeastSquares, ridge: Float[Array, ""]):
@@ -115,11 +100,11 @@ def ridge_regression(
     Y: Float[Array, "N n"],
     ridge: Float[Array, ""],
     spread: Rows | None = None,
-) -> tuple[Float[Array, " r"], Float[Array, "N n"], LeastSquares]:
-    """The minimiser w of ‖Y − Φw‖² + ridge ‖w‖², the residual Y − Φw, and the state.
+) -> tuple[Float[Array, " r"], Float[Array, "N n"]]:
+    """The minimiser w of ‖Y − Φw‖² + ridge ‖w‖², and the residual Y − Φw.
 
     O(N n r²) time and O(r² + N n) memory. Differentiable to every order with respect to the data,
-    the ridge and the arrays in `design`, which must be a PyTree. The state is a constant.
+    the ridge and the arrays in `design`, which must be a PyTree.
 
     Args:
         design: the rows Φ, (t, n) -> (t, n, r).
@@ -134,7 +119,7 @@ def ridge_regression(
     state = accumulate_data(state, fixed, fixed_X, fixed_Y, spread)
     triangle, rotated = _with_ridge(state, fixed_ridge)
     w = _constant(solve_triangular(triangle, rotated))
-    triangle, state = _constant(triangle), _constant(state)
+    triangle = _constant(triangle)
 
     # One step of iterative refinement, w + H⁻¹(Φᵀ(y − Φw) − δw) with H = ΦᵀΦ + δI = RᵀR. It equals
     # H⁻¹Φᵀy for every w, so that its derivatives are exact although w and R are held constant,
@@ -147,7 +132,7 @@ def ridge_regression(
 
     slope = _correlations(design, X, Y, w, spread) - ridge * w
     w = w + jax.lax.custom_linear_solve(times_H, slope, times_inverse, symmetric=True)
-    return w, residual(design, X, Y, w, spread), state
+    return w, residual(design, X, Y, w, spread)
 
 
 def residual(

@@ -134,12 +134,13 @@ def tune(
 
     optimiser = keeping_the_best(optimiser)
     rows = criterion.coarse_points(X)
-    check_memory(solver, criterion, rows, X)
+    if len(rows) < len(X) and not low_rank:
+        check_memory(X)
     part = criterion.on(rows), X[rows], Y[rows], len(X) / len(rows)
     runs = search(space, *part, optimiser, starts, max_steps)
     if len(rows) < len(X):
         fine = criterion
-        if low_rank and not criterion.own:
+        if low_rank:
             kernel, ridge = decode(space, runs.u[0], X)
             fine = criterion.with_basis(basis_of(solver, kernel, ridge, X))
         runs = finish(space, fine, X, Y, runs, optimiser, max_steps)

@@ -17,12 +17,12 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Float, Key
 
 from hamkernel._features import features
 from hamkernel._folds import Partition
 from hamkernel._gram import assemble
-from hamkernel._solve_landmarks import Landmarks
+from hamkernel._solve_landmarks import given_landmarks
 from hamkernel._solve_low_rank import whitening
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._trained import trained
@@ -53,24 +53,8 @@ class LandmarkBasis(AbstractBasis):
 
     def rows(self, K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, "N n r"]:
         S = self.points
-        kept = independent(assemble(K, S, S).reshape(S.size, S.size)).reshape(S.shape)
-        T = whitening(K, Landmarks(S, kept, jnp.asarray(len(S))))
+        T = whitening(K, given_landmarks(K, S))
         return (assemble(K, X, S).reshape(X.size, S.size) @ T).reshape(*X.shape, S.size)
-
-
-def independent(G: Float[Array, "r r"]) -> Bool[Array, " r"]:
-    """The columns that are no combination of those before them, to rounding; no derivative."""
-    G = jax.lax.stop_gradient(G)
-    rounding = 10 * len(G) * jnp.finfo(G.dtype).eps * jnp.abs(jnp.diagonal(G)).max()
-
-    def column(c, carry):
-        left, kept = carry
-        pivot = left[c, c]
-        keep = pivot > rounding
-        v = jnp.where(keep, left[:, c] / jnp.sqrt(jnp.where(keep, pivot, 1.0)), 0.0)
-        return left - v[:, None] * v[None, :], kept.at[c].set(keep)
-
-    return jax.lax.fori_loop(0, len(G), column, (G, jnp.zeros(len(G), bool)))[1]
 
 
 def low_rank_partition_loss(

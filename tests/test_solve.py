@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from data import swings
 
 import hamkernel as hk
 from hamkernel import _solve_choice
@@ -17,14 +18,6 @@ from hamkernel._solve_nystrom import Nystrom
 
 K = hk.Symplectic(hk.Gaussian(1.5))
 RIDGE = 1e-4
-
-
-def data(N=150, n=2, seed=0, noise=0.01):
-    rng = np.random.default_rng(seed)
-    X = rng.uniform(-2, 2, size=(N, n))
-    q, p = X[:, : n // 2], X[:, n // 2 :]
-    velocity = np.concatenate([p, -np.sin(q) * (1 + q**2 / 4)], axis=1)
-    return X, velocity + noise * rng.normal(size=X.shape)
 
 
 def dense(K, X, Z=None):
@@ -75,7 +68,7 @@ def test_nystrom_is_the_exact_fit_where_the_tolerance_is_small(name):
         "divergence_free": hk.DivergenceFree(hk.Gaussian(1.5)),
         "separable": hk.Separable(hk.RationalQuadratic(1.0, 2.0)),
     }[name]
-    X, Y = data()
+    X, Y = swings(150)
     field = fit(K, X, Y, RIDGE, solver=Nystrom(tolerance=1e-5))
     _, values = exact(K, X, Y, RIDGE)
     assert relative(fitted(field, Y), values) < 1e-7  # tolerance × noise
@@ -87,7 +80,7 @@ def test_nystrom_is_the_exact_fit_where_the_tolerance_is_small(name):
 
 @pytest.mark.parametrize("tolerance", [10.0, 0.1, 1e-3])
 def test_fitted_values_are_within_the_tolerance_times_the_residual(tolerance):
-    X, Y = data()
+    X, Y = swings(150)
     field = fit(K, X, Y, RIDGE, solver=Nystrom(tolerance=tolerance))
     _, values = exact(K, X, Y, RIDGE)
     off = np.linalg.norm(fitted(field, Y) - values) / np.linalg.norm(field.residual)
@@ -98,7 +91,7 @@ def test_fitted_values_are_within_the_tolerance_times_the_residual(tolerance):
 
 
 def test_the_truncation_and_the_norm_are_those_of_numpy():
-    X, Y = data()
+    X, Y = swings(150)
     field = fit(K, X, Y, RIDGE, solver=Nystrom())
     S, a = np.asarray(field.points), np.asarray(field.coefficients).ravel()
     used = np.abs(a) > 0
@@ -114,7 +107,7 @@ def test_the_truncation_and_the_norm_are_those_of_numpy():
 
 
 def test_a_larger_ridge_needs_fewer_landmarks():
-    X, Y = data(400)
+    X, Y = swings(400)
     counts = [
         int(info(fit(K, X, Y, regularization, solver=Nystrom())).landmarks)
         for regularization in (1e-2, 1e-4, 1e-6)
@@ -123,7 +116,7 @@ def test_a_larger_ridge_needs_fewer_landmarks():
 
 
 def test_the_number_of_landmarks_is_near_the_best_rank():
-    X, _ = data(400)
+    X, _ = swings(400)
     left = 1e-5
     chosen = choose_landmarks(K, jnp.asarray(X), jnp.asarray(left), 200, 400, jax.random.key(1))
     eigenvalues = np.linalg.eigvalsh(dense(K, X))[::-1]
@@ -132,7 +125,7 @@ def test_the_number_of_landmarks_is_near_the_best_rank():
 
 
 def test_repeated_and_mirrored_points_are_taken_once():
-    X, Y = data(40)
+    X, Y = swings(40)
     X, Y = np.concatenate([X, X, -X]), np.concatenate([Y, Y, -Y])
     odd = hk.Odd(K)
     field = fit(odd, X, Y, RIDGE, solver=Nystrom(tolerance=1e-4))
@@ -143,7 +136,7 @@ def test_repeated_and_mirrored_points_are_taken_once():
 
 def test_no_digits_are_lost_to_normal_equations():
     """At λ = 1e-11 the sums alone keep five digits; with the refinement the fit is that of QR."""
-    X, Y = data(300)
+    X, Y = swings(300)
     regularization = 1e-11
     field = fit(K, X, Y, regularization, solver=Nystrom(tolerance=10.0))
     S = np.asarray(field.points)
@@ -159,7 +152,7 @@ def test_no_digits_are_lost_to_normal_equations():
 
 
 def test_candidates_that_are_a_part_of_the_data_give_the_same_field():
-    X, Y = data(600)
+    X, Y = swings(600)
     field = fit(K, X, Y, RIDGE, solver=Nystrom(candidates=200, key=jax.random.key(5)))
     _, values = exact(K, X, Y, RIDGE)
     off = np.linalg.norm(fitted(field, Y) - values) / np.linalg.norm(field.residual)
@@ -171,7 +164,7 @@ def test_candidates_that_are_a_part_of_the_data_give_the_same_field():
 
 
 def test_nystrom_has_a_hamiltonian_and_a_field_that_is_its_flow():
-    X, Y = data()
+    X, Y = swings(150)
     field = fit(K, X, Y, RIDGE, solver=Nystrom())
     x = jnp.array([0.3, -0.4])
     q_slope, p_slope = jax.grad(field.hamiltonian)(x)
@@ -180,7 +173,7 @@ def test_nystrom_has_a_hamiltonian_and_a_field_that_is_its_flow():
 
 @pytest.mark.slow
 def test_nystrom_works_under_jit_and_its_gradient_is_that_of_finite_differences():
-    X, Y = data(40)
+    X, Y = swings(40)
     solver = Nystrom(tolerance=1e-3, max_points=40)
 
     def loss(log_lengthscale):
@@ -204,7 +197,7 @@ def test_nystrom_works_under_jit_and_its_gradient_is_that_of_finite_differences(
 
 
 def test_too_few_landmarks_are_said():
-    X, Y = data()
+    X, Y = swings(150)
     with pytest.warns(UserWarning, match=r"4 landmarks leave .* Raise max_points"):
         field = fit(K, X, Y, RIDGE, solver=Nystrom(max_points=4))
     assert info(field).truncation > 0.1
@@ -219,7 +212,7 @@ def test_nystrom_refuses_what_makes_no_sense():
 
 
 def test_a_kernel_that_is_not_positive_is_refused():
-    X, Y = data(60)
+    X, Y = swings(60)
     for k in (lambda x, z: -jnp.exp(x @ z), lambda x, z: jnp.linalg.norm(x - z)):
         with pytest.raises(RuntimeError, match="check_kernel"):
             fit(hk.CurlFree(k), X, Y, RIDGE, solver=Nystrom())
@@ -235,7 +228,7 @@ def test_conjugate_gradients_find_the_exact_coefficients(name):
         "odd": hk.Odd(hk.Symplectic(hk.Gaussian(1.5))),
         "rough": hk.Symplectic(hk.Matern(1.5, 1.0)),
     }[name]
-    X, Y = data(n=4)
+    X, Y = swings(150, n=4)
     field = fit(K, X, Y, RIDGE, solver=ConjugateGradient())
     a, values = exact(K, X, Y, RIDGE)
     assert relative(field.coefficients, a) < 1e-7
@@ -251,7 +244,7 @@ def test_conjugate_gradients_find_the_exact_coefficients(name):
 
 
 def test_landmarks_precondition():
-    X, Y = data(n=4)
+    X, Y = swings(150, n=4)
     counts = [
         int(info(fit(K, X, Y, RIDGE, solver=ConjugateGradient(1e-6, 2000, p))).iterations)
         for p in (Nystrom(10.0, 64), Nystrom(1e5, 1))
@@ -260,7 +253,7 @@ def test_landmarks_precondition():
 
 
 def test_conjugate_gradients_that_do_not_converge_say_so():
-    X, Y = data()
+    X, Y = swings(150)
     solver = ConjugateGradient(1e-12, max_iterations=2, preconditioner=Nystrom(1e5, 1))
     with pytest.raises(RuntimeError, match=r"converge after 2 iterations.*max_iterations"):
         hk.fit(K, X, Y, RIDGE, solver=solver)
@@ -270,7 +263,7 @@ def test_conjugate_gradients_that_do_not_converge_say_so():
 
 @pytest.mark.slow
 def test_the_gradient_of_conjugate_gradients_is_that_of_cholesky():
-    X, Y = data(40)
+    X, Y = swings(40)
 
     def loss(log_lengthscale, solver):
         K = hk.Symplectic(hk.Gaussian(jnp.exp(log_lengthscale)))
@@ -294,7 +287,7 @@ def test_conjugate_gradients_refuse_what_makes_no_sense():
 
 
 def test_a_dense_fit_is_chosen_where_it_takes_half_of_the_memory(monkeypatch):
-    X, Y = data(20)
+    X, Y = swings(20)
     need = 3 * 40**2 * 8
     monkeypatch.setattr(_solve_choice, "memory_bytes", lambda: 2 * need)
     assert info(hk.fit(K, X, Y, RIDGE)).solver == "Cholesky"

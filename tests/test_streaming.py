@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from data import swings
 
 import hamkernel as hk
 from hamkernel._solve_nystrom import LandmarkFit, Nystrom
@@ -22,14 +23,6 @@ ROUNDING = 1e-10
 # The root of the condition of the landmarks' Gram, here 1e6, times rounding, and what a thousand
 # sums add to it. Exact arithmetic of 60 digits puts NumPy and this library 2e-9 and 3e-9 off.
 BASIS = 2e-8
-
-
-def data(N=600, n=2, seed=0, noise=0.01):
-    rng = np.random.default_rng(seed)
-    X = rng.uniform(-2, 2, size=(N, n))
-    q, p = X[:, : n // 2], X[:, n // 2 :]
-    velocity = np.concatenate([p, -np.sin(q) * (1 + q**2 / 4)], axis=1)
-    return X, velocity + noise * rng.normal(size=X.shape)
 
 
 def chunks(X, Y, size):
@@ -50,9 +43,9 @@ def relative(a, b):
     return np.linalg.norm(np.asarray(a) - np.asarray(b)) / np.linalg.norm(b)
 
 
-NEW = data(50, seed=9)[0]
+NEW = swings(50, seed=9)[0]
 # Few shapes, so that little is compiled: 600 points in chunks of 200, on 30 landmarks.
-X, Y = data()
+X, Y = swings(600)
 S = X[::20]
 
 
@@ -237,9 +230,9 @@ def test_what_makes_no_sense_is_refused():
     with pytest.raises(ValueError, match="no data yet"):
         solver.start(K, X).field()
     with pytest.raises(ValueError, match="the chunk has 4 coordinates and the fit 2"):
-        solver.start(K, X).add(*data(10, n=4))
+        solver.start(K, X).add(*swings(10, n=4))
     with pytest.raises(ValueError, match="the landmarks have 2 coordinates and X 4"):
-        fit(K, *data(10, n=4), RIDGE, solver=solver)
+        fit(K, *swings(10, n=4), RIDGE, solver=solver)
     with pytest.raises(ValueError, match="NaN or inf in row 3"):
         solver.start(K, np.where(np.arange(600)[:, None] == 3, np.nan, X))
     with pytest.raises(ValueError, match="even"):

@@ -90,7 +90,8 @@ def loss_surface(
         first: values of the first hyperparameter, shape (A,).
         second: values of the second, shape (B,).
         losses: shape (A, B).
-        path: the optimiser's steps (first, second), shape (K, 2), from start to end.
+        path: the optimiser's steps (first, second), shape (K, 2), from start to end; of one
+            row if the end alone is to be shown.
         ax: axes to draw on; new ones if None.
         names: of the hyperparameters.
         label: of the loss.
@@ -125,8 +126,11 @@ def loss_surface(
     ax.plot(first[i], second[j], "*", label="best of the grid", zorder=5, clip_on=False, **best)
     if path is not None:
         path = np.asarray(path)
-        ax.plot(*path.T, "-o", color="#D55E00", ms=3.5, linewidth=1.5, label="optimiser", zorder=4)
-        ax.plot(*path[-1], "D", color="#D55E00", mec="black", ms=7, zorder=6, label="its end")
+        red, end = "#D55E00", "end of the optimiser"
+        if len(path) > 1:
+            ax.plot(*path.T, "-o", color=red, ms=3.5, linewidth=1.5, label="optimiser", zorder=4)
+            end = "its end"
+        ax.plot(*path[-1], "D", color=red, mec="black", ms=7, zorder=6, label=end, linestyle="none")
     ax.set(xscale="log", yscale="log", xlabel=names[0], ylabel=names[1])
     ax.set(xlim=(first.min(), first.max()), ylim=(second.min(), second.max()))
     if title is not None:
