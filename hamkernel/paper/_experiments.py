@@ -66,7 +66,6 @@ class Experiment:
         noise: standard deviation on states and velocities.
         test_state: where the test trajectory starts.
         horizon: how long it runs [s].
-        portrait_horizon: how long the trajectories in the phase portraits run [s], ≥ horizon.
         box: (q limits, p limits) of the portraits; its right half is sampled for the odd error.
         units: of q and p.
         models: the models by name.
@@ -81,7 +80,6 @@ class Experiment:
     noise: float
     test_state: tuple[float, float]
     horizon: float
-    portrait_horizon: float
     box: tuple[tuple[float, float], tuple[float, float]]
     units: tuple[str, str]
     models: Mapping[str, Model]
@@ -108,7 +106,6 @@ def experiments() -> dict[str, Experiment]:
         noise=0.1,
         test_state=(2.0, 0.0),
         horizon=4.0,
-        portrait_horizon=9.0,  # two turns, to see whether orbits close
         box=((-4.0, 4.0), (-4.0, 4.0)),
         units=("m", "kg m/s"),
         models=_models(separable=(19.5, 1e-4), odd_symplectic=(12.1, 1e-4)),
@@ -129,7 +126,6 @@ def _pendulum(mass: float) -> Experiment:
         noise=0.01,
         test_state=(math.pi / 2, 0.0),
         horizon=2.0,
-        portrait_horizon=3.5,
         box=((-math.pi, math.pi), (-8.0, 8.0)),
         units=("rad", "kg m²/s"),
         models=_models(separable=(12.3, 0.1), odd_symplectic=(3.0, 1e-4)),
