@@ -16,7 +16,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hamkernel import _require as require
 from hamkernel._devices import rows_of, split
-from hamkernel._gram import assemble
+from hamkernel._gram import assemble, block_traces
 from hamkernel._structured import AbstractMatrixKernel
 
 BLOCK = 16  # points drawn at once
@@ -100,7 +100,7 @@ def given_landmarks(K: AbstractMatrixKernel, S: Float[Array, "m n"]) -> Landmark
     O((m n)³) time. Nothing is differentiated, as in `choose_landmarks`.
     """
     K, S = jax.lax.stop_gradient((K, S))
-    rounding = _rounding(jax.vmap(lambda x: jnp.trace(K(x, x)))(S), S.size)
+    rounding = _rounding(block_traces(K, S), S.size)
     block = assemble(K, S, S).reshape(S.size, S.size)
     _, kept = _factor(block, jnp.broadcast_to(rounding, len(S)), S.shape[1], rounding)
     kept = kept.reshape(S.shape)
@@ -130,7 +130,7 @@ class _Drawn(NamedTuple):
 def _empty(K, X, size, key):
     P, n = X.shape
     size = size + BLOCK
-    left = jax.vmap(lambda x: jnp.trace(K(x, x)))(X)
+    left = block_traces(K, X)
     zero = jnp.zeros((), int)
     return _Drawn(
         count=zero,

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel._devices import Rows, on_each
-from hamkernel._gram import assemble
+from hamkernel._gram import assemble, block_traces
 from hamkernel._gram_operator import tiles
 from hamkernel._solve_landmarks import Landmarks, masked
 from hamkernel._structured import AbstractMatrixKernel
@@ -74,7 +74,7 @@ def normal_sums(
     @jax.checkpoint
     def sums(x, y, weight):
         F = (assemble(K, x, S) * weight[:, :, None, None]).reshape(x.size, S.size) @ T
-        trace = jax.vmap(lambda x: jnp.trace(K(x, x)))(x) @ weight[:, 0]
+        trace = block_traces(K, x) @ weight[:, 0]
         return Normal(F.T @ F, F.T @ y.reshape(-1), trace)
 
     def add(total, part):

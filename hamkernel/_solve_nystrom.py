@@ -24,7 +24,7 @@ from hamkernel import _require as require
 from hamkernel import _streaming_sums as streaming_sums
 from hamkernel._devices import as_given, rows_of, split
 from hamkernel._field import KernelField, SolverInfo
-from hamkernel._gram import matrix_kernel
+from hamkernel._gram import block_traces, matrix_kernel
 from hamkernel._gram_operator import product
 from hamkernel._solve_landmarks import Landmarks, choose_landmarks, given_landmarks
 from hamkernel._solve_low_rank import (
@@ -281,7 +281,7 @@ def _added(fit, X, Y, spread):
     K = fit.kernel
     new = (
         streaming_sums.add(fit.sums, Columns(K, fit.landmarks.points), X, Y, spread),
-        fit.trace + jax.vmap(lambda x: jnp.trace(K(x, x)))(X).sum(),
+        fit.trace + block_traces(K, X).sum(),
         fit.count + len(X),
     )
     return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), fit, new)
