@@ -19,9 +19,9 @@ from hamkernel._devices import Rows, as_given, rows_of, split, sum_of_columns
 from hamkernel._gram import centred, gram, matrix_kernel
 from hamkernel._structured import AbstractMatrixKernel, unfolded
 
-# Pairs in one tile, rows × columns: 250 × 1000 doubles are 2 MB. Measured on two cores between
-# 100 × 500 and 1000 × 4000, for Gaussian, odd and Matérn kernels with n = 4 and 20.
-ROWS, COLUMNS = 250, 1000
+# Pairs in one tile, rows × columns: 500 × 1000 doubles are 4 MB. Measured on two cores of two
+# machines between 64 × 512 and 4000 × 1000, with n = 4 and 20; half and twice cost up to 15 % more.
+ROWS, COLUMNS = 500, 1000
 
 
 def gram_operator(
