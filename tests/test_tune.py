@@ -1,6 +1,7 @@
 """`tune`: what it trains, keeps, reports and refuses; losses against explicit refits in NumPy."""
 
 import warnings
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -281,7 +282,7 @@ def test_a_rollout_objective_keeps_what_the_field_loss_lets_fly_apart(seed):
         t = jnp.linspace(0.0, 4.0, 201)
         w = np.sqrt(2.0)  # stiffness 1, mass 0.5
         true = jnp.stack([2 * jnp.cos(w * t), -w * jnp.sin(w * t)], axis=1)
-        path = hk.simulate(tuned.field, jnp.array([2.0, 0.0]), t, rtol=1e-6, atol=1e-6).ys
+        path: Any = hk.simulate(tuned.field, jnp.array([2.0, 0.0]), t, rtol=1e-6, atol=1e-6).ys
         return float(jnp.mean(jnp.linalg.norm(path - true, axis=1)))
 
     def field_loss(tuned):
