@@ -262,9 +262,9 @@ def test_any_optimistix_minimiser_and_any_objective_will_do():
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 6])
 def test_a_rollout_objective_keeps_what_the_field_loss_lets_fly_apart(seed):
-    # A point left out of a trajectory lies between neighbours that the fit has seen. On 2 of 24
-    # data sets, these, leave-one-out chooses a field that flies apart beyond the data; in the
-    # median over all 24 the two objectives are alike (errors of 0.30 and 0.33).
+    # A point left out of a trajectory lies between neighbours that the fit has seen, and on these
+    # data sets leave-one-out chooses a field that flies apart beyond them. They were looked for:
+    # on most data sets the objectives are alike.
     X, Y = oscillator(seed)
     times = 0.25 * jnp.arange(5.0)
 
@@ -290,9 +290,11 @@ def test_a_rollout_objective_keeps_what_the_field_loss_lets_fly_apart(seed):
 
     K = hk.Separable(hk.Gaussian(1.0))
     by_field = hk.tune(K, X, Y, 1e-3, "loo", starts=8)
+    by_trajectory = hk.tune(K, X, Y, 1e-3, np.arange(N) // 5, starts=8)
     by_rollout = hk.tune(K, X, Y, 1e-3, objective=rollout, starts=8)
     assert field_loss(by_field) < field_loss(by_rollout)  # it chose what it was asked for
     assert test_error(by_field) > 10
+    assert test_error(by_trajectory) < 1
     assert test_error(by_rollout) < 1
 
 

@@ -22,7 +22,7 @@ _PORTRAIT = 2.25  # horizons of the test that the orbits in the portraits run: t
 _POINTS = 10_000  # where the odd error is sampled, as in the paper
 _POINTS_KEY = 2023  # the same points for every kernel and seed
 _BATCH = 20  # seeds in one call of the compiled program, whatever their number
-_SIZE = 24  # points of a field there, or a multiple
+_SIZE = 24  # fields get points without weight up to a multiple of this, see `_padded`
 
 
 class Outcome(eqx.Module):
