@@ -24,10 +24,14 @@ def main() -> None:
         parser.error("--seeds must be at least 1")
 
     jax.config.update("jax_enable_x64", True)  # before any array is made
-    from hamkernel.paper import reproduce
+    from hamkernel.paper import reproduce, retune
 
-    text, files = reproduce(arguments.out, arguments.seeds, tune=arguments.tune)
-    print(text)
+    text, files = reproduce(arguments.out, arguments.seeds)
+    print(text, flush=True)
+    if arguments.tune:
+        text, more = retune(arguments.out, arguments.seeds)
+        print(f"\n{text}")
+        files += more[1:]  # results.json is there
     print("\nWritten:", *(f"  {file}" for file in files), sep="\n")
 
 

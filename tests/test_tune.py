@@ -330,8 +330,10 @@ def test_flat_limit_stops_where_float64_ends_and_its_loss_is_no_rounding_noise()
         assert tuned.regularization >= low * (1 - 1e-9)
         trace = np.trace(np.asarray(hk.gram(tuned.kernel, X)).reshape(30, 30))
         assert N * tuned.regularization >= 99 * np.finfo(float).eps * trace
+        # At this very point: the loss of the step before, which optimistix also hands out, was
+        # found to be 2e-3 away on seed 0.
         refit = refit_loss(tuned.kernel, X, Y, tuned.regularization)
-        np.testing.assert_allclose(tuned.loss, refit, rtol=FLOOR)
+        np.testing.assert_allclose(tuned.loss, refit, rtol=1e-5)
         # The noise alone, on states and velocities, costs more than half of this.
         assert tuned.loss > 0.5 * 0.1**2
 

@@ -1,9 +1,9 @@
 """The experiments of Smith & Egeland (2023), end to end, over many noise seeds.
 
-`python -m hamkernel` runs `reproduce` and prints its report. An `Experiment` is data alone: the
-system, how it is sampled, the kernels and what the paper publishes. `datasets` draws the data of
-many seeds, `evaluate` fits and tests one kernel on all of them in one compiled program, `compare`
-tunes it on each by the paper's grid search and by `hamkernel.tune`.
+`python -m hamkernel` runs `reproduce`, then `retune`, and prints their reports. An `Experiment`
+is data alone: the system, how it is sampled, the kernels and what the paper publishes. `datasets`
+draws the data of many seeds, `evaluate` fits and tests one kernel on all of them in one compiled
+program, `compare` tunes it on each by the paper's grid search and by `hamkernel.tune`.
 
 The paper leaves three things open, so they are run side by side or stated with the results:
 
@@ -16,8 +16,8 @@ Everything here needs float64: `jax.config.update("jax_enable_x64", True)` befor
 
 from hamkernel.paper._evaluate import Outcome, datasets, evaluate
 from hamkernel.paper._experiments import READINGS, Experiment, Model, Published, experiments
-from hamkernel.paper._report import report
-from hamkernel.paper._reproduce import reproduce, summarise
+from hamkernel.paper._report import report, tuning_report
+from hamkernel.paper._reproduce import reproduce, retune, summarise
 from hamkernel.paper._tuned import Choice, Comparison, compare
 
 __all__ = [
@@ -34,5 +34,7 @@ __all__ = [
     "experiments",
     "report",
     "reproduce",
+    "retune",
     "summarise",
+    "tuning_report",
 ]

@@ -112,7 +112,7 @@ def evaluate(
     ridge = jnp.asarray(regularization, X.dtype)
     if not ridge.ndim:  # the same hyperparameters for all data sets
         kernel, ridge = jax.tree.map(lambda a: jnp.stack([a] * len(X)), (kernel, ridge))
-    fields = _fit(kernel, X, Y, ridge)
+    fields = _in_batches(_fit, (kernel, X, Y, ridge))
     learned, error, quantities = _in_batches(
         lambda batch: _tests(batch, ts, true, points, accuracy), _padded(fields)
     )
@@ -130,8 +130,8 @@ def evaluate(
 
 
 @eqx.filter_jit
-def _fit(kernel, X, Y, regularization) -> KernelField:
-    return cast(KernelField, jax.vmap(fit)(kernel, X, Y, regularization))
+def _fit(kernels_and_data) -> KernelField:
+    return cast(KernelField, jax.vmap(fit)(*kernels_and_data))
 
 
 def _padded(fields: KernelField) -> KernelField:
@@ -145,15 +145,15 @@ def _padded(fields: KernelField) -> KernelField:
     return eqx.tree_at(lambda f: (f.points, f.coefficients, f.residual), fields, parts)
 
 
-def _in_batches(fn: Callable, fields: KernelField):
-    """fn(fields), a PyTree with the leading axis S of the fields, `_BATCH` of them at a time."""
-    S = len(fields.norm)
+def _in_batches(fn: Callable, seeds):
+    """fn(seeds), a PyTree with the leading axis S of that argument, `_BATCH` of them at a time."""
+    S = len(jax.tree.leaves(seeds)[0])
     batch = min(_BATCH, S)
     parts = []
     for start in range(0, S, batch):
         # The last batch is filled up with the last seed, so that no other size is compiled.
         rows = np.minimum(np.arange(start, start + batch), S - 1)
-        parts.append(fn(jax.tree.map(lambda a, rows=rows: a[rows], fields)))
+        parts.append(fn(jax.tree.map(lambda a, rows=rows: a[rows], seeds)))
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:S], *parts)
 
 

@@ -18,17 +18,13 @@ _TUNED = "pendulum_m1"  # the experiment whose tuning is drawn
 _DPI = 150  # 1200 pixels over 8 inches: sharp at the 800 of a README
 
 
-def figures(
-    outcomes: Mapping[str, Mapping[str, Models]],
-    comparisons: Mapping[str, Mapping[str, Comparison]],
-    out: pathlib.Path,
-    progress: bool = True,
+def paper_figures(
+    outcomes: Mapping[str, Mapping[str, Models]], out: pathlib.Path, progress: bool = True
 ) -> list[pathlib.Path]:
-    """Write the figures of each experiment and reading, and one of tuning; return their paths.
+    """Write the figures of each experiment and reading; return their paths.
 
     Args:
         outcomes: by experiment, reading and model.
-        comparisons: by experiment and model.
         out: an existing folder.
         progress: show a progress bar where the standard error is a terminal.
     """
@@ -45,11 +41,22 @@ def figures(
         path = out / f"{name}_{reading.replace('*', '_')}_{kind}.png"
         figure.savefig(path, dpi=_DPI)
         paths.append(path)
-    if not comparisons:
-        return paths
+    return paths
+
+
+def tuning_figure(
+    comparisons: Mapping[str, Mapping[str, Comparison]], out: pathlib.Path
+) -> pathlib.Path:
+    """Write the loss of one experiment over its hyperparameters; return the path.
+
+    Args:
+        comparisons: by experiment and model.
+        out: an existing folder.
+    """
     path = out / f"{_TUNED}_tuning.png"
-    tuning(every[_TUNED], comparisons[_TUNED]["odd_symplectic"]).savefig(path, dpi=_DPI)
-    return [*paths, path]
+    figure = tuning(experiments()[_TUNED], comparisons[_TUNED]["odd_symplectic"])
+    figure.savefig(path, dpi=_DPI)
+    return path
 
 
 def tuning(experiment: Experiment, comparison: Comparison) -> Figure:

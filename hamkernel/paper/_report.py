@@ -14,19 +14,15 @@ Experiments = Mapping[str, Experiment]
 Row = Sequence[str]
 
 
-def report(
-    results: Results, experiments: Experiments, seeds: int, tuned_seeds: int | None = None
-) -> str:
+def report(results: Results, experiments: Experiments, seeds: int) -> str:
     """Return Tables I and II of the paper beside the results, and the trajectory errors.
 
     Args:
         results: of `summarise`.
         experiments: what was run, with the published numbers.
         seeds: how many noise seeds the results are over.
-        tuned_seeds: how many of them were tuned; None if none were.
     """
     published = _published(results)
-    tuned = [] if tuned_seeds is None else _tuned_parts(results, experiments, tuned_seeds)
     head = (
         f"Smith & Egeland (2023) with {seeds} noise seeds: median [10 %, 90 %];\n"
         "the published numbers are of one seed.\n\n"
@@ -45,7 +41,6 @@ def report(
             _hamiltonian_table(published, experiments),
             _closest("Table II", published, experiments, *hamiltonian),
             _trajectory_table(published, experiments),
-            *tuned,
         ]
     )
 
@@ -58,8 +53,14 @@ def _published(results: Results) -> Results:
     }
 
 
-def _tuned_parts(results: Results, experiments: Experiments, seeds: int) -> list[str]:
-    """The table of tuned hyperparameters, and what it says."""
+def tuning_report(results: Results, experiments: Experiments, seeds: int) -> str:
+    """Return the table of tuned hyperparameters, and what it says.
+
+    Args:
+        results: of `summarise`, with the reading "tuned".
+        experiments: what was run.
+        seeds: how many noise seeds were tuned.
+    """
     rows = []
     for name, experiment in experiments.items():
         rows.append((f"{experiment.title}, N = {experiment.size}",))
@@ -76,7 +77,7 @@ def _tuned_parts(results: Results, experiments: Experiments, seeds: int) -> list
         "error: mean trajectory error; seconds: for one data set, compiled before."
     )
     table = _table(title, ("kernel", "by", *_TUNED.values()), rows)
-    return [table, _tuned_verdict(results)]
+    return f"{table}\n\n{_tuned_verdict(results)}"
 
 
 _TUNED = {

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from hamkernel.paper._evaluate import Outcome, datasets, evaluate
 from hamkernel.paper._experiments import READINGS, experiments
-from hamkernel.paper._report import Results, report
+from hamkernel.paper._report import Results, report, tuning_report
 from hamkernel.paper._tuned import Choice, Comparison, compare
 
 # experiment -> reading -> model -> its tests
@@ -25,23 +25,16 @@ TUNED_SEEDS = 20  # of the seeds: enough for a median
 
 
 def reproduce(
-    out: str | pathlib.Path = "results",
-    seeds: int = 100,
-    *,
-    tune: bool = True,
-    progress: bool = True,
+    out: str | pathlib.Path = "results", seeds: int = 100, *, progress: bool = True
 ) -> tuple[str, list[pathlib.Path]]:
     """Run the paper's experiments, write `results.json` and the figures, return a report.
 
     Noise seed i is `jax.random.key(i)`, i = 0 … seeds − 1, the same for all kernels and readings.
-    The first 20 of them are also tuned, by grid search and by gradient.
-
-    The layout of `results.json` is that of `summarise`.
 
     Args:
-        out: folder for the files, made if it is missing.
+        out: folder for the files, made if it is missing. The layout of `results.json` is that of
+            `summarise`.
         seeds: number of noise seeds, ≥ 1.
-        tune: also tune the hyperparameters; without it there is no reading "tuned".
         progress: show a progress bar where the standard error is a terminal.
 
     Returns:
@@ -50,8 +43,53 @@ def reproduce(
     Raises:
         ValueError: seeds < 1. RuntimeError: JAX is not in float64, or a fit failed.
     """
-    from hamkernel.paper._figures import figures  # matplotlib loads after the numbers are safe
+    from hamkernel.paper._figures import (
+        paper_figures,
+    )  # matplotlib loads after the numbers are safe
 
+    outcomes = _outcomes(_data(seeds), progress)
+    results = summarise(outcomes)
+    path = pathlib.Path(out) / "results.json"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _write(results, path)
+    text = report(results, experiments(), seeds)
+    return text, [path, *paper_figures(outcomes, path.parent, progress)]
+
+
+def retune(
+    out: str | pathlib.Path = "results", seeds: int = 100, *, progress: bool = True
+) -> tuple[str, list[pathlib.Path]]:
+    """Tune the hyperparameters on the data of `reproduce`, by grid search and by gradient.
+
+    Of the seeds the first 20 are taken. `results.json` gains the reading "tuned".
+
+    Args:
+        out: folder that `reproduce` wrote its results to.
+        seeds: number of noise seeds, ≥ 1.
+        progress: show a progress bar where the standard error is a terminal.
+
+    Returns:
+        The report, for printing, and the files written.
+
+    Raises:
+        FileNotFoundError: `reproduce` has not been run. ValueError: seeds < 1. RuntimeError: JAX
+            is not in float64, or a fit failed.
+    """
+    from hamkernel.paper._figures import tuning_figure
+
+    path = pathlib.Path(out) / "results.json"
+    if not path.exists():
+        raise FileNotFoundError(f"no {path}: run hamkernel.paper.reproduce({str(out)!r}) first.")
+    comparisons = _comparisons(_data(seeds), progress)
+    results = json.loads(path.read_text())
+    for name, models in comparisons.items():
+        results[name]["tuned"] = {model: _tuned(each) for model, each in models.items()}
+    _write(results, path)
+    text = tuning_report(results, experiments(), min(seeds, TUNED_SEEDS))
+    return text, [path, tuning_figure(comparisons, path.parent)]
+
+
+def _data(seeds: int) -> Data:
     if seeds < 1:
         raise ValueError(f"seeds is {seeds}; at least one noise seed is needed.")
     if jnp.result_type(float) != jnp.float64:
@@ -59,17 +97,12 @@ def reproduce(
             "the paper's regularisation is below the rounding of float32: run "
             "jax.config.update('jax_enable_x64', True) first."
         )
-    out = pathlib.Path(out)
-    out.mkdir(parents=True, exist_ok=True)
     keys = jax.vmap(jax.random.key)(np.arange(seeds))
-    data = {name: datasets(experiment, keys) for name, experiment in experiments().items()}
-    outcomes = _outcomes(data, progress)
-    comparisons = _comparisons(data, progress) if tune else {}
-    results = summarise(outcomes, comparisons)
-    path = out / "results.json"
+    return {name: datasets(experiment, keys) for name, experiment in experiments().items()}
+
+
+def _write(results: Results, path: pathlib.Path) -> None:
     path.write_text(json.dumps(results, indent=2, allow_nan=False) + "\n")
-    text = report(results, experiments(), seeds, min(seeds, TUNED_SEEDS) if tune else None)
-    return text, [path, *figures(outcomes, comparisons, out, progress)]
 
 
 def _outcomes(data: Data, progress: bool) -> Outcomes:
@@ -101,32 +134,25 @@ def _comparisons(data: Data, progress: bool) -> Comparisons:
     return comparisons
 
 
-def summarise(
-    outcomes: Mapping[str, Mapping[str, Mapping[str, Outcome]]],
-    comparisons: Mapping[str, Mapping[str, Comparison]] | None = None,
-) -> Results:
+def summarise(outcomes: Mapping[str, Mapping[str, Mapping[str, Outcome]]]) -> Results:
     """Return median, 10 % and 90 % quantile over the seeds of every quantity.
 
     Args:
         outcomes: by experiment, reading and model.
-        comparisons: by experiment and model.
 
     Returns:
-        `[experiment][reading][model][quantity]["median" | "p10" | "p90"]`. With `comparisons` there
-        is a reading "tuned" with the same quantities for the hyperparameters of the gradient, and
-        besides `["tuned"][model][name]["grid" | "gradient"]["median" | "p10" | "p90"]` for the
-        names lengthscale, regularization, loss, seconds and trajectory_error.
+        `[experiment][reading][model][quantity]["median" | "p10" | "p90"]`. `retune` adds a reading
+        "tuned" with the same quantities for the hyperparameters of the gradient, and besides
+        `["tuned"][model][name]["grid" | "gradient"]["median" | "p10" | "p90"]` for the names
+        lengthscale, regularization, loss, seconds and trajectory_error.
     """
-    results = {
+    return {
         name: {
             reading: {model: _spreads(outcome.quantities) for model, outcome in models.items()}
             for reading, models in readings.items()
         }
         for name, readings in outcomes.items()
     }
-    for name, models in (comparisons or {}).items():
-        results[name]["tuned"] = {model: _tuned(each) for model, each in models.items()}
-    return results
 
 
 def _tuned(comparison: Comparison) -> dict:

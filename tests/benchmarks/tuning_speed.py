@@ -6,9 +6,10 @@ All times are warm, in one process: the minimum and the median over repeats. Wha
 first checked to agree. `--quick` leaves out the loops of minutes.
 
 1. `tune` against a grid of 30 × 25 values of (σ, λ) with a refit for every fold, N = 24 and 300,
-   n = 2, 5 folds, in three forms: (a) public `fit` for every fold and a compiled evaluation, as a
-   user would write it; (b) one compiled function per grid point, in a Python loop; (c) the whole
-   grid in one compiled call. (a) and (b) are timed on a sample of points and scaled.
+   n = 2, 5 folds, in four forms: (a) public `fit` for every fold and a compiled evaluation, as a
+   user would write it; (b) one compiled function for both, called for every fold; (c) one for all
+   folds, called for every grid point; (d) the whole grid in one compiled call. All but (d) are
+   timed on a sample of points and scaled.
 2. The leave-one-out loss with its gradient, N = 1000, n = 2, against one Cholesky factorisation
    of the same matrix by SciPy, and against refits of the same loss (a sample, scaled).
 3. `tune` of a kernel with 10 hyperparameters against one with 2.
@@ -82,8 +83,26 @@ def user_loss(sigma, ridge, X, Y, points) -> float:
 
 
 @eqx.filter_jit
+def one_fold(sigma, ridge, X, Y, rest, out) -> jax.Array:
+    """(b) The refit of one fold."""
+    field = hk.fit(kernel(sigma), X[rest], Y[rest], ridge)
+    return jnp.mean((Y[out] - jax.vmap(field)(X[out])) ** 2)
+
+
+def loop_over_folds(sigma, ridge, X, Y, points) -> float:
+    """(b) Refits by one compiled function."""
+    losses = []
+    for out in points:
+        rest = np.setdiff1d(np.arange(len(X)), out)
+        scale = (len(X) - len(X) / len(points)) / len(rest)
+        arguments = jnp.asarray(sigma), jnp.asarray(scale * ridge), X, Y, rest, out
+        losses.append(float(one_fold(*arguments)))
+    return float(np.mean(losses))
+
+
+@eqx.filter_jit
 def compiled_loss(sigma, ridge, X, Y, partition) -> jax.Array:
-    """(b) All refits of one grid point."""
+    """(c) All refits of one grid point."""
     return grid_losses(kernel_of, sigma[None], ridge[None], X, Y, partition)[0, 0]
 
 
@@ -103,6 +122,7 @@ def against_grids(N: int, quick: bool) -> None:
         exact = float(hk.cross_validation_loss(kernel(sigma), X, Y, ridge, FOLDS))
         for loss in (
             user_loss(sigma, ridge, X, Y, points),
+            loop_over_folds(sigma, ridge, X, Y, points),
             float(compiled_loss(jnp.asarray(sigma), jnp.asarray(ridge), X, Y, partition)),
         ):
             np.testing.assert_allclose(loss, exact, rtol=1e-5)
@@ -122,6 +142,17 @@ def against_grids(N: int, quick: bool) -> None:
         tuned[0],
     )
 
+    def folds() -> None:
+        for sigma, ridge in pairs:
+            loop_over_folds(sigma, ridge, X, Y, points)
+
+    each = timed(folds, 3)
+    show(
+        f"(b) one compiled function per fold, {len(pairs)} of {size} points, scaled",
+        scaled(each, size / len(pairs)),
+        tuned[0],
+    )
+
     def loop() -> list:
         return [
             compiled_loss(jnp.asarray(s), jnp.asarray(r), X, Y, partition).block_until_ready()
@@ -130,7 +161,7 @@ def against_grids(N: int, quick: bool) -> None:
 
     each = timed(loop, 3)
     show(
-        f"(b) one compiled function, {len(pairs)} of {size} points, scaled",
+        f"(c) one compiled function, {len(pairs)} of {size} points, scaled",
         scaled(each, size / len(pairs)),
         tuned[0],
     )
@@ -140,7 +171,7 @@ def against_grids(N: int, quick: bool) -> None:
     whole = timed(
         lambda: grid_losses(kernel_of, sigmas, ridges, X, Y, partition), 1 if N > 100 else 5
     )
-    show("(c) the whole grid in one compiled call", whole, tuned[0])
+    show("(d) the whole grid in one compiled call", whole, tuned[0])
     best = float(np.nanmin(grid_losses(kernel_of, sigmas, ridges, X, Y, partition)))
     loss = float(hk.tune(kernel(1.0), X, Y, 1e-3, FOLDS).loss)
     print(f"  loss of tune {loss:.6g}, best of the grid {best:.6g}, ratio {loss / best:.4f}")
