@@ -11,30 +11,35 @@ from jax.flatten_util import ravel_pytree
 
 
 @eqx.filter_custom_vjp
-def trained(kernel_and_points, make):
-    """make(K, X), an array, cheap to differentiate with respect to K."""
+def trained(kernel_and_points, make, paired=None):
+    """make(K, X), an array, cheap to differentiate with respect to K.
+
+    `paired(K, X, bar)` is ⟨bar, make(K, X)⟩, in as little memory as its derivatives should take;
+    the plain product if None.
+    """
     return make(*kernel_and_points)
 
 
 @trained.def_fwd
-def _(perturbed, kernel_and_points, make):
-    return trained(kernel_and_points, make), None
+def _(perturbed, kernel_and_points, make, paired=None):
+    return trained(kernel_and_points, make, paired), None
 
 
 @trained.def_bwd
-def _(saved, bar, perturbed, kernel_and_points, make):
+def _(saved, bar, perturbed, kernel_and_points, make, paired=None):
     K, X = kernel_and_points
-
-    def paired(K, X):
-        return jnp.vdot(bar, make(K, X))
+    paired = paired or (lambda K, X, bar: jnp.vdot(bar, make(K, X)))
 
     params, static = eqx.partition(K, eqx.is_inexact_array)
     flat, unravel = ravel_pytree(params)
 
     def slope(direction):
-        at = lambda flat: paired(eqx.combine(unravel(flat), static), X)  # noqa: E731
-        return jax.jvp(at, (flat,), (direction,))[1]
+        # What does not depend on the direction depends on it now: XLA would else compute it ahead
+        # of the loop and keep it, several arrays of the size of the Gram.
+        here, direction = jax.lax.optimization_barrier((flat, direction))
+        at = lambda h: paired(eqx.combine(unravel(h), static), X, bar)  # noqa: E731
+        return jax.jvp(at, (here,), (direction,))[1]
 
     K_bar = unravel(jax.lax.map(slope, jnp.eye(flat.size, dtype=flat.dtype)))
-    X_bar = jax.grad(paired, argnums=1)(K, X) if perturbed[1] else None
+    X_bar = jax.vjp(lambda X: make(K, X), X)[1](bar)[0] if perturbed[1] else None
     return K_bar, X_bar
