@@ -50,12 +50,6 @@ class Partition:
             )
         return by_point.reshape(F, -1, C)
 
-    def diagonal_blocks(self, C: Float[Array, "Nn Nn"]) -> Float[Array, "F Sn Sn"]:
-        """The block of C that belongs to each fold; zeros in the padding."""
-        n = len(C) // len(self.labels)
-        rows = (n * self.members[:, :, None] + np.arange(n)).reshape(len(self.members), -1)
-        return C.at[rows[:, :, None], rows[:, None, :]].get(mode="fill", fill_value=0)
-
     def padding_identity(self, blocks: Float[Array, "F Sn Sn"]) -> Float[Array, "F Sn Sn"]:
         """Ones on the diagonal where a fold has no point, zeros elsewhere."""
         empty = self.members == len(self.labels)

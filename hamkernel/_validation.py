@@ -6,7 +6,9 @@ a fit WITHOUT S would have on S,
 
     r_S = y_S − f₋S(X_S) = (C_SS)⁻¹ a_S,    C = A⁻¹,
 
-so no fold is ever refitted.
+so no fold is ever refitted. With A = LLᵀ and U = L⁻ᵀ one has C_SS = U_S U_Sᵀ, where U_S holds the
+rows S of U, and C itself is not needed. (Rows, because those of a fold lie together in memory: the
+products over folds then need no copy of the matrix.)
 
 The derivatives are written down as well, since differentiating the factorisation costs several
 times its price. From dC = −C dA C, and with v_S = (C_SS)⁻¹ r̄_S for a cotangent r̄,
@@ -28,7 +30,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from hamkernel import _require as require
 from hamkernel._folds import Folds, Partition
 from hamkernel._gram import assemble, matrix_kernel
-from hamkernel._inverse import inverse
+from hamkernel._inverse import inverse, inverse_factor
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._trained import trained
 
@@ -59,7 +61,7 @@ def cross_validation_loss(
     Returns:
         The loss, in squared units of Y; inf where the matrix is not positive definite to
         rounding. Differentiable, vmappable, compiled once per shape. O((N n)³) time, at most
-        three matrices of (N n)² numbers, with the gradient over K too.
+        three matrices of (N n)² numbers.
 
     Raises:
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization.
@@ -220,24 +222,31 @@ def held_out(
 
 
 def _held_out_forward(A, y, partition):
-    L = _factor(A)
-    C, a = inverse(L), _solve(L, y)
-    blocks = partition.diagonal_blocks(C)
+    U = inverse_factor(A)
+    a = U @ (U.T @ y)
+    U_S, a_S = partition.gather(U), partition.gather(a[:, None])[..., 0]
+    if U_S.shape[1] <= 8:  # such small products are slower as matrix products, 10 times for "loo"
+        blocks = jnp.sum(U_S[:, :, None] * U_S[:, None], axis=-1)
+    else:
+        blocks = jnp.einsum("fid,fjd->fij", U_S, U_S)
     blocks = blocks + partition.padding_identity(blocks)  # so that they can be solved with
-    factors = _factor(blocks)
-    r = _solve(factors, partition.gather(a[:, None])[..., 0])
+    factors = jax.lax.linalg.cholesky(blocks, symmetrize_input=False)
+    r = _solve_blocks(factors, a_S)
     ok = jnp.isfinite(r).all()
-    return jnp.where(ok, r, jnp.full_like(r, jnp.inf)), (C, a, factors, r, ok)
+    return jnp.where(ok, r, jnp.full_like(r, jnp.inf)), (U, a, factors, r, ok)
 
 
 def _held_out_backward(partition, saved, r_bar):
-    C, a, factors, r, ok = saved
-    v = _solve(factors, r_bar)
-    # C_:S v_S, one column for each fold. The rows of C, since those of a fold lie together.
-    rows = partition.gather(C)
+    U, a, factors, r, ok = saved
+    v = _solve_blocks(factors, r_bar)
+    # C_:S v_S, one column for each fold: of C = UUᵀ or, if they are few, U(U_Sᵀ v_S) without it.
+    few = 6 * len(r) < len(U)
+    rows = partition.gather(U if few else inverse(U))
     P, Q = (jnp.einsum("fid,fi->df", rows, each) for each in (v, r))
     # Else XLA computes these sums again for every entry of the product: 10 times slower.
     P, Q = jax.lax.optimization_barrier((P, Q))
+    if few:
+        P, Q = U @ P, U @ Q
     w = P.sum(axis=1)  # C v
     return _or_zero(ok, P @ Q.T - w[:, None] * a[None, :], w)
 
@@ -254,17 +263,18 @@ def free_residuals(
 
 
 def _free_residuals_forward(A, y):
-    L = _factor(A)
-    C, a = inverse(L), _solve(L, y)
-    squares, trace = a @ a, jnp.trace(C)
+    U = inverse_factor(A)
+    a = U @ (U.T @ y)
+    squares, trace = a @ a, jnp.sum(U * U)
     ok = jnp.isfinite(squares) & jnp.isfinite(trace)
     value = jnp.where(ok, squares, jnp.inf), jnp.where(ok, trace, jnp.ones_like(trace))
-    return value, (C, a, ok)
+    return value, (U, a, ok)
 
 
 def _free_residuals_backward(saved, bars):
-    C, a, ok = saved
+    U, a, ok = saved
     squares_bar, trace_bar = bars
+    C = inverse(U)
     w = 2 * squares_bar * (C @ a)
     return _or_zero(ok, -trace_bar * (C @ C) - w[:, None] * a[None, :], w)
 
@@ -279,29 +289,24 @@ def log_density(A: Float[Array, "D D"], y: Float[Array, " D"]) -> Float[Array, "
 
 
 def _log_density_forward(A, y):
-    L = _factor(A)
-    a = _solve(L, y)
-    log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(L)))
-    value = -0.5 * (y @ a + log_det + len(y) * jnp.log(2 * jnp.pi).astype(y.dtype))
+    U = inverse_factor(A)
+    whitened = U.T @ y
+    log_det = -2 * jnp.sum(jnp.log(jnp.diagonal(U)))
+    value = -0.5 * (whitened @ whitened + log_det + len(y) * jnp.log(2 * jnp.pi).astype(y.dtype))
     ok = jnp.isfinite(value)
-    return jnp.where(ok, value, -jnp.inf), (L, a, ok)
+    return jnp.where(ok, value, -jnp.inf), (U, U @ whitened, ok)
 
 
 def _log_density_backward(saved, bar):
-    L, a, ok = saved
-    return _or_zero(ok, 0.5 * bar * (a[:, None] * a[None, :] - inverse(L)), -bar * a)
+    U, a, ok = saved
+    return _or_zero(ok, 0.5 * bar * (a[:, None] * a[None, :] - inverse(U)), -bar * a)
 
 
 log_density.defvjp(_log_density_forward, _log_density_backward)
 
 
-def _factor(A: Float[Array, "*batch D D"]) -> Float[Array, "*batch D D"]:
-    """L with A = LLᵀ; NaN where there is none. It reads the lower triangle alone."""
-    return jax.lax.linalg.cholesky(A, symmetrize_input=False)
-
-
-def _solve(L: Float[Array, "*batch D D"], b: Float[Array, "*batch D"]) -> Float[Array, "*batch D"]:
-    return jax.scipy.linalg.cho_solve((L, True), b[..., None])[..., 0]
+def _solve_blocks(factors: Float[Array, "F b b"], b: Float[Array, "F b"]) -> Float[Array, "F b"]:
+    return jax.scipy.linalg.cho_solve((factors, True), b[..., None])[..., 0]
 
 
 def _or_zero(ok: Bool[Array, ""], *arrays: Array) -> tuple[Array, ...]:
