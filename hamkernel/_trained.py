@@ -1,13 +1,15 @@
 """Derivatives with respect to the hyperparameters of a kernel, of which there are few.
 
-They are taken FORWARD, one at a time: each costs about one assembly. Backward through the pairs of
-points was measured at 6 to 60 assemblies, and takes several times as long to compile.
+They are taken FORWARD: each costs about one assembly. Backward through the pairs of points was
+measured at 6 to 60 assemblies, and takes several times as long to compile.
 """
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+
+_ENTRIES = 200_000  # of the array and its changes, up to which directions go side by side
 
 
 @eqx.filter_custom_vjp
@@ -40,6 +42,9 @@ def _(saved, bar, perturbed, kernel_and_points, make, paired=None):
         at = lambda h: paired(eqx.combine(unravel(h), static), X, bar)  # noqa: E731
         return jax.jvp(at, (here,), (direction,))[1]
 
-    K_bar = unravel(jax.lax.map(slope, jnp.eye(flat.size, dtype=flat.dtype)))
+    # Side by side the directions share what does not depend on them, at the price of memory.
+    together = min(flat.size, _ENTRIES // max(bar.size, X.size))
+    directions = jnp.eye(flat.size, dtype=flat.dtype)
+    K_bar = unravel(jax.lax.map(slope, directions, batch_size=together if together > 1 else None))
     X_bar = jax.vjp(lambda X: make(K, X), X)[1](bar)[0] if perturbed[1] else None
     return K_bar, X_bar
