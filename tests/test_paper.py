@@ -330,3 +330,8 @@ def test_summary_holds_the_quantiles_over_seeds():
 def test_no_seed_is_refused():
     with pytest.raises(ValueError, match="at least one noise seed"):
         paper.reproduce(seeds=0)
+
+
+def test_tuning_before_the_paper_is_refused_at_once(tmp_path):
+    with pytest.raises(FileNotFoundError, match="reproduce"):
+        paper.retune(tmp_path)

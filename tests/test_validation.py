@@ -352,7 +352,7 @@ def test_labels_equal_in_value_do_not_recompile_and_others_do():
     assert len(traced) > count
 
 
-@pytest.mark.parametrize("folds", ["loo", np.arange(400) % 7], ids=["loo", "labels"])
+@pytest.mark.parametrize("folds", [5, "loo", np.arange(400) % 7], ids=["5", "loo", "labels"])
 def test_loss_and_its_gradient_take_the_memory_of_three_grams(folds):
     X, Y = data(4, count=400)
     K = hk.Odd(hk.Symplectic(hk.Gaussian(np.ones(4))))

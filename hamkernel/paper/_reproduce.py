@@ -43,16 +43,15 @@ def reproduce(
     Raises:
         ValueError: seeds < 1. RuntimeError: JAX is not in float64, or a fit failed.
     """
-    from hamkernel.paper._figures import (
-        paper_figures,
-    )  # matplotlib loads after the numbers are safe
-
     outcomes = _outcomes(_data(seeds), progress)
     results = summarise(outcomes)
     path = pathlib.Path(out) / "results.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     _write(results, path)
     text = report(results, experiments(), seeds)
+    # matplotlib loads after the numbers are safe
+    from hamkernel.paper._figures import paper_figures
+
     return text, [path, *paper_figures(outcomes, path.parent, progress)]
 
 
@@ -75,8 +74,6 @@ def retune(
         FileNotFoundError: `reproduce` has not been run. ValueError: seeds < 1. RuntimeError: JAX
             is not in float64, or a fit failed.
     """
-    from hamkernel.paper._figures import tuning_figure
-
     path = pathlib.Path(out) / "results.json"
     if not path.exists():
         raise FileNotFoundError(f"no {path}: run hamkernel.paper.reproduce({str(out)!r}) first.")
@@ -86,6 +83,8 @@ def retune(
         results[name]["tuned"] = {model: _tuned(each) for model, each in models.items()}
     _write(results, path)
     text = tuning_report(results, experiments(), min(seeds, TUNED_SEEDS))
+    from hamkernel.paper._figures import tuning_figure
+
     return text, [path, tuning_figure(comparisons, path.parent)]
 
 

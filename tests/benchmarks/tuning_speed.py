@@ -71,26 +71,17 @@ def evaluate(field, X):
     return jax.vmap(field)(X)
 
 
-def user_loss(sigma, ridge, X, Y, points) -> float:
-    """(a) Refits by the public functions, with the ridge (N − N/F) λ."""
-    losses = []
-    for out in points:
-        rest = np.setdiff1d(np.arange(len(X)), out)
-        scale = (len(X) - len(X) / len(points)) / len(rest)
-        field = hk.fit(kernel(sigma), X[rest], Y[rest], scale * ridge)
-        losses.append(float(jnp.mean((Y[out] - evaluate(field, X[out])) ** 2)))
-    return float(np.mean(losses))
-
-
-@eqx.filter_jit
-def one_fold(sigma, ridge, X, Y, rest, out) -> jax.Array:
-    """(b) The refit of one fold."""
+def refit(sigma, ridge, X, Y, rest, out) -> jax.Array:
+    """(a) The loss of one fold by the public functions."""
     field = hk.fit(kernel(sigma), X[rest], Y[rest], ridge)
-    return jnp.mean((Y[out] - jax.vmap(field)(X[out])) ** 2)
+    return jnp.mean((Y[out] - evaluate(field, X[out])) ** 2)
 
 
-def loop_over_folds(sigma, ridge, X, Y, points) -> float:
-    """(b) Refits by one compiled function."""
+compiled_refit = eqx.filter_jit(refit)  # (b)
+
+
+def by_folds(one_fold: Callable, sigma, ridge, X, Y, points) -> float:
+    """The loss by one call for every fold, with the ridge (N − N/F) λ."""
     losses = []
     for out in points:
         rest = np.setdiff1d(np.arange(len(X)), out)
@@ -121,8 +112,8 @@ def against_grids(N: int, quick: bool) -> None:
     for sigma, ridge in sound:
         exact = float(hk.cross_validation_loss(kernel(sigma), X, Y, ridge, FOLDS))
         for loss in (
-            user_loss(sigma, ridge, X, Y, points),
-            loop_over_folds(sigma, ridge, X, Y, points),
+            by_folds(refit, sigma, ridge, X, Y, points),
+            by_folds(compiled_refit, sigma, ridge, X, Y, points),
             float(compiled_loss(jnp.asarray(sigma), jnp.asarray(ridge), X, Y, partition)),
         ):
             np.testing.assert_allclose(loss, exact, rtol=1e-5)
@@ -132,7 +123,7 @@ def against_grids(N: int, quick: bool) -> None:
 
     def users() -> None:
         for sigma, ridge in sound:
-            user_loss(sigma, ridge, X, Y, points)
+            by_folds(refit, sigma, ridge, X, Y, points)
 
     size = len(SIGMAS) * len(RIDGES)
     each = timed(users, 2)
@@ -144,7 +135,7 @@ def against_grids(N: int, quick: bool) -> None:
 
     def folds() -> None:
         for sigma, ridge in pairs:
-            loop_over_folds(sigma, ridge, X, Y, points)
+            by_folds(compiled_refit, sigma, ridge, X, Y, points)
 
     each = timed(folds, 3)
     show(
