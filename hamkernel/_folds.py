@@ -40,15 +40,22 @@ class Partition:
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Partition) and np.array_equal(self.labels, other.labels)
 
-    def gather(self, U: Float[Array, "Nn C"]) -> Float[Array, "F Sn C"]:
-        """The rows of U that belong to each fold; zero rows in the padding."""
-        N, F, C = len(self.labels), len(self.members), U.shape[1]
-        by_point = U.reshape(N, -1, C)
+    def gather(self, array: Float[Array, "..."], axis: int = 0) -> Float[Array, "..."]:
+        """The axis of all rows as two, (…, Nn, …) -> (…, F, Sn, …); zeros in the padding."""
+        N, F = len(self.labels), len(self.members)
+        before, after = array.shape[:axis], array.shape[axis + 1 :]
+        by_point = array.reshape(*before, N, -1, *after)
         if not np.array_equal(self.members.reshape(-1), np.arange(N)):
             by_point = jnp.take(
-                by_point, self.members.reshape(-1), axis=0, mode="fill", fill_value=0
+                by_point, self.members.reshape(-1), axis=axis, mode="fill", fill_value=0
             )
-        return by_point.reshape(F, -1, C)
+        return by_point.reshape(*before, F, -1, *after)
+
+    def diagonal_blocks(self, C: Float[Array, "Nn Nn"]) -> Float[Array, "F Sn Sn"]:
+        """The block of C that belongs to each fold; zeros in the padding."""
+        n = len(C) // len(self.labels)
+        rows = (n * self.members[:, :, None] + np.arange(n)).reshape(len(self.members), -1)
+        return C.at[rows[:, :, None], rows[:, None, :]].get(mode="fill", fill_value=0)
 
     def padding_identity(self, blocks: Float[Array, "F Sn Sn"]) -> Float[Array, "F Sn Sn"]:
         """Ones on the diagonal where a fold has no point, zeros elsewhere."""

@@ -1,71 +1,59 @@
-"""The inverse of a positive definite matrix, A⁻¹ = UUᵀ with U = L⁻ᵀ and A = LLᵀ, in blocks.
+"""The inverse of a positive definite matrix, in blocks.
 
-LAPACK has routines for both steps that XLA does not call, and solving with the identity or
-multiplying dense matrices takes three times the operations, since half of U is zero. In blocks,
+LAPACK has a routine for this that XLA does not call, and solving with the identity takes three
+times the operations, since half of the factor is zero. With A = RᵀR and C = A⁻¹ one has RC = R⁻ᵀ,
+which is lower triangular. So from the last rows of blocks to the first,
 
-    U = [A  B]⁻¹ = [A⁻¹  −A⁻¹BC⁻¹]            [A  B][A  B]ᵀ   [AAᵀ + BBᵀ  BCᵀ]
-        [0  C]     [0     C⁻¹    ]     and    [0  C][0  C]  = [CBᵀ        CCᵀ],
+    C_ij = −T C_>j,   C_ii = U Uᵀ + T C_>> Tᵀ,   U = R_ii⁻¹,   T = U R_i>,
 
-so both are matrix products, with no arithmetic on the zero blocks.
+where > stands for all blocks after i, and j for each of them: matrix products, all of them with
+the part of C that is there already.
 
 Source: Du Croz & Higham (1992), IMA J. Numer. Anal. 12, also on the stability of the inversion.
 """
 
+import itertools
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
-# One batch of LAPACK calls after the other: jaxlib 0.10.2 was seen to stall forever on two cores
-# where one that does not depend on it runs beside it, such as a solve with the same factor.
-#
 # OpenBLAS wakes its threads from 1024 entries on, which on a busy machine was measured to take
 # 500 times as long as the work.
-_SOLVED = 31  # rows of the blocks that are inverted by LAPACK, all in one batch
-_MULTIPLIED = 256  # rows up to which products are dense
+_SMALLEST = 31  # rows of a block
+_MOST = 8  # blocks: a program of more compiles longer and does not run faster
 
 
-def inverse_factor(A: Float[Array, "D D"]) -> Float[Array, "D D"]:
-    """U = L⁻ᵀ with A = LLᵀ, upper triangular; NaN where A is not positive definite."""
-    D, count = len(A), 1
-    while -(-D // count) > _SOLVED:
-        count *= 2
-    size = -(-D // count)
-    L = _padded(jax.lax.linalg.cholesky(A, symmetrize_input=False), size * count - D)
-    identity = jnp.broadcast_to(jnp.eye(size, dtype=A.dtype), (count, size, size))
-    # From the inverses of the blocks on the diagonal to those of half as many, and so on.
-    U = jax.lax.linalg.triangular_solve(
-        _diagonal_blocks(L, size), identity, left_side=True, lower=True, transpose_a=True
-    )
-    while len(U) > 1:
-        below = _diagonal_blocks(L, 2 * size)[:, size:, :size]
-        first, second = U[::2], U[1::2]
-        corner = -(first @ jnp.swapaxes(below, 1, 2)) @ second
-        U = jnp.zeros((len(below), 2 * size, 2 * size), A.dtype)
-        U = U.at[:, :size, :size].set(first).at[:, size:, size:].set(second)
-        U = U.at[:, :size, size:].set(corner)  # in place, where joining them takes two copies
-        size *= 2
-    return jax.lax.optimization_barrier(U[0, :D, :D])  # else XLA makes it for each of its uses
+def inverse(A: Float[Array, "D D"]) -> tuple[Float[Array, "D D"], Float[Array, "D D"]]:
+    """C = A⁻¹, and R upper triangular with A = RᵀR; both NaN where A is not positive definite.
+
+    Every LAPACK call waits for the one before: jaxlib 0.10.2 was seen to stall forever on two
+    cores where two batches of them run side by side.
+    """
+    D = len(A)
+    # Transposed twice, the matrix is never copied from the order of rows to that of columns.
+    R = jax.lax.linalg.cholesky(A.T, symmetrize_input=False).T
+    starts = np.linspace(0, D, min(-(-D // _SMALLEST), _MOST) + 1).astype(int)
+    blocks = [slice(start, stop) for start, stop in itertools.pairwise(starts)]
+    C = jnp.zeros_like(A)
+    for i, U in reversed(list(zip(blocks, _triangular_inverses(R, blocks), strict=True))):
+        own = U @ U.T
+        if i.stop < D:
+            after = slice(i.stop, D)
+            T = U @ R[i, after]
+            across = -(T @ C[after, after])
+            own = own - across @ T.T
+            C = C.at[i, after].set(across).at[after, i].set(across.T)
+        C = C.at[i, i].set(own)
+    return C, R
 
 
-def _padded(L: Float[Array, "D D"], extra: int) -> Float[Array, "{len(L)+extra} {len(L)+extra}"]:
-    """L beside an identity."""
-    if not extra:
-        return L
-    past_the_end = jnp.asarray(jnp.arange(len(L) + extra) >= len(L), L.dtype)
-    return jnp.pad(L, ((0, extra), (0, extra))) + jnp.diag(past_the_end)
-
-
-def _diagonal_blocks(L: Float[Array, "D D"], size: int) -> Float[Array, "count size size"]:
-    starts = jnp.arange(0, len(L), size)
-    return jax.vmap(lambda i: jax.lax.dynamic_slice(L, (i, i), (size, size)))(starts)
-
-
-def inverse(U: Float[Array, "D D"]) -> Float[Array, "D D"]:
-    """A⁻¹ = UUᵀ for U of `inverse_factor`."""
-    if len(U) <= _MULTIPLIED:
-        return U @ U.T
-    half = len(U) // 2
-    first, across, second = U[:half, :half], U[:half, half:], U[half:, half:]
-    corner = across @ second.T
-    upper = jnp.concatenate([inverse(first) + across @ across.T, corner], axis=1)
-    return jnp.concatenate([upper, jnp.concatenate([corner.T, inverse(second)], axis=1)])
+def _triangular_inverses(R: Float[Array, "D D"], blocks: list[slice]) -> list[Array]:
+    """The inverse of each block on the diagonal of R, all in one call."""
+    sizes = [block.stop - block.start for block in blocks]
+    one = jnp.eye(max(sizes), dtype=R.dtype)
+    padded = [one.at[:size, :size].set(R[i, i]) for size, i in zip(sizes, blocks, strict=True)]
+    identities = jnp.broadcast_to(one, (len(blocks), *one.shape))
+    U = jax.lax.linalg.triangular_solve(jnp.stack(padded), identities, left_side=True, lower=False)
+    return [each[:size, :size] for each, size in zip(U, sizes, strict=True)]

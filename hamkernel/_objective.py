@@ -138,4 +138,4 @@ def check_memory(X: Float[Array, "N n"]) -> None:
         )
 
 
-LOSS_COPIES = 6  # matrices of the size of the Gram that a run of the optimiser holds: 5.3 measured
+LOSS_COPIES = 5  # matrices of the size of the Gram that a run of the optimiser holds: 4.4 measured

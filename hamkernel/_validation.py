@@ -6,9 +6,7 @@ a fit WITHOUT S would have on S,
 
     r_S = y_S − f₋S(X_S) = (C_SS)⁻¹ a_S,    C = A⁻¹,
 
-so no fold is ever refitted. With A = LLᵀ and U = L⁻ᵀ one has C_SS = U_S U_Sᵀ, where U_S holds the
-rows S of U, and C itself is not needed. (Rows, because those of a fold lie together in memory: the
-products over folds then need no copy of the matrix.)
+so no fold is ever refitted.
 
 The derivatives are written down as well, since differentiating the factorisation costs several
 times its price. From dC = −C dA C, and with v_S = (C_SS)⁻¹ r̄_S for a cotangent r̄,
@@ -30,7 +28,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from hamkernel import _require as require
 from hamkernel._folds import Folds, Partition
 from hamkernel._gram import assemble, matrix_kernel
-from hamkernel._inverse import inverse, inverse_factor
+from hamkernel._inverse import inverse
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._trained import trained
 
@@ -222,33 +220,26 @@ def held_out(
 
 
 def _held_out_forward(A, y, partition):
-    U = inverse_factor(A)
-    a = U @ (U.T @ y)
-    U_S, a_S = partition.gather(U), partition.gather(a[:, None])[..., 0]
-    if U_S.shape[1] <= 8:  # such small products are slower as matrix products, 10 times for "loo"
-        blocks = jnp.sum(U_S[:, :, None] * U_S[:, None], axis=-1)
-    else:
-        blocks = jnp.einsum("fid,fjd->fij", U_S, U_S)
+    C, _ = inverse(A)
+    a = C @ y
+    blocks = partition.diagonal_blocks(C)
     blocks = blocks + partition.padding_identity(blocks)  # so that they can be solved with
     factors = jax.lax.linalg.cholesky(blocks, symmetrize_input=False)
-    r = _solve_blocks(factors, a_S)
+    r = _solve_blocks(factors, partition.gather(a))
     ok = jnp.isfinite(r).all()
-    return jnp.where(ok, r, jnp.full_like(r, jnp.inf)), (U, a, factors, r, ok)
+    return jnp.where(ok, r, jnp.full_like(r, jnp.inf)), (C, a, factors, r, ok)
 
 
 def _held_out_backward(partition, saved, r_bar):
-    U, a, factors, r, ok = saved
+    C, a, factors, r, ok = saved
     v = _solve_blocks(factors, r_bar)
-    # C_:S v_S, one column for each fold: of C = UUᵀ or, if they are few, U(U_Sᵀ v_S) without it.
-    few = 6 * len(r) < len(U)
-    rows = partition.gather(U if few else inverse(U))
-    P, Q = (jnp.einsum("fid,fi->df", rows, each) for each in (v, r))
-    # Else XLA computes these sums again for every entry of the product: 10 times slower.
-    P, Q = jax.lax.optimization_barrier((P, Q))
-    if few:
-        P, Q = U @ P, U @ Q
+    columns = partition.gather(C, axis=1)
+    P, Q = (jnp.einsum("dfi,fi->df", columns, each) for each in (v, r))  # C_:S v_S and C_:S r_S
     w = P.sum(axis=1)  # C v
-    return _or_zero(ok, P @ Q.T - w[:, None] * a[None, :], w)
+    left, right = jnp.column_stack([P, -w]), jnp.column_stack([Q, a])
+    # Else XLA computes these sums again for every entry of the product: 10 times slower.
+    left, right, w = jax.lax.optimization_barrier(_or_zero(ok, left, right, w))
+    return left @ right.T, w
 
 
 held_out.defvjp(_held_out_forward, _held_out_backward)
@@ -263,18 +254,17 @@ def free_residuals(
 
 
 def _free_residuals_forward(A, y):
-    U = inverse_factor(A)
-    a = U @ (U.T @ y)
-    squares, trace = a @ a, jnp.sum(U * U)
+    C, _ = inverse(A)
+    a = C @ y
+    squares, trace = a @ a, jnp.trace(C)
     ok = jnp.isfinite(squares) & jnp.isfinite(trace)
     value = jnp.where(ok, squares, jnp.inf), jnp.where(ok, trace, jnp.ones_like(trace))
-    return value, (U, a, ok)
+    return value, (C, a, ok)
 
 
 def _free_residuals_backward(saved, bars):
-    U, a, ok = saved
+    C, a, ok = saved
     squares_bar, trace_bar = bars
-    C = inverse(U)
     w = 2 * squares_bar * (C @ a)
     return _or_zero(ok, -trace_bar * (C @ C) - w[:, None] * a[None, :], w)
 
@@ -289,17 +279,17 @@ def log_density(A: Float[Array, "D D"], y: Float[Array, " D"]) -> Float[Array, "
 
 
 def _log_density_forward(A, y):
-    U = inverse_factor(A)
-    whitened = U.T @ y
-    log_det = -2 * jnp.sum(jnp.log(jnp.diagonal(U)))
-    value = -0.5 * (whitened @ whitened + log_det + len(y) * jnp.log(2 * jnp.pi).astype(y.dtype))
+    C, R = inverse(A)
+    a = C @ y
+    log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(R)))
+    value = -0.5 * (y @ a + log_det + len(y) * jnp.log(2 * jnp.pi).astype(y.dtype))
     ok = jnp.isfinite(value)
-    return jnp.where(ok, value, -jnp.inf), (U, U @ whitened, ok)
+    return jnp.where(ok, value, -jnp.inf), (C, a, ok)
 
 
 def _log_density_backward(saved, bar):
-    U, a, ok = saved
-    return _or_zero(ok, 0.5 * bar * (a[:, None] * a[None, :] - inverse(U)), -bar * a)
+    C, a, ok = saved
+    return _or_zero(ok, 0.5 * bar * (a[:, None] * a[None, :] - C), -bar * a)
 
 
 log_density.defvjp(_log_density_forward, _log_density_backward)

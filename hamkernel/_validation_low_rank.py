@@ -71,7 +71,7 @@ def low_rank_partition_loss(
     F, size = partition.members.shape
     ridge = (N - N / F) * regularization
     folds = partition.gather(rows)  # (F, S n, r), zero in the padding
-    y = partition.gather(Y.reshape(-1, 1))[..., 0]  # (F, S n)
+    y = partition.gather(Y.reshape(-1))  # (F, S n)
     few = folds.shape[1] <= rows.shape[1]
     residuals = (_by_inversion if few else _by_downdating)(folds, y, ridge)
     squares = jnp.mean(residuals.reshape(F, size, -1) ** 2, axis=2)  # (F, S)
