@@ -18,15 +18,8 @@ from hamkernel._solve import Cholesky
 from hamkernel._solve_cg import ConjugateGradient
 from hamkernel._solve_features import FeatureField, FeatureFit, RandomFeatures
 from hamkernel._solve_nystrom import LandmarkFit, Nystrom
-from hamkernel._structured import (
-    CurlFree,
-    DivergenceFree,
-    Even,
-    Odd,
-    Separable,
-    Sum,
-    Symplectic,
-)
+from hamkernel._structured import Even, Odd, Sum
+from hamkernel._structured_operators import CurlFree, DivergenceFree, Separable, Symplectic
 from hamkernel._tune import Tuned, tune
 from hamkernel._validation import (
     cross_validation_loss,

@@ -21,13 +21,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from hamkernel._features_spectra import Spectrum, spectra
-from hamkernel._structured import (
-    AbstractMatrixKernel,
-    AbstractPotentialKernel,
-    DivergenceFree,
-    Separable,
-    Sum,
-)
+from hamkernel._structured import AbstractMatrixKernel, Sum
+from hamkernel._structured_operators import AbstractPotentialKernel, DivergenceFree, Separable
 
 
 class Waves(eqx.Module):

@@ -17,7 +17,8 @@ from jaxtyping import Array, ArrayLike, Float
 from hamkernel import _require as require
 from hamkernel._devices import Rows, as_given, rows_of, split, sum_of_columns
 from hamkernel._gram import centred, diagonals, gram, matrix_kernel
-from hamkernel._structured import AbstractMatrixKernel, unfolded
+from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._structured_operators import unfolded
 
 # Pairs in one tile, rows × columns: 500 × 1000 doubles are 4 MB. Measured on two cores of two
 # machines between 64 × 512 and 4000 × 1000, with n = 4 and 20; half and twice cost up to 15 % more.

@@ -6,6 +6,7 @@ import pathlib
 
 import jax
 import numpy as np
+from jax.experimental import multihost_utils
 
 from hamkernel import _require as require
 from hamkernel._field import AbstractField
@@ -19,6 +20,9 @@ def save(path: str | os.PathLike[str], field: AbstractField) -> None:
 
     The file at `path` is replaced in one step, so that no reader ever sees half of it. A kernel of
     your own (a function, the map of a `Warp`) is not written, only its arrays are: see `load`.
+
+    If the rows of the field are spread over several processes, all of them must make the call;
+    each writes the whole field, to a path of its own or to one that they share.
 
     Args:
         path: the file. The name is taken as it is; `.npz` fits, since NumPy can open the file.
@@ -36,6 +40,7 @@ def save(path: str | os.PathLike[str], field: AbstractField) -> None:
         )
     if not require.is_concrete(field):
         raise ValueError("save writes numbers and cannot run under jax.jit, grad or vmap.")
+    field = jax.tree.map(_whole, field)
     arrays: list[np.ndarray] = []
     header = {
         "format": FORMAT,
@@ -84,6 +89,13 @@ def load(path: str | os.PathLike[str], kernel: AbstractMatrixKernel | None = Non
             + f": {error}"
         ) from error
     return field
+
+
+def _whole(leaf):
+    """An array of this process for one whose rows are spread over several."""
+    if not isinstance(leaf, jax.Array) or leaf.is_fully_addressable or leaf.is_fully_replicated:
+        return leaf
+    return multihost_utils.process_allgather(leaf, tiled=True)
 
 
 def _library_version() -> str:

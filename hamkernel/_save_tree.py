@@ -37,14 +37,8 @@ from hamkernel._scalar_product import Periodic, Polynomial
 from hamkernel._scalar_radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._scalar_transform import Select, Symmetrised, Warp, identity, reflection
 from hamkernel._solve_features import FeatureField
-from hamkernel._structured import (
-    AbstractMatrixKernel,
-    CurlFree,
-    DivergenceFree,
-    Separable,
-    Sum,
-    Symplectic,
-)
+from hamkernel._structured import AbstractMatrixKernel, Sum
+from hamkernel._structured_operators import CurlFree, DivergenceFree, Separable, Symplectic
 
 # Everything that a file may name. A new class of the library needs one line here.
 CLASSES: dict[str, type[eqx.Module]] = {

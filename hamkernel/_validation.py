@@ -266,7 +266,8 @@ def _free_residuals_backward(saved, bars):
     C, a, ok = saved
     squares_bar, trace_bar = bars
     w = 2 * squares_bar * (C @ a)
-    return _or_zero(ok, -trace_bar * (C @ C) - w[:, None] * a[None, :], w)
+    square = C @ C.T  # XLA takes 1.4 times as long for C @ C, which is the same
+    return _or_zero(ok, -trace_bar * square - w[:, None] * a[None, :], w)
 
 
 free_residuals.defvjp(_free_residuals_forward, _free_residuals_backward)
