@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 # OpenBLAS wakes its threads from 1024 entries on, which on a busy machine was measured to take
 # 500 times as long as the work.
-_SMALLEST = 31  # rows of a block
+_FEW = 31  # rows of a block, while there are not many of them
 _MOST = 8  # blocks: a program of more compiles longer and does not run faster
 
 
@@ -34,7 +34,7 @@ def inverse(A: Float[Array, "D D"]) -> tuple[Float[Array, "D D"], Float[Array, "
     D = len(A)
     # Transposed twice, the matrix is never copied from the order of rows to that of columns.
     R = jax.lax.linalg.cholesky(A.T, symmetrize_input=False).T
-    starts = np.linspace(0, D, min(-(-D // _SMALLEST), _MOST) + 1).astype(int)
+    starts = np.linspace(0, D, min(-(-D // _FEW), _MOST) + 1).astype(int)
     blocks = [slice(start, stop) for start, stop in itertools.pairwise(starts)]
     C = jnp.zeros_like(A)
     for i, U in reversed(list(zip(blocks, _triangular_inverses(R, blocks), strict=True))):

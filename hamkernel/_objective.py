@@ -53,11 +53,11 @@ class SearchCriterion(eqx.Module):
             value = jnp.log(jnp.maximum(value, jnp.finfo(value.dtype).tiny))
         return jnp.where(jnp.isfinite(value), value, HUGE)
 
-    def losses(self, values: Float[np.ndarray, " starts"]) -> Float[Array, " starts"]:
+    def losses(self, values: Float[np.ndarray, " starts"]) -> Float[np.ndarray, " starts"]:
         """The caller's objective for values of the search; inf where there was none."""
         finite = values < HUGE
         losses = np.where(finite, values, 0)
-        return jnp.asarray(np.where(finite, np.exp(losses) if self.logarithmic else losses, np.inf))
+        return np.where(finite, np.exp(losses) if self.logarithmic else losses, np.inf)
 
     def coarse_points(self, X: Float[Array, "N n"]) -> np.ndarray:
         """The rows of the subset: spread evenly over the folds, and over the points of each."""

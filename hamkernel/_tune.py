@@ -136,7 +136,8 @@ def tune(
     rows = criterion.coarse_points(X)
     if len(rows) < len(X) and not low_rank:
         check_memory(X)
-    part = criterion.on(rows), X[rows], Y[rows], len(X) / len(rows)
+    X_part, Y_part = (jnp.take(each, rows, axis=0) for each in (X, Y))
+    part = criterion.on(rows), X_part, Y_part, len(X) / len(rows)
     runs = search(space, *part, optimiser, starts, max_steps)
     if len(rows) < len(X):
         fine = criterion
@@ -159,11 +160,11 @@ def tune(
     return Tuned(
         kernel=kernel,
         regularization=ridge,
-        loss=losses[best],
+        loss=jnp.asarray(losses[best]),
         field=fit(kernel, X, Y, ridge, solver=solver),
         converged=jnp.asarray(runs.converged[best]),
         steps=jnp.asarray(runs.steps[best]),
-        start_losses=losses,
+        start_losses=jnp.asarray(losses),
         at_bounds=space.at_bounds(runs.u[best]),
         bounds=space.box(kernel, X),
     )
