@@ -313,6 +313,7 @@ result = {
     "nystrom": compared(few, m), "chosen": compared(hk.Nystrom(), m),
     "features": compared(waves, m), "gradients": compared(iterative, m),
     "explicit": compared(few, mesh(4, kind=AxisType.Explicit)),
+    "default": hk.fit(K, XS, YS, 1e-4).info.solver,
     "streams": [streamed(few, m), streamed(waves, m)],
 }
 field, file = hk.fit(K, XS, YS, 1e-4, solver=iterative), sys.argv[3] + "/field.npz"
@@ -334,5 +335,6 @@ def test_two_processes_give_the_fit_of_one(tmp_path):
         assert result["product"] < ORDER
         for name in ("nystrom", "chosen", "features", "gradients", "explicit"):
             assert_same(result[name], 40)
+        assert result["default"] == "ConjugateGradient"
         assert max(result["streams"]) < ORDER
         assert result["saved"] < ORDER
