@@ -211,6 +211,17 @@ class Bound(eqx.Module):
         return self.func(*args, *points, **keywords)
 
 
+def one_point(x: ArrayLike) -> Float[Array, " n"]:
+    """`x` as a float array; a batch of points would silently give a wrong number."""
+    x = require.floating(x, "the point")
+    if x.ndim != 1:
+        raise ValueError(
+            f"the point has shape {x.shape}; a kernel takes one pair of points of shape (n,). Use "
+            "jax.vmap for many, or hk.gram for a Gram."
+        )
+    return x
+
+
 def _name(fn: Callable[..., Any]) -> str:
     fn = getattr(fn, "func", fn)
     return getattr(fn, "__name__", type(fn).__name__)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._scalar import AbstractScalarKernel, Invariance
-from hamkernel._scalar_radial import divided, log_lengthscale, one_point
+from hamkernel._scalar import AbstractScalarKernel, Invariance, one_point
+from hamkernel._scalar_radial import divided, log_lengthscale
 
 
 class Polynomial(AbstractScalarKernel):

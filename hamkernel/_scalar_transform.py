@@ -16,6 +16,7 @@ from hamkernel._scalar import (
     Scaled,
     as_pytree,
     as_scalar_kernel,
+    one_point,
 )
 
 
@@ -43,6 +44,7 @@ class Warp(AbstractScalarKernel):
         return self.kernel(self._warped(x), self._warped(z))
 
     def _warped(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        x = one_point(x)
         warped = self.fn(x)
         if jnp.ndim(warped) != 1:
             raise ValueError(
@@ -84,9 +86,10 @@ class Select(AbstractScalarKernel):
         return self.kernel(self._selected(x), self._selected(z))
 
     def _selected(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        if max(self.dims) >= x.shape[0]:
+        x = one_point(x)
+        if max(self.dims) >= len(x):
             raise ValueError(
-                f"Select has coordinates {self.dims} and the point has {x.shape[0]}: "
+                f"Select has coordinates {self.dims} and the point has {len(x)}: "
                 "coordinates are counted from 0."
             )
         # Slices, not a gather: their derivative is a pad, which XLA fuses into its neighbours.

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hamkernel import _require as require
 from hamkernel._scalar import AbstractScalarKernel, Invariance
 
 
@@ -29,6 +30,7 @@ class AbstractMatrixKernel(eqx.Module):
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, "n n"]:
         """The block K(x, z) for one pair of points."""
+        x, z = require.floating(x, "x"), require.floating(z, "z")
         basis = jnp.eye(len(x), dtype=x.dtype)
         columns = jax.vmap(self.form, in_axes=(None, None, None, 0))
         return jax.vmap(columns, in_axes=(None, 0, None, None))(x, basis, z, basis)

@@ -324,6 +324,16 @@ def test_float32_points_give_float32_values_and_derivatives(case):
     np.testing.assert_allclose(block, expected, atol=1e-5 * float(jnp.abs(expected).max()))
 
 
+@BUILTIN
+def test_integer_points_are_read_as_floats(case):
+    # In their own dtype the hyperparameters would be cut to integers.
+    k, x, z = case.make(2), jnp.array([1, 2]), jnp.array([0, 3])
+    expected = case.formula(2)(np.array([1.0, 2.0]), np.array([0.0, 3.0]))
+    np.testing.assert_allclose(k(x, z), expected, rtol=1e-12)
+    K = hk.Symplectic(k)
+    np.testing.assert_array_equal(K(x, z), K(x.astype(float), z.astype(float)))
+
+
 # Refusals.
 
 
