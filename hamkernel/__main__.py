@@ -26,7 +26,10 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)  # before any array is made
     from hamkernel.paper import reproduce, retune
 
-    text, files = reproduce(arguments.out, arguments.seeds)
+    try:
+        text, files = reproduce(arguments.out, arguments.seeds)
+    except OSError as error:
+        parser.error(f"--out {arguments.out} cannot be written: {error}")
     print(text, flush=True)
     if arguments.tune:
         text, more = retune(arguments.out, arguments.seeds)

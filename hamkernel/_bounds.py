@@ -86,7 +86,7 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
                 low=np.broadcast_to(low, child.shape),
                 high=np.broadcast_to(high, child.shape),
             )
-        else:
+        elif child is not node:  # else a leaf that is no array: a degree, an activation
             seen = X
             if isinstance(node, Warp) and isinstance(child, AbstractScalarKernel):
                 seen = np.asarray(jax.vmap(node.fn)(jnp.asarray(X)))

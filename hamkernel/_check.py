@@ -43,7 +43,7 @@ def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
 
     Args:
         k: a kernel of this library or any callable (x, z) → scalar on two points of shape (n,);
-            of an object with a method `evaluate` (tinygp), that method.
+            of a kernel object of tinygp, its method `evaluate`.
         points: representative states, shape (N, n); N = 1 is enough to look at x = z only. Their
             spread sets the largest step h, their dtype the tolerances: an eigenvalue counts as
             negative below −ε^(2/3) of the trace (4e-11 in float64, 2e-5 in float32), or below

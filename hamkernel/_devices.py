@@ -75,6 +75,19 @@ def split(rows: Rows | None, array: Array) -> Array:
     return jax.device_put(array, NamedSharding(rows.mesh, rows.spec))
 
 
+def on_one_device(name: str, array: Array) -> Array:
+    """`array` on one device of this process, where it is spread over several."""
+    if isinstance(array, Tracer) or len(array.sharding.device_set) == 1:
+        return array
+    if not array.is_fully_addressable:
+        raise ValueError(
+            f"{name} is spread over several processes, and only one can work on it here: gather it "
+            "with jax.experimental.multihost_utils.process_allgather(..., tiled=True), or pass a "
+            "part of it."
+        )
+    return jnp.asarray(np.asarray(array))  # by the host: bound to no device
+
+
 def as_given(rows: Rows | None, array: Array) -> Array:
     """`array`, of one row for each given row, on the mesh that was given."""
     if rows is None or isinstance(array, Tracer) or rows.given.mesh == rows.mesh:

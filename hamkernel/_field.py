@@ -26,6 +26,7 @@ class AbstractField(eqx.Module):
     """
 
     kernel: eqx.AbstractVar[AbstractMatrixKernel]
+    residual: eqx.AbstractVar[Float[Array, "N n"]]
     offset: eqx.AbstractVar[Float[Array, ""]]
 
     # jax.jit(field) looks up the function it compiles by hash and equality. Arrays have no hash and
@@ -49,9 +50,42 @@ class AbstractField(eqx.Module):
     def unanchored_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         """The potential with the constant that the representer gives it."""
 
-    @abc.abstractmethod
     def evaluate(self, X: ArrayLike) -> Float[Array, "N n"]:
-        """The velocities at many states, as `jax.vmap(field)(X)` but with bounded memory."""
+        """The velocities at many states, as `jax.vmap(field)(X)` but in bounded memory.
+
+        Args:
+            X: states, shape (N, n).
+
+        Raises:
+            ValueError: the shape does not fit.
+        """
+        X = require.points(X, "X").astype(self.offset.dtype)
+        if X.shape[1] != self.dimension:
+            raise ValueError(f"X has {X.shape[1]} coordinates and the field {self.dimension}.")
+        return self._evaluated(X)
+
+    @abc.abstractmethod
+    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+        """`evaluate` for states that have been checked."""
+
+    def part(self: Field, which: int | str) -> Field:
+        """The field of one term of a sum of kernels, by position or name.
+
+        The parts add up to the field; an anchor of the whole is not theirs. `residual` and `norm`
+        are those of the whole fit.
+
+        Raises:
+            KeyError: there is no such part (with the choices).
+        """
+        if isinstance(self.kernel, Sum):
+            return self._term(self.kernel, which)
+        if which == 0:
+            return self
+        raise KeyError(f"no part {which!r}: {type(self.kernel).__name__} is not a sum.")
+
+    @abc.abstractmethod
+    def _term(self: Field, kernel: Sum, which: int | str) -> Field:
+        """`part` where the kernel is a sum."""
 
     @property
     def potential(self) -> Scalar:
@@ -92,10 +126,18 @@ class AbstractField(eqx.Module):
         Args:
             x0: a state, shape (n,), for example the equilibrium.
             value: the potential there, in units of energy.
+
+        Raises:
+            AttributeError: the structure has no potential. ValueError: x0 is no finite state, or
+                the value no finite number.
         """
         if jnp.shape(value) != ():
             raise ValueError(f"value has shape {jnp.shape(value)}; one number is needed.")
-        offset = jnp.asarray(value, self.offset.dtype) - self.unanchored_potential(jnp.asarray(x0))
+        there = require.floating(value, "value").astype(self.offset.dtype)
+        offset = there - self.unanchored_potential(jnp.asarray(x0))
+        offset = require.value(
+            offset, require.not_finite(offset), "x0 and value must be finite: one of them is not."
+        )
         return eqx.tree_at(lambda field: field.offset, self, offset)
 
     @property
@@ -168,36 +210,13 @@ class KernelField(AbstractField):
         x = self._state(x)
         return expansion(self.kernel, x, self.points, self.coefficients)
 
-    def evaluate(self, X: ArrayLike) -> Float[Array, "N n"]:
-        """The velocities at many states, as `jax.vmap(field)(X)` but in O((N + M) n) memory.
-
-        Args:
-            X: states, shape (N, n).
-
-        Raises:
-            ValueError: the shape does not fit.
-        """
-        X = require.points(X, "X").astype(self.points.dtype)
-        if X.shape[1] != self.dimension:
-            raise ValueError(f"X has {X.shape[1]} coordinates and the field {self.dimension}.")
+    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         return compiled_product(self.kernel, X, self.points, self.coefficients)
 
     def unanchored_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         x = self._state(x)
         return potential(self.kernel, x, self.points, self.coefficients)
 
-    def part(self, which: int | str) -> "KernelField":
-        """The field of one term of a sum of kernels, by position or name.
-
-        The parts add up to the field; an anchor of the whole is not theirs. `residual` and `norm`
-        are those of the whole fit.
-
-        Raises:
-            KeyError: there is no such part (with the choices).
-        """
-        if isinstance(self.kernel, Sum):
-            parts = self.kernel.part(which), jnp.zeros_like(self.offset)
-            return eqx.tree_at(lambda f: (f.kernel, f.offset), self, parts)
-        if which == 0:
-            return self
-        raise KeyError(f"no part {which!r}: {type(self.kernel).__name__} is not a sum.")
+    def _term(self, kernel: Sum, which: int | str) -> "KernelField":
+        parts = kernel.part(which), jnp.zeros_like(self.offset)
+        return eqx.tree_at(lambda f: (f.kernel, f.offset), self, parts)

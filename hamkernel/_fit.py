@@ -55,7 +55,7 @@ def fit(
         raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
     X, Y = require.data(X, Y)
     K.check_dimension(X.shape[1])
-    regularization = require.positive_scalar(regularization, "regularization").astype(X.dtype)
+    regularization = require.ridge(regularization).astype(X.dtype)
     if X.dtype == jnp.float32:
         warnings.warn(
             "fitting in float32: expect three digits, and a failed factorisation for a ridge "

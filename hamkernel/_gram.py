@@ -32,9 +32,7 @@ def gram(
     """
     K = matrix_kernel(K)
     X = require.points(X, "X")
-    Z = X if Z is None else require.points(Z, "Z").astype(X.dtype)
-    if X.shape[1] != Z.shape[1]:
-        raise ValueError(f"X has {X.shape[1]} coordinates and Z has {Z.shape[1]}.")
+    X, Z = require.same_space(X, X if Z is None else require.points(Z, "Z"))
     K.check_dimension(X.shape[1])
     return _compiled_gram(K, X, Z)
 

@@ -57,9 +57,8 @@ def gram_operator(
     """
     K = matrix_kernel(K)
     X = require.points(X, "X")
-    Z = None if Z is None else require.points(Z, "Z").astype(X.dtype)
-    if Z is not None and X.shape[1] != Z.shape[1]:
-        raise ValueError(f"X has {X.shape[1]} coordinates and Z has {Z.shape[1]}.")
+    if Z is not None:
+        X, Z = require.same_space(X, require.points(Z, "Z"))
     K.check_dimension(X.shape[1])
     X_rows = rows_of(X)
     Z_rows = X_rows if Z is None else rows_of(Z)

@@ -5,6 +5,7 @@ by NumPy when they are concrete, for it compiles nothing; under `jax.jit` the sa
 `equinox.error_if` on the value that is returned, so it must be used by the caller.
 """
 
+import reprlib
 from collections.abc import Callable
 from typing import Any
 
@@ -34,13 +35,15 @@ def not_finite(x: Array) -> Any:
 
 
 def value(
-    x: Array,
+    x: Any,
     bad: Bool[ArrayLike, "..."],
     message: str | Callable[[], str],
     error: type[Exception] = ValueError,
-) -> Array:
+) -> Any:
     """Return `x`, or fail where `bad` holds: `error` on concrete values, at run time under jit.
 
+    `x` is an array or a PyTree of them: everything that would be wrong, for under jit a check is
+    dropped together with the value it hangs on.
     Computed with `on_host`, `bad` is known wherever it can be, also for constants under jit.
     """
     bad = bad.any()  # type: ignore[union-attr]
@@ -55,7 +58,13 @@ def floating(x: ArrayLike, name: str) -> Array:
     """`x` as a JAX array of real floats: integers and booleans become the default float."""
     if isinstance(x, bool | int | float):
         x = np.asarray(x, float)
-    array = jnp.asarray(x)
+    try:
+        array = jnp.asarray(x)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"{name} must hold real numbers; got {reprlib.repr(x)}. Pass floats, a NumPy or JAX "
+            "array, or lists of numbers with rows of equal length."
+        ) from error
     if jnp.issubdtype(array.dtype, jnp.floating):
         return array.astype(array.dtype)  # no weak type: a Python float must not recompile
     if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
@@ -66,7 +75,7 @@ def floating(x: ArrayLike, name: str) -> Array:
     )
 
 
-def positive(x: ArrayLike, name: str) -> Array:
+def positive(x: ArrayLike, name: str, cure: str = "") -> Array:
     """`x` as a float array whose every entry is finite and larger than zero."""
     array = floating(x, name)
     seen = on_host(array)
@@ -75,16 +84,24 @@ def positive(x: ArrayLike, name: str) -> Array:
         ~((seen > 0) & (seen < np.inf)),
         lambda: (
             f"{name} must be positive and finite"
-            + (f", got {array}." if is_concrete(array) else ".")
+            + (f", got {array}. " if is_concrete(array) else ". ")
+            + cure
         ),
     )
 
 
-def positive_scalar(x: ArrayLike, name: str) -> Float[Array, ""]:
+def positive_scalar(x: ArrayLike, name: str, cure: str = "") -> Float[Array, ""]:
     """`x` as a positive float array of shape ()."""
-    if jnp.shape(x) != ():
-        raise ValueError(f"{name} has shape {jnp.shape(x)}; one number is needed.")
-    return positive(x, name)
+    array = floating(x, name)
+    if array.shape:
+        raise ValueError(f"{name} has shape {array.shape}; one number is needed.")
+    return positive(array, name, cure)
+
+
+def ridge(x: ArrayLike) -> Float[Array, ""]:
+    """The λ of a fit."""
+    cure = "Data without noise still need a small one, such as 1e-8; hk.tune finds a good one."
+    return positive_scalar(x, "regularization", cure)
 
 
 def finite(x: Array, name: str) -> Array:
@@ -104,6 +121,11 @@ def finite(x: Array, name: str) -> Array:
 def points(X: ArrayLike, name: str = "X") -> Float[Array, "N n"]:
     """States as a float array of shape (N, n) with N ≥ 1; their values are not looked at."""
     array = floating(X, name)
+    if 0 in array.shape:
+        raise ValueError(
+            f"{name} has shape {array.shape}: at least one point is needed, shape (N, n). Look at "
+            "how the data was read or selected."
+        )
     if array.ndim != 2:
         hint = (
             f" One state per row: `{name}[:, None]` for N states of one coordinate, "
@@ -114,9 +136,18 @@ def points(X: ArrayLike, name: str = "X") -> Float[Array, "N n"]:
             else ""
         )
         raise ValueError(f"{name} has shape {array.shape}; it must be (N, n).{hint}")
-    if 0 in array.shape:
-        raise ValueError(f"{name} has shape {array.shape}: at least one point is needed.")
     return array
+
+
+def same_space(X: Array, Z: Array) -> tuple[Array, Array]:
+    """Both in one dtype, if they hold states of the same number of coordinates."""
+    if X.shape[1] != Z.shape[1]:
+        raise ValueError(
+            f"X has {X.shape[1]} coordinates and Z has {Z.shape[1]}: both must be states of one "
+            "system, shapes (N, n) and (M, n)."
+        )
+    dtype = np.promote_types(X.dtype, Z.dtype)
+    return X.astype(dtype), Z.astype(dtype)
 
 
 def data(X: ArrayLike, Y: ArrayLike) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:

@@ -41,6 +41,13 @@ def save(path: str | os.PathLike[str], field: AbstractField) -> None:
     if not require.is_concrete(field):
         raise ValueError("save writes numbers and cannot run under jax.jit, grad or vmap.")
     field = jax.tree.map(_whole, field)
+    try:
+        _evaluable(field)
+    except Exception as error:  # a kernel of the user may raise anything
+        raise ValueError(
+            "save writes one field that can be evaluated, and this one cannot (of a batch made by "
+            f"jax.vmap save each field): {error}"
+        ) from error
     arrays: list[np.ndarray] = []
     header = {
         "format": FORMAT,
@@ -80,8 +87,8 @@ def load(path: str | os.PathLike[str], kernel: AbstractMatrixKernel | None = Non
     header, arrays = unpacked(pathlib.Path(path).read_bytes(), source)
     reader = Reader(source, arrays)
     field = reader.field(header["field"], kernel)
-    try:  # the parts fit each other: as many lengthscales as coordinates, and the like
-        jax.eval_shape(field, jax.ShapeDtypeStruct((field.dimension,), field.offset.dtype))
+    try:
+        _evaluable(field)
     except Exception as error:  # a kernel of the user may raise anything
         raise ValueError(
             f"{source} holds a field that cannot be evaluated"
@@ -89,6 +96,13 @@ def load(path: str | os.PathLike[str], kernel: AbstractMatrixKernel | None = Non
             + f": {error}"
         ) from error
     return field
+
+
+def _evaluable(field: AbstractField) -> None:
+    """Raise unless the parts fit each other: as many lengthscales as coordinates, and the like."""
+    state = jax.ShapeDtypeStruct((field.dimension,), field.offset.dtype)
+    if field.offset.shape or jax.eval_shape(field, state).shape != state.shape:
+        raise ValueError("its arrays have an axis more than those of one field.")
 
 
 def _whole(leaf):

@@ -159,9 +159,7 @@ class UserKernel(AbstractScalarKernel):
     fn: Callable[..., Any]
 
     def __init__(self, fn: Callable[..., Any]):
-        # tinygp's objects give a whole Gram matrix when called and one entry by `evaluate`.
-        fn = getattr(fn, "evaluate", fn)
-        self.fn = as_pytree(fn)
+        self.fn = as_pytree(of_one_pair(fn))
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         value = self.fn(x, z)
@@ -171,7 +169,7 @@ class UserKernel(AbstractScalarKernel):
                 f"two points of shape {jnp.shape(x)}; a scalar is needed. Write the kernel for "
                 "one pair of points, k(x, z) -> (): the library adds the vmap."
             )
-        return jnp.asarray(value)
+        return require.floating(value, f"the value of the kernel {_name(self.fn)}")
 
     @property
     def invariance(self) -> Invariance:
@@ -179,6 +177,12 @@ class UserKernel(AbstractScalarKernel):
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
         return (frozenset(range(n)),)
+
+
+def of_one_pair(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """`fn`; of a kernel of tinygp, which gives a whole Gram when called, the method for a pair."""
+    families = {cls.__module__.partition(".")[0] for cls in type(fn).__mro__}
+    return getattr(fn, "evaluate", fn) if "tinygp" in families else fn
 
 
 def as_pytree(fn: Callable[..., Any]) -> Callable[..., Any]:

@@ -72,7 +72,8 @@ def divided(x: Float[Array, " n"], lengthscale: Float[Array, "..."]) -> Float[Ar
 
 def log_lengthscale(lengthscale: ArrayLike) -> Float[Array, "..."]:
     """The stored form of a lengthscale, which must be () or (n,) and positive."""
-    array = require.positive(lengthscale, "lengthscale")
+    cure = "It is a length in the units of the states."
+    array = require.positive(lengthscale, "lengthscale", cure)
     if array.ndim > 1:
         raise ValueError(
             f"lengthscale has shape {array.shape}; it must be a number or a vector (n,)."

@@ -30,7 +30,7 @@ class SearchSpace(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     free: tuple[int, ...] = eqx.field(static=True)
-    roundings: float = eqx.field(static=True)
+    roundings: Float[Array, ""]
 
     def __init__(
         self,
@@ -42,8 +42,8 @@ class SearchSpace(eqx.Module):
         bounds: dict[str, tuple[ArrayLike, ArrayLike]],
         roundings: float = ROUNDINGS,
     ):
-        self.roundings = roundings
         dtype = X.dtype
+        self.roundings = jnp.asarray(roundings, dtype)
         params = hyperparameters(K, X, Y)
         sizes = [param.low.size for param in params]
         self.names = (*np.repeat([p.name for p in params], sizes).tolist(), RIDGE)
@@ -60,19 +60,41 @@ class SearchSpace(eqx.Module):
         )
         self.given_ridge = None
         for name, given in bounds.items():
-            low_given, high_given = _checked_box(name, given)
-            for i in _matching(name, self.names):
+            entries = _matching(name, self.names)
+            for i, *pair in zip(entries, *_checked_box(name, given, len(entries)), strict=True):
+                if self.logarithmic[i] and pair[0] <= 0:
+                    raise ValueError(f"bounds[{name!r}] must be positive, got {given}.")
                 if self.names[i] == RIDGE:
-                    self.given_ridge = jnp.asarray(low_given, dtype), jnp.asarray(high_given, dtype)
+                    self.given_ridge = jnp.asarray(pair[0], dtype), jnp.asarray(pair[1], dtype)
                 else:
-                    if self.logarithmic[i] and low_given <= 0:
-                        raise ValueError(f"bounds[{name!r}] must be positive, got {given}.")
-                    store = np.log if self.logarithmic[i] else np.asarray
-                    low[i], high[i] = store(low_given), store(high_given)
+                    low[i], high[i] = np.log(pair) if self.logarithmic[i] else pair
         self.kernel = K
         self.low, self.high = jnp.asarray(low, dtype), jnp.asarray(high, dtype)
         leaves, _ = ravel_pytree(eqx.filter(K, eqx.is_inexact_array))
         self.start = jnp.asarray(np.append(leaves, np.log(regularization)), dtype)
+
+    def smooth(
+        self,
+        kernel: AbstractMatrixKernel,
+        regularization: Float[Array, ""],
+        X: Float[Array, "N n"],
+        misfit: float,
+    ) -> "SearchSpace":
+        """This space, or one whose λ is large enough for the fields of that misfit to be smooth.
+
+        Args:
+            kernel: the best one found.
+            regularization: its λ.
+            X: states.
+            misfit: the root mean square of the residual over that of Y.
+        """
+        if self.given_ridge is not None or len(self.names) - 1 not in self.free:
+            return self  # the caller has said what λ may be
+        needed = misfit / jnp.finfo(X.dtype).eps ** 0.5
+        low = jnp.exp(self.ridge_box(kernel, X)[0])
+        if regularization * self.roundings >= low * needed:
+            return self
+        return eqx.tree_at(lambda s: s.roundings, self, jnp.asarray(needed, X.dtype))
 
     def decode(
         self, u: Float[Array, " P"], X: Float[Array, "N n"]
@@ -83,7 +105,8 @@ class SearchSpace(eqx.Module):
         is_free = np.isin(np.arange(len(self.start)), self.free)
         h = jnp.where(is_free, self.low + (self.high - self.low) * moved, self.start)
         params, static = eqx.partition(self.kernel, eqx.is_inexact_array)
-        kernel = eqx.combine(ravel_pytree(params)[1](h[:n_leaves]), static)
+        flat, unravel = ravel_pytree(params)
+        kernel = eqx.combine(unravel(h[:n_leaves].astype(flat.dtype)), static)
         if not is_free[-1]:
             return kernel, jnp.exp(self.start[-1])
         low, high = self.ridge_box(kernel, X)
@@ -117,16 +140,17 @@ class SearchSpace(eqx.Module):
         return tuple(dict.fromkeys(names))
 
     def box(self, kernel: AbstractMatrixKernel, X: Float[Array, "N n"]) -> dict[str, tuple]:
-        """The bounds by name, in the units of the hyperparameters; those of λ for `kernel`."""
+        """The lowest and highest value for each name, in its units; those of λ for `kernel`."""
         ridge_low, ridge_high = self.ridge_box(kernel, X)
         low, high = np.array(self.low), np.array(self.high)
         low[-1], high[-1] = ridge_low, ridge_high
-        return {
-            self.names[i]: tuple(
-                float(np.exp(b[i]) if self.logarithmic[i] else b[i]) for b in (low, high)
-            )
-            for i in self.free
-        }
+        box: dict[str, tuple] = {}
+        for i in self.free:
+            pair = np.array([low[i], high[i]], float)
+            least, most = (np.exp(pair) if self.logarithmic[i] else pair).tolist()
+            before = box.get(self.names[i], (least, most))
+            box[self.names[i]] = min(before[0], least), max(before[1], most)
+        return box
 
 
 def _matching(name: str, names: tuple[str, ...]) -> list[int]:
@@ -139,8 +163,17 @@ def _matching(name: str, names: tuple[str, ...]) -> list[int]:
     return found
 
 
-def _checked_box(name: str, given: tuple[ArrayLike, ArrayLike]) -> tuple[float, float]:
-    low, high = (float(np.asarray(side)) for side in given)
-    if not (np.isfinite(low) and np.isfinite(high) and low < high):
-        raise ValueError(f"bounds[{name!r}] must be finite with low < high, got ({low}, {high}).")
+def _checked_box(
+    name: str, given: tuple[ArrayLike, ArrayLike], size: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Both sides of a box, for each entry of that name."""
+    sides = [np.asarray(side, float) for side in given]
+    if len(sides) != 2 or any(side.shape not in ((), (size,)) for side in sides):
+        raise ValueError(
+            f"bounds[{name!r}] must be (low, high), both numbers or arrays of shape ({size},), "
+            f"one number for each entry; got {given}."
+        )
+    low, high = (np.broadcast_to(side, (size,)) for side in sides)
+    if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
+        raise ValueError(f"bounds[{name!r}] must be finite with low < high, got {given}.")
     return low, high

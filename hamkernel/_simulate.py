@@ -54,11 +54,12 @@ def simulate(
     """Integrate ẋ = f(x) from x0 at time ts[0], and return the states at the times ts.
 
     Without `dt` the step adapts to the tolerances. With `dt` every interval [ts[i], ts[i+1]] is cut
-    into the fewest equal steps of at most `dt`, so that each saved state is the end of a step and
-    none is interpolated. Symplectic solvers need this: they keep the energy error bounded because
-    every step is the same map, and a step chosen from the state is a different map each time.
-    With equally spaced `ts` all steps are of one size; unequal spacing changes the size (by at most
-    dt divided by the spacing) from interval to interval, still independently of the state.
+    into the fewest equal steps of at most `dt` (to √ε of it), so that each saved state is the end
+    of a step and none is interpolated. Symplectic solvers need this: they keep the energy error
+    bounded because every step is the same map, and a step chosen from the state is a different map
+    each time. With equally spaced `ts` all steps are of one size; unequal spacing changes the size
+    (by at most dt divided by the spacing) from interval to interval, still independently of the
+    state.
 
     Args:
         field: x (n,) ↦ ẋ (n,), a function or a PyTree such as a fitted field or a system.
@@ -109,7 +110,7 @@ def simulate(
         # the conservation of energy by 1e-7 where the steps themselves keep it to 1e-10.
         controller = diffrax.ClipStepSizeController(
             diffrax.PIDController(
-                rtol=default if rtol is None else rtol, atol=default if atol is None else atol
+                rtol=_tolerance(rtol, default, x0.dtype), atol=_tolerance(atol, default, x0.dtype)
             ),
             step_ts=ts,
         )
@@ -228,6 +229,13 @@ def _check_solver(solver: Any, dt: Any, rtol: float | None, atol: float | None) 
             f"{name} estimates no error, so the step cannot adapt to one: pass dt=... for constant "
             "steps, or use a solver such as diffrax.Dopri8()."
         )
+
+
+def _tolerance(given: float | None, default: float, dtype: Any) -> Float[Array, ""]:
+    """An array, because a number in a compiled program would compile anew for every value."""
+    given = default if given is None else given
+    with _eager(given):
+        return require.positive_scalar(given, "rtol, and atol,").astype(dtype)
 
 
 def _largest_step(dt: Any) -> Float[Array, ""]:

@@ -22,10 +22,11 @@ from hamkernel import _require as require
 from hamkernel._devices import as_given, rows_of, split
 from hamkernel._field import KernelField, SolverInfo
 from hamkernel._gram_operator import product
-from hamkernel._solve import AbstractSolver
+from hamkernel._solve import AbstractSolver, relative, root
 from hamkernel._solve_low_rank import factor, normal_sums, truncated, whitening
 from hamkernel._solve_nystrom import Nystrom
 from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._trained import constant
 
 
 class ConjugateGradient(AbstractSolver):
@@ -103,14 +104,13 @@ class ConjugateGradient(AbstractSolver):
             )
 
         failed = ~(left <= self.tolerance) | (landmarks.count == 0)
-        C = require.value(C, failed, message, RuntimeError)
-        square = jnp.sum(C * values) / ridge
+        C, values = require.value((C, values), failed, message, RuntimeError)
         return KernelField(
             kernel=K,
             points=X,
             coefficients=C / ridge,
             residual=as_given(spread, Y - values),
-            norm=jnp.sqrt(jnp.maximum(square, jnp.zeros_like(square))),  # ‖f‖² = aᵀGa
+            norm=root(jnp.sum(C * values) / ridge),  # ‖f‖² = aᵀGa
             regularization=regularization,
             offset=jnp.zeros((), X.dtype),
             info=SolverInfo(
@@ -128,7 +128,7 @@ class ConjugateGradient(AbstractSolver):
 def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
     S = landmarks.points
     # The preconditioner changes how fast the answer is found, not the answer.
-    K_, X_, S_, ridge_ = jax.lax.stop_gradient((K, X, S, ridge))
+    K_, X_, S_, ridge_ = constant((K, X, S, ridge))
     T = whitening(K_, landmarks)
     total = normal_sums(K_, S_, T, X_, jnp.zeros_like(X_), spread)
     R = factor(total.square, ridge_)
@@ -147,7 +147,7 @@ def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
     preconditioner = lx.FunctionLinearOperator(preconditioned, structure, positive)
     # lineax asks of the change of c what it asks of the residual; both are in units of y. Half of
     # the tolerance leaves room for what the recursion of the residual rounds off.
-    scale = jnp.linalg.norm(Y)
+    scale = jnp.linalg.norm(jax.lax.stop_gradient(Y))
     solver = lx.CG(
         rtol=0.0,
         atol=0.5 * tolerance * scale,
@@ -159,6 +159,6 @@ def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
     solution = lx.linear_solve(system, Y, solver, options=options, throw=False)
     C = solution.value
     values = gram(C) / ridge  # f(X)
-    left = jnp.linalg.norm(Y - C - values) / scale
+    left = relative(Y - C - values, Y)
     truncation = truncated(total.trace, jnp.trace(total.square), ridge_)
     return C, solution.stats["num_steps"], values, left, truncation

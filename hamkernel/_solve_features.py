@@ -13,9 +13,14 @@ from hamkernel import _streaming_sums as streaming_sums
 from hamkernel._devices import as_given, on_each, rows_of, split
 from hamkernel._features import AbstractFeatures, SumFeatures, features
 from hamkernel._field import AbstractField
-from hamkernel._gram import matrix_kernel
+from hamkernel._solve import root
 from hamkernel._solve_low_rank import singular
-from hamkernel._solve_streaming import AbstractStreamingFit, AbstractStreamingSolver, thinned
+from hamkernel._solve_streaming import (
+    AbstractStreamingFit,
+    AbstractStreamingSolver,
+    checked_start,
+    thinned,
+)
 from hamkernel._streaming import ridge_regression
 from hamkernel._streaming_sums import Sums
 from hamkernel._structured import AbstractMatrixKernel, Sum
@@ -59,18 +64,7 @@ class FeatureField(AbstractField):
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return _field_at(self.features, self._state(x), self.weights)
 
-    def evaluate(self, X: ArrayLike) -> Float[Array, "N n"]:
-        """The velocities at many states, as `jax.vmap(field)(X)` but in O(N n + r) memory.
-
-        Args:
-            X: states, shape (N, n).
-
-        Raises:
-            ValueError: the shape does not fit.
-        """
-        X = require.points(X, "X").astype(self.weights.dtype)
-        if X.shape[1] != self.dimension:
-            raise ValueError(f"X has {X.shape[1]} coordinates and the field {self.dimension}.")
+    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         spread = rows_of(X)
         return as_given(spread, _evaluate(self, split(spread, X), spread))
 
@@ -80,28 +74,17 @@ class FeatureField(AbstractField):
         jax.eval_shape(self.kernel.potential, x, x[None], x[None])
         return _potential_at(self.features, x, self.weights)
 
-    def part(self, which: int | str) -> "FeatureField":
-        """The field of one term of a sum of kernels, by position or name.
-
-        The parts add up to the field; an anchor of the whole is not theirs. `residual` and the
-        norms are those of the whole fit.
-
-        Raises:
-            KeyError: there is no such part (with the choices).
-        """
-        if isinstance(self.kernel, Sum) and isinstance(self.features, SumFeatures):
-            term, names = self.kernel.part(which), self.kernel.names
-            index = names.index(which) if which in names else operator.index(which)  # type: ignore[arg-type]
-            index %= len(names)
-            weights = self.weights[self.features.slice(index)]
-            return eqx.tree_at(
-                lambda f: (f.kernel, f.features, f.weights, f.offset),
-                self,
-                (term, self.features.terms[index], weights, jnp.zeros_like(self.offset)),
-            )
-        if which == 0:
-            return self
-        raise KeyError(f"no part {which!r}: {type(self.kernel).__name__} is not a sum.")
+    def _term(self, kernel: Sum, which: int | str) -> "FeatureField":
+        assert isinstance(self.features, SumFeatures)
+        term, names = kernel.part(which), kernel.names
+        index = names.index(which) if which in names else operator.index(which)  # type: ignore[arg-type]
+        index %= len(names)
+        weights = self.weights[self.features.slice(index)]
+        return eqx.tree_at(
+            lambda f: (f.kernel, f.features, f.weights, f.offset),
+            self,
+            (term, self.features.terms[index], weights, jnp.zeros_like(self.offset)),
+        )
 
 
 @eqx.filter_jit
@@ -172,6 +155,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
     ) -> FeatureField:
         spread = rows_of(X)
         field = _fit(K, self, split(spread, X), split(spread, Y), regularization, spread)
+        field = _checked(field)
         if spread is None:
             return field
         residual = as_given(spread, field.residual)
@@ -192,13 +176,9 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
             TypeError: a kernel without a known spectral density. ValueError: n is not allowed by
                 the structure, the sample is not finite, or λ is not positive.
         """
-        K = matrix_kernel(K)
-        sample = require.finite(require.points(sample, "sample"), "sample")
-        K.check_dimension(sample.shape[1])
-        regularization = require.positive_scalar(regularization, "regularization")
+        K, sample, regularization = checked_start(K, sample, regularization)
         basis = features(K, sample.shape[1], self.count, self.key, sample.dtype)
-        sample = thinned(sample, _SAMPLE)
-        return _start(K, basis, sample, regularization.astype(sample.dtype))
+        return _start(K, basis, thinned(sample, _SAMPLE), regularization)
 
 
 @eqx.filter_jit
@@ -216,10 +196,21 @@ def _field(K, basis, weights, residual, residual_norm, regularization):
         weights=weights,
         residual=residual,
         residual_norm=residual_norm,
-        norm=jnp.linalg.norm(weights),
+        norm=root(weights @ weights),
         regularization=regularization,
         offset=jnp.zeros((), weights.dtype),
     )
+
+
+def _checked(field: FeatureField) -> FeatureField:
+    """The field, if the least squares had a solution."""
+
+    def learned(f: FeatureField):
+        return f.weights, f.residual, f.residual_norm, f.norm
+
+    failed = require.not_finite(field.weights)
+    cause = singular(field.weights.dtype)
+    return eqx.tree_at(learned, field, require.value(learned(field), failed, cause, RuntimeError))
 
 
 class FeatureFit(AbstractStreamingFit[FeatureField]):
@@ -257,10 +248,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
         return eqx.tree_at(lambda f: (f.sums, f.count), self, (sums, self.count + len(X)))
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
-        field = _solved(self, count, regularization)
-        failed = require.not_finite(field.weights)
-        weights = require.value(field.weights, failed, singular(self.dtype), RuntimeError)
-        return eqx.tree_at(lambda f: f.weights, field, weights)
+        return _checked(_solved(self, count, regularization))
 
 
 @eqx.filter_jit

@@ -18,6 +18,7 @@ from hamkernel import _require as require
 from hamkernel._devices import rows_of, split
 from hamkernel._gram import assemble, block_traces
 from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._trained import constant
 
 BLOCK = 16  # points drawn at once
 FIRST = 64  # points in the first buffer; it doubles until they suffice
@@ -64,7 +65,7 @@ def choose_landmarks(
     Source: Chen, Epperly, Tropp & Webber (2023), arXiv 2207.06503; in blocks, Epperly, Tropp &
         Webber (2024), arXiv 2410.03969.
     """
-    K, X, left = jax.lax.stop_gradient((K, X, left))
+    K, X, left = constant((K, X, left))
     first, key = jax.random.split(key)
     rows = rows_of(X)
     X = split(rows, X)
@@ -99,7 +100,7 @@ def given_landmarks(K: AbstractMatrixKernel, S: Float[Array, "m n"]) -> Landmark
 
     O((m n)³) time. Nothing is differentiated, as in `choose_landmarks`.
     """
-    K, S = jax.lax.stop_gradient((K, S))
+    K, S = constant((K, S))
     rounding = _rounding(block_traces(K, S), S.size)
     block = assemble(K, S, S).reshape(S.size, S.size)
     _, kept = _factor(block, jnp.broadcast_to(rounding, len(S)), S.shape[1], rounding)

@@ -24,8 +24,9 @@ from hamkernel import _require as require
 from hamkernel import _streaming_sums as streaming_sums
 from hamkernel._devices import as_given, rows_of, split
 from hamkernel._field import KernelField, SolverInfo
-from hamkernel._gram import block_traces, matrix_kernel
+from hamkernel._gram import block_traces
 from hamkernel._gram_operator import product
+from hamkernel._solve import root
 from hamkernel._solve_landmarks import Landmarks, choose_landmarks, given_landmarks
 from hamkernel._solve_low_rank import (
     Columns,
@@ -35,7 +36,12 @@ from hamkernel._solve_low_rank import (
     truncated,
     whitening,
 )
-from hamkernel._solve_streaming import AbstractStreamingFit, AbstractStreamingSolver, thinned
+from hamkernel._solve_streaming import (
+    AbstractStreamingFit,
+    AbstractStreamingSolver,
+    checked_start,
+    thinned,
+)
 from hamkernel._streaming_sums import Sums
 from hamkernel._structured import AbstractMatrixKernel
 
@@ -140,12 +146,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
             ValueError: a shape does not fit, or λ is not positive. TypeError: K is not
                 matrix-valued.
         """
-        K = matrix_kernel(K)
-        sample = require.points(sample, "sample")
-        sample = require.finite(sample, "sample")
-        K.check_dimension(sample.shape[1])
-        regularization = require.positive_scalar(regularization, "regularization")
-        regularization = regularization.astype(sample.dtype)
+        K, sample, regularization = checked_start(K, sample, regularization)
         landmarks = self.landmarks(K, sample, regularization)
         some = thinned(sample, self.candidates)
         return _start(K, some, regularization, landmarks, self.tolerance)
@@ -170,7 +171,7 @@ def _fit(K, X, Y, regularization, landmarks, spread):
     w, residual = step(w, Y - product(K, X, S, A, spread))
     truncation = truncated(total.trace, jnp.trace(total.square), ridge)
     # ‖f‖² = αᵀ G_SS α = ‖w‖²
-    return _Solution((T @ w).reshape(S.shape), residual, jnp.linalg.norm(w), truncation)
+    return _Solution((T @ w).reshape(S.shape), residual, root(w @ w), truncation)
 
 
 class _Solution(NamedTuple):
@@ -181,14 +182,15 @@ class _Solution(NamedTuple):
 
 
 def _field(K, landmarks, solution, regularization, tolerance) -> KernelField:
-    A, dtype = solution.coefficients, landmarks.points.dtype
-    failed = require.not_finite(A).any() | (require.on_host(landmarks.count) == 0)
-    A = require.value(A, failed, singular(dtype), RuntimeError)
+    dtype = landmarks.points.dtype
+    unsolved = require.not_finite(solution.coefficients).any()
+    failed = unsolved | (require.on_host(landmarks.count) == 0)
+    solution = require.value(solution, failed, singular(dtype), RuntimeError)
     _warn_if_truncated(solution.truncation, landmarks.count, tolerance)
     return KernelField(
         kernel=K,
         points=landmarks.points,
-        coefficients=A,
+        coefficients=solution.coefficients,
         residual=solution.residual,
         norm=solution.norm,
         regularization=regularization,

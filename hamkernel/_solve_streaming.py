@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from hamkernel import _require as require
 from hamkernel._devices import rows_of, split
 from hamkernel._field import AbstractField
+from hamkernel._gram import matrix_kernel
 from hamkernel._solve import AbstractSolver
 from hamkernel._structured import AbstractMatrixKernel
 
@@ -78,7 +79,7 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
         Raises:
             ValueError: λ is not positive, or no data was added.
         """
-        regularization = require.positive_scalar(regularization, "regularization")
+        regularization = require.ridge(regularization)
         none = require.on_host(self.count) == 0
         count = require.value(
             self.count, none, "no data yet: add(X, Y) before asking for the field."
@@ -132,6 +133,16 @@ class AbstractStreamingSolver(AbstractSolver, Generic[Learned]):
         if model is None:
             raise ValueError("fit_chunks needs at least one chunk (X, Y); the iterator was empty.")
         return model.field(regularization)
+
+
+def checked_start(
+    K: AbstractMatrixKernel, sample: ArrayLike, regularization: ArrayLike
+) -> tuple[AbstractMatrixKernel, Float[Array, "N n"], Float[Array, ""]]:
+    """The arguments of `start`, if they are what it says."""
+    K = matrix_kernel(K)
+    sample = require.finite(require.points(sample, "sample"), "sample")
+    K.check_dimension(sample.shape[1])
+    return K, sample, require.ridge(regularization).astype(sample.dtype)
 
 
 def thinned(sample: Float[Array, "N n"], most: int) -> Float[Array, "M n"]:

@@ -16,6 +16,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from hamkernel._devices import Rows, on_each
+from hamkernel._trained import constant
 
 # A design gives the rows of some points at once: (t, n) -> (t, n, r), row (i, a) of a field's
 # component a at point i.
@@ -114,12 +115,12 @@ def ridge_regression(
         ridge: δ ≥ 0; with δ = 0 the columns of Φ must be independent.
         spread: the devices over which points and targets are spread, if they are.
     """
-    fixed, fixed_X, fixed_Y, fixed_ridge = _constant((design, X, Y, ridge))
+    fixed, fixed_X, fixed_Y, fixed_ridge = constant((design, X, Y, ridge))
     state = LeastSquares.empty(columns, X.dtype)
     state = accumulate_data(state, fixed, fixed_X, fixed_Y, spread)
     triangle, rotated = _with_ridge(state, fixed_ridge)
-    w = _constant(solve_triangular(triangle, rotated))
-    triangle = _constant(triangle)
+    w = constant(solve_triangular(triangle, rotated))
+    triangle = constant(triangle)
 
     # One step of iterative refinement, w + H⁻¹(Φᵀ(y − Φw) − δw) with H = ΦᵀΦ + δI = RᵀR. It equals
     # H⁻¹Φᵀy for every w, so that its derivatives are exact although w and R are held constant,
@@ -191,9 +192,3 @@ def over_tiles(step, carry, data: tuple[Array, Array], columns: int):
         carry, out = step(carry, jax.tree.map(lambda a: a[tiles * size :], data))
         outs.append(out)
     return carry, jax.tree.map(lambda *parts: jnp.concatenate(parts), *outs)
-
-
-def _constant(tree):
-    """`tree` with no derivative through its arrays."""
-    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
-    return eqx.combine(jax.tree.map(jax.lax.stop_gradient, arrays), rest)

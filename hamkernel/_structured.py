@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._scalar import AbstractScalarKernel, Invariance
+from hamkernel._scalar import AbstractScalarKernel, Invariance, one_point
 
 
 class AbstractMatrixKernel(eqx.Module):
@@ -29,8 +29,14 @@ class AbstractMatrixKernel(eqx.Module):
         """uᵀ K(x, z) v for one pair of points."""
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, "n n"]:
-        """The block K(x, z) for one pair of points."""
-        x, z = require.floating(x, "x"), require.floating(z, "z")
+        """The block K(x, z) for one pair of points.
+
+        Raises:
+            ValueError: x or z is no single point, or n is not one that the structure allows.
+        """
+        x, z = require.same_space(one_point(x)[None], one_point(z)[None])
+        x, z = x[0], z[0]
+        self.check_dimension(len(x))
         basis = jnp.eye(len(x), dtype=x.dtype)
         columns = jax.vmap(self.form, in_axes=(None, None, None, 0))
         return jax.vmap(columns, in_axes=(None, 0, None, None))(x, basis, z, basis)
@@ -47,9 +53,8 @@ class AbstractMatrixKernel(eqx.Module):
     ) -> Float[Array, ""]:
         """The potential of `expansion`; AttributeError, with the reason, if there is none."""
 
-    @abc.abstractmethod
     def check_dimension(self, n: int) -> None:
-        """ValueError if fields on ℝⁿ cannot have this structure."""
+        """ValueError if fields on ℝⁿ cannot have this structure; by default all can."""
 
     @abc.abstractmethod
     def with_parity(self, parity: int) -> "AbstractMatrixKernel":

@@ -53,9 +53,6 @@ class Separable(AbstractMatrixKernel):
             "Use Symplectic or CurlFree to learn one."
         )
 
-    def check_dimension(self, n: int) -> None:
-        pass
-
     def with_parity(self, parity: int) -> "Separable":
         return Separable(with_parity(self.kernel, parity))  # the field IS the scalar function
 
@@ -119,9 +116,6 @@ class CurlFree(AbstractPotentialKernel):
 
     def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
         return v
-
-    def check_dimension(self, n: int) -> None:
-        pass
 
     def with_parity(self, parity: int) -> "CurlFree":
         return CurlFree(with_parity(self.kernel, -parity))

@@ -45,6 +45,13 @@ def _(saved, bar, perturbed, kernel_and_points, make, paired=None):
     # Side by side the directions share what does not depend on them, at the price of memory.
     together = min(flat.size, _ENTRIES // max(bar.size, X.size))
     directions = jnp.eye(flat.size, dtype=flat.dtype)
-    K_bar = unravel(jax.lax.map(slope, directions, batch_size=together if together > 1 else None))
+    slopes = jax.lax.map(slope, directions, batch_size=together if together > 1 else None)
+    K_bar = unravel(slopes.astype(flat.dtype))
     X_bar = jax.vjp(lambda X: make(K, X), X)[1](bar)[0] if perturbed[1] else None
     return K_bar, X_bar
+
+
+def constant(tree):
+    """`tree` with no derivative through its arrays; it may have leaves of other kinds, as K may."""
+    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.tree.map(jax.lax.stop_gradient, arrays), rest)

@@ -10,6 +10,13 @@ the G that was there before the terms of an odd or even kernel cancelled: what l
 rounding noise and can look like a very good loss. This matters. A quadratic
 Hamiltonian is the flat limit of the Gaussian kernel, so the loss of an oscillator improves all
 the way along ℓ -> ∞, λ -> 0 until nothing is left of it but noise.
+
+The loss can be right where the field is already rough. The coefficients are the residual over Nλ,
+so f(x) rounds at about 1e-2 ε tr(G)/(Nλ) times the residual, and an adaptive step, or the
+iteration of an implicit one, that is asked for more digits fails. If the best field has
+Nλ < √ε tr(G) ‖y − f‖/‖y‖, the search is made once more with that as the bound: measured on
+polynomial and trigonometric H with noise of 1 and 10 %, all fields could then be simulated, and 6
+of 12 could not before. Data without noise has no residual, and keeps the first bound.
 """
 
 from typing import Any
@@ -22,6 +29,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
+from hamkernel._devices import on_one_device
 from hamkernel._field import AbstractField
 from hamkernel._fit import fit
 from hamkernel._folds import Folds
@@ -85,7 +93,8 @@ def tune(
     The search starts from the given kernel and from `starts` − 1 further points, the best of a
     space-filling design in the box. All run in one compiled call, on a subset of the points if
     there are many; the best runs are then finished on all data, and the best point that any of
-    them saw is returned. New data of the same shape does not recompile.
+    them saw is returned. New data of the same shape does not recompile. Data that is spread over
+    devices is gathered on one of them for the search; the field is fitted where the data lies.
 
     Args:
         K: a matrix-valued kernel; every inexact array leaf is a hyperparameter.
@@ -119,9 +128,10 @@ def tune(
     asks for a polynomial: the fit is good and its hyperparameters mean little.
     """
     K = matrix_kernel(K)
-    X, Y = require.data(X, Y)
+    X, Y = given = require.data(X, Y)
+    X, Y = on_one_device("X", X), on_one_device("Y", Y)
     K.check_dimension(X.shape[1])
-    ridge = require.positive_scalar(regularization, "regularization").astype(X.dtype)
+    ridge = require.ridge(regularization).astype(X.dtype)
     criterion = criterion_of(objective, len(X), folds)
     frozen = (frozen,) if isinstance(frozen, str) else tuple(frozen)
     low_rank = isinstance(solver, Nystrom | RandomFeatures)
@@ -138,36 +148,48 @@ def tune(
         check_memory(X)
     X_part, Y_part = (jnp.take(each, rows, axis=0) for each in (X, Y))
     part = criterion.on(rows), X_part, Y_part, len(X) / len(rows)
-    runs = search(space, *part, optimiser, starts, max_steps)
-    if len(rows) < len(X):
-        fine = criterion
-        if low_rank:
-            kernel, ridge = decode(space, runs.u[0], X)
-            fine = criterion.with_basis(basis_of(solver, kernel, ridge, X))
-        runs = finish(space, fine, X, Y, runs, optimiser, max_steps)
-    runs = jax.tree.map(np.asarray, runs)  # NumPy compiles nothing
-    values = runs.value
-    if not (values < HUGE).any():
-        raise RuntimeError(
-            "the objective is not finite at any start. Likely causes, in order: a kernel that is "
-            "not positive definite or not finite (hk.check_kernel(k, X) tells); bounds in which "
-            "no fit succeeds (pass bounds={'regularization': (low, high)} with a larger low); an "
-            "objective of your own that returns NaN."
-        )
-    best = int(values.argmin())
-    kernel, ridge = decode(space, jnp.asarray(runs.u[best]), X)
-    losses = criterion.losses(values)
+
+    def best_in(space: SearchSpace):
+        runs = search(space, *part, optimiser, starts, max_steps)
+        if len(rows) < len(X):
+            fine = criterion
+            if low_rank:
+                kernel, ridge = decode(space, runs.u[0], X)
+                fine = criterion.with_basis(basis_of(solver, kernel, ridge, X))
+            runs = finish(space, fine, X, Y, runs, optimiser, max_steps)
+        runs = jax.tree.map(np.asarray, runs)  # NumPy compiles nothing
+        if not (runs.value < HUGE).any():
+            raise RuntimeError(
+                "the objective is not finite at any start. Likely causes, in order: a kernel that "
+                "is not positive definite or not finite (hk.check_kernel(k, X) tells); bounds in "
+                "which no fit succeeds (pass bounds={'regularization': (low, high)} with a larger "
+                "low); an objective of your own that returns NaN."
+            )
+        best = int(runs.value.argmin())
+        kernel, ridge = decode(space, jnp.asarray(runs.u[best]), X)
+        return runs, best, kernel, ridge, fit(kernel, *given, ridge, solver=solver)
+
+    runs, best, kernel, ridge, field = best_in(space)
+    smooth = space.smooth(kernel, ridge, X, _size(field.residual) / _size(given[1]))
+    if smooth is not space:
+        space = smooth
+        runs, best, kernel, ridge, field = best_in(space)
+    losses = criterion.losses(runs.value)
     return Tuned(
         kernel=kernel,
         regularization=ridge,
         loss=jnp.asarray(losses[best]),
-        field=fit(kernel, X, Y, ridge, solver=solver),
+        field=field,
         converged=jnp.asarray(runs.converged[best]),
         steps=jnp.asarray(runs.steps[best]),
         start_losses=jnp.asarray(losses),
         at_bounds=space.at_bounds(runs.u[best]),
         bounds=space.box(kernel, X),
     )
+
+
+def _size(values: Array) -> float:
+    return max(float(jnp.linalg.norm(values)), float(np.finfo(float).tiny))
 
 
 # Made once: compiled functions are told apart by the functions inside these, too.

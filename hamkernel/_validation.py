@@ -149,7 +149,7 @@ def _checked(K, X, Y, regularization):
     K = matrix_kernel(K)
     X, Y = require.data(X, Y)
     K.check_dimension(X.shape[1])
-    regularization = require.positive_scalar(regularization, "regularization")
+    regularization = require.ridge(regularization)
     return K, X, Y, regularization.astype(X.dtype)
 
 

@@ -23,7 +23,7 @@ from hamkernel._features import features
 from hamkernel._folds import Partition
 from hamkernel._gram import assemble
 from hamkernel._solve_landmarks import given_landmarks
-from hamkernel._solve_low_rank import whitening
+from hamkernel._solve_low_rank import factor, whitening
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._trained import trained
 
@@ -96,7 +96,7 @@ def _by_downdating(folds, y, ridge):
 
 def _by_inversion(folds, y, ridge):
     rows = folds.reshape(-1, folds.shape[2])
-    R = _factor(rows, ridge)
+    R = factor(rows.T @ rows, ridge)
     b = solve_triangular(R, rows.T @ y.reshape(-1), lower=True)
     V = solve_triangular(R, rows.T, lower=True).T.reshape(folds.shape)  # (F, S n, r)
     held_out = jnp.eye(folds.shape[1], dtype=y.dtype)[None] - jnp.einsum("fsr,ftr->fst", V, V)
@@ -140,14 +140,9 @@ def _rows(basis, K, X) -> Float[Array, "Nn r"]:
 
 def _fitted(basis, K, X, Y, regularization):
     rows, ridge, y = _rows(basis, K, X), len(X) * regularization, Y.reshape(-1)
-    R = _factor(rows, ridge)
+    R = factor(rows.T @ rows, ridge)
     w = cho_solve((R, True), rows.T @ y)
     return y - rows @ w, w, R, rows, ridge
-
-
-def _factor(rows: Float[Array, "Nn r"], ridge: Float[Array, ""]) -> Float[Array, "r r"]:
-    identity = jnp.eye(rows.shape[1], dtype=rows.dtype)
-    return jnp.linalg.cholesky(rows.T @ rows + ridge * identity)
 
 
 def _finite(value: Float[Array, ""], otherwise: float) -> Float[Array, ""]:

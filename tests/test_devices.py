@@ -262,6 +262,24 @@ def slow():
     return on_eight(SLOW)
 
 
+TUNED = """
+XS, YS = spread(mesh(8), X[:24], Y[:24])
+options = dict(starts=2, bounds={"regularization": (1e-5, 1.0)})
+one = hk.tune(K, X[:24], Y[:24], 1e-3, 4, **options)
+many = hk.tune(K, XS, YS, 1e-3, 4, **options)
+print(json.dumps([off(many.loss, one.loss), off(many.field.evaluate(new), one.field.evaluate(new)),
+                  many.field.info.solver]))
+"""
+
+
+@pytest.mark.slow
+def test_tune_takes_spread_data_and_fits_it_where_it_lies():
+    loss, field, solver = on_eight(TUNED)
+    assert loss < ORDER
+    assert field < 1e-6  # conjugate gradients against Cholesky
+    assert solver == "ConjugateGradient"
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["gradients", "chosen", "plane", "explicit", "explicit waves"])
 def test_every_solver_and_mesh_give_the_fit_of_one_device(slow, name):

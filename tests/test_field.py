@@ -169,6 +169,12 @@ def test_the_hamiltonian_of_a_sum_is_asked_of_its_part():
     np.testing.assert_allclose(part(x), canonical(2) @ slope, atol=ROUNDING)
 
 
+@pytest.mark.parametrize(("x0", "value"), [([np.nan, 0.0], 0.0), ([0.0, 0.0], np.inf)])
+def test_an_anchor_that_is_not_finite_is_refused(x0, value):
+    with pytest.raises(ValueError, match="x0 and value must be finite"):
+        fitted(hk.Symplectic).anchored(np.array(x0), value)
+
+
 # Points of the wrong kind.
 
 

@@ -1,6 +1,7 @@
 """`fit` against closed forms solved by NumPy, its derivatives, and everything it refuses."""
 
 import re
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -274,9 +275,60 @@ def test_repeated_points_are_solved_or_refused_but_never_nan(structure, ridge):
         assert re.search(r"N \* regularization = .*regularization is too small", refusal)
         return
     assert isinstance(field, hk.KernelField)
-    assert jnp.isfinite(field.coefficients).all()
+    off = system_residual(field, Y)
+    assert off < 1e-2
+    np.testing.assert_allclose(info(field).relative_residual, off, rtol=0.5, atol=1e-15)
     if ridge == 1e-2:  # the mean of the two velocities
         np.testing.assert_allclose(jax.vmap(field)(jnp.asarray(X)), 0.0, atol=SOLVE)
+
+
+def info(field) -> Any:
+    return field.info
+
+
+def learned(X, Y, solver) -> Any:
+    return hk.fit(K, X, Y, RIDGE, solver=solver)
+
+
+def system_residual(field, Y):
+    """‖y − (G + NλI)a‖/‖y‖ of a fitted field, by NumPy in float64."""
+    X, a = (np.asarray(each, float) for each in (field.points, field.coefficients))
+    G = np.asarray(hk.gram(field.kernel, X)).reshape(X.size, X.size)
+    system = G + len(X) * float(field.regularization) * np.eye(X.size)
+    return np.linalg.norm(Y.ravel() - system @ a.ravel()) / np.linalg.norm(Y)
+
+
+@pytest.mark.parametrize(
+    ("dtype", "ridges"),
+    [(float, np.geomspace(1e-12, 1e-19, 15)), (np.float32, np.geomspace(1e-3, 1e-9, 13))],
+)
+@pytest.mark.filterwarnings("ignore:fitting in float32")
+def test_what_rounding_spoils_is_refused_and_never_a_wrong_field(dtype, ridges):
+    # LAPACK factorises some matrices that are singular to rounding, and solves with noise.
+    X, Y = data(8, 2)
+    X, Y = np.concatenate([X, X]), np.concatenate([Y, -2 * Y])
+    residuals = []
+    for ridge in ridges:
+        try:
+            field = hk.fit(K, X.astype(dtype), Y.astype(dtype), ridge / len(X))
+        except RuntimeError:
+            continue
+        # In float32 the Gram rounds as well, at each pair.
+        residuals.append(system_residual(field, Y))
+        assert residuals[-1] < (1e-2 if dtype is float else 3e-2)
+    assert 0 < len(residuals) < len(ridges)  # both happen
+
+
+def test_data_of_zeros_give_the_zero_field_and_finite_derivatives():
+    X, Y = data(6, 2)
+    for solver in (hk.Cholesky(), hk.ConjugateGradient(), hk.Nystrom()):
+
+        def norm(Y, solver=solver):
+            return learned(X, Y, solver).norm
+
+        value, slope = jax.value_and_grad(norm)(jnp.zeros_like(Y))
+        assert value == 0.0
+        assert jnp.isfinite(slope).all()
 
 
 def test_a_ridge_lost_in_rounding_is_refused_also_under_jit():
@@ -327,6 +379,8 @@ ENDLESS = np.where(np.arange(5)[:, None] == 1, np.inf, Y)
         ((K, X, Y, -1e-3), ValueError, r"regularization must be positive .* got -0\.001"),
         ((K, X, Y, float("nan")), ValueError, "regularization must be positive .* got nan"),
         ((K, X, Y, np.ones(5)), ValueError, r"regularization has shape \(5,\); one number"),
+        ((K, X, Y, None), TypeError, "regularization must hold real numbers; got None"),
+        ((K, [[1, 2], [3]], Y), TypeError, r"X must hold real numbers.*rows of equal length"),
         ((K, X * 1j, Y), TypeError, "X has dtype complex128; real numbers are needed"),
         ((K, X, Y, 1e-3j), TypeError, "regularization has dtype complex128"),
         ((K, X.astype(np.float16), Y.astype(np.float16)), TypeError, "dtype float16"),

@@ -170,6 +170,20 @@ def test_new_hyperparameters_do_not_recompile():
     assert len(traces) > first
 
 
+def test_no_argument_is_cut_to_the_precision_of_the_other():
+    X, Z = np.full((1, 2), 1 / 3), np.full((1, 2), 2 / 3)
+    K, single = hk.Symplectic(hk.Gaussian()), X.astype(np.float32)
+    there, back = hk.gram(K, single, Z), hk.gram(K, Z, single)
+    assert there.dtype == back.dtype == jnp.float64
+    np.testing.assert_array_equal(there[0, :, 0], back[0, :, 0].T)
+    np.testing.assert_allclose(
+        hk.gram_operator(K, single, Z).mv(jnp.asarray(Z)),
+        (there.reshape(2, 2) @ Z[0])[None],
+        rtol=1e-12,
+    )
+    assert K(jnp.asarray(single[0]), jnp.asarray(Z[0])).dtype == jnp.float64
+
+
 def test_float32_gives_float32_and_integers_give_floats():
     K = hk.Symplectic(hk.Gaussian(1.3))
     X = states(3, 2)

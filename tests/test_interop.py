@@ -88,6 +88,18 @@ def test_the_matern_of_this_library_is_sound_there(package):
     hk.check_kernel(hk.Matern(2.5, LENGTHSCALE), X)
 
 
+def test_a_method_that_is_called_evaluate_changes_nothing_in_a_kernel_of_ones_own():
+    class Own(eqx.Module):
+        def __call__(self, x, z):
+            return jnp.exp(x @ z)
+
+        def evaluate(self, x, z):
+            return 3 * jnp.exp(x @ z)
+
+    x, z = X[0], X[1]
+    np.testing.assert_allclose(hk.Separable(Own())(x, z)[0, 0], np.exp(x @ z), rtol=1e-14)
+
+
 @packages
 def test_their_hyperparameters_are_leaves_that_a_loss_is_differentiated_by(package):
     leaves, structure = jax.tree.flatten(hk.Symplectic(gaussian(package)))

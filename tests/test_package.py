@@ -19,14 +19,14 @@ PACKAGE = Path(hk.__file__).parent
 # belongs to the room with the longest name that it starts with.
 ROOMS = [
     {"_require"},
-    {"_devices"},
+    {"_devices", "_trained"},
     {"_scalar"},
     {"_structured"},
     {"_check", "_features", "_gram"},
     {"_field"},
     {"_solve", "_streaming"},
     {"_fit"},
-    {"_folds", "_inverse", "_trained", "_validation"},
+    {"_folds", "_inverse", "_validation"},
     {"_bounds", "_objective", "_search", "_tune"},
     {"_integrators", "_simulate", "_save", "systems"},
     {"plot"},

@@ -332,6 +332,23 @@ def test_no_seed_is_refused():
         paper.reproduce(seeds=0)
 
 
+def test_a_folder_that_cannot_be_made_is_refused_before_the_work(tmp_path, monkeypatch):
+    (tmp_path / "file").touch()
+    command = [sys.executable, "-m", "hamkernel", "--out", str(tmp_path / "file")]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "cannot be written" in done.stderr
+
+    def work(*arguments):
+        raise AssertionError("the work began")
+
+    monkeypatch.setattr("hamkernel.paper._reproduce._outcomes", work)
+    with pytest.raises(FileExistsError):
+        paper.reproduce(tmp_path / "file", seeds=1)
+    with pytest.raises(AssertionError, match="the work began"):
+        paper.reproduce(tmp_path / "folder", seeds=1)
+
+
 def test_tuning_before_the_paper_is_refused_at_once(tmp_path):
     with pytest.raises(FileNotFoundError, match="reproduce"):
         paper.retune(tmp_path)

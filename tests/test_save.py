@@ -273,6 +273,15 @@ def test_what_cannot_be_stored_is_named(tmp_path):
         save(tmp_path / "f", field)
 
 
+def test_a_batch_of_fields_is_refused_before_it_is_lost(tmp_path):
+    X, Y = jnp.eye(4), jnp.ones((3, 4, 4))
+    K = hk.Symplectic(hk.Gaussian())
+    batch = jax.vmap(lambda Y: hk.fit(K, X, Y, 1e-3))(Y)
+    with pytest.raises(ValueError, match=r"save each field.*an axis more"):
+        hk.save(tmp_path / "batch", batch)
+    assert not (tmp_path / "batch").exists()
+
+
 def test_saving_under_jit_is_refused(tmp_path):
     with pytest.raises(ValueError, match=r"under jax\.jit"):
         eqx.filter_jit(lambda field: save(tmp_path / "f", field))(fitted())

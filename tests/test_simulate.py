@@ -179,6 +179,25 @@ def test_a_new_start_field_or_step_does_not_compile_again():
         run(Pendulum(jnp.array(g)), START * g, jnp.asarray(TIMES) * g, jnp.array(dt))
 
 
+def test_a_new_tolerance_does_not_compile_again():
+    compiled = []
+    jax.monitoring.register_event_duration_secs_listener(
+        lambda event, duration, **_: compiled.append(event) if "backend_compile" in event else None
+    )
+    field = Pendulum(jnp.array(1.0))
+    coarse = states(field, START, TIMES, rtol=1e-3, atol=1e-3)
+    assert compiled
+    compiled.clear()
+    fine = states(field, START, TIMES, rtol=1e-9, atol=1e-9)
+    assert not compiled
+    assert 1e-8 < np.abs(fine - coarse).max() < 1e-1
+
+
+def test_a_tolerance_must_be_positive():
+    with pytest.raises(ValueError, match="rtol, and atol, must be positive"):
+        states(Pendulum(jnp.array(1.0)), START, TIMES, rtol=0.0)
+
+
 @pytest.mark.parametrize(
     "options",
     [{}, {"solver": ImplicitMidpoint(), "dt": 0.1}, {"solver": StormerVerlet(), "dt": 0.1}],

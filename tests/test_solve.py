@@ -276,6 +276,44 @@ def test_the_gradient_of_conjugate_gradients_is_that_of_cholesky():
     np.testing.assert_allclose(slope, jax.grad(lambda s: loss(s, hk.Cholesky()))(start), rtol=1e-6)
 
 
+def test_the_gradient_of_conjugate_gradients_in_the_velocities_is_that_of_cholesky():
+    X, Y = swings(40)
+    iterative = ConjugateGradient(1e-10, preconditioner=Nystrom(10.0, 16))
+
+    def slope(solver):
+        return jax.grad(lambda Y: fit(K, X, Y, 1e-3, solver=solver)(X[0])[1])(jnp.asarray(Y))
+
+    expected = slope(hk.Cholesky())
+    assert jnp.abs(expected).max() > 1e-3
+    np.testing.assert_allclose(slope(iterative), expected, atol=1e-8)
+
+
+@pytest.mark.parametrize("solver", [Nystrom(1e-6), ConjugateGradient(1e-10)], ids=["low", "cg"])
+def test_a_kernel_may_have_leaves_that_are_no_arrays(solver):
+    net = eqx.nn.MLP(2, 3, 4, 1, activation=jnp.tanh, key=jax.random.key(0))
+    net = jax.tree.map(lambda a: a.astype(float) if eqx.is_inexact_array(a) else a, net)
+    K, (X, Y) = hk.Symplectic(hk.Warp(hk.Gaussian(1.0), net)), swings(40)
+    field = fit(K, X, Y, 1e-3, solver=solver)
+    _, values = exact(K, X, Y, 1e-3)
+    assert relative(fitted(field, Y), values) < 1e-5
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [hk.Cholesky(), Nystrom(), ConjugateGradient(), hk.RandomFeatures(20, jax.random.key(0))],
+    ids=lambda solver: type(solver).__name__,
+)
+def test_a_fit_that_fails_says_so_whatever_is_asked_of_it(solver):
+    # Under jit a check is dropped together with the value it hangs on.
+    X, Y = swings(20)
+    broken = eqx.tree_at(lambda K: K.kernel.log_lengthscale, K, jnp.nan)
+    with pytest.raises(RuntimeError, match="check_kernel"):
+        hk.fit(broken, X, Y, 1e-3, solver=solver)
+    for part in (lambda f: f.norm, lambda f: f.residual, lambda f: f(X[0])):
+        with pytest.raises(Exception, match="check_kernel"):
+            eqx.filter_jit(lambda K, part=part: part(hk.fit(K, X, Y, 1e-3, solver=solver)))(broken)
+
+
 def test_conjugate_gradients_refuse_what_makes_no_sense():
     with pytest.raises(ValueError, match="tolerance must be positive"):
         ConjugateGradient(tolerance=-1.0)

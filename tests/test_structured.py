@@ -442,9 +442,17 @@ def test_constructors_refuse(make, error, match):
 def test_structures_refuse_dimensions_they_cannot_have():
     for K in (hk.Symplectic(hk.Gaussian()), named_sum(), odd_symplectic(hk.Gaussian())):
         with pytest.raises(ValueError, match=r"even dimension, got n = 3\. Add the missing"):
-            K.check_dimension(3)
+            K(jnp.zeros(3), jnp.ones(3))
     with pytest.raises(ValueError, match="n >= 2, got n = 1"):
-        hk.DivergenceFree(hk.Gaussian()).check_dimension(1)
+        hk.DivergenceFree(hk.Gaussian())(jnp.zeros(1), jnp.ones(1))
     for n in (1, 2, 3):
-        hk.CurlFree(hk.Gaussian()).check_dimension(n)
-        hk.Separable(hk.Gaussian()).check_dimension(n)
+        for structure in (hk.CurlFree, hk.Separable):
+            assert structure(hk.Gaussian())(jnp.zeros(n), jnp.ones(n)).shape == (n, n)
+
+
+def test_a_block_needs_two_points_of_one_space():
+    K = hk.Symplectic(hk.Gaussian())
+    with pytest.raises(ValueError, match=r"shape \(4, 2\).*one pair of points.*jax\.vmap"):
+        K(jnp.zeros((4, 2)), jnp.zeros((4, 2)))
+    with pytest.raises(ValueError, match="X has 2 coordinates and Z has 4"):
+        K(jnp.zeros(2), jnp.zeros(4))

@@ -150,6 +150,32 @@ def test_a_single_start_descends_from_the_callers_point():
     assert float(tuned.loss) < 0.9 * refit_loss(K, X, Y, 1e-2)
 
 
+def test_a_network_inside_a_kernel_is_trained():
+    # Its activation is a leaf that is no array.
+    net = eqx.nn.MLP(2, 3, 4, 1, activation=jnp.tanh, key=jax.random.key(0))
+    net = jax.tree.map(lambda a: a.astype(float) if eqx.is_inexact_array(a) else a, net)
+    K, (X, Y) = hk.Symplectic(hk.Warp(hk.Gaussian(1.0), net)), scattered()
+    before = hk.cross_validation_loss(K, X, Y, 1e-3, 5)
+    tuned = hk.tune(K, X, Y, 1e-3, starts=1, max_steps=10)
+    assert "kernel.fn.layers[0].weight" in tuned.bounds
+    assert tuned.loss < 0.8 * before
+    np.testing.assert_allclose(
+        tuned.loss, refit_loss(tuned.kernel, X, Y, tuned.regularization), rtol=1e-5
+    )
+
+
+@pytest.mark.filterwarnings("ignore:fitting in float32")
+def test_a_kernel_with_leaves_of_two_precisions_is_trained():
+    X, Y = (each.astype(np.float32) for each in scattered())
+    K = hk.Symplectic(hk.Gaussian(jnp.float32(1.0)) * jnp.asarray(2.0))
+    with jax.numpy_dtype_promotion("standard"):
+        slope = eqx.filter_grad(lambda K: hk.cross_validation_loss(K, X, Y, 1e-2))(K)
+        tuned = hk.tune(K, X, Y, starts=1, max_steps=3)
+    for each in (slope, tuned.kernel):
+        assert {leaf.dtype.name for leaf in jax.tree.leaves(each)} == {"float32", "float64"}
+    assert np.isfinite(tuned.loss)
+
+
 # Frozen, bounds, names.
 
 
@@ -184,9 +210,22 @@ def test_bounds_of_lambda_are_obeyed():
     np.testing.assert_allclose(tuned.bounds["regularization"], (0.5, 2.0))
 
 
+def test_bounds_may_have_a_number_for_each_coordinate_and_are_reported_by_the_widest():
+    X, Y = scattered()
+    K = hk.Symplectic(hk.Gaussian(np.ones(2)))
+    low, high = np.array([0.3, 2.0]), np.array([0.4, 3.0])
+    tuned = hk.tune(K, X, Y, bounds={"lengthscale": (low, high)}, starts=2)
+    found = np.asarray(tuned.kernel.kernel.lengthscale)  # pyright: ignore[reportAttributeAccessIssue]
+    assert (found >= low * (1 - 1e-9)).all()
+    assert (found <= high * (1 + 1e-9)).all()
+    np.testing.assert_allclose(tuned.bounds["kernel.lengthscale"], (0.3, 3.0))
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"bounds": {"lengthscale": (np.ones(3), np.full(3, 2.0))}}, r"arrays of shape \(1,\)"),
+        ({"bounds": {"lengthscale": (1.0,)}}, r"must be \(low, high\)"),
         ({"frozen": "width"}, "no hyperparameter 'width'; this kernel has .*lengthscale"),
         ({"bounds": {"width": (1, 2)}}, "no hyperparameter 'width'"),
         ({"bounds": {"lengthscale": (2, 1)}}, "low < high"),
@@ -336,6 +375,44 @@ def test_flat_limit_stops_where_float64_ends_and_its_loss_is_no_rounding_noise()
         np.testing.assert_allclose(tuned.loss, refit, rtol=1e-5)
         # The noise alone, on states and velocities, costs more than half of this.
         assert tuned.loss > 0.5 * 0.1**2
+
+
+def rounding(field) -> float:
+    """How far velocities move when the state does by a unit in the last place, over their size."""
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-1.5, 1.5, size=(1, 20, 2)) + 1e-14 * rng.normal(size=(20, 20, 2))
+    velocities = np.asarray(jax.vmap(jax.vmap(field))(jnp.asarray(x)))
+    return float(velocities.std(axis=0).max() / velocities.std())
+
+
+def test_a_field_tuned_on_noisy_data_can_be_simulated():
+    # H is a polynomial: the loss falls slowly, by a few per cent, far down in λ, where the
+    # coefficients are so large that a field rounds at 1e-5.
+    rng = np.random.default_rng(1)
+    X = rng.uniform(-1.6, 1.6, size=(100, 2))
+    Y = np.asarray(jax.vmap(hk.systems.Duffing())(jnp.asarray(X)))
+    Y = Y + 0.05 * rng.normal(size=Y.shape)
+    tuned = hk.tune(SIMPLE, X, Y)
+    assert rounding(tuned.field) < 1e-8
+    ts, start = np.linspace(0, 20, 41), jnp.array([1.2, 0.0])
+    H = tuned.field.hamiltonian  # pyright: ignore[reportAttributeAccessIssue]
+    for options in ({}, {"solver": hk.GaussLegendre4(), "dt": 0.05}):
+        energies = jax.vmap(H)(hk.simulate(tuned.field, start, ts, **options).ys)
+        assert np.ptp(energies) < 1e-5
+    # The negative control: asked for, what float64 can solve for and no more is still searched.
+    low: Any = hk.tune(SIMPLE, X, Y, bounds={"regularization": (1e-30, 1.0)})
+    assert low.regularization < tuned.regularization / 10
+    assert low.loss < tuned.loss
+    assert rounding(low.field) > 1e-7
+
+
+def test_data_without_noise_may_have_the_smallest_ridge():
+    rng = np.random.default_rng(1)
+    X = rng.uniform(-1.6, 1.6, size=(40, 2))
+    Y = np.stack([X[:, 1], -X[:, 0]], axis=1)
+    tuned = hk.tune(SIMPLE, X, Y)
+    trace = np.trace(np.asarray(hk.gram(tuned.kernel, X)).reshape(80, 80))
+    assert len(X) * tuned.regularization < 1e3 * np.finfo(float).eps * trace
 
 
 def test_without_a_floor_the_loss_is_rounding_noise():

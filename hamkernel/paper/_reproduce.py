@@ -41,12 +41,13 @@ def reproduce(
         The report, for printing, and the files written.
 
     Raises:
-        ValueError: seeds < 1. RuntimeError: JAX is not in float64, or a fit failed.
+        ValueError: seeds < 1. OSError: the folder cannot be made. RuntimeError: JAX is not in
+            float64, or a fit failed.
     """
+    path = pathlib.Path(out) / "results.json"
+    path.parent.mkdir(parents=True, exist_ok=True)  # before the work
     outcomes = _outcomes(_data(seeds), progress)
     results = summarise(outcomes)
-    path = pathlib.Path(out) / "results.json"
-    path.parent.mkdir(parents=True, exist_ok=True)
     _write(results, path)
     text = report(results, experiments(), seeds)
     # matplotlib loads after the numbers are safe
