@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from hamkernel import _require as require
 from hamkernel._gram import expansion, potential
 from hamkernel._gram_operator import compiled_product
+from hamkernel._show import described
 from hamkernel._structured import AbstractMatrixKernel, Sum
 
 Field = TypeVar("Field", bound="AbstractField")
@@ -28,6 +29,9 @@ class AbstractField(eqx.Module):
     kernel: eqx.AbstractVar[AbstractMatrixKernel]
     residual: eqx.AbstractVar[Float[Array, "N n"]]
     offset: eqx.AbstractVar[Float[Array, ""]]
+
+    def __repr__(self) -> str:
+        return described(self)
 
     # jax.jit(field) looks up the function it compiles by hash and equality. Arrays have no hash and
     # traced ones no equality, so here a field is equal to itself only.

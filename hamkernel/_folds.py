@@ -78,7 +78,8 @@ def _labels(N: int, folds: Folds) -> Int[np.ndarray, " N"]:
     array = np.asarray(folds)
     if not np.issubdtype(array.dtype, np.integer):
         raise ValueError(
-            f"folds must be a number, 'loo' or an array of integer labels; got dtype {array.dtype}."
+            "folds must be a number, 'loo' or an array of integer labels; got dtype "
+            f"{array.dtype}. Names become integers by np.unique(names, return_inverse=True)[1]."
         )
     if array.ndim == 0:
         if not 2 <= array <= N:

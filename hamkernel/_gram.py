@@ -1,5 +1,7 @@
 """The dense Gram, and the evaluation of kernel expansions."""
 
+import reprlib
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -106,7 +108,11 @@ def matrix_kernel(K: object) -> AbstractMatrixKernel:
     """K, if it is matrix-valued; else a TypeError that says how to make one."""
     if isinstance(K, AbstractMatrixKernel):
         return K
-    raise TypeError(
-        f"a matrix-valued kernel is needed, got {K!r}. Give a scalar kernel its structure: "
-        "hk.Symplectic(k), hk.CurlFree(k), hk.DivergenceFree(k) or hk.Separable(k)."
-    )
+    if isinstance(K, type) and issubclass(K, AbstractMatrixKernel):
+        cure = f"That is a class; make a kernel of it, such as hk.{K.__name__}(hk.Gaussian(1.0))."
+    else:
+        cure = (
+            "It is the first argument; give a scalar kernel its structure: hk.Symplectic(k), "
+            "hk.CurlFree(k), hk.DivergenceFree(k) or hk.Separable(k)."
+        )
+    raise TypeError(f"a matrix-valued kernel is needed, got {reprlib.repr(K)}. {cure}")

@@ -49,6 +49,10 @@ class SearchCriterion(eqx.Module):
     def value(self, K, X, Y, regularization) -> Float[Array, ""]:
         extra = () if self.partition is None else (self.partition,)
         value = self.fn(K, X, Y, regularization, *extra)
+        if jnp.shape(value) != ():
+            raise ValueError(
+                f"the objective returned shape {jnp.shape(value)}; one number, shape (), is needed."
+            )
         if self.logarithmic:
             value = jnp.log(jnp.maximum(value, jnp.finfo(value.dtype).tiny))
         return jnp.where(jnp.isfinite(value), value, HUGE)

@@ -37,6 +37,8 @@ def packed(header: Node, arrays: list[np.ndarray]) -> bytes:
 
 
 def write(path: pathlib.Path, content: bytes) -> None:
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"there is no folder {path.parent} to write {path.name} to.")
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         with temporary.open("xb") as file:

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
+from hamkernel._show import described
 
 
 class Invariance(enum.Flag):
@@ -40,6 +41,9 @@ class AbstractScalarKernel(eqx.Module):
     Every inexact array leaf is an unconstrained real and is trained by `hamkernel.tune`;
     a positive hyperparameter θ is stored as `log_θ` and read through the property `θ`.
     """
+
+    def __repr__(self) -> str:
+        return described(self)
 
     @abc.abstractmethod
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
@@ -247,6 +251,7 @@ def as_scalar_kernel(k: Any) -> AbstractScalarKernel:
     if getattr(k, "matrix_valued", False):
         raise TypeError(
             f"a scalar kernel is needed; got the matrix-valued {type(k).__name__}. "
-            "Structures are not nested: add them with +, or pass the scalar kernel inside."
+            "Scalar kernels are added inside a structure, Symplectic(k1 + k2), and structures to "
+            "structures, Symplectic(k1) + CurlFree(k2)."
         )
     return UserKernel(k)

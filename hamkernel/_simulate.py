@@ -75,7 +75,8 @@ def simulate(
             enough where the number is known, else 2²⁰. It bounds the memory of gradients (as its
             square root).
         progress: show a progress bar (tqdm); with `dt` it moves at every saved time.
-        adjoint: how Diffrax differentiates; None is its default, which is reverse-mode only.
+        adjoint: how Diffrax differentiates; None is its default, which is reverse-mode only. For
+            `jax.jacfwd` and `jax.jvp` pass `diffrax.ForwardMode()`.
         throw: raise if the solve fails. If False, look at `.result`.
 
     Returns:
@@ -139,14 +140,14 @@ def simulate(
         stepsize_controller=controller,
         adjoint=adjoint,
         max_steps=max_steps,
-        throw=throw,
+        throw=False,
         progress_meter=meter,
     )
     if counts is not None:  # Diffrax counted the save intervals; the steps are inside them.
         total = require.on_host(counts).sum()
         steps = {"num_steps": jnp.asarray(total), "num_accepted_steps": jnp.asarray(total)}
         solution = eqx.tree_at(lambda s: s.stats, solution, {**solution.stats, **steps})
-    return _finite(solution) if throw else solution
+    return _successful(solution, dt is not None) if throw else solution
 
 
 def _eager(*values: Any) -> AbstractContextManager[None]:
@@ -187,7 +188,10 @@ def _times(ts: ArrayLike, dtype: Any) -> Float[Array, " T"]:
 
 def _check_field(field: Callable[[Array], Array], x0: Float[Array, " n"]) -> None:
     if not callable(field):
-        raise TypeError(f"field is a {type(field).__name__}; a callable x (n,) -> (n,) is needed.")
+        hint = " Pass its .field." if hasattr(field, "field") else ""
+        raise TypeError(
+            f"field is a {type(field).__name__}; a callable x (n,) -> (n,) is needed.{hint}"
+        )
     out = eqx.filter_eval_shape(field, x0)
     if jnp.shape(out) != x0.shape:
         raise ValueError(
@@ -253,10 +257,29 @@ def _bound(counts: Int[Array, " T-1"]) -> int:
     return 2 ** (int(np.max(counts)) - 1).bit_length()
 
 
-def _finite(solution: Any) -> Any:
+def _successful(solution: Any, constant_steps: bool) -> Any:
+    """The solution, if the solve reached its end in finite numbers."""
+    import diffrax
+
+    failed = solution.result != diffrax.RESULTS.successful
+
+    def message() -> str:
+        reason = "Too many steps, or a step whose equations could not be solved."
+        if require.is_concrete(solution.result):
+            reason = diffrax.RESULTS[solution.result]
+        cure = "Take a smaller dt."
+        if not constant_steps:
+            cure = (
+                "Pass larger tolerances, such as rtol=1e-6, atol=1e-6: a learned field rounds, the "
+                "more the smaller its regularization, and an adaptive step that is asked for more "
+                "digits shrinks without end. Or allow more with max_steps."
+            )
+        return f"The solve failed: {reason} {cure} It may also be that the field has no solution."
+
+    ys = require.value(solution.ys, require.on_host(failed), message, RuntimeError)
     ys = require.value(
-        solution.ys,
-        require.not_finite(solution.ys),
+        ys,
+        require.not_finite(ys),
         "The state overflowed or became NaN. The step is too large for the solver, or the field "
         "has no solution over this time. Take a smaller dt, or a shorter time.",
         RuntimeError,

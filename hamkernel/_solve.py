@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._field import AbstractField, KernelField, SolverInfo
 from hamkernel._gram import assemble
+from hamkernel._gram_operator import product
 from hamkernel._structured import AbstractMatrixKernel
 
 
@@ -83,11 +84,11 @@ def _representer(K, X, Y, regularization):
     N, n = X.shape
     G = assemble(K, X, X).reshape(N * n, N * n)
     ridge = N * regularization
-    y = Y.reshape(N * n)
-    a = solve_positive(G, ridge, y)
-    values = G @ a
-    left = relative(y - values - ridge * a, y)
-    return a.reshape(N, n), ridge * a.reshape(N, n), root(a @ values), left
+    A = solve_positive(G, ridge, Y.reshape(N * n)).reshape(N, n)
+    values = product(K, X, X, A)  # without the Gram, which the factor has overwritten
+    residual = ridge * A
+    left = relative(Y - values - residual, Y)
+    return A, residual, root(jnp.sum(A * values)), left
 
 
 def relative(error: Array, of: Array) -> Float[Array, ""]:

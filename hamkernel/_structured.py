@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._scalar import AbstractScalarKernel, Invariance, one_point
+from hamkernel._show import described
 
 
 class AbstractMatrixKernel(eqx.Module):
@@ -17,6 +18,9 @@ class AbstractMatrixKernel(eqx.Module):
 
     matrix_valued: ClassVar[bool] = True
     symplectic: eqx.AbstractVar[bool]
+
+    def __repr__(self) -> str:
+        return described(self)
 
     @abc.abstractmethod
     def form(
@@ -74,6 +78,14 @@ class AbstractMatrixKernel(eqx.Module):
 
     def __add__(self, other: Any) -> "Sum":
         return Sum(self, other) if isinstance(other, AbstractMatrixKernel) else NotImplemented
+
+    def __mul__(self, other: Any) -> Any:
+        raise TypeError(
+            f"a structured kernel is scaled inside: {type(self).__name__}(2.0 * k), and so it is "
+            f"with products, {type(self).__name__}(k1 * k2)."
+        )
+
+    __rmul__ = __mul__
 
     def __radd__(self, other: Any) -> "AbstractMatrixKernel":
         return self if isinstance(other, int) and other == 0 else NotImplemented

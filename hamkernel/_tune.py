@@ -37,6 +37,7 @@ from hamkernel._gram import matrix_kernel
 from hamkernel._objective import HUGE, Criterion, Objective, basis_of, check_memory, criterion_of
 from hamkernel._search import decode, finish, keeping_the_best, search
 from hamkernel._search_space import LOW_RANK_ROUNDINGS, ROUNDINGS, SearchSpace
+from hamkernel._show import described
 from hamkernel._solve import AbstractSolver
 from hamkernel._solve_features import RandomFeatures
 from hamkernel._solve_nystrom import Nystrom
@@ -70,6 +71,9 @@ class Tuned(eqx.Module):
     start_losses: Float[Array, " starts"]
     at_bounds: tuple[str, ...] = eqx.field(static=True)
     bounds: dict[str, tuple[Any, Any]] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        return described(self)
 
 
 def tune(

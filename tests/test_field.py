@@ -175,6 +175,22 @@ def test_an_anchor_that_is_not_finite_is_refused(x0, value):
         fitted(hk.Symplectic).anchored(np.array(x0), value)
 
 
+# What they print.
+
+
+def test_kernels_and_fields_print_the_values_of_their_hyperparameters():
+    K = hk.CurlFree(2.0 * hk.Gaussian(jnp.array([0.5, 3.28333333])))
+    assert repr(K) == "CurlFree(kernel=Scaled(kernel=Gaussian(lengthscale=[0.5, 3.283]), scale=2))"
+    text = repr(fitted(hk.Symplectic))
+    assert "regularization=0.001" in text
+    assert "lengthscale=" in text
+    assert "points=f64[6,2]" in text
+    # Nothing has a value while it is traced.
+    traced = []
+    jax.eval_shape(lambda K: traced.append(repr(K)), K)
+    assert "log_lengthscale=f64[2]" in traced[0]
+
+
 # Points of the wrong kind.
 
 

@@ -4,6 +4,7 @@ import re
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -26,7 +27,13 @@ def test_the_ten_lines_learn_a_pendulum_that_keeps_its_energy():
         exec(python_blocks()[0], names)
         energy = jax.vmap(names["field"].hamiltonian)(names["orbit"])
         true = names["pendulum"].hamiltonian(names["orbit"][0])
+        exec(python_blocks()[1], names)  # without the velocities
     plt.close("all")
+    states = np.random.default_rng(0).uniform([-2, -4], [2, 4], size=(200, 2))
+    velocities = jax.vmap(names["pendulum"])(jnp.asarray(states))
+    off = names["tuned"].field.evaluate(states) - velocities
+    assert len(names["labels"]) == len(names["X"]) == 18
+    assert np.linalg.norm(off) < 0.2 * np.linalg.norm(velocities)  # differences over 0.2 s
     assert float(abs(energy - energy[0]).max()) < 1e-6 * float(abs(energy[0]))
     assert float(abs(energy[0] - true)) < 0.1 * float(true)
 
@@ -45,9 +52,9 @@ def test_the_lines_for_large_data_give_the_field_of_the_exact_fit():
     data = {"X": X, "Y": Y, "X_new": X[:40], "Y_new": Y[:40]}
     exact = hk.fit(K, X, Y, 1e-5).evaluate(X)
     chunks = ((X[i : i + 100], Y[i : i + 100]) for i in range(0, 400, 100))
-    for block in python_blocks()[1:3]:
+    for block in python_blocks()[2:]:
         names = {"jax": jax, "hk": hk, "K": K, "chunks": chunks, **data}
         exec(block, names)
         # Landmarks to a tolerance of a tenth of the ridge; the last field has some points twice.
         assert abs(names["field"].evaluate(X) - exact).max() < 1e-2
-    assert len(python_blocks()) == 3  # all blocks of the README are run
+    assert len(python_blocks()) == 4  # all blocks of the README are run

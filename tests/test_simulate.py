@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -180,10 +181,13 @@ def test_a_new_start_field_or_step_does_not_compile_again():
 
 
 def test_a_new_tolerance_does_not_compile_again():
-    compiled = []
-    jax.monitoring.register_event_duration_secs_listener(
-        lambda event, duration, **_: compiled.append(event) if "backend_compile" in event else None
-    )
+    compiled: list[str] = []
+
+    def listen(event: str, *_: Any, **__: Any) -> None:
+        if "backend_compile" in event:
+            compiled.append(event)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
     field = Pendulum(jnp.array(1.0))
     coarse = states(field, START, TIMES, rtol=1e-3, atol=1e-3)
     assert compiled

@@ -392,10 +392,10 @@ def test_a_field_tuned_on_noisy_data_can_be_simulated():
     X = rng.uniform(-1.6, 1.6, size=(100, 2))
     Y = np.asarray(jax.vmap(hk.systems.Duffing())(jnp.asarray(X)))
     Y = Y + 0.05 * rng.normal(size=Y.shape)
-    tuned = hk.tune(SIMPLE, X, Y)
+    tuned: Any = hk.tune(SIMPLE, X, Y)
     assert rounding(tuned.field) < 1e-8
     ts, start = np.linspace(0, 20, 41), jnp.array([1.2, 0.0])
-    H = tuned.field.hamiltonian  # pyright: ignore[reportAttributeAccessIssue]
+    H = tuned.field.hamiltonian
     for options in ({}, {"solver": hk.GaussLegendre4(), "dt": 0.05}):
         energies = jax.vmap(H)(hk.simulate(tuned.field, start, ts, **options).ys)
         assert np.ptp(energies) < 1e-5

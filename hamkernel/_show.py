@@ -1,0 +1,61 @@
+"""How kernels, fields and results print: with the values of their hyperparameters."""
+
+import dataclasses
+import textwrap
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+_WIDTH = 88  # of a line, beyond which each attribute has its own
+_FEW = 8  # numbers of an array that are printed
+
+
+def described(module: Any) -> str:
+    """`Gaussian(lengthscale=3.28)`: the attributes as they are read, few numbers as values."""
+    shown = [_attribute(module, field.name) for field in dataclasses.fields(module)]
+    line = f"{type(module).__name__}({', '.join(shown)})"
+    if len(line) <= _WIDTH and "\n" not in line:
+        return line
+    lines = textwrap.indent(",\n".join(shown), "  ")
+    return f"{type(module).__name__}(\n{lines}\n)"
+
+
+def _attribute(module: Any, name: str) -> str:
+    value = getattr(module, name)
+    if name.startswith("log_") and _is_short(value):
+        name, value = name.removeprefix("log_"), np.asarray(np.exp(np.asarray(value)))
+    return f"{name}={_text(value)}"
+
+
+def _is_short(value: Any) -> bool:
+    if isinstance(value, np.ndarray):
+        return value.size <= _FEW
+    if not isinstance(value, jax.Array) or isinstance(value, Tracer):
+        return False
+    is_key = jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
+    return value.is_fully_addressable and not is_key and value.size <= _FEW
+
+
+def _text(value: Any) -> str:
+    if _is_short(value):
+        digits: Any = {"float_kind": _number}
+        return np.array2string(np.asarray(value), formatter=digits, separator=", ")
+    if eqx.is_array(value):
+        return eqx.tree_pformat(value)
+    if isinstance(value, float):
+        return _number(value)
+    if type(value) is tuple:
+        items = [_text(item) for item in value]
+        return f"({', '.join(items)}{',' if len(items) == 1 else ''})"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{key!r}: {_text(item)}" for key, item in value.items()) + "}"
+    name = getattr(getattr(value, "func", value), "__name__", None)
+    return repr(value) if name is None else name
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}"
