@@ -130,6 +130,10 @@ def tune(
 
     The flat limit. When λ rests on its lower bound and a lengthscale on its upper one, the data
     asks for a polynomial: the fit is good and its hyperparameters mean little.
+
+    The ridge. λ is never searched where rounding would decide. Unless `bounds` say what it may be,
+    or it is frozen, it also stays so large that a field fitted to noise is smooth to about 1e-9
+    and can be integrated: where the best one was not, the search is made once more above that λ.
     """
     K = matrix_kernel(K)
     X, Y = given = require.data(X, Y)
