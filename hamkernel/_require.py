@@ -84,8 +84,8 @@ def positive(x: ArrayLike, name: str, cure: str = "") -> Array:
         ~((seen > 0) & (seen < np.inf)),
         lambda: (
             f"{name} must be positive and finite"
-            + (f", got {array}. " if is_concrete(array) else ". ")
-            + cure
+            + (f", got {array}." if is_concrete(array) else ".")
+            + (f" {cure}" if cure else "")
         ),
     )
 

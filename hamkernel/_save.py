@@ -3,8 +3,10 @@
 import importlib.metadata
 import os
 import pathlib
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.experimental import multihost_utils
 
@@ -13,6 +15,8 @@ from hamkernel._field import AbstractField
 from hamkernel._save_bytes import FORMAT, VERSION, packed, unpacked, write
 from hamkernel._save_tree import CLASSES, Reader, encode, field_classes
 from hamkernel._structured import AbstractMatrixKernel
+
+_SAME = 1e-3  # of a velocity computed elsewhere: fields of large coefficients round at 1e-5
 
 
 def save(path: str | os.PathLike[str], field: AbstractField) -> None:
@@ -53,6 +57,7 @@ def save(path: str | os.PathLike[str], field: AbstractField) -> None:
         "format": FORMAT,
         "version": VERSION,
         "hamkernel": _library_version(),
+        "probe": _probe(field),
         "field": encode(field, arrays, "field"),
     }
     write(pathlib.Path(path), packed(header, arrays))
@@ -74,7 +79,8 @@ def load(path: str | os.PathLike[str], kernel: AbstractMatrixKernel | None = Non
 
     Raises:
         ValueError: the file is no such file, cut off, changed, of a newer version, or in float64
-            while JAX is not; or `kernel` is missing or is not the one that was saved.
+            while JAX is not; or `kernel` is missing or is not the one that was saved, which a
+            velocity in the file tells.
         TypeError: `kernel` is not matrix-valued. OSError: the file cannot be read.
 
     Example: `field = hk.load("pendulum.npz", kernel=hk.Symplectic(hk.Warp(hk.Gaussian(), fn)))`
@@ -95,6 +101,8 @@ def load(path: str | os.PathLike[str], kernel: AbstractMatrixKernel | None = Non
             + (" with this kernel" if kernel is not None else "")
             + f": {error}"
         ) from error
+    if kernel is not None:
+        _check_probe(field, header.get("probe"), source)
     return field
 
 
@@ -103,6 +111,28 @@ def _evaluable(field: AbstractField) -> None:
     state = jax.ShapeDtypeStruct((field.dimension,), field.offset.dtype)
     if field.offset.shape or jax.eval_shape(field, state).shape != state.shape:
         raise ValueError("its arrays have an axis more than those of one field.")
+
+
+def _probe(field: AbstractField) -> list[list[float]]:
+    """A state and the velocity there, by which a kernel of the user's own code is known again."""
+    points = getattr(field, "points", np.zeros((1, field.dimension)))
+    state = np.asarray(points)[0]
+    return [state.tolist(), np.asarray(field(jnp.asarray(state))).tolist()]
+
+
+def _check_probe(field: AbstractField, probe: Any, source: str) -> None:
+    try:
+        state, saved = np.asarray(probe, float)
+        velocity = np.asarray(field(jnp.asarray(state)))
+        same = np.linalg.norm(velocity - saved) <= _SAME * np.linalg.norm(saved)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{source} is not a valid file of hamkernel.save: {error}.") from error
+    if not same:
+        raise ValueError(
+            f"with this kernel the field in {source} has the velocity {velocity} at the state "
+            f"{state}, and it had {saved} when it was saved: a function in the kernel is not the "
+            "one that was given to fit."
+        )
 
 
 def _whole(leaf):

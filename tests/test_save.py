@@ -273,6 +273,23 @@ def test_what_cannot_be_stored_is_named(tmp_path):
         save(tmp_path / "f", field)
 
 
+def test_another_function_than_the_saved_one_is_refused(tmp_path):
+    X, Y = jnp.asarray(RNG.normal(size=(6, 2))), jnp.ones((6, 2))
+
+    def kernel(function):
+        return hk.Symplectic(hk.Warp(hk.Gaussian(), function))
+
+    def circle(x):
+        return jnp.array([jnp.cos(x[0]), jnp.sin(x[0]), x[1]])
+
+    field = hk.fit(kernel(circle), X, Y, 1e-3)
+    hk.save(tmp_path / "f", field)
+    again = hk.load(tmp_path / "f", kernel=kernel(lambda x: circle(x)))
+    np.testing.assert_array_equal(again(X[1]), field(X[1]))
+    with pytest.raises(ValueError, match=r"a function in the kernel is not the one"):
+        hk.load(tmp_path / "f", kernel=kernel(lambda x: jnp.array([x[0], x[1], 0.0])))
+
+
 def test_a_batch_of_fields_is_refused_before_it_is_lost(tmp_path):
     X, Y = jnp.eye(4), jnp.ones((3, 4, 4))
     K = hk.Symplectic(hk.Gaussian())
