@@ -20,9 +20,9 @@ from hamkernel._gram import centred, diagonals, gram, matrix_kernel
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._structured_operators import unfolded
 
-# Pairs in one tile, rows × columns: 500 × 1000 doubles are 4 MB. Measured on two cores of two
-# machines between 64 × 512 and 4000 × 1000, with n = 4 and 20; half and twice cost up to 15 % more.
-ROWS, COLUMNS = 500, 1000
+# Pairs in one tile, rows × columns: 1000 × 1000 doubles are 8 MB. Measured on two cores between
+# 125 × 4000 and 2000 × 1000, with n = 4 and 20; half and twice cost up to 15 % more.
+ROWS, COLUMNS = 1000, 1000
 
 
 def gram_operator(
