@@ -58,8 +58,9 @@ def cross_validation_loss(
 
     Returns:
         The loss, in squared units of Y; inf where the matrix is not positive definite to
-        rounding. Differentiable, vmappable, compiled once per shape. O((N n)³) time, at most
-        three matrices of (N n)² numbers, with the gradient over K too.
+        rounding. Differentiable in reverse mode (`jax.grad`, and again of that; no `jax.jvp`),
+        vmappable, compiled once per shape and partition. O((N n)³) time, at most three matrices
+        of (N n)² numbers, with the gradient over K too.
 
     Raises:
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization.
