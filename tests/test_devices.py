@@ -213,9 +213,9 @@ def test_explicit_axes_will_do(quick):
 
 def test_the_memory_of_a_device_falls_as_devices_are_added(quick):
     used = [each["bytes"] for each in quick["memory"]]
-    # Points, coefficients and products are 192 MiB. The columns that travel are a second copy, which
-    # one device does not need: its rows and columns are cut into the same tiles. A tile of pairs
-    # stays, whatever the devices.
+    # Points, coefficients and products are 192 MiB. The columns that travel are a second copy,
+    # which one device does not need: its rows and columns are cut into the same tiles. A tile of
+    # pairs stays, whatever the devices.
     assert used[0] > 192 * 2**20
     assert used[0] > 1.15 * used[1]
     assert all(more > 1.8 * less for more, less in itertools.pairwise(used[1:]))
