@@ -119,7 +119,7 @@ def simulate(
         max_steps = _MAX_STEPS + ts.size if max_steps is None else max_steps
     else:
         with _eager(dt):
-            dt = _largest_step(dt)
+            dt = require.positive_scalar(dt, "dt")
         with _eager(ts, dt):
             counts = step_counts(ts, dt)
             bound = _bound(counts) if max_steps is None else max_steps
@@ -240,13 +240,6 @@ def _tolerance(given: float | None, default: float, dtype: Any) -> Float[Array, 
     given = default if given is None else given
     with _eager(given):
         return require.positive_scalar(given, "rtol, and atol,").astype(dtype)
-
-
-def _largest_step(dt: Any) -> Float[Array, ""]:
-    dt = require.positive(dt, "dt")
-    if dt.ndim:
-        raise ValueError(f"dt has shape {dt.shape}; one number is needed.")
-    return dt
 
 
 def _bound(counts: Int[Array, " T-1"]) -> int:
