@@ -180,6 +180,9 @@ class SolverInfo(eqx.Module):
     iterations: Int[Array, ""] | None = None
     relative_residual: Float[Array, ""] | None = None
 
+    def __repr__(self) -> str:
+        return described(self)
+
 
 class KernelField(AbstractField):
     """f(x) = Σⱼ K(x, zⱼ) aⱼ, the minimiser of the regularised least squares.

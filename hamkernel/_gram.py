@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
+from hamkernel._memory import refuse_beyond_memory
 from hamkernel._scalar import Invariance
 from hamkernel._structured import AbstractMatrixKernel
 
@@ -29,13 +30,15 @@ def gram(
         Shape (N, n, M, n). O(N M n²) time and memory: 8 (N n)² bytes in float64.
 
     Raises:
-        TypeError: K is not matrix-valued. ValueError: shapes do not fit, or n is not one that
-            the structure allows.
+        TypeError: K is not matrix-valued. ValueError: shapes do not fit, n is not one that the
+            structure allows, or the Gram does not fit in memory.
     """
     K = matrix_kernel(K)
     X = require.points(X, "X")
     X, Z = require.same_space(X, X if Z is None else require.points(Z, "Z"))
     K.check_dimension(X.shape[1])
+    cure = "hk.gram_operator(K, X, Z) multiplies with it and never forms it."
+    refuse_beyond_memory("the Gram", X.size, Z.size, X.dtype, 1, cure)
     return _compiled_gram(K, X, Z)
 
 

@@ -11,7 +11,6 @@ from jaxtyping import Array, Float
 
 from hamkernel._folds import Folds, Partition
 from hamkernel._scalar import as_pytree
-from hamkernel._solve_choice import dense_bytes, memory_bytes
 from hamkernel._solve_features import RandomFeatures
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._validation import (
@@ -127,19 +126,3 @@ def basis_of(solver, K, regularization, X) -> AbstractBasis:
         return WaveBasis(solver.key, solver.count)
     landmarks = solver.landmarks(K, X, regularization)
     return LandmarkBasis(landmarks.points)
-
-
-def check_memory(X: Float[Array, "N n"]) -> None:
-    """Refuse a dense loss that does not fit, before the search for its basins."""
-    N, n = X.shape
-    needed, memory = dense_bytes(N, n, X.dtype, LOSS_COPIES), memory_bytes()
-    if memory is not None and needed > memory:
-        raise ValueError(
-            f"the loss of N = {N} points with n = {n} coordinates and its gradient need "
-            f"{needed / 1e9:.3g} GB ({LOSS_COPIES} matrices of {N * n} rows) and there are "
-            f"{memory / 1e9:.3g} GB. Use solver=hk.Nystrom() or hk.RandomFeatures(count, key), "
-            "whose loss is of low rank too, or tune on a part of the data."
-        )
-
-
-LOSS_COPIES = 5  # matrices of the size of the Gram that a run of the optimiser holds: 4.4 measured

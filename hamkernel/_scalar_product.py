@@ -57,7 +57,8 @@ class Periodic(AbstractScalarKernel):
     chord between (cos, sin) pairs, so the sum is a dot product of features.
 
     Args:
-        period: T > 0 in the units of the states; a number, or an array (n,).
+        period: T > 0 in the units of the states; a number, or an array (n,). It is trained like
+            every hyperparameter: where it is known, such as 2π, say `tune(..., frozen="period")`.
         lengthscale: ℓ > 0, dimensionless; a number, or an array (n,).
 
     Raises:

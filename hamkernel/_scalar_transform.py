@@ -1,7 +1,7 @@
 """Scalar kernels on transformed points: warped, selected, and averaged over a group."""
 
 import operator
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -25,16 +25,18 @@ class Warp(AbstractScalarKernel):
 
     Args:
         kernel: a scalar kernel on the warped coordinates, shape (m,).
-        fn: a smooth map (n,) -> (m,); the array leaves of an Equinox module are trained.
+        fn: a smooth map (n,) -> (m,), written with jax.numpy; the array leaves of an Equinox
+            module are trained. Define it once: a lambda made anew for each kernel is another
+            function to JAX, and compiles anew.
 
     Example: `Warp(Gaussian(1.0), lambda x: jnp.array([jnp.cos(x[0]), jnp.sin(x[0]), x[1]]))`
     for a state (angle, momentum) on a cylinder.
     """
 
     kernel: AbstractScalarKernel
-    fn: Callable[[Float[Array, " n"]], Float[Array, " m"]]
+    fn: Callable[[Float[Array, " n"]], Any]
 
-    def __init__(self, kernel: Any, fn: Callable[[Array], Array]):
+    def __init__(self, kernel: Any, fn: Callable[[Array], Array | Sequence[Array]]):
         if not callable(fn):
             raise TypeError(f"Warp needs a callable (n,) -> (m,), got {fn!r}.")
         self.kernel = as_scalar_kernel(kernel)
@@ -46,6 +48,7 @@ class Warp(AbstractScalarKernel):
     def _warped(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         x = one_point(x)
         warped = self.fn(x)
+        warped = jnp.stack(warped) if isinstance(warped, list | tuple) else warped
         if jnp.ndim(warped) != 1:
             raise ValueError(
                 f"the map of Warp returned shape {jnp.shape(warped)} for a point of shape "

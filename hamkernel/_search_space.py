@@ -175,7 +175,7 @@ def _checked_box(
     name: str, given: tuple[ArrayLike, ArrayLike], size: int
 ) -> tuple[np.ndarray, np.ndarray]:
     """Both sides of a box, for each entry of that name."""
-    sides = [np.asarray(side, float) for side in given]
+    sides = [np.asarray(side, float) for side in given] if hasattr(given, "__len__") else []
     if len(sides) != 2 or any(side.shape not in ((), (size,)) for side in sides):
         raise ValueError(
             f"bounds[{name!r}] must be (low, high), both numbers or arrays of shape ({size},), "

@@ -11,12 +11,16 @@ import numpy as np
 from jax.core import Tracer
 
 _WIDTH = 88  # of a line, beyond which each attribute has its own
-_FEW = 8  # numbers of an array that are printed
+_FEW = 16  # numbers of an array that are printed
 
 
 def described(module: Any) -> str:
-    """`Gaussian(lengthscale=3.28)`: the attributes as they are read, few numbers as values."""
-    shown = [_attribute(module, field.name) for field in dataclasses.fields(module)]
+    """`Gaussian(lengthscale=3.28)`: the attributes as they are read, few numbers as values.
+
+    What does not apply, and so is left at None, is left out.
+    """
+    fields = [f for f in dataclasses.fields(module) if getattr(module, f.name) is not None]
+    shown = [_attribute(module, field.name) for field in fields]
     line = f"{type(module).__name__}({', '.join(shown)})"
     if len(line) <= _WIDTH and "\n" not in line:
         return line

@@ -35,7 +35,7 @@ from hamkernel._field import AbstractField
 from hamkernel._fit import fit
 from hamkernel._folds import Folds
 from hamkernel._gram import matrix_kernel
-from hamkernel._objective import HUGE, Criterion, Objective, basis_of, check_memory, criterion_of
+from hamkernel._objective import HUGE, Criterion, Objective, basis_of, criterion_of
 from hamkernel._search import decode, finish, keeping_the_best, moved, search, starting_points
 from hamkernel._search_space import LOW_RANK_ROUNDINGS, ROUNDINGS, SearchSpace
 from hamkernel._show import described
@@ -43,6 +43,7 @@ from hamkernel._solve import AbstractSolver
 from hamkernel._solve_features import RandomFeatures
 from hamkernel._solve_nystrom import Nystrom
 from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._validation import check_memory
 
 
 class Tuned(eqx.Module):
@@ -108,7 +109,9 @@ def tune(
         regularization: the first λ.
         folds: as in `cross_validation_loss`; give trajectory labels for data from trajectories.
         objective: "cross_validation", "generalized_cross_validation", "marginal_likelihood", or
-            a function (K, X, Y, regularization) -> () that is to be small.
+            a function (K, X, Y, regularization) -> () that is to be small. For the marginal
+            likelihood give K an amplitude, `1.0 * k`: built-in kernels have 1, and a signal that
+            is larger than the prior's is explained as noise.
         frozen: names of hyperparameters to keep, such as "lengthscale", "regularization" or
             "terms[0].scale". A name means every hyperparameter whose full name ends in it.
         bounds: {name: (low, high)} in place of the box from the data, in the units of the
@@ -154,7 +157,7 @@ def tune(
     optimiser = keeping_the_best(optimiser)
     rows = criterion.coarse_points(X)
     if len(rows) < len(X) and not low_rank:
-        check_memory(X)
+        check_memory(X, _RUN_COPIES)
     X_part, Y_part = (jnp.take(each, rows, axis=0) for each in (X, Y))
     part = criterion.on(rows), X_part, Y_part, len(X) / len(rows)
 
@@ -201,6 +204,8 @@ def tune(
 def _size(values: Array) -> float:
     return max(float(jnp.linalg.norm(values)), float(np.finfo(float).tiny))
 
+
+_RUN_COPIES = 5  # matrices of the size of the Gram that a run holds: 4.4 measured
 
 # Made once: compiled functions are told apart by the functions inside these, too.
 _BFGS = optx.BFGS(rtol=1e-3, atol=1e-3)

@@ -29,6 +29,7 @@ from hamkernel import _require as require
 from hamkernel._folds import Folds, Partition
 from hamkernel._gram import assemble, matrix_kernel
 from hamkernel._inverse import inverse
+from hamkernel._memory import refuse_beyond_memory
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._trained import trained
 
@@ -151,7 +152,21 @@ def _checked(K, X, Y, regularization):
     X, Y = require.data(X, Y)
     K.check_dimension(X.shape[1])
     regularization = require.ridge(regularization)
+    check_memory(X, LOSS_COPIES)
     return K, X, Y, regularization.astype(X.dtype)
+
+
+LOSS_COPIES = 3  # matrices of the size of the Gram that a loss holds, with its gradient
+
+
+def check_memory(X: Float[Array, "N n"], copies: int) -> None:
+    """Refuse a dense loss that does not fit in memory."""
+    what = f"the loss of N = {len(X)} points with n = {X.shape[1]} coordinates"
+    cure = (
+        "Use hk.tune(..., solver=hk.Nystrom()) or solver=hk.RandomFeatures(count, key), whose loss "
+        "is of low rank too, or a part of the data."
+    )
+    refuse_beyond_memory(what, X.size, X.size, X.dtype, copies, cure)
 
 
 @eqx.filter_jit

@@ -219,6 +219,11 @@ K = hk.Symplectic(hk.Gaussian())
             ValueError,
             "a scalar is needed",
         ),
+        (
+            lambda: hk.gram(K, np.zeros((200_000, 4))),
+            ValueError,
+            r"needs 5.12e\+03 GB \(one matrix of 800000 by 800000 numbers\).*hk.gram_operator",
+        ),
     ],
 )
 def test_gram_refuses(call, error, match):

@@ -99,6 +99,15 @@ def test_stream_lines_of_a_field_that_is_no_rotation_fail_the_same_check():
 def test_a_phase_portrait_of_a_field_outside_the_plane_is_refused():
     with pytest.raises(ValueError, match="plane_slice"):
         plot.phase_portrait(lambda x: jnp.concatenate([x, x]), *LIMITS)
+    with pytest.raises(ValueError, match=r"data has shape \(5, 4\)"):
+        plot.phase_portrait(lambda x: x, *LIMITS, data=np.zeros((5, 4)))
+
+
+def test_no_other_curve_takes_the_colour_of_a_model():
+    ones = np.ones(3)
+    names = ["my kernel", "odd symplectic", "another", "separable", "true", "symplectic"]
+    ax = plot.trajectory_error(np.arange(3.0), dict.fromkeys(names, ones), log=False)
+    assert len({to_hex(line.get_color()) for line in ax.lines}) == len(names)
 
 
 def test_a_name_has_one_colour_in_every_picture():
@@ -207,6 +216,30 @@ def test_slices_of_a_hamiltonian_and_of_its_field_name_their_coordinates():
     assert (ax.get_xlabel(), ax.get_ylabel()) == ("$q_{1}$", "$p_{1}$")
     with pytest.raises(ValueError, match="plane_slice needs"):
         plot.plane_slice(lambda x: x[:3], point, (0, 1), (-1, 1), (-1, 1))
+
+
+def test_a_slice_leaves_out_the_point_where_the_potential_is_infinite():
+    def potential(x):
+        return -1 / jnp.linalg.norm(x[:2])
+
+    ax = plot.plane_slice(potential, np.zeros(4), (0, 1), (-1, 1), (-1, 1), label="$U$")
+    assert ax.figure.axes[-1].get_ylabel() == "$U$"
+    low, high = ax.figure.axes[-1].get_ylim()
+    # From the centre's neighbour, 30 to the unit, to the corner.
+    assert 0.8 * (30 - 0.5**0.5) < high - low < 1.2 * (30 - 0.5**0.5)
+    with pytest.raises(ValueError, match="finite nowhere"):
+        plot.plane_slice(lambda x: jnp.inf * x[0] ** 2, np.zeros(4), (1, 2), (-1, 1), (-1, 1))
+
+
+def test_pictures_of_nothing_are_refused():
+    with pytest.raises(ValueError, match=r"\(T, n\) or \(B, T, n\)"):
+        plot.trajectories(np.zeros(3))
+    with pytest.raises(ValueError, match="points is empty"):
+        plot.poincare_section([], (0, 1))
+    with pytest.raises(ValueError, match="no coordinate 2"):
+        plot.crossings(np.zeros((3, 2)), 2)
+    with pytest.raises(ValueError, match="no relative change"):
+        plot.energy_drift(np.arange(3.0), np.arange(3.0), relative=True)
 
 
 def test_crossings_of_a_circle_are_where_the_closed_form_says():

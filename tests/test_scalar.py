@@ -408,6 +408,12 @@ def test_a_warp_must_return_a_vector():
         hk.Warp(hk.Gaussian(), lambda x: x[0])(jnp.zeros(2), jnp.ones(2))
 
 
+def test_a_warp_may_return_a_list_of_numbers():
+    x, z = jnp.array([0.3, 1.0]), jnp.array([-0.2, 0.5])
+    listed = hk.Warp(hk.Gaussian(), lambda x: [jnp.cos(x[0]), x[1]])
+    assert listed(x, z) == hk.Warp(hk.Gaussian(), lambda x: jnp.array([jnp.cos(x[0]), x[1]]))(x, z)
+
+
 def test_lengthscales_must_match_the_coordinates():
     with pytest.raises(ValueError, match=r"3 lengthscales and the point has shape \(2,\)"):
         hk.Gaussian(np.ones(3))(jnp.zeros(2), jnp.ones(2))

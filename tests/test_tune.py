@@ -226,6 +226,7 @@ def test_bounds_may_have_a_number_for_each_coordinate_and_are_reported_by_the_wi
     [
         ({"bounds": {"lengthscale": (np.ones(3), np.full(3, 2.0))}}, r"arrays of shape \(1,\)"),
         ({"bounds": {"lengthscale": (1.0,)}}, r"must be \(low, high\)"),
+        ({"bounds": {"lengthscale": 3.0}}, r"must be \(low, high\)"),
         ({"frozen": "width"}, "no hyperparameter 'width'; this kernel has .*lengthscale"),
         ({"bounds": {"width": (1, 2)}}, "no hyperparameter 'width'"),
         ({"bounds": {"lengthscale": (2, 1)}}, "low < high"),
@@ -389,7 +390,7 @@ def test_a_field_tuned_on_noisy_data_can_be_simulated():
     # H is a polynomial: the loss falls slowly, by a few per cent, far down in λ, where the
     # coefficients are so large that a field rounds at 1e-5.
     rng = np.random.default_rng(1)
-    X = rng.uniform(-1.6, 1.6, size=(100, 2))
+    X = rng.uniform(-1.6, 1.6, size=(40, 2))
     Y = np.asarray(jax.vmap(hk.systems.Duffing())(jnp.asarray(X)))
     Y = Y + 0.05 * rng.normal(size=Y.shape)
     tuned: Any = hk.tune(SIMPLE, X, Y)

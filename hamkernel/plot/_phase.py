@@ -55,7 +55,7 @@ def phase_portrait(
         show_legend: whether named trajectories and data get a legend.
 
     Raises:
-        ValueError: the field is not one in the plane.
+        ValueError: the field or the data are not in the plane.
     """
     q, p, points = grid(xlim, ylim, resolution)
     velocities = on_points(field, points)
@@ -64,12 +64,14 @@ def phase_portrait(
             f"a phase portrait needs a field (2,) -> (2,), this one returns "
             f"{velocities.shape[1:]}; plane_slice draws fields of more coordinates."
         )
+    X = None if data is None else np.asarray(data)
+    if X is not None and (X.ndim != 2 or X.shape[1] != 2):
+        raise ValueError(f"data has shape {X.shape}; measured states (N, 2) are needed.")
     ax = axes(ax, figsize=(5.2, 4.6))
     _stream(ax, q, p, velocities, density)
     if trajectories is not None:
         _curves(ax, named(trajectories), (0, 1))
-    if data is not None:
-        X = np.asarray(data)
+    if X is not None:
         ax.plot(*X.T, "o", color=DATA, mec="black", mew=0.6, ms=5, zorder=5, label="data")
     return _finish(ax, (0, 1), 2, units, title, show_legend, xlim, ylim)
 
@@ -93,8 +95,16 @@ def trajectories(
         title: of the axes.
         units: of the two coordinates.
         show_legend: whether named trajectories get a legend.
+
+    Raises:
+        ValueError: an array is of another shape.
     """
     curves = named(ys)
+    for values in curves.values():
+        if values.ndim not in (2, 3):
+            raise ValueError(
+                f"a trajectory has shape {values.shape}; (T, n) or (B, T, n) is needed."
+            )
     ax = axes(ax, figsize=(4.6, 4.2))
     _curves(ax, curves, dims)
     n = next(iter(curves.values())).shape[-1]
@@ -111,13 +121,15 @@ def plane_slice(
     *,
     title: str | None = None,
     units: Units | None = None,
+    label: str | None = None,
     levels: int = 15,
     resolution: int = 61,
 ) -> Axes:
     """Draw a function of n coordinates on the plane through a point along two of them.
 
     A scalar function, such as H, becomes filled contours less its minimum there; a field becomes
-    the stream lines of its two components in the plane, over its speed out of the plane.
+    the stream lines of its two components in the plane, over its speed out of the plane. Where a
+    function is not finite, such as at the centre of Kepler's problem, the picture is left white.
 
     Args:
         fn: x (n,) -> () or (n,).
@@ -128,11 +140,13 @@ def plane_slice(
         ax: axes to draw on; new ones if None.
         title: of the axes.
         units: of the two coordinates.
+        label: of the colours.
         levels: number of contours.
         resolution: points on each axis of the grid.
 
     Raises:
-        ValueError: the function is neither scalar nor a field on n coordinates.
+        ValueError: the function is neither scalar nor a field on n coordinates, or it is finite
+            nowhere on the grid.
     """
     point = np.asarray(point, float)
     x, y, plane = grid(xlim, ylim, resolution)
@@ -144,17 +158,19 @@ def plane_slice(
             f"plane_slice needs a function ({len(point)},) -> () or ({len(point)},), this one "
             f"returns {values.shape[1:]}."
         )
+    if not np.isfinite(values).any():
+        raise ValueError("the function is finite nowhere on the grid.")
     ax = axes(ax, figsize=(5.2, 4.3))
     if values.ndim == 2:
         _stream(ax, x, y, values[:, list(dims)], 0.9, "white")
-        out = np.linalg.norm(np.delete(values, dims, axis=1), axis=1)
-        background, label = out, "speed out of the plane"
+        background = np.linalg.norm(np.delete(values, dims, axis=1), axis=1)
+        label = label or "speed out of the plane"
     else:
-        background, label = values - values.min(), "$H - \\min H$"
-    shape = (resolution, resolution)
-    filled = ax.contourf(x, y, background.reshape(shape), levels, cmap="cividis", zorder=0)
+        background, label = values - values[np.isfinite(values)].min(), label or "$H - \\min H$"
+    background = np.ma.masked_invalid(background).reshape(resolution, resolution)
+    filled = ax.contourf(x, y, background, levels, cmap="cividis", zorder=0)
     if values.ndim == 1:
-        ax.contour(x, y, background.reshape(shape), levels, colors="white", linewidths=0.4)
+        ax.contour(x, y, background, levels, colors="white", linewidths=0.4)
     ax.figure.colorbar(filled, ax=ax, label=label)
     return _finish(ax, dims, len(point), units, title, False, xlim, ylim)
 

@@ -29,11 +29,13 @@ def crossings(
         States, shape (M, n), in the order in which they are met; M may be 0.
 
     Raises:
-        ValueError: ys is not one trajectory.
+        ValueError: ys is not one trajectory, or has no such coordinate.
     """
     ys = np.asarray(ys)
     if ys.ndim != 2:
         raise ValueError(f"ys has shape {ys.shape}; one trajectory (T, n) is needed.")
+    if not -ys.shape[1] <= coordinate < ys.shape[1]:
+        raise ValueError(f"there is no coordinate {coordinate} in states of {ys.shape[1]}.")
     height = ys[:, coordinate] - value
     before, after = height[:-1], height[1:]
     # A state exactly on the section counts as above it, so that no crossing is met twice.
@@ -62,6 +64,9 @@ def poincare_section(
         title: of the axes.
         units: of the two coordinates.
         size: of the dots, in points.
+
+    Raises:
+        ValueError: there is no trajectory to draw.
     """
     ax = axes(ax, figsize=(5.0, 4.6))
     dots: dict[str, Any] = {"linestyle": "none", "marker": ".", "ms": size, "mew": 0}
@@ -73,6 +78,8 @@ def poincare_section(
         groups = named(points)
         styles = [{k: s[k] for k in ("color", "label")} for s in line_styles(groups)]
         arrays = list(groups.values())
+    if not arrays:
+        raise ValueError("points is empty: one array (M, n) for each trajectory is needed.")
     for style, array in zip(styles, arrays, strict=True):
         ax.plot(array[:, dims[0]], array[:, dims[1]], **dots, **style)
     label_plane(ax, dims, arrays[0].shape[-1], units)

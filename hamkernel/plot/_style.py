@@ -45,9 +45,10 @@ def named(series: Any) -> dict[str | None, np.ndarray]:
 
 def line_styles(series: Mapping[str | None, Any]) -> Iterator[dict[str, Any]]:
     """Colour, dashes, width, order and legend entry of each curve."""
-    others = itertools.cycle(_OTHERS)
-    for name in series:
-        key = (name or "").lower().replace(" ", "_")
+    keys = [(name or "").lower().replace(" ", "_") for name in series]
+    taken = {COLORS[key] for key in keys if key in COLORS}
+    others = itertools.cycle([color for color in _OTHERS if color not in taken])
+    for name, key in zip(series, keys, strict=True):
         color = COLORS[key] if key in COLORS else next(others)
         yield {
             "color": color,

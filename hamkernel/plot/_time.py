@@ -69,16 +69,21 @@ def energy_drift(
         time_unit: of `ts`.
         title: of the axes.
         show_legend: whether named curves get a legend.
+
+    Raises:
+        ValueError: `relative`, and an energy is zero at the start.
     """
     changes = {}
     for name, values in named(energies).items():
         start = values[..., :1]
+        if relative and not start.all():
+            raise ValueError("H(x(0)) = 0 has no relative change: use relative=False.")
         change = (values - start) / np.abs(start) if relative else values - start
         changes[name] = np.abs(change) if log else change
     ax = axes(ax, figsize=(5.6, 3.8))
     _bands(ax, ts, changes, quantiles, log)
-    change = r"\Delta H / |H(0)|" if relative else r"\Delta H"
-    symbol = f"$|{change}|$" if log and not relative else f"${change}$"
+    change = r"|\Delta H|" if log else r"\Delta H"
+    symbol = rf"${change} / |H(0)|$" if relative else f"${change}$"
     ax.set_ylabel(with_unit(f"energy drift {symbol}", None if relative else unit))
     return _finish(ax, ts, time_unit, title, show_legend)
 

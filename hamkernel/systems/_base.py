@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
+from hamkernel._show import described
 
 Numbers = ArrayLike | Sequence[ArrayLike]
 
@@ -47,6 +48,9 @@ class AbstractHamiltonianSystem(eqx.Module):
                 f"x has shape {x.shape}; one state (q, p) of shape (n,), n even, is needed.{hint}"
             )
         return _velocity(self, x)
+
+    def __repr__(self) -> str:
+        return described(self)
 
 
 @eqx.filter_jit
