@@ -2,6 +2,10 @@
 
 import os
 
+# Before NumPy loads. The threads of BLAS in two workers on two cores wait for each other: half of
+# the time of the suite.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import jax
 import pytest
 
