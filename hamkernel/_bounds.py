@@ -77,6 +77,11 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
     for key, child in children:
         if eqx.is_inexact_array(child):
             name = jax.tree_util.keystr((*path, *key)).removeprefix(".")
+            if jnp.iscomplexobj(child):
+                raise TypeError(
+                    f"the hyperparameter {name} is complex; tune moves real numbers. Store its "
+                    "real and imaginary parts as two arrays."
+                )
             head, dot, last = name.rpartition(".")
             low, high = _box(node, last, child, X, amplitude)
             yield Hyperparameter(

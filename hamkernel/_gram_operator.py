@@ -152,6 +152,10 @@ def _product(K, X, Z, A):
 
         return jax.lax.scan(add, jnp.zeros_like(x), columns)[0]
 
+    # A loop, when differentiated backward, forgets the rule by which a Matérn kernel is smooth
+    # at x = z, and second derivatives are NaN: where one tile will do there is none.
+    if len(rows) == len(columns[0]) == 1:
+        return tile(rows[0], columns[0][0], columns[1][0])
     return jax.lax.map(row, rows).reshape(-1, X.shape[1])[: len(X)]
 
 

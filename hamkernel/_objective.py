@@ -34,6 +34,10 @@ Criterion = Literal["cross_validation", "generalized_cross_validation", "margina
 SMALL_ROWS = 128  # of the Gram, up to which every run is on all points
 COARSE_ROWS = 64  # of the Gram of the subset otherwise
 
+# Share of the residuals that a fit must leave free, tr(I − S)/D, to be judged by generalised
+# cross-validation: it is 0/0 where a fit interpolates, and can be very small there.
+LEAST_FREE = 0.2
+
 HUGE = 1e30  # stands for an objective that is not finite: BFGS backs away from it
 
 
@@ -79,7 +83,7 @@ class SearchCriterion(eqx.Module):
             generalized_loss: low_rank_generalized_loss,
             _negative_log_likelihood: _negative_low_rank_log_likelihood,
         }[self.fn.func]  # type: ignore[attr-defined]
-        fn = jax.tree_util.Partial(low_rank, basis)
+        fn = jax.tree_util.Partial(low_rank, basis, **self.fn.keywords)  # type: ignore[attr-defined]
         return SearchCriterion(fn, self.partition, self.logarithmic)
 
     def on(self, rows: np.ndarray) -> "SearchCriterion":
@@ -95,7 +99,8 @@ def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> Sear
     if objective == "cross_validation":
         return SearchCriterion(partial(partition_loss), Partition(N, folds), logarithmic=True)
     if objective == "generalized_cross_validation":
-        return SearchCriterion(partial(generalized_loss), None, logarithmic=True)
+        loss = partial(generalized_loss, least_free=LEAST_FREE)
+        return SearchCriterion(loss, None, logarithmic=True)
     if objective == "marginal_likelihood":
         return SearchCriterion(partial(_negative_log_likelihood), None, logarithmic=False)
     if objective is log_marginal_likelihood:

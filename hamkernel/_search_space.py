@@ -96,6 +96,10 @@ class SearchSpace(eqx.Module):
             return self
         return eqx.tree_at(lambda s: s.roundings, self, jnp.asarray(needed, X.dtype))
 
+    def allows(self, regularization: Float[Array, ""]) -> bool:
+        """Whether λ is below the upper bound that the caller gave, if there is one."""
+        return self.given_ridge is None or bool(regularization <= 1.01 * self.given_ridge[1])
+
     def decode(
         self, u: Float[Array, " P"], X: Float[Array, "N n"]
     ) -> tuple[AbstractMatrixKernel, Float[Array, ""]]:

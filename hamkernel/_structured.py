@@ -1,6 +1,7 @@
 """What a matrix-valued kernel is, and what is made of any of them: sums, odd and even kernels."""
 
 import abc
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -135,15 +136,20 @@ class Sum(AbstractMatrixKernel):
     def potential(
         self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
     ) -> Float[Array, ""]:
-        kinds = {type(K) for K in self.terms}
-        if len(kinds) > 1:
+        structures = list(self._structures())
+        if len(set(structures)) > 1:
             raise AttributeError(
                 "the sum of structures "
-                + " + ".join(type(K).__name__ for K in self.terms)
+                + " + ".join(each.__name__ for each in structures)
                 + " has no single potential. Ask one part for its own: field.part(0).potential(x)."
             )
         first, *rest = (K.potential(x, Z, A) for K in self.terms)
         return sum(rest, start=first)
+
+    def _structures(self) -> Iterator[type]:
+        """Of all terms, those of named sums among them too."""
+        for K in self.terms:
+            yield from K._structures() if isinstance(K, Sum) else (type(K),)
 
     @property
     def symplectic(self) -> bool:

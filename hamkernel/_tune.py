@@ -128,8 +128,9 @@ def tune(
         A `Tuned`. NaN never comes out: points where the objective is not finite cannot win.
 
     Raises:
-        TypeError: K is not matrix-valued, or a function is given that is to be large. ValueError:
-            bad data, folds, names, or bounds; a dense loss that does not fit in memory.
+        TypeError: K is not matrix-valued or has complex leaves, the optimiser is not one of
+            optimistix, or a function is given that is to be large. ValueError: bad data, folds,
+            names, or bounds; a dense loss that does not fit in memory.
             RuntimeError: the objective is finite nowhere.
 
     The flat limit. When λ rests on its lower bound and a lengthscale on its upper one, the data
@@ -153,9 +154,15 @@ def tune(
         raise ValueError(f"starts must be at least 1, got {starts}.")
     if optimiser is None:
         optimiser = _BFGS_VERBOSE if progress else _BFGS
+    if not isinstance(optimiser, optx.AbstractMinimiser):
+        raise TypeError(
+            "optimiser must be an optimistix minimiser, such as optimistix.BFGS(1e-3, 1e-3) or "
+            f"optimistix.OptaxMinimiser(optax.adam(0.1), 1e-3, 1e-3); got {optimiser!r}."
+        )
 
     optimiser = keeping_the_best(optimiser)
     rows = criterion.coarse_points(X)
+    follows_low_rank = low_rank and not criterion.own
     if len(rows) < len(X) and not low_rank:
         check_memory(X, _RUN_COPIES)
     X_part, Y_part = (jnp.take(each, rows, axis=0) for each in (X, Y))
@@ -163,10 +170,10 @@ def tune(
 
     def best_in(space: SearchSpace, u: Array):
         runs = search(space, *part, u, optimiser, max_steps)
-        if len(rows) < len(X):
+        if len(rows) < len(X) or follows_low_rank:
             fine = criterion
-            if low_rank:
-                kernel, ridge = decode(space, runs.u[0], X)
+            if follows_low_rank:
+                kernel, ridge = decode(space, runs.u[np.argmin(runs.value)], X)
                 fine = criterion.with_basis(basis_of(solver, kernel, ridge, X))
             runs = finish(space, fine, X, Y, runs, optimiser, max_steps)
         runs = jax.tree.map(np.asarray, runs)  # NumPy compiles nothing
@@ -187,6 +194,11 @@ def tune(
         u = moved(space, smooth, runs.u, X)
         space = smooth
         runs, best, kernel, ridge, field = best_in(space, u)
+    if not space.allows(ridge):
+        raise ValueError(
+            f"no lambda within bounds={{'regularization': ...}} can be solved with in {X.dtype}: "
+            f"for {kernel!r} it must be at least {float(ridge):.3g}."
+        )
     losses = criterion.losses(runs.value)
     return Tuned(
         kernel=kernel,

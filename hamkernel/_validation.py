@@ -185,10 +185,11 @@ def _residuals(K, X: Array, Y: Array, regularization: Array, partition: Partitio
 
 
 @eqx.filter_jit
-def generalized_loss(K, X, Y, regularization):
-    A = _regularised(K, X, len(X) * regularization)
-    squares, trace = free_residuals(A, Y.reshape(Y.size))
-    return squares * Y.size / trace**2
+def generalized_loss(K, X, Y, regularization, least_free=0.0):
+    ridge = len(X) * regularization
+    squares, trace = free_residuals(_regularised(K, X, ridge), Y.reshape(Y.size))
+    enough = ridge * trace >= least_free * Y.size  # tr(I − S) = ridge tr A⁻¹
+    return jnp.where(enough, squares * Y.size / trace**2, jnp.inf)
 
 
 @eqx.filter_jit

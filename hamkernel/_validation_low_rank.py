@@ -109,13 +109,18 @@ def low_rank_generalized_loss(
     X: Float[Array, "N n"],
     Y: Float[Array, "N n"],
     regularization: Float[Array, ""],
+    least_free: float = 0.0,
 ) -> Float[Array, ""]:
-    """`generalized_cross_validation` of the low-rank fit; inf where a factorisation fails."""
+    """`generalized_cross_validation` of the low-rank fit; inf where a factorisation fails.
+
+    And where a smaller share than `least_free` of the residuals is free, tr(I − S)/D.
+    """
     misfit, _, R, rows, ridge = _fitted(basis, K, X, Y, regularization)
     # tr(I − S) = D − r + δ tr (H + δI)⁻¹
     inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype), lower=True)
     free = Y.size - rows.shape[1] + ridge * jnp.sum(inverse**2)
-    return _finite(misfit @ misfit * Y.size / free**2, jnp.inf)
+    loss = jnp.where(free >= least_free * Y.size, misfit @ misfit * Y.size / free**2, jnp.inf)
+    return _finite(loss, jnp.inf)
 
 
 def low_rank_log_likelihood(

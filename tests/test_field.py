@@ -1,6 +1,7 @@
 """Learned fields: derivatives at the data, potentials, parts, and the flow they generate."""
 
 import functools
+from typing import Any
 
 import diffrax
 import equinox as eqx
@@ -167,6 +168,17 @@ def test_the_hamiltonian_of_a_sum_is_asked_of_its_part():
     part, x = field.part(0), states(1)[0]
     slope = jax.grad(part.hamiltonian)(x)
     np.testing.assert_allclose(part(x), canonical(2) @ slope, atol=ROUNDING)
+
+
+def test_named_sums_of_one_structure_have_a_hamiltonian_as_a_whole():
+    first, second, third = (hk.Symplectic(hk.Gaussian(ell)) for ell in (0.7, 1.5, 3.0))
+    X = np.random.default_rng(0).normal(size=(12, 2))
+    nested: Any = hk.fit(hk.Sum(a=first + second, b=third), X, X[:, ::-1], 1e-3)
+    flat: Any = hk.fit(first + second + third, X, X[:, ::-1], 1e-3)
+    np.testing.assert_allclose(nested.hamiltonian(X[0]), flat.hamiltonian(X[0]), rtol=1e-9)
+    mixed: Any = hk.fit(hk.Sum(a=first + hk.CurlFree(hk.Gaussian()), b=third), X, X, 1e-3)
+    with pytest.raises(AttributeError, match=r"Symplectic \+ CurlFree \+ Symplectic"):
+        _ = mixed.potential
 
 
 @pytest.mark.parametrize(("x0", "value"), [([np.nan, 0.0], 0.0), ([0.0, 0.0], np.inf)])

@@ -151,6 +151,21 @@ def temporaries(function, *arguments):
     return analysis.temp_size_in_bytes
 
 
+def test_second_derivatives_of_a_matern_product_are_the_same_forward_and_backward():
+    rng = np.random.default_rng(0)
+    X, A = rng.normal(size=(2, 30, 2))
+
+    def square(lengthscale):
+        K = hk.Symplectic(hk.Matern(2.5, lengthscale))
+        return jnp.sum(hk.gram_operator(K, X).mv(A) ** 2)
+
+    forward = jax.jacfwd(jax.jacfwd(square))(1.2)
+    h = 1e-4
+    slope = jax.jit(jax.grad(square))
+    np.testing.assert_allclose(forward, (slope(1.2 + h) - slope(1.2 - h)) / (2 * h), rtol=1e-6)
+    np.testing.assert_allclose(jax.hessian(square)(1.2), forward, rtol=1e-12)
+
+
 def test_value_and_gradient_need_memory_linear_in_the_points():
     K = hk.Symplectic(hk.Gaussian(1.0))
 

@@ -290,6 +290,23 @@ def test_another_function_than_the_saved_one_is_refused(tmp_path):
         hk.load(tmp_path / "f", kernel=kernel(lambda x: jnp.array([x[0], x[1], 0.0])))
 
 
+def test_another_function_is_refused_where_the_first_state_is_an_equilibrium(tmp_path):
+    def first(x, z):
+        return jnp.exp(-0.5 * (x @ x + z @ z - 2 * (x @ z)))
+
+    def second(x, z):
+        return 1 / (1 + (x @ x + z @ z - 2 * (x @ z)))
+
+    def odd(k):
+        return hk.Odd(hk.Symplectic(k))
+
+    X = np.array([[0.0, 0.0], [1.0, 0.5], [-0.5, 1.0]])
+    hk.save(tmp_path / "f.npz", hk.fit(odd(first), X, X[:, ::-1] * [1, -1], 1e-3))
+    assert isinstance(hk.load(tmp_path / "f.npz", kernel=odd(first)), hk.KernelField)
+    with pytest.raises(ValueError, match=r"a function in the kernel is not the one"):
+        hk.load(tmp_path / "f.npz", kernel=odd(second))
+
+
 def test_a_batch_of_fields_is_refused_before_it_is_lost(tmp_path):
     X, Y = jnp.eye(4), jnp.ones((3, 4, 4))
     K = hk.Symplectic(hk.Gaussian())

@@ -282,6 +282,41 @@ def test_other_objectives_reach_a_stationary_point_below_the_start(name, loss):
         assert float(loss(tuned.kernel, X, Y, factor * tuned.regularization)) > best - slack
 
 
+def test_generalized_cross_validation_does_not_choose_fields_that_interpolate(monkeypatch):
+    rng = np.random.default_rng(4)
+    X = rng.normal(size=(24, 2))
+    truth = np.stack([X[:, 1], -np.sin(X[:, 0])], axis=1)
+    Y = truth + 0.1 * rng.normal(size=X.shape)
+
+    def free(tuned) -> float:
+        return float(jnp.linalg.norm(tuned.field.residual) / np.linalg.norm(Y - truth))
+
+    K = hk.Symplectic(hk.Gaussian(1.0))
+    assert free(hk.tune(K, X, Y, objective="generalized_cross_validation")) > 0.5
+    # The negative control: without the limit it leaves hardly a residual.
+    monkeypatch.setattr("hamkernel._objective.LEAST_FREE", 0.0)
+    assert free(hk.tune(K, X, Y, objective="generalized_cross_validation")) < 0.1
+
+
+def test_hyperparameters_that_are_complex_and_other_optimisers_are_refused():
+    class Complex(eqx.Module):
+        c: jax.Array
+
+        def __call__(self, x, z):
+            return jnp.real(self.c) * jnp.exp(x @ z - x @ x / 2 - z @ z / 2)
+
+    with pytest.raises(TypeError, match=r"c is complex"):
+        hk.tune(hk.Symplectic(Complex(jnp.array(1 + 1j))), *scattered())
+    optimiser: Any = optx.BFGS
+    with pytest.raises(TypeError, match="must be an optimistix minimiser"):
+        hk.tune(SIMPLE, *scattered(), optimiser=optimiser)
+
+
+def test_bounds_of_lambda_that_float64_cannot_carry_are_refused():
+    with pytest.raises(ValueError, match=r"can be solved with in float64.*at least"):
+        hk.tune(SIMPLE, *scattered(), bounds={"regularization": (1e-30, 1e-20)})
+
+
 def test_any_optimistix_minimiser_and_any_objective_will_do():
     X, Y = scattered()
 

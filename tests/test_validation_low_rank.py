@@ -160,6 +160,18 @@ def test_tuning_with_low_rank_comes_to_the_optimum_of_the_dense_loss(
     assert type(tuned.field) is type(hk.fit(start, X, Y, 0.1, solver=SOLVERS[solver]))
 
 
+def test_the_loss_of_few_points_is_that_of_the_low_rank_fit_too():
+    solver = hk.RandomFeatures(5, jax.random.key(1))
+    tuned = hk.tune(hk.Symplectic(hk.Gaussian(1.0)), X, Y, 1e-2, 5, starts=2, solver=solver)
+    losses = []
+    for out in np.arange(N).reshape(5, -1):
+        rest = np.setdiff1d(np.arange(N), out)
+        # Without a fold the ridge is (N − N/5) λ, and so is that of the rest alone.
+        field = hk.fit(tuned.kernel, X[rest], Y[rest], tuned.regularization, solver=solver)
+        losses.append(np.mean((field.evaluate(X[out]) - Y[out]) ** 2))
+    np.testing.assert_allclose(tuned.loss, np.mean(losses), rtol=1e-6)
+
+
 def test_a_dense_loss_that_does_not_fit_is_refused_before_the_search(monkeypatch):
     X, Y = data(120)
     monkeypatch.setattr("hamkernel._memory.memory_bytes", lambda: 100_000)
