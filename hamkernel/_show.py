@@ -11,7 +11,7 @@ import numpy as np
 from jax.core import Tracer
 
 _WIDTH = 88  # of a line, beyond which each attribute has its own
-_FEW = 16  # numbers of an array that are printed
+_FEW = 16  # numbers of a vector that are printed
 
 
 def described(module: Any) -> str:
@@ -37,11 +37,11 @@ def _attribute(module: Any, name: str) -> str:
 
 def _is_short(value: Any) -> bool:
     if isinstance(value, np.ndarray):
-        return value.size <= _FEW
+        return value.ndim <= 1 and value.size <= _FEW
     if not isinstance(value, jax.Array) or isinstance(value, Tracer):
         return False
     is_key = jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
-    return value.is_fully_addressable and not is_key and value.size <= _FEW
+    return value.is_fully_addressable and not is_key and value.ndim <= 1 and value.size <= _FEW
 
 
 def _text(value: Any) -> str:

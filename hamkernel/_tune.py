@@ -20,6 +20,7 @@ integrated, and 6 of those from noisy data cannot without it (`tests/benchmarks/
 Data without noise leaves little residual: its bound stays or rises by some tens.
 """
 
+import warnings
 from typing import Any
 
 import equinox as eqx
@@ -136,6 +137,9 @@ def tune(
     The flat limit. When λ rests on its lower bound and a lengthscale on its upper one, the data
     asks for a polynomial: the fit is good and its hyperparameters mean little.
 
+    Warns where the velocities of two coordinates differ 100 times in size: one loss, the sum of
+    their squares, hardly sees the smaller one.
+
     The ridge. λ is never searched where rounding would decide. Unless `bounds` say what it may be,
     or it is frozen, it also stays so large that a field fitted to noise is smooth to about 1e-9
     and can be integrated: where the best one was not, all runs go on above that λ.
@@ -144,6 +148,7 @@ def tune(
     X, Y = given = require.data(X, Y)
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
     K.check_dimension(X.shape[1])
+    _warn_of_unequal_sizes(Y)
     ridge = require.ridge(regularization).astype(X.dtype)
     criterion = criterion_of(objective, len(X), folds)
     frozen = (frozen,) if isinstance(frozen, str) else tuple(frozen)
@@ -211,6 +216,21 @@ def tune(
         at_bounds=space.at_bounds(runs.u[best]),
         bounds=space.box(kernel, X),
     )
+
+
+def _warn_of_unequal_sizes(Y: Array) -> None:
+    sizes = np.asarray(Y).std(axis=0)
+    sizes = sizes[sizes > 0]
+    if sizes.size and sizes.max() > _UNEQUAL * sizes.min():
+        warnings.warn(
+            f"the velocities of one coordinate are {sizes.max() / sizes.min():.3g} times as large "
+            "as those of another, and a loss sums the squares of both: the small one may be lost "
+            "in it. Choose units in which they are of similar size.",
+            stacklevel=3,
+        )
+
+
+_UNEQUAL = 100.0  # the loss of one coordinate is then within the noise of the other's
 
 
 def _size(values: Array) -> float:

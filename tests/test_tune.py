@@ -312,6 +312,13 @@ def test_hyperparameters_that_are_complex_and_other_optimisers_are_refused():
         hk.tune(SIMPLE, *scattered(), optimiser=optimiser)
 
 
+def test_velocities_of_very_different_sizes_are_warned_of():
+    X, Y = scattered()
+    scale = np.array([30.0, 1 / 30])
+    with pytest.warns(UserWarning, match="Choose units"):
+        hk.tune(SIMPLE, X, Y * scale, starts=1, max_steps=1)
+
+
 def test_bounds_of_lambda_that_float64_cannot_carry_are_refused():
     with pytest.raises(ValueError, match=r"can be solved with in float64.*at least"):
         hk.tune(SIMPLE, *scattered(), bounds={"regularization": (1e-30, 1e-20)})
