@@ -24,76 +24,30 @@ decode = eqx.filter_jit(lambda space, u, X: space.decode(u, X))
 
 
 @eqx.filter_jit
-def starting_points(space, criterion, X, Y, scale: float, starts: int) -> Float[Array, "starts P"]:
-    """The caller's values, and the best of a space-filling design in the box, as u.
+def search(space, criterion, X, Y, scale: float, optimiser, starts: int, max_steps: int) -> Runs:
+    """The runs from all starts on X and Y, all points or a part of them; those of a part sorted.
 
     Args:
         space: the search space.
         criterion: of these points.
-        X: states, all or a part of them.
+        X: states.
         Y: velocities.
         scale: the number of all points over those in X; it keeps the ridge Nλ of all points.
-        starts: how many.
+        optimiser: an optimistix minimiser.
+        starts: how many runs.
+        max_steps: the largest number of steps of each.
     """
-    u = space.encode(space.start, X)[None]
+    coarse = _Objective(space, criterion, X, Y, scale)
+    u = space.encode_start(X)[None]
     if starts > 1:
         design = _design(u.shape[1], DESIGN_POINTS, X.dtype)
-        objective = _Objective(space, criterion, X, Y, scale)
-        values = jax.lax.map(objective, design, batch_size=64)
+        values = jax.lax.map(coarse, design, batch_size=64)
         u = jnp.concatenate([u, _spread_out(design, values, starts - 1)])
-    return u
-
-
-@eqx.filter_jit
-def moved(space: SearchSpace, other: SearchSpace, u: Float[Array, "starts P"], X: Array) -> Array:
-    """The points u of a space in another one: the same hyperparameters, moved into its box."""
-    return jax.vmap(lambda u: other.encode(space.entries(u, X), X))(u)
-
-
-def search(
-    space, criterion, X, Y, scale: float, u: Float[Array, "starts P"], optimiser, max_steps: int
-) -> Runs:
-    """The runs from all starts u on X and Y, all points or a part of them; those of a part sorted.
-
-    Starts that are almost the same share a run. Other arguments are those of `starting_points`,
-    and an optimistix minimiser with the largest number of steps of each run.
-    """
-    first, run_of = _distinct(np.asarray(u))
-    order = np.concatenate([first, np.setdiff1d(np.arange(len(u)), first)])
-    count = jnp.asarray(len(first))  # traced: any number is one program
-    runs = _search(space, criterion, X, Y, scale, np.asarray(u)[order], count, optimiser, max_steps)
-    runs = jax.tree.map(lambda leaf: np.asarray(leaf)[run_of], runs)  # NumPy compiles nothing
-    return runs if scale == 1 else _sorted(runs)
-
-
-@eqx.filter_jit
-def _search(space, criterion, X, Y, scale, u, count, optimiser, max_steps) -> Runs:
-    """The runs from the first `count` of the starts."""
-    coarse = _Objective(space, criterion, X, Y, scale)
-
-    def nothing(u):
-        return Runs(u, jnp.asarray(HUGE, u.dtype), jnp.asarray(False), jnp.asarray(0))
-
-    def run(i_and_u):
-        i, u = i_and_u
-        return jax.lax.cond(i < count, lambda u: _run(coarse, u, optimiser, max_steps), nothing, u)
-
     # Side by side all wait for the slowest, which only pays where a lane costs nothing: one after
     # the other took two thirds of the time on a CPU.
-    together = None if jax.default_backend() == "cpu" else len(u)
-    return jax.lax.map(run, (jnp.arange(len(u)), u), batch_size=together)
-
-
-def _distinct(u: Float[np.ndarray, "starts P"]) -> tuple[np.ndarray, np.ndarray]:
-    """The rows of u that are no neighbours of one before, and for each row which of those it is."""
-    shares = np.sin(u) / 2
-    first, run_of = [], []
-    for i, share in enumerate(shares):
-        near = np.abs(shares[first] - share).max(axis=1) < NEIGHBOURS
-        if not near.any():
-            first.append(i)
-        run_of.append(near.argmax() if near.any() else len(first) - 1)
-    return np.array(first), np.array(run_of)
+    together = None if jax.default_backend() == "cpu" else starts
+    runs = jax.lax.map(lambda u: _run(coarse, u, optimiser, max_steps), u, batch_size=together)
+    return runs if scale == 1 else _sorted(runs)
 
 
 @eqx.filter_jit
@@ -112,7 +66,6 @@ def _sorted(runs: Runs) -> Runs:
 
 DESIGN_POINTS = 256  # in the box, from which the starts are chosen
 FINISHERS = 1  # runs that are finished on all points
-NEIGHBOURS = 0.02  # of the side of the box, within which starts share a run
 
 
 class _Objective(eqx.Module):

@@ -104,34 +104,17 @@ class SearchSpace(eqx.Module):
         self, u: Float[Array, " P"], X: Float[Array, "N n"]
     ) -> tuple[AbstractMatrixKernel, Float[Array, ""]]:
         """The kernel and λ at u."""
-        entries = self.entries(u, X)
-        return self._kernel(entries), jnp.exp(entries[-1])
-
-    def entries(self, u: Float[Array, " P"], X: Float[Array, "N n"]) -> Float[Array, " entries"]:
-        """The entries at u."""
+        n_leaves = len(self.start) - 1
         moved = jnp.zeros_like(self.start).at[jnp.asarray(self.free)].set((1 + jnp.sin(u)) / 2)
         is_free = np.isin(np.arange(len(self.start)), self.free)
-        entries = jnp.where(is_free, self.low + (self.high - self.low) * moved, self.start)
-        if not is_free[-1]:
-            return entries
-        low, high = self.ridge_box(self._kernel(entries), X)
-        return entries.at[-1].set(low + (high - low) * moved[-1])
-
-    def encode(
-        self, entries: Float[Array, " entries"], X: Float[Array, "N n"]
-    ) -> Float[Array, " P"]:
-        """The u of these entries, moved a little inside the box where they are not."""
-        ridge_low, ridge_high = self.ridge_box(self._kernel(entries), X)
-        low, high = self.low.at[-1].set(ridge_low), self.high.at[-1].set(ridge_high)
-        width = jnp.where(high > low, high - low, jnp.ones_like(low))
-        # Not on the edge itself, where the derivative of the sine is zero.
-        share = jnp.clip((entries - low) / width, 0.01, 0.99)
-        return jnp.arcsin(2 * share - 1)[jnp.asarray(self.free)]
-
-    def _kernel(self, entries: Float[Array, " entries"]) -> AbstractMatrixKernel:
+        h = jnp.where(is_free, self.low + (self.high - self.low) * moved, self.start)
         params, static = eqx.partition(self.kernel, eqx.is_inexact_array)
         flat, unravel = ravel_pytree(params)
-        return eqx.combine(unravel(entries[:-1].astype(flat.dtype)), static)
+        kernel = eqx.combine(unravel(h[:n_leaves].astype(flat.dtype)), static)
+        if not is_free[-1]:
+            return kernel, jnp.exp(self.start[-1])
+        low, high = self.ridge_box(kernel, X)
+        return kernel, jnp.exp(low + (high - low) * moved[-1])
 
     @eqx.filter_jit
     def ridge_box(
@@ -145,6 +128,15 @@ class SearchSpace(eqx.Module):
             low = jnp.maximum(low, self.given_ridge[0])
             high = jnp.maximum(self.given_ridge[1], low)
         return jnp.log(low), jnp.log(high)
+
+    def encode_start(self, X: Float[Array, "N n"]) -> Float[Array, " P"]:
+        """The u of the caller's values, moved a little inside the box where they are not."""
+        ridge_low, ridge_high = self.ridge_box(self.kernel, X)
+        low, high = self.low.at[-1].set(ridge_low), self.high.at[-1].set(ridge_high)
+        width = jnp.where(high > low, high - low, jnp.ones_like(low))
+        # Not on the edge itself, where the derivative of the sine is zero.
+        share = jnp.clip((self.start - low) / width, 0.01, 0.99)
+        return jnp.arcsin(2 * share - 1)[jnp.asarray(self.free)]
 
     def at_bounds(self, u: Float[Array, " P"]) -> tuple[str, ...]:
         """The names of the hyperparameters within a hundredth of their box of its edge."""

@@ -14,10 +14,11 @@ the way along ℓ -> ∞, λ -> 0 until nothing is left of it but noise.
 The loss can be right where the field is already rough. The coefficients are the residual over Nλ,
 so f(x) rounds at about 1e-2 ε tr(G)/(Nλ) times the residual, and an adaptive step, or the
 iteration of an implicit one, that is asked for more digits fails. If the best field has
-Nλ < √ε tr(G) ‖y − f‖/‖y‖, that becomes the bound and every run goes on from where it ended: of
-18 fields, for polynomial and trigonometric H with noise of 0, 1 and 10 %, all can then be
-integrated, and 6 of those from noisy data cannot without it (`tests/benchmarks/tuned_fields.py`).
-Data without noise leaves little residual: its bound stays or rises by some tens.
+Nλ < √ε tr(G) ‖y − f‖/‖y‖, the search is made once more with that as the bound: of 18 fields, for
+polynomial and trigonometric H with noise of 0, 1 and 10 %, all can then be integrated, and 6 of
+those from noisy data cannot without it (`tests/benchmarks/tuned_fields.py`). To go on from the
+ends of the first search instead is faster, and was caught in a valley in one of the 18. Data
+without noise leaves little residual: its bound stays or rises by some tens.
 """
 
 import warnings
@@ -37,7 +38,7 @@ from hamkernel._fit import fit
 from hamkernel._folds import Folds
 from hamkernel._gram import matrix_kernel
 from hamkernel._objective import HUGE, Criterion, Objective, basis_of, criterion_of
-from hamkernel._search import decode, finish, keeping_the_best, moved, search, starting_points
+from hamkernel._search import decode, finish, keeping_the_best, search
 from hamkernel._search_space import LOW_RANK_ROUNDINGS, ROUNDINGS, SearchSpace
 from hamkernel._show import described
 from hamkernel._solve import AbstractSolver
@@ -60,8 +61,8 @@ class Tuned(eqx.Module):
         at_bounds: the names of the hyperparameters that rest on a bound of the search box. The
             data would have them further out: see "How to choose" in the README.
         start_losses: the loss on all data at the end of the run from each start, shape (starts,):
-            in the order of the starts, the caller's kernel first, or, where the runs were made
-            on a subset, in ascending order of the loss before the best were finished.
+            in the order of the starts, the caller's kernel first, or, where the runs were made on
+            a subset or are finished with a low-rank loss, in ascending order before that.
         bounds: the box that was searched: for each name the lowest and highest value.
     """
 
@@ -142,7 +143,7 @@ def tune(
 
     The ridge. λ is never searched where rounding would decide. Unless `bounds` say what it may be,
     or it is frozen, it also stays so large that a field fitted to noise is smooth to about 1e-9
-    and can be integrated: where the best one was not, all runs go on above that λ.
+    and can be integrated: where the best one was not, the search is made once more above that λ.
     """
     K = matrix_kernel(K)
     X, Y = given = require.data(X, Y)
@@ -173,8 +174,8 @@ def tune(
     X_part, Y_part = (jnp.take(each, rows, axis=0) for each in (X, Y))
     part = criterion.on(rows), X_part, Y_part, len(X) / len(rows)
 
-    def best_in(space: SearchSpace, u: Array):
-        runs = search(space, *part, u, optimiser, max_steps)
+    def best_in(space: SearchSpace):
+        runs = search(space, *part, optimiser, starts, max_steps)
         if len(rows) < len(X) or follows_low_rank:
             fine = criterion
             if follows_low_rank:
@@ -193,12 +194,11 @@ def tune(
         kernel, ridge = decode(space, jnp.asarray(runs.u[best]), X)
         return runs, best, kernel, ridge, fit(kernel, *given, ridge, solver=solver)
 
-    runs, best, kernel, ridge, field = best_in(space, starting_points(space, *part, starts))
+    runs, best, kernel, ridge, field = best_in(space)
     smooth = space.smooth(kernel, ridge, X, _size(field.residual) / _size(given[1]))
     if smooth is not space:
-        u = moved(space, smooth, runs.u, X)
         space = smooth
-        runs, best, kernel, ridge, field = best_in(space, u)
+        runs, best, kernel, ridge, field = best_in(space)
     if not space.allows(ridge):
         raise ValueError(
             f"no lambda within bounds={{'regularization': ...}} can be solved with in {X.dtype}: "

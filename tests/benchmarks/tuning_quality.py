@@ -5,8 +5,8 @@
 Five systems, four kernels, noise seeds, and poor starting points (lengthscale 0.3, 3, 30 with
 λ = 0.1): 240 problems by default. The grid has 60 × 60 points over the box that `tune` searches,
 lengthscale by λ, where λ runs upwards from the rounding of the Gram at each lengthscale, or from
-the larger bound of a search that went on so that the field is smooth. Prints the ratio of the
-tuned loss to the grid's best.
+the larger bound of a search that was made again so that the field is smooth. Prints the ratio of
+the tuned loss to the grid's best.
 """
 
 import argparse
@@ -124,7 +124,7 @@ def main() -> None:
     print(
         f"{len(values)} problems: at most 1.01 in {np.mean(values <= 1.01):.1%}, "
         f"at most 1.10 in {np.mean(values <= 1.10):.1%}, NaN in {np.isnan(values).sum()}; "
-        f"went on above a larger bound in {again}"
+        f"searched again in {again}"
     )
 
 
