@@ -24,6 +24,7 @@ class SearchSpace(eqx.Module):
 
     kernel: AbstractMatrixKernel
     start: Float[Array, " entries"]
+    regularization: Float[Array, ""]
     low: Float[Array, " entries"]
     high: Float[Array, " entries"]
     given_ridge: tuple[Float[Array, ""], Float[Array, ""]] | None
@@ -72,6 +73,7 @@ class SearchSpace(eqx.Module):
         self.low, self.high = jnp.asarray(low, dtype), jnp.asarray(high, dtype)
         leaves, _ = ravel_pytree(eqx.filter(K, eqx.is_inexact_array))
         self.start = jnp.asarray(np.append(leaves, np.log(regularization)), dtype)
+        self.regularization = jnp.asarray(regularization, dtype)
 
     def smooth(
         self,
@@ -88,7 +90,7 @@ class SearchSpace(eqx.Module):
             X: states.
             misfit: the root mean square of the residual over that of Y.
         """
-        if self.given_ridge is not None or len(self.names) - 1 not in self.free:
+        if self.given_ridge is not None or not self._moves_ridge:
             return self  # the caller has said what λ may be
         needed = misfit / jnp.finfo(X.dtype).eps ** 0.5
         low = jnp.exp(self.ridge_box(kernel, X)[0])
@@ -97,8 +99,14 @@ class SearchSpace(eqx.Module):
         return eqx.tree_at(lambda s: s.roundings, self, jnp.asarray(needed, X.dtype))
 
     def allows(self, regularization: Float[Array, ""]) -> bool:
-        """Whether λ is below the upper bound that the caller gave, if there is one."""
-        return self.given_ridge is None or bool(regularization <= 1.01 * self.given_ridge[1])
+        """Whether λ is below the upper bound that the caller gave, if it is searched in one."""
+        if self.given_ridge is None or not self._moves_ridge:
+            return True
+        return bool(regularization <= 1.01 * self.given_ridge[1])
+
+    @property
+    def _moves_ridge(self) -> bool:
+        return len(self.names) - 1 in self.free
 
     def decode(
         self, u: Float[Array, " P"], X: Float[Array, "N n"]
@@ -112,7 +120,7 @@ class SearchSpace(eqx.Module):
         flat, unravel = ravel_pytree(params)
         kernel = eqx.combine(unravel(h[:n_leaves].astype(flat.dtype)), static)
         if not is_free[-1]:
-            return kernel, jnp.exp(self.start[-1])
+            return kernel, self.regularization
         low, high = self.ridge_box(kernel, X)
         return kernel, jnp.exp(low + (high - low) * moved[-1])
 

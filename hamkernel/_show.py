@@ -36,12 +36,14 @@ def _attribute(module: Any, name: str) -> str:
 
 
 def _is_short(value: Any) -> bool:
-    if isinstance(value, np.ndarray):
-        return value.ndim <= 1 and value.size <= _FEW
-    if not isinstance(value, jax.Array) or isinstance(value, Tracer):
+    if isinstance(value, jax.Array):
+        if isinstance(value, Tracer) or jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+            return False
+        if not value.is_fully_addressable:
+            return False
+    elif not isinstance(value, np.ndarray):
         return False
-    is_key = jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
-    return value.is_fully_addressable and not is_key and value.ndim <= 1 and value.size <= _FEW
+    return value.ndim <= 1 and value.size <= _FEW
 
 
 def _text(value: Any) -> str:

@@ -16,9 +16,9 @@ so f(x) rounds at about 1e-2 ε tr(G)/(Nλ) times the residual, and an adaptive 
 iteration of an implicit one, that is asked for more digits fails. If the best field has
 Nλ < √ε tr(G) ‖y − f‖/‖y‖, the search is made once more with that as the bound: of 18 fields, for
 polynomial and trigonometric H with noise of 0, 1 and 10 %, all can then be integrated, and 6 of
-those from noisy data cannot without it (`tests/benchmarks/tuned_fields.py`). To go on from the
-ends of the first search instead is faster, and was caught in a valley in one of the 18. Data
-without noise leaves little residual: its bound stays or rises by some tens.
+those from noisy data cannot without it (`tests/benchmarks/tuned_fields.py`). Anew, and not from
+where the runs ended: those can lie in a valley that the bound cuts off. Data without noise leaves
+little residual: its bound stays or rises by some tens.
 """
 
 import warnings
@@ -132,14 +132,14 @@ def tune(
     Raises:
         TypeError: K is not matrix-valued or has complex leaves, the optimiser is not one of
             optimistix, or a function is given that is to be large. ValueError: bad data, folds,
-            names, or bounds; a dense loss that does not fit in memory.
-            RuntimeError: the objective is finite nowhere.
+            names, or bounds; a dense loss that does not fit in memory. RuntimeError: the
+            objective is finite nowhere.
 
     The flat limit. When λ rests on its lower bound and a lengthscale on its upper one, the data
     asks for a polynomial: the fit is good and its hyperparameters mean little.
 
-    Warns where the velocities of two coordinates differ 100 times in size: one loss, the sum of
-    their squares, hardly sees the smaller one.
+    Units. A warning comes where the velocities of two coordinates differ 100 times in size: the
+    loss, a sum of their squares, hardly sees the smaller one.
 
     The ridge. λ is never searched where rounding would decide. Unless `bounds` say what it may be,
     or it is frozen, it also stays so large that a field fitted to noise is smooth to about 1e-9
@@ -230,7 +230,7 @@ def _warn_of_unequal_sizes(Y: Array) -> None:
         )
 
 
-_UNEQUAL = 100.0  # the loss of one coordinate is then within the noise of the other's
+_UNEQUAL = 100.0  # in size, and so 10 000 in the loss
 
 
 def _size(values: Array) -> float:

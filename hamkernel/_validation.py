@@ -64,7 +64,8 @@ def cross_validation_loss(
         of (N n)² numbers, with the gradient over K too.
 
     Raises:
-        TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization.
+        TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
+            matrices that do not fit in memory.
     """
     K, X, Y, regularization = _checked(K, X, Y, regularization)
     return partition_loss(K, X, Y, regularization, Partition(len(X), folds))
@@ -110,7 +111,8 @@ def generalized_cross_validation(
         The loss, in squared units of Y; inf where the factorisation fails.
 
     Raises:
-        TypeError: K is not matrix-valued. ValueError: bad data or regularization.
+        TypeError: K is not matrix-valued. ValueError: bad data or regularization, or a matrix
+            that does not fit in memory.
 
     Source: Golub, Heath & Wahba (1979), Technometrics 21.
     """
@@ -139,7 +141,8 @@ def log_marginal_likelihood(
         The log density; −inf where the factorisation fails.
 
     Raises:
-        TypeError: K is not matrix-valued. ValueError: bad data or regularization.
+        TypeError: K is not matrix-valued. ValueError: bad data or regularization, or a matrix
+            that does not fit in memory.
 
     Source: Rasmussen & Williams (2006), eq. 2.30.
     """

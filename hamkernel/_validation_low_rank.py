@@ -111,9 +111,10 @@ def low_rank_generalized_loss(
     regularization: Float[Array, ""],
     least_free: float = 0.0,
 ) -> Float[Array, ""]:
-    """`generalized_cross_validation` of the low-rank fit; inf where a factorisation fails.
+    """`generalized_cross_validation` of the low-rank fit.
 
-    And where a smaller share than `least_free` of the residuals is free, tr(I − S)/D.
+    It is inf where a factorisation fails, or where less than the share `least_free` of the
+    residuals is free, tr(I − S)/D.
     """
     misfit, _, R, rows, ridge = _fitted(basis, K, X, Y, regularization)
     # tr(I − S) = D − r + δ tr (H + δI)⁻¹

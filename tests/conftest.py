@@ -3,7 +3,7 @@
 import os
 
 # Before NumPy loads. The threads of BLAS in two workers on two cores wait for each other: half of
-# the time of the suite.
+# the time of test_validation_low_rank.py.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax

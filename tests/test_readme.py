@@ -38,6 +38,14 @@ def test_the_ten_lines_learn_a_pendulum_that_keeps_its_energy():
     assert float(abs(energy[0] - true)) < 0.1 * float(true)
 
 
+def test_the_error_of_differences_is_the_one_that_is_said():
+    pendulum, starts = hk.systems.Pendulum(mass=1.0), [[1.26, 0.0], [2.51, 0.0], [2.98, -4.0]]
+    ts, still = jnp.linspace(0.0, 0.7, 8), jax.random.key(0)
+    X, Y = hk.systems.sample(pendulum, jnp.array(starts), ts, 0.0, 0.0, key=still)
+    errors = np.gradient(X, 0.1, axis=1)[:, 1:-1] - Y[:, 1:-1]
+    assert f"{np.sqrt(np.mean(errors[..., 1] ** 2)):.2f} in ṗ" in README.read_text()
+
+
 def test_the_readme_has_the_two_commands_that_ci_runs():
     text = README.read_text()
     assert text.count("-m pytest") >= 1

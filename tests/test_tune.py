@@ -322,6 +322,10 @@ def test_velocities_of_very_different_sizes_are_warned_of():
 def test_bounds_of_lambda_that_float64_cannot_carry_are_refused():
     with pytest.raises(ValueError, match=r"can be solved with in float64.*at least"):
         hk.tune(SIMPLE, *scattered(), bounds={"regularization": (1e-30, 1e-20)})
+    # Where λ is frozen its bounds are not searched.
+    kept = {"frozen": "regularization", "bounds": {"regularization": (1e-9, 1e-6)}}
+    tuned = hk.tune(SIMPLE, *scattered(), 1e-3, starts=2, **kept)
+    assert tuned.regularization == 1e-3
 
 
 def test_any_optimistix_minimiser_and_any_objective_will_do():

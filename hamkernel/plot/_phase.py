@@ -140,7 +140,7 @@ def plane_slice(
         ax: axes to draw on; new ones if None.
         title: of the axes.
         units: of the two coordinates.
-        label: of the colours.
+        label: of the colours; H − min H, or the speed out of the plane, if None.
         levels: number of contours.
         resolution: points on each axis of the grid.
 
