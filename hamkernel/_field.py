@@ -28,7 +28,10 @@ class AbstractField(eqx.Module):
 
     kernel: eqx.AbstractVar[AbstractMatrixKernel]
     residual: eqx.AbstractVar[Float[Array, "N n"]]
+    norm: eqx.AbstractVar[Float[Array, ""]]
+    regularization: eqx.AbstractVar[Float[Array, ""]]
     offset: eqx.AbstractVar[Float[Array, ""]]
+    info: eqx.AbstractVar["SolverInfo | None"]
 
     def __repr__(self) -> str:
         return described(self)
@@ -45,6 +48,12 @@ class AbstractField(eqx.Module):
     @abc.abstractmethod
     def dimension(self) -> int:
         """n, the number of coordinates of a state."""
+
+    @property
+    def residual_norm(self) -> Float[Array, ""]:
+        """‖y − f(X)‖ over all the training data, that of a stream too, whose residual is gone."""
+        kept = None if self.info is None else self.info.residual_norm
+        return jnp.linalg.norm(self.residual) if kept is None else kept
 
     @abc.abstractmethod
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -169,6 +178,8 @@ class SolverInfo(eqx.Module):
         rank: of the low-rank Gram that was solved with, or that preconditioned, shape ().
         truncation: trace(G − Ĝ)/(Nλ) for that low-rank Gram Ĝ of the training data, shape (). The
             fitted values of Ĝ differ from those of G by at most this fraction of the residual.
+        residual_norm: ‖y − f(X)‖ of a stream, whose residual is not kept, good to 1e-8 of ‖y‖,
+            shape ().
         iterations: of conjugate gradients, shape ().
         relative_residual: ‖y − (G + NλI)a‖/‖y‖ of the coefficients, computed at the end, shape ().
     """
@@ -177,6 +188,7 @@ class SolverInfo(eqx.Module):
     landmarks: Int[Array, ""] | None = None
     rank: Int[Array, ""] | None = None
     truncation: Float[Array, ""] | None = None
+    residual_norm: Float[Array, ""] | None = None
     iterations: Int[Array, ""] | None = None
     relative_residual: Float[Array, ""] | None = None
 

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hamkernel._callable import as_pytree
 from hamkernel._folds import Folds, Partition
-from hamkernel._scalar import as_pytree
 from hamkernel._solve_features import RandomFeatures
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._validation import (

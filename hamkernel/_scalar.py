@@ -8,18 +8,16 @@ differentiation makes every structured kernel from it, so a kernel should be wri
 
 import abc
 import enum
-import functools
 import math
 from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
+from hamkernel._callable import as_pytree
 from hamkernel._show import described
 
 
@@ -187,36 +185,6 @@ def of_one_pair(fn: Callable[..., Any]) -> Callable[..., Any]:
     """`fn`; of a kernel of tinygp, which gives a whole Gram when called, the method for a pair."""
     families = {cls.__module__.partition(".")[0] for cls in type(fn).__mro__}
     return getattr(fn, "evaluate", fn) if "tinygp" in families else fn
-
-
-def as_pytree(fn: Callable[..., Any]) -> Callable[..., Any]:
-    """`fn` as a PyTree; a bare function would be a leaf, which `jax.jit` refuses."""
-    if not jax.tree_util.all_leaves([fn]):
-        return fn
-    return Bound(fn) if isinstance(fn, functools.partial) else jax.tree_util.Partial(fn)
-
-
-class Bound(eqx.Module):
-    """A `functools.partial` whose arrays are leaves; what else it binds is static."""
-
-    func: Callable[..., Any]
-    arrays: tuple[Array | None, ...]
-    static: tuple[Any, ...] = eqx.field(static=True)
-    structure: Any = eqx.field(static=True)
-
-    def __init__(self, partial: "functools.partial[Any]"):
-        leaves, self.structure = jax.tree.flatten((partial.args, partial.keywords))
-        is_array = [isinstance(leaf, jax.Array | np.ndarray) for leaf in leaves]
-        pairs = list(zip(leaves, is_array, strict=True))
-        self.func = as_pytree(partial.func)
-        self.arrays = tuple(jnp.asarray(leaf) if array else None for leaf, array in pairs)
-        self.static = tuple(None if array else leaf for leaf, array in pairs)
-
-    def __call__(self, *points: Float[Array, " n"]) -> Any:
-        pairs = zip(self.arrays, self.static, strict=True)
-        leaves = [static if array is None else array for array, static in pairs]
-        args, keywords = jax.tree.unflatten(self.structure, leaves)
-        return self.func(*args, *points, **keywords)
 
 
 def one_point(x: ArrayLike) -> Float[Array, " n"]:

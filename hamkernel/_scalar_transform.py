@@ -9,12 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hamkernel._callable import as_pytree
 from hamkernel._scalar import (
     AbstractScalarKernel,
     Invariance,
     ScalarSum,
     Scaled,
-    as_pytree,
     as_scalar_kernel,
     one_point,
 )

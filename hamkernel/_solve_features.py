@@ -12,7 +12,7 @@ from hamkernel import _require as require
 from hamkernel import _streaming_sums as streaming_sums
 from hamkernel._devices import as_given, on_each, rows_of, split
 from hamkernel._features import AbstractFeatures, SumFeatures, features
-from hamkernel._field import AbstractField
+from hamkernel._field import AbstractField, SolverInfo
 from hamkernel._solve import root
 from hamkernel._solve_low_rank import singular
 from hamkernel._solve_streaming import (
@@ -41,21 +41,20 @@ class FeatureField(AbstractField):
         weights: w, shape (r,).
         residual: yᵢ − f(xᵢ) at the training data, shape (N, n); of shape (0, n) after a fit to a
             stream, which is not kept.
-        residual_norm: its norm over all the training data, shape (); after a fit to a stream good
-            to 1e-8 of the norm of all velocities.
         norm: ‖w‖, the norm of f in the RKHS of the approximate kernel, shape ().
         regularization: the λ of the fit, shape ().
         offset: the constant in the potential, shape ().
+        info: how the solver went.
     """
 
     kernel: AbstractMatrixKernel
     features: AbstractFeatures
     weights: Float[Array, " r"]
     residual: Float[Array, "N n"]
-    residual_norm: Float[Array, ""]
     norm: Float[Array, ""]
     regularization: Float[Array, ""]
     offset: Float[Array, ""]
+    info: SolverInfo | None = None
 
     @property
     def dimension(self) -> int:
@@ -186,19 +185,21 @@ def _fit(K, solver, X, Y, regularization, spread):
     basis = features(K, X.shape[1], solver.count, solver.key, X.dtype)
     ridge = len(X) * regularization
     weights, residual = ridge_regression(basis, basis.columns, X, Y, ridge, spread)
-    return _field(K, basis, weights, residual, jnp.linalg.norm(residual), regularization)
+    return _field(K, basis, weights, residual, regularization)
 
 
-def _field(K, basis, weights, residual, residual_norm, regularization):
+def _field(K, basis, weights, residual, regularization, residual_norm=None):
     return FeatureField(
         kernel=K,
         features=basis,
         weights=weights,
         residual=residual,
-        residual_norm=residual_norm,
         norm=root(weights @ weights),
         regularization=regularization,
         offset=jnp.zeros((), weights.dtype),
+        info=SolverInfo(
+            "RandomFeatures", rank=jnp.asarray(len(weights)), residual_norm=residual_norm
+        ),
     )
 
 
@@ -206,7 +207,7 @@ def _checked(field: FeatureField) -> FeatureField:
     """The field, if the least squares had a solution."""
 
     def learned(f: FeatureField):
-        return f.weights, f.residual, f.residual_norm, f.norm
+        return f.weights, f.residual, f.norm
 
     failed = require.not_finite(field.weights)
     cause = singular(field.weights.dtype)
@@ -271,4 +272,4 @@ def _solved(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, _, residual_norm = streaming_sums.solve(fit.sums, ridge)
     unseen = jnp.zeros((0, fit.dimension), weights.dtype)
-    return _field(fit.kernel, fit.features, weights, unseen, residual_norm, regularization)
+    return _field(fit.kernel, fit.features, weights, unseen, regularization, residual_norm)

@@ -179,6 +179,7 @@ class _Solution(NamedTuple):
     residual: Float[Array, "N n"]
     norm: Float[Array, ""]
     truncation: Float[Array, ""]
+    residual_norm: Float[Array, ""] | None = None
 
 
 def _field(K, landmarks, solution, regularization, tolerance) -> KernelField:
@@ -200,6 +201,7 @@ def _field(K, landmarks, solution, regularization, tolerance) -> KernelField:
             landmarks=landmarks.count,
             rank=landmarks.kept.sum(),
             truncation=solution.truncation,
+            residual_norm=solution.residual_norm,
         ),
     )
 
@@ -292,10 +294,11 @@ def _added(fit, X, Y, spread):
 @eqx.filter_jit
 def _solved(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
-    weights, norm, _ = streaming_sums.solve(fit.sums, ridge)
+    weights, norm, residual_norm = streaming_sums.solve(fit.sums, ridge)
     return _Solution(
         coefficients=weights.reshape(fit.landmarks.points.shape),
         residual=jnp.zeros((0, fit.dimension), weights.dtype),
         norm=norm,
         truncation=truncated(fit.trace, streaming_sums.trace(fit.sums), ridge),
+        residual_norm=residual_norm,
     )

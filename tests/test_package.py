@@ -19,7 +19,7 @@ PACKAGE = Path(hk.__file__).parent
 # belongs to the room with the longest name that it starts with.
 ROOMS = [
     {"_require"},
-    {"_devices", "_memory", "_show", "_trained"},
+    {"_callable", "_devices", "_memory", "_show", "_trained"},
     {"_scalar"},
     {"_structured"},
     {"_check", "_features", "_gram"},

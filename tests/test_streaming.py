@@ -71,6 +71,7 @@ def test_a_fit_to_chunks_is_the_fit_to_all(name):
     assert streamed.info.solver == "Nystrom"
     assert streamed.info.rank == whole.info.rank
     assert streamed.residual.shape == (0, 2)
+    np.testing.assert_allclose(streamed.residual_norm, whole.residual_norm, rtol=1e-6)
     if name in ("symplectic", "odd"):
         x = jnp.asarray(NEW[0])
         q_slope, p_slope = jax.grad(streamed.hamiltonian)(x)

@@ -1,0 +1,105 @@
+"""Functions as PyTrees, so that JAX sees the arrays that they hold."""
+
+import functools
+import types
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from hamkernel import _require as require
+
+
+def as_pytree(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """`fn` as a PyTree; a bare function would be a leaf, which `jax.jit` refuses."""
+    if not jax.tree_util.all_leaves([fn]):
+        return fn
+    if isinstance(fn, functools.partial):
+        return Bound(fn)
+    if isinstance(fn, types.FunctionType) and _holds_traced(fn):
+        return Closure(fn)
+    return jax.tree_util.Partial(fn)
+
+
+class Bound(eqx.Module):
+    """A `functools.partial` whose arrays are leaves; what else it binds is static."""
+
+    func: Callable[..., Any]
+    arrays: tuple[Array | None, ...]
+    static: tuple[Any, ...] = eqx.field(static=True)
+    structure: Any = eqx.field(static=True)
+
+    def __init__(self, partial: "functools.partial[Any]"):
+        leaves, self.structure = jax.tree.flatten((partial.args, partial.keywords))
+        is_array = [isinstance(leaf, jax.Array | np.ndarray) for leaf in leaves]
+        pairs = list(zip(leaves, is_array, strict=True))
+        self.func = as_pytree(partial.func)
+        self.arrays = tuple(jnp.asarray(leaf) if array else None for leaf, array in pairs)
+        self.static = tuple(None if array else leaf for leaf, array in pairs)
+
+    def __call__(self, *points: Array) -> Any:
+        pairs = zip(self.arrays, self.static, strict=True)
+        leaves = [static if array is None else array for array, static in pairs]
+        args, keywords = jax.tree.unflatten(self.structure, leaves)
+        return self.func(*args, *points, **keywords)
+
+
+class Closure(eqx.Module):
+    """A function that closes over traced values, with these as leaves.
+
+    Derivatives with respect to them are then seen by rules of our own, which JAX does not allow to
+    depend on what is not among their arguments.
+    """
+
+    func: Any = eqx.field(static=True)  # with nothing in the cells of `traced`
+    traced: dict[int, Any]
+
+    def __init__(self, fn: types.FunctionType):
+        cells = list(fn.__closure__ or ())
+        values = {i: _content(cell) for i, cell in enumerate(cells)}
+        self.traced = {
+            i: as_pytree(value) if callable(value) else value
+            for i, value in values.items()
+            if _holds_traced(value)
+        }
+        kept = [types.CellType() if i in self.traced else cell for i, cell in enumerate(cells)]
+        self.func = _with_cells(fn, kept)
+
+    def __call__(self, *points: Array) -> Any:
+        cells: list[types.CellType] = list(self.func.__closure__ or ())
+        for i, value in self.traced.items():
+            cells[i] = types.CellType(value)
+        return _with_cells(self.func, cells)(*points)
+
+
+def _holds_traced(value: Any, outer: tuple[Any, ...] = ()) -> bool:
+    """Whether a PyTree has traced leaves, or a function closes over such a PyTree or function.
+
+    A function that closes over itself cannot be taken apart, and does not count.
+    """
+    if not isinstance(value, types.FunctionType):
+        return not require.is_concrete(value)
+    inner = (*outer, value)
+    contents = [_content(cell) for cell in value.__closure__ or ()]
+    if any(content is each for content in contents for each in inner):
+        return False
+    return any(_holds_traced(content, inner) for content in contents)
+
+
+def _content(cell: types.CellType) -> Any:
+    try:
+        return cell.cell_contents
+    except ValueError:  # nothing yet
+        return None
+
+
+def _with_cells(fn: types.FunctionType, cells: list[types.CellType]) -> types.FunctionType:
+    new = types.FunctionType(
+        fn.__code__, fn.__globals__, fn.__name__, fn.__defaults__, tuple(cells)
+    )
+    new.__kwdefaults__ = fn.__kwdefaults__
+    return new
