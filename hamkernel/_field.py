@@ -5,7 +5,6 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
@@ -107,9 +106,9 @@ class AbstractField(eqx.Module):
         Raises:
             AttributeError: the structure has no potential (with the reason).
         """
+        if self.kernel.no_potential:
+            raise AttributeError(self.kernel.no_potential)
         # A lambda, because JAX would compare the bound method, and so its traced arrays.
-        state = jnp.zeros(self.dimension, self.offset.dtype)
-        jax.eval_shape(lambda x: self.unanchored_potential(x), state)
         return lambda x: self.unanchored_potential(x) + self.offset
 
     @property

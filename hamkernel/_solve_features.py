@@ -68,9 +68,9 @@ class FeatureField(AbstractField):
         return as_given(spread, _evaluate(self, split(spread, X), spread))
 
     def unanchored_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+        if self.kernel.no_potential:
+            raise AttributeError(self.kernel.no_potential)
         x = self._state(x)
-        # The kernel knows whether its fields have a potential, and says why not.
-        jax.eval_shape(self.kernel.potential, x, x[None], x[None])
         return _potential_at(self.features, x, self.weights)
 
     def _term(self, kernel: Sum, which: int | str) -> "FeatureField":

@@ -19,6 +19,7 @@ class AbstractMatrixKernel(eqx.Module):
 
     matrix_valued: ClassVar[bool] = True
     symplectic: eqx.AbstractVar[bool]
+    no_potential: eqx.AbstractVar[str | None]  # why its fields have none; None if they have one
 
     def __repr__(self) -> str:
         return described(self)
@@ -56,7 +57,7 @@ class AbstractMatrixKernel(eqx.Module):
     def potential(
         self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
     ) -> Float[Array, ""]:
-        """The potential of `expansion`; AttributeError, with the reason, if there is none."""
+        """The potential of `expansion`; AttributeError with `no_potential` if there is none."""
 
     def check_dimension(self, n: int) -> None:
         """ValueError if fields on ℝⁿ cannot have this structure; by default all can."""
@@ -136,15 +137,20 @@ class Sum(AbstractMatrixKernel):
     def potential(
         self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
     ) -> Float[Array, ""]:
-        structures = list(self._structures())
-        if len(set(structures)) > 1:
-            raise AttributeError(
-                "the sum of structures "
-                + " + ".join(each.__name__ for each in structures)
-                + " has no single potential. Ask one part for its own: field.part(0).potential(x)."
-            )
+        if self.no_potential:
+            raise AttributeError(self.no_potential)
         first, *rest = (K.potential(x, Z, A) for K in self.terms)
         return sum(rest, start=first)
+
+    @property
+    def no_potential(self) -> str | None:
+        structures = list(self._structures())
+        if len(set(structures)) == 1:
+            return self.terms[0].no_potential
+        return (
+            f"the sum of structures {' + '.join(each.__name__ for each in structures)} has no "
+            "single potential. Ask one part for its own: field.part(0).potential(x)."
+        )
 
     def _structures(self) -> Iterator[type]:
         """Of all terms, those of named sums among them too."""

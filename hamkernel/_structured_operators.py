@@ -35,6 +35,10 @@ class Separable(AbstractMatrixKernel):
 
     kernel: AbstractScalarKernel
     symplectic: ClassVar[bool] = False
+    no_potential: ClassVar[str | None] = (
+        "a field of a Separable kernel has no potential: its components are independent. "
+        "Use Symplectic or CurlFree to learn one."
+    )
 
     def __init__(self, kernel: Any):
         self.kernel = as_scalar_kernel(kernel)
@@ -48,10 +52,7 @@ class Separable(AbstractMatrixKernel):
         return _row(self.kernel, x, Z) @ A
 
     def potential(self, x: Array, Z: Array, A: Array) -> Float[Array, ""]:
-        raise AttributeError(
-            "a field of a Separable kernel has no potential: its components are independent. "
-            "Use Symplectic or CurlFree to learn one."
-        )
+        raise AttributeError(self.no_potential)
 
     def with_parity(self, parity: int) -> "Separable":
         return Separable(with_parity(self.kernel, parity))  # the field IS the scalar function
@@ -68,6 +69,7 @@ class AbstractPotentialKernel(AbstractMatrixKernel):
     """
 
     kernel: eqx.AbstractVar[AbstractScalarKernel]
+    no_potential: ClassVar[str | None] = None
 
     @abc.abstractmethod
     def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
@@ -165,6 +167,10 @@ class DivergenceFree(AbstractMatrixKernel):
 
     kernel: AbstractScalarKernel
     symplectic: ClassVar[bool] = False
+    no_potential: ClassVar[str | None] = (
+        "a field of a DivergenceFree kernel has a matrix potential, not a scalar one. In the plane "
+        "use Symplectic(k), the same kernel, whose potential is the stream function."
+    )
 
     def __init__(self, kernel: Any):
         self.kernel = as_scalar_kernel(kernel)
@@ -193,11 +199,7 @@ class DivergenceFree(AbstractMatrixKernel):
         return jax.vmap(term)(basis).sum(axis=0)
 
     def potential(self, x: Array, Z: Array, A: Array) -> Float[Array, ""]:
-        raise AttributeError(
-            "a field of a DivergenceFree kernel has a matrix potential, not a scalar one. "
-            "In the plane use Symplectic(k), the same kernel, whose potential is the "
-            "stream function."
-        )
+        raise AttributeError(self.no_potential)
 
     def check_dimension(self, n: int) -> None:
         if n < 2:
