@@ -30,7 +30,7 @@ class AbstractField(eqx.Module):
     norm: eqx.AbstractVar[Float[Array, ""]]
     regularization: eqx.AbstractVar[Float[Array, ""]]
     offset: eqx.AbstractVar[Float[Array, ""]]
-    info: eqx.AbstractVar["SolverInfo | None"]
+    info: eqx.AbstractVar["SolverInfo"]
 
     def __repr__(self) -> str:
         return described(self)
@@ -51,7 +51,7 @@ class AbstractField(eqx.Module):
     @property
     def residual_norm(self) -> Float[Array, ""]:
         """‖y − f(X)‖ over all the training data, that of a stream too, whose residual is gone."""
-        kept = None if self.info is None else self.info.residual_norm
+        kept = self.info.residual_norm
         return jnp.linalg.norm(self.residual) if kept is None else kept
 
     @abc.abstractmethod
@@ -218,7 +218,7 @@ class KernelField(AbstractField):
     norm: Float[Array, ""]
     regularization: Float[Array, ""]
     offset: Float[Array, ""]
-    info: SolverInfo | None = None
+    info: SolverInfo = SolverInfo("none")
 
     @property
     def dimension(self) -> int:

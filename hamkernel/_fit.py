@@ -20,6 +20,7 @@ def fit(
     regularization: ArrayLike = 1e-4,
     *,
     solver: AbstractSolver | None = None,
+    throw: bool = True,
 ) -> AbstractField:
     """Learn the field f in the RKHS of K that minimises (1/N) Σᵢ‖f(xᵢ) − yᵢ‖² + λ‖f‖².
 
@@ -36,6 +37,9 @@ def fit(
             which it was. `Nystrom()` is faster, and approximate to a stated tolerance. Where the
             rows of X are spread over a mesh of devices they stay there, with every solver but
             `Cholesky()`, and None is `ConjugateGradient()`.
+        throw: whether a solve that fails raises. If not, what is learned is NaN, `field.norm` among
+            it: for `jax.vmap` over many hyperparameters, where one failure would end them all, and
+            for objectives of your own in `tune`, which steps back from NaN.
 
     Returns:
         The learned field. Works under jit, vmap and grad, with respect to every argument; new
@@ -63,4 +67,4 @@ def fit(
             "jax.config.update('jax_enable_x64', True) first and pass float64 data.",
             stacklevel=2,
         )
-    return chosen(solver, X).fit(K, X, Y, regularization)
+    return chosen(solver, X).fit(K, X, Y, regularization, throw)

@@ -39,14 +39,19 @@ def value(
     bad: Bool[ArrayLike, "..."],
     message: str | Callable[[], str],
     error: type[Exception] = ValueError,
+    throw: bool = True,
 ) -> Any:
     """Return `x`, or fail where `bad` holds: `error` on concrete values, at run time under jit.
+
+    If not `throw`, `x` is NaN there.
 
     `x` is an array or a PyTree of them: everything that would be wrong, for under jit a check is
     dropped together with the value it hangs on.
     Computed with `on_host`, `bad` is known wherever it can be, also for constants under jit.
     """
     bad = bad.any()  # type: ignore[union-attr]
+    if not throw:
+        return jax.tree.map(lambda a: jnp.where(bad, jnp.full_like(a, jnp.nan), a), x)
     if not is_concrete(bad):
         return eqx.error_if(x, bad, message if isinstance(message, str) else message())
     if bad:

@@ -25,8 +25,9 @@ class AbstractSolver(eqx.Module):
         X: Float[Array, "N n"],
         Y: Float[Array, "N n"],
         regularization: Float[Array, ""],
+        throw: bool = True,
     ) -> AbstractField:
-        """The field for data that has been checked."""
+        """The field for data that has been checked; of NaN if it fails and does not `throw`."""
 
 
 # ‖y − (G + NλI)a‖/‖y‖ up to which a factorisation counts as a solution. The fitted values were
@@ -47,6 +48,7 @@ class Cholesky(AbstractSolver):
         X: Float[Array, "N n"],
         Y: Float[Array, "N n"],
         regularization: Float[Array, ""],
+        throw: bool = True,
     ) -> KernelField:
         A, residual, norm, left = _representer(K, X, Y, regularization)
 
@@ -65,7 +67,8 @@ class Cholesky(AbstractSolver):
             )
 
         failed = ~(require.on_host(left) <= _SOLVED)
-        A, residual, norm = require.value((A, residual, norm), failed, message, RuntimeError)
+        learned = A, residual, norm
+        A, residual, norm = require.value(learned, failed, message, RuntimeError, throw)
         return KernelField(
             kernel=K,
             points=X,

@@ -75,6 +75,7 @@ class ConjugateGradient(AbstractSolver):
         X: Float[Array, "N n"],
         Y: Float[Array, "N n"],
         regularization: Float[Array, ""],
+        throw: bool = True,
     ) -> KernelField:
         landmarks = self.preconditioner.landmarks(K, X, regularization)
         ridge = len(X) * regularization
@@ -104,7 +105,7 @@ class ConjugateGradient(AbstractSolver):
             )
 
         failed = ~(left <= self.tolerance) | (landmarks.count == 0)
-        C, values = require.value((C, values), failed, message, RuntimeError)
+        C, values = require.value((C, values), failed, message, RuntimeError, throw)
         return KernelField(
             kernel=K,
             points=X,

@@ -54,7 +54,7 @@ class FeatureField(AbstractField):
     norm: Float[Array, ""]
     regularization: Float[Array, ""]
     offset: Float[Array, ""]
-    info: SolverInfo | None = None
+    info: SolverInfo
 
     @property
     def dimension(self) -> int:
@@ -151,10 +151,11 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
         X: Float[Array, "N n"],
         Y: Float[Array, "N n"],
         regularization: Float[Array, ""],
+        throw: bool = True,
     ) -> FeatureField:
         spread = rows_of(X)
         field = _fit(K, self, split(spread, X), split(spread, Y), regularization, spread)
-        field = _checked(field)
+        field = _checked(field, throw)
         if spread is None:
             return field
         residual = as_given(spread, field.residual)
@@ -203,7 +204,7 @@ def _field(K, basis, weights, residual, regularization, residual_norm=None):
     )
 
 
-def _checked(field: FeatureField) -> FeatureField:
+def _checked(field: FeatureField, throw: bool = True) -> FeatureField:
     """The field, if the least squares had a solution."""
 
     def learned(f: FeatureField):
@@ -211,7 +212,8 @@ def _checked(field: FeatureField) -> FeatureField:
 
     failed = require.not_finite(field.weights)
     cause = singular(field.weights.dtype)
-    return eqx.tree_at(learned, field, require.value(learned(field), failed, cause, RuntimeError))
+    values = require.value(learned(field), failed, cause, RuntimeError, throw)
+    return eqx.tree_at(learned, field, values)
 
 
 class FeatureFit(AbstractStreamingFit[FeatureField]):

@@ -121,13 +121,14 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         X: Float[Array, "N n"],
         Y: Float[Array, "N n"],
         regularization: Float[Array, ""],
+        throw: bool = True,
     ) -> KernelField:
         landmarks = self.landmarks(K, X, regularization)
         spread = rows_of(X)
         X, Y = split(spread, X), split(spread, Y)
         solution = _fit(K, X, Y, regularization, landmarks, spread)
         solution = solution._replace(residual=as_given(spread, solution.residual))
-        return _field(K, landmarks, solution, regularization, self.tolerance)
+        return _field(K, landmarks, solution, regularization, self.tolerance, throw)
 
     def start(
         self, K: AbstractMatrixKernel, sample: ArrayLike, regularization: ArrayLike = 1e-4
@@ -182,11 +183,11 @@ class _Solution(NamedTuple):
     residual_norm: Float[Array, ""] | None = None
 
 
-def _field(K, landmarks, solution, regularization, tolerance) -> KernelField:
+def _field(K, landmarks, solution, regularization, tolerance, throw=True) -> KernelField:
     dtype = landmarks.points.dtype
     unsolved = require.not_finite(solution.coefficients).any()
     failed = unsolved | (require.on_host(landmarks.count) == 0)
-    solution = require.value(solution, failed, singular(dtype), RuntimeError)
+    solution = require.value(solution, failed, singular(dtype), RuntimeError, throw)
     _warn_if_truncated(solution.truncation, landmarks.count, tolerance)
     return KernelField(
         kernel=K,

@@ -348,11 +348,45 @@ def test_a_kernel_that_is_not_finite_is_refused():
         hk.fit(hk.Symplectic(plain), *data(), RIDGE)
 
 
+@pytest.mark.parametrize(
+    "solver",
+    [hk.Cholesky(), hk.ConjugateGradient(), hk.Nystrom(), hk.RandomFeatures(9, jax.random.key(0))],
+    ids=lambda solver: type(solver).__name__,
+)
+def test_a_solve_that_fails_raises_or_is_nan_beside_those_of_its_batch_that_do_not(solver):
+    X, Y = data(12)
+
+    def learned(log_lengthscale, throw):
+        kernel = hk.Gaussian(1.0)
+        kernel = eqx.tree_at(lambda k: k.log_lengthscale, kernel, log_lengthscale)
+        return hk.fit(hk.Symplectic(kernel), X, Y, 1e-2, solver=solver, throw=throw)
+
+    logs = jnp.array([jnp.nan, 0.5])
+    with pytest.raises(RuntimeError):
+        learned(logs[0], throw=True)
+    with pytest.raises(RuntimeError):
+        jax.block_until_ready(jax.vmap(lambda log: learned(log, throw=True).norm)(logs))
+    alone = learned(logs[0], throw=False)
+    for values in (alone.norm, alone.residual, alone(X[0]), alone.hamiltonian(X[0])):
+        assert np.isnan(values).all()
+    norms = jax.vmap(lambda log: learned(log, throw=False).norm)(logs)
+    np.testing.assert_allclose(
+        norms, [jnp.nan, float(learned(logs[1], throw=True).norm)], rtol=1e-6
+    )
+
+
+def test_an_iteration_that_does_not_converge_is_nan_where_it_does_not_raise():
+    solver = hk.ConjugateGradient(1e-12, 2, hk.Nystrom(max_points=2))
+    field: Any = hk.fit(K, *data(30), 1e-6, solver=solver, throw=False)
+    assert np.isnan(field.norm)
+    assert field.info.relative_residual > 1e-12  # says how far it came
+
+
 # Refusals, before any work is done.
 
 
 class Forbidden(AbstractSolver):
-    def fit(self, K, X, Y, regularization):
+    def fit(self, K, X, Y, regularization, throw=True):
         raise AssertionError("the solver was called with bad input")
 
 
