@@ -1,15 +1,14 @@
 """Linear least squares whose rows are made in tiles and never stored.
 
 minimise ‖Φw − y‖² + δ‖w‖² for a tall Φ (m, r) that is never stored. The state is the triangular
-factor of [Φ y] alone: orthogonal transformations of the rows change no norm, so the factor of the
-rows seen so far, with new rows below it, has the factor of all of them (Golub & Van Loan, section
-6.5.3; Demmel et al. (2012), "tall and skinny QR"). The normal equations ΦᵀΦ would have the same
-size and half of the digits.
+factor of [Φ y] alone, below √δ [I 0] from the start: orthogonal transformations of the rows change
+no norm, so the factor of the rows seen so far, with new rows below it, has the factor of all of
+them (Golub & Van Loan, section 6.5.3; Demmel et al. (2012), "tall and skinny QR"). The normal
+equations ΦᵀΦ would have the same size and half of the digits.
 """
 
 from collections.abc import Callable
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
@@ -23,75 +22,48 @@ from hamkernel._trained import constant
 Design = Callable[[Float[Array, "t n"]], Float[Array, "t n r"]]
 
 
-class LeastSquares(eqx.Module):
-    """The rows and targets seen so far, compressed to O(r²) numbers.
-
-    Attributes:
-        factor: upper triangular factor of [Φ y], shape (r + 1, r + 1): R, Qᵀy beside it, and in
-            the corner the norm of what no w can fit.
-    """
-
-    factor: Float[Array, "k k"]
-
-    @staticmethod
-    def empty(columns: int, dtype: jnp.dtype | type) -> "LeastSquares":
-        """The state before the first row, for `columns` = r unknowns."""
-        return LeastSquares(jnp.zeros((columns + 1, columns + 1), dtype))
-
-
-@eqx.filter_jit
-def accumulate(
-    state: LeastSquares, rows: Float[Array, "m r"], targets: Float[Array, " m"]
-) -> LeastSquares:
-    """The state after some more rows; O((m + r) r²) time, O((m + r) r) memory."""
-    below = jnp.concatenate([rows, targets[:, None]], axis=1)
-    stacked = jnp.concatenate([state.factor, below])
-    return LeastSquares(jnp.linalg.qr(stacked, mode="r"))
-
-
-def _with_ridge(state: LeastSquares, ridge: Float[Array, ""]):
-    r = len(state.factor) - 1
-    below = jnp.sqrt(ridge) * jnp.eye(r, r + 1, dtype=state.factor.dtype)
-    factor = jnp.linalg.qr(jnp.concatenate([state.factor, below]), mode="r")
-    return factor[:r, :r], factor[:r, r]
-
-
-def accumulate_data(
-    state: LeastSquares,
+def triangle(
     design: Design,
+    columns: int,
     X: Float[Array, "N n"],
     Y: Float[Array, "N n"],
+    ridge: Float[Array, ""],
     spread: Rows | None = None,
-) -> LeastSquares:
-    """The state after the rows design(X) with targets Y, tile by tile, where the rows are."""
+) -> Float[Array, "r+1 r+1"]:
+    """The upper triangular factor of √ridge [I 0] above [Φ y]: R, and Qᵀy beside it.
+
+    From the start with the ridge: a QR of Φ alone, where it has fewer rows than columns, divides by
+    what rounding leaves of the dependent ones, again and again until that underflows to NaN.
+    """
     if spread is not None:
 
         def part(whole, X, Y):
-            state, design = whole
-            own = LeastSquares(jnp.zeros_like(state.factor))
-            return _with_all(spread, state, accumulate_data(own, design, X, Y))
+            design, ridge = whole
+            return _joined(spread, triangle(design, columns, X, Y, ridge / spread.count))
 
-        return on_each(spread, part, (state, design), X, Y, joined=False)
+        return on_each(spread, part, (design, ridge), X, Y, joined=False)
 
-    def step(state, tile):
+    def step(factor, tile):
         rows = design(tile[0])  # (t, n, r)
-        return accumulate(state, rows.reshape(-1, rows.shape[-1]), tile[1].reshape(-1)), None
+        below = jnp.concatenate([rows, tile[1][..., None]], axis=2).reshape(-1, columns + 1)
+        return jnp.linalg.qr(jnp.concatenate([factor, below]), mode="r"), None
 
-    return over_tiles(step, state, (X, Y), columns=len(state.factor) - 1)[0]
+    on_diagonal = jnp.append(jnp.full(columns, jnp.sqrt(ridge)), jnp.zeros((), Y.dtype))
+    return over_tiles(step, jnp.diag(on_diagonal), (X, Y), columns)[0]
 
 
-def _with_all(spread: Rows, state: LeastSquares, own: LeastSquares) -> LeastSquares:
-    """The state after the rows of each device, of which it has its `own` factor.
+def _joined(spread: Rows, own: Float[Array, "k k"]) -> Float[Array, "k k"]:
+    """The factor of the rows of all devices, of which each has its `own`.
 
     One factor after the other, so that no device holds more than two, and all get the same.
     """
 
     def join(device, factor):
         is_mine = jax.lax.axis_index(spread.axes) == device
-        theirs = spread.sum(jnp.where(is_mine, own.factor, jnp.zeros_like(factor)))
+        theirs = spread.sum(jnp.where(is_mine, own, jnp.zeros_like(own)))
         return jnp.linalg.qr(jnp.concatenate([factor, theirs]), mode="r")
 
-    return LeastSquares(jax.lax.fori_loop(0, spread.count, join, state.factor))
+    return jax.lax.fori_loop(0, spread.count, join, jnp.zeros_like(own))
 
 
 def ridge_regression(
@@ -112,15 +84,13 @@ def ridge_regression(
         columns: r.
         X: points.
         Y: targets.
-        ridge: δ ≥ 0; with δ = 0 the columns of Φ must be independent.
+        ridge: δ > 0.
         spread: the devices over which points and targets are spread, if they are.
     """
-    fixed, fixed_X, fixed_Y, fixed_ridge = constant((design, X, Y, ridge))
-    state = LeastSquares.empty(columns, X.dtype)
-    state = accumulate_data(state, fixed, fixed_X, fixed_Y, spread)
-    triangle, rotated = _with_ridge(state, fixed_ridge)
-    w = constant(solve_triangular(triangle, rotated))
-    triangle = constant(triangle)
+    fixed, *data = constant((design, X, Y, ridge))
+    R = constant(triangle(fixed, columns, *data, spread))
+    R, rotated = R[:-1, :-1], R[:-1, -1]
+    w = solve_triangular(R, rotated)
 
     # One step of iterative refinement, w + H⁻¹(Φᵀ(y − Φw) − δw) with H = ΦᵀΦ + δI = RᵀR. It equals
     # H⁻¹Φᵀy for every w, so that its derivatives are exact although w and R are held constant,
@@ -129,7 +99,7 @@ def ridge_regression(
         return ridge * v - _correlations(design, X, jnp.zeros_like(Y), v, spread)
 
     def times_inverse(_, v):
-        return solve_triangular(triangle, solve_triangular(triangle, v, trans="T"))
+        return solve_triangular(R, solve_triangular(R, v, trans="T"))
 
     slope = _correlations(design, X, Y, w, spread) - ridge * w
     w = w + jax.lax.custom_linear_solve(times_H, slope, times_inverse, symmetric=True)

@@ -17,7 +17,7 @@ import hamkernel as hk
 from hamkernel._features import features
 from hamkernel._features_spectra import spectra
 from hamkernel._solve_features import FeatureField, RandomFeatures
-from hamkernel._streaming import LeastSquares, accumulate, ridge_regression
+from hamkernel._streaming import ridge_regression, triangle
 from hamkernel.paper import datasets, experiments
 
 STRUCTURE = 1e-9  # relative; what sums of a thousand rounded terms leave of an exact zero
@@ -532,19 +532,32 @@ def test_data_and_ridge_may_change_after_the_fit(key):
     np.testing.assert_allclose(after(X[0]), expected(X[0]), atol=SOLVE)
 
 
-def test_the_accumulator_is_least_squares_in_numpy():
+def test_the_triangle_of_many_tiles_is_least_squares_in_numpy():
     rng = np.random.default_rng(0)
-    A, b = rng.normal(size=(50, 6)), rng.normal(size=50)
-    state = LeastSquares.empty(6, jnp.float64)
-    for part in np.split(np.arange(50), [2, 3, 30]):
-        state = accumulate(state, jnp.asarray(A[part]), jnp.asarray(b[part]))
-    factor = np.asarray(state.factor)
+    A, y, ridge = rng.normal(size=(3000, 6)), rng.normal(size=(3000, 1)), 10.0
+    rows = jnp.asarray(A)[:, None, :]
+    index = jnp.arange(3000)[:, None]
+    factor = np.asarray(
+        triangle(lambda X: rows[X[:, 0]], 6, index, jnp.asarray(y), jnp.asarray(ridge))
+    )
     np.testing.assert_array_equal(factor, np.triu(factor))
-    expected, square, *_ = np.linalg.lstsq(A, b)
+    below = np.concatenate([A, np.sqrt(ridge) * np.eye(6)])
+    target = np.append(y, np.zeros(6))
+    expected, square, *_ = np.linalg.lstsq(below, target)
     np.testing.assert_allclose(
         np.linalg.solve(factor[:6, :6], factor[:6, 6]), expected, atol=ROUNDING
     )
     np.testing.assert_allclose(abs(factor[6, 6]), np.sqrt(square[0]), rtol=ROUNDING)
+
+
+@pytest.mark.parametrize("repeated", [1, 40])
+def test_features_may_be_many_more_than_rows(key, repeated):
+    X, Y = (jnp.tile(each, (repeated, 1)) for each in data(N=6, n=2))
+    field = fit(hk.Symplectic(hk.Gaussian(3.0)), X, Y, 1e-5, solver=RandomFeatures(600, key))
+    rows = np.asarray(field.features(X)).reshape(X.size, -1)
+    gram = rows @ rows.T + len(X) * 1e-5 * np.eye(X.size)
+    w = rows.T @ np.linalg.solve(gram, np.asarray(Y).ravel())
+    np.testing.assert_allclose(field.weights, w, atol=SOLVE * np.abs(w).max())
 
 
 # Refusals.
