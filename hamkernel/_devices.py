@@ -63,16 +63,33 @@ def rows_of(array: Array) -> Rows | None:
     mesh = sharding.mesh
     if not isinstance(mesh, Mesh):  # an abstract one has no devices
         return None
-    types = (AxisType.Auto,) * len(mesh.axis_names)
-    rows = Rows(Mesh(np.asarray(mesh.devices), mesh.axis_names, axis_types=types), axes, sharding)
+    rows = Rows(_automatic(mesh), axes, sharding)
     return rows if rows.count > 1 else None
 
 
 def split(rows: Rows | None, array: Array) -> Array:
     """`array` spread as `rows` says, on automatic axes, which leave the rest to the compiler."""
     if rows is None:
-        return array
+        return automatic(array)
     return jax.device_put(array, NamedSharding(rows.mesh, rows.spec))
+
+
+def automatic(array: Array) -> Array:
+    """`array` where it is, on automatic axes."""
+    sharding = None if isinstance(array, Tracer) else getattr(array, "sharding", None)
+    if not isinstance(sharding, NamedSharding) or not isinstance(sharding.mesh, Mesh):
+        return array
+    mesh = _automatic(sharding.mesh)
+    return (
+        array
+        if mesh == sharding.mesh
+        else jax.device_put(array, NamedSharding(mesh, sharding.spec))
+    )
+
+
+def _automatic(mesh: Mesh) -> Mesh:
+    types = (AxisType.Auto,) * len(mesh.axis_names)
+    return Mesh(np.asarray(mesh.devices), mesh.axis_names, axis_types=types)
 
 
 def on_one_device(name: str, array: Array) -> Array:

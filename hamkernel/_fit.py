@@ -1,8 +1,5 @@
 """`fit`: from data to a learned field."""
 
-import warnings
-
-import jax.numpy as jnp
 from jaxtyping import ArrayLike, Num
 
 from hamkernel import _require as require
@@ -35,8 +32,8 @@ def fit(
         solver: if None, `Cholesky()` where its three matrices of (N n)² numbers take at most half
             of the memory, else `ConjugateGradient()`; both are exact, and `field.info.solver` says
             which it was. `Nystrom()` is faster, and approximate to a stated tolerance. Where the
-            rows of X are spread over a mesh of devices they stay there, with every solver but
-            `Cholesky()`, and None is `ConjugateGradient()`.
+            rows of X are spread over a mesh of devices they stay there, and None is
+            `ConjugateGradient()`; only `Cholesky()` gathers them on one device.
         throw: whether a solve that fails raises. If not, what is learned is NaN, `field.norm` among
             it: for `jax.vmap` over many hyperparameters, where one failure would end them all, and
             for objectives of your own in `tune`, which steps back from NaN.
@@ -60,11 +57,5 @@ def fit(
     X, Y = require.data(X, Y)
     K.check_dimension(X.shape[1])
     regularization = require.ridge(regularization).astype(X.dtype)
-    if X.dtype == jnp.float32:
-        warnings.warn(
-            "fitting in float32: expect three digits, and a failed factorisation for a ridge "
-            "below about 1e-6 of the Gram. For float64 run "
-            "jax.config.update('jax_enable_x64', True) first and pass float64 data.",
-            stacklevel=2,
-        )
+    require.warn_of_float32(X, stacklevel=3)
     return chosen(solver, X).fit(K, X, Y, regularization, throw)

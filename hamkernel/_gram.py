@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
+from hamkernel._devices import automatic
 from hamkernel._memory import refuse_beyond_memory
 from hamkernel._scalar import Invariance
 from hamkernel._structured import AbstractMatrixKernel
@@ -37,6 +38,7 @@ def gram(
     X = require.points(X, "X")
     X, Z = require.same_space(X, X if Z is None else require.points(Z, "Z"))
     K.check_dimension(X.shape[1])
+    X, Z = automatic(X), automatic(Z)
     cure = "hk.gram_operator(K, X, Z) multiplies with it and never forms it."
     refuse_beyond_memory("the Gram", X.size, Z.size, X.dtype, 1, cure)
     return _compiled_gram(K, X, Z)

@@ -80,13 +80,17 @@ class GramOperator(lx.AbstractLinearOperator):
         return self.X if self.Z is None else self.Z
 
     def mv(self, vector: Float[Array, "M n"]) -> Float[Array, "N n"]:
-        """G a, shape (N, n)."""
+        """G a, shape (N, n).
+
+        Raises:
+            ValueError: the vector is not of shape (M, n). TypeError: it is complex.
+        """
         if jnp.shape(vector) != self.columns.shape:
             raise ValueError(
                 f"the vector has shape {jnp.shape(vector)}; one coefficient for each column of "
                 f"the Gram, shape {self.columns.shape}, is needed."
             )
-        vector = split(self.Z_rows, jnp.asarray(vector))
+        vector = split(self.Z_rows, require.floating(vector, "the vector"))
         spread = self.X_rows, self.Z_rows
         product = _compiled_product(self.kernel, self.X, self.columns, vector, *spread)
         return as_given(self.X_rows, product)

@@ -6,6 +6,7 @@ by NumPy when they are concrete, for it compiles nothing; under `jax.jit` the sa
 """
 
 import reprlib
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -78,6 +79,17 @@ def floating(x: ArrayLike, name: str) -> Array:
         f"{name} has dtype {array.dtype}; real numbers are needed. "
         f"Pass floats or integers (for complex data, stack real and imaginary parts)."
     )
+
+
+def warn_of_float32(X: Array, stacklevel: int) -> None:
+    """Say what a fit in float32 may be expected to do."""
+    if X.dtype == jnp.float32:
+        warnings.warn(
+            "fitting in float32: expect three digits, and a failed factorisation for a ridge "
+            "below about 1e-6 of the Gram. For float64 run "
+            "jax.config.update('jax_enable_x64', True) first and pass float64 data.",
+            stacklevel=stacklevel,
+        )
 
 
 def positive(x: ArrayLike, name: str, cure: str = "") -> Array:

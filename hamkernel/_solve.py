@@ -9,6 +9,7 @@ import lineax as lx
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
+from hamkernel._devices import on_one_device
 from hamkernel._field import AbstractField, KernelField, SolverInfo
 from hamkernel._gram import assemble
 from hamkernel._gram_operator import product
@@ -50,6 +51,7 @@ class Cholesky(AbstractSolver):
         regularization: Float[Array, ""],
         throw: bool = True,
     ) -> KernelField:
+        X, Y = on_one_device("X", X), on_one_device("Y", Y)
         A, residual, norm, left = _representer(K, X, Y, regularization)
 
         def message() -> str:

@@ -23,7 +23,7 @@ from hamkernel._devices import as_given, rows_of, split
 from hamkernel._field import KernelField, SolverInfo
 from hamkernel._gram_operator import product
 from hamkernel._solve import AbstractSolver, relative, root
-from hamkernel._solve_low_rank import factor, normal_sums, truncated, whitening
+from hamkernel._solve_low_rank import INDEFINITE, factor, normal_sums, truncated, whitening
 from hamkernel._solve_nystrom import Nystrom
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._trained import constant
@@ -106,6 +106,8 @@ class ConjugateGradient(AbstractSolver):
 
         failed = ~(left <= self.tolerance) | (landmarks.count == 0)
         C, values = require.value((C, values), failed, message, RuntimeError, throw)
+        larger = require.not_finite(truncation)
+        C, values = require.value((C, values), larger, INDEFINITE, RuntimeError, throw)
         return KernelField(
             kernel=K,
             points=X,

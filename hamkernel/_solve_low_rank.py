@@ -93,8 +93,19 @@ def factor(square: Float[Array, "r r"], ridge: Float[Array, ""]) -> Float[Array,
 def truncated(
     trace: Float[Array, ""], covered: Float[Array, ""], ridge: Float[Array, ""]
 ) -> Float[Array, ""]:
-    """trace(G − Ĝ)/ridge from trace G and trace Ĝ; rounding may not make it negative."""
-    return jnp.maximum(trace - covered, jnp.zeros_like(trace)) / ridge
+    """trace(G − Ĝ)/ridge from trace G and trace Ĝ; NaN if Ĝ is larger than G.
+
+    Of a positive definite kernel it is not, but for rounding, of 1e-16 where it was measured; of
+    kernels that are not it was by 4 per cent and more.
+    """
+    left = jnp.where(covered - trace > 1e-3 * jnp.abs(trace), jnp.nan, trace - covered)
+    return jnp.maximum(left, jnp.zeros_like(left)) / ridge
+
+
+INDEFINITE = (
+    "the low-rank Gram of the landmarks is larger than the Gram itself, so the kernel is not "
+    "positive definite: hk.check_kernel(k, X) tells."
+)
 
 
 def singular(dtype: jnp.dtype) -> str:

@@ -29,6 +29,7 @@ from hamkernel._gram_operator import product
 from hamkernel._solve import root
 from hamkernel._solve_landmarks import Landmarks, choose_landmarks, given_landmarks
 from hamkernel._solve_low_rank import (
+    INDEFINITE,
     Columns,
     factor,
     normal_sums,
@@ -188,6 +189,8 @@ def _field(K, landmarks, solution, regularization, tolerance, throw=True) -> Ker
     unsolved = require.not_finite(solution.coefficients).any()
     failed = unsolved | (require.on_host(landmarks.count) == 0)
     solution = require.value(solution, failed, singular(dtype), RuntimeError, throw)
+    larger = require.not_finite(solution.truncation)
+    solution = require.value(solution, larger, INDEFINITE, RuntimeError, throw)
     _warn_if_truncated(solution.truncation, landmarks.count, tolerance)
     return KernelField(
         kernel=K,

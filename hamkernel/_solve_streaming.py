@@ -5,12 +5,15 @@ changes them, and any λ is solved for from them.
 """
 
 import abc
-from collections.abc import Iterable
+import contextlib
+import reprlib
+from collections.abc import Iterable, Iterator
 from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from hamkernel import _require as require
@@ -61,13 +64,17 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
             Y: measured velocities, shape (N, n).
 
         Raises:
-            ValueError: a shape does not fit, or the data is not finite. TypeError: its dtype.
+            ValueError: a shape does not fit, or the data is not finite. TypeError: its dtype, or
+                it has more digits than the fit.
         """
         X, Y = require.data(X, Y)
-        if X.shape[1] != self.dimension:
-            raise ValueError(
-                f"the chunk has {X.shape[1]} coordinates and the fit {self.dimension}."
+        if np.promote_types(X.dtype, self.dtype) != self.dtype:
+            raise TypeError(
+                f"the data is {X.dtype} and the fit {self.dtype}, the dtype of the sample that it "
+                f"was started with: start it with a sample in {X.dtype}, or cast the data."
             )
+        if X.shape[1] != self.dimension:
+            raise ValueError(f"the data has {X.shape[1]} coordinates and the fit {self.dimension}.")
         return self._added(X.astype(self.dtype), Y.astype(self.dtype))
 
     def field(self, regularization: ArrayLike = 1e-4) -> Learned:
@@ -123,16 +130,30 @@ class AbstractStreamingSolver(AbstractSolver, Generic[Learned]):
         from tqdm import tqdm  # so that importing the package does not load it
 
         model = None
-        for X, Y in tqdm(chunks, "chunks", disable=None if progress else True):
-            X, Y = require.data(X, Y)
+        for i, chunk in enumerate(tqdm(chunks, "chunks", disable=None if progress else True)):
+            with _naming(i):
+                if not isinstance(chunk, tuple | list) or len(chunk) != 2:
+                    raise TypeError(f"a pair (X, Y) is needed, got {reprlib.repr(chunk)}.")
+                X, Y = require.data(*chunk)
             if model is None:
                 model = self.start(K, X if sample is None else sample, regularization)
             # The next chunk is read while this one is added, and no further ones pile up.
             jax.block_until_ready(model)
-            model = model.add(X, Y)
+            with _naming(i):
+                model = model.add(X, Y)
         if model is None:
             raise ValueError("fit_chunks needs at least one chunk (X, Y); the iterator was empty.")
         return model.field(regularization)
+
+
+@contextlib.contextmanager
+def _naming(chunk: int) -> Iterator[None]:
+    """Errors say in which chunk they are."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        kind = TypeError if isinstance(error, TypeError) else ValueError
+        raise kind(f"chunk {chunk}, counted from 0: {error}") from error
 
 
 def checked_start(
@@ -142,6 +163,7 @@ def checked_start(
     K = matrix_kernel(K)
     sample = require.finite(require.points(sample, "sample"), "sample")
     K.check_dimension(sample.shape[1])
+    require.warn_of_float32(sample, stacklevel=4)
     return K, sample, require.ridge(regularization).astype(sample.dtype)
 
 

@@ -87,8 +87,8 @@ def ridge_regression(
         ridge: δ > 0.
         spread: the devices over which points and targets are spread, if they are.
     """
-    fixed, *data = constant((design, X, Y, ridge))
-    R = constant(triangle(fixed, columns, *data, spread))
+    fixed, fixed_X, fixed_Y, fixed_ridge = constant((design, X, Y, ridge))
+    R = constant(triangle(fixed, columns, fixed_X, fixed_Y, fixed_ridge, spread))
     R, rotated = R[:-1, :-1], R[:-1, -1]
     w = solve_triangular(R, rotated)
 

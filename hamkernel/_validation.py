@@ -26,6 +26,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from hamkernel import _require as require
+from hamkernel._devices import on_one_device
 from hamkernel._folds import Folds, Partition
 from hamkernel._gram import assemble, matrix_kernel
 from hamkernel._inverse import inverse
@@ -153,6 +154,8 @@ def log_marginal_likelihood(
 def _checked(K, X, Y, regularization):
     K = matrix_kernel(K)
     X, Y = require.data(X, Y)
+    # LAPACK on every device at once was seen to stall, see `_inverse.py`.
+    X, Y = on_one_device("X", X), on_one_device("Y", Y)
     K.check_dimension(X.shape[1])
     regularization = require.ridge(regularization)
     check_memory(X, LOSS_COPIES)

@@ -2,7 +2,7 @@
 
 On the devices of one machine:
 
-    mesh = jax.make_mesh((jax.device_count(),), ("data",))
+    mesh = jax.make_mesh((jax.device_count(),), ("data",), axis_types=(AxisType.Auto,))
     rows = NamedSharding(mesh, PartitionSpec("data"))
     X, Y = jax.device_put((X, Y), rows)
     field = hk.fit(K, X, Y, 1e-4, solver=hk.Nystrom())
@@ -10,7 +10,7 @@ On the devices of one machine:
 On many machines, each with a part of the data, all of them run
 
     jax.distributed.initialize()
-    mesh = jax.make_mesh((jax.device_count(),), ("data",))
+    mesh = jax.make_mesh((jax.device_count(),), ("data",), axis_types=(AxisType.Auto,))
     rows = NamedSharding(mesh, PartitionSpec("data"))
     X = jax.make_array_from_process_local_data(rows, X_here)
     Y = jax.make_array_from_process_local_data(rows, Y_here)
@@ -261,6 +261,33 @@ print(json.dumps({
 @pytest.fixture(scope="module")
 def slow():
     return on_eight(SLOW)
+
+
+DENSE = """
+one = (
+    hk.gram(K, X), hk.cross_validation_loss(K, X, Y, 1e-4, 5),
+    hk.log_marginal_likelihood(K, X, Y, 1e-4), hk.fit(K, X, Y, 1e-4).coefficients,
+)
+result = {}
+for kind in (AxisType.Auto, AxisType.Explicit):
+    for spec in (P("data"), P()):
+        XS, YS = jax.device_put((X, Y), NamedSharding(mesh(8, kind=kind), spec))
+        many = (
+            hk.gram(K, XS), hk.cross_validation_loss(K, XS, YS, 1e-4, 5),
+            hk.log_marginal_likelihood(K, XS, YS, 1e-4),
+            hk.fit(K, XS, YS, 1e-4, solver=hk.Cholesky()).coefficients,
+        )
+        result[f"{kind} {spec}"] = max(map(off, many, one))
+        iterated = hk.fit(K, XS, YS, 1e-4, solver=iterative).evaluate(new)
+        result[f"{kind} {spec} CG"] = off(iterated, hk.fit(K, X, Y, 1e-4).evaluate(new)) * 1e-3
+print(json.dumps(result))
+"""
+
+
+def test_what_is_dense_is_gathered_on_one_device():
+    result = on_eight(DENSE)
+    assert len(result) == 8
+    assert max(result.values()) < ORDER, result
 
 
 TUNED = """

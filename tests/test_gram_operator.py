@@ -218,3 +218,5 @@ def test_what_does_not_fit_is_refused():
         gram_operator(K, normal((3, 3)))
     with pytest.raises(ValueError, match=r"vector has shape \(4, 2\)"):
         gram_operator(K, normal((3, 2))).mv(jnp.ones((4, 2)))
+    with pytest.raises(TypeError, match="complex128; real numbers"):
+        gram_operator(K, normal((3, 2))).mv(jnp.ones((3, 2), complex))

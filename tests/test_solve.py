@@ -252,6 +252,19 @@ def test_landmarks_precondition():
     assert counts[0] <= 15 < 2 * counts[0] < counts[1]
 
 
+@pytest.mark.parametrize("structure", [hk.Symplectic, hk.Separable])
+@pytest.mark.parametrize(
+    "kernel", [lambda x, z: jnp.tanh(x @ z - 1.0), lambda x, z: jnp.tanh(0.1 * x @ z + 1.0)]
+)
+@pytest.mark.parametrize("solver", [Nystrom(), ConjugateGradient(1e-6)], ids=["low rank", "CG"])
+def test_a_low_rank_gram_that_is_larger_than_the_gram_is_refused(structure, kernel, solver):
+    X, Y = swings(40)
+    assert np.linalg.eigvalsh(dense(structure(kernel), X)).min() < -0.1
+    with pytest.raises(RuntimeError, match=r"not positive definite|did not converge") as refused:
+        hk.fit(structure(kernel), X, Y, 1e-3, solver=solver)
+    assert "check_kernel" in str(refused.value)
+
+
 def test_conjugate_gradients_that_do_not_converge_say_so():
     X, Y = swings(150)
     solver = ConjugateGradient(1e-12, max_iterations=2, preconditioner=Nystrom(1e5, 1))

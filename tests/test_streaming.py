@@ -230,7 +230,7 @@ def test_what_makes_no_sense_is_refused():
         solver.fit_chunks(K, [])
     with pytest.raises(ValueError, match="no data yet"):
         solver.start(K, X).field()
-    with pytest.raises(ValueError, match="the chunk has 4 coordinates and the fit 2"):
+    with pytest.raises(ValueError, match="the data has 4 coordinates and the fit 2"):
         solver.start(K, X).add(*swings(10, n=4))
     with pytest.raises(ValueError, match="the landmarks have 2 coordinates and X 4"):
         fit(K, *swings(10, n=4), RIDGE, solver=solver)
@@ -245,6 +245,26 @@ def test_what_makes_no_sense_is_refused():
     indefinite = hk.CurlFree(lambda x, z: -jnp.exp(x @ z))
     with pytest.raises(RuntimeError, match="check_kernel"):
         solver.start(indefinite, X).add(X[:200], Y[:200]).field(RIDGE)
+
+
+def test_an_error_in_a_stream_says_in_which_chunk_it_is():
+    good, hole = (X[:9], Y[:9]), (X[:9], np.where(np.arange(9)[:, None] == 7, np.nan, Y[:9]))
+    with pytest.raises(ValueError, match="chunk 2, counted from 0: Y contains NaN or inf in row 7"):
+        given(S).fit_chunks(K, [good, good, hole])
+    with pytest.raises(ValueError, match=r"chunk 1, .* the data has 4 coordinates"):
+        given(S).fit_chunks(K, [good, swings(10, n=4)])
+    with pytest.raises(TypeError, match=r"chunk 0, .* a pair \(X, Y\) is needed"):
+        given(S).fit_chunks(K, (X, Y))  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("solver", [given(S), hk.RandomFeatures(9, jax.random.key(0))])
+def test_a_stream_in_float32_warns_and_takes_no_data_with_more_digits(solver):
+    few = X[:20].astype(np.float32), Y[:20].astype(np.float32)
+    with pytest.warns(UserWarning, match="fitting in float32"):
+        model = solver.start(K, few[0], 1e-2)
+    assert model.add(*few).field(1e-2).norm.dtype == jnp.float32
+    with pytest.raises(TypeError, match="the data is float64 and the fit float32"):
+        model.add(X[:20], Y[:20])
 
 
 # Memory.
