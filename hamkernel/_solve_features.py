@@ -13,6 +13,7 @@ from hamkernel import _streaming_sums as streaming_sums
 from hamkernel._devices import as_given, on_each, rows_of, split
 from hamkernel._features import AbstractFeatures, SumFeatures, features
 from hamkernel._field import AbstractField, SolverInfo
+from hamkernel._memory import refuse_beyond_memory
 from hamkernel._solve import root
 from hamkernel._solve_low_rank import singular
 from hamkernel._solve_streaming import (
@@ -124,7 +125,8 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
         key: the random key, `jax.random.key(0)`. The same key draws the same features.
 
     Raises:
-        ValueError: count is not positive. TypeError: count is no integer, or key is no key.
+        ValueError: count is not positive, or, from `fit`, so large that its matrices do not fit in
+            memory. TypeError: count is no integer, or key is no key.
 
     Source: Rahimi & Recht (2007).
     """
@@ -153,6 +155,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
         regularization: Float[Array, ""],
         throw: bool = True,
     ) -> FeatureField:
+        self._check_memory(X.dtype)
         spread = rows_of(X)
         field = _fit(K, self, split(spread, X), split(spread, Y), regularization, spread)
         field = _checked(field, throw)
@@ -160,6 +163,11 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
             return field
         residual = as_given(spread, field.residual)
         return eqx.tree_at(lambda f: f.residual, field, residual)
+
+    def _check_memory(self, dtype: jnp.dtype) -> None:
+        # There are as many columns as frequencies at least.
+        what, cure = f"a fit with count = {self.count}", "Take fewer features."
+        refuse_beyond_memory(what, self.count, self.count, dtype, _COPIES, cure)
 
     def start(
         self, K: AbstractMatrixKernel, sample: ArrayLike, regularization: ArrayLike = 1e-4
@@ -177,8 +185,12 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
                 the structure, the sample is not finite, or λ is not positive.
         """
         K, sample, regularization = checked_start(K, sample, regularization)
+        self._check_memory(sample.dtype)
         basis = features(K, sample.shape[1], self.count, self.key, sample.dtype)
         return _start(K, basis, thinned(sample, _SAMPLE), regularization)
+
+
+_COPIES = 8  # r² numbers that a fit holds: the triangle, the tile of 3r rows below it, their QR
 
 
 @eqx.filter_jit

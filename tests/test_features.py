@@ -563,6 +563,16 @@ def test_features_may_be_many_more_than_rows(key, repeated):
 # Refusals.
 
 
+def test_features_that_do_not_fit_in_memory_are_refused():
+    X, Y = data(n=2)
+    solver = RandomFeatures(10**7, jax.random.key(0))
+    for ask in (lambda K: fit(K, X, Y, solver=solver), lambda K: solver.start(K, X)):
+        with pytest.raises(
+            ValueError, match=r"count = 10000000 needs 6\.4e\+06 GB.*fewer features"
+        ):
+            ask(hk.Symplectic(hk.Gaussian(1.0)))
+
+
 @pytest.mark.parametrize(
     ("k", "what"),
     [
