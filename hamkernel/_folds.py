@@ -15,8 +15,8 @@ class Partition:
     """N points in F folds: what `folds` means, as a static argument of compiled functions.
 
     Attributes:
-        members: the points of each fold, shape (F, S); the rows of smaller folds end in N,
-            which is no point.
+        folds: the points of each of the F folds.
+        groups: the folds again, those of similar size together.
         weights: 1 / (F |fold of i|) for each point, so that `weights @ squares` is the mean over
             folds of the mean over points, shape (N,).
     """
@@ -29,10 +29,14 @@ class Partition:
                 f"cross-validation needs at least two folds, and these {N} points are in one. "
                 "Give each point the label of its trajectory, a number of folds, or 'loo'."
             )
-        self.members = np.full((len(names), sizes.max()), N)
-        for row, name, size in zip(self.members, names, sizes, strict=True):
-            row[:size] = np.flatnonzero(self.labels == name)
+        self.folds = np.split(np.argsort(index, kind="stable"), np.cumsum(sizes)[:-1])
         self.weights = 1.0 / (len(names) * sizes[index])
+        # Within a factor of two of the largest of them: the padding never doubles the points.
+        octave = np.floor(np.log2(sizes.max() / sizes)).astype(int)
+        self.groups = [
+            Group(N, [self.folds[i] for i in np.flatnonzero(octave == each)])
+            for each in np.unique(octave)
+        ]
 
     def __hash__(self) -> int:
         return hash(self.labels.tobytes())
@@ -40,28 +44,47 @@ class Partition:
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Partition) and np.array_equal(self.labels, other.labels)
 
+
+class Group:
+    """F folds of similar size, S points at most, padded so that they are worked on side by side.
+
+    Attributes:
+        members: the points of each fold, shape (F, S); the rows of smaller folds end in N, which
+            is no point.
+    """
+
+    def __init__(self, N: int, folds: list[Int[np.ndarray, " _"]]):
+        self.N = N
+        self.members = np.full((len(folds), max(map(len, folds))), N)
+        for row, fold in zip(self.members, folds, strict=True):
+            row[: len(fold)] = fold
+
     def gather(self, array: Float[Array, "..."], axis: int = 0) -> Float[Array, "..."]:
         """The axis of all rows as two, (…, Nn, …) -> (…, F, Sn, …); zeros in the padding."""
-        N, F = len(self.labels), len(self.members)
         before, after = array.shape[:axis], array.shape[axis + 1 :]
-        by_point = array.reshape(*before, N, -1, *after)
-        if not np.array_equal(self.members.reshape(-1), np.arange(N)):
+        by_point = array.reshape(*before, self.N, -1, *after)
+        if not np.array_equal(self.members.reshape(-1), np.arange(self.N)):
             by_point = jnp.take(
                 by_point, self.members.reshape(-1), axis=axis, mode="fill", fill_value=0
             )
-        return by_point.reshape(*before, F, -1, *after)
+        return by_point.reshape(*before, len(self.members), -1, *after)
+
+    def scattered(
+        self, values: Float[Array, "F Sn"], into: Float[Array, " Nn"]
+    ) -> Float[Array, " Nn"]:
+        """`into` with the rows of these folds replaced; the padding is dropped."""
+        by_point = values.reshape(*self.members.shape, -1)
+        rows = into.reshape(self.N, -1).at[self.members].set(by_point, mode="drop")
+        return rows.reshape(into.shape)
 
     def diagonal_blocks(self, C: Float[Array, "Nn Nn"]) -> Float[Array, "F Sn Sn"]:
-        """The block of C that belongs to each fold; zeros in the padding."""
-        n = len(C) // len(self.labels)
+        """The block of C that belongs to each fold, and the identity in the padding."""
+        n = len(C) // self.N
         rows = (n * self.members[:, :, None] + np.arange(n)).reshape(len(self.members), -1)
-        return C.at[rows[:, :, None], rows[:, None, :]].get(mode="fill", fill_value=0)
-
-    def padding_identity(self, blocks: Float[Array, "F Sn Sn"]) -> Float[Array, "F Sn Sn"]:
-        """Ones on the diagonal where a fold has no point, zeros elsewhere."""
-        empty = self.members == len(self.labels)
-        empty = np.repeat(empty, blocks.shape[1] // empty.shape[1], axis=1)
-        return jnp.asarray(empty[:, :, None] * np.eye(blocks.shape[1]), blocks.dtype)
+        blocks = C.at[rows[:, :, None], rows[:, None, :]].get(mode="fill", fill_value=0)
+        in_padding = jnp.asarray(rows >= len(C), C.dtype)
+        diagonal = np.arange(rows.shape[1])
+        return blocks.at[:, diagonal, diagonal].add(in_padding)
 
 
 def _labels(N: int, folds: Folds) -> Int[np.ndarray, " N"]:

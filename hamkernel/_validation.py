@@ -184,10 +184,9 @@ def partition_loss(K, X, Y, regularization, partition):
 @eqx.filter_jit
 def _residuals(K, X: Array, Y: Array, regularization: Array, partition: Partition) -> Array:
     N, n = X.shape
-    A = _regularised(K, X, (N - N / len(partition.members)) * regularization)
+    A = _regularised(K, X, (N - N / len(partition.folds)) * regularization)
     r: Any = held_out(A, Y.reshape(N * n), partition)
-    by_point = r.reshape(*partition.members.shape, n)
-    return jnp.zeros_like(Y).at[partition.members].set(by_point, mode="drop")  # padding: dropped
+    return r.reshape(N, n)
 
 
 @eqx.filter_jit
@@ -237,29 +236,34 @@ def _paired_with_gram(K, X: Float[Array, "N n"], bar: Float[Array, "D D"]) -> Fl
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def held_out(
     A: Float[Array, "D D"], y: Float[Array, " D"], partition: Partition
-) -> Float[Array, "F Sn"]:
-    """r_S = (C_SS)⁻¹ a_S for each fold, zero in the padding; inf where A has no factor."""
+) -> Float[Array, " D"]:
+    """r_S = (C_SS)⁻¹ a_S for each fold, in the order of y; inf where A has no factor."""
     return _held_out_forward(A, y, partition)[0]
 
 
 def _held_out_forward(A, y, partition):
     C, _ = inverse(A)
     a = C @ y
-    blocks = partition.diagonal_blocks(C)
-    blocks = blocks + partition.padding_identity(blocks)  # so that they can be solved with
-    factors = jax.lax.linalg.cholesky(blocks, symmetrize_input=False)
-    r = _solve_blocks(factors, partition.gather(a))
+    r, factors = jnp.zeros_like(a), []
+    for group in partition.groups:
+        blocks, r = jax.lax.optimization_barrier((group.diagonal_blocks(C), r))  # not side by side
+        factors.append(jax.lax.linalg.cholesky(blocks, symmetrize_input=False))
+        r = group.scattered(_solve_blocks(factors[-1], group.gather(a)), into=r)
     ok = jnp.isfinite(r).all()
     return jnp.where(ok, r, jnp.full_like(r, jnp.inf)), (C, a, factors, r, ok)
 
 
 def _held_out_backward(partition, saved, r_bar):
     C, a, factors, r, ok = saved
-    v = _solve_blocks(factors, r_bar)
-    columns = partition.gather(C, axis=1)
-    P, Q = (jnp.einsum("dfi,fi->df", columns, each) for each in (v, r))  # C_:S v_S and C_:S r_S
-    w = P.sum(axis=1)  # C v
-    left, right = jnp.column_stack([P, -w]), jnp.column_stack([Q, a])
+    P, Q = [], []  # C_:S v_S and C_:S r_S, a column for each fold
+    for group, own in zip(partition.groups, factors, strict=True):
+        v = _solve_blocks(own, group.gather(r_bar))
+        columns = group.gather(C, axis=1)
+        P.append(jnp.einsum("dfi,fi->df", columns, v))
+        Q.append(jnp.einsum("dfi,fi->df", columns, group.gather(r)))
+        r_bar = jax.lax.optimization_barrier((r_bar, P[-1], Q[-1]))[0]
+    w = jnp.concatenate(P, axis=1).sum(axis=1)  # C v
+    left, right = jnp.column_stack([*P, -w]), jnp.column_stack([*Q, a])
     # Else XLA computes these sums again for every entry of the product: 10 times slower.
     left, right, w = jax.lax.optimization_barrier(_or_zero(ok, left, right, w))
     return left @ right.T, w

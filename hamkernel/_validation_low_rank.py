@@ -67,37 +67,34 @@ def low_rank_partition_loss(
 ) -> Float[Array, ""]:
     """`cross_validation_loss` of the low-rank fit; inf where a factorisation fails."""
     N = len(X)
-    rows = _rows(basis, K, X)
-    F, size = partition.members.shape
-    ridge = (N - N / F) * regularization
-    folds = partition.gather(rows)  # (F, S n, r), zero in the padding
-    y = partition.gather(Y.reshape(-1))  # (F, S n)
-    few = folds.shape[1] <= rows.shape[1]
-    residuals = (_by_inversion if few else _by_downdating)(folds, y, ridge)
-    squares = jnp.mean(residuals.reshape(F, size, -1) ** 2, axis=2)  # (F, S)
-    weights = jnp.asarray(partition.weights, squares.dtype)
-    by_member = jnp.take(weights, partition.members, mode="fill", fill_value=0)
-    return _finite(jnp.sum(by_member * squares), jnp.inf)
+    rows, y = _rows(basis, K, X), Y.reshape(-1)
+    ridge = (N - N / len(partition.folds)) * regularization
+    H, b = rows.T @ rows, rows.T @ y
+    residuals = jnp.zeros_like(y)
+    for group in partition.groups:
+        folds = group.gather(rows), group.gather(y)  # (F, S n, r) and (F, S n)
+        folds, residuals = jax.lax.optimization_barrier((folds, residuals))  # not side by side
+        few = folds[0].shape[1] <= rows.shape[1]
+        found = (_by_inversion if few else _by_downdating)(*folds, H, b, ridge)
+        residuals = group.scattered(found, into=residuals)
+    squares = jnp.mean(residuals.reshape(X.shape) ** 2, axis=1)
+    return _finite(jnp.asarray(partition.weights, squares.dtype) @ squares, jnp.inf)
 
 
-def _by_downdating(folds, y, ridge):
-    H = jnp.einsum("fsr,fst->frt", folds, folds)
-    b = jnp.einsum("fsr,fs->fr", folds, y)
-    identity = jnp.eye(H.shape[1], dtype=H.dtype)
-
+def _by_downdating(folds, y, H, b, ridge):
     def without(fold):
-        own, target, H_own, b_own = fold
-        R = jnp.linalg.cholesky(H.sum(axis=0) - H_own + ridge * identity)
-        return target - own @ cho_solve((R, True), b.sum(axis=0) - b_own)
+        own, target = fold
+        R = factor(H - own.T @ own, ridge)
+        return target - own @ cho_solve((R, True), b - own.T @ target)
 
     # One after the other: a batch of factorisations would be one more copy of H.
-    return jax.lax.map(without, (folds, y, H, b))
+    return jax.lax.map(without, (folds, y))
 
 
-def _by_inversion(folds, y, ridge):
+def _by_inversion(folds, y, H, b, ridge):
+    R = factor(H, ridge)
+    b = solve_triangular(R, b, lower=True)
     rows = folds.reshape(-1, folds.shape[2])
-    R = factor(rows.T @ rows, ridge)
-    b = solve_triangular(R, rows.T @ y.reshape(-1), lower=True)
     V = solve_triangular(R, rows.T, lower=True).T.reshape(folds.shape)  # (F, S n, r)
     held_out = jnp.eye(folds.shape[1], dtype=y.dtype)[None] - jnp.einsum("fsr,ftr->fst", V, V)
     return cho_solve((jnp.linalg.cholesky(held_out), True), (y - V @ b)[..., None])[..., 0]

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from scipy.stats import multivariate_normal
 
 import hamkernel as hk
+from hamkernel._folds import Partition
 
 EXACT = 1e-10  # condition of the systems, up to 1e4, times rounding
 DIFFERENCES = 1e-5  # of central differences: their own error is below 1e-7
@@ -75,6 +76,22 @@ def test_closed_form_is_explicit_refits_with_the_ridge_of_the_average_fold(struc
     np.testing.assert_allclose(residuals, expected, atol=EXACT)
     loss = hk.cross_validation_loss(K, X, Y, RIDGE, FOLDS[folds])
     np.testing.assert_allclose(loss, mean_over_folds(expected, labels), rtol=EXACT)
+
+
+def test_folds_of_very_different_sizes_are_refits_and_so_is_the_slope():
+    X, Y = data(count=40)
+    K = STRUCTURES["symplectic"](hk.Gaussian(1.5))
+    labels = np.concatenate([np.full(20, 9), np.repeat([3, 5, 7], 5), [4, 4, 6, 8, 1]])
+    labels = np.random.default_rng(1).permutation(labels)
+    assert len(Partition(40, labels).groups) > 2  # worked on one after the other
+
+    def expected(regularization):
+        return mean_over_folds(refits(K, X, Y, (40 - 40 / 8) * regularization, labels), labels)
+
+    loss, slope = jax.value_and_grad(hk.cross_validation_loss, 3)(K, X, Y, RIDGE, labels)
+    np.testing.assert_allclose(loss, expected(RIDGE), rtol=EXACT)
+    up, down = (expected(RIDGE * (1 + s * 1e-4)) for s in (1, -1))
+    np.testing.assert_allclose(slope, (up - down) / (2e-4 * RIDGE), rtol=DIFFERENCES)
 
 
 def public_refits(K, X, Y, labels: np.ndarray) -> np.ndarray:
@@ -352,7 +369,12 @@ def test_labels_equal_in_value_do_not_recompile_and_others_do():
     assert len(traced) > count
 
 
-@pytest.mark.parametrize("folds", [5, "loo", np.arange(400) % 7], ids=["5", "loo", "labels"])
+ONE_LONG = np.append(np.zeros(240, int), 1 + np.arange(160) // 10)  # and sixteen short runs
+
+
+@pytest.mark.parametrize(
+    "folds", [5, "loo", np.arange(400) % 7, ONE_LONG], ids=["5", "loo", "labels", "one long"]
+)
 def test_loss_and_its_gradient_take_the_memory_of_three_grams(folds):
     X, Y = data(4, count=400)
     K = hk.Odd(hk.Symplectic(hk.Gaussian(np.ones(4))))

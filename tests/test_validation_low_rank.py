@@ -40,6 +40,7 @@ FOLDS = {
     "5": 5,
     "2": 2,  # folds with more rows than there are features
     "labels": np.repeat(np.arange(6), 5),
+    "one long": np.append(np.zeros(16, int), 1 + np.arange(14) // 2),
 }
 
 
@@ -63,7 +64,7 @@ def test_the_loss_is_that_of_refits(basis, folds):
     loss = low_rank_partition_loss(BASES[basis], K, X, Y, jnp.asarray(RIDGE), partition)
     np.testing.assert_allclose(loss, np.mean(losses), rtol=ROUNDING)
     w = np.linalg.solve(rows.T @ rows + N * RIDGE * np.eye(rows.shape[1]), rows.T @ y)
-    assert abs(np.mean((y - rows @ w) ** 2) / loss - 1) > 0.05  # the training error is another
+    assert abs(np.mean((y - rows @ w) ** 2) / loss - 1) > 0.01  # the training error is another
 
 
 @pytest.mark.parametrize("basis", BASES)
@@ -123,7 +124,7 @@ def test_where_the_factorisation_fails_the_loss_is_infinite():
 
 SOLVERS = {
     "nystrom": hk.Nystrom(),
-    "features": hk.RandomFeatures(200, jax.random.key(0)),
+    "features": hk.RandomFeatures(150, jax.random.key(0)),
 }
 
 
@@ -140,7 +141,7 @@ def test_tuning_with_low_rank_comes_to_the_optimum_of_the_dense_loss(
     X, Y = data(120, seed=2)
     start = hk.Symplectic(hk.Gaussian(0.4))
     with monkeypatch.context() as small:  # too small for the dense loss
-        small.setattr("hamkernel._memory.memory_bytes", lambda: 1_000_000)
+        small.setattr("hamkernel._memory.memory_bytes", lambda: 1_500_000)
         tuned = hk.tune(start, X, Y, 0.1, 5, objective=objective, solver=SOLVERS[solver])
     dense = hk.tune(start, X, Y, 0.1, 5, objective=objective)
 

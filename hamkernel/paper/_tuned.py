@@ -163,7 +163,7 @@ def grid_losses(
         Shape (A, B); NaN where a fit fails.
     """
     N, n = X.shape
-    points = [members[members < N] for members in partition.members]
+    points = partition.folds
 
     def fold_loss(G, ridge, held_out):
         rest = np.setdiff1d(np.arange(N), held_out)

@@ -104,7 +104,7 @@ def kernel_of(k):
 def against_grids(N: int, quick: bool) -> None:
     X, Y = data(N)
     partition = Partition(N, FOLDS)
-    points = [members[members < N] for members in partition.members]
+    points = partition.folds
     sample = np.random.default_rng(1).permutation(len(SIGMAS) * len(RIDGES))[: 3 if quick else 12]
     pairs = [(SIGMAS[i // len(RIDGES)], RIDGES[i % len(RIDGES)]) for i in sample]
     # Grid points that float64 cannot carry are left out of the check, not of the time.
