@@ -38,7 +38,16 @@ def hyperparameters(
     K: AbstractMatrixKernel, X: Float[Array, "N n"], Y: Float[Array, "N n"]
 ) -> list[Hyperparameter]:
     """The trainable leaves of K, in the order of its leaves, with their boxes from the data."""
-    return list(_walk((), K, np.asarray(X), _amplitude(K, X, Y)))
+    seen = np.asarray(X)
+    # What is a fair amplitude depends on the lengthscales: it is that in the middle of their boxes.
+    arrays, rest = eqx.partition(K, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    middle = [
+        jnp.asarray((p.low + p.high) / 2, leaf.dtype)
+        for p, leaf in zip(_walk((), K, seen, 1.0), leaves, strict=True)
+    ]
+    K_middle = eqx.combine(jax.tree.unflatten(structure, middle), rest)
+    return list(_walk((), K, seen, _amplitude(K_middle, X, Y)))
 
 
 @eqx.filter_jit

@@ -100,9 +100,10 @@ def _labels(N: int, folds: Folds) -> Int[np.ndarray, " N"]:
         )
     array = np.asarray(folds)
     if not np.issubdtype(array.dtype, np.integer):
+        cure = " Names become integers by np.unique(names, return_inverse=True)[1]."
         raise ValueError(
-            "folds must be a number, 'loo' or an array of integer labels; got dtype "
-            f"{array.dtype}. Names become integers by np.unique(names, return_inverse=True)[1]."
+            "folds must be a whole number, 'loo' or an array of integer labels; got "
+            + (f"{folds!r}." if array.ndim == 0 else f"dtype {array.dtype}.{cure}")
         )
     if array.ndim == 0:
         if not 2 <= array <= N:

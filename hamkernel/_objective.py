@@ -1,7 +1,7 @@
 """What `tune` minimises: a validation loss of the dense or of the low-rank fit, or the caller's."""
 
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -9,11 +9,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hamkernel import _require as require
 from hamkernel._callable import as_pytree
 from hamkernel._folds import Folds, Partition
 from hamkernel._solve_features import RandomFeatures
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._validation import (
+    cross_validation_loss,
+    generalized_cross_validation,
     generalized_loss,
     log_likelihood,
     log_marginal_likelihood,
@@ -51,7 +54,9 @@ class SearchCriterion(eqx.Module):
 
     def value(self, K, X, Y, regularization) -> Float[Array, ""]:
         extra = () if self.partition is None else (self.partition,)
-        value = self.fn(K, X, Y, regularization, *extra)
+        value = require.floating(
+            self.fn(K, X, Y, regularization, *extra), "the value of the objective"
+        )
         if jnp.shape(value) != ():
             raise ValueError(
                 f"the objective returned shape {jnp.shape(value)}; one number, shape (), is needed."
@@ -96,6 +101,8 @@ class SearchCriterion(eqx.Module):
 
 def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> SearchCriterion:
     partial = jax.tree_util.Partial
+    for loss, name in _NAMED:
+        objective = name if objective is loss else objective
     if objective == "cross_validation":
         return SearchCriterion(partial(partition_loss), Partition(N, folds), logarithmic=True)
     if objective == "generalized_cross_validation":
@@ -115,6 +122,13 @@ def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> Sear
             f"got {objective!r}."
         )
     return SearchCriterion(as_pytree(objective), None, logarithmic=False, own=True)
+
+
+# The public losses, which take the folds of `tune` and are searched by their logarithm.
+_NAMED: tuple[tuple[Callable[..., Any], Criterion], ...] = (
+    (cross_validation_loss, "cross_validation"),
+    (generalized_cross_validation, "generalized_cross_validation"),
+)
 
 
 def _negative_log_likelihood(K, X, Y, regularization):

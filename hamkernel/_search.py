@@ -77,6 +77,17 @@ class _Objective(eqx.Module):
     Y: Float[Array, "N n"]
     thinning: float = eqx.field(static=True)
 
+    def unit(self, u: Float[Array, " P"]) -> Float[Array, ""]:
+        """What the value is measured in by a run from u, whose tolerances are those of numbers ~ 1.
+
+        A validation loss is searched by its logarithm; an objective of the caller's has any size.
+        """
+        one = jnp.ones((), self.X.dtype)
+        if not self.criterion.own:
+            return one
+        size = jnp.abs(self(u))
+        return jnp.where((size > 0) & (size < HUGE), size, one)
+
     def __call__(self, u: Float[Array, " P"]) -> Float[Array, ""]:
         kernel, regularization = self.space.decode(u, self.X)
         return self.criterion.value(kernel, self.X, self.Y, self.thinning * regularization)
@@ -86,9 +97,11 @@ def _run(objective: _Objective, u: Float[Array, " P"], optimiser, max_steps: int
     """One run of the optimiser from u."""
     # optimistix starts its best loss in the default dtype, which float32 data must then meet.
     default = jnp.result_type(float)
+    unit = objective.unit(u).astype(default)
 
     def in_default(v):
-        return objective(v.astype(u.dtype)).astype(default)
+        value = objective(v.astype(u.dtype)).astype(default)
+        return jnp.where(value < HUGE, value / unit, HUGE)
 
     # optimistix linearises forward and transposes; our derivatives are written backward.
     @jax.custom_jvp
@@ -111,7 +124,8 @@ def _run(objective: _Objective, u: Float[Array, " P"], optimiser, max_steps: int
     best = found.value.astype(u.dtype)
     # BFGS keeps the value at its last point. Others are wrapped, see `keeping_the_best`.
     bare = isinstance(optimiser, optx.BFGS)
-    value = found.state.f_info.f.astype(u.dtype) if bare else objective(best)
+    f = found.state.f_info.f if bare else in_default(best)
+    value = jnp.where(f < HUGE, f * unit, HUGE).astype(u.dtype)
     converged = found.result == optx.RESULTS.successful
     return Runs(best, value, converged, found.stats["num_steps"])
 

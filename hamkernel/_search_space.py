@@ -144,6 +144,8 @@ class SearchSpace(eqx.Module):
         width = jnp.where(high > low, high - low, jnp.ones_like(low))
         # Not on the edge itself, where the derivative of the sine is zero.
         share = jnp.clip((self.start - low) / width, 0.01, 0.99)
+        # Where the kernel is not positive at the start there is no box of λ.
+        share = jnp.where(jnp.isfinite(share), share, 0.5)
         return jnp.arcsin(2 * share - 1)[jnp.asarray(self.free)]
 
     def at_bounds(self, u: Float[Array, " P"]) -> tuple[str, ...]:

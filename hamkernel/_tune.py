@@ -113,7 +113,9 @@ def tune(
         objective: "cross_validation", "generalized_cross_validation", "marginal_likelihood", or
             a function (K, X, Y, regularization) -> () that is to be small. For the marginal
             likelihood give K an amplitude, `1.0 * k`: built-in kernels have 1, and a signal that
-            is larger than the prior's is explained as noise.
+            is larger than the prior's is explained as noise. In a function of your own, `hk.fit`
+            and `hk.simulate` want `throw=False`, and the latter a constant `dt`: somewhere in the
+            box they fail, and NaN is then a point that cannot win.
         frozen: names of hyperparameters to keep, such as "lengthscale", "regularization" or
             "terms[0].scale". A name means every hyperparameter whose full name ends in it.
         bounds: {name: (low, high)} in place of the box from the data, in the units of the
@@ -124,14 +126,17 @@ def tune(
         solver: how the final field is fitted; see `fit`. With `Nystrom` and `RandomFeatures` the
             loss on all points is that of the low-rank fit, in O(N n r) memory; the landmarks are
             those of the best kernel on the subset, and of the tuned one for the field.
-        progress: print each step, through optimistix's own hook.
+        progress: print each step of the default optimiser, through optimistix's own hook: the
+            logarithm of a loss, or the objective over its first value, and the coordinates u of
+            the search, whose sines go from one end of the box to the other.
 
     Returns:
         A `Tuned`. NaN never comes out: points where the objective is not finite cannot win.
 
     Raises:
         TypeError: K is not matrix-valued or has complex leaves, the optimiser is not one of
-            optimistix, or a function is given that is to be large. ValueError: bad data, folds,
+            optimistix, a function is given that is to be large, or an argument is traced.
+            ValueError: bad data, folds,
             names, or bounds; a dense loss that does not fit in memory. RuntimeError: the
             objective is finite nowhere.
 
@@ -146,6 +151,7 @@ def tune(
     and can be integrated: where the best one was not, the search is made once more above that λ.
     """
     K = matrix_kernel(K)
+    _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
     X, Y = given = require.data(X, Y)
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
     K.check_dimension(X.shape[1])
@@ -156,10 +162,12 @@ def tune(
     low_rank = isinstance(solver, Nystrom | RandomFeatures)
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
     space = SearchSpace(K, X, Y, ridge, frozen, bounds or {}, roundings)
-    if starts < 1:
-        raise ValueError(f"starts must be at least 1, got {starts}.")
     if optimiser is None:
         optimiser = _BFGS_VERBOSE if progress else _BFGS
+    elif progress:
+        raise ValueError(
+            "progress is printed by the optimiser: pass verbose=True to yours, and no progress."
+        )
     if not isinstance(optimiser, optx.AbstractMinimiser):
         raise TypeError(
             "optimiser must be an optimistix minimiser, such as optimistix.BFGS(1e-3, 1e-3) or "
@@ -216,6 +224,23 @@ def tune(
         at_bounds=space.at_bounds(runs.u[best]),
         bounds=space.box(kernel, X),
     )
+
+
+def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -> None:
+    if not require.is_concrete(K, X, Y, regularization):
+        raise TypeError(
+            "tune cannot be traced: between its compiled searches it decides in Python. Call it "
+            "outside of jax.jit, jax.vmap and jax.grad. The losses, such as "
+            "hk.cross_validation_loss, work inside."
+        )
+    names = (frozen,) if isinstance(frozen, str) else frozen
+    if not (isinstance(names, tuple | list) and all(isinstance(name, str) for name in names)):
+        raise TypeError(f"frozen must be a name or a tuple of names, got {frozen!r}.")
+    if bounds is not None and not isinstance(bounds, dict):
+        raise TypeError(f"bounds must be a dict, {{name: (low, high)}}, got {bounds!r}.")
+    for name, count in {"starts": starts, "max_steps": max_steps}.items():
+        if not hasattr(count, "__index__") or count < 1:
+            raise ValueError(f"{name} must be a whole number, at least 1; got {count!r}.")
 
 
 def _warn_of_unequal_sizes(Y: Array) -> None:

@@ -1,5 +1,6 @@
 """`tune`: what it trains, keeps, reports and refuses; losses against explicit refits in NumPy."""
 
+import functools
 import warnings
 from typing import Any
 
@@ -233,7 +234,11 @@ def test_bounds_may_have_a_number_for_each_coordinate_and_are_reported_by_the_wi
         ({"bounds": {"lengthscale": (1, np.inf)}}, "finite"),
         ({"bounds": {"lengthscale": (-1, 1)}}, "positive"),
         ({"frozen": ("lengthscale", "regularization")}, "nothing to tune"),
-        ({"starts": 0}, "starts must be at least 1"),
+        ({"starts": 0}, "starts must be a whole number, at least 1; got 0"),
+        ({"max_steps": 0}, "max_steps must be a whole number, at least 1; got 0"),
+        ({"starts": 1.5}, r"starts must be a whole number, .* got 1\.5"),
+        ({"progress": True, "optimiser": optx.BFGS(1e-3, 1e-3)}, "pass verbose=True to yours"),
+        ({"folds": 5.0}, r"folds must be a whole number, 'loo' .* got 5\.0\.$"),
         ({"objective": "loo"}, "objective must be"),
         ({"folds": 99}, "between 2 and the number of points"),
         ({"regularization": 0.0}, "positive"),
@@ -242,6 +247,26 @@ def test_bounds_may_have_a_number_for_each_coordinate_and_are_reported_by_the_wi
 def test_bad_options_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
         hk.tune(SIMPLE, *scattered(), **options)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"frozen": None}, "frozen must be a name or a tuple of names, got None"),
+        ({"frozen": (1,)}, "frozen must be a name or a tuple of names"),
+        ({"bounds": [("lengthscale", 1, 2)]}, "bounds must be a dict"),
+        ({"objective": lambda *_: None}, "value of the objective must hold real numbers; got None"),
+    ],
+)
+def test_options_of_the_wrong_type_are_refused(options, message):
+    with pytest.raises(TypeError, match=message):
+        hk.tune(SIMPLE, *scattered(), **options)
+
+
+def test_tune_says_that_it_cannot_be_traced():
+    X, Y = map(jnp.asarray, scattered())
+    with pytest.raises(TypeError, match=r"tune cannot be traced.*hk\.cross_validation_loss"):
+        jax.jit(lambda Y: hk.tune(SIMPLE, X, Y).loss)(Y)
 
 
 def test_kernels_without_structure_and_functions_to_maximise_are_refused():
@@ -390,6 +415,76 @@ def test_an_objective_that_is_nowhere_finite_is_an_error_that_says_what_to_chang
 
     with pytest.raises(RuntimeError, match=r"not finite at any start(.|\n)*check_kernel"):
         hk.tune(SIMPLE, *scattered(), objective=objective)
+
+
+@pytest.mark.parametrize("size", [1e-6, 1e6])
+def test_an_objective_may_have_any_size(size):
+    # Two steps were enough for a small one to be called converged.
+    X, Y = scattered()
+
+    def objective(K, X, Y, regularization):
+        return size * hk.cross_validation_loss(K, X, Y, regularization)
+
+    best = float(hk.tune(SIMPLE, X, Y).loss)
+    for starts in (1, 4):
+        tuned = hk.tune(SIMPLE, X, Y, 0.1, starts=starts, objective=objective)
+        np.testing.assert_allclose(tuned.loss / size, best, rtol=0.01)
+
+
+def test_a_loss_may_be_given_by_its_function_and_keeps_the_folds():
+    X, Y = scattered()
+    labels = np.arange(N) % 3
+    named = hk.tune(SIMPLE, X, Y, folds=labels, starts=2)
+    given = hk.tune(SIMPLE, X, Y, folds=labels, starts=2, objective=hk.cross_validation_loss)
+    assert given.loss == named.loss
+    assert given.loss != hk.tune(SIMPLE, X, Y, starts=2).loss
+
+
+def test_a_start_where_the_kernel_is_not_positive_definite_does_not_win():
+    X, Y = scattered()
+    K = hk.Symplectic(hk.Gaussian(1.0))
+
+    class Weighted(eqx.Module):
+        weight: jax.Array
+
+        def __call__(self, x, z):
+            return self.weight * jnp.exp(-((x - z) @ (x - z)))
+
+    # The losses are above 1, which an optimiser's placeholder of 0 for their logarithm is not.
+    tuned = hk.tune(hk.Symplectic(Weighted(jnp.array(-1.0))), X, 100 * Y)
+    assert 1 < float(tuned.loss) < np.inf
+    fitted = hk.cross_validation_loss(tuned.kernel, X, 100 * Y, tuned.regularization)
+    np.testing.assert_allclose(tuned.loss, fitted, rtol=SAME)
+    nowhere = hk.Symplectic(lambda x, z: -(x @ z) - K.kernel(x, z))
+    with pytest.raises(RuntimeError, match=r"not finite at any start(.|\n)*check_kernel"):
+        hk.tune(nowhere, X, Y)
+
+
+def test_a_fit_or_a_simulation_that_fails_in_an_objective_is_a_point_that_cannot_win():
+    X, Y = scattered()
+
+    def objective(K, X, Y, regularization, throw=False):
+        field = hk.fit(K, X[5:], Y[5:], 1e-9 * regularization, throw=throw)
+        return jnp.mean((field.evaluate(X[:5]) - Y[:5]) ** 2)
+
+    bounds: Any = {"regularization": (1e-12, 1e6)}
+    assert np.isfinite(hk.tune(SIMPLE, X, Y, objective=objective, bounds=bounds, starts=4).loss)
+    raising = functools.partial(objective, throw=True)
+    with pytest.raises(Exception, match="not positive definite"):
+        hk.tune(SIMPLE, X, Y, objective=raising, bounds=bounds, starts=4)
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_the_amplitude_is_searched_in_any_units(unit):
+    X, Y = scattered()
+    K = hk.Symplectic(1.0 * hk.Gaussian(1.0))
+
+    def density(unit):  # of the data in units of 1
+        found = hk.tune(K, unit * X, Y, objective="marginal_likelihood")
+        assert "kernel.scale" not in found.at_bounds
+        return float(found.loss)
+
+    np.testing.assert_allclose(density(unit), density(1.0), atol=0.01)
 
 
 def test_points_where_the_objective_is_nan_cannot_win():
