@@ -60,9 +60,9 @@ def cross_validation_loss(
 
     Returns:
         The loss, in squared units of Y; inf where the matrix is not positive definite to
-        rounding. Differentiable in reverse mode (`jax.grad`, and again of that; no `jax.jvp`),
-        vmappable, compiled once per shape and partition. O((N n)³) time, at most three matrices
-        of (N n)² numbers, with the gradient over K too.
+        rounding. Differentiable in reverse mode: `jax.jacrev(jax.grad(loss))` is the Hessian, for
+        there is no `jax.jvp`. Vmappable, compiled once per shape and partition. O((N n)³) time,
+        three matrices of (N n)² numbers, with the gradient over K too.
 
     Raises:
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
@@ -109,7 +109,8 @@ def generalized_cross_validation(
         regularization: λ > 0.
 
     Returns:
-        The loss, in squared units of Y; inf where the factorisation fails.
+        The loss, in squared units of Y; inf where the factorisation fails. Differentiable as
+        `cross_validation_loss` is.
 
     Raises:
         TypeError: K is not matrix-valued. ValueError: bad data or regularization, or a matrix
@@ -139,7 +140,8 @@ def log_marginal_likelihood(
         regularization: λ > 0; the noise variance is Nλ.
 
     Returns:
-        The log density; −inf where the factorisation fails.
+        The log density; −inf where the factorisation fails. Differentiable as
+        `cross_validation_loss` is.
 
     Raises:
         TypeError: K is not matrix-valued. ValueError: bad data or regularization, or a matrix
