@@ -80,11 +80,9 @@ def automatic(array: Array) -> Array:
     if not isinstance(sharding, NamedSharding) or not isinstance(sharding.mesh, Mesh):
         return array
     mesh = _automatic(sharding.mesh)
-    return (
-        array
-        if mesh == sharding.mesh
-        else jax.device_put(array, NamedSharding(mesh, sharding.spec))
-    )
+    if mesh == sharding.mesh:
+        return array
+    return jax.device_put(array, NamedSharding(mesh, sharding.spec))
 
 
 def _automatic(mesh: Mesh) -> Mesh:

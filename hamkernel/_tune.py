@@ -136,9 +136,8 @@ def tune(
     Raises:
         TypeError: K is not matrix-valued or has complex leaves, the optimiser is not one of
             optimistix, a function is given that is to be large, or an argument is traced.
-            ValueError: bad data, folds,
-            names, or bounds; a dense loss that does not fit in memory. RuntimeError: the
-            objective is finite nowhere.
+            ValueError: bad data, folds, names, or bounds; a dense loss that does not fit in
+            memory. RuntimeError: the objective is finite nowhere.
 
     The flat limit. When λ rests on its lower bound and a lengthscale on its upper one, the data
     asks for a polynomial: the fit is good and its hyperparameters mean little.

@@ -375,6 +375,16 @@ def test_a_solve_that_fails_raises_or_is_nan_beside_those_of_its_batch_that_do_n
     )
 
 
+@pytest.mark.parametrize("kind", [hk.Cholesky, hk.ConjugateGradient, hk.Nystrom, "features"])
+def test_every_field_says_how_it_was_found(kind):
+    solver = hk.RandomFeatures(9, jax.random.key(0)) if kind == "features" else kind()
+    field = hk.fit(K, *data(12), 1e-2, solver=solver)
+    assert field.info.solver == type(solver).__name__
+    assert field.regularization == 1e-2
+    assert field.norm > 0
+    np.testing.assert_allclose(field.residual_norm, np.linalg.norm(field.residual))
+
+
 def test_an_iteration_that_does_not_converge_is_nan_where_it_does_not_raise():
     solver = hk.ConjugateGradient(1e-12, 2, hk.Nystrom(max_points=2))
     field: Any = hk.fit(K, *data(30), 1e-6, solver=solver, throw=False)

@@ -418,7 +418,7 @@ def test_loss_works_under_jit_with_labels_closed_over():
         (16, "between 2 and the number of points"),
         (-3, "between 2 and the number of points"),
         ("trajectory", "number, 'loo' or an array"),
-        (2.0, "integer labels; got dtype float64"),
+        (2.0, r"integer labels; got 2\.0"),
         (np.full(N, 3), "in one"),
         (np.arange(N - 1), r"shape \(14,\)"),
         (np.zeros((N, 2), int), r"shape \(15, 2\)"),
