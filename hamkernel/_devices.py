@@ -55,15 +55,12 @@ def rows_of(array: Array) -> Rows | None:
     A traced array does not say where it lies, so inside `jax.jit` the compiler shards the loops:
     the results are right, but every device holds all rows.
     """
-    sharding = None if isinstance(array, Tracer) else getattr(array, "sharding", None)
-    if not (isinstance(sharding, NamedSharding) and sharding.spec):
+    sharding = _on_mesh(array)
+    if sharding is None or not sharding.spec:
         return None
     first = sharding.spec[0]
     axes = first if isinstance(first, tuple) else () if first is None else (first,)
-    mesh = sharding.mesh
-    if not isinstance(mesh, Mesh):  # an abstract one has no devices
-        return None
-    rows = Rows(_automatic(mesh), axes, sharding)
+    rows = Rows(_automatic(sharding.mesh), axes, sharding)
     return rows if rows.count > 1 else None
 
 
@@ -76,13 +73,20 @@ def split(rows: Rows | None, array: Array) -> Array:
 
 def automatic(array: Array) -> Array:
     """`array` where it is, on automatic axes."""
-    sharding = None if isinstance(array, Tracer) else getattr(array, "sharding", None)
-    if not isinstance(sharding, NamedSharding) or not isinstance(sharding.mesh, Mesh):
+    sharding = _on_mesh(array)
+    if sharding is None:
         return array
     mesh = _automatic(sharding.mesh)
     if mesh == sharding.mesh:
         return array
     return jax.device_put(array, NamedSharding(mesh, sharding.spec))
+
+
+def _on_mesh(array: Array) -> Any:
+    """The sharding of an array on a mesh of devices; None of others, and under tracing."""
+    sharding = None if isinstance(array, Tracer) else getattr(array, "sharding", None)
+    is_named = isinstance(sharding, NamedSharding)
+    return sharding if is_named and isinstance(sharding.mesh, Mesh) else None  # no abstract mesh
 
 
 def _automatic(mesh: Mesh) -> Mesh:

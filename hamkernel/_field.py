@@ -50,7 +50,7 @@ class AbstractField(eqx.Module):
 
     @property
     def residual_norm(self) -> Float[Array, ""]:
-        """‖y − f(X)‖ over all the training data, that of a stream too, whose residual is gone."""
+        """‖y − f(X)‖ over all the training data, in units of Y, shape (); of a stream too."""
         kept = self.info.residual_norm
         return jnp.linalg.norm(self.residual) if kept is None else kept
 
@@ -106,8 +106,7 @@ class AbstractField(eqx.Module):
         Raises:
             AttributeError: the structure has no potential (with the reason).
         """
-        if self.kernel.no_potential:
-            raise AttributeError(self.kernel.no_potential)
+        self.kernel.check_potential()
         # A lambda, because JAX would compare the bound method, and so its traced arrays.
         return lambda x: self.unanchored_potential(x) + self.offset
 
@@ -204,7 +203,8 @@ class KernelField(AbstractField):
         kernel: K.
         points: zⱼ, shape (M, n): the data, or the landmarks of a low-rank solver.
         coefficients: aⱼ, shape (M, n).
-        residual: yᵢ − f(xᵢ) at the training data, shape (N, n).
+        residual: yᵢ − f(xᵢ) at the training data, shape (N, n); of shape (0, n) after a fit to a
+            stream, which is not kept.
         norm: ‖f‖ in the RKHS of K, shape ().
         regularization: the λ of the fit, shape ().
         offset: the constant in the potential, shape ().

@@ -1,7 +1,7 @@
 """What `tune` minimises: a validation loss of the dense or of the low-rank fit, or the caller's."""
 
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import equinox as eqx
 import jax
@@ -101,11 +101,10 @@ class SearchCriterion(eqx.Module):
 
 def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> SearchCriterion:
     partial = jax.tree_util.Partial
-    for loss, name in _NAMED:
-        objective = name if objective is loss else objective
-    if objective == "cross_validation":
+    # A public loss is what its name is: it takes the folds and is searched by its logarithm.
+    if objective == "cross_validation" or objective is cross_validation_loss:
         return SearchCriterion(partial(partition_loss), Partition(N, folds), logarithmic=True)
-    if objective == "generalized_cross_validation":
+    if objective == "generalized_cross_validation" or objective is generalized_cross_validation:
         loss = partial(generalized_loss, least_free=LEAST_FREE)
         return SearchCriterion(loss, None, logarithmic=True)
     if objective == "marginal_likelihood":
@@ -122,13 +121,6 @@ def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> Sear
             f"got {objective!r}."
         )
     return SearchCriterion(as_pytree(objective), None, logarithmic=False, own=True)
-
-
-# The public losses, which take the folds of `tune` and are searched by their logarithm.
-_NAMED: tuple[tuple[Callable[..., Any], Criterion], ...] = (
-    (cross_validation_loss, "cross_validation"),
-    (generalized_cross_validation, "generalized_cross_validation"),
-)
 
 
 def _negative_log_likelihood(K, X, Y, regularization):

@@ -69,8 +69,7 @@ class FeatureField(AbstractField):
         return as_given(spread, _evaluate(self, split(spread, X), spread))
 
     def unanchored_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
-        if self.kernel.no_potential:
-            raise AttributeError(self.kernel.no_potential)
+        self.kernel.check_potential()
         x = self._state(x)
         return _potential_at(self.features, x, self.weights)
 
@@ -125,8 +124,8 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
         key: the random key, `jax.random.key(0)`. The same key draws the same features.
 
     Raises:
-        ValueError: count is not positive, or, from `fit`, so large that its matrices do not fit in
-            memory. TypeError: count is no integer, or key is no key.
+        ValueError: count is not positive, or, from `fit` and `start`, so large that its matrices do
+            not fit in memory. TypeError: count is no integer, or key is no key.
 
     Source: Rahimi & Recht (2007).
     """

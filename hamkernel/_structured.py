@@ -59,6 +59,11 @@ class AbstractMatrixKernel(eqx.Module):
     ) -> Float[Array, ""]:
         """The potential of `expansion`; AttributeError with `no_potential` if there is none."""
 
+    def check_potential(self) -> None:
+        """AttributeError, with the reason, if the fields have no potential."""
+        if self.no_potential:
+            raise AttributeError(self.no_potential)
+
     def check_dimension(self, n: int) -> None:
         """ValueError if fields on ℝⁿ cannot have this structure; by default all can."""
 
@@ -137,8 +142,7 @@ class Sum(AbstractMatrixKernel):
     def potential(
         self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
     ) -> Float[Array, ""]:
-        if self.no_potential:
-            raise AttributeError(self.no_potential)
+        self.check_potential()
         first, *rest = (K.potential(x, Z, A) for K in self.terms)
         return sum(rest, start=first)
 

@@ -150,6 +150,7 @@ def tune(
     and can be integrated: where the best one was not, the search is made once more above that λ.
     """
     K = matrix_kernel(K)
+    frozen = (frozen,) if isinstance(frozen, str) else frozen
     _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
     X, Y = given = require.data(X, Y)
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
@@ -157,10 +158,9 @@ def tune(
     _warn_of_unequal_sizes(Y)
     ridge = require.ridge(regularization).astype(X.dtype)
     criterion = criterion_of(objective, len(X), folds)
-    frozen = (frozen,) if isinstance(frozen, str) else tuple(frozen)
     low_rank = isinstance(solver, Nystrom | RandomFeatures)
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
-    space = SearchSpace(K, X, Y, ridge, frozen, bounds or {}, roundings)
+    space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings)
     if optimiser is None:
         optimiser = _BFGS_VERBOSE if progress else _BFGS
     elif progress:
@@ -232,8 +232,7 @@ def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -
             "outside of jax.jit, jax.vmap and jax.grad. The losses, such as "
             "hk.cross_validation_loss, work inside."
         )
-    names = (frozen,) if isinstance(frozen, str) else frozen
-    if not (isinstance(names, tuple | list) and all(isinstance(name, str) for name in names)):
+    if not (isinstance(frozen, tuple | list) and all(isinstance(name, str) for name in frozen)):
         raise TypeError(f"frozen must be a name or a tuple of names, got {frozen!r}.")
     if bounds is not None and not isinstance(bounds, dict):
         raise TypeError(f"bounds must be a dict, {{name: (low, high)}}, got {bounds!r}.")

@@ -70,12 +70,16 @@ def low_rank_partition_loss(
     rows, y = _rows(basis, K, X), Y.reshape(-1)
     ridge = (N - N / len(partition.folds)) * regularization
     H, b = rows.T @ rows, rows.T @ y
+    few = [group.members.shape[1] * X.shape[1] <= rows.shape[1] for group in partition.groups]
+    R = factor(H, ridge) if any(few) else None
     residuals = jnp.zeros_like(y)
-    for group in partition.groups:
-        folds = group.gather(rows), group.gather(y)  # (F, S n, r) and (F, S n)
-        folds, residuals = jax.lax.optimization_barrier((folds, residuals))  # not side by side
-        few = folds[0].shape[1] <= rows.shape[1]
-        found = (_by_inversion if few else _by_downdating)(*folds, H, b, ridge)
+    for group, is_few in zip(partition.groups, few, strict=True):
+        own = group.gather(rows), group.gather(y)  # (F, S n, r) and (F, S n)
+        own, R, residuals = jax.lax.optimization_barrier((own, R, residuals))  # not side by side
+        if is_few:
+            found = _by_inversion(*own, R, b)
+        else:
+            found = _by_downdating(*own, H, b, ridge)
         residuals = group.scattered(found, into=residuals)
     squares = jnp.mean(residuals.reshape(X.shape) ** 2, axis=1)
     return _finite(jnp.asarray(partition.weights, squares.dtype) @ squares, jnp.inf)
@@ -91,8 +95,7 @@ def _by_downdating(folds, y, H, b, ridge):
     return jax.lax.map(without, (folds, y))
 
 
-def _by_inversion(folds, y, H, b, ridge):
-    R = factor(H, ridge)
+def _by_inversion(folds, y, R, b):
     b = solve_triangular(R, b, lower=True)
     rows = folds.reshape(-1, folds.shape[2])
     V = solve_triangular(R, rows.T, lower=True).T.reshape(folds.shape)  # (F, S n, r)
