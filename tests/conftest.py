@@ -1,6 +1,8 @@
 """Every test runs in float64 with strict promotion: a silent change of dtype is an error."""
 
+import collections
 import os
+import zlib
 
 # Before NumPy loads. The threads of BLAS in two workers on two cores wait for each other: half of
 # the time of test_validation_low_rank.py.
@@ -13,6 +15,21 @@ os.environ.setdefault("MPLBACKEND", "Agg")
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
+
+
+@pytest.hookimpl(tryfirst=True)  # before pytest deselects what is slow
+def pytest_collection_modifyitems(items):
+    """Of the cases of a test that is marked `few(count)`, all but `count` are slow."""
+    cases = collections.defaultdict(list)
+    for item in items:
+        if item.get_closest_marker("few") and not item.get_closest_marker("slow"):
+            cases[item.path, item.originalname].append(item)
+    for of_test in cases.values():
+        # By a hash of the name: as good as at random, and the same in every run.
+        of_test.sort(key=lambda item: zlib.crc32(item.name.encode()))
+        (count,) = of_test[0].get_closest_marker("few").args
+        for item in of_test[count:]:
+            item.add_marker(pytest.mark.slow)
 
 
 @pytest.fixture(scope="module", autouse=True)

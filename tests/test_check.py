@@ -103,6 +103,7 @@ NOT_STATIONARY = {
 # No false alarm
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", SOUND)
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_sound_kernels_pass_at_every_lengthscale_amplitude_and_dimension(name, dtype):
@@ -120,6 +121,7 @@ def test_sound_kernels_pass_at_every_lengthscale_amplitude_and_dimension(name, d
             assert check_kernel(k, cloud(seed, n=n).astype(dtype)) is None
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", NOT_STATIONARY)
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_kernels_that_are_not_stationary_pass(name, dtype):
@@ -127,6 +129,7 @@ def test_kernels_that_are_not_stationary_pass(name, dtype):
         check_kernel(NOT_STATIONARY[name], cloud(seed, n=n).astype(dtype))
 
 
+@pytest.mark.slow
 def test_no_false_alarm_over_many_clouds_of_points():
     @eqx.filter_jit
     def k(x, z):
@@ -136,6 +139,7 @@ def test_no_false_alarm_over_many_clouds_of_points():
         check_kernel(k, cloud(seed, N=16))
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize(
     "points",
     [
@@ -195,6 +199,7 @@ def test_matern_through_a_norm_is_nan(profile, scale, dtype):
     assert "squared distance" in message
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("profile", [matern32, matern52])
 @pytest.mark.parametrize("ratio", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -245,6 +250,7 @@ def test_too_large_a_block_is_refused_though_the_gram_stays_positive():
     assert "wrong block" in refusal(lambda x, z: profile(squared(x, z)), cloud())
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("norm", [naive_norm, safe_norm])
 @pytest.mark.parametrize("n", [1, 2, 4])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

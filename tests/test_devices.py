@@ -283,6 +283,7 @@ print(json.dumps(result | {"low rank, replicated": off(*few_columns)}))
 """
 
 
+@pytest.mark.slow
 def test_what_is_dense_is_gathered_on_one_device():
     result = on_eight(DENSE)
     assert len(result) == 4

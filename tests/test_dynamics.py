@@ -9,6 +9,7 @@ from benchmarks import dynamics
 SEEDS = 2
 
 
+@pytest.mark.slow
 def test_measures_find_no_error_in_the_true_system():
     system, H = dynamics.HENON_HEILES, dynamics.HENON_HEILES.hamiltonian
     points = dynamics.triangle()
@@ -22,6 +23,7 @@ def test_measures_find_no_error_in_the_true_system():
     assert dynamics.energy_drift(bodies, bodies, states, 20.0).max() < 1e-7
 
 
+@pytest.mark.slow
 def test_measures_find_an_error_that_is_there():
     system, H = dynamics.HENON_HEILES, dynamics.HENON_HEILES.hamiltonian
     points = dynamics.triangle()

@@ -58,6 +58,7 @@ def test_a_field_is_jitted_as_it_is(name):
     close(jax.jit(field)(jnp.asarray(STATES[0])), field(jnp.asarray(STATES[0])))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", KERNELS)
 def test_an_exported_field_is_called_without_hamkernel(name, tmp_path):
     field = hk.fit(KERNELS[name], X, Y, 1e-2)

@@ -106,6 +106,7 @@ def estimate(terms, d):
     return mean, np.sqrt(variance), total
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize("name", KERNELS)
 def test_the_mean_of_the_waves_is_the_kernel(name, key):
     make, formula = KERNELS[name]
@@ -137,6 +138,7 @@ MARGINALS = {  # of one coordinate of ω
 }
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", MARGINALS)
 @pytest.mark.parametrize("n", [1, 3])
 def test_frequencies_have_the_spectral_density(name, n, key):
@@ -211,6 +213,7 @@ DEFECTS = {
 }
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize("name", DEFECTS)
 @pytest.mark.parametrize(
     "count", [1, *(pytest.param(c, marks=pytest.mark.slow) for c in (2, 7, 300)), 60]
@@ -282,6 +285,7 @@ def test_the_gram_error_falls_as_the_root_of_the_count(name):
     assert errors[-1] < 0.1
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_the_field_is_the_sum_of_its_features(name, key):
     basis = features(STRUCTURES[name](hk.Gaussian(1.3)), 4, 5, key, jnp.float64)
@@ -294,6 +298,7 @@ def test_the_field_is_the_sum_of_its_features(name, key):
 # The fit, against NumPy in the same features.
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_weights_are_those_of_ridge_regression_in_numpy(name, key):
     X, Y = data()
@@ -385,6 +390,7 @@ def test_many_features_give_the_field_of_the_exact_kernel(key):
     assert many < few / 2
 
 
+@pytest.mark.slow
 def test_the_pendulum_of_the_paper_is_learned_as_by_the_exact_kernel():
     experiment = experiments()["pendulum_m1"]
     keys = jax.random.split(jax.random.key(5), 8)
@@ -410,6 +416,7 @@ def test_the_pendulum_of_the_paper_is_learned_as_by_the_exact_kernel():
 # Transformations of JAX.
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "make",
     [
@@ -435,6 +442,7 @@ def test_gradients_with_respect_to_hyperparameters_are_differences(make, key):
     np.testing.assert_allclose(jax.jacfwd(jax.grad(loss))(t), second, rtol=10 * DIFFERENCES)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("make", "formula"),
     [

@@ -60,6 +60,7 @@ def reference_gram(block, X, Z):
     return np.block([[block(x, z) for z in Z] for x in X])
 
 
+@pytest.mark.few(5)
 @pytest.mark.parametrize("name", REFERENCES)
 @pytest.mark.parametrize("n", [2, 4])
 def test_coefficients_and_field_are_those_of_numpy(name, n):
@@ -169,6 +170,7 @@ def lengthscale_kernel(name, lengthscale):
     }[name]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["gaussian", "matern", "warp"])
 def test_gradients_are_central_differences(name):
     X, Y = data(5, 2)

@@ -53,6 +53,7 @@ def smallest(G):
     return np.linalg.eigvalsh((G + G.T) / 2).min() / np.trace(G)
 
 
+@pytest.mark.few(16)
 @pytest.mark.parametrize(
     ("structure", "case"),
     [

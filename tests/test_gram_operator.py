@@ -61,6 +61,7 @@ KERNELS = {
 }
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize("name", KERNELS)
 def test_products_are_those_of_the_dense_gram(name):
     K, X, Z = KERNELS[name], normal((FEW, n)), normal((FEW + 5, n), 1)
@@ -119,6 +120,7 @@ def test_jit_and_vmap_give_the_same_product():
     np.testing.assert_allclose(jitted, one_by_one[0], rtol=ROUNDING, atol=ROUNDING)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("argument", ["lengthscale", "X", "Z", "A"])
 def test_the_gradient_is_that_of_finite_differences_across_tiles(argument):
     start = {

@@ -96,6 +96,7 @@ def symplectic_defect(solver, term, x, h=0.3):
 
 # The steps are small enough for the leading term of the error to rule, large enough for the error
 # of the finest to stay far above rounding.
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     ("solver", "order", "steps"),
     [
@@ -119,6 +120,7 @@ def test_error_falls_with_the_nominal_order(solver, order, steps):
     assert solver.order(term) == order
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("solver", GAUSS, ids=name)
 def test_gauss_step_is_symplectic_for_any_hamiltonian(solver):
     assert symplectic_defect(solver, bare_term(tangled), jnp.array([0.4, 0.7])) < ROUNDING
@@ -192,6 +194,7 @@ def stage_residual(solver, field, x, h):
     return np.abs(residual).max() / np.abs(k).max(), result
 
 
+@pytest.mark.few(9)
 @pytest.mark.parametrize("solver", GAUSS, ids=name)
 @pytest.mark.parametrize("h", [1e-3, 0.1, 0.8])
 @pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
@@ -262,12 +265,14 @@ def rollout(solver, coupling, x0):
     return jnp.sum(jnp.sin(integrate(solver, term, x0, 0.0, 2.0, 16, max_steps=16)))
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("solver", [*GAUSS, *SPLITTING], ids=name)
 def test_gradient_of_a_rollout_is_the_central_difference(solver):
     f = jax.jit(lambda c, x: rollout(solver, c, x))
     check_grads(f, (jnp.array(0.9), START), order=1, modes=["rev"])
 
 
+@pytest.mark.slow
 def test_forward_mode_agrees_with_reverse_mode():
     term = diffrax.ODETerm(Term(HenonHeiles()))
 
@@ -279,6 +284,7 @@ def test_forward_mode_agrees_with_reverse_mode():
     np.testing.assert_allclose(forward, reverse, atol=1e-13)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("solver", [*GAUSS, *SPLITTING], ids=name)
 def test_batch_by_vmap_under_jit_is_the_loop(solver):
     starts = START[None] * jnp.linspace(0.5, 1.5, 3)[:, None]
@@ -292,6 +298,7 @@ def test_batch_by_vmap_under_jit_is_the_loop(solver):
     )
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("solver", [*GAUSS, *SPLITTING], ids=name)
 def test_float32_stays_float32(solver):
     term = diffrax.ODETerm(Term(HenonHeiles()))
@@ -300,6 +307,7 @@ def test_float32_stays_float32(solver):
     np.testing.assert_allclose(y, one_step(solver, term, START, 0.1), atol=1e-6)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("solver", [GaussLegendre4(), GaussLegendre6(), Yoshida4()], ids=name)
 def test_values_between_steps_are_cubic(solver):
     term = diffrax.ODETerm(Term(HenonHeiles()))

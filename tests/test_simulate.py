@@ -68,6 +68,7 @@ def test_default_solver_agrees_with_scipy():
     np.testing.assert_allclose(jnp.asarray(solution.ys), reference(times), atol=1e-8)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("solver", "error"),
     list(zip(SYMPLECTIC, [2e-3, 1e-6, 1e-9, 2e-3, 1e-5], strict=True)),
@@ -120,7 +121,16 @@ def drift_and_wobble(energy):
     return abs(slope), np.std(energy - slope * time - offset)
 
 
-@pytest.mark.parametrize("solver", [*SYMPLECTIC, diffrax.Tsit5(), diffrax.Heun()], ids=name)
+@pytest.mark.parametrize(
+    "solver",
+    [
+        SYMPLECTIC[0],
+        *(pytest.param(solver, marks=pytest.mark.slow) for solver in SYMPLECTIC[1:]),
+        diffrax.Tsit5(),
+        pytest.param(diffrax.Heun(), marks=pytest.mark.slow),
+    ],
+    ids=name,
+)
 def test_energy_wobbles_without_drift_over_1e5_steps_only_if_symplectic(solver):
     field, dt, steps = Pendulum(), 0.2, 100_000
     # Saved at an irrational fraction of the period, for every phase of the motion to occur.
@@ -202,6 +212,7 @@ def test_a_tolerance_must_be_positive():
         states(Pendulum(jnp.array(1.0)), START, TIMES, rtol=0.0)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "options",
     [{}, {"solver": ImplicitMidpoint(), "dt": 0.1}, {"solver": StormerVerlet(), "dt": 0.1}],

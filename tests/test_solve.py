@@ -57,6 +57,7 @@ def slow(*names):
     return [pytest.param(name, marks=pytest.mark.slow) for name in names]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "name", ["odd", *slow("symplectic", "sum", "divergence_free", "separable")]
 )
@@ -78,6 +79,7 @@ def test_nystrom_is_the_exact_fit_where_the_tolerance_is_small(name):
     assert kept <= field.points.size
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("tolerance", [10.0, 0.1, 1e-3])
 def test_fitted_values_are_within_the_tolerance_times_the_residual(tolerance):
     X, Y = swings(150)
@@ -106,6 +108,7 @@ def test_the_truncation_and_the_norm_are_those_of_numpy():
     np.testing.assert_allclose(fitted(field, Y).ravel(), F @ w, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_a_larger_ridge_needs_fewer_landmarks():
     X, Y = swings(400)
     counts = [
@@ -151,6 +154,7 @@ def test_no_digits_are_lost_to_normal_equations():
     assert relative(C @ alpha, F @ w) > 1e-5  # the normal equations in the coefficients
 
 
+@pytest.mark.slow
 def test_candidates_that_are_a_part_of_the_data_give_the_same_field():
     X, Y = swings(600)
     field = fit(K, X, Y, RIDGE, solver=Nystrom(candidates=200, key=jax.random.key(5)))
@@ -252,6 +256,7 @@ def test_landmarks_precondition():
     assert counts[0] <= 15 < 2 * counts[0] < counts[1]
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("structure", [hk.Symplectic, hk.Separable])
 @pytest.mark.parametrize(
     "kernel", [lambda x, z: jnp.tanh(x @ z - 1.0), lambda x, z: jnp.tanh(0.1 * x @ z + 1.0)]
@@ -301,6 +306,7 @@ def test_the_gradient_of_conjugate_gradients_in_the_velocities_is_that_of_choles
     np.testing.assert_allclose(slope(iterative), expected, atol=1e-8)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("solver", [Nystrom(1e-6), ConjugateGradient(1e-10)], ids=["low", "cg"])
 def test_a_kernel_may_have_leaves_that_are_no_arrays(solver):
     net = eqx.nn.MLP(2, 3, 4, 1, activation=jnp.tanh, key=jax.random.key(0))
@@ -311,6 +317,7 @@ def test_a_kernel_may_have_leaves_that_are_no_arrays(solver):
     assert relative(fitted(field, Y), values) < 1e-5
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "solver",
     [hk.Cholesky(), Nystrom(), ConjugateGradient(), hk.RandomFeatures(20, jax.random.key(0))],

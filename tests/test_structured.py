@@ -128,6 +128,7 @@ def assert_close(ours, theirs):
 # The structure.
 
 
+@pytest.mark.few(6)
 @EVERYWHERE
 def test_symplectic_fields_are_hamiltonian(case, n):
     Df = jacobian(hk.Symplectic, case, n)
@@ -135,11 +136,13 @@ def test_symplectic_fields_are_hamiltonian(case, n):
     assert divergence(Df) < STRUCTURE
 
 
+@pytest.mark.few(6)
 @EVERYWHERE
 def test_curl_free_fields_have_a_symmetric_jacobian(case, n):
     assert asymmetry(jacobian(hk.CurlFree, case, n)) < STRUCTURE
 
 
+@pytest.mark.few(6)
 @EVERYWHERE
 def test_divergence_free_fields_have_no_divergence(case, n):
     assert divergence(jacobian(hk.DivergenceFree, case, n)) < STRUCTURE
@@ -164,6 +167,7 @@ def test_other_structures_fail_the_same_checks(n):
         assert divergence(Df) > 1e-2
 
 
+@pytest.mark.few(6)
 @EVERYWHERE
 def test_odd_symplectic_fields_are_odd_and_hamiltonian(case, n):
     field = seen(odd_symplectic, case, n)
@@ -172,6 +176,7 @@ def test_odd_symplectic_fields_are_odd_and_hamiltonian(case, n):
     assert asymmetry(canonical(n).T @ field["Df"]) < STRUCTURE
 
 
+@pytest.mark.few(5)
 @EVERY
 def test_even_curl_free_fields_are_even_gradients(case):
     field = seen(even_curl_free, case, 4)
@@ -190,6 +195,7 @@ ANY_STRUCTURE = [
 STRUCTURE_NAMES = ["Separable", "CurlFree", "Symplectic", "DivergenceFree", "Sum"]
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", ["partial", "select"])
 @pytest.mark.parametrize("structure", ANY_STRUCTURE, ids=STRUCTURE_NAMES)
 def test_every_structure_can_be_made_odd_or_even(structure, name):
@@ -254,6 +260,7 @@ def test_gaussian_blocks_are_the_papers(n):
         np.testing.assert_allclose(all_blocks(kernels, x, z), expected, atol=ROUNDING)
 
 
+@pytest.mark.few(6)
 @EVERY
 def test_blocks_are_b_times_the_mixed_derivative_times_b_transposed(case):
     n = 4
@@ -329,6 +336,7 @@ def test_in_the_plane_divergence_free_is_symplectic(name):
     assert np.abs(solenoidal - hamiltonian).max() > 1e-3
 
 
+@pytest.mark.few(6)
 @pytest.mark.parametrize("name", ["matern2.5", "partial"])
 @pytest.mark.parametrize(
     "structure",

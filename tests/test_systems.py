@@ -176,6 +176,7 @@ def test_energy_is_constant_along_the_reference_trajectory_and_not_with_friction
 
 
 # The other systems are sampled below, where something about their trajectories is known exactly.
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["duffing", "henon_heiles", "double_pendulum", "spring_chain"])
 def test_sample_follows_the_reference_trajectory(name):
     system, motion, start = CASES[name]
@@ -552,6 +553,7 @@ def test_everything_may_be_traced(key):
     np.testing.assert_allclose(found[1], expected[1], rtol=0, atol=20 * TRAJECTORY)
 
 
+@pytest.mark.slow
 def test_gradients_through_a_trajectory_match_differences():
     def end(mass, length, x0):
         X, Y = systems.sample(systems.Pendulum(mass, length, GRAVITY), x0, TS)

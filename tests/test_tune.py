@@ -151,6 +151,7 @@ def test_a_single_start_descends_from_the_callers_point():
     assert float(tuned.loss) < 0.9 * refit_loss(K, X, Y, 1e-2)
 
 
+@pytest.mark.slow
 def test_a_network_inside_a_kernel_is_trained():
     # Its activation is a leaf that is no array.
     net = eqx.nn.MLP(2, 3, 4, 1, activation=jnp.tanh, key=jax.random.key(0))
@@ -165,6 +166,7 @@ def test_a_network_inside_a_kernel_is_trained():
     )
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:fitting in float32")
 def test_a_kernel_with_leaves_of_two_precisions_is_trained():
     X, Y = (each.astype(np.float32) for each in scattered())
@@ -279,6 +281,7 @@ def test_kernels_without_structure_and_functions_to_maximise_are_refused():
 # Objectives and optimisers.
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("folds", ["loo", np.repeat([7, 3, 9], 5)], ids=["loo", "labels"])
 def test_folds_of_every_kind_are_tuned(folds):
     X, Y = oscillator()
@@ -307,6 +310,7 @@ def test_other_objectives_reach_a_stationary_point_below_the_start(name, loss):
         assert float(loss(tuned.kernel, X, Y, factor * tuned.regularization)) > best - slack
 
 
+@pytest.mark.slow
 def test_generalized_cross_validation_does_not_choose_fields_that_interpolate(monkeypatch):
     rng = np.random.default_rng(4)
     X = rng.normal(size=(24, 2))
@@ -417,6 +421,7 @@ def test_an_objective_that_is_nowhere_finite_is_an_error_that_says_what_to_chang
         hk.tune(SIMPLE, *scattered(), objective=objective)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("size", [1e-6, 1e6])
 def test_an_objective_may_have_any_size(size):
     # Two steps were enough for a small one to be called converged.
@@ -431,6 +436,7 @@ def test_an_objective_may_have_any_size(size):
         np.testing.assert_allclose(tuned.loss / size, best, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_a_loss_may_be_given_by_its_function_and_keeps_the_folds():
     X, Y = scattered()
     labels = np.arange(N) % 3
@@ -440,6 +446,7 @@ def test_a_loss_may_be_given_by_its_function_and_keeps_the_folds():
     assert given.loss != hk.tune(SIMPLE, X, Y, starts=2).loss
 
 
+@pytest.mark.slow
 def test_a_start_where_the_kernel_is_not_positive_definite_does_not_win():
     X, Y = scattered()
     K = hk.Symplectic(hk.Gaussian(1.0))
@@ -474,6 +481,7 @@ def test_a_fit_or_a_simulation_that_fails_in_an_objective_is_a_point_that_cannot
         hk.tune(SIMPLE, X, Y, objective=raising, bounds=bounds, starts=4)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("unit", [1e-4, 1e4])
 def test_the_amplitude_is_searched_in_any_units(unit):
     X, Y = scattered()
@@ -527,6 +535,7 @@ def rounding(field) -> float:
     return float(velocities.std(axis=0).max() / velocities.std())
 
 
+@pytest.mark.slow
 def test_a_field_tuned_on_noisy_data_can_be_simulated():
     # H is a polynomial: the loss falls slowly, by a few per cent, far down in λ, where the
     # coefficients are so large that a field rounds at 1e-5.
@@ -621,6 +630,7 @@ def test_new_data_of_the_same_shape_does_not_recompile():
     assert len(traced) == count
 
 
+@pytest.mark.slow
 def test_data_that_is_searched_on_a_subset_is_finished_on_all_of_it():
     rng = np.random.default_rng(0)
     X = rng.uniform(-2.5, 2.5, size=(100, 2))

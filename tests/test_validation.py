@@ -63,6 +63,7 @@ def regularised(K, X, ridge: float) -> np.ndarray:
 # The closed form.
 
 
+@pytest.mark.few(10)
 @pytest.mark.parametrize("structure", STRUCTURES)
 @pytest.mark.parametrize("folds", FOLDS)
 @pytest.mark.parametrize("n", [2, 4])
@@ -214,6 +215,7 @@ def differences(value, u, h=1e-3):
     return np.array(slope)
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_gradient_over_hyperparameters_is_that_of_central_differences(name):
     X, Y = data(2)
@@ -224,6 +226,7 @@ def test_gradient_over_hyperparameters_is_that_of_central_differences(name):
     np.testing.assert_allclose(jax.grad(value)(u), expected, atol=DIFFERENCES * scale)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_gradient_over_data_is_that_of_central_differences(name):
     X, Y = data(2, seed=1)
@@ -258,6 +261,7 @@ def edge(X) -> float:
     return low
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["cross-validation unequal", *list(OBJECTIVES)[-2:]])
 def test_gradient_is_that_of_differences_right_before_the_factorisation_fails(name):
     # For folds the ridge is (N − N/F) λ; for the other two it is Nλ. Both factorise here.
@@ -285,6 +289,7 @@ def test_gradient_is_that_of_differences_where_points_coincide_and_the_ridge_is_
 # Failure.
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_value_is_infinite_and_its_gradient_zero_where_the_factorisation_fails(name):
     X, Y = data()
@@ -319,6 +324,7 @@ def test_nan_hyperparameters_give_infinity():
 # Transformations.
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_objectives_map_over_hyperparameters(name):
     X, Y = data()
@@ -372,6 +378,7 @@ def test_labels_equal_in_value_do_not_recompile_and_others_do():
 ONE_LONG = np.append(np.zeros(240, int), 1 + np.arange(160) // 10)  # and sixteen short runs
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "folds", [5, "loo", np.arange(400) % 7, ONE_LONG], ids=["5", "loo", "labels", "one long"]
 )
