@@ -40,13 +40,20 @@ SIGMAS, RIDGES = np.geomspace(0.3, 30, 30), np.geomspace(1e-8, 1, 25)
 
 def timed(run: Callable, repeats: int) -> tuple[float, float]:
     """Minimum and median of seconds, after one call to warm up."""
-    jax.block_until_ready(run())
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
+    return in_turn(repeats, run)[0]
+
+
+def in_turn(repeats: int, *runs: Callable) -> list[tuple[float, float]]:
+    """The same for each of `runs`, one after the other: what slows the machine slows them all."""
+    for run in runs:
         jax.block_until_ready(run())
-        seconds.append(time.perf_counter() - start)
-    return min(seconds), float(np.median(seconds))
+    seconds = [[] for _ in runs]
+    for _ in range(repeats):
+        for run, taken in zip(runs, seconds, strict=True):
+            start = time.perf_counter()
+            jax.block_until_ready(run())
+            taken.append(time.perf_counter() - start)
+    return [(min(taken), float(np.median(taken))) for taken in seconds]
 
 
 def show(name: str, seconds: tuple[float, float], of: float | None = None) -> None:
@@ -183,7 +190,7 @@ def one_refit(K, X, Y, ridge, out):
     return jnp.mean((Y[out] - value) ** 2)
 
 
-def leave_one_out(N: int, quick: bool) -> None:
+def leave_one_out(N: int) -> None:
     X, Y = data(N)
     K, ridge = kernel(1.0), jnp.asarray(1e-4)
 
@@ -195,11 +202,13 @@ def leave_one_out(N: int, quick: bool) -> None:
     np.testing.assert_allclose(refit, np.mean(residuals[N // 3] ** 2), rtol=1e-6)
     print(f"leave-one-out, N = {N}, n = 2; a refit agrees to 1e-6", flush=True)
     A = np.asarray(hk.gram(K, X)).reshape(2 * N, 2 * N) + (N - 1) * 1e-4 * np.eye(2 * N)
-    repeats = 3 if quick else 7
-    factor = timed(lambda: scipy.linalg.cho_factor(A), repeats)
     compiled, with_slope = jax.jit(loss), jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))
-    value = timed(lambda: compiled(K, ridge), repeats)
-    both = timed(lambda: with_slope(K, ridge), repeats)
+    factor, value, both = in_turn(
+        15,
+        lambda: scipy.linalg.cho_factor(A),
+        lambda: compiled(K, ridge),
+        lambda: with_slope(K, ridge),
+    )
     slope = jax.jit(jax.value_and_grad(lambda ridge: one_refit(K, X, Y, ridge, jnp.asarray(7))))
     refits = scaled(timed(lambda: slope((N - 1) * ridge), 2), N)
     show("SciPy's cho_factor of the same matrix", factor)
@@ -232,7 +241,7 @@ def main() -> None:
     print(f"  {'':58s} {'min':>10s} {'median':>10s}")
     for N in (24, 300):
         against_grids(N, quick)
-    leave_one_out(1000, quick)
+    leave_one_out(1000)
     many_hyperparameters()
 
 
