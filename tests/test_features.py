@@ -262,6 +262,7 @@ def gram_error(K, X, count, key):
     return jnp.linalg.norm(approximate - exact) / jnp.linalg.norm(exact)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "name",
     [
@@ -495,6 +496,7 @@ def test_float32_stays_float32(key):
 # Streams.
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "name",
     [

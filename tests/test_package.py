@@ -56,6 +56,7 @@ def test_importing_the_package_is_light_and_leaves_jax_alone():
     assert "jax_enable_x64" in before
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("use", "module"), [("hk.ImplicitMidpoint", "diffrax"), ("hk.plot", "matplotlib")]
 )

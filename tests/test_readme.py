@@ -38,6 +38,7 @@ def test_the_ten_lines_learn_a_pendulum_that_keeps_its_energy():
     assert float(abs(energy[0] - true)) < 0.1 * float(true)
 
 
+@pytest.mark.slow
 def test_the_error_of_differences_is_the_one_that_is_said():
     pendulum, starts = hk.systems.Pendulum(mass=1.0), [[1.26, 0.0], [2.51, 0.0], [2.98, -4.0]]
     ts, still = jnp.linspace(0.0, 0.7, 8), jax.random.key(0)

@@ -159,6 +159,7 @@ def test_small_steps_survive_large_times_in_float32():
     np.testing.assert_allclose(jnp.asarray(solution.ys), reference(ts - 1e5), atol=1e-4)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("options", [{}, {"solver": ImplicitMidpoint(), "dt": 0.1}])
 def test_batch_by_vmap_is_the_loop(options):
     starts = jnp.array([[0.3, 0.0], [1.0, 0.5], [2.5, -0.1]])

@@ -301,6 +301,7 @@ def test_n_body_conserves_momentum_and_angular_momentum_in_total_only():
     assert_changes(spin[:, 0])
 
 
+@pytest.mark.slow
 def test_two_bodies_of_n_body_move_relative_to_each_other_as_in_kepler():
     m1, m2 = 1.3, 0.6
     mu = m1 * m2 / (m1 + m2)
@@ -314,6 +315,7 @@ def test_two_bodies_of_n_body_move_relative_to_each_other_as_in_kepler():
     np.testing.assert_allclose(X[:, 2:4] - X[:, :2], relative[:, :2], atol=TRAJECTORY)
 
 
+@pytest.mark.slow
 def test_point_vortices_conserve_their_impulses_weighted_by_circulation():
     X, _ = systems.sample(VORTICES, VORTICES.state(np.array(VORTEX_PLACES)), np.linspace(0, 3, 7))
     r = np.array(jax.vmap(VORTICES.positions)(X))  # (T, vortices, 2)
@@ -331,6 +333,7 @@ def test_point_vortex_positions_and_state_are_inverse_and_carry_velocities():
     np.testing.assert_allclose(velocity, induced_velocity(places), rtol=ALGEBRA)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("circulations", [(1.0, 3.0), (-1.0, -3.0), (3.0, -1.0)])
 def test_vortex_pair_turns_about_its_centre_at_the_textbook_rate(circulations):
     system = systems.PointVortices(circulations)
@@ -525,6 +528,7 @@ def test_velocities_belong_to_the_true_states(key):
     assert np.max(np.abs(velocities - jax.vmap(jax.vmap(PENDULUM))(noisy))) > 0.1
 
 
+@pytest.mark.slow
 def test_seeds_are_vmapped_and_jitted_alike(key):
     keys = jax.random.split(key, 100)
 

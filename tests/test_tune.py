@@ -136,6 +136,7 @@ def test_result_says_how_the_search_went(rich):
         assert low < high
 
 
+@pytest.mark.slow
 def test_loss_of_a_good_start_never_gets_worse():
     X, Y = scattered()
     good = hk.tune(SIMPLE, X, Y)
@@ -290,6 +291,7 @@ def test_folds_of_every_kind_are_tuned(folds):
     np.testing.assert_allclose(tuned.loss, expected, rtol=FLOOR)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("name", "loss"),
     [
@@ -600,6 +602,7 @@ def test_two_points_are_enough():
     assert np.isfinite(tuned.loss)
 
 
+@pytest.mark.slow
 def test_float32_data_gives_float32_results():
     X, Y = (np.asarray(each, np.float32) for each in scattered())
     K = hk.Symplectic(hk.Gaussian(jnp.asarray(1.0, jnp.float32)))
