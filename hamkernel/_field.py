@@ -145,9 +145,13 @@ class AbstractField(eqx.Module):
         if jnp.shape(value) != ():
             raise ValueError(f"value has shape {jnp.shape(value)}; one number is needed.")
         there = require.floating(value, "value").astype(self.offset.dtype)
-        offset = there - self.unanchored_potential(jnp.asarray(x0))
+        x0 = require.point(x0, self.dimension, "x0")
+        offset = there - self.unanchored_potential(x0)
         offset = require.value(
-            offset, require.not_finite(offset), "x0 and value must be finite: one of them is not."
+            offset,
+            require.not_finite(offset),
+            "x0 and value must be finite, and the field, which is NaN where a fit with throw=False "
+            "failed: one of them is not.",
         )
         return eqx.tree_at(lambda field: field.offset, self, offset)
 

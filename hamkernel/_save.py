@@ -35,7 +35,8 @@ def save(path: str | os.PathLike[str], field: AbstractField) -> None:
 
     Raises:
         TypeError: `field` is no field of this library, or holds something that cannot be stored.
-        ValueError: the call is inside `jax.jit`, where there are no numbers yet.
+        ValueError: the call is inside `jax.jit`, where there are no numbers yet; the field is not
+            finite.
         OSError: the file cannot be written; an older one at `path` is left as it was.
     """
     if not isinstance(field, AbstractField) or type(field).__name__ not in CLASSES:
@@ -118,6 +119,11 @@ def _probe(field: AbstractField) -> list[list[float]]:
     """A state and the velocity there, by which a kernel of the user's own code is known again."""
     points = np.asarray(getattr(field, "points", np.zeros((1, field.dimension))))[:_PROBES]
     velocities = np.asarray(jax.vmap(field)(jnp.asarray(points)))
+    if not np.isfinite(velocities).all():
+        raise ValueError(
+            "the field is NaN or infinite at its own points, as one is from a fit that failed with "
+            "throw=False: there is nothing to save."
+        )
     fastest = np.linalg.norm(velocities, axis=1).argmax()  # at an equilibrium all kernels agree
     return [points[fastest].tolist(), velocities[fastest].tolist()]
 

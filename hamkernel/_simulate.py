@@ -86,7 +86,8 @@ def simulate(
         ValueError: a shape, time or value does not fit; a symplectic solver without `dt`; a solver
             that cannot estimate its error without `dt`; a splitting of a field that is not known to
             be separable.
-        TypeError: `solver` is not a Diffrax solver; the field changes the dtype.
+        TypeError: `solver` is not a Diffrax solver; the field changes the dtype; x0 is of less
+            than float32.
         RuntimeError: the solve failed: too many steps, the implicit equations of a step did not
             converge, or the state overflowed. Usually the remedy is a smaller `dt`.
     """
@@ -97,7 +98,7 @@ def simulate(
     with _eager(x0):
         x0 = _initial_state(x0)
     with _eager(ts):
-        ts = _times(ts, x0.dtype)
+        given, ts = _times(ts, x0.dtype)
     if solver is None:
         solver = diffrax.Dopri8()
     _check_solver(solver, dt, rtol, atol)
@@ -143,11 +144,12 @@ def simulate(
         throw=False,
         progress_meter=meter,
     )
+    solution = _at_times(_seen_to_be_finite(solution), given)
     if counts is not None:  # Diffrax counted the save intervals; the steps are inside them.
         total = require.on_host(counts).sum()
         steps = {"num_steps": jnp.asarray(total), "num_accepted_steps": jnp.asarray(total)}
         solution = eqx.tree_at(lambda s: s.stats, solution, {**solution.stats, **steps})
-    return _successful(solution, dt is not None) if throw else solution
+    return _successful(solution, field, x0, dt is not None) if throw else solution
 
 
 def _eager(*values: Any) -> AbstractContextManager[None]:
@@ -166,24 +168,32 @@ def _initial_state(x0: ArrayLike) -> Float[Array, " n"]:
             else ""
         )
         raise ValueError(f"x0 has shape {x0.shape}; one state of shape (n,) is needed.{hint}")
+    if jnp.finfo(x0.dtype).bits < 32:
+        raise TypeError(f"x0 has dtype {x0.dtype}: float32 or float64 is needed.")
     return require.finite(x0, "x0")
 
 
-def _times(ts: ArrayLike, dtype: Any) -> Float[Array, " T"]:
+def _times(ts: ArrayLike, dtype: Any) -> tuple[Float[Array, " T"], Float[Array, " T"]]:
+    """The times, and those since the first one: the field does not depend on time.
+
+    Late times that come in float64 keep their distances, however large they are in float32.
+    """
     ts = require.floating(ts, "ts")
     if ts.ndim != 1 or ts.size < 2:
         raise ValueError(
             f"ts has shape {ts.shape}; at least two times in one dimension, shape (T,), are "
             "needed: ts[0] is the time of x0, ts[1:] are the times to save at."
         )
-    ts = require.finite(ts, "ts").astype(dtype)
-    seen = require.on_host(ts)
-    return require.value(
-        ts,
+    ts = require.finite(ts, "ts")
+    elapsed = (ts - ts[0]).astype(dtype)
+    seen = require.on_host(elapsed)
+    elapsed = require.value(
+        elapsed,
         seen[1:] <= seen[:-1],
-        f"ts must be strictly increasing, also after it is rounded to {ts.dtype}, the dtype of x0. "
+        f"ts must be strictly increasing, also after it is rounded to {dtype}, the dtype of x0. "
         "Sort the times and drop repeated ones; to go back in time integrate x -> -field(x).",
     )
+    return ts.astype(dtype), elapsed
 
 
 def _check_field(field: Callable[[Array], Array], x0: Float[Array, " n"]) -> None:
@@ -199,10 +209,10 @@ def _check_field(field: Callable[[Array], Array], x0: Float[Array, " n"]) -> Non
             "each coordinate is needed. Is x0 of the dimension the field was made for?"
         )
     if out.dtype != x0.dtype:
-        raise TypeError(
-            f"field maps {x0.dtype} to {out.dtype}; the solution has one dtype. "
-            f"Pass x0 as {out.dtype}, or cast the output of the field."
-        )
+        cure = f"Pass x0 as {out.dtype}, or cast the output of the field."
+        if not jnp.issubdtype(out.dtype, jnp.floating):
+            cure = "Let it return floats."
+        raise TypeError(f"field maps {x0.dtype} to {out.dtype}; the solution has one dtype. {cure}")
 
 
 def _check_solver(solver: Any, dt: Any, rtol: float | None, atol: float | None) -> None:
@@ -250,17 +260,51 @@ def _bound(counts: Int[Array, " T-1"]) -> int:
     return 2 ** (int(np.max(counts)) - 1).bit_length()
 
 
-def _successful(solution: Any, constant_steps: bool) -> Any:
+def _seen_to_be_finite(solution: Any) -> Any:
+    """The solution, with a result that says so where a state is not finite.
+
+    Adaptive steps reject such states; constant ones go through them.
+    """
+    import diffrax
+
+    RESULTS: Any = diffrax.RESULTS
+    reached_end = solution.result == RESULTS.successful
+    overflowed = reached_end & ~jnp.isfinite(solution.ys).all()
+    result = RESULTS.where(overflowed, RESULTS.nonfinite, solution.result)
+    return eqx.tree_at(lambda s: s.result, solution, result)
+
+
+def _at_times(solution: Any, ts: Float[Array, " T"]) -> Any:
+    """The solution with the caller's times; those that it did not reach stay infinite."""
+    reached = jnp.where(jnp.isfinite(solution.ts), ts, solution.ts.astype(ts.dtype))
+    return eqx.tree_at(lambda s: (s.t0, s.t1, s.ts), solution, (ts[0], ts[-1], reached))
+
+
+def _successful(solution: Any, field: Any, x0: Float[Array, " n"], constant_steps: bool) -> Any:
     """The solution, if the solve reached its end in finite numbers."""
     import diffrax
 
-    failed = solution.result != diffrax.RESULTS.successful
+    RESULTS = diffrax.RESULTS
+    failed = solution.result != RESULTS.successful
 
     def message() -> str:
         reason = "Too many steps, or a step whose equations could not be solved."
-        if require.is_concrete(solution.result):
-            reason = diffrax.RESULTS[solution.result]
         cure = "Take a smaller dt."
+        if require.is_concrete(solution.result):
+            if require.is_concrete(field, x0) and not jnp.isfinite(field(x0)).all():
+                return (
+                    "The solve failed: the field is NaN or infinite at x0 already. So is one from "
+                    "a fit that failed with throw=False."
+                )
+            if solution.result == RESULTS.nonfinite:
+                return (
+                    "The state overflowed or became NaN. The step is too large for the solver, or "
+                    "the field has no solution over this time. Take a smaller dt, or a shorter "
+                    "time."
+                )
+            reason = RESULTS[solution.result]
+            if solution.result == RESULTS.max_steps_reached:
+                cure = "With dt, max_steps counts those between two saved times: leave it None."
         if not constant_steps:
             cure = (
                 "Pass larger tolerances, such as rtol=1e-6, atol=1e-6: a learned field rounds, the "
@@ -270,11 +314,4 @@ def _successful(solution: Any, constant_steps: bool) -> Any:
         return f"The solve failed: {reason} {cure} It may also be that the field has no solution."
 
     ys = require.value(solution.ys, require.on_host(failed), message, RuntimeError)
-    ys = require.value(
-        ys,
-        require.not_finite(ys),
-        "The state overflowed or became NaN. The step is too large for the solver, or the field "
-        "has no solution over this time. Take a smaller dt, or a shorter time.",
-        RuntimeError,
-    )
     return eqx.tree_at(lambda s: s.ys, solution, ys)

@@ -372,6 +372,8 @@ def test_a_solve_that_fails_raises_or_is_nan_beside_those_of_its_batch_that_do_n
     alone = learned(logs[0], throw=False)
     for values in (alone.norm, alone.residual, alone(X[0]), alone.hamiltonian(X[0])):
         assert np.isnan(values).all()
+    with pytest.raises(ValueError, match="throw=False failed"):
+        alone.anchored(X[0])
     norms = jax.vmap(lambda log: learned(log, throw=False).norm)(logs)
     np.testing.assert_allclose(
         norms, [jnp.nan, float(learned(logs[1], throw=True).norm)], rtol=1e-6

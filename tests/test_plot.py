@@ -269,3 +269,43 @@ def test_poincare_section_gives_each_orbit_a_colour_and_named_ones_a_legend():
     np.testing.assert_array_equal(ax.lines[2].get_xydata(), ys[2][:, [1, 3]])
     ax = plot.poincare_section({"true": ys[0], "learned": ys[1]}, (1, 3))
     assert labels(ax) == {"true", "learned"}
+
+
+def test_a_hamiltonian_that_is_infinite_at_a_point_is_drawn_elsewhere():
+    def kepler(x):
+        return x[1] ** 2 / 2 - 1 / jnp.abs(x[0])  # the grid has points with q = 0
+
+    left, right = plot.hamiltonian(lambda x: kepler(x) + 7.0, kepler, *LIMITS)
+    for panel in (left, right):
+        drawn = np.concatenate([path.vertices for c in panel.collections for path in c.get_paths()])
+        assert np.ptp(drawn[:, 0]) > 3  # of 4, both sides of the pole
+    with pytest.raises(ValueError, match="nowhere on the grid"):
+        plot.hamiltonian(lambda x: x[0] * jnp.nan, kepler, *LIMITS)
+
+
+def test_coordinates_may_be_counted_from_the_end():
+    ax = plot.trajectories(np.zeros((5, 4)), dims=(-3, -1))
+    assert (ax.get_xlabel(), ax.get_ylabel()) == ("$q_{2}$", "$p_{2}$")
+    for dims in [(0, 5), (1, 1), (0, -4)]:
+        with pytest.raises(ValueError, match="two different coordinates"):
+            plot.trajectories(np.zeros((5, 4)), dims=dims)
+
+
+@pytest.mark.parametrize(
+    "curves",
+    [CIRCLE.T, np.tile(CIRCLE, 2), CIRCLE[0], np.zeros((0, 2)), [CIRCLE, CIRCLE[:9]], {}, object()],
+    ids=["transposed", "wide", "one state", "empty", "ragged", "none", "no array"],
+)
+def test_trajectories_that_are_not_in_the_plane_are_refused(curves):
+    with pytest.raises(ValueError, match="trajector"):
+        plot.phase_portrait(SYSTEM, *LIMITS, trajectories=curves)
+
+
+def test_seeds_that_are_not_finite_are_left_out_and_said():
+    errors = np.tile(np.linspace(1, 2, 5), (20, 1))
+    errors[3, 2:] = np.nan
+    with pytest.warns(UserWarning, match="1 of the 20 curves of learned"):
+        ax = plot.trajectory_error(np.arange(5.0), {"learned": errors})
+    np.testing.assert_array_equal(points_of(ax, "learned")[:, 1], errors[0])
+    with pytest.raises(ValueError, match="none of the 20 curves"):
+        plot.trajectory_error(np.arange(5.0), errors * np.nan)

@@ -577,3 +577,12 @@ def test_a_header_with_any_value_exchanged_gives_a_field_or_a_value_error(tmp_pa
         except ValueError:
             refused += 1
     assert refused > 75
+
+
+def test_a_field_that_is_nan_is_not_saved(tmp_path):
+    X = np.random.default_rng(0).normal(size=(6, 2))
+    twice = np.concatenate([X, X])
+    field = hk.fit(hk.Symplectic(hk.Gaussian(2.0)), twice, twice, 1e-30, throw=False)
+    with pytest.raises(ValueError, match="nothing to save"):
+        hk.save(tmp_path / "field", field)
+    assert not list(tmp_path.iterdir())

@@ -326,3 +326,39 @@ def test_progress_shows_a_bar_and_changes_nothing(options, capsys):
 def test_diffrax_loads_only_when_a_simulation_runs():
     code = "import hamkernel._simulate, sys; assert 'diffrax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+@pytest.mark.parametrize("options", [{}, {"solver": GaussLegendre6(), "dt": 0.01}])
+def test_late_times_are_as_exact_as_early_ones_in_float32(options):
+    # The field does not depend on time. Near 1e5 neighbouring float32 are 0.008 apart.
+    ts = 1e5 + np.linspace(0, 5, 101)
+    solution = simulate(Pendulum(), START.astype(jnp.float32), ts, **options)
+    np.testing.assert_allclose(jnp.asarray(solution.ys), reference(ts - ts[0]), atol=2e-5)
+    np.testing.assert_array_equal(solution.ts, ts.astype(np.float32))
+    assert (float(solution.t0), float(solution.t1)) == (ts[0], ts[-1])
+
+
+def test_a_state_that_overflows_in_constant_steps_is_no_success():
+    import diffrax
+
+    def run(throw):
+        return simulate(lambda x: x**2, np.ones(1), np.array([0.0, 0.5, 2.0]), dt=0.01, throw=throw)
+
+    solution = run(throw=False)
+    ys = np.asarray(solution.ys)
+    assert solution.result == diffrax.RESULTS.nonfinite
+    assert not np.isfinite(ys[-1]).any()
+    np.testing.assert_allclose(ys[1], [2.0], atol=1e-8)  # 1/(1 - t)
+    with pytest.raises(RuntimeError, match="overflowed"):
+        run(throw=True)
+
+
+def test_the_reason_of_a_failure_is_the_one_that_is_said():
+    with pytest.raises(RuntimeError, match="NaN or infinite at x0 already"):
+        simulate(lambda x: x * jnp.nan, START, TIMES)
+    with pytest.raises(RuntimeError, match="leave it None"):
+        simulate(Pendulum(), START, TIMES, dt=0.1, max_steps=2)
+    with pytest.raises(TypeError, match="return floats"):
+        simulate(lambda x: jnp.array([1, 2]), START, TIMES)
+    with pytest.raises(TypeError, match="float32 or float64"):
+        simulate(Pendulum(), START.astype(jnp.float16), TIMES)

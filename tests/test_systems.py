@@ -647,3 +647,23 @@ systems.sample(system, np.array([1.0, 0.0]), np.array([0.0, 1.0]))
 """
     run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
+
+
+@pytest.mark.parametrize(
+    ("key", "error", "message"),
+    [
+        (0, TypeError, r"jax.random.key\(0\); got 0"),
+        (np.zeros(2), TypeError, "must be a key"),
+        (jax.random.split(jax.random.key(0), 3), ValueError, "jax.vmap"),
+    ],
+)
+def test_what_is_no_key_is_refused(key, error, message):
+    with pytest.raises(error, match=message):
+        systems.sample(PENDULUM, START, TS, 0.1, key=key)
+
+
+def test_keys_of_the_older_kind_are_the_same():
+    old = systems.sample(PENDULUM, START, TS, 0.1, key=jax.random.PRNGKey(3))[0]
+    np.testing.assert_array_equal(
+        old, systems.sample(PENDULUM, START, TS, 0.1, key=jax.random.key(3))[0]
+    )

@@ -29,7 +29,8 @@ def hamiltonian(
     """Draw the true and the learned Hamiltonian side by side, on the same contours.
 
     Velocities determine H up to a constant: the learned one is shifted by the mean difference
-    over the grid, then both are drawn less the minimum of the true one.
+    over the grid, then both are drawn less the minimum of the true one. Where a function is not
+    finite the picture is left white.
 
     Args:
         learned: x (2,) -> (), such as `field.hamiltonian`.
@@ -45,10 +46,16 @@ def hamiltonian(
 
     Returns:
         The two axes.
+
+    Raises:
+        ValueError: nowhere on the grid are both functions finite.
     """
     q, p, points = grid(xlim, ylim, resolution)
     H, H_learned = (on_points(fn, points).reshape(len(p), len(q)) for fn in (true, learned))
-    H_learned = H_learned - np.mean(H_learned - H)
+    H, H_learned = np.ma.masked_invalid(H), np.ma.masked_invalid(H_learned)
+    if (H + H_learned).count() == 0:
+        raise ValueError("nowhere on the grid are both functions finite.")
+    H_learned = H_learned - (H_learned - H).mean()
     H, H_learned = H - H.min(), H_learned - H.min()
     left, right = _pair() if ax is None else ax
     steps = MaxNLocator(levels).tick_values(0, float(H.max()))

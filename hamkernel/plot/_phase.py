@@ -55,7 +55,7 @@ def phase_portrait(
         show_legend: whether named trajectories and data get a legend.
 
     Raises:
-        ValueError: the field or the data are not in the plane.
+        ValueError: the field, the data or a trajectory is not in the plane.
     """
     q, p, points = grid(xlim, ylim, resolution)
     velocities = on_points(field, points)
@@ -67,10 +67,10 @@ def phase_portrait(
     X = None if data is None else np.asarray(data)
     if X is not None and (X.ndim != 2 or X.shape[1] != 2):
         raise ValueError(f"data has shape {X.shape}; measured states (N, 2) are needed.")
+    curves = {} if trajectories is None else _checked(trajectories, 2)
     ax = axes(ax, figsize=(5.2, 4.6))
     _stream(ax, q, p, velocities, density)
-    if trajectories is not None:
-        _curves(ax, named(trajectories), (0, 1))
+    _curves(ax, curves, (0, 1))
     if X is not None:
         ax.plot(*X.T, "o", color=DATA, mec="black", mew=0.6, ms=5, zorder=5, label="data")
     return _finish(ax, (0, 1), 2, units, title, show_legend, xlim, ylim)
@@ -97,17 +97,14 @@ def trajectories(
         show_legend: whether named trajectories get a legend.
 
     Raises:
-        ValueError: an array is of another shape.
+        ValueError: an array is of another shape, there is none, or `dims` are not two of the
+            coordinates.
     """
-    curves = named(ys)
-    for values in curves.values():
-        if values.ndim not in (2, 3):
-            raise ValueError(
-                f"a trajectory has shape {values.shape}; (T, n) or (B, T, n) is needed."
-            )
+    curves = _checked(ys)
+    n = next(iter(curves.values())).shape[-1]
+    _check_dims(dims, n)
     ax = axes(ax, figsize=(4.6, 4.2))
     _curves(ax, curves, dims)
-    n = next(iter(curves.values())).shape[-1]
     return _finish(ax, dims, n, units, title, show_legend)
 
 
@@ -145,10 +142,11 @@ def plane_slice(
         resolution: points on each axis of the grid.
 
     Raises:
-        ValueError: the function is neither scalar nor a field on n coordinates, or it is finite
-            nowhere on the grid.
+        ValueError: the function is neither scalar nor a field on n coordinates, it is finite
+            nowhere on the grid, or `dims` are not two of the coordinates.
     """
     point = np.asarray(point, float)
+    _check_dims(dims, len(point))
     x, y, plane = grid(xlim, ylim, resolution)
     states = np.tile(point, (len(plane), 1))
     states[:, list(dims)] = plane
@@ -185,6 +183,33 @@ def _stream(
 ) -> None:
     u, v = np.moveaxis(velocities.reshape(len(y), len(x), 2), -1, 0)
     ax.streamplot(x, y, u, v, color=color, linewidth=0.7, arrowsize=0.7, density=density, zorder=1)
+
+
+def _checked(curves: Curves, n: int | None = None) -> dict[str | None, np.ndarray]:
+    """The curves by name, if all of them are trajectories of n coordinates, those of the first."""
+    try:
+        arrays = named(curves)
+    except ValueError as error:  # rows of unequal length
+        raise ValueError(
+            "trajectories of unequal length are not one array: name them, {name: (T, n), ...}."
+        ) from error
+    if not arrays:
+        raise ValueError("there is no trajectory to draw: the mapping is empty.")
+    for name, ys in arrays.items():
+        n = ys.shape[-1] if n is None and ys.ndim in (2, 3) else n
+        if ys.ndim not in (2, 3) or ys.size == 0 or ys.shape[-1] != n:
+            of_name = "" if name is None else f" {name!r}"
+            width = "n" if n is None else n
+            raise ValueError(
+                f"the trajectory{of_name} has shape {ys.shape}; (T, {width}) or (B, T, {width}) is "
+                "needed, such as the .ys of hk.simulate."
+            )
+    return arrays
+
+
+def _check_dims(dims: tuple[int, int], n: int) -> None:
+    if len({range(n)[i] for i in dims if -n <= i < n}) != 2:
+        raise ValueError(f"dims must be two different coordinates of {n}, got {dims}.")
 
 
 def _curves(ax: Axes, curves: Mapping[str | None, np.ndarray], dims: tuple[int, int]) -> None:

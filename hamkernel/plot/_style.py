@@ -62,7 +62,7 @@ def line_styles(series: Mapping[str | None, Any]) -> Iterator[dict[str, Any]]:
 
 def coordinate(i: int, n: int) -> str:
     """The symbol of coordinate i of a state (q, p) of n coordinates."""
-    m = n // 2
+    m, i = n // 2, range(n)[i]  # counted from the end where negative
     symbol = "q" if i < m else "p"
     return f"${symbol}$" if n == 2 else f"${symbol}_{{{i % m + 1}}}$"
 

@@ -1,5 +1,6 @@
 """Pictures over time."""
 
+import warnings
 from collections.abc import Mapping
 
 import numpy as np
@@ -26,6 +27,8 @@ def trajectory_error(
 ) -> Axes:
     """Draw the error of trajectories over time; of several seeds, the median and a band.
 
+    Seeds with a value that is not finite are left out, with a warning.
+
     Args:
         ts: times, shape (T,).
         errors: ‖x_true(t) − x(t)‖, shape (T,) or (S, T), or a mapping from names to such arrays.
@@ -36,6 +39,9 @@ def trajectory_error(
         time_unit: of `ts`.
         title: of the axes.
         show_legend: whether named curves get a legend.
+
+    Raises:
+        ValueError: no seed of a curve is finite.
     """
     ax = axes(ax, figsize=(5.6, 3.8))
     _bands(ax, ts, named(errors), quantiles, log)
@@ -71,7 +77,7 @@ def energy_drift(
         show_legend: whether named curves get a legend.
 
     Raises:
-        ValueError: `relative`, and an energy is zero at the start.
+        ValueError: `relative`, and an energy is zero at the start; no seed of a curve is finite.
     """
     changes = {}
     for name, values in named(energies).items():
@@ -98,6 +104,17 @@ def _bands(
     ts = np.asarray(ts)
     for style, values in zip(line_styles(series), series.values(), strict=True):
         seeds = np.atleast_2d(values)  # (S, T)
+        finite = np.isfinite(seeds).all(axis=1)
+        of_name = f" of {style['label']}" if style["label"] else ""
+        if len(seeds) > 1 and not finite.all():
+            if not finite.any():
+                raise ValueError(f"none of the {len(seeds)} curves{of_name} is finite.")
+            warnings.warn(
+                f"{np.sum(~finite)} of the {len(seeds)} curves{of_name} are NaN or "
+                "infinite somewhere and left out of the median and the band.",
+                stacklevel=3,
+            )
+            seeds = seeds[finite]
         low, median, high = np.quantile(seeds, [quantiles[0], 0.5, quantiles[1]], axis=0)
         if log:
             low, median, high = (np.where(v > 0, v, np.nan) for v in (low, median, high))

@@ -54,6 +54,8 @@ def sample(
     Source: Smith & Egeland (2023), section Experiments, where both levels are one number.
     """
     x0 = require.floating(x0, "x0")
+    if jnp.finfo(x0.dtype).bits < 32:
+        raise TypeError(f"x0 has dtype {x0.dtype}: float32 or float64 is needed.")
     states = finite(require.points(x0[None] if x0.ndim == 1 else x0, "x0"), "x0")
     ts = _times(ts, states.dtype)
     system = _in_precision(system, states.dtype)
@@ -67,6 +69,7 @@ def sample(
         _noise_level(level, name, states, key)
         for level, name in [(state_noise, "state_noise"), (velocity_noise, "velocity_noise")]
     ]
+    _check_key(key)
     X, Y, failed = _trajectories(system, states, ts)  # (B, T, n) twice, (B,)
     X = require.value(X, failed, lambda: _failure(failed), RuntimeError)
     if key is not None:
@@ -102,6 +105,20 @@ def _times(ts: ArrayLike, dtype: jnp.dtype) -> Float[Array, " T"]:
         seen[1:] <= seen[:-1],
         f"ts must be strictly increasing in {dtype}: sort it and drop repeated times.",
     )
+
+
+def _check_key(key: PRNGKeyArray | None) -> None:
+    if key is None:
+        return
+    shape, dtype = jnp.shape(key), getattr(key, "dtype", None)
+    modern = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+    if not modern and dtype != np.uint32:
+        raise TypeError(f"key must be a key of JAX, such as jax.random.key(0); got {key!r}.")
+    if shape != (() if modern else (2,)):
+        raise ValueError(
+            f"key has shape {shape}; one key is needed. For many seeds use "
+            "jax.vmap(lambda key: sample(..., key=key))(keys)."
+        )
 
 
 def _noise_level(
