@@ -81,6 +81,12 @@ def floating(x: ArrayLike, name: str) -> Array:
     )
 
 
+def single_or_double(dtype: Any, whose: str) -> None:
+    """Refuse a dtype with fewer digits than float32."""
+    if jnp.finfo(dtype).bits < 32:
+        raise TypeError(f"{whose} dtype {dtype}: float32 or float64 is needed.")
+
+
 def warn_of_float32(X: Array, stacklevel: int) -> None:
     """Say what a fit in float32 may be expected to do."""
     if X.dtype == jnp.float32:
@@ -135,6 +141,22 @@ def finite(x: Array, name: str) -> Array:
     return value(x, not_finite(x), message)
 
 
+def elapsed(ts: Float[Array, " T"], dtype: Any) -> Float[Array, " T"]:
+    """The times since the first one, which must increase, in the dtype of the states.
+
+    A field does not depend on time. Late times that come in float64 keep their distances so,
+    however large they are in float32.
+    """
+    since = (ts - ts[0]).astype(dtype)
+    seen = on_host(since)
+    return value(
+        since,
+        seen[1:] <= seen[:-1],
+        f"ts must be strictly increasing in {dtype}, the dtype of x0: sort the times and drop "
+        "repeated ones; to go back in time integrate x -> -field(x).",
+    )
+
+
 def points(X: ArrayLike, name: str = "X") -> Float[Array, "N n"]:
     """States as a float array of shape (N, n) with N ≥ 1; their values are not looked at."""
     array = floating(X, name)
@@ -176,8 +198,7 @@ def data(X: ArrayLike, Y: ArrayLike) -> tuple[Float[Array, "N n"], Float[Array, 
             "one velocity Y[i] for each state X[i]."
         )
     dtype = jnp.result_type(X, Y)
-    if jnp.finfo(dtype).bits < 32:
-        raise TypeError(f"X and Y have dtype {dtype}: float32 or float64 is needed.")
+    single_or_double(dtype, "X and Y have")
     return finite(X.astype(dtype), "X"), finite(Y.astype(dtype), "Y")
 
 

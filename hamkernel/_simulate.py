@@ -98,7 +98,8 @@ def simulate(
     with _eager(x0):
         x0 = _initial_state(x0)
     with _eager(ts):
-        given, ts = _times(ts, x0.dtype)
+        given = _times(ts)
+        ts = require.elapsed(given, x0.dtype)
     if solver is None:
         solver = diffrax.Dopri8()
     _check_solver(solver, dt, rtol, atol)
@@ -144,7 +145,7 @@ def simulate(
         throw=False,
         progress_meter=meter,
     )
-    solution = _at_times(_seen_to_be_finite(solution), given)
+    solution = _at_times(_seen_to_be_finite(solution), given.astype(x0.dtype))
     if counts is not None:  # Diffrax counted the save intervals; the steps are inside them.
         total = require.on_host(counts).sum()
         steps = {"num_steps": jnp.asarray(total), "num_accepted_steps": jnp.asarray(total)}
@@ -168,32 +169,18 @@ def _initial_state(x0: ArrayLike) -> Float[Array, " n"]:
             else ""
         )
         raise ValueError(f"x0 has shape {x0.shape}; one state of shape (n,) is needed.{hint}")
-    if jnp.finfo(x0.dtype).bits < 32:
-        raise TypeError(f"x0 has dtype {x0.dtype}: float32 or float64 is needed.")
+    require.single_or_double(x0.dtype, "x0 has")
     return require.finite(x0, "x0")
 
 
-def _times(ts: ArrayLike, dtype: Any) -> tuple[Float[Array, " T"], Float[Array, " T"]]:
-    """The times, and those since the first one: the field does not depend on time.
-
-    Late times that come in float64 keep their distances, however large they are in float32.
-    """
+def _times(ts: ArrayLike) -> Float[Array, " T"]:
     ts = require.floating(ts, "ts")
     if ts.ndim != 1 or ts.size < 2:
         raise ValueError(
             f"ts has shape {ts.shape}; at least two times in one dimension, shape (T,), are "
             "needed: ts[0] is the time of x0, ts[1:] are the times to save at."
         )
-    ts = require.finite(ts, "ts")
-    elapsed = (ts - ts[0]).astype(dtype)
-    seen = require.on_host(elapsed)
-    elapsed = require.value(
-        elapsed,
-        seen[1:] <= seen[:-1],
-        f"ts must be strictly increasing, also after it is rounded to {dtype}, the dtype of x0. "
-        "Sort the times and drop repeated ones; to go back in time integrate x -> -field(x).",
-    )
-    return ts.astype(dtype), elapsed
+    return require.finite(ts, "ts")
 
 
 def _check_field(field: Callable[[Array], Array], x0: Float[Array, " n"]) -> None:
@@ -288,7 +275,10 @@ def _successful(solution: Any, field: Any, x0: Float[Array, " n"], constant_step
     failed = solution.result != RESULTS.successful
 
     def message() -> str:
-        reason = "Too many steps, or a step whose equations could not be solved."
+        reason = (
+            "Too many steps, a step whose equations could not be solved, or a state that "
+            "overflowed or became NaN."
+        )
         cure = "Take a smaller dt."
         if require.is_concrete(solution.result):
             if require.is_concrete(field, x0) and not jnp.isfinite(field(x0)).all():

@@ -339,8 +339,6 @@ def test_late_times_are_as_exact_as_early_ones_in_float32(options):
 
 
 def test_a_state_that_overflows_in_constant_steps_is_no_success():
-    import diffrax
-
     def run(throw):
         return simulate(lambda x: x**2, np.ones(1), np.array([0.0, 0.5, 2.0]), dt=0.01, throw=throw)
 

@@ -182,3 +182,10 @@ def test_a_dense_loss_that_does_not_fit_is_refused_before_the_search(monkeypatch
         hk.tune(K, X, Y, 1e-3, 5)
     with pytest.raises(ValueError, match="3 matrices of 240 by 240"):
         hk.cross_validation_loss(K, X, Y, 1e-3, 5)
+
+
+@pytest.mark.slow
+def test_what_does_not_fit_densely_is_tuned_with_low_rank(monkeypatch):
+    X, Y = data(120)
+    monkeypatch.setattr("hamkernel._memory.memory_bytes", lambda: 100_000)
+    assert np.isfinite(hk.tune(K, X, Y, 1e-3, 5, starts=2, solver=hk.Nystrom()).loss)

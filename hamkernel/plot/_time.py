@@ -104,17 +104,8 @@ def _bands(
     ts = np.asarray(ts)
     for style, values in zip(line_styles(series), series.values(), strict=True):
         seeds = np.atleast_2d(values)  # (S, T)
-        finite = np.isfinite(seeds).all(axis=1)
-        of_name = f" of {style['label']}" if style["label"] else ""
-        if len(seeds) > 1 and not finite.all():
-            if not finite.any():
-                raise ValueError(f"none of the {len(seeds)} curves{of_name} is finite.")
-            warnings.warn(
-                f"{np.sum(~finite)} of the {len(seeds)} curves{of_name} are NaN or "
-                "infinite somewhere and left out of the median and the band.",
-                stacklevel=3,
-            )
-            seeds = seeds[finite]
+        if len(seeds) > 1:
+            seeds = _finite_seeds(seeds, f" of {style['label']}" if style["label"] else "")
         low, median, high = np.quantile(seeds, [quantiles[0], 0.5, quantiles[1]], axis=0)
         if log:
             low, median, high = (np.where(v > 0, v, np.nan) for v in (low, median, high))
@@ -123,6 +114,20 @@ def _bands(
             ax.fill_between(ts, low, high, color=style["color"], alpha=0.2, linewidth=0)
     if log:
         ax.set_yscale("log")
+
+
+def _finite_seeds(seeds: np.ndarray, of_name: str) -> np.ndarray:
+    """The curves (S, T) that are finite throughout."""
+    finite = np.isfinite(seeds).all(axis=1)
+    if not finite.any():
+        raise ValueError(f"none of the {len(seeds)} curves{of_name} is finite.")
+    if not finite.all():
+        warnings.warn(
+            f"{np.sum(~finite)} of the {len(seeds)} curves{of_name} are NaN or infinite somewhere "
+            "and left out of the median and the band.",
+            stacklevel=4,
+        )
+    return seeds[finite]
 
 
 def _finish(
