@@ -7,17 +7,19 @@ that the kernel sees: behind a `Select` or a `Warp` the data is transformed firs
 
 import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import GetAttrKey, SequenceKey, keystr, tree_flatten_with_path
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel._gram import block_traces
 from hamkernel._scalar import AbstractScalarKernel
 from hamkernel._scalar_transform import Select, Symmetrised, Warp
-from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._structured import AbstractMatrixKernel, Sum
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,10 +84,9 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
     """Walk the kernel; X is the data in the coordinates that `node` sees."""
     if isinstance(node, Select):
         X = X[:, list(node.dims)]
-    children, _ = jax.tree_util.tree_flatten_with_path(node, is_leaf=lambda sub: sub is not node)
-    for key, child in children:
+    for key, child in _children(node):
         if eqx.is_inexact_array(child):
-            name = jax.tree_util.keystr((*path, *key)).removeprefix(".")
+            name = keystr((*path, *key)).removeprefix(".")
             if jnp.iscomplexobj(child):
                 raise TypeError(
                     f"the hyperparameter {name} is complex; tune moves real numbers. Store its "
@@ -105,6 +106,17 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
             if isinstance(node, Warp) and isinstance(child, AbstractScalarKernel):
                 seen = np.asarray(jax.vmap(node.fn)(jnp.asarray(X)))
             yield from _walk((*path, *key), child, seen, amplitude)
+
+
+def _children(node: object) -> list[tuple[tuple, Any]]:
+    """The nodes below this one with their keys; the terms of a sum by their names."""
+    if isinstance(node, Sum):
+        keys = [
+            (GetAttrKey(name),) if name else (GetAttrKey("terms"), SequenceKey(i))
+            for i, name in enumerate(node.names)
+        ]
+        return list(zip(keys, node.terms, strict=True))
+    return tree_flatten_with_path(node, is_leaf=lambda sub: sub is not node)[0]
 
 
 def _box(

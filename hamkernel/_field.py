@@ -90,13 +90,13 @@ class AbstractField(eqx.Module):
             KeyError: there is no such part (with the choices).
         """
         if isinstance(self.kernel, Sum):
-            return self._term(self.kernel, which)
+            return self._term(self.kernel, self.kernel.position(which))
         if which == 0:
             return self
         raise KeyError(f"no part {which!r}: {type(self.kernel).__name__} is not a sum.")
 
     @abc.abstractmethod
-    def _term(self: Field, kernel: Sum, which: int | str) -> Field:
+    def _term(self: Field, kernel: Sum, position: int) -> Field:
         """`part` where the kernel is a sum."""
 
     @property
@@ -239,6 +239,6 @@ class KernelField(AbstractField):
         x = self._state(x)
         return potential(self.kernel, x, self.points, self.coefficients)
 
-    def _term(self, kernel: Sum, which: int | str) -> "KernelField":
-        parts = kernel.part(which), jnp.zeros_like(self.offset)
+    def _term(self, kernel: Sum, position: int) -> "KernelField":
+        parts = kernel.terms[position], jnp.zeros_like(self.offset)
         return eqx.tree_at(lambda f: (f.kernel, f.offset), self, parts)

@@ -5,6 +5,7 @@ by NumPy when they are concrete, for it compiles nothing; under `jax.jit` the sa
 `equinox.error_if` on the value that is returned, so it must be used by the caller.
 """
 
+import operator
 import reprlib
 import warnings
 from collections.abc import Callable
@@ -58,6 +59,16 @@ def value(
     if bad:
         raise error(message if isinstance(message, str) else message())
     return x
+
+
+def count(number: Any, name: str) -> int:
+    """`number` as a Python integer, at least 1."""
+    message = f"{name} must be a whole number, at least 1; got {number!r}."
+    if isinstance(number, bool) or not hasattr(number, "__index__"):
+        raise TypeError(message)
+    if operator.index(number) < 1:
+        raise ValueError(message)
+    return operator.index(number)
 
 
 def floating(x: ArrayLike, name: str) -> Array:

@@ -37,6 +37,8 @@ def packed(header: Node, arrays: list[np.ndarray]) -> bytes:
 
 
 def write(path: pathlib.Path, content: bytes) -> None:
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder; save needs the name of a file.")
     if not path.parent.is_dir():
         raise FileNotFoundError(f"there is no folder {path.parent} to write {path.name} to.")
     temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")

@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._callable import as_pytree
-from hamkernel._show import described
+from hamkernel._show import described, exponential, in_brackets, joined, text
 
 
 class Invariance(enum.Flag):
@@ -41,7 +41,7 @@ class AbstractScalarKernel(eqx.Module):
     """
 
     def __repr__(self) -> str:
-        return described(self)
+        return described(self, positional=("kernel",))
 
     @abc.abstractmethod
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
@@ -88,6 +88,9 @@ class ScalarSum(AbstractScalarKernel):
 
     terms: tuple[AbstractScalarKernel, ...]
 
+    def __repr__(self) -> str:
+        return joined("+", [repr(k) for k in self.terms])
+
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         return sum((k(x, z) for k in self.terms[1:]), start=self.terms[0](x, z))
 
@@ -103,6 +106,9 @@ class ScalarProduct(AbstractScalarKernel):
     """k₁(x, z) k₂(x, z) …"""  # noqa: D415
 
     terms: tuple[AbstractScalarKernel, ...]
+
+    def __repr__(self) -> str:
+        return joined("*", [_factor(k) for k in self.terms])
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         return math.prod((k(x, z) for k in self.terms[1:]), start=self.terms[0](x, z))
@@ -135,6 +141,9 @@ class Scaled(AbstractScalarKernel):
         self.kernel = kernel
         self.log_scale = jnp.log(require.positive_scalar(scale, "the scale of a kernel"))
 
+    def __repr__(self) -> str:
+        return f"{exponential(self.log_scale)} * {_factor(self.kernel)}"
+
     @property
     def scale(self) -> Float[Array, ""]:
         return jnp.exp(self.log_scale)
@@ -151,6 +160,10 @@ class Scaled(AbstractScalarKernel):
         return self.kernel.supports(n)
 
 
+def _factor(kernel: AbstractScalarKernel) -> str:
+    return in_brackets(repr(kernel)) if isinstance(kernel, ScalarSum) else repr(kernel)
+
+
 class UserKernel(AbstractScalarKernel):
     """Any callable (x, z) -> scalar: a function, an Equinox module, another library's kernel.
 
@@ -162,6 +175,10 @@ class UserKernel(AbstractScalarKernel):
 
     def __init__(self, fn: Callable[..., Any]):
         self.fn = as_pytree(of_one_pair(fn))
+
+    def __repr__(self) -> str:
+        bare = type(self.fn).__repr__ is eqx.Module.__repr__  # it says nothing of values
+        return described(self.fn) if bare else text(self.fn)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         value = self.fn(x, z)

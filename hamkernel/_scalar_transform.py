@@ -2,7 +2,7 @@
 
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -177,20 +177,29 @@ def with_parity(kernel: AbstractScalarKernel, parity: int) -> AbstractScalarKern
     )
 
 
-def parity_removed(
-    kernel: AbstractScalarKernel,
-) -> tuple[AbstractScalarKernel, float] | None:
-    """The k and the parity of which `kernel` is (k(x, z) + parity k(x, −z))/2, or None."""
-    if isinstance(kernel, Symmetrised):
-        simple = kernel.one_sided and kernel.maps == (identity, reflection)
-        return (kernel.kernel, kernel.characters[1]) if simple else None
+class _ParityRemoved(NamedTuple):
+    kernel: AbstractScalarKernel
+    parity: float
+    one_sided: bool
+
+
+def parity_removed(kernel: AbstractScalarKernel) -> _ParityRemoved | None:
+    """The k and the parity of which `kernel` is `with_parity`, or None.
+
+    Where it is one-sided, it is (k(x, z) + parity k(x, −z))/2.
+    """
+    if isinstance(kernel, Symmetrised) and kernel.maps == (identity, reflection):
+        return _ParityRemoved(kernel.kernel, kernel.characters[1], kernel.one_sided)
     if isinstance(kernel, Scaled | Select):
         inner = parity_removed(kernel.kernel)
-        return inner and (eqx.tree_at(lambda s: s.kernel, kernel, inner[0]), inner[1])
+        return inner and inner._replace(
+            kernel=eqx.tree_at(lambda s: s.kernel, kernel, inner.kernel)
+        )
     if isinstance(kernel, ScalarSum):
         found = [parity_removed(term) for term in kernel.terms]
         known = [each for each in found if each is not None]
-        parities = {parity for _, parity in known}
+        parities = {each.parity for each in known}
         if len(known) == len(found) and len(parities) == 1:
-            return ScalarSum(tuple(k for k, _ in known)), parities.pop()
+            terms = ScalarSum(tuple(each.kernel for each in known))
+            return _ParityRemoved(terms, parities.pop(), all(each.one_sided for each in known))
     return None

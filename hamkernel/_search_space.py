@@ -1,5 +1,7 @@
 """The box of hyperparameters, as all real vectors u."""
 
+from collections.abc import Mapping
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -40,7 +42,7 @@ class SearchSpace(eqx.Module):
         Y: Float[Array, "N n"],
         regularization: Float[Array, ""],
         frozen: tuple[str, ...],
-        bounds: dict[str, tuple[ArrayLike, ArrayLike]],
+        bounds: Mapping[str, tuple[ArrayLike, ArrayLike]],
         roundings: float = ROUNDINGS,
     ):
         dtype = X.dtype
@@ -49,7 +51,7 @@ class SearchSpace(eqx.Module):
         sizes = [param.low.size for param in params]
         self.names = (*np.repeat([p.name for p in params], sizes).tolist(), RIDGE)
         self.logarithmic = (*np.repeat([p.logarithmic for p in params], sizes).tolist(), True)
-        held = {i for name in frozen for i in _matching(name, self.names)}
+        held = {i for name in frozen for i in _matching(name, self.names, of_part=True)}
         self.free = tuple(i for i in range(len(self.names)) if i not in held)
         if not self.free:
             raise ValueError(
@@ -167,9 +169,14 @@ class SearchSpace(eqx.Module):
         return box
 
 
-def _matching(name: str, names: tuple[str, ...]) -> list[int]:
-    """The entries whose full name is `name` or ends in it, after a dot."""
-    found = [i for i, full in enumerate(names) if full == name or full.endswith("." + name)]
+def _matching(name: str, names: tuple[str, ...], of_part: bool = False) -> list[int]:
+    """The entries whose full name ends in `name`, or, of a part, has it anywhere."""
+    name_of_part, full = f".{name}.", [f".{full}." for full in names]
+    found = [
+        i
+        for i, each in enumerate(full)
+        if each.endswith(name_of_part) or (of_part and name_of_part in each)
+    ]
     if not found:
         raise ValueError(
             f"no hyperparameter {name!r}; this kernel has {', '.join(dict.fromkeys(names))}."

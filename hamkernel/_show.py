@@ -9,30 +9,69 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jaxtyping import Array
 
 _WIDTH = 88  # of a line, beyond which each attribute has its own
 _FEW = 16  # numbers of a vector that are printed
 
 
-def described(module: Any) -> str:
+def described(module: Any, positional: tuple[str, ...] = ()) -> str:
     """`Gaussian(lengthscale=3.28)`: the attributes as they are read, few numbers as values.
 
-    What does not apply, and so is left at None, is left out.
+    Those in `positional` are shown without their names. What does not apply, and so is left at
+    None, is left out.
     """
-    fields = [f for f in dataclasses.fields(module) if getattr(module, f.name) is not None]
-    shown = [_attribute(module, field.name) for field in fields]
-    line = f"{type(module).__name__}({', '.join(shown)})"
-    if len(line) <= _WIDTH and "\n" not in line:
+    names = [f.name for f in dataclasses.fields(module) if getattr(module, f.name) is not None]
+    return call(
+        type(module).__name__,
+        [
+            text(getattr(module, name)) if name in positional else _attribute(module, name)
+            for name in names
+        ],
+    )
+
+
+def call(function: str, arguments: list[str]) -> str:
+    """`function(a, b)`, in one line if it fits."""
+    line = f"{function}({', '.join(arguments)})"
+    if _fits(line):
         return line
-    lines = textwrap.indent(",\n".join(shown), "  ")
-    return f"{type(module).__name__}(\n{lines}\n)"
+    lines = _indented(",\n".join(arguments))
+    return f"{function}(\n{lines}\n)"
+
+
+def joined(sign: str, terms: list[str]) -> str:
+    """`a + b`, in one line if it fits."""
+    line = f" {sign} ".join(terms)
+    return line if _fits(line) else f"\n{sign} ".join(terms)
+
+
+def in_brackets(sum_of_terms: str) -> str:
+    """What is to be multiplied."""
+    if _fits(sum_of_terms):
+        return f"({sum_of_terms})"
+    return f"(\n{_indented(sum_of_terms)}\n)"
+
+
+def _fits(line: str) -> bool:
+    return len(line) <= _WIDTH and "\n" not in line
+
+
+def _indented(lines: str) -> str:
+    return textwrap.indent(lines, "  ")
 
 
 def _attribute(module: Any, name: str) -> str:
     value = getattr(module, name)
     if name.startswith("log_") and _is_short(value):
-        name, value = name.removeprefix("log_"), np.asarray(np.exp(np.asarray(value)))
-    return f"{name}={_text(value)}"
+        return f"{name.removeprefix('log_')}={exponential(value)}"
+    return f"{name}={text(value)}"
+
+
+def exponential(log_value: Array) -> str:
+    """What is stored as its logarithm; by its shape where it has no value, as while traced."""
+    short = _is_short(log_value)
+    return text(np.asarray(np.exp(np.asarray(log_value))) if short else log_value)
 
 
 def _is_short(value: Any) -> bool:
@@ -46,7 +85,8 @@ def _is_short(value: Any) -> bool:
     return value.ndim <= 1 and value.size <= _FEW
 
 
-def _text(value: Any) -> str:
+def text(value: Any) -> str:
+    """A value as it would be written; arrays of many numbers by their shape."""
     if _is_short(value):
         digits: Any = {"float_kind": _number}
         return np.array2string(np.asarray(value), formatter=digits, separator=", ")
@@ -55,10 +95,10 @@ def _text(value: Any) -> str:
     if isinstance(value, float):
         return _number(value)
     if type(value) is tuple:
-        items = [_text(item) for item in value]
+        items = [text(item) for item in value]
         return f"({', '.join(items)}{',' if len(items) == 1 else ''})"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{key!r}: {_text(item)}" for key, item in value.items()) + "}"
+        return "{" + ", ".join(f"{key!r}: {text(item)}" for key, item in value.items()) + "}"
     name = getattr(getattr(value, "func", value), "__name__", None)
     return repr(value) if name is None else name
 

@@ -86,8 +86,8 @@ def simulate(
         ValueError: a shape, time or value does not fit; a symplectic solver without `dt`; a solver
             that cannot estimate its error without `dt`; a splitting of a field that is not known to
             be separable.
-        TypeError: `solver` is not a Diffrax solver; the field changes the dtype; x0 is of less
-            than float32.
+        TypeError: `solver` or `adjoint` is none of Diffrax; the field changes the dtype; x0 is of
+            less than float32.
         RuntimeError: the solve failed: too many steps, the implicit equations of a step did not
             converge, or the state overflowed. Usually the remedy is a smaller `dt`.
     """
@@ -104,7 +104,13 @@ def simulate(
         solver = diffrax.Dopri8()
     _check_solver(solver, dt, rtol, atol)
     _check_field(field, x0)
+    if max_steps is not None:
+        max_steps = require.count(max_steps, "max_steps")
     adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+    if not isinstance(adjoint, diffrax.AbstractAdjoint):
+        raise TypeError(
+            f"adjoint must be one of Diffrax, such as diffrax.ForwardMode(); got {adjoint!r}."
+        )
 
     if dt is None:
         counts = None
@@ -243,8 +249,14 @@ def _bound(counts: Int[Array, " T-1"]) -> int:
     """A number of steps that no save interval exceeds, where the counts are known."""
     if not require.is_concrete(counts):
         return _MAX_STEPS
+    most = int(np.max(counts))
+    if most >= np.iinfo(np.int32).max:
+        raise ValueError(
+            "dt is so small that more than two thousand million steps lie between two of ts: "
+            "take a larger dt, in the unit of time of ts."
+        )
     # A power of two, so that neighbouring values of dt share one compiled loop.
-    return 2 ** (int(np.max(counts)) - 1).bit_length()
+    return 2 ** (most - 1).bit_length()
 
 
 def _seen_to_be_finite(solution: Any) -> Any:

@@ -62,10 +62,8 @@ class ConjugateGradient(AbstractSolver):
     ):
         if not (tolerance > 0 and math.isfinite(tolerance)):
             raise ValueError(f"tolerance must be positive and finite, got {tolerance}.")
-        if max_iterations < 1:
-            raise ValueError(f"max_iterations must be at least 1, got {max_iterations}.")
         self.tolerance = float(tolerance)
-        self.max_iterations = max_iterations
+        self.max_iterations = require.count(max_iterations, "max_iterations")
         small = Nystrom(tolerance=10.0, max_points=256)
         self.preconditioner = small if preconditioner is None else preconditioner
 

@@ -1,6 +1,5 @@
 """Least squares in random Fourier features: any number of points, in memory that ignores it."""
 
-import operator
 from typing import Any
 
 import equinox as eqx
@@ -73,16 +72,18 @@ class FeatureField(AbstractField):
         x = self._state(x)
         return _potential_at(self.features, x, self.weights)
 
-    def _term(self, kernel: Sum, which: int | str) -> "FeatureField":
+    def _term(self, kernel: Sum, position: int) -> "FeatureField":
         assert isinstance(self.features, SumFeatures)
-        term, names = kernel.part(which), kernel.names
-        index = names.index(which) if which in names else operator.index(which)  # type: ignore[arg-type]
-        index %= len(names)
-        weights = self.weights[self.features.slice(index)]
+        weights = self.weights[self.features.slice(position)]
         return eqx.tree_at(
             lambda f: (f.kernel, f.features, f.weights, f.offset),
             self,
-            (term, self.features.terms[index], weights, jnp.zeros_like(self.offset)),
+            (
+                kernel.terms[position],
+                self.features.terms[position],
+                weights,
+                jnp.zeros_like(self.offset),
+            ),
         )
 
 
@@ -134,16 +135,13 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
     key: Key[Array, ""]
 
     def __init__(self, count: int, key: Any):
-        if isinstance(count, bool) or not hasattr(count, "__index__"):
-            raise TypeError(f"RandomFeatures needs an integer count, got {count!r}.")
-        if operator.index(count) < 1:
-            raise ValueError(f"RandomFeatures needs count >= 1, got {count}.")
+        count = require.count(count, "count")
         dtype = getattr(key, "dtype", None)
         if dtype == jnp.uint32:  # a key of the older kind, jax.random.PRNGKey
             key = jax.random.wrap_key_data(key)
         elif dtype is None or not jnp.issubdtype(dtype, jax.dtypes.prng_key):
             raise TypeError(f"RandomFeatures needs a key, jax.random.key(0); got {key!r}.")
-        self.count = operator.index(count)
+        self.count = count
         self.key = key
 
     def fit(

@@ -92,13 +92,9 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
     ):
         if not (tolerance > 0 and math.isfinite(tolerance)):
             raise ValueError(f"tolerance must be positive and finite, got {tolerance}.")
-        if max_points < 1 or candidates < 1:
-            raise ValueError(
-                f"max_points and candidates must be at least 1, got {max_points} and {candidates}."
-            )
         self.tolerance = float(tolerance)
-        self.max_points = max_points
-        self.candidates = candidates
+        self.max_points = require.count(max_points, "max_points")
+        self.candidates = require.count(candidates, "candidates")
         self.key = key
         self.points = None if points is None else require.points(points, "points")
 

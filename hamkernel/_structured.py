@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._scalar import AbstractScalarKernel, Invariance, one_point
-from hamkernel._show import described
+from hamkernel._show import call, described, joined
 
 
 class AbstractMatrixKernel(eqx.Module):
@@ -129,6 +129,12 @@ class Sum(AbstractMatrixKernel):
         self.terms = tuple(term for _, term in flat)
         self.names = tuple(name for name, _ in flat)
 
+    def __repr__(self) -> str:
+        if not any(self.names):
+            return joined("+", [repr(K) for K in self.terms])
+        pairs = zip(self.names, self.terms, strict=True)
+        return call("Sum", [f"{name}={K!r}" if name else repr(K) for name, K in pairs])
+
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
         first, *rest = (K.form(x, u, z, v) for K in self.terms)
         return sum(rest, start=first)
@@ -179,14 +185,20 @@ class Sum(AbstractMatrixKernel):
 
     def part(self, which: int | str) -> AbstractMatrixKernel:
         """The term with this position or name; KeyError, with the choices, if there is none."""
-        index = self.names.index(which) if which in self.names else which
-        if not isinstance(index, int) or not -len(self.terms) <= index < len(self.terms):
+        return self.terms[self.position(which)]
+
+    def position(self, which: int | str) -> int:
+        """The position of the term with this position or name."""
+        index: Any = self.names.index(which) if which in self.names else which
+        positions = range(len(self.terms))
+        try:
+            return positions[index]
+        except (IndexError, TypeError):
             named = [name for name in self.names if name is not None]
             raise KeyError(
-                f"no part {which!r}: this sum has positions 0 to {len(self.terms) - 1}"
+                f"no part {which!r}: this sum has positions 0 to {positions[-1]}"
                 + (f" and the names {named}." if named else ".")
-            )
-        return self.terms[index]
+            ) from None
 
 
 def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:

@@ -22,10 +22,34 @@ from jaxtyping import Array, Float
 
 from hamkernel._scalar import AbstractScalarKernel, as_scalar_kernel
 from hamkernel._scalar_transform import parity_removed, with_parity
+from hamkernel._show import call, described
 from hamkernel._structured import AbstractMatrixKernel
 
 
-class Separable(AbstractMatrixKernel):
+class AbstractStructure(AbstractMatrixKernel):
+    """A structure made from one scalar kernel k."""
+
+    kernel: eqx.AbstractVar[AbstractScalarKernel]
+    # The parity of the fields over that of the functions of k; a derivative turns it around.
+    field_parity: eqx.AbstractClassVar[int]
+
+    def __repr__(self) -> str:
+        found = parity_removed(self.kernel)
+        if found is None:
+            return described(self, positional=("kernel",))
+        symmetry = "Odd" if self.field_parity * found.parity < 0 else "Even"
+        return call(symmetry, [repr(eqx.tree_at(lambda K: K.kernel, self, found.kernel))])
+
+    def with_parity(self, parity: int) -> "AbstractStructure":
+        kernel = with_parity(self.kernel, self.field_parity * parity)
+        return eqx.tree_at(lambda K: K.kernel, self, kernel)
+
+    @property
+    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
+        return (self.kernel,)
+
+
+class Separable(AbstractStructure):
     """K(x, z) = k(x, z) I: the components share a kernel and no structure.
 
     The baseline of the paper. Works in every dimension; fields have no potential.
@@ -34,6 +58,7 @@ class Separable(AbstractMatrixKernel):
     """
 
     kernel: AbstractScalarKernel
+    field_parity: ClassVar[int] = 1
     symplectic: ClassVar[bool] = False
     no_potential: ClassVar[str | None] = (
         "a field of a Separable kernel has no potential: its components are independent. "
@@ -54,21 +79,14 @@ class Separable(AbstractMatrixKernel):
     def potential(self, x: Array, Z: Array, A: Array) -> Float[Array, ""]:
         raise AttributeError(self.no_potential)
 
-    def with_parity(self, parity: int) -> "Separable":
-        return Separable(with_parity(self.kernel, parity))  # the field IS the scalar function
 
-    @property
-    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
-        return (self.kernel,)
-
-
-class AbstractPotentialKernel(AbstractMatrixKernel):
+class AbstractPotentialKernel(AbstractStructure):
     """K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ: fields f = B ∇u of a potential u.
 
     A final class adds B; everything else is here.
     """
 
-    kernel: eqx.AbstractVar[AbstractScalarKernel]
+    field_parity: ClassVar[int] = -1
     no_potential: ClassVar[str | None] = None
 
     @abc.abstractmethod
@@ -94,10 +112,6 @@ class AbstractPotentialKernel(AbstractMatrixKernel):
     ) -> Float[Array, " n"]:
         return self.apply(x, jax.grad(self.potential)(x, Z, A))
 
-    @property
-    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
-        return (self.kernel,)
-
 
 class CurlFree(AbstractPotentialKernel):
     """K(x, z) = ∂x ∂zᵀ k(x, z): gradient fields f = ∇u, so Df is symmetric.
@@ -118,9 +132,6 @@ class CurlFree(AbstractPotentialKernel):
 
     def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
         return v
-
-    def with_parity(self, parity: int) -> "CurlFree":
-        return CurlFree(with_parity(self.kernel, -parity))
 
 
 class Symplectic(AbstractPotentialKernel):
@@ -152,11 +163,8 @@ class Symplectic(AbstractPotentialKernel):
                 "Add the missing coordinate, or use CurlFree, DivergenceFree or Separable."
             )
 
-    def with_parity(self, parity: int) -> "Symplectic":
-        return Symplectic(with_parity(self.kernel, -parity))
 
-
-class DivergenceFree(AbstractMatrixKernel):
+class DivergenceFree(AbstractStructure):
     """K(x, z) = tr(M) I − Mᵀ with M = ∂x ∂zᵀ k(x, z): fields with div f = 0, any n ≥ 2.
 
     The fields are f_a = Σ_b ∂_b Ψ_ab of an antisymmetric matrix Ψ whose entries above the
@@ -166,6 +174,7 @@ class DivergenceFree(AbstractMatrixKernel):
     """
 
     kernel: AbstractScalarKernel
+    field_parity: ClassVar[int] = -1
     symplectic: ClassVar[bool] = False
     no_potential: ClassVar[str | None] = (
         "a field of a DivergenceFree kernel has a matrix potential, not a scalar one. In the plane "
@@ -208,13 +217,6 @@ class DivergenceFree(AbstractMatrixKernel):
                 "is constant."
             )
 
-    def with_parity(self, parity: int) -> "DivergenceFree":
-        return DivergenceFree(with_parity(self.kernel, -parity))
-
-    @property
-    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
-        return (self.kernel,)
-
 
 def unfolded(
     K: AbstractMatrixKernel, Z: Float[Array, "M n"], A: Float[Array, "M n"]
@@ -225,15 +227,13 @@ def unfolded(
     sum over many pairs this is cheaper than the two terms at once, which fill the registers.
     K, Z and A themselves where K is of another form.
     """
-    if not isinstance(K, Separable | CurlFree | Symplectic | DivergenceFree):
+    if not isinstance(K, AbstractStructure):
         return K, Z, A
-    simple = parity_removed(K.kernel)
-    if simple is None:
+    found = parity_removed(K.kernel)
+    if found is None or not found.one_sided:
         return K, Z, A
-    kernel, parity = simple
-    # A derivative of an even function is odd.
-    sign = parity if isinstance(K, Separable) else -parity
-    K = eqx.tree_at(lambda s: s.kernel, K, kernel)
+    sign = K.field_parity * found.parity
+    K = eqx.tree_at(lambda K: K.kernel, K, found.kernel)
     return K, jnp.concatenate([Z, -Z]), jnp.concatenate([A, sign * A]) / 2
 
 

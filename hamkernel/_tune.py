@@ -22,6 +22,7 @@ little residual: its bound stays or rises by some tens.
 """
 
 import warnings
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -89,7 +90,7 @@ def tune(
     *,
     objective: Criterion | Objective = "cross_validation",
     frozen: str | tuple[str, ...] = (),
-    bounds: dict[str, tuple[ArrayLike, ArrayLike]] | None = None,
+    bounds: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
     starts: int = 16,
     optimiser: optx.AbstractMinimiser | None = None,
     max_steps: int = 64,
@@ -116,8 +117,9 @@ def tune(
             is larger than the prior's is explained as noise. In a function of your own, `hk.fit`
             and `hk.simulate` want `throw=False`, and the latter a constant `dt`: somewhere in the
             box they fail, and NaN is then a point that cannot win.
-        frozen: names of hyperparameters to keep, such as "lengthscale", "regularization" or
-            "terms[0].scale". A name means every hyperparameter whose full name ends in it.
+        frozen: names of what to keep: hyperparameters, such as "lengthscale", "regularization"
+            or "terms[0].kernel.scale", and parts of K, such as "rest" of Sum(rest=…). A name
+            means every hyperparameter that has it in its full name, at the end or before.
         bounds: {name: (low, high)} in place of the box from the data, in the units of the
             hyperparameter. A start outside the box is moved to its edge.
         starts: the number of runs.
@@ -167,10 +169,12 @@ def tune(
         raise ValueError(
             "progress is printed by the optimiser: pass verbose=True to yours, and no progress."
         )
-    if not isinstance(optimiser, optx.AbstractMinimiser):
+    golden = isinstance(optimiser, optx.GoldenSearch)  # minimises functions of one number
+    if golden or not isinstance(optimiser, optx.AbstractMinimiser):
         raise TypeError(
-            "optimiser must be an optimistix minimiser, such as optimistix.BFGS(1e-3, 1e-3) or "
-            f"optimistix.OptaxMinimiser(optax.adam(0.1), 1e-3, 1e-3); got {optimiser!r}."
+            "optimiser must be an optimistix minimiser of many variables, such as "
+            "optimistix.BFGS(1e-3, 1e-3) or optimistix.OptaxMinimiser(optax.adam(0.1), 1e-3, 1e-3);"
+            f" got {optimiser!r}."
         )
 
     optimiser = keeping_the_best(optimiser)
@@ -234,11 +238,10 @@ def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -
         )
     if not (isinstance(frozen, tuple | list) and all(isinstance(name, str) for name in frozen)):
         raise TypeError(f"frozen must be a name or a tuple of names, got {frozen!r}.")
-    if bounds is not None and not isinstance(bounds, dict):
+    if bounds is not None and not isinstance(bounds, Mapping):
         raise TypeError(f"bounds must be a dict, {{name: (low, high)}}, got {bounds!r}.")
-    for name, count in {"starts": starts, "max_steps": max_steps}.items():
-        if not hasattr(count, "__index__") or count < 1:
-            raise ValueError(f"{name} must be a whole number, at least 1; got {count!r}.")
+    require.count(starts, "starts")
+    require.count(max_steps, "max_steps")
 
 
 def _warn_of_unequal_sizes(Y: Array) -> None:

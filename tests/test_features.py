@@ -604,9 +604,17 @@ def test_kernels_without_a_spectral_density_are_refused(k, what, key):
 @pytest.mark.parametrize(
     ("call", "error", "text"),
     [
-        (lambda key: of_any(0, key), ValueError, "count >= 1, got 0"),
-        (lambda key: of_any(2.5, key), TypeError, "integer count, got 2.5"),
-        (lambda key: of_any(True, key), TypeError, "integer count, got True"),
+        (lambda key: of_any(0, key), ValueError, "count must be a whole number, at least 1; got 0"),
+        (
+            lambda key: of_any(2.5, key),
+            TypeError,
+            "count must be a whole number, at least 1; got 2.5",
+        ),
+        (
+            lambda key: of_any(True, key),
+            TypeError,
+            "count must be a whole number, at least 1; got True",
+        ),
         (lambda key: of_any(10, 3), TypeError, "needs a key, jax.random.key(0); got 3"),
         (
             lambda key: of_any(10, key).fit_chunks(hk.Symplectic(hk.Gaussian(1.0)), []),

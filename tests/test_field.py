@@ -193,7 +193,7 @@ def test_an_anchor_that_is_not_finite_is_refused(x0, value):
 
 def test_kernels_and_fields_print_the_values_of_their_hyperparameters():
     K = hk.CurlFree(2.0 * hk.Gaussian(jnp.array([0.5, 3.28333333])))
-    assert repr(K) == "CurlFree(kernel=Scaled(kernel=Gaussian(lengthscale=[0.5, 3.283]), scale=2))"
+    assert repr(K) == "CurlFree(2 * Gaussian(lengthscale=[0.5, 3.283]))"
     text = repr(fitted(hk.Symplectic))
     assert "regularization=0.001" in text
     assert "lengthscale=" in text
@@ -202,6 +202,59 @@ def test_kernels_and_fields_print_the_values_of_their_hyperparameters():
     traced = []
     jax.eval_shape(lambda K: traced.append(repr(K)), K)
     assert "log_lengthscale=f64[2]" in traced[0]
+
+
+def quadratic(x, z):
+    return (1 + x @ z) ** 2
+
+
+class Mine(eqx.Module):
+    log_width: jax.Array
+
+    def __call__(self, x, z):
+        return jnp.exp(-((x - z) @ (x - z)) / jnp.exp(self.log_width))
+
+
+G, M = hk.Gaussian(2.0), hk.Matern(2.5, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("K", "text"),
+    [
+        (hk.Odd(hk.Symplectic(G)), "Odd(Symplectic(Gaussian(lengthscale=2)))"),
+        (hk.Even(hk.Separable(3.0 * G)), "Even(Separable(3 * Gaussian(lengthscale=2)))"),
+        (
+            hk.CurlFree((G + quadratic) * hk.Select(quadratic, (0, 1))),
+            "CurlFree((Gaussian(lengthscale=2) + quadratic) * Select(quadratic, dims=(0, 1)))",
+        ),
+        (
+            hk.Sum(hk.Symplectic(G), rest=hk.Odd(hk.CurlFree(quadratic))),
+            "Sum(Symplectic(Gaussian(lengthscale=2)), rest=Odd(CurlFree(quadratic)))",
+        ),
+        (
+            hk.Even(hk.Odd(hk.DivergenceFree(G))) + hk.CurlFree(quadratic),
+            "Even(Odd(DivergenceFree(Gaussian(lengthscale=2)))) + CurlFree(quadratic)",
+        ),
+    ],
+)
+def test_a_kernel_prints_as_it_is_written(K, text):
+    assert repr(K) == text
+    again = eval(text, {**vars(hk), "quadratic": quadratic})
+    x, z = np.random.default_rng(0).normal(size=(2, 2))
+    np.testing.assert_allclose(again(x, z), K(x, z), rtol=1e-14)
+
+
+def test_a_long_kernel_prints_over_several_lines_which_say_the_same():
+    terms = hk.Symplectic(2.0 * (G + M + quadratic) * (M + G)) + hk.Odd(hk.CurlFree(G + M + G))
+    text = repr(terms)
+    assert max(map(len, text.splitlines())) <= 88
+    again = eval(f"({text})", {**vars(hk), "quadratic": quadratic})
+    x, z = np.random.default_rng(0).normal(size=(2, 2))
+    np.testing.assert_allclose(again(x, z), terms(x, z), rtol=1e-14)
+
+
+def test_a_kernel_of_ones_own_prints_its_values():
+    assert repr(hk.Symplectic(Mine(jnp.log(0.25)))) == "Symplectic(Mine(width=0.25))"
 
 
 # Points of the wrong kind.

@@ -246,6 +246,12 @@ def test_float64_is_refused_where_jax_would_cut_it(saved):
 # Writing.
 
 
+def test_a_folder_is_no_file_to_write(tmp_path):
+    with pytest.raises(IsADirectoryError, match="is a folder; save needs the name of a file"):
+        save(tmp_path, fitted(hk.CurlFree(hk.Gaussian())))
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_write_that_fails_leaves_the_old_file_and_no_other(saved, monkeypatch):
     before = saved.read_bytes()
     monkeypatch.setattr(os, "fsync", lambda _: (_ for _ in ()).throw(OSError("disk full")))

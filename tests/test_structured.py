@@ -3,6 +3,7 @@
 import functools
 import re
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -414,6 +415,8 @@ def test_a_missing_part_is_refused_with_the_choices():
     for which in ("friction", 2, -3, 0.5):
         with pytest.raises(KeyError, match=r"positions 0 to 1 and the names \['conservative',"):
             field.part(which)  # pyright: ignore[reportArgumentType]
+    second = field.part(np.int64(-1))  # pyright: ignore[reportArgumentType]
+    assert eqx.tree_equal(second, field.part(1))
     alone = random_field(hk.CurlFree(hk.Gaussian()), 2)
     assert alone.part(0) is alone
     with pytest.raises(KeyError, match="CurlFree is not a sum"):

@@ -194,6 +194,20 @@ def test_frozen_hyperparameters_keep_their_values_to_the_last_bit():
     assert abs(gaussian(tuned) - 1) > 1e-2
 
 
+def test_a_part_of_a_named_sum_is_frozen_by_its_name_and_its_hyperparameters_are_called_by_it():
+    X, Y = scattered()
+    K = hk.Sum(energy=hk.Symplectic(2.0 * hk.Gaussian(1.0)), rest=hk.CurlFree(hk.Gaussian(3.0)))
+    tuned = hk.tune(K, X, Y, 1e-1, starts=2, frozen="energy")
+    assert set(tuned.bounds) == {"rest.kernel.lengthscale", "regularization"}
+    assert eqx.tree_equal(tuned.field.part("energy").kernel, K.part("energy"))
+    box = {"rest.kernel.lengthscale": (1.0, 2.0)}
+    tuned = hk.tune(K, X, Y, 1e-1, starts=2, frozen=("energy.kernel.kernel", "scale"), bounds=box)
+    assert tuned.bounds["rest.kernel.lengthscale"] == pytest.approx((1.0, 2.0))
+    assert eqx.tree_equal(tuned.field.part("energy").kernel, K.part("energy"))
+    with pytest.raises(ValueError, match="no hyperparameter 'rest'; this kernel has energy"):
+        hk.tune(K, X, Y, bounds={"rest": (1.0, 2.0)})
+
+
 def test_bounds_are_obeyed_and_reported_and_a_hyperparameter_at_one_is_named():
     X, Y = scattered()
     free = hk.tune(SIMPLE, X, Y)
@@ -239,7 +253,6 @@ def test_bounds_may_have_a_number_for_each_coordinate_and_are_reported_by_the_wi
         ({"frozen": ("lengthscale", "regularization")}, "nothing to tune"),
         ({"starts": 0}, "starts must be a whole number, at least 1; got 0"),
         ({"max_steps": 0}, "max_steps must be a whole number, at least 1; got 0"),
-        ({"starts": 1.5}, r"starts must be a whole number, .* got 1\.5"),
         ({"progress": True, "optimiser": optx.BFGS(1e-3, 1e-3)}, "pass verbose=True to yours"),
         ({"folds": 5.0}, r"folds must be a whole number, 'loo' .* got 5\.0\.$"),
         ({"objective": "loo"}, "objective must be"),
@@ -255,6 +268,7 @@ def test_bad_options_are_refused(options, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"starts": 1.5}, r"starts must be a whole number, .* got 1\.5"),
         ({"frozen": None}, "frozen must be a name or a tuple of names, got None"),
         ({"frozen": (1,)}, "frozen must be a name or a tuple of names"),
         ({"bounds": [("lengthscale", 1, 2)]}, "bounds must be a dict"),
@@ -338,9 +352,10 @@ def test_hyperparameters_that_are_complex_and_other_optimisers_are_refused():
 
     with pytest.raises(TypeError, match=r"c is complex"):
         hk.tune(hk.Symplectic(Complex(jnp.array(1 + 1j))), *scattered())
-    optimiser: Any = optx.BFGS
-    with pytest.raises(TypeError, match="must be an optimistix minimiser"):
-        hk.tune(SIMPLE, *scattered(), optimiser=optimiser)
+    optimisers: list[Any] = [optx.BFGS, optx.GoldenSearch(1e-3, 1e-3)]
+    for optimiser in optimisers:
+        with pytest.raises(TypeError, match="must be an optimistix minimiser of many variables"):
+            hk.tune(SIMPLE, *scattered(), optimiser=optimiser)
 
 
 def test_velocities_of_very_different_sizes_are_warned_of():

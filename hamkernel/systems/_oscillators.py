@@ -4,7 +4,6 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
@@ -190,7 +189,7 @@ class SpringChain(AbstractHamiltonianSystem):
     the normal frequencies are 2√(k/m) sin(jπ/(2(count+1))), j = 1…count.
 
     Args:
-        count: number of masses, one or more; a Python integer.
+        count: number of masses, one or more.
         mass: m > 0 [kg], one for all or shape (count,).
         stiffness: k > 0 [N/m], one for all or shape (count + 1,), from wall to wall.
 
@@ -208,11 +207,7 @@ class SpringChain(AbstractHamiltonianSystem):
     log_stiffness: Float[Array, "*springs"]
 
     def __init__(self, count: int = 10, mass: Numbers = 1.0, stiffness: Numbers = 1.0):
-        if isinstance(count, bool) or not isinstance(count, int | np.integer):
-            raise TypeError(f"count is {count!r}; a Python integer is needed.")
-        if count < 1:
-            raise ValueError(f"count is {count}; at least one mass is needed.")
-        self.count = int(count)
+        self.count = require.count(count, "count")
         self.log_mass = log_parameter(mass, "mass", (), (self.count,))
         self.log_stiffness = log_parameter(stiffness, "stiffness", (), (self.count + 1,))
 
