@@ -240,6 +240,7 @@ def masked(matrix: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[Array,
     return jnp.where(both, matrix, jnp.diag(~kept).astype(matrix.dtype))
 
 
+@eqx.filter_jit
 def _landmarks(X, drawn, size):
     used = jnp.arange(size) < drawn.count
     return Landmarks(

@@ -1,15 +1,14 @@
 """Products with the Gram of a symplectic kernel, against KeOps with a hand-written formula.
 
-    python tests/benchmarks/products.py [--points 20000] [--dimensions 4 20] [--repeats 3]
+    python tests/benchmarks/products.py [--points 20000] [--dimensions 4 20] [--repeats 9]
 
-float64, warm, in one process: the minimum and the median over repeats, and nanoseconds per pair of
-points. The results are first checked to agree with KeOps, or with each other's rows in NumPy where
-pykeops is not installed (`pip install hamkernel[benchmarks]`). KeOps compiles its formula at the
-first call, which is not timed.
+float64, warm, in one process and in turn: the minimum and the median over repeats, nanoseconds per
+pair of points, and the ratios of minima and of medians. That the results agree with some rows in
+NumPy, and with KeOps where it is installed (`pip install hamkernel[benchmarks]`), is checked. KeOps
+compiles its formula at the first call, which is not timed.
 """
 
 import argparse
-import time
 from collections.abc import Callable
 from typing import Any
 
@@ -19,24 +18,13 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp
 import numpy as np
+from timing import Timed, in_turn
 
 import hamkernel as hk
-from hamkernel._gram_operator import gram_operator
 
 SIGMA = 1.3
 # Sums of 20 000 terms of order one.
 AGREEMENT = 1e-10
-
-
-def timed(run: Callable[[], Any], repeats: int) -> tuple[Any, float, float]:
-    """The result, and the minimum and median of seconds after one call to warm up."""
-    result = run()
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        run()
-        seconds.append(time.perf_counter() - start)
-    return result, min(seconds), float(np.median(seconds))
 
 
 def rotated(V: np.ndarray) -> np.ndarray:
@@ -73,43 +61,55 @@ KERNELS = {
     "Matérn 5/2": hk.Symplectic(hk.Matern(2.5, SIGMA)),
     "odd Gaussian": hk.Odd(hk.Symplectic(hk.Gaussian(SIGMA))),
 }
+OURS, PEER = "hamkernel Gaussian", "KeOps Gaussian, formula by hand"
 
 
-def measure(N: int, n: int, repeats: int) -> None:
+def in_this_run(X: np.ndarray, A: np.ndarray) -> dict[str, Callable[[], Any]]:
+    """The products to compare; that of KeOps if it is installed."""
+    coefficients = jnp.asarray(A)
+    operators = {name: hk.gram_operator(K, X) for name, K in KERNELS.items()}
+    runs: dict[str, Callable[[], Any]] = {
+        f"hamkernel {name}": lambda operator=operator: operator.mv(coefficients)
+        for name, operator in operators.items()
+    }
+    try:
+        runs[PEER] = keops(X, A)
+    except ImportError:
+        print("  pykeops is not installed: pip install hamkernel[benchmarks]")
+    return runs
+
+
+def measured(N: int, n: int, repeats: int) -> dict[str, Timed]:
+    """The times of all products, of which those of the Gaussian are seen to agree."""
     rng = np.random.default_rng(0)
     X, A = rng.normal(size=(N, n)), rng.normal(size=(N, n))
-    coefficients = jnp.asarray(A)
+    times = in_turn(repeats, in_this_run(X, A))
     rows = [0, N // 2, N - 1]
-    reference = closed_form(X[rows], X, A)
-    ours = {}
-    for name, K in KERNELS.items():
-        operator = gram_operator(K, X)
-        ours[name] = timed(lambda op=operator: op.mv(coefficients).block_until_ready(), repeats)
-    difference = np.abs(np.asarray(ours["Gaussian"][0])[rows] - reference).max()
-    assert difference < AGREEMENT * np.abs(reference).max() * np.sqrt(N), difference
-    base = ours["Gaussian"][1]
-    lines = [(f"hamkernel {name}", *seconds[1:]) for name, seconds in ours.items()]
-    try:
-        theirs = timed(keops(X, A), repeats)
-    except ImportError:
-        print("pykeops is not installed: pip install hamkernel[benchmarks]")
-    else:
-        off = np.abs(np.asarray(ours["Gaussian"][0]) - theirs[0]).max()
-        assert off < AGREEMENT * np.abs(theirs[0]).max() * np.sqrt(N), off
-        lines.append(("KeOps Gaussian, formula by hand", *theirs[1:]))
+    expected = closed_form(X[rows], X, A)
+    atol = AGREEMENT * np.abs(expected).max() * np.sqrt(N)
+    ours = np.asarray(times[OURS].result)
+    np.testing.assert_allclose(ours[rows], expected, atol=atol)
+    if PEER in times:
+        np.testing.assert_allclose(ours, times[PEER].result, atol=atol)
+    return times
+
+
+def report(N: int, n: int, repeats: int) -> None:
+    times = measured(N, n, repeats)
+    base = times[OURS]
     print(f"\nN = {N}, n = {n}: product with the ({N * n}, {N * n}) Gram")
-    print(f"  {'':34s} {'minimum':>10s} {'median':>10s} {'ns/pair':>8s} {'ratio':>6s}")
-    for name, least, median in lines:
-        per_pair = least / N**2 * 1e9
-        times = f"{least:8.3f} s {median:8.3f} s {per_pair:8.2f} {least / base:6.2f}"
-        print(f"  {name:34s} {times}", flush=True)
+    print(f"  {'':34s} {'minimum':>10s} {'median':>10s} {'ns/pair':>8s} {'ratios':>12s}")
+    for name, each in times.items():
+        seconds = f"{each.least:8.3f} s {each.median:8.3f} s {each.least / N**2 * 1e9:8.2f}"
+        ratios = f"{each.least / base.least:6.2f} {each.median / base.median:5.2f}"
+        print(f"  {name:34s} {seconds} {ratios}", flush=True)
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else None)
     parser.add_argument("--points", type=int, default=20_000)
     parser.add_argument("--dimensions", type=int, nargs="+", default=[4, 20])
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=9)
     arguments = parser.parse_args()
     for n in arguments.dimensions:
-        measure(arguments.points, n, arguments.repeats)
+        report(arguments.points, n, arguments.repeats)

@@ -8,7 +8,6 @@ noise seeds; and the time of a fit against the number of points, in one call and
 """
 
 import argparse
-import time
 
 import jax
 
@@ -16,6 +15,7 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp
 import numpy as np
+from timing import in_turn
 
 import hamkernel as hk
 from hamkernel._features import features
@@ -80,17 +80,11 @@ def cost(largest, count=200, chunk=5000):
             "one call": lambda X=X, Y=Y: hk.fit(KERNEL, X, Y, 1e-6, solver=solver),
             "chunks": lambda cuts=cuts: solver.fit_chunks(KERNEL, cuts, 1e-6),
         }
-        fields = {name: jax.block_until_ready(run()) for name, run in runs.items()}  # compiles
-        gap = jnp.abs(fields["one call"].evaluate(X[:100]) - fields["chunks"].evaluate(X[:100]))
-        shown = []
-        for name, run in runs.items():
-            times = []
-            for _ in range(3):
-                start = time.perf_counter()
-                jax.block_until_ready(run())
-                times.append(time.perf_counter() - start)
-            shown.append(f"{name} {min(times):.2f} s")
-        print(f"N = {N:8d}: {', '.join(shown)}; they differ by {float(gap.max()):.1e}")
+        times = in_turn(3, runs)
+        one, chunked = (each.result.evaluate(X[:100]) for each in times.values())
+        gap = float(jnp.abs(one - chunked).max())
+        shown = ", ".join(f"{name} {each.least:.2f} s" for name, each in times.items())
+        print(f"N = {N:8d}: {shown}; they differ by {gap:.1e}")
 
 
 if __name__ == "__main__":

@@ -9,8 +9,6 @@ minutes on two cores. Memory is the peak of the process so far, so sizes run in 
 
 import argparse
 import resource
-import time
-from collections.abc import Callable
 
 import jax
 
@@ -18,6 +16,7 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp
 import numpy as np
+from timing import timed
 
 import hamkernel as hk
 from hamkernel._solve_cg import ConjugateGradient
@@ -38,21 +37,9 @@ def data(N: int, n: int, noise: float = 0.01) -> tuple[jax.Array, jax.Array]:
     return X, V + noise * V.std() * jnp.asarray(rng.normal(size=(N, n)))
 
 
-def timed(run: Callable[[], hk.KernelField], repeats: int) -> tuple[hk.KernelField, float, float]:
-    """The field, and the minimum and median of seconds after one call to warm up."""
-    field = run()
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        field = run()
-        jax.block_until_ready(field.residual)
-        seconds.append(time.perf_counter() - start)
-    return field, min(seconds), float(np.median(seconds))
-
-
 def report(name: str, N: int, n: int, solver, K, regularization: float, repeats: int, exact=None):
     X, Y = data(N, n)
-    field, least, median = timed(
+    least, median, field = timed(
         lambda: hk.fit(K, X, Y, regularization, solver=solver),  # pyright: ignore
         repeats,
     )

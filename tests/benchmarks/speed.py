@@ -2,10 +2,11 @@
 
     python tests/benchmarks/speed.py [--figure speed.png] [--quick]
 
-float64, warm, in one process: the minimum and the median over repeats, never a single run. Same
-work and same precision; that the results agree is checked before anything is timed. A peer that
-is not installed (`pip install hamkernel[benchmarks]`) is said to be missing. `--quick` leaves out
-what takes minutes. A target is a ratio of minima in this run; "met" or "MISSED" stands beside it.
+float64, warm, in one process, peers in turn: the minimum and the median over repeats, never a
+single run. Same work and same precision; that the results agree is checked. A peer that is not
+installed (`pip install hamkernel[benchmarks]`) is said to be missing. `--quick` leaves out what
+takes minutes. A target is a ratio of minima in this run; "met" or "MISSED" stands beside it, and
+the ratio of medians. How memory is handed out matters to all of them: see "Speed" in the README.
 """
 
 import argparse
@@ -14,8 +15,8 @@ import os
 import platform
 import subprocess
 import sys
-import time
 from collections.abc import Callable
+from time import perf_counter
 from typing import Any
 
 import jax
@@ -24,27 +25,35 @@ jax.config.update("jax_enable_x64", True)
 
 import jax.numpy as jnp
 import numpy as np
+import products
 import scipy.linalg
-from products import KERNELS, SIGMA, keops, timed
+from products import KERNELS, SIGMA
 from solvers import data
+from timing import Timed, in_turn, timed
 
 import hamkernel as hk
 
 ROUNDING = 1e-11
 
 
-def line(name: str, least: float, median: float, remark: str = "") -> None:
-    print(f"  {name:44s} {least * 1e3:10.2f} ms {median * 1e3:10.2f} ms  {remark}", flush=True)
+def line(name: str, time: Timed, remark: str = "") -> None:
+    least, median = time.least * 1e3, time.median * 1e3
+    print(f"  {name:44s} {least:10.2f} ms {median:10.2f} ms  {remark}", flush=True)
 
 
-def verdict(ratio: float, target: float, at_least: bool) -> str:
-    met = ratio >= target if at_least else ratio <= target
-    sign = ">=" if at_least else "<="
-    return f"{ratio:.2f} ({sign} {target:g}: {'met' if met else 'MISSED'})"
+def at_least(target: float, peer: Timed, ours: Timed) -> str:
+    """How many times faster ours is, and whether that is enough."""
+    return _verdict(peer, ours, f">= {target:g}", peer.least / ours.least >= target)
 
 
-def measured(run: Callable[[], Any], repeats: int) -> tuple[Any, float, float]:
-    return timed(lambda: jax.block_until_ready(run()), repeats)
+def at_most(target: float, ours: Timed, other: Timed) -> str:
+    """How many times longer ours takes, and whether that is too long."""
+    return _verdict(ours, other, f"<= {target:g}", ours.least / other.least <= target)
+
+
+def _verdict(above: Timed, below: Timed, target: str, met: bool) -> str:
+    ratio, of_medians = above.least / below.least, above.median / below.median
+    return f"{ratio:.2f} ({target}: {'met' if met else 'MISSED'}; medians {of_medians:.2f})"
 
 
 def dot_product_gaussian(x: jax.Array, z: jax.Array) -> jax.Array:
@@ -94,127 +103,115 @@ def gram_section(repeats: int) -> None:
     N, n = 1000, 4
     print(f"\nDense Gram, Gaussian symplectic, N = {N}, n = {n}")
     X = np.random.default_rng(0).normal(size=(N, n))
-    K = KERNELS["Gaussian"]
-    points = jnp.asarray(X)
-    G, ours, median = measured(lambda: hk.gram(K, points), repeats)
-    line("hamkernel", ours, median)
-    for name, form in (
-        ("NumPy closed form, block by block", closed_blocks),
-        ("NumPy closed form, in the order of memory", closed_gram),
-    ):
-        closed, numpy, numpy_median = measured(lambda form=form: form(X), 3)
-        np.testing.assert_allclose(G, closed, atol=ROUNDING)
-        line(name, numpy, numpy_median, f"{verdict(numpy / ours, 20, True)} times ours")
+    points, closed = jnp.asarray(X), closed_blocks(X)
+    out, own = np.empty_like(closed), hk.Symplectic(dot_product_gaussian)
+    in_place = hk.gram(KERNELS["Gaussian"], points)
+    once_more = jax.jit(lambda G: G + 1.0)
+    runs: dict[str, Callable[[], Any]] = {
+        "hamkernel": lambda: hk.gram(KERNELS["Gaussian"], points),
+        "NumPy closed form, block by block": lambda: closed_blocks(X),
+        "NumPy closed form, in the order of memory": lambda: closed_gram(X),
+        "NumPy copy into memory in use": lambda: np.copyto(out, closed),
+        # What XLA needs to hand out a result of this size: fresh memory.
+        "G + 1 by XLA, into fresh memory": lambda: once_more(in_place),
+        "a user's callable with dot products": lambda: hk.gram(own, points),
+        "odd symplectic": lambda: hk.gram(KERNELS["odd Gaussian"], points),
+    }
     try:
-        blocks, torch, torch_median = measured(gpytorch_gram(X), 3)
+        runs["GPyTorch RBFKernelGrad (curl-free)"] = gpytorch_gram(X)
     except ImportError:
         print("  gpytorch is not installed")
-    else:
+    times = in_turn(repeats, runs)
+    ours, blocks, ordered, copy, fresh, user, odd, *torch = times.values()
+    for each in (ours, ordered, user):
+        np.testing.assert_allclose(each.result, closed, atol=ROUNDING)
+    remarks = [
+        "",
+        f"{at_least(20, blocks, ours)} times ours",
+        f"{at_least(20, ordered, ours)} times ours",
+        f"ours: {at_most(5, ours, copy)}",
+        f"ours: {ours.least / fresh.least:.2f} times",
+        f"{at_least(7, ordered, user)} faster than NumPy",
+        f"{at_most(2, odd, ours)} times symplectic",
+    ]
+    if torch:
         # Its entries are ordered (point, value or derivative), and hold the values besides.
-        theirs = blocks.numpy().reshape(N, n + 1, N, n + 1)[:, 1:, :, 1:]
+        theirs = torch[0].result.numpy().reshape(N, n + 1, N, n + 1)[:, 1:, :, 1:]
         np.testing.assert_allclose(theirs, hk.gram(hk.CurlFree(hk.Gaussian(SIGMA)), X), atol=1e-6)
-        ratio = verdict(torch / ours, 25, True)
-        line("GPyTorch RBFKernelGrad (curl-free)", torch, torch_median, f"{ratio} times ours")
-    out = np.empty_like(closed)
-    _, copy, copy_median = measured(lambda: np.copyto(out, closed), repeats)
-    line(
-        "NumPy copy into memory in use",
-        copy,
-        copy_median,
-        f"ours: {verdict(ours / copy, 5, False)}",
-    )
-    # What XLA needs to hand out a result of this size: fresh pages, one by one.
-    once_more = jax.jit(lambda G: G + 1.0)
-    _, fresh, fresh_median = measured(lambda: once_more(G), repeats)
-    line("G + 1 by XLA, into fresh memory", fresh, fresh_median, f"ours: {ours / fresh:.2f} times")
-    own = hk.Symplectic(dot_product_gaussian)
-    np.testing.assert_allclose(hk.gram(own, points), closed, atol=ROUNDING)
-    _, user, user_median = measured(lambda: hk.gram(own, points), repeats)
-    ratio = verdict(numpy / user, 7, True)
-    line("a user's callable with dot products", user, user_median, f"{ratio} faster than NumPy")
-    _, odd, odd_median = measured(lambda: hk.gram(KERNELS["odd Gaussian"], points), repeats)
-    line("odd symplectic", odd, odd_median, f"{verdict(odd / ours, 2, False)} times symplectic")
+        remarks.append(f"{at_least(25, torch[0], ours)} times ours")
+    for (name, time), remark in zip(times.items(), remarks, strict=True):
+        line(name, time, remark)
 
 
-def product_section(N: int, repeats: int) -> None:
-    for n, target in ((4, 3), (20, 4)):
+def product_section(N: int) -> None:
+    for n, target, repeats in ((4, 3, 9), (20, 4, 3)):
         print(f"\nProduct with the Gram of {N * n} rows, never formed: N = {N}, n = {n}")
-        rng = np.random.default_rng(0)
-        X, A = rng.normal(size=(N, n)), rng.normal(size=(N, n))
-        times = {}
-        for name, K in KERNELS.items():
-            operator = hk.gram_operator(K, X)
-            vector = jnp.asarray(A)
-            times[name] = measured(lambda op=operator, v=vector: op.mv(v), repeats)
-        base = times["Gaussian"][1]
-        for name, (_, least, median) in times.items():
-            remark = "" if name == "Gaussian" else f"{verdict(least / base, 2.5, False)} times"
-            line(f"hamkernel {name}", least, median, remark)
-        try:
-            theirs, least, median = timed(keops(X, A), repeats)
-        except ImportError:
-            print("  pykeops is not installed")
-            continue
-        np.testing.assert_allclose(times["Gaussian"][0], theirs, atol=1e-8)
-        line("KeOps, formula by hand", least, median, f"{verdict(least / base, target, True)} ours")
+        times = products.measured(N, n, repeats)
+        base = times[products.OURS]
+        for name, time in times.items():
+            if name == products.PEER:
+                remark = f"{at_least(target, time, base)} times ours"
+            else:
+                remark = "" if time is base else f"{at_most(2.5, time, base)} times"
+            line(name, time, remark)
 
 
 def fit_section(repeats: int) -> None:
     N, n, regularization = 1000, 4, 1e-4
     print(f"\nExact fit, Nn = {N * n}")
     X, Y = data(N, n)
-    K = hk.Symplectic(hk.Gaussian(2.0))
-    A = np.asarray(hk.gram(K, X)).reshape(N * n, N * n) + N * regularization * np.eye(N * n)
+    K, solver = hk.Symplectic(hk.Gaussian(2.0)), hk.Cholesky()
+    G = np.asarray(hk.gram(K, X)).reshape(N * n, N * n)
+    A = G + N * regularization * np.eye(N * n)
     y = np.asarray(Y).ravel()
-
-    def scipy_solve() -> np.ndarray:
-        return scipy.linalg.cho_solve(scipy.linalg.cho_factor(A), y)
-
-    expected, scipy_least, scipy_median = timed(scipy_solve, repeats)
-    solver = hk.Cholesky()
-    run = lambda: hk.fit(K, X, Y, regularization, solver=solver)  # noqa: E731
-    field, least, median = measured(run, repeats)
-    found = field.coefficients
-    np.testing.assert_allclose(found.ravel(), expected, rtol=1e-5, atol=1e-5 * np.abs(y).max())
-    line("SciPy cho_factor + cho_solve, matrix ready", scipy_least, scipy_median)
-    ratio = verdict(least / scipy_least, 1.3, False)
-    line("hamkernel fit, assembly included", least, median, f"{ratio} times SciPy")
+    runs: dict[str, Callable[[], Any]] = {
+        "SciPy cho_factor + cho_solve, matrix ready": lambda: scipy.linalg.cho_solve(
+            scipy.linalg.cho_factor(A), y
+        ),
+        "hamkernel fit, assembly included": lambda: hk.fit(K, X, Y, regularization, solver=solver),
+    }
     try:
         from sklearn.kernel_ridge import KernelRidge  # pyright: ignore[reportMissingImports]
     except ImportError:
         print("  scikit-learn is not installed")
-        return
-    G = A - N * regularization * np.eye(N * n)
-    ridge = KernelRidge(alpha=N * regularization, kernel="precomputed")
-    _, sklearn, sklearn_median = timed(lambda: ridge.fit(G, y), repeats)
-    line("scikit-learn KernelRidge, matrix ready", sklearn, sklearn_median)
+    else:
+        ridge = KernelRidge(alpha=N * regularization, kernel="precomputed")
+        runs["scikit-learn KernelRidge, matrix ready"] = lambda: ridge.fit(G, y).dual_coef_
+    times = in_turn(repeats, runs)
+    scipy_time, ours, *_ = times.values()
+    for each in times.values():
+        found = getattr(each.result, "coefficients", each.result)
+        np.testing.assert_allclose(
+            np.ravel(found), scipy_time.result, rtol=1e-5, atol=1e-5 * np.abs(y).max()
+        )
+    for name, time in times.items():
+        line(name, time, f"{at_most(1.3, ours, scipy_time)} times SciPy" if time is ours else "")
 
 
 def nystrom_section(large: bool) -> None:
     print("\nLow rank, n = 2, noise 1 %")
     K, regularization = hk.Symplectic(hk.Gaussian(1.5)), 1e-5
     X, Y = data(2000, 2)
-    fields, times = {}, {}
-    for solver in (hk.Cholesky(), hk.Nystrom()):
-        run = lambda solver=solver: hk.fit(K, X, Y, regularization, solver=solver)  # noqa: E731
-        name = type(solver).__name__
-        fields[name], *times[name] = measured(run, 5)
+    runs = {
+        type(solver).__name__: lambda solver=solver: hk.fit(K, X, Y, regularization, solver=solver)
+        for solver in (hk.Cholesky(), hk.Nystrom())
+    }
+    slow, fast = in_turn(9, runs).values()
     new = 0.95 * data(500, 2)[0]
-    exact, low = (fields[name].evaluate(new) for name in ("Cholesky", "Nystrom"))
+    exact, low = slow.result.evaluate(new), fast.result.evaluate(new)
     off = float(jnp.linalg.norm(low - exact) / jnp.linalg.norm(exact))
-    (slow, slow_median), (fast, fast_median) = times["Cholesky"], times["Nystrom"]
-    line("Cholesky, N = 2000", slow, slow_median)
-    ratio = verdict(slow / fast, 10, True)
-    line("Nystrom, N = 2000", fast, fast_median, f"{ratio} faster, {off:.1e} from exact")
+    line("Cholesky, N = 2000", slow)
+    line("Nystrom, N = 2000", fast, f"{at_least(10, slow, fast)} faster, {off:.1e} from exact")
     sizes = [100_000, 1_000_000] if large else [10_000, 100_000]
     least = []
     for N in sizes:
         X, Y = data(N, 2)
         run = lambda X=X, Y=Y: hk.fit(K, X, Y, regularization, solver=hk.Nystrom())  # noqa: E731
-        _, *seconds = measured(run, 2)
-        least.append(seconds[0])
-        line(f"Nystrom, N = {N}", seconds[0], seconds[1])
-    print(f"  log-log slope {verdict(float(np.log10(least[1] / least[0])), 1.1, False)}")
+        time = timed(run, 2)
+        least.append(time.least)
+        line(f"Nystrom, N = {N}", time)
+    slope = float(np.log10(least[1] / least[0]))
+    print(f"  log-log slope {slope:.2f} (<= 1.1: {'met' if slope <= 1.1 else 'MISSED'})")
 
 
 def iterative_section() -> None:
@@ -223,35 +220,35 @@ def iterative_section() -> None:
         X, Y = data(N, n)
         K = hk.Symplectic(hk.Gaussian(sigma))
         run = lambda: hk.fit(K, X, Y, 1e-4, solver=hk.ConjugateGradient(1e-6))  # noqa: E731, B023
-        start = time.perf_counter()
+        start = perf_counter()
         info: Any = jax.block_until_ready(run()).info
-        seconds = time.perf_counter() - start
+        seconds = perf_counter() - start
         done = f"{int(info.iterations)} iterations, residual {float(info.relative_residual):.1e}"
-        line(f"N = {N}, n = {n}, compilation included", seconds, seconds, done)
+        line(f"N = {N}, n = {n}, compilation included", Timed(seconds, seconds), done)
 
 
 def process_section() -> None:
     print("\nFresh processes")
 
-    def fresh(code: str) -> float:
-        seconds = []
-        for _ in range(5):
-            start = time.perf_counter()
-            subprocess.run([sys.executable, "-c", code], check=True)
-            seconds.append(time.perf_counter() - start)
-        return min(seconds)
+    def fresh(code: str) -> Callable[[], Any]:
+        return lambda: subprocess.run([sys.executable, "-c", code], check=True)
 
-    stack = fresh("import jax, equinox, optimistix")
-    ours = fresh("import hamkernel")
-    line("import jax, equinox, optimistix", stack, stack)
-    line("import hamkernel", ours, ours, f"{verdict(ours / stack, 1.3, False)} times")
-    first = fresh(
-        "import jax; jax.config.update('jax_enable_x64', True)\n"
-        "import numpy as np, hamkernel as hk\n"
-        "X, Y = np.random.default_rng(0).normal(size=(2, 24, 2))\n"
-        "f = hk.fit(hk.Odd(hk.Symplectic(hk.Gaussian(1.0))), X, Y, 1e-3); f(X[0])"
-    )
-    line("import, first fit, first value, N = 24", first, first, verdict(first, 4, False) + " s")
+    runs = {
+        "import jax, equinox, optimistix": fresh("import jax, equinox, optimistix"),
+        "import hamkernel": fresh("import hamkernel"),
+        "import, first fit, first value, N = 24": fresh(
+            "import jax; jax.config.update('jax_enable_x64', True)\n"
+            "import numpy as np, hamkernel as hk\n"
+            "X, Y = np.random.default_rng(0).normal(size=(2, 24, 2))\n"
+            "f = hk.fit(hk.Odd(hk.Symplectic(hk.Gaussian(1.0))), X, Y, 1e-3); f(X[0])"
+        ),
+    }
+    times = in_turn(9, runs)
+    stack, ours, first = times.values()
+    met = "met" if first.least <= 4 else "MISSED"
+    remarks = ("", f"{at_most(1.3, ours, stack)} times", f"<= 4 s: {met}")
+    for (name, time), remark in zip(times.items(), remarks, strict=True):
+        line(name, time, remark)
 
 
 def figure_section(path: str) -> None:
@@ -281,7 +278,7 @@ def figure_section(path: str) -> None:
         least = []
         for N in sizes:
             X, Y = data(N, n)
-            least.append(measured(lambda run=run, X=X, Y=Y: run(X, Y), 3)[1])
+            least.append(timed(lambda run=run, X=X, Y=Y: run(X, Y), 3).least)
         slope = np.polyfit(np.log(sizes[-3:]), np.log(least[-3:]), 1)[0]
         label = f"{name}: slope {slope:.2f}"
         print(f"  {label}")
@@ -297,11 +294,12 @@ def main(figure: str | None, quick: bool) -> None:
     print(f"{datetime.date.today()}, {platform.processor() or platform.machine()}, ", end="")
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; ", end="")
     print(f"Python {platform.python_version()}, jax {jax.__version__} on {jax.default_backend()}")
+    print(f"GLIBC_TUNABLES={os.environ.get('GLIBC_TUNABLES', '')}")
     print(f"  {'':44s} {'minimum':>13s} {'median':>13s}")
     process_section()
     gram_section(repeats=9)
-    product_section(4000 if quick else 20_000, repeats=3)
-    fit_section(repeats=5)
+    product_section(4000 if quick else 20_000)
+    fit_section(repeats=9)
     nystrom_section(large=not quick)
     if not quick:
         iterative_section()

@@ -16,7 +16,6 @@ first checked to agree. `--quick` leaves out the loops of minutes.
 """
 
 import argparse
-import time
 from collections.abc import Callable
 
 import jax
@@ -27,6 +26,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
+from timing import Timed, in_turn, timed
 
 import hamkernel as hk
 from hamkernel._folds import Partition
@@ -38,27 +38,10 @@ FOLDS = 5
 SIGMAS, RIDGES = np.geomspace(0.3, 30, 30), np.geomspace(1e-8, 1, 25)
 
 
-def timed(run: Callable, repeats: int) -> tuple[float, float]:
-    """Minimum and median of seconds, after one call to warm up."""
-    return in_turn(repeats, run)[0]
-
-
-def in_turn(repeats: int, *runs: Callable) -> list[tuple[float, float]]:
-    """The same for each of `runs`, one after the other: what slows the machine slows them all."""
-    for run in runs:
-        jax.block_until_ready(run())
-    seconds = [[] for _ in runs]
-    for _ in range(repeats):
-        for run, taken in zip(runs, seconds, strict=True):
-            start = time.perf_counter()
-            jax.block_until_ready(run())
-            taken.append(time.perf_counter() - start)
-    return [(min(taken), float(np.median(taken))) for taken in seconds]
-
-
-def show(name: str, seconds: tuple[float, float], of: float | None = None) -> None:
-    ratio = "" if of is None else f"   {seconds[0] / of:9.3g} x"
-    print(f"  {name:58s} {1e3 * seconds[0]:10.3f} {1e3 * seconds[1]:10.3f} ms{ratio}", flush=True)
+def show(name: str, seconds: Timed, of: Timed | None = None) -> None:
+    ratio = "" if of is None else f"   {seconds.least / of.least:9.3g} x"
+    least, median = 1e3 * seconds.least, 1e3 * seconds.median
+    print(f"  {name:58s} {least:10.3f} {median:10.3f} ms{ratio}", flush=True)
 
 
 def data(N: int) -> tuple[jax.Array, jax.Array]:
@@ -136,8 +119,8 @@ def against_grids(N: int, quick: bool) -> None:
     each = timed(users, 2)
     show(
         f"(a) public fit per fold, {len(sound)} of {size} points, scaled",
-        scaled(each, size / len(sound)),
-        tuned[0],
+        each.scaled(size / len(sound)),
+        tuned,
     )
 
     def folds() -> None:
@@ -147,8 +130,8 @@ def against_grids(N: int, quick: bool) -> None:
     each = timed(folds, 3)
     show(
         f"(b) one compiled function per fold, {len(pairs)} of {size} points, scaled",
-        scaled(each, size / len(pairs)),
-        tuned[0],
+        each.scaled(size / len(pairs)),
+        tuned,
     )
 
     def loop() -> list:
@@ -160,8 +143,8 @@ def against_grids(N: int, quick: bool) -> None:
     each = timed(loop, 3)
     show(
         f"(c) one compiled function, {len(pairs)} of {size} points, scaled",
-        scaled(each, size / len(pairs)),
-        tuned[0],
+        each.scaled(size / len(pairs)),
+        tuned,
     )
     if N > 100 and quick:
         return
@@ -169,14 +152,10 @@ def against_grids(N: int, quick: bool) -> None:
     whole = timed(
         lambda: grid_losses(kernel_of, sigmas, ridges, X, Y, partition), 1 if N > 100 else 5
     )
-    show("(d) the whole grid in one compiled call", whole, tuned[0])
+    show("(d) the whole grid in one compiled call", whole, tuned)
     best = float(np.nanmin(grid_losses(kernel_of, sigmas, ridges, X, Y, partition)))
     loss = float(hk.tune(kernel(1.0), X, Y, 1e-3, FOLDS).loss)
     print(f"  loss of tune {loss:.6g}, best of the grid {best:.6g}, ratio {loss / best:.4f}")
-
-
-def scaled(seconds: tuple[float, float], by: float) -> tuple[float, float]:
-    return seconds[0] * by, seconds[1] * by
 
 
 @eqx.filter_jit
@@ -203,18 +182,18 @@ def leave_one_out(N: int) -> None:
     print(f"leave-one-out, N = {N}, n = 2; a refit agrees to 1e-6", flush=True)
     A = np.asarray(hk.gram(K, X)).reshape(2 * N, 2 * N) + (N - 1) * 1e-4 * np.eye(2 * N)
     compiled, with_slope = jax.jit(loss), jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))
-    factor, value, both = in_turn(
-        15,
-        lambda: scipy.linalg.cho_factor(A),
-        lambda: compiled(K, ridge),
-        lambda: with_slope(K, ridge),
-    )
+    runs = {
+        "factor": lambda: scipy.linalg.cho_factor(A),
+        "loss": lambda: compiled(K, ridge),
+        "both": lambda: with_slope(K, ridge),
+    }
+    factor, value, both = in_turn(15, runs).values()
     slope = jax.jit(jax.value_and_grad(lambda ridge: one_refit(K, X, Y, ridge, jnp.asarray(7))))
-    refits = scaled(timed(lambda: slope((N - 1) * ridge), 2), N)
+    refits = timed(lambda: slope((N - 1) * ridge), 2).scaled(N)
     show("SciPy's cho_factor of the same matrix", factor)
-    show("loss; times cho_factor", value, factor[0])
-    show("loss and gradient; times cho_factor", both, factor[0])
-    show("refits with the gradient over λ alone, scaled; times ours", refits, both[0])
+    show("loss; times cho_factor", value, factor)
+    show("loss and gradient; times cho_factor", both, factor)
+    show("refits with the gradient over λ alone, scaled; times ours", refits, both)
 
 
 def many_hyperparameters() -> None:
@@ -227,11 +206,11 @@ def many_hyperparameters() -> None:
         )
     )
     count = sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(many, eqx.is_inexact_array))) + 1
-    few_seconds = timed(lambda: hk.tune(two, X, Y), 10)
-    many_seconds = timed(lambda: hk.tune(many, X, Y), 5)
+    runs = {"two": lambda: hk.tune(two, X, Y), "many": lambda: hk.tune(many, X, Y)}
+    of_two, of_many = in_turn(10, runs).values()
     print("hyperparameters, λ among them, N = 24, n = 2")
-    show("tune of 2", few_seconds)
-    show(f"tune of {count}", many_seconds, few_seconds[0])
+    show("tune of 2", of_two)
+    show(f"tune of {count}", of_many, of_two)
 
 
 def main() -> None:

@@ -1,0 +1,39 @@
+"""Seconds of what is compared, measured in turn: what slows the machine slows it all."""
+
+import time
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+
+class Timed(NamedTuple):
+    """Minimum and median of seconds over the repeats, and the result."""
+
+    least: float
+    median: float
+    result: Any = None
+
+    def scaled(self, by: float) -> "Timed":
+        return Timed(self.least * by, self.median * by)
+
+
+def in_turn(repeats: int, runs: Mapping[str, Callable[[], Any]]) -> dict[str, Timed]:
+    """Each of `runs`, one after the other and again, after one call of each to warm up."""
+    results = {name: jax.block_until_ready(run()) for name, run in runs.items()}
+    seconds = {name: [] for name in runs}
+    for _ in range(repeats):
+        for name, run in runs.items():
+            start = time.perf_counter()
+            jax.block_until_ready(run())
+            seconds[name].append(time.perf_counter() - start)
+    return {
+        name: Timed(min(taken), float(np.median(taken)), results[name])
+        for name, taken in seconds.items()
+    }
+
+
+def timed(run: Callable[[], Any], repeats: int) -> Timed:
+    """One alone."""
+    return in_turn(repeats, {"": run})[""]
