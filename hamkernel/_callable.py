@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array
 
 from hamkernel import _require as require
+from hamkernel._show import call, text
 
 
 def as_pytree(fn: Callable[..., Any]) -> Callable[..., Any]:
@@ -42,10 +43,18 @@ class Bound(eqx.Module):
         self.static = tuple(None if array else leaf for leaf, array in pairs)
 
     def __call__(self, *points: Array) -> Any:
+        args, keywords = self._bound()
+        return self.func(*args, *points, **keywords)
+
+    def __repr__(self) -> str:
+        args, keywords = self._bound()
+        named = [f"{name}={text(value)}" for name, value in keywords.items()]
+        return call("partial", [text(self.func), *map(text, args), *named])
+
+    def _bound(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
         pairs = zip(self.arrays, self.static, strict=True)
         leaves = [static if array is None else array for array, static in pairs]
-        args, keywords = jax.tree.unflatten(self.structure, leaves)
-        return self.func(*args, *points, **keywords)
+        return jax.tree.unflatten(self.structure, leaves)
 
 
 class Closure(eqx.Module):
@@ -74,6 +83,9 @@ class Closure(eqx.Module):
         for i, value in self.traced.items():
             cells[i] = types.CellType(value)
         return _with_cells(self.func, cells)(*points)
+
+    def __repr__(self) -> str:
+        return text(self.func)
 
 
 def _holds_traced(value: Any, outer: tuple[Any, ...] = ()) -> bool:

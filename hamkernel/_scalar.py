@@ -177,8 +177,9 @@ class UserKernel(AbstractScalarKernel):
         self.fn = as_pytree(of_one_pair(fn))
 
     def __repr__(self) -> str:
-        bare = type(self.fn).__repr__ is eqx.Module.__repr__  # it says nothing of values
-        return described(self.fn) if bare else text(self.fn)
+        fn = getattr(self.fn, "__self__", self.fn)  # the kernel of tinygp that has the method
+        bare = type(fn).__repr__ is eqx.Module.__repr__  # it says nothing of values
+        return described(fn) if bare else text(fn)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         value = self.fn(x, z)

@@ -253,8 +253,22 @@ def test_a_long_kernel_prints_over_several_lines_which_say_the_same():
     np.testing.assert_allclose(again(x, z), terms(x, z), rtol=1e-14)
 
 
-def test_a_kernel_of_ones_own_prints_its_values():
-    assert repr(hk.Symplectic(Mine(jnp.log(0.25)))) == "Symplectic(Mine(width=0.25))"
+def power(x, z, degree):
+    return (1 + x @ z) ** degree
+
+
+@pytest.mark.parametrize(
+    ("k", "text"),
+    [
+        (Mine(jnp.log(0.25)), "Mine(width=0.25)"),
+        (functools.partial(power, degree=jnp.array(3.0)), "partial(power, degree=3)"),
+    ],
+)
+def test_a_kernel_of_ones_own_prints_its_values(k, text):
+    assert repr(hk.Symplectic(k)) == f"Symplectic({text})"
+    named = []
+    jax.eval_shape(lambda c: named.append(repr(hk.CurlFree(lambda x, z: c * k(x, z)))), 1.0)
+    assert named == ["CurlFree(<lambda>)"]
 
 
 # Points of the wrong kind.

@@ -113,3 +113,9 @@ def test_their_hyperparameters_are_leaves_that_a_loss_is_differentiated_by(packa
     step = 1e-6
     difference = (loss(1.0 + step) - loss(1.0 - step)) / (2 * step)
     np.testing.assert_allclose(jax.grad(loss)(1.0), difference, rtol=1e-6)
+
+
+def test_a_kernel_of_tinygp_prints_as_it_is_written():
+    kernel = foreign("tinygp").ExpSquared(scale=jnp.asarray(LENGTHSCALE))
+    written = "Odd(CurlFree(ExpSquared(scale=1.3, distance=L2Distance())))"
+    assert repr(hk.Odd(hk.CurlFree(kernel))) == written
