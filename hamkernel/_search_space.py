@@ -171,11 +171,11 @@ class SearchSpace(eqx.Module):
 
 def _matching(name: str, names: tuple[str, ...], of_part: bool = False) -> list[int]:
     """The entries whose full name ends in `name`, or, of a part, has it anywhere."""
-    name_of_part, full = f".{name}.", [f".{full}." for full in names]
+    dotted = [f".{full}" for full in names]
     found = [
         i
-        for i, each in enumerate(full)
-        if each.endswith(name_of_part) or (of_part and name_of_part in each)
+        for i, full in enumerate(dotted)
+        if full.endswith(f".{name}") or (of_part and f".{name}." in full)
     ]
     if not found:
         raise ValueError(

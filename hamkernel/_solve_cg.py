@@ -43,8 +43,8 @@ class ConjugateGradient(AbstractSolver):
             condition is at most 1 + truncation; more landmarks mean fewer iterations.
 
     Raises:
-        ValueError: an argument is not positive. RuntimeError, from `fit`: no convergence (the text
-            says what to do).
+        ValueError: an argument is not positive. TypeError: `max_iterations` is not whole.
+            RuntimeError, from `fit`: no convergence (the text says what to do).
 
     Source: Frangella, Tropp & Udell (2023) for the preconditioner; Díaz et al. (2023),
         arXiv 2304.12465, for randomly pivoted Cholesky in it.

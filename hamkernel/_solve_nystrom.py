@@ -68,7 +68,8 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
             depend on others are left out. `max_points`, `candidates` and `key` have no effect.
 
     Raises:
-        ValueError: an argument is not positive, or `points` is not of shape (m, n).
+        ValueError: an argument is not positive, or `points` is not of shape (m, n). TypeError: a
+            number of points is not whole.
 
     Warns:
         UserWarning: the landmarks do not reach the tolerance.

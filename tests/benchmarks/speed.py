@@ -3,7 +3,7 @@
     python tests/benchmarks/speed.py [--figure speed.png] [--quick]
 
 float64, warm, in one process, peers in turn: the minimum and the median over repeats, never a
-single run. Same work and same precision; that the results agree is checked. A peer that is not
+single run. Same work and same precision; the results are checked to agree first. A peer that is not
 installed (`pip install hamkernel[benchmarks]`) is said to be missing. `--quick` leaves out what
 takes minutes. A target is a ratio of minima in this run; "met" or "MISSED" stands beside it, and
 the ratio of medians. How memory is handed out matters to all of them: see "Speed" in the README.
@@ -121,10 +121,19 @@ def gram_section(repeats: int) -> None:
         runs["GPyTorch RBFKernelGrad (curl-free)"] = gpytorch_gram(X)
     except ImportError:
         print("  gpytorch is not installed")
-    times = in_turn(repeats, runs)
+
+    def agree(results: dict[str, Any]) -> None:
+        ours, _, ordered, _, _, user, _, *torch = results.values()
+        for each in (ours, ordered, user):
+            np.testing.assert_allclose(each, closed, atol=ROUNDING)
+        for blocks in torch:
+            # Ordered (point, value or derivative), with the values besides.
+            theirs = blocks.numpy().reshape(N, n + 1, N, n + 1)[:, 1:, :, 1:]
+            curl_free = hk.gram(hk.CurlFree(hk.Gaussian(SIGMA)), X)
+            np.testing.assert_allclose(theirs, curl_free, atol=1e-6)
+
+    times = in_turn(repeats, runs, agree)
     ours, blocks, ordered, copy, fresh, user, odd, *torch = times.values()
-    for each in (ours, ordered, user):
-        np.testing.assert_allclose(each.result, closed, atol=ROUNDING)
     remarks = [
         "",
         f"{at_least(20, blocks, ours)} times ours",
@@ -134,11 +143,7 @@ def gram_section(repeats: int) -> None:
         f"{at_least(7, ordered, user)} faster than NumPy",
         f"{at_most(2, odd, ours)} times symplectic",
     ]
-    if torch:
-        # Its entries are ordered (point, value or derivative), and hold the values besides.
-        theirs = torch[0].result.numpy().reshape(N, n + 1, N, n + 1)[:, 1:, :, 1:]
-        np.testing.assert_allclose(theirs, hk.gram(hk.CurlFree(hk.Gaussian(SIGMA)), X), atol=1e-6)
-        remarks.append(f"{at_least(25, torch[0], ours)} times ours")
+    remarks += [f"{at_least(25, each, ours)} times ours" for each in torch]
     for (name, time), remark in zip(times.items(), remarks, strict=True):
         line(name, time, remark)
 
@@ -177,13 +182,15 @@ def fit_section(repeats: int) -> None:
     else:
         ridge = KernelRidge(alpha=N * regularization, kernel="precomputed")
         runs["scikit-learn KernelRidge, matrix ready"] = lambda: ridge.fit(G, y).dual_coef_
-    times = in_turn(repeats, runs)
+
+    def agree(results: dict[str, Any]) -> None:
+        expected, *others = results.values()
+        for each in others:
+            found = np.ravel(getattr(each, "coefficients", each))
+            np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5 * np.abs(y).max())
+
+    times = in_turn(repeats, runs, agree)
     scipy_time, ours, *_ = times.values()
-    for each in times.values():
-        found = getattr(each.result, "coefficients", each.result)
-        np.testing.assert_allclose(
-            np.ravel(found), scipy_time.result, rtol=1e-5, atol=1e-5 * np.abs(y).max()
-        )
     for name, time in times.items():
         line(name, time, f"{at_most(1.3, ours, scipy_time)} times SciPy" if time is ours else "")
 

@@ -19,9 +19,18 @@ class Timed(NamedTuple):
         return Timed(self.least * by, self.median * by)
 
 
-def in_turn(repeats: int, runs: Mapping[str, Callable[[], Any]]) -> dict[str, Timed]:
-    """Each of `runs`, one after the other and again, after one call of each to warm up."""
+def in_turn(
+    repeats: int,
+    runs: Mapping[str, Callable[[], Any]],
+    check: Callable[[dict[str, Any]], None] | None = None,
+) -> dict[str, Timed]:
+    """Each of `runs`, one after the other and again, after one call of each to warm up.
+
+    `check` is given the results of those calls before anything is timed.
+    """
     results = {name: jax.block_until_ready(run()) for name, run in runs.items()}
+    if check is not None:
+        check(results)
     seconds = {name: [] for name in runs}
     for _ in range(repeats):
         for name, run in runs.items():
