@@ -13,7 +13,7 @@ the case k(x, z) = g(x − z); the mixed derivative is the one that is positive 
 """
 
 import abc
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -29,7 +29,7 @@ from hamkernel._structured import AbstractMatrixKernel
 class AbstractStructure(AbstractMatrixKernel):
     """A structure made from one scalar kernel k."""
 
-    kernel: eqx.AbstractVar[AbstractScalarKernel]
+    kernel: AbstractScalarKernel = eqx.field(converter=as_scalar_kernel)
     # The parity of the fields over that of the functions of k; a derivative turns it around.
     field_parity: eqx.AbstractClassVar[int]
 
@@ -57,16 +57,12 @@ class Separable(AbstractStructure):
     Source: Smith & Egeland (2023), eq. (separable_gaussian_kernel).
     """
 
-    kernel: AbstractScalarKernel
     field_parity: ClassVar[int] = 1
     symplectic: ClassVar[bool] = False
     no_potential: ClassVar[str | None] = (
         "a field of a Separable kernel has no potential: its components are independent. "
         "Use Symplectic or CurlFree to learn one."
     )
-
-    def __init__(self, kernel: Any):
-        self.kernel = as_scalar_kernel(kernel)
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
         return self.kernel(x, z) * (u @ v)
@@ -121,11 +117,7 @@ class CurlFree(AbstractPotentialKernel):
     Source: Smith & Egeland (2023), eq. (curl_free_kernel_base); Fuselier (2006).
     """
 
-    kernel: AbstractScalarKernel
     symplectic: ClassVar[bool] = False
-
-    def __init__(self, kernel: Any):
-        self.kernel = as_scalar_kernel(kernel)
 
     def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         return v
@@ -142,11 +134,7 @@ class Symplectic(AbstractPotentialKernel):
     Source: Smith & Egeland (2023), eq. (symplectic_kernel_base); Boffi, Tu & Slotine (2022).
     """
 
-    kernel: AbstractScalarKernel
     symplectic: ClassVar[bool] = True
-
-    def __init__(self, kernel: Any):
-        self.kernel = as_scalar_kernel(kernel)
 
     def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         dq, dp = jnp.split(v, 2)
@@ -173,16 +161,12 @@ class DivergenceFree(AbstractStructure):
     Source: Fuselier (2006); for n = 3 it is the curl of a vector potential.
     """
 
-    kernel: AbstractScalarKernel
     field_parity: ClassVar[int] = -1
     symplectic: ClassVar[bool] = False
     no_potential: ClassVar[str | None] = (
         "a field of a DivergenceFree kernel has a matrix potential, not a scalar one. In the plane "
         "use Symplectic(k), the same kernel, whose potential is the stream function."
     )
-
-    def __init__(self, kernel: Any):
-        self.kernel = as_scalar_kernel(kernel)
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
         along_both = jax.vmap(lambda e: _mixed(self.kernel, x, e, z, e))
