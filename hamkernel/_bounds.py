@@ -104,7 +104,7 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
         elif child is not node:  # else a leaf that is no array: a degree, an activation
             seen = X
             if isinstance(node, Warp) and isinstance(child, AbstractScalarKernel):
-                seen = np.asarray(jax.vmap(node.fn)(jnp.asarray(X)))
+                seen = np.asarray(jax.vmap(node.warped)(jnp.asarray(X)))
             yield from _walk((*path, *key), child, seen, amplitude)
 
 

@@ -5,6 +5,7 @@ from collections.abc import Callable
 from typing import TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
@@ -107,8 +108,7 @@ class AbstractField(eqx.Module):
             AttributeError: the structure has no potential (with the reason).
         """
         self.kernel.check_potential()
-        # A lambda, because JAX would compare the bound method, and so its traced arrays.
-        return lambda x: self.unanchored_potential(x) + self.offset
+        return jax.tree_util.Partial(_potential_of, self)
 
     @property
     def hamiltonian(self) -> Scalar:
@@ -123,8 +123,8 @@ class AbstractField(eqx.Module):
             raise AttributeError(
                 f"a field of the kernel {type(self.kernel).__name__} is not Hamiltonian by "
                 "construction, so it has no learned Hamiltonian. Use Symplectic(k); for a sum "
-                "that contains one ask the part, field.part(0).hamiltonian(x); for CurlFree see "
-                "field.potential(x)."
+                "that contains one ask that part, by position or name, such as "
+                "field.part(0).hamiltonian(x); for CurlFree see field.potential(x)."
             )
         return self.potential
 
@@ -169,6 +169,10 @@ class AbstractField(eqx.Module):
             for k in self.kernel.scalar_kernels
             for support in k.supports(n)
         )
+
+
+def _potential_of(field, x):
+    return field.unanchored_potential(x) + field.offset
 
 
 class SolverInfo(eqx.Module):

@@ -22,8 +22,8 @@ class Partition:
     """
 
     def __init__(self, N: int, folds: Folds):
-        self.labels = _labels(N, folds)
-        names, index, sizes = np.unique(self.labels, return_inverse=True, return_counts=True)
+        names, index, sizes = np.unique(_labels(N, folds), return_inverse=True, return_counts=True)
+        self.labels = index
         if len(names) < 2:
             raise ValueError(
                 f"cross-validation needs at least two folds, and these {N} points are in one. "

@@ -9,7 +9,7 @@ differentiation makes every structured kernel from it, so a kernel should be wri
 import abc
 import enum
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
@@ -96,7 +96,7 @@ class ScalarSum(AbstractScalarKernel):
 
     @property
     def invariance(self) -> Invariance:
-        return _common_invariance(self.terms)
+        return common_invariance(self.terms)
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
         return tuple(support for k in self.terms for support in k.supports(n))
@@ -115,7 +115,7 @@ class ScalarProduct(AbstractScalarKernel):
 
     @property
     def invariance(self) -> Invariance:
-        return _common_invariance(self.terms)
+        return common_invariance(self.terms)
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
         first, *rest = (k.supports(n) for k in self.terms)
@@ -124,7 +124,8 @@ class ScalarProduct(AbstractScalarKernel):
         return first
 
 
-def _common_invariance(terms: tuple[AbstractScalarKernel, ...]) -> Invariance:
+def common_invariance(terms: Iterable[Any]) -> Invariance:
+    """What all of them have; scalar kernels or matrix-valued ones."""
     common = Invariance.TRANSLATION
     for kernel in terms:
         common &= kernel.invariance

@@ -37,15 +37,17 @@ class Warp(AbstractScalarKernel):
     fn: Callable[[Float[Array, " n"]], Any]
 
     def __init__(self, kernel: Any, fn: Callable[[Array], Array | Sequence[Array]]):
-        if not callable(fn):
-            raise TypeError(f"Warp needs a callable (n,) -> (m,), got {fn!r}.")
+        if not callable(fn) or isinstance(fn, AbstractScalarKernel):
+            raise TypeError(
+                f"Warp needs a kernel and then a map (n,) -> (m,), Warp(k, fn); got {fn!r} as map."
+            )
         self.kernel = as_scalar_kernel(kernel)
         self.fn = as_pytree(fn)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
-        return self.kernel(self._warped(x), self._warped(z))
+        return self.kernel(self.warped(x), self.warped(z))
 
-    def _warped(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+    def warped(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         x = one_point(x)
         warped = self.fn(x)
         warped = jnp.stack(warped) if isinstance(warped, list | tuple) else warped
@@ -79,11 +81,16 @@ class Select(AbstractScalarKernel):
     dims: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(self, kernel: Any, dims: Any):
-        dims = tuple(operator.index(d) for d in np.atleast_1d(dims))
-        if not dims or min(dims) < 0 or len(set(dims)) < len(dims):
-            raise ValueError(f"Select needs distinct coordinates, integers >= 0; got {dims}.")
         self.kernel = as_scalar_kernel(kernel)
-        self.dims = dims
+        try:
+            self.dims = tuple(operator.index(d) for d in np.atleast_1d(dims))
+        except TypeError:
+            self.dims = ()
+        if not self.dims or min(self.dims) < 0 or len(set(self.dims)) < len(self.dims):
+            raise ValueError(
+                "Select needs distinct coordinates, integers >= 0, such as Select(k, (0, 1)); got "
+                f"{dims!r}."
+            )
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         return self.kernel(self._selected(x), self._selected(z))
@@ -145,6 +152,8 @@ class Symmetrised(AbstractScalarKernel):
         return Invariance.REFLECTION & self.kernel.invariance
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        if set(self.maps) <= {identity, reflection}:  # which mix no coordinates
+            return self.kernel.supports(n)
         return (frozenset(range(n)),)
 
 
@@ -162,7 +171,14 @@ def with_parity(kernel: AbstractScalarKernel, parity: int) -> AbstractScalarKern
     """The kernel of the even (parity +1) or odd (−1) functions of the RKHS of `kernel`.
 
     The group is {1, −1}. A sum is symmetrised term by term, so that its terms stay visible.
+
+    Raises:
+        ValueError: a term has the other parity already, so that only zero is left of it.
     """
+    if isinstance(kernel, Symmetrised) and set(kernel.maps) == {identity, reflection}:
+        if kernel.characters[kernel.maps.index(reflection)] != parity:
+            raise ValueError("Odd(Even(K)) and Even(Odd(K)) have no fields but zero: choose one.")
+        return kernel
     if isinstance(kernel, ScalarSum):
         return ScalarSum(tuple(with_parity(k, parity) for k in kernel.terms))
     if isinstance(kernel, Scaled):

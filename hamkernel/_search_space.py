@@ -14,6 +14,7 @@ from hamkernel._trained import trained
 
 RIDGE = "regularization"
 ROUNDINGS = 100.0  # how far the ridge must stay above the rounding of the Gram
+_EDGE = 0.01  # the share of the box that counts as resting on a bound
 LOW_RANK_ROUNDINGS = 2e4  # above the rounding at which `choose_landmarks` drops a column
 
 
@@ -145,22 +146,24 @@ class SearchSpace(eqx.Module):
         low, high = self.low.at[-1].set(ridge_low), self.high.at[-1].set(ridge_high)
         width = jnp.where(high > low, high - low, jnp.ones_like(low))
         # Not on the edge itself, where the derivative of the sine is zero.
-        share = jnp.clip((self.start - low) / width, 0.01, 0.99)
+        share = jnp.clip((self.start - low) / width, 2 * _EDGE, 1 - 2 * _EDGE)
         # Where the kernel is not positive at the start there is no box of λ.
         share = jnp.where(jnp.isfinite(share), share, 0.5)
         return jnp.arcsin(2 * share - 1)[jnp.asarray(self.free)]
 
     def at_bounds(self, u: Float[Array, " P"]) -> tuple[str, ...]:
-        """The names of the hyperparameters within a hundredth of their box of its edge."""
-        names = (self.names[i] for i, s in zip(self.free, np.sin(u), strict=True) if abs(s) > 0.98)
-        return tuple(dict.fromkeys(names))
+        """The names of the hyperparameters that rest on a bound."""
+        at_edge = np.abs(np.sin(u)) > 1 - 2 * _EDGE
+        return tuple(dict.fromkeys(self.names[i] for i in np.array(self.free)[at_edge]))
 
-    def box(self, kernel: AbstractMatrixKernel, X: Float[Array, "N n"]) -> dict[str, tuple]:
+    def box(
+        self, kernel: AbstractMatrixKernel, X: Float[Array, "N n"]
+    ) -> dict[str, tuple[float, float]]:
         """The lowest and highest value for each name, in its units; those of λ for `kernel`."""
         ridge_low, ridge_high = self.ridge_box(kernel, X)
         low, high = np.array(self.low), np.array(self.high)
         low[-1], high[-1] = ridge_low, ridge_high
-        box: dict[str, tuple] = {}
+        box: dict[str, tuple[float, float]] = {}
         for i in self.free:
             pair = np.array([low[i], high[i]], float)
             least, most = (np.exp(pair) if self.logarithmic[i] else pair).tolist()

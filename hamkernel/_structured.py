@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._scalar import AbstractScalarKernel, Invariance, one_point
+from hamkernel._scalar import AbstractScalarKernel, Invariance, common_invariance, one_point
 from hamkernel._show import call, described, joined
 
 
@@ -77,11 +77,9 @@ class AbstractMatrixKernel(eqx.Module):
         """The scalar kernels that the structure is made from."""
 
     @property
+    @abc.abstractmethod
     def invariance(self) -> Invariance:
-        common = Invariance.TRANSLATION
-        for kernel in self.scalar_kernels:
-            common &= kernel.invariance
-        return common
+        """The transformations of both arguments that leave every block unchanged, up to sign."""
 
     def __add__(self, other: Any) -> "Sum":
         return Sum(self, other) if isinstance(other, AbstractMatrixKernel) else NotImplemented
@@ -183,21 +181,26 @@ class Sum(AbstractMatrixKernel):
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
         return tuple(k for K in self.terms for k in K.scalar_kernels)
 
+    @property
+    def invariance(self) -> Invariance:
+        return common_invariance(self.terms)
+
     def part(self, which: int | str) -> AbstractMatrixKernel:
         """The term with this position or name; KeyError, with the choices, if there is none."""
         return self.terms[self.position(which)]
 
     def position(self, which: int | str) -> int:
         """The position of the term with this position or name."""
-        index: Any = self.names.index(which) if which in self.names else which
+        named = isinstance(which, str) and which in self.names
+        index: Any = self.names.index(which) if named else which
         positions = range(len(self.terms))
         try:
             return positions[index]
         except (IndexError, TypeError):
-            named = [name for name in self.names if name is not None]
+            names = [name for name in self.names if name is not None]
             raise KeyError(
                 f"no part {which!r}: this sum has positions 0 to {positions[-1]}"
-                + (f" and the names {named}." if named else ".")
+                + (f" and the names {names}." if names else ".")
             ) from None
 
 

@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hamkernel._scalar import AbstractScalarKernel, as_scalar_kernel
+from hamkernel._scalar import AbstractScalarKernel, Invariance, as_scalar_kernel
 from hamkernel._scalar_transform import parity_removed, with_parity
 from hamkernel._show import call, described
 from hamkernel._structured import AbstractMatrixKernel
@@ -32,6 +32,8 @@ class AbstractStructure(AbstractMatrixKernel):
     kernel: AbstractScalarKernel = eqx.field(converter=as_scalar_kernel)
     # The parity of the fields over that of the functions of k; a derivative turns it around.
     field_parity: eqx.AbstractClassVar[int]
+    # Of the operator: TRANSLATION where B is constant, REFLECTION where B(−x) = B(x).
+    operator_invariance: eqx.AbstractClassVar[Invariance]
 
     def __repr__(self) -> str:
         found = parity_removed(self.kernel)
@@ -41,12 +43,21 @@ class AbstractStructure(AbstractMatrixKernel):
         return call(symmetry, [repr(eqx.tree_at(lambda K: K.kernel, self, found.kernel))])
 
     def with_parity(self, parity: int) -> "AbstractStructure":
+        if Invariance.REFLECTION not in self.operator_invariance:
+            raise TypeError(
+                f"the fields of {type(self).__name__} have no parity with any potential: its "
+                "operator B(x) is another one at -x."
+            )
         kernel = with_parity(self.kernel, self.field_parity * parity)
         return eqx.tree_at(lambda K: K.kernel, self, kernel)
 
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
         return (self.kernel,)
+
+    @property
+    def invariance(self) -> Invariance:
+        return self.kernel.invariance & self.operator_invariance
 
 
 class Separable(AbstractStructure):
@@ -58,6 +69,7 @@ class Separable(AbstractStructure):
     """
 
     field_parity: ClassVar[int] = 1
+    operator_invariance: ClassVar[Invariance] = Invariance.TRANSLATION
     symplectic: ClassVar[bool] = False
     no_potential: ClassVar[str | None] = (
         "a field of a Separable kernel has no potential: its components are independent. "
@@ -79,7 +91,7 @@ class Separable(AbstractStructure):
 class AbstractPotentialKernel(AbstractStructure):
     """K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ: fields f = B ∇u of a potential u.
 
-    A final class adds B; everything else is here.
+    A final class adds B, and says what B is invariant to; everything else is here.
     """
 
     field_parity: ClassVar[int] = -1
@@ -117,6 +129,7 @@ class CurlFree(AbstractPotentialKernel):
     Source: Smith & Egeland (2023), eq. (curl_free_kernel_base); Fuselier (2006).
     """
 
+    operator_invariance: ClassVar[Invariance] = Invariance.TRANSLATION
     symplectic: ClassVar[bool] = False
 
     def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
@@ -134,6 +147,7 @@ class Symplectic(AbstractPotentialKernel):
     Source: Smith & Egeland (2023), eq. (symplectic_kernel_base); Boffi, Tu & Slotine (2022).
     """
 
+    operator_invariance: ClassVar[Invariance] = Invariance.TRANSLATION
     symplectic: ClassVar[bool] = True
 
     def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
@@ -162,6 +176,7 @@ class DivergenceFree(AbstractStructure):
     """
 
     field_parity: ClassVar[int] = -1
+    operator_invariance: ClassVar[Invariance] = Invariance.TRANSLATION
     symplectic: ClassVar[bool] = False
     no_potential: ClassVar[str | None] = (
         "a field of a DivergenceFree kernel has a matrix potential, not a scalar one. In the plane "

@@ -23,7 +23,6 @@ little residual: its bound stays or rises by some tens.
 
 import warnings
 from collections.abc import Mapping
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -75,7 +74,7 @@ class Tuned(eqx.Module):
     steps: Int[Array, ""]
     start_losses: Float[Array, " starts"]
     at_bounds: tuple[str, ...] = eqx.field(static=True)
-    bounds: dict[str, tuple[Any, Any]] = eqx.field(static=True)
+    bounds: dict[str, tuple[float, float]]
 
     def __repr__(self) -> str:
         return described(self)
