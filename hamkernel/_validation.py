@@ -81,7 +81,8 @@ def cross_validation_residuals(
 ) -> Float[Array, "N n"]:
     """The residual yᵢ − f(xᵢ) of each point under the fit that has not seen its fold.
 
-    Args and errors are those of `cross_validation_loss`, which is their mean square.
+    Args and errors are those of `cross_validation_loss`, which is the mean over folds of their mean
+    squares: with unequal folds not the mean of all squares.
 
     Returns:
         Shape (N, n), in units of Y; inf where the matrix is not positive definite to rounding.

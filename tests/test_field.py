@@ -86,6 +86,20 @@ def test_two_fields_of_one_shape_are_not_taken_for_each_other():
     assert field != other
 
 
+def test_a_potential_is_a_pytree_whose_arrays_are_no_constants_of_a_program():
+    field = fitted(hk.Symplectic)
+
+    @eqx.debug.assert_max_traces(max_traces=1)
+    def energy(H, x):
+        return H(x)
+
+    compiled, x = eqx.filter_jit(energy), states(1)[0]
+    for scale in (1.0, 2.0, 3.0):
+        scaled = eqx.tree_at(lambda f: f.coefficients, field, scale * field.coefficients)
+        expected = scale * field.hamiltonian(x)
+        np.testing.assert_allclose(compiled(scaled.hamiltonian, x), expected, atol=ROUNDING)
+
+
 def test_potentials_work_where_the_field_is_traced():
     field, X = fitted(hk.Symplectic), states(4, seed=2)
     expected = jnp.stack([field.hamiltonian(x) for x in X])
@@ -232,8 +246,8 @@ G, M = hk.Gaussian(2.0), hk.Matern(2.5, 0.5)
             "Sum(Symplectic(Gaussian(lengthscale=2)), rest=Odd(CurlFree(quadratic)))",
         ),
         (
-            hk.Even(hk.Odd(hk.DivergenceFree(G))) + hk.CurlFree(quadratic),
-            "Even(Odd(DivergenceFree(Gaussian(lengthscale=2)))) + CurlFree(quadratic)",
+            hk.Odd(hk.DivergenceFree(G)) + hk.CurlFree(quadratic),
+            "Odd(DivergenceFree(Gaussian(lengthscale=2))) + CurlFree(quadratic)",
         ),
     ],
 )
@@ -311,6 +325,7 @@ P = hk.Select(hk.Polynomial(2), 1)
         (hk.Symplectic(Q + P), True),
         (hk.Symplectic(2.0 * Q + 0.5 * P), True),
         (hk.Odd(hk.Symplectic(Q + P)), True),
+        (hk.Odd(hk.Symplectic(Q * Q + P)), True),
         (hk.Symplectic(Q) + hk.Symplectic(P), True),
         (hk.Symplectic(Q * P), False),
         (hk.Symplectic(Q + hk.Gaussian()), False),

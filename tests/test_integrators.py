@@ -220,6 +220,19 @@ def test_iteration_stops_at_the_rounding_errors_of_the_field(size, error):
     assert residual < error
 
 
+@pytest.mark.parametrize("solver", [ImplicitMidpoint(), GaussLegendre4()], ids=name)
+@pytest.mark.parametrize("away", [0.0, 1e-12, 1e-9])
+def test_the_iteration_ends_at_an_equilibrium_where_the_field_is_nothing_but_rounding(solver, away):
+    def field(x):  # a pendulum that hangs at q = 0.3, with ten digits
+        return (1e6 + jnp.stack([x[1], -jnp.sin(x[0] - 0.3)])) - 1e6 * jnp.cos(x - x)
+
+    x0 = jnp.array([0.3 + away, 0.0])
+    y = integrate(solver, bare_term(field), x0, 0.0, 10.0, 100)
+    assert jnp.abs(y - x0).max() < 2 * away + 1e-8  # 1e6 eps in every step
+    with pytest.raises(RuntimeError, match=r"diverge|maximum number"):  # hω = 5
+        integrate(solver, bare_term(field), jnp.array([0.3 + 1e-9, 0.0]), 0.0, 50.0, 10)
+
+
 def test_fixed_point_iteration_fails_loudly_where_newton_converges():
     def stiff(x):
         return jnp.stack([x[1], -900.0 * x[0]])  # h ω / 2 = 3: the iteration diverges

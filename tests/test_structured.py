@@ -2,6 +2,7 @@
 
 import functools
 import re
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -11,6 +12,8 @@ import pytest
 from kernels import BY_NAME, CASES, canonical, difference_mixed, mixed
 
 import hamkernel as hk
+from hamkernel._scalar import Invariance
+from hamkernel._structured_operators import AbstractPotentialKernel
 
 STRUCTURE = 1e-9  # relative; what sums of a few dozen rounded terms leave of an exact zero
 ROUNDING = 1e-12
@@ -368,6 +371,58 @@ def test_the_hamiltonian_of_a_gaussian_field_is_the_papers():
 # Sums.
 
 
+def test_what_is_odd_already_stays_as_it_is():
+    k = BARE.make(4)
+    for once in (odd_symplectic(k), odd_symplectic(2.0 * hk.Gaussian() + hk.Select(k, (0, 1)))):
+        assert eqx.tree_equal(hk.Odd(once), once)
+
+
+class Growing(AbstractPotentialKernel):
+    """B(x) = (1 + x₀²) J, the same at −x."""
+
+    operator_invariance: ClassVar[Invariance] = Invariance.REFLECTION
+    symplectic: ClassVar[bool] = False
+
+    def apply(self, x, v):
+        return self.factor(x) * hk.Symplectic(self.kernel).apply(x, v)
+
+    def apply_transpose(self, x, v):
+        return self.factor(x) * hk.Symplectic(self.kernel).apply_transpose(x, v)
+
+    def factor(self, x):
+        return 1 + x[0] ** 2
+
+
+class Skew(AbstractPotentialKernel):
+    """B(x) = exp(x₀) I."""
+
+    operator_invariance: ClassVar[Invariance] = Invariance.NONE
+    symplectic: ClassVar[bool] = False
+
+    def apply(self, x, v):
+        return jnp.exp(x[0]) * v
+
+    def apply_transpose(self, x, v):
+        return self.apply(x, v)
+
+
+@pytest.mark.parametrize("parity", [None, hk.Odd], ids=["bare", "odd"])
+def test_an_operator_may_depend_on_the_state(parity):
+    rng = np.random.default_rng(0)
+    X, Y = 1 + rng.normal(size=(2, 5, 2))
+    K, J = Growing(hk.Gaussian(1.3)), hk.Symplectic(hk.Gaussian(1.3))
+    if parity is not None:
+        K, J = parity(K), parity(J)
+    factor = 1 + X[:, 0] ** 2
+    expected = factor[:, None, None, None] * hk.gram(J, X) * factor[None, None, :, None]
+    np.testing.assert_allclose(hk.gram(K, X), expected, rtol=1e-9, atol=1e-12)
+    field = hk.fit(K, X, Y, 1e-2)
+    assert isinstance(field, hk.KernelField)
+    sums = np.einsum("iajb,jb->ia", expected, field.coefficients)
+    np.testing.assert_allclose(jax.vmap(field)(X), sums, rtol=1e-9, atol=1e-12)
+    np.testing.assert_allclose(field.evaluate(X), sums, rtol=1e-9, atol=1e-12)
+
+
 def named_sum():
     k = BARE.make(4)
     return hk.Sum(conservative=hk.Symplectic(k), rest=hk.Separable(hk.Gaussian(0.7)))
@@ -403,6 +458,27 @@ def test_sums_are_flat_and_keep_names():
     assert odd.names == K.names
 
 
+@pytest.mark.slow
+def test_friction_is_found_where_it_cannot_be_taken_for_energy():
+    mass, length, gravity, damping = 0.3, 0.5, 9.81, 0.05
+    k = hk.Gaussian(1.0)
+    energy, odd = hk.Symplectic(k), hk.Odd(hk.CurlFree(hk.Select(k, 1)))
+    unique, ambiguous = [], []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        q, p = rng.uniform((-2.5, -0.8), (2.5, 0.8), size=(150, 2)).T
+        force = -mass * gravity * length * np.sin(q) - damping * p
+        Y = np.stack([p / (mass * length**2), force], axis=1) + 1e-3 * rng.normal(size=(150, 2))
+        for errors, friction in ((unique, odd), (ambiguous, hk.CurlFree(k))):
+            K = hk.Sum(energy=energy, friction=friction)
+            field = hk.fit(K, np.stack([q, p], axis=1), Y, 1e-8)
+            at = jnp.array([[0.0, 0.5], [1.0, 0.5], [2.0, 0.5], [1.0, -0.5]])
+            found = field.part("friction").evaluate(at)[:, 1]
+            errors.append(np.abs(found / (-damping * at[:, 1]) - 1).max())
+    assert max(unique) < 0.03  # 0.001 to 0.014 measured
+    assert min(ambiguous) > 10  # 50 to 80
+
+
 def test_the_potential_of_a_sum_of_one_structure_is_the_sum_of_potentials():
     K = hk.Symplectic(hk.Gaussian(1.2)) + hk.Symplectic(hk.Polynomial(3))
     field, x = random_field(K, 4), states(4)[0]
@@ -412,7 +488,7 @@ def test_the_potential_of_a_sum_of_one_structure_is_the_sum_of_potentials():
 
 def test_a_missing_part_is_refused_with_the_choices():
     field = random_field(named_sum(), 4)
-    for which in ("friction", 2, -3, 0.5):
+    for which in ("friction", 2, -3, 0.5, None):
         with pytest.raises(KeyError, match=r"positions 0 to 1 and the names \['conservative',"):
             field.part(which)  # pyright: ignore[reportArgumentType]
     second = field.part(np.int64(-1))  # pyright: ignore[reportArgumentType]
@@ -435,6 +511,8 @@ def test_a_missing_part_is_refused_with_the_choices():
         (lambda: hk.Odd(hk.Gaussian()), TypeError, re.escape("Odd(Symplectic(k))")),  # pyright: ignore
         (lambda: hk.Even(lambda x, z: x @ z), TypeError, re.escape("Even(Symplectic(k))")),  # pyright: ignore
         (lambda: hk.Odd(hk.Symplectic), TypeError, "Odd needs a matrix-valued kernel"),  # pyright: ignore
+        (lambda: hk.Odd(even_curl_free(hk.Gaussian())), ValueError, "no fields but zero"),
+        (lambda: hk.Odd(Skew(hk.Gaussian())), TypeError, "fields of Skew have no parity"),
         (lambda: hk.Sum(hk.Gaussian()), TypeError, "Wrap a scalar kernel in a structure"),  # pyright: ignore
         (lambda: hk.Sum(), ValueError, "at least one kernel"),
         (

@@ -13,6 +13,7 @@ import optimistix as optx
 import pytest
 
 import hamkernel as hk
+from hamkernel._search_space import SearchSpace
 
 N = 15
 SAME = 1e-8  # the same loss computed twice, at a condition of up to 1e6
@@ -121,6 +122,28 @@ def test_tuned_point_is_no_worse_than_any_start_and_than_the_callers(rich):
     assert tuned.start_losses.shape == (16,)
     assert float(tuned.loss) == float(tuned.start_losses.min())
     assert float(tuned.loss) <= refit_loss(K, X, Y, 1e-1)
+
+
+def test_a_warp_has_the_same_box_however_its_map_returns_its_numbers():
+    X, Y = scattered()
+    listed, stacked = (
+        SearchSpace(
+            hk.Symplectic(hk.Warp(hk.Gaussian(jnp.ones(3)), fn)), X, Y, jnp.asarray(1e-3), (), {}
+        )
+        for fn in (
+            lambda x: (jnp.cos(x[0]), jnp.sin(x[0]), x[1]),
+            lambda x: jnp.stack([jnp.cos(x[0]), jnp.sin(x[0]), x[1]]),
+        )
+    )
+    np.testing.assert_array_equal(listed.low, stacked.low)
+    np.testing.assert_array_equal(listed.high, stacked.high)
+
+
+def test_results_of_other_data_stack(rich):
+    _, _, _, tuned = rich
+    moved = eqx.tree_at(lambda t: t.bounds, tuned, {k: (0.0, 1.0) for k in tuned.bounds})
+    both = jax.tree.map(lambda a, b: jnp.stack([a, b]), tuned, moved)
+    assert both.loss.shape == (2,)
 
 
 def test_result_says_how_the_search_went(rich):

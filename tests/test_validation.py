@@ -105,6 +105,13 @@ def public_refits(K, X, Y, labels: np.ndarray) -> np.ndarray:
     return residuals
 
 
+def test_the_names_of_folds_do_not_tell_partitions_apart():
+    named = Partition(6, [7, -1, 7, 3, 3, -1])
+    assert named == Partition(6, [2, 0, 2, 1, 1, 0])
+    assert hash(named) == hash(Partition(6, [2, 0, 2, 1, 1, 0]))
+    assert named != Partition(6, [2, 0, 2, 1, 0, 1])
+
+
 @pytest.mark.parametrize("folds", [3, "loo"])
 def test_equal_folds_have_the_same_regularization_as_public_fits(folds):
     X, Y = data()
