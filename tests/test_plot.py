@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from typing import Any
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -101,6 +102,99 @@ def test_a_phase_portrait_of_a_field_outside_the_plane_is_refused():
         plot.phase_portrait(lambda x: jnp.concatenate([x, x]), *LIMITS)
     with pytest.raises(ValueError, match=r"data has shape \(5, 4\)"):
         plot.phase_portrait(lambda x: x, *LIMITS, data=np.zeros((5, 4)))
+    # Systems and learned fields ask for a state of their own shape.
+    system = HenonHeiles()
+    with pytest.raises(ValueError, match=r"plane_slice draws .*\(4,\) is needed"):
+        plot.phase_portrait(system, *LIMITS)
+    with pytest.raises(ValueError, match=r"plane_slice draws .*\(4,\) is needed"):
+        plot.hamiltonian(system.hamiltonian, SYSTEM.hamiltonian, *LIMITS)
+
+
+def test_fields_and_single_axes_are_no_pair_of_hamiltonians():
+    with pytest.raises(ValueError, match=r"\(2,\) -> \(\) is needed, this one returns \(2,\)"):
+        plot.hamiltonian(SYSTEM, SYSTEM.hamiltonian, *LIMITS)
+    one: Any = plt.gca()
+    with pytest.raises(ValueError, match="ax must be a pair"):
+        plot.hamiltonian(SYSTEM.hamiltonian, SYSTEM.hamiltonian, *LIMITS, ax=one)
+
+
+@pytest.mark.parametrize(
+    "limits", [((2, -2), (-1, 1)), ((-2, 2), (1, 1)), ((0, np.inf), (0, 1)), (2, (0, 1))]
+)
+def test_limits_that_do_not_rise_are_refused(limits):
+    with pytest.raises(ValueError, match="lim must be"):
+        plot.phase_portrait(SYSTEM, *limits)
+
+
+@pytest.mark.parametrize("pair", ["rad", "ab", ("rad", "m", "s"), ("rad",), 3])
+def test_what_is_no_pair_is_refused_before_anything_is_drawn(pair):
+    H, grid = SYSTEM.hamiltonian, np.ones(2)
+    draw = {
+        "units": [
+            lambda: plot.phase_portrait(SYSTEM, *LIMITS, units=pair),
+            lambda: plot.trajectories(CIRCLE, units=pair),
+            lambda: plot.poincare_section(CIRCLE, (0, 1), units=pair),
+            lambda: plot.plane_slice(SYSTEM, np.zeros(2), (0, 1), *LIMITS, units=pair),
+            lambda: plot.hamiltonian(H, H, *LIMITS, units=pair),
+        ],
+        "names": [
+            lambda: plot.trajectories(CIRCLE, names=pair),
+            lambda: plot.loss_surface(grid, grid, np.eye(2), names=pair),
+        ],
+        "titles": [lambda: plot.hamiltonian(H, H, *LIMITS, titles=pair)],
+        "dims": [lambda: plot.trajectories(CIRCLE, dims=pair)],
+    }
+    for argument, functions in draw.items():
+        for each in functions:
+            with pytest.raises(ValueError, match=f"{argument} must be a pair"):
+                each()
+    assert not plt.get_fignums()
+
+
+def test_coordinates_may_have_names():
+    names, H = ("charge", "flux"), SYSTEM.hamiltonian
+    left, _ = plot.hamiltonian(H, H, *LIMITS, names=names, units=("C", "Wb"))
+    for ax in (
+        left,
+        plot.phase_portrait(SYSTEM, *LIMITS, names=names, units=("C", "Wb")),
+        plot.trajectories(CIRCLE, names=names, units=("C", "Wb")),
+        plot.plane_slice(H, np.zeros(2), (0, 1), *LIMITS, names=names, units=("C", "Wb")),
+        plot.poincare_section(CIRCLE, (0, 1), names=names, units=("C", "Wb")),
+    ):
+        assert (ax.get_xlabel(), ax.get_ylabel()) == ("charge [C]", "flux [Wb]")
+
+
+@pytest.mark.parametrize("names", [("orbit", "learned"), ("learned", "true")])
+def test_a_learned_curve_does_not_hide_the_first_or_the_true_one(names):
+    curves = dict.fromkeys(names, CIRCLE)
+    wide, thin = ("true", "learned") if "true" in names else names
+    for ax in (plot.trajectories(curves), plot.phase_portrait(SYSTEM, *LIMITS, None, curves)):
+        assert line(ax, wide).get_linewidth() > 1.5 * line(ax, thin).get_linewidth()
+        assert line(ax, wide).get_zorder() < line(ax, thin).get_zorder()
+
+
+@pytest.mark.parametrize("corner", [(-1, -1), (-1, 1), (1, -1), (1, 1)])
+def test_the_legend_lies_in_the_corner_that_is_free(corner):
+    # An orbit that covers all of the portrait but a box at one corner.
+    edge = np.stack(np.meshgrid(np.linspace(-1, 1, 41), np.linspace(-1, 1, 41)), axis=-1)
+    ys = edge.reshape(-1, 2) * [2.0, 1.5]
+    ys = ys[(ys * corner < [0.4, 0.8]).any(axis=1)]
+    ax = plot.phase_portrait(SYSTEM, *LIMITS, ys)
+    ax.figure.canvas.draw()
+    legend = ax.get_legend()
+    assert legend is not None
+    assert not legend.get_window_extent().count_contains(ax.transData.transform(ys))
+
+
+def test_levels_may_be_given():
+    levels = np.linspace(0, 0.5, 6)
+    H = SYSTEM.hamiltonian
+    ax = plot.plane_slice(H, np.zeros(2), (0, 1), *LIMITS, levels=levels)
+    pair = plot.hamiltonian(H, H, *LIMITS, levels=levels)
+    for panel in (ax, *pair):
+        filled: Any = panel.collections[0]
+        np.testing.assert_array_equal(filled.levels, levels)
+        assert filled.extend == "both"  # colours, not white, beyond the last level
 
 
 def test_no_other_curve_takes_the_colour_of_a_model():
@@ -133,14 +227,26 @@ def test_error_of_many_seeds_is_their_median_in_a_band_of_quantiles():
     ax = plot.trajectory_error(TS, {"separable": seeds, "true": seeds[0]}, time_unit="s")
     ranked = np.sort(seeds, axis=0)  # of 11 values, the quantiles are elements 1, 5 and 9
     np.testing.assert_allclose(heights_of(ax, "separable"), ranked[5])
-    (band,) = ax.collections  # a single run has no band
+    band, of_legend = ax.collections  # a single run has no band
+    assert not of_legend.get_paths()
     (path,) = band.get_paths()
     corners = {(x, y) for x, y in np.round(np.asarray(path.vertices), 9)}
     for edge in (ranked[1], ranked[9]):
         assert {(x, y) for x, y in np.round(np.stack([TS, edge], axis=1), 9)} <= corners
     assert ax.get_yscale() == "log"
     assert ax.get_xlabel() == "time $t$ [s]"
-    assert labels(ax) == {"separable", "true"}
+    assert labels(ax) == {"separable", "true", "median and 10 to 90 % of 11"}
+    bare = plot.trajectory_error(TS, seeds, quantiles=(0.25, 0.75))
+    assert labels(bare) == {"median and 25 to 75 % of 11"}
+
+
+def test_a_curve_that_has_not_one_value_for_each_time_is_refused():
+    with pytest.raises(ValueError, match=r"shape \(201,\); .* with T = 5"):
+        plot.trajectory_error(TS[:5], TS)
+    with pytest.raises(ValueError, match=r"curve 'a' has shape \(201, 2\)"):
+        plot.energy_drift(TS, {"a": CIRCLE})
+    with pytest.raises(ValueError, match=r"ts has shape \(201, 1\)"):
+        plot.energy_drift(TS[:, None], TS)
 
 
 def test_an_error_of_zero_is_left_out_of_a_logarithmic_axis_and_kept_on_a_linear_one():
@@ -205,6 +311,21 @@ def test_a_loss_surface_with_nothing_to_draw_or_transposed_is_refused():
         plot.loss_surface(first, second, np.full((3, 4), np.nan))
     with pytest.raises(ValueError, match=r"\(3, 4\) is needed"):
         plot.loss_surface(first, second, np.ones((4, 3)))
+    with pytest.raises(ValueError, match="must be positive"):
+        plot.loss_surface(-first, second, np.ones((3, 4)))
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "first", "last"),
+    [(0.5, 500, "0.5", "500"), (1e-6, 1e-2, "1.0e-06", "1.0e-02"), (1, 1.001, "1", "1.001")],
+)
+def test_the_numbers_of_a_loss_have_one_format_and_differ(low, high, first, last):
+    grid = np.geomspace(0.1, 1, 3)
+    ax = plot.loss_surface(grid, grid, np.geomspace(low, high, 9).reshape(3, 3), levels=15)
+    texts = [text.get_text() for text in ax.figure.axes[-1].get_yticklabels()]
+    assert (texts[0], texts[-1]) == (first, last)
+    assert len({"e" in text for text in texts}) == 1
+    assert len(set(texts)) == len(texts)
 
 
 def test_slices_of_a_hamiltonian_and_of_its_field_name_their_coordinates():
@@ -289,6 +410,8 @@ def test_coordinates_may_be_counted_from_the_end():
     for dims in [(0, 5), (1, 1), (0, -4)]:
         with pytest.raises(ValueError, match="two different coordinates"):
             plot.trajectories(np.zeros((5, 4)), dims=dims)
+        with pytest.raises(ValueError, match="two different coordinates"):
+            plot.poincare_section(np.zeros((5, 4)), dims)
 
 
 @pytest.mark.parametrize(

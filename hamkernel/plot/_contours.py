@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import MaxNLocator
 
-from hamkernel.plot._style import Limits, Units, axes, grid, label_plane, legend, on_points
+from hamkernel.plot._style import Limits, Texts, axes, grid, in_plane, legend, plane_labels, two
 
 Scalar = Callable[[Float[Array, "2"]], Float[Array, ""]]
 
@@ -21,9 +21,10 @@ def hamiltonian(
     ax: Sequence[Axes] | None = None,
     *,
     titles: tuple[str, str] = ("True $H$", "Learned $H$"),
-    units: Units | None = None,
+    units: Texts | None = None,
+    names: Texts | None = None,
     energy_unit: str | None = None,
-    levels: int = 12,
+    levels: int | Float[ArrayLike, " L"] = 12,
     resolution: int = 81,
 ) -> tuple[Axes, Axes]:
     """Draw the true and the learned Hamiltonian side by side, on the same contours.
@@ -40,30 +41,37 @@ def hamiltonian(
         ax: two axes, for the true and the learned one; new ones if None.
         titles: of the two axes.
         units: of q and p.
+        names: of the coordinates; q and p if None.
         energy_unit: of H.
-        levels: number of contours at most.
+        levels: number of contours at most, or the levels themselves.
         resolution: points on each axis of the grid.
 
     Returns:
         The two axes.
 
     Raises:
-        ValueError: nowhere on the grid are both functions finite.
+        ValueError: a function is not scalar or not one of the plane, nowhere on the grid are both
+            finite, or an argument is no pair.
     """
+    titles, labels = two("titles", titles), plane_labels((0, 1), 2, units, names)
+    panels = None if ax is None else two("ax", ax)
     q, p, points = grid(xlim, ylim, resolution)
-    H, H_learned = (on_points(fn, points).reshape(len(p), len(q)) for fn in (true, learned))
+    need = "a scalar function, such as field.hamiltonian,"
+    H, H_learned = (in_plane(fn, points, (), need).reshape(len(p), -1) for fn in (true, learned))
     H, H_learned = np.ma.masked_invalid(H), np.ma.masked_invalid(H_learned)
     if (H + H_learned).count() == 0:
         raise ValueError("nowhere on the grid are both functions finite.")
     H_learned = H_learned - (H_learned - H).mean()
     H, H_learned = H - H.min(), H_learned - H.min()
-    left, right = _pair() if ax is None else ax
-    steps = MaxNLocator(levels).tick_values(0, float(H.max()))
+    left, right = panels or _pair()
+    if isinstance(levels, int | np.integer):
+        steps = MaxNLocator(int(levels)).tick_values(0, float(H.max()))
+    else:
+        steps = np.asarray(levels)
     for panel, values, title in zip((left, right), (H, H_learned), titles, strict=True):
         filled = panel.contourf(q, p, values, steps, cmap="cividis", extend="both")
         panel.contour(q, p, values, steps[1:], colors="white", linewidths=0.5)
-        label_plane(panel, (0, 1), 2, units)
-        panel.set_title(title)
+        panel.set(title=title, **labels)
     right.set_ylabel("")
     label = r"$H - \min H_\mathrm{true}$" + (f" [{energy_unit}]" if energy_unit else "")
     left.figure.colorbar(filled, ax=[left, right], label=label)
@@ -106,14 +114,18 @@ def loss_surface(
         levels: number of contours.
 
     Raises:
-        ValueError: the shapes do not fit, or no loss is finite and positive.
+        ValueError: the shapes do not fit, a hyperparameter is not positive, no loss is finite and
+            positive, or `names` is no pair.
     """
+    names = two("names", names)
     first, second, losses = np.asarray(first), np.asarray(second), np.asarray(losses)
     if losses.shape != (len(first), len(second)):
         raise ValueError(
             f"losses has shape {losses.shape}; ({len(first)}, {len(second)}) is needed, one row "
             "for each value of the first hyperparameter."
         )
+    if not ((first > 0).all() and (second > 0).all()):
+        raise ValueError("the hyperparameters must be positive, for their axes are logarithmic.")
     shown = np.ma.masked_where(~(np.isfinite(losses) & (losses > 0)), losses)
     if shown.count() == 0:
         raise ValueError("no loss is finite and positive, so there is nothing to draw.")
@@ -125,8 +137,8 @@ def loss_surface(
     )
     ax.contour(first, second, shown.T, steps, colors="white", linewidths=0.4)
     bar = ax.figure.colorbar(filled, ax=ax, label=label)
-    shown_steps = steps[:: max(1, levels // 5)].tolist()
-    bar.set_ticks(shown_steps, labels=[f"{step:.2g}" for step in shown_steps])
+    ticks = steps[:: max(1, levels // 5)].tolist()
+    bar.set_ticks(ticks, labels=_in_one_format(ticks))
     bar.ax.minorticks_off()
     i, j = np.unravel_index(np.ma.argmin(shown), shown.shape)
     best = {"ms": 13, "mec": "black", "mfc": "white", "mew": 0.8, "linestyle": "none"}
@@ -144,3 +156,15 @@ def loss_surface(
         ax.set_title(title)
     legend(ax)
     return ax
+
+
+def _in_one_format(values: list[float]) -> list[str]:
+    """Numbers all with or all without an exponent, with digits enough to tell them apart."""
+    plain = 1e-3 <= values[0] and values[-1] < 1e5
+    for digits in range(2, 8):
+        texts = [f"{value:.{digits - 1}e}" for value in values]
+        if plain:
+            texts = [np.format_float_positional(float(text), trim="-") for text in texts]
+        if len(set(texts)) == len(texts):
+            break
+    return texts

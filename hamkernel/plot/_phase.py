@@ -7,17 +7,19 @@ from jaxtyping import Array, ArrayLike, Float
 from matplotlib.axes import Axes
 
 from hamkernel.plot._style import (
+    BENEATH,
     DATA,
     STREAM,
     Limits,
-    Units,
+    Texts,
     axes,
     grid,
-    label_plane,
+    in_plane,
     legend,
     line_styles,
     named,
     on_points,
+    plane_labels,
 )
 
 # Each (T, n), or (B, T, n) for trajectories under one name.
@@ -33,7 +35,8 @@ def phase_portrait(
     ax: Axes | None = None,
     *,
     title: str | None = None,
-    units: Units | None = None,
+    units: Texts | None = None,
+    names: Texts | None = None,
     density: float = 0.9,
     resolution: int = 41,
     show_legend: bool = True,
@@ -45,25 +48,23 @@ def phase_portrait(
         xlim: limits of q.
         ylim: limits of p.
         data: measured states, shape (N, 2).
-        trajectories: shape (T, 2) or (B, T, 2), or a mapping from names to such arrays. A dot
-            marks where each starts.
+        trajectories: shape (T, 2) or (B, T, 2), or a mapping from names to such arrays, as in
+            `trajectories`.
         ax: axes to draw on; new ones if None.
         title: of the axes.
         units: of q and p.
+        names: of the coordinates; q and p if None.
         density: of the stream lines.
         resolution: points on each axis of the grid where the field is evaluated.
         show_legend: whether named trajectories and data get a legend.
 
     Raises:
-        ValueError: the field, the data or a trajectory is not in the plane.
+        ValueError: the field, the data or a trajectory is not in the plane, the limits do not
+            rise, or an argument is no pair.
     """
+    labels = plane_labels((0, 1), 2, units, names)
     q, p, points = grid(xlim, ylim, resolution)
-    velocities = on_points(field, points)
-    if velocities.shape != points.shape:
-        raise ValueError(
-            f"a phase portrait needs a field (2,) -> (2,), this one returns "
-            f"{velocities.shape[1:]}; plane_slice draws fields of more coordinates."
-        )
+    velocities = in_plane(field, points, (2,), "a field")
     X = None if data is None else np.asarray(data)
     if X is not None and (X.ndim != 2 or X.shape[1] != 2):
         raise ValueError(f"data has shape {X.shape}; measured states (N, 2) are needed.")
@@ -73,7 +74,10 @@ def phase_portrait(
     _curves(ax, curves, (0, 1))
     if X is not None:
         ax.plot(*X.T, "o", color=DATA, mec="black", mew=0.6, ms=5, zorder=5, label="data")
-    return _finish(ax, (0, 1), 2, units, title, show_legend, xlim, ylim)
+    _finish(ax, labels, title, xlim, ylim)
+    if show_legend:
+        legend(ax, loc=_widest_corner(ax))
+    return ax
 
 
 def trajectories(
@@ -82,30 +86,34 @@ def trajectories(
     *,
     dims: tuple[int, int] = (0, 1),
     title: str | None = None,
-    units: Units | None = None,
+    units: Texts | None = None,
+    names: Texts | None = None,
     show_legend: bool = True,
 ) -> Axes:
     """Draw trajectories in the plane of two coordinates, for example true and learned ones.
 
     Args:
         ys: shape (T, n) or (B, T, n), or a mapping from names to such arrays. A dot marks where
-            each starts.
+            each starts. Of several names "true", or else the first, is wide beneath the others.
         ax: axes to draw on; new ones if None.
         dims: the two coordinates, counted from 0.
         title: of the axes.
         units: of the two coordinates.
+        names: of the two coordinates, if they are not q and p.
         show_legend: whether named trajectories get a legend.
 
     Raises:
-        ValueError: an array is of another shape, there is none, or `dims` are not two of the
-            coordinates.
+        ValueError: an array is of another shape, there is none, `dims` are not two of the
+            coordinates, or an argument is no pair.
     """
     curves = _checked(ys)
     n = next(iter(curves.values())).shape[-1]
-    _check_dims(dims, n)
+    labels = plane_labels(dims, n, units, names)
     ax = axes(ax, figsize=(4.6, 4.2))
     _curves(ax, curves, dims)
-    return _finish(ax, dims, n, units, title, show_legend)
+    if show_legend:
+        legend(ax)
+    return _finish(ax, labels, title)
 
 
 def plane_slice(
@@ -117,9 +125,10 @@ def plane_slice(
     ax: Axes | None = None,
     *,
     title: str | None = None,
-    units: Units | None = None,
+    units: Texts | None = None,
+    names: Texts | None = None,
     label: str | None = None,
-    levels: int = 15,
+    levels: int | Float[ArrayLike, " L"] = 15,
     resolution: int = 61,
 ) -> Axes:
     """Draw a function of n coordinates on the plane through a point along two of them.
@@ -137,16 +146,18 @@ def plane_slice(
         ax: axes to draw on; new ones if None.
         title: of the axes.
         units: of the two coordinates.
+        names: of the two coordinates, if they are not q and p.
         label: of the colours; H − min H, or the speed out of the plane, if None.
-        levels: number of contours.
+        levels: number of contours, or the levels themselves; colours go on beyond them.
         resolution: points on each axis of the grid.
 
     Raises:
         ValueError: the function is neither scalar nor a field on n coordinates, it is finite
-            nowhere on the grid, or `dims` are not two of the coordinates.
+            nowhere on the grid, `dims` are not two of the coordinates, the limits do not rise, or
+            an argument is no pair.
     """
     point = np.asarray(point, float)
-    _check_dims(dims, len(point))
+    labels = plane_labels(dims, len(point), units, names)
     x, y, plane = grid(xlim, ylim, resolution)
     states = np.tile(point, (len(plane), 1))
     states[:, list(dims)] = plane
@@ -166,11 +177,12 @@ def plane_slice(
     else:
         background, label = values - values[np.isfinite(values)].min(), label or "$H - \\min H$"
     background = np.ma.masked_invalid(background).reshape(resolution, resolution)
-    filled = ax.contourf(x, y, background, levels, cmap="cividis", zorder=0)
+    extend = "both" if np.ndim(levels) else "neither"
+    filled = ax.contourf(x, y, background, levels, cmap="cividis", extend=extend, zorder=0)
     if values.ndim == 1:
         ax.contour(x, y, background, levels, colors="white", linewidths=0.4)
     ax.figure.colorbar(filled, ax=ax, label=label)
-    return _finish(ax, dims, len(point), units, title, False, xlim, ylim)
+    return _finish(ax, labels, title, xlim, ylim)
 
 
 def _stream(
@@ -207,13 +219,11 @@ def _checked(curves: Curves, n: int | None = None) -> dict[str | None, np.ndarra
     return arrays
 
 
-def _check_dims(dims: tuple[int, int], n: int) -> None:
-    if len({range(n)[i] for i in dims if -n <= i < n}) != 2:
-        raise ValueError(f"dims must be two different coordinates of {n}, got {dims}.")
-
-
 def _curves(ax: Axes, curves: Mapping[str | None, np.ndarray], dims: tuple[int, int]) -> None:
-    for style, ys in zip(line_styles(curves), curves.values(), strict=True):
+    styles = list(line_styles(curves))
+    if len({style["linewidth"] for style in styles}) == 1 < len(styles):  # none is "true"
+        styles[0].update(BENEATH)
+    for style, ys in zip(styles, curves.values(), strict=True):
         batch = ys if ys.ndim == 3 else ys[None]  # (B, T, n)
         for i, y in enumerate(batch):
             label = style["label"] if i == 0 else None
@@ -223,18 +233,27 @@ def _curves(ax: Axes, curves: Mapping[str | None, np.ndarray], dims: tuple[int, 
 
 def _finish(
     ax: Axes,
-    dims: tuple[int, int],
-    n: int,
-    units: Units | None,
+    labels: Mapping[str, str],
     title: str | None,
-    show_legend: bool,
     xlim: Limits | None = None,
     ylim: Limits | None = None,
 ) -> Axes:
-    label_plane(ax, dims, n, units)
-    ax.set(**{key: lim for key, lim in (("xlim", xlim), ("ylim", ylim)) if lim is not None})
-    if title is not None:
-        ax.set_title(title)
-    if show_legend:
-        legend(ax)
+    options = {**labels, "title": title, "xlim": xlim, "ylim": ylim}
+    ax.set(**{key: value for key, value in options.items() if value is not None})
     return ax
+
+
+def _widest_corner(ax: Axes) -> str:
+    """The corner with the largest box, twice as wide as high, free of curves and data.
+
+    Matplotlib's own choice counts the arrows of the stream lines, and so may cover a curve.
+    """
+    points = np.concatenate([np.empty((0, 2)), *(line.get_xydata() for line in ax.lines)])
+    points = (ax.transData - ax.transAxes).transform(points)
+    points = points[((points >= 0) & (points <= 1)).all(axis=1)]
+
+    def width(corner: str) -> float:
+        x_y = ("right" in corner, "upper" in corner)
+        return (np.abs(points - x_y) * (1, 2)).max(axis=1).min(initial=np.inf)
+
+    return max(("upper right", "upper left", "lower left", "lower right"), key=width)

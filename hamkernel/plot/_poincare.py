@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike, Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 
-from hamkernel.plot._style import Units, axes, label_plane, legend, line_styles, named
+from hamkernel.plot._style import Texts, axes, legend, line_styles, named, plane_labels
 
 
 def crossings(
@@ -51,7 +51,8 @@ def poincare_section(
     ax: Axes | None = None,
     *,
     title: str | None = None,
-    units: Units | None = None,
+    units: Texts | None = None,
+    names: Texts | None = None,
     size: float = 3.0,
 ) -> Axes:
     """Draw the points of a Poincaré section in the plane of two coordinates.
@@ -63,12 +64,13 @@ def poincare_section(
         ax: axes to draw on; new ones if None.
         title: of the axes.
         units: of the two coordinates.
+        names: of the two coordinates, if they are not q and p.
         size: of the dots, in points.
 
     Raises:
-        ValueError: there is no trajectory to draw.
+        ValueError: there is no trajectory to draw, `dims` are not two of the coordinates, or an
+            argument is no pair.
     """
-    ax = axes(ax, figsize=(5.0, 4.6))
     dots: dict[str, Any] = {"linestyle": "none", "marker": ".", "ms": size, "mew": 0}
     if isinstance(points, list | tuple):
         arrays = [np.asarray(group) for group in points]
@@ -80,9 +82,11 @@ def poincare_section(
         arrays = list(groups.values())
     if not arrays:
         raise ValueError("points is empty: one array (M, n) for each trajectory is needed.")
+    labels = plane_labels(dims, arrays[0].shape[-1], units, names)
+    ax = axes(ax, figsize=(5.0, 4.6))
     for style, array in zip(styles, arrays, strict=True):
         ax.plot(array[:, dims[0]], array[:, dims[1]], **dots, **style)
-    label_plane(ax, dims, arrays[0].shape[-1], units)
+    ax.set(**labels)
     if title is not None:
         ax.set_title(title)
     legend(ax, markerscale=4)

@@ -24,8 +24,18 @@ _DASHES: Mapping[str, Any] = {"separable": (0, (5, 1.5)), "symplectic": (0, (1, 
 STREAM = "#AEB6BF"  # stream lines and other background
 DATA = "#E69F00"
 
+BENEATH: Mapping[str, Any] = {"linewidth": 3.2, "zorder": 2.5}  # wide, under what may cover it
+
 Limits = tuple[float, float]
-Units = tuple[str | None, str | None]
+Texts = tuple[str | None, str | None]  # the units, or the names, of two coordinates
+
+
+def two(name: str, values: Any) -> tuple[Any, Any]:
+    """The entries of an argument that is a pair; a string is no pair of its letters."""
+    entries = () if isinstance(values, str) or not np.iterable(values) else tuple(values)
+    if len(entries) != 2:
+        raise ValueError(f"{name} must be a pair (first, second), got {values!r}.")
+    return entries
 
 
 def axes(ax: Axes | None, **options: Any) -> Axes:
@@ -54,9 +64,9 @@ def line_styles(series: Mapping[str | None, Any]) -> Iterator[dict[str, Any]]:
             "color": color,
             "linestyle": _DASHES.get(key, "-"),
             "label": name and name.replace("_", " "),
-            # Wide, and below a learned curve that covers it.
-            "linewidth": 3.2 if key == "true" and len(series) > 1 else 1.6,
-            "zorder": 2.5 if key == "true" else 3,
+            "linewidth": 1.6,
+            "zorder": 3,
+            **(BENEATH if key == "true" and len(series) > 1 else {}),
         }
 
 
@@ -72,11 +82,19 @@ def with_unit(name: str, unit: str | None) -> str:
     return f"{name} [{unit}]" if unit else name
 
 
-def label_plane(ax: Axes, dims: tuple[int, int], n: int, units: Units | None) -> None:
-    """Axis labels of a plane of two coordinates."""
-    units = units or (None, None)
-    ax.set_xlabel(with_unit(coordinate(dims[0], n), units[0]))
-    ax.set_ylabel(with_unit(coordinate(dims[1], n), units[1]))
+def plane_labels(
+    dims: tuple[int, int], n: int, units: Texts | None, names: Texts | None
+) -> dict[str, str]:
+    """Axis labels of a plane of two of n coordinates, for `ax.set`."""
+    if len({range(n)[i] for i in two("dims", dims) if -n <= i < n}) != 2:
+        raise ValueError(f"dims must be two different coordinates of {n}, got {dims}.")
+    units = (None, None) if units is None else two("units", units)
+    names = (None, None) if names is None else two("names", names)
+    symbols = [name or coordinate(i, n) for name, i in zip(names, dims, strict=True)]
+    return {
+        "xlabel": with_unit(symbols[0], units[0]),
+        "ylabel": with_unit(symbols[1], units[1]),
+    }
 
 
 def legend(ax: Axes, **options: Any) -> None:
@@ -89,6 +107,10 @@ def grid(
     xlim: Limits, ylim: Limits, resolution: int
 ) -> tuple[np.ndarray, np.ndarray, Float[np.ndarray, "P 2"]]:
     """Ticks on both axes and all points of their grid, y by y, P = resolution²."""
+    for name, limits in (("xlim", xlim), ("ylim", ylim)):
+        low, high = two(name, limits)
+        if not -np.inf < low < high < np.inf:
+            raise ValueError(f"{name} must be finite limits (low, high), low < high; got {limits}.")
     x, y = np.linspace(*xlim, resolution), np.linspace(*ylim, resolution)
     return x, y, np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
@@ -101,3 +123,21 @@ def _mapped(fn: Callable[[Array], Array], points: Float[Array, "P n"]) -> Array:
 def on_points(fn: Callable[[Array], Array], points: np.ndarray) -> np.ndarray:
     """The values of fn at each row of `points`, in JAX's default float."""
     return np.asarray(_mapped(fn, jnp.asarray(points, float)))
+
+
+def in_plane(
+    fn: Callable[[Array], Array],
+    points: Float[np.ndarray, "P 2"],
+    shape: tuple[int, ...],
+    need: str,
+) -> np.ndarray:
+    """The values of fn on a plane, (P, *shape); a function of more coordinates is refused."""
+    need = f"{need} (2,) -> {shape} is needed"
+    hint = "plane_slice draws functions of more coordinates."
+    try:
+        values = on_points(fn, points)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{need}; {hint} This one says: {error}") from error
+    if values.shape[1:] != shape:
+        raise ValueError(f"{need}, this one returns {values.shape[1:]}; {hint}")
+    return values

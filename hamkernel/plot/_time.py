@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
 
-from hamkernel.plot._style import axes, legend, line_styles, named, with_unit
+from hamkernel.plot._style import axes, legend, line_styles, named, two, with_unit
 
 # Each (T,), or (S, T) for several seeds.
 Series = ArrayLike | Mapping[str, ArrayLike]
@@ -41,10 +41,11 @@ def trajectory_error(
         show_legend: whether named curves get a legend.
 
     Raises:
-        ValueError: no seed of a curve is finite.
+        ValueError: a curve has not one value for each time, or no seed of it is finite.
     """
+    curves = _checked(ts, errors)
     ax = axes(ax, figsize=(5.6, 3.8))
-    _bands(ax, ts, named(errors), quantiles, log)
+    _bands(ax, ts, curves, quantiles, log)
     ax.set_ylabel(with_unit("trajectory error", unit))
     return _finish(ax, ts, time_unit, title, show_legend)
 
@@ -77,10 +78,11 @@ def energy_drift(
         show_legend: whether named curves get a legend.
 
     Raises:
-        ValueError: `relative`, and an energy is zero at the start; no seed of a curve is finite.
+        ValueError: a curve has not one value for each time, or no seed of it is finite; or
+            `relative`, and an energy is zero at the start.
     """
     changes = {}
-    for name, values in named(energies).items():
+    for name, values in _checked(ts, energies).items():
         start = values[..., :1]
         if relative and not start.all():
             raise ValueError("H(x(0)) = 0 has no relative change: use relative=False.")
@@ -94,6 +96,21 @@ def energy_drift(
     return _finish(ax, ts, time_unit, title, show_legend)
 
 
+def _checked(ts: ArrayLike, series: Series) -> dict[str | None, np.ndarray]:
+    """The curves by name, if each has one value for each time."""
+    shape, curves = np.shape(ts), named(series)
+    if len(shape) != 1:
+        raise ValueError(f"ts has shape {shape}; times (T,) are needed.")
+    for name, values in curves.items():
+        if values.ndim not in (1, 2) or values.shape[-1:] != shape:
+            of_name = "" if name is None else f" {name!r}"
+            raise ValueError(
+                f"the curve{of_name} has shape {values.shape}; (T,) or (S, T) with T = {shape[0]} "
+                "is needed, one value for each time in ts."
+            )
+    return curves
+
+
 def _bands(
     ax: Axes,
     ts: ArrayLike,
@@ -101,17 +118,23 @@ def _bands(
     quantiles: tuple[float, float],
     log: bool,
 ) -> None:
-    ts = np.asarray(ts)
+    ts, counts = np.asarray(ts), set()
+    first, last = two("quantiles", quantiles)
     for style, values in zip(line_styles(series), series.values(), strict=True):
         seeds = np.atleast_2d(values)  # (S, T)
         if len(seeds) > 1:
             seeds = _finite_seeds(seeds, f" of {style['label']}" if style["label"] else "")
-        low, median, high = np.quantile(seeds, [quantiles[0], 0.5, quantiles[1]], axis=0)
+        low, median, high = np.quantile(seeds, [first, 0.5, last], axis=0)
         if log:
             low, median, high = (np.where(v > 0, v, np.nan) for v in (low, median, high))
         ax.plot(ts, median, **style)
         if len(seeds) > 1:
             ax.fill_between(ts, low, high, color=style["color"], alpha=0.2, linewidth=0)
+            counts.add(len(seeds))
+    if counts:
+        of_count = " or ".join(map(str, sorted(counts)))
+        label = f"median and {100 * first:g} to {100 * last:g} % of {of_count}"
+        ax.fill_between([], [], color="0.5", alpha=0.3, linewidth=0, label=label)
     if log:
         ax.set_yscale("log")
 
