@@ -5,10 +5,12 @@ by NumPy when they are concrete, for it compiles nothing; under `jax.jit` the sa
 `equinox.error_if` on the value that is returned, so it must be used by the caller.
 """
 
+import inspect
 import operator
 import reprlib
 import warnings
 from collections.abc import Callable
+from contextlib import suppress
 from typing import Any
 
 import equinox as eqx
@@ -152,6 +154,17 @@ def finite(x: Array, name: str) -> Array:
     return value(x, not_finite(x), message)
 
 
+def times(ts: ArrayLike, least: int) -> Float[Array, " T"]:
+    """Finite times, at least `least` of them, as a float array of shape (T,)."""
+    array = floating(ts, "ts")
+    if array.ndim != 1 or array.size < least:
+        raise ValueError(
+            f"ts has shape {array.shape}; times of shape (T,), T ≥ {least}, are needed, the first "
+            "that of x0."
+        )
+    return finite(array, "ts")
+
+
 def elapsed(ts: Float[Array, " T"], dtype: Any) -> Float[Array, " T"]:
     """The times since the first one, which must increase, in the dtype of the states.
 
@@ -164,8 +177,45 @@ def elapsed(ts: Float[Array, " T"], dtype: Any) -> Float[Array, " T"]:
         since,
         seen[1:] <= seen[:-1],
         f"ts must be strictly increasing in {dtype}, the dtype of x0: sort the times and drop "
-        "repeated ones; to go back in time integrate x -> -field(x).",
+        "repeated ones. To go back in time, hk.simulate(lambda x: -field(x), ...).",
     )
+
+
+def velocity(field: Any, x: Float[Array, " n"], name: str = "field") -> jax.ShapeDtypeStruct:
+    """Shape and dtype of `field(x)`, which must be one velocity; what it raises itself passes."""
+    if not callable(field):
+        hint = " Pass its .field." if hasattr(field, "field") else ""
+        raise TypeError(
+            f"{name} is a {type(field).__name__}; a callable x (n,) -> (n,) is needed.{hint}"
+        )
+    with suppress(ValueError):  # raised for a builtin without a signature
+        signature = inspect.signature(field)
+        try:
+            signature.bind(x)
+        except TypeError:
+            raise TypeError(
+                f"{name} takes ({', '.join(signature.parameters)}); it is called with one "
+                "argument, the state x of shape (n,). Bind the others, as in `lambda x: f(0.0, x)` "
+                "where time does not enter. A kernel becomes a field by hk.fit."
+            ) from None
+    try:
+        out = eqx.filter_eval_shape(field, x)
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+        raise TypeError(
+            f"{name} asks for numbers while JAX traces it, when only shapes are known: write it "
+            "with jax.numpy in place of numpy and math, and with jnp.where in place of if."
+        ) from error
+    if not hasattr(out, "shape"):
+        raise TypeError(
+            f"{name} returns {type(out).__name__}; one velocity is needed, a JAX array of shape "
+            f"{x.shape}, such as jnp.array([...])."
+        )
+    if out.shape != x.shape:
+        raise ValueError(
+            f"{name} maps a state of shape {x.shape} to shape {out.shape}; one velocity for each "
+            "coordinate is needed. Is x0 of the dimension it was made for?"
+        )
+    return out
 
 
 def points(X: ArrayLike, name: str = "X") -> Float[Array, "N n"]:

@@ -71,12 +71,13 @@ def simulate(
         dt: the largest step; required by a symplectic solver.
         rtol: relative tolerance of the adaptive step: 1e-10 if None, 1e-5 in float32.
         atol: absolute tolerance, likewise, in the units of x.
-        max_steps: the most steps of the whole solve, or with `dt` between two saved times. If None,
-            enough where the number is known, else 2²⁰. It bounds the memory of gradients (as its
-            square root).
+        max_steps: the most steps of the whole solve, or between two saved times where `dt` is given
+            and it or `ts` is traced. If None, enough where the number is known, else 2²⁰. It bounds
+            the memory of gradients (as its square root).
         progress: show a progress bar (tqdm); with `dt` it moves at every saved time.
-        adjoint: how Diffrax differentiates; None is its default, which is reverse-mode only. For
-            `jax.jacfwd` and `jax.jvp` pass `diffrax.ForwardMode()`.
+        adjoint: how Diffrax differentiates; None is its default, for reverse mode alone.
+            For `jax.jvp` and `jax.jacfwd` pass `diffrax.ForwardMode()`, for `jax.hessian`
+            `diffrax.DirectAdjoint()`.
         throw: raise if the solve fails. If False, look at `.result`.
 
     Returns:
@@ -85,9 +86,10 @@ def simulate(
     Raises:
         ValueError: a shape, time or value does not fit; a symplectic solver without `dt`; a solver
             that cannot estimate its error without `dt`; a splitting of a field that is not known to
-            be separable.
-        TypeError: `solver` or `adjoint` is none of Diffrax; the field changes the dtype; x0 is of
-            less than float32.
+            be separable; more steps of `dt` than `max_steps`.
+        TypeError: `field` is no function of one JAX array that returns one, of the same dtype;
+            `solver` or `adjoint` is none of Diffrax; x0 is of less than float32; forward mode
+            through the default adjoint.
         RuntimeError: the solve failed: too many steps, the implicit equations of a step did not
             converge, or the state overflowed. Usually the remedy is a smaller `dt`.
     """
@@ -98,7 +100,7 @@ def simulate(
     with _eager(x0):
         x0 = _initial_state(x0)
     with _eager(ts):
-        given = _times(ts)
+        given = require.times(ts, least=2)
         ts = require.elapsed(given, x0.dtype)
     if solver is None:
         solver = diffrax.Dopri8()
@@ -130,27 +132,36 @@ def simulate(
             dt = require.positive_scalar(dt, "dt")
         with _eager(ts, dt):
             counts = step_counts(ts, dt)
-            bound = _bound(counts) if max_steps is None else max_steps
+            bound = _bound(counts, max_steps)
         solver = EqualSteps(solver, dt, adjoint, bound)
         controller = diffrax.StepTo(ts)
         saveat = diffrax.SaveAt(t0=True, steps=True)
         max_steps = ts.size - 1
 
     meter = diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter()
-    solution = diffrax.diffeqsolve(
-        diffrax.ODETerm(_Autonomous(field)),
-        solver,
-        ts[0],
-        ts[-1],
-        None,
-        x0,
-        saveat=saveat,
-        stepsize_controller=controller,
-        adjoint=adjoint,
-        max_steps=max_steps,
-        throw=False,
-        progress_meter=meter,
-    )
+    try:
+        solution = diffrax.diffeqsolve(
+            diffrax.ODETerm(_Autonomous(field)),
+            solver,
+            ts[0],
+            ts[-1],
+            None,
+            x0,
+            saveat=saveat,
+            stepsize_controller=controller,
+            adjoint=adjoint,
+            max_steps=max_steps,
+            throw=False,
+            progress_meter=meter,
+        )
+    except TypeError as error:
+        if "forward-mode" not in str(error) or isinstance(adjoint, diffrax.ForwardMode):
+            raise
+        raise TypeError(
+            f"{type(adjoint).__name__} is for reverse mode alone: pass adjoint="
+            "diffrax.ForwardMode() for jax.jvp and jax.jacfwd, adjoint=diffrax.DirectAdjoint() for "
+            "jax.hessian."
+        ) from error
     solution = _at_times(_seen_to_be_finite(solution), given.astype(x0.dtype))
     if counts is not None:  # Diffrax counted the save intervals; the steps are inside them.
         total = require.on_host(counts).sum()
@@ -179,33 +190,13 @@ def _initial_state(x0: ArrayLike) -> Float[Array, " n"]:
     return require.finite(x0, "x0")
 
 
-def _times(ts: ArrayLike) -> Float[Array, " T"]:
-    ts = require.floating(ts, "ts")
-    if ts.ndim != 1 or ts.size < 2:
-        raise ValueError(
-            f"ts has shape {ts.shape}; at least two times in one dimension, shape (T,), are "
-            "needed: ts[0] is the time of x0, ts[1:] are the times to save at."
-        )
-    return require.finite(ts, "ts")
-
-
 def _check_field(field: Callable[[Array], Array], x0: Float[Array, " n"]) -> None:
-    if not callable(field):
-        hint = " Pass its .field." if hasattr(field, "field") else ""
-        raise TypeError(
-            f"field is a {type(field).__name__}; a callable x (n,) -> (n,) is needed.{hint}"
-        )
-    out = eqx.filter_eval_shape(field, x0)
-    if jnp.shape(out) != x0.shape:
-        raise ValueError(
-            f"field maps a state of shape {x0.shape} to shape {jnp.shape(out)}; one velocity for "
-            "each coordinate is needed. Is x0 of the dimension the field was made for?"
-        )
-    if out.dtype != x0.dtype:
-        cure = f"Pass x0 as {out.dtype}, or cast the output of the field."
-        if not jnp.issubdtype(out.dtype, jnp.floating):
+    dtype = require.velocity(field, x0).dtype
+    if dtype != x0.dtype:
+        cure = f"Pass x0 as {dtype}, or cast the output of the field."
+        if not jnp.issubdtype(dtype, jnp.floating):
             cure = "Let it return floats."
-        raise TypeError(f"field maps {x0.dtype} to {out.dtype}; the solution has one dtype. {cure}")
+        raise TypeError(f"field maps {x0.dtype} to {dtype}; the solution has one dtype. {cure}")
 
 
 def _check_solver(solver: Any, dt: Any, rtol: float | None, atol: float | None) -> None:
@@ -245,18 +236,25 @@ def _tolerance(given: float | None, default: float, dtype: Any) -> Float[Array, 
         return require.positive_scalar(given, "rtol, and atol,").astype(dtype)
 
 
-def _bound(counts: Int[Array, " T-1"]) -> int:
+def _bound(counts: Int[Array, " T-1"], max_steps: int | None) -> int:
     """A number of steps that no save interval exceeds, where the counts are known."""
     if not require.is_concrete(counts):
-        return _MAX_STEPS
-    most = int(np.max(counts))
+        return max_steps or _MAX_STEPS
+    each = np.asarray(counts)
+    most = int(each.max())
     if most >= np.iinfo(np.int32).max:
         raise ValueError(
             "dt is so small that more than two thousand million steps lie between two of ts: "
             "take a larger dt, in the unit of time of ts."
         )
-    # A power of two, so that neighbouring values of dt share one compiled loop.
-    return 2 ** (most - 1).bit_length()
+    if max_steps is None:  # A power of two: neighbouring values of dt share one compiled loop.
+        return 2 ** (most - 1).bit_length()
+    if each.sum() > max_steps:
+        raise ValueError(
+            f"dt cuts ts into {each.sum()} steps, more than max_steps={max_steps}: take a larger "
+            "dt, or leave max_steps None."
+        )
+    return max_steps
 
 
 def _seen_to_be_finite(solution: Any) -> Any:
@@ -305,8 +303,6 @@ def _successful(solution: Any, field: Any, x0: Float[Array, " n"], constant_step
                     "time."
                 )
             reason = RESULTS[solution.result]
-            if solution.result == RESULTS.max_steps_reached:
-                cure = "With dt, max_steps counts those between two saved times: leave it None."
         if not constant_steps:
             cure = (
                 "Pass larger tolerances, such as rtol=1e-6, atol=1e-6: a learned field rounds, the "

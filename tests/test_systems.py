@@ -592,16 +592,15 @@ def test_single_precision_stays_single_and_is_looser():
         ({"velocity_noise": [0.1, 0.1, 0.1], "key": 0}, "velocity_noise has shape"),
         ({"ts": [0.0, 1.0, 1.0]}, "strictly increasing"),
         ({"ts": [1.0, 0.0]}, "strictly increasing"),
-        ({"ts": [0.0, np.inf]}, "ts must be finite"),
+        ({"ts": [0.0, np.inf]}, "ts contains NaN"),
         ({"ts": 1.0}, "ts has shape"),
         ({"ts": []}, "ts has shape"),
         ({"ts": [[0.0, 1.0]]}, "ts has shape"),
-        ({"x0": [1.0, np.nan]}, "x0 must be finite"),
+        ({"x0": [1.0, np.nan]}, "x0 contains NaN or inf in row 0"),
         ({"x0": np.zeros((2, 3, 2))}, "x0 has shape"),
         ({"x0": 1.0}, "x0 has shape"),
         ({"x0": [1.0, 0.0, 0.0, 0.0]}, "one state of shape"),
-        ({"system": lambda x: x[0]}, "one velocity"),
-        ({"system": lambda x: (x, x)}, "one velocity"),
+        ({"system": lambda x: x[0]}, "system maps .* one velocity"),
     ],
 )
 def test_impossible_samples_are_refused(change, message):
@@ -610,6 +609,20 @@ def test_impossible_samples_are_refused(change, message):
         arguments["key"] = jax.random.key(arguments["key"])
     with pytest.raises(ValueError, match=message):
         systems.sample(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("system", "message"),
+    [
+        (1.0, "system is a float"),
+        (lambda t, x: x, r"system takes \(t, x\)"),
+        (lambda x: (x, x), "system returns tuple; one velocity"),
+        (lambda x: np.sin(x), r"jax\.numpy in place of numpy"),
+    ],
+)
+def test_what_is_no_field_is_refused(system, message):
+    with pytest.raises(TypeError, match=message):
+        systems.sample(system, START, TS)
 
 
 def test_a_noise_level_known_only_later_needs_a_key():

@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num, PRNGKeyArray
 
 from hamkernel import _require as require
-from hamkernel.systems._base import finite, shaped
+from hamkernel._simulate import simulate
+from hamkernel.systems._base import shaped
 
 
 def sample(
@@ -49,28 +50,25 @@ def sample(
     Raises:
         ValueError: a shape is wrong; x0 or ts is not finite; ts does not increase; a noise level
             is negative or not finite; there is noise but no key, or more than one.
-        TypeError: x0 is of less than float32; the key is none of JAX.
+        TypeError: `system` is no function of one JAX array that returns one; x0 is of less than
+            float32; the key is none of JAX.
         RuntimeError: a trajectory left the finite numbers or needed too many steps.
 
     Source: Smith & Egeland (2023), section Experiments, where both levels are one number.
     """
     x0 = require.floating(x0, "x0")
     require.single_or_double(x0.dtype, "x0 has")
-    states = finite(require.points(x0[None] if x0.ndim == 1 else x0, "x0"), "x0")
-    ts = require.elapsed(_times(ts), states.dtype)
+    states = require.finite(require.points(x0[None] if x0.ndim == 1 else x0, "x0"), "x0")
+    ts = require.elapsed(require.times(ts, least=1), states.dtype)
     system = _in_precision(system, states.dtype)
-    velocity = eqx.filter_eval_shape(system, states[0])
-    if getattr(velocity, "shape", None) != states[0].shape:
-        raise ValueError(
-            f"system(x) must return one velocity, of the shape {states[0].shape} of x; "
-            f"it returns {velocity}."
-        )
+    require.velocity(system, states[0], "system")
     levels = [
         _noise_level(level, name, states, key)
         for level, name in [(state_noise, "state_noise"), (velocity_noise, "velocity_noise")]
     ]
     _check_key(key)
-    X, Y, failed = _trajectories(system, states, ts)  # (B, T, n) twice, (B,)
+    X, Y = _trajectories(system, states, ts)
+    failed = (require.not_finite(X) | require.not_finite(Y)).any(axis=(1, 2))  # (B,)
     X = require.value(X, failed, lambda: _failure(failed), RuntimeError)
     if key is not None:
         noises = (jax.random.normal(k, X.shape, X.dtype) for k in jax.random.split(key))
@@ -89,13 +87,6 @@ def _in_precision(field: Callable[[Array], Array], dtype: jnp.dtype) -> Callable
         return leaf.astype(dtype) if real else leaf
 
     return jax.tree.map(cast_leaf, field)
-
-
-def _times(ts: ArrayLike) -> Float[Array, " T"]:
-    ts = require.floating(ts, "ts")
-    if ts.ndim != 1 or ts.size == 0:
-        raise ValueError(f"ts has shape {ts.shape}; times of shape (T,), T ≥ 1, are needed.")
-    return finite(ts, "ts")
 
 
 def _check_key(key: PRNGKeyArray | None) -> None:
@@ -148,38 +139,18 @@ _MAX_STEPS = 2**16
 @eqx.filter_jit
 def _trajectories(
     field: Callable[[Array], Array], states: Float[Array, "B n"], ts: Float[Array, " T"]
-) -> tuple[Float[Array, "B T n"], Float[Array, "B T n"], Array]:
-    """True states and velocities at times ts from the first on, and which trajectories failed."""
-    import diffrax  # heavy, so it loads when used
+) -> tuple[Float[Array, "B T n"], Float[Array, "B T n"]]:
+    """True states and velocities at times ts from the first on; not finite where that failed."""
 
-    def velocity(t, x, field):
-        del t
+    def velocity(x):
         return field(x).astype(x.dtype)
 
-    tolerance = max(1e-10, 10 * float(jnp.finfo(states.dtype).eps))
-    # Steps end on ts: the solver's interpolant between steps is of lower order, and was measured
-    # to break conservation of energy by 1e-7 where the steps themselves keep it to 1e-10.
-    controller = diffrax.ClipStepSizeController(
-        diffrax.PIDController(rtol=tolerance, atol=tolerance), step_ts=ts
-    )
-
     def trajectory(x0):
-        solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(velocity),
-            diffrax.Dopri8(),
-            t0=ts[0],
-            t1=ts[-1],
-            dt0=None,
-            y0=x0,
-            args=field,
-            saveat=diffrax.SaveAt(ts=ts),
-            stepsize_controller=controller,
-            max_steps=_MAX_STEPS + ts.size,
-            throw=False,
-        )
-        return cast(Array, solution.ys), solution.result == diffrax.RESULTS.successful
+        if ts.size == 1:
+            return x0[None]
+        tolerance = max(1e-10, 10 * float(jnp.finfo(x0.dtype).eps))
+        bounds = {"rtol": tolerance, "atol": tolerance, "max_steps": _MAX_STEPS + ts.size}
+        return cast(Array, simulate(velocity, x0, ts, **bounds, throw=False).ys)
 
-    X, successful = jax.vmap(trajectory)(states)
-    Y = jax.vmap(jax.vmap(lambda x: velocity(None, x, field)))(X)
-    finite = jnp.isfinite(X).all(axis=(1, 2)) & jnp.isfinite(Y).all(axis=(1, 2))
-    return X, Y, ~(successful & finite)
+    X = jax.vmap(trajectory)(states)
+    return X, jax.vmap(jax.vmap(velocity))(X)
