@@ -12,6 +12,7 @@ from hamkernel import _streaming_sums as streaming_sums
 from hamkernel._devices import as_given, on_each, rows_of, split
 from hamkernel._features import AbstractFeatures, SumFeatures, features
 from hamkernel._field import AbstractField, SolverInfo
+from hamkernel._least_squares import ridge_regression
 from hamkernel._memory import refuse_beyond_memory
 from hamkernel._solve import root
 from hamkernel._solve_low_rank import singular
@@ -21,7 +22,6 @@ from hamkernel._solve_streaming import (
     checked_start,
     thinned,
 )
-from hamkernel._streaming import ridge_regression
 from hamkernel._streaming_sums import Sums
 from hamkernel._structured import AbstractMatrixKernel, Sum
 

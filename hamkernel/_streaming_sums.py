@@ -18,7 +18,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
 from hamkernel._devices import Rows, on_each
-from hamkernel._streaming import Design, over_tiles
+from hamkernel._least_squares import Design, over_tiles
 
 
 class Sums(eqx.Module):

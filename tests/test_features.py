@@ -16,8 +16,8 @@ from kernels import canonical, gaussian_profile, matern_profile, periodic, radia
 import hamkernel as hk
 from hamkernel._features import features
 from hamkernel._features_spectra import spectra
+from hamkernel._least_squares import ridge_regression, triangle
 from hamkernel._solve_features import FeatureField, RandomFeatures
-from hamkernel._streaming import ridge_regression, triangle
 from hamkernel.paper import datasets, experiments
 
 STRUCTURE = 1e-9  # relative; what sums of a thousand rounded terms leave of an exact zero

@@ -24,7 +24,7 @@ ROOMS = [
     {"_structured"},
     {"_check", "_features", "_gram"},
     {"_field"},
-    {"_solve", "_streaming"},
+    {"_least_squares", "_solve", "_streaming"},
     {"_fit"},
     {"_folds", "_inverse", "_validation"},
     {"_bounds", "_objective", "_search", "_tune"},
