@@ -49,7 +49,7 @@ def triangle(
         return jnp.linalg.qr(jnp.concatenate([factor, below]), mode="r"), None
 
     on_diagonal = jnp.append(jnp.full(columns, jnp.sqrt(ridge)), jnp.zeros((), Y.dtype))
-    return over_tiles(step, jnp.diag(on_diagonal), (X, Y), columns)[0]
+    return over_tiles(step, jnp.diag(on_diagonal), (X, Y), _rows(columns))[0]
 
 
 def _joined(spread: Rows, own: Float[Array, "k k"]) -> Float[Array, "k k"]:
@@ -124,7 +124,7 @@ def residual(
     def step(_, tile):
         return None, tile[1] - design(tile[0]) @ w
 
-    return over_tiles(step, None, (X, Y), columns=len(w))[1]
+    return over_tiles(step, None, (X, Y), _rows(len(w)))[1]
 
 
 def _correlations(design, X, Y, w, spread: Rows | None) -> Float[Array, " r"]:
@@ -140,25 +140,30 @@ def _correlations(design, X, Y, w, spread: Rows | None) -> Float[Array, " r"]:
         rows = design(tile[0])
         return total + jnp.einsum("inr,in->r", rows, tile[1] - rows @ w), None
 
-    return over_tiles(step, jnp.zeros_like(w), (X, Y), columns=len(w))[0]
+    return over_tiles(step, jnp.zeros_like(w), (X, Y), _rows(len(w)))[0]
 
 
-def over_tiles(step, carry, data: tuple[Array, Array], columns: int):
-    """`jax.lax.scan` of `step` over tiles of points, the last one shorter.
+def over_tiles(step, carry, data: tuple[Array, Array], rows: int):
+    """`jax.lax.scan` of `step` over tiles of so many rows of a design; the last one, no loop.
 
-    A factorisation of a tile on top of R costs (tile rows + r) r², so tiles of 3r rows lose a
-    quarter to the repetition of R. Derivatives recompute the rows of a tile: they are not kept.
+    A loop, when differentiated backward, forgets the rule by which a Matérn kernel is smooth at
+    x = z, and second derivatives are NaN: where one tile will do there is none. Derivatives
+    recompute the rows of a tile: they are not kept.
     """
     N, n = data[0].shape
-    size = max(1024, 3 * columns) // n + 1
-    tiles, rest = divmod(N, size)
+    size = rows // n + 1
+    full = (N - 1) // size
     step = jax.checkpoint(step)
     outs = []
-    if tiles:
-        full = jax.tree.map(lambda a: a[: tiles * size].reshape(tiles, size, n), data)
-        carry, out = jax.lax.scan(step, carry, full)
+    if full:
+        tiles = jax.tree.map(lambda a: a[: full * size].reshape(full, size, n), data)
+        carry, out = jax.lax.scan(step, carry, tiles)
         outs.append(jax.tree.map(lambda a: a.reshape(-1, n), out))
-    if rest:
-        carry, out = step(carry, jax.tree.map(lambda a: a[tiles * size :], data))
-        outs.append(out)
+    carry, out = step(carry, jax.tree.map(lambda a: a[full * size :], data))
+    outs.append(out)
     return carry, jax.tree.map(lambda *parts: jnp.concatenate(parts), *outs)
+
+
+def _rows(columns: int) -> int:
+    """Of a tile. A factorisation below R costs (rows + r) r²: 3r lose a quarter to repeating R."""
+    return max(1024, 3 * columns)

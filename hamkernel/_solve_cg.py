@@ -21,10 +21,12 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._devices import as_given, rows_of, split
 from hamkernel._field import KernelField, SolverInfo
+from hamkernel._gram import block_traces
 from hamkernel._gram_operator import product
 from hamkernel._solve import AbstractSolver, relative, root
-from hamkernel._solve_low_rank import INDEFINITE, factor, normal_sums, truncated, whitening
+from hamkernel._solve_low_rank import INDEFINITE, Columns, factor, truncated, whitening
 from hamkernel._solve_nystrom import Nystrom
+from hamkernel._streaming_sums import normal
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._trained import constant
 
@@ -131,8 +133,8 @@ def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
     # The preconditioner changes how fast the answer is found, not the answer.
     K_, X_, S_, ridge_ = constant((K, X, S, ridge))
     T = whitening(K_, landmarks)
-    total = normal_sums(K_, S_, T, X_, jnp.zeros_like(X_), spread)
-    R = factor(total.square, ridge_)
+    square = normal(Columns(K_, S_), T, X_, jnp.zeros_like(X_), spread).square
+    R = factor(square, ridge_)
 
     def preconditioned(c):
         moment = T.T @ product(K_, S_, X_, c, None, spread).reshape(-1)
@@ -161,5 +163,5 @@ def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
     C = solution.value
     values = gram(C) / ridge  # f(X)
     left = relative(Y - C - values, Y)
-    truncation = truncated(total.trace, jnp.trace(total.square), ridge_)
+    truncation = truncated(block_traces(K_, X_).sum(), jnp.trace(square), ridge_)
     return C, solution.stats["num_steps"], values, left, truncation

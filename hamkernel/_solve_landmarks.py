@@ -96,16 +96,37 @@ def _spread(key, N: int, count: int) -> Int[Array, " count"]:
 
 @eqx.filter_jit
 def given_landmarks(K: AbstractMatrixKernel, S: Float[Array, "m n"]) -> Landmarks:
-    """All of S, with those columns that are independent of the columns before them.
+    """All of S, with those columns that pivoted Cholesky finds independent.
 
-    O((m n)³) time. Nothing is differentiated, as in `choose_landmarks`.
+    O((m n)² r) time for r of them. Nothing is differentiated, as in `choose_landmarks`.
     """
     K, S = constant((K, S))
     rounding = _rounding(block_traces(K, S), S.size)
-    block = assemble(K, S, S).reshape(S.size, S.size)
-    _, kept = _factor(block, jnp.broadcast_to(rounding, len(S)), S.shape[1], rounding)
-    kept = kept.reshape(S.shape)
+    kept = _independent(assemble(K, S, S).reshape(S.size, S.size), rounding).reshape(S.shape)
     return Landmarks(points=S, kept=kept, count=kept.any(axis=1).sum())
+
+
+def _independent(matrix, rounding):
+    """Columns of a Gram: the one with the most left, until what is left is rounding.
+
+    In the order in which they come, columns whose pivots all exceed rounding may still depend on
+    each other: only with pivoting does a small eigenvalue show in a small pivot.
+    """
+
+    def more(carry):
+        rank, _, left, _ = carry
+        return (rank < len(matrix)) & (left.max() > rounding)
+
+    def column(carry):
+        rank, factor, left, kept = carry
+        c = jnp.argmax(left)
+        v = (matrix[c] - factor[:, c] @ factor) / jnp.sqrt(left[c])
+        left = (left - v**2).at[c].set(0.0)
+        return rank + 1, factor.at[rank].set(v), left, kept.at[c].set(True)
+
+    none = jnp.zeros(len(matrix), bool)
+    start = (jnp.zeros((), int), jnp.zeros_like(matrix), jnp.diagonal(matrix), none)
+    return jax.lax.while_loop(more, column, start)[3]
 
 
 def _rounding(traces: Float[Array, " P"], columns: int) -> Float[Array, ""]:

@@ -32,7 +32,6 @@ from hamkernel._solve_low_rank import (
     INDEFINITE,
     Columns,
     factor,
-    normal_sums,
     singular,
     truncated,
     whitening,
@@ -155,7 +154,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
 def _fit(K, X, Y, regularization, landmarks, spread):
     S, ridge = landmarks.points, len(X) * regularization
     T = whitening(K, landmarks)
-    total = normal_sums(K, S, T, X, Y, spread)
+    total = streaming_sums.normal(Columns(K, S), T, X, Y, spread)
     R = factor(total.square, ridge)
 
     def step(w, residual):
@@ -168,7 +167,7 @@ def _fit(K, X, Y, regularization, landmarks, spread):
     w = jax.scipy.linalg.cho_solve((R, True), total.moment)
     A = (T @ w).reshape(S.shape)
     w, residual = step(w, Y - product(K, X, S, A, spread))
-    truncation = truncated(total.trace, jnp.trace(total.square), ridge)
+    truncation = truncated(block_traces(K, X).sum(), jnp.trace(total.square), ridge)
     # ‖f‖² = αᵀ G_SS α = ‖w‖²
     return _Solution((T @ w).reshape(S.shape), residual, root(w @ w), truncation)
 

@@ -11,6 +11,8 @@ al. (2020), "shifted Cholesky QR"), whose first pass needs to see a sample only.
 Rows that the sample does not resemble are treated no worse than by the normal equations.
 """
 
+from typing import NamedTuple
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -19,6 +21,17 @@ from jaxtyping import Array, Float
 
 from hamkernel._devices import Rows, on_each
 from hamkernel._least_squares import Design, over_tiles
+
+# Numbers in the tile of rows that is held at once; see `_gram_operator`.
+TILE = 2**20
+
+
+class Normal(NamedTuple):
+    """The sums over rows F with targets y; those of parts of the rows add up."""
+
+    square: Float[Array, "r r"]  # FᵀF
+    moment: Float[Array, " r"]  # Fᵀy
+    energy: Float[Array, ""]  # yᵀy
 
 
 class Sums(eqx.Module):
@@ -47,8 +60,7 @@ def start(
     NaN where the kernel is not finite, or λ below rounding.
     """
     zero = jnp.zeros_like(W)
-    empty = Sums(zero, W, zero, zero[0], zero[0, 0])
-    seen = add(empty, design, sample, jnp.zeros_like(sample))
+    seen = normal(design, W, sample, jnp.zeros_like(sample))
     diagonal = jnp.arange(len(W))
     matrix = (seen.square / len(sample)).at[diagonal, diagonal].add(ridge)
     R = jnp.linalg.cholesky(matrix).T
@@ -62,27 +74,36 @@ def add(
     Y: Float[Array, "N n"],
     spread: Rows | None = None,
 ) -> Sums:
-    """The sums after the rows design(X) with targets Y, tile by tile, where the rows are."""
-    zero = jax.tree.map(jnp.zeros_like, (sums.square, sums.moment, sums.energy))
-
-    def total(whole, X, Y):
-        design, basis, zero = whole
-
-        def step(carry, tile):
-            rows = design(tile[0])  # (t, n, r)
-            rows, y = rows.reshape(-1, rows.shape[-1]) @ basis, tile[1].reshape(-1)
-            return jax.tree.map(jnp.add, carry, (rows.T @ rows, rows.T @ y, y @ y)), None
-
-        found = over_tiles(step, zero, (X, Y), columns=len(basis))[0]
-        return found if spread is None else spread.sum(found)
-
-    whole = design, sums.basis, zero
-    if spread is None:
-        new = total(whole, X, Y)
-    else:
-        new = on_each(spread, total, whole, X, Y, joined=False)
-    old = sums.square, sums.moment, sums.energy
+    """The sums after the rows design(X) with targets Y."""
+    old = Normal(sums.square, sums.moment, sums.energy)
+    new = normal(design, sums.basis, X, Y, spread)
     return Sums(sums.triangle, sums.basis, *jax.tree.map(jnp.add, old, new))
+
+
+def normal(
+    design: Design,
+    basis: Float[Array, "r r"],
+    X: Float[Array, "N n"],
+    Y: Float[Array, "N n"],
+    spread: Rows | None = None,
+) -> Normal:
+    """The sums over the rows F = design(X) basis, tile by tile, on the devices where they are."""
+    if spread is not None:
+
+        def part(whole, X, Y):
+            design, basis = whole
+            return spread.sum(normal(design, basis, X, Y))
+
+        return on_each(spread, part, (design, basis), X, Y, joined=False)
+
+    def step(total, tile):
+        rows = design(tile[0])  # (t, n, r)
+        F, y = rows.reshape(-1, rows.shape[-1]) @ basis, tile[1].reshape(-1)
+        return jax.tree.map(jnp.add, total, Normal(F.T @ F, F.T @ y, y @ y)), None
+
+    zero = jnp.zeros_like(basis)
+    empty = Normal(zero, zero[0], zero[0, 0])
+    return over_tiles(step, empty, (X, Y), max(1024, TILE // len(basis)))[0]
 
 
 def solve(
