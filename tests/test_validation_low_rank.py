@@ -111,17 +111,31 @@ def test_dependent_columns_are_found():
     rng = np.random.default_rng(1)
     F = rng.normal(size=(6, 4))
     F[3], F[5] = 2 * F[0], F[1] - F[2]
-    # Of six rows of rank four the rows 3 and 5 depend on those before them; 4 is the fourth.
     landmarks = given_landmarks(hk.Separable(lambda x, z: x @ z), jnp.asarray(F))
-    np.testing.assert_array_equal(landmarks.kept[:, 0], [1, 1, 1, 0, 1, 0])
+    kept = np.asarray(landmarks.kept[:, 0])
+    assert kept.sum() == np.linalg.matrix_rank(F[kept]) == np.linalg.matrix_rank(F) == 4
 
 
-def test_where_the_factorisation_fails_the_loss_is_infinite():
-    bad = hk.Symplectic(lambda x, z: -jnp.exp(-((x - z) @ (x - z))))
-    loss = low_rank_partition_loss(
-        LandmarkBasis(X[:3]), bad, X, np.nan * Y, jnp.asarray(1e-3), Partition(N, 3)
-    )
-    assert loss == np.inf
+def test_columns_kept_of_many_close_points_are_independent_and_span_the_others():
+    # The Gram of 200 points in the plane, of numerical rank 120 or so.
+    S, smooth = data(200)[0], hk.Symplectic(hk.Gaussian(1.5))
+    kept = np.asarray(given_landmarks(smooth, jnp.asarray(S)).kept).ravel()
+    G = np.asarray(hk.gram(smooth, S)).reshape(S.size, S.size)
+    np.linalg.cholesky(G[np.ix_(kept, kept)])  # raises where a column depends on others
+    across = G[np.ix_(kept, ~kept)]
+    left = G[np.ix_(~kept, ~kept)] - across.T @ np.linalg.solve(G[np.ix_(kept, kept)], across)
+    assert np.abs(np.diag(left)).max() < 1e-11 < 1e-2 < G.diagonal().max()
+    assert 50 < kept.sum() < 200
+
+
+def test_where_no_landmark_can_be_used_the_losses_are_infinite():
+    # A fit is refused then; without columns it would be the zero field.
+    for sign in (1.0, -1.0):
+        K = hk.Symplectic(lambda x, z, sign=sign: sign * jnp.exp(-((x - z) @ (x - z))))
+        given = LandmarkBasis(X[:3]), K, X, Y, jnp.asarray(1e-3)
+        folds = low_rank_partition_loss(*given, Partition(N, 3))
+        losses = folds, low_rank_generalized_loss(*given), -low_rank_log_likelihood(*given)
+        assert all(np.isfinite(loss) if sign > 0 else loss == np.inf for loss in losses)
 
 
 SOLVERS = {
