@@ -17,6 +17,7 @@ from jaxtyping import Array, ArrayLike, Float
 from hamkernel import _require as require
 from hamkernel._devices import Rows, as_given, rows_of, split, sum_of_columns
 from hamkernel._gram import centred, diagonals, gram, matrix_kernel
+from hamkernel._show import described
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._structured_operators import unfolded
 
@@ -75,6 +76,9 @@ class GramOperator(lx.AbstractLinearOperator):
     X_rows: Rows | None = eqx.field(static=True, default=None)
     Z_rows: Rows | None = eqx.field(static=True, default=None)
 
+    def __repr__(self) -> str:
+        return described(self)
+
     @property
     def columns(self) -> Float[Array, "M n"]:
         return self.X if self.Z is None else self.Z
@@ -90,10 +94,8 @@ class GramOperator(lx.AbstractLinearOperator):
                 f"the vector has shape {jnp.shape(vector)}; one coefficient for each column of "
                 f"the Gram, shape {self.columns.shape}, is needed."
             )
-        vector = split(self.Z_rows, require.floating(vector, "the vector"))
-        spread = self.X_rows, self.Z_rows
-        product = _compiled_product(self.kernel, self.X, self.columns, vector, *spread)
-        return as_given(self.X_rows, product)
+        vector = require.floating(vector, "the vector")
+        return _placed(self.kernel, self.X, self.columns, vector, self.X_rows, self.Z_rows)
 
     def as_matrix(self) -> Float[Array, "Nn Mn"]:
         """The dense Gram, O(N M n²) memory."""
@@ -132,8 +134,13 @@ def compiled_product(
 ) -> Float[Array, "N n"]:
     """`product` for arrays that know where they are."""
     X_rows, Z_rows = rows_of(X), rows_of(Z)
-    X, Z, A = split(X_rows, X), split(Z_rows, Z), split(Z_rows, A)
-    return as_given(X_rows, _compiled_product(K, X, Z, A, X_rows, Z_rows))
+    X, Z = split(X_rows, X), split(Z_rows, Z)
+    return _placed(K, X, Z, A, X_rows, Z_rows)
+
+
+def _placed(K, X, Z, A, X_rows, Z_rows):
+    """`product` of X and Z that are split already."""
+    return as_given(X_rows, _compiled_product(K, X, Z, split(Z_rows, A), X_rows, Z_rows))
 
 
 _compiled_product = eqx.filter_jit(product)

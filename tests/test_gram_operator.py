@@ -210,6 +210,13 @@ def test_float32_stays_float32():
     assert product.dtype == jnp.float32
 
 
+def test_an_operator_prints_its_kernel_and_the_shapes_of_its_points():
+    operator = gram_operator(hk.Symplectic(hk.Gaussian(1.0)), normal((FEW, n)))
+    kernel = "kernel=Symplectic(Gaussian(lengthscale=1))"
+    assert repr(operator) == f"GramOperator({kernel}, X=f64[12,2])"
+    jax.eval_shape(lambda operator: repr(operator) and operator.X, operator)
+
+
 def test_what_does_not_fit_is_refused():
     K = hk.Symplectic(hk.Gaussian(1.0))
     with pytest.raises(TypeError, match="matrix-valued"):
