@@ -81,8 +81,9 @@ class ConjugateGradient(AbstractSolver):
         ridge = len(X) * regularization
         spread = rows_of(X)
         X, Y = split(spread, X), split(spread, Y)
+        tolerance = jnp.asarray(self.tolerance, X.dtype)  # a Python float would compile anew
         C, iterations, values, left, truncation = _solve(
-            K, X, Y, ridge, landmarks, self.tolerance, self.max_iterations, spread
+            K, X, Y, ridge, landmarks, tolerance, self.max_iterations, spread
         )
 
         def message() -> str:
