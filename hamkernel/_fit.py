@@ -40,7 +40,8 @@ def fit(
 
     Returns:
         The learned field. Works under jit, vmap and grad, with respect to every argument; new
-        values of hyperparameters or λ do not recompile.
+        values of hyperparameters or λ do not recompile, but for `Nystrom()` where they change the
+        number of landmarks.
 
     Raises:
         TypeError: K is not matrix-valued, `solver` is no solver, or the data is complex or in half

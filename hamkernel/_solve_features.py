@@ -231,15 +231,16 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     It has a fixed size, 3r² numbers for r columns. `add` returns a new one, and `field` solves
     for any λ:
 
-        model = hk.RandomFeatures(500, key).start(K, X).add(X, Y)
-        field = model.field(1e-4)
-        better = model.add(X_new, Y_new).field(1e-4)
+        model = hk.RandomFeatures(500, key).start(K, X, 1e-4).add(X, Y)
+        field = model.field()
+        better = model.add(X_new, Y_new).field()
 
     Attributes:
         kernel: K.
         features: the features of K.
         sums: what the least squares need of the points added.
         count: N, the number of points added, shape ().
+        regularization: the λ of `start`, shape ().
         dimension: n, the number of coordinates of a state.
     """
 
@@ -247,11 +248,11 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     features: AbstractFeatures
     sums: Sums
     count: Int[Array, ""]
+    regularization: Float[Array, ""]
     dimension: int = eqx.field(static=True)
 
-    @property
-    def dtype(self) -> jnp.dtype:
-        return self.sums.energy.dtype
+    def _size(self) -> str:
+        return f"features={len(self.sums.moment)}"
 
     def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "FeatureFit":
         spread = rows_of(X)
@@ -271,6 +272,7 @@ def _start(K, basis, sample, regularization):
         features=basis,
         sums=streaming_sums.start(basis, identity, sample, regularization),
         count=jnp.zeros((), int),
+        regularization=regularization,
         dimension=sample.shape[1],
     )
 

@@ -26,6 +26,7 @@ from hamkernel._devices import as_given, rows_of, split
 from hamkernel._field import KernelField, SolverInfo
 from hamkernel._gram import block_traces
 from hamkernel._gram_operator import product
+from hamkernel._show import text
 from hamkernel._solve import root
 from hamkernel._solve_landmarks import Landmarks, choose_landmarks, given_landmarks
 from hamkernel._solve_low_rank import (
@@ -41,6 +42,7 @@ from hamkernel._solve_streaming import (
     AbstractStreamingSolver,
     checked_start,
     thinned,
+    users_level,
 )
 from hamkernel._streaming_sums import Sums
 from hamkernel._structured import AbstractMatrixKernel
@@ -56,7 +58,9 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
     result carries `field.info.landmarks`, `.rank` and the `.truncation` that was reached.
 
     Under jit, vmap and grad the number of landmarks cannot depend on values: buffers have the size
-    of `max_points`. Derivatives hold the landmarks fixed.
+    of `max_points`. Outside of them it is rounded up to a multiple of 16, and each such number
+    compiles anew: for a sweep over hyperparameters give `points`. Derivatives hold the landmarks
+    fixed.
 
     Args:
         tolerance: the bound on trace(G − Ĝ)/(Nλ), dimensionless.
@@ -67,8 +71,9 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
             depend on others are left out. `max_points`, `candidates` and `key` have no effect.
 
     Raises:
-        ValueError: an argument is not positive, or `points` is not of shape (m, n). TypeError: a
-            number of points is not whole.
+        ValueError: an argument is not positive, `points` is not of shape (m, n), or the tolerance
+            is a whole number above 1, which looks like `max_points`; write 10.0 if it is meant.
+            TypeError: a number of points is not whole.
 
     Warns:
         UserWarning: the landmarks do not reach the tolerance.
@@ -90,6 +95,12 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         key: PRNGKeyArray | None = None,
         points: ArrayLike | None = None,
     ):
+        if isinstance(tolerance, int) and tolerance > 1:
+            raise ValueError(
+                f"got the whole number {tolerance} as the tolerance on trace(G - Ĝ)/(N λ). For at "
+                f"most {tolerance} landmarks say hk.Nystrom(max_points={tolerance}); for that "
+                f"tolerance write {tolerance}.0."
+            )
         if not (tolerance > 0 and math.isfinite(tolerance)):
             raise ValueError(f"tolerance must be positive and finite, got {tolerance}.")
         self.tolerance = float(tolerance)
@@ -125,7 +136,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         X, Y = split(spread, X), split(spread, Y)
         solution = _fit(K, X, Y, regularization, landmarks, spread)
         solution = solution._replace(residual=as_given(spread, solution.residual))
-        return _field(K, landmarks, solution, regularization, self.tolerance, throw)
+        return _field(K, landmarks, solution, regularization, self.tolerance, _CHOOSE, throw)
 
     def start(
         self, K: AbstractMatrixKernel, sample: ArrayLike, regularization: ArrayLike = 1e-4
@@ -139,6 +150,9 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
                 first chunk does where chunks are alike; one trajectory out of many does not.
             regularization: the smallest λ that will be asked for, since the tolerance is relative
                 to it, and so are the digits that are kept: a smaller one loses some.
+
+        Where `field.info.truncation` of the data added exceeds the tolerance, start anew with a
+        sample that looks like the data so far.
 
         Raises:
             ValueError: a shape does not fit, or λ is not positive. TypeError: K is not
@@ -180,14 +194,14 @@ class _Solution(NamedTuple):
     residual_norm: Float[Array, ""] | None = None
 
 
-def _field(K, landmarks, solution, regularization, tolerance, throw=True) -> KernelField:
+def _field(K, landmarks, solution, regularization, tolerance, cure, throw=True) -> KernelField:
     dtype = landmarks.points.dtype
     unsolved = require.not_finite(solution.coefficients).any()
     failed = unsolved | (require.on_host(landmarks.count) == 0)
     solution = require.value(solution, failed, singular(dtype), RuntimeError, throw)
     larger = require.not_finite(solution.truncation)
     solution = require.value(solution, larger, INDEFINITE, RuntimeError, throw)
-    _warn_if_truncated(solution.truncation, landmarks.count, tolerance)
+    _warn_if_truncated(solution.truncation, landmarks.count, tolerance, cure)
     return KernelField(
         kernel=K,
         points=landmarks.points,
@@ -206,7 +220,17 @@ def _field(K, landmarks, solution, regularization, tolerance, throw=True) -> Ker
     )
 
 
-def _warn_if_truncated(truncation, count, tolerance):
+_CHOOSE = (
+    "Raise max_points, the tolerance or the regularization; let landmarks be chosen from more "
+    "candidates;"
+)
+_START_ANEW = (
+    "Start anew with landmarks from a sample that looks like the data so far, and a max_points "
+    "that suffices; or ask for a larger regularization;"
+)
+
+
+def _warn_if_truncated(truncation, count, tolerance, cure):
     if not require.is_concrete(truncation, count):
         return
     # Twice: a random part of the data need not show all that the rest has.
@@ -214,11 +238,9 @@ def _warn_if_truncated(truncation, count, tolerance):
         warnings.warn(
             f"{int(count)} landmarks leave trace(G - Ĝ)/(N λ) = {float(truncation):.2g}, more than "
             f"the tolerance {tolerance:.2g}. The field is the best one on these landmarks, but may "
-            "be far from the exact fit. Raise max_points, the tolerance or the regularization; let "
-            "landmarks be chosen from a sample that looks like all of the data (candidates, or "
-            "the sample of a stream); for a rough kernel or many dimensions take "
+            f"be far from the exact fit. {cure} for a rough kernel or many dimensions take "
             "hk.ConjugateGradient(), which is exact.",
-            stacklevel=6,
+            stacklevel=users_level(),
         )
 
 
@@ -229,8 +251,8 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
     for any λ:
 
         model = hk.Nystrom().start(K, X, 1e-4).add(X, Y)
-        field = model.field(1e-4)
-        better = model.add(X_new, Y_new).field(1e-4)
+        field = model.field()
+        better = model.add(X_new, Y_new).field()
 
     `field.info.truncation` is that of all the data added: it shows whether the landmarks still do.
 
@@ -240,6 +262,7 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         sums: what the least squares need of the points added.
         trace: the trace of their Gram, shape ().
         count: N, the number of points added, shape ().
+        regularization: the λ of `start`, shape ().
         dimension: n, the number of coordinates of a state.
         tolerance: of the solver, for its warning.
     """
@@ -249,12 +272,12 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
     sums: Sums
     trace: Float[Array, ""]
     count: Int[Array, ""]
+    regularization: Float[Array, ""]
     dimension: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
 
-    @property
-    def dtype(self) -> jnp.dtype:
-        return self.trace.dtype
+    def _size(self) -> str:
+        return f"landmarks={text(self.landmarks.count)}"
 
     def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "LandmarkFit":
         spread = rows_of(X)
@@ -262,7 +285,8 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
         solution = _solved(self, count, regularization)
-        return _field(self.kernel, self.landmarks, solution, regularization, self.tolerance)
+        landmarks, tolerance = self.landmarks, self.tolerance
+        return _field(self.kernel, landmarks, solution, regularization, tolerance, _START_ANEW)
 
 
 @eqx.filter_jit
@@ -275,6 +299,7 @@ def _start(K, sample, regularization, landmarks, tolerance):
         sums=streaming_sums.start(Columns(K, S), T, sample, regularization),
         trace=jnp.zeros((), S.dtype),
         count=jnp.zeros((), int),
+        regularization=regularization,
         dimension=S.shape[1],
         tolerance=tolerance,
     )

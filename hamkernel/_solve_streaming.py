@@ -7,6 +7,7 @@ changes them, and any λ is solved for from them.
 import abc
 import contextlib
 import reprlib
+import sys
 from collections.abc import Iterable, Iterator
 from typing import Generic, TypeVar
 
@@ -20,6 +21,7 @@ from hamkernel import _require as require
 from hamkernel._devices import rows_of, split
 from hamkernel._field import AbstractField
 from hamkernel._gram import matrix_kernel
+from hamkernel._show import call, text
 from hamkernel._solve import AbstractSolver
 from hamkernel._structured import AbstractMatrixKernel
 
@@ -32,21 +34,30 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
 
     It has a fixed size. `add` returns a new one, and `field` solves for any λ:
 
-        model = solver.start(K, X).add(X, Y)
-        field = model.field(1e-4)
-        better = model.add(X_new, Y_new).field(1e-4)
+        model = solver.start(K, X, 1e-4).add(X, Y)
+        field = model.field()
+        better = model.add(X_new, Y_new).field()
 
     It is a PyTree, so that `jax.tree_util` and `equinox.tree_serialise_leaves` keep it for later.
     """
 
     kernel: eqx.AbstractVar[AbstractMatrixKernel]
     count: eqx.AbstractVar[Int[Array, ""]]
+    regularization: eqx.AbstractVar[Float[Array, ""]]
     dimension: eqx.AbstractVar[int]
 
+    def __repr__(self) -> str:
+        name, kernel = type(self).__name__, text(self.kernel)
+        return call(name, [f"kernel={kernel}", self._size(), f"added={text(self.count)}"])
+
     @property
-    @abc.abstractmethod
     def dtype(self) -> jnp.dtype:
         """That of the fit, and of its fields."""
+        return self.regularization.dtype
+
+    @abc.abstractmethod
+    def _size(self) -> str:
+        """What carries the field, as it is printed."""
 
     @abc.abstractmethod
     def _added(self: Fit, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> Fit:
@@ -77,21 +88,24 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
             raise ValueError(f"the data has {X.shape[1]} coordinates and the fit {self.dimension}.")
         return self._added(X.astype(self.dtype), Y.astype(self.dtype))
 
-    def field(self, regularization: ArrayLike = 1e-4) -> Learned:
+    def field(self, regularization: ArrayLike | None = None) -> Learned:
         """The field learned from all data added so far; O(r³), and no pass over the data.
 
         Args:
-            regularization: λ > 0, as in `hk.fit`, with N the number of points added so far.
+            regularization: λ > 0, as in `hk.fit`, with N the number of points added so far; that
+                of `start` if None.
 
         Raises:
             ValueError: λ is not positive, or no data was added.
         """
-        regularization = require.ridge(regularization)
+        if regularization is None:
+            regularization = self.regularization
+        regularization = _ridge(regularization, self.dtype)
         none = require.on_host(self.count) == 0
         count = require.value(
             self.count, none, "no data yet: add(X, Y) before asking for the field."
         )
-        return self._solved(count, regularization.astype(self.dtype))
+        return self._solved(count, regularization)
 
 
 class AbstractStreamingSolver(AbstractSolver, Generic[Learned]):
@@ -113,8 +127,10 @@ class AbstractStreamingSolver(AbstractSolver, Generic[Learned]):
     ) -> Learned:
         """`hk.fit` to data that comes in chunks, in one pass and with memory for two chunks.
 
-        The field is that of one fit to all the data, to rounding. To add data later keep the fit
-        of `start` instead.
+        The field is that of one fit to all the data: to rounding for `RandomFeatures`, and for
+        `Nystrom` where the landmarks are the same (`sample=X`, or its `points`), else within the
+        tolerance. If `Nystrom` warns of the truncation, start anew with a `sample` that looks like
+        all of the data. To add data later keep the fit of `start` instead.
 
         Args:
             K: a matrix-valued kernel.
@@ -143,7 +159,7 @@ class AbstractStreamingSolver(AbstractSolver, Generic[Learned]):
                 model = model.add(X, Y)
         if model is None:
             raise ValueError("fit_chunks needs at least one chunk (X, Y); the iterator was empty.")
-        return model.field(regularization)
+        return model.field()
 
 
 @contextlib.contextmanager
@@ -163,8 +179,24 @@ def checked_start(
     K = matrix_kernel(K)
     sample = require.finite(require.points(sample, "sample"), "sample")
     K.check_dimension(sample.shape[1])
-    require.warn_of_float32(sample, stacklevel=4)
-    return K, sample, require.ridge(regularization).astype(sample.dtype)
+    require.warn_of_float32(sample, stacklevel=users_level() + 1)
+    return K, sample, _ridge(regularization, sample.dtype)
+
+
+def _ridge(x: ArrayLike, dtype: jnp.dtype) -> Float[Array, ""]:
+    """λ, positive in the dtype of the data too: 1e-50 is zero in float32."""
+    return require.ridge(require.ridge(x).astype(dtype))
+
+
+def users_level() -> int:
+    """The `stacklevel` of a warning of the caller that names the line of the user.
+
+    Equinox puts frames of its own between methods, so it is no constant.
+    """
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back and frame.f_globals["__name__"].split(".")[0] in ("hamkernel", "equinox"):
+        level, frame = level + 1, frame.f_back
+    return level
 
 
 def thinned(sample: Float[Array, "N n"], most: int) -> Float[Array, "M n"]:

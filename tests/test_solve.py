@@ -213,6 +213,21 @@ def test_nystrom_refuses_what_makes_no_sense():
         Nystrom(tolerance=0.0)
     with pytest.raises(ValueError, match="at least 1"):
         Nystrom(max_points=0)
+    with pytest.raises(ValueError, match=r"most 100 landmarks say hk.Nystrom\(max_points=100\)"):
+        Nystrom(100)
+    assert Nystrom(100.0).tolerance == 100.0
+
+
+def test_second_derivatives_of_a_fit_on_landmarks_are_those_of_differences():
+    X, Y = np.random.default_rng(0).normal(size=(2, 20, 2))
+    solver = Nystrom(tolerance=1e9, points=X[::3])
+
+    def norm(lengthscale):
+        return fit(hk.Symplectic(hk.Matern(2.5, lengthscale)), X, Y, 1e-2, solver=solver).norm
+
+    slope, h = jax.jit(jax.grad(norm)), 1e-4
+    expected = (slope(1.2 + h) - slope(1.2 - h)) / (2 * h)
+    np.testing.assert_allclose(jax.hessian(norm)(1.2), expected, rtol=1e-6)
 
 
 def test_a_kernel_that_is_not_positive_is_refused():
@@ -245,6 +260,20 @@ def test_conjugate_gradients_find_the_exact_coefficients(name):
     )
     assert info(field).relative_residual < 1e-8
     assert 1 <= int(info(field).iterations) <= 30
+
+
+def test_a_new_tolerance_of_conjugate_gradients_compiles_nothing():
+    traces = []
+
+    def kernel(x, z):
+        traces.append(1)
+        return jnp.exp(-((x - z) @ (x - z)))
+
+    X, Y = swings(20)
+    for tolerance, new in (1e-6, True), (1e-7, False):
+        hk.fit(hk.Symplectic(kernel), X, Y, RIDGE, solver=ConjugateGradient(tolerance))
+        assert bool(traces) == new
+        traces.clear()
 
 
 def test_landmarks_precondition():

@@ -146,16 +146,27 @@ def test_data_and_ridge_may_change_after_the_fit():
     assert relative(before.evaluate(NEW), after.evaluate(NEW)) > 1e-3
 
 
+def test_the_ridge_is_that_of_the_start_unless_another_one_is_asked_for():
+    model = given(S).start(K, X, 1e-2).add(X[:200], Y[:200])
+    assert model.field().regularization == 1e-2
+    assert model.field(1e-3).regularization == 1e-3
+
+
 @pytest.mark.parametrize(
-    "solver", [given(S), hk.RandomFeatures(20, jax.random.key(0))], ids=["nystrom", "features"]
+    ("solver", "size"),
+    [(given(S), "landmarks=30"), (hk.RandomFeatures(20, jax.random.key(0)), "features=40")],
+    ids=["nystrom", "features"],
 )
-def test_both_solvers_stream_with_the_same_words(solver: AbstractStreamingSolver):
+def test_both_solvers_stream_with_the_same_words(solver: AbstractStreamingSolver, size):
     model = solver.start(K, X, RIDGE)
     for x, y in chunks(X, Y, 200):
         model = model.add(x, y)
     assert int(model.count) == 600
     assert model.dimension == 2
-    field = model.field(RIDGE)
+    kernel = "kernel=Symplectic(Gaussian(lengthscale=1.5))"
+    assert repr(model) == f"{type(model).__name__}({kernel}, {size}, added=600)"
+    jax.eval_shape(lambda model: repr(model) and model.count, model)
+    field = model.field()
     whole = fit(K, X, Y, RIDGE, solver=solver)
     assert relative(field.evaluate(NEW), whole.evaluate(NEW)) < ROUNDING
     streamed = solver.fit_chunks(K, chunks(X, Y, 200), RIDGE, sample=X)
@@ -171,12 +182,27 @@ def test_landmarks_of_the_first_chunk_do_where_chunks_are_alike():
 
 def test_a_first_chunk_that_is_not_like_the_rest_is_said():
     order = np.argsort(X[:, 0])
-    with pytest.warns(UserWarning, match="a sample that looks like all of the data"):
+    with pytest.warns(UserWarning, match="from a sample that looks like the data so far"):
         narrow: Any = Nystrom(0.01).fit_chunks(K, chunks(X[order], Y[order], 200), RIDGE)
     spread: Any = Nystrom(0.01).fit_chunks(
         K, chunks(X[order], Y[order], 200), RIDGE, sample=X[:200]
     )
     assert spread.info.truncation < 0.2 < 100 < narrow.info.truncation
+
+
+def test_warnings_name_the_line_of_the_user():
+    with pytest.warns(UserWarning, match="fitting in float32") as warned:
+        Nystrom().start(K, X[:200].astype(np.float32), 1e-2)
+    few = Nystrom(0.01, max_points=4)
+    model = few.start(K, X, RIDGE).add(X[:200], Y[:200])
+    for ask in (
+        lambda: model.field(),
+        lambda: few.fit_chunks(K, [(X[:200], Y[:200])], RIDGE),
+        lambda: fit(K, X[:200], Y[:200], RIDGE, solver=few),
+    ):
+        with pytest.warns(UserWarning, match="4 landmarks leave") as truncated:
+            ask()
+        assert [warning.filename for warning in (*warned, *truncated)] == [__file__] * 2
 
 
 def test_memory_mapped_files_and_a_shorter_last_chunk(tmp_path):
@@ -265,6 +291,13 @@ def test_a_stream_in_float32_warns_and_takes_no_data_with_more_digits(solver):
     assert model.add(*few).field(1e-2).norm.dtype == jnp.float32
     with pytest.raises(TypeError, match="the data is float64 and the fit float32"):
         model.add(X[:20], Y[:20])
+    with pytest.raises(ValueError, match="regularization must be positive"):
+        model.add(*few).field(1e-50)  # zero in float32
+    with (
+        pytest.warns(UserWarning, match="fitting in float32"),
+        pytest.raises(ValueError, match="regularization must be positive"),
+    ):
+        solver.start(K, few[0], 1e-50)
 
 
 # Memory.
