@@ -182,7 +182,7 @@ def test_gradients_are_central_differences(name):
         return field(x) @ jnp.array([1.0, 2.0]) + field.hamiltonian(x)
 
     at = (jnp.array(1.1), jnp.array(1e-2), jnp.asarray(X), jnp.asarray(Y))
-    gradients = jax.grad(number, argnums=(0, 1, 2, 3))(*at)
+    gradients = jax.jit(jax.grad(number, argnums=(0, 1, 2, 3)))(*at)
     for i, (value, gradient) in enumerate(zip(at, gradients, strict=True)):
         rng = np.random.default_rng(i)
         direction = jnp.asarray(rng.normal(size=value.shape)) if value.ndim else jnp.array(1.0)
@@ -328,7 +328,7 @@ def test_data_of_zeros_give_the_zero_field_and_finite_derivatives():
         def norm(Y, solver=solver):
             return learned(X, Y, solver).norm
 
-        value, slope = jax.value_and_grad(norm)(jnp.zeros_like(Y))
+        value, slope = jax.jit(jax.value_and_grad(norm))(jnp.zeros_like(Y))
         assert value == 0.0
         assert jnp.isfinite(slope).all()
 
