@@ -208,11 +208,11 @@ def test_a_kernel_with_leaves_of_two_precisions_is_trained():
 
 def test_frozen_hyperparameters_keep_their_values_to_the_last_bit():
     X, Y = scattered()
-    tuned = hk.tune(SIMPLE, X, Y, 1e-1, frozen="lengthscale")
+    tuned = hk.tune(SIMPLE, X, Y, 1e-1, starts=1, frozen="lengthscale")
     assert gaussian(tuned) == 1.0
     assert abs(tuned.regularization / 1e-1 - 1) > 1e-2
     assert set(tuned.bounds) == {"regularization"}
-    tuned = hk.tune(SIMPLE, X, Y, 1e-1, frozen=("regularization",))
+    tuned = hk.tune(SIMPLE, X, Y, 1e-1, starts=1, frozen=("regularization",))
     np.testing.assert_allclose(tuned.regularization, 1e-1, rtol=1e-14)  # exp of its logarithm
     assert abs(gaussian(tuned) - 1) > 1e-2
 
@@ -220,11 +220,11 @@ def test_frozen_hyperparameters_keep_their_values_to_the_last_bit():
 def test_a_part_of_a_named_sum_is_frozen_by_its_name_and_its_hyperparameters_are_called_by_it():
     X, Y = scattered()
     K = hk.Sum(energy=hk.Symplectic(2.0 * hk.Gaussian(1.0)), rest=hk.CurlFree(hk.Gaussian(3.0)))
-    tuned = hk.tune(K, X, Y, 1e-1, starts=2, frozen="energy")
+    tuned = hk.tune(K, X, Y, 1e-1, starts=1, frozen="energy")
     assert set(tuned.bounds) == {"rest.kernel.lengthscale", "regularization"}
     assert eqx.tree_equal(tuned.field.part("energy").kernel, K.part("energy"))
     box = {"rest.kernel.lengthscale": (1.0, 2.0)}
-    tuned = hk.tune(K, X, Y, 1e-1, starts=2, frozen=("energy.kernel.kernel", "scale"), bounds=box)
+    tuned = hk.tune(K, X, Y, 1e-1, starts=1, frozen=("energy.kernel.kernel", "scale"), bounds=box)
     assert tuned.bounds["rest.kernel.lengthscale"] == pytest.approx((1.0, 2.0))
     assert eqx.tree_equal(tuned.field.part("energy").kernel, K.part("energy"))
     with pytest.raises(ValueError, match="no hyperparameter 'rest'; this kernel has energy"):
@@ -255,7 +255,7 @@ def test_bounds_may_have_a_number_for_each_coordinate_and_are_reported_by_the_wi
     X, Y = scattered()
     K = hk.Symplectic(hk.Gaussian(np.ones(2)))
     low, high = np.array([0.3, 2.0]), np.array([0.4, 3.0])
-    tuned = hk.tune(K, X, Y, bounds={"lengthscale": (low, high)}, starts=2)
+    tuned = hk.tune(K, X, Y, bounds={"lengthscale": (low, high)}, starts=1)
     found = np.asarray(tuned.kernel.kernel.lengthscale)  # pyright: ignore[reportAttributeAccessIssue]
     assert (found >= low * (1 - 1e-9)).all()
     assert (found <= high * (1 + 1e-9)).all()
@@ -385,7 +385,7 @@ def test_velocities_of_very_different_sizes_are_warned_of():
     X, Y = scattered()
     scale = np.array([30.0, 1 / 30])
     with pytest.warns(UserWarning, match="Choose units"):
-        hk.tune(SIMPLE, X, Y * scale, starts=1, max_steps=1)
+        hk.tune(SIMPLE, X, Y * scale, starts=1)
 
 
 def test_bounds_of_lambda_that_float64_cannot_carry_are_refused():
@@ -393,7 +393,7 @@ def test_bounds_of_lambda_that_float64_cannot_carry_are_refused():
         hk.tune(SIMPLE, *scattered(), bounds={"regularization": (1e-30, 1e-20)})
     # Where λ is frozen its bounds are not searched.
     kept = {"frozen": "regularization", "bounds": {"regularization": (1e-9, 1e-6)}}
-    tuned = hk.tune(SIMPLE, *scattered(), 1e-3, starts=2, **kept)
+    tuned = hk.tune(SIMPLE, *scattered(), 1e-3, starts=1, **kept)
     assert tuned.regularization == 1e-3
 
 
@@ -471,9 +471,10 @@ def test_an_objective_may_have_any_size(size):
         return size * hk.cross_validation_loss(K, X, Y, regularization)
 
     best = float(hk.tune(SIMPLE, X, Y).loss)
-    for starts in (1, 4):
-        tuned = hk.tune(SIMPLE, X, Y, 0.1, starts=starts, objective=objective)
-        np.testing.assert_allclose(tuned.loss / size, best, rtol=0.01)
+    tuned = hk.tune(SIMPLE, X, Y, 0.1, starts=4, objective=objective)
+    # The run from the caller's point, and the best of all.
+    for loss in (tuned.start_losses[0], tuned.loss):
+        np.testing.assert_allclose(loss / size, best, rtol=0.01)
 
 
 @pytest.mark.slow
@@ -518,7 +519,7 @@ def test_a_fit_or_a_simulation_that_fails_in_an_objective_is_a_point_that_cannot
     assert np.isfinite(hk.tune(SIMPLE, X, Y, objective=objective, bounds=bounds, starts=4).loss)
     raising = functools.partial(objective, throw=True)
     with pytest.raises(Exception, match="not positive definite"):
-        hk.tune(SIMPLE, X, Y, objective=raising, bounds=bounds, starts=4)
+        hk.tune(SIMPLE, X, Y, 1e-8, objective=raising, bounds=bounds, starts=1)
 
 
 @pytest.mark.few(1)
@@ -598,11 +599,10 @@ def test_a_field_tuned_on_noisy_data_can_be_simulated():
 
 
 def test_data_without_noise_may_have_the_smallest_ridge():
-    rng = np.random.default_rng(1)
-    X = rng.uniform(-1.6, 1.6, size=(40, 2))
+    X, _ = scattered()
     Y = np.stack([X[:, 1], -X[:, 0]], axis=1)
     tuned = hk.tune(SIMPLE, X, Y)
-    trace = np.trace(np.asarray(hk.gram(tuned.kernel, X)).reshape(80, 80))
+    trace = np.trace(np.asarray(hk.gram(tuned.kernel, X)).reshape(30, 30))
     assert len(X) * tuned.regularization < 1e3 * np.finfo(float).eps * trace
 
 
