@@ -278,8 +278,18 @@ def rollout(solver, coupling, x0):
     return jnp.sum(jnp.sin(integrate(solver, term, x0, 0.0, 2.0, 16, max_steps=16)))
 
 
-@pytest.mark.few(2)
-@pytest.mark.parametrize("solver", [*GAUSS, *SPLITTING], ids=name)
+# One of each family by default.
+@pytest.mark.parametrize(
+    "solver",
+    [
+        pytest.param(ImplicitMidpoint(), marks=pytest.mark.slow),
+        GaussLegendre4(),
+        pytest.param(GaussLegendre6(), marks=pytest.mark.slow),
+        StormerVerlet(),
+        pytest.param(Yoshida4(), marks=pytest.mark.slow),
+    ],
+    ids=name,
+)
 def test_gradient_of_a_rollout_is_the_central_difference(solver):
     f = jax.jit(lambda c, x: rollout(solver, c, x))
     check_grads(f, (jnp.array(0.9), START), order=1, modes=["rev"])
