@@ -57,6 +57,6 @@ def fit(
         raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
     X, Y = require.data(X, Y)
     K.check_dimension(X.shape[1])
-    regularization = require.ridge(regularization).astype(X.dtype)
+    regularization = require.ridge(regularization, X.dtype)
     require.warn_of_float32(X, stacklevel=3)
     return chosen(solver, X).fit(K, X, Y, regularization, throw)

@@ -134,10 +134,10 @@ def positive_scalar(x: ArrayLike, name: str, cure: str = "") -> Float[Array, ""]
     return positive(array, name, cure)
 
 
-def ridge(x: ArrayLike) -> Float[Array, ""]:
-    """The λ of a fit."""
+def ridge(x: ArrayLike, dtype: jnp.dtype) -> Float[Array, ""]:
+    """The λ of a fit, positive in the dtype of the data too: 1e-50 is zero in float32."""
     cure = "Data without noise still need a small one, such as 1e-8; hk.tune finds a good one."
-    return positive_scalar(x, "regularization", cure)
+    return positive_scalar(floating(x, "regularization").astype(dtype), "regularization", cure)
 
 
 def finite(x: Array, name: str) -> Array:

@@ -100,7 +100,7 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
         """
         if regularization is None:
             regularization = self.regularization
-        regularization = _ridge(regularization, self.dtype)
+        regularization = require.ridge(regularization, self.dtype)
         none = require.on_host(self.count) == 0
         count = require.value(
             self.count, none, "no data yet: add(X, Y) before asking for the field."
@@ -180,12 +180,7 @@ def checked_start(
     sample = require.finite(require.points(sample, "sample"), "sample")
     K.check_dimension(sample.shape[1])
     require.warn_of_float32(sample, stacklevel=users_level() + 1)
-    return K, sample, _ridge(regularization, sample.dtype)
-
-
-def _ridge(x: ArrayLike, dtype: jnp.dtype) -> Float[Array, ""]:
-    """λ, positive in the dtype of the data too: 1e-50 is zero in float32."""
-    return require.ridge(require.ridge(x).astype(dtype))
+    return K, sample, require.ridge(regularization, sample.dtype)
 
 
 def users_level() -> int:

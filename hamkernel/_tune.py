@@ -157,7 +157,7 @@ def tune(
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
     K.check_dimension(X.shape[1])
     _warn_of_unequal_sizes(Y)
-    ridge = require.ridge(regularization).astype(X.dtype)
+    ridge = require.ridge(regularization, X.dtype)
     criterion = criterion_of(objective, len(X), folds)
     low_rank = isinstance(solver, Nystrom | RandomFeatures)
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS

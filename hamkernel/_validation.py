@@ -160,9 +160,9 @@ def _checked(K, X, Y, regularization):
     # LAPACK on every device at once was seen to stall, see `_inverse.py`.
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
     K.check_dimension(X.shape[1])
-    regularization = require.ridge(regularization)
+    regularization = require.ridge(regularization, X.dtype)
     check_memory(X, LOSS_COPIES)
-    return K, X, Y, regularization.astype(X.dtype)
+    return K, X, Y, regularization
 
 
 LOSS_COPIES = 3  # matrices of the size of the Gram that a loss holds, with its gradient

@@ -256,6 +256,8 @@ def test_float32_agrees_to_three_digits_and_says_so():
         jnp.dtype("float32"),
         jnp.dtype("float64"),  # the lengthscale
     }
+    with pytest.raises(ValueError, match="regularization must be positive and finite, got 0"):
+        hk.fit(K, single[0], single[1], 1e-50)  # zero in float32
     exact, new = hk.fit(K, X, Y, ridge), jnp.asarray(data(5, seed=1)[0])
     ours, theirs = jax.vmap(field)(new.astype(jnp.float32)), jax.vmap(exact)(new)
     assert ours.dtype == jnp.float32

@@ -385,7 +385,7 @@ def test_hyperparameters_must_be_positive(name, make, bad):
         (lambda: hk.Select((0,), hk.Gaussian()), TypeError, "scalar kernel is needed"),
         (lambda: hk.Select(3, 0), TypeError, "scalar kernel is needed"),
         (lambda: hk.Warp(hk.Gaussian(), 3), TypeError, "got 3 as map"),  # pyright: ignore
-        (lambda: hk.Warp(jnp.sin, hk.Gaussian()), TypeError, "a kernel and then a map"),
+        (lambda: hk.Warp(jnp.sin, hk.Gaussian()), TypeError, "a kernel and then a map"),  # pyright: ignore
         (lambda: hk.Warp(hk.Gaussian, jnp.sin), TypeError, r"hk\.Gaussian\(lengthscale=1\.0\)"),
     ],
 )

@@ -125,7 +125,7 @@ def test_tuned_point_is_no_worse_than_any_start_and_than_the_callers(rich):
 
 
 def test_a_warp_has_the_same_box_however_its_map_returns_its_numbers():
-    X, Y = scattered()
+    X, Y = map(jnp.asarray, scattered())
     listed, stacked = (
         SearchSpace(
             hk.Symplectic(hk.Warp(hk.Gaussian(jnp.ones(3)), fn)), X, Y, jnp.asarray(1e-3), (), {}

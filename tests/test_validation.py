@@ -106,10 +106,13 @@ def public_refits(K, X, Y, labels: np.ndarray) -> np.ndarray:
 
 
 def test_the_names_of_folds_do_not_tell_partitions_apart():
-    named = Partition(6, [7, -1, 7, 3, 3, -1])
-    assert named == Partition(6, [2, 0, 2, 1, 1, 0])
-    assert hash(named) == hash(Partition(6, [2, 0, 2, 1, 1, 0]))
-    assert named != Partition(6, [2, 0, 2, 1, 0, 1])
+    named, counted, other = (
+        Partition(6, np.array(labels))
+        for labels in ([7, -1, 7, 3, 3, -1], [2, 0, 2, 1, 1, 0], [2, 0, 2, 1, 0, 1])
+    )
+    assert named == counted
+    assert hash(named) == hash(counted)
+    assert named != other
 
 
 @pytest.mark.parametrize("folds", [3, "loo"])
