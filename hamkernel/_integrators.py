@@ -137,7 +137,9 @@ class EqualSteps(diffrax.AbstractSolver):
             max_steps=self.max_steps,
             throw=False,
         )
-        y1 = jax.tree.map(lambda y: y[-1], solution.ys)
+        # Infinite where the steps did not reach t1, as what Diffrax itself has not reached.
+        reached = solution.result == diffrax.RESULTS.successful
+        y1 = jax.tree.map(lambda y: jnp.where(reached, y[-1], jnp.inf), solution.ys)
         return y1, None, {"y0": y0, "y1": y1}, None, solution.result
 
 

@@ -186,7 +186,8 @@ def checked_start(
 def users_level() -> int:
     """The `stacklevel` of a warning of the caller that names the line of the user.
 
-    Equinox puts frames of its own between methods, so it is no constant.
+    Equinox puts frames of its own between methods, so it is no constant. From Python 3.12 on
+    `skip_file_prefixes` of `warnings.warn` does this.
     """
     level, frame = 1, sys._getframe(1)
     while frame.f_back and frame.f_globals["__name__"].split(".")[0] in ("hamkernel", "equinox"):

@@ -380,6 +380,10 @@ def test_failed_solves_raise_unless_told_not_to():
         simulate(lambda x: x**3, START, ts, diffrax.Euler(), dt=0.1)
     quiet = simulate(Pendulum(), START, ts, max_steps=3, throw=False)
     assert quiet.result == diffrax.RESULTS.max_steps_reached
+    stiff = Pendulum(jnp.array(1e4))
+    stuck = simulate(stiff, START, ts, ImplicitMidpoint(), dt=0.5, throw=False)
+    assert stuck.result != diffrax.RESULTS.successful
+    assert not jnp.isfinite(stuck.ys[1:]).any()  # the state of a step that failed is no state
 
 
 @pytest.mark.parametrize("options", [{}, {"solver": Yoshida4(), "dt": 0.1}])
