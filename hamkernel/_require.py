@@ -82,7 +82,7 @@ def floating(x: ArrayLike, name: str) -> Array:
     except (TypeError, ValueError) as error:
         raise TypeError(
             f"{name} must hold real numbers; got {reprlib.repr(x)}. Pass floats, a NumPy or JAX "
-            "array, or lists of numbers with rows of equal length."
+            "array of them (of objects: .astype(float)), or lists with rows of equal length."
         ) from error
     if jnp.issubdtype(array.dtype, jnp.floating):
         return array.astype(array.dtype)  # no weak type: a Python float must not recompile

@@ -48,6 +48,7 @@ class Warp(AbstractScalarKernel):
         return self.kernel(self.warped(x), self.warped(z))
 
     def warped(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """fn(x), as a vector."""
         x = one_point(x)
         warped = self.fn(x)
         warped = jnp.stack(warped) if isinstance(warped, list | tuple) else warped

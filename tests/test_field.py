@@ -178,7 +178,7 @@ def test_a_field_without_a_potential_says_why(structure, reason):
 
 def test_the_hamiltonian_of_a_sum_is_asked_of_its_part():
     field = fitted(symplectic_plus_separable)
-    with pytest.raises(AttributeError, match=r"ask the part, field\.part\(0\)\.hamiltonian\(x\)"):
+    with pytest.raises(AttributeError, match=r"such as field\.part\(0\)\.hamiltonian\(x\)"):
         _ = field.hamiltonian
     part, x = field.part(0), states(1)[0]
     slope = jax.grad(part.hamiltonian)(x)

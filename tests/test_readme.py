@@ -28,7 +28,11 @@ def test_the_ten_lines_learn_a_pendulum_that_keeps_its_energy():
         energy = jax.vmap(names["field"].hamiltonian)(names["orbit"])
         true = names["pendulum"].hamiltonian(names["orbit"][0])
         exec(python_blocks()[1], names)  # without the velocities
+        exec(python_blocks()[2], names)  # and with friction
     plt.close("all")
+    force, opposite = names["friction"](jnp.array([1.0, 2.0])), names["friction"](-jnp.ones(2) * 2)
+    assert force[0] == 0
+    np.testing.assert_allclose(opposite, -force)
     states = np.random.default_rng(0).uniform([-2, -4], [2, 4], size=(200, 2))
     velocities = jax.vmap(names["pendulum"])(jnp.asarray(states))
     off = names["tuned"].field.evaluate(states) - velocities
@@ -61,9 +65,9 @@ def test_the_lines_for_large_data_give_the_field_of_the_exact_fit():
     data = {"X": X, "Y": Y, "X_new": X[:40], "Y_new": Y[:40]}
     exact = hk.fit(K, X, Y, 1e-5).evaluate(X)
     chunks = ((X[i : i + 100], Y[i : i + 100]) for i in range(0, 400, 100))
-    for block in python_blocks()[2:]:
+    for block in python_blocks()[3:]:
         names = {"jax": jax, "hk": hk, "K": K, "chunks": chunks, **data}
         exec(block, names)
         # Landmarks to a tolerance of a tenth of the ridge; the last field has some points twice.
         assert abs(names["field"].evaluate(X) - exact).max() < 1e-2
-    assert len(python_blocks()) == 4  # all blocks of the README are run
+    assert len(python_blocks()) == 5  # all blocks of the README are run
