@@ -190,10 +190,10 @@ def users_level() -> int:
     `skip_file_prefixes` of `warnings.warn` does this.
     """
     level, frame = 1, sys._getframe(1)
-    while frame.f_back and frame.f_globals.get("__name__", "").split(".")[0] in (
-        "hamkernel",
-        "equinox",
-    ):
+    while frame.f_back:
+        package = frame.f_globals.get("__name__", "").split(".")[0]
+        if package not in ("hamkernel", "equinox"):
+            break
         level, frame = level + 1, frame.f_back
     return level
 
