@@ -172,6 +172,7 @@ class AbstractField(eqx.Module):
 
 
 def _potential_of(field, x):
+    # With the field as an argument, so that a potential is a PyTree and its arrays no constants.
     return field.unanchored_potential(x) + field.offset
 
 

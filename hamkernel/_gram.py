@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._devices import automatic
+from hamkernel._devices import Rows, automatic, on_each
 from hamkernel._memory import refuse_beyond_memory
 from hamkernel._scalar import Invariance
 from hamkernel._structured import AbstractMatrixKernel
@@ -75,6 +75,25 @@ def diagonals(
 def block_traces(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, " N"]:
     """The traces of the diagonal blocks of the Gram, tr K(xᵢ, xᵢ)."""
     return diagonals(K, X, X).sum(axis=1)
+
+
+# Whose blocks are made at once: of a network in a kernel they take kilobytes each. A Gaussian's
+# then stay in the cache: 16 ms for a million points, four times as many at once 90 ms.
+_POINTS = 1024
+
+
+def trace(
+    K: AbstractMatrixKernel, X: Float[Array, "N n"], spread: Rows | None = None
+) -> Float[Array, ""]:
+    """The trace of the Gram, in O(N n) memory for every kernel, where the rows are."""
+    if spread is not None:
+        return on_each(spread, lambda K, X: spread.sum(trace(K, X)), K, X, joined=False)
+
+    @jax.checkpoint
+    def of_point(x):
+        return block_traces(K, x[None])[0]
+
+    return jax.lax.map(of_point, X, batch_size=_POINTS).sum()
 
 
 @eqx.filter_jit

@@ -14,8 +14,8 @@ from hamkernel._trained import trained
 
 RIDGE = "regularization"
 ROUNDINGS = 100.0  # how far the ridge must stay above the rounding of the Gram
-_EDGE = 0.01  # the share of the box that counts as resting on a bound
 LOW_RANK_ROUNDINGS = 2e4  # above the rounding at which `choose_landmarks` drops a column
+_EDGE = 0.01  # the share of the box that counts as resting on a bound
 
 
 class SearchSpace(eqx.Module):
@@ -145,7 +145,8 @@ class SearchSpace(eqx.Module):
         ridge_low, ridge_high = self.ridge_box(self.kernel, X)
         low, high = self.low.at[-1].set(ridge_low), self.high.at[-1].set(ridge_high)
         width = jnp.where(high > low, high - low, jnp.ones_like(low))
-        # Not on the edge itself, where the derivative of the sine is zero.
+        # Not on the edge itself, where the derivative of the sine is zero, nor where it would
+        # count as resting there before it has moved.
         share = jnp.clip((self.start - low) / width, 2 * _EDGE, 1 - 2 * _EDGE)
         # Where the kernel is not positive at the start there is no box of λ.
         share = jnp.where(jnp.isfinite(share), share, 0.5)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._devices import as_given, rows_of, split
 from hamkernel._field import KernelField, SolverInfo
-from hamkernel._gram import block_traces
+from hamkernel._gram import trace
 from hamkernel._gram_operator import product
 from hamkernel._solve import AbstractSolver, relative, root
 from hamkernel._solve_low_rank import INDEFINITE, Columns, factor, truncated, whitening
@@ -164,5 +164,5 @@ def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
     C = solution.value
     values = gram(C) / ridge  # f(X)
     left = relative(Y - C - values, Y)
-    truncation = truncated(block_traces(K_, X_).sum(), jnp.trace(square), ridge_)
+    truncation = truncated(trace(K_, X_, spread), jnp.trace(square), ridge_)
     return C, solution.stats["num_steps"], values, left, truncation

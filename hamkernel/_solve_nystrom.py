@@ -24,7 +24,7 @@ from hamkernel import _require as require
 from hamkernel import _streaming_sums as streaming_sums
 from hamkernel._devices import as_given, rows_of, split
 from hamkernel._field import KernelField, SolverInfo
-from hamkernel._gram import block_traces
+from hamkernel._gram import trace
 from hamkernel._gram_operator import product
 from hamkernel._show import text
 from hamkernel._solve import root
@@ -181,7 +181,7 @@ def _fit(K, X, Y, regularization, landmarks, spread):
     w = jax.scipy.linalg.cho_solve((R, True), total.moment)
     A = (T @ w).reshape(S.shape)
     w, residual = step(w, Y - product(K, X, S, A, spread))
-    truncation = truncated(block_traces(K, X).sum(), jnp.trace(total.square), ridge)
+    truncation = truncated(trace(K, X, spread), jnp.trace(total.square), ridge)
     # ‖f‖² = αᵀ G_SS α = ‖w‖²
     return _Solution((T @ w).reshape(S.shape), residual, root(w @ w), truncation)
 
@@ -310,7 +310,7 @@ def _added(fit, X, Y, spread):
     K = fit.kernel
     new = (
         streaming_sums.add(fit.sums, Columns(K, fit.landmarks.points), X, Y, spread),
-        fit.trace + block_traces(K, X).sum(),
+        fit.trace + trace(K, X, spread),
         fit.count + len(X),
     )
     return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), fit, new)

@@ -79,7 +79,7 @@ class AbstractMatrixKernel(eqx.Module):
     @property
     @abc.abstractmethod
     def invariance(self) -> Invariance:
-        """The transformations of both arguments that leave every block unchanged, up to sign."""
+        """The transformations of both arguments that leave every block unchanged."""
 
     def __add__(self, other: Any) -> "Sum":
         return Sum(self, other) if isinstance(other, AbstractMatrixKernel) else NotImplemented

@@ -9,6 +9,7 @@ import pytest
 from kernels import BY_NAME, CASES, canonical
 
 import hamkernel as hk
+from hamkernel._gram import block_traces, trace
 
 SYMMETRY = 1e-12  # relative: entries are computed twice, in two orders
 NEGATIVE = -1e-10  # smallest eigenvalue relative to the trace: rounding of the eigenvalues
@@ -153,6 +154,31 @@ def test_gram_works_under_jit_vmap_and_grad():
     np.testing.assert_allclose(jax.grad(trace, 1)(ell, X), 0.0, atol=1e-12)
     several = jax.vmap(trace, in_axes=(0, None))(jnp.array([1.0, 2.0]), X)
     np.testing.assert_allclose(several, [6.0, 1.5], rtol=1e-12)
+
+
+def test_the_trace_takes_memory_linear_in_the_points_for_a_kernel_with_a_network():
+    weights = jnp.asarray(np.random.default_rng(0).normal(size=(30, 2)))
+    K = hk.Symplectic(hk.Warp(hk.Gaussian(2.0), lambda x: jnp.tanh(weights @ x)))
+    X = jnp.asarray(np.random.default_rng(1).normal(size=(10, 2)))
+    expected = np.trace(np.asarray(hk.gram(K, X)).reshape(20, 20))
+    np.testing.assert_allclose(trace(K, X), expected, rtol=1e-12)
+
+    def more(function):
+        """Bytes of temporaries that a further point takes."""
+        few, many = (
+            memory(jax.jit(lambda X: function(K, X)), jax.ShapeDtypeStruct((N, 2), X.dtype))
+            for N in (10_000, 110_000)
+        )
+        return (many - few) / 100_000
+
+    assert more(trace) < 50
+    assert more(block_traces) > 500  # all at once
+
+
+def memory(compiled, X) -> int:
+    analysis = compiled.lower(X).compile().memory_analysis()
+    assert analysis is not None
+    return analysis.temp_size_in_bytes
 
 
 def test_new_hyperparameters_do_not_recompile():

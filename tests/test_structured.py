@@ -475,7 +475,7 @@ def test_friction_is_found_where_it_cannot_be_taken_for_energy():
             at = jnp.array([[0.0, 0.5], [1.0, 0.5], [2.0, 0.5], [1.0, -0.5]])
             found = field.part("friction").evaluate(at)[:, 1]
             errors.append(np.abs(found / (-damping * at[:, 1]) - 1).max())
-    assert max(unique) < 0.03  # 0.001 to 0.014 measured
+    assert max(unique) < 0.03  # 0.002 to 0.018 measured
     assert min(ambiguous) > 10  # 50 to 80
 
 
