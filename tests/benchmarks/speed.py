@@ -6,7 +6,7 @@ float64, warm, in one process, peers in turn: the minimum and the median over re
 single run. Same work and same precision; the results are checked to agree first. A peer that is not
 installed (`pip install hamkernel[benchmarks]`) is said to be missing. `--quick` leaves out what
 takes minutes. A target is a ratio of minima in this run; "met" or "MISSED" stands beside it, and
-the ratio of medians. How memory is handed out matters to all of them: see "Speed" in the README.
+the ratio of medians. The environment matters to all of them: see "Speed" in the README.
 """
 
 import argparse
@@ -29,7 +29,7 @@ import products
 import scipy.linalg
 from products import KERNELS, SIGMA
 from solvers import data
-from timing import Timed, in_turn, timed
+from timing import Timed, environment, in_turn, timed
 
 import hamkernel as hk
 
@@ -301,7 +301,7 @@ def main(figure: str | None, quick: bool) -> None:
     print(f"{datetime.date.today()}, {platform.processor() or platform.machine()}, ", end="")
     print(f"{os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}; ", end="")
     print(f"Python {platform.python_version()}, jax {jax.__version__} on {jax.default_backend()}")
-    print(f"GLIBC_TUNABLES={os.environ.get('GLIBC_TUNABLES', '')}")
+    print(environment())
     print(f"  {'':44s} {'minimum':>13s} {'median':>13s}")
     process_section()
     gram_section(repeats=9)

@@ -1,11 +1,22 @@
 """Seconds of what is compared, measured in turn: what slows the machine slows it all."""
 
+import os
 import time
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+
+
+# Threads of OpenBLAS keep a core busy for 30 ms after their work: not on the time of the next.
+_PAUSE = 0.1
+
+
+def environment() -> str:
+    """What changes the times of all: how memory is handed out, how long idle threads stay awake."""
+    names = ["GLIBC_TUNABLES", "OPENBLAS_THREAD_TIMEOUT"]
+    return ", ".join(f"{name}={os.environ.get(name, '')}" for name in names)
 
 
 class Timed(NamedTuple):
@@ -34,6 +45,7 @@ def in_turn(
     seconds = {name: [] for name in runs}
     for _ in range(repeats):
         for name, run in runs.items():
+            time.sleep(_PAUSE)
             start = time.perf_counter()
             jax.block_until_ready(run())
             seconds[name].append(time.perf_counter() - start)

@@ -26,7 +26,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import scipy.linalg
-from timing import Timed, in_turn, timed
+from timing import Timed, environment, in_turn, timed
 
 import hamkernel as hk
 from hamkernel._folds import Partition
@@ -217,6 +217,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="What tuning costs, beside grids.")
     parser.add_argument("--quick", action="store_true", help="smaller samples")
     quick = parser.parse_args().quick
+    print(environment())
     print(f"  {'':58s} {'min':>10s} {'median':>10s}")
     for N in (24, 300):
         against_grids(N, quick)
