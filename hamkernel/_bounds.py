@@ -142,7 +142,7 @@ def _box(
     return value - reach, value + reach
 
 
-def _spacing_and_extent(X: np.ndarray, per_coordinate: bool) -> tuple[np.ndarray, np.ndarray]:
+def _spacing_and_extent(X: np.ndarray, per_coordinate: bool) -> tuple[ArrayLike, ArrayLike]:
     """The typical distance of nearest neighbours and the extent of the data, 1 where it is 0.
 
     The distance of N points in an extent L is taken as L / N: a fair lower bound in any dimension,

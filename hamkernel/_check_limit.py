@@ -8,6 +8,7 @@ from hamkernel._check_pairs import Pairs, lowest, size_of
 
 _SHRINK = 4.0  # ratio of one step to the next
 _SETTLED, _VIOLATED = 0.03, 0.05  # plateau of M(x, x + h); negative eigenvalue of a pair
+_DECADES = 5  # steps in a row in which the blocks of a sound kernel do not grow: 4⁵ = 1000
 _CLOSE = 0.01  # change of k, relative to k, within which a neighbour counts as near
 
 PROFILE = (
@@ -93,12 +94,21 @@ def near_blocks(
     growing &= (both & (ratio > 1.3)).sum(axis=-1) > 0.8 * steps
     # A block of a sound kernel with a second, unresolved scale may grow, but not beyond M(x, x).
     growing &= raw.max(axis=-1) > 2 * size_of(diagonal.block)[:, None]
+    # A scale is passed in a step or two. Growth over decades is a kernel of the distance, also
+    # where a term under the root stops it in the end: M(x, x) is then a delta beside the rest.
+    run = np.zeros(steps.shape, int)
+    longest = run
+    for step in np.moveaxis(both & (ratio > 1.3), -1, 0):
+        run = np.where(step, run + 1, 0)
+        longest = np.maximum(longest, run)
+    endless = longest >= _DECADES
+    growing |= endless
     missed = judged.any(axis=-1) & ~reached.any(axis=-1) & (settled.any(axis=-1) | growing)
 
     broken = np.asarray(~np.isfinite(diagonal.block).all(axis=(-2, -1)))
     broken |= ~np.isfinite(diagonal.gradient).all(axis=-1)
     settled = np.where(settled.any(axis=-1, keepdims=True), settled, blatant)
-    wrong = missed | violated.any(axis=-1) | broken[:, None]
+    wrong = missed | violated.any(axis=-1) | broken[:, None] | endless
     return [
         _Near(index, diagonal.block[i], between.block[i], settled[i], change[i], growing[i], bad)
         for i, (index, bad) in enumerate(zip(near, wrong, strict=True))
@@ -122,9 +132,10 @@ def check_limit(one: _Near, unit: np.ndarray) -> None:
         how = "turns negative" if negative else "grows without end"
         raise ValueError(
             f"k has no second derivative at x = z; the kernel is too rough (Matérn-1/2, "
-            f"exponential/Laplace, …): {where} autodiff returns M(x, x) = {got}, while M(x, x + h) "
-            f"{how} as h → 0. Use a kernel whose mixed derivative exists: Matérn with nu > 1 "
-            "(hk.Matern(nu=1.5), …), hk.Gaussian, hk.RationalQuadratic."
+            "exponential/Laplace, …, also with a small number under the root): "
+            f"{where} autodiff returns M(x, x) = {got}, while M(x, x + h) {how} as h → 0. Use a "
+            "kernel whose mixed derivative exists: Matérn with nu > 1 (hk.Matern(nu=1.5), …), "
+            "hk.Gaussian, hk.RationalQuadratic."
         )
     if len(plateaus) > 1 and float(size_of(plateaus[0] - plateaus[1])) > 0.2 * scale:
         first, second = (_show(p / unit[:, None] / unit) for p in plateaus)

@@ -22,10 +22,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
-from hamkernel._scalar import AbstractScalarKernel, ScalarProduct, ScalarSum, Scaled
+from hamkernel._scalar import AbstractScalarKernel, ScalarProduct, ScalarSum, Scaled, divided
 from hamkernel._scalar_product import Periodic
-from hamkernel._scalar_radial import Gaussian, Matern, RationalQuadratic, divided
-from hamkernel._scalar_transform import Select, Symmetrised, identity, reflection
+from hamkernel._scalar_radial import Gaussian, Matern, RationalQuadratic
+from hamkernel._scalar_transform import Select, Symmetrised
 
 
 class Spectrum(eqx.Module):
@@ -150,7 +150,7 @@ def _(k: Periodic, n: int, count: int, key, dtype):
     index = jax.vmap(jnp.searchsorted)(cumulative, uniform)  # (n, F)
     ratio = jnp.take_along_axis(probability, index, 1) / jnp.take_along_axis(fixed, index, 1)
     harmonic = (index - _HARMONICS // 2).astype(dtype).T  # (F, n)
-    frequencies = jax.vmap(divided, in_axes=(0, None))(2 * jnp.pi * harmonic, k.period)
+    frequencies = jax.vmap(lambda j: divided(2 * jnp.pi * j, k.period, "period"))(harmonic)
     return _one(frequencies, jnp.prod(ratio, axis=0))
 
 
@@ -204,10 +204,9 @@ def _(k: Select, n: int, count: int, key, dtype):
 @spectra.register
 def _(k: Symmetrised, n: int, count: int, key, dtype):
     inner = spectra(k.kernel, n, count, key, dtype)
-    parity = int(k.characters[-1])
-    if k.maps != (identity, reflection) or any(s.parity == -parity for s in inner):
+    if k.parity is None or any(s.parity == -k.parity for s in inner):
         raise TypeError(
             "RandomFeatures knows only the reflection x -> -x, once: hk.Odd(K) or hk.Even(K). "
             "For other groups use hk.Cholesky() or hk.Nystrom()."
         )
-    return tuple(Spectrum(s.frequencies, s.weights, parity) for s in inner)
+    return tuple(Spectrum(s.frequencies, s.weights, k.parity) for s in inner)

@@ -7,7 +7,7 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._gram import expansion, potential
@@ -16,7 +16,7 @@ from hamkernel._show import described
 from hamkernel._structured import AbstractMatrixKernel, Sum
 
 Field = TypeVar("Field", bound="AbstractField")
-Scalar = Callable[[Float[Array, " n"]], Float[Array, ""]]
+Scalar = Callable[[Num[ArrayLike, " n"]], Float[Array, ""]]
 
 
 class AbstractField(eqx.Module):
@@ -56,14 +56,14 @@ class AbstractField(eqx.Module):
         return jnp.linalg.norm(self.residual) if kept is None else kept
 
     @abc.abstractmethod
-    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
         """The velocity f(x)."""
 
     @abc.abstractmethod
-    def unanchored_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+    def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """The potential with the constant that the representer gives it."""
 
-    def evaluate(self, X: ArrayLike) -> Float[Array, "N n"]:
+    def evaluate(self, X: Num[ArrayLike, "N n"]) -> Float[Array, "N n"]:
         """The velocities at many states, as `jax.vmap(field)(X)` but in bounded memory.
 
         Args:
@@ -84,8 +84,8 @@ class AbstractField(eqx.Module):
     def part(self: Field, which: int | str) -> Field:
         """The field of one term of a sum of kernels, by position or name.
 
-        The parts add up to the field; an anchor of the whole is not theirs. `residual` and `norm`
-        are those of the whole fit.
+        The parts add up to the field, and the squares of their norms to that of its norm; an anchor
+        of the whole is not theirs. `residual` and `info` are those of the whole fit.
 
         Raises:
             KeyError: there is no such part (with the choices).
@@ -128,10 +128,14 @@ class AbstractField(eqx.Module):
             )
         return self.potential
 
-    def _state(self, x: ArrayLike) -> Float[Array, " n"]:
+    def _state(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+        if self.offset.shape:
+            raise ValueError(
+                f"this is a batch of {self.offset.size} fields: jax.vmap(lambda f: f(x))(fields)."
+            )
         return require.point(x, self.dimension).astype(self.offset.dtype)
 
-    def anchored(self: Field, x0: ArrayLike, value: ArrayLike = 0.0) -> Field:
+    def anchored(self: Field, x0: Num[ArrayLike, " n"], value: ArrayLike = 0.0) -> Field:
         """The same field with the constant of its potential set so that u(x₀) = value.
 
         Args:
@@ -169,6 +173,12 @@ class AbstractField(eqx.Module):
             for k in self.kernel.scalar_kernels
             for support in k.supports(n)
         )
+
+
+def root(square: Float[Array, ""]) -> Float[Array, ""]:
+    """√square, zero with a derivative of zero where rounding or zero data leave no square."""
+    nothing = square <= 0
+    return jnp.where(nothing, 0.0, jnp.sqrt(jnp.where(nothing, jnp.ones_like(square), square)))
 
 
 def _potential_of(field, x):
@@ -231,19 +241,21 @@ class KernelField(AbstractField):
 
     @property
     def dimension(self) -> int:
-        return self.points.shape[1]
+        return self.points.shape[-1]
 
-    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
         x = self._state(x)
         return expansion(self.kernel, x, self.points, self.coefficients)
 
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         return compiled_product(self.kernel, X, self.points, self.coefficients)
 
-    def unanchored_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+    def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         x = self._state(x)
         return potential(self.kernel, x, self.points, self.coefficients)
 
     def _term(self, kernel: Sum, position: int) -> "KernelField":
-        parts = kernel.terms[position], jnp.zeros_like(self.offset)
-        return eqx.tree_at(lambda f: (f.kernel, f.offset), self, parts)
+        term, Z, A = kernel.terms[position], self.points, self.coefficients
+        norm = root(jnp.sum(A * compiled_product(term, Z, Z, A)))  # ‖f‖² = aᵀGa
+        parts = term, norm, jnp.zeros_like(self.offset)
+        return eqx.tree_at(lambda f: (f.kernel, f.norm, f.offset), self, parts)

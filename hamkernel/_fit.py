@@ -1,13 +1,49 @@
 """`fit`: from data to a learned field."""
 
-from jaxtyping import ArrayLike, Num
+from typing import overload
+
+from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._field import AbstractField
+from hamkernel._devices import rows_of
+from hamkernel._field import AbstractField, KernelField
 from hamkernel._gram import matrix_kernel
-from hamkernel._solve import AbstractSolver
-from hamkernel._solve_choice import chosen
+from hamkernel._memory import dense_bytes, memory_bytes
+from hamkernel._solve import COPIES, AbstractSolver, Cholesky, Learned
+from hamkernel._solve_cg import ConjugateGradient
 from hamkernel._structured import AbstractMatrixKernel
+
+
+@overload
+def fit(
+    K: AbstractMatrixKernel,
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
+    regularization: ArrayLike = 1e-4,
+    *,
+    solver: None = None,
+    throw: bool = True,
+) -> KernelField: ...
+@overload
+def fit(
+    K: AbstractMatrixKernel,
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
+    regularization: ArrayLike = 1e-4,
+    *,
+    solver: AbstractSolver[Learned],
+    throw: bool = True,
+) -> Learned: ...
+@overload
+def fit(
+    K: AbstractMatrixKernel,
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
+    regularization: ArrayLike = 1e-4,
+    *,
+    solver: AbstractSolver | None,
+    throw: bool = True,
+) -> AbstractField: ...
 
 
 def fit(
@@ -58,5 +94,13 @@ def fit(
     X, Y = require.data(X, Y)
     K.check_dimension(X.shape[1])
     regularization = require.ridge(regularization, X.dtype)
-    require.warn_of_float32(X, stacklevel=3)
-    return chosen(solver, X).fit(K, X, Y, regularization, throw)
+    require.warn_of_float32(X)
+    solver = _default(X) if solver is None else solver
+    return solver.fit(K, X, Y, regularization, throw)
+
+
+def _default(X: Float[Array, "N n"]) -> AbstractSolver[KernelField]:
+    """Cholesky where it takes at most half of the memory of one device, which has all the data."""
+    needed, memory = dense_bytes(X.size, X.size, X.dtype, COPIES), memory_bytes()
+    fits = memory is None or needed <= memory / 2
+    return Cholesky() if fits and rows_of(X) is None else ConjugateGradient()

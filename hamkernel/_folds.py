@@ -1,5 +1,6 @@
 """Which points cross-validation holds out together."""
 
+from collections.abc import Sequence
 from typing import Literal
 
 import jax.numpy as jnp
@@ -8,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from hamkernel import _require as require
 
-Folds = int | Literal["loo"] | Int[ArrayLike, " N"]
+Folds = int | Literal["loo"] | Int[ArrayLike, " N"] | Sequence[int]
 
 
 class Partition:

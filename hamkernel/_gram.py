@@ -5,7 +5,7 @@ import reprlib
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._devices import Rows, automatic, on_each
@@ -15,7 +15,7 @@ from hamkernel._structured import AbstractMatrixKernel
 
 
 def gram(
-    K: AbstractMatrixKernel, X: ArrayLike, Z: ArrayLike | None = None
+    K: AbstractMatrixKernel, X: Num[ArrayLike, "N n"], Z: Num[ArrayLike, "M n"] | None = None
 ) -> Float[Array, "N n M n"]:
     """The Gram G[i, a, j, b] = K(xᵢ, zⱼ)[a, b].
 

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._devices import Rows, as_given, rows_of, split, sum_of_columns
@@ -27,7 +27,7 @@ ROWS, COLUMNS = 1000, 1000
 
 
 def gram_operator(
-    K: AbstractMatrixKernel, X: ArrayLike, Z: ArrayLike | None = None
+    K: AbstractMatrixKernel, X: Num[ArrayLike, "N n"], Z: Num[ArrayLike, "M n"] | None = None
 ) -> "GramOperator":
     """The Gram of K as a linear operator that maps coefficients (M, n) to fields (N, n).
 
@@ -83,7 +83,7 @@ class GramOperator(lx.AbstractLinearOperator):
     def columns(self) -> Float[Array, "M n"]:
         return self.X if self.Z is None else self.Z
 
-    def mv(self, vector: Float[Array, "M n"]) -> Float[Array, "N n"]:
+    def mv(self, vector: Num[ArrayLike, "M n"]) -> Float[Array, "N n"]:
         """G a, shape (N, n).
 
         Raises:

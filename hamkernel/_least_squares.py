@@ -29,7 +29,7 @@ def triangle(
     Y: Float[Array, "N n"],
     ridge: Float[Array, ""],
     spread: Rows | None = None,
-) -> Float[Array, "r+1 r+1"]:
+) -> Float[Array, "k k"]:
     """The upper triangular factor of √ridge [I 0] above [Φ y]: R, and Qᵀy beside it.
 
     From the start with the ridge: a QR of Φ alone, where it has fewer rows than columns, divides by

@@ -1,5 +1,6 @@
 """What `tune` minimises: a validation loss of the dense or of the low-rank fit, or the caller's."""
 
+import dataclasses
 from collections.abc import Callable
 from typing import Literal
 
@@ -48,9 +49,14 @@ class SearchCriterion(eqx.Module):
     """The function to minimise. Losses are searched by their logarithm, which has no scale."""
 
     fn: Callable[..., Float[Array, ""]]
+    low_rank: Callable[..., Float[Array, ""]] | None  # the same of a low-rank fit, its basis first
     partition: Partition | None = eqx.field(static=True)
     logarithmic: bool = eqx.field(static=True)
-    own: bool = eqx.field(static=True, default=False)  # the caller's: it may need all the data
+
+    @property
+    def own(self) -> bool:
+        """Whether it is the caller's, which may need all the data."""
+        return self.low_rank is None
 
     def value(self, K, X, Y, regularization) -> Float[Array, ""]:
         extra = () if self.partition is None else (self.partition,)
@@ -83,32 +89,35 @@ class SearchCriterion(eqx.Module):
 
     def with_basis(self, basis: AbstractBasis) -> "SearchCriterion":
         """The same criterion of the low-rank fit in this basis."""
-        low_rank = {
-            partition_loss: low_rank_partition_loss,
-            generalized_loss: low_rank_generalized_loss,
-            _negative_log_likelihood: _negative_low_rank_log_likelihood,
-        }[self.fn.func]  # type: ignore[attr-defined]
-        fn = jax.tree_util.Partial(low_rank, basis, **self.fn.keywords)  # type: ignore[attr-defined]
-        return SearchCriterion(fn, self.partition, self.logarithmic)
+        assert self.low_rank is not None
+        return dataclasses.replace(self, fn=jax.tree_util.Partial(self.low_rank, basis))
 
     def on(self, rows: np.ndarray) -> "SearchCriterion":
         """The same criterion for a subset of the points."""
         if self.partition is None:
             return self
         partition = Partition(len(rows), self.partition.labels[rows])
-        return SearchCriterion(self.fn, partition, self.logarithmic, self.own)
+        return dataclasses.replace(self, partition=partition)
 
 
 def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> SearchCriterion:
+    """What the objective of `tune` means for N points.
+
+    A public loss is what its name is: it takes the folds and is searched by its logarithm.
+    """
     partial = jax.tree_util.Partial
-    # A public loss is what its name is: it takes the folds and is searched by its logarithm.
     if objective == "cross_validation" or objective is cross_validation_loss:
-        return SearchCriterion(partial(partition_loss), Partition(N, folds), logarithmic=True)
+        losses = partial(partition_loss), partial(low_rank_partition_loss)
+        return SearchCriterion(*losses, Partition(N, folds), logarithmic=True)
     if objective == "generalized_cross_validation" or objective is generalized_cross_validation:
-        loss = partial(generalized_loss, least_free=LEAST_FREE)
-        return SearchCriterion(loss, None, logarithmic=True)
+        losses = (
+            partial(generalized_loss, least_free=LEAST_FREE),
+            partial(low_rank_generalized_loss, least_free=LEAST_FREE),
+        )
+        return SearchCriterion(*losses, None, logarithmic=True)
     if objective == "marginal_likelihood":
-        return SearchCriterion(partial(_negative_log_likelihood), None, logarithmic=False)
+        losses = partial(_negative_log_likelihood), partial(_negative_low_rank_log_likelihood)
+        return SearchCriterion(*losses, None, logarithmic=False)
     if objective is log_marginal_likelihood:
         raise TypeError(
             "log_marginal_likelihood is to be large and an objective is to be small: pass "
@@ -120,7 +129,7 @@ def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> Sear
             "'marginal_likelihood' or a function (K, X, Y, regularization) -> (); "
             f"got {objective!r}."
         )
-    return SearchCriterion(as_pytree(objective), None, logarithmic=False, own=True)
+    return SearchCriterion(as_pytree(objective), None, None, logarithmic=False)
 
 
 def _negative_log_likelihood(K, X, Y, regularization):

@@ -8,6 +8,7 @@ by NumPy when they are concrete, for it compiles nothing; under `jax.jit` the sa
 import inspect
 import operator
 import reprlib
+import sys
 import warnings
 from collections.abc import Callable
 from contextlib import suppress
@@ -18,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Key
 
 
 def is_concrete(*values: object) -> bool:
@@ -100,15 +101,44 @@ def single_or_double(dtype: Any, whose: str) -> None:
         raise TypeError(f"{whose} dtype {dtype}: float32 or float64 is needed.")
 
 
-def warn_of_float32(X: Array, stacklevel: int) -> None:
+def warn(message: str) -> None:
+    """Warn, with the line of the user.
+
+    Equinox puts frames of its own between methods, so that the level is no constant. From Python
+    3.12 on `skip_file_prefixes` of `warnings.warn` does this.
+    """
+    level, frame = 1, sys._getframe()
+    while frame.f_back:
+        package = frame.f_globals.get("__name__", "").split(".")[0]
+        if package not in ("hamkernel", "equinox"):
+            break
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, stacklevel=level)
+
+
+def warn_of_float32(X: Array) -> None:
     """Say what a fit in float32 may be expected to do."""
     if X.dtype == jnp.float32:
-        warnings.warn(
+        warn(
             "fitting in float32: expect three digits, and a failed factorisation for a ridge "
             "below about 1e-6 of the Gram. For float64 run "
-            "jax.config.update('jax_enable_x64', True) first and pass float64 data.",
-            stacklevel=stacklevel,
+            "jax.config.update('jax_enable_x64', True) first and pass float64 data."
         )
+
+
+def key(key: Any) -> Key[Array, ""]:
+    """One random key, of the newer kind also where one of the older, `jax.random.PRNGKey`, came."""
+    if getattr(key, "dtype", None) == jnp.uint32 and jnp.ndim(key):
+        key = jax.random.wrap_key_data(key)
+    dtype = getattr(key, "dtype", None)
+    if dtype is None or not jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        raise TypeError(f"key must be a key of JAX, such as jax.random.key(0); got {key!r}.")
+    if key.shape:
+        raise ValueError(
+            f"key is an array of keys of shape {key.shape}; one is needed. For many seeds map over "
+            "them, jax.vmap(lambda key: ...)(keys)."
+        )
+    return key
 
 
 def positive(x: ArrayLike, name: str, cure: str = "") -> Array:

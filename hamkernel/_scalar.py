@@ -217,6 +217,27 @@ def one_point(x: ArrayLike) -> Float[Array, " n"]:
     return x
 
 
+def divided(
+    x: Float[Array, " n"], scale: Float[Array, "..."], name: str = "lengthscale"
+) -> Float[Array, " n"]:
+    """x/scale in the dtype of x, for one point; the scale is a number, or one per coordinate."""
+    x = one_point(x)
+    if scale.ndim and scale.shape != x.shape:
+        raise ValueError(
+            f"the kernel has {scale.size} values of {name} and the point has shape {x.shape}: "
+            "give one number, or one for each coordinate that the kernel sees."
+        )
+    return x / scale.astype(x.dtype)
+
+
+def log_per_coordinate(value: ArrayLike, name: str, cure: str = "") -> Float[Array, "..."]:
+    """The stored form of a positive hyperparameter that is a number, or one per coordinate."""
+    array = require.positive(value, name, cure)
+    if array.ndim > 1:
+        raise ValueError(f"{name} has shape {array.shape}; it must be a number or a vector (n,).")
+    return jnp.log(array)
+
+
 def _name(fn: Callable[..., Any]) -> str:
     fn = getattr(fn, "func", fn)
     return getattr(fn, "__name__", type(fn).__name__)

@@ -5,8 +5,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._scalar import AbstractScalarKernel, Invariance, one_point
-from hamkernel._scalar_radial import divided, log_lengthscale
+from hamkernel._scalar import (
+    AbstractScalarKernel,
+    Invariance,
+    divided,
+    log_per_coordinate,
+    one_point,
+)
 
 
 class Polynomial(AbstractScalarKernel):
@@ -20,7 +25,8 @@ class Polynomial(AbstractScalarKernel):
         offset: c > 0, in squared units of the states.
 
     Raises:
-        ValueError: `degree` is no positive integer, `offset` is not positive and finite.
+        ValueError: `degree` or `offset` is not positive, or `offset` not finite. TypeError:
+            `degree` is not whole.
 
     Source: Rasmussen & Williams (2006), section 4.2.2.
     """
@@ -29,10 +35,8 @@ class Polynomial(AbstractScalarKernel):
     degree: int = eqx.field(static=True)
 
     def __init__(self, degree: int = 4, offset: ArrayLike = 1.0):
-        if isinstance(degree, bool) or int(degree) != degree or degree < 1:
-            raise ValueError(f"Polynomial needs an integer degree >= 1, got {degree!r}.")
         self.log_offset = jnp.log(require.positive_scalar(offset, "offset"))
-        self.degree = int(degree)
+        self.degree = require.count(degree, "degree")
 
     @property
     def offset(self) -> Float[Array, ""]:
@@ -71,11 +75,8 @@ class Periodic(AbstractScalarKernel):
     log_lengthscale: Float[Array, "..."]
 
     def __init__(self, period: ArrayLike = 1.0, lengthscale: ArrayLike = 1.0):
-        period = require.positive(period, "period")
-        if period.ndim > 1:
-            raise ValueError(f"period has shape {period.shape}; it must be a number or (n,).")
-        self.log_period = jnp.log(period)
-        self.log_lengthscale = log_lengthscale(lengthscale)
+        self.log_period = log_per_coordinate(period, "period")
+        self.log_lengthscale = log_per_coordinate(lengthscale, "lengthscale")
 
     @property
     def period(self) -> Float[Array, "..."]:
@@ -92,7 +93,7 @@ class Periodic(AbstractScalarKernel):
         return jnp.exp(self._features(x) @ (jnp.tile(weight, 2) * self._features(z)) - weight.sum())
 
     def _features(self, x: Float[Array, " n"]) -> Float[Array, " 2*n"]:
-        angle = divided(2 * jnp.pi * x, self.period)
+        angle = divided(2 * jnp.pi * x, self.period, "period")
         return jnp.concatenate([jnp.cos(angle), jnp.sin(angle)])
 
     @property

@@ -17,7 +17,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._scalar import AbstractScalarKernel, Invariance, one_point
+from hamkernel._scalar import AbstractScalarKernel, Invariance, divided, log_per_coordinate
+
+_LENGTH = "It is a length in the units of the states."
 
 
 def squared_distance(x: Float[Array, " n"], z: Float[Array, " n"], cut: bool) -> Float[Array, ""]:
@@ -65,28 +67,6 @@ class AbstractRadialKernel(AbstractScalarKernel):
         return (frozenset(range(n)),)
 
 
-def divided(x: Float[Array, " n"], lengthscale: Float[Array, "..."]) -> Float[Array, " n"]:
-    """x/ℓ in the dtype of x, for one point."""
-    x = one_point(x)
-    if lengthscale.ndim and lengthscale.shape != x.shape:
-        raise ValueError(
-            f"the kernel has {lengthscale.size} lengthscales and the point has shape {x.shape}: "
-            "give one lengthscale, or one for each coordinate that the kernel sees."
-        )
-    return x / lengthscale.astype(x.dtype)
-
-
-def log_lengthscale(lengthscale: ArrayLike) -> Float[Array, "..."]:
-    """The stored form of a lengthscale, which must be () or (n,) and positive."""
-    cure = "It is a length in the units of the states."
-    array = require.positive(lengthscale, "lengthscale", cure)
-    if array.ndim > 1:
-        raise ValueError(
-            f"lengthscale has shape {array.shape}; it must be a number or a vector (n,)."
-        )
-    return jnp.log(array)
-
-
 class Gaussian(AbstractRadialKernel):
     """The Gaussian kernel, k(x, z) = exp(−‖(x − z)/ℓ‖²/2).
 
@@ -104,7 +84,7 @@ class Gaussian(AbstractRadialKernel):
     of_distance: ClassVar[bool] = False
 
     def __init__(self, lengthscale: ArrayLike = 1.0):
-        self.log_lengthscale = log_lengthscale(lengthscale)
+        self.log_lengthscale = log_per_coordinate(lengthscale, "lengthscale", _LENGTH)
 
     def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
         return jnp.exp(-0.5 * s)
@@ -117,7 +97,9 @@ class Matern(AbstractRadialKernel):
 
     Args:
         nu: 1.5, 2.5, 3.5, …; fixed, not trained. A field of this kernel is differentiable
-            ⌈ν⌉ − 2 times, so 2.5 is the roughest whose flow has a continuous Jacobian.
+            ⌈ν⌉ − 2 times, so 2.5 is the roughest whose flow has a continuous Jacobian. Second
+            derivatives of `evaluate` and of products with more than 1000 points are NaN in
+            reverse mode where points coincide, and right in forward mode, `jax.jacfwd`.
         lengthscale: ℓ > 0 in the units of the states; a number, or an array (n,).
 
     Raises:
@@ -140,11 +122,14 @@ class Matern(AbstractRadialKernel):
             )
         if not (nu > 0.5 and nu % 1 == 0.5):  # refuses NaN and inf as well
             raise ValueError(f"Matern needs nu = 1.5, 2.5, 3.5, ...; got {nu}.")
-        self.log_lengthscale = log_lengthscale(lengthscale)
+        self.log_lengthscale = log_per_coordinate(lengthscale, "lengthscale", _LENGTH)
         self.nu = nu
 
     def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
         return _matern(round(self.nu - 0.5), 2 * self.nu * s)
+
+
+_FAR = 1e8  # of r²: e^(−r) is zero, and the polynomial finite
 
 
 # With ψ_p(t) the Matérn function of order p + 1/2 at r = √t, the identity
@@ -155,10 +140,10 @@ class Matern(AbstractRadialKernel):
 # x − z that vanish faster, so the value 0 at r = 0 gives the limit of the whole expression.
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _matern(p: int, t: Float[Array, ""]) -> Float[Array, ""]:
-    r = jnp.sqrt(jnp.maximum(t, jnp.zeros_like(t)))
+    r = jnp.sqrt(jnp.clip(t, 0.0, _FAR))
     polynomial = jnp.zeros_like(t)
     for i in range(p + 1):  # Horner's scheme in 2r, the highest power first
-        polynomial = polynomial * (2 * r) + math.comb(p, i) * math.perm(p + i, i) / 1.0
+        polynomial = polynomial * (2 * r) + math.comb(p, i) * float(math.perm(p + i, i))
     return polynomial * jnp.exp(-r) * (math.factorial(p) / math.factorial(2 * p))
 
 
@@ -197,7 +182,7 @@ class RationalQuadratic(AbstractRadialKernel):
 
     def __init__(self, alpha: ArrayLike = 1.0, lengthscale: ArrayLike = 1.0):
         self.log_alpha = jnp.log(require.positive_scalar(alpha, "alpha"))
-        self.log_lengthscale = log_lengthscale(lengthscale)
+        self.log_lengthscale = log_per_coordinate(lengthscale, "lengthscale", _LENGTH)
 
     @property
     def alpha(self) -> Float[Array, ""]:

@@ -149,11 +149,18 @@ class Symmetrised(AbstractScalarKernel):
         return sum(values[1:], start=values[0]) / len(values)
 
     @property
+    def parity(self) -> int | None:
+        """±1 with u(−x) = ±u(x), where the group is {1, −1}; None for other groups."""
+        if set(self.maps) != {identity, reflection}:
+            return None
+        return int(self.characters[self.maps.index(reflection)])
+
+    @property
     def invariance(self) -> Invariance:
         return Invariance.REFLECTION & self.kernel.invariance
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
-        if set(self.maps) <= {identity, reflection}:  # which mix no coordinates
+        if self.parity is not None:  # whose maps mix no coordinates
             return self.kernel.supports(n)
         return (frozenset(range(n)),)
 
@@ -176,8 +183,8 @@ def with_parity(kernel: AbstractScalarKernel, parity: int) -> AbstractScalarKern
     Raises:
         ValueError: a term has the other parity already, so that only zero is left of it.
     """
-    if isinstance(kernel, Symmetrised) and set(kernel.maps) == {identity, reflection}:
-        if kernel.characters[kernel.maps.index(reflection)] != parity:
+    if isinstance(kernel, Symmetrised) and kernel.parity is not None:
+        if kernel.parity != parity:
             raise ValueError("Odd(Even(K)) and Even(Odd(K)) have no fields but zero: choose one.")
         return kernel
     if isinstance(kernel, ScalarSum):
@@ -196,7 +203,7 @@ def with_parity(kernel: AbstractScalarKernel, parity: int) -> AbstractScalarKern
 
 class _ParityRemoved(NamedTuple):
     kernel: AbstractScalarKernel
-    parity: float
+    parity: int
     one_sided: bool
 
 
@@ -205,8 +212,8 @@ def parity_removed(kernel: AbstractScalarKernel) -> _ParityRemoved | None:
 
     Where it is one-sided, it is (k(x, z) + parity k(x, −z))/2.
     """
-    if isinstance(kernel, Symmetrised) and kernel.maps == (identity, reflection):
-        return _ParityRemoved(kernel.kernel, kernel.characters[1], kernel.one_sided)
+    if isinstance(kernel, Symmetrised) and kernel.parity is not None:
+        return _ParityRemoved(kernel.kernel, kernel.parity, kernel.one_sided)
     if isinstance(kernel, Scaled | Select):
         inner = parity_removed(kernel.kernel)
         return inner and inner._replace(

@@ -12,12 +12,12 @@ from hamkernel._search_space import SearchSpace
 
 
 class Runs(eqx.Module):
-    """The best point of each run."""
+    """The best point of a run; of several with a leading axis."""
 
-    u: Float[Array, "starts P"]
-    value: Float[Array, " starts"]
-    converged: Bool[Array, " starts"]
-    steps: Int[Array, " starts"]
+    u: Float[Array, "*starts P"]
+    value: Float[Array, "*starts"]
+    converged: Bool[Array, "*starts"]
+    steps: Int[Array, "*starts"]
 
 
 decode = eqx.filter_jit(lambda space, u, X: space.decode(u, X))
@@ -52,11 +52,11 @@ def search(space, criterion, X, Y, scale: float, optimiser, starts: int, max_ste
 
 @eqx.filter_jit
 def finish(space, criterion, X, Y, runs: Runs, optimiser, max_steps: int) -> Runs:
-    """The runs with their losses on all points, the best of them finished there."""
+    """The runs with their losses on all points, the best one finished there."""
     fine = _Objective(space, criterion, X, Y, 1.0)
     runs = _sorted(eqx.tree_at(lambda r: r.value, runs, jax.lax.map(fine, runs.u)))
-    finished = jax.lax.map(lambda u: _run(fine, u, optimiser, max_steps), runs.u[:FINISHERS])
-    return jax.tree.map(lambda new, old: old.at[:FINISHERS].set(new), finished, runs)
+    finished = _run(fine, runs.u[0], optimiser, max_steps)
+    return jax.tree.map(lambda new, old: old.at[0].set(new), finished, runs)
 
 
 def _sorted(runs: Runs) -> Runs:
@@ -65,7 +65,6 @@ def _sorted(runs: Runs) -> Runs:
 
 
 DESIGN_POINTS = 256  # in the box, from which the starts are chosen
-FINISHERS = 1  # runs that are finished on all points
 
 
 class _Objective(eqx.Module):

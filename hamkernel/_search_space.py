@@ -152,7 +152,7 @@ class SearchSpace(eqx.Module):
         share = jnp.where(jnp.isfinite(share), share, 0.5)
         return jnp.arcsin(2 * share - 1)[jnp.asarray(self.free)]
 
-    def at_bounds(self, u: Float[Array, " P"]) -> tuple[str, ...]:
+    def at_bounds(self, u: Float[np.ndarray, " P"]) -> tuple[str, ...]:
         """The names of the hyperparameters that rest on a bound."""
         at_edge = np.abs(np.sin(u)) > 1 - 2 * _EDGE
         return tuple(dict.fromkeys(self.names[i] for i in np.array(self.free)[at_edge]))

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
 
@@ -30,7 +30,8 @@ class _Autonomous(eqx.Module):
 
     @property
     def is_separable(self) -> bool:
-        return bool(getattr(self.field, "is_separable", False))
+        field = getattr(self.field, "__wrapped__", self.field)  # behind jax.jit
+        return bool(getattr(field, "is_separable", False))
 
     def __call__(self, t: Any, x: Float[Array, " n"], args: Any) -> Float[Array, " n"]:
         del t, args
@@ -39,10 +40,10 @@ class _Autonomous(eqx.Module):
 
 def simulate(
     field: Callable[[Float[Array, " n"]], Float[Array, " n"]],
-    x0: Float[ArrayLike, " n"],
-    ts: Float[ArrayLike, " T"],
+    x0: Num[ArrayLike, " n"],
+    ts: Num[ArrayLike, " T"],
     solver: "diffrax.AbstractSolver | None" = None,
-    dt: float | Float[Array, ""] | None = None,
+    dt: ArrayLike | None = None,
     *,
     rtol: float | None = None,
     atol: float | None = None,
@@ -236,7 +237,7 @@ def _tolerance(given: float | None, default: float, dtype: Any) -> Float[Array, 
         return require.positive_scalar(given, "rtol, and atol,").astype(dtype)
 
 
-def _bound(counts: Int[Array, " T-1"], max_steps: int | None) -> int:
+def _bound(counts: Int[Array, " intervals"], max_steps: int | None) -> int:
     """A number of steps that no save interval exceeds, where the counts are known."""
     if not require.is_concrete(counts):
         return max_steps or _MAX_STEPS

@@ -1,6 +1,7 @@
 """Regularised least squares by a dense factorisation: (G + NλI) a = y."""
 
 import abc
+from typing import Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -10,13 +11,16 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._devices import on_one_device
-from hamkernel._field import AbstractField, KernelField, SolverInfo
+from hamkernel._field import AbstractField, KernelField, SolverInfo, root
 from hamkernel._gram import assemble
 from hamkernel._gram_operator import product
+from hamkernel._memory import refuse_beyond_memory
 from hamkernel._structured import AbstractMatrixKernel
 
+Learned = TypeVar("Learned", bound=AbstractField, covariant=True)
 
-class AbstractSolver(eqx.Module):
+
+class AbstractSolver(eqx.Module, Generic[Learned]):
     """How `fit` finds the field."""
 
     @abc.abstractmethod
@@ -27,7 +31,7 @@ class AbstractSolver(eqx.Module):
         Y: Float[Array, "N n"],
         regularization: Float[Array, ""],
         throw: bool = True,
-    ) -> AbstractField:
+    ) -> Learned:
         """The field for data that has been checked; of NaN if it fails and does not `throw`."""
 
 
@@ -36,11 +40,19 @@ class AbstractSolver(eqx.Module):
 _SOLVED = 1e-2
 
 
-class Cholesky(AbstractSolver):
+# Matrices of the size of the Gram that a dense fit holds: Gram, Gram with ridge, factor.
+COPIES = 3
+
+
+class Cholesky(AbstractSolver[KernelField]):
     """The dense Gram and its Cholesky factor: exact, O((N n)³) time and O((N n)²) memory.
 
     What rounding left of the system is `field.info.relative_residual`; a fit in which that is more
     than one per cent of the velocities is refused.
+
+    Raises:
+        ValueError, from `fit`: the matrices do not fit in memory. RuntimeError, from `fit`: the
+            ridge is too small for this Gram (the text says what to do).
     """
 
     def fit(
@@ -51,6 +63,7 @@ class Cholesky(AbstractSolver):
         regularization: Float[Array, ""],
         throw: bool = True,
     ) -> KernelField:
+        _check_memory(X)
         X, Y = on_one_device("X", X), on_one_device("Y", Y)
         A, residual, norm, left = _representer(K, X, Y, regularization)
 
@@ -83,6 +96,15 @@ class Cholesky(AbstractSolver):
         )
 
 
+def _check_memory(X: Float[Array, "N n"]) -> None:
+    cure = (
+        "Use solver=hk.ConjugateGradient(), which is exact, or solver=hk.Nystrom(), which is "
+        "faster and approximate to a stated tolerance."
+    )
+    what = f"a dense fit of N = {len(X)} points with n = {X.shape[1]} coordinates"
+    refuse_beyond_memory(what, X.size, X.size, X.dtype, COPIES, cure)
+
+
 @eqx.filter_jit
 def _representer(K, X, Y, regularization):
     """Coefficients, residual y − Ga = Nλa, the norm with ‖f‖² = aᵀGa, and the relative residual."""
@@ -101,12 +123,6 @@ def relative(error: Array, of: Array) -> Float[Array, ""]:
     error, of = jax.lax.stop_gradient((error, of))
     scale = jnp.linalg.norm(of)
     return jnp.linalg.norm(error) / jnp.where(scale > 0, scale, jnp.ones_like(scale))
-
-
-def root(square: Float[Array, ""]) -> Float[Array, ""]:
-    """√square, zero with a derivative of zero where rounding or zero data leave no square."""
-    nothing = square <= 0
-    return jnp.where(nothing, 0.0, jnp.sqrt(jnp.where(nothing, jnp.ones_like(square), square)))
 
 
 def solve_positive(

@@ -20,10 +20,10 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._devices import as_given, rows_of, split
-from hamkernel._field import KernelField, SolverInfo
+from hamkernel._field import KernelField, SolverInfo, root
 from hamkernel._gram import trace
 from hamkernel._gram_operator import product
-from hamkernel._solve import AbstractSolver, relative, root
+from hamkernel._solve import AbstractSolver, relative
 from hamkernel._solve_low_rank import INDEFINITE, Columns, factor, truncated, whitening
 from hamkernel._solve_nystrom import Nystrom
 from hamkernel._streaming_sums import normal
@@ -31,7 +31,7 @@ from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._trained import constant
 
 
-class ConjugateGradient(AbstractSolver):
+class ConjugateGradient(AbstractSolver[KernelField]):
     """The exact fit without the Gram: preconditioned conjugate gradients on its products.
 
     For N where the dense Gram does not fit in memory, and kernels for which `Nystrom` alone is not
@@ -39,35 +39,42 @@ class ConjugateGradient(AbstractSolver):
     `field.info.iterations` and `.relative_residual`, computed anew at the end.
 
     Args:
-        tolerance: the largest ‖y − (G + NλI)a‖/‖y‖, dimensionless.
+        tolerance: the largest ‖y − (G + NλI)a‖/‖y‖, dimensionless; 1e-8 if None, and 1e-5 for data
+            in float32.
         max_iterations: after which the solve has failed.
         preconditioner: the low-rank Gram that preconditions. Its tolerance may be large, since the
             condition is at most 1 + truncation; more landmarks mean fewer iterations.
 
     Raises:
-        ValueError: an argument is not positive. TypeError: `max_iterations` is not whole.
-            RuntimeError, from `fit`: no convergence (the text says what to do).
+        ValueError: an argument is not positive. TypeError: `max_iterations` is not whole, or the
+            preconditioner no `Nystrom`. RuntimeError, from `fit`: no convergence (the text says
+            what to do).
 
     Source: Frangella, Tropp & Udell (2023) for the preconditioner; Díaz et al. (2023),
         arXiv 2304.12465, for randomly pivoted Cholesky in it.
     """
 
-    tolerance: float = eqx.field(static=True)
+    tolerance: float | None = eqx.field(static=True)
     max_iterations: int = eqx.field(static=True)
     preconditioner: Nystrom
 
     def __init__(
         self,
-        tolerance: float = 1e-8,
+        tolerance: float | None = None,
         max_iterations: int = 100,
         preconditioner: Nystrom | None = None,
     ):
-        if not (tolerance > 0 and math.isfinite(tolerance)):
+        if tolerance is not None and not (tolerance > 0 and math.isfinite(tolerance)):
             raise ValueError(f"tolerance must be positive and finite, got {tolerance}.")
-        self.tolerance = float(tolerance)
+        self.tolerance = None if tolerance is None else float(tolerance)
         self.max_iterations = require.count(max_iterations, "max_iterations")
-        small = Nystrom(tolerance=10.0, max_points=256)
-        self.preconditioner = small if preconditioner is None else preconditioner
+        if preconditioner is None:
+            preconditioner = Nystrom(tolerance=10.0, max_points=256)
+        if not isinstance(preconditioner, Nystrom):
+            raise TypeError(
+                f"the preconditioner must be an instance of hk.Nystrom, got {preconditioner!r}."
+            )
+        self.preconditioner = preconditioner
 
     def fit(
         self,
@@ -77,13 +84,16 @@ class ConjugateGradient(AbstractSolver):
         regularization: Float[Array, ""],
         throw: bool = True,
     ) -> KernelField:
+        tolerance = self.tolerance
+        if tolerance is None:
+            tolerance = 1e-8 if X.dtype == jnp.float64 else 1e-5
         landmarks = self.preconditioner.landmarks(K, X, regularization)
         ridge = len(X) * regularization
         spread = rows_of(X)
         X, Y = split(spread, X), split(spread, Y)
-        tolerance = jnp.asarray(self.tolerance, X.dtype)  # a Python float would compile anew
+        within = jnp.asarray(tolerance, X.dtype)  # a Python float would compile anew
         C, iterations, values, left, truncation = _solve(
-            K, X, Y, ridge, landmarks, tolerance, self.max_iterations, spread
+            K, X, Y, ridge, landmarks, within, self.max_iterations, spread
         )
 
         def message() -> str:
@@ -91,7 +101,7 @@ class ConjugateGradient(AbstractSolver):
             if require.is_concrete(left, iterations, truncation):
                 reached = (
                     f" after {int(iterations)} iterations: the relative residual is "
-                    f"{float(left):.1e} and the tolerance {self.tolerance:.1e}"
+                    f"{float(left):.1e} and the tolerance {tolerance:.1e}"
                 )
                 reached += (
                     f" ({int(landmarks.count)} landmarks, truncation {float(truncation):.1e})"
@@ -105,7 +115,7 @@ class ConjugateGradient(AbstractSolver):
                 "that is NaN the kernel is at fault: hk.check_kernel(k, X) tells."
             )
 
-        failed = ~(left <= self.tolerance) | (landmarks.count == 0)
+        failed = ~(left <= tolerance) | ((landmarks.count == 0) & (truncation != 0))
         C, values = require.value((C, values), failed, message, RuntimeError, throw)
         larger = require.not_finite(truncation)
         C, values = require.value((C, values), larger, INDEFINITE, RuntimeError, throw)

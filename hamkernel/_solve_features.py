@@ -1,20 +1,17 @@
 """Least squares in random Fourier features: any number of points, in memory that ignores it."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int, Key
+from jaxtyping import Array, ArrayLike, Float, Int, Key, Num, UInt32
 
 from hamkernel import _require as require
 from hamkernel import _streaming_sums as streaming_sums
 from hamkernel._devices import as_given, on_each, rows_of, split
 from hamkernel._features import AbstractFeatures, SumFeatures, features
-from hamkernel._field import AbstractField, SolverInfo
+from hamkernel._field import AbstractField, SolverInfo, root
 from hamkernel._least_squares import ridge_regression
 from hamkernel._memory import refuse_beyond_memory
-from hamkernel._solve import root
 from hamkernel._solve_low_rank import singular
 from hamkernel._solve_streaming import (
     AbstractStreamingFit,
@@ -58,16 +55,16 @@ class FeatureField(AbstractField):
 
     @property
     def dimension(self) -> int:
-        return self.residual.shape[1]
+        return self.residual.shape[-1]
 
-    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
         return _field_at(self.features, self._state(x), self.weights)
 
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         spread = rows_of(X)
         return as_given(spread, _evaluate(self, split(spread, X), spread))
 
-    def unanchored_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+    def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         self.kernel.check_potential()
         x = self._state(x)
         return _potential_at(self.features, x, self.weights)
@@ -75,15 +72,11 @@ class FeatureField(AbstractField):
     def _term(self, kernel: Sum, position: int) -> "FeatureField":
         assert isinstance(self.features, SumFeatures)
         weights = self.weights[self.features.slice(position)]
+        terms = kernel.terms[position], self.features.terms[position]
         return eqx.tree_at(
-            lambda f: (f.kernel, f.features, f.weights, f.offset),
+            lambda f: (f.kernel, f.features, f.weights, f.norm, f.offset),
             self,
-            (
-                kernel.terms[position],
-                self.features.terms[position],
-                weights,
-                jnp.zeros_like(self.offset),
-            ),
+            (*terms, weights, root(weights @ weights), jnp.zeros_like(self.offset)),
         )
 
 
@@ -134,15 +127,9 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
     count: int = eqx.field(static=True)
     key: Key[Array, ""]
 
-    def __init__(self, count: int, key: Any):
-        count = require.count(count, "count")
-        dtype = getattr(key, "dtype", None)
-        if dtype == jnp.uint32:  # a key of the older kind, jax.random.PRNGKey
-            key = jax.random.wrap_key_data(key)
-        elif dtype is None or not jnp.issubdtype(dtype, jax.dtypes.prng_key):
-            raise TypeError(f"RandomFeatures needs a key, jax.random.key(0); got {key!r}.")
-        self.count = count
-        self.key = key
+    def __init__(self, count: int, key: Key[Array, ""] | UInt32[Array, "..."]):
+        self.count = require.count(count, "count")
+        self.key = require.key(key)
 
     def fit(
         self,
@@ -167,7 +154,10 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
         refuse_beyond_memory(what, self.count, self.count, dtype, _COPIES, cure)
 
     def start(
-        self, K: AbstractMatrixKernel, sample: ArrayLike, regularization: ArrayLike = 1e-4
+        self,
+        K: AbstractMatrixKernel,
+        sample: Num[ArrayLike, "N n"],
+        regularization: ArrayLike = 1e-4,
     ) -> "FeatureFit":
         """A fit without data yet, to which chunks are added: see `FeatureFit`.
 
@@ -257,11 +247,11 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "FeatureFit":
         spread = rows_of(X)
         X, Y = split(spread, X), split(spread, Y)
-        sums = _added(self.sums, self.features, X, Y, spread)
+        sums = _add(self.sums, self.features, X, Y, spread)
         return eqx.tree_at(lambda f: (f.sums, f.count), self, (sums, self.count + len(X)))
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
-        return _checked(_solved(self, count, regularization))
+        return _checked(_solution(self, count, regularization))
 
 
 @eqx.filter_jit
@@ -277,11 +267,11 @@ def _start(K, basis, sample, regularization):
     )
 
 
-_added = eqx.filter_jit(streaming_sums.add)
+_add = eqx.filter_jit(streaming_sums.add)
 
 
 @eqx.filter_jit
-def _solved(fit, count, regularization):
+def _solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, _, residual_norm = streaming_sums.solve(fit.sums, ridge)
     unseen = jnp.zeros((0, fit.dimension), weights.dtype)

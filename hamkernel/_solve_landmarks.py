@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from hamkernel import _require as require
 from hamkernel._devices import rows_of, split
@@ -44,7 +44,7 @@ def choose_landmarks(
     left: Float[Array, ""],
     most: int,
     candidates: int,
-    key: PRNGKeyArray,
+    key: Key[Array, ""],
 ) -> Landmarks:
     """Points of X after which the mean of trace(K(x, x)) over X falls to `left`, at most `most`.
 
@@ -144,7 +144,7 @@ class _Drawn(NamedTuple):
     factor: Float[Array, "m n P n"]  # Ĝ = FᵀF over the candidates
     left: Float[Array, " P"]  # the traces of the diagonal blocks of G − Ĝ
     rounding: Float[Array, ""]  # what a pivot must exceed
-    key: PRNGKeyArray
+    key: Key[Array, ""]
     rounds: Int[Array, ""]
 
 

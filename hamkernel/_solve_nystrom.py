@@ -12,22 +12,20 @@ A stream is seen once and leaves no residual; `_streaming_sums.py` says how its 
 """
 
 import math
-import warnings
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, Int, Key, Num, UInt32
 
 from hamkernel import _require as require
 from hamkernel import _streaming_sums as streaming_sums
 from hamkernel._devices import as_given, rows_of, split
-from hamkernel._field import KernelField, SolverInfo
+from hamkernel._field import KernelField, SolverInfo, root
 from hamkernel._gram import trace
 from hamkernel._gram_operator import product
 from hamkernel._show import text
-from hamkernel._solve import root
 from hamkernel._solve_landmarks import Landmarks, choose_landmarks, given_landmarks
 from hamkernel._solve_low_rank import (
     INDEFINITE,
@@ -42,7 +40,6 @@ from hamkernel._solve_streaming import (
     AbstractStreamingSolver,
     checked_start,
     thinned,
-    users_level,
 )
 from hamkernel._streaming_sums import Sums
 from hamkernel._structured import AbstractMatrixKernel
@@ -84,7 +81,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
     tolerance: float = eqx.field(static=True)
     max_points: int = eqx.field(static=True)
     candidates: int = eqx.field(static=True)
-    key: PRNGKeyArray | None
+    key: Key[Array, ""] | None
     points: Float[Array, "m n"] | None
 
     def __init__(
@@ -92,8 +89,8 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         tolerance: float = 0.1,
         max_points: int = 512,
         candidates: int = 4096,
-        key: PRNGKeyArray | None = None,
-        points: ArrayLike | None = None,
+        key: Key[Array, ""] | UInt32[Array, "..."] | None = None,
+        points: Num[ArrayLike, "m n"] | None = None,
     ):
         if isinstance(tolerance, int) and tolerance > 1:
             raise ValueError(
@@ -106,7 +103,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         self.tolerance = float(tolerance)
         self.max_points = require.count(max_points, "max_points")
         self.candidates = require.count(candidates, "candidates")
-        self.key = key
+        self.key = None if key is None else require.key(key)
         self.points = None if points is None else require.points(points, "points")
 
     def landmarks(
@@ -139,7 +136,10 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         return _field(K, landmarks, solution, regularization, self.tolerance, _CHOOSE, throw)
 
     def start(
-        self, K: AbstractMatrixKernel, sample: ArrayLike, regularization: ArrayLike = 1e-4
+        self,
+        K: AbstractMatrixKernel,
+        sample: Num[ArrayLike, "N n"],
+        regularization: ArrayLike = 1e-4,
     ) -> "LandmarkFit":
         """A fit without data yet, to which chunks are added: see `LandmarkFit`.
 
@@ -197,7 +197,9 @@ class _Solution(NamedTuple):
 def _field(K, landmarks, solution, regularization, tolerance, cure, throw=True) -> KernelField:
     dtype = landmarks.points.dtype
     unsolved = require.not_finite(solution.coefficients).any()
-    failed = unsolved | (require.on_host(landmarks.count) == 0)
+    # Without landmarks all of the Gram must be missing, unless it is zero, and so is the field.
+    none = require.on_host(landmarks.count) == 0
+    failed = unsolved | (none & (require.on_host(solution.truncation) != 0))
     solution = require.value(solution, failed, singular(dtype), RuntimeError, throw)
     larger = require.not_finite(solution.truncation)
     solution = require.value(solution, larger, INDEFINITE, RuntimeError, throw)
@@ -235,12 +237,11 @@ def _warn_if_truncated(truncation, count, tolerance, cure):
         return
     # Twice: a random part of the data need not show all that the rest has.
     if truncation > 2 * tolerance:
-        warnings.warn(
+        require.warn(
             f"{int(count)} landmarks leave trace(G - Ĝ)/(N λ) = {float(truncation):.2g}, more than "
             f"the tolerance {tolerance:.2g}. The field is the best one on these landmarks, but may "
             f"be far from the exact fit. {cure} for a rough kernel or many dimensions take "
-            "hk.ConjugateGradient(), which is exact.",
-            stacklevel=users_level(),
+            "hk.ConjugateGradient(), which is exact."
         )
 
 
@@ -281,10 +282,10 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 
     def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "LandmarkFit":
         spread = rows_of(X)
-        return _added(self, split(spread, X), split(spread, Y), spread)
+        return _with_data(self, split(spread, X), split(spread, Y), spread)
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
-        solution = _solved(self, count, regularization)
+        solution = _solution(self, count, regularization)
         landmarks, tolerance = self.landmarks, self.tolerance
         return _field(self.kernel, landmarks, solution, regularization, tolerance, _START_ANEW)
 
@@ -306,7 +307,7 @@ def _start(K, sample, regularization, landmarks, tolerance):
 
 
 @eqx.filter_jit
-def _added(fit, X, Y, spread):
+def _with_data(fit, X, Y, spread):
     K = fit.kernel
     new = (
         streaming_sums.add(fit.sums, Columns(K, fit.landmarks.points), X, Y, spread),
@@ -317,7 +318,7 @@ def _added(fit, X, Y, spread):
 
 
 @eqx.filter_jit
-def _solved(fit, count, regularization):
+def _solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, norm, residual_norm = streaming_sums.solve(fit.sums, ridge)
     return _Solution(

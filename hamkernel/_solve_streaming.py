@@ -7,7 +7,6 @@ changes them, and any λ is solved for from them.
 import abc
 import contextlib
 import reprlib
-import sys
 from collections.abc import Iterable, Iterator
 from typing import Generic, TypeVar
 
@@ -15,18 +14,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._devices import rows_of, split
-from hamkernel._field import AbstractField
 from hamkernel._gram import matrix_kernel
 from hamkernel._show import call, text
-from hamkernel._solve import AbstractSolver
+from hamkernel._solve import AbstractSolver, Learned
 from hamkernel._structured import AbstractMatrixKernel
 
 Fit = TypeVar("Fit", bound="AbstractStreamingFit")
-Learned = TypeVar("Learned", bound=AbstractField)
 
 
 class AbstractStreamingFit(eqx.Module, Generic[Learned]):
@@ -67,7 +64,7 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> Learned:
         """`field` for a λ that has been checked, and the number of points, which is not 0."""
 
-    def add(self: Fit, X: ArrayLike, Y: ArrayLike) -> Fit:
+    def add(self: Fit, X: Num[ArrayLike, "N n"], Y: Num[ArrayLike, "N n"]) -> Fit:
         """The fit with more data.
 
         Args:
@@ -108,21 +105,24 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
         return self._solved(count, regularization)
 
 
-class AbstractStreamingSolver(AbstractSolver, Generic[Learned]):
+class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned]):
     """A solver whose fit to all the data can be made from chunks of it."""
 
     @abc.abstractmethod
     def start(
-        self, K: AbstractMatrixKernel, sample: ArrayLike, regularization: ArrayLike = 1e-4
+        self,
+        K: AbstractMatrixKernel,
+        sample: Num[ArrayLike, "N n"],
+        regularization: ArrayLike = 1e-4,
     ) -> AbstractStreamingFit[Learned]:
         """A fit without data yet, to which chunks are added."""
 
     def fit_chunks(
         self,
         K: AbstractMatrixKernel,
-        chunks: Iterable[tuple[ArrayLike, ArrayLike]],
+        chunks: Iterable[tuple[Num[ArrayLike, "N n"], Num[ArrayLike, "N n"]]],
         regularization: ArrayLike = 1e-4,
-        sample: ArrayLike | None = None,
+        sample: Num[ArrayLike, "S n"] | None = None,
         progress: bool = False,
     ) -> Learned:
         """`hk.fit` to data that comes in chunks, in one pass and with memory for two chunks.
@@ -173,29 +173,14 @@ def _naming(chunk: int) -> Iterator[None]:
 
 
 def checked_start(
-    K: AbstractMatrixKernel, sample: ArrayLike, regularization: ArrayLike
+    K: AbstractMatrixKernel, sample: Num[ArrayLike, "N n"], regularization: ArrayLike
 ) -> tuple[AbstractMatrixKernel, Float[Array, "N n"], Float[Array, ""]]:
     """The arguments of `start`, if they are what it says."""
     K = matrix_kernel(K)
     sample = require.finite(require.points(sample, "sample"), "sample")
     K.check_dimension(sample.shape[1])
-    require.warn_of_float32(sample, stacklevel=users_level() + 1)
+    require.warn_of_float32(sample)
     return K, sample, require.ridge(regularization, sample.dtype)
-
-
-def users_level() -> int:
-    """The `stacklevel` of a warning of the caller that names the line of the user.
-
-    Equinox puts frames of its own between methods, so it is no constant. From Python 3.12 on
-    `skip_file_prefixes` of `warnings.warn` does this.
-    """
-    level, frame = 1, sys._getframe(1)
-    while frame.f_back:
-        package = frame.f_globals.get("__name__", "").split(".")[0]
-        if package not in ("hamkernel", "equinox"):
-            break
-        level, frame = level + 1, frame.f_back
-    return level
 
 
 def thinned(sample: Float[Array, "N n"], most: int) -> Float[Array, "M n"]:

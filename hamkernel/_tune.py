@@ -21,8 +21,7 @@ where the runs ended: those can lie in a valley that the bound cuts off. Data wi
 little residual: its bound stays or rises by some tens.
 """
 
-import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import equinox as eqx
 import jax
@@ -88,7 +87,7 @@ def tune(
     folds: Folds = 5,
     *,
     objective: Criterion | Objective = "cross_validation",
-    frozen: str | tuple[str, ...] = (),
+    frozen: str | Sequence[str] = (),
     bounds: Mapping[str, tuple[ArrayLike, ArrayLike]] | None = None,
     starts: int = 16,
     optimiser: optx.AbstractMinimiser | None = None,
@@ -100,7 +99,7 @@ def tune(
 
     The search starts from the given kernel and from `starts` − 1 further points, the best of a
     space-filling design in the box. All run in one compiled call, on a subset of the points if
-    there are many; the best runs are then finished on all data, and the best point that any of
+    there are many; the best one is then finished on all data, and the best point that any of
     them saw is returned. New data of the same shape does not recompile. Data that is spread over
     devices is gathered on one of them for the search; the field is fitted where the data lies.
 
@@ -111,7 +110,9 @@ def tune(
         regularization: the first λ.
         folds: as in `cross_validation_loss`; give trajectory labels for data from trajectories.
         objective: "cross_validation", "generalized_cross_validation", "marginal_likelihood", or
-            a function (K, X, Y, regularization) -> () that is to be small. For the marginal
+            a function (K, X, Y, regularization) -> () that is to be small. The second leaves out
+            fits that leave less than a fifth of the residuals free, tr(I − S) < 0.2 N n: it is 0/0
+            where a fit interpolates. For the marginal
             likelihood give K an amplitude, `1.0 * k`: built-in kernels have 1, and a signal that
             is larger than the prior's is explained as noise. In a function of your own, `hk.fit`
             and `hk.simulate` want `throw=False`, and the latter a constant `dt`: somewhere in the
@@ -127,9 +128,10 @@ def tune(
         solver: how the final field is fitted; see `fit`. With `Nystrom` and `RandomFeatures` the
             loss on all points is that of the low-rank fit, in O(N n r) memory; the landmarks are
             those of the best kernel on the subset, and of the tuned one for the field.
-        progress: print each step of the default optimiser, through optimistix's own hook: the
-            logarithm of a loss, or the objective over its first value, and the coordinates u of
-            the search, whose sines go from one end of the box to the other.
+        progress: print each step of the default optimiser, through optimistix's own hook (of one
+            of yours say verbose=True to itself): the logarithm of a loss, or the objective over
+            its first value, and the coordinates u of the search, whose sines go from one end of
+            the box to the other.
 
     Returns:
         A `Tuned`. NaN never comes out: points where the objective is not finite cannot win.
@@ -247,11 +249,10 @@ def _warn_of_unequal_sizes(Y: Array) -> None:
     sizes = np.asarray(Y).std(axis=0)
     sizes = sizes[sizes > 0]
     if sizes.size and sizes.max() > _UNEQUAL * sizes.min():
-        warnings.warn(
+        require.warn(
             f"the velocities of one coordinate are {sizes.max() / sizes.min():.3g} times as large "
             "as those of another, and a loss sums the squares of both: the small one may be lost "
-            "in it. Choose units in which they are of similar size.",
-            stacklevel=3,
+            "in it. Choose units in which they are of similar size."
         )
 
 

@@ -23,7 +23,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._devices import on_one_device
@@ -37,8 +37,8 @@ from hamkernel._trained import trained
 
 def cross_validation_loss(
     K: AbstractMatrixKernel,
-    X: Float[ArrayLike, "N n"],
-    Y: Float[ArrayLike, "N n"],
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
     regularization: ArrayLike,
     folds: Folds = 5,
 ) -> Float[Array, ""]:
@@ -74,8 +74,8 @@ def cross_validation_loss(
 
 def cross_validation_residuals(
     K: AbstractMatrixKernel,
-    X: Float[ArrayLike, "N n"],
-    Y: Float[ArrayLike, "N n"],
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
     regularization: ArrayLike,
     folds: Folds = 5,
 ) -> Float[Array, "N n"]:
@@ -93,8 +93,8 @@ def cross_validation_residuals(
 
 def generalized_cross_validation(
     K: AbstractMatrixKernel,
-    X: Float[ArrayLike, "N n"],
-    Y: Float[ArrayLike, "N n"],
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
     regularization: ArrayLike,
 ) -> Float[Array, ""]:
     """Generalised cross-validation: the training error over the squared share of free residuals.
@@ -125,8 +125,8 @@ def generalized_cross_validation(
 
 def log_marginal_likelihood(
     K: AbstractMatrixKernel,
-    X: Float[ArrayLike, "N n"],
-    Y: Float[ArrayLike, "N n"],
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
     regularization: ArrayLike,
 ) -> Float[Array, ""]:
     """The log density of Y under f ~ GP(0, K) and independent noise of variance Nλ.

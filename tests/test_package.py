@@ -42,6 +42,10 @@ def run(code):
     return json.loads(done.stdout)
 
 
+def test_the_package_says_that_it_is_typed():
+    assert (PACKAGE / "py.typed").exists()  # PEP 561
+
+
 def test_importing_the_package_is_light_and_leaves_jax_alone():
     loaded, before, after = run(
         "import json, sys, jax\n"
@@ -198,7 +202,26 @@ for structure in (K, hk.Separable(k), hk.CurlFree(k), hk.DivergenceFree(k), hk.O
     field = hk.fit(structure, X, X, 1e-2)
     field(x), jax.vmap(field)(jnp.asarray(X)), hk.gram(structure, X, X[:2]), field.is_separable
 hk.fit(K, X, X, 1e-2).anchored(x, 1.0).hamiltonian(x)
-hk.Sum(a=K, b=K).part("a")
+X = np.random.default_rng(0).normal(size=(12, 2))
+both, key = hk.Sum(a=K, b=hk.CurlFree(k)), jax.random.key(0)
+solvers = (hk.Cholesky(), hk.ConjugateGradient(), hk.Nystrom(), hk.RandomFeatures(8, key))
+for solver in solvers:
+    field = hk.fit(both, X, X, 1e-2, solver=solver)
+    field.evaluate(X), field.part("b").potential(x)
+    hk.save(sys.argv[2], field), hk.load(sys.argv[2])(x)
+    if hasattr(solver, "start"):
+        solver.start(both, X, 1e-2).add(X, X).field()(x), solver.fit_chunks(both, [(X, X)])
+for loss in (hk.cross_validation_loss, hk.generalized_cross_validation, hk.log_marginal_likelihood):
+    jax.grad(lambda ridge: loss(K, X, X, ridge))(1e-2)
+hk.cross_validation_residuals(K, X, X, 1e-2, [0, 1, 1] * 4)
+for other, solver in ((K, None), (1.0 * hk.Gaussian(jnp.ones(2)), solvers[2]), (k, solvers[3])):
+    other = other if other is K else hk.Odd(hk.Symplectic(other))
+    hk.tune(other, X, X, folds=[0, 1, 2] * 4, starts=2, max_steps=2, solver=solver)
+hk.check_kernel(k, X), hk.gram_operator(K, X, X[:2]).mv(X[:2])
+pendulum = hk.systems.Pendulum()
+hk.systems.sample(pendulum, X[0], np.linspace(0, 1, 3), 0.1, key=key)
+for options in ({}, {"dt": 1}, {"dt": 0.1, "solver": hk.GaussLegendre4()}):
+    hk.simulate(pendulum, x, np.arange(3), **options)
 def refused(call):
     try:
         call()
@@ -211,10 +234,10 @@ print(json.dumps([refused(lambda: k(X, X)), refused(lambda: K(x, jnp.zeros(3)))]
 
 @pytest.mark.slow
 @pytest.mark.ci
-def test_annotations_hold_when_they_are_executed():
-    here = str(Path(__file__).parent)
+def test_annotations_hold_when_they_are_executed(tmp_path):
+    here, file = str(Path(__file__).parent), str(tmp_path / "field.npz")
     done = subprocess.run(
-        [sys.executable, "-c", ANNOTATED, here], capture_output=True, text=True, check=False
+        [sys.executable, "-c", ANNOTATED, here, file], capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert json.loads(done.stdout) == [True, True]  # wrong shapes, the control

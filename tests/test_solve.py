@@ -11,7 +11,7 @@ import pytest
 from data import swings
 
 import hamkernel as hk
-from hamkernel import _solve_choice
+from hamkernel import _fit
 from hamkernel._solve_cg import ConjugateGradient
 from hamkernel._solve_landmarks import choose_landmarks
 from hamkernel._solve_nystrom import Nystrom
@@ -376,9 +376,9 @@ def test_conjugate_gradients_refuse_what_makes_no_sense():
 def test_a_dense_fit_is_chosen_where_it_takes_half_of_the_memory(monkeypatch):
     X, Y = swings(20)
     need = 3 * 40**2 * 8
-    monkeypatch.setattr(_solve_choice, "memory_bytes", lambda: 2 * need)
+    monkeypatch.setattr(_fit, "memory_bytes", lambda: 2 * need)
     assert info(hk.fit(K, X, Y, RIDGE)).solver == "Cholesky"
-    monkeypatch.setattr(_solve_choice, "memory_bytes", lambda: 2 * need - 1)
+    monkeypatch.setattr(_fit, "memory_bytes", lambda: 2 * need - 1)
     assert info(hk.fit(K, X, Y, RIDGE)).solver == "ConjugateGradient"
     assert info(hk.fit(K, X, Y, RIDGE, solver=hk.Cholesky())).solver == "Cholesky"
 

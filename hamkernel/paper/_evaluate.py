@@ -131,14 +131,14 @@ def evaluate(
 
 @eqx.filter_jit
 def _fit(kernels_and_data) -> KernelField:
-    return cast(KernelField, jax.vmap(fit)(*kernels_and_data))
+    return jax.vmap(fit)(*kernels_and_data)
 
 
 def _padded(fields: KernelField) -> KernelField:
     """The same fields with points that carry no weight, so that all experiments are one program."""
     extra = -fields.points.shape[1] % _SIZE
 
-    def longer(a: Float[Array, "S N n"]) -> Float[Array, "S N+extra n"]:
+    def longer(a: Float[Array, "S N n"]) -> Float[Array, "S M n"]:
         return jnp.pad(a, ((0, 0), (0, extra), (0, 0)))
 
     parts = longer(fields.points), longer(fields.coefficients), longer(fields.residual)

@@ -1,12 +1,12 @@
 """Pictures over time."""
 
-import warnings
 from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
 
+from hamkernel import _require as require
 from hamkernel.plot._style import axes, legend, line_styles, named, two, with_unit
 
 # Each (T,), or (S, T) for several seeds.
@@ -145,10 +145,9 @@ def _finite_seeds(seeds: np.ndarray, of_name: str) -> np.ndarray:
     if not finite.any():
         raise ValueError(f"none of the {len(seeds)} curves{of_name} is finite.")
     if not finite.all():
-        warnings.warn(
+        require.warn(
             f"{np.sum(~finite)} of the {len(seeds)} curves{of_name} are NaN or infinite somewhere "
-            "and left out of the median and the band.",
-            stacklevel=4,
+            "and left out of the median and the band."
         )
     return seeds[finite]
 

@@ -1,13 +1,13 @@
 """Noisy data from the trajectories of a system."""
 
 from collections.abc import Callable
-from typing import cast
+from typing import Any, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Num, PRNGKeyArray
+from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 
 from hamkernel import _require as require
 from hamkernel._simulate import simulate
@@ -21,7 +21,7 @@ def sample(
     state_noise: Num[ArrayLike, "..."] = 0.0,
     velocity_noise: Num[ArrayLike, "..."] = 0.0,
     *,
-    key: PRNGKeyArray | None = None,
+    key: Key[Array, ""] | UInt32[Array, "..."] | None = None,
 ) -> tuple[Float[Array, "*batch T n"], Float[Array, "*batch T n"]]:
     """Return noisy states and velocities along trajectories of `system`.
 
@@ -66,7 +66,7 @@ def sample(
         _noise_level(level, name, states, key)
         for level, name in [(state_noise, "state_noise"), (velocity_noise, "velocity_noise")]
     ]
-    _check_key(key)
+    key = None if key is None else require.key(key)
     X, Y = _trajectories(system, states, ts)
     failed = (require.not_finite(X) | require.not_finite(Y)).any(axis=(1, 2))  # (B,)
     X = require.value(X, failed, lambda: _failure(failed), RuntimeError)
@@ -89,23 +89,7 @@ def _in_precision(field: Callable[[Array], Array], dtype: jnp.dtype) -> Callable
     return jax.tree.map(cast_leaf, field)
 
 
-def _check_key(key: PRNGKeyArray | None) -> None:
-    if key is None:
-        return
-    shape, dtype = jnp.shape(key), getattr(key, "dtype", None)
-    modern = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
-    if not modern and dtype != np.uint32:
-        raise TypeError(f"key must be a key of JAX, such as jax.random.key(0); got {key!r}.")
-    if shape != (() if modern else (2,)):
-        raise ValueError(
-            f"key has shape {shape}; one key is needed. For many seeds use "
-            "jax.vmap(lambda key: sample(..., key=key))(keys)."
-        )
-
-
-def _noise_level(
-    level: ArrayLike, name: str, states: Float[Array, "B n"], key: PRNGKeyArray | None
-) -> Array:
+def _noise_level(level: ArrayLike, name: str, states: Float[Array, "B n"], key: Any) -> Array:
     """A standard deviation in the dtype of the states, shape () or (n,)."""
     if key is None and not (require.is_concrete(level) and np.all(np.asarray(level) == 0)):
         raise ValueError(f"{name} needs randomness: pass `key=jax.random.key(...)`.")
