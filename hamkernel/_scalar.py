@@ -224,7 +224,7 @@ def divided(
     x = one_point(x)
     if scale.ndim and scale.shape != x.shape:
         raise ValueError(
-            f"the kernel has {scale.size} values of {name} and the point has shape {x.shape}: "
+            f"the kernel has {scale.size} {name}s and the point has shape {x.shape}: "
             "give one number, or one for each coordinate that the kernel sees."
         )
     return x / scale.astype(x.dtype)

@@ -257,6 +257,13 @@ CASES = [
         reflective=True,
     ),
     Case(
+        "periodic_ard",
+        lambda n: hk.Periodic(period=3 * widths(n), lengthscale=widths(n)[::-1]),
+        lambda n: periodic(3 * widths(n), widths(n)[::-1]),
+        stationary=True,
+        reflective=True,
+    ),
+    Case(
         "sum",
         lambda n: hk.Gaussian(1.3) + hk.Polynomial(2, 0.5) + hk.Matern(3.5, 1.2),
         _added(

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import hamkernel as hk
 from hamkernel._check import check_kernel
 
 ROOT3, ROOT5 = 3**0.5, 5**0.5
@@ -302,6 +303,35 @@ reverse_only.defvjp(
     lambda x, z: (reverse_only(x, z), (x, z)),
     lambda xz, g: (g * reverse_only(*xz) * xz[1], g * reverse_only(*xz) * xz[0]),
 )
+
+
+@pytest.mark.parametrize("jitter", [1e-9, 1e-12, 1e-36, 1e-300])
+def test_a_small_number_under_the_root_does_not_make_laplace_smooth(jitter):
+    for seed, n in ((0, 2), (1, 4)):
+        rough = lambda x, z: jnp.exp(-jnp.sqrt(squared(x, z) + jitter))  # noqa: E731
+        product = lambda x, z: jnp.exp(  # noqa: E731
+            -jnp.sqrt(jnp.maximum(x @ x + z @ z - 2 * x @ z, 0.0) + jitter)
+        )
+        for k in (rough, product):
+            assert "too rough" in refusal(k, cloud(seed, n=n))
+
+
+def test_a_kernel_with_a_second_smaller_scale_is_sound():
+    small = [
+        1e-4 * hk.Gaussian(1e-3),
+        1e-8 * hk.Gaussian(1e-5),
+        1e-6 * hk.Matern(1.5, 1e-4),
+        1e-4 * hk.RationalQuadratic(1.0, 1e-4),
+    ]
+    for second in small:
+        check_kernel(hk.Gaussian(1.0) + second, cloud())
+
+
+def test_single_precision_in_the_kernel_is_no_fault():
+    def k(x, z):
+        return jnp.exp(-squared(x.astype(jnp.float32), z.astype(jnp.float32)) / 2)
+
+    check_kernel(k, cloud(N=12))
 
 
 def test_functions_that_jax_cannot_run_or_differentiate_are_refused():

@@ -664,10 +664,10 @@ def test_kernels_without_a_spectral_density_are_refused(k, what, key):
         ),
         (
             lambda key: of_any(10, key).start(
-                hk.CurlFree(hk.Select(hk.Gaussian(1.0), 5)), points(n=3)
+                hk.CurlFree(hk.Select(hk.Gaussian(1.0), 3)), points(n=3)
             ),
             ValueError,
-            "Select has coordinates (5,)",
+            "Select has coordinates (3,)",
         ),
         (
             lambda key: of_any(10, key).start(hk.CurlFree(hk.Periodic(1.0, 0.01)), points(n=3)),
@@ -697,6 +697,17 @@ def test_a_field_without_a_potential_says_why(structure, text, key):
         field.potential  # noqa: B018
     with pytest.raises(AttributeError, match="not Hamiltonian by construction"):
         field.hamiltonian  # noqa: B018
+
+
+def test_a_heavy_tail_of_frequencies_overflows_nowhere(key):
+    X, Y = data(n=2)
+
+    def size(alpha):
+        K = hk.CurlFree(hk.RationalQuadratic(alpha))
+        return hk.fit(K, X, Y, solver=RandomFeatures(50, key))(X[0]).sum()
+
+    assert np.isfinite(size(0.01))
+    assert np.isfinite(jax.grad(size)(0.01))
 
 
 def test_a_key_of_the_older_kind_is_a_key():

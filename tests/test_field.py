@@ -398,3 +398,45 @@ def test_the_learned_flow_is_symplectic_and_keeps_the_learned_energy(system, n):
     for structure in (hk.Separable, hk.CurlFree):
         wrong = hk.fit(structure(hk.Gaussian(1.5)), X, Y, 1e-3)
         assert symplecticity_defect(flow(wrong)(x0, 3.0)[1]) > 1e-3
+
+
+def test_a_field_far_from_the_origin_is_the_same_field():
+    K, X, far = hk.Symplectic(hk.Gaussian(1.0)), states(), 2.0**20
+    near, moved = hk.fit(K, X, states(seed=1), 1e-2), hk.fit(K, X + far, states(seed=1), 1e-2)
+    x = X[0] + 0.25
+    np.testing.assert_allclose(moved(x + far), near(x), atol=1e-8)
+    np.testing.assert_allclose(moved.hamiltonian(x + far), near.hamiltonian(x), atol=1e-8)
+
+
+def test_a_field_of_matern_is_zero_where_the_distance_overflows():
+    field = fitted(hk.Symplectic, "matern2.5")
+    for x in (jnp.array([1e9, 0.0]), jnp.array([1e160, -1e160])):
+        assert not field(x).any()
+        assert not jax.jacfwd(field)(x).any()
+
+
+@pytest.mark.parametrize("solver", [None, hk.RandomFeatures(20, jax.random.key(0))], ids=str)
+def test_a_part_has_its_own_norm_and_no_anchor(solver):
+    X, K = states(12), hk.Symplectic(hk.Gaussian(1.0)) + hk.Symplectic(hk.Gaussian(2.0))
+    field = hk.fit(K, X, states(12, seed=1), 1e-2, solver=solver).anchored(jnp.zeros(2), 5.0)
+    parts = [field.part(0), field.part(1)]
+    np.testing.assert_allclose(sum(part.norm**2 for part in parts), field.norm**2, rtol=1e-12)
+    if isinstance(field, hk.KernelField):
+        G = np.asarray(hk.gram(K.terms[0], X)).reshape(24, 24)
+        a = np.asarray(field.coefficients).ravel()
+        np.testing.assert_allclose(parts[0].norm ** 2, a @ G @ a, rtol=1e-10)
+    x = X[0] + 0.25
+    for part in parts:
+        np.testing.assert_allclose(part.hamiltonian(x), part.unanchored_potential(x), rtol=1e-12)
+
+
+def test_a_batch_of_fields_says_how_it_is_called():
+    X, Y, x = states(), states(seed=1), jnp.ones(2)
+    fields = jax.vmap(lambda ridge: hk.fit(hk.Symplectic(hk.Gaussian()), X, Y, ridge))(
+        jnp.array([1e-1, 1e-2])
+    )
+    with pytest.raises(ValueError, match=r"a batch of 2 fields: jax\.vmap\(lambda f: f\(x\)\)"):
+        fields(x)
+    velocities = jax.vmap(lambda field: field(x))(fields)
+    alone = hk.fit(hk.Symplectic(hk.Gaussian()), X, Y, 1e-2)(x)
+    np.testing.assert_allclose(velocities[1], alone, rtol=1e-10)

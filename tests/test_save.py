@@ -18,6 +18,7 @@ import pytest
 
 import hamkernel as hk
 from hamkernel._save import load, save
+from hamkernel._scalar_transform import Symmetrised, identity
 from hamkernel._solve_features import RandomFeatures
 
 RNG = np.random.default_rng(5)
@@ -512,6 +513,49 @@ def test_a_forged_array_is_refused(content, message, saved):
     forge(saved, header, replaced(entries, index, content))
     with pytest.raises(ValueError, match=message):
         load(saved)
+
+
+@pytest.mark.parametrize("order", [np.asfortranarray, lambda points: points.astype(">f8")])
+def test_an_array_in_another_order_is_the_same_array(order, saved):
+    header, entries = parts(saved.read_bytes())
+    index = header["field"]["fields"]["points"]["array"]
+    forge(saved, header, replaced(entries, index, npy(order(X))))
+    assert same(fitted(), load(saved))
+
+
+def signed(content):
+    """A file of this content with a right checksum."""
+    content = content[:-64]
+    return content + hashlib.sha256(content).hexdigest().encode()
+
+
+def test_an_encrypted_part_is_refused(saved):
+    content = bytearray(saved.read_bytes())
+    content[content.rindex(b"PK\x01\x02") + 8] |= 1
+    saved.write_bytes(signed(bytes(content)))
+    with pytest.raises(ValueError, match=r"hamkernel\.save"):
+        load(saved)
+
+
+@pytest.mark.filterwarnings("ignore:Duplicate name")
+def test_a_part_that_is_there_twice_is_refused(saved):
+    with zipfile.ZipFile(saved, "a") as archive:
+        archive.writestr("array_0.npy", archive.read("array_0.npy"))
+        archive.comment = b"0" * 64
+    saved.write_bytes(signed(saved.read_bytes()))
+    with pytest.raises(ValueError, match=r"hamkernel\.save"):
+        load(saved)
+
+
+def swapped(x):
+    return x[::-1]
+
+
+def test_another_group_of_maps_than_the_saved_one_is_refused(tmp_path):
+    save(tmp_path / "f", fitted(hk.Odd(hk.Symplectic(hk.Gaussian()))))
+    other = Symmetrised(hk.Gaussian(), (identity, swapped), (1.0, -1.0), one_sided=True)
+    with pytest.raises(ValueError, match="not the one saved"):
+        load(tmp_path / "f", kernel=hk.Symplectic(other))
 
 
 def test_a_claim_of_a_huge_array_allocates_nothing(saved):

@@ -387,3 +387,67 @@ def test_a_dense_fit_that_cannot_fit_is_refused_before_it_starts():
     X = np.zeros((10_000_000, 2))
     with pytest.raises(ValueError, match=r"needs 9.6e\+06 GB .* Use solver=hk.ConjugateGradient"):
         hk.fit(K, X, X, RIDGE, solver=hk.Cholesky())
+
+
+def test_landmarks_beyond_the_first_buffer_are_all_different():
+    X = np.random.default_rng(0).normal(size=(400, 4))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # a hundred do not suffice
+        field = hk.fit(hk.Symplectic(hk.Gaussian(1.0)), X, X, solver=Nystrom(max_points=100))
+    assert field.points.shape == (100, 4)
+    assert len(np.unique(field.points, axis=0)) == 100
+
+
+SOLVERS = [None, Nystrom(), ConjugateGradient(), hk.RandomFeatures(20, jax.random.key(0))]
+
+
+@pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
+def test_data_at_the_centre_of_an_odd_kernel_has_the_zero_field(solver):
+    field = hk.fit(hk.Odd(K), np.zeros((3, 2)), np.ones((3, 2)), RIDGE, solver=solver)
+    assert not field(jnp.ones(2)).any()
+    np.testing.assert_allclose(field.residual_norm, 6**0.5, rtol=1e-12)
+
+
+@pytest.mark.parametrize("solver", SOLVERS[1:3], ids=lambda solver: type(solver).__name__)
+def test_a_gram_without_any_column_above_rounding_is_no_zero_gram(solver):
+    X, Y = swings(20)
+    with pytest.raises(RuntimeError, match=r"positive definite|did not converge"):
+        hk.fit(hk.CurlFree(lambda x, z: -(x @ z)), X, Y, RIDGE, solver=solver)
+
+
+def test_gradients_in_single_precision_ask_for_what_it_can_give():
+    X, Y = (each.astype(np.float32) for each in swings(20))
+    with pytest.warns(UserWarning, match="float32"):
+        reached = info(hk.fit(K, X, Y, 1e-3, solver=ConjugateGradient())).relative_residual
+    assert reached <= 1e-5
+    float32 = pytest.warns(UserWarning, match="float32")
+    with float32, pytest.raises(RuntimeError, match=r"tolerance 1\.0e-08"):
+        hk.fit(K, X, Y, 1e-3, solver=ConjugateGradient(1e-8))
+
+
+def test_a_preconditioner_is_an_instance_of_nystrom():
+    for other in (3, hk.Cholesky(), Nystrom):
+        with pytest.raises(TypeError, match=r"an instance of hk\.Nystrom"):
+            ConjugateGradient(preconditioner=other)  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize("key", [5, "a"])
+def test_a_key_is_one_key_of_jax(key):
+    for made in (lambda: Nystrom(key=key), lambda: hk.RandomFeatures(5, key)):
+        with pytest.raises(TypeError, match="a key of JAX"):
+            made()
+    with pytest.raises(ValueError, match=r"array of keys of shape \(3,\)"):
+        Nystrom(key=jax.random.split(jax.random.key(0), 3))
+
+
+def test_warnings_name_the_line_of_the_user():
+    X, Y = (each.astype(np.float32) for each in swings(20))
+    calls = [
+        lambda: hk.fit(K, X, Y, 1e-2),
+        lambda: Nystrom().start(K, X, 1e-2),
+        lambda: hk.tune(K, X, Y, starts=1, max_steps=1),
+    ]
+    for call in calls:
+        with pytest.warns(UserWarning, match="float32") as seen:
+            call()
+        assert {each.filename for each in seen} == {__file__}

@@ -545,3 +545,10 @@ def test_a_block_needs_two_points_of_one_space():
         K(jnp.zeros((4, 2)), jnp.zeros((4, 2)))
     with pytest.raises(ValueError, match="X has 2 coordinates and Z has 4"):
         K(jnp.zeros(2), jnp.zeros(4))
+
+
+def test_a_number_is_no_term_of_a_sum_of_structures():
+    K = hk.CurlFree(hk.Gaussian())
+    assert (0 + K) is K  # as the built-in sum begins
+    with pytest.raises(TypeError):
+        _ = 3 + K  # pyright: ignore[reportOperatorIssue]
