@@ -1,4 +1,24 @@
-"""Learn Hamiltonian dynamics with structured kernels, by automatic differentiation in JAX."""
+"""Learn Hamiltonian dynamics with structured kernels, by automatic differentiation in JAX.
+
+Where things are, in the order of the data; a file imports from its own line and those above it:
+
+    _scalar*                     scalar kernels k(x, z)
+    _structured*                 matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, odd and even ones
+    _check*, _features*, _gram*  the test of a kernel; random features; the Gram and its products
+    _field*                      what is learned: f and its potential
+    _solve*, _least_squares, _streaming_sums
+                                 how it is found
+    _fit                         from data to a field
+    _validation*, _folds, _inverse
+                                 the losses in closed form
+    _tune, _search*, _bounds, _objective
+                                 hyperparameters by their gradients
+    _simulate, _integrators*, _save*, systems, plot, paper
+                                 what is done with fields
+
+`_require` says what is wrong with an argument; `_devices`, `_memory`, `_trained`, `_callable` and
+`_show` are for all.
+"""
 
 import importlib
 from typing import TYPE_CHECKING, Any
@@ -6,6 +26,7 @@ from typing import TYPE_CHECKING, Any
 from hamkernel import systems
 from hamkernel._check import check_kernel
 from hamkernel._field import KernelField, SolverInfo
+from hamkernel._field_features import FeatureField
 from hamkernel._fit import fit
 from hamkernel._gram import gram
 from hamkernel._gram_operator import gram_operator
@@ -16,7 +37,7 @@ from hamkernel._scalar_transform import Select, Warp
 from hamkernel._simulate import simulate
 from hamkernel._solve import Cholesky
 from hamkernel._solve_cg import ConjugateGradient
-from hamkernel._solve_features import FeatureField, FeatureFit, RandomFeatures
+from hamkernel._solve_features import FeatureFit, RandomFeatures
 from hamkernel._solve_nystrom import LandmarkFit, Nystrom
 from hamkernel._structured import Even, Odd, Sum
 from hamkernel._structured_operators import CurlFree, DivergenceFree, Separable, Symplectic

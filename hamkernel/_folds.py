@@ -116,4 +116,4 @@ def _labels(N: int, folds: Folds) -> Int[np.ndarray, " N"]:
             f"folds has shape {array.shape}; one integer label for each of the {N} points is "
             "needed, shape (N,), or a number of folds, or 'loo'."
         )
-    return array.astype(np.int64)
+    return array

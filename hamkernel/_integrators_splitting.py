@@ -72,8 +72,8 @@ class AbstractSplitting(AbstractSymplecticSolver):
             raise ValueError(
                 f"{name} needs a separable Hamiltonian H = T(p) + U(q), and this field cannot be "
                 "proved to have one: it has no attribute `is_separable` that is True. A learned H "
-                "is separable if its kernel is, hk.Select(k1, q) + hk.Select(k2, p) with the "
-                "coordinates q and p; for every other use hk.ImplicitMidpoint() or "
+                "is separable if its kernel is, hk.Select(k1, (0, 1)) + hk.Select(k2, (2, 3)) for "
+                "four coordinates; for every other use hk.ImplicitMidpoint() or "
                 "hk.GaussLegendre4(). "
                 f"If you know that it is, say so with hk.{name}(assume_separable=True)."
             )

@@ -32,11 +32,11 @@ from hamkernel._features import (
     Waves,
 )
 from hamkernel._field import AbstractField, KernelField, SolverInfo
+from hamkernel._field_features import FeatureField
 from hamkernel._scalar import ScalarProduct, ScalarSum, Scaled, UserKernel
 from hamkernel._scalar_product import Periodic, Polynomial
 from hamkernel._scalar_radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._scalar_transform import Select, Symmetrised, Warp, identity, reflection
-from hamkernel._solve_features import FeatureField
 from hamkernel._structured import AbstractMatrixKernel, Sum
 from hamkernel._structured_operators import CurlFree, DivergenceFree, Separable, Symplectic
 

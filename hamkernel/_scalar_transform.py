@@ -29,6 +29,10 @@ class Warp(AbstractScalarKernel):
             module are trained. Define it once: a lambda made anew for each kernel is another
             function to JAX, and compiles anew.
 
+    Raises:
+        TypeError: `kernel` is no scalar kernel, or `fn` no function. ValueError, when called: `fn`
+            returns no vector.
+
     Example: `Warp(Gaussian(1.0), lambda x: jnp.array([jnp.cos(x[0]), jnp.sin(x[0]), x[1]]))`
     for a state (angle, momentum) on a cylinder.
     """
@@ -76,6 +80,10 @@ class Select(AbstractScalarKernel):
     Args:
         kernel: a scalar kernel on len(dims) coordinates.
         dims: distinct coordinates, integers ≥ 0.
+
+    Raises:
+        TypeError: `kernel` is no scalar kernel. ValueError: `dims` are no such coordinates, or,
+            when called, the points have none of that number.
     """
 
     kernel: AbstractScalarKernel

@@ -25,7 +25,7 @@ decode = eqx.filter_jit(lambda space, u, X: space.decode(u, X))
 
 @eqx.filter_jit
 def search(space, criterion, X, Y, scale: float, optimiser, starts: int, max_steps: int) -> Runs:
-    """The runs from all starts on X and Y, all points or a part of them; those of a part sorted.
+    """The runs from all starts on X and Y, all points or a part of them.
 
     Args:
         space: the search space.
@@ -46,22 +46,18 @@ def search(space, criterion, X, Y, scale: float, optimiser, starts: int, max_ste
     # Side by side all wait for the slowest, which only pays where a lane costs nothing: one after
     # the other took two thirds of the time on a CPU.
     together = None if jax.default_backend() == "cpu" else starts
-    runs = jax.lax.map(lambda u: _run(coarse, u, optimiser, max_steps), u, batch_size=together)
-    return runs if scale == 1 else _sorted(runs)
+    return jax.lax.map(lambda u: _run(coarse, u, optimiser, max_steps), u, batch_size=together)
 
 
 @eqx.filter_jit
 def finish(space, criterion, X, Y, runs: Runs, optimiser, max_steps: int) -> Runs:
-    """The runs with their losses on all points, the best one finished there."""
+    """The runs with their losses on all points, in that order, the best one finished there."""
     fine = _Objective(space, criterion, X, Y, 1.0)
-    runs = _sorted(eqx.tree_at(lambda r: r.value, runs, jax.lax.map(fine, runs.u)))
+    runs = eqx.tree_at(lambda r: r.value, runs, jax.lax.map(fine, runs.u))
+    order = jnp.argsort(runs.value)
+    runs = jax.tree.map(lambda leaf: leaf[order], runs)
     finished = _run(fine, runs.u[0], optimiser, max_steps)
     return jax.tree.map(lambda new, old: old.at[0].set(new), finished, runs)
-
-
-def _sorted(runs: Runs) -> Runs:
-    order = jnp.argsort(runs.value)
-    return jax.tree.map(lambda leaf: leaf[order], runs)
 
 
 DESIGN_POINTS = 256  # in the box, from which the starts are chosen

@@ -102,8 +102,13 @@ class Sum(AbstractMatrixKernel):
     `K1 + K2` makes one with positions; `Sum(conservative=K1, rest=K2)` one with names. After a
     fit `field.part("rest")` or `field.part(1)` is the part alone.
 
+    Args:
+        terms: matrix-valued kernels; a sum among them is taken apart.
+        named: the same with names.
+
     Raises:
-        TypeError: a term is no matrix-valued kernel.
+        TypeError: a term is no matrix-valued kernel. ValueError: there is no term, or two have one
+            name.
     """
 
     terms: tuple[AbstractMatrixKernel, ...]

@@ -65,6 +65,12 @@ class Separable(AbstractStructure):
 
     The baseline of the paper. Works in every dimension; fields have no potential.
 
+    Args:
+        kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
+
+    Raises:
+        TypeError: `kernel` is no scalar kernel.
+
     Source: Smith & Egeland (2023), eq. (separable_gaussian_kernel).
     """
 
@@ -126,6 +132,12 @@ class CurlFree(AbstractPotentialKernel):
 
     Works in every dimension n ≥ 1. `field.potential(x)` is u.
 
+    Args:
+        kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
+
+    Raises:
+        TypeError: `kernel` is no scalar kernel.
+
     Source: Smith & Egeland (2023), eq. (curl_free_kernel_base); Fuselier (2006).
     """
 
@@ -143,6 +155,12 @@ class Symplectic(AbstractPotentialKernel):
     """K(x, z) = J [∂x ∂zᵀ k(x, z)] Jᵀ: Hamiltonian fields f = J∇H, J = [[0, I], [−I, 0]].
 
     The state is x = (q₁…q_m, p₁…p_m), so n = 2m is even. `field.hamiltonian(x)` is H.
+
+    Args:
+        kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
+
+    Raises:
+        TypeError: `kernel` is no scalar kernel. ValueError, with data: n is odd.
 
     Source: Smith & Egeland (2023), eq. (symplectic_kernel_base); Boffi, Tu & Slotine (2022).
     """
@@ -171,6 +189,12 @@ class DivergenceFree(AbstractStructure):
 
     The fields are f_a = Σ_b ∂_b Ψ_ab of an antisymmetric matrix Ψ whose entries above the
     diagonal are independent functions in the RKHS of k. For n = 2, K = J M Jᵀ.
+
+    Args:
+        kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
+
+    Raises:
+        TypeError: `kernel` is no scalar kernel. ValueError, with data: n is 1.
 
     Source: Fuselier (2006); for n = 3 it is the curl of a vector potential.
     """

@@ -258,8 +258,8 @@ CASES = [
     ),
     Case(
         "periodic_ard",
-        lambda n: hk.Periodic(period=3 * widths(n), lengthscale=widths(n)[::-1]),
-        lambda n: periodic(3 * widths(n), widths(n)[::-1]),
+        lambda n: hk.Periodic(period=6 * widths(n), lengthscale=widths(n)[::-1]),
+        lambda n: periodic(6 * widths(n), widths(n)[::-1]),
         stationary=True,
         reflective=True,
     ),

@@ -16,8 +16,9 @@ from kernels import canonical, gaussian_profile, matern_profile, periodic, radia
 import hamkernel as hk
 from hamkernel._features import features
 from hamkernel._features_spectra import spectra
+from hamkernel._field_features import FeatureField
 from hamkernel._least_squares import ridge_regression, triangle
-from hamkernel._solve_features import FeatureField, RandomFeatures
+from hamkernel._solve_features import RandomFeatures
 from hamkernel.paper import datasets, experiments
 
 STRUCTURE = 1e-9  # relative; what sums of a thousand rounded terms leave of an exact zero
@@ -26,11 +27,6 @@ SOLVE = 1e-10  # the condition of the ridge problems here, below 1e5, times roun
 DIFFERENCES = 1e-5  # what central differences of step 1e-5 leave
 DEVIATIONS = 5.0  # standard errors of a mean of random numbers; one in 2 million goes beyond
 ELL = np.array([1.0, 2.0, 1.5, 0.8])
-
-
-def fit(*args: Any, **kwargs: Any) -> Any:
-    """`hk.fit`, of which the type checker knows only that it returns some field."""
-    return hk.fit(*args, **kwargs)
 
 
 def of_any(count: Any, key: Any) -> Any:
@@ -221,14 +217,14 @@ DEFECTS = {
 def test_the_structure_is_exact_for_every_count(name, count, key):
     structure, defect = DEFECTS[name]
     X, Y = data()
-    field = fit(structure(hk.Gaussian(ELL)), X, Y, 1e-3, solver=RandomFeatures(count, key))
+    field = hk.fit(structure(hk.Gaussian(ELL)), X, Y, 1e-3, solver=RandomFeatures(count, key))
     assert all(defect(field, x) < STRUCTURE for x in points(3, seed=9))
 
 
 @pytest.mark.parametrize("name", DEFECTS)
 def test_without_the_structure_the_same_check_fails(name, key):
     X, Y = data()
-    field = fit(hk.Separable(hk.Gaussian(ELL)), X, Y, 1e-3, solver=RandomFeatures(50, key))
+    field = hk.fit(hk.Separable(hk.Gaussian(ELL)), X, Y, 1e-3, solver=RandomFeatures(50, key))
     assert all(DEFECTS[name][1](field, x) > 1e-3 for x in points(3, seed=9))
 
 
@@ -311,7 +307,7 @@ def numpy_weights(rows, Y, ridge):
 def test_weights_are_those_of_ridge_regression_in_numpy(name, key):
     X, Y = data()
     K, ridge = STRUCTURES[name](hk.Gaussian(1.3)), 1e-3
-    field = fit(K, X, Y, ridge, solver=RandomFeatures(30, key))
+    field = hk.fit(K, X, Y, ridge, solver=RandomFeatures(30, key))
     assert isinstance(field, FeatureField)
     rows = np.asarray(field.features(X))
     w = numpy_weights(rows, Y, ridge)
@@ -349,7 +345,7 @@ def test_a_small_ridge_keeps_the_digits_that_normal_equations_lose(key):
 @pytest.mark.parametrize("name", ["curl_free", "symplectic", "odd_symplectic"])
 def test_the_field_comes_from_its_potential(name, key):
     X, Y = data()
-    field = fit(STRUCTURES[name](hk.Gaussian(1.3)), X, Y, solver=RandomFeatures(30, key))
+    field = hk.fit(STRUCTURES[name](hk.Gaussian(1.3)), X, Y, solver=RandomFeatures(30, key))
     B = np.eye(4) if name == "curl_free" else canonical(4)
     x = X[0]
     slope = [(field.potential(x + e) - field.potential(x - e)) / 2e-5 for e in 1e-5 * jnp.eye(4)]
@@ -364,7 +360,7 @@ def test_parts_add_up_to_the_field(key):
     X, Y = data()
     k = hk.Gaussian(1.3)
     K = hk.Sum(hamiltonian=hk.Symplectic(k), rest=hk.CurlFree(hk.Matern(2.5)))
-    field = fit(K, X, Y, solver=RandomFeatures(30, key))
+    field = hk.fit(K, X, Y, solver=RandomFeatures(30, key))
     parts = field.part("hamiltonian"), field.part(-1)
     np.testing.assert_allclose(parts[0](X[0]) + parts[1](X[0]), field(X[0]), atol=ROUNDING)
     assert jnp.isfinite(parts[0].hamiltonian(X[0]))
@@ -378,7 +374,7 @@ def test_parts_add_up_to_the_field(key):
 def test_a_separable_hamiltonian_is_recognised_and_learned_exactly_so(key):
     X, Y = data(n=2)
     k = hk.Select(hk.Gaussian(1.0), 0) + hk.Select(hk.Gaussian(2.0), 1)
-    field = fit(hk.Symplectic(k), X, Y, solver=RandomFeatures(20, key))
+    field = hk.fit(hk.Symplectic(k), X, Y, solver=RandomFeatures(20, key))
     assert field.is_separable
     mixed = jax.hessian(field.hamiltonian)(X[0])[0, 1]
     assert abs(float(mixed)) < STRUCTURE
@@ -387,9 +383,9 @@ def test_a_separable_hamiltonian_is_recognised_and_learned_exactly_so(key):
 def test_many_features_give_the_field_of_the_exact_kernel(key):
     X, Y = data(n=2)
     K, new = odd_symplectic(hk.Gaussian(1.5)), points(50, 2, seed=5)
-    exact = jax.vmap(fit(K, X, Y, 1e-2))(new)
+    exact = jax.vmap(hk.fit(K, X, Y, 1e-2))(new)
     few, many = (
-        jnp.linalg.norm(fit(K, X, Y, 1e-2, solver=RandomFeatures(c, key)).evaluate(new) - exact)
+        jnp.linalg.norm(hk.fit(K, X, Y, 1e-2, solver=RandomFeatures(c, key)).evaluate(new) - exact)
         / jnp.linalg.norm(exact)
         for c in (10, 500)
     )
@@ -411,7 +407,7 @@ def test_the_pendulum_of_the_paper_is_learned_as_by_the_exact_kernel():
         solvers = None, RandomFeatures(500, key)
         # The reading of the ridge that reproduces the paper's tables.
         ridge = model.regularization / experiment.size
-        fields = [fit(model.kernel, X, Y, ridge, solver=s) for s in solvers]
+        fields = [hk.fit(model.kernel, X, Y, ridge, solver=s) for s in solvers]
         orbits = [hk.simulate(field, x0, ts).ys for field in fields]
         return jnp.stack([jnp.linalg.norm(jnp.asarray(ys) - true, axis=1).mean() for ys in orbits])
 
@@ -439,7 +435,7 @@ def test_gradients_with_respect_to_hyperparameters_are_differences(make, key):
 
     def loss(t):
         K = odd_symplectic(make(t))
-        return jnp.sum(fit(K, X, Y, t * 1e-2, solver=RandomFeatures(20, key)).residual ** 2)
+        return jnp.sum(hk.fit(K, X, Y, t * 1e-2, solver=RandomFeatures(20, key)).residual ** 2)
 
     t, h = jnp.asarray(1.1), 1e-5
     gradient = jax.grad(loss)
@@ -489,11 +485,11 @@ def test_fits_run_under_jit_and_vmap_and_new_values_do_not_recompile(key):
     @jax.jit
     @eqx.debug.assert_max_traces(max_traces=1)
     def fitted(ell, ridge):
-        return fit(hk.Symplectic(hk.Gaussian(ell)), X, Y, ridge, solver=solver)(X[0])
+        return hk.fit(hk.Symplectic(hk.Gaussian(ell)), X, Y, ridge, solver=solver)(X[0])
 
     alone = jnp.stack([fitted(jnp.asarray(ell), jnp.asarray(1e-3)) for ell in (1.0, 1.5)])
     together = jax.vmap(
-        lambda ell: fit(hk.Symplectic(hk.Gaussian(ell)), X, Y, 1e-3, solver=solver)(X[0])
+        lambda ell: hk.fit(hk.Symplectic(hk.Gaussian(ell)), X, Y, 1e-3, solver=solver)(X[0])
     )(jnp.array([1.0, 1.5]))
     np.testing.assert_allclose(together, alone, rtol=SOLVE)
 
@@ -502,7 +498,7 @@ def test_fits_run_under_jit_and_vmap_and_new_values_do_not_recompile(key):
 def test_float32_stays_float32(key):
     X, Y = (a.astype(jnp.float32) for a in data(n=2))
     k = hk.Matern(2.5) + hk.Gaussian(1.0) + hk.RationalQuadratic() + hk.Periodic(4.0, 1.0)
-    field = fit(hk.Symplectic(2.0 * k), X, Y, solver=RandomFeatures(20, key))
+    field = hk.fit(hk.Symplectic(2.0 * k), X, Y, solver=RandomFeatures(20, key))
     assert field.weights.dtype == field(X[0]).dtype == field.potential(X[0]).dtype == X.dtype
 
 
@@ -520,7 +516,7 @@ def test_float32_stays_float32(key):
 def test_a_fit_to_chunks_is_the_fit_to_all(name, key):
     X, Y = data(N=90)
     K, solver = STRUCTURES[name](hk.Gaussian(1.3)), RandomFeatures(20, key)
-    whole = fit(K, X, Y, 1e-3, solver=solver)
+    whole = hk.fit(K, X, Y, 1e-3, solver=solver)
     cuts = [(0, 2), (2, 46), (46, 90)]  # the first with fewer rows than features
     chunks = ((np.asarray(X[a:b]), np.asarray(Y[a:b])) for a, b in cuts)
     streamed = solver.fit_chunks(K, chunks, 1e-3)
@@ -535,7 +531,7 @@ def test_a_fit_to_chunks_is_the_fit_to_all(name, key):
 def test_many_tiles_are_one(key):
     X, Y = data(N=2000, n=2)  # rows in tiles of a thousand, and a rest
     K, solver = hk.Symplectic(hk.Gaussian(1.3)), RandomFeatures(20, key)
-    field = fit(K, X, Y, 1e-3, solver=solver)
+    field = hk.fit(K, X, Y, 1e-3, solver=solver)
     rows = np.asarray(field.features(X)).reshape(X.size, -1)
     square = rows.T @ rows + len(X) * 1e-3 * np.eye(40)
     w = np.linalg.solve(square, rows.T @ np.asarray(Y).ravel())
@@ -578,7 +574,7 @@ def test_the_triangle_of_many_tiles_is_least_squares_in_numpy():
 @pytest.mark.parametrize("repeated", [1, 40])
 def test_features_may_be_many_more_than_rows(key, repeated):
     X, Y = (jnp.tile(each, (repeated, 1)) for each in data(N=6, n=2))
-    field = fit(hk.Symplectic(hk.Gaussian(3.0)), X, Y, 1e-5, solver=RandomFeatures(600, key))
+    field = hk.fit(hk.Symplectic(hk.Gaussian(3.0)), X, Y, 1e-5, solver=RandomFeatures(600, key))
     rows = np.asarray(field.features(X)).reshape(X.size, -1)
     gram = rows @ rows.T + len(X) * 1e-5 * np.eye(X.size)
     w = rows.T @ np.linalg.solve(gram, np.asarray(Y).ravel())
@@ -591,7 +587,7 @@ def test_features_may_be_many_more_than_rows(key, repeated):
 def test_features_that_do_not_fit_in_memory_are_refused():
     X, Y = data(n=2)
     solver = RandomFeatures(10**7, jax.random.key(0))
-    for ask in (lambda K: fit(K, X, Y, solver=solver), lambda K: solver.start(K, X)):
+    for ask in (lambda K: hk.fit(K, X, Y, solver=solver), lambda K: solver.start(K, X)):
         with pytest.raises(
             ValueError, match=r"count = 10000000 needs 6\.4e\+06 GB.*fewer features"
         ):
@@ -613,7 +609,7 @@ def test_kernels_without_a_spectral_density_are_refused(k, what, key):
     X, Y = data()
     for K in (hk.Symplectic(k()), hk.Odd(hk.Separable(k()))):
         with pytest.raises(TypeError, match=f"cannot draw frequencies for {re.escape(what)}"):
-            fit(K, X, Y, solver=RandomFeatures(10, key))
+            hk.fit(K, X, Y, solver=RandomFeatures(10, key))
 
 
 @pytest.mark.parametrize(
@@ -630,7 +626,7 @@ def test_kernels_without_a_spectral_density_are_refused(k, what, key):
             TypeError,
             "count must be a whole number, at least 1; got True",
         ),
-        (lambda key: of_any(10, 3), TypeError, "needs a key, jax.random.key(0); got 3"),
+        (lambda key: of_any(10, 3), TypeError, "a key of JAX, such as jax.random.key(0); got 3"),
         (
             lambda key: of_any(10, key).fit_chunks(hk.Symplectic(hk.Gaussian(1.0)), []),
             ValueError,
@@ -692,7 +688,7 @@ def test_what_makes_no_sense_is_refused(call, error, text, key):
 )
 def test_a_field_without_a_potential_says_why(structure, text, key):
     X, Y = data(n=2)
-    field = fit(structure(hk.Gaussian(1.0)), X, Y, solver=RandomFeatures(10, key))
+    field = hk.fit(structure(hk.Gaussian(1.0)), X, Y, solver=RandomFeatures(10, key))
     with pytest.raises(AttributeError, match=text):
         field.potential  # noqa: B018
     with pytest.raises(AttributeError, match="not Hamiltonian by construction"):

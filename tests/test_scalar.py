@@ -371,11 +371,15 @@ def test_hyperparameters_must_be_positive(name, make, bad):
         (lambda: hk.RationalQuadratic(alpha=0.0), ValueError, "alpha must be positive"),
         (lambda: hk.RationalQuadratic(alpha=np.ones(2)), ValueError, "alpha has shape"),
         (lambda: hk.Polynomial(offset=0.0), ValueError, "offset must be positive"),
-        (lambda: hk.Polynomial(degree=0), ValueError, "integer degree >= 1, got 0"),
-        (lambda: hk.Polynomial(degree=2.5), ValueError, r"integer degree >= 1, got 2\.5"),  # pyright: ignore
+        (lambda: hk.Polynomial(degree=0), ValueError, "degree must be a whole number"),
+        (lambda: hk.Polynomial(degree=2.5), TypeError, r"whole number, at least 1; got 2\.5"),  # pyright: ignore
         (lambda: -1.0 * hk.Gaussian(), ValueError, r"scale of a kernel must be .* got -1\.0"),
         (lambda: hk.Gaussian(np.ones((2, 2))), ValueError, r"number or a vector \(n,\)"),
-        (lambda: hk.Periodic(np.ones((2, 2))), ValueError, r"number or \(n,\)"),
+        (
+            lambda: hk.Periodic(np.ones((2, 2))),
+            ValueError,
+            r"period .* a number or a vector \(n,\)",
+        ),
         (lambda: hk.Gaussian(1j), TypeError, "real numbers are needed"),
         (lambda: hk.Select(hk.Gaussian(), ()), ValueError, "distinct coordinates"),
         (lambda: hk.Select(hk.Gaussian(), (0, 0)), ValueError, "distinct coordinates"),

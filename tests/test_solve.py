@@ -32,12 +32,6 @@ def exact(K, X, Y, regularization):
     return a.reshape(X.shape), (G @ a).reshape(X.shape)
 
 
-def fit(*arguments, **options) -> hk.KernelField:
-    field = hk.fit(*arguments, **options)
-    assert isinstance(field, hk.KernelField)
-    return field
-
-
 def info(field) -> Any:
     return field.info
 
@@ -70,7 +64,7 @@ def test_nystrom_is_the_exact_fit_where_the_tolerance_is_small(name):
         "separable": hk.Separable(hk.RationalQuadratic(1.0, 2.0)),
     }[name]
     X, Y = swings(150)
-    field = fit(K, X, Y, RIDGE, solver=Nystrom(tolerance=1e-5))
+    field = hk.fit(K, X, Y, RIDGE, solver=Nystrom(tolerance=1e-5))
     _, values = exact(K, X, Y, RIDGE)
     assert relative(fitted(field, Y), values) < 1e-7  # tolerance × noise
     assert len(field.points) < len(X)
@@ -83,7 +77,7 @@ def test_nystrom_is_the_exact_fit_where_the_tolerance_is_small(name):
 @pytest.mark.parametrize("tolerance", [10.0, 0.1, 1e-3])
 def test_fitted_values_are_within_the_tolerance_times_the_residual(tolerance):
     X, Y = swings(150)
-    field = fit(K, X, Y, RIDGE, solver=Nystrom(tolerance=tolerance))
+    field = hk.fit(K, X, Y, RIDGE, solver=Nystrom(tolerance=tolerance))
     _, values = exact(K, X, Y, RIDGE)
     off = np.linalg.norm(fitted(field, Y) - values) / np.linalg.norm(field.residual)
     assert info(field).truncation <= tolerance
@@ -94,7 +88,7 @@ def test_fitted_values_are_within_the_tolerance_times_the_residual(tolerance):
 
 def test_the_truncation_and_the_norm_are_those_of_numpy():
     X, Y = swings(150)
-    field = fit(K, X, Y, RIDGE, solver=Nystrom())
+    field = hk.fit(K, X, Y, RIDGE, solver=Nystrom())
     S, a = np.asarray(field.points), np.asarray(field.coefficients).ravel()
     used = np.abs(a) > 0
     C, G = dense(K, X, S)[:, used], dense(K, S)[np.ix_(used, used)]
@@ -112,7 +106,7 @@ def test_the_truncation_and_the_norm_are_those_of_numpy():
 def test_a_larger_ridge_needs_fewer_landmarks():
     X, Y = swings(400)
     counts = [
-        int(info(fit(K, X, Y, regularization, solver=Nystrom())).landmarks)
+        int(info(hk.fit(K, X, Y, regularization, solver=Nystrom())).landmarks)
         for regularization in (1e-2, 1e-4, 1e-6)
     ]
     assert counts[0] < counts[1] < counts[2] < 100
@@ -131,7 +125,7 @@ def test_repeated_and_mirrored_points_are_taken_once():
     X, Y = swings(40)
     X, Y = np.concatenate([X, X, -X]), np.concatenate([Y, Y, -Y])
     odd = hk.Odd(K)
-    field = fit(odd, X, Y, RIDGE, solver=Nystrom(tolerance=1e-4))
+    field = hk.fit(odd, X, Y, RIDGE, solver=Nystrom(tolerance=1e-4))
     assert int(info(field).rank) <= 2 * 40
     _, values = exact(odd, X, Y, RIDGE)
     assert relative(fitted(field, Y), values) < 1e-6
@@ -141,7 +135,7 @@ def test_no_digits_are_lost_to_normal_equations():
     """At λ = 1e-11 the sums alone keep five digits; with the refinement the fit is that of QR."""
     X, Y = swings(300)
     regularization = 1e-11
-    field = fit(K, X, Y, regularization, solver=Nystrom(tolerance=10.0))
+    field = hk.fit(K, X, Y, regularization, solver=Nystrom(tolerance=10.0))
     S = np.asarray(field.points)
     used = np.abs(np.asarray(field.coefficients).ravel()) > 0
     C, G = dense(K, X, S)[:, used], dense(K, S)[np.ix_(used, used)]
@@ -157,19 +151,19 @@ def test_no_digits_are_lost_to_normal_equations():
 @pytest.mark.slow
 def test_candidates_that_are_a_part_of_the_data_give_the_same_field():
     X, Y = swings(600)
-    field = fit(K, X, Y, RIDGE, solver=Nystrom(candidates=200, key=jax.random.key(5)))
+    field = hk.fit(K, X, Y, RIDGE, solver=Nystrom(candidates=200, key=jax.random.key(5)))
     _, values = exact(K, X, Y, RIDGE)
     off = np.linalg.norm(fitted(field, Y) - values) / np.linalg.norm(field.residual)
     assert off < info(field).truncation < 0.2
-    again = fit(K, X, Y, RIDGE, solver=Nystrom(candidates=200, key=jax.random.key(5)))
+    again = hk.fit(K, X, Y, RIDGE, solver=Nystrom(candidates=200, key=jax.random.key(5)))
     np.testing.assert_array_equal(field.coefficients, again.coefficients)
-    other = fit(K, X, Y, RIDGE, solver=Nystrom(candidates=200, key=jax.random.key(6)))
+    other = hk.fit(K, X, Y, RIDGE, solver=Nystrom(candidates=200, key=jax.random.key(6)))
     assert field.points.shape != other.points.shape or np.any(field.points != other.points)
 
 
 def test_nystrom_has_a_hamiltonian_and_a_field_that_is_its_flow():
     X, Y = swings(150)
-    field = fit(K, X, Y, RIDGE, solver=Nystrom())
+    field = hk.fit(K, X, Y, RIDGE, solver=Nystrom())
     x = jnp.array([0.3, -0.4])
     q_slope, p_slope = jax.grad(field.hamiltonian)(x)
     np.testing.assert_allclose(field(x), [p_slope, -q_slope], atol=1e-12)
@@ -182,7 +176,7 @@ def test_nystrom_works_under_jit_and_its_gradient_is_that_of_finite_differences(
 
     def loss(log_lengthscale):
         K = hk.Symplectic(hk.Gaussian(jnp.exp(log_lengthscale)))
-        field = fit(K, X, Y, 1e-3, solver=solver)
+        field = hk.fit(K, X, Y, 1e-3, solver=solver)
         return jnp.sum(field(jnp.array([0.2, 0.1])) ** 2) + jnp.sum(field.residual**2)
 
     start, step = jnp.asarray(0.4), 1e-4
@@ -193,7 +187,7 @@ def test_nystrom_works_under_jit_and_its_gradient_is_that_of_finite_differences(
 
     def objective(log_lengthscale):  # the exact fit, which this tolerance stands for
         K = hk.Symplectic(hk.Gaussian(jnp.exp(log_lengthscale)))
-        field = fit(K, X, Y, 1e-3)
+        field = hk.fit(K, X, Y, 1e-3)
         return jnp.sum(field(jnp.array([0.2, 0.1])) ** 2) + jnp.sum(field.residual**2)
 
     expected = (objective(start + step) - objective(start - step)) / (2 * step)
@@ -203,7 +197,7 @@ def test_nystrom_works_under_jit_and_its_gradient_is_that_of_finite_differences(
 def test_too_few_landmarks_are_said():
     X, Y = swings(150)
     with pytest.warns(UserWarning, match=r"4 landmarks leave .* Raise max_points"):
-        field = fit(K, X, Y, RIDGE, solver=Nystrom(max_points=4))
+        field = hk.fit(K, X, Y, RIDGE, solver=Nystrom(max_points=4))
     assert info(field).truncation > 0.1
     assert int(info(field).landmarks) == 4
 
@@ -223,7 +217,7 @@ def test_second_derivatives_of_a_fit_on_landmarks_are_those_of_differences():
     solver = Nystrom(tolerance=1e9, points=X[::3])
 
     def norm(lengthscale):
-        return fit(hk.Symplectic(hk.Matern(2.5, lengthscale)), X, Y, 1e-2, solver=solver).norm
+        return hk.fit(hk.Symplectic(hk.Matern(2.5, lengthscale)), X, Y, 1e-2, solver=solver).norm
 
     slope, h = jax.jit(jax.grad(norm)), 1e-4
     expected = (slope(1.2 + h) - slope(1.2 - h)) / (2 * h)
@@ -234,7 +228,7 @@ def test_a_kernel_that_is_not_positive_is_refused():
     X, Y = swings(60)
     for k in (lambda x, z: -jnp.exp(x @ z), lambda x, z: jnp.linalg.norm(x - z)):
         with pytest.raises(RuntimeError, match="check_kernel"):
-            fit(hk.CurlFree(k), X, Y, RIDGE, solver=Nystrom())
+            hk.fit(hk.CurlFree(k), X, Y, RIDGE, solver=Nystrom())
 
 
 # Conjugate gradients.
@@ -248,7 +242,7 @@ def test_conjugate_gradients_find_the_exact_coefficients(name):
         "rough": hk.Symplectic(hk.Matern(1.5, 1.0)),
     }[name]
     X, Y = swings(150, n=4)
-    field = fit(K, X, Y, RIDGE, solver=ConjugateGradient())
+    field = hk.fit(K, X, Y, RIDGE, solver=ConjugateGradient())
     a, values = exact(K, X, Y, RIDGE)
     assert relative(field.coefficients, a) < 1e-7
     np.testing.assert_allclose(fitted(field, Y), values, atol=1e-7)
@@ -279,7 +273,7 @@ def test_a_new_tolerance_of_conjugate_gradients_compiles_nothing():
 def test_landmarks_precondition():
     X, Y = swings(150, n=4)
     counts = [
-        int(info(fit(K, X, Y, RIDGE, solver=ConjugateGradient(1e-6, 2000, p))).iterations)
+        int(info(hk.fit(K, X, Y, RIDGE, solver=ConjugateGradient(1e-6, 2000, p))).iterations)
         for p in (Nystrom(10.0, 64), Nystrom(1e5, 1))
     ]
     assert counts[0] <= 15 < 2 * counts[0] < counts[1]
@@ -314,7 +308,7 @@ def test_the_gradient_of_conjugate_gradients_is_that_of_cholesky():
 
     def loss(log_lengthscale, solver):
         K = hk.Symplectic(hk.Gaussian(jnp.exp(log_lengthscale)))
-        field = fit(K, X, Y, 1e-3, solver=solver)
+        field = hk.fit(K, X, Y, 1e-3, solver=solver)
         return jnp.sum(field(jnp.array([0.2, 0.1])) ** 2)
 
     start = jnp.asarray(0.4)
@@ -328,7 +322,7 @@ def test_the_gradient_of_conjugate_gradients_in_the_velocities_is_that_of_choles
     iterative = ConjugateGradient(1e-10, preconditioner=Nystrom(10.0, 16))
 
     def slope(solver):
-        return jax.grad(lambda Y: fit(K, X, Y, 1e-3, solver=solver)(X[0])[1])(jnp.asarray(Y))
+        return jax.grad(lambda Y: hk.fit(K, X, Y, 1e-3, solver=solver)(X[0])[1])(jnp.asarray(Y))
 
     expected = slope(hk.Cholesky())
     assert jnp.abs(expected).max() > 1e-3
@@ -341,7 +335,7 @@ def test_a_kernel_may_have_leaves_that_are_no_arrays(solver):
     net = eqx.nn.MLP(2, 3, 4, 1, activation=jnp.tanh, key=jax.random.key(0))
     net = jax.tree.map(lambda a: a.astype(float) if eqx.is_inexact_array(a) else a, net)
     K, (X, Y) = hk.Symplectic(hk.Warp(hk.Gaussian(1.0), net)), swings(40)
-    field = fit(K, X, Y, 1e-3, solver=solver)
+    field = hk.fit(K, X, Y, 1e-3, solver=solver)
     _, values = exact(K, X, Y, 1e-3)
     assert relative(fitted(field, Y), values) < 1e-5
 

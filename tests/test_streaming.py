@@ -30,10 +30,6 @@ def chunks(X, Y, size):
         yield X[start : start + size], Y[start : start + size]
 
 
-def fit(*arguments, **options) -> Any:
-    return hk.fit(*arguments, **options)
-
-
 def given(points):
     """Few landmarks: these tests are about what is done with them."""
     return Nystrom(tolerance=1e9, points=points)
@@ -63,7 +59,7 @@ def test_a_fit_to_chunks_is_the_fit_to_all(name):
         "sum": hk.CurlFree(hk.Gaussian(2.0)) + hk.Symplectic(hk.Matern(2.5, 2.0)),
         "separable": hk.Separable(hk.RationalQuadratic(1.0, 2.0)),
     }[name]
-    whole: Any = fit(K, X, Y, RIDGE, solver=given(S))
+    whole: Any = hk.fit(K, X, Y, RIDGE, solver=given(S))
     streamed: Any = given(S).fit_chunks(K, chunks(X, Y, 200), RIDGE)
     assert relative(streamed.evaluate(NEW), whole.evaluate(NEW)) < ROUNDING
     np.testing.assert_allclose(streamed.norm, whole.norm, rtol=ROUNDING)
@@ -79,7 +75,7 @@ def test_a_fit_to_chunks_is_the_fit_to_all(name):
 
 
 def test_landmarks_chosen_from_a_sample_are_those_chosen_from_the_data():
-    whole: Any = fit(K, X, Y, RIDGE, solver=Nystrom())
+    whole: Any = hk.fit(K, X, Y, RIDGE, solver=Nystrom())
     streamed: Any = Nystrom().fit_chunks(K, chunks(X, Y, 200), RIDGE, sample=X)
     np.testing.assert_array_equal(streamed.points, whole.points)
     assert relative(streamed.evaluate(NEW), whole.evaluate(NEW)) < ROUNDING
@@ -122,7 +118,7 @@ def test_digits_survive_a_small_ridge():
 def test_sums_in_the_basis_of_a_sample_keep_the_digits_of_a_qr():
     """At λ = 1e-13 the same sums in the basis that they come in lose four digits more."""
     waves, regularization = hk.RandomFeatures(40, jax.random.key(0)), 1e-13
-    design: Any = fit(K, X[:1], Y[:1], RIDGE, solver=waves).features
+    design: Any = hk.fit(K, X[:1], Y[:1], RIDGE, solver=waves).features
     rows = np.asarray(design(jnp.asarray(X))).reshape(X.size, -1)
     values = rows @ least_squares(rows, Y, len(X) * regularization)
 
@@ -139,9 +135,9 @@ def test_sums_in_the_basis_of_a_sample_keep_the_digits_of_a_qr():
 def test_data_and_ridge_may_change_after_the_fit():
     model = given(S).start(K, X).add(X[:200], Y[:200]).add(X[200:400], Y[200:400])
     before, after = model.field(1e-2), model.add(X[400:], Y[400:]).field(RIDGE)
-    expected = fit(K, X[:400], Y[:400], 1e-2, solver=given(S))
+    expected = hk.fit(K, X[:400], Y[:400], 1e-2, solver=given(S))
     assert relative(before.evaluate(NEW), expected.evaluate(NEW)) < ROUNDING
-    expected = fit(K, X, Y, RIDGE, solver=given(S))
+    expected = hk.fit(K, X, Y, RIDGE, solver=given(S))
     assert relative(after.evaluate(NEW), expected.evaluate(NEW)) < ROUNDING
     assert relative(before.evaluate(NEW), after.evaluate(NEW)) > 1e-3
 
@@ -167,7 +163,7 @@ def test_both_solvers_stream_with_the_same_words(solver: AbstractStreamingSolver
     assert repr(model) == f"{type(model).__name__}({kernel}, {size}, added=600)"
     jax.eval_shape(lambda model: repr(model) and model.count, model)
     field = model.field()
-    whole = fit(K, X, Y, RIDGE, solver=solver)
+    whole = hk.fit(K, X, Y, RIDGE, solver=solver)
     assert relative(field.evaluate(NEW), whole.evaluate(NEW)) < ROUNDING
     streamed = solver.fit_chunks(K, chunks(X, Y, 200), RIDGE, sample=X)
     np.testing.assert_array_equal(streamed.evaluate(NEW), field.evaluate(NEW))
@@ -176,7 +172,7 @@ def test_both_solvers_stream_with_the_same_words(solver: AbstractStreamingSolver
 def test_landmarks_of_the_first_chunk_do_where_chunks_are_alike():
     field: Any = Nystrom(tolerance=0.01).fit_chunks(K, chunks(X, Y, 200), RIDGE)
     assert field.info.truncation < 0.2  # seen on all of the data
-    exact = fit(K, X, Y, RIDGE)
+    exact = hk.fit(K, X, Y, RIDGE)
     assert relative(field.evaluate(NEW), exact.evaluate(NEW)) < 1e-3  # a tenth of the noise
 
 
@@ -198,7 +194,7 @@ def test_warnings_name_the_line_of_the_user():
     for ask in (
         lambda: model.field(),
         lambda: few.fit_chunks(K, [(X[:200], Y[:200])], RIDGE),
-        lambda: fit(K, X[:200], Y[:200], RIDGE, solver=few),
+        lambda: hk.fit(K, X[:200], Y[:200], RIDGE, solver=few),
     ):
         with pytest.warns(UserWarning, match="4 landmarks leave") as truncated:
             ask()
@@ -210,7 +206,7 @@ def test_memory_mapped_files_and_a_shorter_last_chunk(tmp_path):
     np.save(tmp_path / "Y.npy", Y[:450])
     states, velocities = (np.load(tmp_path / f"{name}.npy", mmap_mode="r") for name in "XY")
     field = given(S).fit_chunks(K, chunks(states, velocities, 200), RIDGE)
-    whole = fit(K, X[:450], Y[:450], RIDGE, solver=given(S))
+    whole = hk.fit(K, X[:450], Y[:450], RIDGE, solver=given(S))
     assert relative(field.evaluate(NEW), whole.evaluate(NEW)) < ROUNDING
 
 
@@ -239,10 +235,10 @@ def test_the_size_of_a_fit_ignores_the_data():
 
 
 def test_given_landmarks_carry_the_field_and_repeated_ones_are_left_out():
-    once: Any = fit(K, X, Y, RIDGE, solver=given(S))
+    once: Any = hk.fit(K, X, Y, RIDGE, solver=given(S))
     np.testing.assert_array_equal(once.points, S)
     assert (int(once.info.landmarks), int(once.info.rank)) == (30, 60)
-    twice: Any = fit(K, X, Y, RIDGE, solver=given(np.concatenate([S, S])))
+    twice: Any = hk.fit(K, X, Y, RIDGE, solver=given(np.concatenate([S, S])))
     assert (int(twice.info.landmarks), int(twice.info.rank)) == (30, 60)
     assert relative(twice.evaluate(NEW), once.evaluate(NEW)) < BASIS
 
@@ -259,7 +255,7 @@ def test_what_makes_no_sense_is_refused():
     with pytest.raises(ValueError, match="the data has 4 coordinates and the fit 2"):
         solver.start(K, X).add(*swings(10, n=4))
     with pytest.raises(ValueError, match="the landmarks have 2 coordinates and X 4"):
-        fit(K, *swings(10, n=4), RIDGE, solver=solver)
+        hk.fit(K, *swings(10, n=4), RIDGE, solver=solver)
     with pytest.raises(ValueError, match="NaN or inf in row 3"):
         solver.start(K, np.where(np.arange(600)[:, None] == 3, np.nan, X))
     with pytest.raises(ValueError, match="even"):

@@ -76,12 +76,8 @@ def log_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:
 def signed_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:
     """A finite parameter of either sign, by default a scalar."""
     array = shaped(require.floating(jnp.asarray(x), name), name, *(shapes or ((),)))
-    return finite(array, name)
-
-
-def finite(x: Array, name: str) -> Array:
-    """`x`, in which every entry must be finite."""
-    return require.value(x, require.not_finite(x), lambda: f"{name} must be finite, got {x}.")
+    bad = require.not_finite(array)
+    return require.value(array, bad, lambda: f"{name} must be finite, got {array}.")
 
 
 def count_of(x: Numbers, name: str) -> int:
