@@ -8,7 +8,7 @@ from hamkernel import _require as require
 from hamkernel import _streaming_sums as streaming_sums
 from hamkernel._devices import as_given, rows_of, split
 from hamkernel._features import AbstractFeatures, features
-from hamkernel._field import SolverInfo
+from hamkernel._field import SolverInfo, root
 from hamkernel._field_features import FeatureField
 from hamkernel._least_squares import ridge_regression
 from hamkernel._memory import refuse_beyond_memory
