@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel._gram import block_traces
 from hamkernel._scalar import AbstractScalarKernel
+from hamkernel._scalar_product import Periodic
 from hamkernel._scalar_transform import Select, Symmetrised, Warp
 from hamkernel._structured import AbstractMatrixKernel, Sum
 
@@ -124,6 +125,9 @@ def _box(
 ) -> tuple[ArrayLike, ArrayLike]:
     """Bounds for the leaf `name` of `node`, in its stored coordinates."""
     ours = isinstance(node, AbstractScalarKernel)
+    if isinstance(node, Periodic) and name == "log_lengthscale":
+        # On a circle of radius 1; below 1/64 its Fourier series is too long for random features.
+        return np.log(max(0.6 / len(X), 1 / 64)), np.log(60.0)
     if ours and name == "log_lengthscale":
         spacing, extent = _spacing_and_extent(X, per_coordinate=leaf.ndim > 0)
         return np.log(0.3 * spacing), np.log(30 * extent)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
+import hamkernel as hk
 from hamkernel._integrators import equal_steps
 from hamkernel._integrators_gauss import GaussLegendre4, GaussLegendre6, ImplicitMidpoint
 from hamkernel._integrators_splitting import StormerVerlet, Yoshida4
@@ -433,3 +434,13 @@ def test_the_reason_of_a_failure_is_the_one_that_is_said():
         simulate(lambda x: jnp.array([1, 2]), START, TIMES)
     with pytest.raises(TypeError, match="float32 or float64"):
         simulate(Pendulum(), START.astype(jnp.float16), TIMES)
+
+
+def test_each_tolerance_is_its_own():
+    pendulum, x0, ts = hk.systems.Pendulum(), jnp.array([1.0, 0.0]), jnp.linspace(0.0, 1.0, 5)
+
+    def steps(**tolerances):
+        return int(hk.simulate(pendulum, x0, ts, **tolerances).stats["num_steps"])
+
+    assert steps(atol=1e-2) < steps(atol=1e-12)
+    assert steps(rtol=1e-2, atol=1e-9) < steps(rtol=1e-12, atol=1e-9)

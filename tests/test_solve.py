@@ -445,3 +445,20 @@ def test_warnings_name_the_line_of_the_user():
         with pytest.warns(UserWarning, match="float32") as seen:
             call()
         assert {each.filename for each in seen} == {__file__}
+
+
+def test_landmarks_depend_on_the_key():
+    X, Y = swings(60)
+    keys = None, jax.random.key(0), jax.random.key(1)
+    default, same, other = (hk.fit(K, X, Y, 1e-2, solver=Nystrom(key=key)).points for key in keys)
+    np.testing.assert_array_equal(default, same)
+    assert default.shape != other.shape or (default != other).any()
+
+
+def test_the_warning_of_few_landmarks_comes_at_twice_the_tolerance():
+    X, Y = swings(60)
+    few = hk.fit(K, X, Y, 1e-3, solver=Nystrom(1e9, points=X[:4]))
+    truncation = float(info(few).truncation)
+    hk.fit(K, X, Y, 1e-3, solver=Nystrom(truncation / 1.9, points=X[:4]))  # warnings are errors
+    with pytest.warns(UserWarning, match="4 landmarks leave"):
+        hk.fit(K, X, Y, 1e-3, solver=Nystrom(truncation / 2.1, points=X[:4]))

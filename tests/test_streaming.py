@@ -328,3 +328,13 @@ def test_memory_ignores_the_number_of_points():
     few, many = json.loads(done.stdout)
     # 38 more chunks are 24 MB; one stays, with what the allocator holds back.
     assert many - few < 8e6
+
+
+def test_chunks_of_fewer_digits_are_added_to_a_fit_of_more():
+    X, Y = swings(60)
+    low = [each.astype(np.float32) for each in (X, Y)]
+    model = given(X[:20]).start(hk.Symplectic(hk.Gaussian(1.5)), X, 1e-2)
+    field = model.add(*low).field()
+    assert field.coefficients.dtype == np.float64
+    wide = model.add(*(each.astype(np.float64) for each in low)).field()
+    np.testing.assert_array_equal(field.coefficients, wide.coefficients)

@@ -473,3 +473,17 @@ def test_bad_kernels_data_and_ridges_are_refused(name):
         objective(K, X, Y, -RIDGE)
     with pytest.raises(ValueError, match=r"odd|even"):
         objective(K, X[:, :1], Y[:, :1], RIDGE)
+
+
+def test_the_gradient_over_many_strips_of_the_gram_is_that_of_differences():
+    rng = np.random.default_rng(0)
+    X, Y = rng.uniform(-3, 3, size=(240, 2)), rng.normal(size=(240, 2))
+
+    @jax.jit
+    def loss(t):
+        k = hk.Gaussian(jnp.exp(t) * jnp.array([1.0, 1.5]))
+        return hk.log_marginal_likelihood(hk.Symplectic(k), X, Y, 1e-3)
+
+    h = 1e-5
+    difference = (loss(0.1 + h) - loss(0.1 - h)) / (2 * h)
+    np.testing.assert_allclose(jax.grad(loss)(0.1), difference, rtol=1e-6)

@@ -1,0 +1,128 @@
+"""Where `tune` looks: the box of each hyperparameter, the subset of points, the starts."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hamkernel as hk
+from hamkernel._bounds import hyperparameters, traces
+from hamkernel._objective import HUGE, criterion_of
+from hamkernel._search import _design, _spread_out
+from hamkernel._search_space import SearchSpace
+from hamkernel._validation import generalized_loss
+from hamkernel._validation_low_rank import WaveBasis, low_rank_generalized_loss
+
+N = 20
+RNG = np.random.default_rng(0)
+X = RNG.uniform([-3, -1], [3, 1], size=(N, 2))
+Y = RNG.normal(size=X.shape)
+EXTENTS = np.ptp(X, axis=0)
+EXTENT = np.linalg.norm(EXTENTS)
+K = hk.Symplectic(hk.Gaussian(1.0))
+
+
+class Own(eqx.Module):
+    """A kernel of the user, whose parameter says by its name only that it is positive."""
+
+    log_width: jax.Array
+
+    def __call__(self, x, z):
+        return jnp.exp(-((x - z) @ (x - z)) * jnp.exp(-2 * self.log_width))
+
+
+def tenfold(x):
+    return 10 * x
+
+
+SQUARE = np.mean(np.sum(X**2, axis=1))
+BOXES = {
+    "lengthscale": (hk.Gaussian(1.0), "lengthscale", 0.3 * EXTENT / N, 30 * EXTENT),
+    "for each": (hk.Gaussian(np.ones(2)), "lengthscale", 0.3 * EXTENTS / N, 30 * EXTENTS),
+    "selected": (hk.Select(hk.Gaussian(), 1), "lengthscale", 0.3 * EXTENTS[1] / N, 30 * EXTENTS[1]),
+    "warped": (hk.Warp(hk.Gaussian(), tenfold), "lengthscale", 3 * EXTENT / N, 300 * EXTENT),
+    "period": (hk.Periodic(), "period", 2 * EXTENT / N, 10 * EXTENT),
+    # Dimensionless: on a circle of radius 1, whatever the units of the states.
+    "on a circle": (hk.Periodic(), "lengthscale", 0.6 / N, 60.0),
+    "offset": (hk.Polynomial(2), "offset", 1e-4 * SQUARE, 1e4 * SQUARE),
+    "scale": (2.0 * hk.Gaussian(), "scale", 1e-5 * np.mean(Y**2), 1e5 * np.mean(Y**2)),
+    "own": (Own(jnp.log(1e5)), "width", 1e2, 1e8),
+}
+
+
+@pytest.mark.parametrize("name", BOXES)
+def test_the_box_comes_from_the_data(name):
+    k, parameter, low, high = BOXES[name]
+    found = hyperparameters(hk.Separable(k), jnp.asarray(X), jnp.asarray(Y))
+    (box,) = (each for each in found if each.name.endswith("." + parameter))
+    np.testing.assert_allclose(np.exp(box.low), low, rtol=1e-9)
+    np.testing.assert_allclose(np.exp(box.high), high, rtol=1e-9)
+
+
+def test_the_lengthscale_of_a_periodic_kernel_does_not_know_the_units_of_the_states():
+    for units in (1.0, 1e4):
+        K = hk.Separable(hk.Periodic(2.0 * units))
+        tuned = hk.tune(K, X * units, np.sin(np.pi * X), folds=4, starts=4, frozen="period")
+        assert tuned.loss < 1e-2 * np.mean(np.sin(np.pi * X) ** 2)
+
+
+def test_rounding_is_that_of_the_terms_before_they_cancel():
+    long = hk.Symplectic(hk.Gaussian(30.0))
+    odd = hk.Odd(long)
+    expected = [np.trace(np.asarray(hk.gram(each, X)).reshape(2 * N, -1)) for each in (odd, long)]
+    np.testing.assert_allclose(traces(odd, jnp.asarray(X)), expected, rtol=1e-9)
+
+
+def space(kernel=K, bounds=None):
+    return SearchSpace(kernel, jnp.asarray(X), jnp.asarray(Y), jnp.asarray(1e-3), (), bounds or {})
+
+
+def test_the_floor_of_lambda_rises_where_the_field_would_be_rough():
+    whole, states = space(), jnp.asarray(X)
+    lowest = jnp.exp(whole.ridge_box(K, states)[0])
+    smooth = whole.smooth(K, lowest, states, 0.1)
+    trace = 2 * N * 1.0  # of the Gram
+    floor = 0.1 * np.sqrt(np.finfo(float).eps) * trace / N
+    np.testing.assert_allclose(jnp.exp(smooth.ridge_box(K, states)[0]), floor)
+    assert whole.smooth(K, lowest, states, 1e-12) is whole  # there is no misfit
+    assert whole.smooth(K, jnp.asarray(1.0), states, 0.1) is whole  # λ is large enough
+    given = space(bounds={"regularization": (1e-9, 1.0)})
+    assert given.smooth(K, lowest, states, 0.1) is given  # the caller has said
+
+
+def test_a_start_whose_kernel_is_not_positive_is_in_the_box():
+    start = space(hk.Symplectic(lambda x, z: -jnp.exp(-((x - z) @ (x - z)))))
+    assert np.isfinite(start.encode_start(jnp.asarray(X))).all()
+
+
+def test_the_subset_has_its_share_of_every_fold():
+    labels = np.where(np.arange(400) % 12 == 0, 1, 0)
+    rows = criterion_of("cross_validation", 400, labels).coarse_points(jnp.zeros((400, 2)))
+    assert abs(labels[rows].mean() - labels.mean()) < 1 / len(rows)
+
+
+def test_starts_are_no_neighbours():
+    design = _design(2, 256, np.float64)
+    shares = np.sin(_spread_out(design, jnp.sum(design**2, axis=1), 6)) / 2
+    gaps = np.linalg.norm(shares[:, None] - shares[None], axis=2)[np.triu_indices(6, 1)]
+    assert gaps.min() >= 0.25 * 2**0.5
+
+
+def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free():
+    few, states, ridge = jnp.asarray(Y[:6]), jnp.asarray(X[:6]), jnp.asarray(1e-3)
+    waves = WaveBasis(jax.random.key(0), 3)
+    F, G = (
+        np.asarray(each).reshape(12, -1) for each in (waves.rows(K, states), hk.gram(K, states))
+    )
+
+    def free(matrix):
+        return 6e-3 * np.trace(np.linalg.inv(matrix + 6e-3 * np.eye(12))) / 12
+
+    low_rank, dense = free(F @ F.T), free(G)
+    for more, judged in ((-1e-6, np.isfinite), (1e-6, np.isinf)):
+        assert judged(low_rank_generalized_loss(waves, K, states, few, ridge, low_rank + more))
+        assert judged(generalized_loss(K, states, few, ridge, dense + more))
+    criterion = criterion_of("generalized_cross_validation", 6, 5)
+    assert criterion.value(K, states, few, jnp.asarray(1e-12)) == HUGE
+    assert criterion.with_basis(waves).value(K, states, few, jnp.asarray(1.0)) < HUGE
