@@ -97,14 +97,15 @@ class Matern(AbstractRadialKernel):
 
     Args:
         nu: 1.5, 2.5, 3.5, …; fixed, not trained. A field of this kernel is differentiable
-            ⌈ν⌉ − 2 times, so 2.5 is the roughest whose flow has a continuous Jacobian. Second
-            derivatives of `evaluate` and of products with more than 1000 points are NaN in
-            reverse mode where points coincide, and right in forward mode, `jax.jacfwd`.
+            ⌈ν⌉ − 2 times, so 2.5 is the roughest whose flow has a continuous Jacobian.
         lengthscale: ℓ > 0 in the units of the states; a number, or an array (n,).
 
     Raises:
         ValueError: `nu` is 1/2, whose second derivative at x = z does not exist, or no
             half-integer; a lengthscale is not positive and finite.
+
+    Of products with more than 1000 points, `field.evaluate` among them, second derivatives are NaN
+    in reverse mode where points coincide, and right in forward mode, `jax.jacfwd`.
 
     Source: Rasmussen & Williams (2006), eq. 4.16.
     """
