@@ -8,7 +8,7 @@ from hamkernel._check_pairs import Pairs, lowest, size_of
 
 _SHRINK = 4.0  # ratio of one step to the next
 _SETTLED, _VIOLATED = 0.03, 0.05  # plateau of M(x, x + h); negative eigenvalue of a pair
-_DECADES = 5  # steps in a row in which the blocks of a sound kernel do not grow: 4⁵ = 1000
+_STEADY = 5  # steps of growth in a row, 4⁵ = 1000 in distance: more than a sound kernel has
 _CLOSE = 0.01  # change of k, relative to k, within which a neighbour counts as near
 
 PROFILE = (
@@ -90,18 +90,18 @@ def near_blocks(
     ratio = raw[:, :, 1:] / np.where(raw[:, :, :-1] > 0, raw[:, :, :-1], np.inf)
     both = close[:, :, 1:] & close[:, :, :-1]
     steps = both.sum(axis=-1)
+    grown = both & (ratio > 1.3)
     growing = (steps >= 3) & ~settled.any(axis=-1)
-    growing &= (both & (ratio > 1.3)).sum(axis=-1) > 0.8 * steps
+    growing &= grown.sum(axis=-1) > 0.8 * steps
     # A block of a sound kernel with a second, unresolved scale may grow, but not beyond M(x, x).
     growing &= raw.max(axis=-1) > 2 * size_of(diagonal.block)[:, None]
     # A scale is passed in a step or two. Growth over decades is a kernel of the distance, also
     # where a term under the root stops it in the end: M(x, x) is then a delta beside the rest.
-    run = np.zeros(steps.shape, int)
-    longest = run
-    for step in np.moveaxis(both & (ratio > 1.3), -1, 0):
+    run = longest = np.zeros(steps.shape, int)
+    for step in np.moveaxis(grown, -1, 0):
         run = np.where(step, run + 1, 0)
         longest = np.maximum(longest, run)
-    endless = longest >= _DECADES
+    endless = longest >= _STEADY
     growing |= endless
     missed = judged.any(axis=-1) & ~reached.any(axis=-1) & (settled.any(axis=-1) | growing)
 

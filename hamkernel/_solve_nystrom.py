@@ -70,7 +70,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
     Raises:
         ValueError: an argument is not positive, `points` is not of shape (m, n), or the tolerance
             is a whole number above 1, which looks like `max_points`; write 10.0 if it is meant.
-            TypeError: a number of points is not whole.
+            TypeError: a number of points is not whole, or `key` no key.
 
     Warns:
         UserWarning: the landmarks do not reach the tolerance.

@@ -384,9 +384,8 @@ def test_failed_solves_raise_unless_told_not_to():
     stiff = Pendulum(jnp.array(1e4))
     stuck = simulate(stiff, START, ts, ImplicitMidpoint(), dt=0.5, throw=False)
     assert stuck.result != diffrax.RESULTS.successful
-    assert not jnp.isfinite(
-        jnp.asarray(stuck.ys)[1:]
-    ).any()  # the state of a step that failed is no state
+    # The state of a step that failed is no state.
+    assert not jnp.isfinite(jnp.asarray(stuck.ys)[1:]).any()
 
 
 @pytest.mark.parametrize("options", [{}, {"solver": Yoshida4(), "dt": 0.1}])

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-# Threads of OpenBLAS keep a core busy for 30 ms after their work: not on the time of the next.
+# Threads of OpenBLAS keep a core busy for 2²⁶ cycles after their work: not on the time of the next.
 _PAUSE = 0.1
 
 
