@@ -16,7 +16,7 @@ import numpy as np
 from jax.tree_util import GetAttrKey, SequenceKey, keystr, tree_flatten_with_path
 from jaxtyping import Array, ArrayLike, Float
 
-from hamkernel._gram import block_traces
+from hamkernel._gram import trace
 from hamkernel._scalar import AbstractScalarKernel
 from hamkernel._scalar_product import Periodic
 from hamkernel._scalar_transform import Select, Symmetrised, Warp
@@ -53,10 +53,7 @@ def hyperparameters(
     return list(_walk((), K, seen, _amplitude(K_middle, X, Y)))
 
 
-@eqx.filter_jit
-def gram_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
-    """The trace of the Gram, from its diagonal blocks alone."""
-    return jnp.sum(block_traces(K, X))
+gram_trace = eqx.filter_jit(trace)
 
 
 def traces(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, "2"]:
@@ -68,11 +65,11 @@ def traces(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, "2"]
     def is_mean(node: object) -> bool:
         return isinstance(node, Symmetrised)
 
-    trace = gram_trace(K, X)
+    of_gram = gram_trace(K, X)
     if not any(map(is_mean, jax.tree.leaves(K, is_leaf=is_mean))):
-        return jnp.stack([trace, trace])
+        return jnp.stack([of_gram, of_gram])
     terms = jax.tree.map(lambda node: node.kernel if is_mean(node) else node, K, is_leaf=is_mean)
-    return jnp.stack([trace, jnp.maximum(gram_trace(terms, X), trace)])
+    return jnp.stack([of_gram, jnp.maximum(gram_trace(terms, X), of_gram)])
 
 
 def _amplitude(K: AbstractMatrixKernel, X: Array, Y: Array) -> float:

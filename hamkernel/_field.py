@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
-from hamkernel._gram import expansion, potential
+from hamkernel._gram import centred
 from hamkernel._gram_operator import compiled_product
 from hamkernel._show import described
 from hamkernel._structured import AbstractMatrixKernel, Sum
@@ -51,7 +51,10 @@ class AbstractField(eqx.Module):
 
     @property
     def residual_norm(self) -> Float[Array, ""]:
-        """‖y − f(X)‖ over all the training data, in units of Y, shape (); of a stream too."""
+        """‖y − f(X)‖ over all the training data, in units of Y, shape ().
+
+        Known after a fit to a stream too, which keeps no residuals.
+        """
         kept = self.info.residual_norm
         return jnp.linalg.norm(self.residual) if kept is None else kept
 
@@ -72,6 +75,7 @@ class AbstractField(eqx.Module):
         Raises:
             ValueError: the shape does not fit.
         """
+        self._check_single()
         X = require.points(X, "X").astype(self.offset.dtype)
         if X.shape[1] != self.dimension:
             raise ValueError(f"X has {X.shape[1]} coordinates and the field {self.dimension}.")
@@ -90,6 +94,7 @@ class AbstractField(eqx.Module):
         Raises:
             KeyError: there is no such part (with the choices).
         """
+        self._check_single()
         if isinstance(self.kernel, Sum):
             return self._term(self.kernel, self.kernel.position(which))
         if which == 0:
@@ -128,11 +133,14 @@ class AbstractField(eqx.Module):
             )
         return self.potential
 
-    def _state(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+    def _check_single(self) -> None:
         if self.offset.shape:
             raise ValueError(
                 f"this is a batch of {self.offset.size} fields: jax.vmap(lambda f: f(x))(fields)."
             )
+
+    def _state(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+        self._check_single()
         return require.point(x, self.dimension).astype(self.offset.dtype)
 
     def anchored(self: Field, x0: Num[ArrayLike, " n"], value: ArrayLike = 0.0) -> Field:
@@ -146,6 +154,7 @@ class AbstractField(eqx.Module):
             AttributeError: the structure has no potential. ValueError: x0 is no finite state, or
                 the value no finite number.
         """
+        self._check_single()
         if jnp.shape(value) != ():
             raise ValueError(f"value has shape {jnp.shape(value)}; one number is needed.")
         there = require.floating(value, "value").astype(self.offset.dtype)
@@ -245,17 +254,35 @@ class KernelField(AbstractField):
 
     def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
         x = self._state(x)
-        return expansion(self.kernel, x, self.points, self.coefficients)
+        return _expansion(self.kernel, x, self.points, self.coefficients)
 
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         return compiled_product(self.kernel, X, self.points, self.coefficients)
 
     def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         x = self._state(x)
-        return potential(self.kernel, x, self.points, self.coefficients)
+        return _potential(self.kernel, x, self.points, self.coefficients)
 
     def _term(self, kernel: Sum, position: int) -> "KernelField":
         term, Z, A = kernel.terms[position], self.points, self.coefficients
         norm = root(jnp.sum(A * compiled_product(term, Z, Z, A)))  # ‖f‖² = aᵀGa
         parts = term, norm, jnp.zeros_like(self.offset)
         return eqx.tree_at(lambda f: (f.kernel, f.norm, f.offset), self, parts)
+
+
+@eqx.filter_jit
+def _expansion(
+    K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
+) -> Float[Array, " n"]:
+    """f(x) = Σⱼ K(x, zⱼ) aⱼ through the potential, without (n, n) blocks."""
+    x, Z = centred(K, x, Z)
+    return K.expansion(x, Z, A)
+
+
+@eqx.filter_jit
+def _potential(
+    K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
+) -> Float[Array, ""]:
+    """The potential of `_expansion`."""
+    x, Z = centred(K, x, Z)
+    return K.potential(x, Z, A)

@@ -7,11 +7,10 @@ from jaxtyping import Array, ArrayLike, Float, Num
 from hamkernel import _require as require
 from hamkernel._devices import rows_of
 from hamkernel._field import AbstractField, KernelField
-from hamkernel._gram import matrix_kernel
 from hamkernel._memory import dense_bytes, memory_bytes
 from hamkernel._solve import COPIES, AbstractSolver, Cholesky, Learned
 from hamkernel._solve_cg import ConjugateGradient
-from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._structured import AbstractMatrixKernel, matrix_kernel
 
 
 @overload
@@ -96,7 +95,7 @@ def fit(
     regularization = require.ridge(regularization, X.dtype)
     require.warn_of_float32(X)
     solver = _default(X) if solver is None else solver
-    return solver.fit(K, X, Y, regularization, throw)
+    return solver._fitted(K, X, Y, regularization, throw)
 
 
 def _default(X: Float[Array, "N n"]) -> AbstractSolver[KernelField]:

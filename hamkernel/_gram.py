@@ -1,6 +1,4 @@
-"""The dense Gram, and the evaluation of kernel expansions."""
-
-import reprlib
+"""The dense Gram."""
 
 import equinox as eqx
 import jax
@@ -11,7 +9,7 @@ from hamkernel import _require as require
 from hamkernel._devices import Rows, automatic, on_each
 from hamkernel._memory import refuse_beyond_memory
 from hamkernel._scalar import Invariance
-from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._structured import AbstractMatrixKernel, matrix_kernel
 
 
 def gram(
@@ -96,24 +94,6 @@ def trace(
     return jax.lax.map(of_point, X, batch_size=_POINTS).sum()
 
 
-@eqx.filter_jit
-def expansion(
-    K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-) -> Float[Array, " n"]:
-    """f(x) = Σⱼ K(x, zⱼ) aⱼ through the potential, without (n, n) blocks."""
-    x, Z = centred(K, x, Z)
-    return K.expansion(x, Z, A)
-
-
-@eqx.filter_jit
-def potential(
-    K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-) -> Float[Array, ""]:
-    """The potential of `expansion`."""
-    x, Z = centred(K, x, Z)
-    return K.potential(x, Z, A)
-
-
 def centred(K: AbstractMatrixKernel, x: Array, Z: Float[Array, "M n"]) -> tuple[Array, Array]:
     """Both arguments relative to the mean of Z, where K allows it.
 
@@ -128,15 +108,7 @@ def centred(K: AbstractMatrixKernel, x: Array, Z: Float[Array, "M n"]) -> tuple[
     return x - centre[None], Z - centre[None]
 
 
-def matrix_kernel(K: object) -> AbstractMatrixKernel:
-    """K, if it is matrix-valued; else a TypeError that says how to make one."""
-    if isinstance(K, AbstractMatrixKernel):
-        return K
-    if isinstance(K, type) and issubclass(K, AbstractMatrixKernel):
-        cure = f"That is a class; make a kernel of it, such as hk.{K.__name__}(hk.Gaussian(1.0))."
-    else:
-        cure = (
-            "It is the first argument; give a scalar kernel its structure: hk.Symplectic(k), "
-            "hk.CurlFree(k), hk.DivergenceFree(k) or hk.Separable(k)."
-        )
-    raise TypeError(f"a matrix-valued kernel is needed, got {reprlib.repr(K)}. {cure}")
+def plus_ridge(G: Float[Array, "D D"], ridge: Float[Array, ""]) -> Float[Array, "D D"]:
+    """G + ridge I."""
+    diagonal = jnp.arange(len(G))
+    return G.at[diagonal, diagonal].add(ridge)

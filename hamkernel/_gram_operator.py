@@ -16,9 +16,9 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._devices import Rows, as_given, rows_of, split, sum_of_columns
-from hamkernel._gram import centred, diagonals, gram, matrix_kernel
+from hamkernel._gram import centred, diagonals, gram
 from hamkernel._show import described
-from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._structured import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structured_operators import unfolded
 
 # Pairs in one tile, rows × columns: 1000 × 1000 doubles are 8 MB. Measured on two cores between

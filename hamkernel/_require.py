@@ -74,7 +74,20 @@ def count(number: Any, name: str) -> int:
     return operator.index(number)
 
 
-def floating(x: ArrayLike, name: str) -> Array:
+def positive_number(number: Any, name: str) -> float:
+    """`number` as a Python float, positive and finite: one that is compiled in."""
+    try:
+        converted = float(number)
+    except (TypeError, ValueError):
+        converted = None
+    if converted is None or isinstance(number, bool | str):
+        raise TypeError(f"{name} must be a number; got {number!r}.")
+    if not 0 < converted < np.inf:
+        raise ValueError(f"{name} must be positive and finite, got {number}.")
+    return converted
+
+
+def floating(x: Any, name: str) -> Array:
     """`x` as a JAX array of real floats: integers and booleans become the default float."""
     if isinstance(x, bool | int | float):
         x = np.asarray(x, float)
@@ -141,7 +154,7 @@ def key(key: Any) -> Key[Array, ""]:
     return key
 
 
-def positive(x: ArrayLike, name: str, cure: str = "") -> Array:
+def positive(x: Any, name: str, cure: str = "") -> Array:
     """`x` as a float array whose every entry is finite and larger than zero."""
     array = floating(x, name)
     seen = on_host(array)
@@ -276,6 +289,11 @@ def same_space(X: Array, Z: Array) -> tuple[Array, Array]:
             f"X has {X.shape[1]} coordinates and Z has {Z.shape[1]}: both must be states of one "
             "system, shapes (N, n) and (M, n)."
         )
+    return one_dtype(X, Z)
+
+
+def one_dtype(X: Array, Z: Array) -> tuple[Array, Array]:
+    """Both in the wider of their dtypes, under strict promotion too."""
     dtype = np.promote_types(X.dtype, Z.dtype)
     return X.astype(dtype), Z.astype(dtype)
 
@@ -288,9 +306,9 @@ def data(X: ArrayLike, Y: ArrayLike) -> tuple[Float[Array, "N n"], Float[Array, 
             f"X has shape {X.shape} and Y has shape {Y.shape}: they must be equal, "
             "one velocity Y[i] for each state X[i]."
         )
-    dtype = jnp.result_type(X, Y)
-    single_or_double(dtype, "X and Y have")
-    return finite(X.astype(dtype), "X"), finite(Y.astype(dtype), "Y")
+    X, Y = one_dtype(X, Y)
+    single_or_double(X.dtype, "X and Y have")
+    return finite(X, "X"), finite(Y, "Y")
 
 
 def point(x: ArrayLike, n: int, name: str = "x") -> Float[Array, " n"]:

@@ -25,7 +25,8 @@ _LENGTH = "It is a length in the units of the states."
 def squared_distance(x: Float[Array, " n"], z: Float[Array, " n"], cut: bool) -> Float[Array, ""]:
     """‖x − z‖² as x·x + z·z − 2 x·z, which under two vmaps is one matrix product.
 
-    The factors are placed where the derivative of exp(−s/2) needs no pass over the pairs for them.
+    The factor −2 stands outside, so that the derivative of exp(−s/2) needs no pass over all pairs
+    for it.
 
     With `cut`, what lies below the rounding of the product form is zero: on the Gram's diagonal its
     noise of one unit in the last place would be a distance of 1e-8, which Matérn-3/2 can feel.
@@ -43,9 +44,9 @@ class AbstractRadialKernel(AbstractScalarKernel):
     """k(x, z) = φ(‖(x − z)/ℓ‖²), ℓ a number or one lengthscale per coordinate."""
 
     log_lengthscale: eqx.AbstractVar[Float[Array, "..."]]
-    # Whether φ is a function of the distance √s, which feels the rounding of s at zero. In a
-    # product with the Gram to cut that off takes a quarter of the time.
-    of_distance: eqx.AbstractClassVar[bool]
+    # Whether the rounding of s at zero is felt by φ and must be cut off, which takes a quarter of
+    # the time of a product with the Gram.
+    cuts_rounding: eqx.AbstractClassVar[bool]
 
     @abc.abstractmethod
     def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
@@ -57,7 +58,7 @@ class AbstractRadialKernel(AbstractScalarKernel):
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         x, z = divided(x, self.lengthscale), divided(z, self.lengthscale)
-        return self.profile(squared_distance(x, z, cut=self.of_distance))
+        return self.profile(squared_distance(x, z, cut=self.cuts_rounding))
 
     @property
     def invariance(self) -> Invariance:
@@ -81,7 +82,7 @@ class Gaussian(AbstractRadialKernel):
     """
 
     log_lengthscale: Float[Array, "..."]
-    of_distance: ClassVar[bool] = False
+    cuts_rounding: ClassVar[bool] = False
 
     def __init__(self, lengthscale: ArrayLike = 1.0):
         self.log_lengthscale = log_per_coordinate(lengthscale, "lengthscale", _LENGTH)
@@ -104,15 +105,16 @@ class Matern(AbstractRadialKernel):
         ValueError: `nu` is 1/2, whose second derivative at x = z does not exist, or no
             half-integer; a lengthscale is not positive and finite.
 
-    Of products with more than 1000 points, `field.evaluate` among them, second derivatives are NaN
-    in reverse mode where points coincide, and right in forward mode, `jax.jacfwd`.
+    Where more than 1000 points are multiplied, as in `field.evaluate` and `gram_operator`, second
+    derivatives at points that coincide are NaN once one of the two is in reverse mode, as in
+    `jax.hessian`; `jax.jacfwd(jax.jacfwd(f))` is right.
 
     Source: Rasmussen & Williams (2006), eq. 4.16.
     """
 
     log_lengthscale: Float[Array, "..."]
     nu: float = eqx.field(static=True)
-    of_distance: ClassVar[bool] = True
+    cuts_rounding: ClassVar[bool] = True  # φ is a function of √s
 
     def __init__(self, nu: float = 2.5, lengthscale: ArrayLike = 1.0):
         nu = float(nu)
@@ -130,9 +132,6 @@ class Matern(AbstractRadialKernel):
         return _matern(round(self.nu - 0.5), 2 * self.nu * s)
 
 
-_FAR = 1e8  # of r²: e^(−r) is zero, and the polynomial finite
-
-
 # With ψ_p(t) the Matérn function of order p + 1/2 at r = √t, the identity
 # d/dr [r^ν K_ν(r)] = −r^ν K_{ν−1}(r) (DLMF 10.29.4) gives  ψ_p′(t) = −ψ_{p−1}(t) / (4p − 2):
 # the derivative of a Matérn function is a smoother multiple of the next rougher one, so a
@@ -141,11 +140,13 @@ _FAR = 1e8  # of r²: e^(−r) is zero, and the polynomial finite
 # x − z that vanish faster, so the value 0 at r = 0 gives the limit of the whole expression.
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _matern(p: int, t: Float[Array, ""]) -> Float[Array, ""]:
-    r = jnp.sqrt(jnp.clip(t, 0.0, _FAR))
+    far = -1.2 * math.log(float(jnp.finfo(t.dtype).tiny))  # e^(−r) is zero, the polynomial finite
+    r = jnp.sqrt(jnp.clip(t, 0.0, far**2))
     polynomial = jnp.zeros_like(t)
     for i in range(p + 1):  # Horner's scheme in 2r, the highest power first
-        polynomial = polynomial * (2 * r) + math.comb(p, i) * float(math.perm(p + i, i))
-    return polynomial * jnp.exp(-r) * (math.factorial(p) / math.factorial(2 * p))
+        ways = math.comb(p, i) * math.perm(p + i, i) * math.factorial(p)
+        polynomial = polynomial * (2 * r) + ways / math.factorial(2 * p)
+    return polynomial * jnp.exp(-r)
 
 
 @_matern.defjvp
@@ -179,7 +180,7 @@ class RationalQuadratic(AbstractRadialKernel):
 
     log_alpha: Float[Array, ""]
     log_lengthscale: Float[Array, "..."]
-    of_distance: ClassVar[bool] = False
+    cuts_rounding: ClassVar[bool] = True  # of a small α the logarithm would be of less than zero
 
     def __init__(self, alpha: ArrayLike = 1.0, lengthscale: ArrayLike = 1.0):
         self.log_alpha = jnp.log(require.positive_scalar(alpha, "alpha"))

@@ -68,7 +68,7 @@ class SearchSpace(eqx.Module):
             for i, *pair in zip(entries, *_checked_box(name, given, len(entries)), strict=True):
                 if self.logarithmic[i] and pair[0] <= 0:
                     raise ValueError(f"bounds[{name!r}] must be positive, got {given}.")
-                if self.names[i] == RIDGE:
+                if i == len(self.names) - 1:
                     self.given_ridge = jnp.asarray(pair[0], dtype), jnp.asarray(pair[1], dtype)
                 else:
                     low[i], high[i] = np.log(pair) if self.logarithmic[i] else pair

@@ -30,8 +30,7 @@ class _Autonomous(eqx.Module):
 
     @property
     def is_separable(self) -> bool:
-        field = getattr(self.field, "__wrapped__", self.field)  # behind jax.jit
-        return bool(getattr(field, "is_separable", False))
+        return bool(getattr(self.field, "is_separable", False))
 
     def __call__(self, t: Any, x: Float[Array, " n"], args: Any) -> Float[Array, " n"]:
         del t, args
@@ -106,6 +105,7 @@ def simulate(
     if solver is None:
         solver = diffrax.Dopri8()
     _check_solver(solver, dt, rtol, atol)
+    field = _uncompiled(field)
     _check_field(field, x0)
     if max_steps is not None:
         max_steps = require.count(max_steps, "max_steps")
@@ -122,7 +122,8 @@ def simulate(
         # the conservation of energy by 1e-7 where the steps themselves keep it to 1e-10.
         controller = diffrax.ClipStepSizeController(
             diffrax.PIDController(
-                rtol=_tolerance(rtol, default, x0.dtype), atol=_tolerance(atol, default, x0.dtype)
+                rtol=_tolerance("rtol", rtol, default, x0.dtype),
+                atol=_tolerance("atol", atol, default, x0.dtype),
             ),
             step_ts=ts,
         )
@@ -169,6 +170,17 @@ def simulate(
         steps = {"num_steps": jnp.asarray(total), "num_accepted_steps": jnp.asarray(total)}
         solution = eqx.tree_at(lambda s: s.stats, solution, {**solution.stats, **steps})
     return _successful(solution, field, x0, dt is not None) if throw else solution
+
+
+_FilterJit = type(eqx.filter_jit(abs))  # Equinox does not name it
+
+
+def _uncompiled(field: Any) -> Any:
+    """What a compiled field compiles: it knows what it is, and the loop around it is compiled."""
+    # Not behind every `__wrapped__`: what functools.wraps names is another field.
+    while isinstance(field, (jax.stages.Wrapped, _FilterJit)):
+        field = field.__wrapped__
+    return field
 
 
 def _eager(*values: Any) -> AbstractContextManager[None]:
@@ -230,11 +242,11 @@ def _check_solver(solver: Any, dt: Any, rtol: float | None, atol: float | None) 
         )
 
 
-def _tolerance(given: float | None, default: float, dtype: Any) -> Float[Array, ""]:
+def _tolerance(name: str, given: float | None, default: float, dtype: Any) -> Float[Array, ""]:
     """An array, because a number in a compiled program would compile anew for every value."""
     given = default if given is None else given
     with _eager(given):
-        return require.positive_scalar(given, "rtol, and atol,").astype(dtype)
+        return require.positive_scalar(given, name).astype(dtype)
 
 
 def _bound(counts: Int[Array, " intervals"], max_steps: int | None) -> int:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._devices import on_one_device
 from hamkernel._field import AbstractField, KernelField, SolverInfo, root
-from hamkernel._gram import assemble
+from hamkernel._gram import assemble, plus_ridge
 from hamkernel._gram_operator import product
 from hamkernel._memory import refuse_beyond_memory
 from hamkernel._structured import AbstractMatrixKernel
@@ -24,7 +24,7 @@ class AbstractSolver(eqx.Module, Generic[Learned]):
     """How `fit` finds the field."""
 
     @abc.abstractmethod
-    def fit(
+    def _fitted(
         self,
         K: AbstractMatrixKernel,
         X: Float[Array, "N n"],
@@ -55,7 +55,7 @@ class Cholesky(AbstractSolver[KernelField]):
             ridge is too small for this Gram (the text says what to do).
     """
 
-    def fit(
+    def _fitted(
         self,
         K: AbstractMatrixKernel,
         X: Float[Array, "N n"],
@@ -132,7 +132,5 @@ def solve_positive(
 
     Differentiated implicitly, by one more solve with the same factor.
     """
-    diagonal = jnp.arange(len(G))
-    matrix = G.at[diagonal, diagonal].add(ridge)
-    operator = lx.MatrixLinearOperator(matrix, lx.positive_semidefinite_tag)
+    operator = lx.MatrixLinearOperator(plus_ridge(G, ridge), lx.positive_semidefinite_tag)
     return lx.linear_solve(operator, y, lx.Cholesky(), throw=False).value

@@ -10,8 +10,6 @@ whose F = G_XS T is applied as a product with the Gram, so that it needs no memo
 trace(G − Ĝ) ≤ τρ the condition is at most 1 + τ and the iterations do not depend on N.
 """
 
-import math
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -41,7 +39,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
     Args:
         tolerance: the largest ‖y − (G + NλI)a‖/‖y‖, dimensionless; 1e-8 if None, and 1e-5 for data
             in float32.
-        max_iterations: after which the solve has failed.
+        max_iterations: the largest number of iterations; the solve fails beyond it.
         preconditioner: the low-rank Gram that preconditions. Its tolerance may be large, since the
             condition is at most 1 + truncation; more landmarks mean fewer iterations.
 
@@ -64,9 +62,8 @@ class ConjugateGradient(AbstractSolver[KernelField]):
         max_iterations: int = 100,
         preconditioner: Nystrom | None = None,
     ):
-        if tolerance is not None and not (tolerance > 0 and math.isfinite(tolerance)):
-            raise ValueError(f"tolerance must be positive and finite, got {tolerance}.")
-        self.tolerance = None if tolerance is None else float(tolerance)
+        own = tolerance is not None
+        self.tolerance = require.positive_number(tolerance, "tolerance") if own else None
         self.max_iterations = require.count(max_iterations, "max_iterations")
         if preconditioner is None:
             preconditioner = Nystrom(tolerance=10.0, max_points=256)
@@ -76,7 +73,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
             )
         self.preconditioner = preconditioner
 
-    def fit(
+    def _fitted(
         self,
         K: AbstractMatrixKernel,
         X: Float[Array, "N n"],

@@ -59,7 +59,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
         self.count = require.count(count, "count")
         self.key = require.key(key)
 
-    def fit(
+    def _fitted(
         self,
         K: AbstractMatrixKernel,
         X: Float[Array, "N n"],
@@ -67,7 +67,6 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
         regularization: Float[Array, ""],
         throw: bool = True,
     ) -> FeatureField:
-        self._check_memory(X.dtype)
         spread = rows_of(X)
         field = _fit(K, self, split(spread, X), split(spread, Y), regularization, spread)
         field = _checked(field, throw)
@@ -76,10 +75,16 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
         residual = as_given(spread, field.residual)
         return eqx.tree_at(lambda f: f.residual, field, residual)
 
-    def _check_memory(self, dtype: jnp.dtype) -> None:
-        # There are as many columns as frequencies at least.
+    def _features(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> AbstractFeatures:
+        """The features of K for n coordinates, if a fit in them fits in memory."""
+
+        def of_kernel(K, key):
+            return features(K, n, self.count, key, dtype)
+
+        r = eqx.filter_eval_shape(of_kernel, K, self.key).columns
         what, cure = f"a fit with count = {self.count}", "Take fewer features."
-        refuse_beyond_memory(what, self.count, self.count, dtype, _COPIES, cure)
+        refuse_beyond_memory(what, r, r, dtype, _COPIES, cure)
+        return of_kernel(K, self.key)
 
     def start(
         self,
@@ -100,8 +105,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
                 the structure, the sample is not finite, or λ is not positive.
         """
         K, sample, regularization = checked_start(K, sample, regularization)
-        self._check_memory(sample.dtype)
-        basis = features(K, sample.shape[1], self.count, self.key, sample.dtype)
+        basis = self._features(K, sample.shape[1], sample.dtype)
         return _start(K, basis, thinned(sample, _SAMPLE), regularization)
 
 
@@ -110,7 +114,7 @@ _COPIES = 8  # r² numbers that a fit holds: the triangle, the tile of 3r rows b
 
 @eqx.filter_jit
 def _fit(K, solver, X, Y, regularization, spread):
-    basis = features(K, X.shape[1], solver.count, solver.key, X.dtype)
+    basis = solver._features(K, X.shape[1], X.dtype)
     ridge = len(X) * regularization
     weights, residual = ridge_regression(basis, basis.columns, X, Y, ridge, spread)
     return _field(K, basis, weights, residual, regularization)

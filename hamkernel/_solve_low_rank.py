@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hamkernel._gram import assemble
+from hamkernel._gram import assemble, plus_ridge
 from hamkernel._solve_landmarks import Landmarks, masked
 from hamkernel._structured import AbstractMatrixKernel
 
@@ -36,8 +36,7 @@ def whitening(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r 
 
 def factor(square: Float[Array, "r r"], ridge: Float[Array, ""]) -> Float[Array, "r r"]:
     """The lower Cholesky factor of FᵀF + ridge I; NaN where the ridge is below rounding."""
-    diagonal = jnp.arange(len(square))
-    return jnp.linalg.cholesky(square.at[diagonal, diagonal].add(ridge))
+    return jnp.linalg.cholesky(plus_ridge(square, ridge))
 
 
 def truncated(

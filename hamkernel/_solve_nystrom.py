@@ -11,7 +11,7 @@ refinement with the residual of the data (Björck's corrected seminormal equatio
 A stream is seen once and leaves no residual; `_streaming_sums.py` says how its sums keep digits.
 """
 
-import math
+import numbers
 from typing import NamedTuple
 
 import equinox as eqx
@@ -61,7 +61,8 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
 
     Args:
         tolerance: the bound on trace(G − Ĝ)/(Nλ), dimensionless.
-        max_points: the largest number of landmarks m; memory 16 (m n)² bytes in float64.
+        max_points: the largest number of landmarks m. In float64 at most 8 m n² `candidates` bytes
+            while they are chosen, and 16 (m n)² after that.
         candidates: landmarks are chosen from the data, or from a random part of this size.
         key: for the draws; `jax.random.key(0)` if None, so that a fit can be repeated.
         points: the landmarks, shape (m, n), if they are not to be chosen; columns of theirs that
@@ -92,15 +93,13 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         key: Key[Array, ""] | UInt32[Array, "..."] | None = None,
         points: Num[ArrayLike, "m n"] | None = None,
     ):
-        if isinstance(tolerance, int) and tolerance > 1:
+        self.tolerance = require.positive_number(tolerance, "tolerance")
+        if isinstance(tolerance, numbers.Integral) and tolerance > 1:
             raise ValueError(
                 f"got the whole number {tolerance} as the tolerance on trace(G - Ĝ)/(N λ). For at "
                 f"most {tolerance} landmarks say hk.Nystrom(max_points={tolerance}); for that "
                 f"tolerance write {tolerance}.0."
             )
-        if not (tolerance > 0 and math.isfinite(tolerance)):
-            raise ValueError(f"tolerance must be positive and finite, got {tolerance}.")
-        self.tolerance = float(tolerance)
         self.max_points = require.count(max_points, "max_points")
         self.candidates = require.count(candidates, "candidates")
         self.key = None if key is None else require.key(key)
@@ -120,7 +119,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         left = self.tolerance * regularization
         return choose_landmarks(K, X, left, self.max_points, self.candidates, key)
 
-    def fit(
+    def _fitted(
         self,
         K: AbstractMatrixKernel,
         X: Float[Array, "N n"],

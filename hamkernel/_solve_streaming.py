@@ -18,10 +18,9 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._devices import rows_of, split
-from hamkernel._gram import matrix_kernel
 from hamkernel._show import call, text
 from hamkernel._solve import AbstractSolver, Learned
-from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._structured import AbstractMatrixKernel, matrix_kernel
 
 Fit = TypeVar("Fit", bound="AbstractStreamingFit")
 

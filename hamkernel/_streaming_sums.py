@@ -20,6 +20,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
 from hamkernel._devices import Rows, on_each
+from hamkernel._gram import plus_ridge
 from hamkernel._least_squares import Design, over_tiles
 
 # Numbers in the tile of rows that is held at once; see `_gram_operator`.
@@ -61,9 +62,7 @@ def start(
     """
     zero = jnp.zeros_like(W)
     seen = normal(design, W, sample, jnp.zeros_like(sample))
-    diagonal = jnp.arange(len(W))
-    matrix = (seen.square / len(sample)).at[diagonal, diagonal].add(ridge)
-    R = jnp.linalg.cholesky(matrix).T
+    R = jnp.linalg.cholesky(plus_ridge(seen.square / len(sample), ridge)).T
     return Sums(R, solve_triangular(R, W.T, trans="T").T, zero, zero[0], zero[0, 0])
 
 

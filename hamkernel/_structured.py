@@ -1,6 +1,7 @@
 """What a matrix-valued kernel is, and what is made of any of them: sums, odd and even kernels."""
 
 import abc
+import reprlib
 from collections.abc import Iterator
 from typing import Any, ClassVar
 
@@ -107,8 +108,8 @@ class Sum(AbstractMatrixKernel):
         named: the same with names.
 
     Raises:
-        TypeError: a term is no matrix-valued kernel. ValueError: there is no term, or two have one
-            name.
+        TypeError: a term is no matrix-valued kernel. ValueError: there is no term, two have one
+            name, or one is called regularization, as λ is.
     """
 
     terms: tuple[AbstractMatrixKernel, ...]
@@ -121,12 +122,10 @@ class Sum(AbstractMatrixKernel):
             flat += zip(term.names, term.terms, strict=True) if is_sum else [(None, term)]
         flat += named.items()
         for _, term in flat:
-            if not isinstance(term, AbstractMatrixKernel):
-                raise TypeError(
-                    f"Sum adds matrix-valued kernels, got {term!r}. Wrap a scalar kernel in a "
-                    "structure first, for example Symplectic(k)."
-                )
+            matrix_kernel(term, "a term of a Sum", "Symplectic(k) + CurlFree(k)")
         names = [name for name, _ in flat if name is not None]
+        if "regularization" in names:
+            raise ValueError("a part cannot be called regularization: tune calls λ so.")
         if not flat or len(set(names)) < len(names):
             raise ValueError(f"Sum needs at least one kernel and distinct names, got {names}.")
         self.terms = tuple(term for _, term in flat)
@@ -224,7 +223,7 @@ def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
 
     Source: Smith & Egeland (2023), eq. (odd_symplectic_kernel), there for k(x, z) = g(x − z).
     """
-    return _matrix_kernel(K, "Odd").with_parity(-1)
+    return matrix_kernel(K, "the argument of Odd", "Odd(Symplectic(k))").with_parity(-1)
 
 
 def Even(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
@@ -235,13 +234,18 @@ def Even(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
     Raises:
         TypeError: K is not matrix-valued.
     """
-    return _matrix_kernel(K, "Even").with_parity(+1)
+    return matrix_kernel(K, "the argument of Even", "Even(Symplectic(k))").with_parity(+1)
 
 
-def _matrix_kernel(K: Any, caller: str) -> AbstractMatrixKernel:
-    if not isinstance(K, AbstractMatrixKernel):
-        raise TypeError(
-            f"{caller} needs a matrix-valued kernel, got {K!r}. Give a scalar kernel its "
-            f"structure first, for example {caller}(Symplectic(k))."
-        )
-    return K
+def matrix_kernel(
+    K: Any,
+    what: str = "K, the first argument,",
+    example: str = "hk.Symplectic(k), hk.CurlFree(k), hk.DivergenceFree(k) or hk.Separable(k)",
+) -> AbstractMatrixKernel:
+    """K, if it is matrix-valued; else a TypeError that says how to make one."""
+    if isinstance(K, AbstractMatrixKernel):
+        return K
+    cure = f"Give a scalar kernel its structure first: {example}."
+    if isinstance(K, type) and issubclass(K, AbstractMatrixKernel):
+        cure = f"That is a class; make a kernel of it, such as hk.{K.__name__}(hk.Gaussian(1.0))."
+    raise TypeError(f"{what} must be a matrix-valued kernel; got {reprlib.repr(K)}. {cure}")

@@ -35,7 +35,6 @@ from hamkernel._devices import on_one_device
 from hamkernel._field import AbstractField
 from hamkernel._fit import fit
 from hamkernel._folds import Folds
-from hamkernel._gram import matrix_kernel
 from hamkernel._objective import HUGE, Criterion, Objective, basis_of, criterion_of
 from hamkernel._search import decode, finish, keeping_the_best, search
 from hamkernel._search_space import LOW_RANK_ROUNDINGS, ROUNDINGS, SearchSpace
@@ -43,7 +42,7 @@ from hamkernel._show import described
 from hamkernel._solve import AbstractSolver
 from hamkernel._solve_features import RandomFeatures
 from hamkernel._solve_nystrom import Nystrom
-from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._structured import AbstractMatrixKernel, matrix_kernel
 from hamkernel._validation import check_memory
 
 

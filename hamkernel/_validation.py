@@ -28,10 +28,10 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Num
 from hamkernel import _require as require
 from hamkernel._devices import on_one_device
 from hamkernel._folds import Folds, Partition
-from hamkernel._gram import assemble, matrix_kernel
+from hamkernel._gram import assemble, plus_ridge
 from hamkernel._inverse import inverse
 from hamkernel._memory import refuse_beyond_memory
-from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._structured import AbstractMatrixKernel, matrix_kernel
 from hamkernel._trained import trained
 
 
@@ -208,8 +208,7 @@ def log_likelihood(K, X, Y, regularization):
 
 def _regularised(K, X: Array, ridge: Array) -> Float[Array, "D D"]:
     G = trained((K, X), _square_gram, _paired_with_gram)
-    diagonal = jnp.arange(X.size)
-    return G.at[diagonal, diagonal].add(ridge)
+    return plus_ridge(G, ridge)
 
 
 def _square_gram(K, X) -> Float[Array, "D D"]:

@@ -673,7 +673,7 @@ def test_kernels_without_a_spectral_density_are_refused(k, what, key):
         (
             lambda key: of_any(10, key).start(hk.Gaussian(1.0), points(n=3)),
             TypeError,
-            "matrix-valued kernel is needed",
+            "must be a matrix-valued kernel",
         ),
     ],
 )

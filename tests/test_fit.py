@@ -398,7 +398,7 @@ def test_an_iteration_that_does_not_converge_is_nan_where_it_does_not_raise():
 
 
 class Forbidden(AbstractSolver):
-    def fit(self, K, X, Y, regularization, throw=True):
+    def _fitted(self, K, X, Y, regularization, throw=True):
         raise AssertionError("the solver was called with bad input")
 
 
@@ -431,8 +431,16 @@ ENDLESS = np.where(np.arange(5)[:, None] == 1, np.inf, Y)
         ((K, X, Y, 1e-3j), TypeError, "regularization has dtype complex128"),
         ((K, X.astype(np.float16), Y.astype(np.float16)), TypeError, "dtype float16"),
         ((hk.Gaussian(), X, Y), TypeError, r"hk\.Symplectic\(k\), hk\.CurlFree\(k\)"),
-        ((lambda x, z: x @ z, X, Y), TypeError, "matrix-valued kernel is needed, got <function"),
-        ((hk.Symplectic, X, Y), TypeError, "matrix-valued kernel is needed, got <class"),
+        (
+            (lambda x, z: x @ z, X, Y),
+            TypeError,
+            "K, the first argument, must be a matrix-valued kernel; got <function",
+        ),
+        (
+            (hk.Symplectic, X, Y),
+            TypeError,
+            "K, the first argument, must be a matrix-valued kernel; got <class",
+        ),
     ],
 )
 def test_bad_input_is_refused_before_the_solve(arguments, error, match):

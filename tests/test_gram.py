@@ -228,7 +228,7 @@ K = hk.Symplectic(hk.Gaussian())
     ("call", "error", "match"),
     [
         (lambda: hk.gram(hk.Gaussian(), states()), TypeError, re.escape("hk.Symplectic(k), ")),  # pyright: ignore
-        (lambda: hk.gram(hk.Symplectic, states()), TypeError, "matrix-valued kernel is needed"),  # pyright: ignore
+        (lambda: hk.gram(hk.Symplectic, states()), TypeError, "must be a matrix-valued kernel"),  # pyright: ignore
         (lambda: hk.gram(K, states()[0]), ValueError, r"shape \(4,\); it must be \(N, n\).*None"),
         (lambda: hk.gram(K, states()[None]), ValueError, r"reshape\(-1, X\.shape\[-1\]\)"),
         (lambda: hk.gram(K, states(0)), ValueError, "at least one point"),

@@ -213,7 +213,7 @@ def test_a_new_tolerance_does_not_compile_again():
 
 
 def test_a_tolerance_must_be_positive():
-    with pytest.raises(ValueError, match="rtol, and atol, must be positive"):
+    with pytest.raises(ValueError, match="rtol must be positive"):
         states(Pendulum(jnp.array(1.0)), START, TIMES, rtol=0.0)
 
 

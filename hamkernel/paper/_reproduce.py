@@ -78,12 +78,13 @@ def retune(
     path = pathlib.Path(out) / "results.json"
     if not path.exists():
         raise FileNotFoundError(f"no {path}: run hamkernel.paper.reproduce({str(out)!r}) first.")
+    seeds = min(seeds, TUNED_SEEDS)
     comparisons = _comparisons(_data(seeds), progress)
     results = json.loads(path.read_text())
     for name, models in comparisons.items():
         results[name]["tuned"] = {model: _tuned(each) for model, each in models.items()}
     _write(results, path)
-    text = tuning_report(results, experiments(), min(seeds, TUNED_SEEDS))
+    text = tuning_report(results, experiments(), seeds)
     from hamkernel.paper._figures import tuning_figure
 
     return text, [path, tuning_figure(comparisons, path.parent)]
@@ -124,13 +125,12 @@ def _outcomes(data: Data, progress: bool) -> Outcomes:
 
 
 def _comparisons(data: Data, progress: bool) -> Comparisons:
-    runs = [(name, model) for name, each in experiments().items() for model in each.models]
+    known = experiments()
+    runs = [(name, model) for name, each in known.items() for model in each.models]
     comparisons: Comparisons = {}
     for name, model in tqdm(runs, desc="tuning", disable=None if progress else True):
-        experiment = experiments()[name]
-        X, Y = (each[:TUNED_SEEDS] for each in data[name])
-        structure = experiment.models[model].structure
-        comparisons.setdefault(name, {})[model] = compare(experiment, structure, X, Y)
+        structure = known[name].models[model].structure
+        comparisons.setdefault(name, {})[model] = compare(known[name], structure, *data[name])
     return comparisons
 
 

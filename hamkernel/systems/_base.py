@@ -1,8 +1,8 @@
 """What all systems share: the field that follows from H, and how parameters are stored."""
 
 import abc
-from collections.abc import Sequence
-from typing import ClassVar
+from collections.abc import Callable, Sequence
+from typing import ClassVar, TypeVar
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ from hamkernel import _require as require
 from hamkernel._show import described
 
 Numbers = ArrayLike | Sequence[ArrayLike]
+Field = TypeVar("Field", bound=Callable[[Array], Array])
 
 
 class AbstractHamiltonianSystem(eqx.Module):
@@ -55,8 +56,24 @@ class AbstractHamiltonianSystem(eqx.Module):
 
 @eqx.filter_jit
 def _velocity(system: AbstractHamiltonianSystem, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    dq, dp = jnp.split(jax.grad(system.hamiltonian)(x), 2)
+    dq, dp = jnp.split(jax.grad(in_precision(system, x.dtype).hamiltonian)(x), 2)
     return jnp.concatenate([dp, -dq])
+
+
+def in_precision(field: Field, dtype: jnp.dtype) -> Field:
+    """`field` with its real arrays in the dtype of the states; a plain function has none."""
+
+    def cast_leaf(leaf):
+        real = eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jnp.floating)
+        return leaf.astype(dtype) if real else leaf
+
+    return jax.tree.map(cast_leaf, field)
+
+
+def at(system: Field, x: Num[ArrayLike, " n"], n: int) -> tuple[Field, Float[Array, " n"]]:
+    """`system` in the dtype of x, and x, which must be one state of n coordinates."""
+    x = require.point(x, n)
+    return in_precision(system, x.dtype), x
 
 
 def shaped(x: Array, name: str, *shapes: tuple[int, ...]) -> Array:
@@ -69,20 +86,20 @@ def shaped(x: Array, name: str, *shapes: tuple[int, ...]) -> Array:
 
 def log_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:
     """The logarithm of a positive parameter, by default a scalar."""
-    array = require.positive(jnp.asarray(x), name)
+    array = require.positive(x, name)
     return jnp.log(shaped(array, name, *(shapes or ((),))))
 
 
 def signed_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:
     """A finite parameter of either sign, by default a scalar."""
-    array = shaped(require.floating(jnp.asarray(x), name), name, *(shapes or ((),)))
+    array = shaped(require.floating(x, name), name, *(shapes or ((),)))
     bad = require.not_finite(array)
     return require.value(array, bad, lambda: f"{name} must be finite, got {array}.")
 
 
 def count_of(x: Numbers, name: str) -> int:
     """How many entries a list of masses or circulations has; at least two."""
-    shape = jnp.asarray(x).shape
+    shape = require.floating(x, name).shape
     if len(shape) != 1 or shape[0] < 2:
         raise ValueError(f"{name} has shape {shape}; one number for each of two or more is needed.")
     return shape[0]

@@ -9,7 +9,9 @@ from hamkernel import _require as require
 from hamkernel.systems._base import (
     AbstractHamiltonianSystem,
     Numbers,
+    at,
     count_of,
+    in_precision,
     log_parameter,
     shaped,
     signed_parameter,
@@ -70,7 +72,7 @@ class DoublePendulum(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
-        q1, q2, p1, p2 = require.point(x, 4)
+        self, (q1, q2, p1, p2) = at(self, x, 4)
         (m1, m2), (l1, l2), g = self.masses, self.lengths, self.gravity
         # Momenta per length: the kinetic energy is then free of the lengths.
         u1, u2 = p1 / l1, p2 / l2
@@ -120,7 +122,8 @@ class Kepler(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
-        q, p = jnp.split(require.point(x, 4), 2)
+        self, x = at(self, x, 4)
+        q, p = jnp.split(x, 2)
         potential = -self.gravitational_parameter * self.reduced_mass / jnp.sqrt(q @ q)
         return p @ p / (2 * self.reduced_mass) + potential
 
@@ -167,8 +170,9 @@ class NBody(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4·bodies,)."""
+        self, x = at(self, x, 4 * self.masses.size)
         m = self.masses
-        q, p = require.point(x, 4 * m.size).reshape(2, m.size, 2)  # (bodies, 2) each
+        q, p = x.reshape(2, m.size, 2)  # (bodies, 2) each
         i, j, squared = squared_distances(q)
         kinetic = jnp.sum(jnp.sum(p**2, axis=1) / (2 * m))
         return kinetic - self.gravitational_constant * jnp.sum(m[i] * m[j] / jnp.sqrt(squared))
@@ -236,6 +240,7 @@ class PointVortices(AbstractHamiltonianSystem):
         """
         positions = require.floating(positions, "positions")
         x, y = shaped(positions, "positions", (self.circulations.size, 2)).T
+        self = in_precision(self, x.dtype)
         scale = jnp.sqrt(jnp.abs(self.circulations))
         return jnp.concatenate([scale * x, jnp.sign(self.circulations) * scale * y])
 
@@ -247,12 +252,14 @@ class PointVortices(AbstractHamiltonianSystem):
         Raises:
             ValueError: x is not one state of shape (2·vortices,).
         """
-        q, p = jnp.split(require.point(x, 2 * self.circulations.size), 2)
+        self, x = at(self, x, 2 * self.circulations.size)
+        q, p = jnp.split(x, 2)
         scale = jnp.sqrt(jnp.abs(self.circulations))
         return jnp.stack([q / scale, jnp.sign(self.circulations) * p / scale], axis=1)
 
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2·vortices,)."""
+        self, x = at(self, x, 2 * self.circulations.size)
         i, j, squared = squared_distances(self.positions(x))
         strengths = self.circulations[i] * self.circulations[j]
         return -jnp.sum(strengths * jnp.log(squared)) / (4 * jnp.pi)

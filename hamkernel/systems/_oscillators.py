@@ -10,6 +10,7 @@ from hamkernel import _require as require
 from hamkernel.systems._base import (
     AbstractHamiltonianSystem,
     Numbers,
+    at,
     log_parameter,
     signed_parameter,
 )
@@ -51,7 +52,7 @@ class HarmonicOscillator(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2,)."""
-        q, p = require.point(x, 2)
+        self, (q, p) = at(self, x, 2)
         return p**2 / (2 * self.mass) + self.stiffness * q**2 / 2
 
 
@@ -100,7 +101,7 @@ class Pendulum(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2,)."""
-        q, p = require.point(x, 2)
+        self, (q, p) = at(self, x, 2)
         kinetic = p**2 / (2 * self.mass * self.length**2)
         return kinetic + self.mass * self.gravity * self.length * (1 - jnp.cos(q))
 
@@ -146,7 +147,7 @@ class Duffing(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2,)."""
-        q, p = require.point(x, 2)
+        self, (q, p) = at(self, x, 2)
         potential = self.linear_stiffness * q**2 / 2 + self.cubic_stiffness * q**4 / 4
         return p**2 / (2 * self.mass) + potential
 
@@ -176,7 +177,7 @@ class HenonHeiles(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
-        x = require.point(x, 4)
+        self, x = at(self, x, 4)
         return x @ x / 2 + self.coupling * (x[0] ** 2 * x[1] - x[1] ** 3 / 3)
 
 
@@ -223,6 +224,7 @@ class SpringChain(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2·count,)."""
-        q, p = jnp.split(require.point(x, 2 * self.count), 2)
+        self, x = at(self, x, 2 * self.count)
+        q, p = jnp.split(x, 2)
         stretch = jnp.diff(jnp.pad(q, 1))  # (count + 1,)
         return jnp.sum(p**2 / (2 * self.mass)) + jnp.sum(self.stiffness * stretch**2) / 2

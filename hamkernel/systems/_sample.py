@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 
 from hamkernel import _require as require
 from hamkernel._simulate import simulate
-from hamkernel.systems._base import shaped
+from hamkernel.systems._base import in_precision, shaped
 
 
 def sample(
@@ -60,7 +60,7 @@ def sample(
     require.single_or_double(x0.dtype, "x0 has")
     states = require.finite(require.points(x0[None] if x0.ndim == 1 else x0, "x0"), "x0")
     ts = require.elapsed(require.times(ts, least=1), states.dtype)
-    system = _in_precision(system, states.dtype)
+    system = in_precision(system, states.dtype)
     require.velocity(system, states[0], "system")
     levels = [
         _noise_level(level, name, states, key)
@@ -77,16 +77,6 @@ def sample(
             for clean, level, noise in zip((X, Y), levels, noises, strict=True)
         )
     return (X[0], Y[0]) if x0.ndim == 1 else (X, Y)
-
-
-def _in_precision(field: Callable[[Array], Array], dtype: jnp.dtype) -> Callable[[Array], Array]:
-    """`field` with its real arrays in the dtype of the states; a plain function has none."""
-
-    def cast_leaf(leaf):
-        real = eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jnp.floating)
-        return leaf.astype(dtype) if real else leaf
-
-    return jax.tree.map(cast_leaf, field)
 
 
 def _noise_level(level: ArrayLike, name: str, states: Float[Array, "B n"], key: Any) -> Array:
