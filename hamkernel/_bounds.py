@@ -16,6 +16,7 @@ import numpy as np
 from jax.tree_util import GetAttrKey, SequenceKey, keystr, tree_flatten_with_path
 from jaxtyping import Array, ArrayLike, Float
 
+from hamkernel._callable import Bound
 from hamkernel._gram import trace
 from hamkernel._scalar import AbstractScalarKernel
 from hamkernel._scalar_product import Periodic
@@ -51,6 +52,17 @@ def hyperparameters(
     ]
     K_middle = eqx.combine(jax.tree.unflatten(structure, middle), rest)
     return list(_walk((), K, seen, _amplitude(K_middle, X, Y)))
+
+
+def constants(K: AbstractMatrixKernel) -> dict[str, float]:
+    """The Python floats among the attributes of a kernel, which are no leaves to train."""
+    found: dict[str, float] = {}
+    for path, node in tree_flatten_with_path(K, is_leaf=lambda node: isinstance(node, Bound))[0]:
+        if isinstance(node, float):
+            found[keystr(path).removeprefix(".")] = node
+        elif isinstance(node, Bound):
+            found |= node.floats
+    return found
 
 
 gram_trace = eqx.filter_jit(trace)

@@ -51,6 +51,13 @@ class Bound(eqx.Module):
         named = [f"{name}={text(value)}" for name, value in keywords.items()]
         return call("partial", [text(self.func), *map(text, args), *named])
 
+    @property
+    def floats(self) -> dict[str, float]:
+        """The Python floats that it binds, by their keywords or positions."""
+        args, keywords = self._bound()
+        bound = {f"argument {i}": value for i, value in enumerate(args)} | keywords
+        return {name: value for name, value in bound.items() if isinstance(value, float)}
+
     def _bound(self) -> tuple[tuple[Any, ...], dict[str, Any]]:
         pairs = zip(self.arrays, self.static, strict=True)
         leaves = [static if array is None else array for array, static in pairs]
@@ -93,6 +100,10 @@ def _holds_traced(value: Any, outer: tuple[Any, ...] = ()) -> bool:
 
     A function that closes over itself cannot be taken apart, and does not count.
     """
+    if isinstance(value, functools.partial):
+        return any(
+            _holds_traced(v, outer) for v in (value.func, *value.args, *value.keywords.values())
+        )
     if not isinstance(value, types.FunctionType):
         return not require.is_concrete(value)
     inner = (*outer, value)

@@ -95,9 +95,11 @@ def _automatic(mesh: Mesh) -> Mesh:
 
 
 def on_one_device(name: str, array: Array) -> Array:
-    """`array` on one device of this process, where it is spread over several."""
-    if isinstance(array, Tracer) or len(array.sharding.device_set) == 1:
+    """`array` on one device of this process, and on automatic axes."""
+    if isinstance(array, Tracer):
         return array
+    if len(array.sharding.device_set) == 1:
+        return automatic(array)
     if not array.is_fully_addressable:
         raise ValueError(
             f"{name} is spread over several processes, and only one can work on it here: gather it "

@@ -60,9 +60,9 @@ class SearchCriterion(eqx.Module):
 
     def value(self, K, X, Y, regularization) -> Float[Array, ""]:
         extra = () if self.partition is None else (self.partition,)
-        value = require.floating(
-            self.fn(K, X, Y, regularization, *extra), "the value of the objective"
-        )
+        with require.traceable("the objective"):
+            value = self.fn(K, X, Y, regularization, *extra)
+        value = require.floating(value, "the value of the objective")
         if jnp.shape(value) != ():
             raise ValueError(
                 f"the objective returned shape {jnp.shape(value)}; one number, shape (), is needed."

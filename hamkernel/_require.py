@@ -10,8 +10,8 @@ import operator
 import reprlib
 import sys
 import warnings
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import equinox as eqx
@@ -241,13 +241,8 @@ def velocity(field: Any, x: Float[Array, " n"], name: str = "field") -> jax.Shap
                 "argument, the state x of shape (n,). Bind the others, as in `lambda x: f(0.0, x)` "
                 "where time does not enter. A kernel becomes a field by hk.fit."
             ) from None
-    try:
+    with traceable(name):
         out = eqx.filter_eval_shape(field, x)
-    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
-        raise TypeError(
-            f"{name} asks for numbers while JAX traces it, when only shapes are known: write it "
-            "with jax.numpy in place of numpy and math, and with jnp.where in place of if."
-        ) from error
     if not hasattr(out, "shape"):
         raise TypeError(
             f"{name} returns {type(out).__name__}; one velocity is needed, a JAX array of shape "
@@ -259,6 +254,18 @@ def velocity(field: Any, x: Float[Array, " n"], name: str = "field") -> jax.Shap
             "coordinate is needed. Is x0 of the dimension it was made for?"
         )
     return out
+
+
+@contextmanager
+def traceable(name: str) -> Iterator[None]:
+    """A TypeError that says what to do, in place of JAX's own where `name` is traced inside."""
+    try:
+        yield
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+        raise TypeError(
+            f"{name} asks for numbers while JAX traces it, when only shapes are known: write it "
+            "with jax.numpy in place of numpy and math, and with jnp.where in place of if."
+        ) from error
 
 
 def points(X: ArrayLike, name: str = "X") -> Float[Array, "N n"]:

@@ -51,9 +51,16 @@ def search(space, criterion, X, Y, scale: float, optimiser, starts: int, max_ste
 
 @eqx.filter_jit
 def finish(space, criterion, X, Y, runs: Runs, optimiser, max_steps: int) -> Runs:
-    """The runs with their losses on all points, in that order, the best one finished there."""
+    """The runs with their losses on all points, in that order, the best one finished there.
+
+    The first is the caller's point itself if the run from there, on a subset, made it worse.
+    """
     fine = _Objective(space, criterion, X, Y, 1.0)
-    runs = eqx.tree_at(lambda r: r.value, runs, jax.lax.map(fine, runs.u))
+    start = space.encode_start(X)
+    losses = jax.lax.map(fine, jnp.concatenate([runs.u, start[None]]))
+    values, given = losses[:-1], losses[-1]
+    u = runs.u.at[0].set(jnp.where(given < values[0], start, runs.u[0]))
+    runs = eqx.tree_at(lambda r: (r.u, r.value), runs, (u, values.at[0].min(given)))
     order = jnp.argsort(runs.value)
     runs = jax.tree.map(lambda leaf: leaf[order], runs)
     finished = _run(fine, runs.u[0], optimiser, max_steps)

@@ -172,7 +172,7 @@ def simulate(
     return _successful(solution, field, x0, dt is not None) if throw else solution
 
 
-_FilterJit = type(eqx.filter_jit(abs))  # Equinox does not name it
+_FilterJit: Any = type(eqx.filter_jit(abs))  # Equinox does not name it
 
 
 def _uncompiled(field: Any) -> Any:

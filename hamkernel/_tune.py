@@ -31,6 +31,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
+from hamkernel._bounds import constants
 from hamkernel._devices import on_one_device
 from hamkernel._field import AbstractField
 from hamkernel._fit import fit
@@ -94,33 +95,36 @@ def tune(
     solver: AbstractSolver | None = None,
     progress: bool = False,
 ) -> Tuned:
-    """Tune every hyperparameter of K, and λ with them, by gradient descent on a validation loss.
+    """Tune every hyperparameter of K, and λ with them, down the gradient of a validation loss.
 
     The search starts from the given kernel and from `starts` − 1 further points, the best of a
     space-filling design in the box. All run in one compiled call, on a subset of the points if
     there are many; the best one is then finished on all data, and the best point that any of
-    them saw is returned. New data of the same shape does not recompile. Data that is spread over
-    devices is gathered on one of them for the search; the field is fitted where the data lies.
+    them saw is returned, or the given one where that is better on all data. New data of the same
+    shape does not recompile. Data that is spread over devices is gathered on one of them for the
+    search; the field is fitted where the data lies.
 
     Args:
-        K: a matrix-valued kernel; every inexact array leaf is a hyperparameter.
+        K: a matrix-valued kernel; every inexact array leaf is a hyperparameter, and no Python
+            float is one.
         X: states, shape (N, n).
         Y: measured velocities, shape (N, n).
         regularization: the first λ.
         folds: as in `cross_validation_loss`; give trajectory labels for data from trajectories.
         objective: "cross_validation", "generalized_cross_validation", "marginal_likelihood", or
-            a function (K, X, Y, regularization) -> () that is to be small. The second leaves out
-            fits that leave less than a fifth of the residuals free, tr(I − S) < 0.2 N n: it is 0/0
-            where a fit interpolates. For the marginal
-            likelihood give K an amplitude, `1.0 * k`: built-in kernels have 1, and a signal that
-            is larger than the prior's is explained as noise. In a function of your own, `hk.fit`
-            and `hk.simulate` want `throw=False`, and the latter a constant `dt`: somewhere in the
-            box they fail, and NaN is then a point that cannot win.
+            a function (K, X, Y, regularization) -> () to minimise. The second ignores fits that
+            leave less than a fifth of the residuals free, tr(I − S) < 0.2 N n, since it is 0/0
+            where a fit interpolates. For the third give K an amplitude, `1.0 * k`: built-in
+            kernels have 1, and a signal that is larger than the prior's is explained as noise. In
+            a function of your own, `hk.fit` and `hk.simulate` want `throw=False`, and the latter a
+            constant `dt`: somewhere in the box they fail, and NaN is then a point that cannot win.
         frozen: names of what to keep: hyperparameters, such as "lengthscale", "regularization"
             or "terms[0].kernel.scale", and parts of K, such as "rest" of Sum(rest=…). A name
             means every hyperparameter that has it in its full name, at the end or before.
         bounds: {name: (low, high)} in place of the box from the data, in the units of the
-            hyperparameter. A start outside the box is moved to its edge.
+            hyperparameter. A start outside the box is moved to its edge. A leaf h of your own has
+            the box h ± 10 max(1, |h|), which may be too small, and of both signs: store what is
+            positive as `log_…`, whose box is a factor of 1000 to either side, or say its bounds.
         starts: the number of runs.
         optimiser: an optimistix minimiser; BFGS with tolerance 1e-3 if None.
         max_steps: the largest number of steps of one run.
@@ -145,7 +149,8 @@ def tune(
     asks for a polynomial: the fit is good and its hyperparameters mean little.
 
     Units. A warning comes where the velocities of two coordinates differ 100 times in size: the
-    loss, a sum of their squares, hardly sees the smaller one.
+    loss, a sum of their squares, hardly sees the smaller one. Another warning names the Python
+    floats in K, which are kept.
 
     The ridge. λ is never searched where rounding would decide. Unless `bounds` say what it may be,
     or it is frozen, it also stays so large that a field fitted to noise is smooth to about 1e-9
@@ -158,6 +163,7 @@ def tune(
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
     K.check_dimension(X.shape[1])
     _warn_of_unequal_sizes(Y)
+    _warn_of_constants(K)
     ridge = require.ridge(regularization, X.dtype)
     criterion = criterion_of(objective, len(X), folds)
     low_rank = isinstance(solver, Nystrom | RandomFeatures)
@@ -252,6 +258,16 @@ def _warn_of_unequal_sizes(Y: Array) -> None:
             f"the velocities of one coordinate are {sizes.max() / sizes.min():.3g} times as large "
             "as those of another, and a loss sums the squares of both: the small one may be lost "
             "in it. Choose units in which they are of similar size."
+        )
+
+
+def _warn_of_constants(K: AbstractMatrixKernel) -> None:
+    kept = constants(K)
+    if kept:
+        shown = ", ".join(f"{name} = {value:.4g}" for name, value in kept.items())
+        require.warn(
+            f"kept, and not tuned: {shown}. Python floats are constants to JAX. Store an array to "
+            "have them tuned, jnp.array(0.3), and name it in frozen=... to have it kept."
         )
 
 

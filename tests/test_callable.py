@@ -1,5 +1,6 @@
 """Plain functions that close over what JAX differentiates or maps over."""
 
+import functools
 import itertools
 
 import jax
@@ -110,3 +111,58 @@ def test_a_function_that_closes_over_itself_is_left_alone():
 
     difference = (value(1.5 + STEP) - value(1.5 - STEP)) / (2 * STEP)
     np.testing.assert_allclose(jax.grad(value)(1.5), difference, rtol=1e-5)
+
+
+def closure(width):
+    return lambda power, x, z: jnp.exp(-power * (x - z) @ (x - z) / width**2)
+
+
+def in_a_partial(width):
+    return functools.partial(closure(width), 0.5)
+
+
+def in_a_function(width):
+    gaussian = closure(width)
+    return lambda x, z: gaussian(0.5, x, z)
+
+
+def in_a_function_and_a_partial(width):
+    gaussian = in_a_partial(width)
+    return lambda x, z: gaussian(x, z)
+
+
+@pytest.mark.parametrize("kernel", [in_a_partial, in_a_function, in_a_function_and_a_partial])
+def test_what_closes_over_the_differentiated_may_be_inside_of_a_partial_or_function(kernel):
+    @jax.jit
+    def value(width):
+        return hk.log_marginal_likelihood(hk.Separable(kernel(width)), X, Y, 1e-2)
+
+    difference = (value(1.5 + STEP) - value(1.5 - STEP)) / (2 * STEP)
+    np.testing.assert_allclose(jax.grad(value)(1.5), difference, rtol=1e-6)
+
+
+def test_functions_that_close_over_each_other_are_left_alone():
+    def even(s, exponent):
+        return 1.0 if exponent == 0 else s * odd(s, exponent - 1)
+
+    def odd(s, exponent):
+        return 0.5 * s * even(s, exponent - 1)
+
+    gram = hk.gram(hk.Separable(lambda x, z: even(1 + x @ z, 2)), X)
+    np.testing.assert_allclose(gram[:, 0, :, 0], 0.5 * (1 + X @ X.T) ** 2, rtol=1e-12)
+
+
+def test_a_function_may_name_what_has_no_value_yet():
+    K = hk.Separable(lambda x, z: width + x @ z)
+    width = 0.5
+    np.testing.assert_allclose(hk.gram(K, X)[:, 0, :, 0], 0.5 + X @ X.T, rtol=1e-12)
+
+
+def test_one_function_makes_the_same_kernel_again():
+    # So that it is compiled once. One made anew, as a lambda of each call, is another kernel.
+    def made(width):
+        return lambda x, z: jnp.exp(-((x - z) @ (x - z)) / width)
+
+    one, other = made(2.0), made(2.0)
+    same = [jax.tree.structure(hk.Symplectic(k)) for k in (one, one, other)]
+    assert same[0] == same[1] != same[2]

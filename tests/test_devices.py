@@ -27,7 +27,14 @@ import subprocess
 import sys
 import time
 
+import jax
+import numpy as np
 import pytest
+from data import swings
+from jax.sharding import AxisType, NamedSharding
+from jax.sharding import PartitionSpec as P
+
+import hamkernel as hk
 
 # Sums in another order: rounding times the condition of the fits, below 1e5 here. The claim that
 # is to be kept is 1e-9.
@@ -177,6 +184,14 @@ try:
     refused = ""
 except ValueError as error:
     refused = str(error)
+half = NamedSharding(mesh(4, 2), P("data"))  # each row on two of the eight devices
+XH, YH = jax.device_put((X, Y), half)
+one_axis = hk.gram_operator(K, XH).mv(YH)
+XE, YE = spread(mesh(8, kind=AxisType.Explicit), X, Y)
+fitted = hk.fit(K, XE, YE, 1e-4, solver=few)
+given = fitted.residual, fitted.evaluate(XE), hk.gram_operator(K, XE).mv(YE)
+dense = {kind: hk.fit(K, *data, 1e-4, solver=hk.Cholesky()).coefficients
+         for kind, data in {"one": (X, Y), "spread": (XS, YS), "explicit": (XE, YE)}.items()}
 from hamkernel._gram_operator import product as multiply
 there = lambda X, A, rows: multiply(K, X, X, A, rows, rows)
 lost = lambda X, A, rows: multiply(K, X, X, A)
@@ -187,6 +202,11 @@ print(json.dumps({
     "explicit": compared(few, mesh(8, kind=AxisType.Explicit)), "refused": refused,
     "memory": [memory(there, mesh(devices), 2**22) for devices in (1, 2, 4, 8)],
     "lost": memory(lost, m, 2**22),
+    "one axis": [
+        off(one_axis, expected["square"]), on_a_device(one_axis), one_axis.sharding == half
+    ],
+    "given": [each.sharding == XE.sharding for each in given],
+    "dense": [[off(a, dense["one"]), len(a.sharding.device_set)] for a in dense.values()],
 }))
 """
 
@@ -227,6 +247,36 @@ def test_the_memory_of_a_device_falls_as_devices_are_added(quick):
 
 def test_rows_that_are_spread_differently_are_refused(quick):
     assert "Put both on one mesh" in quick["refused"]
+
+
+def test_rows_may_be_spread_over_one_axis_of_a_mesh(quick):
+    off, shape, as_they_came = quick["one axis"]
+    assert off < ORDER
+    assert shape == [40, 2]
+    assert as_they_came
+
+
+def test_results_with_a_row_for_each_state_are_spread_as_the_states_came(quick):
+    assert quick["given"] == [True, True, True]
+
+
+def test_the_exact_fit_of_spread_data_is_on_one_device(quick):
+    for off, devices in quick["dense"]:
+        assert off < ORDER
+        assert devices == 1
+
+
+@pytest.mark.parametrize("spec", [P("data"), P(), P(None, "data")], ids=["rows", "none", "columns"])
+@pytest.mark.parametrize("kind", [AxisType.Auto, AxisType.Explicit], ids=["auto", "explicit"])
+def test_a_mesh_of_one_device_has_the_default_solver_of_one_device(kind, spec):
+    X, Y = swings(12)
+    mesh = jax.make_mesh((1,), ("data",), axis_types=(kind,))
+    K, given = hk.Symplectic(hk.Gaussian(1.5)), jax.device_put((X, Y), NamedSharding(mesh, spec))
+    field, one = hk.fit(K, given[0], given[1], 1e-4), hk.fit(K, X, Y, 1e-4)
+    assert field.info.solver == one.info.solver == "Cholesky"
+    np.testing.assert_allclose(field.coefficients, one.coefficients, rtol=1e-10)
+    loss = hk.cross_validation_loss(K, given[0], given[1], 1e-4, 3)
+    np.testing.assert_allclose(loss, hk.cross_validation_loss(K, X, Y, 1e-4, 3), rtol=1e-10)
 
 
 SLOW = """

@@ -589,9 +589,17 @@ def test_features_that_do_not_fit_in_memory_are_refused():
     solver = RandomFeatures(10**7, jax.random.key(0))
     for ask in (lambda K: hk.fit(K, X, Y, solver=solver), lambda K: solver.start(K, X)):
         with pytest.raises(
-            ValueError, match=r"count = 10000000 needs 6\.4e\+06 GB.*fewer features"
+            ValueError, match=r"count = 10000000 needs 2\.56e\+07 GB.*fewer features"
         ):
             ask(hk.Symplectic(hk.Gaussian(1.0)))
+
+
+def test_the_memory_of_features_is_that_of_all_their_columns():
+    # Six pairs of four coordinates, sines and cosines, two kernels: 24 columns for a frequency.
+    X, Y = data(n=4)
+    K = hk.DivergenceFree(hk.Gaussian(1.0) + hk.Gaussian(2.0))
+    with pytest.raises(ValueError, match="8 matrices of 240000 by 240000"):
+        hk.fit(K, X, Y, solver=RandomFeatures(10**4, jax.random.key(0)))
 
 
 @pytest.mark.parametrize(

@@ -283,6 +283,27 @@ def test_a_kernel_of_ones_own_prints_its_values(k, text):
     assert named == ["CurlFree(<lambda>)"]
 
 
+def weighted(x, z, weights):
+    return jnp.sum(weights) * (x @ z)
+
+
+@pytest.mark.parametrize(
+    ("weights", "text"),
+    [
+        (jnp.full(16, 0.5), "[" + ", ".join(16 * ["0.5"]) + "]"),
+        (jnp.asarray(np.full(17, 0.5)), "f64[17]"),
+        (np.full((2, 2), 0.5), "f64[2,2]"),
+        ({"of q": jnp.array([2.0]), "of p": 1 / 3}, "{'of p': 0.3333, 'of q': [2]}"),
+        ((1 / 3,), "(0.3333,)"),
+        (jax.random.key(0), "key<fry>[]"),
+    ],
+    ids=["sixteen", "seventeen", "a matrix", "a dictionary", "a tuple", "a key"],
+)
+def test_few_numbers_print_as_values_and_many_by_their_shape(weights, text):
+    K = repr(hk.Separable(functools.partial(weighted, weights=weights)))
+    assert "".join(K.split()) == f"Separable(partial(weighted,weights={text}))".replace(" ", "")
+
+
 # Points of the wrong kind.
 
 
@@ -435,6 +456,9 @@ def test_a_batch_of_fields_says_how_it_is_called():
     )
     with pytest.raises(ValueError, match=r"a batch of 2 fields: jax\.vmap\(lambda f: f\(x\)\)"):
         fields(x)
+    for ask in (lambda: fields.evaluate(X), lambda: fields.part(0), lambda: fields.anchored(x)):
+        with pytest.raises(ValueError, match="a batch of 2 fields"):
+            ask()
     velocities = jax.vmap(lambda field: field(x))(fields)
     alone = hk.fit(hk.Symplectic(hk.Gaussian()), X, Y, 1e-2)(x)
     np.testing.assert_allclose(velocities[1], alone, rtol=1e-10)

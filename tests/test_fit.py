@@ -242,6 +242,13 @@ def test_integers_and_lists_are_read_as_floats():
         np.testing.assert_array_equal(field(X[0]), expected(X[0]))  # pyright: ignore
 
 
+def test_the_wider_of_two_precisions_is_that_of_the_fit():
+    X, Y = data(12)
+    mixed = hk.fit(K, X.astype(np.float32), Y, 1e-2)
+    same = hk.fit(K, X.astype(np.float32).astype(float), Y, 1e-2)
+    np.testing.assert_array_equal(mixed.coefficients, same.coefficients)
+
+
 def test_float32_agrees_to_three_digits_and_says_so():
     X, Y = data(20)
     ridge = 1e-4 / len(X)

@@ -338,6 +338,21 @@ def test_integer_points_are_read_as_floats(case):
 # Refusals.
 
 
+@pytest.mark.parametrize("nu", [1.5, 9.5, 20.5])
+def test_matern_is_zero_far_away_and_not_nan(nu):
+    far = jnp.asarray([0.0, 3e3, 1e10, 1e19], jnp.float32)
+    k = hk.Matern(nu)
+    values, slopes = jax.vmap(jax.value_and_grad(lambda r: k(jnp.zeros(1, r.dtype), r[None])))(far)
+    np.testing.assert_array_equal(values, [1.0, 0.0, 0.0, 0.0])
+    np.testing.assert_array_equal(slopes, np.zeros(4))
+
+
+def test_a_heavy_tail_is_finite_where_rounding_makes_a_square_negative():
+    k = hk.RationalQuadratic(alpha=1e-3, lengthscale=0.01)
+    X = np.random.default_rng(0).normal(size=(30, 2)).astype(np.float32)
+    assert np.isfinite(hk.gram(hk.Odd(hk.Symplectic(k)), X)).all()
+
+
 def test_matern_one_half_is_refused_with_the_reason():
     with pytest.raises(ValueError, match=r"not differentiable at x = z.*nu=1\.5"):
         hk.Matern(0.5)

@@ -32,6 +32,16 @@ class Own(eqx.Module):
         return jnp.exp(-((x - z) @ (x - z)) * jnp.exp(-2 * self.log_width))
 
 
+class Plain(eqx.Module):
+    """A kernel of the user, whose parameters may mean anything."""
+
+    log_lengthscale: jax.Array
+    shift: jax.Array
+
+    def __call__(self, x, z):
+        return jnp.exp(-((x - z) @ (x - z)) * jnp.exp(-2 * self.log_lengthscale)) + self.shift[0]
+
+
 def tenfold(x):
     return 10 * x
 
@@ -46,8 +56,11 @@ BOXES = {
     # Dimensionless: on a circle of radius 1, whatever the units of the states.
     "on a circle": (hk.Periodic(), "lengthscale", 0.6 / N, 60.0),
     "offset": (hk.Polynomial(2), "offset", 1e-4 * SQUARE, 1e4 * SQUARE),
+    "period for each": (hk.Periodic(np.ones(2)), "period", 2 * EXTENTS / N, 10 * EXTENTS),
     "scale": (2.0 * hk.Gaussian(), "scale", 1e-5 * np.mean(Y**2), 1e5 * np.mean(Y**2)),
     "own": (Own(jnp.log(1e5)), "width", 1e2, 1e8),
+    # Not one of ours: its lengthscale need not be a distance between states.
+    "own lengthscale": (Plain(jnp.log(1e5), jnp.zeros(1)), "lengthscale", 1e2, 1e8),
 }
 
 
@@ -58,6 +71,38 @@ def test_the_box_comes_from_the_data(name):
     (box,) = (each for each in found if each.name.endswith("." + parameter))
     np.testing.assert_allclose(np.exp(box.low), low, rtol=1e-9)
     np.testing.assert_allclose(np.exp(box.high), high, rtol=1e-9)
+
+
+def only_box(k, parameter, X, Y):
+    found = hyperparameters(hk.Separable(k), jnp.asarray(X), jnp.asarray(Y))
+    (box,) = (each for each in found if each.name.endswith("." + parameter))
+    return box.low, box.high
+
+
+def test_a_number_of_unknown_meaning_has_a_box_of_ten_times_its_size_and_of_ten_at_least():
+    k = Plain(jnp.zeros(()), jnp.array([-50.0, 0.0, 0.2]))
+    low, high = only_box(k, "shift", X, Y)
+    np.testing.assert_allclose(low, [-550.0, -10.0, -9.8], rtol=1e-12)
+    np.testing.assert_allclose(high, [450.0, 10.0, 10.2], rtol=1e-12)
+
+
+def test_on_a_circle_many_points_do_not_ask_for_more_than_a_series_can_carry():
+    many = RNG.uniform(-3, 3, size=(100, 2))
+    low, high = only_box(hk.Periodic(), "lengthscale", many, many)
+    np.testing.assert_allclose(np.exp([low, high]), [1 / 64, 60.0], rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("k", "parameter", "low", "high"),
+    [
+        (hk.Gaussian(1.0), "lengthscale", 0.3 / 2, 30.0),
+        (hk.Polynomial(2), "offset", 1e-4, 1e4),
+        (2.0 * hk.Gaussian(1.0), "scale", 1e-5, 1e5),
+    ],
+)
+def test_data_without_extent_or_size_has_the_box_of_one(k, parameter, low, high):
+    found = only_box(k, parameter, np.zeros((1, 2)), np.zeros((1, 2)))
+    np.testing.assert_allclose(np.exp(found), [low, high], rtol=1e-12)
 
 
 def test_the_lengthscale_of_a_periodic_kernel_does_not_know_the_units_of_the_states():
@@ -89,6 +134,21 @@ def test_the_floor_of_lambda_rises_where_the_field_would_be_rough():
     assert whole.smooth(K, jnp.asarray(1.0), states, 0.1) is whole  # λ is large enough
     given = space(bounds={"regularization": (1e-9, 1.0)})
     assert given.smooth(K, lowest, states, 0.1) is given  # the caller has said
+
+
+def test_the_slope_of_the_floor_of_lambda_takes_the_memory_of_a_few_copies_of_the_states():
+    many = jnp.asarray(RNG.normal(size=(50_000, 4)))
+    whole = SearchSpace(
+        hk.Symplectic(hk.Gaussian(np.ones(4))), many[:9], many[:9], jnp.asarray(1e-3), (), {}
+    )
+
+    def floor(log_lengthscale):
+        kernel = eqx.tree_at(lambda K: K.kernel.log_lengthscale, whole.kernel, log_lengthscale)
+        return whole.ridge_box(kernel, many)[0]
+
+    analysis = jax.jit(jax.grad(floor)).lower(jnp.zeros(4)).compile().memory_analysis()
+    assert analysis is not None
+    assert analysis.temp_size_in_bytes < 12 * many.nbytes
 
 
 def test_a_start_whose_kernel_is_not_positive_is_in_the_box():

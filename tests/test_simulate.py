@@ -1,8 +1,10 @@
 """Trajectories against SciPy, at times that are no multiples of the step, and every refusal."""
 
+import functools
 import math
 import subprocess
 import sys
+import warnings
 from typing import Any
 
 import diffrax
@@ -296,8 +298,27 @@ def test_splitting_of_a_bare_function_is_refused():
 
     with pytest.raises(ValueError, match="cannot be proved"):
         simulate(bare, START, TIMES, StormerVerlet(), dt=0.1)
+
+    @functools.wraps(field)
+    def damped(x):  # names a separable field, and is none
+        return field(x) - 0.3 * x
+
+    with warnings.catch_warnings():  # of Equinox, that the function holds a module
+        warnings.simplefilter("ignore")
+        with pytest.raises(ValueError, match="cannot be proved"):
+            simulate(damped, START, TIMES, StormerVerlet(), dt=0.1)
+
     ys = states(bare, START, TIMES, StormerVerlet(assume_separable=True), dt=0.1)
     np.testing.assert_array_equal(ys, states(field, START, TIMES, StormerVerlet(), dt=0.1))
+
+
+def test_a_compiled_field_is_the_field():
+    K = hk.Symplectic(hk.Select(hk.Gaussian(), 0) + hk.Select(hk.Gaussian(), 1))
+    X = np.random.default_rng(0).normal(size=(2, 10, 2))
+    field = hk.fit(K, X[0], X[1], 1e-2)
+    ys = states(field, START, TIMES, StormerVerlet(), dt=0.1)
+    for compiled in (jax.jit(field), eqx.filter_jit(field)):
+        np.testing.assert_array_equal(ys, states(compiled, START, TIMES, StormerVerlet(), dt=0.1))
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Solvers that never form the Gram, against the same algebra done densely in NumPy."""
 
+import os
+import types
 import warnings
 from typing import Any
 
@@ -11,7 +13,7 @@ import pytest
 from data import swings
 
 import hamkernel as hk
-from hamkernel import _fit
+from hamkernel import _fit, _memory
 from hamkernel._solve_cg import ConjugateGradient
 from hamkernel._solve_landmarks import choose_landmarks
 from hamkernel._solve_nystrom import Nystrom
@@ -209,6 +211,11 @@ def test_nystrom_refuses_what_makes_no_sense():
         Nystrom(max_points=0)
     with pytest.raises(ValueError, match=r"most 100 landmarks say hk.Nystrom\(max_points=100\)"):
         Nystrom(100)
+    with pytest.raises(ValueError, match=r"hk.Nystrom\(max_points=100\)"):
+        Nystrom(np.int64(100))  # pyright: ignore[reportArgumentType]
+    for wrong in (True, "0.1", None):
+        with pytest.raises(TypeError, match="tolerance must be a number; got"):
+            Nystrom(wrong)  # pyright: ignore[reportArgumentType]
     assert Nystrom(100.0).tolerance == 100.0
 
 
@@ -381,6 +388,60 @@ def test_a_dense_fit_that_cannot_fit_is_refused_before_it_starts():
     X = np.zeros((10_000_000, 2))
     with pytest.raises(ValueError, match=r"needs 9.6e\+06 GB .* Use solver=hk.ConjugateGradient"):
         hk.fit(K, X, X, RIDGE, solver=hk.Cholesky())
+
+
+MACHINE = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") if os.name == "posix" else None
+
+
+@pytest.mark.skipif(MACHINE is None, reason="asks the operating system")
+@pytest.mark.parametrize(
+    ("limit", "expected"),
+    [("4096\n", 4096), ("max\n", MACHINE), ("9" * 20, MACHINE), (None, MACHINE)],
+    ids=["a small container", "no limit", "a limit above all", "no container"],
+)
+def test_memory_is_that_of_the_machine_or_of_a_smaller_container(
+    tmp_path, monkeypatch, limit, expected
+):
+    if jax.default_backend() != "cpu":
+        pytest.skip("the device says what it has")
+    file = tmp_path / "memory.max"
+    if limit is not None:
+        file.write_text(limit)
+    monkeypatch.setattr(_memory, "_CGROUP_LIMIT", file)
+    assert _memory.memory_bytes.__wrapped__() == expected
+
+
+def test_the_memory_of_a_device_that_says_it_is_believed(monkeypatch):
+    class Device:
+        def memory_stats(self):
+            return {"bytes_in_use": 7, "bytes_limit": 12345}
+
+    monkeypatch.setattr(jax, "local_devices", lambda: [Device()])
+    assert _memory.memory_bytes.__wrapped__() == 12345
+
+
+def test_where_the_system_does_not_say_its_memory_nothing_is_refused(monkeypatch):
+    monkeypatch.delattr(os, "sysconf")
+    monkeypatch.setattr(jax, "local_devices", lambda: [types.SimpleNamespace(memory_stats=dict)])
+    assert _memory.memory_bytes.__wrapped__() is None
+    monkeypatch.setattr(_memory, "memory_bytes", lambda: None)
+    monkeypatch.setattr(_fit, "memory_bytes", lambda: None)
+    X, Y = swings(20)
+    assert info(hk.fit(K, X, Y, RIDGE)).solver == "Cholesky"
+
+
+@pytest.mark.parametrize(("dtype", "size"), [(np.float32, 4), (np.float64, 8)])
+def test_what_just_fits_is_not_refused_and_a_byte_less_is_with_its_size(monkeypatch, dtype, size):
+    matrices = {1: "one matrix of 3000 by 2000", 3: "3 matrices of 3000 by 2000"}
+    for copies, words in matrices.items():
+        problem = "a fit", 3000, 2000, jnp.dtype(dtype), copies, "Use less."
+        need = size * copies * 3000 * 2000
+        monkeypatch.setattr(_memory, "memory_bytes", lambda need=need: need)
+        _memory.refuse_beyond_memory(*problem)
+        monkeypatch.setattr(_memory, "memory_bytes", lambda need=need: need - 1)
+        gigabytes = f"{need / 1e9:.3g} GB"
+        with pytest.raises(ValueError, match=rf"a fit needs {gigabytes} \({words}.*Use less\."):
+            _memory.refuse_beyond_memory(*problem)
 
 
 def test_landmarks_beyond_the_first_buffer_are_all_different():

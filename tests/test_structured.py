@@ -515,6 +515,11 @@ def test_a_missing_part_is_refused_with_the_choices():
         (lambda: hk.Sum(hk.Gaussian()), TypeError, "a term of a Sum must be a matrix"),  # pyright: ignore
         (lambda: hk.Sum(), ValueError, "at least one kernel"),
         (
+            lambda: hk.Sum(regularization=hk.Symplectic(hk.Gaussian())),
+            ValueError,
+            "cannot be called regularization",
+        ),
+        (
             lambda: named_sum() + named_sum(),
             ValueError,
             r"distinct names, got \['conservative', 'rest', 'conservative', 'rest'\]",

@@ -175,6 +175,15 @@ def test_energy_is_constant_along_the_reference_trajectory_and_not_with_friction
     assert np.max(np.abs(lost - lost[0])) > 1e-3
 
 
+@every_system
+def test_float32_states_have_float32_velocities_and_energies(system, motion, start):
+    x = jnp.asarray(start, jnp.float32)
+    velocity, energy = system(x), system.hamiltonian(x)
+    assert velocity.dtype == energy.dtype == jnp.float32
+    np.testing.assert_allclose(velocity, motion(np.array(start)), rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(energy, system.hamiltonian(jnp.array(start)), rtol=1e-4, atol=1e-4)
+
+
 # The other systems are sampled below, where something about their trajectories is known exactly.
 @pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["duffing", "henon_heiles", "double_pendulum", "spring_chain"])

@@ -724,3 +724,55 @@ def test_a_lengthscale_per_coordinate_switches_an_irrelevant_coordinate_off():
     irrelevant, relevant = np.exp(leaf)
     assert irrelevant > 5 * 6  # several times the extent of the data
     assert abs(relevant - 1) < 0.3
+
+
+def rbf(x, z, ell):
+    return jnp.exp(-(x @ x + z @ z - 2 * x @ z) / (2 * ell**2))
+
+
+class Floating(eqx.Module):
+    """A user's kernel whose lengthscale may be an array, or a float that is no leaf to train."""
+
+    ell: Any
+
+    def __call__(self, x, z):
+        return rbf(x, z, self.ell)
+
+
+@pytest.mark.parametrize(
+    ("k", "name"),
+    [
+        (Floating(0.3), r"kernel\.fn\.ell = 0\.3"),
+        (functools.partial(rbf, ell=0.3), r"ell = 0\.3"),
+        (functools.partial(lambda ell, x, z: rbf(x, z, ell), 0.3), r"argument 0 = 0\.3"),
+    ],
+    ids=["module", "keyword", "argument"],
+)
+def test_a_python_float_is_kept_with_a_warning(k, name):
+    X, Y = scattered()
+    with pytest.warns(UserWarning, match=f"kept, and not tuned: {name}"):
+        found = hk.tune(hk.Symplectic(k), X, Y, starts=1, max_steps=2)
+    assert set(found.bounds) == {"regularization"}
+    trained = hk.tune(hk.Symplectic(Floating(jnp.array(0.3))), X, Y, starts=1, max_steps=2)
+    assert set(trained.bounds) == {"kernel.fn.ell", "regularization"}
+
+
+def test_an_objective_that_jax_cannot_trace_is_told_to_use_jax_numpy():
+    def objective(K, X, Y, regularization):
+        return float(hk.log_marginal_likelihood(K, X, Y, regularization))
+
+    X, Y = scattered()
+    with pytest.raises(TypeError, match=r"the objective asks for numbers.*jax\.numpy"):
+        hk.tune(hk.Symplectic(hk.Gaussian()), X, Y, objective=objective)  # pyright: ignore
+
+
+def test_what_was_tuned_is_not_tuned_to_anything_worse():
+    # Of so many points the run is on a subset first, whose optimum is another.
+    rng = np.random.default_rng(1)
+    X = rng.uniform(-2.5, 2.5, size=(80, 2))
+    Y = np.stack([X[:, 1], -np.sin(X[:, 0])], axis=1) + 0.1 * rng.normal(size=X.shape)
+    once = hk.tune(hk.Symplectic(hk.Matern(2.5, 3.0)), X, Y, frozen="lengthscale")
+    assert not once.at_bounds  # else the start is moved off the edge
+    few = {"frozen": "lengthscale", "starts": 1, "max_steps": 5}
+    again = hk.tune(once.kernel, X, Y, once.regularization, **few)
+    assert again.loss <= once.loss * (1 + 1e-9)

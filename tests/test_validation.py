@@ -1,9 +1,11 @@
 """Validation losses against explicit refits, NumPy, SciPy and central differences."""
 
+import itertools
 from typing import Any, cast
 
 import equinox as eqx
 import jax
+import jax.extend
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -12,6 +14,7 @@ from scipy.stats import multivariate_normal
 
 import hamkernel as hk
 from hamkernel._folds import Partition
+from hamkernel._validation import held_out
 
 EXACT = 1e-10  # condition of the systems, up to 1e4, times rounding
 DIFFERENCES = 1e-5  # of central differences: their own error is below 1e-7
@@ -123,6 +126,11 @@ def test_equal_folds_have_the_same_regularization_as_public_fits(folds):
     residuals = public_refits(K, X, Y, labels)
     loss = hk.cross_validation_loss(K, X, Y, RIDGE, folds)
     np.testing.assert_allclose(loss, mean_over_folds(residuals, labels), rtol=EXACT)
+
+
+def test_as_many_folds_as_points_leave_one_out():
+    assert Partition(N, N) == Partition(N, "loo") == Partition(N, np.arange(N))
+    assert [fold.tolist() for fold in Partition(N, N).folds] == [[i] for i in range(N)]
 
 
 def test_unequal_folds_do_not_have_the_ridge_of_each_training_set():
@@ -415,6 +423,42 @@ def test_loss_and_its_gradient_take_the_memory_of_three_grams(folds):
         assert gram < analysis.temp_size_in_bytes <= 3 * gram + small
 
 
+def test_many_hyperparameters_do_not_take_the_memory_of_many_grams():
+    X, Y = data(16, count=100)
+    k = hk.Gaussian(np.ones(16))
+
+    def loss(K):
+        return hk.log_marginal_likelihood(K, X, Y, RIDGE)
+
+    analysis = jax.jit(jax.grad(loss)).lower(hk.Symplectic(k + k + k)).compile().memory_analysis()
+    assert analysis is not None
+    gram = 8 * X.size**2
+    assert gram < analysis.temp_size_in_bytes < 3 * gram  # 48 directions, a few at a time
+
+
+def test_every_lapack_call_of_a_loss_and_its_gradient_waits_for_the_one_before():
+    # Side by side they were seen to stall for ever, see `_inverse.py`.
+    partition = Partition(N, SCATTERED)
+    assert len(partition.groups) == 2
+
+    def loss_and_gradient(A, y):
+        r, pull = jax.vjp(lambda A, y: held_out(A, y, partition), A, y)
+        return r, pull(r)
+
+    program = jax.make_jaxpr(loss_and_gradient)(jnp.eye(5 * N), jnp.ones(5 * N)).jaxpr
+    upstream, calls = {}, []  # the calls that each variable depends on
+    for i, equation in enumerate(program.eqns):
+        variables = [v for v in equation.invars if isinstance(v, jax.extend.core.Var)]
+        before = set().union(*(upstream.get(v, set()) for v in variables))
+        if "cholesky" in str(equation) or "triangular_solve" in str(equation):
+            calls.append((i, before))
+            before = before | {i}
+        upstream |= dict.fromkeys(equation.outvars, before)
+    # A factor and the inverses of its blocks, then of each group a factor and two solves.
+    assert len(calls) == 2 + 2 * 3
+    assert all(one in before for (one, _), (_, before) in itertools.pairwise(calls))
+
+
 @of_each_formula
 def test_float32_data_gives_float32_losses(name):
     X, Y = (each.astype(np.float32) for each in data())
@@ -444,6 +488,8 @@ def test_loss_works_under_jit_with_labels_closed_over():
         (-3, "between 2 and the number of points"),
         ("trajectory", "number, 'loo' or an array"),
         (2.0, r"integer labels; got 2\.0"),
+        (np.full(N, 2.0), r"got dtype float64\. Names become integers"),
+        (np.array(N * ["north"]), r"got dtype <U5\. Names become integers"),
         (np.full(N, 3), "in one"),
         (np.arange(N - 1), r"shape \(14,\)"),
         (np.zeros((N, 2), int), r"shape \(15, 2\)"),
