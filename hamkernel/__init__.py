@@ -17,7 +17,7 @@ Where things are, in the order of the data; a file imports from its own line and
                                  what is done with fields
 
 `_require` says what is wrong with an argument; `_devices`, `_memory`, `_trained`, `_callable` and
-`_show` are for all.
+`_show` are used everywhere.
 """
 
 import importlib

@@ -10,6 +10,7 @@ _SHRINK = 4.0  # ratio of one step to the next
 _SETTLED, _VIOLATED = 0.03, 0.05  # plateau of M(x, x + h); negative eigenvalue of a pair
 _STEADY = 5  # steps of growth in a row, 4⁵ = 1000 in distance: more than a sound kernel has
 _CLOSE = 0.01  # change of k, relative to k, within which a neighbour counts as near
+_TAIL = 0.1  # change of k, relative to its largest, beyond which h is no small step
 
 PROFILE = (
     "Write the kernel as a profile of the squared distance s = ‖x - z‖² with exact derivatives at "
@@ -45,74 +46,120 @@ def neighbours_of(X: np.ndarray, near: np.ndarray, unit: np.ndarray, eps: float)
 def near_blocks(
     near: np.ndarray, diagonal: Pairs, between: Pairs, beyond: Pairs, eps: float
 ) -> list[_Near]:
-    """Compare M(x, x) with M(x, x + h) at every point of `near`, direction and step.
+    """Compare M(x, x) with M(x, x + h) at every point of `near`, direction and step."""
+    measures = _measured(diagonal, between, beyond)
+    settled = measures.close & (measures.change <= _SETTLED) & (size_of(measures.block) >= 0.1)
+    has_limit = settled.any(axis=-1)
 
-    Sizes are relative to the largest block of any point at the same step: a block that happens to
-    vanish, such as that of (x·z)² at the origin, is then no fault, and a diverging one stays one.
+    violation = _violation(measures)
+    blatant = measures.close & (measures.change <= 10 * _SETTLED) & (violation > 10 * _VIOLATED)
+    violated = ((settled & (violation > _VIOLATED)) | blatant).any(axis=-1)
+
+    grows, endless = _growth(measures, size_of(diagonal.block))
+    growing = (grows & ~has_limit) | endless
+    missed = _never_reached(measures, eps) & (has_limit | growing)
+
+    sound = np.isfinite(diagonal.block).all(axis=(-2, -1))
+    sound = np.asarray(sound & np.isfinite(diagonal.gradient).all(axis=-1))
+    wrong = missed | violated | ~sound[:, None] | endless
+    plateau = np.where(has_limit[..., None], settled, blatant)
+    change = measures.change
+    return [
+        _Near(index, diagonal.block[i], between.block[i], plateau[i], change[i], growing[i], bad)
+        for i, (index, bad) in enumerate(zip(near, wrong, strict=True))
+    ]
+
+
+class _Measures(NamedTuple):
+    """The blocks of P points, D directions and J steps, and how much k and they move.
+
+    Blocks are in the unit of their step, the largest block of any point at that step: one that
+    happens to vanish, such as that of (x·z)² at the origin, is then no fault, and a diverging one
+    stays one.
     """
-    own = diagonal.block[:, None, None]  # (P, 1, 1, n, n)
-    A, after = between.block, beyond.block  # (P, D, J, n, n): M(x, x + h), M(x + h, x + h)
-    own = np.broadcast_to(own, A.shape)
-    scale = np.stack([size_of(own), size_of(A), size_of(after)]).max(axis=(0, 1, 2))  # (J,)
-    unit = np.where(scale > 0, scale, 1.0)[:, None, None]
-    own, A, after = own / unit, A / unit, after / unit
-    size = size_of(A)
-    finite = np.asarray(np.isfinite(A).all(axis=(-2, -1)))
 
-    # Distance in feature space, ‖φ(x) − φ(x + h)‖², as a fraction of its largest possible value.
+    own: np.ndarray  # (P, D, J, n, n): M(x, x)
+    block: np.ndarray  # (P, D, J, n, n): M(x, x + h)
+    after: np.ndarray  # (P, D, J, n, n): M(x + h, x + h)
+    unit: np.ndarray  # (J,)
+    raw: np.ndarray  # (P, D, J): the size of M(x, x + h), in no unit
+    finite: np.ndarray  # (P, D, J): whether M(x, x + h) is
+    # ‖φ(x) − φ(x + h)‖², the distance in feature space, as a fraction of its largest value.
+    moved: np.ndarray  # (P, D, J)
+    change: np.ndarray  # (P, D, J): of M(x, x + h) to the next step; ∞ after the last
+
+    @property
+    def close(self) -> np.ndarray:
+        return self.finite & (self.moved <= _CLOSE)
+
+
+def _measured(diagonal: Pairs, between: Pairs, beyond: Pairs) -> _Measures:
+    own = np.broadcast_to(diagonal.block[:, None, None], between.block.shape)
+    scale = np.stack([size_of(own), size_of(between.block), size_of(beyond.block)])
+    scale = scale.max(axis=(0, 1, 2))  # (J,)
+    unit = np.where(scale > 0, scale, 1.0)
+    own, block, after = (b / unit[:, None, None] for b in (own, between.block, beyond.block))
+    finite = np.asarray(np.isfinite(block).all(axis=(-2, -1)))
+
     k_own = diagonal.k[:, None, None]
     largest = np.asarray(np.abs(k_own) + np.abs(beyond.k))
     moved = np.abs(k_own + beyond.k - 2 * between.k) / np.where(largest > 0, largest, 1.0)
-    close = finite & (moved <= _CLOSE)
 
-    # Change to the next step, with the scale of this step on both sides.
-    later = np.roll(between.block, -1, axis=2) / unit
-    change = np.where(finite & np.isfinite(later).all(axis=(-2, -1)), size_of(A - later), np.inf)
+    # The next step, in the unit of this one.
+    later = np.roll(between.block, -1, axis=2) / unit[:, None, None]
+    both = finite & np.isfinite(later).all(axis=(-2, -1))
+    change = np.where(both, size_of(block - later), np.inf)
     change[:, :, -1] = np.inf
-    settled = close & (change <= _SETTLED) & (size >= 0.1)
-
-    pair = np.block([[own, A], [np.swapaxes(A, -1, -2), after]])
-    violation = np.minimum(size_of(A - own), -lowest(pair))
-    blatant = close & (change <= 10 * _SETTLED) & (violation > 10 * _VIOLATED)
-    violated = (settled & (violation > _VIOLATED)) | blatant
-
-    # A Matérn-3/2 block moves by 2√3 r while k moves by 3r²/2 (r = ‖h‖/ℓ), the slowest of the
-    # sound kernels. Where k has moved more than that, h is not small yet: no verdict.
-    # Where all blocks shrink to zero together (an indefinite k with a flat top), the largest of
-    # the near ones at this step or before is the measure.
-    tolerance = eps**0.25
     raw = size_of(between.block)
-    largest_near = np.maximum.accumulate(np.where(close, raw, 0.0), axis=-1)
-    reached = finite & (
-        size_of(A - own) <= tolerance * np.maximum(1.0, largest_near / unit[:, 0, 0])
-    )
-    judged = finite & (moved <= tolerance**2 / 8)
+    return _Measures(own, block, after, unit, raw, finite, np.asarray(moved), change)
+
+
+def _violation(measures: _Measures) -> np.ndarray:
+    """By how much the matrix of the blocks of x and x + h is not positive, (P, D, J)."""
+    own, block, after = measures.own, measures.block, measures.after
+    pair = np.block([[own, block], [np.swapaxes(block, -1, -2), after]])
+    return np.minimum(size_of(block - own), -lowest(pair))
+
+
+def _never_reached(measures: _Measures, eps: float) -> np.ndarray:
+    """Whether no M(x, x + h) comes near to M(x, x), though h becomes small, (P, D).
+
+    A Matérn-3/2 block moves by 2√3 r while k moves by 3r²/2 (r = ‖h‖/ℓ), the slowest of the sound
+    kernels. Where k has moved more than that, h is not small yet: no verdict. Where all blocks
+    shrink to zero together (an indefinite k with a flat top), the largest of the near ones at this
+    step or before is the measure.
+    """
+    tolerance = eps**0.25
+    near = np.where(measures.close, measures.raw, 0.0)
+    largest = np.maximum(1.0, np.maximum.accumulate(near, axis=-1) / measures.unit)
+    off = size_of(measures.block - measures.own)
+    reached = measures.finite & (off <= tolerance * largest)
+    judged = measures.finite & (measures.moved <= tolerance**2 / 8)
+    return judged.any(axis=-1) & ~reached.any(axis=-1)
+
+
+def _growth(measures: _Measures, own: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whether M(x, x + h) grows in almost all steps, and whether over decades of h; (P, D) each.
+
+    A block of a sound kernel with a second, unresolved scale may grow, but not beyond M(x, x), of
+    the sizes `own`, (P,). It passes a scale in a step or two: growth over decades is a kernel of
+    the distance, also where a term under the root stops it in the end, and M(x, x) is then a delta
+    beside the rest. The tails of a sound kernel grow over decades as well. There k has moved by
+    all that it can, which beside a large constant is not much.
+    """
+    raw, moved = measures.raw, np.where(measures.finite, measures.moved, 0.0)
     ratio = raw[:, :, 1:] / np.where(raw[:, :, :-1] > 0, raw[:, :, :-1], np.inf)
-    both = close[:, :, 1:] & close[:, :, :-1]
-    steps = both.sum(axis=-1)
+    both = measures.close[:, :, 1:] & measures.close[:, :, :-1]
     grown = both & (ratio > 1.3)
-    growing = (steps >= 3) & ~settled.any(axis=-1)
-    growing &= grown.sum(axis=-1) > 0.8 * steps
-    # A block of a sound kernel with a second, unresolved scale may grow, but not beyond M(x, x).
-    growing &= raw.max(axis=-1) > 2 * size_of(diagonal.block)[:, None]
-    # A scale is passed in a step or two. Growth over decades is a kernel of the distance, also
-    # where a term under the root stops it in the end: M(x, x) is then a delta beside the rest.
+    steps = both.sum(axis=-1)
+    grows = (steps >= 3) & (grown.sum(axis=-1) > 0.8 * steps)
+    grows &= raw.max(axis=-1) > 2 * own[:, None]
+    in_tail = moved > _TAIL * moved.max(axis=-1, keepdims=True)
     run = longest = np.zeros(steps.shape, int)
-    for step in np.moveaxis(grown, -1, 0):
+    for step in np.moveaxis(grown & ~in_tail[:, :, :-1], -1, 0):
         run = np.where(step, run + 1, 0)
         longest = np.maximum(longest, run)
-    endless = longest >= _STEADY
-    growing |= endless
-    missed = judged.any(axis=-1) & ~reached.any(axis=-1) & (settled.any(axis=-1) | growing)
-
-    broken = np.asarray(~np.isfinite(diagonal.block).all(axis=(-2, -1)))
-    broken |= ~np.isfinite(diagonal.gradient).all(axis=-1)
-    settled = np.where(settled.any(axis=-1, keepdims=True), settled, blatant)
-    wrong = missed | violated.any(axis=-1) | broken[:, None] | endless
-    return [
-        _Near(index, diagonal.block[i], between.block[i], settled[i], change[i], growing[i], bad)
-        for i, (index, bad) in enumerate(zip(near, wrong, strict=True))
-    ]
+    return grows, longest >= _STEADY
 
 
 def check_limit(one: _Near, unit: np.ndarray) -> None:

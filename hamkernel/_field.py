@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._gram import centred
-from hamkernel._gram_operator import compiled_product
+from hamkernel._gram_operator import placed_product
 from hamkernel._show import described
 from hamkernel._structured import AbstractMatrixKernel, Sum
 
@@ -257,7 +257,7 @@ class KernelField(AbstractField):
         return _expansion(self.kernel, x, self.points, self.coefficients)
 
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
-        return compiled_product(self.kernel, X, self.points, self.coefficients)
+        return placed_product(self.kernel, X, self.points, self.coefficients)
 
     def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         x = self._state(x)
@@ -265,7 +265,7 @@ class KernelField(AbstractField):
 
     def _term(self, kernel: Sum, position: int) -> "KernelField":
         term, Z, A = kernel.terms[position], self.points, self.coefficients
-        norm = root(jnp.sum(A * compiled_product(term, Z, Z, A)))  # ‖f‖² = aᵀGa
+        norm = root(jnp.sum(A * placed_product(term, Z, Z, A)))  # ‖f‖² = aᵀGa
         parts = term, norm, jnp.zeros_like(self.offset)
         return eqx.tree_at(lambda f: (f.kernel, f.norm, f.offset), self, parts)
 

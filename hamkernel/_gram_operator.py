@@ -95,7 +95,7 @@ class GramOperator(lx.AbstractLinearOperator):
                 f"the Gram, shape {self.columns.shape}, is needed."
             )
         vector = require.floating(vector, "the vector")
-        return _placed(self.kernel, self.X, self.columns, vector, self.X_rows, self.Z_rows)
+        return _compiled(self.kernel, self.X, self.columns, vector, self.X_rows, self.Z_rows)
 
     def as_matrix(self) -> Float[Array, "Nn Mn"]:
         """The dense Gram, O(N M n²) memory."""
@@ -123,10 +123,10 @@ def product(
     Z_rows: Rows | None = None,
 ) -> Float[Array, "N n"]:
     """Σⱼ K(xᵢ, zⱼ) aⱼ for all i, tile by tile, on the devices where the rows are."""
-    return sum_of_columns(_product, K, X, Z, A, X_rows, Z_rows)
+    return sum_of_columns(_tiled, K, X, Z, A, X_rows, Z_rows)
 
 
-def compiled_product(
+def placed_product(
     K: AbstractMatrixKernel,
     X: Float[Array, "N n"],
     Z: Float[Array, "M n"],
@@ -135,18 +135,19 @@ def compiled_product(
     """`product` for arrays that know where they are."""
     X_rows, Z_rows = rows_of(X), rows_of(Z)
     X, Z = split(X_rows, X), split(Z_rows, Z)
-    return _placed(K, X, Z, A, X_rows, Z_rows)
+    return _compiled(K, X, Z, A, X_rows, Z_rows)
 
 
-def _placed(K, X, Z, A, X_rows, Z_rows):
+def _compiled(K, X, Z, A, X_rows, Z_rows):
     """`product` of X and Z that are split already."""
-    return as_given(X_rows, _compiled_product(K, X, Z, split(Z_rows, A), X_rows, Z_rows))
+    return as_given(X_rows, _product(K, X, Z, split(Z_rows, A), X_rows, Z_rows))
 
 
-_compiled_product = eqx.filter_jit(product)
+_product = eqx.filter_jit(product)
 
 
-def _product(K, X, Z, A):
+def _tiled(K, X, Z, A):
+    """`product` on one device."""
     K, Z, A = unfolded(K, Z, A.astype(X.dtype))
     X, Z = centred(K, X, Z)
     rows = tiles(X, X[:1], ROWS)

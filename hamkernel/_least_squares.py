@@ -144,7 +144,7 @@ def _correlations(design, X, Y, w, spread: Rows | None) -> Float[Array, " r"]:
 
 
 def over_tiles(step, carry, data: tuple[Array, Array], rows: int):
-    """`jax.lax.scan` of `step` over tiles of so many rows of a design; the last one, no loop.
+    """`jax.lax.scan` of `step` over tiles of so many rows of a design, the last one after it.
 
     A loop, when differentiated backward, forgets the rule by which a Matérn kernel is smooth at
     x = z, and second derivatives are NaN: where one tile will do there is none. Derivatives

@@ -22,7 +22,7 @@ from hamkernel._show import described, exponential, in_brackets, joined, text
 
 
 class Invariance(enum.Flag):
-    """What a kernel knows of itself; it decides which cheap forms are allowed.
+    """The symmetries that a kernel declares; they decide which cheap forms are allowed.
 
     REFLECTION: k(−x, −z) = k(x, z). TRANSLATION: k(x + c, z + c) = k(x, z), which for a
     symmetric real kernel implies REFLECTION. A sum or product has what all its terms have.

@@ -68,7 +68,7 @@ class Periodic(AbstractScalarKernel):
     Raises:
         ValueError: a hyperparameter is not positive and finite.
 
-    Source: MacKay (1998), "Introduction to Gaussian processes", eq. 47.
+    Source: Rasmussen & Williams (2006), eq. 4.31, there of period 2π; first in MacKay (1998).
     """
 
     log_period: Float[Array, "..."]

@@ -180,7 +180,7 @@ class RationalQuadratic(AbstractRadialKernel):
 
     log_alpha: Float[Array, ""]
     log_lengthscale: Float[Array, "..."]
-    cuts_rounding: ClassVar[bool] = True  # of a small α the logarithm would be of less than zero
+    cuts_rounding: ClassVar[bool] = True  # or a small α makes it log of a negative
 
     def __init__(self, alpha: ArrayLike = 1.0, lengthscale: ArrayLike = 1.0):
         self.log_alpha = jnp.log(require.positive_scalar(alpha, "alpha"))

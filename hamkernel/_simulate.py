@@ -88,8 +88,8 @@ def simulate(
             that cannot estimate its error without `dt`; a splitting of a field that is not known to
             be separable; more steps of `dt` than `max_steps`.
         TypeError: `field` is no function of one JAX array that returns one, of the same dtype;
-            `solver` or `adjoint` is none of Diffrax; x0 is of less than float32; forward mode
-            through the default adjoint.
+            `solver` or `adjoint` is none of Diffrax; x0 is of less precision than float32; forward
+            mode through the default adjoint.
         RuntimeError: the solve failed: too many steps, the implicit equations of a step did not
             converge, or the state overflowed. Usually the remedy is a smaller `dt`.
     """

@@ -47,8 +47,8 @@ COPIES = 3
 class Cholesky(AbstractSolver[KernelField]):
     """The dense Gram and its Cholesky factor: exact, O((N n)³) time and O((N n)²) memory.
 
-    What rounding left of the system is `field.info.relative_residual`; a fit in which that is more
-    than one per cent of the velocities is refused.
+    `field.info.relative_residual` is the error that rounding leaves in the linear system; a fit in
+    which it is more than one per cent of the velocities is refused.
 
     Raises:
         ValueError, from `fit`: the matrices do not fit in memory. RuntimeError, from `fit`: the

@@ -1,4 +1,4 @@
-"""Least squares in random Fourier features: any number of points, in memory that ignores it."""
+"""Least squares in random Fourier features, in memory that does not grow with the points."""
 
 import equinox as eqx
 import jax.numpy as jnp

@@ -146,7 +146,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
             K: a matrix-valued kernel.
             sample: states that look like all of the data, shape (N, n), from which the landmarks
                 are chosen now; later data does not move them. They are not added to the fit. The
-                first chunk does where chunks are alike; one trajectory out of many does not.
+                first chunk is enough if all chunks look alike; one trajectory out of many is not.
             regularization: the smallest λ that will be asked for, since the tolerance is relative
                 to it, and so are the digits that are kept: a smaller one loses some.
 
@@ -254,7 +254,8 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         field = model.field()
         better = model.add(X_new, Y_new).field()
 
-    `field.info.truncation` is that of all the data added: it shows whether the landmarks still do.
+    `field.info.truncation` is that of all the data added: it shows whether the landmarks are still
+    enough.
 
     Attributes:
         kernel: K.

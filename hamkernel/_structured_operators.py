@@ -30,7 +30,7 @@ class AbstractStructure(AbstractMatrixKernel):
     """A structure made from one scalar kernel k."""
 
     kernel: AbstractScalarKernel = eqx.field(converter=as_scalar_kernel)
-    # The parity of the fields over that of the functions of k; a derivative turns it around.
+    # 1 if the fields have the parity of the functions of k, −1 if the other; a derivative flips it.
     field_parity: eqx.AbstractClassVar[int]
     # Of the operator: TRANSLATION where B is constant, REFLECTION where B(−x) = B(x).
     operator_invariance: eqx.AbstractClassVar[Invariance]

@@ -58,7 +58,7 @@ class Tuned(eqx.Module):
         converged: whether the run that found the best point met the tolerances, shape ().
         steps: the number of its optimiser steps, shape ().
         at_bounds: the names of the hyperparameters that rest on a bound of the search box. The
-            data would have them further out: see "How to choose" in the README.
+            data prefers values beyond it: see "How to choose" in the README.
         start_losses: the loss on all data at the end of the run from each start, shape (starts,):
             in the order of the starts, the caller's kernel first, or, where the runs were made on
             a subset or are finished with a low-rank loss, in ascending order before that.

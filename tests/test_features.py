@@ -703,6 +703,7 @@ def test_a_field_without_a_potential_says_why(structure, text, key):
         field.hamiltonian  # noqa: B018
 
 
+@pytest.mark.slow
 def test_a_heavy_tail_of_frequencies_overflows_nowhere(key):
     X, Y = data(n=2)
 

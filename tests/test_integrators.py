@@ -241,6 +241,7 @@ def test_iteration_stops_at_the_rounding_errors_of_the_field(size, error):
     assert residual < error
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("solver", [ImplicitMidpoint(), GaussLegendre4()], ids=name)
 @pytest.mark.parametrize("away", [0.0, 1e-12, 1e-9])
 def test_the_iteration_ends_at_an_equilibrium_where_the_field_is_nothing_but_rounding(solver, away):

@@ -332,6 +332,7 @@ def test_no_seed_is_refused():
         paper.reproduce(seeds=0)
 
 
+@pytest.mark.slow
 def test_a_folder_that_cannot_be_made_is_refused_before_the_work(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     command = [sys.executable, "-m", "hamkernel", "--out", str(tmp_path / "file")]

@@ -219,6 +219,7 @@ def test_nystrom_refuses_what_makes_no_sense():
     assert Nystrom(100.0).tolerance == 100.0
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_a_fit_on_landmarks_are_those_of_differences():
     X, Y = np.random.default_rng(0).normal(size=(2, 20, 2))
     solver = Nystrom(tolerance=1e9, points=X[::3])

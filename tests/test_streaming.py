@@ -186,6 +186,7 @@ def test_a_first_chunk_that_is_not_like_the_rest_is_said():
     assert spread.info.truncation < 0.2 < 100 < narrow.info.truncation
 
 
+@pytest.mark.slow
 def test_warnings_name_the_line_of_the_user():
     with pytest.warns(UserWarning, match="fitting in float32") as warned:
         Nystrom().start(K, X[:200].astype(np.float32), 1e-2)

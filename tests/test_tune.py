@@ -739,6 +739,7 @@ class Floating(eqx.Module):
         return rbf(x, z, self.ell)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("k", "name"),
     [
@@ -766,6 +767,7 @@ def test_an_objective_that_jax_cannot_trace_is_told_to_use_jax_numpy():
         hk.tune(hk.Symplectic(hk.Gaussian()), X, Y, objective=objective)  # pyright: ignore
 
 
+@pytest.mark.slow
 def test_what_was_tuned_is_not_tuned_to_anything_worse():
     # Of so many points the run is on a subset first, whose optimum is another.
     rng = np.random.default_rng(1)

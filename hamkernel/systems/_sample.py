@@ -50,8 +50,8 @@ def sample(
     Raises:
         ValueError: a shape is wrong; x0 or ts is not finite; ts does not increase; a noise level
             is negative or not finite; there is noise but no key, or more than one.
-        TypeError: `system` is no function of one JAX array that returns one; x0 is of less than
-            float32; the key is none of JAX.
+        TypeError: `system` is no function of one JAX array that returns one; x0 is of less
+            precision than float32; the key is none of JAX.
         RuntimeError: a trajectory left the finite numbers or needed too many steps.
 
     Source: Smith & Egeland (2023), section Experiments, where both levels are one number.
