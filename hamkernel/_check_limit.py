@@ -49,7 +49,7 @@ def near_blocks(
     """Compare M(x, x) with M(x, x + h) at every point of `near`, direction and step."""
     measures = _measured(diagonal, between, beyond)
     settled = measures.close & (measures.change <= _SETTLED) & (size_of(measures.block) >= 0.1)
-    has_limit = settled.any(axis=-1)
+    has_limit = np.asarray(settled.any(axis=-1))
 
     violation = _violation(measures)
     blatant = measures.close & (measures.change <= 10 * _SETTLED) & (violation > 10 * _VIOLATED)
@@ -59,9 +59,9 @@ def near_blocks(
     growing = (grows & ~has_limit) | endless
     missed = _never_reached(measures, eps) & (has_limit | growing)
 
-    sound = np.isfinite(diagonal.block).all(axis=(-2, -1))
-    sound = np.asarray(sound & np.isfinite(diagonal.gradient).all(axis=-1))
-    wrong = missed | violated | ~sound[:, None] | endless
+    pairs = zip(diagonal.block, diagonal.gradient, strict=True)
+    broken = np.array([not (np.isfinite(b).all() and np.isfinite(g).all()) for b, g in pairs])
+    wrong = missed | violated | broken[:, None] | endless
     plateau = np.where(has_limit[..., None], settled, blatant)
     change = measures.change
     return [

@@ -169,21 +169,7 @@ def tune(
     low_rank = isinstance(solver, Nystrom | RandomFeatures)
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
     space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings)
-    if optimiser is None:
-        optimiser = _BFGS_VERBOSE if progress else _BFGS
-    elif progress:
-        raise ValueError(
-            "progress is printed by the optimiser: pass verbose=True to yours, and no progress."
-        )
-    golden = isinstance(optimiser, optx.GoldenSearch)  # minimises functions of one number
-    if golden or not isinstance(optimiser, optx.AbstractMinimiser):
-        raise TypeError(
-            "optimiser must be an optimistix minimiser of many variables, such as "
-            "optimistix.BFGS(1e-3, 1e-3) or optimistix.OptaxMinimiser(optax.adam(0.1), 1e-3, 1e-3);"
-            f" got {optimiser!r}."
-        )
-
-    optimiser = keeping_the_best(optimiser)
+    optimiser = keeping_the_best(_minimiser(optimiser, progress))
     rows = criterion.coarse_points(X)
     follows_low_rank = low_rank and not criterion.own
     if len(rows) < len(X) and not low_rank:
@@ -191,7 +177,7 @@ def tune(
     X_part, Y_part = (jnp.take(each, rows, axis=0) for each in (X, Y))
     part = criterion.on(rows), X_part, Y_part, len(X) / len(rows)
 
-    def best_in(space: SearchSpace):
+    def tuned_in(space: SearchSpace) -> Tuned:
         runs = search(space, *part, optimiser, starts, max_steps)
         if len(rows) < len(X) or follows_low_rank:
             fine = criterion
@@ -208,31 +194,31 @@ def tune(
                 "low); an objective of your own that returns NaN."
             )
         best = int(runs.value.argmin())
+        losses = criterion.losses(runs.value)
         kernel, ridge = decode(space, jnp.asarray(runs.u[best]), X)
-        return runs, best, kernel, ridge, fit(kernel, *given, ridge, solver=solver)
+        return Tuned(
+            kernel=kernel,
+            regularization=ridge,
+            loss=jnp.asarray(losses[best]),
+            field=fit(kernel, *given, ridge, solver=solver),
+            converged=jnp.asarray(runs.converged[best]),
+            steps=jnp.asarray(runs.steps[best]),
+            start_losses=jnp.asarray(losses),
+            at_bounds=space.at_bounds(runs.u[best]),
+            bounds=space.box(kernel, X),
+        )
 
-    runs, best, kernel, ridge, field = best_in(space)
-    smooth = space.smooth(kernel, ridge, X, _size(field.residual) / _size(given[1]))
+    found = tuned_in(space)
+    misfit = _size(found.field.residual) / _size(given[1])
+    smooth = space.smooth(found.kernel, found.regularization, X, misfit)
     if smooth is not space:
-        space = smooth
-        runs, best, kernel, ridge, field = best_in(space)
-    if not space.allows(ridge):
+        found = tuned_in(smooth)
+    if not smooth.allows(found.regularization):
         raise ValueError(
             f"no lambda within bounds={{'regularization': ...}} can be solved with in {X.dtype}: "
-            f"for {kernel!r} it must be at least {float(ridge):.3g}."
+            f"for {found.kernel!r} it must be at least {float(found.regularization):.3g}."
         )
-    losses = criterion.losses(runs.value)
-    return Tuned(
-        kernel=kernel,
-        regularization=ridge,
-        loss=jnp.asarray(losses[best]),
-        field=field,
-        converged=jnp.asarray(runs.converged[best]),
-        steps=jnp.asarray(runs.steps[best]),
-        start_losses=jnp.asarray(losses),
-        at_bounds=space.at_bounds(runs.u[best]),
-        bounds=space.box(kernel, X),
-    )
+    return found
 
 
 def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -> None:
@@ -248,6 +234,24 @@ def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -
         raise TypeError(f"bounds must be a dict, {{name: (low, high)}}, got {bounds!r}.")
     require.count(starts, "starts")
     require.count(max_steps, "max_steps")
+
+
+def _minimiser(given: optx.AbstractMinimiser | None, progress: bool) -> optx.AbstractMinimiser:
+    """The optimiser of the caller, or ours."""
+    if given is None:
+        return _BFGS_VERBOSE if progress else _BFGS
+    if progress:
+        raise ValueError(
+            "progress is printed by the optimiser: pass verbose=True to yours, and no progress."
+        )
+    golden = isinstance(given, optx.GoldenSearch)  # minimises functions of one number
+    if golden or not isinstance(given, optx.AbstractMinimiser):
+        raise TypeError(
+            "optimiser must be an optimistix minimiser of many variables, such as "
+            "optimistix.BFGS(1e-3, 1e-3) or optimistix.OptaxMinimiser(optax.adam(0.1), 1e-3, 1e-3);"
+            f" got {given!r}."
+        )
+    return given
 
 
 def _warn_of_unequal_sizes(Y: Array) -> None:
