@@ -142,7 +142,7 @@ def test_where_no_landmark_can_be_used_the_losses_are_infinite():
 
 SOLVERS = {
     "nystrom": hk.Nystrom(),
-    "features": hk.RandomFeatures(150, jax.random.key(0)),
+    "features": hk.RandomFeatures(75, jax.random.key(0)),
 }
 
 
