@@ -110,5 +110,4 @@ def centred(K: AbstractMatrixKernel, x: Array, Z: Float[Array, "M n"]) -> tuple[
 
 def plus_ridge(G: Float[Array, "D D"], ridge: Float[Array, ""]) -> Float[Array, "D D"]:
     """G + ridge I."""
-    diagonal = jnp.arange(len(G))
-    return G.at[diagonal, diagonal].add(ridge)
+    return G + ridge * jnp.eye(len(G), dtype=G.dtype)

@@ -49,7 +49,7 @@ class SearchCriterion(eqx.Module):
     """The function to minimise. Losses are searched by their logarithm, which has no scale."""
 
     fn: Callable[..., Float[Array, ""]]
-    low_rank: Callable[..., Float[Array, ""]] | None  # the same of a low-rank fit, its basis first
+    low_rank: jax.tree_util.Partial | None  # the same of a low-rank fit, its basis first
     partition: Partition | None = eqx.field(static=True)
     logarithmic: bool = eqx.field(static=True)
 
@@ -90,7 +90,9 @@ class SearchCriterion(eqx.Module):
     def with_basis(self, basis: AbstractBasis) -> "SearchCriterion":
         """The same criterion of the low-rank fit in this basis."""
         assert self.low_rank is not None
-        return dataclasses.replace(self, fn=jax.tree_util.Partial(self.low_rank, basis))
+        # A Partial of a Partial would be another function, to be compiled, for each call of `tune`.
+        fn = jax.tree_util.Partial(self.low_rank.func, basis, **self.low_rank.keywords)
+        return dataclasses.replace(self, fn=fn)
 
     def on(self, rows: np.ndarray) -> "SearchCriterion":
         """The same criterion for a subset of the points."""

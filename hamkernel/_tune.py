@@ -177,7 +177,7 @@ def tune(
     X_part, Y_part = (jnp.take(each, rows, axis=0) for each in (X, Y))
     part = criterion.on(rows), X_part, Y_part, len(X) / len(rows)
 
-    def tuned_in(space: SearchSpace) -> Tuned:
+    def tuned_in(space: SearchSpace, throw: bool = True) -> Tuned:
         runs = search(space, *part, optimiser, starts, max_steps)
         if len(rows) < len(X) or follows_low_rank:
             fine = criterion
@@ -200,7 +200,7 @@ def tune(
             kernel=kernel,
             regularization=ridge,
             loss=jnp.asarray(losses[best]),
-            field=fit(kernel, *given, ridge, solver=solver),
+            field=fit(kernel, *given, ridge, solver=solver, throw=throw),
             converged=jnp.asarray(runs.converged[best]),
             steps=jnp.asarray(runs.steps[best]),
             start_losses=jnp.asarray(losses),
@@ -208,10 +208,11 @@ def tune(
             bounds=space.box(kernel, X),
         )
 
-    found = tuned_in(space)
+    found = tuned_in(space, throw=False)
     misfit = _size(found.field.residual) / _size(given[1])
-    smooth = space.smooth(found.kernel, found.regularization, X, misfit)
-    if smooth is not space:
+    solved = np.isfinite(misfit)  # conjugate gradients can fail near the rounding of the Gram
+    smooth = space.smooth(found.kernel, found.regularization, X, misfit if solved else 1.0)
+    if smooth is not space or not solved:
         found = tuned_in(smooth)
     if not smooth.allows(found.regularization):
         raise ValueError(
@@ -279,7 +280,7 @@ _UNEQUAL = 100.0  # in size, and so 10 000 in the loss
 
 
 def _size(values: Array) -> float:
-    return max(float(jnp.linalg.norm(values)), float(np.finfo(float).tiny))
+    return float(np.maximum(jnp.linalg.norm(values), np.finfo(float).tiny))  # NaN stays NaN
 
 
 _RUN_COPIES = 5  # matrices of the size of the Gram that a run holds: 4.4 measured

@@ -215,21 +215,33 @@ def _square_gram(K, X) -> Float[Array, "D D"]:
     return assemble(K, X, X).reshape(X.size, X.size)
 
 
+_FEW = 10_000  # entries of the Gram: as fast at once, and sooner compiled
 _STRIP = 200_000  # entries of the Gram at once; its derivatives hold up to 13 arrays of this size
 
 
 def _paired_with_gram(K, X: Float[Array, "N n"], bar: Float[Array, "D D"]) -> Float[Array, ""]:
-    """⟨bar, Gram⟩, in strips of rows."""
+    """⟨bar, Gram⟩, in strips of rows.
+
+    The products of all strips are added entry by entry, and summed once: entries that XLA sums as
+    it makes them are made by one thread, one at a time, in four times as long.
+    """
     N, n = X.shape
-    if X.size**2 <= _STRIP:
+    if X.size**2 <= _FEW:
         return jnp.vdot(bar, _square_gram(K, X))
+    points = max(1, min(N // 4, _STRIP // (n * X.size)))  # a loop of few strips is unrolled
 
-    def of_point(point_and_rows):
-        x, rows = point_and_rows
-        return jnp.vdot(rows, assemble(K, x[None], X))
+    def strip(start, count):
+        x = jax.lax.dynamic_slice_in_dim(X, start, count)
+        rows = jax.lax.dynamic_slice_in_dim(bar, n * start, n * count)
+        return rows * assemble(K, x, X).reshape(rows.shape)
 
-    points = -(-_STRIP // (n * X.size))
-    return jnp.sum(jax.lax.map(of_point, (X, bar.reshape(N, n, X.size)), batch_size=points))
+    def add(total, start):
+        return total + strip(start, points), None
+
+    starts = jnp.arange(0, N - points + 1, points)
+    total, _ = jax.lax.scan(add, jnp.zeros((n * points, X.size), bar.dtype), starts)
+    left = N % points
+    return total.sum() + (strip(N - left, left).sum() if left else 0.0)
 
 
 # What each loss needs of A and y, with its derivative.
@@ -260,9 +272,9 @@ def _held_out_backward(partition, saved, r_bar):
     P, Q = [], []  # C_:S v_S and C_:S r_S, a column for each fold
     for group, own in zip(partition.groups, factors, strict=True):
         v = _solve_blocks(own, group.gather(r_bar))
-        columns = group.gather(C, axis=1)
-        P.append(jnp.einsum("dfi,fi->df", columns, v))
-        Q.append(jnp.einsum("dfi,fi->df", columns, group.gather(r)))
+        rows = group.gather(C)  # whose sums are three times faster than those of columns
+        P.append(jnp.einsum("fid,fi->fd", rows, v).T)
+        Q.append(jnp.einsum("fid,fi->fd", rows, group.gather(r)).T)
         r_bar = jax.lax.optimization_barrier((r_bar, P[-1], Q[-1]))[0]
     w = jnp.concatenate(P, axis=1).sum(axis=1)  # C v
     left, right = jnp.column_stack([*P, -w]), jnp.column_stack([*Q, a])

@@ -671,6 +671,24 @@ def test_new_data_of_the_same_shape_does_not_recompile():
     assert len(traced) == count
 
 
+def test_a_second_search_with_features_compiles_nothing(caplog):
+    solver = hk.RandomFeatures(20, jax.random.key(0))
+
+    def run(seed):
+        K = hk.Symplectic(hk.Gaussian(jnp.asarray(1.0 + seed)))
+        return hk.tune(K, *scattered(seed), starts=1, solver=solver)
+
+    def compiled():
+        return [record.getMessage() for record in caplog.records if "XLA" in record.getMessage()]
+
+    with jax.log_compiles():
+        first = run(0)
+        assert any("finish" in message for message in compiled())
+        caplog.clear()
+        assert float(run(1).loss) != float(first.loss)
+    assert not compiled()
+
+
 @pytest.mark.slow
 def test_data_that_is_searched_on_a_subset_is_finished_on_all_of_it():
     rng = np.random.default_rng(0)
@@ -684,6 +702,21 @@ def test_data_that_is_searched_on_a_subset_is_finished_on_all_of_it():
         other = hk.Symplectic(hk.Gaussian(factor * gaussian(tuned)))
         assert refit_loss(other, X, Y, tuned.regularization) > best * (1 - FLOOR)
         assert refit_loss(tuned.kernel, X, Y, factor * tuned.regularization) > best * (1 - FLOOR)
+
+
+def test_conjugate_gradients_may_fail_where_the_search_is_still_to_be_made_again():
+    # With no bound but the rounding of the Gram the best λ is 3e-17, and the solver fails there.
+    rng = np.random.default_rng(1)
+    X = rng.uniform(-2, 2, size=(40, 2))
+    Y = np.stack([X[:, 1], -np.sin(X[:, 0])], axis=1) + 0.05 * rng.normal(size=X.shape)
+    K, solver = hk.Odd(hk.Symplectic(hk.Gaussian(jnp.asarray(4.0)))), hk.ConjugateGradient()
+    tuned = hk.tune(K, X, Y, solver=solver, starts=4)
+    np.testing.assert_allclose(tuned.loss, refit_loss(tuned.kernel, X, Y, tuned.regularization))
+    assert float(tuned.field.info.relative_residual) <= 1e-8
+    # Where the caller has said what λ is, there is no search to be made again.
+    small = {"regularization": (1e-20, 1e-16), "lengthscale": (40.0, 41.0)}
+    with pytest.raises(RuntimeError, match="did not converge"):
+        hk.tune(K, X, Y, 1e-17, solver=solver, starts=4, bounds=small)
 
 
 # Planted truths.
