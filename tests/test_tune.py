@@ -710,7 +710,7 @@ def test_conjugate_gradients_may_fail_where_the_search_is_still_to_be_made_again
     X = rng.uniform(-2, 2, size=(40, 2))
     Y = np.stack([X[:, 1], -np.sin(X[:, 0])], axis=1) + 0.05 * rng.normal(size=X.shape)
     K, solver = hk.Odd(hk.Symplectic(hk.Gaussian(jnp.asarray(4.0)))), hk.ConjugateGradient()
-    tuned = hk.tune(K, X, Y, solver=solver, starts=4)
+    tuned: Any = hk.tune(K, X, Y, solver=solver, starts=4)
     np.testing.assert_allclose(tuned.loss, refit_loss(tuned.kernel, X, Y, tuned.regularization))
     assert float(tuned.field.info.relative_residual) <= 1e-8
     # Where the caller has said what λ is, there is no search to be made again.
