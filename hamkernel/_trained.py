@@ -8,29 +8,36 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
 
+_FEW = 10_000  # entries of an array: paired as fast at once, and sooner compiled
 _ENTRIES = 200_000  # of the array and its changes, up to which directions go side by side
+_STRIP = 200_000  # entries of rows at once; their derivatives hold up to 13 arrays of this size
 
 
 @eqx.filter_custom_vjp
-def trained(kernel_and_points, make, paired=None):
+def trained(kernel_and_points, make, rowwise: bool = False):
     """make(K, X), an array, cheap to differentiate with respect to K.
 
-    `paired(K, X, bar)` is ⟨bar, make(K, X)⟩, in as little memory as its derivatives should take;
-    the plain product if None.
+    If `rowwise` then make(K, X) is a function instead, which makes of points a row for each, and
+    the array is its value at X. Its derivatives take the memory of a strip of rows.
     """
-    return make(*kernel_and_points)
+    made = make(*kernel_and_points)
+    return made(kernel_and_points[1]) if rowwise else made
 
 
 @trained.def_fwd
-def _(perturbed, kernel_and_points, make, paired=None):
-    return trained(kernel_and_points, make, paired), None
+def _(perturbed, kernel_and_points, make, rowwise=False):
+    return trained(kernel_and_points, make, rowwise), None
 
 
 @trained.def_bwd
-def _(saved, bar, perturbed, kernel_and_points, make, paired=None):
+def _(saved, bar, perturbed, kernel_and_points, make, rowwise=False):
     K, X = kernel_and_points
-    paired = paired or (lambda K, X, bar: jnp.vdot(bar, make(K, X)))
+
+    def paired(K, X, bar):
+        made = make(K, X)
+        return _paired_by_rows(made, X, bar) if rowwise else jnp.vdot(bar, made)
 
     params, static = eqx.partition(K, eqx.is_inexact_array)
     flat, unravel = ravel_pytree(params)
@@ -47,8 +54,34 @@ def _(saved, bar, perturbed, kernel_and_points, make, paired=None):
     directions = jnp.eye(flat.size, dtype=flat.dtype)
     slopes = jax.lax.map(slope, directions, batch_size=together if together > 1 else None)
     K_bar = unravel(slopes.astype(flat.dtype))
-    X_bar = jax.vjp(lambda X: make(K, X), X)[1](bar)[0] if perturbed[1] else None
-    return K_bar, X_bar
+    if not perturbed[1]:
+        return K_bar, None
+    _, pull = jax.vjp(lambda X: make(K, X)(X) if rowwise else make(K, X), X)
+    return K_bar, pull(bar)[0]
+
+
+def _paired_by_rows(rows, X: Float[Array, "N n"], bar: Float[Array, "N ..."]) -> Float[Array, ""]:
+    """⟨bar, rows(X)⟩, in strips.
+
+    The products of all strips are added entry by entry, and summed once: entries that XLA sums as
+    it makes them are made by one thread, one at a time, in four times as long.
+    """
+    N = len(X)
+    if bar.size <= _FEW:
+        return jnp.vdot(bar, rows(X))
+    points = max(1, min(N // 4, _STRIP * N // bar.size))  # a loop of few strips is unrolled
+
+    def strip(start, count):
+        x, own = (jax.lax.dynamic_slice_in_dim(each, start, count) for each in (X, bar))
+        return own * rows(x)
+
+    def add(total, start):
+        return total + strip(start, points), None
+
+    starts = jnp.arange(0, N - points + 1, points)
+    total, _ = jax.lax.scan(add, jnp.zeros((points, *bar.shape[1:]), bar.dtype), starts)
+    left = N % points
+    return total.sum() + (strip(N - left, left).sum() if left else 0.0)
 
 
 def constant(tree):

@@ -18,6 +18,7 @@ folds, Ginsbourger & Schärer (2021), arXiv:2101.03108.
 """
 
 import functools
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -207,41 +208,12 @@ def log_likelihood(K, X, Y, regularization):
 
 
 def _regularised(K, X: Array, ridge: Array) -> Float[Array, "D D"]:
-    G = trained((K, X), _square_gram, _paired_with_gram)
-    return plus_ridge(G, ridge)
+    G = trained((K, X), _rows_of_gram, rowwise=True)
+    return plus_ridge(G.reshape(X.size, X.size), ridge)
 
 
-def _square_gram(K, X) -> Float[Array, "D D"]:
-    return assemble(K, X, X).reshape(X.size, X.size)
-
-
-_FEW = 10_000  # entries of the Gram: as fast at once, and sooner compiled
-_STRIP = 200_000  # entries of the Gram at once; its derivatives hold up to 13 arrays of this size
-
-
-def _paired_with_gram(K, X: Float[Array, "N n"], bar: Float[Array, "D D"]) -> Float[Array, ""]:
-    """⟨bar, Gram⟩, in strips of rows.
-
-    The products of all strips are added entry by entry, and summed once: entries that XLA sums as
-    it makes them are made by one thread, one at a time, in four times as long.
-    """
-    N, n = X.shape
-    if X.size**2 <= _FEW:
-        return jnp.vdot(bar, _square_gram(K, X))
-    points = max(1, min(N // 4, _STRIP // (n * X.size)))  # a loop of few strips is unrolled
-
-    def strip(start, count):
-        x = jax.lax.dynamic_slice_in_dim(X, start, count)
-        rows = jax.lax.dynamic_slice_in_dim(bar, n * start, n * count)
-        return rows * assemble(K, x, X).reshape(rows.shape)
-
-    def add(total, start):
-        return total + strip(start, points), None
-
-    starts = jnp.arange(0, N - points + 1, points)
-    total, _ = jax.lax.scan(add, jnp.zeros((n * points, X.size), bar.dtype), starts)
-    left = N % points
-    return total.sum() + (strip(N - left, left).sum() if left else 0.0)
+def _rows_of_gram(K, X: Float[Array, "N n"]) -> Callable[[Array], Float[Array, "t n N n"]]:
+    return lambda x: assemble(K, x, X)
 
 
 # What each loss needs of A and y, with its derivative.

@@ -12,6 +12,7 @@ and the losses that look at all rows at once need H alone (Weinstein & Aronszajn
 """
 
 import abc
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -21,19 +22,20 @@ from jaxtyping import Array, Float, Key
 
 from hamkernel._features import features
 from hamkernel._folds import Partition
-from hamkernel._gram import assemble
 from hamkernel._solve_landmarks import given_landmarks
-from hamkernel._solve_low_rank import factor, whitening
+from hamkernel._solve_low_rank import Columns, factor, whitening
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._trained import trained
+
+Features = Callable[[Float[Array, "t n"]], Float[Array, "t n r"]]
 
 
 class AbstractBasis(eqx.Module):
     """Features that follow the hyperparameters of a kernel, Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z)."""
 
     @abc.abstractmethod
-    def rows(self, K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, "N n r"]:
-        """The features of K at the points."""
+    def features(self, K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Features:
+        """The features of K, at points such as X."""
 
 
 class WaveBasis(AbstractBasis):
@@ -42,8 +44,8 @@ class WaveBasis(AbstractBasis):
     key: Key[Array, ""]
     count: int = eqx.field(static=True)
 
-    def rows(self, K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, "N n r"]:
-        return features(K, X.shape[1], self.count, self.key, X.dtype)(X)
+    def features(self, K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Features:
+        return features(K, X.shape[1], self.count, self.key, X.dtype)
 
 
 class LandmarkBasis(AbstractBasis):
@@ -51,12 +53,13 @@ class LandmarkBasis(AbstractBasis):
 
     points: Float[Array, "m n"]
 
-    def rows(self, K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, "N n r"]:
+    def features(self, K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Features:
         S = self.points
         landmarks = given_landmarks(K, S)
         # Without a column a fit fails; its features would be those of the zero field.
         T = jnp.where(landmarks.count == 0, jnp.nan, whitening(K, landmarks))
-        return (assemble(K, X, S).reshape(X.size, S.size) @ T).reshape(*X.shape, S.size)
+        columns = Columns(K, S)
+        return lambda X: (columns(X).reshape(X.size, S.size) @ T).reshape(*X.shape, S.size)
 
 
 def low_rank_partition_loss(
@@ -71,7 +74,7 @@ def low_rank_partition_loss(
     N = len(X)
     rows, y = _rows(basis, K, X), Y.reshape(-1)
     ridge = (N - N / len(partition.folds)) * regularization
-    H, b = rows.T @ rows, rows.T @ y
+    H, b = _square(rows), rows.T @ y
     few = [group.members.shape[1] * X.shape[1] <= rows.shape[1] for group in partition.groups]
     R = factor(H, ridge) if any(few) else None
     residuals = jnp.zeros_like(y)
@@ -87,14 +90,51 @@ def low_rank_partition_loss(
     return _finite(jnp.asarray(partition.weights, squares.dtype) @ squares, jnp.inf)
 
 
-def _by_downdating(folds, y, H, b, ridge):
+@jax.custom_vjp
+def _by_downdating(
+    folds: Float[Array, "F s r"],
+    y: Float[Array, "F s"],
+    H: Float[Array, "r r"],
+    b: Float[Array, " r"],
+    ridge: Float[Array, ""],
+) -> Float[Array, "F s"]:
+    return _by_downdating_forward(folds, y, H, b, ridge)[0]
+
+
+def _by_downdating_forward(folds, y, H, b, ridge):
     def without(fold):
         own, target = fold
         R = factor(H - own.T @ own, ridge)
-        return target - own @ cho_solve((R, True), b - own.T @ target)
+        w = cho_solve((R, True), b - own.T @ target)
+        return target - own @ w, R, w
 
     # One after the other: a batch of factorisations would be one more copy of H.
-    return jax.lax.map(without, (folds, y))
+    residuals, R, w = jax.lax.map(without, (folds, y))
+    return residuals, (folds, residuals, R, w)
+
+
+def _by_downdating_backward(saved, bar):
+    folds, residuals, R, w = saved
+    moments = jnp.einsum("fsr,fs->fr", folds, bar)
+    z = jax.lax.map(lambda fold: cho_solve((fold[0], True), -fold[1]), (R, moments))
+    y_bar = bar - jnp.einsum("fsr,fr->fs", folds, z)
+    folds_bar = -y_bar[:, :, None] * w[:, None, :] - residuals[:, :, None] * z[:, None, :]
+    return folds_bar, y_bar, -z.T @ w, z.sum(axis=0), -jnp.vdot(z, w)
+
+
+_by_downdating.defvjp(_by_downdating_forward, _by_downdating_backward)
+
+
+@jax.custom_vjp
+def _square(rows: Float[Array, "D r"]) -> Float[Array, "r r"]:
+    """ΦᵀΦ, whose derivative is one product with Φ and not two."""
+    return rows.T @ rows
+
+
+_square.defvjp(
+    lambda rows: (_square(rows), rows),
+    lambda rows, bar: (rows @ (bar + bar.T),),
+)
 
 
 def _by_inversion(folds, y, R, b):
@@ -143,12 +183,12 @@ def low_rank_log_likelihood(
 
 
 def _rows(basis, K, X) -> Float[Array, "Nn r"]:
-    return trained((K, X), basis.rows).reshape(X.size, -1)
+    return trained((K, X), basis.features, rowwise=True).reshape(X.size, -1)
 
 
 def _fitted(basis, K, X, Y, regularization):
     rows, ridge, y = _rows(basis, K, X), len(X) * regularization, Y.reshape(-1)
-    R = factor(rows.T @ rows, ridge)
+    R = factor(_square(rows), ridge)
     w = cho_solve((R, True), rows.T @ y)
     return y - rows @ w, w, R, rows, ridge
 

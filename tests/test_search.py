@@ -172,9 +172,8 @@ def test_starts_are_no_neighbours():
 def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free():
     few, states, ridge = jnp.asarray(Y[:6]), jnp.asarray(X[:6]), jnp.asarray(1e-3)
     waves = WaveBasis(jax.random.key(0), 3)
-    F, G = (
-        np.asarray(each).reshape(12, -1) for each in (waves.rows(K, states), hk.gram(K, states))
-    )
+    features, gram = waves.features(K, states)(states), hk.gram(K, states)
+    F, G = (np.asarray(each).reshape(12, -1) for each in (features, gram))
 
     def free(matrix):
         return 6e-3 * np.trace(np.linalg.inv(matrix + 6e-3 * np.eye(12))) / 12
