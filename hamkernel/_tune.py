@@ -101,8 +101,9 @@ def tune(
     space-filling design in the box. All run in one compiled call, on a subset of the points if
     there are many; the best one is then finished on all data, and the best point that any of
     them saw is returned, or the given one where that is better on all data. New data of the same
-    shape does not recompile. Data that is spread over devices is gathered on one of them for the
-    search; the field is fitted where the data lies.
+    shape does not recompile, unless `Nystrom` takes another number of landmarks. Data that is
+    spread over devices is gathered on one of them for the search; the field is fitted where the
+    data lies.
 
     Args:
         K: a matrix-valued kernel; every inexact array leaf is a hyperparameter, and no Python
