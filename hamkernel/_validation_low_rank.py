@@ -9,6 +9,12 @@ gives the same residual from one factorisation of H + δI = RRᵀ and one of the
     r_S = (I − VᵀV)⁻¹ (y_S − Vᵀ R⁻¹b),    V = R⁻¹Φ_Sᵀ,
 
 and the losses that look at all rows at once need H alone (Weinstein & Aronszajn).
+
+The derivative of r_S = y_S − Φ_S w, with w = A⁻¹(b − b_S) and A = H − H_S + δI, is written down,
+since that of a factorisation costs several times its price. For a cotangent r̄, and with
+z = −A⁻¹Φ_Sᵀr̄,
+
+    Ā = −z wᵀ,   b̄ = z,   ȳ_S = r̄ − Φ_S z,   Φ̄_S = −ȳ_S wᵀ − r_S zᵀ   besides what H and b give.
 """
 
 import abc
@@ -108,7 +114,7 @@ def _by_downdating_forward(folds, y, H, b, ridge):
         w = cho_solve((R, True), b - own.T @ target)
         return target - own @ w, R, w
 
-    # One after the other: a batch of factorisations would be one more copy of H.
+    # One after the other. Their factors, for the derivative, are no larger than the rows.
     residuals, R, w = jax.lax.map(without, (folds, y))
     return residuals, (folds, residuals, R, w)
 
