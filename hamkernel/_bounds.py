@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel._callable import Bound
 from hamkernel._gram import trace
-from hamkernel._scalar import AbstractScalarKernel
+from hamkernel._scalar import AbstractScalarKernel, Invariance
 from hamkernel._scalar_product import Periodic
 from hamkernel._scalar_transform import Select, Symmetrised, Warp
 from hamkernel._structured import AbstractMatrixKernel, Sum
@@ -68,8 +68,8 @@ def constants(K: AbstractMatrixKernel) -> dict[str, float]:
 gram_trace = eqx.filter_jit(trace)
 
 
-def traces(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, "2"]:
-    """The trace of the Gram, and before the terms of an odd or even kernel cancel: what rounds.
+def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
+    """The trace of the Gram before the terms of an odd or even kernel cancel: what rounds.
 
     (k(x, z) − k(−x, z))/2 of a long lengthscale is the small difference of large numbers.
     """
@@ -77,16 +77,17 @@ def traces(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, "2"]
     def is_mean(node: object) -> bool:
         return isinstance(node, Symmetrised)
 
-    of_gram = gram_trace(K, X)
-    if not any(map(is_mean, jax.tree.leaves(K, is_leaf=is_mean))):
-        return jnp.stack([of_gram, of_gram])
     terms = jax.tree.map(lambda node: node.kernel if is_mean(node) else node, K, is_leaf=is_mean)
-    return jnp.stack([of_gram, jnp.maximum(gram_trace(terms, X), of_gram)])
+    trace = gram_trace(terms, X)
+    if Invariance.REFLECTION in terms.invariance:
+        return trace  # that of the Gram is no larger
+    return jnp.maximum(trace, gram_trace(K, X))
 
 
 def _amplitude(K: AbstractMatrixKernel, X: Array, Y: Array) -> float:
     """The factor that gives K(x, x) the size of Y: mean Y² over the mean diagonal."""
-    ratio = float(np.mean(np.asarray(Y) ** 2) / gram_trace(K, X) * X.size)
+    trace = float(gram_trace(K, X))
+    ratio = float(np.mean(np.asarray(Y) ** 2)) * X.size / trace if trace > 0 else 0.0
     return ratio if np.isfinite(ratio) and ratio > 0 else 1.0
 
 

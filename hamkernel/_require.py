@@ -214,7 +214,8 @@ def elapsed(ts: Float[Array, " T"], dtype: Any) -> Float[Array, " T"]:
     A field does not depend on time. Late times that come in float64 keep their distances so,
     however large they are in float32.
     """
-    since = (ts - ts[0]).astype(dtype)
+    ts = on_host(ts)
+    since = jnp.asarray((ts - ts[0]).astype(dtype))
     seen = on_host(since)
     return value(
         since,

@@ -156,10 +156,10 @@ def _spread_out(
     """The best points of the design that are not neighbours of a better one already taken."""
     reach = 0.25 * design.shape[1] ** 0.5  # of a box of side 1; a float has no dtype
     shares = jnp.sin(design) / 2
-    taken = []
-    for _ in range(count):
+
+    def take(values, _):
         best = jnp.argmin(values)
-        taken.append(design[best])
         near = jnp.linalg.norm(shares - shares[best][None], axis=1) < reach
-        values = jnp.where(near, HUGE + values, values)
-    return jnp.stack(taken)
+        return jnp.where(near, HUGE + values, values), design[best]
+
+    return jax.lax.scan(take, values, length=count)[1]

@@ -8,7 +8,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float
 
-from hamkernel._bounds import hyperparameters, traces
+from hamkernel._bounds import full_trace, hyperparameters
 from hamkernel._structured import AbstractMatrixKernel
 from hamkernel._trained import trained
 
@@ -96,8 +96,8 @@ class SearchSpace(eqx.Module):
         if self.given_ridge is not None or not self._moves_ridge:
             return self  # the caller has said what λ may be
         needed = misfit / jnp.finfo(X.dtype).eps ** 0.5
-        low = jnp.exp(self.ridge_box(kernel, X)[0])
-        if regularization * self.roundings >= low * needed:
+        low = np.exp(float(self.ridge_box(kernel, X)[0]))
+        if float(regularization) * float(self.roundings) >= low * needed:
             return self
         return eqx.tree_at(lambda s: s.roundings, self, jnp.asarray(needed, X.dtype))
 
@@ -132,9 +132,8 @@ class SearchSpace(eqx.Module):
         self, kernel: AbstractMatrixKernel, X: Float[Array, "N n"]
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """The bounds of log λ: from the rounding of the Gram to where the field is almost zero."""
-        trace, cancelling = trained((kernel, X), traces)
-        low = self.roundings * jnp.finfo(X.dtype).eps * cancelling / len(X)
-        high = jnp.maximum(10 * trace / len(X), 2 * low)
+        size = trained((kernel, X), full_trace) / len(X)
+        low, high = self.roundings * jnp.finfo(X.dtype).eps * size, 10 * size
         if self.given_ridge is not None:
             low = jnp.maximum(low, self.given_ridge[0])
             high = jnp.maximum(self.given_ridge[1], low)

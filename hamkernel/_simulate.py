@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int, Num
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
 
@@ -164,12 +164,12 @@ def simulate(
             "diffrax.ForwardMode() for jax.jvp and jax.jacfwd, adjoint=diffrax.DirectAdjoint() for "
             "jax.hessian."
         ) from error
-    solution = _at_times(_seen_to_be_finite(solution), given.astype(x0.dtype))
+    solution, failed = _finished(solution, given.astype(x0.dtype))
     if counts is not None:  # Diffrax counted the save intervals; the steps are inside them.
         total = require.on_host(counts).sum()
         steps = {"num_steps": jnp.asarray(total), "num_accepted_steps": jnp.asarray(total)}
         solution = eqx.tree_at(lambda s: s.stats, solution, {**solution.stats, **steps})
-    return _successful(solution, field, x0, dt is not None) if throw else solution
+    return _successful(solution, failed, field, x0, dt is not None) if throw else solution
 
 
 _FilterJit: Any = type(eqx.filter_jit(abs))  # Equinox does not name it
@@ -270,10 +270,12 @@ def _bound(counts: Int[Array, " intervals"], max_steps: int | None) -> int:
     return max_steps
 
 
-def _seen_to_be_finite(solution: Any) -> Any:
-    """The solution, with a result that says so where a state is not finite.
+@eqx.filter_jit
+def _finished(solution: Any, ts: Float[Array, " T"]) -> tuple[Any, Bool[Array, ""]]:
+    """The solution with the caller's times, and whether it failed.
 
-    Adaptive steps reject such states; constant ones go through them.
+    Times that it did not reach stay infinite. Where a state is not finite the result says so:
+    adaptive steps reject such states, constant ones go through them.
     """
     import diffrax
 
@@ -281,21 +283,24 @@ def _seen_to_be_finite(solution: Any) -> Any:
     reached_end = solution.result == RESULTS.successful
     overflowed = reached_end & ~jnp.isfinite(solution.ys).all()
     result = RESULTS.where(overflowed, RESULTS.nonfinite, solution.result)
-    return eqx.tree_at(lambda s: s.result, solution, result)
-
-
-def _at_times(solution: Any, ts: Float[Array, " T"]) -> Any:
-    """The solution with the caller's times; those that it did not reach stay infinite."""
     reached = jnp.where(jnp.isfinite(solution.ts), ts, solution.ts.astype(ts.dtype))
-    return eqx.tree_at(lambda s: (s.t0, s.t1, s.ts), solution, (ts[0], ts[-1], reached))
+    solution = eqx.tree_at(
+        lambda s: (s.t0, s.t1, s.ts, s.result), solution, (ts[0], ts[-1], reached, result)
+    )
+    return solution, result != RESULTS.successful
 
 
-def _successful(solution: Any, field: Any, x0: Float[Array, " n"], constant_steps: bool) -> Any:
+def _successful(
+    solution: Any,
+    failed: Bool[Array, ""],
+    field: Any,
+    x0: Float[Array, " n"],
+    constant_steps: bool,
+) -> Any:
     """The solution, if the solve reached its end in finite numbers."""
     import diffrax
 
     RESULTS = diffrax.RESULTS
-    failed = solution.result != RESULTS.successful
 
     def message() -> str:
         reason = (

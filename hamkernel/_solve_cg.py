@@ -89,7 +89,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
         spread = rows_of(X)
         X, Y = split(spread, X), split(spread, Y)
         within = jnp.asarray(tolerance, X.dtype)  # a Python float would compile anew
-        C, iterations, values, left, truncation = _solve(
+        learned, iterations, left, truncation = _solve(
             K, X, Y, ridge, landmarks, within, self.max_iterations, spread
         )
 
@@ -112,16 +112,18 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                 "that is NaN the kernel is at fault: hk.check_kernel(k, X) tells."
             )
 
-        failed = ~(left <= tolerance) | ((landmarks.count == 0) & (truncation != 0))
-        C, values = require.value((C, values), failed, message, RuntimeError, throw)
+        none = require.on_host(landmarks.count) == 0
+        failed = ~(require.on_host(left) <= tolerance) | (none & (require.on_host(truncation) != 0))
+        learned = require.value(learned, failed, message, RuntimeError, throw)
         larger = require.not_finite(truncation)
-        C, values = require.value((C, values), larger, INDEFINITE, RuntimeError, throw)
+        learned = require.value(learned, larger, INDEFINITE, RuntimeError, throw)
+        coefficients, residual, norm = learned
         return KernelField(
             kernel=K,
             points=X,
-            coefficients=C / ridge,
-            residual=as_given(spread, Y - values),
-            norm=root(jnp.sum(C * values) / ridge),  # ‖f‖² = aᵀGa
+            coefficients=coefficients,
+            residual=as_given(spread, residual),
+            norm=norm,
             regularization=regularization,
             offset=jnp.zeros((), X.dtype),
             info=SolverInfo(
@@ -172,4 +174,5 @@ def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
     values = gram(C) / ridge  # f(X)
     left = relative(Y - C - values, Y)
     truncation = truncated(trace(K_, X_, spread), jnp.trace(square), ridge_)
-    return C, solution.stats["num_steps"], values, left, truncation
+    norm = root(jnp.sum(C * values) / ridge)  # ‖f‖² = aᵀGa
+    return (C / ridge, Y - values, norm), solution.stats["num_steps"], left, truncation

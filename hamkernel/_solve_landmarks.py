@@ -66,19 +66,18 @@ def choose_landmarks(
         Webber (2024), arXiv 2410.03969.
     """
     K, X, left = constant((K, X, left))
-    first, key = jax.random.split(key)
     rows = rows_of(X)
     X = split(rows, X)
     if len(X) > candidates:
-        X = X[_spread(first, len(X), candidates)]
+        X = X[_spread(jax.random.split(key)[0], len(X), candidates)]
     if rows is not None:
         X = rows.whole(X)
     most = min(most, len(X))
     if not require.is_concrete(K, X, left, key):
-        drawn = _draw(K, X, left, _empty(K, X, most, key), most)
+        drawn = _begin(K, X, left, key, most)
         return _landmarks(X, drawn, most)
     size = min(FIRST, most)
-    drawn = _draw(K, X, left, _empty(K, X, size, key), size)
+    drawn = _begin(K, X, left, key, size)
     while int(drawn.count) >= size and size < most:
         size = min(2 * size, most)
         drawn = _draw(K, X, left, _enlarged(drawn, size + BLOCK), size)
@@ -149,21 +148,23 @@ class _Drawn(NamedTuple):
 
 
 @eqx.filter_jit
-def _empty(K, X, size, key):
+def _begin(K, X, left, key, size):
+    """`_draw` from the beginning."""
     P, n = X.shape
-    size = size + BLOCK
-    left = block_traces(K, X)
+    buffer = size + BLOCK
+    traces = block_traces(K, X)
     zero = jnp.zeros((), int)
-    return _Drawn(
+    drawn = _Drawn(
         count=zero,
-        index=jnp.zeros(size, int),
-        kept=jnp.zeros((size, n), bool),
-        factor=jnp.zeros((size, n, P, n), X.dtype),
-        left=left,
-        rounding=_rounding(left, size * n),
-        key=key,
+        index=jnp.zeros(buffer, int),
+        kept=jnp.zeros((buffer, n), bool),
+        factor=jnp.zeros((buffer, n, P, n), X.dtype),
+        left=traces,
+        rounding=_rounding(traces, buffer * n),
+        key=jax.random.split(key)[1],  # the other is for the candidates
         rounds=zero,
     )
+    return _draw(K, X, left, drawn, size)
 
 
 def _enlarged(drawn: _Drawn, size: int) -> _Drawn:

@@ -22,8 +22,7 @@ def trained(kernel_and_points, make, rowwise: bool = False):
     If `rowwise` then make(K, X) is a function instead, which makes of points a row for each, and
     the array is its value at X. Its derivatives take the memory of a strip of rows.
     """
-    made = make(*kernel_and_points)
-    return made(kernel_and_points[1]) if rowwise else made
+    return _array(make, rowwise, *kernel_and_points)
 
 
 @trained.def_fwd
@@ -56,15 +55,21 @@ def _(saved, bar, perturbed, kernel_and_points, make, rowwise=False):
     K_bar = unravel(slopes.astype(flat.dtype))
     if not perturbed[1]:
         return K_bar, None
-    _, pull = jax.vjp(lambda X: make(K, X)(X) if rowwise else make(K, X), X)
+    _, pull = jax.vjp(lambda X: _array(make, rowwise, K, X), X)
     return K_bar, pull(bar)[0]
+
+
+def _array(make, rowwise: bool, K, X: Float[Array, "N n"]) -> Array:
+    made = make(K, X)
+    return made(X) if rowwise else made
 
 
 def _paired_by_rows(rows, X: Float[Array, "N n"], bar: Float[Array, "N ..."]) -> Float[Array, ""]:
     """⟨bar, rows(X)⟩, in strips.
 
     The products of all strips are added entry by entry, and summed once: entries that XLA sums as
-    it makes them are made by one thread, one at a time, in four times as long.
+    it makes them are made by one thread, one at a time, in four times as long. Strips are cut out
+    one at a time: `over_tiles` would rearrange, and so copy, `bar`.
     """
     N = len(X)
     if bar.size <= _FEW:

@@ -173,14 +173,15 @@ def tune(
     optimiser = keeping_the_best(_minimiser(optimiser, progress))
     rows = criterion.coarse_points(X)
     follows_low_rank = low_rank and not criterion.own
-    if len(rows) < len(X) and not low_rank:
+    thinned = len(rows) < len(X)
+    if thinned and not low_rank:
         check_memory(X, _RUN_COPIES)
-    X_part, Y_part = (jnp.take(each, rows, axis=0) for each in (X, Y))
+    X_part, Y_part = (X[rows], Y[rows]) if thinned else (X, Y)
     part = criterion.on(rows), X_part, Y_part, len(X) / len(rows)
 
     def tuned_in(space: SearchSpace, throw: bool = True) -> Tuned:
         runs = search(space, *part, optimiser, starts, max_steps)
-        if len(rows) < len(X) or follows_low_rank:
+        if thinned or follows_low_rank:
             fine = criterion
             if follows_low_rank:
                 kernel, ridge = decode(space, runs.u[np.argmin(runs.value)], X)
@@ -213,8 +214,10 @@ def tune(
     misfit = _size(found.field.residual) / _size(given[1])
     solved = np.isfinite(misfit)  # conjugate gradients can fail near the rounding of the Gram
     smooth = space.smooth(found.kernel, found.regularization, X, misfit if solved else 1.0)
-    if smooth is not space or not solved:
+    if smooth is not space:
         found = tuned_in(smooth)
+    elif not solved:
+        fit(found.kernel, *given, found.regularization, solver=solver)  # raises
     if not smooth.allows(found.regularization):
         raise ValueError(
             f"no lambda within bounds={{'regularization': ...}} can be solved with in {X.dtype}: "

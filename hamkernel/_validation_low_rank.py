@@ -65,7 +65,7 @@ class LandmarkBasis(AbstractBasis):
         # Without a column a fit fails; its features would be those of the zero field.
         T = jnp.where(landmarks.count == 0, jnp.nan, whitening(K, landmarks))
         columns = Columns(K, S)
-        return lambda X: (columns(X).reshape(X.size, S.size) @ T).reshape(*X.shape, S.size)
+        return lambda x: (columns(x).reshape(x.size, S.size) @ T).reshape(*x.shape, S.size)
 
 
 def low_rank_partition_loss(

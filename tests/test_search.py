@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._bounds import hyperparameters, traces
+from hamkernel._bounds import full_trace, hyperparameters
 from hamkernel._objective import HUGE, criterion_of
 from hamkernel._search import _design, _spread_out
 from hamkernel._search_space import SearchSpace
@@ -113,10 +113,22 @@ def test_the_lengthscale_of_a_periodic_kernel_does_not_know_the_units_of_the_sta
 
 
 def test_rounding_is_that_of_the_terms_before_they_cancel():
+    def trace(kernel):
+        return np.trace(np.asarray(hk.gram(kernel, X)).reshape(2 * N, -1))
+
     long = hk.Symplectic(hk.Gaussian(30.0))
     odd = hk.Odd(long)
-    expected = [np.trace(np.asarray(hk.gram(each, X)).reshape(2 * N, -1)) for each in (odd, long)]
-    np.testing.assert_allclose(traces(odd, jnp.asarray(X)), expected, rtol=1e-9)
+    assert trace(odd) < 1e-2 * trace(long)
+    for K in (odd, hk.Even(hk.Symplectic(hk.Gaussian(30.0))), long, odd + long):
+        terms = trace(long) * (2 if isinstance(K, hk.Sum) else 1)
+        np.testing.assert_allclose(full_trace(K, jnp.asarray(X)), terms, rtol=1e-9)
+    # Of a kernel that is larger on the other side, where there is no data, both terms round.
+    lopsided = hk.Symplectic(hk.Warp(hk.Polynomial(1), lambda x: jnp.exp(-3.0 * x)))
+    right = jnp.asarray(np.abs(X))
+    both = np.trace(np.asarray(hk.gram(hk.Odd(lopsided), right)).reshape(2 * N, -1))
+    one = np.trace(np.asarray(hk.gram(lopsided, right)).reshape(2 * N, -1))
+    assert both > 10 * one
+    np.testing.assert_allclose(full_trace(hk.Odd(lopsided), right), both, rtol=1e-9)
 
 
 def space(kernel=K, bounds=None):

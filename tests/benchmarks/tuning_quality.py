@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hamkernel as hk
-from hamkernel._bounds import traces
+from hamkernel._bounds import full_trace
 from hamkernel._folds import Partition
 from hamkernel._search_space import ROUNDINGS, SearchSpace
 from hamkernel._validation import partition_loss
@@ -80,7 +80,7 @@ def data(system: str, seed: int) -> tuple[jax.Array, jax.Array]:
 def roundings(tuned, X) -> float:
     """How far λ had to stay above the rounding of the Gram in the box that was searched."""
     low = tuned.bounds["regularization"][0]
-    return float(low * len(X) / (jnp.finfo(X.dtype).eps * traces(tuned.kernel, X)[1]))
+    return float(low * len(X) / (jnp.finfo(X.dtype).eps * full_trace(tuned.kernel, X)))
 
 
 def grid_optimum(K, X, Y, folds: int, roundings: float) -> float:
