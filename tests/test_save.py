@@ -116,6 +116,7 @@ def test_built_in_kernels_restore_by_themselves(name, tmp_path):
     np.testing.assert_array_equal(jax.jit(field)(x), jax.jit(loaded)(x))
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_the_kernel_may_be_given_for_a_built_in_one_too(name, tmp_path):
     field = fitted(BUILT_IN[name])
@@ -145,6 +146,7 @@ def test_a_field_without_stored_residuals_restores(tmp_path):
     assert same(field, load(tmp_path / "f"))
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", USERS)
 def test_a_kernel_of_the_user_is_given_and_gets_the_saved_arrays(name, tmp_path):
     kernel, given = USERS[name]

@@ -104,6 +104,7 @@ def test_a_kernel_of_the_distance_fails_the_same_checks():
         assert not jump_at_coincidence(theirs) < 0.1  # NaN for the plain square root
 
 
+@pytest.mark.few(8)
 @pytest.mark.parametrize("case", [c for c in CASES if c.smoothness >= 1], ids=str)
 def test_third_derivatives_at_coincident_points_are_the_limit_from_neighbours(case):
     k = as_scalar_kernel(case.make(4))
@@ -313,6 +314,7 @@ def test_leaves_are_unconstrained_reals(case):
         assert jnp.isfinite(G).all()
 
 
+@pytest.mark.few(7)
 @BUILTIN
 def test_float32_points_give_float32_values_and_derivatives(case):
     k = case.make(4)
@@ -325,6 +327,7 @@ def test_float32_points_give_float32_values_and_derivatives(case):
     np.testing.assert_allclose(block, expected, atol=1e-5 * float(jnp.abs(expected).max()))
 
 
+@pytest.mark.few(4)
 @BUILTIN
 def test_integer_points_are_read_as_floats(case):
     # In their own dtype the hyperparameters would be cut to integers.

@@ -457,6 +457,7 @@ def test_landmarks_beyond_the_first_buffer_are_all_different():
 SOLVERS = [None, Nystrom(), ConjugateGradient(), hk.RandomFeatures(20, jax.random.key(0))]
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
 def test_data_at_the_centre_of_an_odd_kernel_has_the_zero_field(solver):
     field = hk.fit(hk.Odd(K), np.zeros((3, 2)), np.ones((3, 2)), RIDGE, solver=solver)

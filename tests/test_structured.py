@@ -283,6 +283,7 @@ def test_blocks_are_b_times_the_mixed_derivative_times_b_transposed(case):
         np.testing.assert_allclose(block, expected, atol=tolerance * max(1.0, np.abs(M).max()))
 
 
+@pytest.mark.few(6)
 @EVERY
 def test_blocks_of_swapped_points_are_transposed(case):
     x, z = states(4)[0], states(4, seed=2)[0]

@@ -175,6 +175,7 @@ def test_energy_is_constant_along_the_reference_trajectory_and_not_with_friction
     assert np.max(np.abs(lost - lost[0])) > 1e-3
 
 
+@pytest.mark.few(4)
 @every_system
 def test_float32_states_have_float32_velocities_and_energies(system, motion, start):
     x = jnp.asarray(start, jnp.float32)

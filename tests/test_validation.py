@@ -404,7 +404,7 @@ def test_labels_equal_in_value_do_not_recompile_and_others_do():
 ONE_LONG = np.append(np.zeros(240, int), 1 + np.arange(160) // 10)  # and sixteen short runs
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "folds", [5, "loo", np.arange(400) % 7, ONE_LONG], ids=["5", "loo", "labels", "one long"]
 )

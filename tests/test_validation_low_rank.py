@@ -147,12 +147,10 @@ SOLVERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("solver", "objective"),
-    [
-        pytest.param("nystrom", "cross_validation", marks=pytest.mark.slow),
-        ("features", "marginal_likelihood"),
-    ],
+    [("nystrom", "cross_validation"), ("features", "marginal_likelihood")],
 )
 def test_tuning_with_low_rank_comes_to_the_optimum_of_the_dense_loss(
     solver, objective, monkeypatch
