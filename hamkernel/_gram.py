@@ -85,7 +85,7 @@ def trace(
 ) -> Float[Array, ""]:
     """The trace of the Gram, in O(N n) memory for every kernel, where the rows are."""
     if Invariance.TRANSLATION in K.invariance:  # all blocks on the diagonal are K(0, 0)
-        return len(X) * block_traces(K, jnp.zeros_like(X[:1]))[0]
+        return len(X) * block_traces(K, jnp.zeros((1, X.shape[1]), X.dtype))[0]
     if spread is not None:
         return on_each(spread, lambda K, X: spread.sum(trace(K, X)), K, X, joined=False)
 
