@@ -58,7 +58,7 @@ def constants(K: AbstractMatrixKernel) -> dict[str, float]:
     """The Python floats among the attributes of a kernel, which are no leaves to train."""
     found: dict[str, float] = {}
     for path, node in tree_flatten_with_path(K, is_leaf=lambda node: isinstance(node, Bound))[0]:
-        if isinstance(node, float):
+        if isinstance(node, float) and not eqx.is_array(node):  # that of NumPy is both
             found[keystr(path).removeprefix(".")] = node
         elif isinstance(node, Bound):
             found |= node.floats

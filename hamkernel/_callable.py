@@ -8,7 +8,6 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from hamkernel import _require as require
@@ -36,7 +35,7 @@ class Bound(eqx.Module):
 
     def __init__(self, partial: "functools.partial[Any]"):
         leaves, self.structure = jax.tree.flatten((partial.args, partial.keywords))
-        is_array = [isinstance(leaf, jax.Array | np.ndarray) for leaf in leaves]
+        is_array = [eqx.is_array(leaf) for leaf in leaves]
         pairs = list(zip(leaves, is_array, strict=True))
         self.func = as_pytree(partial.func)
         self.arrays = tuple(jnp.asarray(leaf) if array else None for leaf, array in pairs)

@@ -12,6 +12,8 @@ M(x, x) with its neighbours M(x, x + h) while h shrinks to the resolution of the
 After that come symmetry and the smallest eigenvalue of the two Grams.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any
 

@@ -1,5 +1,7 @@
 """`fit`: from data to a learned field."""
 
+from __future__ import annotations
+
 from typing import overload
 
 from jaxtyping import Array, ArrayLike, Float, Num

@@ -1,5 +1,7 @@
 """The dense Gram."""
 
+from __future__ import annotations
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp

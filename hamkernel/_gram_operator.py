@@ -6,6 +6,8 @@ to stay in the cache: above about 32 MB every temporary is fresh memory from the
 and its page faults cost more than the arithmetic.
 """
 
+from __future__ import annotations
+
 import math
 
 import equinox as eqx
@@ -28,7 +30,7 @@ ROWS, COLUMNS = 1000, 1000
 
 def gram_operator(
     K: AbstractMatrixKernel, X: Num[ArrayLike, "N n"], Z: Num[ArrayLike, "M n"] | None = None
-) -> "GramOperator":
+) -> GramOperator:
     """The Gram of K as a linear operator that maps coefficients (M, n) to fields (N, n).
 
     `gram_operator(K, X, Z).mv(A)[i] = Σⱼ K(xᵢ, zⱼ) aⱼ`, any kernel by automatic differentiation.
@@ -101,7 +103,7 @@ class GramOperator(lx.AbstractLinearOperator):
         """The dense Gram, O(N M n²) memory."""
         return gram(self.kernel, self.X, self.columns).reshape(self.X.size, self.columns.size)
 
-    def transpose(self) -> "GramOperator":
+    def transpose(self) -> GramOperator:
         # K(x, z)ᵀ = K(z, x)
         if self.Z is None:
             return self

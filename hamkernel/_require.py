@@ -232,16 +232,13 @@ def velocity(field: Any, x: Float[Array, " n"], name: str = "field") -> jax.Shap
         raise TypeError(
             f"{name} is a {type(field).__name__}; a callable x (n,) -> (n,) is needed.{hint}"
         )
-    with suppress(ValueError):  # raised for a builtin without a signature
-        signature = inspect.signature(field)
-        try:
-            signature.bind(x)
-        except TypeError:
-            raise TypeError(
-                f"{name} takes ({', '.join(signature.parameters)}); it is called with one "
-                "argument, the state x of shape (n,). Bind the others, as in `lambda x: f(0.0, x)` "
-                "where time does not enter. A kernel becomes a field by hk.fit."
-            ) from None
+    other = other_arguments(field, x)
+    if other is not None:
+        raise TypeError(
+            f"{name} takes ({other}); it is called with one argument, the state x of shape (n,). "
+            "Bind the others, as in `lambda x: f(0.0, x)` where time does not enter. A kernel "
+            "becomes a field by hk.fit."
+        )
     with traceable(name):
         out = eqx.filter_eval_shape(field, x)
     if not hasattr(out, "shape"):
@@ -255,6 +252,17 @@ def velocity(field: Any, x: Float[Array, " n"], name: str = "field") -> jax.Shap
             "coordinate is needed. Is x0 of the dimension it was made for?"
         )
     return out
+
+
+def other_arguments(function: Any, *arguments: Any) -> str | None:
+    """What `function` takes, by name, if it does not take these arguments."""
+    with suppress(ValueError):  # raised for a builtin without a signature
+        signature = inspect.signature(function)
+        try:
+            signature.bind(*arguments)
+        except TypeError:
+            return ", ".join(signature.parameters)
+    return None
 
 
 @contextmanager

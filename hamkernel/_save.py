@@ -1,5 +1,7 @@
 """`save` and `load`: a learned field in one file, which is read without running anything in it."""
 
+from __future__ import annotations
+
 import importlib.metadata
 import os
 import pathlib

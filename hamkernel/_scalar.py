@@ -190,7 +190,9 @@ class UserKernel(AbstractScalarKernel):
                 f"two points of shape {jnp.shape(x)}; a scalar is needed. Write the kernel for "
                 "one pair of points, k(x, z) -> (): the library adds the vmap."
             )
-        return require.floating(value, f"the value of the kernel {_name(self.fn)}")
+        value = require.floating(value, f"the value of the kernel {_name(self.fn)}")
+        # Its parameters may be more precise than the data.
+        return value.astype(require.floating(x, "the point").dtype)
 
     @property
     def invariance(self) -> Invariance:

@@ -61,7 +61,7 @@ class Warp(AbstractScalarKernel):
                 f"the map of Warp returned shape {jnp.shape(warped)} for a point of shape "
                 f"{jnp.shape(x)}; a vector (m,) is needed. Return, for example, jnp.array([...])."
             )
-        return warped
+        return warped.astype(x.dtype)  # the map's parameters may be more precise than the data
 
     @property
     def invariance(self) -> Invariance:

@@ -40,7 +40,7 @@ def search(space, criterion, X, Y, scale: float, optimiser, starts: int, max_ste
     coarse = _Objective(space, criterion, X, Y, scale)
     u = space.encode_start(X)[None]
     if starts > 1:
-        design = _design(u.shape[1], DESIGN_POINTS, X.dtype)
+        design = _design(space.directions, X.dtype)
         values = jax.lax.map(coarse, design, batch_size=64)
         u = jnp.concatenate([u, _spread_out(design, values, starts - 1)])
     # Side by side all wait for the slowest, which only pays where a lane costs nothing: one after
@@ -67,7 +67,7 @@ def finish(space, criterion, X, Y, runs: Runs, optimiser, max_steps: int) -> Run
     return jax.tree.map(lambda new, old: old.at[0].set(new), finished, runs)
 
 
-DESIGN_POINTS = 256  # in the box, from which the starts are chosen
+DESIGN_POINTS = 64  # for each direction of the box, and four at most: the starts are the best
 
 
 class _Objective(eqx.Module):
@@ -141,13 +141,20 @@ def keeping_the_best(optimiser: optx.AbstractMinimiser) -> optx.AbstractMinimise
     return optimiser if isinstance(optimiser, optx.BFGS) else optx.BestSoFarMinimiser(optimiser)
 
 
-def _design(P: int, count: int, dtype) -> Float[Array, "count P"]:
-    """A space-filling design in the box: the additive sequence of Roberts (2018), R_d."""
+def _design(directions: tuple[int, ...], dtype) -> Float[Array, "count P"]:
+    """A space-filling design in the box: the additive sequence of Roberts (2018), R_d.
+
+    Coordinates with the same direction move together, each through its own box. Were the
+    lengthscales of n coordinates to move apart, almost every point would have some that is far
+    too short or too long: with n = 4 all of 16 starts ended in poor optima.
+    """
+    d = max(directions) + 1
+    count = DESIGN_POINTS * min(d, 4)
     root = 2.0
-    for _ in range(64):  # the positive solution of root^(P + 1) = root + 1
-        root = (1 + root) ** (1 / (P + 1))
-    share = (0.5 + np.outer(np.arange(1, count + 1), root ** -np.arange(1.0, P + 1))) % 1.0
-    return jnp.asarray(np.arcsin(2 * share - 1), dtype)
+    for _ in range(64):  # the positive solution of root^(d + 1) = root + 1
+        root = (1 + root) ** (1 / (d + 1))
+    share = (0.5 + np.outer(np.arange(1, count + 1), root ** -np.arange(1.0, d + 1))) % 1.0
+    return jnp.asarray(np.arcsin(2 * share - 1)[:, list(directions)], dtype)
 
 
 def _spread_out(

@@ -151,6 +151,15 @@ class SearchSpace(eqx.Module):
         share = jnp.where(jnp.isfinite(share), share, 0.5)
         return jnp.arcsin(2 * share - 1)[jnp.asarray(self.free)]
 
+    @property
+    def directions(self) -> tuple[int, ...]:
+        """For each entry that u moves, the direction in which a design of starts moves it.
+
+        It is one for all logarithms in an array: those are lengthscales of several coordinates.
+        """
+        keys = [self.names[i] if self.logarithmic[i] else i for i in self.free]
+        return tuple(list(dict.fromkeys(keys)).index(key) for key in keys)
+
     def at_bounds(self, u: Float[np.ndarray, " P"]) -> tuple[str, ...]:
         """The names of the hyperparameters that rest on a bound."""
         at_edge = np.abs(np.sin(u)) > 1 - 2 * _EDGE

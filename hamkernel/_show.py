@@ -71,7 +71,8 @@ def _attribute(module: Any, name: str) -> str:
 def exponential(log_value: Array) -> str:
     """What is stored as its logarithm; by its shape where it has no value, as while traced."""
     short = _is_short(log_value)
-    return text(np.asarray(np.exp(np.asarray(log_value))) if short else log_value)
+    with np.errstate(over="ignore"):  # a gradient, in the place of the hyperparameter
+        return text(np.asarray(np.exp(np.asarray(log_value))) if short else log_value)
 
 
 def _is_short(value: Any) -> bool:

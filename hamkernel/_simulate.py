@@ -4,6 +4,8 @@ Diffrax takes most of a second to import, so it loads when `simulate` is called 
 package.
 """
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from typing import TYPE_CHECKING, Any
@@ -41,16 +43,16 @@ def simulate(
     field: Callable[[Float[Array, " n"]], Float[Array, " n"]],
     x0: Num[ArrayLike, " n"],
     ts: Num[ArrayLike, " T"],
-    solver: "diffrax.AbstractSolver | None" = None,
+    solver: diffrax.AbstractSolver | None = None,
     dt: ArrayLike | None = None,
     *,
     rtol: float | None = None,
     atol: float | None = None,
     max_steps: int | None = None,
     progress: bool = False,
-    adjoint: "diffrax.AbstractAdjoint | None" = None,
+    adjoint: diffrax.AbstractAdjoint | None = None,
     throw: bool = True,
-) -> "diffrax.Solution":
+) -> diffrax.Solution:
     """Integrate ẋ = f(x) from x0 at time ts[0], and return the states at the times ts.
 
     Without `dt` the step adapts to the tolerances. With `dt` every interval [ts[i], ts[i+1]] is cut

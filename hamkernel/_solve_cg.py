@@ -103,12 +103,15 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                 reached += (
                     f" ({int(landmarks.count)} landmarks, truncation {float(truncation):.1e})"
                 )
+            more = "a larger tolerance"
+            if not require.is_concrete(iterations) or iterations >= self.max_iterations:
+                more = f"max_iterations or {more}"
             return (
                 f"conjugate gradients did not converge{reached}. Raise the regularization; give "
                 "the preconditioner more landmarks, hk.ConjugateGradient(preconditioner="
-                "hk.Nystrom(tolerance=1.0, max_points=1000)); allow more with max_iterations or a "
-                "larger tolerance. In float32 a tolerance below 1e-5 is out of reach: "
-                "jax.config.update('jax_enable_x64', True). With 0 landmarks or a residual "
+                f"hk.Nystrom(tolerance=1.0, max_points=1000)); allow more with {more}. In float32 "
+                "a tolerance below 1e-5 is out of reach, and a small regularization is lost in "
+                "rounding: jax.config.update('jax_enable_x64', True). With 0 landmarks or a residual "
                 "that is NaN the kernel is at fault: hk.check_kernel(k, X) tells."
             )
 

@@ -236,6 +236,11 @@ def _warn_if_truncated(truncation, count, tolerance, cure):
         return
     # Twice: a random part of the data need not show all that the rest has.
     if truncation > 2 * tolerance:
+        if truncation.dtype == jnp.float32:
+            cure = (
+                "In float32 rounding may have ended the choice of landmarks early: "
+                f"jax.config.update('jax_enable_x64', True). {cure}"
+            )
         require.warn(
             f"{int(count)} landmarks leave trace(G - Ĝ)/(N λ) = {float(truncation):.2g}, more than "
             f"the tolerance {tolerance:.2g}. The field is the best one on these landmarks, but may "

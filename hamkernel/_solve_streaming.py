@@ -128,8 +128,9 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned]):
 
         The field is that of one fit to all the data: to rounding for `RandomFeatures`, and for
         `Nystrom` where the landmarks are the same (`sample=X`, or its `points`), else within the
-        tolerance. If `Nystrom` warns of the truncation, start anew with a `sample` that looks like
-        all of the data. To add data later keep the fit of `start` instead.
+        tolerance. The sums of a stream need a larger λ than one fit, in float32 most of all, and
+        fail where it is too small. If `Nystrom` warns of the truncation, start anew with a
+        `sample` that looks like all of the data. To add data later keep the fit of `start` instead.
 
         Args:
             K: a matrix-valued kernel.
@@ -144,11 +145,19 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned]):
         """
         from tqdm import tqdm  # so that importing the package does not load it
 
+        if not isinstance(chunks, Iterable):
+            raise TypeError(
+                f"chunks must be an iterable of pairs (X, Y), got {chunks!r}. Call a generator "
+                "function: fit_chunks(K, read(), ...)."
+            )
         model = None
         for i, chunk in enumerate(tqdm(chunks, "chunks", disable=None if progress else True)):
             with _naming(i):
                 if not isinstance(chunk, tuple | list) or len(chunk) != 2:
-                    raise TypeError(f"a pair (X, Y) is needed, got {reprlib.repr(chunk)}.")
+                    raise TypeError(
+                        f"a pair (X, Y) is needed, got {reprlib.repr(chunk)}. All of the data in "
+                        "one chunk is [(X, Y)]."
+                    )
                 X, Y = require.data(*chunk)
             if model is None:
                 model = self.start(K, X if sample is None else sample, regularization)

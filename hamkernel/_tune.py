@@ -21,6 +21,8 @@ where the runs ended: those can lie in a valley that the bound cuts off. Data wi
 little residual: its bound stays or rises by some tens.
 """
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
@@ -266,7 +268,8 @@ def _warn_of_unequal_sizes(Y: Array) -> None:
         require.warn(
             f"the velocities of one coordinate are {sizes.max() / sizes.min():.3g} times as large "
             "as those of another, and a loss sums the squares of both: the small one may be lost "
-            "in it. Choose units in which they are of similar size."
+            "in it. Choose units in which they are of similar size. With more than one degree of "
+            "freedom x stays canonical only if [q_i][p_i] is the same product of units for every i."
         )
 
 
@@ -289,6 +292,12 @@ def _size(values: Array) -> float:
 
 _RUN_COPIES = 5  # matrices of the size of the Gram that a run holds: 4.4 measured
 
+
+def _bfgs(verbose: bool) -> optx.BFGS:
+    """BFGS whose line search quarters a step: by halves there are 11 % more of them."""
+    bfgs = optx.BFGS(rtol=1e-3, atol=1e-3, verbose=verbose)
+    return eqx.tree_at(lambda o: o.search, bfgs, optx.BacktrackingArmijo(decrease_factor=0.25))
+
+
 # Made once: compiled functions are told apart by the functions inside these, too.
-_BFGS = optx.BFGS(rtol=1e-3, atol=1e-3)
-_BFGS_VERBOSE = optx.BFGS(rtol=1e-3, atol=1e-3, verbose=True)
+_BFGS, _BFGS_VERBOSE = _bfgs(verbose=False), _bfgs(verbose=True)

@@ -17,6 +17,8 @@ Source: for scalar outputs and single points, Rasmussen & Williams (2006), secti
 folds, Ginsbourger & Schärer (2021), arXiv:2101.03108.
 """
 
+from __future__ import annotations
+
 import functools
 from collections.abc import Callable
 from typing import Any

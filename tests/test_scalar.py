@@ -327,6 +327,30 @@ def test_float32_points_give_float32_values_and_derivatives(case):
     np.testing.assert_allclose(block, expected, atol=1e-5 * float(jnp.abs(expected).max()))
 
 
+class Wide(eqx.Module):
+    """A kernel of the user with a parameter in float64, which is more than the data may have."""
+
+    ell: jax.Array
+
+    def __call__(self, x, z):
+        return jnp.exp(-((x - z) @ (x - z)) / self.ell**2)
+
+    def scaled(self, x):
+        return x / self.ell
+
+
+@pytest.mark.parametrize("make", [lambda k: k, lambda k: hk.Warp(hk.Gaussian(), k.scaled)])
+def test_a_users_parameters_do_not_widen_the_data(make):
+    K = hk.Symplectic(make(Wide(jnp.asarray(np.float64(1.3)))))
+    X, Y = (points.astype(np.float32) for points in clouds(2))
+    with jax.numpy_dtype_promotion("standard"):  # the kernel mixes dtypes itself
+        assert hk.gram(K, X).dtype == jnp.float32
+        with pytest.warns(UserWarning, match="fitting in float32"):
+            values = hk.fit(K, X, Y, 1e-2).evaluate(X)
+        expected = hk.fit(K, X.astype(float), Y.astype(float), 1e-2).evaluate(X)
+    np.testing.assert_allclose(values, expected, atol=1e-3)
+
+
 @pytest.mark.few(4)
 @BUILTIN
 def test_integer_points_are_read_as_floats(case):

@@ -175,10 +175,20 @@ def test_the_subset_has_its_share_of_every_fold():
 
 
 def test_starts_are_no_neighbours():
-    design = _design(2, 256, np.float64)
+    design = _design((0, 1), np.float64)
     shares = np.sin(_spread_out(design, jnp.sum(design**2, axis=1), 6)) / 2
     gaps = np.linalg.norm(shares[:, None] - shares[None], axis=2)[np.triu_indices(6, 1)]
     assert gaps.min() >= 0.25 * 2**0.5
+
+
+def test_the_lengthscales_of_a_vector_start_together():
+    moved = space(hk.Symplectic(hk.Gaussian(np.ones(2)) + 2.0 * hk.Gaussian(np.ones(2))))
+    assert moved.directions == (0, 0, 1, 1, 2, 3)
+    design = _design(moved.directions, np.float64)
+    assert design.shape == (256, 6)
+    np.testing.assert_array_equal(design[:, 0], design[:, 1])
+    # Weights of a network that start equal would stay so.
+    assert space(hk.Symplectic(Plain(jnp.zeros(()), jnp.zeros(2)))).directions == (0, 1, 2, 3)
 
 
 def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free():

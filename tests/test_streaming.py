@@ -276,8 +276,10 @@ def test_an_error_in_a_stream_says_in_which_chunk_it_is():
         given(S).fit_chunks(K, [good, good, hole])
     with pytest.raises(ValueError, match=r"chunk 1, .* the data has 4 coordinates"):
         given(S).fit_chunks(K, [good, swings(10, n=4)])
-    with pytest.raises(TypeError, match=r"chunk 0, .* a pair \(X, Y\) is needed"):
+    with pytest.raises(TypeError, match=r"chunk 0, .* a pair \(X, Y\) is needed.* \[\(X, Y\)\]"):
         given(S).fit_chunks(K, (X, Y))  # type: ignore[arg-type]
+    with pytest.raises(TypeError, match=r"chunks must be an iterable.*Call a generator function"):
+        given(S).fit_chunks(K, lambda: iter([good]))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("solver", [given(S), hk.RandomFeatures(9, jax.random.key(0))])

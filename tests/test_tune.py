@@ -296,6 +296,7 @@ def test_bad_options_are_refused(options, message):
         ({"frozen": (1,)}, "frozen must be a name or a tuple of names"),
         ({"bounds": [("lengthscale", 1, 2)]}, "bounds must be a dict"),
         ({"objective": lambda *_: None}, "value of the objective must hold real numbers; got None"),
+        ({"objective": lambda K, X: 0.0}, r"\(K, X, Y, regularization\), .* takes \(K, X\)"),
     ],
 )
 def test_options_of_the_wrong_type_are_refused(options, message):
@@ -787,8 +788,24 @@ def test_a_python_float_is_kept_with_a_warning(k, name):
     with pytest.warns(UserWarning, match=f"kept, and not tuned: {name}"):
         found = hk.tune(hk.Symplectic(k), X, Y, starts=1, max_steps=2)
     assert set(found.bounds) == {"regularization"}
-    trained = hk.tune(hk.Symplectic(Floating(jnp.array(0.3))), X, Y, starts=1, max_steps=2)
-    assert set(trained.bounds) == {"kernel.fn.ell", "regularization"}
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize(
+    ("k", "name"),
+    [
+        (Floating(jnp.array(0.3)), "kernel.fn.ell"),
+        (Floating(np.float64(0.3)), "kernel.fn.ell"),
+        (functools.partial(rbf, ell=np.float64(0.3)), "kernel.fn.arrays[0]"),
+        (functools.partial(rbf, ell=np.float32(0.3)), "kernel.fn.arrays[0]"),
+    ],
+)
+def test_a_number_of_jax_or_numpy_is_trained_without_a_warning(k, name):
+    X, Y = scattered()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        trained = hk.tune(hk.Symplectic(k), X, Y, starts=1, max_steps=2)
+    assert set(trained.bounds) == {name, "regularization"}
 
 
 def test_an_objective_that_jax_cannot_trace_is_told_to_use_jax_numpy():

@@ -1,5 +1,7 @@
 """Functions of two variables as contours."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Sequence
 
 import numpy as np
@@ -31,7 +33,8 @@ def hamiltonian(
 
     Velocities determine H up to a constant: the learned one is shifted by the mean difference
     over the grid, then both are drawn less the minimum of the true one. Where a function is not
-    finite the picture is left white.
+    finite the picture is left white. A learned one alone is drawn by
+    `plane_slice(field.hamiltonian, jnp.zeros(2), (0, 1), xlim, ylim)`.
 
     Args:
         learned: x (2,) -> (), such as `field.hamiltonian`.

@@ -1,5 +1,7 @@
 """Pictures in the plane of two coordinates."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Mapping
 
 import numpy as np

@@ -1,5 +1,7 @@
 """What all pictures share: colours, axes, labels, and functions on a grid."""
 
+from __future__ import annotations
+
 import itertools
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any

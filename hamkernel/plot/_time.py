@@ -1,5 +1,7 @@
 """Pictures over time."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 
 import numpy as np

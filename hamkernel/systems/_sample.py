@@ -1,5 +1,7 @@
 """Noisy data from the trajectories of a system."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from typing import Any, cast
 
