@@ -111,8 +111,8 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                 "the preconditioner more landmarks, hk.ConjugateGradient(preconditioner="
                 f"hk.Nystrom(tolerance=1.0, max_points=1000)); allow more with {more}. In float32 "
                 "a tolerance below 1e-5 is out of reach, and a small regularization is lost in "
-                "rounding: jax.config.update('jax_enable_x64', True). With 0 landmarks or a residual "
-                "that is NaN the kernel is at fault: hk.check_kernel(k, X) tells."
+                "rounding: jax.config.update('jax_enable_x64', True). With 0 landmarks or a "
+                "residual that is NaN the kernel is at fault: hk.check_kernel(k, X) tells."
             )
 
         none = require.on_host(landmarks.count) == 0

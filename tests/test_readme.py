@@ -29,8 +29,11 @@ def test_the_ten_lines_learn_a_pendulum_that_keeps_its_energy():
         true = names["pendulum"].hamiltonian(names["orbit"][0])
         exec(python_blocks()[1], names)  # without the velocities
         exec(python_blocks()[2], names)  # and with friction
+        exec(python_blocks()[3], names)  # and with deviations
     plt.close("all")
     force, opposite = names["friction"](jnp.array([1.0, 2.0])), names["friction"](-jnp.ones(2) * 2)
+    among, far = names["deviation"]
+    assert (among < far).all()
     assert force[0] == 0
     np.testing.assert_allclose(opposite, -force)
     states = np.random.default_rng(0).uniform([-2, -4], [2, 4], size=(200, 2))
@@ -40,6 +43,27 @@ def test_the_ten_lines_learn_a_pendulum_that_keeps_its_energy():
     assert np.linalg.norm(off) < 0.2 * np.linalg.norm(velocities)  # differences over 0.2 s
     assert float(abs(energy - energy[0]).max()) < 1e-6 * float(abs(energy[0]))
     assert float(abs(energy[0] - true)) < 0.1 * float(true)
+
+
+@pytest.mark.slow
+def test_the_deviations_of_fields_drawn_from_the_prior_are_the_ones_that_are_said():
+    scores = []
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        X = rng.uniform(-2, 2, size=(30, 2))
+        names = {"hk": hk, "jnp": jnp, "k": hk.Gaussian(1.0), "X": X}
+        states = np.concatenate([X, [[1.0, 0.0], [3.0, 8.0]]])
+        G = hk.gram(hk.Odd(hk.Symplectic(4.0 * hk.Gaussian(1.5))), states).reshape(64, 64)
+        drawn = np.linalg.cholesky(G + 1e-9 * np.eye(64)) @ rng.normal(size=64)
+        names["Y"] = drawn.reshape(-1, 2)[:30] + 0.1 * rng.normal(size=X.shape)
+        with jax.numpy_dtype_promotion("standard"):
+            exec(python_blocks()[3], names)
+        np.testing.assert_array_equal(names["there"], states[30:])
+        away = names["sure"].field.evaluate(states[30:]) - drawn.reshape(-1, 2)[30:]
+        scores.append(abs(away / names["deviation"]))
+    inside = np.mean(np.array(scores) < 1)
+    assert abs(inside - 0.68) < 0.1  # two standard errors of 160 numbers, of which few depend
+    assert np.mean(np.array(scores) < 2) > 0.9
 
 
 @pytest.mark.slow
@@ -65,9 +89,9 @@ def test_the_lines_for_large_data_give_the_field_of_the_exact_fit():
     data = {"X": X, "Y": Y, "X_new": X[:40], "Y_new": Y[:40]}
     exact = hk.fit(K, X, Y, 1e-5).evaluate(X)
     chunks = ((X[i : i + 100], Y[i : i + 100]) for i in range(0, 400, 100))
-    for block in python_blocks()[3:]:
+    for block in python_blocks()[4:]:
         names = {"jax": jax, "hk": hk, "K": K, "chunks": chunks, **data}
         exec(block, names)
         # Landmarks to a tolerance of a tenth of the ridge; the last field has some points twice.
         assert abs(names["field"].evaluate(X) - exact).max() < 1e-2
-    assert len(python_blocks()) == 5  # all blocks of the README are run
+    assert len(python_blocks()) == 6  # all blocks of the README are run
