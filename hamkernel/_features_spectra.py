@@ -146,7 +146,9 @@ def _(k: Periodic, n: int, count: int, key, dtype):
     probability = jnp.fft.fftshift(jnp.fft.fft(samples).real, axes=1) / _HARMONICS  # j ≥ −M/2
     fixed = jax.lax.stop_gradient(probability)
     cumulative = jnp.cumsum(fixed, axis=1)
-    uniform = jax.random.uniform(key, (n, count), dtype) * cumulative[:, -1:]
+    # Never zero: it would draw a harmonic whose probability underflows, and then 0/0.
+    uniform = jax.random.uniform(key, (n, count), dtype, minval=jnp.finfo(dtype).tiny)
+    uniform = uniform * cumulative[:, -1:]
     index = jax.vmap(jnp.searchsorted)(cumulative, uniform)  # (n, F)
     ratio = jnp.take_along_axis(probability, index, 1) / jnp.take_along_axis(fixed, index, 1)
     harmonic = (index - _HARMONICS // 2).astype(dtype).T  # (F, n)
