@@ -100,12 +100,12 @@ def tune(
     """Tune every hyperparameter of K, and λ with them, down the gradient of a validation loss.
 
     The search starts from the given kernel and from `starts` − 1 further points, the best of a
-    space-filling design in the box. All run in one compiled call, on a subset of 64 points, with
-    n > 4 of 256/n, if there are more; the best one is then finished on all data, and the best point that any of
-    them saw is returned, or the given one where that is better on all data. New data of the same
-    shape does not recompile, unless `Nystrom` takes another number of landmarks. Data that is
-    spread over devices is gathered on one of them for the search; the field is fitted where the
-    data lies.
+    space-filling design in the box. All run in one compiled call, on a subset of 64 points (of
+    256/n, with n > 4) if there are more; the best one is then finished on all data, and the best
+    point that any of them saw is returned, or the given one where that is better on all data. New
+    data of the same shape does not recompile, unless `Nystrom` takes another number of landmarks.
+    Data that is spread over devices is gathered on one of them for the search; the field is fitted
+    where the data lies.
 
     Args:
         K: a matrix-valued kernel; every inexact array leaf is a hyperparameter, and no Python
