@@ -22,7 +22,7 @@ from hamkernel._field import KernelField, SolverInfo, root
 from hamkernel._gram import trace
 from hamkernel._gram_operator import product
 from hamkernel._solve import AbstractSolver, relative
-from hamkernel._solve_low_rank import INDEFINITE, Columns, factor, truncated, whitening
+from hamkernel._solve_low_rank import Columns, checked, factor, truncated, whitening
 from hamkernel._solve_nystrom import Nystrom
 from hamkernel._streaming_sums import normal
 from hamkernel._structured import AbstractMatrixKernel
@@ -115,11 +115,8 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                 "residual that is NaN the kernel is at fault: hk.check_kernel(k, X) tells."
             )
 
-        none = require.on_host(landmarks.count) == 0
-        failed = ~(require.on_host(left) <= tolerance) | (none & (require.on_host(truncation) != 0))
-        learned = require.value(learned, failed, message, RuntimeError, throw)
-        larger = require.not_finite(truncation)
-        learned = require.value(learned, larger, INDEFINITE, RuntimeError, throw)
+        failed = ~(require.on_host(left) <= tolerance)
+        learned = checked(learned, landmarks, truncation, failed, message, throw)
         coefficients, residual, norm = learned
         return KernelField(
             kernel=K,

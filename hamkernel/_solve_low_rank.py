@@ -5,14 +5,20 @@ columns of F are the orthonormal basis of the span of their kernels, taken at th
 F are the field Σⱼ K(x, sⱼ) αⱼ with α = L⁻ᵀw, of norm ‖w‖.
 """
 
+from collections.abc import Callable
+from typing import TypeVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
+from hamkernel import _require as require
 from hamkernel._gram import assemble, plus_ridge
 from hamkernel._solve_landmarks import Landmarks, masked
 from hamkernel._structured import AbstractMatrixKernel
+
+Learned = TypeVar("Learned")
 
 
 class Columns(eqx.Module):
@@ -51,10 +57,26 @@ def truncated(
     return jnp.maximum(left, jnp.zeros_like(left)) / ridge
 
 
-INDEFINITE = (
-    "the low-rank Gram of the landmarks is larger than the Gram itself, so the kernel is not "
-    "positive definite: hk.check_kernel(k, X) tells."
-)
+def checked(
+    learned: Learned,
+    landmarks: Landmarks,
+    truncation: Float[Array, ""],
+    failed: Bool[ArrayLike, ""],
+    message: str | Callable[[], str],
+    throw: bool,
+) -> Learned:
+    """What was learned with landmarks, if it was; `message` says what to do where it `failed`.
+
+    Without landmarks all of the Gram must be missing, unless it is zero, and so is the field.
+    """
+    none = require.on_host(landmarks.count) == 0
+    failed = failed | (none & (require.on_host(truncation) != 0))
+    learned = require.value(learned, failed, message, RuntimeError, throw)
+    indefinite = (
+        "the low-rank Gram of the landmarks is larger than the Gram itself, so the kernel is not "
+        "positive definite: hk.check_kernel(k, X) tells."
+    )
+    return require.value(learned, require.not_finite(truncation), indefinite, RuntimeError, throw)
 
 
 def singular(dtype: jnp.dtype) -> str:

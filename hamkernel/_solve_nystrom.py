@@ -27,14 +27,7 @@ from hamkernel._gram import trace
 from hamkernel._gram_operator import product
 from hamkernel._show import text
 from hamkernel._solve_landmarks import Landmarks, choose_landmarks, given_landmarks
-from hamkernel._solve_low_rank import (
-    INDEFINITE,
-    Columns,
-    factor,
-    singular,
-    truncated,
-    whitening,
-)
+from hamkernel._solve_low_rank import Columns, checked, factor, singular, truncated, whitening
 from hamkernel._solve_streaming import (
     AbstractStreamingFit,
     AbstractStreamingSolver,
@@ -195,13 +188,8 @@ class _Solution(NamedTuple):
 
 def _field(K, landmarks, solution, regularization, tolerance, cure, throw=True) -> KernelField:
     dtype = landmarks.points.dtype
-    unsolved = require.not_finite(solution.coefficients).any()
-    # Without landmarks all of the Gram must be missing, unless it is zero, and so is the field.
-    none = require.on_host(landmarks.count) == 0
-    failed = unsolved | (none & (require.on_host(solution.truncation) != 0))
-    solution = require.value(solution, failed, singular(dtype), RuntimeError, throw)
-    larger = require.not_finite(solution.truncation)
-    solution = require.value(solution, larger, INDEFINITE, RuntimeError, throw)
+    failed = require.not_finite(solution.coefficients).any()
+    solution = checked(solution, landmarks, solution.truncation, failed, singular(dtype), throw)
     _warn_if_truncated(solution.truncation, landmarks.count, tolerance, cure)
     return KernelField(
         kernel=K,
