@@ -802,7 +802,7 @@ def test_a_python_float_is_kept_with_a_warning(k, name):
 )
 def test_a_number_of_jax_or_numpy_is_trained_without_a_warning(k, name):
     X, Y = scattered()
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), jax.numpy_dtype_promotion("standard"):
         warnings.simplefilter("error")
         trained = hk.tune(hk.Symplectic(k), X, Y, starts=1, max_steps=2)
     assert set(trained.bounds) == {name, "regularization"}
