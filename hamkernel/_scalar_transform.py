@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hamkernel import _require as require
 from hamkernel._callable import as_pytree
 from hamkernel._scalar import (
     AbstractScalarKernel,
@@ -61,7 +62,8 @@ class Warp(AbstractScalarKernel):
                 f"the map of Warp returned shape {jnp.shape(warped)} for a point of shape "
                 f"{jnp.shape(x)}; a vector (m,) is needed. Return, for example, jnp.array([...])."
             )
-        return warped.astype(x.dtype)  # the map's parameters may be more precise than the data
+        # The map's parameters may be more precise than the data.
+        return require.floating(warped, "the value of the map of Warp").astype(x.dtype)
 
     @property
     def invariance(self) -> Invariance:

@@ -146,7 +146,7 @@ def _design(directions: tuple[int, ...], dtype) -> Float[Array, "count P"]:
 
     Coordinates with the same direction move together, each through its own box. Were the
     lengthscales of n coordinates to move apart, almost every point would have some that is far
-    too short or too long: with n = 4 all of 16 starts ended in poor optima.
+    too short or too long, and hardly a start would lead to a good optimum.
     """
     d = max(directions) + 1
     count = DESIGN_POINTS * min(d, 4)

@@ -294,7 +294,7 @@ _RUN_COPIES = 5  # matrices of the size of the Gram that a run holds: 4.4 measur
 
 
 def _bfgs(verbose: bool) -> optx.BFGS:
-    """BFGS whose line search quarters a step: by halves there are 11 % more of them."""
+    """BFGS whose line search quarters a step, which takes fewer evaluations than to halve it."""
     bfgs = optx.BFGS(rtol=1e-3, atol=1e-3, verbose=verbose)
     return eqx.tree_at(lambda o: o.search, bfgs, optx.BacktrackingArmijo(decrease_factor=0.25))
 

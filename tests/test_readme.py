@@ -62,7 +62,7 @@ def test_the_deviations_of_fields_drawn_from_the_prior_are_the_ones_that_are_sai
         away = names["sure"].field.evaluate(states[30:]) - drawn.reshape(-1, 2)[30:]
         scores.append(abs(away / names["deviation"]))
     inside = np.mean(np.array(scores) < 1)
-    assert abs(inside - 0.68) < 0.1  # two standard errors of 160 numbers, of which few depend
+    assert abs(inside - 0.68) < 0.1  # nearly three standard errors of 160 independent numbers
     assert np.mean(np.array(scores) < 2) > 0.9
 
 

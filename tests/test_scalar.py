@@ -458,6 +458,17 @@ def test_a_warp_must_return_a_vector():
         hk.Warp(hk.Gaussian(), lambda x: x[0])(jnp.zeros(2), jnp.ones(2))
 
 
+def test_a_warp_into_complex_numbers_is_refused():
+    warped = hk.Warp(hk.Gaussian(), lambda x: jnp.exp(1j * x))
+    with (
+        jax.numpy_dtype_promotion("standard"),
+        pytest.raises(
+            TypeError, match=r"map of Warp has dtype complex128; real numbers are needed"
+        ),
+    ):
+        warped(jnp.zeros(2), jnp.ones(2))
+
+
 def test_a_warp_may_return_a_list_of_numbers():
     x, z = jnp.array([0.3, 1.0]), jnp.array([-0.2, 0.5])
     listed = hk.Warp(hk.Gaussian(), lambda x: [jnp.cos(x[0]), x[1]])
