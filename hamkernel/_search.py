@@ -24,29 +24,52 @@ decode = eqx.filter_jit(lambda space, u, X: space.decode(u, X))
 
 
 @eqx.filter_jit
-def search(space, criterion, X, Y, scale: float, optimiser, starts: int, max_steps: int) -> Runs:
-    """The runs from all starts on X and Y, all points or a part of them.
+def spread_starts(space, criterion, X, Y, scale: float, starts: int) -> Runs:
+    """The runs before their first step: from the caller's point, and the best of a design.
 
     Args:
         space: the search space.
         criterion: of these points.
-        X: states.
+        X: states, all of them or a part.
         Y: velocities.
         scale: the number of all points over those in X; it keeps the ridge Nλ of all points.
-        optimiser: an optimistix minimiser.
         starts: how many runs.
-        max_steps: the largest number of steps of each.
     """
-    coarse = _Objective(space, criterion, X, Y, scale)
     u = space.encode_start(X)[None]
     if starts > 1:
+        coarse = _Objective(space, criterion, X, Y, scale)
         design = _design(space.directions, X.dtype)
         values = jax.lax.map(coarse, design, batch_size=64)
         u = jnp.concatenate([u, _spread_out(design, values, starts - 1)])
-    # Side by side all wait for the slowest, which only pays where a lane costs nothing: one after
-    # the other took two thirds of the time on a CPU.
-    together = None if jax.default_backend() == "cpu" else starts
-    return jax.lax.map(lambda u: _run(coarse, u, optimiser, max_steps), u, batch_size=together)
+    none = jnp.zeros(starts, int)
+    return Runs(u, jnp.full(starts, HUGE, u.dtype), none > 0, none)
+
+
+@eqx.filter_jit
+def search(space, criterion, X, Y, scale: float, runs: Runs, which, optimiser, max_steps) -> Runs:
+    """The runs, of which those from which[0] to which[1] have been made; see `spread_starts`."""
+    coarse = _Objective(space, criterion, X, Y, scale)
+
+    def run(i, runs: Runs) -> Runs:
+        made = _run(coarse, runs.u[i], optimiser, max_steps)
+        return jax.tree.map(lambda all_runs, one: all_runs.at[i].set(one), runs, made)
+
+    if _side_by_side():
+        return jax.vmap(lambda u: _run(coarse, u, optimiser, max_steps))(runs.u)
+    return jax.lax.fori_loop(which[0], which[1], run, runs)
+
+
+def _side_by_side() -> bool:
+    """Whether all runs are made at once, where all wait for the slowest.
+
+    That pays where a lane costs nothing. On a CPU one after the other took two thirds of the time.
+    """
+    return jax.default_backend() != "cpu"
+
+
+def scouts(starts: int) -> int:
+    """How many of the runs are made before it is decided where all of them search."""
+    return starts if _side_by_side() else min(starts, 4)
 
 
 @eqx.filter_jit

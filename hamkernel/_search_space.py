@@ -34,7 +34,8 @@ class SearchSpace(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     free: tuple[int, ...] = eqx.field(static=True)
-    roundings: Float[Array, ""]
+    least_roundings: float = eqx.field(static=True)
+    roundings: Float[Array, ""]  # how far Nλ stays above the rounding of the Gram
 
     def __init__(
         self,
@@ -47,6 +48,7 @@ class SearchSpace(eqx.Module):
         roundings: float = ROUNDINGS,
     ):
         dtype = X.dtype
+        self.least_roundings = roundings
         self.roundings = jnp.asarray(roundings, dtype)
         params = hyperparameters(K, X, Y)
         sizes = [param.low.size for param in params]
@@ -85,7 +87,7 @@ class SearchSpace(eqx.Module):
         X: Float[Array, "N n"],
         misfit: float,
     ) -> "SearchSpace":
-        """This space, or one whose λ is large enough for the fields of that misfit to be smooth.
+        """This space, or one whose least λ suits that misfit: fields are smooth, none is held up.
 
         Args:
             kernel: the best one found.
@@ -95,11 +97,16 @@ class SearchSpace(eqx.Module):
         """
         if self.given_ridge is not None or not self._moves_ridge:
             return self  # the caller has said what λ may be
-        needed = misfit / jnp.finfo(X.dtype).eps ** 0.5
-        low = np.exp(float(self.ridge_box(kernel, X)[0]))
-        if float(regularization) * float(self.roundings) >= low * needed:
+        needed = max(misfit / float(jnp.finfo(X.dtype).eps) ** 0.5, self.least_roundings)
+        bound = float(self.roundings)
+        there = bound * float(regularization) / np.exp(float(self.ridge_box(kernel, X)[0]))
+        if there < 0.5 * needed:
+            roundings = needed
+        elif there < 2 * bound and bound > 10 * needed:  # at a bound for a larger misfit
+            roundings = self.least_roundings
+        else:
             return self
-        return eqx.tree_at(lambda s: s.roundings, self, jnp.asarray(needed, X.dtype))
+        return eqx.tree_at(lambda s: s.roundings, self, jnp.asarray(roundings, X.dtype))
 
     def allows(self, regularization: Float[Array, ""]) -> bool:
         """Whether λ is below the upper bound that the caller gave, if it is searched in one."""

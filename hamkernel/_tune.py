@@ -10,15 +10,6 @@ the G that was there before the terms of an odd or even kernel cancelled: what l
 rounding noise and can look like a very good loss. This matters. A quadratic
 Hamiltonian is the flat limit of the Gaussian kernel, so the loss of an oscillator improves all
 the way along ℓ -> ∞, λ -> 0 until nothing is left of it but noise.
-
-The loss can be right where the field is already rough. The coefficients are the residual over Nλ,
-so f(x) rounds at about 1e-2 ε tr(G)/(Nλ) times the residual, and an adaptive step, or the
-iteration of an implicit one, that is asked for more digits fails. If the best field has
-Nλ < √ε tr(G) ‖y − f‖/‖y‖, the search is made once more with that as the bound: of 18 fields, for
-polynomial and trigonometric H with noise of 0, 1 and 10 %, all can then be integrated, and 6 of
-those from noisy data cannot without it (`tests/benchmarks/tuned_fields.py`). Anew, and not from
-where the runs ended: those can lie in a valley that the bound cuts off. Data without noise leaves
-little residual: its bound stays or rises by some tens.
 """
 
 from __future__ import annotations
@@ -26,7 +17,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
@@ -38,8 +28,9 @@ from hamkernel._devices import on_one_device
 from hamkernel._field import AbstractField
 from hamkernel._fit import fit
 from hamkernel._folds import Folds
-from hamkernel._objective import HUGE, Criterion, Objective, basis_of, criterion_of
-from hamkernel._search import decode, finish, keeping_the_best, search
+from hamkernel._objective import Criterion, Objective, criterion_of
+from hamkernel._search import keeping_the_best
+from hamkernel._search_plan import SearchPlan
 from hamkernel._search_space import LOW_RANK_ROUNDINGS, ROUNDINGS, SearchSpace
 from hamkernel._show import described
 from hamkernel._solve import AbstractSolver
@@ -157,7 +148,7 @@ def tune(
 
     The ridge. λ is never searched where rounding would decide. Unless `bounds` say what it may be,
     or it is frozen, it also stays so large that a field fitted to noise is smooth to about 1e-9
-    and can be integrated: where the best one was not, the search is made once more above that λ.
+    and can be integrated: a few runs tell how much that is, then all of them search above it.
     """
     K = matrix_kernel(K)
     frozen = (frozen,) if isinstance(frozen, str) else frozen
@@ -174,58 +165,37 @@ def tune(
     space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings)
     optimiser = keeping_the_best(_minimiser(optimiser, progress))
     rows = criterion.coarse_points(X)
-    follows_low_rank = low_rank and not criterion.own
-    thinned = len(rows) < len(X)
-    if thinned and not low_rank:
+    if len(rows) < len(X) and not low_rank:
         check_memory(X, _RUN_COPIES)
-    X_part, Y_part = (X[rows], Y[rows]) if thinned else (X, Y)
-    part = criterion.on(rows), X_part, Y_part, len(X) / len(rows)
-
-    def tuned_in(space: SearchSpace, throw: bool = True) -> Tuned:
-        runs = search(space, *part, optimiser, starts, max_steps)
-        if thinned or follows_low_rank:
-            fine = criterion
-            if follows_low_rank:
-                kernel, ridge = decode(space, runs.u[np.argmin(runs.value)], X)
-                fine = criterion.with_basis(basis_of(solver, kernel, ridge, X))
-            runs = finish(space, fine, X, Y, runs, optimiser, max_steps)
-        runs = jax.tree.map(np.asarray, runs)  # NumPy compiles nothing
-        if not (runs.value < HUGE).any():
-            raise RuntimeError(
-                "the objective is not finite at any start. Likely causes, in order: a kernel that "
-                "is not positive definite or not finite (hk.check_kernel(k, X) tells); bounds in "
-                "which no fit succeeds (pass bounds={'regularization': (low, high)} with a larger "
-                "low); an objective of your own that returns NaN."
-            )
-        best = int(runs.value.argmin())
-        losses = criterion.losses(runs.value)
-        kernel, ridge = decode(space, jnp.asarray(runs.u[best]), X)
-        return Tuned(
-            kernel=kernel,
-            regularization=ridge,
-            loss=jnp.asarray(losses[best]),
-            field=fit(kernel, *given, ridge, solver=solver, throw=throw),
-            converged=jnp.asarray(runs.converged[best]),
-            steps=jnp.asarray(runs.steps[best]),
-            start_losses=jnp.asarray(losses),
-            at_bounds=space.at_bounds(runs.u[best]),
-            bounds=space.box(kernel, X),
+    plan = SearchPlan(criterion, X, Y, given, rows, solver, optimiser, starts, max_steps)
+    found = plan.carry_out(space)
+    runs, best = found.runs, found.best
+    if not found.finite:
+        raise RuntimeError(
+            "the objective is not finite at any start. Likely causes, in order: a kernel that "
+            "is not positive definite or not finite (hk.check_kernel(k, X) tells); bounds in "
+            "which no fit succeeds (pass bounds={'regularization': (low, high)} with a larger "
+            "low); an objective of your own that returns NaN."
         )
-
-    found = tuned_in(space, throw=False)
-    misfit = _size(found.field.residual) / _size(given[1])
-    solved = np.isfinite(misfit)  # conjugate gradients can fail near the rounding of the Gram
-    smooth = space.smooth(found.kernel, found.regularization, X, misfit if solved else 1.0)
-    if smooth is not space:
-        found = tuned_in(smooth)
-    elif not solved:
+    if not found.solved:
         fit(found.kernel, *given, found.regularization, solver=solver)  # raises
-    if not smooth.allows(found.regularization):
+    if not found.space.allows(found.regularization):
         raise ValueError(
             f"no lambda within bounds={{'regularization': ...}} can be solved with in {X.dtype}: "
             f"for {found.kernel!r} it must be at least {float(found.regularization):.3g}."
         )
-    return found
+    losses = criterion.losses(np.asarray(runs.value))
+    return Tuned(
+        kernel=found.kernel,
+        regularization=found.regularization,
+        loss=jnp.asarray(losses[best]),
+        field=found.field,
+        converged=jnp.asarray(runs.converged[best]),
+        steps=jnp.asarray(runs.steps[best]),
+        start_losses=jnp.asarray(losses),
+        at_bounds=found.space.at_bounds(np.asarray(runs.u[best])),
+        bounds=found.space.box(found.kernel, X),
+    )
 
 
 def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -> None:
@@ -284,10 +254,6 @@ def _warn_of_constants(K: AbstractMatrixKernel) -> None:
 
 
 _UNEQUAL = 100.0  # in size, and so 10 000 in the loss
-
-
-def _size(values: Array) -> float:
-    return float(np.maximum(jnp.linalg.norm(values), np.finfo(float).tiny))  # NaN stays NaN
 
 
 _RUN_COPIES = 5  # matrices of the size of the Gram that a run holds: 4.4 measured

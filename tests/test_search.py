@@ -144,6 +144,9 @@ def test_the_floor_of_lambda_rises_where_the_field_would_be_rough():
     np.testing.assert_allclose(jnp.exp(smooth.ridge_box(K, states)[0]), floor)
     assert whole.smooth(K, lowest, states, 1e-12) is whole  # there is no misfit
     assert whole.smooth(K, jnp.asarray(1.0), states, 0.1) is whole  # λ is large enough
+    held_up = floor, states, 1e-4  # λ rests on a floor for a thousand times that misfit
+    assert smooth.smooth(K, *held_up).roundings == whole.roundings
+    assert smooth.smooth(K, 10 * floor, states, 1e-4) is smooth  # λ is where it wants to be
     given = space(bounds={"regularization": (1e-9, 1.0)})
     assert given.smooth(K, lowest, states, 0.1) is given  # the caller has said
 
@@ -207,3 +210,22 @@ def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free
     criterion = criterion_of("generalized_cross_validation", 6, 5)
     assert criterion.value(K, states, few, jnp.asarray(1e-12)) == HUGE
     assert criterion.with_basis(waves).value(K, states, few, jnp.asarray(1.0)) < HUGE
+
+
+def test_runs_that_misled_about_the_noise_do_not_decide(monkeypatch):
+    """As if the first runs had ended far away: all λ of the second search are too large."""
+    rng = np.random.default_rng(3)
+    S = jnp.asarray(rng.uniform(-2, 2, size=(30, 2)))
+    V = jnp.stack([S[:, 1], -jnp.sin(S[:, 0])], axis=1)
+    right = hk.tune(K, S, V)
+    suits, asked = SearchSpace.smooth, []
+
+    def misled(space, kernel, regularization, X, misfit):
+        asked.append(float(space.roundings))
+        return suits(space, kernel, regularization, X, misfit if len(asked) > 1 else 0.5)
+
+    monkeypatch.setattr(SearchSpace, "smooth", misled)
+    tuned = hk.tune(K, S, V)
+    assert asked[1] > 1e5 * asked[0]
+    assert asked[2] == asked[0]
+    np.testing.assert_allclose(tuned.loss, right.loss)

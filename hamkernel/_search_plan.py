@@ -1,0 +1,134 @@
+"""The searches of `tune`, one after the other: a few runs that see the noise, then all of them.
+
+The loss can be right where the field is already rough. The coefficients are the residual over Nλ,
+so f(x) rounds at about 1e-2 ε tr(G)/(Nλ) times the residual, and an adaptive step, or the
+iteration of an implicit one, that is asked for more digits fails. So where the best field has
+Nλ < √ε tr(G) ‖y − f‖/‖y‖ that becomes the bound: of 18 fields, for polynomial and trigonometric H
+with noise of 0, 1 and 10 %, all can then be integrated, and 5 of those from noisy data cannot
+without it (`tests/benchmarks/tuned_fields.py`). The runs above the bound start anew, and not from
+where those without it ended: that can be in a valley that the bound cuts off. Four runs tell the
+residual as well as all of them do, and where they did not, all are made once more.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from hamkernel._field import AbstractField
+from hamkernel._fit import fit
+from hamkernel._objective import HUGE, SearchCriterion, basis_of
+from hamkernel._search import Runs, decode, finish, scouts, search, spread_starts
+from hamkernel._search_space import SearchSpace
+from hamkernel._solve import AbstractSolver
+from hamkernel._solve_features import RandomFeatures
+from hamkernel._solve_nystrom import Nystrom
+from hamkernel._structured import AbstractMatrixKernel
+
+
+class Found(NamedTuple):
+    """The runs in a space, as NumPy arrays, and the fit to all data at the best of their points."""
+
+    space: SearchSpace
+    runs: Runs
+    best: int
+    kernel: AbstractMatrixKernel
+    regularization: Float[Array, ""]
+    field: AbstractField
+
+    @property
+    def finite(self) -> bool:
+        """Whether any run found a point where the objective is."""
+        return bool(self.runs.value[self.best] < HUGE)
+
+    @property
+    def solved(self) -> bool:
+        """Whether the fit is. Conjugate gradients can fail near the rounding of the Gram."""
+        return bool(jnp.isfinite(self.field.residual).all())
+
+
+@dataclasses.dataclass(frozen=True)
+class SearchPlan:
+    """What every search of one call has in common; (N, n) `X`, `Y` are on one device."""
+
+    criterion: SearchCriterion
+    X: Float[Array, "N n"]
+    Y: Float[Array, "N n"]
+    scattered: tuple[Float[Array, "N n"], Float[Array, "N n"]]  # where the caller has them
+    rows: np.ndarray  # of the subset that the runs are made on
+    solver: AbstractSolver | None
+    optimiser: optx.AbstractMinimiser
+    starts: int
+    max_steps: int
+
+    @property
+    def thinned(self) -> bool:
+        return len(self.rows) < len(self.X)
+
+    def carry_out(self, space: SearchSpace) -> Found:
+        """The best of all runs, in this space or in one whose least λ suits the noise."""
+        few = scouts(self.starts)
+        runs = self._run(space, self._not_run(space), 0, few)
+        if few < self.starts:
+            smooth = self._smooth(self._found(space, runs))
+            if smooth is space:
+                runs = self._run(space, runs, few, self.starts)
+            else:
+                space, runs = smooth, self._all(smooth)
+        found = self._found(space, self._finished(space, runs))
+        for _ in range(2):
+            smooth = self._smooth(found)
+            if smooth is found.space:
+                break
+            found = self._found(smooth, self._finished(smooth, self._all(smooth)))
+        return found
+
+    def _not_run(self, space: SearchSpace) -> Runs:
+        return spread_starts(space, *self._part, self.starts)
+
+    def _all(self, space: SearchSpace) -> Runs:
+        return self._run(space, self._not_run(space), 0, self.starts)
+
+    def _run(self, space: SearchSpace, runs: Runs, first: int, stop: int) -> Runs:
+        which = np.array([first, stop])
+        return search(space, *self._part, runs, which, self.optimiser, self.max_steps)
+
+    @functools.cached_property
+    def _part(self) -> tuple[SearchCriterion, Array, Array, float]:
+        """The criterion, X and Y of the subset, and how many points stand behind each of them."""
+        X, Y = (self.X[self.rows], self.Y[self.rows]) if self.thinned else (self.X, self.Y)
+        return self.criterion.on(self.rows), X, Y, len(self.X) / len(self.rows)
+
+    def _finished(self, space: SearchSpace, runs: Runs) -> Runs:
+        """The runs with their losses on all data, and the best one finished there."""
+        low_rank = isinstance(self.solver, Nystrom | RandomFeatures) and not self.criterion.own
+        if not (self.thinned or low_rank):
+            return runs
+        criterion = self.criterion
+        if low_rank:
+            kernel, ridge = decode(space, runs.u[np.argmin(runs.value)], self.X)
+            criterion = criterion.with_basis(basis_of(self.solver, kernel, ridge, self.X))
+        return finish(space, criterion, self.X, self.Y, runs, self.optimiser, self.max_steps)
+
+    def _found(self, space: SearchSpace, runs: Runs) -> Found:
+        runs = jax.tree.map(np.asarray, runs)  # NumPy compiles nothing
+        best = int(runs.value.argmin())
+        kernel, ridge = decode(space, jnp.asarray(runs.u[best]), self.X)
+        field = fit(kernel, *self.scattered, ridge, solver=self.solver, throw=False)
+        return Found(space, runs, best, kernel, ridge, field)
+
+    def _smooth(self, found: Found) -> SearchSpace:
+        """The space for the misfit of what was found, which is that of `found` where it suits."""
+        if not found.finite:
+            return found.space
+        misfit = _size(found.field.residual) / _size(self.scattered[1]) if found.solved else 1.0
+        return found.space.smooth(found.kernel, found.regularization, self.X, misfit)
+
+
+def _size(values: Array) -> float:
+    return float(np.maximum(jnp.linalg.norm(values), np.finfo(float).tiny))
