@@ -47,16 +47,17 @@ def spread_starts(space, criterion, X, Y, scale: float, starts: int) -> Runs:
 
 @eqx.filter_jit
 def search(space, criterion, X, Y, scale: float, runs: Runs, which, optimiser, max_steps) -> Runs:
-    """The runs, of which those from which[0] to which[1] have been made; see `spread_starts`."""
+    """The runs, those from which[0] to which[1] gone on with from where they are."""
     coarse = _Objective(space, criterion, X, Y, scale)
 
-    def run(i, runs: Runs) -> Runs:
-        made = _run(coarse, runs.u[i], optimiser, max_steps)
-        return jax.tree.map(lambda all_runs, one: all_runs.at[i].set(one), runs, made)
+    def one(i, runs: Runs) -> Runs:
+        run = jax.tree.map(lambda leaf: leaf[i], runs)
+        run = _gone_on(coarse, run, optimiser, max_steps)
+        return jax.tree.map(lambda leaf, new: leaf.at[i].set(new), runs, run)
 
     if _side_by_side():
-        return jax.vmap(lambda u: _run(coarse, u, optimiser, max_steps))(runs.u)
-    return jax.lax.fori_loop(which[0], which[1], run, runs)
+        return jax.vmap(lambda run: _gone_on(coarse, run, optimiser, max_steps))(runs)
+    return jax.lax.fori_loop(which[0], which[1], one, runs)
 
 
 def _side_by_side() -> bool:
@@ -86,7 +87,8 @@ def finish(space, criterion, X, Y, runs: Runs, optimiser, max_steps: int) -> Run
     runs = eqx.tree_at(lambda r: (r.u, r.value), runs, (u, values.at[0].min(given)))
     order = jnp.argsort(runs.value)
     runs = jax.tree.map(lambda leaf: leaf[order], runs)
-    finished = _run(fine, runs.u[0], optimiser, max_steps)
+    best = jax.tree.map(lambda leaf: leaf[0], runs)
+    finished = _gone_on(fine, best, optimiser, max_steps)
     return jax.tree.map(lambda new, old: old.at[0].set(new), finished, runs)
 
 
@@ -118,8 +120,9 @@ class _Objective(eqx.Module):
         return self.criterion.value(kernel, self.X, self.Y, self.thinning * regularization)
 
 
-def _run(objective: _Objective, u: Float[Array, " P"], optimiser, max_steps: int) -> Runs:
-    """One run of the optimiser from u."""
+def _gone_on(objective: _Objective, run: Runs, optimiser, max_steps: int) -> Runs:
+    """One run of the optimiser, from where it is."""
+    u = run.u
     # optimistix starts its best loss in the default dtype, which float32 data must then meet.
     default = jnp.result_type(float)
     unit = objective.unit(u).astype(default)
@@ -152,7 +155,7 @@ def _run(objective: _Objective, u: Float[Array, " P"], optimiser, max_steps: int
     f = found.state.f_info.f if bare else in_default(best)
     value = jnp.where(f < HUGE, f * unit, HUGE).astype(u.dtype)
     converged = found.result == optx.RESULTS.successful
-    return Runs(best, value, converged, found.stats["num_steps"])
+    return Runs(best, value, converged, run.steps + found.stats["num_steps"])
 
 
 def keeping_the_best(optimiser: optx.AbstractMinimiser) -> optx.AbstractMinimiser:

@@ -63,6 +63,7 @@ class SearchPlan:
     rows: np.ndarray  # of the subset that the runs are made on
     solver: AbstractSolver | None
     optimiser: optx.AbstractMinimiser
+    coarse: optx.AbstractMinimiser  # of runs on a subset
     starts: int
     max_steps: int
 
@@ -96,7 +97,8 @@ class SearchPlan:
 
     def _run(self, space: SearchSpace, runs: Runs, first: int, stop: int) -> Runs:
         which = np.array([first, stop])
-        return search(space, *self._part, runs, which, self.optimiser, self.max_steps)
+        optimiser = self.coarse if self.thinned else self.optimiser
+        return search(space, *self._part, runs, which, optimiser, self.max_steps)
 
     @functools.cached_property
     def _part(self) -> tuple[SearchCriterion, Array, Array, float]:

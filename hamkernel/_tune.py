@@ -120,7 +120,7 @@ def tune(
             the box h ± 10 max(1, |h|), which may be too small, and of both signs: store what is
             positive as `log_…`, whose box is a factor of 1000 to either side, or say its bounds.
         starts: the number of runs.
-        optimiser: an optimistix minimiser; BFGS with tolerance 1e-3 if None.
+        optimiser: an optimistix minimiser. If None, BFGS with tolerance 1e-3, on a subset 1e-2.
         max_steps: the largest number of steps of one run.
         solver: how the final field is fitted; see `fit`. With `Nystrom` and `RandomFeatures` the
             loss on all points is that of the low-rank fit, in O(N n r) memory; the landmarks are
@@ -163,11 +163,12 @@ def tune(
     low_rank = isinstance(solver, Nystrom | RandomFeatures)
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
     space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings)
-    optimiser = keeping_the_best(_minimiser(optimiser, progress))
+    coarse = keeping_the_best(_minimiser(optimiser, progress, _COARSE))
+    optimiser = keeping_the_best(_minimiser(optimiser, progress, _BFGS))
     rows = criterion.coarse_points(X)
     if len(rows) < len(X) and not low_rank:
         check_memory(X, _RUN_COPIES)
-    plan = SearchPlan(criterion, X, Y, given, rows, solver, optimiser, starts, max_steps)
+    plan = SearchPlan(criterion, X, Y, given, rows, solver, optimiser, coarse, starts, max_steps)
     found = plan.carry_out(space)
     runs, best = found.runs, found.best
     if not found.finite:
@@ -213,10 +214,12 @@ def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -
     require.count(max_steps, "max_steps")
 
 
-def _minimiser(given: optx.AbstractMinimiser | None, progress: bool) -> optx.AbstractMinimiser:
+def _minimiser(
+    given: optx.AbstractMinimiser | None, progress: bool, ours: dict[bool, optx.BFGS]
+) -> optx.AbstractMinimiser:
     """The optimiser of the caller, or ours."""
     if given is None:
-        return _BFGS_VERBOSE if progress else _BFGS
+        return ours[bool(progress)]
     if progress:
         raise ValueError(
             "progress is printed by the optimiser: pass verbose=True to yours, and no progress."
@@ -259,11 +262,12 @@ _UNEQUAL = 100.0  # in size, and so 10 000 in the loss
 _RUN_COPIES = 5  # matrices of the size of the Gram that a run holds: 4.4 measured
 
 
-def _bfgs(verbose: bool) -> optx.BFGS:
+def _bfgs(verbose: bool, tolerance: float) -> optx.BFGS:
     """BFGS whose line search quarters a step, which takes fewer evaluations than to halve it."""
-    bfgs = optx.BFGS(rtol=1e-3, atol=1e-3, verbose=verbose)
+    bfgs = optx.BFGS(tolerance, tolerance, verbose=verbose)
     return eqx.tree_at(lambda o: o.search, bfgs, optx.BacktrackingArmijo(decrease_factor=0.25))
 
 
 # Made once: compiled functions are told apart by the functions inside these, too.
-_BFGS, _BFGS_VERBOSE = _bfgs(verbose=False), _bfgs(verbose=True)
+_BFGS = {verbose: _bfgs(verbose, 1e-3) for verbose in (False, True)}
+_COARSE = {verbose: _bfgs(verbose, 1e-2) for verbose in (False, True)}
