@@ -42,6 +42,11 @@ class Found(NamedTuple):
     field: AbstractField
 
     @property
+    def fitted(self) -> tuple[AbstractMatrixKernel, Float[Array, ""]]:
+        """The kernel and λ."""
+        return self.kernel, self.regularization
+
+    @property
     def finite(self) -> bool:
         """Whether any run found a point where the objective is."""
         return bool(self.runs.value[self.best] < HUGE)
@@ -73,27 +78,26 @@ class SearchPlan:
 
     def carry_out(self, space: SearchSpace) -> Found:
         """The best of all runs, in this space or in one whose least λ suits the noise."""
-        few = scouts(self.starts)
+        few, found = scouts(self.starts), None
         runs = self._run(space, self._not_run(space), 0, few)
         if few < self.starts:
             smooth = self._smooth(self._found(space, runs))
-            if smooth is space:
-                runs = self._run(space, runs, few, self.starts)
-            else:
-                space, runs = smooth, self._all(smooth)
-        found = self._found(space, self._finished(space, runs))
-        for _ in range(2):
-            smooth = self._smooth(found)
-            if smooth is found.space:
-                break
-            found = self._found(smooth, self._finished(smooth, self._all(smooth)))
+            if smooth is not space:
+                found = self._best_of_all(smooth, self._not_run(smooth), 0)
+        if found is None or smooth.holds_up(*found.fitted, self.X, self._misfit(found)):
+            found = self._best_of_all(space, runs, few)
+        smooth = self._smooth(found)
+        if smooth is not found.space:
+            found = self._best_of_all(smooth, self._not_run(smooth), 0)
         return found
 
     def _not_run(self, space: SearchSpace) -> Runs:
         return spread_starts(space, *self._part, self.starts)
 
-    def _all(self, space: SearchSpace) -> Runs:
-        return self._run(space, self._not_run(space), 0, self.starts)
+    def _best_of_all(self, space: SearchSpace, runs: Runs, made: int) -> Found:
+        """The best of all the runs, of which so many have been made."""
+        runs = self._run(space, runs, made, self.starts)
+        return self._found(space, self._finished(space, runs))
 
     def _run(self, space: SearchSpace, runs: Runs, first: int, stop: int) -> Runs:
         which = np.array([first, stop])
@@ -128,8 +132,11 @@ class SearchPlan:
         """The space for the misfit of what was found, which is that of `found` where it suits."""
         if not found.finite:
             return found.space
-        misfit = _size(found.field.residual) / _size(self.scattered[1]) if found.solved else 1.0
-        return found.space.smooth(found.kernel, found.regularization, self.X, misfit)
+        return found.space.smooth(*found.fitted, self.X, self._misfit(found))
+
+    def _misfit(self, found: Found) -> float:
+        """The residual over Y, in size; 1 where there is none."""
+        return _size(found.field.residual) / _size(self.scattered[1]) if found.solved else 1.0
 
 
 def _size(values: Array) -> float:

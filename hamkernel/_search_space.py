@@ -87,7 +87,7 @@ class SearchSpace(eqx.Module):
         X: Float[Array, "N n"],
         misfit: float,
     ) -> "SearchSpace":
-        """This space, or one whose least λ suits that misfit: fields are smooth, none is held up.
+        """This space, or one whose λ is large enough for the fields of that misfit to be smooth.
 
         Args:
             kernel: the best one found.
@@ -97,16 +97,29 @@ class SearchSpace(eqx.Module):
         """
         if self.given_ridge is not None or not self._moves_ridge:
             return self  # the caller has said what λ may be
-        needed = max(misfit / float(jnp.finfo(X.dtype).eps) ** 0.5, self.least_roundings)
-        bound = float(self.roundings)
-        there = bound * float(regularization) / np.exp(float(self.ridge_box(kernel, X)[0]))
-        if there < 0.5 * needed:
-            roundings = needed
-        elif there < 2 * bound and bound > 10 * needed:  # at a bound for a larger misfit
-            roundings = self.least_roundings
-        else:
+        needed = self._roundings_for(misfit)
+        if self._roundings_at(kernel, regularization, X) >= 0.5 * needed:
             return self
-        return eqx.tree_at(lambda s: s.roundings, self, jnp.asarray(roundings, X.dtype))
+        return eqx.tree_at(lambda s: s.roundings, self, jnp.asarray(needed, X.dtype))
+
+    def holds_up(
+        self,
+        kernel: AbstractMatrixKernel,
+        regularization: Float[Array, ""],
+        X: Float[Array, "N n"],
+        misfit: float,
+    ) -> bool:
+        """Whether λ rests on a bound that is for fields of a much larger misfit; see `smooth`."""
+        bound = float(self.roundings)
+        rests = self._roundings_at(kernel, regularization, X) < 2 * bound
+        return rests and bound > 10 * self._roundings_for(misfit)
+
+    def _roundings_for(self, misfit: float) -> float:
+        return max(misfit / float(jnp.finfo(self.low.dtype).eps) ** 0.5, self.least_roundings)
+
+    def _roundings_at(self, kernel, regularization, X) -> float:
+        least = np.exp(float(self.ridge_box(kernel, X)[0]))
+        return float(self.roundings) * float(regularization) / least
 
     def allows(self, regularization: Float[Array, ""]) -> bool:
         """Whether λ is below the upper bound that the caller gave, if it is searched in one."""

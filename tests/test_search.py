@@ -144,9 +144,9 @@ def test_the_floor_of_lambda_rises_where_the_field_would_be_rough():
     np.testing.assert_allclose(jnp.exp(smooth.ridge_box(K, states)[0]), floor)
     assert whole.smooth(K, lowest, states, 1e-12) is whole  # there is no misfit
     assert whole.smooth(K, jnp.asarray(1.0), states, 0.1) is whole  # λ is large enough
-    held_up = floor, states, 1e-4  # λ rests on a floor for a thousand times that misfit
-    assert smooth.smooth(K, *held_up).roundings == whole.roundings
-    assert smooth.smooth(K, 10 * floor, states, 1e-4) is smooth  # λ is where it wants to be
+    assert smooth.holds_up(K, floor, states, 1e-4)  # that of a thousand times the misfit
+    assert not smooth.holds_up(K, 10 * floor, states, 1e-4)  # λ is where it wants to be
+    assert not smooth.holds_up(K, floor, states, 0.1)
     given = space(bounds={"regularization": (1e-9, 1.0)})
     assert given.smooth(K, lowest, states, 0.1) is given  # the caller has said
 
@@ -218,14 +218,16 @@ def test_runs_that_misled_about_the_noise_do_not_decide(monkeypatch):
     S = jnp.asarray(rng.uniform(-2, 2, size=(30, 2)))
     V = jnp.stack([S[:, 1], -jnp.sin(S[:, 0])], axis=1)
     right = hk.tune(K, S, V)
-    suits, asked = SearchSpace.smooth, []
+    suits, searched = SearchSpace.smooth, []
 
     def misled(space, kernel, regularization, X, misfit):
-        asked.append(float(space.roundings))
-        return suits(space, kernel, regularization, X, misfit if len(asked) > 1 else 0.5)
+        first = not searched
+        smooth = suits(space, kernel, regularization, X, 0.5 if first else misfit)
+        searched.append(float(smooth.roundings / space.roundings))
+        return smooth
 
     monkeypatch.setattr(SearchSpace, "smooth", misled)
     tuned = hk.tune(K, S, V)
-    assert asked[1] > 1e5 * asked[0]
-    assert asked[2] == asked[0]
+    assert searched[0] > 1e5
+    assert searched[1:] == [1.0]
     np.testing.assert_allclose(tuned.loss, right.loss)
