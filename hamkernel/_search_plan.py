@@ -100,6 +100,8 @@ class SearchPlan:
         return self._found(space, self._finished(space, runs))
 
     def _run(self, space: SearchSpace, runs: Runs, first: int, stop: int) -> Runs:
+        if first == stop:
+            return runs
         which = np.array([first, stop])
         optimiser = self.coarse if self.thinned else self.optimiser
         return search(space, *self._part, runs, which, optimiser, self.max_steps)
