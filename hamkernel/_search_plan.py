@@ -6,8 +6,8 @@ iteration of an implicit one, that is asked for more digits fails. So where the 
 Nλ < √ε tr(G) ‖y − f‖/‖y‖ that becomes the bound: of 18 fields, for polynomial and trigonometric H
 with noise of 0, 1 and 10 %, all can then be integrated, and 5 of those from noisy data cannot
 without it (`tests/benchmarks/tuned_fields.py`). The runs above the bound start anew, and not from
-where those without it ended: that can be in a valley that the bound cuts off. Four runs tell the
-residual as well as all of them do, and where they did not, all are made once more.
+where those without it ended: that can be in a valley that the bound cuts off. A few runs
+tell the residual; where they were wrong about it, their bound is taken back.
 """
 
 import dataclasses
@@ -78,7 +78,8 @@ class SearchPlan:
 
     def carry_out(self, space: SearchSpace) -> Found:
         """The best of all runs, in this space or in one whose least λ suits the noise."""
-        few, found = scouts(self.starts), None
+        few = scouts(self.starts) if space.may_rise else self.starts
+        found = None
         runs = self._run(space, self._not_run(space), 0, few)
         if few < self.starts:
             smooth = self._smooth(self._found(space, runs))

@@ -95,12 +95,17 @@ class SearchSpace(eqx.Module):
             X: states.
             misfit: the root mean square of the residual over that of Y.
         """
-        if self.given_ridge is not None or not self._moves_ridge:
-            return self  # the caller has said what λ may be
+        if not self.may_rise:
+            return self
         needed = self._roundings_for(misfit)
         if self._roundings_at(kernel, regularization, X) >= 0.5 * needed:
             return self
         return eqx.tree_at(lambda s: s.roundings, self, jnp.asarray(needed, X.dtype))
+
+    @property
+    def may_rise(self) -> bool:
+        """Whether the least λ is ours to choose, and not what the caller has said."""
+        return self.given_ridge is None and self._moves_ridge
 
     def holds_up(
         self,

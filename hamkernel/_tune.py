@@ -166,9 +166,9 @@ def tune(
     coarse = keeping_the_best(_minimiser(optimiser, progress, _COARSE))
     optimiser = keeping_the_best(_minimiser(optimiser, progress, _BFGS))
     rows = criterion.coarse_points(X)
-    if len(rows) < len(X) and not low_rank:
-        check_memory(X, _RUN_COPIES)
     plan = SearchPlan(criterion, X, Y, given, rows, solver, optimiser, coarse, starts, max_steps)
+    if plan.thinned and not low_rank:
+        check_memory(X, _RUN_COPIES)
     found = plan.carry_out(space)
     runs, best = found.runs, found.best
     if not found.finite:
