@@ -34,7 +34,9 @@ def in_turn(
     runs: Mapping[str, Callable[[], Any]],
     check: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Timed]:
-    """Each of `runs`, one after the other and again, after one call of each to warm up.
+    """Each of `runs`, one after the other, then in reverse, and again, after one call of each.
+
+    In reverse, so that nobody always comes after the one that leaves the caches cold.
 
     `check` is given the results of those calls before anything is timed.
     """
@@ -42,8 +44,8 @@ def in_turn(
     if check is not None:
         check(results)
     seconds = {name: [] for name in runs}
-    for _ in range(repeats):
-        for name, run in runs.items():
+    for repeat in range(repeats):
+        for name, run in list(runs.items())[:: -1 if repeat % 2 else 1]:
             time.sleep(_PAUSE)
             start = time.perf_counter()
             jax.block_until_ready(run())
