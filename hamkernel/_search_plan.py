@@ -7,7 +7,7 @@ Nλ < √ε tr(G) ‖y − f‖/‖y‖ that becomes the bound: of 18 fields, fo
 with noise of 0, 1 and 10 %, all can then be integrated, and 5 of those from noisy data cannot
 without it (`tests/benchmarks/tuned_fields.py`). The runs above the bound start anew, and not from
 where those without it ended: that can be in a valley that the bound cuts off. A few runs
-tell the residual; where they were wrong about it, their bound is taken back.
+tell the residual of noisy data; where they were wrong about it, their bound is taken back.
 """
 
 import dataclasses
@@ -30,6 +30,10 @@ from hamkernel._solve_features import RandomFeatures
 from hamkernel._solve_nystrom import Nystrom
 from hamkernel._structured import AbstractMatrixKernel
 
+# The least misfit that a few runs tell. What is smaller is less of the data than of the search: of
+# a Hénon-Heiles field without noise they made it six times too large, and the error twice.
+_NOISE = 1e-3
+
 
 class Found(NamedTuple):
     """The runs in a space, as NumPy arrays, and the fit to all data at the best of their points."""
@@ -40,16 +44,12 @@ class Found(NamedTuple):
     kernel: AbstractMatrixKernel
     regularization: Float[Array, ""]
     field: AbstractField
+    misfit: float  # the residual over Y, in size; 1 where there is none
 
     @property
     def fitted(self) -> tuple[AbstractMatrixKernel, Float[Array, ""]]:
         """The kernel and λ."""
         return self.kernel, self.regularization
-
-    @property
-    def finite(self) -> bool:
-        """Whether any run found a point where the objective is."""
-        return bool(self.runs.value[self.best] < HUGE)
 
     @property
     def solved(self) -> bool:
@@ -76,26 +76,33 @@ class SearchPlan:
     def thinned(self) -> bool:
         return len(self.rows) < len(self.X)
 
-    def carry_out(self, space: SearchSpace) -> Found:
-        """The best of all runs, in this space or in one whose least λ suits the noise."""
+    def carry_out(self, space: SearchSpace) -> Found | None:
+        """The best of all runs, in this space or in one whose least λ suits the noise.
+
+        None if no run found a point where the objective is finite.
+        """
         few = scouts(self.starts) if space.may_rise else self.starts
-        found = None
         runs = self._run(space, self._not_run(space), 0, few)
-        if few < self.starts:
-            smooth = self._smooth(self._found(space, runs))
-            if smooth is not space:
-                found = self._best_of_all(smooth, self._not_run(smooth), 0)
-        if found is None or smooth.holds_up(*found.fitted, self.X, self._misfit(found)):
+        scouted = self._found(space, runs) if few < self.starts else None
+        noisy = scouted is not None and scouted.misfit > _NOISE
+        found = self._smoothed(scouted) if noisy else None
+        if found is None or found.space.holds_up(*found.fitted, self.X, found.misfit):
             found = self._best_of_all(space, runs, few)
-        smooth = self._smooth(found)
-        if smooth is not found.space:
-            found = self._best_of_all(smooth, self._not_run(smooth), 0)
-        return found
+        return self._smoothed(found) or found
+
+    def _smoothed(self, found: Found | None) -> Found | None:
+        """The best of all runs where λ suits the misfit of `found`; None where it did already."""
+        if found is None:
+            return None
+        smooth = found.space.smooth(*found.fitted, self.X, found.misfit)
+        if smooth is found.space:
+            return None
+        return self._best_of_all(smooth, self._not_run(smooth), 0)
 
     def _not_run(self, space: SearchSpace) -> Runs:
         return spread_starts(space, *self._part, self.starts)
 
-    def _best_of_all(self, space: SearchSpace, runs: Runs, made: int) -> Found:
+    def _best_of_all(self, space: SearchSpace, runs: Runs, made: int) -> Found | None:
         """The best of all the runs, of which so many have been made."""
         runs = self._run(space, runs, made, self.starts)
         return self._found(space, self._finished(space, runs))
@@ -124,22 +131,16 @@ class SearchPlan:
             criterion = criterion.with_basis(basis_of(self.solver, kernel, ridge, self.X))
         return finish(space, criterion, self.X, self.Y, runs, self.optimiser, self.max_steps)
 
-    def _found(self, space: SearchSpace, runs: Runs) -> Found:
+    def _found(self, space: SearchSpace, runs: Runs) -> Found | None:
         runs = jax.tree.map(np.asarray, runs)  # NumPy compiles nothing
         best = int(runs.value.argmin())
+        if not runs.value[best] < HUGE:
+            return None
         kernel, ridge = decode(space, jnp.asarray(runs.u[best]), self.X)
         field = fit(kernel, *self.scattered, ridge, solver=self.solver, throw=False)
-        return Found(space, runs, best, kernel, ridge, field)
-
-    def _smooth(self, found: Found) -> SearchSpace:
-        """The space for the misfit of what was found, which is that of `found` where it suits."""
-        if not found.finite:
-            return found.space
-        return found.space.smooth(*found.fitted, self.X, self._misfit(found))
-
-    def _misfit(self, found: Found) -> float:
-        """The residual over Y, in size; 1 where there is none."""
-        return _size(found.field.residual) / _size(self.scattered[1]) if found.solved else 1.0
+        misfit = _size(field.residual) / _size(self.scattered[1])
+        misfit = misfit if np.isfinite(misfit) else 1.0
+        return Found(space, runs, best, kernel, ridge, field, misfit)
 
 
 def _size(values: Array) -> float:

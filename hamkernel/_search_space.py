@@ -89,6 +89,9 @@ class SearchSpace(eqx.Module):
     ) -> "SearchSpace":
         """This space, or one whose λ is large enough for the fields of that misfit to be smooth.
 
+        It is this one where λ rests on a bound that was raised before: the misfit is then that of
+        the bound, and a bound for it would go up with every search.
+
         Args:
             kernel: the best one found.
             regularization: its λ.
@@ -98,7 +101,9 @@ class SearchSpace(eqx.Module):
         if not self.may_rise:
             return self
         needed = self._roundings_for(misfit)
-        if self._roundings_at(kernel, regularization, X) >= 0.5 * needed:
+        has = self._roundings_at(kernel, regularization, X)
+        raised = float(self.roundings) > self.least_roundings
+        if has >= 0.5 * needed or (raised and self._rests(has)):
             return self
         return eqx.tree_at(lambda s: s.roundings, self, jnp.asarray(needed, X.dtype))
 
@@ -115,9 +120,12 @@ class SearchSpace(eqx.Module):
         misfit: float,
     ) -> bool:
         """Whether λ rests on a bound that is for fields of a much larger misfit; see `smooth`."""
-        bound = float(self.roundings)
-        rests = self._roundings_at(kernel, regularization, X) < 2 * bound
-        return rests and bound > 10 * self._roundings_for(misfit)
+        rests = self._rests(self._roundings_at(kernel, regularization, X))
+        return rests and float(self.roundings) > 10 * self._roundings_for(misfit)
+
+    def _rests(self, roundings: float) -> bool:
+        """Whether that is the least λ, but for a factor of two."""
+        return roundings < 2 * float(self.roundings)
 
     def _roundings_for(self, misfit: float) -> float:
         return max(misfit / float(jnp.finfo(self.low.dtype).eps) ** 0.5, self.least_roundings)

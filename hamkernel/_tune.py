@@ -170,8 +170,7 @@ def tune(
     if plan.thinned and not low_rank:
         check_memory(X, _RUN_COPIES)
     found = plan.carry_out(space)
-    runs, best = found.runs, found.best
-    if not found.finite:
+    if found is None:
         raise RuntimeError(
             "the objective is not finite at any start. Likely causes, in order: a kernel that "
             "is not positive definite or not finite (hk.check_kernel(k, X) tells); bounds in "
@@ -185,6 +184,7 @@ def tune(
             f"no lambda within bounds={{'regularization': ...}} can be solved with in {X.dtype}: "
             f"for {found.kernel!r} it must be at least {float(found.regularization):.3g}."
         )
+    runs, best = found.runs, found.best
     losses = criterion.losses(np.asarray(runs.value))
     return Tuned(
         kernel=found.kernel,

@@ -28,13 +28,18 @@ def test_the_ten_lines_learn_a_pendulum_that_keeps_its_energy():
         energy = jax.vmap(names["field"].hamiltonian)(names["orbit"])
         true = names["pendulum"].hamiltonian(names["orbit"][0])
         exec(python_blocks()[1], names)  # without the velocities
-        exec(python_blocks()[2], names)  # and with friction
-        exec(python_blocks()[3], names)  # and with deviations
+        exec(python_blocks()[2], names)  # with a known kinetic energy
+        exec(python_blocks()[3], names)  # with friction
+        exec(python_blocks()[4], names)  # and with deviations
     plt.close("all")
     force, opposite = names["friction"](jnp.array([1.0, 2.0])), names["friction"](-jnp.ones(2) * 2)
     among, far = names["deviation"]
     assert (among < far).all()
     assert force[0] == 0
+    angles = jnp.linspace(1.3, 2.4, 12)  # of the data
+    pull = names["rest"].evaluate(jnp.stack([angles, 9.0 * jnp.ones(12)], axis=1))
+    np.testing.assert_array_equal(pull[:, 0], 0)
+    assert float(abs(pull[:, 1] + 9.81 * jnp.sin(angles)).max()) < 0.5
     np.testing.assert_allclose(opposite, -force)
     states = np.random.default_rng(0).uniform([-2, -4], [2, 4], size=(200, 2))
     velocities = jax.vmap(names["pendulum"])(jnp.asarray(states))
@@ -57,7 +62,7 @@ def test_the_deviations_of_fields_drawn_from_the_prior_are_the_ones_that_are_sai
         drawn = np.linalg.cholesky(G + 1e-9 * np.eye(64)) @ rng.normal(size=64)
         names["Y"] = drawn.reshape(-1, 2)[:30] + 0.1 * rng.normal(size=X.shape)
         with jax.numpy_dtype_promotion("standard"):
-            exec(python_blocks()[3], names)
+            exec(python_blocks()[4], names)
         np.testing.assert_array_equal(names["there"], states[30:])
         away = names["sure"].field.evaluate(states[30:]) - drawn.reshape(-1, 2)[30:]
         scores.append(abs(away / names["deviation"]))
@@ -89,9 +94,9 @@ def test_the_lines_for_large_data_give_the_field_of_the_exact_fit():
     data = {"X": X, "Y": Y, "X_new": X[:40], "Y_new": Y[:40]}
     exact = hk.fit(K, X, Y, 1e-5).evaluate(X)
     chunks = ((X[i : i + 100], Y[i : i + 100]) for i in range(0, 400, 100))
-    for block in python_blocks()[4:]:
+    for block in python_blocks()[5:]:
         names = {"jax": jax, "hk": hk, "K": K, "chunks": chunks, **data}
         exec(block, names)
         # Landmarks to a tolerance of a tenth of the ridge; the last field has some points twice.
         assert abs(names["field"].evaluate(X) - exact).max() < 1e-2
-    assert len(python_blocks()) == 6  # all blocks of the README are run
+    assert len(python_blocks()) == 7  # all blocks of the README are run

@@ -1,5 +1,7 @@
 """Where `tune` looks: the box of each hyperparameter, the subset of points, the starts."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,6 +12,7 @@ import hamkernel as hk
 from hamkernel._bounds import full_trace, hyperparameters
 from hamkernel._objective import HUGE, criterion_of
 from hamkernel._search import _design, _spread_out
+from hamkernel._search_plan import SearchPlan
 from hamkernel._search_space import SearchSpace
 from hamkernel._validation import generalized_loss
 from hamkernel._validation_low_rank import WaveBasis, low_rank_generalized_loss
@@ -144,6 +147,8 @@ def test_the_floor_of_lambda_rises_where_the_field_would_be_rough():
     np.testing.assert_allclose(jnp.exp(smooth.ridge_box(K, states)[0]), floor)
     assert whole.smooth(K, lowest, states, 1e-12) is whole  # there is no misfit
     assert whole.smooth(K, jnp.asarray(1.0), states, 0.1) is whole  # λ is large enough
+    assert smooth.smooth(K, floor, states, 0.4) is smooth  # the misfit is that of the bound
+    assert smooth.smooth(K, 3 * floor, states, 0.9) is not smooth
     assert smooth.holds_up(K, floor, states, 1e-4)  # that of a thousand times the misfit
     assert not smooth.holds_up(K, 10 * floor, states, 1e-4)  # λ is where it wants to be
     assert not smooth.holds_up(K, floor, states, 0.1)
@@ -218,16 +223,15 @@ def test_runs_that_misled_about_the_noise_do_not_decide(monkeypatch):
     S = jnp.asarray(rng.uniform(-2, 2, size=(30, 2)))
     V = jnp.stack([S[:, 1], -jnp.sin(S[:, 0])], axis=1)
     right = hk.tune(K, S, V)
-    suits, searched = SearchSpace.smooth, []
+    really, bounds = SearchPlan._found, []
 
-    def misled(space, kernel, regularization, X, misfit):
-        first = not searched
-        smooth = suits(space, kernel, regularization, X, 0.5 if first else misfit)
-        searched.append(float(smooth.roundings / space.roundings))
-        return smooth
+    def misled(plan, space, runs):
+        found: Any = really(plan, space, runs)
+        bounds.append(float(space.roundings))
+        return found._replace(misfit=0.5) if len(bounds) == 1 else found
 
-    monkeypatch.setattr(SearchSpace, "smooth", misled)
+    monkeypatch.setattr(SearchPlan, "_found", misled)
     tuned = hk.tune(K, S, V)
-    assert searched[0] > 1e5
-    assert searched[1:] == [1.0]
+    assert bounds[1] > 1e5 * bounds[0]
+    assert bounds[2:] == bounds[:1]
     np.testing.assert_allclose(tuned.loss, right.loss)

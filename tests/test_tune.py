@@ -491,7 +491,6 @@ def test_a_loss_may_be_given_by_its_function_and_keeps_the_folds():
 @pytest.mark.slow
 def test_a_start_where_the_kernel_is_not_positive_definite_does_not_win():
     X, Y = scattered()
-    K = hk.Symplectic(hk.Gaussian(1.0))
 
     class Weighted(eqx.Module):
         weight: jax.Array
@@ -504,9 +503,14 @@ def test_a_start_where_the_kernel_is_not_positive_definite_does_not_win():
     assert 1 < float(tuned.loss) < np.inf
     fitted = hk.cross_validation_loss(tuned.kernel, X, 100 * Y, tuned.regularization)
     np.testing.assert_allclose(tuned.loss, fitted, rtol=SAME)
-    nowhere = hk.Symplectic(lambda x, z: -(x @ z) - K.kernel(x, z))
+
+
+@pytest.mark.parametrize(("copies", "solver"), [(1, None), (3, hk.Cholesky()), (3, hk.Nystrom())])
+def test_a_kernel_that_is_positive_definite_nowhere_is_named_as_the_cause(copies, solver):
+    X, Y = (np.tile(values, (copies, 1)) for values in scattered())
+    nowhere = hk.Symplectic(lambda x, z: -(x @ z) - hk.Gaussian(1.0)(x, z))
     with pytest.raises(RuntimeError, match=r"not finite at any start(.|\n)*check_kernel"):
-        hk.tune(nowhere, X, Y)
+        hk.tune(nowhere, X, Y, solver=solver)
 
 
 def test_a_fit_or_a_simulation_that_fails_in_an_objective_is_a_point_that_cannot_win():
