@@ -30,8 +30,8 @@ from hamkernel._solve_features import RandomFeatures
 from hamkernel._solve_nystrom import Nystrom
 from hamkernel._structured import AbstractMatrixKernel
 
-# The least misfit that a few runs tell. What is smaller is less of the data than of the search: of
-# a Hénon-Heiles field without noise they made it six times too large, and the error twice.
+# The least misfit, as a share of Y, that a few runs tell. What is smaller is less of the data than
+# of the search.
 _NOISE = 1e-3
 
 

@@ -71,7 +71,7 @@ def runs(kernels, learn):
 def test_henon_heiles_from_100_velocities():
     found = runs(dynamics.HENON_HEILES_KERNELS, dynamics.henon_heiles)
     for plain, structured, exact in zip(*found.values(), strict=True):
-        # 5e-4, 5e-5 to 2e-4, and 1e-11 were seen: the work along a line is nearly as good a guess of H.
+        # 5e-4, 5e-5 to 2e-4, 1e-11 were seen: the work along a line is as good a guess of H.
         assert structured.hamiltonian_error < 5e-4
         assert exact.hamiltonian_error < 1e-8  # H is in the space of the kernel
         # 2e-3, 3e-5 to 2e-4, and 1e-11.
