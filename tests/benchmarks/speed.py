@@ -247,8 +247,10 @@ def process_section() -> None:
     print("\nFresh processes")
 
     def fresh(code: str, **variables: str) -> Callable[[], Any]:
-        command, env = [sys.executable, "-c", code], os.environ | variables
-        return lambda: subprocess.run(command, check=True, env=env)
+        env = os.environ | variables
+        # Else a package that pip has not compiled is compiled by every process.
+        env.pop("PYTHONDONTWRITEBYTECODE", None)
+        return lambda: subprocess.run([sys.executable, "-c", code], check=True, env=env)
 
     tuning = FRESH + "hk.tune(K, X, Y)"
     with tempfile.TemporaryDirectory() as folder:
