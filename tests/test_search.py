@@ -217,21 +217,26 @@ def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free
     assert criterion.with_basis(waves).value(K, states, few, jnp.asarray(1.0)) < HUGE
 
 
-def test_runs_that_misled_about_the_noise_do_not_decide(monkeypatch):
-    """As if the first runs had ended far away: all λ of the second search are too large."""
+@pytest.mark.parametrize("told", [5e-4, 0.5])
+def test_a_few_runs_decide_neither_without_noise_nor_where_they_misled(told, monkeypatch):
+    """The misfit that they tell is wrong: if it were 0.5, all λ of a search would be too large."""
     rng = np.random.default_rng(3)
     S = jnp.asarray(rng.uniform(-2, 2, size=(30, 2)))
     V = jnp.stack([S[:, 1], -jnp.sin(S[:, 0])], axis=1)
     right = hk.tune(K, S, V)
-    really, bounds = SearchPlan._found, []
+    really, bounds, made = SearchPlan._found, [], []
 
-    def misled(plan, space, runs):
+    def watched(plan, space, runs):
         found: Any = really(plan, space, runs)
         bounds.append(float(space.roundings))
-        return found._replace(misfit=0.5) if len(bounds) == 1 else found
+        made.append(int((found.runs.value < HUGE).sum()))
+        return found._replace(misfit=told) if len(made) == 1 else found
 
-    monkeypatch.setattr(SearchPlan, "_found", misled)
+    monkeypatch.setattr(SearchPlan, "_found", watched)
     tuned = hk.tune(K, S, V)
-    assert bounds[1] > 1e5 * bounds[0]
-    assert bounds[2:] == bounds[:1]
+    if told == 0.5:
+        assert bounds[1] > 1e5 * bounds[0]
+        del bounds[1], made[1]
+    assert bounds == 2 * bounds[:1]
+    assert made == [4, 16]
     np.testing.assert_allclose(tuned.loss, right.loss)
