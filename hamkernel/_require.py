@@ -220,8 +220,9 @@ def elapsed(ts: Float[Array, " T"], dtype: Any) -> Float[Array, " T"]:
     return value(
         since,
         seen[1:] <= seen[:-1],
-        f"ts must be strictly increasing in {dtype}, the dtype of x0: sort the times and drop "
-        "repeated ones. To go back in time, hk.simulate(lambda x: -field(x), ...).",
+        f"ts, the argument after x0, must be strictly increasing in {dtype}, the dtype of x0: sort "
+        "the times and drop repeated ones. To go back in time, "
+        "hk.simulate(lambda x: -field(x), ...).",
     )
 
 
