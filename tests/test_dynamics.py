@@ -71,13 +71,15 @@ def runs(kernels, learn):
 def test_henon_heiles_from_100_velocities():
     found = runs(dynamics.HENON_HEILES_KERNELS, dynamics.henon_heiles)
     for plain, structured, exact in zip(*found.values(), strict=True):
-        # 5e-4, 5e-5 to 2e-4, 1e-11 were seen: the work along a line is as good a guess of H.
+        # 5e-4, 5e-5 to 2e-4, and 1e-11 were seen: the work along a line is no bad guess of H.
         assert structured.hamiltonian_error < 5e-4
         assert exact.hamiltonian_error < 1e-8  # H is in the space of the kernel
         # 2e-3, 3e-5 to 2e-4, and 1e-11.
         assert structured.drift < 5e-4
         assert plain.drift > 3 * structured.drift
         assert exact.drift < 1e-8
+    # One of the seeds ends in the flat limit, in which the processor decides how good it is.
+    assert np.median([one.drift for one in found["symplectic Gaussian"]]) < 2e-4
 
 
 @pytest.mark.slow
