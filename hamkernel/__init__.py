@@ -1,48 +1,48 @@
 """Learn Hamiltonian dynamics with structured kernels, by automatic differentiation in JAX.
 
-Where things are, in the order of the data; a file imports from its own line and those above it:
+Where things are, in the order of the data; a folder imports from itself and those above it:
 
-    _scalar*                     scalar kernels k(x, z)
-    _structured*                 matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, odd and even ones
-    _check*, _features*, _gram*  the test of a kernel; random features; the Gram and its products
-    _field*                      what is learned: f and its potential
-    _solve*, _least_squares, _streaming_sums
-                                 how it is found
-    _fit                         from data to a field
-    _validation*, _folds, _inverse
-                                 the losses in closed form
-    _tune, _search*, _bounds, _objective
-                                 hyperparameters by their gradients
-    _simulate, _integrators*, _save*, systems, plot, paper
-                                 what is done with fields
+    _kernels      scalar kernels k(x, z), and any callable as one
+    _structures   matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, odd and even ones
+    _gram         the Gram: dense, as an operator, and its derivatives
+    _features     random Fourier features
+    _checks       the test of a kernel
+    _fields       what is learned: f and its potential
+    _solvers      how it is found: dense, by conjugate gradients, of low rank, from streams
+    _validation   the losses in closed form
+    _tuning       hyperparameters by their gradients
+    _dynamics     simulation
+    _save         fields in files
+    systems, plot, paper
+                  example systems, pictures, the paper's experiments
 
-`_require` says what is wrong with an argument; `_devices`, `_memory`, `_trained`, `_callable` and
-`_show` are used everywhere.
+`_require` says what is wrong with an argument, `_show` how things print, and `_machine` knows the
+devices, the memory and the threads.
 """
 
 import importlib
 from typing import TYPE_CHECKING, Any
 
 from hamkernel import systems
-from hamkernel._check import check_kernel
-from hamkernel._field import KernelField, SolverInfo
-from hamkernel._field_features import FeatureField
-from hamkernel._fit import fit
-from hamkernel._gram import gram
-from hamkernel._gram_operator import gram_operator
-from hamkernel._save import load, save
-from hamkernel._scalar_product import Periodic, Polynomial
-from hamkernel._scalar_radial import Gaussian, Matern, RationalQuadratic
-from hamkernel._scalar_transform import Select, Warp
-from hamkernel._simulate import simulate
-from hamkernel._solve import Cholesky
-from hamkernel._solve_cg import ConjugateGradient
-from hamkernel._solve_features import FeatureFit, RandomFeatures
-from hamkernel._solve_nystrom import LandmarkFit, Nystrom
-from hamkernel._structured import Even, Odd, Sum
-from hamkernel._structured_operators import CurlFree, DivergenceFree, Separable, Symplectic
-from hamkernel._tune import Tuned, tune
-from hamkernel._validation import (
+from hamkernel._checks.kernel import check_kernel
+from hamkernel._dynamics.simulate import simulate
+from hamkernel._fields.base import KernelField, SolverInfo
+from hamkernel._fields.features import FeatureField
+from hamkernel._gram.dense import gram
+from hamkernel._gram.operator import gram_operator
+from hamkernel._kernels.dot_products import Periodic, Polynomial
+from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
+from hamkernel._kernels.transforms import Select, Warp
+from hamkernel._save.files import load, save
+from hamkernel._solvers.cholesky import Cholesky
+from hamkernel._solvers.conjugate_gradient import ConjugateGradient
+from hamkernel._solvers.fit import fit
+from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
+from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
+from hamkernel._structures.base import Even, Odd, Sum
+from hamkernel._structures.operators import CurlFree, DivergenceFree, Separable, Symplectic
+from hamkernel._tuning.tune import Tuned, tune
+from hamkernel._validation.losses import (
     cross_validation_loss,
     cross_validation_residuals,
     generalized_cross_validation,
@@ -51,8 +51,8 @@ from hamkernel._validation import (
 
 if TYPE_CHECKING:
     from hamkernel import paper, plot
-    from hamkernel._integrators_gauss import GaussLegendre4, GaussLegendre6, ImplicitMidpoint
-    from hamkernel._integrators_splitting import StormerVerlet, Yoshida4
+    from hamkernel._dynamics.gauss_legendre import GaussLegendre4, GaussLegendre6, ImplicitMidpoint
+    from hamkernel._dynamics.splitting import StormerVerlet, Yoshida4
 
 __all__ = [  # noqa: RUF022 - in reading order
     # Scalar kernels.
@@ -110,11 +110,11 @@ __all__ = [  # noqa: RUF022 - in reading order
 
 # Loaded when first asked for, so that `import hamkernel` loads neither diffrax nor matplotlib.
 _LAZY = {
-    "ImplicitMidpoint": "_integrators_gauss",
-    "GaussLegendre4": "_integrators_gauss",
-    "GaussLegendre6": "_integrators_gauss",
-    "StormerVerlet": "_integrators_splitting",
-    "Yoshida4": "_integrators_splitting",
+    "ImplicitMidpoint": "_dynamics.gauss_legendre",
+    "GaussLegendre4": "_dynamics.gauss_legendre",
+    "GaussLegendre6": "_dynamics.gauss_legendre",
+    "StormerVerlet": "_dynamics.splitting",
+    "Yoshida4": "_dynamics.splitting",
 }
 
 

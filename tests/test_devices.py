@@ -52,7 +52,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec as P
 import hamkernel as hk
-from hamkernel._devices import Rows
+from hamkernel._machine.devices import Rows
 
 rng = np.random.default_rng(0)
 X = rng.uniform(-2, 2, size=(160, 2))
@@ -192,7 +192,7 @@ fitted = hk.fit(K, XE, YE, 1e-4, solver=few)
 given = fitted.residual, fitted.evaluate(XE), hk.gram_operator(K, XE).mv(YE)
 dense = {kind: hk.fit(K, *data, 1e-4, solver=hk.Cholesky()).coefficients
          for kind, data in {"one": (X, Y), "spread": (XS, YS), "explicit": (XE, YE)}.items()}
-from hamkernel._gram_operator import product as multiply
+from hamkernel._gram.operator import product as multiply
 there = lambda X, A, rows: multiply(K, X, X, A, rows, rows)
 lost = lambda X, A, rows: multiply(K, X, X, A)
 print(json.dumps({
@@ -280,7 +280,7 @@ def test_a_mesh_of_one_device_has_the_default_solver_of_one_device(kind, spec):
 
 
 SLOW = """
-from hamkernel import _solve_cg, _solve_features, _solve_nystrom
+from hamkernel._solvers import conjugate_gradient, nystrom, random_features
 m = mesh(8)
 def slope(X, Y):
     def loss(scale):
@@ -291,9 +291,11 @@ def slope(X, Y):
     return jax.grad(loss)(jnp.asarray(1.3))
 regularization, marks = jnp.asarray(1e-4), few.landmarks(K, jnp.asarray(X), jnp.asarray(1e-4))
 fits = {
-    "nystrom": lambda X, Y, rows: _solve_nystrom._fit(K, X, Y, regularization, marks, rows),
-    "features": lambda X, Y, rows: _solve_features._fit(K, waves, X, Y, regularization, rows),
-    "gradients": lambda X, Y, rows: _solve_cg._solve(K, X, Y, regularization, marks, 1e-8, 9, rows),
+    "nystrom": lambda X, Y, rows: nystrom._fit(K, X, Y, regularization, marks, rows),
+    "features": lambda X, Y, rows: random_features._fit(K, waves, X, Y, regularization, rows),
+    "gradients": lambda X, Y, rows: conjugate_gradient._solve(
+        K, X, Y, regularization, marks, 1e-8, 9, rows
+    ),
 }
 print(json.dumps({
     "gradients": compared(iterative, m), "chosen": compared(hk.Nystrom(), m),

@@ -11,13 +11,13 @@ from jax.test_util import check_grads
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._integrators_gauss import (
+from hamkernel._dynamics.gauss_legendre import (
     FixedPointToRounding,
     GaussLegendre4,
     GaussLegendre6,
     ImplicitMidpoint,
 )
-from hamkernel._integrators_splitting import StormerVerlet, Yoshida4
+from hamkernel._dynamics.splitting import StormerVerlet, Yoshida4
 
 GAUSS = [ImplicitMidpoint(), GaussLegendre4(), GaussLegendre6()]
 SPLITTING = [StormerVerlet(), Yoshida4()]

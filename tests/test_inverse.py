@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hamkernel._inverse import inverse
+from hamkernel._solvers.inverse import inverse
 
 
 def positive(D: int) -> np.ndarray:

@@ -17,9 +17,9 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._save import load, save
-from hamkernel._scalar_transform import Symmetrised, identity
-from hamkernel._solve_features import RandomFeatures
+from hamkernel._kernels.transforms import Symmetrised, identity
+from hamkernel._save.files import load, save
+from hamkernel._solvers.random_features import RandomFeatures
 
 RNG = np.random.default_rng(5)
 X = RNG.normal(size=(6, 2))
@@ -226,7 +226,7 @@ def test_another_process_evaluates_the_same_field(saved):
     code = (
         "import jax; jax.config.update('jax_enable_x64', True)\n"
         "import sys, jax.numpy as jnp\n"
-        "from hamkernel._save import load\n"
+        "from hamkernel._save.files import load\n"
         "print(bytes(memoryview(jax.jit(load(sys.argv[1]))(jnp.array([0.3, -0.7])))).hex())"
     )
     command = [sys.executable, "-c", code, str(saved)]

@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from kernels import BY_NAME, CASES, difference_mixed, fourth_power, mixed, slope
 
 import hamkernel as hk
-from hamkernel._scalar import Invariance, ScalarProduct, ScalarSum, as_scalar_kernel
+from hamkernel._kernels.base import Invariance, ScalarProduct, ScalarSum, as_scalar_kernel
 
 ROUNDING = 1e-12  # a few operations in float64, for values of order one
 DIFFERENCES = 1e-8  # what sixth-order differences of a formula leave

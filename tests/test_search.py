@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._bounds import full_trace, hyperparameters
-from hamkernel._objective import HUGE, criterion_of
-from hamkernel._search import _design, _spread_out
-from hamkernel._search_plan import SearchPlan
-from hamkernel._search_space import SearchSpace
-from hamkernel._validation import generalized_loss
-from hamkernel._validation_low_rank import WaveBasis, low_rank_generalized_loss
+from hamkernel._tuning.boxes import full_trace, hyperparameters
+from hamkernel._tuning.objective import HUGE, criterion_of
+from hamkernel._tuning.plan import SearchPlan
+from hamkernel._tuning.runs import _design, _spread_out
+from hamkernel._tuning.space import SearchSpace
+from hamkernel._validation.losses import generalized_loss
+from hamkernel._validation.low_rank import WaveBasis, low_rank_generalized_loss
 
 N = 20
 RNG = np.random.default_rng(0)

@@ -16,12 +16,12 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._integrators import equal_steps
-from hamkernel._integrators_gauss import GaussLegendre4, GaussLegendre6, ImplicitMidpoint
-from hamkernel._integrators_splitting import StormerVerlet, Yoshida4
-from hamkernel._scalar_radial import Gaussian
-from hamkernel._simulate import simulate
-from hamkernel._structured_operators import Symplectic
+from hamkernel._dynamics.equal_steps import equal_steps
+from hamkernel._dynamics.gauss_legendre import GaussLegendre4, GaussLegendre6, ImplicitMidpoint
+from hamkernel._dynamics.simulate import simulate
+from hamkernel._dynamics.splitting import StormerVerlet, Yoshida4
+from hamkernel._kernels.radial import Gaussian
+from hamkernel._structures.operators import Symplectic
 
 SYMPLECTIC = [
     ImplicitMidpoint(),
@@ -420,7 +420,7 @@ def test_progress_shows_a_bar_and_changes_nothing(options, capsys):
 
 
 def test_diffrax_loads_only_when_a_simulation_runs():
-    code = "import hamkernel._simulate, sys; assert 'diffrax' not in sys.modules"
+    code = "import hamkernel._dynamics.simulate, sys; assert 'diffrax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

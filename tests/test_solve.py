@@ -14,9 +14,9 @@ from data import swings
 
 import hamkernel as hk
 from hamkernel import _fit, _memory
-from hamkernel._solve_cg import ConjugateGradient
-from hamkernel._solve_landmarks import choose_landmarks
-from hamkernel._solve_nystrom import Nystrom
+from hamkernel._solvers.conjugate_gradient import ConjugateGradient
+from hamkernel._solvers.landmarks import choose_landmarks
+from hamkernel._solvers.nystrom import Nystrom
 
 K = hk.Symplectic(hk.Gaussian(1.5))
 RIDGE = 1e-4

@@ -12,8 +12,8 @@ import pytest
 from data import swings
 
 import hamkernel as hk
-from hamkernel._solve_nystrom import LandmarkFit, Nystrom
-from hamkernel._solve_streaming import AbstractStreamingSolver
+from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
+from hamkernel._solvers.streaming import AbstractStreamingSolver
 
 K = hk.Symplectic(hk.Gaussian(1.5))
 RIDGE = 1e-4

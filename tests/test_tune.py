@@ -13,7 +13,7 @@ import optimistix as optx
 import pytest
 
 import hamkernel as hk
-from hamkernel._search_space import SearchSpace
+from hamkernel._tuning.space import SearchSpace
 
 N = 15
 SAME = 1e-8  # the same loss computed twice, at a condition of up to 1e6

@@ -13,8 +13,8 @@ from jax.flatten_util import ravel_pytree
 from scipy.stats import multivariate_normal
 
 import hamkernel as hk
-from hamkernel._folds import Partition
-from hamkernel._validation import held_out
+from hamkernel._validation.folds import Partition
+from hamkernel._validation.losses import held_out
 
 EXACT = 1e-10  # condition of the systems, up to 1e4, times rounding
 DIFFERENCES = 1e-5  # of central differences: their own error is below 1e-7
@@ -437,7 +437,7 @@ def test_many_hyperparameters_do_not_take_the_memory_of_many_grams():
 
 
 def test_every_lapack_call_of_a_loss_and_its_gradient_waits_for_the_one_before():
-    # Side by side they were seen to stall for ever, see `_inverse.py`.
+    # Side by side they were seen to stall for ever, see `_solvers/inverse.py`.
     partition = Partition(N, SCATTERED)
     assert len(partition.groups) == 2
 

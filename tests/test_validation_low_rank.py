@@ -9,9 +9,9 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import hamkernel as hk
-from hamkernel._folds import Partition
-from hamkernel._solve_landmarks import given_landmarks
-from hamkernel._validation_low_rank import (
+from hamkernel._solvers.landmarks import given_landmarks
+from hamkernel._validation.folds import Partition
+from hamkernel._validation.low_rank import (
     LandmarkBasis,
     WaveBasis,
     low_rank_generalized_loss,

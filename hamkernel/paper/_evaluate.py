@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
-from hamkernel._field import KernelField
-from hamkernel._fit import fit
-from hamkernel._simulate import simulate
-from hamkernel._structured import AbstractMatrixKernel
+from hamkernel._dynamics.simulate import simulate
+from hamkernel._fields.base import KernelField
+from hamkernel._solvers.fit import fit
+from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel.paper._experiments import Experiment
 from hamkernel.systems import sample
 

@@ -4,9 +4,9 @@ import dataclasses
 import math
 from collections.abc import Callable, Mapping
 
-from hamkernel._scalar_radial import Gaussian
-from hamkernel._structured import AbstractMatrixKernel, Odd
-from hamkernel._structured_operators import Separable, Symplectic
+from hamkernel._kernels.radial import Gaussian
+from hamkernel._structures.base import AbstractMatrixKernel, Odd
+from hamkernel._structures.operators import Separable, Symplectic
 from hamkernel.systems import AbstractHamiltonianSystem, HarmonicOscillator, Pendulum
 
 # What `fit` must be given, whose ridge is N · regularization, for the ridge that is meant.

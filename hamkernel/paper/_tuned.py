@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hamkernel._folds import Partition
-from hamkernel._gram import assemble
-from hamkernel._scalar_radial import Gaussian
-from hamkernel._solve import solve_positive
-from hamkernel._tune import tune
+from hamkernel._gram.dense import assemble
+from hamkernel._kernels.radial import Gaussian
+from hamkernel._solvers.cholesky import solve_positive
+from hamkernel._tuning.tune import tune
+from hamkernel._validation.folds import Partition
 from hamkernel.paper._evaluate import evaluate
 from hamkernel.paper._experiments import STRUCTURES, Experiment
 

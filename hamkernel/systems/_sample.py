@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 
 from hamkernel import _require as require
-from hamkernel._simulate import simulate
+from hamkernel._dynamics.simulate import simulate
 from hamkernel.systems._base import in_precision, shaped
 
 

@@ -21,9 +21,9 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import hamkernel as hk
-from hamkernel import _solve_cg, _solve_features, _solve_nystrom
-from hamkernel._devices import Rows
-from hamkernel._gram_operator import product
+from hamkernel._gram.operator import product
+from hamkernel._machine.devices import Rows
+from hamkernel._solvers import conjugate_gradient, nystrom, random_features
 
 KERNEL = hk.Symplectic(hk.Gaussian(1.5))
 REGULARIZATION = 1e-4
@@ -58,14 +58,14 @@ def programs():
     S = hk.Nystrom(points=some).landmarks(KERNEL, jnp.asarray(some), ridge)
 
     def features(X, Y, rows):
-        return _solve_features._fit(KERNEL, waves, X, Y, ridge, rows).residual
+        return random_features._fit(KERNEL, waves, X, Y, ridge, rows).residual
 
     def gradients(X, Y, rows):
-        return _solve_cg._solve(KERNEL, X, Y, len(X) * ridge, S, 1e-8, 100, rows)
+        return conjugate_gradient._solve(KERNEL, X, Y, len(X) * ridge, S, 1e-8, 100, rows)
 
     return {
         "product": lambda X, Y, rows: product(KERNEL, X, X, Y, rows, rows),
-        "Nystrom": lambda X, Y, rows: _solve_nystrom._fit(KERNEL, X, Y, ridge, S, rows),
+        "Nystrom": lambda X, Y, rows: nystrom._fit(KERNEL, X, Y, ridge, S, rows),
         "RandomFeatures": features,
         "ConjugateGradient": gradients,
     }

@@ -19,8 +19,8 @@ import numpy as np
 from timing import timed
 
 import hamkernel as hk
-from hamkernel._solve_cg import ConjugateGradient
-from hamkernel._solve_nystrom import Nystrom
+from hamkernel._solvers.conjugate_gradient import ConjugateGradient
+from hamkernel._solvers.nystrom import Nystrom
 
 
 def hamiltonian(x: jax.Array) -> jax.Array:

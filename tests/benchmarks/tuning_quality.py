@@ -21,10 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import hamkernel as hk
-from hamkernel._bounds import full_trace
-from hamkernel._folds import Partition
-from hamkernel._search_space import ROUNDINGS, SearchSpace
-from hamkernel._validation import partition_loss
+from hamkernel._tuning.boxes import full_trace
+from hamkernel._tuning.space import ROUNDINGS, SearchSpace
+from hamkernel._validation.folds import Partition
+from hamkernel._validation.losses import partition_loss
 
 GRID = 60
 START_RIDGE = 0.1

@@ -29,9 +29,9 @@ import scipy.linalg
 from timing import Timed, environment, in_turn, timed
 
 import hamkernel as hk
-from hamkernel._folds import Partition
-from hamkernel._gram import assemble
-from hamkernel._solve import solve_positive
+from hamkernel._gram.dense import assemble
+from hamkernel._solvers.cholesky import solve_positive
+from hamkernel._validation.folds import Partition
 from hamkernel.paper._tuned import grid_losses
 
 FOLDS = 5

@@ -1,0 +1,1 @@
+"""The test of a kernel of the user's own."""

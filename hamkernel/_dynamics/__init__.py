@@ -1,0 +1,1 @@
+"""Simulation: trajectories of any vector field."""

@@ -1,0 +1,208 @@
+"""Random Fourier features of structured kernels.
+
+With frequencies ω_r and weights c_r of a scalar kernel (`spectra.py`),
+
+    k(x, z) ≈ Σ_r c_r cos(ω_r·(x − z)) = Σ_r c_r [cos ω_r·x cos ω_r·z + sin ω_r·x sin ω_r·z]
+
+is the kernel of the functions u(x) = Σ_r √c_r (α_r cos ω_r·x + β_r sin ω_r·x). Any structure is an
+operator on such a u, f = B∇u, so the structure is exact for every number of frequencies; only the
+kernel is approximate. An even kernel keeps the cosines alone, an odd one the sines.
+
+Source: Rahimi & Recht (2007); the odd symplectic case: Smith & Egeland (2024), arXiv 2404.07703.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from hamkernel._features.spectra import Spectrum, spectra
+from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.operators import AbstractPotentialKernel, DivergenceFree, Separable
+
+
+class Waves(eqx.Module):
+    """Functions amplitude·cos(ω·x), and after the first `cosines` of them amplitude·sin(ω·x)."""
+
+    frequencies: Float[Array, "w n"]
+    amplitudes: Float[Array, " w"]
+    cosines: int = eqx.field(static=True)
+
+    def __init__(self, terms: tuple[Spectrum, ...]):
+        cosines = [s for s in terms if s.parity >= 0]
+        both = cosines + [s for s in terms if s.parity <= 0]
+        self.frequencies = jnp.concatenate([s.frequencies for s in both])
+        self.amplitudes = jnp.sqrt(jnp.concatenate([s.weights for s in both]))
+        self.cosines = sum(len(s.weights) for s in cosines)
+
+    def values(self, x: Float[Array, " n"]) -> Float[Array, " w"]:
+        phase = self.frequencies @ x
+        cosines, sines = jnp.cos(phase[: self.cosines]), jnp.sin(phase[self.cosines :])
+        return self.amplitudes * jnp.concatenate([cosines, sines])
+
+    def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n w"]:
+        phase = self.frequencies @ x
+        slopes = jnp.concatenate([-jnp.sin(phase[: self.cosines]), jnp.cos(phase[self.cosines :])])
+        return self.frequencies.T * (self.amplitudes * slopes)[None]
+
+
+class AbstractFeatures(eqx.Module):
+    """Fields that span the features of a structured kernel: Σ of them with weights w is a field.
+
+    Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z), and each φ_r has the structure of K exactly.
+    """
+
+    @property
+    @abc.abstractmethod
+    def columns(self) -> int:
+        """r, the number of features."""
+
+    @abc.abstractmethod
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
+        """The features φ_r(x), side by side."""
+
+    @abc.abstractmethod
+    def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        """Σ_r w_r φ_r(x), without the rows."""
+
+    @abc.abstractmethod
+    def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
+        """The potential of `field`, for the structures that have one."""
+
+    def __call__(self, X: Float[Array, "t n"]) -> Float[Array, "t n r"]:
+        return jax.vmap(self.rows)(X)
+
+
+class PotentialFeatures(AbstractFeatures):
+    """φ = B∇(wave)."""
+
+    structure: AbstractPotentialKernel
+    waves: Waves
+
+    @property
+    def columns(self) -> int:
+        return len(self.waves.amplitudes)
+
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
+        return self.structure.apply(x, self.waves.gradients(x))
+
+    def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        return self.structure.apply(x, self.waves.gradients(x) @ w)
+
+    def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
+        return self.waves.values(x) @ w
+
+
+class DivergenceFreeFeatures(AbstractFeatures):
+    """φ = e_a ∂_b(wave) − e_b ∂_a(wave) for each pair a < b: an antisymmetric matrix potential."""
+
+    waves: Waves
+    dimension: int = eqx.field(static=True)
+
+    @property
+    def columns(self) -> int:
+        return len(self.waves.amplitudes) * self.dimension * (self.dimension - 1) // 2
+
+    def _pairs(self) -> Float[Array, "n P n"]:
+        a, b = np.triu_indices(self.dimension, 1)
+        pairs = np.zeros((self.dimension, len(a), self.dimension))
+        pairs[a, np.arange(len(a)), b] = 1.0
+        pairs[b, np.arange(len(a)), a] = -1.0
+        return jnp.asarray(pairs, self.waves.amplitudes.dtype)
+
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
+        rows = jnp.einsum("apb,bw->apw", self._pairs(), self.waves.gradients(x))
+        return rows.reshape(self.dimension, -1)
+
+    def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        pairs = self._pairs()
+        slopes = w.reshape(pairs.shape[1], -1) @ self.waves.gradients(x).T  # (P, n)
+        return jnp.einsum("apb,pb->a", pairs, slopes)
+
+    def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
+        raise AttributeError("a divergence-free field has a matrix potential, not a scalar one.")
+
+
+class SeparableFeatures(AbstractFeatures):
+    """φ = e_a (wave) for each component a."""
+
+    waves: Waves
+    dimension: int = eqx.field(static=True)
+
+    @property
+    def columns(self) -> int:
+        return len(self.waves.amplitudes) * self.dimension
+
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
+        return jnp.kron(jnp.eye(self.dimension, dtype=x.dtype), self.waves.values(x)[None])
+
+    def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        return w.reshape(self.dimension, -1) @ self.waves.values(x)
+
+    def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
+        raise AttributeError("a field with independent components has no potential.")
+
+
+class SumFeatures(AbstractFeatures):
+    """The features of all terms, one after the other."""
+
+    terms: tuple[AbstractFeatures, ...]
+
+    @property
+    def columns(self) -> int:
+        return sum(term.columns for term in self.terms)
+
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
+        return jnp.concatenate([term.rows(x) for term in self.terms], axis=1)
+
+    def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        return sum(
+            (t.field(x, w[self.slice(i)]) for i, t in enumerate(self.terms)), jnp.zeros_like(x)
+        )
+
+    def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
+        return sum(
+            (t.potential(x, w[self.slice(i)]) for i, t in enumerate(self.terms)),
+            jnp.zeros((), x.dtype),
+        )
+
+    def slice(self, index: int) -> slice:
+        """Where the weights of one term stand."""
+        start = sum(term.columns for term in self.terms[:index])
+        return slice(start, start + self.terms[index].columns)
+
+
+def features(
+    K: AbstractMatrixKernel, n: int, count: int, key: Key[Array, ""], dtype: Any
+) -> AbstractFeatures:
+    """Random Fourier features of a structured kernel.
+
+    Args:
+        K: a structure, or a sum of structures, on shift-invariant scalar kernels.
+        n: the number of coordinates.
+        count: frequencies for each term of each scalar kernel.
+        key: the random key.
+        dtype: of the features.
+
+    Raises:
+        TypeError: a kernel without a known spectral density, or an unknown structure.
+    """
+    if isinstance(K, Sum):
+        keys = jax.random.split(key, len(K.terms))
+        pairs = zip(K.terms, keys, strict=True)
+        return SumFeatures(tuple(features(term, n, count, key, dtype) for term, key in pairs))
+    if not isinstance(K, Separable | DivergenceFree | AbstractPotentialKernel):
+        raise TypeError(
+            f"RandomFeatures does not know the structure {type(K).__name__}. Use Symplectic, "
+            "CurlFree, DivergenceFree, Separable or sums of them, or another solver."
+        )
+    waves = Waves(spectra(K.kernel, n, count, key, dtype))
+    if isinstance(K, AbstractPotentialKernel):
+        return PotentialFeatures(K, waves)
+    return (DivergenceFreeFeatures if isinstance(K, DivergenceFree) else SeparableFeatures)(
+        waves, n
+    )

@@ -1,0 +1,1 @@
+"""What is learned: a vector field and its potential."""

@@ -1,0 +1,288 @@
+"""Learned vector fields."""
+
+import abc
+from collections.abc import Callable
+from typing import TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Int, Num
+
+from hamkernel import _require as require
+from hamkernel._gram.dense import centred
+from hamkernel._gram.operator import placed_product
+from hamkernel._show import described
+from hamkernel._structures.base import AbstractMatrixKernel, Sum
+
+Field = TypeVar("Field", bound="AbstractField")
+Scalar = Callable[[Num[ArrayLike, " n"]], Float[Array, ""]]
+
+
+class AbstractField(eqx.Module):
+    """A learned vector field x -> f(x), one state of shape (n,) per call.
+
+    It is a PyTree and a pure function: `jax.jit(field)`, `jax.vmap(field)(X)`, `jax.jacfwd(field)`
+    and `jax.export` work on it.
+    """
+
+    kernel: eqx.AbstractVar[AbstractMatrixKernel]
+    residual: eqx.AbstractVar[Float[Array, "N n"]]
+    norm: eqx.AbstractVar[Float[Array, ""]]
+    regularization: eqx.AbstractVar[Float[Array, ""]]
+    offset: eqx.AbstractVar[Float[Array, ""]]
+    info: eqx.AbstractVar["SolverInfo"]
+
+    def __repr__(self) -> str:
+        return described(self)
+
+    # jax.jit(field) looks up the function it compiles by hash and equality. Arrays have no hash and
+    # traced ones no equality, so here a field is equal to itself only.
+    def __hash__(self) -> int:
+        return id(self)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    @property
+    @abc.abstractmethod
+    def dimension(self) -> int:
+        """n, the number of coordinates of a state."""
+
+    @property
+    def residual_norm(self) -> Float[Array, ""]:
+        """‖y − f(X)‖ over all the training data, in units of Y, shape ().
+
+        Known after a fit to a stream too, which keeps no residuals.
+        """
+        kept = self.info.residual_norm
+        return jnp.linalg.norm(self.residual) if kept is None else kept
+
+    @abc.abstractmethod
+    def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+        """The velocity f(x)."""
+
+    @abc.abstractmethod
+    def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        """The potential with the constant that the representer gives it."""
+
+    def evaluate(self, X: Num[ArrayLike, "N n"]) -> Float[Array, "N n"]:
+        """The velocities at many states, as `jax.vmap(field)(X)` but in bounded memory.
+
+        Args:
+            X: states, shape (N, n).
+
+        Raises:
+            ValueError: the shape does not fit.
+        """
+        self._check_single()
+        X = require.points(X, "X").astype(self.offset.dtype)
+        if X.shape[1] != self.dimension:
+            raise ValueError(f"X has {X.shape[1]} coordinates and the field {self.dimension}.")
+        return self._evaluated(X)
+
+    @abc.abstractmethod
+    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+        """`evaluate` for states that have been checked."""
+
+    def part(self: Field, which: int | str) -> Field:
+        """The field of one term of a sum of kernels, by position or name.
+
+        The parts add up to the field, and the squares of their norms to that of its norm; an anchor
+        of the whole is not theirs. `residual` and `info` are those of the whole fit.
+
+        Raises:
+            KeyError: there is no such part (with the choices).
+        """
+        self._check_single()
+        if isinstance(self.kernel, Sum):
+            return self._term(self.kernel, self.kernel.position(which))
+        if which == 0:
+            return self
+        raise KeyError(f"no part {which!r}: {type(self.kernel).__name__} is not a sum.")
+
+    @abc.abstractmethod
+    def _term(self: Field, kernel: Sum, position: int) -> Field:
+        """`part` where the kernel is a sum."""
+
+    @property
+    def potential(self) -> Scalar:
+        """The function u with f = B∇u, x (n,) -> (), with the constant set by `anchored`.
+
+        Raises:
+            AttributeError: the structure has no potential (with the reason).
+        """
+        self.kernel.check_potential()
+        return jax.tree_util.Partial(_potential_of, self)
+
+    @property
+    def hamiltonian(self) -> Scalar:
+        """The learned Hamiltonian H with f = J∇H, x (n,) -> ().
+
+        Velocities determine H up to a constant: see `anchored`.
+
+        Raises:
+            AttributeError: the field is not Hamiltonian by construction (with the reason).
+        """
+        if not self.kernel.symplectic:
+            raise AttributeError(
+                f"a field of the kernel {type(self.kernel).__name__} is not Hamiltonian by "
+                "construction, so it has no learned Hamiltonian. Use Symplectic(k); for a sum "
+                "that contains one ask that part, by position or name, such as "
+                "field.part(0).hamiltonian(x); for CurlFree see field.potential(x)."
+            )
+        return self.potential
+
+    def _check_single(self) -> None:
+        if self.offset.shape:
+            raise ValueError(
+                f"this is a batch of {self.offset.size} fields: jax.vmap(lambda f: f(x))(fields)."
+            )
+
+    def _state(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+        self._check_single()
+        return require.point(x, self.dimension).astype(self.offset.dtype)
+
+    def anchored(self: Field, x0: Num[ArrayLike, " n"], value: ArrayLike = 0.0) -> Field:
+        """The same field with the constant of its potential set so that u(x₀) = value.
+
+        Args:
+            x0: a state, shape (n,), for example the equilibrium.
+            value: the potential there, in units of energy.
+
+        Raises:
+            AttributeError: the structure has no potential. ValueError: x0 is no finite state, or
+                the value no finite number.
+        """
+        self._check_single()
+        if jnp.shape(value) != ():
+            raise ValueError(f"value has shape {jnp.shape(value)}; one number is needed.")
+        there = require.floating(value, "value").astype(self.offset.dtype)
+        x0 = require.point(x0, self.dimension, "x0")
+        offset = there - self.unanchored_potential(x0)
+        offset = require.value(
+            offset,
+            require.not_finite(offset),
+            "x0 and value must be finite, and the field, which is NaN where a fit with throw=False "
+            "failed: one of them is not.",
+        )
+        return eqx.tree_at(lambda field: field.offset, self, offset)
+
+    @property
+    def is_separable(self) -> bool:
+        """Whether H(q, p) = T(p) + U(q) follows from the kernel, as explicit integrators need.
+
+        True for a symplectic kernel whose scalar kernels are sums of `Select`s, each on q alone
+        or on p alone.
+        """
+        n = self.dimension
+        q, p = frozenset(range(n // 2)), frozenset(range(n // 2, n))
+        return self.kernel.symplectic and all(
+            support <= q or support <= p
+            for k in self.kernel.scalar_kernels
+            for support in k.supports(n)
+        )
+
+
+def root(square: Float[Array, ""]) -> Float[Array, ""]:
+    """√square, zero with a derivative of zero where rounding or zero data leave no square."""
+    nothing = square <= 0
+    return jnp.where(nothing, 0.0, jnp.sqrt(jnp.where(nothing, jnp.ones_like(square), square)))
+
+
+def _potential_of(field, x):
+    # With the field as an argument, so that a potential is a PyTree and its arrays no constants.
+    return field.unanchored_potential(x) + field.offset
+
+
+class SolverInfo(eqx.Module):
+    """How a field was found. What does not apply to the solver is None.
+
+    Attributes:
+        solver: the name of the solver.
+        landmarks: the number of points that carry the field, shape ().
+        rank: of the low-rank Gram that was solved with, or that preconditioned, shape ().
+        truncation: trace(G − Ĝ)/(Nλ) for that low-rank Gram Ĝ of the training data, shape (). The
+            fitted values of Ĝ differ from those of G by at most this fraction of the residual.
+        residual_norm: ‖y − f(X)‖ of a stream, whose residual is not kept, good to 1e-8 of ‖y‖,
+            shape ().
+        iterations: of conjugate gradients, shape ().
+        relative_residual: ‖y − (G + NλI)a‖/‖y‖ of the coefficients, computed at the end, shape ().
+    """
+
+    solver: str = eqx.field(static=True)
+    landmarks: Int[Array, ""] | None = None
+    rank: Int[Array, ""] | None = None
+    truncation: Float[Array, ""] | None = None
+    residual_norm: Float[Array, ""] | None = None
+    iterations: Int[Array, ""] | None = None
+    relative_residual: Float[Array, ""] | None = None
+
+    def __repr__(self) -> str:
+        return described(self)
+
+
+class KernelField(AbstractField):
+    """f(x) = Σⱼ K(x, zⱼ) aⱼ, the minimiser of the regularised least squares.
+
+    Evaluating f or its potential costs O(M n) for M points.
+
+    Attributes:
+        kernel: K.
+        points: zⱼ, shape (M, n): the data, or the landmarks of a low-rank solver.
+        coefficients: aⱼ, shape (M, n).
+        residual: yᵢ − f(xᵢ) at the training data, shape (N, n); of shape (0, n) after a fit to a
+            stream, which is not kept.
+        norm: ‖f‖ in the RKHS of K, shape ().
+        regularization: the λ of the fit, shape ().
+        offset: the constant in the potential, shape ().
+        info: how the solver went.
+    """
+
+    kernel: AbstractMatrixKernel
+    points: Float[Array, "M n"]
+    coefficients: Float[Array, "M n"]
+    residual: Float[Array, "N n"]
+    norm: Float[Array, ""]
+    regularization: Float[Array, ""]
+    offset: Float[Array, ""]
+    info: SolverInfo = SolverInfo("none")
+
+    @property
+    def dimension(self) -> int:
+        return self.points.shape[-1]
+
+    def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+        x = self._state(x)
+        return _expansion(self.kernel, x, self.points, self.coefficients)
+
+    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+        return placed_product(self.kernel, X, self.points, self.coefficients)
+
+    def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        x = self._state(x)
+        return _potential(self.kernel, x, self.points, self.coefficients)
+
+    def _term(self, kernel: Sum, position: int) -> "KernelField":
+        term, Z, A = kernel.terms[position], self.points, self.coefficients
+        norm = root(jnp.sum(A * placed_product(term, Z, Z, A)))  # ‖f‖² = aᵀGa
+        parts = term, norm, jnp.zeros_like(self.offset)
+        return eqx.tree_at(lambda f: (f.kernel, f.norm, f.offset), self, parts)
+
+
+@eqx.filter_jit
+def _expansion(
+    K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
+) -> Float[Array, " n"]:
+    """f(x) = Σⱼ K(x, zⱼ) aⱼ through the potential, without (n, n) blocks."""
+    x, Z = centred(K, x, Z)
+    return K.expansion(x, Z, A)
+
+
+@eqx.filter_jit
+def _potential(
+    K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
+) -> Float[Array, ""]:
+    """The potential of `_expansion`."""
+    x, Z = centred(K, x, Z)
+    return K.potential(x, Z, A)

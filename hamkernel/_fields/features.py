@@ -1,0 +1,84 @@
+"""A field learned in random Fourier features."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from hamkernel._features.waves import AbstractFeatures, SumFeatures
+from hamkernel._fields.base import AbstractField, SolverInfo, root
+from hamkernel._machine.devices import as_given, on_each, rows_of, split
+from hamkernel._structures.base import AbstractMatrixKernel, Sum
+
+_BATCH = 1024  # points evaluated at once: 8 MB of waves for 1000 features
+
+
+class FeatureField(AbstractField):
+    """f(x) = Σ_r w_r φ_r(x), φ_r random features with the structure of the kernel.
+
+    The structure is exact: f = B∇u of the potential u(x) = Σ_r (α_r cos ω_r·x + β_r sin ω_r·x).
+    Evaluating f or its potential costs O(r n), whatever the number of data.
+
+    Attributes:
+        kernel: K, which the features approximate.
+        features: φ, with frequencies and amplitudes.
+        weights: w, shape (r,).
+        residual: yᵢ − f(xᵢ) at the training data, shape (N, n); of shape (0, n) after a fit to a
+            stream, which is not kept.
+        norm: ‖w‖, the norm of f in the RKHS of the approximate kernel, shape ().
+        regularization: the λ of the fit, shape ().
+        offset: the constant in the potential, shape ().
+        info: how the solver went.
+    """
+
+    kernel: AbstractMatrixKernel
+    features: AbstractFeatures
+    weights: Float[Array, " r"]
+    residual: Float[Array, "N n"]
+    norm: Float[Array, ""]
+    regularization: Float[Array, ""]
+    offset: Float[Array, ""]
+    info: SolverInfo
+
+    @property
+    def dimension(self) -> int:
+        return self.residual.shape[-1]
+
+    def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+        return _field_at(self.features, self._state(x), self.weights)
+
+    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+        spread = rows_of(X)
+        return as_given(spread, _evaluate(self, split(spread, X), spread))
+
+    def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        self.kernel.check_potential()
+        x = self._state(x)
+        return _potential_at(self.features, x, self.weights)
+
+    def _term(self, kernel: Sum, position: int) -> "FeatureField":
+        assert isinstance(self.features, SumFeatures)
+        weights = self.weights[self.features.slice(position)]
+        terms = kernel.terms[position], self.features.terms[position]
+        return eqx.tree_at(
+            lambda f: (f.kernel, f.features, f.weights, f.norm, f.offset),
+            self,
+            (*terms, weights, root(weights @ weights), jnp.zeros_like(self.offset)),
+        )
+
+
+@eqx.filter_jit
+def _field_at(features, x, weights):
+    return features.field(x, weights)
+
+
+@eqx.filter_jit
+def _potential_at(features, x, weights):
+    return features.potential(x, weights)
+
+
+@eqx.filter_jit
+def _evaluate(field, X, spread):
+    if spread is not None:
+        return on_each(spread, lambda field, X: _evaluate(field, X, None), field, X, joined=True)
+    return jax.lax.map(lambda x: field(x), X, batch_size=_BATCH)

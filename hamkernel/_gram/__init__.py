@@ -1,0 +1,1 @@
+"""The Gram of a kernel: dense, as an operator, and its derivatives."""

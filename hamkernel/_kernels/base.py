@@ -1,0 +1,267 @@
+"""Scalar kernels on one pair of points, k(x, z) -> (), and their algebra.
+
+A kernel is written once, for one pair. `jax.vmap` makes the Gram matrix, and automatic
+differentiation makes every structured kernel from it, so a kernel should be written with
+*products* of its arguments: `x @ z` under two vmaps becomes one matrix product, while
+`jnp.sum((x - z) ** 2)` becomes an (N, M, n) array and runs many times slower.
+"""
+
+import abc
+import enum
+import math
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from hamkernel import _require as require
+from hamkernel._kernels.functions import as_pytree
+from hamkernel._show import described, exponential, in_brackets, joined, text
+
+
+class Invariance(enum.Flag):
+    """The symmetries that a kernel declares; they decide which cheap forms are allowed.
+
+    REFLECTION: k(−x, −z) = k(x, z). TRANSLATION: k(x + c, z + c) = k(x, z), which for a
+    symmetric real kernel implies REFLECTION. A sum or product has what all its terms have.
+    """
+
+    NONE = 0
+    REFLECTION = 1
+    TRANSLATION = 3
+
+
+class AbstractScalarKernel(eqx.Module):
+    """A positive definite function k(x, z) -> () of two points of shape (n,).
+
+    Every inexact array leaf is an unconstrained real and is trained by `hamkernel.tune`;
+    a positive hyperparameter θ is stored as `log_θ` and read through the property `θ`.
+    """
+
+    def __repr__(self) -> str:
+        return described(self, positional=("kernel",))
+
+    @abc.abstractmethod
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        """k(x, z) for one pair of points."""
+
+    @property
+    @abc.abstractmethod
+    def invariance(self) -> Invariance:
+        """The transformations of both arguments that leave k unchanged."""
+
+    @abc.abstractmethod
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        """For each term of an additive kernel, the coordinates that it depends on."""
+
+    def __add__(self, other: Any) -> "ScalarSum":
+        if not callable(other):
+            return NotImplemented
+        return ScalarSum(_terms(ScalarSum, self) + _terms(ScalarSum, as_scalar_kernel(other)))
+
+    def __radd__(self, other: Any) -> "AbstractScalarKernel":
+        if isinstance(other, int | float) and other == 0:
+            return self  # so that the built-in sum(kernels) works
+        return as_scalar_kernel(other) + self if callable(other) else NotImplemented
+
+    def __mul__(self, other: Any) -> "AbstractScalarKernel":
+        if callable(other):
+            other = as_scalar_kernel(other)
+            return ScalarProduct(_terms(ScalarProduct, self) + _terms(ScalarProduct, other))
+        return Scaled(self, other)
+
+    def __rmul__(self, other: Any) -> "AbstractScalarKernel":
+        return as_scalar_kernel(other) * self if callable(other) else Scaled(self, other)
+
+
+def _terms(
+    cls: "type[ScalarSum] | type[ScalarProduct]", kernel: AbstractScalarKernel
+) -> tuple[AbstractScalarKernel, ...]:
+    """The terms of `kernel` if it is a `cls`, so that (a + b) + c is one sum of three."""
+    return kernel.terms if isinstance(kernel, cls) else (kernel,)
+
+
+class ScalarSum(AbstractScalarKernel):
+    """k₁(x, z) + k₂(x, z) + …"""  # noqa: D415
+
+    terms: tuple[AbstractScalarKernel, ...]
+
+    def __repr__(self) -> str:
+        return joined("+", [repr(k) for k in self.terms])
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        return sum((k(x, z) for k in self.terms[1:]), start=self.terms[0](x, z))
+
+    @property
+    def invariance(self) -> Invariance:
+        return common_invariance(self.terms)
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        return tuple(support for k in self.terms for support in k.supports(n))
+
+
+class ScalarProduct(AbstractScalarKernel):
+    """k₁(x, z) k₂(x, z) …"""  # noqa: D415
+
+    terms: tuple[AbstractScalarKernel, ...]
+
+    def __repr__(self) -> str:
+        return joined("*", [_factor(k) for k in self.terms])
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        return math.prod((k(x, z) for k in self.terms[1:]), start=self.terms[0](x, z))
+
+    @property
+    def invariance(self) -> Invariance:
+        return common_invariance(self.terms)
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        first, *rest = (k.supports(n) for k in self.terms)
+        for factor in rest:  # expand the product of the sums
+            first = tuple(a | b for a in first for b in factor)
+        return first
+
+
+def common_invariance(terms: Iterable[Any]) -> Invariance:
+    """What all of them have; scalar kernels or matrix-valued ones."""
+    common = Invariance.TRANSLATION
+    for kernel in terms:
+        common &= kernel.invariance
+    return common
+
+
+class Scaled(AbstractScalarKernel):
+    """c k(x, z) with c > 0; made by `2.0 * k`."""
+
+    kernel: AbstractScalarKernel
+    log_scale: Float[Array, ""]
+
+    def __init__(self, kernel: AbstractScalarKernel, scale: ArrayLike):
+        self.kernel = kernel
+        self.log_scale = jnp.log(require.positive_scalar(scale, "the scale of a kernel"))
+
+    def __repr__(self) -> str:
+        return f"{exponential(self.log_scale)} * {_factor(self.kernel)}"
+
+    @property
+    def scale(self) -> Float[Array, ""]:
+        return jnp.exp(self.log_scale)
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        value = self.kernel(x, z)
+        return self.scale.astype(value.dtype) * value
+
+    @property
+    def invariance(self) -> Invariance:
+        return self.kernel.invariance
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        return self.kernel.supports(n)
+
+
+def _factor(kernel: AbstractScalarKernel) -> str:
+    return in_brackets(repr(kernel)) if isinstance(kernel, ScalarSum) else repr(kernel)
+
+
+class UserKernel(AbstractScalarKernel):
+    """Any callable (x, z) -> scalar: a function, an Equinox module, another library's kernel.
+
+    Array leaves of a module are trained like those of the built-in kernels. Nothing is assumed
+    of the callable: it is taken to depend on every coordinate and to have no invariance.
+    """
+
+    fn: Callable[..., Any]
+
+    def __init__(self, fn: Callable[..., Any]):
+        self.fn = as_pytree(of_one_pair(fn))
+
+    def __repr__(self) -> str:
+        fn = getattr(self.fn, "__self__", self.fn)  # the kernel of tinygp that has the method
+        bare = type(fn).__repr__ is eqx.Module.__repr__  # it says nothing of values
+        return described(fn) if bare else text(fn)
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        value = self.fn(x, z)
+        if jnp.shape(value) != ():
+            raise ValueError(
+                f"the kernel {_name(self.fn)} returned an array of shape {jnp.shape(value)} for "
+                f"two points of shape {jnp.shape(x)}; a scalar is needed. Write the kernel for "
+                "one pair of points, k(x, z) -> (): the library adds the vmap."
+            )
+        value = require.floating(value, f"the value of the kernel {_name(self.fn)}")
+        # Its parameters may be more precise than the data.
+        return value.astype(require.floating(x, "the point").dtype)
+
+    @property
+    def invariance(self) -> Invariance:
+        return Invariance.NONE
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        return (frozenset(range(n)),)
+
+
+def of_one_pair(fn: Callable[..., Any]) -> Callable[..., Any]:
+    """`fn`; of a kernel of tinygp, which gives a whole Gram when called, the method for a pair."""
+    families = {cls.__module__.partition(".")[0] for cls in type(fn).__mro__}
+    return getattr(fn, "evaluate", fn) if "tinygp" in families else fn
+
+
+def one_point(x: ArrayLike) -> Float[Array, " n"]:
+    """`x` as a float array; a batch of points would silently give a wrong number."""
+    x = require.floating(x, "the point")
+    if x.ndim != 1:
+        raise ValueError(
+            f"the point has shape {x.shape}; a kernel takes one pair of points of shape (n,). Use "
+            "jax.vmap for many, or hk.gram for a Gram."
+        )
+    return x
+
+
+def divided(
+    x: Float[Array, " n"], scale: Float[Array, "..."], name: str = "lengthscale"
+) -> Float[Array, " n"]:
+    """x/scale in the dtype of x, for one point; the scale is a number, or one per coordinate."""
+    x = one_point(x)
+    if scale.ndim and scale.shape != x.shape:
+        raise ValueError(
+            f"the kernel has {scale.size} {name}s and the point has shape {x.shape}: "
+            "give one number, or one for each coordinate that the kernel sees."
+        )
+    return x / scale.astype(x.dtype)
+
+
+def log_per_coordinate(value: ArrayLike, name: str, cure: str = "") -> Float[Array, "..."]:
+    """The stored form of a positive hyperparameter that is a number, or one per coordinate."""
+    array = require.positive(value, name, cure)
+    if array.ndim > 1:
+        raise ValueError(f"{name} has shape {array.shape}; it must be a number or a vector (n,).")
+    return jnp.log(array)
+
+
+def _name(fn: Callable[..., Any]) -> str:
+    fn = getattr(fn, "func", fn)
+    return getattr(fn, "__name__", type(fn).__name__)
+
+
+def as_scalar_kernel(k: Any) -> AbstractScalarKernel:
+    """`k` itself if it is one of ours, else the callable wrapped as a `UserKernel`.
+
+    Raises:
+        TypeError: `k` is not callable, or is a matrix-valued kernel.
+    """
+    if isinstance(k, AbstractScalarKernel):
+        return k
+    if isinstance(k, type) or not callable(k):
+        raise TypeError(
+            f"a scalar kernel is needed, a callable (x, z) -> scalar; got {k!r}. "
+            "For a built-in one write, for example, hk.Gaussian(lengthscale=1.0)."
+        )
+    if getattr(k, "matrix_valued", False):
+        raise TypeError(
+            f"a scalar kernel is needed; got the matrix-valued {type(k).__name__}. "
+            "Scalar kernels are added inside a structure, Symplectic(k1 + k2), and structures to "
+            "structures, Symplectic(k1) + CurlFree(k2)."
+        )
+    return UserKernel(k)

@@ -1,0 +1,1 @@
+"""The devices, memory and threads that there are."""

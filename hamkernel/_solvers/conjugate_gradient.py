@@ -1,0 +1,178 @@
+"""The exact fit by conjugate gradients: products with the Gram only, O((N + m) n + r²) memory.
+
+The unknown is the residual of the fit, c = y − f(X) = Nλ a, so the system is (I + G/ρ) c = y with
+ρ = Nλ: both sides are in units of y. The preconditioner is the inverse for the low-rank Gram
+Ĝ = F Fᵀ of a Nyström fit,
+
+    (I + Ĝ/ρ)⁻¹ = I − F (FᵀF + ρI)⁻¹ Fᵀ,
+
+whose F = G_XS T is applied as a product with the Gram, so that it needs no memory of its own. If
+trace(G − Ĝ) ≤ τρ the condition is at most 1 + τ and the iterations do not depend on N.
+"""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import lineax as lx
+from jaxtyping import Array, Float
+
+from hamkernel import _require as require
+from hamkernel._fields.base import KernelField, SolverInfo, root
+from hamkernel._gram.dense import trace
+from hamkernel._gram.derivatives import constant
+from hamkernel._gram.operator import product
+from hamkernel._machine.devices import as_given, rows_of, split
+from hamkernel._solvers.cholesky import AbstractSolver, relative
+from hamkernel._solvers.landmark_gram import Columns, checked, factor, truncated, whitening
+from hamkernel._solvers.nystrom import Nystrom
+from hamkernel._solvers.stream_sums import normal
+from hamkernel._structures.base import AbstractMatrixKernel
+
+
+class ConjugateGradient(AbstractSolver[KernelField]):
+    """The exact fit without the Gram: preconditioned conjugate gradients on its products.
+
+    For N where the dense Gram does not fit in memory, and kernels for which `Nystrom` alone is not
+    exact enough. Each iteration costs one product with the Gram, O(N² n). The result carries
+    `field.info.iterations` and `.relative_residual`, computed anew at the end.
+
+    Args:
+        tolerance: the largest ‖y − (G + NλI)a‖/‖y‖, dimensionless; 1e-8 if None, and 1e-5 for data
+            in float32.
+        max_iterations: the largest number of iterations; the solve fails beyond it.
+        preconditioner: the low-rank Gram that preconditions. Its tolerance may be large, since the
+            condition is at most 1 + truncation; more landmarks mean fewer iterations.
+
+    Raises:
+        ValueError: an argument is not positive. TypeError: `max_iterations` is not whole, or the
+            preconditioner no `Nystrom`. RuntimeError, from `fit`: no convergence (the text says
+            what to do).
+
+    Source: Frangella, Tropp & Udell (2023) for the preconditioner; Díaz et al. (2023),
+        arXiv 2304.12465, for randomly pivoted Cholesky in it.
+    """
+
+    tolerance: float | None = eqx.field(static=True)
+    max_iterations: int = eqx.field(static=True)
+    preconditioner: Nystrom
+
+    def __init__(
+        self,
+        tolerance: float | None = None,
+        max_iterations: int = 100,
+        preconditioner: Nystrom | None = None,
+    ):
+        own = tolerance is not None
+        self.tolerance = require.positive_number(tolerance, "tolerance") if own else None
+        self.max_iterations = require.count(max_iterations, "max_iterations")
+        if preconditioner is None:
+            preconditioner = Nystrom(tolerance=10.0, max_points=256)
+        if not isinstance(preconditioner, Nystrom):
+            raise TypeError(
+                f"the preconditioner must be an instance of hk.Nystrom, got {preconditioner!r}."
+            )
+        self.preconditioner = preconditioner
+
+    def _fitted(
+        self,
+        K: AbstractMatrixKernel,
+        X: Float[Array, "N n"],
+        Y: Float[Array, "N n"],
+        regularization: Float[Array, ""],
+        throw: bool = True,
+    ) -> KernelField:
+        tolerance = self.tolerance
+        if tolerance is None:
+            tolerance = 1e-8 if X.dtype == jnp.float64 else 1e-5
+        landmarks = self.preconditioner.landmarks(K, X, regularization)
+        ridge = len(X) * regularization
+        spread = rows_of(X)
+        X, Y = split(spread, X), split(spread, Y)
+        within = jnp.asarray(tolerance, X.dtype)  # a Python float would compile anew
+        learned, iterations, left, truncation = _solve(
+            K, X, Y, ridge, landmarks, within, self.max_iterations, spread
+        )
+
+        def message() -> str:
+            reached = ""
+            if require.is_concrete(left, iterations, truncation):
+                reached = (
+                    f" after {int(iterations)} iterations: the relative residual is "
+                    f"{float(left):.1e} and the tolerance {tolerance:.1e}"
+                )
+                reached += (
+                    f" ({int(landmarks.count)} landmarks, truncation {float(truncation):.1e})"
+                )
+            more = "a larger tolerance"
+            if not require.is_concrete(iterations) or iterations >= self.max_iterations:
+                more = f"max_iterations or {more}"
+            return (
+                f"conjugate gradients did not converge{reached}. Raise the regularization; give "
+                "the preconditioner more landmarks, hk.ConjugateGradient(preconditioner="
+                f"hk.Nystrom(tolerance=1.0, max_points=1000)); allow more with {more}. In float32 "
+                "a tolerance below 1e-5 is out of reach, and a small regularization is lost in "
+                "rounding: jax.config.update('jax_enable_x64', True). With 0 landmarks or a "
+                "residual that is NaN the kernel is at fault: hk.check_kernel(k, X) tells."
+            )
+
+        failed = ~(require.on_host(left) <= tolerance)
+        learned = checked(learned, landmarks, truncation, failed, message, throw)
+        coefficients, residual, norm = learned
+        return KernelField(
+            kernel=K,
+            points=X,
+            coefficients=coefficients,
+            residual=as_given(spread, residual),
+            norm=norm,
+            regularization=regularization,
+            offset=jnp.zeros((), X.dtype),
+            info=SolverInfo(
+                "ConjugateGradient",
+                landmarks=landmarks.count,
+                rank=landmarks.kept.sum(),
+                truncation=truncation,
+                iterations=iterations,
+                relative_residual=left,
+            ),
+        )
+
+
+@eqx.filter_jit
+def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
+    S = landmarks.points
+    # The preconditioner changes how fast the answer is found, not the answer.
+    K_, X_, S_, ridge_ = constant((K, X, S, ridge))
+    T = whitening(K_, landmarks)
+    square = normal(Columns(K_, S_), T, X_, jnp.zeros_like(X_), spread).square
+    R = factor(square, ridge_)
+
+    def preconditioned(c):
+        moment = T.T @ product(K_, S_, X_, c, None, spread).reshape(-1)
+        w = jax.scipy.linalg.cho_solve((R, True), moment)
+        return c - product(K_, X_, S_, (T @ w).reshape(S.shape), spread)
+
+    def gram(c):
+        return product(K, X, X, c, spread, spread)
+
+    structure = jax.ShapeDtypeStruct(X.shape, X.dtype)
+    positive = lx.positive_semidefinite_tag
+    system = lx.FunctionLinearOperator(lambda c: c + gram(c) / ridge, structure, positive)
+    preconditioner = lx.FunctionLinearOperator(preconditioned, structure, positive)
+    # lineax asks of the change of c what it asks of the residual; both are in units of y. Half of
+    # the tolerance leaves room for what the recursion of the residual rounds off.
+    scale = jnp.linalg.norm(jax.lax.stop_gradient(Y))
+    solver = lx.CG(
+        rtol=0.0,
+        atol=0.5 * tolerance * scale,
+        norm=jnp.linalg.norm,
+        stabilise_every=None,
+        max_steps=max_iterations,
+    )
+    options = {"preconditioner": preconditioner}
+    solution = lx.linear_solve(system, Y, solver, options=options, throw=False)
+    C = solution.value
+    values = gram(C) / ridge  # f(X)
+    left = relative(Y - C - values, Y)
+    truncation = truncated(trace(K_, X_, spread), jnp.trace(square), ridge_)
+    norm = root(jnp.sum(C * values) / ridge)  # ‖f‖² = aᵀGa
+    return (C / ridge, Y - values, norm), solution.stats["num_steps"], left, truncation

@@ -1,0 +1,107 @@
+"""`fit`: from data to a learned field."""
+
+from __future__ import annotations
+
+from typing import overload
+
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from hamkernel import _require as require
+from hamkernel._fields.base import AbstractField, KernelField
+from hamkernel._machine.devices import rows_of
+from hamkernel._machine.memory import dense_bytes, memory_bytes
+from hamkernel._solvers.cholesky import COPIES, AbstractSolver, Cholesky, Learned
+from hamkernel._solvers.conjugate_gradient import ConjugateGradient
+from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+
+
+@overload
+def fit(
+    K: AbstractMatrixKernel,
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
+    regularization: ArrayLike = 1e-4,
+    *,
+    solver: None = None,
+    throw: bool = True,
+) -> KernelField: ...
+@overload
+def fit(
+    K: AbstractMatrixKernel,
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
+    regularization: ArrayLike = 1e-4,
+    *,
+    solver: AbstractSolver[Learned],
+    throw: bool = True,
+) -> Learned: ...
+@overload
+def fit(
+    K: AbstractMatrixKernel,
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
+    regularization: ArrayLike = 1e-4,
+    *,
+    solver: AbstractSolver | None,
+    throw: bool = True,
+) -> AbstractField: ...
+
+
+def fit(
+    K: AbstractMatrixKernel,
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
+    regularization: ArrayLike = 1e-4,
+    *,
+    solver: AbstractSolver | None = None,
+    throw: bool = True,
+) -> AbstractField:
+    """Learn the field f in the RKHS of K that minimises (1/N) Σᵢ‖f(xᵢ) − yᵢ‖² + λ‖f‖².
+
+    By the representer theorem f(x) = Σⱼ K(x, xⱼ) aⱼ with (G + NλI) a = y. Nothing else is added
+    to the diagonal. Read as a Gaussian process, Nλ is the variance of the noise on Y.
+
+    Args:
+        K: a matrix-valued kernel, for example `Odd(Symplectic(Gaussian(3.0)))`.
+        X: states, shape (N, n).
+        Y: measured velocities, shape (N, n), in units of X per unit of time.
+        regularization: λ > 0, in squared units of Y over those of the kernel.
+        solver: if None, `Cholesky()` where its three matrices of (N n)² numbers take at most half
+            of the memory, else `ConjugateGradient()`; both are exact, and `field.info.solver` says
+            which it was. `Nystrom()` is faster, and approximate to a stated tolerance. Where the
+            rows of X are spread over a mesh of devices they stay there, and None is
+            `ConjugateGradient()`; only `Cholesky()` gathers them on one device.
+        throw: whether a solve that fails raises. If not, what is learned is NaN, `field.norm` among
+            it: for `jax.vmap` over many hyperparameters, where one failure would end them all, and
+            for objectives of your own in `tune`, which steps back from NaN.
+
+    Returns:
+        The learned field. Works under jit, vmap and grad, with respect to every argument; new
+        values of hyperparameters or λ do not recompile, but for `Nystrom()` where they change the
+        number of landmarks.
+
+    Raises:
+        TypeError: K is not matrix-valued, `solver` is no solver, or the data is complex or in half
+            precision. ValueError: a shape does not fit, the data is empty or not finite, n is not
+            allowed by the structure, λ is not positive, or a dense problem does not fit in memory.
+            RuntimeError: the ridge is too small for this Gram (the text says what to do).
+
+    Source: Smith & Egeland (2023), eq. (vector_valued_regular_least_squares_a_equation), where
+        "Nλ a_j" should read "Nλ a_i".
+    """
+    K = matrix_kernel(K)
+    if not (solver is None or isinstance(solver, AbstractSolver)):
+        raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
+    X, Y = require.data(X, Y)
+    K.check_dimension(X.shape[1])
+    regularization = require.ridge(regularization, X.dtype)
+    require.warn_of_float32(X)
+    solver = _default(X) if solver is None else solver
+    return solver._fitted(K, X, Y, regularization, throw)
+
+
+def _default(X: Float[Array, "N n"]) -> AbstractSolver[KernelField]:
+    """Cholesky where it takes at most half of the memory of one device, which has all the data."""
+    needed, memory = dense_bytes(X.size, X.size, X.dtype, COPIES), memory_bytes()
+    fits = memory is None or needed <= memory / 2
+    return Cholesky() if fits and rows_of(X) is None else ConjugateGradient()

@@ -1,0 +1,330 @@
+"""Regularised least squares in the span of landmarks: O(N r²) time, O(N n + r²) memory.
+
+With S the landmarks, L the Cholesky factor of their Gram and F = G_XS L⁻ᵀ, the Gram is nearly
+Ĝ = F Fᵀ, and the field Σⱼ K(x, sⱼ) αⱼ with α = L⁻ᵀw minimises ‖y − F w‖² + Nλ‖w‖². F is seen tile
+by tile and only the sums FᵀF and Fᵀy stay.
+
+The matrix FᵀF + NλI has the condition of G + NλI, not its square: these are no normal equations in
+α, which would lose twice the digits. What the sums round off is given back by one step of
+refinement with the residual of the data (Björck's corrected seminormal equations).
+
+A stream is seen once and leaves no residual; `stream_sums.py` says how its sums keep digits.
+"""
+
+import numbers
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Int, Key, Num, UInt32
+
+from hamkernel import _require as require
+from hamkernel._fields.base import KernelField, SolverInfo, root
+from hamkernel._gram.dense import trace
+from hamkernel._gram.operator import product
+from hamkernel._machine.devices import as_given, rows_of, split
+from hamkernel._show import text
+from hamkernel._solvers import stream_sums
+from hamkernel._solvers.landmark_gram import (
+    Columns,
+    checked,
+    factor,
+    singular,
+    truncated,
+    whitening,
+)
+from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks
+from hamkernel._solvers.stream_sums import Sums
+from hamkernel._solvers.streaming import (
+    AbstractStreamingFit,
+    AbstractStreamingSolver,
+    checked_start,
+    thinned,
+)
+from hamkernel._structures.base import AbstractMatrixKernel
+
+
+class Nystrom(AbstractStreamingSolver[KernelField]):
+    """A low-rank fit: the field lives on a few landmarks, chosen from the data.
+
+    Landmarks are drawn by randomly pivoted Cholesky until trace(G − Ĝ) ≤ tolerance · Nλ. Then the
+    fitted values ŷ differ from those of the exact fit by at most tolerance · ‖y − ŷ‖, since the
+    difference is Nλ (G + NλI)⁻¹ (G − Ĝ) (Ĝ + NλI)⁻¹ y. So more noise and a larger λ need fewer
+    landmarks, and N does not matter. Smooth kernels in few dimensions need tens to hundreds. The
+    result carries `field.info.landmarks`, `.rank` and the `.truncation` that was reached.
+
+    Under jit, vmap and grad the number of landmarks cannot depend on values: buffers have the size
+    of `max_points`. Outside of them it is rounded up to a multiple of 16, and each such number
+    compiles anew: for a sweep over hyperparameters give `points`. Derivatives hold the landmarks
+    fixed.
+
+    Args:
+        tolerance: the bound on trace(G − Ĝ)/(Nλ), dimensionless.
+        max_points: the largest number of landmarks m. In float64 at most 8 m n² `candidates` bytes
+            while they are chosen, and 16 (m n)² after that.
+        candidates: landmarks are chosen from the data, or from a random part of this size.
+        key: for the draws; `jax.random.key(0)` if None, so that a fit can be repeated.
+        points: the landmarks, shape (m, n), if they are not to be chosen; columns of theirs that
+            depend on others are left out. `max_points`, `candidates` and `key` have no effect.
+
+    Raises:
+        ValueError: an argument is not positive, `points` is not of shape (m, n), or the tolerance
+            is a whole number above 1, which looks like `max_points`; write 10.0 if it is meant.
+            TypeError: a number of points is not whole, or `key` no key.
+
+    Warns:
+        UserWarning: the landmarks do not reach the tolerance.
+
+    Source: Chen, Epperly, Tropp & Webber (2023), arXiv 2207.06503; Björck (1987) for the solve.
+    """
+
+    tolerance: float = eqx.field(static=True)
+    max_points: int = eqx.field(static=True)
+    candidates: int = eqx.field(static=True)
+    key: Key[Array, ""] | None
+    points: Float[Array, "m n"] | None
+
+    def __init__(
+        self,
+        tolerance: float = 0.1,
+        max_points: int = 512,
+        candidates: int = 4096,
+        key: Key[Array, ""] | UInt32[Array, "..."] | None = None,
+        points: Num[ArrayLike, "m n"] | None = None,
+    ):
+        self.tolerance = require.positive_number(tolerance, "tolerance")
+        if isinstance(tolerance, numbers.Integral) and tolerance > 1:
+            raise ValueError(
+                f"got the whole number {tolerance} as the tolerance on trace(G - Ĝ)/(N λ). For at "
+                f"most {tolerance} landmarks say hk.Nystrom(max_points={tolerance}); for that "
+                f"tolerance write {tolerance}.0."
+            )
+        self.max_points = require.count(max_points, "max_points")
+        self.candidates = require.count(candidates, "candidates")
+        self.key = None if key is None else require.key(key)
+        self.points = None if points is None else require.points(points, "points")
+
+    def landmarks(
+        self, K: AbstractMatrixKernel, X: Float[Array, "N n"], regularization: Float[Array, ""]
+    ) -> Landmarks:
+        """The points given, or those that reach the tolerance, or `max_points` of them."""
+        if self.points is not None:
+            if self.points.shape[1] != X.shape[1]:
+                raise ValueError(
+                    f"the landmarks have {self.points.shape[1]} coordinates and X {X.shape[1]}."
+                )
+            return given_landmarks(K, self.points.astype(X.dtype))
+        key = jax.random.key(0) if self.key is None else self.key
+        left = self.tolerance * regularization
+        return choose_landmarks(K, X, left, self.max_points, self.candidates, key)
+
+    def _fitted(
+        self,
+        K: AbstractMatrixKernel,
+        X: Float[Array, "N n"],
+        Y: Float[Array, "N n"],
+        regularization: Float[Array, ""],
+        throw: bool = True,
+    ) -> KernelField:
+        landmarks = self.landmarks(K, X, regularization)
+        spread = rows_of(X)
+        X, Y = split(spread, X), split(spread, Y)
+        solution = _fit(K, X, Y, regularization, landmarks, spread)
+        solution = solution._replace(residual=as_given(spread, solution.residual))
+        return _field(K, landmarks, solution, regularization, self.tolerance, _CHOOSE, throw)
+
+    def start(
+        self,
+        K: AbstractMatrixKernel,
+        sample: Num[ArrayLike, "N n"],
+        regularization: ArrayLike = 1e-4,
+    ) -> "LandmarkFit":
+        """A fit without data yet, to which chunks are added: see `LandmarkFit`.
+
+        Args:
+            K: a matrix-valued kernel.
+            sample: states that look like all of the data, shape (N, n), from which the landmarks
+                are chosen now; later data does not move them. They are not added to the fit. The
+                first chunk is enough if all chunks look alike; one trajectory out of many is not.
+            regularization: the smallest λ that will be asked for, since the tolerance is relative
+                to it, and so are the digits that are kept: a smaller one loses some.
+
+        Where `field.info.truncation` of the data added exceeds the tolerance, start anew with a
+        sample that looks like the data so far.
+
+        Raises:
+            ValueError: a shape does not fit, or λ is not positive. TypeError: K is not
+                matrix-valued.
+        """
+        K, sample, regularization = checked_start(K, sample, regularization)
+        landmarks = self.landmarks(K, sample, regularization)
+        some = thinned(sample, self.candidates)
+        return _start(K, some, regularization, landmarks, self.tolerance)
+
+
+@eqx.filter_jit
+def _fit(K, X, Y, regularization, landmarks, spread):
+    S, ridge = landmarks.points, len(X) * regularization
+    T = whitening(K, landmarks)
+    total = stream_sums.normal(Columns(K, S), T, X, Y, spread)
+    R = factor(total.square, ridge)
+
+    def step(w, residual):
+        """One step of refinement, from w and y − F w."""
+        slope = T.T @ product(K, S, X, residual, None, spread).reshape(-1) - ridge * w
+        correction = jax.scipy.linalg.cho_solve((R, True), slope)
+        change = product(K, X, S, (T @ correction).reshape(S.shape), spread)
+        return w + correction, residual - change
+
+    w = jax.scipy.linalg.cho_solve((R, True), total.moment)
+    A = (T @ w).reshape(S.shape)
+    w, residual = step(w, Y - product(K, X, S, A, spread))
+    truncation = truncated(trace(K, X, spread), jnp.trace(total.square), ridge)
+    # ‖f‖² = αᵀ G_SS α = ‖w‖²
+    return _Solution((T @ w).reshape(S.shape), residual, root(w @ w), truncation)
+
+
+class _Solution(NamedTuple):
+    coefficients: Float[Array, "m n"]
+    residual: Float[Array, "N n"]
+    norm: Float[Array, ""]
+    truncation: Float[Array, ""]
+    residual_norm: Float[Array, ""] | None = None
+
+
+def _field(K, landmarks, solution, regularization, tolerance, cure, throw=True) -> KernelField:
+    dtype = landmarks.points.dtype
+    failed = require.not_finite(solution.coefficients).any()
+    solution = checked(solution, landmarks, solution.truncation, failed, singular(dtype), throw)
+    _warn_if_truncated(solution.truncation, landmarks.count, tolerance, cure)
+    return KernelField(
+        kernel=K,
+        points=landmarks.points,
+        coefficients=solution.coefficients,
+        residual=solution.residual,
+        norm=solution.norm,
+        regularization=regularization,
+        offset=jnp.zeros((), dtype),
+        info=SolverInfo(
+            "Nystrom",
+            landmarks=landmarks.count,
+            rank=landmarks.kept.sum(),
+            truncation=solution.truncation,
+            residual_norm=solution.residual_norm,
+        ),
+    )
+
+
+_CHOOSE = (
+    "Raise max_points, the tolerance or the regularization; let landmarks be chosen from more "
+    "candidates;"
+)
+_START_ANEW = (
+    "Start anew with landmarks from a sample that looks like the data so far, and a max_points "
+    "that suffices; or ask for a larger regularization;"
+)
+
+
+def _warn_if_truncated(truncation, count, tolerance, cure):
+    if not require.is_concrete(truncation, count):
+        return
+    # Twice: a random part of the data need not show all that the rest has.
+    if truncation > 2 * tolerance:
+        if truncation.dtype == jnp.float32:
+            cure = (
+                "In float32 rounding may have ended the choice of landmarks early: "
+                f"jax.config.update('jax_enable_x64', True). {cure}"
+            )
+        require.warn(
+            f"{int(count)} landmarks leave trace(G - Ĝ)/(N λ) = {float(truncation):.2g}, more than "
+            f"the tolerance {tolerance:.2g}. The field is the best one on these landmarks, but may "
+            f"be far from the exact fit. {cure} for a rough kernel or many dimensions take "
+            "hk.ConjugateGradient(), which is exact."
+        )
+
+
+class LandmarkFit(AbstractStreamingFit[KernelField]):
+    """A fit on landmarks to the data added so far, made by `Nystrom.start`.
+
+    It has a fixed size, 3r² numbers for r columns. `add` returns a new one, and `field` solves
+    for any λ:
+
+        model = hk.Nystrom().start(K, X, 1e-4).add(X, Y)
+        field = model.field()
+        better = model.add(X_new, Y_new).field()
+
+    `field.info.truncation` is that of all the data added: it shows whether the landmarks are still
+    enough.
+
+    Attributes:
+        kernel: K.
+        landmarks: the points that carry the field.
+        sums: what the least squares need of the points added.
+        trace: the trace of their Gram, shape ().
+        count: N, the number of points added, shape ().
+        regularization: the λ of `start`, shape ().
+        dimension: n, the number of coordinates of a state.
+        tolerance: of the solver, for its warning.
+    """
+
+    kernel: AbstractMatrixKernel
+    landmarks: Landmarks
+    sums: Sums
+    trace: Float[Array, ""]
+    count: Int[Array, ""]
+    regularization: Float[Array, ""]
+    dimension: int = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True)
+
+    def _size(self) -> str:
+        return f"landmarks={text(self.landmarks.count)}"
+
+    def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "LandmarkFit":
+        spread = rows_of(X)
+        return _with_data(self, split(spread, X), split(spread, Y), spread)
+
+    def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
+        solution = _solution(self, count, regularization)
+        landmarks, tolerance = self.landmarks, self.tolerance
+        return _field(self.kernel, landmarks, solution, regularization, tolerance, _START_ANEW)
+
+
+@eqx.filter_jit
+def _start(K, sample, regularization, landmarks, tolerance):
+    S = landmarks.points
+    T = whitening(K, landmarks)
+    return LandmarkFit(
+        kernel=K,
+        landmarks=landmarks,
+        sums=stream_sums.start(Columns(K, S), T, sample, regularization),
+        trace=jnp.zeros((), S.dtype),
+        count=jnp.zeros((), int),
+        regularization=regularization,
+        dimension=S.shape[1],
+        tolerance=tolerance,
+    )
+
+
+@eqx.filter_jit
+def _with_data(fit, X, Y, spread):
+    K = fit.kernel
+    new = (
+        stream_sums.add(fit.sums, Columns(K, fit.landmarks.points), X, Y, spread),
+        fit.trace + trace(K, X, spread),
+        fit.count + len(X),
+    )
+    return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), fit, new)
+
+
+@eqx.filter_jit
+def _solution(fit, count, regularization):
+    ridge = count.astype(regularization.dtype) * regularization
+    weights, norm, residual_norm = stream_sums.solve(fit.sums, ridge)
+    return _Solution(
+        coefficients=weights.reshape(fit.landmarks.points.shape),
+        residual=jnp.zeros((0, fit.dimension), weights.dtype),
+        norm=norm,
+        truncation=truncated(fit.trace, stream_sums.trace(fit.sums), ridge),
+        residual_norm=residual_norm,
+    )

@@ -1,0 +1,210 @@
+"""Least squares in random Fourier features, in memory that does not grow with the points."""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Int, Key, Num, UInt32
+
+from hamkernel import _require as require
+from hamkernel._features.waves import AbstractFeatures, features
+from hamkernel._fields.base import SolverInfo, root
+from hamkernel._fields.features import FeatureField
+from hamkernel._machine.devices import as_given, rows_of, split
+from hamkernel._machine.memory import refuse_beyond_memory
+from hamkernel._solvers import stream_sums
+from hamkernel._solvers.landmark_gram import singular
+from hamkernel._solvers.stream_sums import Sums
+from hamkernel._solvers.streaming import (
+    AbstractStreamingFit,
+    AbstractStreamingSolver,
+    checked_start,
+    thinned,
+)
+from hamkernel._solvers.tall_least_squares import ridge_regression
+from hamkernel._structures.base import AbstractMatrixKernel
+
+_SAMPLE = 4096  # points of a sample that are looked at
+
+
+class RandomFeatures(AbstractStreamingSolver[FeatureField]):
+    """Ridge regression in random Fourier features: O(N n r²) time, O(r²) memory beside the data.
+
+    Solves for the weights of r features by QR, tile by tile, never through the normal equations.
+    The structure of the field is exact for every count; the kernel is approximate, with an error
+    that falls as count^(−1/2), and faster than that for fields that the features can represent.
+    For shift-invariant kernels: Gaussian, Matern, RationalQuadratic and Periodic, their sums,
+    products, multiples and Select, in every structure and parity.
+
+    How to choose: from 500 frequencies in the plane; more for short lengthscales and rough kernels
+    (a field of Matern(1.5) has frequencies of infinite fourth moment, and converges slowly). Where
+    N n is a few thousands `Cholesky()` is exact and as fast; `Nystrom()` needs fewer columns for
+    the same accuracy, and places them on the data.
+
+    Args:
+        count: frequencies for each term of each scalar kernel. Each has a cosine and a sine, of an
+            odd or even kernel only one of them; a divergence-free field has a set for each of the
+            n(n − 1)/2 planes, a separable one for each component.
+        key: the random key, `jax.random.key(0)`. The same key draws the same features.
+
+    Raises:
+        ValueError: count is not positive, or, from `fit` and `start`, so large that its matrices do
+            not fit in memory. TypeError: count is no integer, or key is no key.
+
+    Source: Rahimi & Recht (2007).
+    """
+
+    count: int = eqx.field(static=True)
+    key: Key[Array, ""]
+
+    def __init__(self, count: int, key: Key[Array, ""] | UInt32[Array, "..."]):
+        self.count = require.count(count, "count")
+        self.key = require.key(key)
+
+    def _fitted(
+        self,
+        K: AbstractMatrixKernel,
+        X: Float[Array, "N n"],
+        Y: Float[Array, "N n"],
+        regularization: Float[Array, ""],
+        throw: bool = True,
+    ) -> FeatureField:
+        spread = rows_of(X)
+        field = _fit(K, self, split(spread, X), split(spread, Y), regularization, spread)
+        field = _checked(field, throw)
+        if spread is None:
+            return field
+        residual = as_given(spread, field.residual)
+        return eqx.tree_at(lambda f: f.residual, field, residual)
+
+    def _features(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> AbstractFeatures:
+        """The features of K for n coordinates, if a fit in them fits in memory."""
+
+        def of_kernel(K, key):
+            return features(K, n, self.count, key, dtype)
+
+        r = eqx.filter_eval_shape(of_kernel, K, self.key).columns
+        what, cure = f"a fit with count = {self.count}", "Take fewer features."
+        refuse_beyond_memory(what, r, r, dtype, _COPIES, cure)
+        return of_kernel(K, self.key)
+
+    def start(
+        self,
+        K: AbstractMatrixKernel,
+        sample: Num[ArrayLike, "N n"],
+        regularization: ArrayLike = 1e-4,
+    ) -> "FeatureFit":
+        """A fit without data yet, to which chunks are added: see `FeatureFit`.
+
+        Args:
+            K: a matrix-valued kernel.
+            sample: states that look like all of the data, shape (N, n). The features do not depend
+                on them, only the rounding of the sums does. They are not added to the fit.
+            regularization: the smallest λ that will be asked for; a smaller one loses digits.
+
+        Raises:
+            TypeError: a kernel without a known spectral density. ValueError: n is not allowed by
+                the structure, the sample is not finite, or λ is not positive.
+        """
+        K, sample, regularization = checked_start(K, sample, regularization)
+        basis = self._features(K, sample.shape[1], sample.dtype)
+        return _start(K, basis, thinned(sample, _SAMPLE), regularization)
+
+
+_COPIES = 8  # r² numbers that a fit holds: the triangle, the tile of 3r rows below it, their QR
+
+
+@eqx.filter_jit
+def _fit(K, solver, X, Y, regularization, spread):
+    basis = solver._features(K, X.shape[1], X.dtype)
+    ridge = len(X) * regularization
+    weights, residual = ridge_regression(basis, basis.columns, X, Y, ridge, spread)
+    return _field(K, basis, weights, residual, regularization)
+
+
+def _field(K, basis, weights, residual, regularization, residual_norm=None):
+    return FeatureField(
+        kernel=K,
+        features=basis,
+        weights=weights,
+        residual=residual,
+        norm=root(weights @ weights),
+        regularization=regularization,
+        offset=jnp.zeros((), weights.dtype),
+        info=SolverInfo(
+            "RandomFeatures", rank=jnp.asarray(len(weights)), residual_norm=residual_norm
+        ),
+    )
+
+
+def _checked(field: FeatureField, throw: bool = True) -> FeatureField:
+    """The field, if the least squares had a solution."""
+
+    def learned(f: FeatureField):
+        return f.weights, f.residual, f.norm
+
+    failed = require.not_finite(field.weights)
+    cause = singular(field.weights.dtype)
+    values = require.value(learned(field), failed, cause, RuntimeError, throw)
+    return eqx.tree_at(learned, field, values)
+
+
+class FeatureFit(AbstractStreamingFit[FeatureField]):
+    """A fit in random features to the data added so far, made by `RandomFeatures.start`.
+
+    It has a fixed size, 3r² numbers for r columns. `add` returns a new one, and `field` solves
+    for any λ:
+
+        model = hk.RandomFeatures(500, key).start(K, X, 1e-4).add(X, Y)
+        field = model.field()
+        better = model.add(X_new, Y_new).field()
+
+    Attributes:
+        kernel: K.
+        features: the features of K.
+        sums: what the least squares need of the points added.
+        count: N, the number of points added, shape ().
+        regularization: the λ of `start`, shape ().
+        dimension: n, the number of coordinates of a state.
+    """
+
+    kernel: AbstractMatrixKernel
+    features: AbstractFeatures
+    sums: Sums
+    count: Int[Array, ""]
+    regularization: Float[Array, ""]
+    dimension: int = eqx.field(static=True)
+
+    def _size(self) -> str:
+        return f"features={len(self.sums.moment)}"
+
+    def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "FeatureFit":
+        spread = rows_of(X)
+        X, Y = split(spread, X), split(spread, Y)
+        sums = _add(self.sums, self.features, X, Y, spread)
+        return eqx.tree_at(lambda f: (f.sums, f.count), self, (sums, self.count + len(X)))
+
+    def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
+        return _checked(_solution(self, count, regularization))
+
+
+@eqx.filter_jit
+def _start(K, basis, sample, regularization):
+    identity = jnp.eye(basis.columns, dtype=sample.dtype)
+    return FeatureFit(
+        kernel=K,
+        features=basis,
+        sums=stream_sums.start(basis, identity, sample, regularization),
+        count=jnp.zeros((), int),
+        regularization=regularization,
+        dimension=sample.shape[1],
+    )
+
+
+_add = eqx.filter_jit(stream_sums.add)
+
+
+@eqx.filter_jit
+def _solution(fit, count, regularization):
+    ridge = count.astype(regularization.dtype) * regularization
+    weights, _, residual_norm = stream_sums.solve(fit.sums, ridge)
+    unseen = jnp.zeros((0, fit.dimension), weights.dtype)
+    return _field(fit.kernel, fit.features, weights, unseen, regularization, residual_norm)

@@ -1,0 +1,126 @@
+"""Least squares over a stream by sums that keep their digits: matrix products only.
+
+minimise ‖Φw − y‖² + Nλ‖w‖² for rows Φ that are seen once. The normal equations lose the digits of
+the condition of ΦᵀΦ + NλI, which is of order 1/λ, because small directions drown in the rounding
+of the large ones. So the sums are over the rows ΦR⁻¹ instead, where RᵀR = ΦᵀΦ/N + λI on a sample of
+the data: in this basis the system is near N times the identity and no direction is small. What is
+left is the rounding of ΦR⁻¹, of order eps/√λ, as with a QR of all rows, which costs several times
+as much and waits for threads on a busy machine. This is the second pass of a Cholesky QR (Fukaya et
+al. (2020), "shifted Cholesky QR"), whose first pass needs to see a sample only.
+
+Rows that the sample does not resemble are treated no worse than by the normal equations.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jaxtyping import Array, Float
+
+from hamkernel._gram.dense import plus_ridge
+from hamkernel._machine.devices import Rows, on_each
+from hamkernel._solvers.tall_least_squares import Design, over_tiles
+
+# Numbers in the tile of rows that is held at once; see `_gram/operator.py`.
+TILE = 2**20
+
+
+class Normal(NamedTuple):
+    """The sums over rows F with targets y; those of parts of the rows add up."""
+
+    square: Float[Array, "r r"]  # FᵀF
+    moment: Float[Array, " r"]  # Fᵀy
+    energy: Float[Array, ""]  # yᵀy
+
+
+class Sums(eqx.Module):
+    """What has been seen, in r² numbers. Rows are those of a design, times `basis`.
+
+    Attributes:
+        triangle: R, upper triangular, shape (r, r).
+        basis: R⁻¹, or WR⁻¹ if Φ is a design times W, shape (r, r).
+        square: R⁻ᵀΦᵀΦR⁻¹, shape (r, r).
+        moment: R⁻ᵀΦᵀy, shape (r,).
+        energy: yᵀy, shape ().
+    """
+
+    triangle: Float[Array, "r r"]
+    basis: Float[Array, "r r"]
+    square: Float[Array, "r r"]
+    moment: Float[Array, " r"]
+    energy: Float[Array, ""]
+
+
+def start(
+    design: Design, W: Float[Array, "r r"], sample: Float[Array, "N n"], ridge: Float[Array, ""]
+) -> Sums:
+    """The sums before the first row, in the basis of a sample and of λ = ridge.
+
+    NaN where the kernel is not finite, or λ below rounding.
+    """
+    zero = jnp.zeros_like(W)
+    seen = normal(design, W, sample, jnp.zeros_like(sample))
+    R = jnp.linalg.cholesky(plus_ridge(seen.square / len(sample), ridge)).T
+    return Sums(R, solve_triangular(R, W.T, trans="T").T, zero, zero[0], zero[0, 0])
+
+
+def add(
+    sums: Sums,
+    design: Design,
+    X: Float[Array, "N n"],
+    Y: Float[Array, "N n"],
+    spread: Rows | None = None,
+) -> Sums:
+    """The sums after the rows design(X) with targets Y."""
+    old = Normal(sums.square, sums.moment, sums.energy)
+    new = normal(design, sums.basis, X, Y, spread)
+    return Sums(sums.triangle, sums.basis, *jax.tree.map(jnp.add, old, new))
+
+
+def normal(
+    design: Design,
+    basis: Float[Array, "r r"],
+    X: Float[Array, "N n"],
+    Y: Float[Array, "N n"],
+    spread: Rows | None = None,
+) -> Normal:
+    """The sums over the rows F = design(X) basis, tile by tile, on the devices where they are."""
+    if spread is not None:
+
+        def part(whole, X, Y):
+            design, basis = whole
+            return spread.sum(normal(design, basis, X, Y))
+
+        return on_each(spread, part, (design, basis), X, Y, joined=False)
+
+    def step(total, tile):
+        rows = design(tile[0])  # (t, n, r)
+        F, y = rows.reshape(-1, rows.shape[-1]) @ basis, tile[1].reshape(-1)
+        return jax.tree.map(jnp.add, total, Normal(F.T @ F, F.T @ y, y @ y)), None
+
+    zero = jnp.zeros_like(basis)
+    empty = Normal(zero, zero[0], zero[0, 0])
+    return over_tiles(step, empty, (X, Y), max(1024, TILE // len(basis)))[0]
+
+
+def solve(
+    sums: Sums, ridge: Float[Array, ""]
+) -> tuple[Float[Array, " r"], Float[Array, ""], Float[Array, ""]]:
+    """For the minimiser w: its weights in the design, ‖w‖, and ‖Φw − y‖; NaN if it fails.
+
+    The last one has the digits of a difference of squares: it is good to 1e-8 ‖y‖ in float64.
+    """
+    R = sums.triangle
+    inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype))
+    L = jnp.linalg.cholesky(sums.square + ridge * inverse.T @ inverse)
+    v = cho_solve((L, True), sums.moment)
+    norm = jnp.linalg.norm(inverse @ v)
+    left = sums.energy - sums.moment @ v - ridge * norm**2
+    return sums.basis @ v, norm, jnp.sqrt(jnp.maximum(left, jnp.zeros_like(left)))
+
+
+def trace(sums: Sums) -> Float[Array, ""]:
+    """The trace of ΦᵀΦ."""
+    return jnp.sum((sums.square @ sums.triangle) * sums.triangle)

@@ -1,0 +1,198 @@
+"""Fits to data that comes in chunks: one pass, and memory that ignores the number of points.
+
+A low-rank solver that can do so compresses what it has seen to r² numbers for r columns. More data
+changes them, and any λ is solved for from them.
+"""
+
+import abc
+import contextlib
+import reprlib
+from collections.abc import Iterable, Iterator
+from typing import Generic, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Int, Num
+
+from hamkernel import _require as require
+from hamkernel._machine.devices import rows_of, split
+from hamkernel._show import call, text
+from hamkernel._solvers.cholesky import AbstractSolver, Learned
+from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+
+Fit = TypeVar("Fit", bound="AbstractStreamingFit")
+
+
+class AbstractStreamingFit(eqx.Module, Generic[Learned]):
+    """A fit to the data added so far, made by `solver.start`.
+
+    It has a fixed size. `add` returns a new one, and `field` solves for any λ:
+
+        model = solver.start(K, X, 1e-4).add(X, Y)
+        field = model.field()
+        better = model.add(X_new, Y_new).field()
+
+    It is a PyTree, so that `jax.tree_util` and `equinox.tree_serialise_leaves` keep it for later.
+    """
+
+    kernel: eqx.AbstractVar[AbstractMatrixKernel]
+    count: eqx.AbstractVar[Int[Array, ""]]
+    regularization: eqx.AbstractVar[Float[Array, ""]]
+    dimension: eqx.AbstractVar[int]
+
+    def __repr__(self) -> str:
+        name, kernel = type(self).__name__, text(self.kernel)
+        return call(name, [f"kernel={kernel}", self._size(), f"added={text(self.count)}"])
+
+    @property
+    def dtype(self) -> jnp.dtype:
+        """That of the fit, and of its fields."""
+        return self.regularization.dtype
+
+    @abc.abstractmethod
+    def _size(self) -> str:
+        """What carries the field, as it is printed."""
+
+    @abc.abstractmethod
+    def _added(self: Fit, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> Fit:
+        """`add` for data that has been checked."""
+
+    @abc.abstractmethod
+    def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> Learned:
+        """`field` for a λ that has been checked, and the number of points, which is not 0."""
+
+    def add(self: Fit, X: Num[ArrayLike, "N n"], Y: Num[ArrayLike, "N n"]) -> Fit:
+        """The fit with more data.
+
+        Args:
+            X: states, shape (N, n).
+            Y: measured velocities, shape (N, n).
+
+        Raises:
+            ValueError: a shape does not fit, or the data is not finite. TypeError: its dtype, or
+                it has more digits than the fit.
+        """
+        X, Y = require.data(X, Y)
+        if np.promote_types(X.dtype, self.dtype) != self.dtype:
+            raise TypeError(
+                f"the data is {X.dtype} and the fit {self.dtype}, the dtype of the sample that it "
+                f"was started with: start it with a sample in {X.dtype}, or cast the data."
+            )
+        if X.shape[1] != self.dimension:
+            raise ValueError(f"the data has {X.shape[1]} coordinates and the fit {self.dimension}.")
+        return self._added(X.astype(self.dtype), Y.astype(self.dtype))
+
+    def field(self, regularization: ArrayLike | None = None) -> Learned:
+        """The field learned from all data added so far; O(r³), and no pass over the data.
+
+        Args:
+            regularization: λ > 0, as in `hk.fit`, with N the number of points added so far; that
+                of `start` if None.
+
+        Raises:
+            ValueError: λ is not positive, or no data was added.
+        """
+        if regularization is None:
+            regularization = self.regularization
+        regularization = require.ridge(regularization, self.dtype)
+        none = require.on_host(self.count) == 0
+        count = require.value(
+            self.count, none, "no data yet: add(X, Y) before asking for the field."
+        )
+        return self._solved(count, regularization)
+
+
+class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned]):
+    """A solver whose fit to all the data can be made from chunks of it."""
+
+    @abc.abstractmethod
+    def start(
+        self,
+        K: AbstractMatrixKernel,
+        sample: Num[ArrayLike, "N n"],
+        regularization: ArrayLike = 1e-4,
+    ) -> AbstractStreamingFit[Learned]:
+        """A fit without data yet, to which chunks are added."""
+
+    def fit_chunks(
+        self,
+        K: AbstractMatrixKernel,
+        chunks: Iterable[tuple[Num[ArrayLike, "N n"], Num[ArrayLike, "N n"]]],
+        regularization: ArrayLike = 1e-4,
+        sample: Num[ArrayLike, "S n"] | None = None,
+        progress: bool = False,
+    ) -> Learned:
+        """`hk.fit` to data that comes in chunks, in one pass and with memory for two chunks.
+
+        The field is that of one fit to all the data: to rounding for `RandomFeatures`, and for
+        `Nystrom` where the landmarks are the same (`sample=X`, or its `points`), else within the
+        tolerance. The sums of a stream need a larger λ than one fit, in float32 most of all, and
+        fail where it is too small. If `Nystrom` warns of the truncation, start anew with a
+        `sample` that looks like all of the data. To add data later keep the fit of `start` instead.
+
+        Args:
+            K: a matrix-valued kernel.
+            chunks: pairs (X, Y) of states and velocities, shape (Nᵢ, n) each: a generator, or
+                slices of memory-mapped files. Every new Nᵢ compiles anew: equal ones are fast.
+            regularization: λ > 0, as in `hk.fit`, with N the number of all points.
+            sample: states that look like all of the data, for `start`; the first chunk if None.
+            progress: show a progress bar where the standard error is a terminal.
+
+        Raises:
+            ValueError: there is no chunk, or as `hk.fit` for one of them. TypeError: as `hk.fit`.
+        """
+        from tqdm import tqdm  # so that importing the package does not load it
+
+        if not isinstance(chunks, Iterable):
+            raise TypeError(
+                f"chunks must be an iterable of pairs (X, Y), got {chunks!r}. Call a generator "
+                "function: fit_chunks(K, read(), ...)."
+            )
+        model = None
+        for i, chunk in enumerate(tqdm(chunks, "chunks", disable=None if progress else True)):
+            with _naming(i):
+                if not isinstance(chunk, tuple | list) or len(chunk) != 2:
+                    raise TypeError(
+                        f"a pair (X, Y) is needed, got {reprlib.repr(chunk)}. All of the data in "
+                        "one chunk is [(X, Y)]."
+                    )
+                X, Y = require.data(*chunk)
+            if model is None:
+                model = self.start(K, X if sample is None else sample, regularization)
+            # The next chunk is read while this one is added, and no further ones pile up.
+            jax.block_until_ready(model)
+            with _naming(i):
+                model = model.add(X, Y)
+        if model is None:
+            raise ValueError("fit_chunks needs at least one chunk (X, Y); the iterator was empty.")
+        return model.field()
+
+
+@contextlib.contextmanager
+def _naming(chunk: int) -> Iterator[None]:
+    """Errors say in which chunk they are."""
+    try:
+        yield
+    except (TypeError, ValueError) as error:
+        kind = TypeError if isinstance(error, TypeError) else ValueError
+        raise kind(f"chunk {chunk}, counted from 0: {error}") from error
+
+
+def checked_start(
+    K: AbstractMatrixKernel, sample: Num[ArrayLike, "N n"], regularization: ArrayLike
+) -> tuple[AbstractMatrixKernel, Float[Array, "N n"], Float[Array, ""]]:
+    """The arguments of `start`, if they are what it says."""
+    K = matrix_kernel(K)
+    sample = require.finite(require.points(sample, "sample"), "sample")
+    K.check_dimension(sample.shape[1])
+    require.warn_of_float32(sample)
+    return K, sample, require.ridge(regularization, sample.dtype)
+
+
+def thinned(sample: Float[Array, "N n"], most: int) -> Float[Array, "M n"]:
+    """Every k-th point, at most `most` of them, on every device."""
+    spread = rows_of(sample)
+    some = split(spread, sample)[:: -(-len(sample) // most)]
+    return some if spread is None else spread.whole(some)

@@ -1,0 +1,1 @@
+"""Matrix-valued kernels K = B [∂x ∂zᵀ k] Bᵀ, their sums, odd and even ones."""

@@ -1,0 +1,251 @@
+"""What a matrix-valued kernel is, and what is made of any of them: sums, odd and even kernels."""
+
+import abc
+import reprlib
+from collections.abc import Iterator
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hamkernel import _require as require
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance, common_invariance, one_point
+from hamkernel._show import call, described, joined
+
+
+class AbstractMatrixKernel(eqx.Module):
+    """A positive definite kernel K(x, z) -> (n, n) of fields ℝⁿ -> ℝⁿ."""
+
+    matrix_valued: ClassVar[bool] = True
+    symplectic: eqx.AbstractVar[bool]
+    no_potential: eqx.AbstractVar[str | None]  # why its fields have none; None if they have one
+
+    def __repr__(self) -> str:
+        return described(self)
+
+    @abc.abstractmethod
+    def form(
+        self,
+        x: Float[Array, " n"],
+        u: Float[Array, " n"],
+        z: Float[Array, " n"],
+        v: Float[Array, " n"],
+    ) -> Float[Array, ""]:
+        """uᵀ K(x, z) v for one pair of points."""
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, "n n"]:
+        """The block K(x, z) for one pair of points.
+
+        Raises:
+            ValueError: x or z is no single point, or n is not one that the structure allows.
+        """
+        x, z = require.same_space(one_point(x)[None], one_point(z)[None])
+        x, z = x[0], z[0]
+        self.check_dimension(len(x))
+        basis = jnp.eye(len(x), dtype=x.dtype)
+        columns = jax.vmap(self.form, in_axes=(None, None, None, 0))
+        return jax.vmap(columns, in_axes=(None, 0, None, None))(x, basis, z, basis)
+
+    @abc.abstractmethod
+    def expansion(
+        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
+    ) -> Float[Array, " n"]:
+        """Σⱼ K(x, zⱼ) aⱼ, without the blocks."""
+
+    @abc.abstractmethod
+    def potential(
+        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
+    ) -> Float[Array, ""]:
+        """The potential of `expansion`; AttributeError with `no_potential` if there is none."""
+
+    def check_potential(self) -> None:
+        """AttributeError, with the reason, if the fields have no potential."""
+        if self.no_potential:
+            raise AttributeError(self.no_potential)
+
+    def check_dimension(self, n: int) -> None:
+        """ValueError if fields on ℝⁿ cannot have this structure; by default all can."""
+
+    @abc.abstractmethod
+    def with_parity(self, parity: int) -> "AbstractMatrixKernel":
+        """The kernel of the even (+1) or odd (−1) FIELDS with this structure."""
+
+    @property
+    @abc.abstractmethod
+    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
+        """The scalar kernels that the structure is made from."""
+
+    @property
+    @abc.abstractmethod
+    def invariance(self) -> Invariance:
+        """The transformations of both arguments that leave every block unchanged."""
+
+    def __add__(self, other: Any) -> "Sum":
+        return Sum(self, other) if isinstance(other, AbstractMatrixKernel) else NotImplemented
+
+    def __mul__(self, other: Any) -> Any:
+        raise TypeError(
+            f"a structured kernel is scaled inside: {type(self).__name__}(2.0 * k), and so it is "
+            f"with products, {type(self).__name__}(k1 * k2)."
+        )
+
+    __rmul__ = __mul__
+
+    def __radd__(self, other: Any) -> "AbstractMatrixKernel":
+        return self if isinstance(other, int) and other == 0 else NotImplemented
+
+
+class Sum(AbstractMatrixKernel):
+    """K₁(x, z) + K₂(x, z) + …: fields that are sums of fields with different structures.
+
+    `K1 + K2` makes one with positions; `Sum(conservative=K1, rest=K2)` one with names. After a
+    fit `field.part("rest")` or `field.part(1)` is the part alone.
+
+    Args:
+        terms: matrix-valued kernels; a sum among them is taken apart.
+        named: the same with names.
+
+    Raises:
+        TypeError: a term is no matrix-valued kernel. ValueError: there is no term, two have one
+            name, or one is called regularization, as λ is.
+    """
+
+    terms: tuple[AbstractMatrixKernel, ...]
+    names: tuple[str | None, ...] = eqx.field(static=True)
+
+    def __init__(self, *terms: AbstractMatrixKernel, **named: AbstractMatrixKernel):
+        flat: list[tuple[str | None, AbstractMatrixKernel]] = []
+        for term in terms:
+            is_sum = isinstance(term, Sum)
+            flat += zip(term.names, term.terms, strict=True) if is_sum else [(None, term)]
+        flat += named.items()
+        for _, term in flat:
+            matrix_kernel(term, "a term of a Sum", "Symplectic(k) + CurlFree(k)")
+        names = [name for name, _ in flat if name is not None]
+        if "regularization" in names:
+            raise ValueError("a part cannot be called regularization: tune calls λ so.")
+        if not flat or len(set(names)) < len(names):
+            raise ValueError(f"Sum needs at least one kernel and distinct names, got {names}.")
+        self.terms = tuple(term for _, term in flat)
+        self.names = tuple(name for name, _ in flat)
+
+    def __repr__(self) -> str:
+        if not any(self.names):
+            return joined("+", [repr(K) for K in self.terms])
+        pairs = zip(self.names, self.terms, strict=True)
+        return call("Sum", [f"{name}={K!r}" if name else repr(K) for name, K in pairs])
+
+    def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
+        first, *rest = (K.form(x, u, z, v) for K in self.terms)
+        return sum(rest, start=first)
+
+    def expansion(
+        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
+    ) -> Float[Array, " n"]:
+        first, *rest = (K.expansion(x, Z, A) for K in self.terms)
+        return sum(rest, start=first)
+
+    def potential(
+        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
+    ) -> Float[Array, ""]:
+        self.check_potential()
+        first, *rest = (K.potential(x, Z, A) for K in self.terms)
+        return sum(rest, start=first)
+
+    @property
+    def no_potential(self) -> str | None:
+        structures = list(self._structures())
+        if len(set(structures)) == 1:
+            return self.terms[0].no_potential
+        return (
+            f"the sum of structures {' + '.join(each.__name__ for each in structures)} has no "
+            "single potential. Ask one part for its own: field.part(0).potential(x)."
+        )
+
+    def _structures(self) -> Iterator[type]:
+        """Of all terms, those of named sums among them too."""
+        for K in self.terms:
+            yield from K._structures() if isinstance(K, Sum) else (type(K),)
+
+    @property
+    def symplectic(self) -> bool:
+        return all(K.symplectic for K in self.terms)
+
+    def check_dimension(self, n: int) -> None:
+        for K in self.terms:
+            K.check_dimension(n)
+
+    def with_parity(self, parity: int) -> "Sum":
+        parts = tuple(K.with_parity(parity) for K in self.terms)
+        return eqx.tree_at(lambda s: s.terms, self, parts)
+
+    @property
+    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
+        return tuple(k for K in self.terms for k in K.scalar_kernels)
+
+    @property
+    def invariance(self) -> Invariance:
+        return common_invariance(self.terms)
+
+    def part(self, which: int | str) -> AbstractMatrixKernel:
+        """The term with this position or name; KeyError, with the choices, if there is none."""
+        return self.terms[self.position(which)]
+
+    def position(self, which: int | str) -> int:
+        """The position of the term with this position or name."""
+        named = isinstance(which, str) and which in self.names
+        index: Any = self.names.index(which) if named else which
+        positions = range(len(self.terms))
+        try:
+            return positions[index]
+        except (IndexError, TypeError):
+            names = [name for name in self.names if name is not None]
+            raise KeyError(
+                f"no part {which!r}: this sum has positions 0 to {positions[-1]}"
+                + (f" and the names {names}." if names else ".")
+            ) from None
+
+
+def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
+    """The kernel of the odd fields with the structure of K, f(−x) = −f(x).
+
+    The SCALAR kernel inside is symmetrised: a field B∇u is odd when u is even. Exact for every
+    kernel, also without k(−x, −z) = k(x, z); twice the cost of K where that is known, four times
+    where it is not. A sum is symmetrised part by part.
+
+    Args:
+        K: a structured kernel whose B does not depend on x.
+
+    Raises:
+        TypeError: K is not matrix-valued.
+
+    Source: Smith & Egeland (2023), eq. (odd_symplectic_kernel), there for k(x, z) = g(x − z).
+    """
+    return matrix_kernel(K, "the argument of Odd", "Odd(Symplectic(k))").with_parity(-1)
+
+
+def Even(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
+    """The kernel of the even fields with the structure of K, f(−x) = f(x).
+
+    As `Odd`, with an odd potential: H(−x) = −H(x).
+
+    Raises:
+        TypeError: K is not matrix-valued.
+    """
+    return matrix_kernel(K, "the argument of Even", "Even(Symplectic(k))").with_parity(+1)
+
+
+def matrix_kernel(
+    K: Any,
+    what: str = "K, the first argument,",
+    example: str = "hk.Symplectic(k), hk.CurlFree(k), hk.DivergenceFree(k) or hk.Separable(k)",
+) -> AbstractMatrixKernel:
+    """K, if it is matrix-valued; else a TypeError that says how to make one."""
+    if isinstance(K, AbstractMatrixKernel):
+        return K
+    cure = f"Give a scalar kernel its structure first: {example}."
+    if isinstance(K, type) and issubclass(K, AbstractMatrixKernel):
+        cure = f"That is a class; make a kernel of it, such as hk.{K.__name__}(hk.Gaussian(1.0))."
+    raise TypeError(f"{what} must be a matrix-valued kernel; got {reprlib.repr(K)}. {cure}")

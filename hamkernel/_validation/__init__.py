@@ -1,0 +1,1 @@
+"""Validation losses in closed form."""
