@@ -13,7 +13,8 @@ import pytest
 from data import swings
 
 import hamkernel as hk
-from hamkernel import _fit, _memory
+from hamkernel._machine import memory as _memory
+from hamkernel._solvers import fit as _fit
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.landmarks import choose_landmarks
 from hamkernel._solvers.nystrom import Nystrom

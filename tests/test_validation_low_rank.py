@@ -158,7 +158,7 @@ def test_tuning_with_low_rank_comes_to_the_optimum_of_the_dense_loss(
     X, Y = data(120, seed=2)
     start = hk.Symplectic(hk.Gaussian(0.4))
     with monkeypatch.context() as small:  # too small for the dense loss
-        small.setattr("hamkernel._memory.memory_bytes", lambda: 1_500_000)
+        small.setattr("hamkernel._machine.memory.memory_bytes", lambda: 1_500_000)
         options: Any = {"objective": objective, "starts": 3}
         tuned = hk.tune(start, X, Y, 0.1, 5, solver=SOLVERS[solver], **options)
     dense = hk.tune(start, X, Y, 0.1, 5, **options)
@@ -193,7 +193,7 @@ def test_the_loss_of_few_points_is_that_of_the_low_rank_fit_too():
 
 def test_a_dense_loss_that_does_not_fit_is_refused_before_the_search(monkeypatch):
     X, Y = data(120)
-    monkeypatch.setattr("hamkernel._memory.memory_bytes", lambda: 100_000)
+    monkeypatch.setattr("hamkernel._machine.memory.memory_bytes", lambda: 100_000)
     with pytest.raises(ValueError, match=r"hk.Nystrom\(\)"):
         hk.tune(K, X, Y, 1e-3, 5)
     with pytest.raises(ValueError, match="3 matrices of 240 by 240"):
@@ -203,5 +203,5 @@ def test_a_dense_loss_that_does_not_fit_is_refused_before_the_search(monkeypatch
 @pytest.mark.slow
 def test_what_does_not_fit_densely_is_tuned_with_low_rank(monkeypatch):
     X, Y = data(120)
-    monkeypatch.setattr("hamkernel._memory.memory_bytes", lambda: 100_000)
+    monkeypatch.setattr("hamkernel._machine.memory.memory_bytes", lambda: 100_000)
     assert np.isfinite(hk.tune(K, X, Y, 1e-3, 5, starts=2, solver=hk.Nystrom()).loss)
