@@ -29,17 +29,15 @@ def spread_out(
 ) -> Float[np.ndarray, "starts P"]:
     """The best points of the design that are not neighbours of a better one already taken."""
     reach = 0.25 * design.shape[1] ** 0.5  # of a box of side 1
-    taken, near = [], np.zeros(len(design), bool)
-    for _ in range(starts):
-        near = np.zeros_like(near) if near.all() else near
-        best = int(np.argmin(np.where(near, np.inf, values)))
-        taken.append(best)
-        near |= shares_apart(design, design[best]) < reach
-    return design[taken]
+    order = np.argsort(values, kind="stable")
+    taken: list[int] = []
+    for i in order:
+        if all(shares_apart(design[i], design[j]) >= reach for j in taken):
+            taken.append(i)
+    left = [i for i in order if i not in taken]  # of which the best, where the box is full
+    return design[(taken + left)[:starts]]
 
 
-def shares_apart(
-    u: Float[np.ndarray, "count P"], v: Float[np.ndarray, " P"]
-) -> Float[np.ndarray, " count"]:
-    """Distances in a box of side 1."""
-    return np.linalg.norm(np.sin(u) / 2 - np.sin(v) / 2, axis=1)
+def shares_apart(u: Float[np.ndarray, " P"], v: Float[np.ndarray, " P"]) -> float:
+    """The distance of two points in a box of side 1."""
+    return float(np.linalg.norm(np.sin(u) - np.sin(v)) / 2)
