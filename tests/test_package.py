@@ -22,6 +22,7 @@ ROOMS = [
     {"_kernels"},
     {"_structures"},
     {"_gram"},
+    {"_factors"},
     {"_features", "_checks"},
     {"_fields"},
     {"_solvers"},
