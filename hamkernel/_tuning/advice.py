@@ -57,8 +57,7 @@ def warn_of_few_folds(criterion: SearchCriterion, folds: object) -> None:
 def warn_of_free_scale(space: SearchSpace, criterion: SearchCriterion) -> None:
     """Amplitudes on every term, of which only the ratios to λ count."""
     free = {space.names[i] for i in space.free}
-    logarithmic = criterion.logarithmic and criterion.low_rank is not None
-    if not logarithmic or RIDGE not in free or space.given_ridge is not None:
+    if not criterion.logarithmic or RIDGE not in free or space.given_ridge is not None:
         return
     if _has_amplitude(space.kernel, "", free):
         require.warn(

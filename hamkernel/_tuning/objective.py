@@ -19,10 +19,10 @@ from hamkernel._validation.folds import Folds, Partition
 from hamkernel._validation.losses import (
     cross_validation_loss,
     generalized_cross_validation,
-    generalized_loss,
+    generalized_loss_and_square,
     log_likelihood,
     log_marginal_likelihood,
-    partition_loss,
+    partition_loss_and_square,
 )
 
 Objective = Callable[[AbstractMatrixKernel, Array, Array, Array], Float[Array, ""]]
@@ -45,45 +45,44 @@ class SearchCriterion(eqx.Module):
     logarithmic: bool = eqx.field(static=True)
     own: bool = eqx.field(static=True)  # the caller's, which may need all the data
 
-    def loss(self, K, X, Y, regularization) -> Float[Array, ""]:
-        """The objective, as `tune` reports it."""
+    def loss(self, K, X, Y, regularization) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
+        """The objective, as `tune` reports it, and ‖a‖² of the fit where there is a wall for it."""
         extra = () if self.partition is None else (self.partition,)
         with require.traceable("the objective"):
             value = self.fn(K, X, Y, regularization, *extra)
+        value, square = value if self.logarithmic else (value, None)
         value = require.floating(value, "the value of the objective")
         if jnp.shape(value) != ():
             raise ValueError(
                 f"the objective returned shape {jnp.shape(value)}; one number, shape (), is needed."
             )
-        return value
+        return value, square
 
-    def searched(self, loss, Y, regularization, size) -> Float[Array, ""]:
+    def searched(self, loss, square, Y, size) -> Float[Array, ""]:
         """What the search minimises: the loss in its units, and the wall.
 
         The wall keeps away from fields that rounding makes rough where the loss is still right.
-        The coefficients a of a fit meet Nλ a = y − f, and f(x) = Σ K(x, xⱼ) aⱼ rounds by up to
-        ε tr(G) ‖a‖, of which an adaptive step, or the iteration of an implicit one, sees 1e-2.
-        It is to stay a share √ε of the velocities: ‖a‖ tr(G) √ε ≤ ‖y‖. A validation loss is the
-        square of y − f at points that the fit has not seen, so √(N n loss) stands for Nλ ‖a‖.
-        Beyond the wall the square of the logarithm of what is too much is added: of 18 fields, for
-        polynomial and trigonometric H with noise of 0, 1 and 10 %, all can then be integrated
-        (`tests/benchmarks/tuned_fields.py`). The likelihood has no need of one: its Nλ is the
-        variance of y − f. An objective of the caller's says nothing of y − f.
+        f(x) = Σ K(x, xⱼ) aⱼ rounds by up to ε tr(G) ‖a‖, of which an adaptive step, or the
+        iteration of an implicit one, sees 1e-2. It is to stay a share √ε of the velocities:
+        ‖a‖ tr(G) √ε ≤ ‖y‖. Beyond the wall the square of the logarithm of what is too much is
+        added: of 18 fields, for polynomial and trigonometric H with noise of 0, 1 and 10 %, all can
+        then be integrated (`tests/benchmarks/tuned_fields.py`). The likelihood has no need of one:
+        its Nλ is the variance of y − f = Nλ a. Of an objective of the caller's nothing is known.
 
         Args:
             loss: the value of `loss`, shape ().
+            square: ‖a‖², shape ().
             Y: velocities.
-            regularization: λ, of all points.
-            size: tr(G)/N; None where the caller has said what λ may be.
+            size: tr(G) of all points; None where the caller has said what λ may be.
         """
         value = loss
         if self.logarithmic:
             tiny = jnp.finfo(loss.dtype).tiny
             value = jnp.log(jnp.maximum(loss, tiny))
             if size is not None:
-                relative = value - jnp.log(jnp.maximum(jnp.mean(Y**2), tiny))
+                relative = jnp.maximum(square, tiny) / jnp.maximum(jnp.sum(Y**2), tiny)
                 eps = jnp.log(jnp.finfo(loss.dtype).eps).astype(loss.dtype)
-                beyond = (relative + eps) / 2 + jnp.log(size) - jnp.log(regularization)
+                beyond = (jnp.log(relative) + eps) / 2 + jnp.log(size)
                 value = value + jnp.maximum(beyond, 0) ** 2
         elif not self.own:
             value = value * (2 / Y.size)
@@ -111,9 +110,9 @@ def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> Sear
     partial = jax.tree_util.Partial
     if objective == "cross_validation" or objective is cross_validation_loss:
         partition = Partition(N, folds)
-        return SearchCriterion(partial(partition_loss), partition, logarithmic=True, own=False)
+        return SearchCriterion(partial(partition_loss_and_square), partition, logarithmic=True, own=False)
     if objective == "generalized_cross_validation" or objective is generalized_cross_validation:
-        fn = partial(generalized_loss, least_free=LEAST_FREE)
+        fn = partial(generalized_loss_and_square, least_free=LEAST_FREE)
         return SearchCriterion(fn, None, logarithmic=True, own=False)
     if objective == "marginal_likelihood":
         fn = partial(_negative_log_likelihood)

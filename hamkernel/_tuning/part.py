@@ -96,9 +96,11 @@ class SearchObjective(eqx.Module):
 
     def __call__(self, u: Float[Array, " P"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         kernel, regularization, size = self.space.decode(u)
-        loss = self.criterion.loss(kernel, self.X, self.Y, self.thinning * regularization)
-        walled = size if self.space.chooses_ridge else None
-        value = self.criterion.searched(loss, self.Y, regularization, walled)
+        ridge = self.thinning * regularization
+        loss, square = self.criterion.loss(kernel, self.X, self.Y, ridge)
+        # Of noise a is as large at every point as it is of all of them.
+        trace = self.thinning * len(self.X) * size if self.space.chooses_ridge else None
+        value = self.criterion.searched(loss, square, self.Y, trace)
         return value.astype(u.dtype), loss.astype(u.dtype)
 
 

@@ -97,8 +97,8 @@ def space_of(K, X, Y) -> SearchSpace:
 def searched(space, tuned, X, Y, partition) -> jax.Array:
     """The same for what was tuned."""
     criterion = criterion_of("cross_validation", len(X), partition.labels)
-    size = space.size_of_gram(tuned.kernel)
-    return criterion.searched(tuned.loss, Y, tuned.regularization, size)
+    loss, square = criterion.loss(tuned.kernel, X, Y, tuned.regularization)
+    return criterion.searched(loss, square, Y, len(X) * space.size_of_gram(tuned.kernel))
 
 
 def main() -> None:
