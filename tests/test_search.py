@@ -287,6 +287,6 @@ def test_the_wall_is_where_the_coefficients_are_too_large_and_only_where_lambda_
     size = np.linalg.norm(a) * np.trace(G) * np.finfo(float).eps ** 0.5 / np.linalg.norm(Y)
     assert size > 2
     np.testing.assert_allclose(value, np.log(loss) + np.log(size) ** 2, rtol=1e-4)
-    low, high = (float(np.exp(side)) for side in part.objective.space.ridge_box(2.0))
+    low, high = (float(np.exp(side)) for side in part.objective.space.ridge_box(jnp.asarray(2.0)))
     ((value, loss, _),) = whole(hk.Symplectic(k), Y, {"regularization": (low, high)})(u[None])
     np.testing.assert_allclose(value, np.log(loss))

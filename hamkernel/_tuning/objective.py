@@ -110,7 +110,9 @@ def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> Sear
     partial = jax.tree_util.Partial
     if objective == "cross_validation" or objective is cross_validation_loss:
         partition = Partition(N, folds)
-        return SearchCriterion(partial(partition_loss_and_square), partition, logarithmic=True, own=False)
+        return SearchCriterion(
+            partial(partition_loss_and_square), partition, logarithmic=True, own=False
+        )
     if objective == "generalized_cross_validation" or objective is generalized_cross_validation:
         fn = partial(generalized_loss_and_square, least_free=LEAST_FREE)
         return SearchCriterion(fn, None, logarithmic=True, own=False)

@@ -99,9 +99,7 @@ class Search:
         self._descend(part, runs, tolerance, self.max_steps)
         return runs
 
-    def _finished(
-        self, part: Part, ends: list[Run], max_steps: int
-    ) -> tuple[list[Run], list[Run]]:
+    def _finished(self, part: Part, ends: list[Run], max_steps: int) -> tuple[list[Run], list[Run]]:
         """The ends in the order of their losses on these points, the best one finished there.
 
         The last of the ends is the caller's point. The second list has those of them that are worth
