@@ -6,6 +6,7 @@ to all points. The price of a loss grows with the cube of the points, so that th
 most of the time although it looks at two points and takes few steps.
 """
 
+import sys
 from collections.abc import Callable
 
 import numpy as np
@@ -130,12 +131,12 @@ class Search:
                 self._say(part, runs, len(going))
 
     def _say(self, part: Part, runs: list[Run], going: int) -> None:
-        print(
+        sys.stdout.write(
             f"tune: {part.points} of {len(self.X)} points, "
             f"step {max(run.steps for run in runs)}, {going} of {len(runs)} runs, "
-            f"best loss {best(runs).loss:.6g}",
-            flush=True,
+            f"best loss {best(runs).loss:.6g}\n"
         )
+        sys.stdout.flush()
 
     def _warn_of_waiting(self, seconds: float, cure: str) -> None:
         if seconds > _LONG:
