@@ -166,13 +166,6 @@ def back_substituted(U: Float[Array, "S n n"], b: Float[Array, "S n"]) -> Float[
     return jnp.stack(out, axis=1)
 
 
-@eqx.filter_jit
-def represented(K, S, field) -> Float[Array, " q"]:
-    """The weights of the field of least norm with the values of `field` at the landmarks."""
-    values = jax.vmap(field)(S).reshape(-1)
-    return whitening(K, S).T @ values
-
-
 class Model(NamedTuple):
     """A kernel and the noise, as one vector h of hyperparameters."""
 
@@ -218,7 +211,11 @@ def _best(model: Model, S, rows: Rows, spread, low, high, free, steps):
     def loss(h):
         return _loss(model, jnp.where(free, h, start), S, rows, spread)
 
-    found, value = minimise(loss, start, low, high, steps)
+    # Of log σ a sample of N knows 1/√(2N); a lengthscale or an amplitude is known to some tenths.
+    count = jnp.maximum((rows.counts > 0).sum(axis=(0, 1)), 1).astype(start.dtype)
+    kernel = jnp.full(start.size - count.size, 0.2, start.dtype)
+    sizes = jnp.concatenate([kernel, 1 / jnp.sqrt(2 * count)])
+    found, value = minimise(loss, start, low, high, sizes, steps)
     return jnp.where(free & (value < HUGE), found, start), value
 
 

@@ -20,7 +20,6 @@ from hamkernel._trajectories.evidence import (
     Solution,
     losses,
     most_likely,
-    represented,
     solved,
     whitening,
 )
@@ -77,7 +76,7 @@ class Task(NamedTuple):
 def begin(task: Task, model: Model, design: np.ndarray) -> tuple[Current, np.ndarray]:
     """INT: one closed form along the smoothed runs; and which runs it explains."""
     runs = task.data.runs
-    pieces = cuts(runs, LONG)
+    pieces = cuts(runs, SHORT)
     segments = segmented(runs, pieces, [run.path for run in runs])
     real = np.arange(len(segments.starts)) < len(pieces)
     rows = smooth_rows(task.data, pieces, segments, task.mean, real)
@@ -102,8 +101,9 @@ def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, di
     rows = rows_along(now.field, before.path, segments, jnp.asarray(good))
     model, loss = most_likely(now.model, task.S, rows, task.spread, task.box, _SEARCH)
     found = solved(model.kernel, model.log_noise, task.S, rows, task.spread)
-    learned = Expansion(now.field.kernel, now.field.points, now.field.coefficients, None)
-    old = represented(model.kernel, task.S, learned)
+    # The current field in the new basis, by what it says of the same rows.
+    known = rows._replace(target=rows.along, displaced=jnp.zeros_like(rows.displaced))
+    old = solved(model.kernel, model.log_noise, task.S, known, task.spread).weights
     T = _whitening(model.kernel, task.S)
 
     def objective(weights, starts):

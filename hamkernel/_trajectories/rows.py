@@ -47,6 +47,7 @@ class Rows(NamedTuple):
         weights: Γ, shape (S, L, 3, n, n).
         tangent: Φ at the samples, shape (S, L + 1, n, n).
         target: x − x̂ + ô, shape (S, L + 1, n).
+        along: ô, what the rows would be if x̂ were right, the same shape.
         counts: those of the segments, zero on what was dropped.
         displaced: where the prior of the start has its middle, relative to x̂, shape (S, n).
     """
@@ -56,6 +57,7 @@ class Rows(NamedTuple):
     weights: Float[Array, "S L 3 n n"]
     tangent: Float[Array, "S L+1 n n"]
     target: Float[Array, "S L+1 n"]
+    along: Float[Array, "S L+1 n"]
     counts: Float[Array, "S L+1 n"]
     displaced: Float[Array, "S n"]
 
@@ -129,6 +131,7 @@ def linearised(
         weights=weights,
         tangent=tangents(across),
         target=segments.measured - x + offset,
+        along=offset,
         counts=jnp.where(keep, segments.counts, jnp.zeros_like(segments.counts)),
         displaced=_where(good, segments.starts - x[:, 0]),
     )
