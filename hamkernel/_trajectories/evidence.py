@@ -76,15 +76,15 @@ def projected(
     M = jnp.concatenate([(W[..., None] * M).reshape(size, -1, q), none], axis=1)
     prior = jnp.broadcast_to(jnp.diag(1 / spread), (size, n, n))
     P = jnp.concatenate([(W[..., None] * rows.tangent).reshape(size, -1, n), prior], axis=1)
-    r = jnp.concatenate([(W * rows.target).reshape(size, -1), rows.displaced / spread[None]], axis=1)
+    r = jnp.concatenate(
+        [(W * rows.target).reshape(size, -1), rows.displaced / spread[None]], axis=1
+    )
     Q, U = orthonormal(P)
     QM, Qr = jnp.einsum("sdn,sdq->snq", Q, M), jnp.einsum("sdn,sd->sn", Q, r)
     M = M - jnp.einsum("sdn,snq->sdq", Q, QM)
     r = r - jnp.einsum("sdn,sn->sd", Q, Qr)
     seen = (rows.counts > 0).astype(M.dtype)
-    log_det = jnp.log(jnp.diagonal(U, axis1=1, axis2=2)).sum() + (
-        seen.sum(axis=(0, 1)) @ log_noise
-    )
+    log_det = jnp.log(jnp.diagonal(U, axis1=1, axis2=2)).sum() + (seen.sum(axis=(0, 1)) @ log_noise)
     return Projected(M.reshape(-1, q), r.reshape(-1), log_det, T, (QM, Qr, U))
 
 
@@ -219,9 +219,7 @@ def _best(model: Model, S, rows: Rows, spread, low, high, free, steps):
     return jnp.where(free & (value < HUGE), found, start), value
 
 
-def most_likely(
-    model: Model, S, rows: Rows, spread, box: Box, steps: int
-) -> tuple[Model, float]:
+def most_likely(model: Model, S, rows: Rows, spread, box: Box, steps: int) -> tuple[Model, float]:
     """The model whose rows are the most likely, by BFGS from this one, and −log p there."""
     if not box.free.any():
         return model, float(losses(model, model.flat[None], S, rows, spread)[0])

@@ -51,9 +51,7 @@ class Path(NamedTuple):
     across: Float[Array, "S L n n"]
 
 
-def steps_for(
-    spans: Float[np.ndarray, "S L"], stiffness: float
-) -> Int[np.ndarray, " L"]:
+def steps_for(spans: Float[np.ndarray, "S L"], stiffness: float) -> Int[np.ndarray, " L"]:
     """Runge-Kutta steps between two nodes, for intervals of these lengths and this ‖Df‖."""
     needed = np.ceil(spans.max(axis=0) * _PIECES.max() * stiffness / _REACH)
     return np.clip(np.nan_to_num(needed, nan=1.0), 1, _MOST).astype(int)

@@ -39,9 +39,7 @@ def padded(times: Sequence[np.ndarray], states: Sequence[np.ndarray], least: int
     R = half_octave(len(times))
     T = max(power_of_two(max(len(t) for t in times)), least)
     n = states[0].shape[1]
-    out = Padded(
-        np.zeros((R, T)), np.zeros((R, T, n)), np.zeros((R, T, n), bool), np.zeros(R, int)
-    )
+    out = Padded(np.zeros((R, T)), np.zeros((R, T, n)), np.zeros((R, T, n), bool), np.zeros(R, int))
     for r, (t, x) in enumerate(zip(times, states, strict=True)):
         out.times[r] = t[-1] - t[0]
         out.times[r, : len(t)] = t - t[0]

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hamkernel import _require as require
 from hamkernel._trajectories.flow import NODES
@@ -56,18 +56,20 @@ class Prepared(NamedTuple):
         runs: the condensed runs.
         noise: that of each coordinate as smoothing finds it, NaN where never measured.
         scale: the standard deviation of each coordinate, shape (n,).
+        usable: which runs look like the others, shape (R,).
     """
 
     runs: list[Run]
     noise: Float[np.ndarray, " n"]
     scale: Float[np.ndarray, " n"]
+    usable: Bool[np.ndarray, " R"]
 
 
 def prepared(runs: Runs, mean: Callable[[Array], Array] | None) -> Prepared:
     """Condense, smooth and complete the runs; `mean` fills in what was never measured."""
     times, states = runs.on_host()
     times = [t - t[0] for t in times]
-    found = _robust_processes(times, states)
+    found, usable = _robust_processes(times, states)
     counts = [np.isfinite(x).astype(float) for x in states]
     lengths = [c.lengthscale for c in found if np.isfinite(c.process.log_amplitude)]
     block = _DENSE * min(lengths, default=np.inf)
@@ -82,23 +84,25 @@ def prepared(runs: Runs, mean: Callable[[Array], Array] | None) -> Prepared:
     if not all(c.seen for c in found) or mean is not None:
         path_runs = [_completed(run, mean) for run in path_runs]
     noise = np.array([c.noise if c.seen else np.nan for c in found])
-    scale = np.concatenate([run.path for run in path_runs]).std(axis=0)
-    return Prepared(path_runs, noise, np.where(scale > 0, scale, 1.0))
+    good = [run.path for run, use in zip(path_runs, usable, strict=True) if use]
+    scale = np.concatenate(good).std(axis=0)
+    return Prepared(path_runs, noise, np.where(scale > 0, scale, 1.0), usable)
 
 
-def _robust_processes(times, states) -> list[Coordinate]:
+def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:
     """The processes, without runs that are five times as far from them as half of the others."""
     found = processes(times, states)
     if len(times) < 3:
-        return found
+        return found, np.ones(len(times), bool)
     paths = smoothed(found, times, states)
     far = np.array(
         [np.sqrt(np.nanmean((x - paths.value[r, : len(x)]) ** 2)) for r, x in enumerate(states)]
     )
-    kept = [r for r in range(len(times)) if not far[r] > 5 * np.nanmedian(far)]
-    if len(kept) == len(times):
-        return found
-    return processes([times[r] for r in kept], [states[r] for r in kept])
+    usable = ~(far > 5 * np.nanmedian(far))
+    if usable.all():
+        return found, usable
+    chosen = np.flatnonzero(usable)
+    return processes([times[r] for r in chosen], [states[r] for r in chosen]), usable
 
 
 def _condensed(t, x, path, block: float):
@@ -165,9 +169,7 @@ def _completed(run: Run, mean: Callable[[Array], Array] | None) -> Run:
         gradient = np.gradient(there[:, c], at_nodes) if len(at_nodes) > 1 else 0.0
         found_slopes[:, c] = gradient
     shape = run.nodes.shape
-    return run._replace(
-        path=path, nodes=there.reshape(shape), slopes=found_slopes.reshape(shape)
-    )
+    return run._replace(path=path, nodes=there.reshape(shape), slopes=found_slopes.reshape(shape))
 
 
 @eqx.filter_jit

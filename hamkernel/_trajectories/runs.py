@@ -49,7 +49,8 @@ class Runs(eqx.Module):
         _check_counts(times, states, inputs)
         self.times = tuple(_times(t, r) for r, t in enumerate(times))
         self.states = tuple(
-            _rows(x, t, r, "states") for r, (x, t) in enumerate(zip(states, self.times, strict=True))
+            _rows(x, t, r, "states")
+            for r, (x, t) in enumerate(zip(states, self.times, strict=True))
         )
         self.inputs = None
         if inputs is not None:
@@ -138,7 +139,9 @@ def _times(t: Any, run: int) -> Float[Array, " T"]:
         )
     seen = np.asarray(t)
     if not np.isfinite(seen).all():
-        raise ValueError(f"times[{run}] contains NaN or inf at {np.flatnonzero(~np.isfinite(seen))[0]}.")
+        raise ValueError(
+            f"times[{run}] contains NaN or inf at {np.flatnonzero(~np.isfinite(seen))[0]}."
+        )
     back = np.flatnonzero(np.diff(seen) <= 0)
     if back.size:
         i = int(back[0])
@@ -209,7 +212,9 @@ def _warn_of_oddities(times: tuple[Array, ...], states: tuple[Array, ...]) -> No
             "run in two there if the system was moved meanwhile."
         )
     if still:
-        require.warn(f"constant in all runs: coordinate {_some(still)}. Leave it out of the states.")
+        require.warn(
+            f"constant in all runs: coordinate {_some(still)}. Leave it out of the states."
+        )
 
 
 def _some(names: list[str]) -> str:

@@ -121,15 +121,18 @@ def shot(
         return (best, jnp.minimum(squares, least), new, mu), None
 
     # The first step goes nowhere: it finds the way from the given starts.
-    begin = starts, jnp.full(S, jnp.inf, starts.dtype), jnp.zeros_like(starts), jnp.zeros_like(starts[:, 0])
+    begin = (
+        starts,
+        jnp.full(S, jnp.inf, starts.dtype),
+        jnp.zeros_like(starts),
+        jnp.zeros_like(starts[:, 0]),
+    )
     (best, _, _, _), _ = jax.lax.scan(step, begin, length=rounds + 1)
     path, _, squares = at(best)
     return Shot(best, path, squares)
 
 
-def trusted(
-    found: Shot, segments: Segments, noise_free: bool = False
-) -> Bool[np.ndarray, " S"]:
+def trusted(found: Shot, segments: Segments, noise_free: bool = False) -> Bool[np.ndarray, " S"]:
     """Which segments the field explains well enough to learn from them."""
     squares = np.asarray(found.squares)
     samples = np.asarray(segments.counts > 0).sum(axis=(1, 2))

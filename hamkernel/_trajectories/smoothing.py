@@ -102,7 +102,9 @@ def _found(steps, y, seen, low, high) -> Float[Array, "3"]:
     values = jax.lax.map(loss, design, batch_size=12)
     values = jnp.where(jnp.isfinite(values), values, jnp.inf)
     count = jnp.maximum(seen.sum(), 1).astype(y.dtype)
-    sizes = jnp.stack([jnp.full_like(count, 0.2), jnp.full_like(count, 0.1), 1 / jnp.sqrt(2 * count)])
+    sizes = jnp.stack(
+        [jnp.full_like(count, 0.2), jnp.full_like(count, 0.1), 1 / jnp.sqrt(2 * count)]
+    )
     return minimise(loss, design[jnp.argmin(values)], low, high, sizes, steps=40)[0]
 
 

@@ -47,8 +47,9 @@ def _has_amplitude(k: object) -> bool:
 def sampled(data: Prepared) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]]:
     """States and velocities of the smoothed runs at some of their nodes."""
     n = len(data.scale)
-    X = np.concatenate([run.nodes.reshape(-1, n) for run in data.runs])
-    Y = np.concatenate([run.slopes.reshape(-1, n) for run in data.runs])
+    runs = [run for run, use in zip(data.runs, data.usable, strict=True) if use]
+    X = np.concatenate([run.nodes.reshape(-1, n) for run in runs])
+    Y = np.concatenate([run.slopes.reshape(-1, n) for run in runs])
     chosen = np.unique(np.linspace(0, len(X) - 1, min(len(X), _POINTS)).round().astype(int))
     return X[chosen], Y[chosen]
 
@@ -87,19 +88,21 @@ def box_of(
     size = len(start) - len(scale)
     low = np.concatenate([*(p.low.ravel() for p in leaves), np.log(1e-7 * scale)])
     high = np.concatenate([*(p.high.ravel() for p in leaves), np.log(2 * scale)])
-    low[:size], high[:size] = np.minimum(low[:size], start[:size]), np.maximum(high[:size], start[:size])
+    low[:size] = np.minimum(low[:size], start[:size])
+    high[:size] = np.maximum(high[:size], start[:size])
     free = np.concatenate([np.ones(size, bool), moves])
-    names = [(p.name, p.low.size) for p in leaves]
-    flags = np.concatenate([np.repeat([n.endswith("lengthscale") for n, _ in names], [s for _, s in names]).astype(bool), np.zeros(len(scale), bool)]) if names else np.zeros(len(start), bool)
-    scales = np.concatenate([np.repeat([n.endswith("scale") and not n.endswith("lengthscale") for n, _ in names], [s for _, s in names]).astype(bool), np.zeros(len(scale), bool)]) if names else flags
+    names = [p.name for p in leaves for _ in range(p.low.size)]
+    none = np.zeros(len(scale), bool)
+    lengths = np.append([name.endswith("lengthscale") for name in names], none).astype(bool)
+    scales = np.append([name.split(".")[-1] == "scale" for name in names], none).astype(bool)
     extent = np.log(np.linalg.norm(np.ptp(X, axis=0)))
     design = [start]
     for shift in (None, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0):
         point = start.copy()
         if shift is not None:
-            if not flags.any():
+            if not lengths.any():
                 continue
-            point[flags] = np.clip(extent - 0.7 + shift, low[flags], high[flags])
+            point[lengths] = np.clip(extent - 0.7 + shift, low[lengths], high[lengths])
         design.append(_amplified(model, point, scales, X, Y))
     return Box(low, high, free), np.clip(np.array(design), low, high)
 
