@@ -3,7 +3,7 @@
 Where things are, in the order of the data; a folder imports from itself and those above it:
 
     _kernels      scalar kernels k(x, z), and any callable as one
-    _structures   matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, odd and even ones
+    _structures   matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, symmetries; `poisson` has tensors
     _gram         the Gram: dense, as an operator, and its derivatives
     _features     random Fourier features
     _checks       the test of a kernel
@@ -23,7 +23,7 @@ devices, the memory and the threads.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from hamkernel import systems
+from hamkernel import poisson, systems
 from hamkernel._checks.kernel import check_kernel
 from hamkernel._dynamics.simulate import simulate
 from hamkernel._fields.base import KernelField, SolverInfo
@@ -39,8 +39,11 @@ from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.fit import fit
 from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
 from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
-from hamkernel._structures.base import Even, Odd, Sum
+from hamkernel._structures.base import Sum
 from hamkernel._structures.operators import CurlFree, DivergenceFree, Separable, Symplectic
+from hamkernel._structures.own import Poisson, Structured
+from hamkernel._structures.port_hamiltonian import PortHamiltonian
+from hamkernel._structures.symmetry import Even, Invariant, Odd, Reversible
 from hamkernel._tuning.tune import Tuned, tune
 from hamkernel._validation.losses import (
     cross_validation_loss,
@@ -69,8 +72,14 @@ __all__ = [  # noqa: RUF022 - in reading order
     "CurlFree",
     "DivergenceFree",
     "Symplectic",
+    "PortHamiltonian",
+    "Poisson",
+    "Structured",
+    "poisson",
     "Odd",
     "Even",
+    "Reversible",
+    "Invariant",
     "Sum",
     # Learning.
     "gram",

@@ -20,7 +20,7 @@ ROOMS = [
     {"_require", "_show"},
     {"_machine"},
     {"_kernels"},
-    {"_structures"},
+    {"_structures", "poisson"},
     {"_gram"},
     {"_features", "_checks"},
     {"_fields"},

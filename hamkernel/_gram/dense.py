@@ -37,7 +37,7 @@ def gram(
     K = matrix_kernel(K)
     X = require.points(X, "X")
     X, Z = require.same_space(X, X if Z is None else require.points(Z, "Z"))
-    K.check_dimension(X.shape[1])
+    K.check_points(X)
     X, Z = automatic(X), automatic(Z)
     cure = "hk.gram_operator(K, X, Z) multiplies with it and never forms it."
     refuse_beyond_memory("the Gram", X.size, Z.size, X.dtype, 1, cure)

@@ -62,7 +62,7 @@ def gram_operator(
     X = require.points(X, "X")
     if Z is not None:
         X, Z = require.same_space(X, require.points(Z, "Z"))
-    K.check_dimension(X.shape[1])
+    K.check_points(X)
     X_rows = rows_of(X)
     Z_rows = X_rows if Z is None else rows_of(Z)
     Z = None if Z is None else split(Z_rows, Z)

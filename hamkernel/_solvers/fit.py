@@ -93,7 +93,7 @@ def fit(
     if not (solver is None or isinstance(solver, AbstractSolver)):
         raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
     X, Y = require.data(X, Y)
-    K.check_dimension(X.shape[1])
+    K.check_points(X)
     regularization = require.ridge(regularization, X.dtype)
     require.warn_of_float32(X)
     solver = _default(X) if solver is None else solver

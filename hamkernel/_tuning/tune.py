@@ -155,7 +155,7 @@ def tune(
     _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
     X, Y = given = require.data(X, Y)
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
-    K.check_dimension(X.shape[1])
+    K.check_points(X)
     _warn_of_unequal_sizes(Y)
     _warn_of_constants(K)
     ridge = require.ridge(regularization, X.dtype)
