@@ -63,7 +63,7 @@ def linear_maps(maps: Any) -> tuple[LinearMap, ...]:
             invertible.
     """
     single = callable(maps) or getattr(maps, "ndim", None) == 2
-    given = [maps] if single else maps
+    given: Any = [maps] if single else maps
     if not isinstance(given, Sequence | np.ndarray | jax.Array) or len(given) == 0:
         raise TypeError(
             "maps must be a list of linear maps of the state, (n, n) arrays or functions "

@@ -203,7 +203,9 @@ class Symmetrised(AbstractScalarKernel):
             return inner
         group = self.group(n)
         return tuple(
-            frozenset(j for g in group for i in support for j in np.flatnonzero(g.matrix[i]))
+            frozenset(
+                j for g in group for i in support for j in np.flatnonzero(g.matrix[i]).tolist()
+            )
             for support in inner
         )
 

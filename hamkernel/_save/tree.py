@@ -26,6 +26,7 @@ from jaxtyping import jaxtyped
 
 from hamkernel._features.waves import (
     DivergenceFreeFeatures,
+    GroupWaves,
     PotentialFeatures,
     SeparableFeatures,
     SumFeatures,
@@ -49,7 +50,14 @@ CLASSES: dict[str, type[eqx.Module]] = {
     cls.__name__: cls
     for cls in (
         *(KernelField, FeatureField, SolverInfo),
-        *(Waves, PotentialFeatures, DivergenceFreeFeatures, SeparableFeatures, SumFeatures),
+        *(
+            Waves,
+            GroupWaves,
+            PotentialFeatures,
+            DivergenceFreeFeatures,
+            SeparableFeatures,
+            SumFeatures,
+        ),
         *(Separable, CurlFree, DivergenceFree, Symplectic, Sum),
         *(PortHamiltonian, Poisson, Structured),
         *(RigidBodyTensor, LotkaVolterraTensor, ChargedParticleTensor),

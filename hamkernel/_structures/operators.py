@@ -346,10 +346,11 @@ def unfolded(
         return K, Z, A
     group = found.group(n)
     carried = [K.carried(h.matrix) for h in group]
-    if any(each is None for each in carried):
+    known = [T for T in carried if T is not None]
+    if len(known) < len(group):
         return K, Z, A
     images = jnp.concatenate([jax.vmap(h)(Z) for h in group])
-    pairs = zip(group, carried, strict=True)
+    pairs = zip(group, known, strict=True)
     moved = [jax.vmap(h._replace(matrix=h.character * T))(A) for h, T in pairs]
     K = eqx.tree_at(lambda K: K.kernel, K, found.kernel)
     return K, images, jnp.concatenate(moved) / len(group)

@@ -136,7 +136,8 @@ class Driven(eqx.Module):
     def input_matrix(self, x: Num[ArrayLike, " n"]) -> Float[Array, "n m"]:
         """Return G(x), shape (n, m)."""
         x = require.floating(x, "x")
-        G = self.inputs(x) if callable(self.inputs) else self.inputs
+        G: Any = self.inputs
+        G = G(x) if callable(G) else G
         if jnp.ndim(G) != 2 or len(G) != len(x):
             raise ValueError(
                 f"the input matrix has shape {jnp.shape(G)} and the state {x.shape}: (n, m) and "
