@@ -5,6 +5,7 @@ Where things are, in the order of the data; a folder imports from itself and tho
     _kernels      scalar kernels k(x, z), and any callable as one
     _structures   matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, symmetries; `poisson` has tensors
     _gram         the Gram: dense, as an operator, and its derivatives
+    _factors      factors of G + ridge I, dense and of low rank
     _features     random Fourier features
     _checks       the test of a kernel
     _fields       what is learned: f and its potential

@@ -22,6 +22,7 @@ ROOMS = [
     {"_kernels"},
     {"_structures", "poisson"},
     {"_gram"},
+    {"_factors"},
     {"_features", "_checks"},
     {"_fields"},
     {"_solvers"},

@@ -10,6 +10,7 @@ from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, KernelField
 from hamkernel._machine.devices import rows_of
 from hamkernel._machine.memory import dense_bytes, memory_bytes
+from hamkernel._machine.threads import one_blas_thread
 from hamkernel._solvers.cholesky import COPIES, AbstractSolver, Cholesky, Learned
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
@@ -47,6 +48,7 @@ def fit(
 ) -> AbstractField: ...
 
 
+@one_blas_thread
 def fit(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"],
