@@ -28,6 +28,7 @@ from hamkernel import poisson, systems
 from hamkernel._checks.kernel import check_kernel
 from hamkernel._dynamics.simulate import simulate
 from hamkernel._fields.base import KernelField, SolverInfo
+from hamkernel._fields.controlled import ControlledField
 from hamkernel._fields.features import FeatureField
 from hamkernel._gram.dense import gram
 from hamkernel._gram.operator import gram_operator
@@ -41,6 +42,7 @@ from hamkernel._solvers.fit import fit
 from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
 from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
 from hamkernel._structures.base import Sum
+from hamkernel._structures.controlled import Controlled, InputMatrix
 from hamkernel._structures.operators import CurlFree, DivergenceFree, Separable, Symplectic
 from hamkernel._structures.own import Poisson, Structured
 from hamkernel._structures.port_hamiltonian import PortHamiltonian
@@ -81,12 +83,15 @@ __all__ = [  # noqa: RUF022 - in reading order
     "Even",
     "Reversible",
     "Invariant",
+    "Controlled",
+    "InputMatrix",
     "Sum",
     # Learning.
     "gram",
     "fit",
     "KernelField",
     "FeatureField",
+    "ControlledField",
     "LandmarkFit",
     "FeatureFit",
     "SolverInfo",

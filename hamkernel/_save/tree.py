@@ -33,6 +33,7 @@ from hamkernel._features.waves import (
     Waves,
 )
 from hamkernel._fields.base import AbstractField, KernelField, SolverInfo
+from hamkernel._fields.controlled import ControlledField
 from hamkernel._fields.features import FeatureField
 from hamkernel._kernels.base import ScalarProduct, ScalarSum, Scaled, UserKernel
 from hamkernel._kernels.dot_products import Periodic, Polynomial
@@ -40,6 +41,7 @@ from hamkernel._kernels.groups import identity, reflection, time_reversal
 from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._kernels.transforms import Select, Symmetrised, Warp
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.controlled import Constant, Controlled, InputMatrix, KnownMatrix
 from hamkernel._structures.operators import CurlFree, DivergenceFree, Separable, Symplectic
 from hamkernel._structures.own import Poisson, Structured
 from hamkernel._structures.port_hamiltonian import PortHamiltonian
@@ -49,7 +51,7 @@ from hamkernel.poisson import ChargedParticleTensor, LotkaVolterraTensor, RigidB
 CLASSES: dict[str, type[eqx.Module]] = {
     cls.__name__: cls
     for cls in (
-        *(KernelField, FeatureField, SolverInfo),
+        *(KernelField, FeatureField, ControlledField, SolverInfo),
         *(
             Waves,
             GroupWaves,
@@ -60,6 +62,7 @@ CLASSES: dict[str, type[eqx.Module]] = {
         ),
         *(Separable, CurlFree, DivergenceFree, Symplectic, Sum),
         *(PortHamiltonian, Poisson, Structured),
+        *(Controlled, InputMatrix, KnownMatrix, Constant),
         *(RigidBodyTensor, LotkaVolterraTensor, ChargedParticleTensor),
         *(Gaussian, Matern, RationalQuadratic, Polynomial, Periodic),
         *(ScalarSum, ScalarProduct, Scaled, Select, Symmetrised, Warp, UserKernel),

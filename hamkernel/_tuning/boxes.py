@@ -22,6 +22,7 @@ from hamkernel._kernels.dot_products import Periodic
 from hamkernel._kernels.functions import Bound
 from hamkernel._kernels.transforms import Select, Symmetrised, Warp
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.controlled import Controlled
 from hamkernel._structures.port_hamiltonian import PortHamiltonian
 
 
@@ -88,7 +89,7 @@ def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, 
 def _amplitude(K: AbstractMatrixKernel, X: Array, Y: Array) -> float:
     """The factor that gives K(x, x) the size of Y: mean Y² over the mean diagonal."""
     trace = float(gram_trace(K, X))
-    ratio = float(np.mean(np.asarray(Y) ** 2)) * X.size / trace if trace > 0 else 0.0
+    ratio = float(np.mean(np.asarray(Y) ** 2)) * Y.size / trace if trace > 0 else 0.0
     return ratio if np.isfinite(ratio) and ratio > 0 else 1.0
 
 
@@ -96,6 +97,8 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
     """Walk the kernel; X is the data in the coordinates that `node` sees."""
     if isinstance(node, Select):
         X = X[:, list(node.dims)]
+    if isinstance(node, Controlled):  # points are (x, u)
+        X = X[:, : node.outputs(X.shape[1])]
     for key, child in _children(node):
         if eqx.is_inexact_array(child):
             name = keystr((*path, *key)).removeprefix(".")
