@@ -97,7 +97,7 @@ class EqualSteps(diffrax.AbstractSolver):
     With `diffrax.StepTo(ts)` every time in `ts` is the end of a step: nothing is interpolated, and
     memory is that of the saved points. The steps between two times are all of one size, at most
     `dt`, and do not depend on the state. Each long step starts at time 0, so that a small step is
-    not lost in the rounding of a large time; `args` of a field that depends on time is when that is.
+    not lost in the rounding of a large time; the `args` of a field with inputs say when that is.
     """
 
     solver: diffrax.AbstractSolver

@@ -42,19 +42,17 @@ class Driven(eqx.Module):
 
     field: Callable[[Array, Array], Array]
     inputs: Callable[[Array], Any]
+    # Whether t is counted from the last of the saved times and inputs are held from there: the last
+    # stage of a step would otherwise see the next ones.
+    held_from_args: bool = eqx.field(static=True)
 
     def __call__(self, t: Any, x: Float[Array, " n"], args: Any) -> Float[Array, " n"]:
-        return self.field(x, self.at(args + t, x.dtype))
-
-    def at(self, t: Array, dtype: Any) -> Float[Array, " m"]:
-        """u(t) in the dtype of the state."""
-        return require.floating(self.inputs(t), "the value of inputs").astype(dtype)
+        u = self.inputs(args if self.held_from_args else args + t)
+        return self.field(x, require.floating(u, "the value of inputs").astype(x.dtype))
 
 
-def inputs_of(
-    given: Any, ts: Float[Array, " T"], dtype: Any, between: Between
-) -> Callable[[Array], Any]:
-    """u as a function of the caller's time.
+def inputs_of(given: Any, ts: Float[Array, " T"], between: Between) -> Callable[[Array], Any]:
+    """The inputs u as a function of the time; samples are at the times ts.
 
     Raises:
         ValueError: samples are not of shape (T, m), or not finite; `between` is unknown.
@@ -63,7 +61,7 @@ def inputs_of(
     if between not in ("held", "linear"):
         raise ValueError(f"between must be 'held' or 'linear'; got {between!r}.")
     if callable(given):
-        shape = jax.eval_shape(given, jax.ShapeDtypeStruct((), dtype))
+        shape = jax.eval_shape(given, jax.ShapeDtypeStruct((), ts.dtype))
         if len(getattr(shape, "shape", (0, 0))) != 1:
             raise ValueError(
                 f"inputs(t) returns shape {getattr(shape, 'shape', type(shape).__name__)}; one "
@@ -77,8 +75,8 @@ def inputs_of(
             f"inputs has shape {values.shape}; a function t -> (m,) is needed, or samples (T, m) at"
             f" the T = {len(ts)} times ts.{hint}"
         )
-    values = require.finite(values, "inputs").astype(dtype)
-    return Samples(ts.astype(dtype), values, between == "held")
+    values = require.finite(values, "inputs").astype(ts.dtype)
+    return Samples(ts, values, between == "held")
 
 
 def refuse_symplectic(solver: Any) -> None:

@@ -142,8 +142,10 @@ def simulate(
     else:
         if isinstance(solver, AbstractSymplecticSolver):
             refuse_symplectic(solver)
-        start = given[0].astype(x0.dtype)
-        right_hand_side = Driven(field, inputs_of(inputs, given, x0.dtype, between))
+        # Functions get the caller's time, samples have times of their own: those since the start.
+        start = given[0].astype(x0.dtype) if callable(inputs) else jnp.zeros((), x0.dtype)
+        held = dt is not None and between == "held" and not callable(inputs)
+        right_hand_side = Driven(field, inputs_of(inputs, ts, between), held)
         field = _At(right_hand_side, start)
     _check_field(field, x0)
     if max_steps is not None:
@@ -188,8 +190,9 @@ def simulate(
             solver,
             ts[0],
             ts[-1],
-            start,
+            None,
             x0,
+            start,
             saveat=saveat,
             stepsize_controller=controller,
             adjoint=adjoint,
