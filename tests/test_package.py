@@ -21,10 +21,12 @@ ROOMS = [
     {"_machine"},
     {"_kernels"},
     {"_structures"},
+    {"_observations"},
     {"_gram"},
     {"_features", "_checks"},
     {"_fields"},
     {"_solvers"},
+    {"_posterior"},
     {"_validation"},
     {"_tuning"},
     {"_dynamics", "_save", "systems"},
@@ -163,7 +165,7 @@ def test_every_public_name_is_documented(name):
     assert not text.startswith(f"{name}(")
     elsewhere = re.search(r"(As|those\s+of)\s+`", text)  # "Args and errors are those of `fit`."
     made_by_library = name in ("KernelField", "FeatureField", "SolverInfo", "Tuned")
-    made_by_library |= name in ("LandmarkFit", "FeatureFit")
+    made_by_library |= name in ("LandmarkFit", "FeatureFit", "Posterior")
     if callable(thing) and not elsewhere and not made_by_library:
         for parameter in inspect.signature(thing).parameters:
             assert f"{parameter}:" in text, f"{name} does not document {parameter}"
