@@ -7,6 +7,7 @@ so to a field again, whatever was observed.
 """
 
 import abc
+from collections.abc import Iterable
 from typing import ClassVar
 
 import equinox as eqx
@@ -43,6 +44,10 @@ class AbstractBlock(eqx.Module):
     @abc.abstractmethod
     def coefficients(self, c: Float[Array, " D"]) -> Float[Array, "P *n"]:
         """The transpose of `rows`."""
+
+    @abc.abstractmethod
+    def then(self, other: "AbstractBlock") -> "AbstractBlock | None":
+        """One block of these rows and then the others; None if they are of another kind."""
 
 
 class Components(AbstractBlock):
@@ -82,6 +87,19 @@ class Components(AbstractBlock):
             c = jnp.zeros(self.points.size, c.dtype).at[self.kept].set(c)
         return c.reshape(self.points.shape)
 
+    def then(self, other: AbstractBlock) -> "Components | None":
+        if not isinstance(other, Components):
+            return None
+        kept = noise = None
+        if self.kept is not None or other.kept is not None:
+            own, others = (
+                jnp.arange(b.points.size) if b.kept is None else b.kept for b in (self, other)
+            )
+            kept = jnp.concatenate([own, others + self.points.size])
+        if self.noise is not None or other.noise is not None:
+            noise = jnp.concatenate([self.scale, other.scale])
+        return Components(jnp.concatenate([self.points, other.points]), kept, noise)
+
 
 class Combinations(AbstractBlock):
     """Σ_q weights[s, r, q] · f(groups[s, q]), R rows for each of S groups of Q points."""
@@ -115,6 +133,12 @@ class Combinations(AbstractBlock):
         S, R, _, _ = self.weights.shape
         return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(self.points.shape)
 
+    def then(self, other: AbstractBlock) -> "Combinations | None":
+        if not isinstance(other, Combinations) or self.weights.shape[1:] != other.weights.shape[1:]:
+            return None
+        pairs = (self.groups, other.groups), (self.weights, other.weights)
+        return Combinations(*map(jnp.concatenate, pairs))
+
 
 class Values(AbstractBlock):
     """The potential at points; `noise` is that of each, None if it is 1."""
@@ -139,6 +163,23 @@ class Values(AbstractBlock):
 
     def coefficients(self, c: Float[Array, " E"]) -> Float[Array, " E"]:
         return c if self.noise is None else c / self.noise
+
+    def then(self, other: AbstractBlock) -> "Values | None":
+        if not isinstance(other, Values):
+            return None
+        noise = None
+        if self.noise is not None or other.noise is not None:
+            noise = jnp.concatenate([self.scale, other.scale])
+        return Values(jnp.concatenate([self.points, other.points]), noise)
+
+
+def merged(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:
+    """The same rows in fewer blocks, where neighbours are of one kind: there is less to compile."""
+    found: list[AbstractBlock] = []
+    for block in blocks:
+        both = found[-1].then(block) if found else None
+        found = [*found[:-1], both] if both is not None else [*found, block]
+    return tuple(found)
 
 
 def _along(noise: Float[Array, " D"], rows: Float[Array, "D *rest"]) -> Array:

@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
-from hamkernel._observations.blocks import AbstractBlock, Combinations, Components, Values
+from hamkernel._observations.blocks import AbstractBlock, Combinations, Components, Values, merged
 from hamkernel._observations.rows import Rows
 from hamkernel._show import described, joined
 
@@ -292,7 +292,8 @@ def rows_of_data(data: AbstractObservations, beside: Rows | None = None) -> Rows
     dtype = np.result_type(*[block.points.dtype for block in blocks])
     blocks = tuple(_cast(block, dtype) for block in blocks)
     pairs = zip(blocks, targets, strict=True)
-    rows = Rows(blocks, jnp.concatenate([y.astype(dtype) / block.scale for block, y in pairs]))
+    divided = jnp.concatenate([y.astype(dtype) / block.scale for block, y in pairs])
+    rows = Rows(merged(blocks), divided)
     before = 0 if beside is None else len(beside.energies)
     if before + len(rows.energies) == 1:
         raise ValueError(

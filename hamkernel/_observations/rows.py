@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hamkernel._observations.blocks import AbstractBlock
+from hamkernel._observations.blocks import AbstractBlock, merged
 
 
 class Rows(eqx.Module):
@@ -100,7 +100,8 @@ class Rows(eqx.Module):
 
     def joined(self, new: "Rows") -> "Rows":
         """These rows and then the new ones."""
-        return Rows(self.blocks + new.blocks, jnp.concatenate([self.targets, new.targets]))
+        blocks = merged(self.blocks + new.blocks)
+        return Rows(blocks, jnp.concatenate([self.targets, new.targets]))
 
     def beside(self, new: "Rows") -> "Rows":
         """The new rows, after those of these that their contrasts need: the energies, if any."""
@@ -155,12 +156,17 @@ class Rows(eqx.Module):
     def coefficients(
         self, c: Float[Array, " D"]
     ) -> tuple[Float[Array, "P n"], Float[Array, "P n"], Float[Array, "E n"], Float[Array, " E"]]:
-        """Points and coefficients of the field Lᵀc, and those of its values."""
+        """Points and coefficients of the field Lᵀc, and those of its values.
+
+        Of energies alone there is one point of the field, with coefficients of zero.
+        """
         raw = self.uncontrasted(c)
         pairs = [(b, b.coefficients(raw[s])) for b, s in zip(self.blocks, self.slices, strict=True)]
-        empty = jnp.zeros((0, self.dimension), raw.dtype)
-        fields = [(b.points, a) for b, a in pairs if not b.of_values] or [(empty, empty)]
-        values = [(b.points, a) for b, a in pairs if b.of_values] or [(empty, empty[:, 0])]
+        none = self.blocks[0].points[:1]
+        fields = [(b.points, a) for b, a in pairs if not b.of_values]
+        values = [(b.points, a) for b, a in pairs if b.of_values]
+        fields = fields or [(none, jnp.zeros_like(none))]
+        values = values or [(none[:0], jnp.zeros(0, raw.dtype))]
         Z, A = (jnp.concatenate(each) for each in zip(*fields, strict=True))
         S, b = (jnp.concatenate(each) for each in zip(*values, strict=True))
         return Z, A, S, b
