@@ -6,6 +6,7 @@ Where things are, in the order of the data; a folder imports from itself and tho
     _structures   matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, odd and even ones
     _observations what is measured, as rows of linear functionals
     _gram         the Gram: dense, as an operator, and its derivatives
+    _factors      factors of G + ridge I, dense and of low rank
     _features     random Fourier features
     _checks       the test of a kernel
     _fields       what is learned: f and its potential

@@ -23,6 +23,7 @@ ROOMS = [
     {"_structures"},
     {"_observations"},
     {"_gram"},
+    {"_factors"},
     {"_features", "_checks"},
     {"_fields"},
     {"_solvers"},

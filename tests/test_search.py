@@ -14,8 +14,8 @@ from hamkernel._tuning.objective import HUGE, criterion_of
 from hamkernel._tuning.plan import SearchPlan
 from hamkernel._tuning.runs import _design, _spread_out
 from hamkernel._tuning.space import SearchSpace
+from hamkernel._validation.bases import WaveBasis
 from hamkernel._validation.losses import generalized_loss
-from hamkernel._validation.low_rank import WaveBasis, low_rank_generalized_loss
 
 N = 20
 RNG = np.random.default_rng(0)
@@ -210,8 +210,8 @@ def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free
 
     low_rank, dense = free(F @ F.T), free(G)
     for more, judged in ((-1e-6, np.isfinite), (1e-6, np.isinf)):
-        assert judged(low_rank_generalized_loss(waves, K, states, few, ridge, low_rank + more))
-        assert judged(generalized_loss(K, states, few, ridge, dense + more))
+        assert judged(generalized_loss(K, states, few, ridge, waves, low_rank + more))
+        assert judged(generalized_loss(K, states, few, ridge, None, dense + more))
     criterion = criterion_of("generalized_cross_validation", 6, 5)
     assert criterion.value(K, states, few, jnp.asarray(1e-12)) == HUGE
     assert criterion.with_basis(waves).value(K, states, few, jnp.asarray(1.0)) < HUGE

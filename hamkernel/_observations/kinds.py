@@ -268,16 +268,20 @@ class Functionals(AbstractObservations):
         yield Combinations(self.points, self.weights), self.targets
 
 
+def both(X: Any, Y: Any) -> tuple[Any, Any]:
+    """States and velocities, if there are both."""
+    if Y is None:
+        raise TypeError(
+            "with states X the velocities Y are needed, of the same shape (N, n); or observations "
+            f"in the place of both, hk.Velocities(X, Y); got {type(X).__name__} and nothing."
+        )
+    return X, Y
+
+
 def observations(X: Any, Y: Any) -> AbstractObservations:
     """`X` if it is observations, and then there is no Y; else the velocities Y at states X."""
     if not isinstance(X, AbstractObservations):
-        if Y is None:
-            raise TypeError(
-                "with states X the velocities Y are needed, of the same shape (N, n); or "
-                f"observations in the place of both, hk.Velocities(X, Y); got {type(X).__name__} "
-                "and nothing."
-            )
-        return Velocities(*require.data(X, Y))
+        return Velocities(*require.data(*both(X, Y)))
     if Y is not None:
         raise TypeError(
             f"{type(X).__name__} is all of the data, and Y is not needed. Say the regularization "

@@ -20,6 +20,7 @@ from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, potential_of, root
 from hamkernel._kernels.base import Invariance
 from hamkernel._kernels.transforms import parity_removed
+from hamkernel._machine.threads import one_blas_thread
 from hamkernel._observations.blocks import Components, Values
 from hamkernel._observations.kinds import AbstractObservations, observations, rows_of_data
 from hamkernel._show import text
@@ -30,6 +31,7 @@ from hamkernel._solvers.means import Mean, with_mean, without_mean
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 
+@one_blas_thread
 def condition(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,

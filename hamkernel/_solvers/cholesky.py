@@ -6,10 +6,10 @@ from typing import ClassVar, Generic, TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
+from hamkernel._factors.dense import DenseFactor
 from hamkernel._fields.base import AbstractField, KernelField, SolverInfo, root
 from hamkernel._gram.dense import assemble, plus_ridge
 from hamkernel._gram.operator import product
@@ -156,5 +156,7 @@ def solve_positive(
 
     Differentiated implicitly, by one more solve with the same factor.
     """
-    operator = lx.MatrixLinearOperator(plus_ridge(G, ridge), lx.positive_semidefinite_tag)
-    return lx.linear_solve(operator, y, lx.Cholesky(), throw=False).value
+    A = plus_ridge(G, ridge)
+    factor = DenseFactor(jax.lax.stop_gradient(A))
+    solve = jax.lax.custom_linear_solve
+    return solve(lambda x: A @ x, y, lambda _, b: factor.solve(b), symmetric=True)

@@ -17,13 +17,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
+from hamkernel._factors.dense import DenseFactor, cholesky
 from hamkernel._fields.base import AbstractField, KernelField, SolverInfo, root
 from hamkernel._gram.dense import plus_ridge
 from hamkernel._gram.observed import between, gram_of_rows, rows_between
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.rows import Rows
-from hamkernel._solvers.dense_factor import DenseFactor, cholesky
 from hamkernel._structures.base import AbstractMatrixKernel
 
 Own = TypeVar("Own", bound="AbstractConditional")
@@ -87,18 +87,12 @@ class DenseConditional(AbstractConditional):
         return between(self.field.kernel, left, right) - told.T @ other
 
     def _told(self, block: AbstractBlock) -> Float[Array, "D d"]:
-        """R⁻ᵀc, differentiable with respect to what the block looks at."""
-        R = self.factor.R
-        return jax.lax.custom_linear_solve(
-            lambda v: R.T @ v,
-            rows_between(self.field.kernel, self.rows, block),
-            lambda _, b: self.factor.whiten(b),
-            lambda _, b: jax.scipy.linalg.solve_triangular(R, b),
-        )
+        """R⁻ᵀ c."""
+        return self.factor.whiten(rows_between(self.field.kernel, self.rows, block))
 
     def updated(self, new: Rows) -> "DenseConditional":
         factor, c, field = _extended(self, new)
-        field = _solved(field, field.norm, "the rows that were added")
+        field = _solved(field, 0 * field.norm, "the rows that were added")
         return DenseConditional(field, self.rows.joined(new), self.ridge, factor, c)
 
 
@@ -116,8 +110,8 @@ def dense_conditional(
     what = f"conditioning on {rows.size} rows of observations"
     refuse_beyond_memory(what, rows.size, rows.size, rows.targets.dtype, _COPIES, cure)
     ridge = rows.count * regularization
-    factor, c, field = _dense(K, rows, regularization, ridge)
-    field = _solved(field, field.info.relative_residual, "the data", throw)
+    factor, c, field, left = _dense(K, rows, regularization, ridge)
+    field = _solved(field, left, "the data", throw)
     return DenseConditional(field, rows, ridge, factor, c)
 
 
@@ -135,7 +129,7 @@ _SOLVED = 1e-2  # ‖y − (G + σ²I)c‖/‖y‖ up to which it counts as solv
 def _dense(K, rows, regularization, ridge):
     G, y = gram_of_rows(K, rows), rows.y
     A = plus_ridge(G, ridge)
-    factor = DenseFactor(jax.lax.stop_gradient(A))
+    factor = DenseFactor(A)
     c = jax.lax.custom_linear_solve(
         lambda v: A @ v, y, lambda _, b: factor.solve(b), symmetric=True
     )
@@ -144,7 +138,7 @@ def _dense(K, rows, regularization, ridge):
     left = jnp.linalg.norm(left) / jnp.where(scale > 0, scale, jnp.ones_like(scale))
     info = SolverInfo("Cholesky", relative_residual=left)
     residual, norm = rows.residual(ridge * c), root(c @ (G @ c))
-    return factor, c, field_of_rows(K, rows, c, residual, norm, regularization, info)
+    return factor, c, field_of_rows(K, rows, c, residual, norm, regularization, info), left
 
 
 @eqx.filter_jit
@@ -209,6 +203,6 @@ def _solved(field: KernelField, left: Array, of: str, throw: bool = True) -> Ker
     def learned(f):
         return [f.coefficients, f.residual, f.norm]
 
-    failed = ~(require.on_host(left) <= (_SOLVED if left is not field.norm else jnp.inf))
+    failed = ~(require.on_host(left) <= _SOLVED)
     values = require.value(learned(field), failed, message, RuntimeError, throw)
     return eqx.tree_at(learned, field, values)

@@ -10,7 +10,8 @@ from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, KernelField, at_points
 from hamkernel._machine.devices import rows_of
 from hamkernel._machine.memory import dense_bytes, memory_bytes
-from hamkernel._observations.kinds import AbstractObservations, observations, rows_of_data
+from hamkernel._machine.threads import one_blas_thread
+from hamkernel._observations.kinds import AbstractObservations, both, observations, rows_of_data
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers.cholesky import COPIES, AbstractSolver, Cholesky, Learned
 from hamkernel._solvers.conditional import check_potential
@@ -54,6 +55,7 @@ def fit(
 ) -> AbstractField: ...
 
 
+@one_blas_thread
 def fit(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
@@ -112,9 +114,7 @@ def fit(
         solver = default_solver(rows.size, rows.targets.dtype) if solver is None else solver
         field = solver._given(K, without_mean(K, rows, mean), regularization, throw).field
         return with_mean(field, mean)
-    if Y is None:
-        observations(X, Y)  # raises
-    X, Y = require.data(X, Y)
+    X, Y = require.data(*both(X, Y))
     K.check_dimension(X.shape[1])
     regularization = require.ridge(regularization, X.dtype)
     require.warn_of_float32(X)

@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
@@ -14,6 +14,7 @@ from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._validation.bases import AbstractBasis, LandmarkBasis, WaveBasis
 from hamkernel._validation.folds import Folds, Partition
 from hamkernel._validation.losses import (
     cross_validation_loss,
@@ -22,14 +23,6 @@ from hamkernel._validation.losses import (
     log_likelihood,
     log_marginal_likelihood,
     partition_loss,
-)
-from hamkernel._validation.low_rank import (
-    AbstractBasis,
-    LandmarkBasis,
-    WaveBasis,
-    low_rank_generalized_loss,
-    low_rank_log_likelihood,
-    low_rank_partition_loss,
 )
 
 Objective = Callable[[AbstractMatrixKernel, Array, Array, Array], Float[Array, ""]]
@@ -50,15 +43,10 @@ HUGE = 1e30  # stands for an objective that is not finite: BFGS backs away from 
 class SearchCriterion(eqx.Module):
     """The function to minimise. Losses are searched by their logarithm, which has no scale."""
 
-    fn: Callable[..., Float[Array, ""]]
-    low_rank: jax.tree_util.Partial | None  # the same of a low-rank fit, its basis first
+    fn: Any  # a function, or the `Partial` of one of ours
     partition: Partition | None = eqx.field(static=True)
     logarithmic: bool = eqx.field(static=True)
-
-    @property
-    def own(self) -> bool:
-        """Whether it is the caller's, which may need all the data."""
-        return self.low_rank is None
+    own: bool = eqx.field(static=True)  # the caller's, which may need all the data
 
     def value(self, K, X, Y, regularization) -> Float[Array, ""]:
         extra = () if self.partition is None else (self.partition,)
@@ -91,9 +79,8 @@ class SearchCriterion(eqx.Module):
 
     def with_basis(self, basis: AbstractBasis) -> "SearchCriterion":
         """The same criterion of the low-rank fit in this basis."""
-        assert self.low_rank is not None
         # A Partial of a Partial would be another function, to be compiled, for each call of `tune`.
-        fn = jax.tree_util.Partial(self.low_rank.func, basis, **self.low_rank.keywords)
+        fn = jax.tree_util.Partial(self.fn.func, **self.fn.keywords, basis=basis)
         return dataclasses.replace(self, fn=fn)
 
     def on(self, rows: np.ndarray) -> "SearchCriterion":
@@ -111,17 +98,14 @@ def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> Sear
     """
     partial = jax.tree_util.Partial
     if objective == "cross_validation" or objective is cross_validation_loss:
-        losses = partial(partition_loss), partial(low_rank_partition_loss)
-        return SearchCriterion(*losses, Partition(N, folds), logarithmic=True)
+        partition = Partition(N, folds)
+        return SearchCriterion(partial(partition_loss), partition, logarithmic=True, own=False)
     if objective == "generalized_cross_validation" or objective is generalized_cross_validation:
-        losses = (
-            partial(generalized_loss, least_free=LEAST_FREE),
-            partial(low_rank_generalized_loss, least_free=LEAST_FREE),
-        )
-        return SearchCriterion(*losses, None, logarithmic=True)
+        fn = partial(generalized_loss, least_free=LEAST_FREE)
+        return SearchCriterion(fn, None, logarithmic=True, own=False)
     if objective == "marginal_likelihood":
-        losses = partial(_negative_log_likelihood), partial(_negative_low_rank_log_likelihood)
-        return SearchCriterion(*losses, None, logarithmic=False)
+        fn = partial(_negative_log_likelihood)
+        return SearchCriterion(fn, None, logarithmic=False, own=False)
     if objective is log_marginal_likelihood:
         raise TypeError(
             "log_marginal_likelihood is to be large and an objective is to be small: pass "
@@ -139,15 +123,11 @@ def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> Sear
             "an objective is called with (K, X, Y, regularization), by position, and returns one "
             f"number; this one takes ({other})."
         )
-    return SearchCriterion(as_pytree(objective), None, None, logarithmic=False)
+    return SearchCriterion(as_pytree(objective), None, logarithmic=False, own=True)
 
 
-def _negative_log_likelihood(K, X, Y, regularization):
-    return -log_likelihood(K, X, Y, regularization)
-
-
-def _negative_low_rank_log_likelihood(basis, K, X, Y, regularization):
-    return -low_rank_log_likelihood(basis, K, X, Y, regularization)
+def _negative_log_likelihood(K, X, Y, regularization, basis=None):
+    return -log_likelihood(K, X, Y, regularization, basis)
 
 
 def basis_of(solver, K, regularization, X) -> AbstractBasis:

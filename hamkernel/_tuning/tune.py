@@ -25,6 +25,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._machine.devices import on_one_device
+from hamkernel._machine.threads import one_blas_thread
 from hamkernel._show import described
 from hamkernel._solvers.cholesky import AbstractSolver
 from hamkernel._solvers.fit import fit
@@ -72,6 +73,7 @@ class Tuned(eqx.Module):
         return described(self)
 
 
+@one_blas_thread
 def tune(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"],
