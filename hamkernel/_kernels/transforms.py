@@ -2,9 +2,10 @@
 
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -19,6 +20,8 @@ from hamkernel._kernels.base import (
     one_point,
 )
 from hamkernel._kernels.functions import as_pytree
+
+T = TypeVar("T")
 
 
 class Warp(AbstractScalarKernel):
@@ -173,6 +176,18 @@ class Symmetrised(AbstractScalarKernel):
         if self.parity is not None:  # whose maps mix no coordinates
             return self.kernel.supports(n)
         return (frozenset(range(n)),)
+
+
+def without_symmetry(tree: T) -> T:
+    """A kernel, or what holds some, before the terms of odd and even ones cancel: what rounds.
+
+    (k(x, z) − k(−x, z))/2 of a long lengthscale is the small difference of large numbers.
+    """
+
+    def is_mean(node: object) -> bool:
+        return isinstance(node, Symmetrised)
+
+    return jax.tree.map(lambda node: node.kernel if is_mean(node) else node, tree, is_leaf=is_mean)
 
 
 def identity(x: Float[Array, " n"]) -> Float[Array, " n"]:

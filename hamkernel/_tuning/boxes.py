@@ -20,7 +20,7 @@ from hamkernel._gram.dense import trace
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance
 from hamkernel._kernels.dot_products import Periodic
 from hamkernel._kernels.functions import Bound
-from hamkernel._kernels.transforms import Select, Symmetrised, Warp
+from hamkernel._kernels.transforms import Select, Warp, without_symmetry
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 
 
@@ -84,15 +84,8 @@ gram_trace = eqx.filter_jit(trace)
 
 
 def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
-    """The trace of the Gram before the terms of an odd or even kernel cancel: what rounds.
-
-    (k(x, z) − k(−x, z))/2 of a long lengthscale is the small difference of large numbers.
-    """
-
-    def is_mean(node: object) -> bool:
-        return isinstance(node, Symmetrised)
-
-    terms = jax.tree.map(lambda node: node.kernel if is_mean(node) else node, K, is_leaf=is_mean)
+    """The trace of the Gram before the terms of an odd or even kernel cancel: what rounds."""
+    terms = without_symmetry(K)
     trace = gram_trace(terms, X)
     if Invariance.REFLECTION in terms.invariance:
         return trace  # that of the Gram is no larger
