@@ -6,7 +6,7 @@ A = RᵀR by LAPACK, U = R⁻¹ from blocks of columns,
 
 and every quadratic form as ‖R⁻ᵀy‖². C is then positive by construction. A faster inversion, with
 blocks of C itself in place of U, was wrong by a factor of 1e14 at condition 1e13; this one is
-compared with 60 digits from condition 1e2 to 1e14 in `tests/benchmarks/accuracy.py`.
+compared with 100 digits from condition 1e2 to 1e14 in `tests/benchmarks/accuracy.py`.
 
 Source: Du Croz & Higham (1992), IMA J. Numer. Anal. 12, method 2, on the stability of inversions.
 """
