@@ -41,6 +41,7 @@ def test_the_variance_is_the_recipe_of_the_readme():
     np.testing.assert_allclose(POSTERIOR.deviation(INSIDE) ** 2, np.diagonal(expected), atol=1e-10)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("posterior", [POSTERIOR, BOTH], ids=["velocities", "energies"])
 def test_the_covariance_of_energies_differentiated_twice_is_that_of_the_field(posterior):
     def energies(x, z):
@@ -93,7 +94,7 @@ def same(one, other, rtol=SOLVE):
 MEAN = hk.systems.HarmonicOscillator()
 
 
-@pytest.mark.parametrize("mean", [None, MEAN], ids=["", "mean"])
+@pytest.mark.parametrize("mean", [MEAN, pytest.param(None, marks=pytest.mark.slow)])
 def test_an_update_is_a_refit_with_the_same_noise(mean):
     old, new = (hk.Velocities(*data(12)) + ENERGIES, hk.Velocities(*data(5, 7)))
     more = hk.Energies(data(3, 8)[0], np.ones(3))
@@ -129,6 +130,7 @@ def test_landmarks_tell_what_the_dense_posterior_tells_where_they_are():
     same(updated, hk.condition(K, all_data, regularization=RIDGE * 18 / 23, solver=solver), 1e-8)
 
 
+@pytest.mark.slow
 def test_features_tell_what_their_own_kernel_tells(key):
     solver = hk.RandomFeatures(30, key)
     posterior = hk.condition(K, X, Y, RIDGE, solver=solver)
@@ -150,11 +152,18 @@ SOLVERS = {
     "nystrom": hk.Nystrom(tolerance=1e-3),
     "features": hk.RandomFeatures(100, jax.random.key(0)),
 }
+slow = pytest.mark.slow
 
 
-@pytest.mark.few(1)
-@pytest.mark.parametrize("solver", SOLVERS)
-@pytest.mark.parametrize("mean", [None, MEAN], ids=["", "mean"])
+@pytest.mark.parametrize(
+    ("solver", "mean"),
+    [
+        ("dense", MEAN),
+        pytest.param("dense", None, marks=slow),
+        pytest.param("nystrom", MEAN, marks=slow),
+        pytest.param("features", MEAN, marks=slow),
+    ],
+)
 def test_draws_have_the_mean_and_the_covariance_of_the_posterior(solver, mean, key):
     posterior = hk.condition(K, X, Y, RIDGE, solver=SOLVERS[solver], mean=mean)
     points = jnp.asarray([INSIDE, X[0], OUTSIDE])
@@ -179,6 +188,7 @@ def test_draws_have_the_mean_and_the_covariance_of_the_posterior(solver, mean, k
     assert abs(changes.std() / deviation - 1) < 5 / (2 * SAMPLES) ** 0.5
 
 
+@pytest.mark.slow
 def test_draws_without_a_spectrum_are_right_in_the_region(key):
     kernel = hk.Symplectic(hk.Warp(3.0 * hk.Gaussian(1.5), jnp.tanh))
     posterior = hk.condition(kernel, X, Y, RIDGE)

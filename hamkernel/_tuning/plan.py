@@ -12,7 +12,7 @@ tell the residual of noisy data; where they were wrong about it, their bound is 
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -64,7 +64,9 @@ class SearchPlan:
     criterion: SearchCriterion
     X: Float[Array, "N n"]
     Y: Float[Array, "N n"]
-    scattered: tuple[Float[Array, "N n"], Float[Array, "N n"]]  # where the caller has them
+    data: tuple[Any, Any]  # X and Y where the caller has them, or observations and None
+    mean: Any
+    size: float  # of what was measured, its norm
     rows: np.ndarray  # of the subset that the runs are made on
     solver: AbstractSolver | None
     optimiser: optx.AbstractMinimiser
@@ -137,11 +139,11 @@ class SearchPlan:
         if not runs.value[best] < HUGE:
             return None
         kernel, ridge = decode(space, jnp.asarray(runs.u[best]), self.X)
-        field = fit(kernel, *self.scattered, ridge, solver=self.solver, throw=False)
-        misfit = _size(field.residual) / _size(self.scattered[1])
+        field = fit(kernel, *self.data, ridge, solver=self.solver, mean=self.mean, throw=False)
+        misfit = float(field.residual_norm) / self.size
         misfit = misfit if np.isfinite(misfit) else 1.0
         return Found(space, runs, best, kernel, ridge, field, misfit)
 
 
-def _size(values: Array) -> float:
+def size(values: Array) -> float:
     return float(np.maximum(jnp.linalg.norm(values), np.finfo(float).tiny))

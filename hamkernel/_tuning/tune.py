@@ -26,15 +26,17 @@ from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.threads import one_blas_thread
+from hamkernel._observations.kinds import AbstractObservations, as_states, both, observations
 from hamkernel._show import described
 from hamkernel._solvers.cholesky import AbstractSolver
-from hamkernel._solvers.fit import fit
+from hamkernel._solvers.fit import checked_rows, fit
+from hamkernel._solvers.means import Mean, without_mean
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._tuning.boxes import constants
-from hamkernel._tuning.objective import Criterion, Objective, criterion_of
-from hamkernel._tuning.plan import SearchPlan
+from hamkernel._tuning.boxes import constants, typical_velocities
+from hamkernel._tuning.objective import Criterion, Objective, criterion_of, criterion_of_rows
+from hamkernel._tuning.plan import SearchPlan, size
 from hamkernel._tuning.runs import keeping_the_best
 from hamkernel._tuning.space import LOW_RANK_ROUNDINGS, ROUNDINGS, SearchSpace
 from hamkernel._validation.folds import Folds
@@ -76,8 +78,8 @@ class Tuned(eqx.Module):
 @one_blas_thread
 def tune(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
     regularization: ArrayLike = 1e-3,
     folds: Folds = 5,
     *,
@@ -88,6 +90,7 @@ def tune(
     optimiser: optx.AbstractMinimiser | None = None,
     max_steps: int = 64,
     solver: AbstractSolver | None = None,
+    mean: Mean | None = None,
     progress: bool = False,
 ) -> Tuned:
     """Tune every hyperparameter of K, and λ with them, down the gradient of a validation loss.
@@ -103,7 +106,8 @@ def tune(
     Args:
         K: a matrix-valued kernel; every inexact array leaf is a hyperparameter, and no Python
             float is one.
-        X: states, shape (N, n).
+        X: states, shape (N, n); or observations, and then there is no Y. Every run is on all of
+            them, with the dense loss.
         Y: measured velocities, shape (N, n).
         regularization: the first λ.
         folds: as in `cross_validation_loss`; give trajectory labels for data from trajectories.
@@ -127,6 +131,8 @@ def tune(
         solver: how the final field is fitted; see `fit`. With `Nystrom` and `RandomFeatures` the
             loss on all points is that of the low-rank fit, in O(N n r) memory; the landmarks are
             those of the best kernel on the subset, and of the tuned one for the field.
+        mean: what is known already, x (n,) -> (n,), as in `fit`; with it, too, every run is on all
+            data.
         progress: print each step of the default optimiser, through optimistix's own hook (of one
             of yours say verbose=True to itself): the logarithm of a loss, or the objective over
             its first value, and the coordinates u of the search, whose sines go from one end of
@@ -155,20 +161,30 @@ def tune(
     K = matrix_kernel(K)
     frozen = (frozen,) if isinstance(frozen, str) else frozen
     _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
-    X, Y = given = require.data(X, Y)
-    X, Y = on_one_device("X", X), on_one_device("Y", Y)
-    K.check_dimension(X.shape[1])
-    _warn_of_unequal_sizes(Y)
-    _warn_of_constants(K)
-    ridge = require.ridge(regularization, X.dtype)
-    criterion = criterion_of(objective, len(X), folds)
-    low_rank = isinstance(solver, Nystrom | RandomFeatures)
-    roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
-    space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings)
+    X, Y = as_states(X, Y)
     coarse = keeping_the_best(_minimiser(optimiser, progress, _COARSE))
     optimiser = keeping_the_best(_minimiser(optimiser, progress, _BFGS))
-    rows = criterion.coarse_points(X)
-    plan = SearchPlan(criterion, X, Y, given, rows, solver, optimiser, coarse, starts, max_steps)
+    _warn_of_constants(K)
+    low_rank = isinstance(solver, Nystrom | RandomFeatures)
+    roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
+    if isinstance(X, AbstractObservations) or mean is not None:
+        given = observations(X, Y), None
+        rows, ridge, mean = checked_rows(K, *given, regularization, mean)
+        rows = without_mean(K, rows, mean)
+        check_memory(rows.targets, _RUN_COPIES)
+        X, Y, measured = rows.points, typical_velocities(K, rows), rows.measured()
+        criterion = criterion_of_rows(objective, given[0], rows, folds)
+    else:
+        X, Y = given = require.data(*both(X, Y))
+        X, Y = on_one_device("X", X), on_one_device("Y", Y)
+        K.check_dimension(X.shape[1])
+        _warn_of_unequal_sizes(Y)
+        ridge, measured = require.ridge(regularization, X.dtype), Y
+        criterion = criterion_of(objective, len(X), folds)
+    space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings)
+    thin = criterion.coarse_points(X)
+    runs = optimiser, coarse, starts, max_steps
+    plan = SearchPlan(criterion, X, Y, given, mean, size(measured), thin, solver, *runs)
     if plan.thinned and not low_rank:
         check_memory(X, _RUN_COPIES)
     found = plan.carry_out(space)
@@ -180,7 +196,7 @@ def tune(
             "low); an objective of your own that returns NaN."
         )
     if not found.solved:
-        fit(found.kernel, *given, found.regularization, solver=solver)  # raises
+        fit(found.kernel, *given, found.regularization, solver=solver, mean=mean)  # raises
     if not found.space.allows(found.regularization):
         raise ValueError(
             f"no lambda within bounds={{'regularization': ...}} can be solved with in {X.dtype}: "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,18 +18,28 @@ from hamkernel._gram.derivatives import trained
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._machine.threads import one_blas_thread
+from hamkernel._observations.kinds import AbstractObservations, as_states, both
+from hamkernel._observations.rows import Rows
+from hamkernel._solvers.fit import checked_rows
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._validation.bases import AbstractBasis
 from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
 from hamkernel._validation.folds import Folds, Partition
+from hamkernel._validation.observed import (
+    rows_generalized_loss,
+    rows_log_likelihood,
+    rows_partition,
+    rows_partition_loss,
+    rows_residuals,
+)
 
 
 @one_blas_thread
 def cross_validation_loss(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
-    regularization: ArrayLike,
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
+    regularization: ArrayLike = 1e-4,
     folds: Folds = 5,
 ) -> Float[Array, ""]:
     """The mean over folds of the mean squared error of a fit that has not seen the fold.
@@ -39,24 +50,29 @@ def cross_validation_loss(
 
     Args:
         K: a matrix-valued kernel.
-        X: states, shape (N, n).
+        X: states, shape (N, n); or observations, and then there is no Y.
         Y: measured velocities, shape (N, n).
         regularization: λ > 0.
         folds: a number of folds, made of consecutive points as equal in size as possible; "loo"
             for one point per fold; or an integer label for each point, shape (N,), to hold out,
             say, one trajectory at a time. A fold always holds out whole points: leaving out
-            single components would leak their siblings. Labels must be concrete under jit.
+            single components would leak their siblings. Labels must be concrete under jit. Of
+            observations N is the number of all: points, energies, functionals, in their order.
 
     Returns:
-        The loss, in squared units of Y; inf where the matrix is not positive definite to
-        rounding. Differentiable in reverse mode: `jax.jacrev(jax.grad(loss))` is the Hessian, for
-        there is no `jax.jvp`. Vmappable, compiled once per shape and partition. O((N n)³) time,
+        The loss, in squared units of Y, and of observations in those of the rows over their
+        relative noise; inf where the matrix is not positive definite to rounding. Differentiable
+        in reverse mode: `jax.jacrev(jax.grad(loss))` is the Hessian, for there is no `jax.jvp`.
+        Vmappable, compiled once per shape and partition. O((N n)³) time,
         three matrices of (N n)² numbers, with the gradient over K too.
 
     Raises:
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
             matrices that do not fit in memory.
     """
+    X, Y, rows, regularization = _rows(K, X, Y, regularization)
+    if rows is not None:
+        return rows_partition_loss(K, rows, regularization, rows_partition(rows, folds))
     K, X, Y, regularization = _checked(K, X, Y, regularization)
     return partition_loss(K, X, Y, regularization, Partition(len(X), folds))
 
@@ -64,9 +80,9 @@ def cross_validation_loss(
 @one_blas_thread
 def cross_validation_residuals(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
-    regularization: ArrayLike,
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
+    regularization: ArrayLike = 1e-4,
     folds: Folds = 5,
 ) -> Float[Array, "N n"]:
     """The residual yᵢ − f(xᵢ) of each point under the fit that has not seen its fold.
@@ -75,8 +91,13 @@ def cross_validation_residuals(
     squares: with unequal folds not the mean of all squares.
 
     Returns:
-        Shape (N, n), in units of Y; inf where the matrix is not positive definite to rounding.
+        Shape (N, n), in units of Y; of observations one for each row, in its units; inf where the
+        matrix is not positive definite to rounding.
     """
+    X, Y, rows, regularization = _rows(K, X, Y, regularization)
+    if rows is not None:
+        left = rows_residuals(K, rows, regularization, rows_partition(rows, folds))
+        return rows.scale * left
     K, X, Y, regularization = _checked(K, X, Y, regularization)
     return _residuals(K, X, Y, regularization, Partition(len(X), folds))
 
@@ -84,9 +105,9 @@ def cross_validation_residuals(
 @one_blas_thread
 def generalized_cross_validation(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
-    regularization: ArrayLike,
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
+    regularization: ArrayLike = 1e-4,
 ) -> Float[Array, ""]:
     """Generalised cross-validation: the training error over the squared share of free residuals.
 
@@ -96,7 +117,7 @@ def generalized_cross_validation(
 
     Args:
         K: a matrix-valued kernel.
-        X: states, shape (N, n).
+        X: states, shape (N, n); or observations, and then there is no Y.
         Y: measured velocities, shape (N, n).
         regularization: λ > 0.
 
@@ -110,6 +131,9 @@ def generalized_cross_validation(
 
     Source: Golub, Heath & Wahba (1979), Technometrics 21.
     """
+    X, Y, rows, regularization = _rows(K, X, Y, regularization)
+    if rows is not None:
+        return rows_generalized_loss(K, rows, regularization)
     K, X, Y, regularization = _checked(K, X, Y, regularization)
     return generalized_loss(K, X, Y, regularization)
 
@@ -117,9 +141,9 @@ def generalized_cross_validation(
 @one_blas_thread
 def log_marginal_likelihood(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
-    regularization: ArrayLike,
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
+    regularization: ArrayLike = 1e-4,
 ) -> Float[Array, ""]:
     """The log density of Y under f ~ GP(0, K) and independent noise of variance Nλ.
 
@@ -128,7 +152,7 @@ def log_marginal_likelihood(
 
     Args:
         K: a matrix-valued kernel.
-        X: states, shape (N, n).
+        X: states, shape (N, n); or observations, and then there is no Y.
         Y: measured velocities, shape (N, n).
         regularization: λ > 0; the noise variance is Nλ.
 
@@ -142,13 +166,26 @@ def log_marginal_likelihood(
 
     Source: Rasmussen & Williams (2006), eq. 2.30.
     """
+    X, Y, rows, regularization = _rows(K, X, Y, regularization)
+    if rows is not None:
+        return rows_log_likelihood(K, rows, regularization)
     K, X, Y, regularization = _checked(K, X, Y, regularization)
     return log_likelihood(K, X, Y, regularization)
 
 
+def _rows(K, X, Y, regularization) -> tuple[Any, Any, Rows | None, Any]:
+    """X, Y, the rows of observations, and λ; no rows of states X, whose losses are shorter."""
+    X, Y = as_states(X, Y)
+    if not isinstance(X, AbstractObservations):
+        return X, Y, None, regularization
+    rows, regularization, _ = checked_rows(matrix_kernel(K), X, Y, regularization, None)
+    check_memory(rows.targets, LOSS_COPIES)
+    return X, Y, rows, regularization
+
+
 def _checked(K, X, Y, regularization):
     K = matrix_kernel(K)
-    X, Y = require.data(X, Y)
+    X, Y = require.data(*both(X, Y))
     # LAPACK on every device at once was seen to stall, see `_factors/dense.py`.
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
     K.check_dimension(X.shape[1])
@@ -160,9 +197,9 @@ def _checked(K, X, Y, regularization):
 LOSS_COPIES = 3  # matrices of the size of the Gram that a loss holds, with its gradient
 
 
-def check_memory(X: Float[Array, "N n"], copies: int) -> None:
+def check_memory(X: Float[Array, "..."], copies: int) -> None:
     """Refuse a dense loss that does not fit in memory."""
-    what = f"the loss of N = {len(X)} points with n = {X.shape[1]} coordinates"
+    what = f"the loss of {X.size} rows"
     cure = (
         "Use hk.tune(..., solver=hk.Nystrom()) or solver=hk.RandomFeatures(count, key), whose loss "
         "is of low rank too, or a part of the data."
