@@ -459,3 +459,78 @@ def test_observations_are_pytrees_that_cross_jit_and_print():
     expected = hk.fit(K, masked, regularization=RIDGE).coefficients
     np.testing.assert_allclose(field(masked), expected, atol=SOLVE)
     assert re.search(r"Velocities\(.*\+ Energies\(", repr(masked + energies(0)[0]), re.DOTALL)
+
+
+# Losses.
+
+
+def mixed():
+    (v, rows_v, _), (e, rows_e, _) = KINDS["masked_and_noisy"](1), KINDS["noisy_energies"](2)
+    f, rows_f, _ = KINDS["functionals"](3)
+    return v + e + f, Reference(rows_v, rows_e, rows_f), v
+
+
+def test_held_out_rows_are_those_of_refits():
+    data, reference, v = mixed()
+    point = np.concatenate([np.asarray(v.kept) // 2, np.arange(5, 13)])  # of each row
+    folds = np.arange(13) % 3
+    sigma2 = 13 * (1 - 1 / 3) * RIDGE
+    A = reference.matrix(reference.rows, reference.rows) + sigma2 * np.diag(reference.noise**2)
+    expected = np.zeros(len(A))
+    for fold in range(3):
+        out = folds[point] == fold
+        # Generalised least squares with the constant, from the rows that are left.
+        P, y = reference.constant[:, None], reference.targets
+        C = np.linalg.inv(A[~out][:, ~out])
+        constant = np.linalg.solve(P[~out].T @ C @ P[~out], P[~out].T @ C @ y[~out])
+        off = y - P @ constant
+        expected[out] = off[out] - A[out][:, ~out] @ C @ off[~out]
+    residuals = hk.cross_validation_residuals(K, data, regularization=RIDGE, folds=folds)
+    np.testing.assert_allclose(residuals, expected, atol=1e-8)
+    squares = (expected / reference.noise) ** 2
+    loss = np.mean([squares[folds[point] == fold].mean() for fold in range(3)])
+    got = hk.cross_validation_loss(K, data, regularization=RIDGE, folds=folds)
+    np.testing.assert_allclose(got, loss, rtol=1e-8)
+
+
+def test_the_likelihood_and_the_generalised_loss_are_their_closed_forms():
+    data, reference, _ = mixed()
+    sigma2, y, P = 13 * RIDGE, reference.targets, reference.constant
+    A = reference.matrix(reference.rows, reference.rows) + sigma2 * np.diag(reference.noise**2)
+    C = reference.projected(sigma2)
+    # Under a flat prior of the constant.
+    log_det = np.linalg.slogdet(A)[1] + np.log(P @ np.linalg.solve(A, P))
+    density = -0.5 * (y @ C @ y + log_det + (len(y) - 1) * np.log(2 * np.pi))
+    got = hk.log_marginal_likelihood(K, data, regularization=RIDGE)
+    np.testing.assert_allclose(got, density, rtol=1e-9)
+    s = reference.noise
+    D, free = len(y) - 1, np.trace(C * np.outer(s, s))
+    loss = D * np.sum((s * (C @ y)) ** 2) / free**2
+    got = hk.generalized_cross_validation(K, data, regularization=RIDGE)
+    np.testing.assert_allclose(got, loss, rtol=1e-9)
+
+
+def test_losses_of_velocities_are_those_of_x_and_y():
+    data = velocities(0, N=8)[0]
+    for loss in (
+        hk.cross_validation_loss,
+        hk.generalized_cross_validation,
+        hk.log_marginal_likelihood,
+    ):
+        old = loss(K, data.X, data.Y, RIDGE)
+        np.testing.assert_allclose(loss(K, data, regularization=RIDGE), old, rtol=SOLVE)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize(
+    "loss",
+    [hk.cross_validation_loss, hk.generalized_cross_validation, hk.log_marginal_likelihood],
+)
+def test_derivatives_of_losses_of_observations_are_those_of_differences(loss):
+    data, _, _ = mixed()
+
+    def of(h):
+        return loss(hk.Symplectic(h * hk.Gaussian(h)), data, regularization=h * RIDGE)
+
+    at, h = jnp.asarray(1.4), 1e-5
+    np.testing.assert_allclose(jax.grad(of)(at), (of(at + h) - of(at - h)) / (2 * h), rtol=1e-5)

@@ -278,6 +278,13 @@ def both(X: Any, Y: Any) -> tuple[Any, Any]:
     return X, Y
 
 
+def as_states(X: Any, Y: Any) -> tuple[Any, Any]:
+    """X and Y of velocities that were all measured with one noise, for which less is to be done."""
+    if isinstance(X, Velocities) and Y is None and X.kept is None and X.noise is None:
+        return X.X, X.Y
+    return X, Y
+
+
 def observations(X: Any, Y: Any) -> AbstractObservations:
     """`X` if it is observations, and then there is no Y; else the velocities Y at states X."""
     if not isinstance(X, AbstractObservations):

@@ -98,6 +98,10 @@ class Rows(eqx.Module):
         """The same rows of what is left when the rows of something known are taken off."""
         return dataclasses.replace(self, targets=self.targets - known)
 
+    def measured(self) -> Float[Array, " M"]:
+        """The targets in their own units, less the constant that the energies have on average."""
+        return self.scale * self.uncontrasted(self.y)
+
     def joined(self, new: "Rows") -> "Rows":
         """These rows and then the new ones."""
         blocks = merged(self.blocks + new.blocks)

@@ -14,7 +14,7 @@ from typing import TypeVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
 from hamkernel._factors.dense import DenseFactor, cholesky
@@ -24,6 +24,7 @@ from hamkernel._gram.observed import between, gram_of_rows, rows_between
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.rows import Rows
+from hamkernel._solvers.prior import Prior, of_features, prior_draws
 from hamkernel._structures.base import AbstractMatrixKernel
 
 Own = TypeVar("Own", bound="AbstractConditional")
@@ -50,6 +51,10 @@ class AbstractConditional(eqx.Module):
     def updated(self: Own, new: Rows) -> Own:
         """The same given new rows too, with the same σ²."""
 
+    @abc.abstractmethod
+    def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> AbstractField:
+        """Fields drawn given the data, every leaf with a leading axis of `count`."""
+
 
 class FieldAlone(AbstractConditional):
     """Of a solver that keeps no factor."""
@@ -62,6 +67,9 @@ class FieldAlone(AbstractConditional):
         raise TypeError(NO_FACTOR)
 
     def updated(self, new: Rows) -> "FieldAlone":
+        raise TypeError(NO_FACTOR)
+
+    def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> AbstractField:
         raise TypeError(NO_FACTOR)
 
 
@@ -94,6 +102,11 @@ class DenseConditional(AbstractConditional):
         factor, c, field = _extended(self, new)
         field = _solved(field, 0 * field.norm, "the rows that were added")
         return DenseConditional(field, self.rows.joined(new), self.ridge, factor, c)
+
+    def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> KernelField:
+        before, noise = jax.random.split(key)
+        prior = prior_draws(self.field.kernel, self.rows.points, region, before, count)
+        return _corrected(self, prior, noise)
 
 
 def dense_conditional(
@@ -159,6 +172,33 @@ def _extended(old: DenseConditional, new: Rows):
     residual, norm = rows.residual(old.ridge * c), root(c @ (y - old.ridge * c))
     info = SolverInfo("Cholesky")
     return factor, c, field_of_rows(K, rows, c, residual, norm, regularization, info)
+
+
+@eqx.filter_jit
+def _corrected(given: DenseConditional, prior: Prior, key) -> KernelField:
+    """Matheron's rule, for every draw of the prior."""
+    rows, n = given.rows, given.rows.dimension
+    would = prior.rows(rows)  # (D, count)
+    noise = jnp.sqrt(given.ridge) * jax.random.normal(key, would.shape, would.dtype)
+    c = given.factor.solve(rows.y[:, None] - would - noise)
+
+    def one(c, coefficients, basis, w):
+        Z, A, S, b = rows.coefficients(c)
+        return KernelField(
+            kernel=prior.kernel,
+            points=jnp.concatenate([Z, prior.points]),
+            coefficients=jnp.concatenate([A, coefficients]),
+            residual=jnp.zeros((0, n), c.dtype),
+            norm=jnp.full((), jnp.inf, c.dtype),
+            regularization=given.field.regularization,
+            offset=jnp.zeros((), c.dtype),
+            info=SolverInfo("draw"),
+            value_points=S if len(S) else None,
+            value_coefficients=b if len(S) else None,
+            mean=None if basis is None else of_features(prior.kernel, basis, w, n),
+        )
+
+    return jax.vmap(one)(c.T, prior.coefficients, prior.features, prior.weights)
 
 
 def field_of_rows(

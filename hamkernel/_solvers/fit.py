@@ -12,7 +12,13 @@ from hamkernel._fields.controlled import with_inputs
 from hamkernel._machine.devices import rows_of
 from hamkernel._machine.memory import dense_bytes, memory_bytes
 from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.kinds import AbstractObservations, both, observations, rows_of_data
+from hamkernel._observations.kinds import (
+    AbstractObservations,
+    as_states,
+    both,
+    observations,
+    rows_of_data,
+)
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers.cholesky import COPIES, AbstractSolver, Cholesky, Learned
 from hamkernel._solvers.conditional import check_potential
@@ -117,6 +123,7 @@ def fit(
     """
     K = matrix_kernel(K)
     check_solver(solver)
+    X, Y = as_states(X, Y)
     if isinstance(X, AbstractObservations):
         rows, regularization, mean = checked_rows(K, X, Y, regularization, mean)
         solver = default_solver(rows.size, rows.targets.dtype) if solver is None else solver

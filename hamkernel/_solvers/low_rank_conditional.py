@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
 from hamkernel._features.waves import AbstractFeatures
@@ -27,6 +27,7 @@ from hamkernel._observations.rows import Rows
 from hamkernel._solvers.conditional import AbstractConditional, check_potential
 from hamkernel._solvers.landmark_gram import singular, whitening
 from hamkernel._solvers.landmarks import Landmarks
+from hamkernel._solvers.prior import Prior, of_features, prior_draws
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -46,6 +47,16 @@ class AbstractSpan(eqx.Module):
     @abc.abstractmethod
     def field(self, w: Float[Array, " r"], residual: Array, ridge: Array, N: int) -> AbstractField:
         """The function with these weights."""
+
+    @abc.abstractmethod
+    def draws(
+        self,
+        weights: Float[Array, "count r"],
+        rows: Rows,
+        key: Key[Array, ""],
+        region: Float[Array, "2 n"],
+    ) -> AbstractField:
+        """The functions with these weights, and what they leave of the prior, as a batch."""
 
     def of_rows(self, rows: Rows) -> Float[Array, "D r"]:
         """The rows of observations of each function."""
@@ -79,6 +90,35 @@ class LandmarkSpan(AbstractSpan):
             info=info,
         )
 
+    def draws(self, weights, rows, key, region) -> KernelField:
+        count, S = len(weights), self.landmarks.points
+        everywhere = jnp.concatenate([S, rows.points])
+        prior = prior_draws(self.kernel, everywhere, region, key, count)
+        return _on_landmarks(self, weights, prior)
+
+
+@eqx.filter_jit
+def _on_landmarks(span: LandmarkSpan, weights, prior: Prior) -> KernelField:
+    S, T, n = span.landmarks.points, span.T, span.landmarks.points.shape[1]
+    # A draw of the prior less what it is in the span.
+    here = Rows((Components(S),), jnp.zeros(S.size, S.dtype))
+    less = weights - prior.rows(here).T @ T
+
+    def one(w, coefficients, basis, of_basis):
+        return KernelField(
+            kernel=span.kernel,
+            points=jnp.concatenate([S, prior.points]),
+            coefficients=jnp.concatenate([(T @ w).reshape(S.shape), coefficients]),
+            residual=jnp.zeros((0, n), w.dtype),
+            norm=jnp.full((), jnp.inf, w.dtype),
+            regularization=jnp.zeros((), w.dtype),
+            offset=jnp.zeros((), w.dtype),
+            info=SolverInfo("draw"),
+            mean=None if basis is None else of_features(span.kernel, basis, of_basis, n),
+        )
+
+    return jax.vmap(one)(less, prior.coefficients, prior.features, prior.weights)
+
 
 class FeatureSpan(AbstractSpan):
     """Random Fourier features, which stand for a kernel of their own."""
@@ -111,6 +151,12 @@ class FeatureSpan(AbstractSpan):
             info=SolverInfo("RandomFeatures", rank=jnp.asarray(len(w)), residual_norm=left),
         )
 
+    def draws(self, weights, rows, key, region) -> FeatureField:
+        def one(w):
+            return of_features(self.kernel, self.features, w, self.dimension)
+
+        return jax.vmap(one)(weights)
+
 
 class LowRankConditional(AbstractConditional):
     """By R with RᵀR = FᵀF + σ²I; the weights are w = R⁻¹ `rotated`."""
@@ -136,6 +182,12 @@ class LowRankConditional(AbstractConditional):
         own = self.span.of_rows(beside)[-fresh:], rows.y[-fresh:]
         R, rotated = _below(self.R, self.rotated, *own)
         return _conditional(self.span, rows, self.ridge, R, rotated)
+
+    def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> AbstractField:
+        of_weights, rest = jax.random.split(key)
+        z = jax.random.normal(of_weights, (len(self.R), count), self.R.dtype)
+        w = solve_triangular(self.R, self.rotated[:, None] + jnp.sqrt(self.ridge) * z)
+        return self.span.draws(w.T, self.rows, rest, region)
 
 
 def low_rank_conditional(

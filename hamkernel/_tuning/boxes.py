@@ -17,10 +17,12 @@ from jax.tree_util import GetAttrKey, SequenceKey, keystr, tree_flatten_with_pat
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel._gram.dense import trace
+from hamkernel._gram.observed import gram_of_rows
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance
 from hamkernel._kernels.dot_products import Periodic
 from hamkernel._kernels.functions import Bound
 from hamkernel._kernels.transforms import Select, Warp, without_symmetry
+from hamkernel._observations.rows import Rows
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.controlled import Controlled
 from hamkernel._structures.port_hamiltonian import PortHamiltonian
@@ -92,6 +94,17 @@ def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, 
     if Invariance.REFLECTION in terms.invariance:
         return trace  # that of the Gram is no larger
     return jnp.maximum(trace, gram_trace(K, X))
+
+
+def typical_velocities(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, "P n"]:
+    """Velocities of one size at the points of observations, of which K explains as much.
+
+    Their mean square is to the mean diagonal of the Gram of the points as that of the rows is to
+    that of the rows: an amplitude then fits both.
+    """
+    X = rows.points
+    ratio = jnp.sum(rows.y**2) / jnp.trace(gram_of_rows(K, rows))
+    return jnp.full_like(X, jnp.sqrt(ratio * gram_trace(K, X) / X.size))
 
 
 def _amplitude(K: AbstractMatrixKernel, X: Array, Y: Array) -> float:

@@ -12,6 +12,8 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._observations.rows import Rows
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._validation.bases import AbstractBasis, LandmarkBasis, WaveBasis
@@ -23,6 +25,12 @@ from hamkernel._validation.losses import (
     log_likelihood,
     log_marginal_likelihood,
     partition_loss_and_square,
+)
+from hamkernel._validation.observed import (
+    rows_generalized_loss_and_square,
+    rows_log_likelihood,
+    rows_partition,
+    rows_partition_loss_and_square,
 )
 
 Objective = Callable[[AbstractMatrixKernel, Array, Array, Array], Float[Array, ""]]
@@ -137,6 +145,49 @@ def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> Sear
             f"number; this one takes ({other})."
         )
     return SearchCriterion(as_pytree(objective), None, logarithmic=False, own=True)
+
+
+def criterion_of_rows(
+    objective: Criterion | Objective, data: AbstractObservations, rows: Rows, folds: Folds
+) -> SearchCriterion:
+    """The same of observations, for all of them at once: what it is called with is not looked at.
+
+    A function of the caller's is called with (K, data, None, regularization).
+    """
+    named = criterion_of(objective, rows.count, folds)
+    if named.own:
+        fn = jax.tree_util.Partial(_own_of_data, named.fn, data)
+    elif named.partition is not None:
+        fn = jax.tree_util.Partial(
+            _partition_loss_of, rows, partition=_Kept(rows_partition(rows, folds))
+        )
+    elif named.logarithmic:
+        fn = jax.tree_util.Partial(_generalized_loss_of, rows)
+    else:
+        fn = jax.tree_util.Partial(_negative_log_likelihood_of, rows)
+    return SearchCriterion(fn, None, logarithmic=named.logarithmic, own=True)
+
+
+class _Kept(eqx.Module):
+    """A partition as a PyTree without leaves."""
+
+    value: Partition = eqx.field(static=True)
+
+
+def _own_of_data(fn, data, K, X, Y, regularization):
+    return fn(K, data, None, regularization)
+
+
+def _partition_loss_of(rows, K, X, Y, regularization, *, partition):
+    return rows_partition_loss_and_square(K, rows, regularization, partition.value)
+
+
+def _generalized_loss_of(rows, K, X, Y, regularization):
+    return rows_generalized_loss_and_square(K, rows, regularization, LEAST_FREE)
+
+
+def _negative_log_likelihood_of(rows, K, X, Y, regularization):
+    return -rows_log_likelihood(K, rows, regularization)
 
 
 def _negative_log_likelihood(K, X, Y, regularization, basis=None):

@@ -15,6 +15,7 @@ the way along ℓ -> ∞, λ -> 0 until nothing is left of it but noise.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,14 +27,17 @@ from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.threads import one_blas_thread
+from hamkernel._observations.kinds import AbstractObservations, as_states, both, observations
 from hamkernel._show import described
 from hamkernel._solvers.cholesky import AbstractSolver
-from hamkernel._solvers.fit import fit
+from hamkernel._solvers.fit import checked_rows, fit
+from hamkernel._solvers.means import Mean, without_mean
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.controlled import joined_data
 from hamkernel._tuning import advice
+from hamkernel._tuning.boxes import typical_velocities
 from hamkernel._tuning.descent import Run
 from hamkernel._tuning.objective import (
     Criterion,
@@ -41,6 +45,7 @@ from hamkernel._tuning.objective import (
     SearchCriterion,
     basis_of,
     criterion_of,
+    criterion_of_rows,
 )
 from hamkernel._tuning.other_optimisers import checked_optimiser
 from hamkernel._tuning.part import rows_of_parts
@@ -89,8 +94,8 @@ class Tuned(eqx.Module):
 @one_blas_thread
 def tune(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
     regularization: ArrayLike = 1e-3,
     folds: Folds = 5,
     *,
@@ -101,6 +106,7 @@ def tune(
     optimiser: optx.AbstractMinimiser | None = None,
     max_steps: int = 64,
     solver: AbstractSolver | None = None,
+    mean: Mean | None = None,
     progress: bool = False,
     inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Tuned:
@@ -118,7 +124,8 @@ def tune(
     Args:
         K: a matrix-valued kernel; every inexact array leaf is a hyperparameter, and no Python
             float is one.
-        X: states, shape (N, n).
+        X: states, shape (N, n); or observations, and then there is no Y. Every run is on all of
+            them, with the dense loss.
         Y: measured velocities, shape (N, n).
         regularization: the first λ.
         folds: as in `cross_validation_loss`; give trajectory labels for data from trajectories,
@@ -144,6 +151,8 @@ def tune(
         solver: how the final field is fitted; see `fit`. With `Nystrom` and `RandomFeatures` the
             loss on all points is that of the low-rank fit, in O(N n r) memory; the landmarks are
             those of the best kernel on the subset, and of the tuned one for the field.
+        mean: what is known already, x (n,) -> (n,), as in `fit`; with it, too, every run is on all
+            data.
         progress: print a line for each step: on how many points, how many runs go on, and the best
             loss. Of an optimiser of yours say verbose=True to itself.
         inputs: of a `Controlled` kernel, shape (N, m). An objective of your own gets points (x, u)
@@ -177,14 +186,25 @@ def tune(
     _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
     if optimiser is not None:
         optimiser = checked_optimiser(optimiser, progress)
-    K, X, Y = joined_data(K, X, Y, inputs)
-    given = X, Y
-    X, Y = on_one_device("X", X), on_one_device("Y", Y)
-    K.check_points(X)
-    advice.warn_of_unequal_sizes(Y)
     advice.warn_of_constants(K)
-    ridge = require.ridge(regularization, X.dtype)
-    criterion = criterion_of(objective, len(X), folds)
+    X, Y = as_states(X, Y)
+    if isinstance(X, AbstractObservations) or mean is not None:
+        if inputs is not None:
+            raise ValueError("inputs= go with states and velocities (X, Y), and without a mean.")
+        given = observations(X, Y), None
+        rows, ridge, mean = checked_rows(K, *given, regularization, mean)
+        rows = without_mean(K, rows, mean)
+        check_memory(rows.targets, _LOSS_COPIES)
+        X, Y = rows.points, typical_velocities(K, rows)
+        criterion = criterion_of_rows(objective, given[0], rows, folds)
+    else:
+        K, X, Y = joined_data(K, *both(X, Y), inputs)
+        given = X, Y
+        X, Y = on_one_device("X", X), on_one_device("Y", Y)
+        K.check_points(X)
+        advice.warn_of_unequal_sizes(Y)
+        ridge = require.ridge(regularization, X.dtype)
+        criterion = criterion_of(objective, len(X), folds)
     advice.warn_of_few_folds(criterion, folds)
     low_rank = isinstance(solver, Nystrom | RandomFeatures) and not criterion.own
     few = rows_of_parts(X, criterion, dense=True)[0]
@@ -208,24 +228,25 @@ def tune(
             "which no fit succeeds (pass bounds={'regularization': (low, high)} with a larger "
             "low); an objective of your own that returns NaN."
         )
-    return _tuned(space, runs, starts, given, solver)
+    return _tuned(space, runs, starts, given, solver, mean)
 
 
 def _tuned(
     space: SearchSpace,
     runs: list[Run],
     starts: int,
-    data: tuple[Array, Array],
+    data: tuple[Any, Any],
     solver: AbstractSolver | None,
+    mean: Mean | None,
 ) -> Tuned:
     """The fit at the best point, and what is to be said of the search."""
     found = best(runs)
-    X, Y = data
-    kernel, regularization, size = decode(space, jnp.asarray(found.u, space.low.dtype))
-    field = fit(kernel, X, Y, regularization, solver=solver)
+    dtype = space.low.dtype
+    kernel, regularization, size = decode(space, jnp.asarray(found.u, dtype))
+    field = fit(kernel, *data, regularization, solver=solver, mean=mean)
     if not space.allows(regularization):
         raise ValueError(
-            f"no lambda within bounds={{'regularization': ...}} can be solved with in {X.dtype}: "
+            f"no lambda within bounds={{'regularization': ...}} can be solved with in {dtype}: "
             f"for {kernel!r} it must be at least {float(regularization):.3g}."
         )
     losses = [run.loss for run in runs]
@@ -233,12 +254,12 @@ def _tuned(
     return Tuned(
         kernel=kernel,
         regularization=regularization,
-        loss=jnp.asarray(found.loss, X.dtype),
+        loss=jnp.asarray(found.loss, dtype),
         field=field,
         hyperparameters=space.values(kernel, regularization),
         converged=jnp.asarray(found.converged),
         steps=jnp.asarray(found.steps),
-        start_losses=jnp.asarray(losses, X.dtype),
+        start_losses=jnp.asarray(losses, dtype),
         at_bounds=space.at_bounds(found.u),
         bounds=space.box(size),
     )

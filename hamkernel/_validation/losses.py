@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -17,19 +18,29 @@ from hamkernel._gram.derivatives import trained
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._machine.threads import one_blas_thread
+from hamkernel._observations.kinds import AbstractObservations, as_states, both
+from hamkernel._observations.rows import Rows
+from hamkernel._solvers.fit import checked_rows
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.controlled import joined_data
 from hamkernel._validation.bases import AbstractBasis
 from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
 from hamkernel._validation.folds import Folds, Partition
+from hamkernel._validation.observed import (
+    rows_generalized_loss,
+    rows_log_likelihood,
+    rows_partition,
+    rows_partition_loss,
+    rows_residuals,
+)
 
 
 @one_blas_thread
 def cross_validation_loss(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
-    regularization: ArrayLike,
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
+    regularization: ArrayLike = 1e-4,
     folds: Folds = 5,
     *,
     inputs: Num[ArrayLike, "N m"] | None = None,
@@ -42,25 +53,30 @@ def cross_validation_loss(
 
     Args:
         K: a matrix-valued kernel.
-        X: states, shape (N, n).
+        X: states, shape (N, n); or observations, and then there is no Y.
         Y: measured velocities, shape (N, n).
         regularization: λ > 0.
         folds: a number of folds, made of consecutive points as equal in size as possible; "loo"
             for one point per fold; or an integer label for each point, shape (N,), to hold out,
             say, one trajectory at a time. A fold always holds out whole points: leaving out
-            single components would leak their siblings. Labels must be concrete under jit.
+            single components would leak their siblings. Labels must be concrete under jit. Of
+            observations N is the number of all: points, energies, functionals, in their order.
         inputs: of a `Controlled` kernel, shape (N, m).
 
     Returns:
-        The loss, in squared units of Y; inf where the matrix is not positive definite to
-        rounding. Differentiable in reverse mode: `jax.jacrev(jax.grad(loss))` is the Hessian, for
-        there is no `jax.jvp`. Vmappable, compiled once per shape and partition. O((N n)³) time,
+        The loss, in squared units of Y, and of observations in those of the rows over their
+        relative noise; inf where the matrix is not positive definite to rounding. Differentiable
+        in reverse mode: `jax.jacrev(jax.grad(loss))` is the Hessian, for there is no `jax.jvp`.
+        Vmappable, compiled once per shape and partition. O((N n)³) time,
         three matrices of (N n)² numbers, with the gradient over K too.
 
     Raises:
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
             matrices that do not fit in memory.
     """
+    X, Y, rows, regularization = _rows(K, X, Y, regularization)
+    if rows is not None:
+        return rows_partition_loss(K, rows, regularization, rows_partition(rows, folds))
     K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
     return partition_loss(K, X, Y, regularization, Partition(len(X), folds))
 
@@ -68,9 +84,9 @@ def cross_validation_loss(
 @one_blas_thread
 def cross_validation_residuals(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
-    regularization: ArrayLike,
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
+    regularization: ArrayLike = 1e-4,
     folds: Folds = 5,
     *,
     inputs: Num[ArrayLike, "N m"] | None = None,
@@ -81,8 +97,13 @@ def cross_validation_residuals(
     squares: with unequal folds not the mean of all squares.
 
     Returns:
-        Shape (N, n), in units of Y; inf where the matrix is not positive definite to rounding.
+        Shape (N, n), in units of Y; of observations one for each row, in its units; inf where the
+        matrix is not positive definite to rounding.
     """
+    X, Y, rows, regularization = _rows(K, X, Y, regularization)
+    if rows is not None:
+        left = rows_residuals(K, rows, regularization, rows_partition(rows, folds))
+        return rows.scale * left
     K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
     return _held_out(K, X, Y, regularization, Partition(len(X), folds))[0]
 
@@ -90,9 +111,9 @@ def cross_validation_residuals(
 @one_blas_thread
 def generalized_cross_validation(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
-    regularization: ArrayLike,
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
+    regularization: ArrayLike = 1e-4,
     *,
     inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Float[Array, ""]:
@@ -104,7 +125,7 @@ def generalized_cross_validation(
 
     Args:
         K: a matrix-valued kernel.
-        X: states, shape (N, n).
+        X: states, shape (N, n); or observations, and then there is no Y.
         Y: measured velocities, shape (N, n).
         regularization: λ > 0.
         inputs: of a `Controlled` kernel, shape (N, m).
@@ -119,6 +140,9 @@ def generalized_cross_validation(
 
     Source: Golub, Heath & Wahba (1979), Technometrics 21.
     """
+    X, Y, rows, regularization = _rows(K, X, Y, regularization)
+    if rows is not None:
+        return rows_generalized_loss(K, rows, regularization)
     K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
     return generalized_loss(K, X, Y, regularization)
 
@@ -126,9 +150,9 @@ def generalized_cross_validation(
 @one_blas_thread
 def log_marginal_likelihood(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
-    regularization: ArrayLike,
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
+    regularization: ArrayLike = 1e-4,
     *,
     inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Float[Array, ""]:
@@ -139,7 +163,7 @@ def log_marginal_likelihood(
 
     Args:
         K: a matrix-valued kernel.
-        X: states, shape (N, n).
+        X: states, shape (N, n); or observations, and then there is no Y.
         Y: measured velocities, shape (N, n).
         regularization: λ > 0; the noise variance is Nλ.
         inputs: of a `Controlled` kernel, shape (N, m).
@@ -154,13 +178,26 @@ def log_marginal_likelihood(
 
     Source: Rasmussen & Williams (2006), eq. 2.30.
     """
+    X, Y, rows, regularization = _rows(K, X, Y, regularization)
+    if rows is not None:
+        return rows_log_likelihood(K, rows, regularization)
     K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
     return log_likelihood(K, X, Y, regularization)
 
 
+def _rows(K, X, Y, regularization) -> tuple[Any, Any, Rows | None, Any]:
+    """X, Y, the rows of observations, and λ; no rows of states X, whose losses are shorter."""
+    X, Y = as_states(X, Y)
+    if not isinstance(X, AbstractObservations):
+        return X, Y, None, regularization
+    rows, regularization, _ = checked_rows(matrix_kernel(K), X, Y, regularization, None)
+    check_memory(rows.targets, LOSS_COPIES)
+    return X, Y, rows, regularization
+
+
 def _checked(K, X, Y, regularization, inputs=None):
     K = matrix_kernel(K)
-    K, X, Y = joined_data(K, X, Y, inputs)
+    K, X, Y = joined_data(K, *both(X, Y), inputs)
     # LAPACK on every device at once was seen to stall, see `_factors/dense.py`.
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
     K.check_points(X)
@@ -172,9 +209,9 @@ def _checked(K, X, Y, regularization, inputs=None):
 LOSS_COPIES = 3  # matrices of the size of the Gram that a loss holds, with its gradient
 
 
-def check_memory(X: Float[Array, "N n"], copies: int) -> None:
+def check_memory(X: Float[Array, "..."], copies: int) -> None:
     """Refuse a dense loss that does not fit in memory."""
-    what = f"the loss of N = {len(X)} points with n = {X.shape[1]} coordinates"
+    what = f"the loss of {X.size} rows"
     cure = (
         "Use hk.tune(..., solver=hk.Nystrom()) or solver=hk.RandomFeatures(count, key), whose loss "
         "is of low rank too, or a part of the data."

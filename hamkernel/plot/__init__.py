@@ -10,11 +10,15 @@ from hamkernel.plot._phase import phase_portrait, plane_slice, trajectories
 from hamkernel.plot._poincare import crossings, poincare_section
 from hamkernel.plot._style import COLORS
 from hamkernel.plot._time import energy_drift, trajectory_error
+from hamkernel.plot._uncertainty import band, deviation, ensemble
 
 __all__ = [
     "COLORS",
+    "band",
     "crossings",
+    "deviation",
     "energy_drift",
+    "ensemble",
     "hamiltonian",
     "loss_surface",
     "phase_portrait",
