@@ -208,8 +208,8 @@ def symmetry(seeds: int) -> None:
         print(f"\n{title}, noise {NOISE}: {bound}")
         for name, kernel in kernels.items():
             row(name, [errors_of(problem, kernel, seed) for seed in range(seeds)])
-    print("\nTime of a product, 1000 points, over that of the plain kernel: at most |G|")
-    X = jax.random.normal(jax.random.key(0), (1000, 4))
+    print("\nTime of a product, 3000 points, over that of the plain kernel: at most |G|")
+    X = jax.random.normal(jax.random.key(0), (3000, 4))
     named = {
         "plain": K,
         "C3, 3": hk.Symplectic(hk.Invariant(k, [turn])),
@@ -217,7 +217,7 @@ def symmetry(seeds: int) -> None:
         "all, 12": hk.Reversible(triangle),
     }
     operators = {name: hk.gram_operator(kernel, X) for name, kernel in named.items()}
-    times = in_turn(7, {name: (lambda op=op: op.mv(X)) for name, op in operators.items()})
+    times = in_turn(5, {name: (lambda op=op: op.mv(X)) for name, op in operators.items()})
     for name, taken in times.items():
         print(f"  {name:44s} {taken.least / times['plain'].least:.2f}")
 
