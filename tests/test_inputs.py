@@ -100,7 +100,7 @@ def test_tune_learns_friction_and_input_matrix_together():
     Y = torque(X, U) + 0.01 * rng.normal(size=(40, 2))
     G = hk.InputMatrix(1.0 * hk.Gaussian(2.0), acts_on=(1,))
     K = hk.Controlled(hk.PortHamiltonian(1.0 * hk.Gaussian(2.0), 0.3), inputs=G)
-    options = {"objective": "marginal_likelihood", "starts": 2, "max_steps": 40}
+    options = {"objective": "marginal_likelihood", "starts": 2, "max_steps": 100}
     tuned = hk.tune(K, X, Y, inputs=U, **options)
     fresh = rng.uniform(-2.3, 2.3, size=(100, 2)), rng.uniform(-2, 2, size=(100, 1))
     truth = torque(*fresh)
