@@ -21,6 +21,7 @@ from hamkernel._trajectories.learned import (
     Learned,
     Step,
     empty,
+    explains,
     interpolated,
     misfits,
     warn_of_dropped,
@@ -33,7 +34,7 @@ from hamkernel._trajectories.start import box_of, landmarks, sampled, with_ampli
 
 _WIDE = 100.0  # standard deviations of the states: the prior of a start
 _SHORT_ROUNDS = 2  # iterations with short segments, in which a rough field stays near the samples
-_MOST = 10  # iterations; 4 or 5 are the rule
+_MOST = 8  # iterations; 4 or 5 are the rule
 _SETTLED = 0.01  # of log σ, and of the objective by degree of freedom
 
 
@@ -158,9 +159,10 @@ def _learned(
     misfit = misfits(runs, states, noise)
     chi_squared = now.squares / max(now.free, 1.0)
     warn_of_dropped(kept)
-    if given:
-        warn_of_misfit(chi_squared, now.free, misfit)
-    if not converged:
+    explained = not given or explains(chi_squared, now.free)
+    if not explained:
+        warn_of_misfit(chi_squared, misfit)
+    if explained and not converged:
         require.warn(
             f"learning stopped after {_MOST} iterations with noise or objective still moving: see "
             ".history. The field may be usable; more samples a swing, or a kernel closer to the "
