@@ -47,7 +47,7 @@ def test_what_cannot_be_meant_is_refused():
         hk.Runs(TIMES, STATES[:2])
     with pytest.raises(ValueError, match="there are no runs"):
         hk.Runs([], [])
-    with pytest.raises(ValueError, match="run 0 has 1 sample: .* Leave it out"):
+    with pytest.raises(ValueError, match=r"run 0 has 1 sample: .* Leave it out"):
         hk.Runs([TIMES[0][:1]], [STATES[0][:1]])
     with pytest.raises(ValueError, match=r"times\[1\] must increase; sample 4"):
         hk.Runs(*changed(1, lambda t, x: t.__setitem__(4, t[3])))

@@ -16,7 +16,7 @@ from hamkernel._kernels.functions import as_pytree
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._trajectories.evidence import Model
-from hamkernel._trajectories.iteration import Current, Task, begin, iterated
+from hamkernel._trajectories.iteration import Current, Task, begin, changed, iterated
 from hamkernel._trajectories.learned import (
     Learned,
     Step,
@@ -36,6 +36,7 @@ _WIDE = 100.0  # standard deviations of the states: the prior of a start
 _SHORT_ROUNDS = 2  # iterations with short segments, in which a rough field stays near the samples
 _MOST = 8  # iterations; 4 or 5 are the rule
 _SETTLED = 0.01  # of log σ, and of the objective by degree of freedom
+_UNCHANGED = 1e-4  # of the field: without noise its digits end before the objective settles
 
 
 def learn(
@@ -118,13 +119,14 @@ def _iterated(
             wanted = grown(task.data.runs, pieces, now.good)
         else:
             wanted = halved(pieces, now.good)
-        before, same, pieces = now.model.log_noise, wanted == pieces, wanted
+        before, same, pieces = now, wanted == pieces, wanted
         now, step = iterated(task, now, pieces)
         history.append(step)
         noise = ", ".join(f"{sigma:.3g}" for sigma in np.asarray(step.noise))
         bar.set_postfix_str(f"noise {noise}, kept {float(step.kept):.0%}")
-        moved = float(jnp.abs(now.model.log_noise - before).max())
-        settled = moved < _SETTLED and float(step.gain) < _SETTLED * max(now.free, 1.0)
+        moved = float(jnp.abs(now.model.log_noise - before.model.log_noise).max())
+        small = float(step.gain) < _SETTLED * max(now.free, 1.0)
+        settled = moved < _SETTLED and (small or changed(task, before, now) < _UNCHANGED)
         if settled and same and i > _SHORT_ROUNDS:
             bar.close()
             return now, pieces, history, True

@@ -109,15 +109,14 @@ def warn_of_misfit(chi_squared: float, misfit: Float[np.ndarray, "R n"]) -> None
     """Say that the structure does not explain the runs at the noise that was given, and where."""
     causes = (
         "Likely causes, in order: a part of the motion that the kernel cannot have, such as "
-        "friction (add hk.CurlFree or use hk.PortHamiltonian); (q, q̇) given where (q, p) is needed "
-        "(masses=True finds the ratios of constant masses); units that do not fit each other; a jump "
-        "or a push in a run."
+        "friction (add hk.CurlFree, or take hk.PortHamiltonian); (q, q̇) given where (q, p) is "
+        "needed (masses=True learns the ratios of masses); a wrong unit; a jump or push in a run."
     )
     run, c = np.unravel_index(np.nanargmax(misfit), misfit.shape)
     require.warn(
-        f"the structure does not explain the runs: χ² is {chi_squared:.3g} per degree of freedom at "
-        f"the noise given, and should be 1. The residuals are largest in coordinate {c} of run "
-        f"{run}, {misfit[run, c]:.2g} σ. {causes}"
+        f"the structure does not explain the runs: χ² is {chi_squared:.3g} per degree of freedom "
+        f"at the noise given, and should be 1. The residuals are largest in coordinate {c} of run "
+        f"{run}, {misfit[run, c]:.2g} standard deviations. {causes}"
     )
 
 

@@ -202,7 +202,7 @@ def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> Non
             f"coordinate {which} was measured in no run. From the others alone it is known only up "
             "to any change of coordinates, p -> g(q, p), so there is nothing to learn it from. "
             "Say how it moves the others: mean=lambda x: jnp.array([x[1] / m, 0.0]) for q̇ = p/m "
-            "and K a kernel for the rest, such as hk.Symplectic(hk.Select(k, 0)) for ṗ = −U'(q). "
+            "and K a kernel for the rest, such as hk.Symplectic(hk.Select(k, 0)) for ṗ = -U'(q). "
             "Or log it."
         )
     n = runs.dimension

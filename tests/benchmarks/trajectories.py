@@ -160,7 +160,7 @@ def main():
         ours = [r["learn"] for r in rows]
         noises, times = (np.array([v[i] for v in ours]) for i in (3, 2))
         print(
-            f"| {case} | σ of q, found | {np.median(noises):.4f} ({noises.min():.4f} to "
+            f"| {case} | noise of q, found | {np.median(noises):.4f} ({noises.min():.4f} to "
             f"{noises.max():.4f}); seconds {np.median(times):.1f}, first {times[0]:.1f} |",
             flush=True,
         )
