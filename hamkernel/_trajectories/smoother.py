@@ -20,7 +20,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
 
 # Moments ∫ω^(2j) S(ω) dω of the spectral density (1 + ω²)⁻⁴, of mass one, are 1, 1/5, 1/5, 1.
 _STATIONARY = np.array(
@@ -33,9 +33,9 @@ _POWERS = np.stack([np.linalg.matrix_power(_NILPOTENT, j) / f for j, f in enumer
 class Process(NamedTuple):
     """Hyperparameters: standard deviation of the signal, rate λ per time, that of the noise."""
 
-    log_amplitude: Float[ArrayLike, ""]
-    log_rate: Float[ArrayLike, ""]
-    log_noise: Float[ArrayLike, ""]
+    log_amplitude: Float[Array, ""]
+    log_rate: Float[Array, ""]
+    log_noise: Float[Array, ""]
 
 
 class Smoothed(NamedTuple):

@@ -109,7 +109,7 @@ def box_of(
 
 
 def _amplified(model: Model, h, scales, X, Y):
-    """The point h with amplitudes such that a velocity of the prior is twice as large as those seen."""
+    """The point h, its amplitudes such that a velocity of the prior is twice one that was seen."""
     if not scales.any():
         return h
     trace = float(gram_trace(model.at(jnp.asarray(h)).kernel, jnp.asarray(X))) / len(X)
