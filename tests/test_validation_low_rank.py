@@ -10,14 +10,9 @@ from scipy.stats import multivariate_normal
 
 import hamkernel as hk
 from hamkernel._solvers.landmarks import given_landmarks
+from hamkernel._validation.bases import LandmarkBasis, WaveBasis
 from hamkernel._validation.folds import Partition
-from hamkernel._validation.low_rank import (
-    LandmarkBasis,
-    WaveBasis,
-    low_rank_generalized_loss,
-    low_rank_log_likelihood,
-    low_rank_partition_loss,
-)
+from hamkernel._validation.losses import generalized_loss, log_likelihood, partition_loss
 
 N, n, RIDGE = 30, 2, 1e-3
 # Systems of condition 1e4.
@@ -64,7 +59,7 @@ def test_the_loss_is_that_of_refits(basis, folds):
         F, t = rows[~out], y[~out]
         w = np.linalg.solve(F.T @ F + ridge * np.eye(F.shape[1]), F.T @ t)
         losses.append(np.mean((y[out] - rows[out] @ w) ** 2))
-    loss = low_rank_partition_loss(BASES[basis], K, X, Y, jnp.asarray(RIDGE), partition)
+    loss = partition_loss(K, X, Y, jnp.asarray(RIDGE), partition, BASES[basis])
     np.testing.assert_allclose(loss, np.mean(losses), rtol=ROUNDING)
     w = np.linalg.solve(rows.T @ rows + N * RIDGE * np.eye(rows.shape[1]), rows.T @ y)
     assert abs(np.mean((y - rows @ w) ** 2) / loss - 1) > 0.01  # the training error is another
@@ -75,10 +70,10 @@ def test_likelihood_and_gcv_are_those_of_the_low_rank_gram(basis):
     rows, y = rows_of(BASES[basis]), np.asarray(Y).ravel()
     A = rows @ rows.T + N * RIDGE * np.eye(N * n)
     expected = multivariate_normal(np.zeros(N * n), A).logpdf(y)  # type: ignore[arg-type]
-    found = low_rank_log_likelihood(BASES[basis], K, X, Y, jnp.asarray(RIDGE))
+    found = log_likelihood(K, X, Y, jnp.asarray(RIDGE), BASES[basis])
     np.testing.assert_allclose(found, expected, rtol=ROUNDING)
     a, trace = np.linalg.solve(A, y), np.trace(np.linalg.inv(A))
-    found = low_rank_generalized_loss(BASES[basis], K, X, Y, jnp.asarray(RIDGE))
+    found = generalized_loss(K, X, Y, jnp.asarray(RIDGE), BASES[basis])
     np.testing.assert_allclose(found, N * n * (a @ a) / trace**2, rtol=ROUNDING)
 
 
@@ -86,9 +81,9 @@ def test_with_all_points_as_landmarks_it_is_the_dense_loss():
     # A ridge far above what the columns left out as dependent carry.
     partition = Partition(N, 5)
     basis = LandmarkBasis(X)
-    found = low_rank_partition_loss(basis, K, X, Y, jnp.asarray(RIDGE), partition)
+    found = partition_loss(K, X, Y, jnp.asarray(RIDGE), partition, basis)
     np.testing.assert_allclose(found, hk.cross_validation_loss(K, X, Y, RIDGE, 5), rtol=1e-7)
-    few = low_rank_partition_loss(LandmarkBasis(X[:2]), K, X, Y, jnp.asarray(RIDGE), partition)
+    few = partition_loss(K, X, Y, jnp.asarray(RIDGE), partition, LandmarkBasis(X[:2]))
     assert abs(few / found - 1) > 0.1
 
 
@@ -100,7 +95,7 @@ def test_gradients_are_those_of_finite_differences(basis, folds):
 
     def loss(log_scale, log_ridge):
         kernel = hk.Odd(hk.Symplectic(hk.Gaussian(jnp.exp(log_scale))))
-        return low_rank_partition_loss(BASES[basis], kernel, X, Y, jnp.exp(log_ridge), partition)
+        return partition_loss(kernel, X, Y, jnp.exp(log_ridge), partition, BASES[basis])
 
     at = jnp.log(1.2), jnp.log(RIDGE)
     slopes = jax.grad(loss, (0, 1))(*at)
@@ -135,9 +130,9 @@ def test_where_no_landmark_can_be_used_the_losses_are_infinite():
     # A fit is refused then; without columns it would be the zero field.
     for sign in (1.0, -1.0):
         K = hk.Symplectic(lambda x, z, sign=sign: sign * jnp.exp(-((x - z) @ (x - z))))
-        given = LandmarkBasis(X[:3]), K, X, Y, jnp.asarray(1e-3)
-        folds = low_rank_partition_loss(*given, Partition(N, 3))
-        losses = folds, low_rank_generalized_loss(*given), -low_rank_log_likelihood(*given)
+        given, basis = (K, X, Y, jnp.asarray(1e-3)), LandmarkBasis(X[:3])
+        folds = partition_loss(*given, Partition(N, 3), basis)
+        losses = folds, generalized_loss(*given, basis), -log_likelihood(*given, basis)
         assert all(np.isfinite(loss) if sign > 0 else loss == np.inf for loss in losses)
 
 

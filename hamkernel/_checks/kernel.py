@@ -26,11 +26,13 @@ from hamkernel import _require as require
 from hamkernel._checks.limit import PROFILE, check_limit, near_blocks, neighbours_of
 from hamkernel._checks.pairs import Pairs, evaluate, lowest, mixed
 from hamkernel._kernels.base import UserKernel, as_scalar_kernel
+from hamkernel._machine.threads import one_blas_thread
 
 _NEAR_POINTS = 8  # points whose diagonal block is compared with its neighbours
 _GRAM_POINTS, _GRAM_ROWS = 64, 256  # caps on the Grams whose eigenvalues are taken
 
 
+@one_blas_thread
 def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     """Raise if the scalar kernel `k` is unfit for the structured kernels; return None if sound.
 

@@ -1,20 +1,22 @@
 """Regularised least squares by a dense factorisation: (G + NλI) a = y."""
 
 import abc
-from typing import Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
+from hamkernel._factors.dense import DenseFactor
 from hamkernel._fields.base import AbstractField, KernelField, SolverInfo, root
 from hamkernel._gram.dense import assemble, plus_ridge
 from hamkernel._gram.operator import product
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.memory import refuse_beyond_memory
+from hamkernel._observations.rows import Rows
+from hamkernel._solvers.conditional import AbstractConditional, dense_conditional
 from hamkernel._structures.base import AbstractMatrixKernel
 
 Learned = TypeVar("Learned", bound=AbstractField, covariant=True)
@@ -22,6 +24,8 @@ Learned = TypeVar("Learned", bound=AbstractField, covariant=True)
 
 class AbstractSolver(eqx.Module, Generic[Learned]):
     """How `fit` finds the field."""
+
+    no_factor: ClassVar[str | None] = None  # why it cannot say how far the field may be off
 
     @abc.abstractmethod
     def _fitted(
@@ -33,6 +37,17 @@ class AbstractSolver(eqx.Module, Generic[Learned]):
         throw: bool = True,
     ) -> Learned:
         """The field for data that has been checked; of NaN if it fails and does not `throw`."""
+
+    def _given(
+        self,
+        K: AbstractMatrixKernel,
+        rows: Rows,
+        regularization: Float[Array, ""],
+        throw: bool = True,
+    ) -> AbstractConditional:
+        """The field given any observations, with what the solver keeps of them."""
+        del K, rows, regularization, throw
+        raise TypeError(f"{type(self).__name__} learns from velocities X and Y alone.")
 
 
 # ‖y − (G + NλI)a‖/‖y‖ up to which a factorisation counts as a solution. The fitted values were
@@ -95,6 +110,15 @@ class Cholesky(AbstractSolver[KernelField]):
             info=SolverInfo("Cholesky", relative_residual=left),
         )
 
+    def _given(
+        self,
+        K: AbstractMatrixKernel,
+        rows: Rows,
+        regularization: Float[Array, ""],
+        throw: bool = True,
+    ) -> AbstractConditional:
+        return dense_conditional(K, rows, regularization, throw)
+
 
 def _check_memory(X: Float[Array, "N n"]) -> None:
     cure = (
@@ -108,7 +132,7 @@ def _check_memory(X: Float[Array, "N n"]) -> None:
 @eqx.filter_jit
 def _representer(K, X, Y, regularization):
     """Coefficients, residual y − Ga = Nλa, the norm with ‖f‖² = aᵀGa, and the relative residual."""
-    N, n = X.shape
+    N, n = Y.shape
     G = assemble(K, X, X).reshape(N * n, N * n)
     ridge = N * regularization
     A = solve_positive(G, ridge, Y.reshape(N * n)).reshape(N, n)
@@ -132,5 +156,7 @@ def solve_positive(
 
     Differentiated implicitly, by one more solve with the same factor.
     """
-    operator = lx.MatrixLinearOperator(plus_ridge(G, ridge), lx.positive_semidefinite_tag)
-    return lx.linear_solve(operator, y, lx.Cholesky(), throw=False).value
+    A = plus_ridge(G, ridge)
+    factor = DenseFactor(jax.lax.stop_gradient(A))
+    solve = jax.lax.custom_linear_solve
+    return solve(lambda x: A @ x, y, lambda _, b: factor.solve(b), symmetric=True)

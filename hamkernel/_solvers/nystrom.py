@@ -24,6 +24,7 @@ from hamkernel._fields.base import KernelField, SolverInfo, root
 from hamkernel._gram.dense import trace
 from hamkernel._gram.operator import product
 from hamkernel._machine.devices import as_given, rows_of, split
+from hamkernel._observations.rows import Rows
 from hamkernel._show import text
 from hamkernel._solvers import stream_sums
 from hamkernel._solvers.landmark_gram import (
@@ -35,6 +36,11 @@ from hamkernel._solvers.landmark_gram import (
     whitening,
 )
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks
+from hamkernel._solvers.low_rank_conditional import (
+    LowRankConditional,
+    landmark_span,
+    low_rank_conditional,
+)
 from hamkernel._solvers.stream_sums import Sums
 from hamkernel._solvers.streaming import (
     AbstractStreamingFit,
@@ -134,6 +140,16 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         solution = solution._replace(residual=as_given(spread, solution.residual))
         return _field(K, landmarks, solution, regularization, self.tolerance, _CHOOSE, throw)
 
+    def _given(
+        self,
+        K: AbstractMatrixKernel,
+        rows: Rows,
+        regularization: Float[Array, ""],
+        throw: bool = True,
+    ) -> LowRankConditional:
+        span = landmark_span(K, self.landmarks(K, rows.points, regularization))
+        return low_rank_conditional(span, rows, regularization, throw)
+
     def start(
         self,
         K: AbstractMatrixKernel,
@@ -174,15 +190,15 @@ def _fit(K, X, Y, regularization, landmarks, spread):
         """One step of refinement, from w and y − F w."""
         slope = T.T @ product(K, S, X, residual, None, spread).reshape(-1) - ridge * w
         correction = jax.scipy.linalg.cho_solve((R, True), slope)
-        change = product(K, X, S, (T @ correction).reshape(S.shape), spread)
+        change = product(K, X, S, (T @ correction).reshape(len(S), -1), spread)
         return w + correction, residual - change
 
     w = jax.scipy.linalg.cho_solve((R, True), total.moment)
-    A = (T @ w).reshape(S.shape)
+    A = (T @ w).reshape(len(S), -1)
     w, residual = step(w, Y - product(K, X, S, A, spread))
     truncation = truncated(trace(K, X, spread), jnp.trace(total.square), ridge)
     # ‖f‖² = αᵀ G_SS α = ‖w‖²
-    return _Solution((T @ w).reshape(S.shape), residual, root(w @ w), truncation)
+    return _Solution((T @ w).reshape(len(S), -1), residual, root(w @ w), truncation)
 
 
 class _Solution(NamedTuple):

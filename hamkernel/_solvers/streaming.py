@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._machine.devices import rows_of, split
+from hamkernel._machine.threads import one_blas_thread
 from hamkernel._show import call, text
 from hamkernel._solvers.cholesky import AbstractSolver, Learned
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
@@ -84,6 +85,7 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
             raise ValueError(f"the data has {X.shape[1]} coordinates and the fit {self.dimension}.")
         return self._added(X.astype(self.dtype), Y.astype(self.dtype))
 
+    @one_blas_thread
     def field(self, regularization: ArrayLike | None = None) -> Learned:
         """The field learned from all data added so far; O(r³), and no pass over the data.
 
@@ -116,6 +118,7 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned]):
     ) -> AbstractStreamingFit[Learned]:
         """A fit without data yet, to which chunks are added."""
 
+    @one_blas_thread
     def fit_chunks(
         self,
         K: AbstractMatrixKernel,

@@ -20,8 +20,10 @@ from hamkernel._gram.dense import trace
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance
 from hamkernel._kernels.dot_products import Periodic
 from hamkernel._kernels.functions import Bound
-from hamkernel._kernels.transforms import Select, Symmetrised, Warp
+from hamkernel._kernels.transforms import Select, Warp, without_symmetry
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.controlled import Controlled
+from hamkernel._structures.port_hamiltonian import PortHamiltonian
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,11 +39,26 @@ class Hyperparameter:
     low: np.ndarray
     high: np.ndarray
 
+    @property
+    def entries(self) -> list[str]:
+        """The name of each number, with its place if there are several: `kernel.lengthscale[1]`."""
+        if self.low.ndim == 0:
+            return [self.name]
+        return [
+            f"{self.name}[{', '.join(map(str, index))}]" for index in np.ndindex(self.low.shape)
+        ]
+
 
 def hyperparameters(
-    K: AbstractMatrixKernel, X: Float[Array, "N n"], Y: Float[Array, "N n"]
+    K: AbstractMatrixKernel,
+    X: Float[Array, "N n"],
+    Y: Float[Array, "N n"],
+    states: Float[Array, "M n"],
 ) -> list[Hyperparameter]:
-    """The trainable leaves of K, in the order of its leaves, with their boxes from the data."""
+    """The trainable leaves of K, in the order of its leaves, with their boxes from the data.
+
+    The size of K(x, x) is that at `states`, some of X or all.
+    """
     seen = np.asarray(X)
     # What is a fair amplitude depends on the lengthscales: it is that in the middle of their boxes.
     arrays, rest = eqx.partition(K, eqx.is_inexact_array)
@@ -51,7 +68,7 @@ def hyperparameters(
         for p, leaf in zip(_walk((), K, seen, 1.0), leaves, strict=True)
     ]
     K_middle = eqx.combine(jax.tree.unflatten(structure, middle), rest)
-    return list(_walk((), K, seen, _amplitude(K_middle, X, Y)))
+    return list(_walk((), K, seen, _amplitude(K_middle, states, Y)))
 
 
 def constants(K: AbstractMatrixKernel) -> dict[str, float]:
@@ -69,15 +86,8 @@ gram_trace = eqx.filter_jit(trace)
 
 
 def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
-    """The trace of the Gram before the terms of an odd or even kernel cancel: what rounds.
-
-    (k(x, z) − k(−x, z))/2 of a long lengthscale is the small difference of large numbers.
-    """
-
-    def is_mean(node: object) -> bool:
-        return isinstance(node, Symmetrised)
-
-    terms = jax.tree.map(lambda node: node.kernel if is_mean(node) else node, K, is_leaf=is_mean)
+    """The trace of the Gram before the terms of an odd or even kernel cancel: what rounds."""
+    terms = without_symmetry(K)
     trace = gram_trace(terms, X)
     if Invariance.REFLECTION in terms.invariance:
         return trace  # that of the Gram is no larger
@@ -87,7 +97,8 @@ def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, 
 def _amplitude(K: AbstractMatrixKernel, X: Array, Y: Array) -> float:
     """The factor that gives K(x, x) the size of Y: mean Y² over the mean diagonal."""
     trace = float(gram_trace(K, X))
-    ratio = float(np.mean(np.asarray(Y) ** 2)) * X.size / trace if trace > 0 else 0.0
+    rows = len(X) * Y.shape[1]
+    ratio = float(np.mean(np.asarray(Y) ** 2)) * rows / trace if trace > 0 else 0.0
     return ratio if np.isfinite(ratio) and ratio > 0 else 1.0
 
 
@@ -95,6 +106,8 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
     """Walk the kernel; X is the data in the coordinates that `node` sees."""
     if isinstance(node, Select):
         X = X[:, list(node.dims)]
+    if isinstance(node, Controlled):  # points are (x, u)
+        X = X[:, : node.outputs(X.shape[1])]
     for key, child in _children(node):
         if eqx.is_inexact_array(child):
             name = keystr((*path, *key)).removeprefix(".")
@@ -149,11 +162,30 @@ def _box(
     if ours and name == "log_offset":
         square = np.mean(np.sum(X**2, axis=1)) or 1.0
         return np.log(1e-4 * square), np.log(1e4 * square)
+    if isinstance(node, PortHamiltonian) and name == "log_friction":
+        return _friction_box(node, X)
     value = np.asarray(leaf)
     if name.startswith("log_"):
         return value - np.log(1e3), value + np.log(1e3)
     reach = 10 * np.maximum(1.0, np.abs(value))  # a number of unknown meaning
     return value - reach, value + reach
+
+
+# Of the damping ratio, r over the critical friction: from 1e-5, at which an oscillation loses 6e-5
+# of its amplitude in a period and far less than can be seen, to overdamped 30 times over.
+_LEAST_DAMPING, _MOST_DAMPING = 1e-5, 30.0
+
+
+def _friction_box(node: PortHamiltonian, X: np.ndarray) -> tuple[ArrayLike, ArrayLike]:
+    """Bounds for log r: an oscillation of extents (Δq, Δp) in X is critical near r = Δp/Δq."""
+    n = X.shape[1]
+    damped = np.asarray(range(n // 2, n) if node.damped is None else node.damped)
+    extent = np.ptp(X, axis=0)
+    extent = np.where(extent > 0, extent, 1.0)
+    critical = np.log(extent[damped] / extent[(damped + n // 2) % n])
+    if node.log_friction.ndim == 0:
+        critical = critical.mean()
+    return critical + np.log(_LEAST_DAMPING), critical + np.log(_MOST_DAMPING)
 
 
 def _spacing_and_extent(X: np.ndarray, per_coordinate: bool) -> tuple[ArrayLike, ArrayLike]:

@@ -25,16 +25,26 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._machine.devices import on_one_device
+from hamkernel._machine.threads import one_blas_thread
 from hamkernel._show import described
 from hamkernel._solvers.cholesky import AbstractSolver
 from hamkernel._solvers.fit import fit
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._tuning.boxes import constants
-from hamkernel._tuning.objective import Criterion, Objective, criterion_of
-from hamkernel._tuning.plan import SearchPlan
-from hamkernel._tuning.runs import keeping_the_best
+from hamkernel._structures.controlled import joined_data
+from hamkernel._tuning import advice
+from hamkernel._tuning.descent import Run
+from hamkernel._tuning.objective import (
+    Criterion,
+    Objective,
+    SearchCriterion,
+    basis_of,
+    criterion_of,
+)
+from hamkernel._tuning.other_optimisers import checked_optimiser
+from hamkernel._tuning.part import rows_of_parts
+from hamkernel._tuning.search import Search, best
 from hamkernel._tuning.space import LOW_RANK_ROUNDINGS, ROUNDINGS, SearchSpace
 from hamkernel._validation.folds import Folds
 from hamkernel._validation.losses import check_memory
@@ -48,13 +58,16 @@ class Tuned(eqx.Module):
         regularization: the tuned λ, shape ().
         loss: the objective there, shape (); for "marginal_likelihood" the NEGATIVE log density.
         field: the fit to all data with them.
-        converged: whether the run that found the best point met the tolerances, shape ().
+        hyperparameters: the tuned values by the names of `bounds`, in their units.
+        converged: whether the run that found the best point met the tolerance, shape ().
         steps: the number of its optimiser steps, shape ().
-        at_bounds: the names of the hyperparameters that rest on a bound of the search box. The
-            data prefers values beyond it: see "How to choose" in the README.
+        at_bounds: the names of the hyperparameters that rest on a bound of the search box, and of
+            which coordinate: `kernel.lengthscale[1]`. The data prefers values beyond it: see "How
+            to choose" in the README.
         start_losses: the loss on all data at the end of the run from each start, shape (starts,):
             in the order of the starts, the caller's kernel first, or, where the runs were made on
-            a subset or are finished with a low-rank loss, in ascending order before that.
+            a subset or are finished with a low-rank loss, in ascending order; inf of those that
+            were not looked at there.
         bounds: the box that was searched: for each name the lowest and highest value.
     """
 
@@ -62,6 +75,7 @@ class Tuned(eqx.Module):
     regularization: Float[Array, ""]
     loss: Float[Array, ""]
     field: AbstractField
+    hyperparameters: dict[str, Array]
     converged: Bool[Array, ""]
     steps: Int[Array, ""]
     start_losses: Float[Array, " starts"]
@@ -72,6 +86,7 @@ class Tuned(eqx.Module):
         return described(self)
 
 
+@one_blas_thread
 def tune(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"],
@@ -87,16 +102,18 @@ def tune(
     max_steps: int = 64,
     solver: AbstractSolver | None = None,
     progress: bool = False,
+    inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Tuned:
     """Tune every hyperparameter of K, and λ with them, down the gradient of a validation loss.
 
     The search starts from the given kernel and from `starts` − 1 further points, the best of a
-    space-filling design in the box. All run in one compiled call, on a subset of 64 points (of
-    256/n, with n > 4) if there are more; the best one is then finished on all data, and the best
-    point that any of them saw is returned, or the given one where that is better on all data. New
-    data of the same shape does not recompile, unless `Nystrom` takes another number of landmarks.
-    Data that is spread over devices is gathered on one of them for the search; the field is fitted
-    where the data lies.
+    space-filling design in the box, on a subset of 64 points (of 256/n, with n > 4) if there are
+    more. Where the runs end is compared on all data, together with the given point, and the best is
+    finished there. From 2048/n points on this is done on 1024/n of them, and the best is corrected
+    on all data by three more losses: each takes the time of some ten factorisations. New data of
+    the same shape does not recompile, unless `Nystrom` takes another number of landmarks. Data that
+    is spread over devices is gathered on one of them for the search; the field is fitted where the
+    data lies.
 
     Args:
         K: a matrix-valued kernel; every inexact array leaf is a hyperparameter, and no Python
@@ -104,7 +121,8 @@ def tune(
         X: states, shape (N, n).
         Y: measured velocities, shape (N, n).
         regularization: the first λ.
-        folds: as in `cross_validation_loss`; give trajectory labels for data from trajectories.
+        folds: as in `cross_validation_loss`; give trajectory labels for data from trajectories,
+            if there are five or more. JUDGES
         objective: "cross_validation", "generalized_cross_validation", "marginal_likelihood", or
             a function (K, X, Y, regularization) -> () to minimise. The second ignores fits that
             leave less than a fifth of the residuals free, tr(I − S) < 0.2 N n, since it is 0/0
@@ -120,15 +138,16 @@ def tune(
             the box h ± 10 max(1, |h|), which may be too small, and of both signs: store what is
             positive as `log_…`, whose box is a factor of 1000 to either side, or say its bounds.
         starts: the number of runs.
-        optimiser: an optimistix minimiser. If None, BFGS with tolerance 1e-3, on a subset 1e-2.
-        max_steps: the largest number of steps of one run.
+        optimiser: an optimistix minimiser. If None, BFGS until the loss falls by less than 0.01 %,
+            on the subset 0.1 %.
+        max_steps: the largest number of steps of one run, on each part of the data.
         solver: how the final field is fitted; see `fit`. With `Nystrom` and `RandomFeatures` the
             loss on all points is that of the low-rank fit, in O(N n r) memory; the landmarks are
             those of the best kernel on the subset, and of the tuned one for the field.
-        progress: print each step of the default optimiser, through optimistix's own hook (of one
-            of yours say verbose=True to itself): the logarithm of a loss, or the objective over
-            its first value, and the coordinates u of the search, whose sines go from one end of
-            the box to the other.
+        progress: print a line for each step: on how many points, how many runs go on, and the best
+            loss. Of an optimiser of yours say verbose=True to itself.
+        inputs: of a `Controlled` kernel, shape (N, m). An objective of your own gets points (x, u)
+            and passes them on, as `hk.fit(K, X, Y, λ)`.
 
     Returns:
         A `Tuned`. NaN never comes out: points where the objective is not finite cannot win.
@@ -144,59 +163,88 @@ def tune(
 
     Units. A warning comes where the velocities of two coordinates differ 100 times in size: the
     loss, a sum of their squares, hardly sees the smaller one. Another warning names the Python
-    floats in K, which are kept.
+    floats in K, which are kept, and another says that the scale is free, where every term of K has
+    an amplitude and the objective is one of cross-validation.
+
+    Time. A search that will take more than a minute says so before the long part of it.
 
     The ridge. λ is never searched where rounding would decide. Unless `bounds` say what it may be,
-    or it is frozen, it also stays so large that a field fitted to noise is smooth to about 1e-9
-    and can be integrated: a few runs tell how much that is, then all of them search above it.
+    or it is frozen, a wall also keeps cross-validation from fields that round so much that they
+    cannot be integrated, ‖a‖ tr(G) √ε > ‖y‖ for the coefficients a; the likelihood needs none.
     """
     K = matrix_kernel(K)
     frozen = (frozen,) if isinstance(frozen, str) else frozen
     _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
-    X, Y = given = require.data(X, Y)
+    if optimiser is not None:
+        optimiser = checked_optimiser(optimiser, progress)
+    K, X, Y = joined_data(K, X, Y, inputs)
+    given = X, Y
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
-    K.check_dimension(X.shape[1])
-    _warn_of_unequal_sizes(Y)
-    _warn_of_constants(K)
+    K.check_points(X)
+    advice.warn_of_unequal_sizes(Y)
+    advice.warn_of_constants(K)
     ridge = require.ridge(regularization, X.dtype)
     criterion = criterion_of(objective, len(X), folds)
-    low_rank = isinstance(solver, Nystrom | RandomFeatures)
+    advice.warn_of_few_folds(criterion, folds)
+    low_rank = isinstance(solver, Nystrom | RandomFeatures) and not criterion.own
+    few = rows_of_parts(X, criterion, dense=True)[0]
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
-    space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings)
-    coarse = keeping_the_best(_minimiser(optimiser, progress, _COARSE))
-    optimiser = keeping_the_best(_minimiser(optimiser, progress, _BFGS))
-    rows = criterion.coarse_points(X)
-    plan = SearchPlan(criterion, X, Y, given, rows, solver, optimiser, coarse, starts, max_steps)
-    if plan.thinned and not low_rank:
-        check_memory(X, _RUN_COPIES)
-    found = plan.carry_out(space)
-    if found is None:
+    space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings, X[few])
+    advice.warn_of_free_scale(space, criterion)
+    if len(few) < len(X) and not low_rank:
+        check_memory(X, _LOSS_COPIES)
+    search = Search(space, criterion, X, Y, starts, max_steps, optimiser, progress)
+
+    def of_low_rank(run: Run) -> SearchCriterion:
+        kernel, regularization, _ = decode(space, run.u)
+        return criterion.with_basis(basis_of(solver, kernel, regularization, X))
+
+    runs = search.runs(of_low_rank if low_rank else None)
+    found = best(runs)
+    if not found.value < np.inf:
         raise RuntimeError(
             "the objective is not finite at any start. Likely causes, in order: a kernel that "
             "is not positive definite or not finite (hk.check_kernel(k, X) tells); bounds in "
             "which no fit succeeds (pass bounds={'regularization': (low, high)} with a larger "
             "low); an objective of your own that returns NaN."
         )
-    if not found.solved:
-        fit(found.kernel, *given, found.regularization, solver=solver)  # raises
-    if not found.space.allows(found.regularization):
+    return _tuned(space, runs, starts, given, solver)
+
+
+def _tuned(
+    space: SearchSpace,
+    runs: list[Run],
+    starts: int,
+    data: tuple[Array, Array],
+    solver: AbstractSolver | None,
+) -> Tuned:
+    """The fit at the best point, and what is to be said of the search."""
+    found = best(runs)
+    X, Y = data
+    kernel, regularization, size = decode(space, jnp.asarray(found.u, space.low.dtype))
+    field = fit(kernel, X, Y, regularization, solver=solver)
+    if not space.allows(regularization):
         raise ValueError(
             f"no lambda within bounds={{'regularization': ...}} can be solved with in {X.dtype}: "
-            f"for {found.kernel!r} it must be at least {float(found.regularization):.3g}."
+            f"for {kernel!r} it must be at least {float(regularization):.3g}."
         )
-    runs, best = found.runs, found.best
-    losses = criterion.losses(np.asarray(runs.value))
+    losses = [run.loss for run in runs]
+    losses += [np.inf] * (starts - len(losses))
     return Tuned(
-        kernel=found.kernel,
-        regularization=found.regularization,
-        loss=jnp.asarray(losses[best]),
-        field=found.field,
-        converged=jnp.asarray(runs.converged[best]),
-        steps=jnp.asarray(runs.steps[best]),
-        start_losses=jnp.asarray(losses),
-        at_bounds=found.space.at_bounds(np.asarray(runs.u[best])),
-        bounds=found.space.box(found.kernel, X),
+        kernel=kernel,
+        regularization=regularization,
+        loss=jnp.asarray(found.loss, X.dtype),
+        field=field,
+        hyperparameters=space.values(kernel, regularization),
+        converged=jnp.asarray(found.converged),
+        steps=jnp.asarray(found.steps),
+        start_losses=jnp.asarray(losses, X.dtype),
+        at_bounds=space.at_bounds(found.u),
+        bounds=space.box(size),
     )
+
+
+decode = eqx.filter_jit(lambda space, u: space.decode(u))
 
 
 def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -> None:
@@ -214,60 +262,4 @@ def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -
     require.count(max_steps, "max_steps")
 
 
-def _minimiser(
-    given: optx.AbstractMinimiser | None, progress: bool, ours: dict[bool, optx.BFGS]
-) -> optx.AbstractMinimiser:
-    """The optimiser of the caller, or ours."""
-    if given is None:
-        return ours[bool(progress)]
-    if progress:
-        raise ValueError(
-            "progress is printed by the optimiser: pass verbose=True to yours, and no progress."
-        )
-    golden = isinstance(given, optx.GoldenSearch)  # minimises functions of one number
-    if golden or not isinstance(given, optx.AbstractMinimiser):
-        raise TypeError(
-            "optimiser must be an optimistix minimiser of many variables, such as "
-            "optimistix.BFGS(1e-3, 1e-3) or optimistix.OptaxMinimiser(optax.adam(0.1), 1e-3, 1e-3);"
-            f" got {given!r}."
-        )
-    return given
-
-
-def _warn_of_unequal_sizes(Y: Array) -> None:
-    sizes = np.asarray(Y).std(axis=0)
-    sizes = sizes[sizes > 0]
-    if sizes.size and sizes.max() > _UNEQUAL * sizes.min():
-        require.warn(
-            f"the velocities of one coordinate are {sizes.max() / sizes.min():.3g} times as large "
-            "as those of another, and a loss sums the squares of both: the small one may be lost "
-            "in it. Choose units in which they are of similar size. With more than one degree of "
-            "freedom x stays canonical only if [q_i][p_i] is the same product of units for every i."
-        )
-
-
-def _warn_of_constants(K: AbstractMatrixKernel) -> None:
-    kept = constants(K)
-    if kept:
-        shown = ", ".join(f"{name} = {value:.4g}" for name, value in kept.items())
-        require.warn(
-            f"kept, and not tuned: {shown}. Python floats are constants to JAX. Store an array to "
-            "have them tuned, jnp.array(0.3), and name it in frozen=... to have it kept."
-        )
-
-
-_UNEQUAL = 100.0  # in size, and so 10 000 in the loss
-
-
-_RUN_COPIES = 5  # matrices of the size of the Gram that a run holds: 4.4 measured
-
-
-def _bfgs(verbose: bool, tolerance: float) -> optx.BFGS:
-    """BFGS whose line search quarters a step, which takes fewer evaluations than to halve it."""
-    bfgs = optx.BFGS(tolerance, tolerance, verbose=verbose)
-    return eqx.tree_at(lambda o: o.search, bfgs, optx.BacktrackingArmijo(decrease_factor=0.25))
-
-
-# Made once: compiled functions are told apart by the functions inside these, too.
-_BFGS = {verbose: _bfgs(verbose, 1e-3) for verbose in (False, True)}
-_COARSE = {verbose: _bfgs(verbose, 1e-2) for verbose in (False, True)}
+_LOSS_COPIES = 5  # matrices of the size of the Gram that a loss in a loop holds: 4.4 measured

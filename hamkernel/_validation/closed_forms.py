@@ -1,0 +1,126 @@
+"""What the validation losses need of A and y, with its derivative, for every kind of factor.
+
+Write A = G + ridge I and a = A⁻¹y for the system with ALL points, and let S be the rows of a
+held-out fold. Eliminating the other rows from A a = y by block inversion gives the residual that
+a fit WITHOUT S would have on S,
+
+    r_S = y_S − f₋S(X_S) = (C_SS)⁻¹ a_S,    C = A⁻¹,
+
+so no fold is ever refitted.
+
+The derivatives are written down as well, since differentiating the factorisation costs several
+times its price. From dC = −C dA C, and with v_S = (C_SS)⁻¹ r̄_S for a cotangent r̄,
+
+    r̄·dr = Σ_S v_Sᵀ[(dC y)_S − dC_SS r_S]   so   Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − (C v) aᵀ,
+
+and a itself, with da = −C dA a, adds −(C ā) aᵀ.
+
+A result that rounding has spoiled is infinite, with a derivative of zero.
+
+Source: for scalar outputs and single points, Rasmussen & Williams (2006), section 5.4.2; for
+folds, Ginsbourger & Schärer (2021), arXiv:2101.03108.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from hamkernel._factors.base import AbstractSystem
+from hamkernel._validation.folds import Partition
+
+
+def _solved(system: AbstractSystem, y: Float[Array, " D"]):
+    """The factor, a, yᵀa and whether they can be trusted: no LAPACK call beside another."""
+    factor = system.factor()
+    factor, a, square = jax.lax.optimization_barrier((factor, *factor.solved(y)))
+    return jax.lax.optimization_barrier((factor, a, square, factor.trusted(y)))
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
+def held_out(
+    system: AbstractSystem, y: Float[Array, " D"], partition: Partition
+) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
+    """r_S = (C_SS)⁻¹ a_S for each fold, in the order of y, and a; inf where not to be trusted."""
+    return _held_out_forward(system, y, partition)[0]
+
+
+def _held_out_forward(system, y, partition):
+    factor, a, _, trusted = _solved(system, y)
+    C = factor.inverse()
+    r, blocks = jnp.zeros_like(a), []
+    for group in partition.groups:
+        C, r = jax.lax.optimization_barrier((C, r))  # not side by side
+        blocks.append(C.blocks(group))
+        r = group.scattered(blocks[-1].solve(group.gather(a)), into=r)
+    ok = trusted & jnp.isfinite(r).all()
+    value = jax.tree.map(lambda each: jnp.where(ok, each, jnp.full_like(each, jnp.inf)), (r, a))
+    return value, (C, a, blocks, r, ok)
+
+
+def _held_out_backward(partition, saved, bars):
+    C, a, blocks, r, ok = saved
+    r_bar, a_bar = bars
+    V, bar = [], r_bar
+    for group, own in zip(partition.groups, blocks, strict=True):
+        V.append(own.solve(group.gather(bar)))
+        bar = jax.lax.optimization_barrier((bar, V[-1]))[0]
+    R = [group.gather(r) for group in partition.groups]
+    return _or_zero(ok, C.pulled_folds(a, partition.groups, V, R, (r_bar, a_bar)))
+
+
+held_out.defvjp(_held_out_forward, _held_out_backward)
+
+
+@jax.custom_vjp
+def free_residuals(
+    system: AbstractSystem, y: Float[Array, " D"]
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """‖A⁻¹y‖² and tr A⁻¹; inf and 1 where they cannot be trusted."""
+    return _free_residuals_forward(system, y)[0]
+
+
+def _free_residuals_forward(system, y):
+    factor, a, _, trusted = _solved(system, y)
+    squares, trace = a @ a, factor.inverse_trace
+    ok = trusted & jnp.isfinite(squares) & jnp.isfinite(trace)
+    value = jnp.where(ok, squares, jnp.inf), jnp.where(ok, trace, jnp.ones_like(trace))
+    return value, (factor, a, ok)
+
+
+def _free_residuals_backward(saved, bars):
+    factor, a, ok = saved
+    squares_bar, trace_bar = bars
+    w = 2 * squares_bar * factor.solve(a)
+    return _or_zero(ok, (factor.inverse().pulled(-w, a, square=-trace_bar), w))
+
+
+free_residuals.defvjp(_free_residuals_forward, _free_residuals_backward)
+
+
+@jax.custom_vjp
+def log_density(system: AbstractSystem, y: Float[Array, " D"]) -> Float[Array, ""]:
+    """The log density of y under N(0, A); −inf where it cannot be trusted."""
+    return _log_density_forward(system, y)[0]
+
+
+def _log_density_forward(system, y):
+    factor, a, square, trusted = _solved(system, y)
+    value = -0.5 * (square + factor.log_det + len(y) * jnp.log(2 * jnp.pi).astype(y.dtype))
+    ok = trusted & jnp.isfinite(value)
+    return jnp.where(ok, value, -jnp.inf), (factor, a, ok)
+
+
+def _log_density_backward(saved, bar):
+    factor, a, ok = saved
+    system_bar = factor.inverse().pulled(0.5 * bar * a, a, inverse=-0.5 * bar)
+    return _or_zero(ok, (system_bar, -bar * a))
+
+
+log_density.defvjp(_log_density_forward, _log_density_backward)
+
+
+def _or_zero(ok: Bool[Array, ""], tree):
+    """Derivatives, zero in place of NaN where the value is infinite."""
+    return jax.tree.map(lambda each: jnp.where(ok, each, jnp.zeros_like(each)), tree)

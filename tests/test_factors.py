@@ -1,0 +1,87 @@
+"""The factors of A against NumPy, and their derivatives against the rules of JAX."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hamkernel._factors.dense import DenseFactor, DenseSystem
+from hamkernel._factors.low_rank import LowRankSystem
+
+
+def positive(D: int) -> np.ndarray:
+    B = np.random.default_rng(D).normal(size=(D, D))
+    return B @ B.T / D + 0.1 * np.eye(D)
+
+
+def tall(D: int, r: int) -> tuple[jax.Array, jax.Array]:
+    return jnp.asarray(np.random.default_rng(D).normal(size=(D, r))), jnp.asarray(0.3)
+
+
+@pytest.mark.parametrize("D", [1, 31, 129, 601, 1500])  # one block, two, of unequal size, all
+def test_the_dense_inverse_and_factor_are_those_of_numpy(D):
+    A = positive(D)
+    factor = DenseFactor(jnp.asarray(A))
+    C = factor.inverse().C
+    np.testing.assert_allclose(C, np.linalg.inv(A), atol=1e-10)
+    np.testing.assert_array_equal(C, C.T)
+    np.testing.assert_allclose(factor.R, np.linalg.cholesky(A).T, atol=1e-11)
+
+
+@pytest.mark.parametrize("shape", [(40, 7), (7, 12)], ids=["tall", "wide"])
+@pytest.mark.parametrize("kind", ["dense", "low rank"])
+def test_every_primitive_is_that_of_numpy(kind, shape):
+    rows, ridge = tall(*shape)
+    A = np.asarray(rows @ rows.T) + float(ridge) * np.eye(len(rows))
+    system = DenseSystem(jnp.asarray(A)) if kind == "dense" else LowRankSystem(rows, ridge)
+    factor, y = system.factor(), np.cos(np.arange(len(rows)))
+    a, square = factor.solved(jnp.asarray(y))
+    expected = np.linalg.solve(A, y)
+    np.testing.assert_allclose(a, expected, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(factor.solve(jnp.asarray(y)), expected, rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(square, y @ expected, rtol=1e-12)
+    np.testing.assert_allclose(factor.log_det, np.linalg.slogdet(A)[1], rtol=1e-12)
+    np.testing.assert_allclose(factor.inverse_trace, np.trace(np.linalg.inv(A)), rtol=1e-12)
+
+
+def test_a_batch_is_one_matrix_after_the_other():
+    A = np.stack([positive(40), 2 * positive(40)])
+    C = jax.vmap(lambda A: DenseFactor(A).inverse().C)(jnp.asarray(A))
+    np.testing.assert_allclose(C, np.linalg.inv(A), atol=1e-12)
+    program = str(jax.make_jaxpr(jax.vmap(lambda A: DenseFactor(A).R))(jnp.asarray(A)))
+    assert "scan" in program or "while" in program  # not one call for the batch
+    assert "cholesky" in program
+
+
+def test_a_matrix_that_is_not_positive_gives_nan():
+    A = positive(75)
+    A[50, 50] = -1.0
+    factor = DenseFactor(jnp.asarray(A))
+    assert np.isnan(factor.inverse().C).all()
+    assert np.isnan(factor.log_det)
+    assert not factor.trusted(jnp.ones(75))
+
+
+@pytest.mark.parametrize("mode", ["forward", "backward", "twice"])
+def test_derivatives_of_the_primitives_are_those_of_jax(mode):
+    # `jnp.linalg` has rules of its own, which no call of ours goes through.
+    A, dA = jnp.asarray(positive(6)), jnp.asarray(positive(7)[:6, :6])
+    y = jnp.cos(jnp.arange(6.0))
+
+    def ours(t):
+        factor = DenseFactor(A + t * dA)
+        a, square = factor.solved(y)
+        return factor.log_det + square + a @ jnp.sin(y) + factor.inverse_trace
+
+    def reference(t):
+        B = A + t * dA
+        a = jnp.linalg.solve(B, y)
+        log_det = jnp.linalg.slogdet(B)[1]
+        return log_det + y @ a + a @ jnp.sin(y) + jnp.trace(jnp.linalg.inv(B))
+
+    derivative = {
+        "forward": jax.jacfwd,
+        "backward": jax.grad,
+        "twice": lambda f: jax.jacrev(jax.grad(f)),
+    }[mode]
+    np.testing.assert_allclose(derivative(ours)(0.1), derivative(reference)(0.1), rtol=1e-9)
