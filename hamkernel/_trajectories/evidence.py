@@ -6,7 +6,8 @@ starts have a prior so wide that it only stands in where nothing else is known. 
 orthonormal columns of P, what is left is M̃ = (I − QQᵀ) M and r̃ = (I − QQᵀ) r, which is exact
 generalised least squares with the starts integrated out; no complete QR is needed:
 
-    (I + M̃ᵀM̃) w = M̃ᵀ r̃,     −2 log p = ‖r̃ − M̃w‖² + ‖w‖² + log det(I + M̃ᵀM̃) + 2 log det U − 2 log det W
+    (I + M̃ᵀM̃) w = M̃ᵀ r̃,
+    −2 log p = ‖r̃ − M̃w‖² + ‖w‖² + log det(I + M̃ᵀM̃) + 2 log det U − 2 log det W
 
 for P = QU, but for a constant.
 """
@@ -151,7 +152,7 @@ def solved(K, log_noise, S, rows: Rows, spread) -> Solution:
     inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype), lower=True)
     used = len(w) - jnp.sum(inverse**2)  # tr M̃ (I + M̃ᵀM̃)⁻¹ M̃ᵀ
     started = rows.counts.any(axis=(1, 2)).sum() * U.shape[1]
-    free = (rows.counts > 0).sum() - started - used
+    free = ((rows.counts > 0).sum() - started).astype(used.dtype) - used
     return Solution(w, (made.T @ w).reshape(S.shape), moves, free)
 
 

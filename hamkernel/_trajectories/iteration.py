@@ -27,11 +27,12 @@ from hamkernel._trajectories.start import smooth_rows
 
 _ROUNDS = 4  # Levenberg steps before a segment is judged: without them up to 40 % were lost
 _SEARCH = 25  # steps of BFGS, which go on in the next iteration
+_NEGLIGIBLE = 1e-3  # of the states: no residual that drops a segment
 _SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a step, until one makes the objective smaller
 
 
 class Task(NamedTuple):
-    """What does not change while learning: the runs, the mean, landmarks, boxes, prior of starts."""
+    """What does not change: the runs, the mean, landmarks, the box and the prior of starts."""
 
     data: Prepared
     mean: Any
@@ -91,7 +92,8 @@ def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, St
     before = shot(
         now.field, segments, now.model.log_noise, task.spread, steps, segments.starts, _ROUNDS
     )
-    good = trusted(before, segments)
+    least = _NEGLIGIBLE * task.data.scale
+    good = trusted(before, segments, np.maximum(np.exp(np.asarray(now.model.log_noise)), least))
     rows = rows_along(now.field, before.path, segments, jnp.asarray(good))
     model, loss = most_likely(now.model, task.S, rows, task.spread, task.box, _SEARCH)
     found = solved(model.kernel, model.log_noise, task.S, rows, task.spread)
@@ -159,3 +161,12 @@ def _stiffness(field: Expansion, paths: list[np.ndarray]) -> float:
     X = X[np.linspace(0, len(X) - 1, 256).round().astype(int)]
     norms = np.asarray(_norms(field, jnp.asarray(X)))
     return float(np.nanquantile(np.where(np.isfinite(norms), norms, 0.0), 0.95))
+
+
+def changed(task: Task, before: Current, now: Current) -> float:
+    """By how much the field has changed at the landmarks, relative to its size there."""
+    old, new = (np.asarray(_values(each.field, task.S)) for each in (before, now))
+    return float(np.linalg.norm(new - old) / max(np.linalg.norm(new), np.finfo(float).tiny))
+
+
+_values = eqx.filter_jit(lambda field, S: jax.vmap(field)(S))

@@ -168,7 +168,7 @@ def segments_of(
     size: int,
     length: int,
 ) -> Segments:
-    """Padded arrays of pieces (times, states, counts, start); `size` segments of `length` samples."""
+    """Pieces (times, states, counts, start) as `size` segments of `length` samples, padded."""
     n = pieces[0][1].shape[1]
     spans = np.zeros((size, length - 1))
     measured, counts = np.zeros((size, length, n)), np.zeros((size, length, n))

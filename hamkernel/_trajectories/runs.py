@@ -147,7 +147,7 @@ def _times(t: Any, run: int) -> Float[Array, " T"]:
         i = int(back[0])
         raise ValueError(
             f"times[{run}] must increase; sample {i + 1}, at {seen[i + 1]:g}, does not come after "
-            f"sample {i}, at {seen[i]:g} ({back.size} such). Sort by time and drop repeated samples; "
+            f"sample {i}, at {seen[i]:g} ({back.size} such). Sort by time and drop repeats; "
             "where a log starts anew, start a new run."
         )
     return t

@@ -1,5 +1,6 @@
 """Multiple shooting: segments, their starts by Levenberg steps, and which of them to trust."""
 
+import itertools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -34,8 +35,15 @@ def cuts(runs: list[Run], most: int) -> list[Piece]:
     for r, run in enumerate(runs):
         T = len(run.times)
         ends = np.linspace(0, T, -(-T // most) + 1).round().astype(int)
-        pieces += [Piece(r, int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+        pieces += [Piece(r, int(a), int(b)) for a, b in itertools.pairwise(ends)]
     return pieces
+
+
+def grown(runs: list[Run], pieces: list[Piece], good: Bool[np.ndarray, " S"]) -> list[Piece]:
+    """Runs of which all pieces are good in one piece, up to `LONG` samples; others as they are."""
+    lost = {piece.run for piece, is_good in zip(pieces, good, strict=True) if not is_good}
+    whole = [piece for piece in cuts(runs, LONG) if piece.run not in lost]
+    return whole + [piece for piece in pieces if piece.run in lost]
 
 
 def halved(pieces: list[Piece], good: Bool[np.ndarray, " S"]) -> list[Piece]:
@@ -132,13 +140,24 @@ def shot(
     return Shot(best, path, squares)
 
 
-def trusted(found: Shot, segments: Segments, noise_free: bool = False) -> Bool[np.ndarray, " S"]:
-    """Which segments the field explains well enough to learn from them."""
-    squares = np.asarray(found.squares)
-    samples = np.asarray(segments.counts > 0).sum(axis=(1, 2))
-    growth = np.abs(np.asarray(tangents(found.path.across))).max(axis=(1, 2, 3))
-    real = samples > 0
-    good = real & np.isfinite(squares) & (growth < _GROWTH)
+def trusted(
+    found: Shot, segments: Segments, sigma: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, " S"]:
+    """Which segments the field follows well enough to learn from them.
+
+    Args:
+        found: the paths.
+        segments: the samples.
+        sigma: what residuals are compared with: the noise, or a thousandth of the states where that
+            is more, since a field that is not yet exact leaves more than no noise at all.
+    """
+    counts = np.asarray(segments.counts)
+    samples = (counts > 0).sum(axis=(1, 2))
+    with np.errstate(all="ignore"):  # a path that is lost is infinite
+        growth = np.abs(np.asarray(tangents(found.path.across))).max(axis=(1, 2, 3))
+        residual = (np.asarray(segments.measured) - np.asarray(found.path.x)) / sigma[None, None]
+        squares = np.where(counts > 0, counts * residual**2, 0.0).sum(axis=(1, 2))
+    good = (samples > 0) & np.isfinite(found.squares) & np.isfinite(squares) & (growth < _GROWTH)
     if good.any():
         each = squares / np.maximum(samples, 1)
         # Where half of them are better than their noise, that is no reason to drop the others.

@@ -68,7 +68,7 @@ def processes(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> list
 def _process(steps, y, seen, longest: float, spacing: float) -> Coordinate:
     scale = y[seen].std() if seen.any() else 0.0
     if not scale > 0:  # never measured, or constant
-        nothing = Process(*(np.asarray(v) for v in (-np.inf, -np.log(longest), -np.inf)))
+        nothing = Process(*(jnp.asarray(v) for v in (-np.inf, -np.log(longest), -np.inf)))
         return Coordinate(nothing, bool(seen.any()))
     # A swing of a hundred spans of the data looks like a line; one faster than half of a sample,
     # like noise. The noise is at least what the digits of the states leave.
@@ -77,7 +77,10 @@ def _process(steps, y, seen, longest: float, spacing: float) -> Coordinate:
     found = _found(jnp.asarray(steps), jnp.asarray(y / scale), jnp.asarray(seen), low, high)
     log_amplitude, log_rate, log_noise = np.asarray(found)
     shift = np.log(scale)
-    return Coordinate(Process(log_amplitude + shift, log_rate, log_noise + shift), True)
+    return Coordinate(
+        Process(*(jnp.asarray(v) for v in (log_amplitude + shift, log_rate, log_noise + shift))),
+        True,
+    )
 
 
 @eqx.filter_jit
@@ -138,7 +141,9 @@ def smoothed(
             for path in paths:
                 path[:, :, c] = 0.0 if coordinate.seen else np.nan
         else:
-            one = _smoothed(coordinate.process, steps, runs.states[:, :, c], runs.seen[:, :, c])
+            one = _smoothed(
+                coordinate.process, steps, runs.states[:, :, c], jnp.asarray(runs.seen[:, :, c])
+            )
             for path, values in zip(paths, one, strict=True):
                 path[:, :, c] = np.asarray(values)
         paths.value[: len(means), :, c] += means[:, None, c]
