@@ -12,6 +12,7 @@ Where things are, in the order of the data; a folder imports from itself and tho
     _solvers      how it is found: dense, by conjugate gradients, of low rank, from streams
     _validation   the losses in closed form
     _tuning       hyperparameters by their gradients
+    _trajectories from logged runs to a field
     _dynamics     simulation
     _save         fields in files
     systems, plot, paper
@@ -42,6 +43,9 @@ from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
 from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
 from hamkernel._structures.base import Even, Odd, Sum
 from hamkernel._structures.operators import CurlFree, DivergenceFree, Separable, Symplectic
+from hamkernel._trajectories.learn import learn
+from hamkernel._trajectories.learned import Learned
+from hamkernel._trajectories.runs import Runs
 from hamkernel._tuning.tune import Tuned, tune
 from hamkernel._validation.losses import (
     cross_validation_loss,
@@ -96,6 +100,10 @@ __all__ = [  # noqa: RUF022 - in reading order
     "log_marginal_likelihood",
     "tune",
     "Tuned",
+    # Logged runs.
+    "Runs",
+    "learn",
+    "Learned",
     # Simulation.
     "simulate",
     "ImplicitMidpoint",

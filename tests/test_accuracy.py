@@ -1,4 +1,4 @@
-"""Losses and their gradients against 60 digits of mpmath and refits of SciPy, where it is hard."""
+"""Losses and their gradients against 100 digits of Arb and refits of SciPy, where it is hard."""
 
 import jax
 import jax.numpy as jnp
@@ -62,3 +62,57 @@ def test_losses_below_rounding_are_infinite_and_not_large():
         assert hk.log_marginal_likelihood(K, X, Y, ridge) == -np.inf
         slope = jax.grad(lambda log_ridge: hk.cross_validation_loss(K, X, Y, jnp.exp(log_ridge)))
         assert slope(np.log(ridge)) == 0
+
+
+# What fits say of themselves.
+
+
+def test_conjugate_gradients_name_cholesky_where_the_ridge_is_rounding():
+    for regularization in (1e-12, 1e-14):
+        with pytest.raises(RuntimeError, match=r"times the rounding.*hk\.Cholesky\(\)"):
+            hk.fit(K, X, Y, regularization, solver=hk.ConjugateGradient())
+    few = hk.ConjugateGradient(max_iterations=1)
+    with pytest.raises(RuntimeError) as failure:
+        hk.fit(K, X, Y, 1e-8, solver=few)
+    assert "rounding" not in str(failure.value).split("float32")[0]  # another cause
+
+
+@pytest.mark.parametrize("regularization", [1e-2, 1e-5, 1e-8])
+def test_the_truncation_bounds_the_distance_to_the_exact_fit(regularization):
+    exact = hk.fit(K, X, Y, regularization)
+    field = hk.fit(K, X, Y, regularization, solver=hk.Nystrom(tolerance=0.5))
+    a = np.linalg.solve(G + len(X) * regularization * np.eye(Y.size), Y.ravel())
+    misfit = len(X) * regularization * np.linalg.norm(a)  # of the exact fit, by NumPy
+    distance = np.linalg.norm(field.evaluate(X) - exact.evaluate(X))
+    bound = float(field.info.truncation) * misfit
+    assert distance <= bound + 1e-13 * np.linalg.norm(Y) * np.linalg.cond(G)
+    coarse = hk.fit(K, X, Y, regularization, solver=hk.Nystrom(points=X[::40]))
+    assert np.linalg.norm(coarse.evaluate(X) - exact.evaluate(X)) > bound  # the control
+
+
+@pytest.mark.parametrize("regularization", [1e-4, 1e-9, 1e-13])
+def test_the_relative_residual_is_that_of_the_coefficients(regularization):
+    field = hk.fit(K, X, Y, regularization)
+    a = field.coefficients.astype(np.longdouble).reshape(-1)
+    left = Y.ravel() - (G.astype(np.longdouble) @ a + len(X) * regularization * a)
+    expected = float(np.linalg.norm(left) / np.linalg.norm(Y))
+    # Both round: the products of the fit by ε‖G‖‖a‖.
+    rounding = np.finfo(float).eps * np.linalg.norm(G, 2) * np.linalg.norm(a) / np.linalg.norm(Y)
+    assert abs(float(field.info.relative_residual) - expected) <= 10 * rounding
+    assert expected < 1e-9
+
+
+@pytest.mark.parametrize("solver", [None, hk.Nystrom(max_points=40), hk.ConjugateGradient()])
+@pytest.mark.parametrize("regularization", [1e-3, 1e-7])
+def test_energy_differences_are_line_integrals_of_the_field(solver, regularization):
+    field = hk.fit(K, X, Y, regularization, solver=solver)
+    nodes, weights = np.polynomial.legendre.leggauss(60)
+    rotated = np.kron([[0, -1], [1, 0]], np.eye(2))  # ∇H = −J f
+    for start, end in ((X[0], X[50]), (X[3], X[3] + 0.4), (X[7] - 0.3, X[80])):
+        path = start + (end - start) * (nodes[:, None] + 1) / 2
+        slopes = np.asarray(field.evaluate(path)) @ rotated.T
+        integral = weights / 2 @ (slopes @ (end - start))
+        difference = field.hamiltonian(end) - field.hamiltonian(start)
+        terms = np.abs(field.coefficients).sum() * np.finfo(float).eps
+        np.testing.assert_allclose(difference, integral, rtol=1e-9, atol=10 * terms + 1e-12)
+    assert abs(integral + weights / 2 @ (slopes @ (end - start))) > 1e-2  # the wrong sign

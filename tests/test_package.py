@@ -28,6 +28,7 @@ ROOMS = [
     {"_solvers"},
     {"_validation"},
     {"_tuning"},
+    {"_trajectories"},
     {"_dynamics", "_save", "systems"},
     {"plot"},
     {"paper"},

@@ -1,7 +1,5 @@
 """Where `tune` looks: the box of each hyperparameter, the subset of points, the starts."""
 
-from typing import Any
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,10 +8,11 @@ import pytest
 
 import hamkernel as hk
 from hamkernel._tuning.boxes import full_trace, hyperparameters
-from hamkernel._tuning.objective import HUGE, criterion_of
-from hamkernel._tuning.plan import SearchPlan
-from hamkernel._tuning.runs import _design, _spread_out
+from hamkernel._tuning.descent import Descent, Run
+from hamkernel._tuning.objective import criterion_of
+from hamkernel._tuning.part import Part, rows_of_parts
 from hamkernel._tuning.space import SearchSpace
+from hamkernel._tuning.starts import design, shares_apart, spread_out
 from hamkernel._validation.bases import WaveBasis
 from hamkernel._validation.losses import generalized_loss
 
@@ -67,17 +66,22 @@ BOXES = {
 }
 
 
+def boxes(k, X, Y):
+    X, Y = jnp.asarray(X), jnp.asarray(Y)
+    return hyperparameters(hk.Separable(k), X, Y, X)
+
+
 @pytest.mark.parametrize("name", BOXES)
 def test_the_box_comes_from_the_data(name):
     k, parameter, low, high = BOXES[name]
-    found = hyperparameters(hk.Separable(k), jnp.asarray(X), jnp.asarray(Y))
+    found = boxes(k, X, Y)
     (box,) = (each for each in found if each.name.endswith("." + parameter))
     np.testing.assert_allclose(np.exp(box.low), low, rtol=1e-9)
     np.testing.assert_allclose(np.exp(box.high), high, rtol=1e-9)
 
 
 def only_box(k, parameter, X, Y):
-    found = hyperparameters(hk.Separable(k), jnp.asarray(X), jnp.asarray(Y))
+    found = boxes(k, X, Y)
     (box,) = (each for each in found if each.name.endswith("." + parameter))
     return box.low, box.high
 
@@ -138,65 +142,17 @@ def space(kernel=K, bounds=None):
     return SearchSpace(kernel, jnp.asarray(X), jnp.asarray(Y), jnp.asarray(1e-3), (), bounds or {})
 
 
-def test_the_floor_of_lambda_rises_where_the_field_would_be_rough():
-    whole, states = space(), jnp.asarray(X)
-    lowest = jnp.exp(whole.ridge_box(K, states)[0])
-    smooth = whole.smooth(K, lowest, states, 0.1)
-    trace = 2 * N * 1.0  # of the Gram
-    floor = 0.1 * np.sqrt(np.finfo(float).eps) * trace / N
-    np.testing.assert_allclose(jnp.exp(smooth.ridge_box(K, states)[0]), floor)
-    assert whole.smooth(K, lowest, states, 1e-12) is whole  # there is no misfit
-    assert whole.smooth(K, jnp.asarray(1.0), states, 0.1) is whole  # λ is large enough
-    assert smooth.smooth(K, floor, states, 0.4) is smooth  # the misfit is that of the bound
-    assert smooth.smooth(K, 3 * floor, states, 0.9) is not smooth
-    assert smooth.holds_up(K, floor, states, 1e-4)  # that of a thousand times the misfit
-    assert not smooth.holds_up(K, 10 * floor, states, 1e-4)  # λ is where it wants to be
-    assert not smooth.holds_up(K, floor, states, 0.1)
-    given = space(bounds={"regularization": (1e-9, 1.0)})
-    assert given.smooth(K, lowest, states, 0.1) is given  # the caller has said
-
-
-def test_the_slope_of_the_floor_of_lambda_takes_the_memory_of_a_few_copies_of_the_states():
-    many = jnp.asarray(RNG.normal(size=(50_000, 4)))
-    whole = SearchSpace(
-        hk.Symplectic(hk.Gaussian(np.ones(4))), many[:9], many[:9], jnp.asarray(1e-3), (), {}
-    )
-
-    def floor(log_lengthscale):
-        kernel = eqx.tree_at(lambda K: K.kernel.log_lengthscale, whole.kernel, log_lengthscale)
-        return whole.ridge_box(kernel, many)[0]
-
-    analysis = jax.jit(jax.grad(floor)).lower(jnp.zeros(4)).compile().memory_analysis()
-    assert analysis is not None
-    assert analysis.temp_size_in_bytes < 12 * many.nbytes
-
-
 def test_a_start_whose_kernel_is_not_positive_is_in_the_box():
     start = space(hk.Symplectic(lambda x, z: -jnp.exp(-((x - z) @ (x - z)))))
-    assert np.isfinite(start.encode_start(jnp.asarray(X))).all()
+    assert np.isfinite(start.encode_start()).all()
 
 
 def test_the_subset_has_its_share_of_every_fold():
     labels = np.where(np.arange(400) % 12 == 0, 1, 0)
-    rows = criterion_of("cross_validation", 400, labels).coarse_points(jnp.zeros((400, 2)))
+    criterion = criterion_of("cross_validation", 400, labels)
+    rows, everything = rows_of_parts(jnp.zeros((400, 2)), criterion, dense=True)
+    assert (len(rows), len(everything)) == (64, 400)
     assert abs(labels[rows].mean() - labels.mean()) < 1 / len(rows)
-
-
-def test_starts_are_no_neighbours():
-    design = _design((0, 1), np.float64)
-    shares = np.sin(_spread_out(design, jnp.sum(design**2, axis=1), 6)) / 2
-    gaps = np.linalg.norm(shares[:, None] - shares[None], axis=2)[np.triu_indices(6, 1)]
-    assert gaps.min() >= 0.25 * 2**0.5
-
-
-def test_the_lengthscales_of_a_vector_start_together():
-    moved = space(hk.Symplectic(hk.Gaussian(np.ones(2)) + 2.0 * hk.Gaussian(np.ones(2))))
-    assert moved.directions == (0, 0, 1, 1, 2, 3)
-    design = _design(moved.directions, np.float64)
-    assert design.shape == (256, 6)
-    np.testing.assert_array_equal(design[:, 0], design[:, 1])
-    # Weights of a network that start equal would stay so.
-    assert space(hk.Symplectic(Plain(jnp.zeros(()), jnp.zeros(2)))).directions == (0, 1, 2, 3)
 
 
 def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free():
@@ -213,30 +169,124 @@ def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free
         assert judged(generalized_loss(K, states, few, ridge, waves, low_rank + more))
         assert judged(generalized_loss(K, states, few, ridge, None, dense + more))
     criterion = criterion_of("generalized_cross_validation", 6, 5)
-    assert criterion.value(K, states, few, jnp.asarray(1e-12)) == HUGE
-    assert criterion.with_basis(waves).value(K, states, few, jnp.asarray(1.0)) < HUGE
+    assert criterion.loss(K, states, few, jnp.asarray(1e-12))[0] == np.inf
+    assert criterion.with_basis(waves).loss(K, states, few, jnp.asarray(1.0))[0] < np.inf
 
 
-@pytest.mark.parametrize("told", [5e-4, 0.5])
-def test_a_few_runs_decide_neither_without_noise_nor_where_they_misled(told, monkeypatch):
-    """The misfit that they tell is wrong: if it were 0.5, all λ of a search would be too large."""
-    rng = np.random.default_rng(3)
-    S = jnp.asarray(rng.uniform(-2, 2, size=(30, 2)))
-    V = jnp.stack([S[:, 1], -jnp.sin(S[:, 0])], axis=1)
-    right = hk.tune(K, S, V)
-    really, bounds, made = SearchPlan._found, [], []
+@pytest.mark.parametrize(("N", "n", "parts"), [(64, 2, 1), (65, 2, 2), (2000, 2, 3), (600, 8, 3)])
+def test_many_points_are_searched_in_parts_that_grow_and_end_with_all(N, n, parts):
+    criterion = criterion_of("cross_validation", N, 5)
+    rows = rows_of_parts(jnp.zeros((N, n)), criterion, dense=True)
+    sizes = [len(each) for each in rows]
+    assert len(rows) == parts
+    assert sizes == sorted(sizes)
+    np.testing.assert_array_equal(rows[-1], np.arange(N))
+    for some in rows:
+        assert len(set(some.tolist())) == len(some)
+    few = rows_of_parts(jnp.zeros((N, n)), criterion, dense=False)
+    assert len(few) == max(parts - 1, 1)
 
-    def watched(plan, space, runs):
-        found: Any = really(plan, space, runs)
-        bounds.append(float(space.roundings))
-        made.append(int((found.runs.value < HUGE).sum()))
-        return found._replace(misfit=told) if len(made) == 1 else found
 
-    monkeypatch.setattr(SearchPlan, "_found", watched)
-    tuned = hk.tune(K, S, V)
-    if told == 0.5:
-        assert bounds[1] > 1e5 * bounds[0]
-        del bounds[1], made[1]
-    assert bounds == 2 * bounds[:1]
-    assert made == [4, 16]
-    np.testing.assert_allclose(tuned.loss, right.loss)
+def test_starts_are_no_neighbours():
+    points = design((0, 1))
+    starts = spread_out(points, np.sum(points**2, axis=1), 6)
+    gaps = [shares_apart(starts[i], starts[j]) for i in range(6) for j in range(i)]
+    assert min(gaps) >= 0.25 * 2**0.5
+    everywhere = spread_out(points, np.sum(points**2, axis=1), 60)
+    assert len(np.unique(everywhere, axis=0)) == 60  # full, but none is taken twice
+
+
+def test_the_lengthscales_of_a_vector_start_together():
+    moved = space(hk.Symplectic(hk.Gaussian(np.ones(2)) + 2.0 * hk.Gaussian(np.ones(2))))
+    assert moved.directions == (0, 0, 1, 1, 2, 3)
+    points = design(moved.directions)
+    assert points.shape == (256, 6)
+    np.testing.assert_array_equal(points[:, 0], points[:, 1])
+    # Weights of a network that start equal would stay so.
+    assert space(hk.Symplectic(Plain(jnp.zeros(()), jnp.zeros(2)))).directions == (0, 1, 2, 3)
+
+
+def minimum(function, start, tolerance=1e-8, max_steps=200):
+    """What a run finds of a function (u) -> (value, slope), and how many values it asked for."""
+    run = Run(np.asarray(start, float))
+    descent, asked = Descent(run, tolerance, max_steps), 0
+    while descent.going:
+        value, slope = function(descent.trial)
+        descent.tell(value, value, slope)
+        asked += 1
+    return run, asked
+
+
+def rosenbrock(u):
+    (x, y), a = u, 10.0
+    slope = np.array([-2 * (1 - x) - 4 * a * x * (y - x**2), 2 * a * (y - x**2)])
+    return (1 - x) ** 2 + a * (y - x**2) ** 2, slope
+
+
+def test_a_run_finds_the_minimum_at_the_end_of_a_curved_valley():
+    run, asked = minimum(rosenbrock, [-1.2, 1.0])
+    np.testing.assert_allclose(run.u, [1, 1], atol=1e-3)
+    assert run.converged
+    assert asked < 60
+    stopped, _ = minimum(rosenbrock, [-1.2, 1.0], max_steps=3)
+    assert stopped.steps == 3
+    assert not stopped.converged
+
+
+def test_a_run_backs_away_from_where_there_is_no_value():
+    def half(u):
+        value, slope = rosenbrock(u)
+        return (value, slope) if u[0] < 0.5 else (np.inf, np.zeros(2))
+
+    run, _ = minimum(half, [-1.2, 1.0])
+    assert rosenbrock(run.u)[0] < 0.3
+    nowhere, asked = minimum(lambda u: (np.inf, np.zeros(2)), [0.0, 0.0])
+    assert asked == 1
+    assert not nowhere.converged
+
+
+def test_a_run_takes_its_curvature_along():
+    run, _ = minimum(rosenbrock, [-1.2, 1.0])
+    shifted = Run(run.u + np.array([0.01, 0.02]), curvature=run.curvature)
+    descent, asked = Descent(shifted, 1e-8, 50), 0
+    while descent.going:
+        value, slope = rosenbrock(descent.trial)
+        descent.tell(value, value, slope)
+        asked += 1
+    np.testing.assert_allclose(shifted.u, [1, 1], atol=1e-3)
+    assert asked <= 5
+
+
+def whole(kernel, Y, bounds=None):
+    """The objective of the search on all of X."""
+    given = SearchSpace(kernel, jnp.asarray(X), jnp.asarray(Y), jnp.asarray(1e-3), (), bounds or {})
+    criterion = criterion_of("cross_validation", N, 5)
+    return Part(given, criterion, jnp.asarray(X), jnp.asarray(Y), np.arange(N))
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_the_slope_is_that_of_the_value_on_both_sides_of_the_wall(share):
+    part = whole(hk.Symplectic(hk.Gaussian(4.0)), Y)
+    u = np.arcsin(2 * np.array([0.8, share]) - 1)
+    ((value, loss, slope),) = part(u[None])
+    assert (value > np.log(loss) + 1) == (share < 0.5)  # far beyond the wall, and before it
+    h = 1e-4
+    for i, one in enumerate(np.eye(2)):
+        (more, *_), (less, *_) = part(np.stack([u + h * one, u - h * one]))
+        np.testing.assert_allclose(slope[i], (more - less) / (2 * h), rtol=1e-3, atol=1e-5)
+
+
+def test_the_wall_is_where_the_coefficients_are_too_large_and_only_where_lambda_is_ours():
+    k = hk.Gaussian(8.0)
+    u = np.arcsin(2 * np.array([0.75, 0.25]) - 1)
+    part = whole(hk.Symplectic(k), Y)
+    ((value, loss, _),) = part(u[None])
+    kernel, ridge, _ = part.objective.space.decode(jnp.asarray(u))
+    G = np.asarray(hk.gram(kernel, X)).reshape(2 * N, 2 * N)
+    a = np.linalg.solve(G + 0.8 * N * float(ridge) * np.eye(2 * N), Y.ravel())
+    size = np.linalg.norm(a) * np.trace(G) * np.finfo(float).eps ** 0.5 / np.linalg.norm(Y)
+    assert size > 2
+    np.testing.assert_allclose(value, np.log(loss) + np.log(size) ** 2, rtol=1e-4)
+    low, high = (float(np.exp(side)) for side in part.objective.space.ridge_box(jnp.asarray(2.0)))
+    ((value, loss, _),) = whole(hk.Symplectic(k), Y, {"regularization": (low, high)})(u[None])
+    np.testing.assert_allclose(value, np.log(loss))

@@ -80,6 +80,12 @@ SIMPLE = hk.Symplectic(hk.Gaussian(1.0))
 
 
 @pytest.fixture(scope="module")
+def simple():
+    """The plainest kernel with everything by default, on `scattered()`."""
+    return hk.tune(SIMPLE, *scattered())
+
+
+@pytest.fixture(scope="module")
 def rich():
     """A kernel with leaves of every kind: per coordinate, a weight of a sum, a user's own."""
     K = hk.Symplectic(2.0 * hk.Gaussian(np.array([0.4, 6.0]))) + hk.Separable(
@@ -153,7 +159,7 @@ def test_result_says_how_the_search_went(rich):
     assert 0 < int(tuned.steps) <= 64
     names = {name.rpartition(".")[2] for name in tuned.bounds}
     assert names == {"lengthscale", "scale", "w", "regularization"}
-    assert set(tuned.at_bounds) <= set(tuned.bounds)
+    assert {name.removesuffix("[1]") for name in tuned.at_bounds} <= set(tuned.bounds)
     for low, high in tuned.bounds.values():
         assert np.isfinite([low, high]).all()
         assert low < high
@@ -231,9 +237,9 @@ def test_a_part_of_a_named_sum_is_frozen_by_its_name_and_its_hyperparameters_are
         hk.tune(K, X, Y, bounds={"rest": (1.0, 2.0)})
 
 
-def test_bounds_are_obeyed_and_reported_and_a_hyperparameter_at_one_is_named():
+def test_bounds_are_obeyed_and_reported_and_a_hyperparameter_at_one_is_named(simple):
     X, Y = scattered()
-    free = hk.tune(SIMPLE, X, Y)
+    free = simple
     best = gaussian(free)
     assert "lengthscale" not in " ".join(free.at_bounds)
     below = hk.tune(SIMPLE, X, Y, bounds={"lengthscale": (0.2, best / 2)})
@@ -324,7 +330,9 @@ def test_kernels_without_structure_and_functions_to_maximise_are_refused():
 @pytest.mark.parametrize("folds", ["loo", np.repeat([7, 3, 9], 5)], ids=["loo", "labels"])
 def test_folds_of_every_kind_are_tuned(folds):
     X, Y = oscillator()
-    tuned = hk.tune(SIMPLE, X, Y, folds=folds)
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "the labels in folds make 3 folds")
+        tuned = hk.tune(SIMPLE, X, Y, folds=folds)
     expected = hk.cross_validation_loss(tuned.kernel, X, Y, tuned.regularization, folds)
     np.testing.assert_allclose(tuned.loss, expected, rtol=FLOOR)
 
@@ -398,7 +406,7 @@ def test_bounds_of_lambda_that_float64_cannot_carry_are_refused():
     assert tuned.regularization == 1e-3
 
 
-def test_any_optimistix_minimiser_and_any_objective_will_do():
+def test_any_optimistix_minimiser_and_any_objective_will_do(simple):
     X, Y = scattered()
 
     def objective(K, X, Y, regularization):
@@ -410,7 +418,7 @@ def test_any_optimistix_minimiser_and_any_objective_will_do():
         tuned.loss, refit_loss(tuned.kernel, X, Y, tuned.regularization), rtol=FLOOR
     )
     # Without slopes the valley of the flat limit is not followed to its end: no equality here.
-    best = float(hk.tune(SIMPLE, X, Y, 1e-1).loss)
+    best = float(simple.loss)
     assert best * (1 - FLOOR) < float(tuned.loss) < 1.5 * best
     assert float(tuned.loss) < 0.9 * refit_loss(SIMPLE, X, Y, 1e-1)
 
@@ -464,14 +472,14 @@ def test_an_objective_that_is_nowhere_finite_is_an_error_that_says_what_to_chang
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("size", [1e-6, 1e6])
-def test_an_objective_may_have_any_size(size):
+def test_an_objective_may_have_any_size(size, simple):
     # Two steps were enough for a small one to be called converged.
     X, Y = scattered()
 
     def objective(K, X, Y, regularization):
         return size * hk.cross_validation_loss(K, X, Y, regularization)
 
-    best = float(hk.tune(SIMPLE, X, Y).loss)
+    best = float(simple.loss)
     tuned = hk.tune(SIMPLE, X, Y, 0.1, starts=4, objective=objective)
     # The run from the caller's point, and the best of all.
     for loss in (tuned.start_losses[0], tuned.loss):
@@ -523,8 +531,9 @@ def test_a_fit_or_a_simulation_that_fails_in_an_objective_is_a_point_that_cannot
     bounds: Any = {"regularization": (1e-12, 1e6)}
     assert np.isfinite(hk.tune(SIMPLE, X, Y, objective=objective, bounds=bounds, starts=4).loss)
     raising = functools.partial(objective, throw=True)
+    long = hk.Symplectic(hk.Gaussian(100.0))
     with pytest.raises(Exception, match="not positive definite"):
-        hk.tune(SIMPLE, X, Y, 1e-8, objective=raising, bounds=bounds, starts=1)
+        hk.tune(long, X, Y, 1e-11, objective=raising, bounds=bounds, starts=1)
 
 
 @pytest.mark.few(1)
@@ -688,7 +697,7 @@ def test_a_second_search_with_features_compiles_nothing(caplog):
 
     with jax.log_compiles():
         first = run(0)
-        assert any("finish" in message for message in compiled())
+        assert any("_evaluated" in message for message in compiled())
         caplog.clear()
         assert float(run(1).loss) != float(first.loss)
     assert not compiled()
@@ -709,19 +718,15 @@ def test_data_that_is_searched_on_a_subset_is_finished_on_all_of_it():
         assert refit_loss(tuned.kernel, X, Y, factor * tuned.regularization) > best * (1 - FLOOR)
 
 
-def test_conjugate_gradients_may_fail_where_the_search_is_still_to_be_made_again():
-    # With no bound but the rounding of the Gram the best λ is 3e-17, and the solver fails there.
-    rng = np.random.default_rng(1)
-    X = rng.uniform(-2, 2, size=(40, 2))
-    Y = np.stack([X[:, 1], -np.sin(X[:, 0])], axis=1) + 0.05 * rng.normal(size=X.shape)
-    K, solver = hk.Odd(hk.Symplectic(hk.Gaussian(jnp.asarray(4.0)))), hk.ConjugateGradient()
-    tuned: Any = hk.tune(K, X, Y, solver=solver, starts=4)
-    np.testing.assert_allclose(tuned.loss, refit_loss(tuned.kernel, X, Y, tuned.regularization))
+def test_conjugate_gradients_solve_what_was_tuned_on_noisy_data(simple):
+    # Where the caller has said what λ is they may fail.
+    X, Y = scattered()
+    tuned: Any = hk.tune(SIMPLE, X, Y, solver=hk.ConjugateGradient())
+    np.testing.assert_allclose(tuned.loss, simple.loss)
     assert float(tuned.field.info.relative_residual) <= 1e-8
-    # Where the caller has said what λ is, there is no search to be made again.
     small = {"regularization": (1e-20, 1e-16), "lengthscale": (40.0, 41.0)}
     with pytest.raises(RuntimeError, match="did not converge"):
-        hk.tune(K, X, Y, 1e-17, solver=solver, starts=4, bounds=small)
+        hk.tune(SIMPLE, X, Y, 1e-17, solver=hk.ConjugateGradient(), bounds=small)
 
 
 # Planted truths.

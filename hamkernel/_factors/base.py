@@ -54,8 +54,9 @@ class AbstractInverse(eqx.Module, Generic[System]):
         groups: list[Group],
         V: list[Float[Array, "F s"]],
         R: list[Float[Array, "F s"]],
+        a_bar: Float[Array, " D"],
     ) -> tuple[System, Float[Array, " D"]]:
-        """The cotangent for Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − (C v) aᵀ, and C v = Σ_S C_:S v_S."""
+        """The cotangent for Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − w aᵀ, and w = C (v + ā)."""
 
 
 class AbstractFactor(eqx.Module, Generic[System]):

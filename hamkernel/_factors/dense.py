@@ -6,7 +6,7 @@ A = RᵀR by LAPACK, U = R⁻¹ from blocks of columns,
 
 and every quadratic form as ‖R⁻ᵀy‖². C is then positive by construction. A faster inversion, with
 blocks of C itself in place of U, was wrong by a factor of 1e14 at condition 1e13; this one is
-compared with 60 digits from condition 1e2 to 1e14 in `tests/benchmarks/accuracy.py`.
+compared with 100 digits from condition 1e2 to 1e14 in `tests/benchmarks/accuracy.py`.
 
 Source: Du Croz & Higham (1992), IMA J. Numer. Anal. 12, method 2, on the stability of inversions.
 """
@@ -164,13 +164,13 @@ class DenseInverse(AbstractInverse[DenseSystem]):
             A_bar = A_bar + square * (self.C @ self.C)
         return DenseSystem(A_bar)
 
-    def pulled_folds(self, a, groups, V, R) -> tuple[DenseSystem, Float[Array, " D"]]:
+    def pulled_folds(self, a, groups, V, R, a_bar) -> tuple[DenseSystem, Float[Array, " D"]]:
         P, Q = [], []  # C_:S v_S and C_:S r_S, a column for each fold
         for group, v, r in zip(groups, V, R, strict=True):
             rows = group.gather(self.C)  # whose sums are three times faster than those of columns
             P.append(jnp.einsum("fid,fi->df", rows, v))
             Q.append(jnp.einsum("fid,fi->df", rows, r))
-        w = jnp.concatenate(P, axis=1).sum(axis=1)
+        w = jnp.concatenate(P, axis=1).sum(axis=1) + self.C @ a_bar
         left, right = jnp.column_stack([*P, -w]), jnp.column_stack([*Q, a])
         # Else XLA computes these sums again for every entry of the product: 10 times slower.
         left, right, w = jax.lax.optimization_barrier((left, right, w))

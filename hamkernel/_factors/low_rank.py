@@ -121,7 +121,7 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
             ridge = ridge + square * trace
         return LowRankSystem(rows, ridge)
 
-    def pulled_folds(self, a, groups, V, R) -> tuple[LowRankSystem, Float[Array, " D"]]:
+    def pulled_folds(self, a, groups, V, R, a_bar) -> tuple[LowRankSystem, Float[Array, " D"]]:
         Q, T = self.Q, _right_solve(self.R, self.Q, transposed=True)
         P = jnp.sqrt(self.ridge) * backward(self.R, jnp.eye(len(self.R), dtype=Q.dtype))
         v_all, W, ridge = jnp.zeros_like(a), jnp.zeros_like(Q), jnp.zeros_like(self.ridge)
@@ -136,7 +136,7 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
             v_Q, r_Q = (jnp.einsum("fsr,fs->fr", own, each) for each in (v, r))
             dot = jnp.vdot(v, r) - jnp.vdot(v_Q, r_Q) - jnp.vdot(v_Q @ P.T, r_Q @ P.T)
             ridge = ridge + dot / self.ridge**2
-        w = self.solve(v_all)
+        w = self.solve(v_all + a_bar)
         less = self.pulled(w, a)
         return LowRankSystem(self.solve(W) - less.rows, ridge - less.ridge), w
 

@@ -208,6 +208,7 @@ class SolverInfo(eqx.Module):
             shape ().
         iterations: of conjugate gradients, shape ().
         relative_residual: ‖y − (G + NλI)a‖/‖y‖ of the coefficients, computed at the end, shape ().
+            It is about the training data: far from them a field was up to 250 times worse.
     """
 
     solver: str = eqx.field(static=True)

@@ -37,11 +37,26 @@ class Hyperparameter:
     low: np.ndarray
     high: np.ndarray
 
+    @property
+    def entries(self) -> list[str]:
+        """The name of each number, with its place if there are several: `kernel.lengthscale[1]`."""
+        if self.low.ndim == 0:
+            return [self.name]
+        return [
+            f"{self.name}[{', '.join(map(str, index))}]" for index in np.ndindex(self.low.shape)
+        ]
+
 
 def hyperparameters(
-    K: AbstractMatrixKernel, X: Float[Array, "N n"], Y: Float[Array, "N n"]
+    K: AbstractMatrixKernel,
+    X: Float[Array, "N n"],
+    Y: Float[Array, "N n"],
+    states: Float[Array, "M n"],
 ) -> list[Hyperparameter]:
-    """The trainable leaves of K, in the order of its leaves, with their boxes from the data."""
+    """The trainable leaves of K, in the order of its leaves, with their boxes from the data.
+
+    The size of K(x, x) is that at `states`, some of X or all.
+    """
     seen = np.asarray(X)
     # What is a fair amplitude depends on the lengthscales: it is that in the middle of their boxes.
     arrays, rest = eqx.partition(K, eqx.is_inexact_array)
@@ -51,7 +66,7 @@ def hyperparameters(
         for p, leaf in zip(_walk((), K, seen, 1.0), leaves, strict=True)
     ]
     K_middle = eqx.combine(jax.tree.unflatten(structure, middle), rest)
-    return list(_walk((), K, seen, _amplitude(K_middle, X, Y)))
+    return list(_walk((), K, seen, _amplitude(K_middle, states, Y)))
 
 
 def constants(K: AbstractMatrixKernel) -> dict[str, float]:

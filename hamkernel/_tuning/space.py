@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -13,7 +14,7 @@ from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._tuning.boxes import full_trace, hyperparameters
 
 RIDGE = "regularization"
-ROUNDINGS = 100.0  # how far the ridge must stay above the rounding of the Gram
+ROUNDINGS = 100.0  # how far the ridge stays above the rounding of the Gram, ε tr(G): two digits
 LOW_RANK_ROUNDINGS = 2e4  # above the rounding at which `choose_landmarks` drops a column
 _EDGE = 0.01  # the share of the box that counts as resting on a bound
 
@@ -26,16 +27,17 @@ class SearchSpace(eqx.Module):
     """
 
     kernel: AbstractMatrixKernel
+    states: Float[Array, "M n"]
     start: Float[Array, " entries"]
     regularization: Float[Array, ""]
     low: Float[Array, " entries"]
     high: Float[Array, " entries"]
     given_ridge: tuple[Float[Array, ""], Float[Array, ""]] | None
+    entries: tuple[str, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
     free: tuple[int, ...] = eqx.field(static=True)
-    least_roundings: float = eqx.field(static=True)
-    roundings: Float[Array, ""]  # how far Nλ stays above the rounding of the Gram
+    roundings: float = eqx.field(static=True)
 
     def __init__(
         self,
@@ -46,15 +48,18 @@ class SearchSpace(eqx.Module):
         frozen: tuple[str, ...],
         bounds: Mapping[str, tuple[ArrayLike, ArrayLike]],
         roundings: float = ROUNDINGS,
+        states: Float[Array, "M n"] | None = None,
     ):
+        """Make the space for the data X, Y; the size of the Gram is taken on `states`, or X."""
         dtype = X.dtype
-        self.least_roundings = roundings
-        self.roundings = jnp.asarray(roundings, dtype)
-        params = hyperparameters(K, X, Y)
+        self.roundings = roundings
+        self.states = X if states is None else states
+        params = hyperparameters(K, X, Y, self.states)
         sizes = [param.low.size for param in params]
         self.names = (*np.repeat([p.name for p in params], sizes).tolist(), RIDGE)
+        self.entries = (*(entry for p in params for entry in p.entries), RIDGE)
         self.logarithmic = (*np.repeat([p.logarithmic for p in params], sizes).tolist(), True)
-        held = {i for name in frozen for i in _matching(name, self.names, of_part=True)}
+        held = {i for name in frozen for i in self._matching(name, of_part=True)}
         self.free = tuple(i for i in range(len(self.names)) if i not in held)
         if not self.free:
             raise ValueError(
@@ -66,8 +71,8 @@ class SearchSpace(eqx.Module):
         )
         self.given_ridge = None
         for name, given in bounds.items():
-            entries = _matching(name, self.names)
-            for i, *pair in zip(entries, *_checked_box(name, given, len(entries)), strict=True):
+            matching = self._matching(name)
+            for i, *pair in zip(matching, *_checked_box(name, given, len(matching)), strict=True):
                 if self.logarithmic[i] and pair[0] <= 0:
                     raise ValueError(f"bounds[{name!r}] must be positive, got {given}.")
                 if i == len(self.names) - 1:
@@ -80,59 +85,14 @@ class SearchSpace(eqx.Module):
         self.start = jnp.asarray(np.append(leaves, np.log(regularization)), dtype)
         self.regularization = jnp.asarray(regularization, dtype)
 
-    def smooth(
-        self,
-        kernel: AbstractMatrixKernel,
-        regularization: Float[Array, ""],
-        X: Float[Array, "N n"],
-        misfit: float,
-    ) -> "SearchSpace":
-        """This space, or one whose λ is large enough for the fields of that misfit to be smooth.
-
-        It is this one where λ rests on a bound that was raised before: the misfit is then that of
-        the bound, and a bound for it would go up with every search.
-
-        Args:
-            kernel: the best one found.
-            regularization: its λ.
-            X: states.
-            misfit: the root mean square of the residual over that of Y.
-        """
-        if not self.may_rise:
-            return self
-        needed = self._roundings_for(misfit)
-        has = self._roundings_at(kernel, regularization, X)
-        raised = float(self.roundings) > self.least_roundings
-        if has >= 0.5 * needed or (raised and self._rests(has)):
-            return self
-        return eqx.tree_at(lambda s: s.roundings, self, jnp.asarray(needed, X.dtype))
-
     @property
-    def may_rise(self) -> bool:
+    def chooses_ridge(self) -> bool:
         """Whether the least λ is ours to choose, and not what the caller has said."""
         return self.given_ridge is None and self._moves_ridge
 
-    def holds_up(
-        self,
-        kernel: AbstractMatrixKernel,
-        regularization: Float[Array, ""],
-        X: Float[Array, "N n"],
-        misfit: float,
-    ) -> bool:
-        """Whether λ rests on a bound that is for fields of a much larger misfit; see `smooth`."""
-        rests = self._rests(self._roundings_at(kernel, regularization, X))
-        return rests and float(self.roundings) > 10 * self._roundings_for(misfit)
-
-    def _rests(self, roundings: float) -> bool:
-        """Whether that is the least λ, but for a factor of two."""
-        return roundings < 2 * float(self.roundings)
-
-    def _roundings_for(self, misfit: float) -> float:
-        return max(misfit / float(jnp.finfo(self.low.dtype).eps) ** 0.5, self.least_roundings)
-
-    def _roundings_at(self, kernel, regularization, X) -> float:
-        least = np.exp(float(self.ridge_box(kernel, X)[0]))
-        return float(self.roundings) * float(regularization) / least
+    @property
+    def _moves_ridge(self) -> bool:
+        return len(self.names) - 1 in self.free
 
     def allows(self, regularization: Float[Array, ""]) -> bool:
         """Whether λ is below the upper bound that the caller gave, if it is searched in one."""
@@ -140,14 +100,10 @@ class SearchSpace(eqx.Module):
             return True
         return bool(regularization <= 1.01 * self.given_ridge[1])
 
-    @property
-    def _moves_ridge(self) -> bool:
-        return len(self.names) - 1 in self.free
-
     def decode(
-        self, u: Float[Array, " P"], X: Float[Array, "N n"]
-    ) -> tuple[AbstractMatrixKernel, Float[Array, ""]]:
-        """The kernel and λ at u."""
+        self, u: Float[Array, " P"]
+    ) -> tuple[AbstractMatrixKernel, Float[Array, ""], Float[Array, ""]]:
+        """The kernel and λ at u, and tr(G)/N there."""
         n_leaves = len(self.start) - 1
         moved = jnp.zeros_like(self.start).at[jnp.asarray(self.free)].set((1 + jnp.sin(u)) / 2)
         is_free = np.isin(np.arange(len(self.start)), self.free)
@@ -155,26 +111,32 @@ class SearchSpace(eqx.Module):
         params, static = eqx.partition(self.kernel, eqx.is_inexact_array)
         flat, unravel = ravel_pytree(params)
         kernel = eqx.combine(unravel(h[:n_leaves].astype(flat.dtype)), static)
+        size = self.size_of_gram(kernel)
         if not is_free[-1]:
-            return kernel, self.regularization
-        low, high = self.ridge_box(kernel, X)
-        return kernel, jnp.exp(low + (high - low) * moved[-1])
+            return kernel, self.regularization, size
+        low, high = self.ridge_box(size)
+        return kernel, jnp.exp(low + (high - low) * moved[-1]), size
 
-    @eqx.filter_jit
-    def ridge_box(
-        self, kernel: AbstractMatrixKernel, X: Float[Array, "N n"]
-    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The bounds of log λ: from the rounding of the Gram to where the field is almost zero."""
-        size = trained((kernel, X), full_trace) / len(X)
-        low, high = self.roundings * jnp.finfo(X.dtype).eps * size, 10 * size
+    def size_of_gram(self, kernel: AbstractMatrixKernel) -> Float[Array, ""]:
+        """tr(G)/N, before the terms of an odd or even kernel cancel."""
+        return trained((kernel, self.states), full_trace) / len(self.states)
+
+    def ridge_box(self, size: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """The bounds of log λ: from the rounding of the Gram to where the field is almost zero.
+
+        Args:
+            size: `size_of_gram` of the kernel.
+        """
+        low, high = self.roundings * jnp.finfo(self.low.dtype).eps * size, 10 * size
         if self.given_ridge is not None:
             low = jnp.maximum(low, self.given_ridge[0])
             high = jnp.maximum(self.given_ridge[1], low)
         return jnp.log(low), jnp.log(high)
 
-    def encode_start(self, X: Float[Array, "N n"]) -> Float[Array, " P"]:
+    @eqx.filter_jit
+    def encode_start(self) -> Float[Array, " P"]:
         """The u of the caller's values, moved a little inside the box where they are not."""
-        ridge_low, ridge_high = self.ridge_box(self.kernel, X)
+        ridge_low, ridge_high = self.ridge_box(self.size_of_gram(self.kernel))
         low, high = self.low.at[-1].set(ridge_low), self.high.at[-1].set(ridge_high)
         width = jnp.where(high > low, high - low, jnp.ones_like(low))
         # Not on the edge itself, where the derivative of the sine is zero, nor where it would
@@ -194,39 +156,51 @@ class SearchSpace(eqx.Module):
         return tuple(list(dict.fromkeys(keys)).index(key) for key in keys)
 
     def at_bounds(self, u: Float[np.ndarray, " P"]) -> tuple[str, ...]:
-        """The names of the hyperparameters that rest on a bound."""
+        """The hyperparameters that rest on a bound; of an array by name and coordinate."""
         at_edge = np.abs(np.sin(u)) > 1 - 2 * _EDGE
-        return tuple(dict.fromkeys(self.names[i] for i in np.array(self.free)[at_edge]))
+        return tuple(self.entries[i] for i in np.array(self.free)[at_edge])
 
-    def box(
-        self, kernel: AbstractMatrixKernel, X: Float[Array, "N n"]
-    ) -> dict[str, tuple[float, float]]:
-        """The lowest and highest value for each name, in its units; those of λ for `kernel`."""
-        ridge_low, ridge_high = self.ridge_box(kernel, X)
-        low, high = np.array(self.low), np.array(self.high)
-        low[-1], high[-1] = ridge_low, ridge_high
+    def box(self, size: Float[Array, ""]) -> dict[str, tuple[float, float]]:
+        """The lowest and highest value for each name, in its units; λ where the Gram has `size`."""
+        low, high = np.array(self.low, float), np.array(self.high, float)
+        low[-1], high[-1] = self.ridge_box(size)
         box: dict[str, tuple[float, float]] = {}
         for i in self.free:
-            pair = np.array([low[i], high[i]], float)
+            pair = np.array([low[i], high[i]])
             least, most = (np.exp(pair) if self.logarithmic[i] else pair).tolist()
             before = box.get(self.names[i], (least, most))
             box[self.names[i]] = min(before[0], least), max(before[1], most)
         return box
 
+    def values(
+        self, kernel: AbstractMatrixKernel, regularization: Float[Array, ""]
+    ) -> dict[str, Array]:
+        """The hyperparameters that are searched, in their units, in the shapes of the leaves."""
+        names = iter(dict.fromkeys(self.names))
+        leaves = jax.tree.leaves(eqx.filter(kernel, eqx.is_inexact_array))
+        logarithmic = dict(zip(self.names, self.logarithmic, strict=True))
+        values = {
+            name: jnp.asarray(np.exp(np.asarray(leaf)) if logarithmic[name] else leaf)
+            for name, leaf in zip(names, leaves, strict=False)
+        }
+        values[RIDGE] = regularization
+        return {name: values[name] for name in dict.fromkeys(self.names[i] for i in self.free)}
 
-def _matching(name: str, names: tuple[str, ...], of_part: bool = False) -> list[int]:
-    """The entries whose full name ends in `name`, or, of a part, has it anywhere."""
-    dotted = [f".{full}" for full in names]
-    found = [
-        i
-        for i, full in enumerate(dotted)
-        if full.endswith(f".{name}") or (of_part and f".{name}." in full)
-    ]
-    if not found:
-        raise ValueError(
-            f"no hyperparameter {name!r}; this kernel has {', '.join(dict.fromkeys(names))}."
-        )
-    return found
+    def _matching(self, name: str, of_part: bool = False) -> list[int]:
+        """The entries whose full name ends in `name`, or, of a part, has it anywhere."""
+        found = [
+            i
+            for i, (full, entry) in enumerate(zip(self.names, self.entries, strict=True))
+            if f".{full}".endswith(f".{name}")
+            or f".{entry}".endswith(f".{name}")
+            or (of_part and f".{name}." in f".{full}")
+        ]
+        if not found:
+            raise ValueError(
+                f"no hyperparameter {name!r}; this kernel has "
+                f"{', '.join(dict.fromkeys(self.names))}."
+            )
+        return found
 
 
 def _checked_box(

@@ -32,10 +32,18 @@ from hamkernel._solvers.fit import fit
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._tuning.boxes import constants
-from hamkernel._tuning.objective import Criterion, Objective, criterion_of
-from hamkernel._tuning.plan import SearchPlan
-from hamkernel._tuning.runs import keeping_the_best
+from hamkernel._tuning import advice
+from hamkernel._tuning.descent import Run
+from hamkernel._tuning.objective import (
+    Criterion,
+    Objective,
+    SearchCriterion,
+    basis_of,
+    criterion_of,
+)
+from hamkernel._tuning.other_optimisers import checked_optimiser
+from hamkernel._tuning.part import rows_of_parts
+from hamkernel._tuning.search import Search, best
 from hamkernel._tuning.space import LOW_RANK_ROUNDINGS, ROUNDINGS, SearchSpace
 from hamkernel._validation.folds import Folds
 from hamkernel._validation.losses import check_memory
@@ -63,6 +71,7 @@ class Tuned(eqx.Module):
     regularization: Float[Array, ""]
     loss: Float[Array, ""]
     field: AbstractField
+    hyperparameters: dict[str, Array]
     converged: Bool[Array, ""]
     steps: Int[Array, ""]
     start_losses: Float[Array, " starts"]
@@ -155,50 +164,75 @@ def tune(
     K = matrix_kernel(K)
     frozen = (frozen,) if isinstance(frozen, str) else frozen
     _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
+    if optimiser is not None:
+        optimiser = checked_optimiser(optimiser, progress)
     X, Y = given = require.data(X, Y)
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
     K.check_dimension(X.shape[1])
-    _warn_of_unequal_sizes(Y)
-    _warn_of_constants(K)
+    advice.warn_of_unequal_sizes(Y)
+    advice.warn_of_constants(K)
     ridge = require.ridge(regularization, X.dtype)
     criterion = criterion_of(objective, len(X), folds)
-    low_rank = isinstance(solver, Nystrom | RandomFeatures)
+    advice.warn_of_few_folds(criterion, folds)
+    low_rank = isinstance(solver, Nystrom | RandomFeatures) and not criterion.own
+    few = rows_of_parts(X, criterion, dense=True)[0]
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
-    space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings)
-    coarse = keeping_the_best(_minimiser(optimiser, progress, _COARSE))
-    optimiser = keeping_the_best(_minimiser(optimiser, progress, _BFGS))
-    rows = criterion.coarse_points(X)
-    plan = SearchPlan(criterion, X, Y, given, rows, solver, optimiser, coarse, starts, max_steps)
-    if plan.thinned and not low_rank:
-        check_memory(X, _RUN_COPIES)
-    found = plan.carry_out(space)
-    if found is None:
+    space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings, X[few])
+    advice.warn_of_free_scale(space, criterion)
+    if len(few) < len(X) and not low_rank:
+        check_memory(X, _LOSS_COPIES)
+    search = Search(space, criterion, X, Y, starts, max_steps, optimiser, progress)
+
+    def of_low_rank(run: Run) -> SearchCriterion:
+        kernel, regularization, _ = decode(space, run.u)
+        return criterion.with_basis(basis_of(solver, kernel, regularization, X))
+
+    runs = search.runs(of_low_rank if low_rank else None)
+    found = best(runs)
+    if not found.value < np.inf:
         raise RuntimeError(
             "the objective is not finite at any start. Likely causes, in order: a kernel that "
             "is not positive definite or not finite (hk.check_kernel(k, X) tells); bounds in "
             "which no fit succeeds (pass bounds={'regularization': (low, high)} with a larger "
             "low); an objective of your own that returns NaN."
         )
-    if not found.solved:
-        fit(found.kernel, *given, found.regularization, solver=solver)  # raises
-    if not found.space.allows(found.regularization):
+    return _tuned(space, runs, starts, given, solver)
+
+
+def _tuned(
+    space: SearchSpace,
+    runs: list[Run],
+    starts: int,
+    data: tuple[Array, Array],
+    solver: AbstractSolver | None,
+) -> Tuned:
+    """The fit at the best point, and what is to be said of the search."""
+    found = best(runs)
+    X, Y = data
+    kernel, regularization, size = decode(space, jnp.asarray(found.u, space.low.dtype))
+    field = fit(kernel, X, Y, regularization, solver=solver)
+    if not space.allows(regularization):
         raise ValueError(
             f"no lambda within bounds={{'regularization': ...}} can be solved with in {X.dtype}: "
-            f"for {found.kernel!r} it must be at least {float(found.regularization):.3g}."
+            f"for {kernel!r} it must be at least {float(regularization):.3g}."
         )
-    runs, best = found.runs, found.best
-    losses = criterion.losses(np.asarray(runs.value))
+    losses = [run.loss for run in runs]
+    losses += [np.inf] * (starts - len(losses))
     return Tuned(
-        kernel=found.kernel,
-        regularization=found.regularization,
-        loss=jnp.asarray(losses[best]),
-        field=found.field,
-        converged=jnp.asarray(runs.converged[best]),
-        steps=jnp.asarray(runs.steps[best]),
-        start_losses=jnp.asarray(losses),
-        at_bounds=found.space.at_bounds(np.asarray(runs.u[best])),
-        bounds=found.space.box(found.kernel, X),
+        kernel=kernel,
+        regularization=regularization,
+        loss=jnp.asarray(found.loss, X.dtype),
+        field=field,
+        hyperparameters=space.values(kernel, regularization),
+        converged=jnp.asarray(found.converged),
+        steps=jnp.asarray(found.steps),
+        start_losses=jnp.asarray(losses, X.dtype),
+        at_bounds=space.at_bounds(found.u),
+        bounds=space.box(size),
     )
+
+
+decode = eqx.filter_jit(lambda space, u: space.decode(u))
 
 
 def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -> None:
@@ -216,60 +250,4 @@ def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -
     require.count(max_steps, "max_steps")
 
 
-def _minimiser(
-    given: optx.AbstractMinimiser | None, progress: bool, ours: dict[bool, optx.BFGS]
-) -> optx.AbstractMinimiser:
-    """The optimiser of the caller, or ours."""
-    if given is None:
-        return ours[bool(progress)]
-    if progress:
-        raise ValueError(
-            "progress is printed by the optimiser: pass verbose=True to yours, and no progress."
-        )
-    golden = isinstance(given, optx.GoldenSearch)  # minimises functions of one number
-    if golden or not isinstance(given, optx.AbstractMinimiser):
-        raise TypeError(
-            "optimiser must be an optimistix minimiser of many variables, such as "
-            "optimistix.BFGS(1e-3, 1e-3) or optimistix.OptaxMinimiser(optax.adam(0.1), 1e-3, 1e-3);"
-            f" got {given!r}."
-        )
-    return given
-
-
-def _warn_of_unequal_sizes(Y: Array) -> None:
-    sizes = np.asarray(Y).std(axis=0)
-    sizes = sizes[sizes > 0]
-    if sizes.size and sizes.max() > _UNEQUAL * sizes.min():
-        require.warn(
-            f"the velocities of one coordinate are {sizes.max() / sizes.min():.3g} times as large "
-            "as those of another, and a loss sums the squares of both: the small one may be lost "
-            "in it. Choose units in which they are of similar size. With more than one degree of "
-            "freedom x stays canonical only if [q_i][p_i] is the same product of units for every i."
-        )
-
-
-def _warn_of_constants(K: AbstractMatrixKernel) -> None:
-    kept = constants(K)
-    if kept:
-        shown = ", ".join(f"{name} = {value:.4g}" for name, value in kept.items())
-        require.warn(
-            f"kept, and not tuned: {shown}. Python floats are constants to JAX. Store an array to "
-            "have them tuned, jnp.array(0.3), and name it in frozen=... to have it kept."
-        )
-
-
-_UNEQUAL = 100.0  # in size, and so 10 000 in the loss
-
-
-_RUN_COPIES = 5  # matrices of the size of the Gram that a run holds: 4.4 measured
-
-
-def _bfgs(verbose: bool, tolerance: float) -> optx.BFGS:
-    """BFGS whose line search quarters a step, which takes fewer evaluations than to halve it."""
-    bfgs = optx.BFGS(tolerance, tolerance, verbose=verbose)
-    return eqx.tree_at(lambda o: o.search, bfgs, optx.BacktrackingArmijo(decrease_factor=0.25))
-
-
-# Made once: compiled functions are told apart by the functions inside these, too.
-_BFGS = {verbose: _bfgs(verbose, 1e-3) for verbose in (False, True)}
-_COARSE = {verbose: _bfgs(verbose, 1e-2) for verbose in (False, True)}
+_LOSS_COPIES = 5  # matrices of the size of the Gram that a loss in a loop holds: 4.4 measured

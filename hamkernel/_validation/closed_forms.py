@@ -11,7 +11,9 @@ so no fold is ever refitted.
 The derivatives are written down as well, since differentiating the factorisation costs several
 times its price. From dC = −C dA C, and with v_S = (C_SS)⁻¹ r̄_S for a cotangent r̄,
 
-    r̄·dr = Σ_S v_Sᵀ[(dC y)_S − dC_SS r_S]   so   Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − (C v) aᵀ.
+    r̄·dr = Σ_S v_Sᵀ[(dC y)_S − dC_SS r_S]   so   Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − (C v) aᵀ,
+
+and a itself, with da = −C dA a, adds −(C ā) aᵀ.
 
 A result that rounding has spoiled is infinite, with a derivative of zero.
 
@@ -39,8 +41,8 @@ def _solved(system: AbstractSystem, y: Float[Array, " D"]):
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def held_out(
     system: AbstractSystem, y: Float[Array, " D"], partition: Partition
-) -> Float[Array, " D"]:
-    """r_S = (C_SS)⁻¹ a_S for each fold, in the order of y; inf where it cannot be trusted."""
+) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
+    """r_S = (C_SS)⁻¹ a_S for each fold, in the order of y, and a; inf where not to be trusted."""
     return _held_out_forward(system, y, partition)[0]
 
 
@@ -53,17 +55,19 @@ def _held_out_forward(system, y, partition):
         blocks.append(C.blocks(group))
         r = group.scattered(blocks[-1].solve(group.gather(a)), into=r)
     ok = trusted & jnp.isfinite(r).all()
-    return jnp.where(ok, r, jnp.full_like(r, jnp.inf)), (C, a, blocks, r, ok)
+    value = jax.tree.map(lambda each: jnp.where(ok, each, jnp.full_like(each, jnp.inf)), (r, a))
+    return value, (C, a, blocks, r, ok)
 
 
-def _held_out_backward(partition, saved, r_bar):
+def _held_out_backward(partition, saved, bars):
     C, a, blocks, r, ok = saved
+    r_bar, a_bar = bars
     V = []
     for group, own in zip(partition.groups, blocks, strict=True):
         V.append(own.solve(group.gather(r_bar)))
         r_bar = jax.lax.optimization_barrier((r_bar, V[-1]))[0]
     R = [group.gather(r) for group in partition.groups]
-    return _or_zero(ok, C.pulled_folds(a, partition.groups, V, R))
+    return _or_zero(ok, C.pulled_folds(a, partition.groups, V, R, a_bar))
 
 
 held_out.defvjp(_held_out_forward, _held_out_backward)

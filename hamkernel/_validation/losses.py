@@ -78,7 +78,7 @@ def cross_validation_residuals(
         Shape (N, n), in units of Y; inf where the matrix is not positive definite to rounding.
     """
     K, X, Y, regularization = _checked(K, X, Y, regularization)
-    return _residuals(K, X, Y, regularization, Partition(len(X), folds))
+    return _held_out(K, X, Y, regularization, Partition(len(X), folds))[0]
 
 
 @one_blas_thread
@@ -173,26 +173,39 @@ def check_memory(X: Float[Array, "N n"], copies: int) -> None:
 # The losses of the dense fit, where `basis` is None, and of the low-rank fit in a basis.
 
 
-@eqx.filter_jit
+# Where ‖a‖² comes with them it tells `tune` how far the field will round.
+
+
 def partition_loss(K, X, Y, regularization, partition, basis=None):
-    squares = jnp.mean(_residuals(K, X, Y, regularization, partition, basis) ** 2, axis=1)
-    return jnp.asarray(partition.weights, squares.dtype) @ squares
+    return partition_loss_and_square(K, X, Y, regularization, partition, basis)[0]
 
 
 @eqx.filter_jit
-def _residuals(K, X, Y, regularization, partition: Partition, basis=None) -> Float[Array, "N n"]:
+def partition_loss_and_square(K, X, Y, regularization, partition, basis=None):
+    residuals, a = _held_out(K, X, Y, regularization, partition, basis)
+    squares = jnp.mean(residuals**2, axis=1)
+    return jnp.asarray(partition.weights, squares.dtype) @ squares, a @ a
+
+
+@eqx.filter_jit
+def _held_out(K, X, Y, regularization, partition: Partition, basis=None):
     N = len(X)
     system = _system(K, X, (N - N / len(partition.folds)) * regularization, basis)
-    return held_out(system, Y.reshape(Y.size), partition).reshape(X.shape)  # pyright: ignore
+    residuals, a = held_out(system, Y.reshape(Y.size), partition)  # pyright: ignore
+    return residuals.reshape(X.shape), a
+
+
+def generalized_loss(K, X, Y, regularization, basis=None, least_free=0.0):
+    return generalized_loss_and_square(K, X, Y, regularization, basis, least_free)[0]
 
 
 @eqx.filter_jit
-def generalized_loss(K, X, Y, regularization, basis=None, least_free=0.0):
+def generalized_loss_and_square(K, X, Y, regularization, basis=None, least_free=0.0):
     # Infinite where less than the share `least_free` of the residuals is free, tr(I − S)/D.
     ridge = len(X) * regularization
     squares, trace = free_residuals(_system(K, X, ridge, basis), Y.reshape(Y.size))
     enough = ridge * trace >= least_free * Y.size  # tr(I − S) = ridge tr A⁻¹
-    return jnp.where(enough, squares * Y.size / trace**2, jnp.inf)
+    return jnp.where(enough, squares * Y.size / trace**2, jnp.inf), squares
 
 
 @eqx.filter_jit

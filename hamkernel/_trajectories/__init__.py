@@ -1,0 +1,1 @@
+"""From logged runs, states at times, to a field."""

@@ -1,0 +1,225 @@
+"""`learn`: from noisy states at times to a field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from hamkernel import _require as require
+from hamkernel._fields.base import KernelField, SolverInfo
+from hamkernel._kernels.functions import as_pytree
+from hamkernel._solvers.nystrom import Nystrom
+from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._trajectories.evidence import Model
+from hamkernel._trajectories.iteration import Current, Task, begin, iterated
+from hamkernel._trajectories.learned import (
+    Learned,
+    Step,
+    empty,
+    interpolated,
+    misfits,
+    warn_of_dropped,
+    warn_of_misfit,
+)
+from hamkernel._trajectories.prepared import check_identifiable, prepared
+from hamkernel._trajectories.runs import Runs
+from hamkernel._trajectories.shooting import LONG, SHORT, Piece, cuts, halved
+from hamkernel._trajectories.start import box_of, landmarks, sampled, with_amplitude
+
+_WIDE = 100.0  # standard deviations of the states: the prior of a start
+_SHORT_ROUNDS = 2  # iterations with short segments, in which a rough field stays near the samples
+_MOST = 10  # iterations; 4 or 5 are the rule
+_SETTLED = 0.01  # of log σ, and of the objective by degree of freedom
+
+
+def learn(
+    K: AbstractMatrixKernel,
+    runs: Runs,
+    mean: Callable[[Array], Array] | None = None,
+    noise: ArrayLike | None = None,
+    solver: Nystrom | None = None,
+    *,
+    progress: bool = False,
+) -> Learned:
+    """Learn a field from noisy states at times, without velocities.
+
+    A sample is the start of its run plus the integral of the field along the path. First the path
+    is a smoothed one, and then that of the field found so far, whose tangent says how samples
+    change with the field and with the start (Gauss-Newton multiple shooting). Each iteration is one
+    closed form: starts are projected out, hyperparameters and the noise of each coordinate follow
+    from the marginal likelihood, and a line search looks at ‖W(x − x̂)‖² + ‖f‖² itself. Segments
+    are 10 samples long at first, and then whole runs; where a run cannot be followed as a whole,
+    parts of it are.
+
+    Args:
+        K: a matrix-valued kernel. Its hyperparameters are the first guess. A structure without an
+            amplitude gets one, `Symplectic(k)` becomes `Symplectic(1.0 * k)`.
+        runs: what was logged; see `Runs`.
+        mean: a known part of the field, x (n,) -> (n,); K learns the rest.
+        noise: the standard deviation of the sensor noise, in units of the states, a number or one
+            for each coordinate, shape (n,), if it is known. Then a field that does not explain the
+            runs is noticed. If None it is found.
+        solver: `hk.Nystrom(max_points=…)` sets how many landmarks carry the field; if None, 64 for
+            n = 2 and 128 for n = 4, which cover the paths evenly.
+        progress: show a progress bar (tqdm).
+
+    Returns:
+        A `Learned`: the field, its kernel, the noise, the fitted states, and how well they fit.
+        Runs of other lengths, in the same powers of two, do not compile anew.
+
+    Raises:
+        TypeError: K is not matrix-valued, `runs` no Runs, or `solver` no Nystrom. ValueError: n is
+            not one that the structure allows; the noise is not positive; a coordinate was never
+            measured and no mean says how it moves the others; doubles are not enabled.
+
+    Warns:
+        UserWarning: parts of runs were dropped, the structure does not explain the runs, or the
+            iterations did not settle.
+    """
+    K = with_amplitude(matrix_kernel(K))
+    given = _check(K, runs, noise, solver)
+    check_identifiable(runs, mean)
+    mean = None if mean is None else as_pytree(mean)
+    data = prepared(runs, mean)
+    measured = np.isfinite(data.noise)
+    X, Y = sampled(data)
+    if mean is not None:
+        Y = Y - np.asarray(jax.vmap(mean)(jnp.asarray(X)))
+    # Smoothing may find no noise at all; a share of 1e-7 is what the digits of a log leave.
+    level = np.maximum(np.where(measured, data.noise, data.scale), 1e-6 * data.scale)
+    model = Model(K, jnp.log(jnp.asarray(level if given is None else given)))
+    moves = measured & (given is None)
+    box, design = box_of(model, X, Y, data.scale, moves)
+    S = landmarks(X, data.scale, None if solver is None else solver.max_points)
+    task = Task(data, mean, S, box, jnp.asarray(_WIDE * data.scale))
+    now, pieces, history, converged = _iterated(task, begin(task, model, design), progress)
+    return _learned(runs, task, now, pieces, history, converged, given is not None, measured)
+
+
+def _iterated(
+    task: Task, now: Current, progress: bool
+) -> tuple[Current, list[Piece], list[Step], bool]:
+    """Gauss-Newton steps until noise and objective settle."""
+    from tqdm import tqdm  # so that importing the package does not load it
+
+    history: list[Step] = []
+    pieces: list[Piece] = []
+    bar = tqdm(range(_MOST), "learning", disable=None if progress else True)
+    for i in bar:
+        if i <= _SHORT_ROUNDS:
+            wanted = cuts(task.data.runs, SHORT if i < _SHORT_ROUNDS else LONG)
+        else:
+            wanted = halved(pieces, now.good)
+        before, same, pieces = now.model.log_noise, wanted == pieces, wanted
+        now, step = iterated(task, now, pieces)
+        history.append(step)
+        noise = ", ".join(f"{sigma:.3g}" for sigma in np.asarray(step.noise))
+        bar.set_postfix_str(f"noise {noise}, kept {float(step.kept):.0%}")
+        moved = float(jnp.abs(now.model.log_noise - before).max())
+        settled = moved < _SETTLED and float(step.gain) < _SETTLED * max(now.free, 1.0)
+        if settled and same and i > _SHORT_ROUNDS:
+            bar.close()
+            return now, pieces, history, True
+    bar.close()
+    return now, pieces, history, False
+
+
+def _learned(
+    runs: Runs,
+    task: Task,
+    now: Current,
+    pieces: list[Piece],
+    history: list[Step],
+    converged: bool,
+    given: bool,
+    measured: np.ndarray,
+) -> Learned:
+    """The result, and the warnings that it asks for."""
+    field, data = now.field, task.data
+    times, _ = runs.on_host()
+    velocity = jax.jit(jax.vmap(field))
+    states = [
+        path
+        if len(path) == len(t)
+        else interpolated(t - t[0], run.times, path, np.asarray(velocity(jnp.asarray(path))))
+        for t, run, path in zip(times, data.runs, now.paths, strict=True)
+    ]
+    kept = np.zeros(len(data.runs))
+    for (r, start, stop), good in zip(pieces, now.good, strict=True):
+        kept[r] += good * (stop - start) / len(data.runs[r].times)
+    noise = np.where(measured, np.exp(np.asarray(now.model.log_noise)), np.nan)
+    misfit = misfits(runs, states, noise)
+    chi_squared = now.squares / max(now.free, 1.0)
+    warn_of_dropped(kept)
+    if given:
+        warn_of_misfit(chi_squared, now.free, misfit)
+    if not converged:
+        require.warn(
+            f"learning stopped after {_MOST} iterations with noise or objective still moving: see "
+            ".history. The field may be usable; more samples a swing, or a kernel closer to the "
+            "truth, help."
+        )
+    count = sum(int(np.isfinite(np.asarray(x)).sum()) for x in runs.states)
+    regularization = jnp.asarray(np.nanmean(noise**2) / count)
+    return Learned(
+        field=_field(field, regularization),
+        kernel=field.kernel,
+        regularization=regularization,
+        noise=jnp.asarray(noise),
+        states=tuple(jnp.asarray(x) for x in states),
+        kept=jnp.asarray(kept),
+        misfit=jnp.asarray(misfit),
+        chi_squared=jnp.asarray(chi_squared),
+        history=tuple(history),
+        converged=converged,
+        runs=runs,
+    )
+
+
+def _field(found: Any, regularization: Float[Array, ""]) -> Any:
+    """The field as one of the library; with a mean, as the sum of both."""
+    if found.mean is not None:
+        return found
+    S, A = found.points, found.coefficients
+    square = jnp.sum(A * jax.vmap(found)(S))
+    return KernelField(
+        kernel=found.kernel,
+        points=S,
+        coefficients=A,
+        residual=empty(S.shape[1]),
+        norm=jnp.sqrt(jnp.maximum(square, 0.0)),
+        regularization=regularization,
+        offset=jnp.zeros((), S.dtype),
+        info=SolverInfo("learn", landmarks=jnp.asarray(len(S))),
+    )
+
+
+def _check(K: AbstractMatrixKernel, runs: Any, noise: Any, solver: Any) -> np.ndarray | None:
+    """The noise that was given, for each coordinate; what is wrong with the arguments is said."""
+    if not isinstance(runs, Runs):
+        raise TypeError(
+            f"learn takes hk.Runs(times, states), lists of arrays, one entry a run; got a "
+            f"{type(runs).__name__}. For states with velocities take hk.fit or hk.tune."
+        )
+    if not (solver is None or isinstance(solver, Nystrom)):
+        raise TypeError(f"the solver of learn is hk.Nystrom(max_points=…) or None; got {solver!r}.")
+    n = runs.dimension
+    K.check_dimension(n)
+    if jnp.zeros(()).dtype != jnp.float64:
+        raise ValueError(
+            "learn needs doubles, since paths and their tangents are compared over many steps: "
+            "jax.config.update('jax_enable_x64', True) first."
+        )
+    if noise is None:
+        return None
+    given = np.asarray(
+        require.positive(noise, "noise", "Leave it out to have it found from the runs.")
+    )
+    if given.shape not in ((), (n,)):
+        raise ValueError(f"noise has shape {given.shape}; a number or shape ({n},) is needed.")
+    return np.broadcast_to(given, (n,))

@@ -1,0 +1,157 @@
+"""What `learn` returns, and whether the structure explains the runs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hamkernel import _require as require
+from hamkernel._show import described
+from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._trajectories.runs import Runs
+
+# χ² per degree of freedom has the standard deviation √(2/ν); five of them, and a tenth for the
+# curvature that a linearisation misses.
+_SIGMAS, _CURVATURE = 5.0, 0.1
+
+
+class Step(eqx.Module):
+    """One iteration.
+
+    Attributes:
+        samples: in the longest segment.
+        objective: ‖W(x − x̂)‖² + ‖f‖² after it, over the segments that were kept, shape ().
+        gain: by how much it went down at these hyperparameters, shape ().
+        step: the share of the step that was taken, 0 where none made it smaller, shape ().
+        noise: σ of each coordinate, shape (n,).
+        kept: the share of the samples in segments that were kept, shape ().
+        loss: −log p of the rows, but for a constant, shape ().
+    """
+
+    samples: int = eqx.field(static=True)
+    objective: Float[Array, ""]
+    gain: Float[Array, ""]
+    step: Float[Array, ""]
+    noise: Float[Array, " n"]
+    kept: Float[Array, ""]
+    loss: Float[Array, ""]
+
+    def __repr__(self) -> str:
+        return described(self)
+
+
+class Learned(eqx.Module):
+    """What `learn` found.
+
+    Attributes:
+        field: the learned field, the mean included.
+        kernel: the kernel with its hyperparameters, and an amplitude.
+        regularization: λ with Nλ = σ², N the number of measured values and σ² the mean of their
+            variances, in squared units of the states; the amplitude of the field is in `kernel`.
+        noise: the standard deviation of the sensor noise of each coordinate, shape (n,); NaN where
+            nothing was measured.
+        states: the fitted path of each run at its times, missing coordinates filled in, (T, n).
+        kept: for each run the share of its samples that the field is learned from, shape (R,).
+        misfit: for each run and coordinate the root mean square of (measured − fitted)/σ, shape
+            (R, n); about one where the structure explains the run, NaN where nothing was measured.
+        chi_squared: the sum of squares of all of them over the degrees of freedom that the fit
+            leaves, shape (). It says nothing where σ was found from the same residuals.
+        history: one entry an iteration.
+        converged: whether noise and objective settled.
+        runs: what was given.
+    """
+
+    field: Any
+    kernel: AbstractMatrixKernel
+    regularization: Float[Array, ""]
+    noise: Float[Array, " n"]
+    states: tuple[Float[Array, "T n"], ...]
+    kept: Float[Array, " R"]
+    misfit: Float[Array, "R n"]
+    chi_squared: Float[Array, ""]
+    history: tuple[Step, ...]
+    converged: bool = eqx.field(static=True)
+    runs: Runs
+
+    def __repr__(self) -> str:
+        return described(self)
+
+    @property
+    def residuals(self) -> tuple[Float[Array, "T n"], ...]:
+        """(measured − fitted)/σ for each run, NaN where nothing was measured."""
+        pairs = zip(self.runs.states, self.states, strict=True)
+        return tuple((x - fit) / self.noise[None] for x, fit in pairs)
+
+
+def misfits(runs: Runs, states: list[np.ndarray], noise: np.ndarray) -> np.ndarray:
+    """Root mean squares of the normalised residuals, by run and coordinate."""
+    out = []
+    for x, fit in zip(runs.on_host()[1], states, strict=True):
+        squares = ((x - fit) / noise[None]) ** 2
+        seen = np.isfinite(squares)
+        total = np.where(seen, squares, 0.0).sum(axis=0)
+        out.append(
+            np.where(seen.any(axis=0), np.sqrt(total / np.maximum(seen.sum(axis=0), 1)), np.nan)
+        )
+    return np.array(out)
+
+
+def warn_of_misfit(chi_squared: float, free: float, misfit: np.ndarray) -> None:
+    """Say where the structure does not explain the runs at the noise that was given.
+
+    Args:
+        chi_squared: per degree of freedom.
+        free: the degrees of freedom.
+        misfit: as in `Learned`.
+    """
+    causes = (
+        "Likely causes, in order: a part of the motion that the kernel cannot have, such as "
+        "friction (add hk.CurlFree or use hk.PortHamiltonian); (q, q̇) given where (q, p) is needed "
+        "(masses=True finds the ratios of constant masses); units that do not fit each other; a jump "
+        "or a push in a run."
+    )
+    if chi_squared > 1 + _CURVATURE + _SIGMAS * np.sqrt(2 / max(free, 1.0)):
+        run, c = np.unravel_index(np.nanargmax(misfit), misfit.shape)
+        require.warn(
+            f"the structure does not explain the runs: χ² is {chi_squared:.3g} per degree of "
+            f"freedom at the noise given, and should be 1. The residuals are largest in coordinate "
+            f"{c} of run {run}, {misfit[run, c]:.2g} σ. {causes}"
+        )
+
+
+def warn_of_dropped(kept: np.ndarray) -> None:
+    """Name the runs that the field is not learned from."""
+    lost = [f"{r} ({1 - share:.0%})" for r, share in enumerate(kept) if share < 1]
+    if lost:
+        more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
+        require.warn(
+            f"dropped from run {', '.join(lost[:5])}{more}: the field does not follow the samples "
+            "there (a χ² above 25 times the median, or a tangent above 1e4). Look at these runs: a "
+            "jump, another system, or chaos with samples too far apart."
+        )
+
+
+def interpolated(
+    times: np.ndarray, at: np.ndarray, x: np.ndarray, slopes: np.ndarray
+) -> Float[np.ndarray, "T n"]:
+    """Hermite's cubic through states and velocities, at the times of the log."""
+    if len(at) == len(times):
+        return x
+    i = np.clip(np.searchsorted(at, times) - 1, 0, len(at) - 2)
+    h = (at[i + 1] - at[i])[:, None]
+    s = ((times - at[i])[:, None]) / h
+    return (
+        (1 + 2 * s) * (1 - s) ** 2 * x[i]
+        + s * (1 - s) ** 2 * h * slopes[i]
+        + s**2 * (3 - 2 * s) * x[i + 1]
+        + s**2 * (s - 1) * h * slopes[i + 1]
+    )
+
+
+def empty(n: int) -> Float[Array, "0 n"]:
+    """The residual of velocities, of which there were none."""
+    return jnp.zeros((0, n))

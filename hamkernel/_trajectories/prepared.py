@@ -1,0 +1,217 @@
+"""The runs before anything is learned of the field: condensed, smoothed, completed.
+
+Samples that are much closer than the motion needs are averaged: what they say together is the
+smoothed path in their middle plus the mean of their residuals, with the noise of so many. The bias
+of this is of the second order in what smoothing missed.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hamkernel import _require as require
+from hamkernel._trajectories.flow import NODES
+from hamkernel._trajectories.runs import Runs
+from hamkernel._trajectories.smoothing import Coordinate, processes, smoothed
+
+# Of the lengthscale in time, between samples that are kept. A pendulum of frequency ω has a
+# lengthscale near 2.7/ω, so these are 15 samples a radian, where three Gauss nodes in an interval
+# and the average of a sine over it are exact to 1e-7 and 2e-4.
+_DENSE = 0.025
+
+
+class Run(NamedTuple):
+    """One run, condensed.
+
+    Attributes:
+        times: since the first sample, shape (T,).
+        states: NaN where nothing was measured, shape (T, n).
+        counts: of the samples that an entry is the mean of, shape (T, n).
+        path: smoothed states at the times, no NaN, shape (T, n).
+        nodes: the same at the Gauss nodes between them, shape (T − 1, 3, n).
+        slopes: their velocities there.
+    """
+
+    times: np.ndarray
+    states: np.ndarray
+    counts: np.ndarray
+    path: np.ndarray
+    nodes: np.ndarray
+    slopes: np.ndarray
+
+    @property
+    def duration(self) -> float:
+        return float(self.times[-1] - self.times[0])
+
+
+class Prepared(NamedTuple):
+    """All runs, with the processes of their coordinates.
+
+    Attributes:
+        runs: the condensed runs.
+        noise: that of each coordinate as smoothing finds it, NaN where never measured.
+        scale: the standard deviation of each coordinate, shape (n,).
+        usable: which runs look like the others, shape (R,).
+    """
+
+    runs: list[Run]
+    noise: Float[np.ndarray, " n"]
+    scale: Float[np.ndarray, " n"]
+    usable: Bool[np.ndarray, " R"]
+
+
+def prepared(runs: Runs, mean: Callable[[Array], Array] | None) -> Prepared:
+    """Condense, smooth and complete the runs; `mean` fills in what was never measured."""
+    times, states = runs.on_host()
+    times = [t - t[0] for t in times]
+    found, usable = _robust_processes(times, states)
+    counts = [np.isfinite(x).astype(float) for x in states]
+    lengths = [c.lengthscale for c in found if np.isfinite(c.process.log_amplitude)]
+    block = _DENSE * min(lengths, default=np.inf)
+    if any(2 * np.median(np.diff(t)) < block for t in times):
+        paths = smoothed(found, times, states)
+        condensed = [
+            _condensed(t, x, paths.value[r, : len(t)], block)
+            for r, (t, x) in enumerate(zip(times, states, strict=True))
+        ]
+        times, states, counts = (list(each) for each in zip(*condensed, strict=True))
+    path_runs = _with_paths(found, times, states, counts)
+    if not all(c.seen for c in found) or mean is not None:
+        path_runs = [_completed(run, mean) for run in path_runs]
+    noise = np.array([c.noise if c.seen else np.nan for c in found])
+    good = [run.path for run, use in zip(path_runs, usable, strict=True) if use]
+    scale = np.concatenate(good).std(axis=0)
+    return Prepared(path_runs, noise, np.where(scale > 0, scale, 1.0), usable)
+
+
+def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:
+    """The processes, without runs that are five times as far from them as half of the others."""
+    found = processes(times, states)
+    if len(times) < 3:
+        return found, np.ones(len(times), bool)
+    paths = smoothed(found, times, states)
+    far = np.array(
+        [np.sqrt(np.nanmean((x - paths.value[r, : len(x)]) ** 2)) for r, x in enumerate(states)]
+    )
+    usable = ~(far > 5 * np.nanmedian(far))
+    if usable.all():
+        return found, usable
+    chosen = np.flatnonzero(usable)
+    return processes([times[r] for r in chosen], [states[r] for r in chosen]), usable
+
+
+def _condensed(t, x, path, block: float):
+    """Times, means and counts of blocks of samples that span at most `block`."""
+    edges = [0]
+    for i in range(1, len(t)):
+        if t[i] - t[edges[-1]] >= block:
+            edges.append(i)
+    if len(edges) < 2:
+        edges.append(len(t) // 2)
+    seen = np.isfinite(x)
+    residual = np.where(seen, x - path, 0.0)
+    counts = np.add.reduceat(seen.astype(float), edges, axis=0)
+    sizes = np.diff([*edges, len(t)])
+    middle = np.add.reduceat(t, edges) / sizes
+    means = np.add.reduceat(residual, edges, axis=0) / np.maximum(counts, 1)
+    there = np.stack([np.interp(middle, t, path[:, c]) for c in range(x.shape[1])], axis=1)
+    return middle, np.where(counts > 0, there + means, np.nan), counts
+
+
+def _with_paths(found, times, states, counts) -> list[Run]:
+    """The smoothed path at the samples and at the nodes between them."""
+    grids, filled = [], []
+    for t, x in zip(times, states, strict=True):
+        inside = t[:-1, None] + np.diff(t)[:, None] * NODES[None]
+        grid = np.concatenate([np.column_stack([t[:-1], inside]).ravel(), t[-1:]])
+        wide = np.full((len(grid), x.shape[1]), np.nan)
+        wide[::4] = x
+        grids.append(grid)
+        filled.append(wide)
+    paths = smoothed(found, grids, filled)
+    out = []
+    for r, (t, x, count) in enumerate(zip(times, states, counts, strict=True)):
+        size = 4 * len(t) - 3
+        value, slope = (a[r, :size] for a in (paths.value, paths.slope))
+        inside = [a[:-1].reshape(len(t) - 1, 4, -1)[:, 1:] for a in (value, slope)]
+        out.append(Run(t, x, count, value[::4], *inside))
+    return out
+
+
+def _completed(run: Run, mean: Callable[[Array], Array] | None) -> Run:
+    """The run with coordinates that it never measured found from how they move the others.
+
+    Given q̇ and a mean with q̇ = p/m, that is p = m q̇; in general Newton's method for the
+    coordinates that explain the slopes.
+    """
+    missing = ~np.isfinite(run.states).any(axis=0)
+    if not missing.any():
+        return run
+    if mean is None:  # known from other runs; the fit finds where this one started
+        return run._replace(
+            path=np.nan_to_num(run.path),
+            nodes=np.nan_to_num(run.nodes),
+            slopes=np.nan_to_num(run.slopes),
+        )
+    n = run.states.shape[1]
+    nodes, slopes = run.nodes.reshape(-1, n), run.slopes.reshape(-1, n)
+    there = np.array(_solved_for(mean, np.nan_to_num(nodes), np.nan_to_num(slopes), missing))
+    span = np.diff(run.times)
+    at_nodes = (run.times[:-1, None] + span[:, None] * NODES[None]).ravel()
+    path, found_slopes = run.path.copy(), slopes.copy()
+    for c in np.flatnonzero(missing):
+        path[:, c] = np.interp(run.times, at_nodes, there[:, c])
+        gradient = np.gradient(there[:, c], at_nodes) if len(at_nodes) > 1 else 0.0
+        found_slopes[:, c] = gradient
+    shape = run.nodes.shape
+    return run._replace(path=path, nodes=there.reshape(shape), slopes=found_slopes.reshape(shape))
+
+
+@eqx.filter_jit
+def _solved_for(mean, X, slopes, missing):
+    """X with its missing coordinates such that the mean has the slopes of the others."""
+    on = jnp.asarray(missing)
+
+    def one(x, slope):
+        def step(x, _):
+            D = jnp.where(on[None, :] & ~on[:, None], jax.jacfwd(mean)(x), 0.0)
+            wrong = jnp.where(on, 0.0, slope - mean(x))
+            A = D.T @ D
+            # The smallest ridge that keeps coordinates that move nothing where they are.
+            A = A + 1e-9 * (1 + jnp.trace(A)) * jnp.eye(len(x), dtype=x.dtype)
+            return x + jnp.linalg.solve(A, D.T @ wrong), None
+
+        return jax.lax.scan(step, x, length=5)[0]
+
+    return jax.lax.map(lambda pair: one(*pair), (X, slopes))
+
+
+def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> None:
+    """A coordinate that no run measured must be known through a mean."""
+    never = ~np.any([np.isfinite(np.asarray(x)).any(axis=0) for x in runs.states], axis=0)
+    if not never.any():
+        return
+    which = ", ".join(str(c) for c in np.flatnonzero(never))
+    if mean is None:
+        raise ValueError(
+            f"coordinate {which} was measured in no run. From the others alone it is known only up "
+            "to any change of coordinates, p -> g(q, p), so there is nothing to learn it from. "
+            "Say how it moves the others: mean=lambda x: jnp.array([x[1] / m, 0.0]) for q̇ = p/m "
+            "and K a kernel for the rest, such as hk.Symplectic(hk.Select(k, 0)) for ṗ = −U'(q). "
+            "Or log it."
+        )
+    n = runs.dimension
+    points = np.random.default_rng(0).standard_normal((8, n))
+    with require.traceable("mean"):
+        D = np.asarray(jax.vmap(jax.jacfwd(mean))(jnp.asarray(points)))
+    blind = [c for c in np.flatnonzero(never) if not np.abs(D[:, ~never, c]).max() > 0]
+    if blind:
+        raise ValueError(
+            f"coordinate {blind[0]} was measured in no run, and the velocities of the mean do not "
+            "depend on it: give a mean that says how it moves the others, such as q̇ = p/m."
+        )

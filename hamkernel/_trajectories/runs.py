@@ -1,0 +1,222 @@
+"""`Runs`: what was logged, with what is wrong with it said at once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from hamkernel import _require as require
+from hamkernel._trajectories.smoothing import Coordinate, Paths, processes, smoothed
+
+_GAP = 10.0  # times the median spacing: between such samples the path is a guess
+
+
+class Runs(eqx.Module):
+    """Logged runs of one system: states at times, with noise, gaps and uneven steps.
+
+    Everything is kept as it came, no run is resampled. NaN stands for what was not measured: a
+    whole coordinate, such as the momenta of a log of positions, or single entries.
+
+    Args:
+        times: for each run the times of its samples, shape (T,), strictly increasing.
+        states: for each run the states, shape (T, n). Angles must be continuous: `np.unwrap`.
+        inputs: for each run what was applied, shape (T, m), kept with the times; None if nothing.
+
+    A single run may come as bare arrays (T,) and (T, n).
+
+    Raises:
+        ValueError: shapes do not fit, a run has one sample only, times do not increase, or an entry
+            is infinite. TypeError: something is no array of real numbers.
+
+    Warns:
+        UserWarning: a jump of 2π, a long gap, a coordinate that never moves: once, with the run.
+    """
+
+    times: tuple[Float[Array, " T"], ...]
+    states: tuple[Float[Array, "T n"], ...]
+    inputs: tuple[Float[Array, "T m"], ...] | None
+
+    def __init__(self, times: Any, states: Any, inputs: Any = None):
+        if hasattr(times, "ndim") and times.ndim == 1:  # one run
+            times, states = [times], [states]
+            inputs = None if inputs is None else [inputs]
+        times, states = list(times), list(states)
+        _check_counts(times, states, inputs)
+        self.times = tuple(_times(t, r) for r, t in enumerate(times))
+        self.states = tuple(
+            _rows(x, t, r, "states")
+            for r, (x, t) in enumerate(zip(states, self.times, strict=True))
+        )
+        self.inputs = None
+        if inputs is not None:
+            pairs = zip(inputs, self.times, strict=True)
+            self.inputs = tuple(_rows(u, t, r, "inputs") for r, (u, t) in enumerate(pairs))
+        _check_coordinates(self.states)
+        _warn_of_oddities(self.times, self.states)
+
+    def __len__(self) -> int:
+        return len(self.times)
+
+    def __repr__(self) -> str:
+        samples = sum(len(t) for t in self.times)
+        return f"Runs({len(self)} runs, {samples} samples, n={self.dimension})"
+
+    @property
+    def dimension(self) -> int:
+        """n, the number of coordinates of a state."""
+        return self.states[0].shape[1]
+
+    def velocities(
+        self,
+    ) -> tuple[Float[Array, "N n"], Float[Array, "N n"], Int[Array, " N"]]:
+        """Smoothed states X, their velocities Y, and the run of each, for `hk.fit` and `hk.tune`.
+
+        Every coordinate is a Gaussian process in time (Matérn-7/2), whose lengthscale, amplitude
+        and noise come from the marginal likelihood of all runs. Linear in the number of samples.
+        `hk.learn` does better: it needs no velocities.
+
+        Returns:
+            X and Y, shape (N, n), N all samples of all runs, and labels (N,), 0, 1, … by run.
+
+        Raises:
+            ValueError: a coordinate was never measured.
+        """
+        times, states = self.on_host()
+        self._check_measured()
+        paths = smoothed(processes(times, states), times, states)
+        lengths = [len(t) for t in times]
+        X, Y = (
+            jnp.asarray(np.concatenate([a[r, :T] for r, T in enumerate(lengths)]))
+            for a in (paths.value, paths.slope)
+        )
+        return X, Y, jnp.asarray(np.repeat(np.arange(len(times)), lengths))
+
+    def smoothed(self) -> tuple[list[Coordinate], Paths]:
+        """The processes of the coordinates, and the runs smoothed with them, padded."""
+        times, states = self.on_host()
+        found = processes(times, states)
+        return found, smoothed(found, times, states)
+
+    def on_host(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+        """Times and states as NumPy arrays of doubles."""
+        return [np.asarray(t, float) for t in self.times], [
+            np.asarray(x, float) for x in self.states
+        ]
+
+    def _check_measured(self) -> None:
+        for c in range(self.dimension):
+            if not any(np.isfinite(np.asarray(x)[:, c]).any() for x in self.states):
+                raise ValueError(
+                    f"coordinate {c} was measured in no run, so it has no velocities. hk.learn(K, "
+                    "runs, mean=f) finds it where f says how it moves the others, as q̇ = p/m does."
+                )
+
+
+def _check_counts(times: Sequence[Any], states: Sequence[Any], inputs: Any) -> None:
+    if not times:
+        raise ValueError("there are no runs: pass lists of arrays, one entry a run.")
+    for name, other in (("states", states), ("inputs", inputs)):
+        if other is not None and len(other) != len(times):
+            raise ValueError(
+                f"times has {len(times)} runs and {name} has {len(other)}: pass lists of equal "
+                "length, one entry a run, times (T,) and states (T, n)."
+            )
+
+
+def _times(t: Any, run: int) -> Float[Array, " T"]:
+    t = require.floating(t, f"times[{run}]")
+    if t.ndim != 1:
+        raise ValueError(f"times[{run}] has shape {t.shape}; times of shape (T,) are needed.")
+    if t.size < 2:
+        raise ValueError(
+            f"run {run} has {t.size} sample{'s' * (t.size != 1)}: at least two are needed to see "
+            "anything move. Leave it out."
+        )
+    seen = np.asarray(t)
+    if not np.isfinite(seen).all():
+        raise ValueError(
+            f"times[{run}] contains NaN or inf at {np.flatnonzero(~np.isfinite(seen))[0]}."
+        )
+    back = np.flatnonzero(np.diff(seen) <= 0)
+    if back.size:
+        i = int(back[0])
+        raise ValueError(
+            f"times[{run}] must increase; sample {i + 1}, at {seen[i + 1]:g}, does not come after "
+            f"sample {i}, at {seen[i]:g} ({back.size} such). Sort by time and drop repeated samples; "
+            "where a log starts anew, start a new run."
+        )
+    return t
+
+
+def _rows(x: Any, t: Array, run: int, name: str) -> Float[Array, "T n"]:
+    x = require.floating(x, f"{name}[{run}]")
+    if x.ndim != 2 or len(x) != len(t) or x.shape[1] == 0:
+        hint = ""
+        if x.ndim == 2 and x.shape[1] == len(t):
+            hint = f" It seems transposed: {name}[{run}].T."
+        elif x.ndim == 1 and len(x) == len(t):
+            hint = f" One row a sample: {name}[{run}][:, None]."
+        raise ValueError(
+            f"{name}[{run}] has shape {x.shape} and times[{run}] has shape {t.shape}; one row a "
+            f"sample, shape ({len(t)}, {'n' if name == 'states' else 'm'}), is needed.{hint}"
+        )
+    if np.isinf(np.asarray(x)).any():
+        raise ValueError(f"{name}[{run}] contains inf. Write NaN for what was not measured.")
+    return x
+
+
+def _check_coordinates(states: tuple[Array, ...]) -> None:
+    sizes = {x.shape[1] for x in states}
+    if len(sizes) > 1:
+        raise ValueError(
+            f"the runs have {sorted(sizes)} coordinates: all must be states of one system. Write "
+            "NaN for coordinates that a run did not measure."
+        )
+    for run, x in enumerate(states):
+        if not np.isfinite(np.asarray(x)).any():
+            raise ValueError(f"nothing was measured in run {run}: leave it out.")
+
+
+def _warn_of_oddities(times: tuple[Array, ...], states: tuple[Array, ...]) -> None:
+    gaps, jumps, still = [], [], []
+    for run, (t, x) in enumerate(zip(times, states, strict=True)):
+        dt, x = np.diff(np.asarray(t)), np.asarray(x)
+        if len(dt) > 2 and dt.max() > _GAP * np.median(dt):
+            gaps.append(f"{dt.max():.3g} in run {run}, at a median spacing of {np.median(dt):.3g}")
+        for c in range(x.shape[1]):
+            column = x[np.isfinite(x[:, c]), c]
+            step = np.abs(np.diff(column))
+            # A wrapped angle turns by 2π between samples that are else less than a third as far.
+            full = np.abs(step - 2 * np.pi) < 0.7
+            if full.any() and (full.all() or step[~full].max() < 2 * np.pi / 3):
+                jumps.append(f"coordinate {c} of run {run}")
+    X = np.concatenate([np.asarray(x) for x in states])
+    for c in range(X.shape[1]):
+        column = X[np.isfinite(X[:, c]), c]
+        if column.size and np.ptp(column) == 0:
+            still.append(f"{c} (always {column[0]:g})")
+    if jumps:
+        require.warn(
+            f"{_some(jumps)} jumps by about 2π: a wrapped angle. A field is learned along "
+            "continuous paths; use np.unwrap(states[:, c]) before, and a kernel that is periodic, "
+            "hk.Periodic or hk.Warp, where the field is."
+        )
+    if gaps:
+        require.warn(
+            f"a gap of {_some(gaps)}. The path inside a gap is known from the field alone; cut the "
+            "run in two there if the system was moved meanwhile."
+        )
+    if still:
+        require.warn(
+            f"constant in all runs: coordinate {_some(still)}. Leave it out of the states."
+        )
+
+
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(names[:3]) + more

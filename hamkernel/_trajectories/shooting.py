@@ -1,0 +1,161 @@
+"""Multiple shooting: segments, their starts by Levenberg steps, and which of them to trust."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hamkernel._trajectories.evidence import back_substituted, orthonormal
+from hamkernel._trajectories.flow import Expansion, Path, simulated
+from hamkernel._trajectories.padding import half_octave, power_of_two
+from hamkernel._trajectories.prepared import Run
+from hamkernel._trajectories.rows import Rows, Segments, linearised, segments_of, tangents
+
+SHORT = 10  # samples in a segment while the field is rough
+LONG = 256  # at most: the tangent of a longer path says little more, and arrays stay small
+_GROWTH = 1e4  # of the tangent, beyond which a path says nothing of its start
+_FAR = 25.0  # times the median χ² per sample
+
+
+class Piece(NamedTuple):
+    """Samples `start` to `stop` of one run."""
+
+    run: int
+    start: int
+    stop: int
+
+
+def cuts(runs: list[Run], most: int) -> list[Piece]:
+    """Every run in pieces of at most `most` samples, of nearly equal lengths."""
+    pieces = []
+    for r, run in enumerate(runs):
+        T = len(run.times)
+        ends = np.linspace(0, T, -(-T // most) + 1).round().astype(int)
+        pieces += [Piece(r, int(a), int(b)) for a, b in zip(ends[:-1], ends[1:], strict=True)]
+    return pieces
+
+
+def halved(pieces: list[Piece], good: Bool[np.ndarray, " S"]) -> list[Piece]:
+    """The pieces, those that are not good in halves where they are long."""
+    out = []
+    for piece, is_good in zip(pieces, good, strict=True):
+        middle = (piece.start + piece.stop) // 2
+        if is_good or piece.stop - piece.start <= SHORT:
+            out.append(piece)
+        else:
+            out += [piece._replace(stop=middle), piece._replace(start=middle)]
+    return out
+
+
+def segmented(runs: list[Run], pieces: list[Piece], paths: list[np.ndarray]) -> Segments:
+    """The pieces as arrays of a few shapes; they start on `paths`."""
+    longest = max(piece.stop - piece.start for piece in pieces)
+    length = half_octave(longest) if longest <= 2 * SHORT else power_of_two(longest)
+    filled = []
+    for r, start, stop in pieces:
+        run, part = runs[r], slice(start, stop)
+        filled.append((run.times[part], run.states[part], run.counts[part], paths[r][start]))
+    return segments_of(filled, half_octave(len(pieces)), length)
+
+
+class Shot(NamedTuple):
+    """The path of the current field through every segment.
+
+    Attributes:
+        starts: where it starts, shape (S, n).
+        path: the path.
+        squares: χ² of each segment, inf where the path is lost.
+    """
+
+    starts: Float[Array, "S n"]
+    path: Path
+    squares: Float[Array, " S"]
+
+
+@eqx.filter_jit
+def shot(
+    field: Any,
+    segments: Segments,
+    log_noise: Float[Array, " n"],
+    spread: Float[Array, " n"],
+    steps,
+    starts: Float[Array, "S n"],
+    rounds: int,
+) -> Shot:
+    """The starts after some Levenberg steps from `starts`, of each segment on its own.
+
+    δz minimises ‖r − Pδz‖² + μ‖U δz‖², where P = QU scales the coordinates; μ goes down by ten
+    after a step that was better, and up after one that was worse.
+    """
+    W = jnp.sqrt(segments.counts) * jnp.exp(-log_noise)[None, None]
+    S, n = starts.shape
+    prior = jnp.broadcast_to(jnp.diag(1 / spread), (S, n, n))
+
+    def at(z):
+        path = simulated(field, z, segments.spans, steps)
+        r = (W * (segments.measured - path.x)).reshape(S, -1)
+        r = jnp.concatenate([r, (segments.starts - z) / spread[None]], axis=1)
+        squares = jnp.sum(r**2, axis=1)
+        squares = jnp.where(jnp.isfinite(squares), squares, jnp.inf)
+        return path, r, squares
+
+    def move(path, r, squares):
+        P = (W[..., None] * tangents(path.across)).reshape(S, -1, n)
+        P = jnp.concatenate([P, prior], axis=1)
+        P = jnp.where(jnp.isfinite(P), P, jnp.zeros_like(P))
+        Q, U = orthonormal(P)
+        return back_substituted(U, jnp.einsum("sdn,sd->sn", Q, jnp.where(jnp.isfinite(r), r, 0.0)))
+
+    def step(carry, _):
+        best, least, way, mu = carry
+        z = best + way / (1 + mu)[:, None]
+        path, r, squares = at(z)
+        better = squares < least
+        new = jnp.where(better[:, None], move(path, r, squares), way)
+        new = jnp.where(jnp.isfinite(new), new, jnp.zeros_like(new))
+        best = jnp.where(better[:, None], z, best)
+        mu = jnp.where(better, mu / 10, mu * 10 + 1)
+        return (best, jnp.minimum(squares, least), new, mu), None
+
+    # The first step goes nowhere: it finds the way from the given starts.
+    begin = (
+        starts,
+        jnp.full(S, jnp.inf, starts.dtype),
+        jnp.zeros_like(starts),
+        jnp.zeros_like(starts[:, 0]),
+    )
+    (best, _, _, _), _ = jax.lax.scan(step, begin, length=rounds + 1)
+    path, _, squares = at(best)
+    return Shot(best, path, squares)
+
+
+def trusted(found: Shot, segments: Segments, noise_free: bool = False) -> Bool[np.ndarray, " S"]:
+    """Which segments the field explains well enough to learn from them."""
+    squares = np.asarray(found.squares)
+    samples = np.asarray(segments.counts > 0).sum(axis=(1, 2))
+    growth = np.abs(np.asarray(tangents(found.path.across))).max(axis=(1, 2, 3))
+    real = samples > 0
+    good = real & np.isfinite(squares) & (growth < _GROWTH)
+    if good.any():
+        each = squares / np.maximum(samples, 1)
+        # Where half of them are better than their noise, that is no reason to drop the others.
+        good &= each < _FAR * max(np.median(each[good]), 1.0)
+    return good
+
+
+@eqx.filter_jit
+def rows_along(field: Expansion, path: Path, segments: Segments, good) -> Rows:
+    """The rows along the path of the current field."""
+    nodes = jnp.where(good[:, None, None, None], path.nodes, jnp.zeros_like(path.nodes))
+    slopes = jax.vmap(jax.vmap(jax.vmap(field)))(nodes)
+    return linearised(path, slopes, means(field.mean, nodes), segments, good, is_solution=True)
+
+
+def means(mean, nodes: Float[Array, "S L 3 n"]) -> Float[Array, "S L 3 n"]:
+    """The prior mean at the nodes."""
+    if mean is None:
+        return jnp.zeros_like(nodes)
+    return jax.vmap(jax.vmap(jax.vmap(mean)))(nodes).astype(nodes.dtype)

@@ -1,0 +1,152 @@
+"""Where learning starts: landmarks, the box of hyperparameters, and rows along smoothed runs."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.operators import AbstractStructure
+from hamkernel._kernels.base import Scaled, ScalarSum
+from hamkernel._trajectories.evidence import Box, Model
+from hamkernel._trajectories.flow import WEIGHTS
+from hamkernel._trajectories.prepared import Prepared
+from hamkernel._trajectories.rows import Rows, Segments, frozen, linearised
+from hamkernel._trajectories.shooting import Piece, means
+from hamkernel._tuning.boxes import gram_trace, hyperparameters
+
+_FEWEST = {1: 24, 2: 64, 3: 96, 4: 128}  # landmarks for n coordinates, 192 for more
+_POINTS = 1024  # of the smoothed runs, from which boxes and landmarks are taken
+
+
+def with_amplitude(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
+    """K, every structure in it scaled; a likelihood needs amplitudes.
+
+    `Symplectic(Gaussian(2.0))` becomes `Symplectic(1.0 * Gaussian(2.0))`.
+    """
+
+    def is_structure(node: object) -> bool:
+        return isinstance(node, AbstractStructure)
+
+    def scaled(node):
+        if not is_structure(node) or _has_amplitude(node.kernel):
+            return node
+        return eqx.tree_at(lambda node: node.kernel, node, Scaled(node.kernel, 1.0))
+
+    return jax.tree.map(scaled, K, is_leaf=is_structure)
+
+
+def _has_amplitude(k: object) -> bool:
+    if isinstance(k, ScalarSum):
+        return all(_has_amplitude(term) for term in k.terms)
+    nodes = jax.tree.leaves(k, is_leaf=lambda node: isinstance(node, Scaled))
+    return any(isinstance(node, Scaled) for node in nodes)
+
+
+def sampled(data: Prepared) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]]:
+    """States and velocities of the smoothed runs at some of their nodes."""
+    n = len(data.scale)
+    runs = [run for run, use in zip(data.runs, data.usable, strict=True) if use]
+    X = np.concatenate([run.nodes.reshape(-1, n) for run in runs])
+    Y = np.concatenate([run.slopes.reshape(-1, n) for run in runs])
+    chosen = np.unique(np.linspace(0, len(X) - 1, min(len(X), _POINTS)).round().astype(int))
+    return X[chosen], Y[chosen]
+
+
+def landmarks(X: Float[np.ndarray, "N n"], scale, count: int | None) -> Float[Array, "m n"]:
+    """Points of X that cover it: each the one farthest from those before, in standard deviations.
+
+    They do not depend on hyperparameters, which are not known yet.
+    """
+    count = _FEWEST.get(X.shape[1], 192) if count is None else count
+    points = X / scale[None]
+    chosen = [int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
+    distance = np.full(len(points), np.inf)
+    while len(chosen) < min(count, len(points)):
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        if not distance.max() > 0:
+            break
+        chosen.append(int(np.argmax(distance)))
+    return jnp.asarray(X[chosen])
+
+
+def box_of(
+    model: Model, X: np.ndarray, Y: np.ndarray, scale: np.ndarray, moves: np.ndarray
+) -> tuple[Box, np.ndarray]:
+    """The box of all hyperparameters, those of the caller inside, and a design of first points.
+
+    Args:
+        model: the caller's kernel and the noise of the smoothed runs.
+        X: states.
+        Y: their velocities.
+        scale: the standard deviations of the coordinates.
+        moves: the coordinates whose noise is looked for.
+    """
+    leaves = hyperparameters(model.kernel, jnp.asarray(X), jnp.asarray(Y))
+    start = np.asarray(model.flat)
+    size = len(start) - len(scale)
+    low = np.concatenate([*(p.low.ravel() for p in leaves), np.log(1e-7 * scale)])
+    high = np.concatenate([*(p.high.ravel() for p in leaves), np.log(2 * scale)])
+    low[:size] = np.minimum(low[:size], start[:size])
+    high[:size] = np.maximum(high[:size], start[:size])
+    free = np.concatenate([np.ones(size, bool), moves])
+    names = [p.name for p in leaves for _ in range(p.low.size)]
+    none = np.zeros(len(scale), bool)
+    lengths = np.append([name.endswith("lengthscale") for name in names], none).astype(bool)
+    scales = np.append([name.split(".")[-1] == "scale" for name in names], none).astype(bool)
+    extent = np.log(np.linalg.norm(np.ptp(X, axis=0)))
+    design = [start]
+    for shift in (None, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0):
+        point = start.copy()
+        if shift is not None:
+            if not lengths.any():
+                continue
+            point[lengths] = np.clip(extent - 0.7 + shift, low[lengths], high[lengths])
+        design.append(_amplified(model, point, scales, X, Y))
+    return Box(low, high, free), np.clip(np.array(design), low, high)
+
+
+def _amplified(model: Model, h, scales, X, Y):
+    """h with amplitudes such that a velocity of the prior is twice as large as those seen."""
+    if not scales.any():
+        return h
+    trace = float(gram_trace(model.at(jnp.asarray(h)).kernel, jnp.asarray(X))) / len(X)
+    target = 4 * np.mean(np.sum(Y**2, axis=1))
+    out = h.copy()
+    if np.isfinite(trace) and trace > 0 and target > 0:
+        out[scales] += np.log(target / trace)
+    return out
+
+
+def smooth_rows(
+    data: Prepared, pieces: list[Piece], segments: Segments, mean, good: np.ndarray
+) -> Rows:
+    """The rows along the smoothed runs, whose tangent is that of the mean."""
+    S, L = segments.spans.shape
+    n = len(data.scale)
+    x, nodes = np.zeros((S, L + 1, n)), np.zeros((S, L, 3, n))
+    slopes = np.zeros((S, L, 3, n))
+    for s, (r, start, stop) in enumerate(pieces):
+        run, T = data.runs[r], stop - start
+        x[s] = run.path[stop - 1]
+        nodes[s] = run.path[stop - 1]
+        x[s, :T] = run.path[start:stop]
+        nodes[s, : T - 1] = run.nodes[start : stop - 1]
+        slopes[s, : T - 1] = run.slopes[start : stop - 1]
+    x, nodes, slopes = jnp.asarray(x), jnp.asarray(nodes), jnp.asarray(slopes)
+    D = jacobians(mean, nodes)
+    path = frozen(x, nodes, segments.spans, D)
+    return linearised(
+        path, slopes, means(mean, nodes), segments, jnp.asarray(good), is_solution=False
+    )
+
+
+@eqx.filter_jit
+def jacobians(mean, nodes: Float[Array, "S L 3 n"]) -> Float[Array, "S L n n"]:
+    """The Jacobian of the mean in each interval, averaged over its nodes."""
+    n = nodes.shape[-1]
+    if mean is None:
+        return jnp.zeros((*nodes.shape[:2], n, n), nodes.dtype)
+    D = jax.vmap(jax.vmap(jax.vmap(jax.jacfwd(mean))))(nodes)
+    return jnp.einsum("slkab,k->slab", D, jnp.asarray(WEIGHTS, nodes.dtype))

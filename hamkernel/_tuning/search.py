@@ -1,0 +1,165 @@
+"""The search of `tune`: many runs on few points, and few on many.
+
+The runs are made on a subset of the points. Their ends, those that differ, are compared on more
+points, and the best one is finished there, with the curvature that it has learned; and so on, up
+to all points. The price of a loss grows with the cube of the points, so that the last part takes
+most of the time although it looks at two points and takes few steps.
+"""
+
+import sys
+from collections.abc import Callable
+
+import numpy as np
+import optimistix as optx
+from jaxtyping import Array, Float
+
+from hamkernel import _require as require
+from hamkernel._tuning.descent import Descent, Run
+from hamkernel._tuning.objective import SearchCriterion
+from hamkernel._tuning.other_optimisers import minimised
+from hamkernel._tuning.part import Part, rows_of_parts
+from hamkernel._tuning.space import SearchSpace
+from hamkernel._tuning.starts import design, shares_apart, spread_out
+
+_TOLERANCE = 1e-4  # of the logarithm of a loss: what a run may still gain at its end
+_COARSE = 1e-3  # the same where it goes on with more points
+_SAME = 0.01  # of the box: ends that are closer are one
+# On so many points the loss has an optimum of its own, of the runs that happen to be held out: to
+# follow it for 23 steps made the error of the field 25 % larger (141 runs of a pendulum).
+_LAST_STEPS = 2
+_CLOSE = 0.1  # the caller's point, if it is no more than 10 % worse, is looked at again
+_LONG = 60.0  # seconds of which the caller is told beforehand
+_CALLS_OF_A_RUN, _CALLS_OF_THE_LAST = 25, 5  # of the loss, as the estimates count
+
+
+class Search:
+    """The runs, part by part.
+
+    Args:
+        space: where.
+        criterion: of all points.
+        X: states, shape (N, n), on one device.
+        Y: velocities, shape (N, n).
+        starts: the number of runs.
+        max_steps: of one run, on each part.
+        optimiser: one of optimistix, or None for BFGS.
+        progress: whether to print how it goes.
+    """
+
+    def __init__(
+        self,
+        space: SearchSpace,
+        criterion: SearchCriterion,
+        X: Float[Array, "N n"],
+        Y: Float[Array, "N n"],
+        starts: int,
+        max_steps: int,
+        optimiser: optx.AbstractMinimiser | None,
+        progress: bool,
+    ):
+        self.space, self.criterion, self.X, self.Y = space, criterion, X, Y
+        self.starts, self.max_steps = starts, max_steps
+        self.optimiser, self.progress = optimiser, progress
+        self._given = np.asarray(space.encode_start(), float)
+
+    def runs(self, low_rank: Callable[[Run], SearchCriterion] | None = None) -> list[Run]:
+        """A run for each start, where the search ends.
+
+        Args:
+            low_rank: the criterion of the last part, given the best run before; None if dense.
+        """
+        rows = rows_of_parts(self.X, self.criterion, dense=low_rank is None)
+        part = self._part(self.criterion, rows[0])
+        only = len(rows) == 1 and low_rank is None
+        runs = self._first(part, _TOLERANCE if only else _COARSE)
+        ends = [*_different(runs), Run(self._given)]
+        last = rows[-1] if len(rows) > 2 else None
+        for more in rows[1:]:
+            steps = min(self.max_steps, _LAST_STEPS) if more is last else self.max_steps
+            growth = (len(more) / part.points) ** 3
+            self._warn_of_waiting(part.seconds * growth * _CALLS_OF_THE_LAST, _SMALLER)
+            part = self._part(self.criterion, more)
+            runs, ends = self._finished(part, ends, steps)
+        if low_rank is not None and best(runs).value < np.inf:
+            part = self._part(low_rank(best(runs)), np.arange(len(self.X)))
+            runs, _ = self._finished(part, ends, self.max_steps)
+        return runs
+
+    def _part(self, criterion: SearchCriterion, rows: np.ndarray) -> Part:
+        return Part(self.space, criterion, self.X, self.Y, rows)
+
+    def _first(self, part: Part, tolerance: float) -> list[Run]:
+        """A run from the caller's point, and from the best points of a design."""
+        runs = [Run(self._given)]
+        if self.starts > 1:
+            points = design(self.space.directions)
+            values = np.array([value for value, *_ in part(points)])
+            runs += [Run(u) for u in spread_out(points, values, self.starts - 1)]
+            seconds = part.seconds * self.starts * _CALLS_OF_A_RUN
+            self._warn_of_waiting(seconds, f"Pass fewer starts than {self.starts}.")
+        self._descend(part, runs, tolerance, self.max_steps)
+        return runs
+
+    def _finished(self, part: Part, ends: list[Run], max_steps: int) -> tuple[list[Run], list[Run]]:
+        """The ends in the order of their losses on these points, the best one finished there.
+
+        The last of the ends is the caller's point. The second list has those of them that are worth
+        looking at on more points: the best, and the caller's where it came close.
+        """
+        points = part(np.stack([end.u for end in ends]))
+        for end, (end.value, end.loss, end.slope) in zip(ends, points, strict=True):
+            end.converged = False
+        given = ends[-1]
+        ends = sorted(ends, key=lambda end: end.value)
+        close = given.value < ends[0].value + _CLOSE
+        self._descend(part, ends[:1], _TOLERANCE, max_steps)
+        return ends[: self.starts], [ends[0], *([Run(self._given)] if close else [])]
+
+    def _descend(self, part: Part, runs: list[Run], tolerance: float, max_steps: int) -> None:
+        """Go on with the runs, side by side, until each has converged or used up its steps."""
+        if self.optimiser is not None:
+            for run in runs:
+                minimised(part.objective, run, self.optimiser, max_steps)
+            return
+        relative = self.criterion.own  # it has a unit of its own
+        descents = [Descent(run, tolerance, max_steps, relative) for run in runs]
+        while going := [descent for descent in descents if descent.going]:
+            points = part(np.stack([descent.trial for descent in going]))
+            for descent, point in zip(going, points, strict=True):
+                descent.tell(*point)
+            if self.progress:
+                self._say(part, runs, len(going))
+
+    def _say(self, part: Part, runs: list[Run], going: int) -> None:
+        sys.stdout.write(
+            f"tune: {part.points} of {len(self.X)} points, "
+            f"step {max(run.steps for run in runs)}, {going} of {len(runs)} runs, "
+            f"best loss {best(runs).loss:.6g}\n"
+        )
+        sys.stdout.flush()
+
+    def _warn_of_waiting(self, seconds: float, cure: str) -> None:
+        if seconds > _LONG:
+            require.warn(f"this search will take about {seconds / 60:.0f} minutes. {cure}")
+
+
+_SMALLER = (
+    "The price of the loss grows with the cube of N n: pass a part of the data and fit all of it "
+    "with what is found, or a solver whose loss is of low rank, solver=hk.Nystrom() or "
+    "solver=hk.RandomFeatures(count, key)."
+)
+
+
+def best(runs: list[Run]) -> Run:
+    """The run that found the least value."""
+    return min(runs, key=lambda run: run.value)
+
+
+def _different(runs: list[Run]) -> list[Run]:
+    """The runs that ended where no better one did, from the best on."""
+    ends: list[Run] = []
+    for run in sorted(runs, key=lambda run: run.value):
+        apart = [shares_apart(run.u, end.u) for end in ends]
+        if run.value < np.inf and min(apart, default=1.0) > _SAME:
+            ends.append(run)
+    return ends
