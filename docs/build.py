@@ -33,6 +33,8 @@ def build(site: Path) -> None:
         warnings.simplefilter("error")
         pdoc.render.configure(docformat="google", math=True, search=True)
         pdoc.pdoc("hamkernel", output_directory=site)
+    for path in site.rglob("*.html"):
+        path.write_text(without_dead_anchors(path.read_text()))
 
     def write(notebook, path: Path) -> None:
         page, _ = HTMLExporter().from_notebook_node(
@@ -66,6 +68,16 @@ def linked(page: str) -> str:
     for heading in ids:
         page = page.replace(f'href="#{heading.lower()}"', f'href="#{heading}"')
     return page
+
+
+def without_dead_anchors(page: str) -> str:
+    """The text alone of links to anchors that the page lacks: pdoc links what it does not show."""
+    ids = set(re.findall(r'id="([^"]+)"', page))
+
+    def kept(link: re.Match) -> str:
+        return link[0] if link[1] in ids else link[2]
+
+    return re.sub(r'<a href="#([^"]+)">([^<]*)</a>', kept, page)
 
 
 if __name__ == "__main__":

@@ -38,7 +38,7 @@ def broken(site):
             there = (path.parent / unquote(file)).resolve() if file else path
             if not there.exists():
                 yield path.name, target
-            elif anchor and there in pages and unquote(anchor) not in pages[there].anchors:
+            elif there in pages and not {anchor, unquote(anchor)} & {"", *pages[there].anchors}:
                 yield path.name, target
 
 
