@@ -3,7 +3,7 @@
 Where things are, in the order of the data; a folder imports from itself and those above it:
 
     _kernels      scalar kernels k(x, z), and any callable as one
-    _structures   matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, odd and even ones
+    _structures   matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, symmetries; `poisson` has tensors
     _gram         the Gram: dense, as an operator, and its derivatives
     _factors      factors of G + ridge I, dense and of low rank
     _features     random Fourier features
@@ -25,10 +25,11 @@ devices, the memory and the threads.
 import importlib
 from typing import TYPE_CHECKING, Any
 
-from hamkernel import systems
+from hamkernel import poisson, systems
 from hamkernel._checks.kernel import check_kernel
 from hamkernel._dynamics.simulate import simulate
 from hamkernel._fields.base import KernelField, SolverInfo
+from hamkernel._fields.controlled import ControlledField
 from hamkernel._fields.features import FeatureField
 from hamkernel._gram.dense import gram
 from hamkernel._gram.operator import gram_operator
@@ -41,8 +42,12 @@ from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.fit import fit
 from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
 from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
-from hamkernel._structures.base import Even, Odd, Sum
+from hamkernel._structures.base import Sum
+from hamkernel._structures.controlled import Controlled, InputMatrix
 from hamkernel._structures.operators import CurlFree, DivergenceFree, Separable, Symplectic
+from hamkernel._structures.own import Poisson, Structured
+from hamkernel._structures.port_hamiltonian import PortHamiltonian
+from hamkernel._structures.symmetry import Even, Invariant, Odd, Reversible
 from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.runs import Runs
@@ -74,14 +79,23 @@ __all__ = [  # noqa: RUF022 - in reading order
     "CurlFree",
     "DivergenceFree",
     "Symplectic",
+    "PortHamiltonian",
+    "Poisson",
+    "Structured",
+    "poisson",
     "Odd",
     "Even",
+    "Reversible",
+    "Invariant",
+    "Controlled",
+    "InputMatrix",
     "Sum",
     # Learning.
     "gram",
     "fit",
     "KernelField",
     "FeatureField",
+    "ControlledField",
     "LandmarkFit",
     "FeatureFit",
     "SolverInfo",

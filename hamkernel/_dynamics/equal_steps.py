@@ -96,8 +96,8 @@ class EqualSteps(diffrax.AbstractSolver):
 
     With `diffrax.StepTo(ts)` every time in `ts` is the end of a step: nothing is interpolated, and
     memory is that of the saved points. The steps between two times are all of one size, at most
-    `dt`, and do not depend on the state. The field must be autonomous: each long step starts at
-    time 0, so that a small step is not lost in the rounding of a large time.
+    `dt`, and do not depend on the state. Each long step starts at time 0, so that a small step is
+    not lost in the rounding of a large time; the `args` of a field with inputs say when that is.
     """
 
     solver: diffrax.AbstractSolver
@@ -132,7 +132,8 @@ class EqualSteps(diffrax.AbstractSolver):
             span,
             span / equal_steps(span, self.dt),
             y0,
-            args,
+            # Of a field with inputs, the time at which its own is zero.
+            None if args is None else args + t0,
             adjoint=self.adjoint,
             max_steps=self.max_steps,
             throw=False,

@@ -17,6 +17,13 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
+from hamkernel._dynamics.inputs import (
+    Between,
+    Driven,
+    inputs_of,
+    refuse_missing,
+    refuse_symplectic,
+)
 
 if TYPE_CHECKING:
     import diffrax
@@ -39,6 +46,16 @@ class _Autonomous(eqx.Module):
         return self.field(x)
 
 
+class _At(eqx.Module):
+    """A driven field at the first time, to be looked at before the solve."""
+
+    driven: Driven
+    start: Float[Array, ""]
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.driven(jnp.zeros_like(self.start), x, self.start)
+
+
 def simulate(
     field: Callable[[Float[Array, " n"]], Float[Array, " n"]],
     x0: Num[ArrayLike, " n"],
@@ -52,6 +69,8 @@ def simulate(
     progress: bool = False,
     adjoint: diffrax.AbstractAdjoint | None = None,
     throw: bool = True,
+    inputs: Callable[[Float[Array, ""]], Any] | Num[ArrayLike, "T m"] | None = None,
+    between: Between = "held",
 ) -> diffrax.Solution:
     """Integrate ẋ = f(x) from x0 at time ts[0], and return the states at the times ts.
 
@@ -81,6 +100,9 @@ def simulate(
             For `jax.jvp` and `jax.jacfwd` pass `diffrax.ForwardMode()`, for `jax.hessian`
             `diffrax.DirectAdjoint()`.
         throw: raise if the solve fails. If False, look at `.result`.
+        inputs: u of a field (x, u) ↦ ẋ: a function t ↦ (m,) of the time as it is in ts, or samples
+            (T, m) at ts. An explicit time is one: `inputs=lambda t: jnp.array([t])`.
+        between: samples are "held" until the next one, or "linear" in between.
 
     Returns:
         A `diffrax.Solution`: `.ts` (T,), `.ys` (T, n), `.stats["num_steps"]`.
@@ -88,7 +110,8 @@ def simulate(
     Raises:
         ValueError: a shape, time or value does not fit; a symplectic solver without `dt`; a solver
             that cannot estimate its error without `dt`; a splitting of a field that is not known to
-            be separable; more steps of `dt` than `max_steps`.
+            be separable; more steps of `dt` than `max_steps`; inputs that are missing, of another
+            shape, or together with a symplectic solver.
         TypeError: `field` is no function of one JAX array that returns one, of the same dtype;
             `solver` or `adjoint` is none of Diffrax; x0 is of less precision than float32; forward
             mode through the default adjoint.
@@ -97,7 +120,11 @@ def simulate(
     """
     import diffrax
 
-    from hamkernel._dynamics.equal_steps import EqualSteps, step_counts
+    from hamkernel._dynamics.equal_steps import (
+        AbstractSymplecticSolver,
+        EqualSteps,
+        step_counts,
+    )
 
     with _eager(x0):
         x0 = _initial_state(x0)
@@ -108,6 +135,18 @@ def simulate(
         solver = diffrax.Dopri8()
     _check_solver(solver, dt, rtol, atol)
     field = _uncompiled(field)
+    start = None
+    if inputs is None:
+        refuse_missing(field)
+        right_hand_side: Any = _Autonomous(field)
+    else:
+        if isinstance(solver, AbstractSymplecticSolver):
+            refuse_symplectic(solver)
+        # Functions get the caller's time, samples have times of their own: those since the start.
+        start = given[0].astype(x0.dtype) if callable(inputs) else jnp.zeros((), x0.dtype)
+        held = dt is not None and between == "held" and not callable(inputs)
+        right_hand_side = Driven(field, inputs_of(inputs, ts, between), held)
+        field = _At(right_hand_side, start)
     _check_field(field, x0)
     if max_steps is not None:
         max_steps = require.count(max_steps, "max_steps")
@@ -128,6 +167,8 @@ def simulate(
                 atol=_tolerance("atol", atol, default, x0.dtype),
             ),
             step_ts=ts,
+            # A held input jumps there: no step may have a stage on the other side.
+            jump_ts=ts[1:-1] if inputs is not None and not callable(inputs) else None,
         )
         saveat = diffrax.SaveAt(ts=ts)
         max_steps = _MAX_STEPS + ts.size if max_steps is None else max_steps
@@ -145,12 +186,13 @@ def simulate(
     meter = diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter()
     try:
         solution = diffrax.diffeqsolve(
-            diffrax.ODETerm(_Autonomous(field)),
+            diffrax.ODETerm(right_hand_side),
             solver,
             ts[0],
             ts[-1],
             None,
             x0,
+            start,
             saveat=saveat,
             stepsize_controller=controller,
             adjoint=adjoint,

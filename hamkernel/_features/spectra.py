@@ -208,7 +208,8 @@ def _(k: Symmetrised, n: int, count: int, key, dtype):
     inner = spectra(k.kernel, n, count, key, dtype)
     if k.parity is None or any(s.parity == -k.parity for s in inner):
         raise TypeError(
-            "RandomFeatures knows only the reflection x -> -x, once: hk.Odd(K) or hk.Even(K). "
-            "For other groups use hk.Cholesky() or hk.Nystrom()."
+            "RandomFeatures takes one group for all of a structure, around all of its terms: "
+            "hk.Odd(K), hk.Reversible(K), hk.Symplectic(hk.Invariant(k1 + k2, maps)). For others "
+            "use hk.Cholesky() or hk.Nystrom()."
         )
     return tuple(Spectrum(s.frequencies, s.weights, k.parity) for s in inner)

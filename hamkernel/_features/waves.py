@@ -21,6 +21,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from hamkernel._features.spectra import Spectrum, spectra
+from hamkernel._kernels.base import AbstractScalarKernel
+from hamkernel._kernels.transforms import symmetry_removed
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.operators import AbstractPotentialKernel, DivergenceFree, Separable
 
@@ -48,6 +50,49 @@ class Waves(eqx.Module):
         phase = self.frequencies @ x
         slopes = jnp.concatenate([-jnp.sin(phase[: self.cosines]), jnp.cos(phase[self.cosines :])])
         return self.frequencies.T * (self.amplitudes * slopes)[None]
+
+
+class GroupWaves(eqx.Module):
+    """The means of waves over a finite group, Σ_g χ(g) wave(g x)/|G|.
+
+    They are the features of the mean of a kernel over the group in both arguments.
+    """
+
+    waves: Waves
+    matrices: Float[Array, "G n n"]
+    characters: Float[Array, " G"]
+
+    @property
+    def amplitudes(self) -> Float[Array, " w"]:
+        return self.waves.amplitudes
+
+    def values(self, x: Float[Array, " n"]) -> Float[Array, " w"]:
+        matrices, characters = self._constants()
+        return characters @ jax.vmap(self.waves.values)(matrices @ x) / len(characters)
+
+    def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n w"]:
+        matrices, characters = self._constants()
+        slopes = jax.vmap(self.waves.gradients)(matrices @ x)  # (G, n, w) at g x
+        return jnp.einsum("g,gba,gbw->aw", characters, matrices, slopes) / len(characters)
+
+    def _constants(self) -> tuple[Float[Array, "G n n"], Float[Array, " G"]]:
+        """The group, which is not differentiated."""
+        return jax.lax.stop_gradient((self.matrices, self.characters))
+
+
+def waves_of(
+    k: AbstractScalarKernel, n: int, count: int, key: Key[Array, ""], dtype: Any
+) -> Waves | GroupWaves:
+    """Waves with the spectrum of a scalar kernel, and with its symmetry."""
+    found = symmetry_removed(k)
+    if found is None or found.parity is not None:  # which `Spectrum` knows
+        return Waves(spectra(k, n, count, key, dtype))
+    group = found.group(n)
+    return GroupWaves(
+        Waves(spectra(found.kernel, n, count, key, dtype)),
+        jnp.asarray(np.stack([g.matrix for g in group]), dtype),
+        jnp.asarray([g.character for g in group], dtype),
+    )
 
 
 class AbstractFeatures(eqx.Module):
@@ -81,7 +126,7 @@ class PotentialFeatures(AbstractFeatures):
     """φ = B∇(wave)."""
 
     structure: AbstractPotentialKernel
-    waves: Waves
+    waves: Waves | GroupWaves
 
     @property
     def columns(self) -> int:
@@ -100,7 +145,7 @@ class PotentialFeatures(AbstractFeatures):
 class DivergenceFreeFeatures(AbstractFeatures):
     """φ = e_a ∂_b(wave) − e_b ∂_a(wave) for each pair a < b: an antisymmetric matrix potential."""
 
-    waves: Waves
+    waves: Waves | GroupWaves
     dimension: int = eqx.field(static=True)
 
     @property
@@ -130,7 +175,7 @@ class DivergenceFreeFeatures(AbstractFeatures):
 class SeparableFeatures(AbstractFeatures):
     """φ = e_a (wave) for each component a."""
 
-    waves: Waves
+    waves: Waves | GroupWaves
     dimension: int = eqx.field(static=True)
 
     @property
@@ -200,7 +245,7 @@ def features(
             f"RandomFeatures does not know the structure {type(K).__name__}. Use Symplectic, "
             "CurlFree, DivergenceFree, Separable or sums of them, or another solver."
         )
-    waves = Waves(spectra(K.kernel, n, count, key, dtype))
+    waves = waves_of(K.kernel, n, count, key, dtype)
     if isinstance(K, AbstractPotentialKernel):
         return PotentialFeatures(K, waves)
     return (DivergenceFreeFeatures if isinstance(K, DivergenceFree) else SeparableFeatures)(

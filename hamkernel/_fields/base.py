@@ -117,14 +117,15 @@ class AbstractField(eqx.Module):
 
     @property
     def hamiltonian(self) -> Scalar:
-        """The learned Hamiltonian H with f = J∇H, x (n,) -> ().
+        """The learned Hamiltonian H with f = B∇H, x (n,) -> (); B = J, J − R, Π(x) or your own.
 
-        Velocities determine H up to a constant: see `anchored`.
+        Velocities determine H up to a constant: see `anchored`. That there is one does not say
+        that it is conserved: see `dissipation`.
 
         Raises:
             AttributeError: the field is not Hamiltonian by construction (with the reason).
         """
-        if not self.kernel.symplectic:
+        if not self.kernel.has_hamiltonian:
             raise AttributeError(
                 f"a field of the kernel {type(self.kernel).__name__} is not Hamiltonian by "
                 "construction, so it has no learned Hamiltonian. Use Symplectic(k); for a sum "
@@ -132,6 +133,18 @@ class AbstractField(eqx.Module):
                 "field.part(0).hamiltonian(x); for CurlFree see field.potential(x)."
             )
         return self.potential
+
+    def dissipation(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        """The power that is lost at x, −dH/dt = ∇HᵀR∇H along the field, shape ().
+
+        Not negative with `PortHamiltonian`, zero where H is conserved, and of any sign with an
+        operator of your own.
+
+        Raises:
+            AttributeError: the field has no Hamiltonian. ValueError: x is no state (n,).
+        """
+        slope = jax.grad(self.hamiltonian)(self._state(x))
+        return self.kernel.dissipated(self._state(x), slope)
 
     def _check_single(self) -> None:
         if self.offset.shape:

@@ -37,7 +37,7 @@ def gram(
     K = matrix_kernel(K)
     X = require.points(X, "X")
     X, Z = require.same_space(X, X if Z is None else require.points(Z, "Z"))
-    K.check_dimension(X.shape[1])
+    K.check_points(X)
     X, Z = automatic(X), automatic(Z)
     cure = "hk.gram_operator(K, X, Z) multiplies with it and never forms it."
     refuse_beyond_memory("the Gram", X.size, Z.size, X.dtype, 1, cure)
@@ -54,7 +54,7 @@ def assemble(
 ) -> Float[Array, "N n M n"]:
     """`gram` without its checks and its own compilation."""
     X, Z = centred(K, X, Z)
-    basis = jnp.eye(X.shape[1], dtype=X.dtype)
+    basis = jnp.eye(K.outputs(X.shape[1]), dtype=X.dtype)
     # Entry by entry in the order of memory. Blocks of K that are then moved to their place were
     # measured to take two to four times as long, most of it for a copy of the Gram.
     form = K.form
@@ -67,7 +67,7 @@ def diagonals(
     K: AbstractMatrixKernel, X: Float[Array, "N n"], Z: Float[Array, "N n"]
 ) -> Float[Array, "N n"]:
     """The diagonals of the blocks K(xᵢ, zᵢ)."""
-    basis = jnp.eye(X.shape[1], dtype=X.dtype)
+    basis = jnp.eye(K.outputs(X.shape[1]), dtype=X.dtype)
     over_basis = jax.vmap(K.form, in_axes=(None, 0, None, 0))
     return jax.vmap(over_basis, in_axes=(0, None, 0, None))(X, basis, Z, basis)
 

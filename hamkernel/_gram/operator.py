@@ -62,7 +62,7 @@ def gram_operator(
     X = require.points(X, "X")
     if Z is not None:
         X, Z = require.same_space(X, require.points(Z, "Z"))
-    K.check_dimension(X.shape[1])
+    K.check_points(X)
     X_rows = rows_of(X)
     Z_rows = X_rows if Z is None else rows_of(Z)
     Z = None if Z is None else split(Z_rows, Z)
@@ -91,17 +91,19 @@ class GramOperator(lx.AbstractLinearOperator):
         Raises:
             ValueError: the vector is not of shape (M, n). TypeError: it is complex.
         """
-        if jnp.shape(vector) != self.columns.shape:
+        columns = self.in_structure().shape
+        if jnp.shape(vector) != columns:
             raise ValueError(
                 f"the vector has shape {jnp.shape(vector)}; one coefficient for each column of "
-                f"the Gram, shape {self.columns.shape}, is needed."
+                f"the Gram, shape {columns}, is needed."
             )
         vector = require.floating(vector, "the vector")
         return _compiled(self.kernel, self.X, self.columns, vector, self.X_rows, self.Z_rows)
 
     def as_matrix(self) -> Float[Array, "Nn Mn"]:
         """The dense Gram, O(N M n²) memory."""
-        return gram(self.kernel, self.X, self.columns).reshape(self.X.size, self.columns.size)
+        G = gram(self.kernel, self.X, self.columns)
+        return G.reshape(G.shape[0] * G.shape[1], -1)
 
     def transpose(self) -> GramOperator:
         # K(x, z)ᵀ = K(z, x)
@@ -110,10 +112,14 @@ class GramOperator(lx.AbstractLinearOperator):
         return GramOperator(self.kernel, self.Z, self.X, self.Z_rows, self.X_rows)
 
     def in_structure(self) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct(self.columns.shape, self.X.dtype)
+        return self._coefficients(self.columns)
 
     def out_structure(self) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct(self.X.shape, self.X.dtype)
+        return self._coefficients(self.X)
+
+    def _coefficients(self, points: Float[Array, "N n"]) -> jax.ShapeDtypeStruct:
+        N, coordinates = points.shape
+        return jax.ShapeDtypeStruct((N, self.kernel.outputs(coordinates)), self.X.dtype)
 
 
 def product(
@@ -164,13 +170,13 @@ def _tiled(K, X, Z, A):
         def add(total, column):
             return total + tile(x, *column), None
 
-        return jax.lax.scan(add, jnp.zeros_like(x), columns)[0]
+        return jax.lax.scan(add, jnp.zeros((len(x), A.shape[1]), x.dtype), columns)[0]
 
     # A loop, when differentiated backward, forgets the rule by which a Matérn kernel is smooth
     # at x = z, and second derivatives are NaN: where one tile will do there is none.
     if len(rows) == len(columns[0]) == 1:
         return tile(rows[0], columns[0][0], columns[1][0])
-    return jax.lax.map(row, rows).reshape(-1, X.shape[1])[: len(X)]
+    return jax.lax.map(row, rows).reshape(-1, A.shape[1])[: len(X)]
 
 
 def tiles(
@@ -213,8 +219,8 @@ def _(operator: GramOperator) -> GramOperator:
 
 @lx.materialise.register
 def _(operator: GramOperator) -> lx.PyTreeLinearOperator:
-    N, n = operator.X.shape
-    blocks = operator.as_matrix().reshape(N, n, *operator.columns.shape)
+    into, out = operator.in_structure().shape, operator.out_structure().shape
+    blocks = operator.as_matrix().reshape(*out, *into)
     tags = lx.positive_semidefinite_tag if operator.Z is None else ()
     return lx.PyTreeLinearOperator(blocks, operator.out_structure(), tags)
 

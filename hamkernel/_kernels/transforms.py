@@ -1,7 +1,7 @@
 """Scalar kernels on transformed points: warped, selected, and averaged over a group."""
 
 import operator
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,12 +13,24 @@ from hamkernel import _require as require
 from hamkernel._kernels.base import (
     AbstractScalarKernel,
     Invariance,
+    ScalarProduct,
     ScalarSum,
     Scaled,
     as_scalar_kernel,
     one_point,
 )
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._kernels.groups import (
+    Element,
+    LinearMap,
+    closed,
+    identity,
+    matrix_of,
+    pairs,
+    reflection,
+)
+from hamkernel._kernels.unchanged import known_unchanged
+from hamkernel._show import call, text
 
 
 class Warp(AbstractScalarKernel):
@@ -138,25 +150,41 @@ class Symmetrised(AbstractScalarKernel):
 
     Args:
         kernel: the scalar kernel k.
-        maps: the linear maps g of the group, each (n,) -> (n,).
+        maps: linear maps that generate the group, functions (n,) -> (n,) or the rows of matrices.
         characters: χ(g) = ±1 for each map.
-        one_sided: whether k(gx, gz) = k(x, z) is known to hold for all g.
+        one_sided: whether k(gx, gz) = k(x, z) is known to hold for all g; if None, that is found
+            out once the dimension is known.
 
     Source: Krejník & Tyutin (2012) for the odd kernel k(x, z) − k(−x, z); the two-sided mean is
     the projection of the feature map onto the functions with the symmetry.
     """
 
     kernel: AbstractScalarKernel
-    maps: tuple[Callable[[Array], Array], ...] = eqx.field(static=True)
+    maps: tuple[LinearMap, ...] = eqx.field(static=True)
     characters: tuple[float, ...] = eqx.field(static=True)
-    one_sided: bool = eqx.field(static=True)
+    one_sided: bool | None = eqx.field(static=True, default=None)
+
+    def __repr__(self) -> str:
+        names = [_name_of(each) for each in self.maps if each is not identity]
+        if self.parity is not None:  # a structure says Odd or Even of itself
+            return call("Symmetrised", [repr(self.kernel), f"parity={self.parity}"])
+        return call("Invariant", [repr(self.kernel), f"[{', '.join(names)}]"])
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
-        group = tuple(zip(self.maps, self.characters, strict=True))
-        left = group[:1] if self.one_sided else group
-        pairs = [(g, h, a * b) for g, a in left for h, b in group]
-        values = [sign * self.kernel(g(x), h(z)) for g, h, sign in pairs]
+        x, z = one_point(x), one_point(z)
+        terms = pairs(self.group(len(x)), self.is_one_sided(len(x)))
+        values = [sign * self.kernel(g(x), h(z)) for g, h, sign in terms]
         return sum(values[1:], start=values[0]) / len(values)
+
+    def group(self, n: int) -> tuple[Element, ...]:
+        """All maps of the group on states of n coordinates, the identity first."""
+        return closed(self.maps, self.characters, n)
+
+    def is_one_sided(self, n: int) -> bool:
+        """Whether k(gx, gz) = k(x, z) is known to hold for all g."""
+        if self.one_sided is not None:
+            return self.one_sided
+        return all(known_unchanged(self.kernel, matrix_of(each, n)) for each in self.maps)
 
     @property
     def parity(self) -> int | None:
@@ -170,70 +198,115 @@ class Symmetrised(AbstractScalarKernel):
         return Invariance.REFLECTION & self.kernel.invariance
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        inner = self.kernel.supports(n)
         if self.parity is not None:  # whose maps mix no coordinates
-            return self.kernel.supports(n)
-        return (frozenset(range(n)),)
+            return inner
+        group = self.group(n)
+        return tuple(
+            frozenset(
+                j for g in group for i in support for j in np.flatnonzero(g.matrix[i]).tolist()
+            )
+            for support in inner
+        )
 
 
-def identity(x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The neutral element of every group of maps."""
-    return x
+def _name_of(given: LinearMap) -> str:
+    return text(given) if callable(given) else f"{len(given)} by {len(given)} matrix"
 
 
-def reflection(x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """The map x -> −x."""
-    return -x
+@known_unchanged.register
+def _(k: Select, S) -> bool:
+    inside = list(k.dims)
+    outside = [i for i in range(len(S)) if i not in inside]
+    apart = not S[np.ix_(inside, outside)].any()
+    return apart and known_unchanged(k.kernel, S[np.ix_(inside, inside)])
+
+
+def symmetrised(
+    kernel: AbstractScalarKernel, maps: tuple[LinearMap, ...], characters: tuple[float, ...]
+) -> AbstractScalarKernel:
+    """The kernel of the functions u(gx) = χ(g) u(x) of the RKHS of `kernel`, g in the maps.
+
+    A sum is symmetrised term by term, so that its terms stay visible, and what has a symmetry
+    already gets the group of both.
+
+    Raises:
+        ValueError: a map has the other sign already, so that only zero is left.
+    """
+    if isinstance(kernel, ScalarSum):
+        return ScalarSum(tuple(symmetrised(k, maps, characters) for k in kernel.terms))
+    reflects = set(maps) <= {identity, reflection}  # which the coordinates of a Select do, too
+    if isinstance(kernel, Scaled) or (isinstance(kernel, Select) and reflects):
+        inner = symmetrised(kernel.kernel, maps, characters)
+        return eqx.tree_at(lambda k: k.kernel, kernel, inner)
+    if isinstance(kernel, Symmetrised):
+        known = dict(zip(kernel.maps, kernel.characters, strict=True))
+        given = dict(zip(maps, characters, strict=True))
+        if any(known.get(each, sign) != sign for each, sign in given.items()):
+            raise ValueError("Odd(Even(K)) and Even(Odd(K)) have no fields but zero: choose one.")
+        if given.keys() <= known.keys():
+            return kernel
+        both = known | given
+        return Symmetrised(kernel.kernel, tuple(both), tuple(both.values()))
+    known = Invariance.REFLECTION in kernel.invariance if reflects else None
+    return Symmetrised(kernel, maps, characters, known)
 
 
 def with_parity(kernel: AbstractScalarKernel, parity: int) -> AbstractScalarKernel:
     """The kernel of the even (parity +1) or odd (−1) functions of the RKHS of `kernel`.
 
-    The group is {1, −1}. A sum is symmetrised term by term, so that its terms stay visible.
+    The group is {1, −1}.
 
     Raises:
         ValueError: a term has the other parity already, so that only zero is left of it.
     """
-    if isinstance(kernel, Symmetrised) and kernel.parity is not None:
-        if kernel.parity != parity:
-            raise ValueError("Odd(Even(K)) and Even(Odd(K)) have no fields but zero: choose one.")
-        return kernel
-    if isinstance(kernel, ScalarSum):
-        return ScalarSum(tuple(with_parity(k, parity) for k in kernel.terms))
-    if isinstance(kernel, Scaled):
-        return eqx.tree_at(lambda s: s.kernel, kernel, with_parity(kernel.kernel, parity))
-    if isinstance(kernel, Select):
-        return eqx.tree_at(lambda s: s.kernel, kernel, with_parity(kernel.kernel, parity))
-    return Symmetrised(
-        kernel,
-        maps=(identity, reflection),
-        characters=(1.0, float(parity)),
-        one_sided=Invariance.REFLECTION in kernel.invariance,
-    )
+    return symmetrised(kernel, (identity, reflection), (1.0, float(parity)))
 
 
-class _ParityRemoved(NamedTuple):
+class Removed(NamedTuple):
+    """The kernel of which another one is the mean over a group."""
+
     kernel: AbstractScalarKernel
-    parity: int
-    one_sided: bool
+    means: tuple[Symmetrised, ...]  # over one group; the terms of a sum have one each
+
+    @property
+    def parity(self) -> int | None:
+        return self.means[0].parity
+
+    def group(self, n: int) -> tuple[Element, ...]:
+        return self.means[0].group(n)
+
+    def is_one_sided(self, n: int) -> bool:
+        return all(mean.is_one_sided(n) for mean in self.means)
 
 
-def parity_removed(kernel: AbstractScalarKernel) -> _ParityRemoved | None:
-    """The k and the parity of which `kernel` is `with_parity`, or None.
+def symmetry_removed(kernel: AbstractScalarKernel) -> Removed | None:
+    """The k and the group of which `kernel` is `symmetrised`, or None.
 
-    Where it is one-sided, it is (k(x, z) + parity k(x, −z))/2.
+    Where all of it is one-sided, it is the mean over h of χ(h) k(x, hz).
     """
-    if isinstance(kernel, Symmetrised) and kernel.parity is not None:
-        return _ParityRemoved(kernel.kernel, kernel.parity, kernel.one_sided)
+    if isinstance(kernel, Symmetrised):
+        return Removed(kernel.kernel, (kernel,))
     if isinstance(kernel, Scaled | Select):
-        inner = parity_removed(kernel.kernel)
-        return inner and inner._replace(
-            kernel=eqx.tree_at(lambda s: s.kernel, kernel, inner.kernel)
-        )
+        inner = symmetry_removed(kernel.kernel)
+        if inner is None or (isinstance(kernel, Select) and inner.parity is None):
+            return None
+        return inner._replace(kernel=eqx.tree_at(lambda k: k.kernel, kernel, inner.kernel))
     if isinstance(kernel, ScalarSum):
-        found = [parity_removed(term) for term in kernel.terms]
+        found = [symmetry_removed(term) for term in kernel.terms]
         known = [each for each in found if each is not None]
-        parities = {each.parity for each in known}
-        if len(known) == len(found) and len(parities) == 1:
-            terms = ScalarSum(tuple(each.kernel for each in known))
-            return _ParityRemoved(terms, parities.pop(), all(each.one_sided for each in known))
+        means = tuple(mean for each in known for mean in each.means)
+        if len(known) == len(found) and len({(m.maps, m.characters) for m in means}) == 1:
+            return Removed(ScalarSum(tuple(each.kernel for each in known)), means)
     return None
+
+
+def symmetries(kernel: AbstractScalarKernel) -> Iterator[Symmetrised]:
+    """The groups over which terms of the kernel are means, in the coordinates of the states."""
+    if isinstance(kernel, Symmetrised):
+        yield kernel
+    elif isinstance(kernel, Scaled):
+        yield from symmetries(kernel.kernel)
+    elif isinstance(kernel, ScalarSum | ScalarProduct):
+        for term in kernel.terms:
+            yield from symmetries(term)

@@ -5,15 +5,18 @@ from __future__ import annotations
 import importlib.metadata
 import os
 import pathlib
+from collections.abc import Callable
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jax.experimental import multihost_utils
 
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
+from hamkernel._fields.controlled import ControlledField
 from hamkernel._save.bytes import FORMAT, VERSION, packed, unpacked, write
 from hamkernel._save.tree import CLASSES, Reader, encode, field_classes
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -110,17 +113,25 @@ def load(path: str | os.PathLike[str], kernel: AbstractMatrixKernel | None = Non
     return field
 
 
+def _of_state(field: AbstractField) -> Callable[[Array], Array]:
+    """The field as a function of the state alone: where it has inputs, they are 1."""
+    if isinstance(field, ControlledField):
+        u = jnp.ones(field.inputs.shape[-1], field.inputs.dtype)
+        return lambda x: field(x, u)
+    return field
+
+
 def _evaluable(field: AbstractField) -> None:
     """Raise unless the parts fit each other: as many lengthscales as coordinates, and the like."""
     state = jax.ShapeDtypeStruct((field.dimension,), field.offset.dtype)
-    if field.offset.shape or jax.eval_shape(field, state).shape != state.shape:
+    if field.offset.shape or jax.eval_shape(_of_state(field), state).shape != state.shape:
         raise ValueError("its arrays have an axis more than those of one field.")
 
 
 def _probe(field: AbstractField) -> list[list[float]]:
     """A state and the velocity there, by which a kernel of the user's own code is known again."""
     points = np.asarray(getattr(field, "points", np.zeros((1, field.dimension))))[:_PROBES]
-    velocities = np.asarray(jax.vmap(field)(jnp.asarray(points)))
+    velocities = np.asarray(jax.vmap(_of_state(field))(jnp.asarray(points)))
     if not np.isfinite(velocities).all():
         raise ValueError(
             "the field is NaN or infinite at its own points, as one is from a fit that failed with "
@@ -133,7 +144,7 @@ def _probe(field: AbstractField) -> list[list[float]]:
 def _check_probe(field: AbstractField, probe: Any, source: str) -> None:
     try:
         state, saved = np.asarray(probe, float)
-        velocity = np.asarray(field(jnp.asarray(state)))
+        velocity = np.asarray(_of_state(field)(jnp.asarray(state)))
         same = np.linalg.norm(velocity - saved) <= _SAME * np.linalg.norm(saved)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{source} is not a valid file of hamkernel.save: {error}.") from error

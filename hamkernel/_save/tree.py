@@ -26,32 +26,51 @@ from jaxtyping import jaxtyped
 
 from hamkernel._features.waves import (
     DivergenceFreeFeatures,
+    GroupWaves,
     PotentialFeatures,
     SeparableFeatures,
     SumFeatures,
     Waves,
 )
 from hamkernel._fields.base import AbstractField, KernelField, SolverInfo
+from hamkernel._fields.controlled import ControlledField
 from hamkernel._fields.features import FeatureField
 from hamkernel._kernels.base import ScalarProduct, ScalarSum, Scaled, UserKernel
 from hamkernel._kernels.dot_products import Periodic, Polynomial
+from hamkernel._kernels.groups import identity, reflection, time_reversal
 from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
-from hamkernel._kernels.transforms import Select, Symmetrised, Warp, identity, reflection
+from hamkernel._kernels.transforms import Select, Symmetrised, Warp
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.controlled import Constant, Controlled, InputMatrix, KnownMatrix
 from hamkernel._structures.operators import CurlFree, DivergenceFree, Separable, Symplectic
+from hamkernel._structures.own import Poisson, Structured
+from hamkernel._structures.port_hamiltonian import PortHamiltonian
+from hamkernel.poisson import ChargedParticleTensor, LotkaVolterraTensor, RigidBodyTensor
 
 # Everything that a file may name. A new class of the library needs one line here.
 CLASSES: dict[str, type[eqx.Module]] = {
     cls.__name__: cls
     for cls in (
-        *(KernelField, FeatureField, SolverInfo),
-        *(Waves, PotentialFeatures, DivergenceFreeFeatures, SeparableFeatures, SumFeatures),
+        *(KernelField, FeatureField, ControlledField, SolverInfo),
+        *(
+            Waves,
+            GroupWaves,
+            PotentialFeatures,
+            DivergenceFreeFeatures,
+            SeparableFeatures,
+            SumFeatures,
+        ),
         *(Separable, CurlFree, DivergenceFree, Symplectic, Sum),
+        *(PortHamiltonian, Poisson, Structured),
+        *(Controlled, InputMatrix, KnownMatrix, Constant),
+        *(RigidBodyTensor, LotkaVolterraTensor, ChargedParticleTensor),
         *(Gaussian, Matern, RationalQuadratic, Polynomial, Periodic),
         *(ScalarSum, ScalarProduct, Scaled, Select, Symmetrised, Warp, UserKernel),
     )
 }
-FUNCTIONS: dict[str, Callable] = {"identity": identity, "reflection": reflection}
+FUNCTIONS: dict[str, Callable] = {
+    function.__name__: function for function in (identity, reflection, time_reversal)
+}
 
 _DEPTH = 64  # of the tree; kernels that people write have a depth below ten
 Node = dict[str, Any]

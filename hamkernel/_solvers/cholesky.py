@@ -108,7 +108,7 @@ def _check_memory(X: Float[Array, "N n"]) -> None:
 @eqx.filter_jit
 def _representer(K, X, Y, regularization):
     """Coefficients, residual y − Ga = Nλa, the norm with ‖f‖² = aᵀGa, and the relative residual."""
-    N, n = X.shape
+    N, n = Y.shape
     G = assemble(K, X, X).reshape(N * n, N * n)
     ridge = N * regularization
     A = solve_positive(G, ridge, Y.reshape(N * n)).reshape(N, n)

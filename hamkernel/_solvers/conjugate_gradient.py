@@ -156,18 +156,18 @@ def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
     # The preconditioner changes how fast the answer is found, not the answer.
     K_, X_, S_, ridge_ = constant((K, X, S, ridge))
     T = whitening(K_, landmarks)
-    square = normal(Columns(K_, S_), T, X_, jnp.zeros_like(X_), spread).square
+    square = normal(Columns(K_, S_), T, X_, jnp.zeros_like(Y), spread).square
     R = factor(square, ridge_)
 
     def preconditioned(c):
         moment = T.T @ product(K_, S_, X_, c, None, spread).reshape(-1)
         w = jax.scipy.linalg.cho_solve((R, True), moment)
-        return c - product(K_, X_, S_, (T @ w).reshape(S.shape), spread)
+        return c - product(K_, X_, S_, (T @ w).reshape(len(S), -1), spread)
 
     def gram(c):
         return product(K, X, X, c, spread, spread)
 
-    structure = jax.ShapeDtypeStruct(X.shape, X.dtype)
+    structure = jax.ShapeDtypeStruct(Y.shape, Y.dtype)
     positive = lx.positive_semidefinite_tag
     system = lx.FunctionLinearOperator(lambda c: c + gram(c) / ridge, structure, positive)
     preconditioner = lx.FunctionLinearOperator(preconditioned, structure, positive)

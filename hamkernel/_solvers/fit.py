@@ -8,12 +8,14 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, KernelField
+from hamkernel._fields.controlled import with_inputs
 from hamkernel._machine.devices import rows_of
 from hamkernel._machine.memory import dense_bytes, memory_bytes
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._solvers.cholesky import COPIES, AbstractSolver, Cholesky, Learned
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._structures.controlled import joined_data
 
 
 @overload
@@ -25,6 +27,7 @@ def fit(
     *,
     solver: None = None,
     throw: bool = True,
+    inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> KernelField: ...
 @overload
 def fit(
@@ -35,6 +38,7 @@ def fit(
     *,
     solver: AbstractSolver[Learned],
     throw: bool = True,
+    inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Learned: ...
 @overload
 def fit(
@@ -45,6 +49,7 @@ def fit(
     *,
     solver: AbstractSolver | None,
     throw: bool = True,
+    inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> AbstractField: ...
 
 
@@ -57,6 +62,7 @@ def fit(
     *,
     solver: AbstractSolver | None = None,
     throw: bool = True,
+    inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> AbstractField:
     """Learn the field f in the RKHS of K that minimises (1/N) Σᵢ‖f(xᵢ) − yᵢ‖² + λ‖f‖².
 
@@ -76,6 +82,8 @@ def fit(
         throw: whether a solve that fails raises. If not, what is learned is NaN, `field.norm` among
             it: for `jax.vmap` over many hyperparameters, where one failure would end them all, and
             for objectives of your own in `tune`, which steps back from NaN.
+        inputs: of a `Controlled` kernel: u at each state, shape (N, m). What is learned is then a
+            `ControlledField`, field(x, u).
 
     Returns:
         The learned field. Works under jit, vmap and grad, with respect to every argument; new
@@ -94,12 +102,12 @@ def fit(
     K = matrix_kernel(K)
     if not (solver is None or isinstance(solver, AbstractSolver)):
         raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
-    X, Y = require.data(X, Y)
-    K.check_dimension(X.shape[1])
+    K, X, Y = joined_data(K, X, Y, inputs)
+    K.check_points(X)
     regularization = require.ridge(regularization, X.dtype)
     require.warn_of_float32(X)
     solver = _default(X) if solver is None else solver
-    return solver._fitted(K, X, Y, regularization, throw)
+    return with_inputs(K, solver._fitted(K, X, Y, regularization, throw))
 
 
 def _default(X: Float[Array, "N n"]) -> AbstractSolver[KernelField]:

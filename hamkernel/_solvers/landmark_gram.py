@@ -28,14 +28,16 @@ class Columns(eqx.Module):
     points: Float[Array, "m n"]
 
     def __call__(self, X: Float[Array, "t n"]) -> Float[Array, "t n r"]:
-        return assemble(self.kernel, X, self.points).reshape(*X.shape, -1)
+        G = assemble(self.kernel, X, self.points)
+        return G.reshape(*G.shape[:2], -1)
 
 
 def whitening(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r r"]:
     """T = L⁻ᵀ with L Lᵀ = G_SS on the kept columns, zero on the others."""
     S, kept = landmarks.points, landmarks.kept.reshape(-1)
-    L = jnp.linalg.cholesky(masked(assemble(K, S, S).reshape(S.size, S.size), kept))
-    T = jax.scipy.linalg.solve_triangular(L, jnp.eye(S.size, dtype=S.dtype), lower=True).T
+    r = len(kept)
+    L = jnp.linalg.cholesky(masked(assemble(K, S, S).reshape(r, r), kept))
+    T = jax.scipy.linalg.solve_triangular(L, jnp.eye(r, dtype=S.dtype), lower=True).T
     both = kept[:, None] & kept[None, :]
     return jnp.where(both, T, jnp.zeros_like(T))
 

@@ -100,8 +100,9 @@ def given_landmarks(K: AbstractMatrixKernel, S: Float[Array, "m n"]) -> Landmark
     O((m n)² r) time for r of them. Nothing is differentiated, as in `choose_landmarks`.
     """
     K, S = constant((K, S))
-    rounding = _rounding(block_traces(K, S), S.size)
-    kept = _independent(assemble(K, S, S).reshape(S.size, S.size), rounding).reshape(S.shape)
+    m, r = len(S), len(S) * K.outputs(S.shape[1])
+    rounding = _rounding(block_traces(K, S), r)
+    kept = _independent(assemble(K, S, S).reshape(r, r), rounding).reshape(m, -1)
     return Landmarks(points=S, kept=kept, count=kept.any(axis=1).sum())
 
 
@@ -150,7 +151,7 @@ class _Drawn(NamedTuple):
 @eqx.filter_jit
 def _begin(K, X, left, key, size):
     """`_draw` from the beginning."""
-    P, n = X.shape
+    P, n = len(X), K.outputs(X.shape[1])
     buffer = size + BLOCK
     traces = block_traces(K, X)
     zero = jnp.zeros((), int)
@@ -190,7 +191,7 @@ def _draw(K, X, left, drawn, size):
 
 
 def _draw_block(K, X, drawn: _Drawn) -> _Drawn:
-    P, n = X.shape
+    P, n = len(X), drawn.kept.shape[1]
     key, draw, accept = jax.random.split(drawn.key, 3)
     index = jax.random.choice(draw, P, (BLOCK,), p=drawn.left / drawn.left.sum())
     size = len(drawn.index)

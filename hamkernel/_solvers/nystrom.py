@@ -174,15 +174,15 @@ def _fit(K, X, Y, regularization, landmarks, spread):
         """One step of refinement, from w and y − F w."""
         slope = T.T @ product(K, S, X, residual, None, spread).reshape(-1) - ridge * w
         correction = jax.scipy.linalg.cho_solve((R, True), slope)
-        change = product(K, X, S, (T @ correction).reshape(S.shape), spread)
+        change = product(K, X, S, (T @ correction).reshape(len(S), -1), spread)
         return w + correction, residual - change
 
     w = jax.scipy.linalg.cho_solve((R, True), total.moment)
-    A = (T @ w).reshape(S.shape)
+    A = (T @ w).reshape(len(S), -1)
     w, residual = step(w, Y - product(K, X, S, A, spread))
     truncation = truncated(trace(K, X, spread), jnp.trace(total.square), ridge)
     # ‖f‖² = αᵀ G_SS α = ‖w‖²
-    return _Solution((T @ w).reshape(S.shape), residual, root(w @ w), truncation)
+    return _Solution((T @ w).reshape(len(S), -1), residual, root(w @ w), truncation)
 
 
 class _Solution(NamedTuple):

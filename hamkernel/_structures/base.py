@@ -1,4 +1,4 @@
-"""What a matrix-valued kernel is, and what is made of any of them: sums, odd and even kernels."""
+"""What a matrix-valued kernel is, and sums of them."""
 
 import abc
 import reprlib
@@ -19,8 +19,18 @@ class AbstractMatrixKernel(eqx.Module):
     """A positive definite kernel K(x, z) -> (n, n) of fields ℝⁿ -> ℝⁿ."""
 
     matrix_valued: ClassVar[bool] = True
-    symplectic: eqx.AbstractVar[bool]
+    symplectic: eqx.AbstractVar[bool]  # whether flows keep dq ∧ dp, as those of J∇H do
     no_potential: eqx.AbstractVar[str | None]  # why its fields have none; None if they have one
+
+    @property
+    def has_hamiltonian(self) -> bool:
+        """Whether the potential is an energy H; the fields need not conserve it."""
+        return self.symplectic
+
+    @property
+    def conserves(self) -> bool:
+        """Whether every field conserves its H."""
+        return self.symplectic
 
     def __repr__(self) -> str:
         return described(self)
@@ -65,8 +75,24 @@ class AbstractMatrixKernel(eqx.Module):
         if self.no_potential:
             raise AttributeError(self.no_potential)
 
+    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
+        """−dH/dt at x for ∇H = `slope`, shape (); for structures with a Hamiltonian."""
+        raise AttributeError(self.no_potential)
+
     def check_dimension(self, n: int) -> None:
         """ValueError if fields on ℝⁿ cannot have this structure; by default all can."""
+
+    def check_points(self, X: Float[Array, "N d"]) -> None:
+        """ValueError if the structure cannot hold at these points, whose values may be traced."""
+        self.check_dimension(X.shape[1])
+
+    def outputs(self, inputs: int) -> int:
+        """The number of components of a field at points of so many coordinates."""
+        return inputs
+
+    @abc.abstractmethod
+    def shares_potential(self, other: "AbstractMatrixKernel") -> bool:
+        """Whether the fields of both are made from a potential by one and the same operator."""
 
     @abc.abstractmethod
     def with_parity(self, parity: int) -> "AbstractMatrixKernel":
@@ -156,22 +182,42 @@ class Sum(AbstractMatrixKernel):
 
     @property
     def no_potential(self) -> str | None:
-        structures = list(self._structures())
-        if len(set(structures)) == 1:
-            return self.terms[0].no_potential
+        first, *rest = self._structures()
+        if all(first.shares_potential(K) for K in rest):
+            return first.no_potential
+        names = " + ".join(type(K).__name__ for K in (first, *rest))
         return (
-            f"the sum of structures {' + '.join(each.__name__ for each in structures)} has no "
-            "single potential. Ask one part for its own: field.part(0).potential(x)."
+            f"the sum of structures {names} has no single potential: each has an operator of its "
+            "own. Ask one part for its own: field.part(0).potential(x)."
         )
 
-    def _structures(self) -> Iterator[type]:
-        """Of all terms, those of named sums among them too."""
+    def _structures(self) -> Iterator[AbstractMatrixKernel]:
+        """All terms, those of named sums among them too."""
         for K in self.terms:
-            yield from K._structures() if isinstance(K, Sum) else (type(K),)
+            yield from K._structures() if isinstance(K, Sum) else (K,)
+
+    def shares_potential(self, other: AbstractMatrixKernel) -> bool:
+        return all(K.shares_potential(other) for K in self._structures())
 
     @property
     def symplectic(self) -> bool:
         return all(K.symplectic for K in self.terms)
+
+    @property
+    def has_hamiltonian(self) -> bool:
+        return self.no_potential is None and all(K.has_hamiltonian for K in self.terms)
+
+    @property
+    def conserves(self) -> bool:
+        return self.has_hamiltonian and all(K.conserves for K in self.terms)
+
+    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
+        self.check_potential()
+        return self.terms[0].dissipated(x, slope)
+
+    def check_points(self, X: Float[Array, "N d"]) -> None:
+        for K in self.terms:
+            K.check_points(X)
 
     def check_dimension(self, n: int) -> None:
         for K in self.terms:
@@ -206,35 +252,6 @@ class Sum(AbstractMatrixKernel):
                 f"no part {which!r}: this sum has positions 0 to {positions[-1]}"
                 + (f" and the names {names}." if names else ".")
             ) from None
-
-
-def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
-    """The kernel of the odd fields with the structure of K, f(−x) = −f(x).
-
-    The SCALAR kernel inside is symmetrised: a field B∇u is odd when u is even. Exact for every
-    kernel, also without k(−x, −z) = k(x, z); twice the cost of K where that is known, four times
-    where it is not. A sum is symmetrised part by part.
-
-    Args:
-        K: a structured kernel whose B does not depend on x.
-
-    Raises:
-        TypeError: K is not matrix-valued.
-
-    Source: Smith & Egeland (2023), eq. (odd_symplectic_kernel), there for k(x, z) = g(x − z).
-    """
-    return matrix_kernel(K, "the argument of Odd", "Odd(Symplectic(k))").with_parity(-1)
-
-
-def Even(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
-    """The kernel of the even fields with the structure of K, f(−x) = f(x).
-
-    As `Odd`, with an odd potential: H(−x) = −H(x).
-
-    Raises:
-        TypeError: K is not matrix-valued.
-    """
-    return matrix_kernel(K, "the argument of Even", "Even(Symplectic(k))").with_parity(+1)
 
 
 def matrix_kernel(

@@ -13,15 +13,18 @@ the case k(x, z) = g(x − z); the mixed derivative is the one that is positive 
 """
 
 import abc
-from typing import ClassVar
+import dataclasses
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
-from hamkernel._kernels.transforms import parity_removed, with_parity
+from hamkernel._kernels.groups import matrix_of
+from hamkernel._kernels.transforms import symmetries, symmetry_removed, with_parity
 from hamkernel._show import call, described
 from hamkernel._structures.base import AbstractMatrixKernel
 
@@ -36,8 +39,8 @@ class AbstractStructure(AbstractMatrixKernel):
     operator_invariance: eqx.AbstractClassVar[Invariance]
 
     def __repr__(self) -> str:
-        found = parity_removed(self.kernel)
-        if found is None:
+        found = symmetry_removed(self.kernel)
+        if found is None or found.parity is None:
             return described(self, positional=("kernel",))
         symmetry = "Odd" if self.field_parity * found.parity < 0 else "Even"
         return call(symmetry, [repr(eqx.tree_at(lambda K: K.kernel, self, found.kernel))])
@@ -51,6 +54,17 @@ class AbstractStructure(AbstractMatrixKernel):
         kernel = with_parity(self.kernel, self.field_parity * parity)
         return eqx.tree_at(lambda K: K.kernel, self, kernel)
 
+    def shares_potential(self, other: AbstractMatrixKernel) -> bool:
+        """By what the operators hold: two with arrays, which are trained, are never the same."""
+        if type(self) is not type(other):
+            return False
+        (own, tree), (others, other_tree) = (jax.tree.flatten(_operator(K)) for K in (self, other))
+        return tree == other_tree and not any(map(eqx.is_array, own)) and own == others
+
+    @abc.abstractmethod
+    def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"] | None:
+        """T such that what k(x, Sz) in place of k(x, z) makes of a is the same of Sz and Ta."""
+
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
         return (self.kernel,)
@@ -58,6 +72,12 @@ class AbstractStructure(AbstractMatrixKernel):
     @property
     def invariance(self) -> Invariance:
         return self.kernel.invariance & self.operator_invariance
+
+
+def _operator(K: AbstractMatrixKernel) -> dict[str, Any]:
+    """What a structure has beside its scalar kernel."""
+    fields = dataclasses.fields(K)
+    return {field.name: getattr(K, field.name) for field in fields if field.name != "kernel"}
 
 
 class Separable(AbstractStructure):
@@ -93,6 +113,9 @@ class Separable(AbstractStructure):
     def potential(self, x: Array, Z: Array, A: Array) -> Float[Array, ""]:
         raise AttributeError(self.no_potential)
 
+    def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+        return np.eye(len(S))
+
 
 class AbstractPotentialKernel(AbstractStructure):
     """K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ: fields f = B ∇u of a potential u.
@@ -126,6 +149,52 @@ class AbstractPotentialKernel(AbstractStructure):
     ) -> Float[Array, " n"]:
         return self.apply(x, jax.grad(self.potential)(x, Z, A))
 
+    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
+        if self.conserves:
+            return jnp.zeros((), x.dtype)
+        return -slope @ self.apply(x, slope)
+
+    def operator_at(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+        """B(x) for all values of what is trained in it: where a symmetry of B must hold."""
+        return self.apply(x, jnp.eye(len(x), dtype=x.dtype))
+
+    def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"] | None:
+        # S B(z)ᵀ = ± B(Sz)ᵀ S⁻ᵀ, where B(Sz) = ± S B(z) Sᵀ
+        if Invariance.TRANSLATION not in self.operator_invariance:
+            return S if np.array_equal(S, S[0, 0] * np.eye(len(S))) else None
+        with jax.ensure_compile_time_eval():
+            B = np.asarray(self.operator_at(jnp.zeros(len(S))))
+        image = S @ B @ S.T
+        sign = 1.0 if np.abs(image - B).max() < np.abs(image + B).max() else -1.0
+        return sign * np.linalg.inv(S).T
+
+    def check_dimension(self, n: int) -> None:
+        if Invariance.TRANSLATION in self.operator_invariance:  # B is the same everywhere
+            with jax.ensure_compile_time_eval():
+                check_symmetries(self, jnp.zeros((1, n)))
+
+
+def check_symmetries(K: AbstractPotentialKernel, X: Float[Array, "N n"]) -> None:
+    """ValueError unless B(Sx) = ± S B(x) Sᵀ for the maps S of the kernel, at these points."""
+    n = X.shape[1]
+    for mean in symmetries(K.kernel):
+        for each in mean.maps:
+            S = matrix_of(each, n)
+            here, there = (
+                np.asarray(jax.vmap(K.operator_at)(points))
+                for points in (X, jnp.asarray(np.asarray(X) @ S.T, X.dtype))
+            )
+            image = S @ here @ S.T
+            room = 1e-5 * np.abs(here).max()  # maps may come in float32
+            if min(np.abs(there - image).max(), np.abs(there + image).max()) > room:
+                raise ValueError(
+                    f"a map of the symmetry is not one of the fields of {type(K).__name__}: with "
+                    f"S = {np.round(S, 3).tolist()} neither B(Sx) = S B(x) Sᵀ nor -S B(x) Sᵀ holds."
+                    " For J∇H it must be symplectic or antisymplectic, SᵀJS = ±J, so momenta move "
+                    "with their positions; for gradients orthogonal. With friction time reversal "
+                    "is false."
+                )
+
 
 class CurlFree(AbstractPotentialKernel):
     """K(x, z) = ∂x ∂zᵀ k(x, z): gradient fields f = ∇u, so Df is symmetric.
@@ -149,6 +218,17 @@ class CurlFree(AbstractPotentialKernel):
 
     def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
         return v
+
+
+def check_even(n: int, whose: str) -> None:
+    """ValueError where states cannot be (q, p)."""
+    if n % 2:
+        raise ValueError(
+            f"{whose} needs states x = (q, p) of even dimension, got n = {n}. "
+            "Add the missing coordinate, or drop a column that is no state, such as time; for "
+            "conservative systems of any dimension use Poisson(k, tensor), for others CurlFree, "
+            "DivergenceFree or Separable."
+        )
 
 
 class Symplectic(AbstractPotentialKernel):
@@ -177,11 +257,8 @@ class Symplectic(AbstractPotentialKernel):
         return jnp.concatenate([-dp, dq])
 
     def check_dimension(self, n: int) -> None:
-        if n % 2:
-            raise ValueError(
-                f"a Symplectic kernel needs states x = (q, p) of even dimension, got n = {n}. "
-                "Add the missing coordinate, or use CurlFree, DivergenceFree or Separable."
-            )
+        check_even(n, "a Symplectic kernel")
+        super().check_dimension(n)
 
 
 class DivergenceFree(AbstractStructure):
@@ -233,31 +310,50 @@ class DivergenceFree(AbstractStructure):
     def potential(self, x: Array, Z: Array, A: Array) -> Float[Array, ""]:
         raise AttributeError(self.no_potential)
 
+    def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+        return S  # ±1, see `check_dimension`
+
     def check_dimension(self, n: int) -> None:
         if n < 2:
             raise ValueError(
                 f"a DivergenceFree kernel needs n >= 2, got n = {n}: on a line such a field "
                 "is constant."
             )
+        if any(mean.parity is None for mean in symmetries(self.kernel)):
+            raise ValueError(
+                "a DivergenceFree field gets no symmetry from its matrix potential but Odd and "
+                "Even: use Symplectic(Invariant(k, maps)) or CurlFree(Invariant(k, maps))."
+            )
 
 
 def unfolded(
     K: AbstractMatrixKernel, Z: Float[Array, "M n"], A: Float[Array, "M n"]
 ) -> tuple[AbstractMatrixKernel, Float[Array, "L n"], Float[Array, "L n"]]:
-    """A kernel, points and coefficients with the expansion of K, Z, A, without its odd kernels.
+    """A kernel, points and coefficients with the expansion of K, Z, A, without its group.
 
-    An odd or even field Σⱼ ½[K₀(x, zⱼ) ± K₀(x, −zⱼ)] aⱼ is one of K₀ with twice the points. In a
-    sum over many pairs this is cheaper than the two terms at once, which fill the registers.
+    A one-sided mean over |G| maps is a sum over |G| times the points: with B(hz)ᵀ = ± h B(z)ᵀ hᵀ
+
+        Σⱼ ∂x ∂zᵀ k(x, hzⱼ) B(zⱼ)ᵀ aⱼ = ± Σⱼ (∂x ∂₂ᵀ k)(x, hzⱼ) B(hzⱼ)ᵀ h⁻ᵀ aⱼ.
+
+    In a sum over many pairs this is cheaper than all terms at once, which fill the registers.
     K, Z and A themselves where K is of another form.
     """
     if not isinstance(K, AbstractStructure):
         return K, Z, A
-    found = parity_removed(K.kernel)
-    if found is None or not found.one_sided:
+    found = symmetry_removed(K.kernel)
+    n = Z.shape[1]
+    if found is None or not found.is_one_sided(n):
         return K, Z, A
-    sign = K.field_parity * found.parity
+    group = found.group(n)
+    carried = [K.carried(h.matrix) for h in group]
+    known = [T for T in carried if T is not None]
+    if len(known) < len(group):
+        return K, Z, A
+    images = jnp.concatenate([jax.vmap(h)(Z) for h in group])
+    pairs = zip(group, known, strict=True)
+    moved = [jax.vmap(h._replace(matrix=h.character * T))(A) for h, T in pairs]
     K = eqx.tree_at(lambda K: K.kernel, K, found.kernel)
-    return K, jnp.concatenate([Z, -Z]), jnp.concatenate([A, sign * A]) / 2
+    return K, images, jnp.concatenate(moved) / len(group)
 
 
 def _row(k: AbstractScalarKernel, x: Float[Array, " n"], Z: Float[Array, "M n"]):

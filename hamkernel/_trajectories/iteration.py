@@ -12,7 +12,7 @@ from hamkernel._trajectories.evidence import Box, Model, losses, most_likely, so
 from hamkernel._trajectories.flow import Expansion, steps_for
 from hamkernel._trajectories.learned import Step
 from hamkernel._trajectories.prepared import Prepared
-from hamkernel._trajectories.rows import Rows, Segments
+from hamkernel._trajectories.rows import Rows
 from hamkernel._trajectories.shooting import (
     SHORT,
     Piece,

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hamkernel._kernels.base import ScalarSum, Scaled
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.operators import AbstractStructure
-from hamkernel._kernels.base import Scaled, ScalarSum
 from hamkernel._trajectories.evidence import Box, Model
 from hamkernel._trajectories.flow import WEIGHTS
 from hamkernel._trajectories.prepared import Prepared
@@ -108,7 +108,7 @@ def box_of(
 
 
 def _amplified(model: Model, h, scales, X, Y):
-    """h with amplitudes such that a velocity of the prior is twice as large as those seen."""
+    """H with amplitudes such that a velocity of the prior is twice as large as those seen."""
     if not scales.any():
         return h
     trace = float(gram_trace(model.at(jnp.asarray(h)).kernel, jnp.asarray(X))) / len(X)

@@ -22,6 +22,8 @@ from hamkernel._kernels.dot_products import Periodic
 from hamkernel._kernels.functions import Bound
 from hamkernel._kernels.transforms import Select, Symmetrised, Warp
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.controlled import Controlled
+from hamkernel._structures.port_hamiltonian import PortHamiltonian
 
 
 @dataclasses.dataclass(frozen=True)
@@ -102,7 +104,7 @@ def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, 
 def _amplitude(K: AbstractMatrixKernel, X: Array, Y: Array) -> float:
     """The factor that gives K(x, x) the size of Y: mean Y² over the mean diagonal."""
     trace = float(gram_trace(K, X))
-    ratio = float(np.mean(np.asarray(Y) ** 2)) * X.size / trace if trace > 0 else 0.0
+    ratio = float(np.mean(np.asarray(Y) ** 2)) * Y.size / trace if trace > 0 else 0.0
     return ratio if np.isfinite(ratio) and ratio > 0 else 1.0
 
 
@@ -110,6 +112,8 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
     """Walk the kernel; X is the data in the coordinates that `node` sees."""
     if isinstance(node, Select):
         X = X[:, list(node.dims)]
+    if isinstance(node, Controlled):  # points are (x, u)
+        X = X[:, : node.outputs(X.shape[1])]
     for key, child in _children(node):
         if eqx.is_inexact_array(child):
             name = keystr((*path, *key)).removeprefix(".")
@@ -164,11 +168,30 @@ def _box(
     if ours and name == "log_offset":
         square = np.mean(np.sum(X**2, axis=1)) or 1.0
         return np.log(1e-4 * square), np.log(1e4 * square)
+    if isinstance(node, PortHamiltonian) and name == "log_friction":
+        return _friction_box(node, X)
     value = np.asarray(leaf)
     if name.startswith("log_"):
         return value - np.log(1e3), value + np.log(1e3)
     reach = 10 * np.maximum(1.0, np.abs(value))  # a number of unknown meaning
     return value - reach, value + reach
+
+
+# Of the damping ratio, r over the critical friction: from 1e-5, at which an oscillation loses 6e-5
+# of its amplitude in a period and far less than can be seen, to overdamped 30 times over.
+_LEAST_DAMPING, _MOST_DAMPING = 1e-5, 30.0
+
+
+def _friction_box(node: PortHamiltonian, X: np.ndarray) -> tuple[ArrayLike, ArrayLike]:
+    """Bounds for log r: an oscillation of extents (Δq, Δp) in X is critical near r = Δp/Δq."""
+    n = X.shape[1]
+    damped = np.asarray(range(n // 2, n) if node.damped is None else node.damped)
+    extent = np.ptp(X, axis=0)
+    extent = np.where(extent > 0, extent, 1.0)
+    critical = np.log(extent[damped] / extent[(damped + n // 2) % n])
+    if node.log_friction.ndim == 0:
+        critical = critical.mean()
+    return critical + np.log(_LEAST_DAMPING), critical + np.log(_MOST_DAMPING)
 
 
 def _spacing_and_extent(X: np.ndarray, per_coordinate: bool) -> tuple[ArrayLike, ArrayLike]:

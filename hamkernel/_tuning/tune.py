@@ -32,6 +32,7 @@ from hamkernel._solvers.fit import fit
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._structures.controlled import joined_data
 from hamkernel._tuning import advice
 from hamkernel._tuning.descent import Run
 from hamkernel._tuning.objective import (
@@ -98,6 +99,7 @@ def tune(
     max_steps: int = 64,
     solver: AbstractSolver | None = None,
     progress: bool = False,
+    inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Tuned:
     """Tune every hyperparameter of K, and λ with them, down the gradient of a validation loss.
 
@@ -140,6 +142,8 @@ def tune(
             of yours say verbose=True to itself): the logarithm of a loss, or the objective over
             its first value, and the coordinates u of the search, whose sines go from one end of
             the box to the other.
+        inputs: of a `Controlled` kernel, shape (N, m). An objective of your own gets points (x, u)
+            and passes them on, as `hk.fit(K, X, Y, λ)`.
 
     Returns:
         A `Tuned`. NaN never comes out: points where the objective is not finite cannot win.
@@ -166,9 +170,10 @@ def tune(
     _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
     if optimiser is not None:
         optimiser = checked_optimiser(optimiser, progress)
-    X, Y = given = require.data(X, Y)
+    K, X, Y = joined_data(K, X, Y, inputs)
+    given = X, Y
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
-    K.check_dimension(X.shape[1])
+    K.check_points(X)
     advice.warn_of_unequal_sizes(Y)
     advice.warn_of_constants(K)
     ridge = require.ridge(regularization, X.dtype)

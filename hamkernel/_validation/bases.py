@@ -44,4 +44,9 @@ class LandmarkBasis(AbstractBasis):
         # Without a column a fit fails; its features would be those of the zero field.
         T = jnp.where(landmarks.count == 0, jnp.nan, whitening(K, landmarks))
         columns = Columns(K, S)
-        return lambda x: (columns(x).reshape(x.size, S.size) @ T).reshape(*x.shape, S.size)
+
+        def orthonormal(x):
+            rows = columns(x)
+            return (rows.reshape(-1, rows.shape[-1]) @ T).reshape(rows.shape)
+
+        return orthonormal

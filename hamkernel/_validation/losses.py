@@ -18,6 +18,7 @@ from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._structures.controlled import joined_data
 from hamkernel._validation.bases import AbstractBasis
 from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
 from hamkernel._validation.folds import Folds, Partition
@@ -30,6 +31,8 @@ def cross_validation_loss(
     Y: Num[ArrayLike, "N n"],
     regularization: ArrayLike,
     folds: Folds = 5,
+    *,
+    inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Float[Array, ""]:
     """The mean over folds of the mean squared error of a fit that has not seen the fold.
 
@@ -46,6 +49,7 @@ def cross_validation_loss(
             for one point per fold; or an integer label for each point, shape (N,), to hold out,
             say, one trajectory at a time. A fold always holds out whole points: leaving out
             single components would leak their siblings. Labels must be concrete under jit.
+        inputs: of a `Controlled` kernel, shape (N, m).
 
     Returns:
         The loss, in squared units of Y; inf where the matrix is not positive definite to
@@ -57,7 +61,7 @@ def cross_validation_loss(
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
             matrices that do not fit in memory.
     """
-    K, X, Y, regularization = _checked(K, X, Y, regularization)
+    K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
     return partition_loss(K, X, Y, regularization, Partition(len(X), folds))
 
 
@@ -68,6 +72,8 @@ def cross_validation_residuals(
     Y: Num[ArrayLike, "N n"],
     regularization: ArrayLike,
     folds: Folds = 5,
+    *,
+    inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Float[Array, "N n"]:
     """The residual yᵢ − f(xᵢ) of each point under the fit that has not seen its fold.
 
@@ -77,7 +83,7 @@ def cross_validation_residuals(
     Returns:
         Shape (N, n), in units of Y; inf where the matrix is not positive definite to rounding.
     """
-    K, X, Y, regularization = _checked(K, X, Y, regularization)
+    K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
     return _held_out(K, X, Y, regularization, Partition(len(X), folds))[0]
 
 
@@ -87,6 +93,8 @@ def generalized_cross_validation(
     X: Num[ArrayLike, "N n"],
     Y: Num[ArrayLike, "N n"],
     regularization: ArrayLike,
+    *,
+    inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Float[Array, ""]:
     """Generalised cross-validation: the training error over the squared share of free residuals.
 
@@ -99,6 +107,7 @@ def generalized_cross_validation(
         X: states, shape (N, n).
         Y: measured velocities, shape (N, n).
         regularization: λ > 0.
+        inputs: of a `Controlled` kernel, shape (N, m).
 
     Returns:
         The loss, in squared units of Y; inf where the factorisation fails. Differentiable as
@@ -110,7 +119,7 @@ def generalized_cross_validation(
 
     Source: Golub, Heath & Wahba (1979), Technometrics 21.
     """
-    K, X, Y, regularization = _checked(K, X, Y, regularization)
+    K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
     return generalized_loss(K, X, Y, regularization)
 
 
@@ -120,6 +129,8 @@ def log_marginal_likelihood(
     X: Num[ArrayLike, "N n"],
     Y: Num[ArrayLike, "N n"],
     regularization: ArrayLike,
+    *,
+    inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Float[Array, ""]:
     """The log density of Y under f ~ GP(0, K) and independent noise of variance Nλ.
 
@@ -131,6 +142,7 @@ def log_marginal_likelihood(
         X: states, shape (N, n).
         Y: measured velocities, shape (N, n).
         regularization: λ > 0; the noise variance is Nλ.
+        inputs: of a `Controlled` kernel, shape (N, m).
 
     Returns:
         The log density; −inf where the factorisation fails. Differentiable as
@@ -142,16 +154,16 @@ def log_marginal_likelihood(
 
     Source: Rasmussen & Williams (2006), eq. 2.30.
     """
-    K, X, Y, regularization = _checked(K, X, Y, regularization)
+    K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
     return log_likelihood(K, X, Y, regularization)
 
 
-def _checked(K, X, Y, regularization):
+def _checked(K, X, Y, regularization, inputs=None):
     K = matrix_kernel(K)
-    X, Y = require.data(X, Y)
+    K, X, Y = joined_data(K, X, Y, inputs)
     # LAPACK on every device at once was seen to stall, see `_factors/dense.py`.
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
-    K.check_dimension(X.shape[1])
+    K.check_points(X)
     regularization = require.ridge(regularization, X.dtype)
     check_memory(X, LOSS_COPIES)
     return K, X, Y, regularization
@@ -192,7 +204,7 @@ def _held_out(K, X, Y, regularization, partition: Partition, basis=None):
     N = len(X)
     system = _system(K, X, (N - N / len(partition.folds)) * regularization, basis)
     residuals, a = held_out(system, Y.reshape(Y.size), partition)  # pyright: ignore
-    return residuals.reshape(X.shape), a
+    return residuals.reshape(Y.shape), a
 
 
 def generalized_loss(K, X, Y, regularization, basis=None, least_free=0.0):
@@ -216,9 +228,10 @@ def log_likelihood(K, X, Y, regularization, basis=None):
 def _system(K, X: Array, ridge: Array, basis: AbstractBasis | None) -> AbstractSystem:
     if basis is None:
         G = trained((K, X), _rows_of_gram, rowwise=True)
-        return DenseSystem(plus_ridge(G.reshape(X.size, X.size), ridge))
+        D = G.shape[0] * G.shape[1]
+        return DenseSystem(plus_ridge(G.reshape(D, D), ridge))
     rows = trained((K, X), basis.features, rowwise=True)
-    return LowRankSystem(rows.reshape(X.size, -1), ridge)
+    return LowRankSystem(rows.reshape(-1, rows.shape[-1]), ridge)
 
 
 def _rows_of_gram(K, X: Float[Array, "N n"]) -> Callable[[Array], Float[Array, "t n N n"]]:

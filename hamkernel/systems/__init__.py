@@ -8,8 +8,10 @@ Positive parameters are stored as logarithms (`log_mass`) and read through prope
 signed ones as they are: every array leaf is an unconstrained real, and everything is
 differentiable with respect to it.
 
-A system only states H, and the field follows from it here and nowhere else. What is not J∇H, such
-as damping, is to be added by a module that wraps a system, not by one that overrides its field.
+A system only states H, and the field follows from it here and nowhere else: J∇H, or Π(x)∇H of
+`RigidBody`, `LotkaVolterra` and `ChargedParticle`. Friction and inputs are added by modules that
+wrap a system, `Driven(Damped(Pendulum(), 0.1), [[0.0], [1.0]])`, and a driven one is called as
+`system(x, u)`.
 """
 
 from hamkernel.systems._base import AbstractHamiltonianSystem
@@ -21,18 +23,31 @@ from hamkernel.systems._oscillators import (
     Pendulum,
     SpringChain,
 )
+from hamkernel.systems._poisson import (
+    AbstractPoissonSystem,
+    ChargedParticle,
+    LotkaVolterra,
+    RigidBody,
+)
 from hamkernel.systems._sample import sample
+from hamkernel.systems._wrapped import Damped, Driven
 
 __all__ = [
     "AbstractHamiltonianSystem",
+    "AbstractPoissonSystem",
+    "ChargedParticle",
+    "Damped",
     "DoublePendulum",
+    "Driven",
     "Duffing",
     "HarmonicOscillator",
     "HenonHeiles",
     "Kepler",
+    "LotkaVolterra",
     "NBody",
     "Pendulum",
     "PointVortices",
+    "RigidBody",
     "SpringChain",
     "sample",
 ]

@@ -1,0 +1,350 @@
+"""Fields with inputs, f(x, u) = f(x) + G(x) u, as kernels of the joined points (x, u).
+
+With independent priors of the drift f and of the input matrix G the kernel of two joined points is
+
+    K((x, u), (x′, u′)) = K_f(x, x′) + Σᵢⱼ uᵢ u′ⱼ K_g,ij(x, x′),        shape (n, n),
+
+so points have n + m coordinates and fields n components. Everything downstream asks a kernel for
+its `outputs`.
+"""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from hamkernel import _require as require
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Invariance,
+    Scaled,
+    as_scalar_kernel,
+    one_point,
+)
+from hamkernel._show import described
+from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._structures.port_hamiltonian import distinct_coordinates
+
+
+class Constant(AbstractScalarKernel):
+    """k(x, z) = 1: functions that are one number."""
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        return jnp.ones((), one_point(x).dtype)
+
+    @property
+    def invariance(self) -> Invariance:
+        return Invariance.TRANSLATION
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        return (frozenset(),)
+
+
+class InputMatrix(eqx.Module):
+    """What is believed of an unknown input matrix G(x), shape (n, m).
+
+    Its entries are independent functions in the RKHS of one scalar kernel, in the rows `acts_on`;
+    the other rows are zero: a torque changes momenta and not positions.
+
+    Args:
+        kernel: a scalar kernel, for a G that depends on the state; or a positive number, the prior
+            variance of the entries of an unknown constant G.
+        acts_on: the coordinates that inputs change, counted from 0; all of them if None.
+
+    Raises:
+        TypeError: `kernel` is neither. ValueError: the variance is not positive, or `acts_on` are
+            no coordinates.
+
+    Example: `hk.Controlled(K, inputs=hk.InputMatrix(hk.Gaussian(2.0), acts_on=(1,)))`.
+    """
+
+    kernel: AbstractScalarKernel
+    acts_on: tuple[int, ...] | None = eqx.field(static=True)
+
+    def __init__(self, kernel: Any, acts_on: Any = None):
+        if callable(kernel):
+            self.kernel = as_scalar_kernel(kernel)
+        else:
+            variance = require.positive_scalar(kernel, "the variance of a constant input matrix")
+            self.kernel = Scaled(Constant(), variance)
+        self.acts_on = None if acts_on is None else distinct_coordinates(acts_on, "acts_on")
+
+    def __repr__(self) -> str:
+        return described(self, positional=("kernel",))
+
+    def rows(self, n: int, dtype: Any) -> Float[Array, " n"]:
+        """1 for the rows of G that are not zero."""
+        if self.acts_on is None:
+            return jnp.ones(n, dtype)
+        return jnp.zeros(n, dtype).at[np.asarray(self.acts_on)].set(1.0)
+
+
+class KnownMatrix(eqx.Module):
+    """A known constant input matrix G, kept as numbers: nothing of it is trained."""
+
+    entries: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        return repr([list(row) for row in self.entries])
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """G, shape (n, m)."""
+        return np.asarray(self.entries)
+
+
+class Controlled(AbstractMatrixKernel):
+    """Fields with inputs: f(x, u) = f(x) + G(x) u, f in the RKHS of K.
+
+    Give the inputs of each point to `fit`, `tune` and the losses: `hk.fit(K, X, Y, λ, inputs=U)`
+    with U of shape (N, m). The field is `field(x, u)`; `field.drift(x)` is f, with its Hamiltonian
+    and everything else that a field of K has, and `field.input_matrix(x)` is G.
+
+    Time is an input as any other: with U the values of t, or of cos ωt and sin ωt, the field is
+    f(x) + G(x) u(t), and `hk.simulate(field, x0, ts, inputs=lambda t: jnp.array([t]))` follows it.
+
+    An input that is the same in all data cannot be told from the drift, and is refused unless G is
+    known: vary it.
+
+    Args:
+        drift: K, the structured kernel of f.
+        inputs: an `InputMatrix`, for an unknown G; or G itself, an array (n, m), where it is known.
+        count: m, the number of inputs. `fit` takes it from the data.
+
+    Raises:
+        TypeError: `drift` is not matrix-valued, or `inputs` is neither. ValueError: a known G is no
+            finite matrix.
+
+    Example: `hk.Controlled(hk.PortHamiltonian(k), inputs=hk.InputMatrix(1.0, acts_on=(1,)))`.
+
+    Source: Beckers et al. (2022) for the process; the kernel of a function that is affine in u is
+        that of Castañeda et al. (2021).
+    """
+
+    drift: AbstractMatrixKernel
+    inputs: InputMatrix | KnownMatrix
+    count: int | None = eqx.field(static=True)
+
+    symplectic: ClassVar[bool] = False
+
+    def __init__(self, drift: AbstractMatrixKernel, inputs: Any, count: int | None = None):
+        self.drift = matrix_kernel(drift, "the drift of Controlled", "Controlled(Symplectic(k), …)")
+        if isinstance(self.drift, Controlled):
+            raise TypeError("the drift is controlled already: give all inputs to one Controlled.")
+        if isinstance(inputs, InputMatrix | KnownMatrix):
+            self.inputs = inputs
+        elif callable(inputs) or isinstance(inputs, str):
+            raise TypeError(
+                "inputs must be hk.InputMatrix(k, acts_on=(1,)), for an unknown input matrix, or a "
+                f"known one as an array (n, m); got {inputs!r}."
+            )
+        else:
+            self.inputs = KnownMatrix(_entries(inputs))
+        known = isinstance(self.inputs, KnownMatrix)
+        self.count = self.inputs.matrix.shape[1] if known else count
+
+    @property
+    def no_potential(self) -> str | None:
+        return self.drift.no_potential
+
+    @property
+    def has_hamiltonian(self) -> bool:
+        """Whether the drift has one."""
+        return self.drift.has_hamiltonian
+
+    @property
+    def conserves(self) -> bool:
+        """No: inputs have a power."""
+        return False
+
+    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
+        return self.drift.dissipated(x, slope)
+
+    def outputs(self, inputs: int) -> int:
+        return inputs - self._count
+
+    @property
+    def _count(self) -> int:
+        if self.count is None:
+            raise ValueError(
+                "this Controlled kernel does not know how many inputs there are: give them, "
+                "hk.fit(K, X, Y, inputs=U), or say Controlled(K, inputs, count=1)."
+            )
+        return self.count
+
+    def _split(self, s: Array) -> tuple[Array, Array]:
+        """X and U of joined points, or x and u of one."""
+        n = self.outputs(s.shape[-1])
+        return s[..., :n], s[..., n:]
+
+    def __call__(self, x: Float[Array, " d"], z: Float[Array, " d"]) -> Float[Array, "n n"]:
+        """The block for two joined points (x, u)."""
+        x, z = require.same_space(one_point(x)[None], one_point(z)[None])
+        self.check_points(x)
+        basis = jnp.eye(self.outputs(x.shape[1]), dtype=x.dtype)
+        columns = jax.vmap(self.form, in_axes=(None, None, None, 0))
+        return jax.vmap(columns, in_axes=(None, 0, None, None))(x[0], basis, z[0], basis)
+
+    def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
+        (x, inputs), (z, others) = self._split(x), self._split(z)
+        drift = self.drift.form(x, u, z, v)
+        if isinstance(self.inputs, KnownMatrix):
+            return drift
+        rows = self.inputs.rows(len(x), x.dtype)
+        return drift + (inputs @ others) * self.inputs.kernel(x, z) * ((u * rows) @ v)
+
+    def expansion(
+        self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Float[Array, "M n"]
+    ) -> Float[Array, " n"]:
+        (x, u), (Z, U) = self._split(x), self._split(Z)
+        drift = self.drift.expansion(x, Z, A)
+        if isinstance(self.inputs, KnownMatrix):
+            return drift
+        return drift + self.input_matrix(x, Z, A, U) @ u
+
+    def input_matrix(
+        self,
+        x: Float[Array, " n"],
+        Z: Float[Array, "M n"],
+        A: Float[Array, "M n"],
+        U: Float[Array, "M m"],
+    ) -> Float[Array, "n m"]:
+        """G(x) of the field Σⱼ K(·, (zⱼ, uⱼ)) aⱼ."""
+        if isinstance(self.inputs, KnownMatrix):
+            return jnp.asarray(self.inputs.matrix, x.dtype)
+        row = jax.vmap(self.inputs.kernel, in_axes=(None, 0))(x, Z)
+        rows = self.inputs.rows(len(x), x.dtype)
+        return rows[:, None] * (A.T @ (row[:, None] * U))
+
+    def potential(
+        self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Float[Array, "M n"]
+    ) -> Float[Array, ""]:
+        return self.drift.potential(self._split(x)[0], self._split(Z)[0], A)
+
+    def check_dimension(self, n: int) -> None:
+        """`n` counts the inputs, too."""
+        n = self.outputs(n)
+        if n < 1:
+            raise ValueError(f"points (x, u) with {self._count} inputs have no coordinates left.")
+        self.drift.check_dimension(n)
+        if isinstance(self.inputs, KnownMatrix):
+            if len(self.inputs.matrix) != n:
+                raise ValueError(
+                    f"the known input matrix has shape {self.inputs.matrix.shape} and states have "
+                    f"{n} coordinates: (n, m) is needed."
+                )
+        elif self.inputs.acts_on is not None and max(self.inputs.acts_on) >= n:
+            raise ValueError(
+                f"acts_on = {self.inputs.acts_on} names a coordinate that does not exist: the "
+                f"states have {n}, counted from 0."
+            )
+
+    def check_points(self, X: Float[Array, "N d"]) -> None:
+        self.check_dimension(X.shape[1])
+        self.drift.check_points(self._split(X)[0])
+
+    def shares_potential(self, other: AbstractMatrixKernel) -> bool:
+        return False
+
+    def with_parity(self, parity: int) -> "AbstractMatrixKernel":
+        raise TypeError("say the symmetry of the drift: Controlled(Odd(K), inputs=…).")
+
+    @property
+    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
+        own = (self.inputs.kernel,) if isinstance(self.inputs, InputMatrix) else ()
+        return (*self.drift.scalar_kernels, *own)
+
+    @property
+    def invariance(self) -> Invariance:
+        return Invariance.NONE
+
+
+def _entries(matrix: Any) -> tuple[tuple[float, ...], ...]:
+    array = np.asarray(require.floating(matrix, "the known input matrix"), float)
+    if array.ndim != 2 or not np.isfinite(array).all():
+        raise ValueError(
+            f"the known input matrix has shape {array.shape}; a finite array (n, m), one column "
+            "for each input, is needed, such as [[0.0], [1.0]]."
+        )
+    return tuple(tuple(row) for row in array.tolist())
+
+
+def joined_data(
+    K: AbstractMatrixKernel,
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
+    inputs: Num[ArrayLike, "N m"] | None = None,
+) -> tuple[AbstractMatrixKernel, Float[Array, "N d"], Float[Array, "N n"]]:
+    """Kernel, points and targets of a regression: with inputs the points are (x, u).
+
+    Without inputs these are K, X and Y as they came, checked. Joined points are let through.
+
+    Raises:
+        ValueError: shapes do not fit, the inputs are missing, or cannot be told from the drift;
+            TypeError: K takes no inputs.
+    """
+    if not isinstance(K, Controlled):
+        if inputs is not None:
+            raise TypeError(
+                f"{type(K).__name__} takes no inputs: say how they act, hk.Controlled(K, "
+                "inputs=hk.InputMatrix(k, acts_on=(1,)))."
+            )
+        X, Y = require.data(X, Y)
+        return K, X, Y
+    X, Y = require.points(X, "X"), require.points(Y, "Y")
+    if inputs is None:
+        if K.count is None or X.shape[1] != Y.shape[1] + K.count:
+            raise ValueError(
+                "the inputs are missing: a Controlled kernel needs inputs=U, shape (N, m), one row "
+                "for each state."
+            )
+        known = require.data(X[:, : Y.shape[1]], Y)  # joined before
+        X, Y = require.one_dtype(require.finite(X, "X"), known[1])
+        return K, X, Y
+    U = require.floating(inputs, "inputs")
+    if X.shape != Y.shape and U.shape == Y.shape:
+        raise ValueError(
+            f"X has shape {X.shape}, inputs {U.shape} and Y {Y.shape}: X and the inputs seem to be "
+            "swapped, hk.fit(K, X, Y, inputs=U)."
+        )
+    X, Y = require.data(X, Y)
+    K = _counted(K, X, U)
+    U = require.finite(U.astype(X.dtype), "inputs")
+    if isinstance(K.inputs, KnownMatrix):
+        Y = Y - U @ jnp.asarray(K.inputs.matrix, X.dtype).T
+    else:
+        _check_identified(U)
+    return K, jnp.concatenate([X, U], axis=1), Y
+
+
+def _counted(K: Controlled, X: Float[Array, "N n"], U: Array) -> Controlled:
+    """The kernel that knows the number of inputs."""
+    if U.ndim != 2 or len(U) != len(X) or U.shape[1] == 0:
+        hint = " For one input write U[:, None]." if U.ndim == 1 else ""
+        raise ValueError(
+            f"inputs has shape {U.shape}; (N, m) is needed, m inputs for each of the N = {len(X)} "
+            f"states.{hint}"
+        )
+    if K.count is not None and K.count != U.shape[1]:
+        raise ValueError(f"inputs has {U.shape[1]} columns and the kernel {K.count} inputs.")
+    K = Controlled(K.drift, K.inputs, U.shape[1])
+    K.check_dimension(X.shape[1] + U.shape[1])
+    return K
+
+
+def _check_identified(U: Float[Array, "N m"]) -> None:
+    """ValueError where a combination of the inputs is the same at all points."""
+    if not require.is_concrete(U):
+        return
+    values = np.asarray(U)
+    rank = int(np.linalg.matrix_rank(values - values.mean(axis=0)))
+    if rank < values.shape[1]:
+        raise ValueError(
+            f"the inputs, less their means, have rank {rank} and there are {values.shape[1]}: a "
+            "combination of them is the same at all points, and cannot be told from the drift. "
+            "Vary every input on its own, leave out those that repeat others, or give the matrix "
+            "that is known, Controlled(K, inputs=G)."
+        )

@@ -1,0 +1,139 @@
+"""Fields that lose energy: (J − R)∇H with friction on some of the coordinates."""
+
+import operator
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from hamkernel import _require as require
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
+from hamkernel._structures.operators import AbstractPotentialKernel, check_even
+
+
+class PortHamiltonian(AbstractPotentialKernel):
+    """K(x, z) = (J − R) [∂x ∂zᵀ k(x, z)] (J − R)ᵀ: fields f = (J − R)∇H with friction R ≥ 0.
+
+    R is diagonal, constant and positive on the damped coordinates, zero on the others. With the
+    momenta damped q̇ = ∂H/∂p and ṗ = −∂H/∂q − r ∂H/∂p = −∂H/∂q − r q̇: viscous friction. Along the
+    flow dH/dt = −∇HᵀR∇H, `field.dissipation(x)`.
+
+    The friction is a hyperparameter, found by every objective of `tune` and kept with
+    `frozen="friction"`. What can be told: friction on p with ∂²H/∂p² invertible is unique. Of a
+    (nearly) linear system only the sum of the frictions on q and p is seen. A friction at the
+    lower end of its box, see `tuned.at_bounds`, means that none was seen.
+
+    Args:
+        kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
+        friction: r > 0, a number for all damped coordinates or one for each, in units of the
+            momentum over those of the position, for damped momenta (mass per time).
+        damped: the coordinates with friction, counted from 0; the momenta if None.
+
+    Raises:
+        TypeError: `kernel` is no scalar kernel. ValueError: the friction is not positive, or not
+            one number or one per damped coordinate; `damped` are no coordinates. With data: n is
+            odd, or there is no such coordinate.
+
+    Example: `hk.tune(hk.PortHamiltonian(1.0 * hk.Gaussian(1.0), friction=0.1), X, Y,
+        objective="marginal_likelihood").kernel.friction`.
+
+    Source: van der Schaft & Jeltsema (2014), Port-Hamiltonian Systems Theory; as a Gaussian
+        process Beckers et al. (2022).
+    """
+
+    kernel: AbstractScalarKernel
+    log_friction: Float[Array, "..."]
+    damped: tuple[int, ...] | None = eqx.field(static=True)
+
+    operator_invariance: ClassVar[Invariance] = Invariance.TRANSLATION
+    symplectic: ClassVar[bool] = False
+    has_hamiltonian: ClassVar[bool] = True
+    conserves: ClassVar[bool] = False
+
+    def __init__(
+        self,
+        kernel: Any,
+        friction: ArrayLike = 0.1,
+        damped: int | Sequence[int] | None = None,
+    ):
+        self.kernel = as_scalar_kernel(kernel)
+        cure = (
+            "Energy that grows is no friction; of a system without friction use Symplectic(k), and "
+            "for other damping a Structured(k, operator)."
+        )
+        array = require.positive(friction, "friction", cure)
+        self.damped = None if damped is None else distinct_coordinates(damped, "damped")
+        most = array.size if self.damped is None else len(self.damped)
+        if array.ndim > 1 or (array.ndim and array.size != most):
+            raise ValueError(
+                f"friction has shape {array.shape}; one number, or one for each of the "
+                f"{most} damped coordinates, is needed."
+            )
+        self.log_friction = jnp.log(array)
+
+    @property
+    def friction(self) -> Float[Array, "..."]:
+        """The friction r, one number or one for each damped coordinate."""
+        return jnp.exp(self.log_friction)
+
+    def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+        dq, dp = jnp.split(v, 2)
+        return jnp.concatenate([dp, -dq]) - self._rubbed(v)
+
+    def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
+        dq, dp = jnp.split(v, 2)
+        return jnp.concatenate([-dp, dq]) - self._rubbed(v)
+
+    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
+        """∇HᵀR∇H, a sum of squares."""
+        return jnp.sum(self.resistance(len(x)).astype(x.dtype) * slope**2)
+
+    def resistance(self, n: int) -> Float[Array, " n"]:
+        """The diagonal of R."""
+        zero = jnp.zeros(n, self.log_friction.dtype)
+        return zero.at[np.asarray(self._coordinates(n))].set(self.friction)
+
+    def _rubbed(self, v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+        r = self.resistance(len(v)).astype(v.dtype)
+        return r.reshape(-1, *(1,) * (v.ndim - 1)) * v
+
+    def _coordinates(self, n: int) -> tuple[int, ...]:
+        return tuple(range(n // 2, n)) if self.damped is None else self.damped
+
+    def operator_at(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+        # Frictions that are trained apart must be told apart: the square roots of 2, 3, 4, …
+        apart = jnp.sqrt(jnp.arange(2.0, 2 + self.log_friction.size)).astype(x.dtype)
+        stand_in = jnp.log(apart.reshape(self.log_friction.shape))
+        general = eqx.tree_at(lambda K: K.log_friction, self, stand_in)
+        return general.apply(x, jnp.eye(len(x), dtype=x.dtype))
+
+    def check_dimension(self, n: int) -> None:
+        check_even(n, "a PortHamiltonian kernel")
+        coordinates = self._coordinates(n)
+        if max(coordinates) >= n:
+            raise ValueError(
+                f"damped = {self.damped} names a coordinate that does not exist: the states have "
+                f"{n}, counted from 0, and the momenta are {n // 2} to {n - 1}."
+            )
+        if self.log_friction.ndim and self.log_friction.size != len(coordinates):
+            raise ValueError(
+                f"friction has {self.log_friction.size} numbers and the states have "
+                f"{len(coordinates)} momenta: give one number, or one for each of them."
+            )
+        super().check_dimension(n)
+
+
+def distinct_coordinates(given: Any, name: str) -> tuple[int, ...]:
+    """Coordinates as a tuple of distinct integers >= 0."""
+    try:
+        found = tuple(operator.index(i) for i in np.atleast_1d(given))
+    except TypeError:
+        found = ()
+    if not found or min(found) < 0 or len(set(found)) < len(found):
+        raise ValueError(
+            f"{name} must be distinct coordinates, integers >= 0 such as (2, 3); got {given!r}."
+        )
+    return found

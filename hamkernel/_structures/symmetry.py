@@ -1,0 +1,117 @@
+"""Kernels of fields with a symmetry: odd, even, reversible ones, and any finite group.
+
+The SCALAR kernel inside a structure is averaged over the group, so that the potential has the
+symmetry, and with it the field: where B(Sx) = ± S B(x) Sᵀ, a potential with u(Sx) = u(x) gives
+f(Sx) = ± S f(x).
+"""
+
+from typing import Any, overload
+
+import equinox as eqx
+
+from hamkernel._kernels.base import AbstractScalarKernel, as_scalar_kernel
+from hamkernel._kernels.groups import linear_maps, time_reversal
+from hamkernel._kernels.transforms import symmetrised
+from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel
+from hamkernel._structures.operators import AbstractStructure
+
+
+def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
+    """The kernel of the odd fields with the structure of K, f(−x) = −f(x).
+
+    The SCALAR kernel inside is symmetrised: a field B∇u is odd when u is even. Exact for every
+    kernel, also without k(−x, −z) = k(x, z); twice the cost of K where that is known, four times
+    where it is not. A sum is symmetrised part by part.
+
+    Args:
+        K: a structured kernel whose B does not depend on x.
+
+    Raises:
+        TypeError: K is not matrix-valued.
+
+    Source: Smith & Egeland (2023), eq. (odd_symplectic_kernel), there for k(x, z) = g(x − z).
+    """
+    return matrix_kernel(K, "the argument of Odd", "Odd(Symplectic(k))").with_parity(-1)
+
+
+def Even(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
+    """The kernel of the even fields with the structure of K, f(−x) = f(x).
+
+    As `Odd`, with an odd potential: H(−x) = −H(x).
+
+    Raises:
+        TypeError: K is not matrix-valued.
+    """
+    return matrix_kernel(K, "the argument of Even", "Even(Symplectic(k))").with_parity(+1)
+
+
+def Reversible(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
+    """The kernel of the reversible fields J∇H: H(q, −p) = H(q, p), a film that may run backwards.
+
+    With S = diag(I, −I) they obey f(Sx) = −S f(x). Right for every H = T(p) + U(q) with an even T,
+    and false with friction, with magnetic fields and in rotating frames. Twice the cost of K where
+    k(Sx, Sz) = k(x, z) is known, four times where it is not. `Reversible(Odd(K))` is both, with a
+    group of four.
+
+    Args:
+        K: `Symplectic(k)`, an odd or even one, or a sum of them.
+
+    Raises:
+        TypeError: K is not matrix-valued, or its fields are not J∇H.
+
+    Example: `hk.Reversible(hk.Odd(hk.Symplectic(hk.Gaussian(2.0))))` for a pendulum.
+    """
+    K = matrix_kernel(K, "the argument of Reversible", "Reversible(Symplectic(k))")
+    if not K.symplectic:
+        raise TypeError(
+            f"the fields of {type(K).__name__} are not reversible: time reversal holds for J∇H, "
+            "Reversible(Symplectic(k)), and not with friction, magnetic fields or in rotating "
+            "frames. In a sum say it of the part: Reversible(Symplectic(k)) + CurlFree(k)."
+        )
+    return _averaged(K, (time_reversal,))
+
+
+@overload
+def Invariant(k: AbstractMatrixKernel, maps: Any) -> AbstractMatrixKernel: ...
+@overload
+def Invariant(k: Any, maps: Any) -> AbstractScalarKernel: ...
+
+
+def Invariant(k: Any, maps: Any) -> Any:
+    """The kernel of the functions that a finite group of linear maps leaves unchanged.
+
+    H(Sx) = H(x) for every S that the maps generate: the mean (1/|G|²) Σ k(gx, hz) over both
+    arguments, right for every k. Where k(Sx, Sz) = k(x, z) is known one side is enough, at |G|
+    times the cost of k in place of |G|²: an orthogonal S and one lengthscale for all coordinates,
+    or an S that only changes signs.
+
+    Inside `Symplectic` a map with SᵀJS = J gives fields f(Sx) = S f(x), one with SᵀJS = −J
+    reversible ones, f(Sx) = −S f(x); another one is an error there.
+
+    Args:
+        k: a scalar kernel, or a structure, inside which the scalar kernels are averaged.
+        maps: generators of the group, (n, n) arrays or linear functions x -> S x. The group is
+            closed from them, and may have up to 64 elements.
+
+    Returns:
+        A scalar kernel, or a structure where one was given.
+
+    Raises:
+        TypeError: `k` is no kernel, or `maps` no list of maps. ValueError: a matrix is not square;
+            when called: a map is not linear or of another dimension, the group does not close, or
+            a structure does not allow the map.
+
+    Example: `hk.Symplectic(hk.Invariant(hk.Gaussian(1.0), [rotation, mirror]))`.
+    """
+    given = linear_maps(maps)
+    if isinstance(k, AbstractMatrixKernel):
+        return _averaged(k, given)
+    return symmetrised(as_scalar_kernel(k), given, (1.0,) * len(given))
+
+
+def _averaged(K: AbstractMatrixKernel, maps: tuple) -> AbstractMatrixKernel:
+    if isinstance(K, Sum):
+        return eqx.tree_at(lambda s: s.terms, K, tuple(_averaged(term, maps) for term in K.terms))
+    assert isinstance(K, AbstractStructure)
+    kernel = symmetrised(K.kernel, maps, (1.0,) * len(maps))
+    return eqx.tree_at(lambda K: K.kernel, K, kernel)
