@@ -4,12 +4,14 @@ Where things are, in the order of the data; a folder imports from itself and tho
 
     _kernels      scalar kernels k(x, z), and any callable as one
     _structures   matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, symmetries; `poisson` has tensors
+    _observations what is measured, as rows of linear functionals
     _gram         the Gram: dense, as an operator, and its derivatives
     _factors      factors of G + ridge I, dense and of low rank
     _features     random Fourier features
     _checks       the test of a kernel
     _fields       what is learned: f and its potential
     _solvers      how it is found: dense, by conjugate gradients, of low rank, from streams
+    _posterior    a field and how far it may be off
     _validation   the losses in closed form
     _tuning       hyperparameters by their gradients
     _trajectories from logged runs to a field
@@ -36,6 +38,8 @@ from hamkernel._gram.operator import gram_operator
 from hamkernel._kernels.dot_products import Periodic, Polynomial
 from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._kernels.transforms import Select, Warp
+from hamkernel._observations.kinds import Energies, Equilibria, Functionals, Velocities
+from hamkernel._posterior.posterior import Posterior, condition
 from hamkernel._save.files import load, save
 from hamkernel._solvers.cholesky import Cholesky
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
@@ -90,9 +94,16 @@ __all__ = [  # noqa: RUF022 - in reading order
     "Controlled",
     "InputMatrix",
     "Sum",
+    # What was measured.
+    "Velocities",
+    "Energies",
+    "Equilibria",
+    "Functionals",
     # Learning.
     "gram",
     "fit",
+    "condition",
+    "Posterior",
     "KernelField",
     "FeatureField",
     "ControlledField",

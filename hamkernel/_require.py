@@ -328,6 +328,24 @@ def data(X: ArrayLike, Y: ArrayLike) -> tuple[Float[Array, "N n"], Float[Array, 
     return finite(X, "X"), finite(Y, "Y")
 
 
+def measured(X: ArrayLike, Y: ArrayLike) -> tuple[Array, Array, np.ndarray | None]:
+    """`data` with NaN in Y where nothing was measured, and which entries were; None if all were.
+
+    Not everywhere, and not under jit, where it is not known which.
+    """
+    Y = points(Y, "Y")
+    missing = np.isnan(np.asarray(Y)) if is_concrete(Y) else np.zeros(Y.shape, bool)
+    if missing.all():
+        raise ValueError(
+            f"all {missing.size} components of Y are NaN, which says not measured: there is "
+            "nothing to learn from."
+        )
+    if not missing.any():
+        return *data(X, Y), None
+    X, filled = data(X, jnp.where(missing, jnp.zeros_like(Y), Y))
+    return X, jnp.where(missing, jnp.nan, filled), np.flatnonzero(~missing.reshape(-1))
+
+
 def point(x: ArrayLike, n: int, name: str = "x") -> Float[Array, " n"]:
     """One state of `n` coordinates; for many, the caller is pointed to `jax.vmap`."""
     array = floating(x, name)

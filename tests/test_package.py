@@ -21,11 +21,13 @@ ROOMS = [
     {"_machine"},
     {"_kernels"},
     {"_structures", "poisson"},
+    {"_observations"},
     {"_gram"},
     {"_factors"},
     {"_features", "_checks"},
     {"_fields"},
     {"_solvers"},
+    {"_posterior"},
     {"_validation"},
     {"_tuning"},
     {"_trajectories"},
@@ -165,7 +167,7 @@ def test_every_public_name_is_documented(name):
     assert not text.startswith(f"{name}(")
     elsewhere = re.search(r"(As|those\s+of)\s+`", text)  # "Args and errors are those of `fit`."
     made_by_library = name in ("KernelField", "FeatureField", "SolverInfo", "Tuned")
-    made_by_library |= name in ("LandmarkFit", "FeatureFit", "ControlledField")
+    made_by_library |= name in ("LandmarkFit", "FeatureFit", "ControlledField", "Posterior")
     if callable(thing) and not elsewhere and not made_by_library:
         for parameter in inspect.signature(thing).parameters:
             assert f"{parameter}:" in text, f"{name} does not document {parameter}"

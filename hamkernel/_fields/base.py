@@ -1,8 +1,9 @@
 """Learned vector fields."""
 
 import abc
+import dataclasses
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -27,11 +28,12 @@ class AbstractField(eqx.Module):
     """
 
     kernel: eqx.AbstractVar[AbstractMatrixKernel]
-    residual: eqx.AbstractVar[Float[Array, "N n"]]
+    residual: eqx.AbstractVar[Float[Array, "..."]]
     norm: eqx.AbstractVar[Float[Array, ""]]
     regularization: eqx.AbstractVar[Float[Array, ""]]
     offset: eqx.AbstractVar[Float[Array, ""]]
     info: eqx.AbstractVar["SolverInfo"]
+    mean: eqx.AbstractVar[Callable[..., Any] | None]
 
     def __repr__(self) -> str:
         return described(self)
@@ -58,13 +60,28 @@ class AbstractField(eqx.Module):
         kept = self.info.residual_norm
         return jnp.linalg.norm(self.residual) if kept is None else kept
 
-    @abc.abstractmethod
     def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
-        """The velocity f(x)."""
+        """The velocity f(x), that of the mean included."""
+        x = self._state(x)
+        learned = self._learned(x)
+        return learned if self.mean is None else learned + self.mean(x).astype(learned.dtype)
 
     @abc.abstractmethod
+    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The velocity without that of the mean."""
+
     def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """The potential with the constant that the representer gives it."""
+        """The potential with the constants that the representer and the mean give it."""
+        self.kernel.check_potential()
+        x = self._state(x)
+        learned = self._learned_potential(x)
+        if self.mean is None:
+            return learned
+        return learned + potential_of(self.mean, self.kernel)(x).astype(learned.dtype)
+
+    @abc.abstractmethod
+    def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+        """The potential without that of the mean."""
 
     def evaluate(self, X: Num[ArrayLike, "N n"]) -> Float[Array, "N n"]:
         """The velocities at many states, as `jax.vmap(field)(X)` but in bounded memory.
@@ -79,17 +96,19 @@ class AbstractField(eqx.Module):
         X = require.points(X, "X").astype(self.offset.dtype)
         if X.shape[1] != self.dimension:
             raise ValueError(f"X has {X.shape[1]} coordinates and the field {self.dimension}.")
-        return self._evaluated(X)
+        learned = self._evaluated(X)
+        return learned if self.mean is None else learned + at_points(self.mean, X)
 
     @abc.abstractmethod
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
-        """`evaluate` for states that have been checked."""
+        """`evaluate`, without the mean, for states that have been checked."""
 
     def part(self: Field, which: int | str) -> Field:
         """The field of one term of a sum of kernels, by position or name.
 
-        The parts add up to the field, and the squares of their norms to that of its norm; an anchor
-        of the whole is not theirs. `residual` and `info` are those of the whole fit.
+        The parts add up to the field less its mean, and the squares of their norms to that of its
+        norm; an anchor of the whole is not theirs. `residual` and `info` are those of the whole
+        fit.
 
         Raises:
             KeyError: there is no such part (with the choices).
@@ -113,6 +132,8 @@ class AbstractField(eqx.Module):
             AttributeError: the structure has no potential (with the reason).
         """
         self.kernel.check_potential()
+        if self.mean is not None:
+            potential_of(self.mean, self.kernel)
         return jax.tree_util.Partial(_potential_of, self)
 
     @property
@@ -186,8 +207,10 @@ class AbstractField(eqx.Module):
         """Whether H(q, p) = T(p) + U(q) follows from the kernel, as explicit integrators need.
 
         True for a symplectic kernel whose scalar kernels are sums of `Select`s, each on q alone
-        or on p alone.
+        or on p alone, and a mean that says it of itself.
         """
+        if self.mean is not None and not getattr(self.mean, "is_separable", False):
+            return False
         n = self.dimension
         q, p = frozenset(range(n // 2)), frozenset(range(n // 2, n))
         return self.kernel.symplectic and all(
@@ -195,6 +218,46 @@ class AbstractField(eqx.Module):
             for k in self.kernel.scalar_kernels
             for support in k.supports(n)
         )
+
+
+class FieldSum(eqx.Module):
+    """x -> Σ f(x) of fields, such as a mean and what is added to it."""
+
+    terms: tuple[Callable[..., Any], ...]
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        first, *rest = (term(x) for term in self.terms)
+        return sum((each.astype(first.dtype) for each in rest), start=first)
+
+    @property
+    def is_separable(self) -> bool:
+        """Whether H = T(p) + U(q) for every term."""
+        return all(getattr(term, "is_separable", False) for term in self.terms)
+
+
+def potential_of(field: Callable[..., Any], kernel: AbstractMatrixKernel) -> Scalar:
+    """The potential u with `field` = B∇u for the B of `kernel`; AttributeError if none is known."""
+    if isinstance(field, FieldSum):
+        parts = [potential_of(term, kernel) for term in field.terms]
+        return lambda x: sum((part(x) for part in parts[1:]), start=parts[0](x))
+    if isinstance(field, AbstractField):
+        if Sum(kernel, field.kernel).no_potential is None:
+            return field.potential
+    elif kernel.symplectic and callable(getattr(field, "hamiltonian", None)):
+        return field.hamiltonian  # type: ignore[attr-defined]
+    raise AttributeError(
+        f"the mean, {type(field).__name__}, has no potential of this structure, so neither has the "
+        "field. A mean with a Hamiltonian is one of hk.systems, a field learned with the same "
+        "structure, or, for Symplectic, an object of yours with a method hamiltonian(x)."
+    )
+
+
+_BATCH = 1024  # states at which a mean is evaluated at once
+
+
+def at_points(fn: Callable[..., Any], X: Float[Array, "N n"]) -> Float[Array, "N *out"]:
+    """fn(x) at many states, in bounded memory, in their dtype."""
+    return jax.lax.map(lambda x: jnp.asarray(fn(x)).astype(X.dtype), X, batch_size=_BATCH)
 
 
 def root(square: Float[Array, ""]) -> Float[Array, ""]:
@@ -239,6 +302,7 @@ class SolverInfo(eqx.Module):
 class KernelField(AbstractField):
     """f(x) = Σⱼ K(x, zⱼ) aⱼ, the minimiser of the regularised least squares.
 
+    After energies the potential has the values Σₑ bₑ k(·, sₑ) besides, and a prior mean is added.
     Evaluating f or its potential costs O(M n) for M points.
 
     Attributes:
@@ -246,42 +310,61 @@ class KernelField(AbstractField):
         points: zⱼ, shape (M, n): the data, or the landmarks of a low-rank solver.
         coefficients: aⱼ, shape (M, n).
         residual: yᵢ − f(xᵢ) at the training data, shape (N, n); of shape (0, n) after a fit to a
-            stream, which is not kept.
-        norm: ‖f‖ in the RKHS of K, shape ().
+            stream, which is not kept; of other observations that of each row, in its own units,
+            shape (D,).
+        norm: ‖f‖ in the RKHS of K, of f less its mean, shape ().
         regularization: the λ of the fit, shape ().
         offset: the constant in the potential, shape ().
         info: how the solver went.
+        value_points: sₑ, shape (E, n); None without energies.
+        value_coefficients: bₑ, shape (E,); None without energies.
+        mean: the prior mean, x (n,) -> (n,), which is added; None if it is zero.
     """
 
     kernel: AbstractMatrixKernel
     points: Float[Array, "M n"]
     coefficients: Float[Array, "M n"]
-    residual: Float[Array, "N n"]
+    residual: Float[Array, "..."]
     norm: Float[Array, ""]
     regularization: Float[Array, ""]
     offset: Float[Array, ""]
     info: SolverInfo = SolverInfo("none")
+    value_points: Float[Array, "E n"] | None = None
+    value_coefficients: Float[Array, " E"] | None = None
+    mean: Callable[..., Any] | None = None
 
     @property
     def dimension(self) -> int:
         return self.points.shape[-1]
 
-    def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
-        x = self._state(x)
-        return _expansion(self.kernel, x, self.points, self.coefficients)
+    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        field = _expansion(self.kernel, x, self.points, self.coefficients)
+        if self.value_points is None:
+            return field
+        return field + _of_values(self.kernel, x, self.value_points, self.value_coefficients)
 
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
-        return placed_product(self.kernel, X, self.points, self.coefficients)
+        fields = placed_product(self.kernel, X, self.points, self.coefficients)
+        if self.value_points is None:
+            return fields
+        at = jax.tree_util.Partial(_value_field, self.kernel)
+        return fields + at_points(lambda x: at(x, self.value_points, self.value_coefficients), X)
 
-    def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        x = self._state(x)
-        return _potential(self.kernel, x, self.points, self.coefficients)
+    def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+        potential = _potential(self.kernel, x, self.points, self.coefficients)
+        if self.value_points is None:
+            return potential
+        return potential + _values(self.kernel, x, self.value_points, self.value_coefficients)
 
     def _term(self, kernel: Sum, position: int) -> "KernelField":
         term, Z, A = kernel.terms[position], self.points, self.coefficients
-        norm = root(jnp.sum(A * placed_product(term, Z, Z, A)))  # ‖f‖² = aᵀGa
-        parts = term, norm, jnp.zeros_like(self.offset)
-        return eqx.tree_at(lambda f: (f.kernel, f.norm, f.offset), self, parts)
+        square = jnp.sum(A * placed_product(term, Z, Z, A))  # ‖f‖² = aᵀGa
+        bare = dataclasses.replace(self, kernel=term, offset=jnp.zeros_like(self.offset), mean=None)
+        if self.value_points is not None:  # 2 aᵀG_av b + bᵀG_vv b
+            S, b = self.value_points, self.value_coefficients
+            at = dataclasses.replace(bare, coefficients=2 * A)
+            square = square + b @ at_points(at._learned_potential, S)
+        return dataclasses.replace(bare, norm=root(square))
 
 
 @eqx.filter_jit
@@ -300,3 +383,30 @@ def _potential(
     """The potential of `_expansion`."""
     x, Z = centred(K, x, Z)
     return K.potential(x, Z, A)
+
+
+def _value_potential(
+    K: AbstractMatrixKernel, x: Float[Array, " n"], S: Float[Array, "E n"], b: Float[Array, " E"]
+) -> Float[Array, ""]:
+    """Σₑ bₑ k(x, sₑ)."""
+    x, S = centred(K, x, S)
+    return b @ jax.vmap(K.potential_covariance, in_axes=(None, 0))(x, S)
+
+
+def _value_field(
+    K: AbstractMatrixKernel, x: Float[Array, " n"], S: Float[Array, "E n"], b: Float[Array, " E"]
+) -> Float[Array, " n"]:
+    """The field of `_value_potential`.
+
+    Its component along v is Cov(vᵀf(x), Σ bₑ u(sₑ)), the values at sₑ of the potential of K(·, x)v:
+    linear in v, so that its gradient is the field, and B need not be known.
+    """
+    x, S = centred(K, x, S)
+
+    def along(v):
+        return b @ jax.vmap(lambda s: K.potential(s, x[None], v[None]))(S)
+
+    return jax.grad(along)(jnp.zeros_like(x))
+
+
+_of_values, _values = eqx.filter_jit(_value_field), eqx.filter_jit(_value_potential)

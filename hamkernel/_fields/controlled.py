@@ -39,6 +39,7 @@ class ControlledField(AbstractField):
     regularization: Float[Array, ""]
     offset: Float[Array, ""]
     info: SolverInfo
+    mean: None = None  # see `fit`
 
     @property
     def drift(self) -> KernelField:
@@ -117,8 +118,11 @@ class ControlledField(AbstractField):
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         return self.drift._evaluated(X)
 
-    def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        return self.drift.unanchored_potential(x)
+    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.drift._learned(x)
+
+    def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+        return self.drift._learned_potential(x)
 
     def _term(self, kernel: Sum, position: int) -> "ControlledField":
         raise KeyError("the parts are those of the drift: field.drift.part(…).")

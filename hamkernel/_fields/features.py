@@ -1,9 +1,13 @@
 """A field learned in random Fourier features."""
 
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Num
+from jaxtyping import Array, Float
 
 from hamkernel._features.waves import AbstractFeatures, SumFeatures
 from hamkernel._fields.base import AbstractField, SolverInfo, root
@@ -29,6 +33,7 @@ class FeatureField(AbstractField):
         regularization: the λ of the fit, shape ().
         offset: the constant in the potential, shape ().
         info: how the solver went.
+        mean: the prior mean, x (n,) -> (n,), which is added; None if it is zero.
     """
 
     kernel: AbstractMatrixKernel
@@ -39,31 +44,34 @@ class FeatureField(AbstractField):
     regularization: Float[Array, ""]
     offset: Float[Array, ""]
     info: SolverInfo
+    mean: Callable[..., Any] | None = None
 
     @property
     def dimension(self) -> int:
         return self.residual.shape[-1]
 
-    def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
-        return _field_at(self.features, self._state(x), self.weights)
+    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return _field_at(self.features, x, self.weights)
 
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         spread = rows_of(X)
         return as_given(spread, _evaluate(self, split(spread, X), spread))
 
-    def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        self.kernel.check_potential()
-        x = self._state(x)
+    def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         return _potential_at(self.features, x, self.weights)
 
     def _term(self, kernel: Sum, position: int) -> "FeatureField":
         assert isinstance(self.features, SumFeatures)
         weights = self.weights[self.features.slice(position)]
         terms = kernel.terms[position], self.features.terms[position]
-        return eqx.tree_at(
-            lambda f: (f.kernel, f.features, f.weights, f.norm, f.offset),
+        return dataclasses.replace(
             self,
-            (*terms, weights, root(weights @ weights), jnp.zeros_like(self.offset)),
+            kernel=terms[0],
+            features=terms[1],
+            weights=weights,
+            norm=root(weights @ weights),
+            offset=jnp.zeros_like(self.offset),
+            mean=None,
         )
 
 
@@ -81,4 +89,4 @@ def _potential_at(features, x, weights):
 def _evaluate(field, X, spread):
     if spread is not None:
         return on_each(spread, lambda field, X: _evaluate(field, X, None), field, X, joined=True)
-    return jax.lax.map(lambda x: field(x), X, batch_size=_BATCH)
+    return jax.lax.map(field._learned, X, batch_size=_BATCH)

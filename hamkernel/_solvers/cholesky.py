@@ -1,7 +1,7 @@
 """Regularised least squares by a dense factorisation: (G + NλI) a = y."""
 
 import abc
-from typing import Generic, TypeVar
+from typing import ClassVar, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -15,6 +15,8 @@ from hamkernel._gram.dense import assemble, plus_ridge
 from hamkernel._gram.operator import product
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.memory import refuse_beyond_memory
+from hamkernel._observations.rows import Rows
+from hamkernel._solvers.conditional import AbstractConditional, dense_conditional
 from hamkernel._structures.base import AbstractMatrixKernel
 
 Learned = TypeVar("Learned", bound=AbstractField, covariant=True)
@@ -22,6 +24,8 @@ Learned = TypeVar("Learned", bound=AbstractField, covariant=True)
 
 class AbstractSolver(eqx.Module, Generic[Learned]):
     """How `fit` finds the field."""
+
+    no_factor: ClassVar[str | None] = None  # why it cannot say how far the field may be off
 
     @abc.abstractmethod
     def _fitted(
@@ -33,6 +37,17 @@ class AbstractSolver(eqx.Module, Generic[Learned]):
         throw: bool = True,
     ) -> Learned:
         """The field for data that has been checked; of NaN if it fails and does not `throw`."""
+
+    def _given(
+        self,
+        K: AbstractMatrixKernel,
+        rows: Rows,
+        regularization: Float[Array, ""],
+        throw: bool = True,
+    ) -> AbstractConditional:
+        """The field given any observations, with what the solver keeps of them."""
+        del K, rows, regularization, throw
+        raise TypeError(f"{type(self).__name__} learns from velocities X and Y alone.")
 
 
 # ‖y − (G + NλI)a‖/‖y‖ up to which a factorisation counts as a solution. The fitted values were
@@ -94,6 +109,15 @@ class Cholesky(AbstractSolver[KernelField]):
             offset=jnp.zeros((), X.dtype),
             info=SolverInfo("Cholesky", relative_residual=left),
         )
+
+    def _given(
+        self,
+        K: AbstractMatrixKernel,
+        rows: Rows,
+        regularization: Float[Array, ""],
+        throw: bool = True,
+    ) -> AbstractConditional:
+        return dense_conditional(K, rows, regularization, throw)
 
 
 def _check_memory(X: Float[Array, "N n"]) -> None:

@@ -10,6 +10,8 @@ whose F = G_XS T is applied as a product with the Gram, so that it needs no memo
 trace(G − Ĝ) ≤ τρ the condition is at most 1 + τ and the iterations do not depend on N.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,13 +19,16 @@ import lineax as lx
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._fields.base import KernelField, SolverInfo, root
+from hamkernel._fields.base import KernelField, SolverInfo, at_points, root
 from hamkernel._gram.dense import trace
 from hamkernel._gram.derivatives import constant
 from hamkernel._gram.operator import product
 from hamkernel._machine.devices import as_given, rows_of, split
+from hamkernel._observations.rows import Rows
 from hamkernel._solvers.cholesky import AbstractSolver, relative
+from hamkernel._solvers.conditional import NO_FACTOR, FieldAlone, check_potential, field_of_rows
 from hamkernel._solvers.landmark_gram import Columns, checked, factor, truncated, whitening
+from hamkernel._solvers.low_rank_conditional import landmark_span
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.stream_sums import normal
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -56,6 +61,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
         arXiv 2304.12465, for randomly pivoted Cholesky in it.
     """
 
+    no_factor: ClassVar[str | None] = NO_FACTOR
     tolerance: float | None = eqx.field(static=True)
     max_iterations: int = eqx.field(static=True)
     preconditioner: Nystrom
@@ -85,17 +91,75 @@ class ConjugateGradient(AbstractSolver[KernelField]):
         regularization: Float[Array, ""],
         throw: bool = True,
     ) -> KernelField:
-        tolerance = self.tolerance
-        if tolerance is None:
-            tolerance = 1e-8 if X.dtype == jnp.float64 else 1e-5
         landmarks = self.preconditioner.landmarks(K, X, regularization)
         ridge = len(X) * regularization
         spread = rows_of(X)
         X, Y = split(spread, X), split(spread, Y)
-        within = jnp.asarray(tolerance, X.dtype)  # a Python float would compile anew
+        within = jnp.asarray(self._tolerance(X.dtype), X.dtype)  # a Python float would compile anew
         learned, iterations, left, truncation = _solve(
             K, X, Y, ridge, landmarks, within, self.max_iterations, spread
         )
+
+        learned = self._converged(
+            K, X, ridge, learned, iterations, left, truncation, landmarks, throw
+        )
+        coefficients, residual, norm = learned
+        return KernelField(
+            kernel=K,
+            points=X,
+            coefficients=coefficients,
+            residual=as_given(spread, residual),
+            norm=norm,
+            regularization=regularization,
+            offset=jnp.zeros((), X.dtype),
+            info=SolverInfo(
+                "ConjugateGradient",
+                landmarks=landmarks.count,
+                rank=landmarks.kept.sum(),
+                truncation=truncation,
+                iterations=iterations,
+                relative_residual=left,
+            ),
+        )
+
+    def _given(
+        self,
+        K: AbstractMatrixKernel,
+        rows: Rows,
+        regularization: Float[Array, ""],
+        throw: bool = True,
+    ) -> FieldAlone:
+        check_potential(K, rows)
+        dtype = rows.targets.dtype
+        landmarks = self.preconditioner.landmarks(K, rows.points, regularization)
+        ridge = rows.count * regularization
+        within = jnp.asarray(self._tolerance(dtype), dtype)
+        learned, iterations, left, truncation = _solve_rows(
+            K, rows, ridge, landmarks, within, self.max_iterations
+        )
+        C, residual, norm = self._converged(
+            K, rows.points, ridge, learned, iterations, left, truncation, landmarks, throw
+        )
+        info = SolverInfo(
+            "ConjugateGradient",
+            landmarks=landmarks.count,
+            rank=landmarks.kept.sum(),
+            iterations=iterations,
+            relative_residual=left,
+        )
+        field = field_of_rows(K, rows, C, residual, norm, regularization, info)
+        return FieldAlone(field, rows, ridge)
+
+    def _tolerance(self, dtype: jnp.dtype) -> float:
+        if self.tolerance is not None:
+            return self.tolerance
+        return 1e-8 if dtype == jnp.float64 else 1e-5
+
+    def _converged(
+        self, K, X, ridge, learned, iterations, left, truncation, landmarks, throw: bool
+    ):
+        """What was learned, if the iterations converged."""
+        tolerance = self._tolerance(X.dtype)
 
         def message() -> str:
             reached = ""
@@ -107,7 +171,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                 reached += (
                     f" ({int(landmarks.count)} landmarks, truncation {float(truncation):.1e})"
                 )
-                rounding = float(jnp.finfo(X.dtype).eps * trace(K, X, spread))
+                rounding = float(jnp.finfo(X.dtype).eps * trace(K, X, rows_of(X)))
                 if ridge < _DIGITS * rounding:
                     return (
                         f"conjugate gradients did not converge{reached}: the ridge N λ = "
@@ -129,25 +193,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
             )
 
         failed = ~(require.on_host(left) <= tolerance)
-        learned = checked(learned, landmarks, truncation, failed, message, throw)
-        coefficients, residual, norm = learned
-        return KernelField(
-            kernel=K,
-            points=X,
-            coefficients=coefficients,
-            residual=as_given(spread, residual),
-            norm=norm,
-            regularization=regularization,
-            offset=jnp.zeros((), X.dtype),
-            info=SolverInfo(
-                "ConjugateGradient",
-                landmarks=landmarks.count,
-                rank=landmarks.kept.sum(),
-                truncation=truncation,
-                iterations=iterations,
-                relative_residual=left,
-            ),
-        )
+        return checked(learned, landmarks, truncation, failed, message, throw)
 
 
 @eqx.filter_jit
@@ -167,13 +213,46 @@ def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
     def gram(c):
         return product(K, X, X, c, spread, spread)
 
-    structure = jax.ShapeDtypeStruct(Y.shape, Y.dtype)
+    C, steps = _iterated(gram, preconditioned, Y, ridge, tolerance, max_iterations)
+    values = gram(C) / ridge  # f(X)
+    left = relative(Y - C - values, Y)
+    truncation = truncated(trace(K_, X_, spread), jnp.trace(square), ridge_)
+    norm = root(jnp.sum(C * values) / ridge)  # ‖f‖² = aᵀGa
+    return (C / ridge, Y - values, norm), steps, left, truncation
+
+
+@eqx.filter_jit
+def _solve_rows(K, rows, ridge, landmarks, tolerance, max_iterations):
+    """`_solve` of rows of observations, whose product is that of their field with their rows."""
+    y = rows.y
+    K_, rows_, ridge_ = constant((K, rows, ridge))
+    F = landmark_span(K_, landmarks).of_rows(rows_)
+    R = factor(F.T @ F, ridge_)
+
+    def gram(c):
+        field = field_of_rows(K, rows, c, c, ridge, ridge, SolverInfo("none"))
+        potential = jax.tree_util.Partial(at_points, field._learned_potential)
+        return rows.contrast(rows.of(field._evaluated, potential))
+
+    def preconditioned(c):
+        return c - F @ jax.scipy.linalg.cho_solve((R, True), F.T @ c)
+
+    C, steps = _iterated(gram, preconditioned, y, ridge, tolerance, max_iterations)
+    values = gram(C) / ridge
+    left = relative(y - C - values, y)
+    norm = root(C @ values / ridge)
+    return (C / ridge, rows.residual(C), norm), steps, left, jnp.zeros((), y.dtype)
+
+
+def _iterated(gram, preconditioned, y, ridge, tolerance, max_iterations):
+    """The solution of (I + G/ridge) c = y, and the number of iterations."""
+    structure = jax.ShapeDtypeStruct(y.shape, y.dtype)
     positive = lx.positive_semidefinite_tag
     system = lx.FunctionLinearOperator(lambda c: c + gram(c) / ridge, structure, positive)
     preconditioner = lx.FunctionLinearOperator(preconditioned, structure, positive)
     # lineax asks of the change of c what it asks of the residual; both are in units of y. Half of
     # the tolerance leaves room for what the recursion of the residual rounds off.
-    scale = jnp.linalg.norm(jax.lax.stop_gradient(Y))
+    scale = jnp.linalg.norm(jax.lax.stop_gradient(y))
     solver = lx.CG(
         rtol=0.0,
         atol=0.5 * tolerance * scale,
@@ -182,10 +261,5 @@ def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
         max_steps=max_iterations,
     )
     options = {"preconditioner": preconditioner}
-    solution = lx.linear_solve(system, Y, solver, options=options, throw=False)
-    C = solution.value
-    values = gram(C) / ridge  # f(X)
-    left = relative(Y - C - values, Y)
-    truncation = truncated(trace(K_, X_, spread), jnp.trace(square), ridge_)
-    norm = root(jnp.sum(C * values) / ridge)  # ‖f‖² = aᵀGa
-    return (C / ridge, Y - values, norm), solution.stats["num_steps"], left, truncation
+    solution = lx.linear_solve(system, y, solver, options=options, throw=False)
+    return solution.value, solution.stats["num_steps"]

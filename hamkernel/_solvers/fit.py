@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-from typing import overload
+from typing import Any, overload
 
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._fields.base import AbstractField, KernelField
+from hamkernel._fields.base import AbstractField, KernelField, at_points
 from hamkernel._fields.controlled import with_inputs
 from hamkernel._machine.devices import rows_of
 from hamkernel._machine.memory import dense_bytes, memory_bytes
 from hamkernel._machine.threads import one_blas_thread
+from hamkernel._observations.kinds import AbstractObservations, both, observations, rows_of_data
+from hamkernel._observations.rows import Rows
 from hamkernel._solvers.cholesky import COPIES, AbstractSolver, Cholesky, Learned
+from hamkernel._solvers.conditional import check_potential
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
+from hamkernel._solvers.means import Mean, checked_mean, with_mean, without_mean
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.controlled import joined_data
 
@@ -21,33 +25,36 @@ from hamkernel._structures.controlled import joined_data
 @overload
 def fit(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
     regularization: ArrayLike = 1e-4,
     *,
     solver: None = None,
+    mean: Mean | None = None,
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> KernelField: ...
 @overload
 def fit(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
     regularization: ArrayLike = 1e-4,
     *,
     solver: AbstractSolver[Learned],
+    mean: Mean | None = None,
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Learned: ...
 @overload
 def fit(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
     regularization: ArrayLike = 1e-4,
     *,
     solver: AbstractSolver | None,
+    mean: Mean | None = None,
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> AbstractField: ...
@@ -56,11 +63,12 @@ def fit(
 @one_blas_thread
 def fit(
     K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
     regularization: ArrayLike = 1e-4,
     *,
     solver: AbstractSolver | None = None,
+    mean: Mean | None = None,
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> AbstractField:
@@ -71,14 +79,21 @@ def fit(
 
     Args:
         K: a matrix-valued kernel, for example `Odd(Symplectic(Gaussian(3.0)))`.
-        X: states, shape (N, n).
+        X: states, shape (N, n); or observations of any kind, and then there is no Y:
+            `hk.fit(K, hk.Velocities(X, Y) + hk.Energies(Z, E), regularization=1e-4)`. With X and Y
+            they are `hk.Velocities(X, Y)`.
         Y: measured velocities, shape (N, n), in units of X per unit of time.
-        regularization: λ > 0, in squared units of Y over those of the kernel.
+        regularization: λ > 0, in squared units of Y over those of the kernel. With other
+            observations Nλ is the variance of a row of relative noise 1, and N counts points of
+            velocities and equilibria, energies and functionals.
         solver: if None, `Cholesky()` where its three matrices of (N n)² numbers take at most half
             of the memory, else `ConjugateGradient()`; both are exact, and `field.info.solver` says
             which it was. `Nystrom()` is faster, and approximate to a stated tolerance. Where the
             rows of X are spread over a mesh of devices they stay there, and None is
             `ConjugateGradient()`; only `Cholesky()` gathers them on one device.
+        mean: what is known already, x (n,) -> (n,): a learned field, one of `hk.systems`, any
+            function of one state. The kernel learns what is left, and the field has both; it has a
+            Hamiltonian where both have.
         throw: whether a solve that fails raises. If not, what is learned is NaN, `field.norm` among
             it: for `jax.vmap` over many hyperparameters, where one failure would end them all, and
             for objectives of your own in `tune`, which steps back from NaN.
@@ -94,24 +109,56 @@ def fit(
         TypeError: K is not matrix-valued, `solver` is no solver, or the data is complex or in half
             precision. ValueError: a shape does not fit, the data is empty or not finite, n is not
             allowed by the structure, λ is not positive, or a dense problem does not fit in memory.
-            RuntimeError: the ridge is too small for this Gram (the text says what to do).
+            AttributeError: energies, of a structure or a mean that has no potential. RuntimeError:
+            the ridge is too small for this Gram (the text says what to do).
 
     Source: Smith & Egeland (2023), eq. (vector_valued_regular_least_squares_a_equation), where
         "Nλ a_j" should read "Nλ a_i".
     """
     K = matrix_kernel(K)
-    if not (solver is None or isinstance(solver, AbstractSolver)):
-        raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
-    K, X, Y = joined_data(K, X, Y, inputs)
+    check_solver(solver)
+    if isinstance(X, AbstractObservations):
+        rows, regularization, mean = checked_rows(K, X, Y, regularization, mean)
+        solver = default_solver(rows.size, rows.targets.dtype) if solver is None else solver
+        field = solver._given(K, without_mean(K, rows, mean), regularization, throw).field
+        return with_mean(field, mean)
+    if mean is not None and inputs is not None:
+        raise ValueError(
+            "mean= and inputs= cannot be given together: subtract the known part from Y, and add "
+            "it to the field that is learned."
+        )
+    K, X, Y = joined_data(K, *both(X, Y), inputs)
     K.check_points(X)
     regularization = require.ridge(regularization, X.dtype)
     require.warn_of_float32(X)
-    solver = _default(X) if solver is None else solver
-    return with_inputs(K, solver._fitted(K, X, Y, regularization, throw))
+    mean = checked_mean(mean, X.shape[1], X.dtype)
+    if mean is not None:
+        Y = Y - at_points(mean, X)
+    if solver is None:
+        solver = default_solver(Y.size, X.dtype) if rows_of(X) is None else ConjugateGradient()
+    field = with_mean(solver._fitted(K, X, Y, regularization, throw), mean)
+    return with_inputs(K, field)
 
 
-def _default(X: Float[Array, "N n"]) -> AbstractSolver[KernelField]:
+def check_solver(solver: Any) -> None:
+    """TypeError if it is no solver, nor None."""
+    if not (solver is None or isinstance(solver, AbstractSolver)):
+        raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
+
+
+def checked_rows(
+    K: AbstractMatrixKernel, X: Any, Y: Any, regularization: ArrayLike, mean: Any
+) -> tuple[Rows, Float[Array, ""], Any]:
+    """The rows of the data, λ and the mean, where they fit each other and the kernel."""
+    rows = rows_of_data(observations(X, Y))
+    K.check_dimension(rows.dimension)
+    check_potential(K, rows)
+    require.warn_of_float32(rows.targets)
+    regularization = require.ridge(regularization, rows.targets.dtype)
+    return rows, regularization, checked_mean(mean, rows.dimension, rows.targets.dtype)
+
+
+def default_solver(rows: int, dtype: Any) -> AbstractSolver[KernelField]:
     """Cholesky where it takes at most half of the memory of one device, which has all the data."""
-    needed, memory = dense_bytes(X.size, X.size, X.dtype, COPIES), memory_bytes()
-    fits = memory is None or needed <= memory / 2
-    return Cholesky() if fits and rows_of(X) is None else ConjugateGradient()
+    needed, memory = dense_bytes(rows, rows, dtype, COPIES), memory_bytes()
+    return Cholesky() if memory is None or needed <= memory / 2 else ConjugateGradient()

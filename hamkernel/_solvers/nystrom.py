@@ -24,6 +24,7 @@ from hamkernel._fields.base import KernelField, SolverInfo, root
 from hamkernel._gram.dense import trace
 from hamkernel._gram.operator import product
 from hamkernel._machine.devices import as_given, rows_of, split
+from hamkernel._observations.rows import Rows
 from hamkernel._show import text
 from hamkernel._solvers import stream_sums
 from hamkernel._solvers.landmark_gram import (
@@ -35,6 +36,11 @@ from hamkernel._solvers.landmark_gram import (
     whitening,
 )
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks
+from hamkernel._solvers.low_rank_conditional import (
+    LowRankConditional,
+    landmark_span,
+    low_rank_conditional,
+)
 from hamkernel._solvers.stream_sums import Sums
 from hamkernel._solvers.streaming import (
     AbstractStreamingFit,
@@ -133,6 +139,16 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         solution = _fit(K, X, Y, regularization, landmarks, spread)
         solution = solution._replace(residual=as_given(spread, solution.residual))
         return _field(K, landmarks, solution, regularization, self.tolerance, _CHOOSE, throw)
+
+    def _given(
+        self,
+        K: AbstractMatrixKernel,
+        rows: Rows,
+        regularization: Float[Array, ""],
+        throw: bool = True,
+    ) -> LowRankConditional:
+        span = landmark_span(K, self.landmarks(K, rows.points, regularization))
+        return low_rank_conditional(span, rows, regularization, throw)
 
     def start(
         self,

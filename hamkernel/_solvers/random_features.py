@@ -10,8 +10,14 @@ from hamkernel._fields.base import SolverInfo, root
 from hamkernel._fields.features import FeatureField
 from hamkernel._machine.devices import as_given, rows_of, split
 from hamkernel._machine.memory import refuse_beyond_memory
+from hamkernel._observations.rows import Rows
 from hamkernel._solvers import stream_sums
 from hamkernel._solvers.landmark_gram import singular
+from hamkernel._solvers.low_rank_conditional import (
+    FeatureSpan,
+    LowRankConditional,
+    low_rank_conditional,
+)
 from hamkernel._solvers.stream_sums import Sums
 from hamkernel._solvers.streaming import (
     AbstractStreamingFit,
@@ -74,6 +80,17 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
             return field
         residual = as_given(spread, field.residual)
         return eqx.tree_at(lambda f: f.residual, field, residual)
+
+    def _given(
+        self,
+        K: AbstractMatrixKernel,
+        rows: Rows,
+        regularization: Float[Array, ""],
+        throw: bool = True,
+    ) -> LowRankConditional:
+        n = rows.dimension
+        span = FeatureSpan(K, self._features(K, n, rows.targets.dtype), n)
+        return low_rank_conditional(span, rows, regularization, throw)
 
     def _features(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> AbstractFeatures:
         """The features of K for n coordinates, if a fit in them fits in memory."""

@@ -70,6 +70,13 @@ class AbstractMatrixKernel(eqx.Module):
     ) -> Float[Array, ""]:
         """The potential of `expansion`; AttributeError with `no_potential` if there is none."""
 
+    def potential_covariance(
+        self, x: Float[Array, " n"], z: Float[Array, " n"]
+    ) -> Float[Array, ""]:
+        """The kernel of the potential, of which K is B ∂x∂zᵀ(·) Bᵀ; AttributeError if none."""
+        del x, z
+        raise AttributeError(self.no_potential)
+
     def check_potential(self) -> None:
         """AttributeError, with the reason, if the fields have no potential."""
         if self.no_potential:
@@ -178,6 +185,13 @@ class Sum(AbstractMatrixKernel):
     ) -> Float[Array, ""]:
         self.check_potential()
         first, *rest = (K.potential(x, Z, A) for K in self.terms)
+        return sum(rest, start=first)
+
+    def potential_covariance(
+        self, x: Float[Array, " n"], z: Float[Array, " n"]
+    ) -> Float[Array, ""]:
+        self.check_potential()
+        first, *rest = (K.potential_covariance(x, z) for K in self.terms)
         return sum(rest, start=first)
 
     @property

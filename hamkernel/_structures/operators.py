@@ -144,6 +144,11 @@ class AbstractPotentialKernel(AbstractStructure):
         _, slopes = jax.jvp(lambda Z: _row(self.kernel, x, Z), (Z,), (directions,))
         return slopes.sum()
 
+    def potential_covariance(
+        self, x: Float[Array, " n"], z: Float[Array, " n"]
+    ) -> Float[Array, ""]:
+        return self.kernel(x, z)
+
     def expansion(
         self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
     ) -> Float[Array, " n"]:

@@ -1,0 +1,91 @@
+"""The Gram of observations: covariances of linear functionals of a field and its potential.
+
+Between values of u and derivatives there is one forward derivative less than between derivatives,
+
+    Cov(u(x), u(z)) = k(x, z),  Cov(u(x), vᵀf(z)) = ∂z k(x, z)·B(z)ᵀv,  Cov(uᵀf(x), vᵀf(z)) = uᵀKv,
+
+the second of which is the potential of the representer K(·, z)v, and the third is `K.form`. A block
+of observations maps such covariances at its points to rows.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hamkernel._gram.dense import assemble, centred
+from hamkernel._observations.blocks import AbstractBlock, Combinations
+from hamkernel._observations.rows import Rows
+from hamkernel._structures.base import AbstractMatrixKernel
+
+# Groups of combinations whose points are made at once, for each of which there are Q n rows as long
+# as all points of the other side.
+_ENTRIES = 1_000_000
+
+
+def gram_of_rows(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, "D D"]:
+    """The Gram of all rows, without the constant of the energies."""
+    blocks = rows.blocks
+    upper = {
+        (i, j): between(K, a, b)
+        for j, b in enumerate(blocks)
+        for i, a in enumerate(blocks[: j + 1])
+    }
+    if len(blocks) == 1:
+        G = upper[0, 0]
+    else:
+        places = range(len(blocks))
+        G = jnp.block([[upper[i, j] if i <= j else upper[j, i].T for j in places] for i in places])
+    if not len(rows.energies):
+        return G
+    return rows.contrast(rows.contrast(G).T)
+
+
+def rows_between(K: AbstractMatrixKernel, rows: Rows, block: AbstractBlock) -> Float[Array, "D d"]:
+    """The covariances of all rows with those of a block."""
+    return rows.contrast(jnp.concatenate([between(K, each, block) for each in rows.blocks]))
+
+
+def between(
+    K: AbstractMatrixKernel, left: AbstractBlock, right: AbstractBlock
+) -> Float[Array, "D d"]:
+    """The covariances of the rows of two blocks."""
+    if isinstance(right, Combinations) and not isinstance(left, Combinations):
+        return between(K, right, left).T
+    if not isinstance(left, Combinations):
+        return _mapped(K, left, right)
+
+    def of_group(group):
+        points, weights = group
+        return _mapped(K, Combinations(points[None], weights[None]), right)
+
+    # One group after the other: the covariances of all points need not fit in memory.
+    at_once = max(1, _ENTRIES // (left.groups[0].size * right.points.size))
+    out = jax.lax.map(of_group, (left.groups, left.weights), batch_size=at_once)
+    return out.reshape(left.count, -1)
+
+
+def _mapped(K: AbstractMatrixKernel, left: AbstractBlock, right: AbstractBlock) -> Array:
+    """Rows of the left of covariances, and of the right of these."""
+    of_left = left.rows(_at_points(K, left, right))  # (D, P′, *n′)
+    return jax.vmap(right.rows)(of_left)
+
+
+def _at_points(K: AbstractMatrixKernel, left: AbstractBlock, right: AbstractBlock) -> Array:
+    """The covariances of f or u at the points of the left with f or u at those of the right."""
+    X, Z = left.points, right.points
+    if not left.of_values and not right.of_values:
+        return assemble(K, X, Z)  # (P, n, P′, n)
+    if not left.of_values:
+        return jnp.moveaxis(_at_points(K, right, left), 0, -1)  # (P, n, P′)
+    X, Z = centred(K, X, Z)
+    if right.of_values:
+        pair = jax.vmap(K.potential_covariance, in_axes=(None, 0))
+        return jax.vmap(pair, in_axes=(0, None))(X, Z)  # (P, P′)
+    basis = jnp.eye(X.shape[1], dtype=X.dtype)
+
+    def entry(x, z, e):
+        return K.potential(x, z[None], e[None])
+
+    for axis in (2, 1, 0):  # b, zⱼ, xᵢ
+        entry = jax.vmap(entry, in_axes=[0 if i == axis else None for i in range(3)])
+    return entry(X, Z, basis)  # (P, P′, n)

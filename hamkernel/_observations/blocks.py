@@ -1,0 +1,186 @@
+"""Rows of linear functionals of a field f = B∇u and of its potential u, as maps from points.
+
+A block has points z and maps what is there, f(z) or u(z), to rows: the components that were
+measured, weighted sums along groups of points, or values. Divided by the relative noise of a row
+every row has the same noise. The transpose maps coefficients of rows to coefficients at points, and
+so to a field again, whatever was observed.
+"""
+
+import abc
+from collections.abc import Iterable
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+
+class AbstractBlock(eqx.Module):
+    """Some rows of one kind."""
+
+    of_values: eqx.AbstractClassVar[bool]  # of the potential; else of the field
+
+    points: eqx.AbstractVar[Float[Array, "P n"]]
+
+    @property
+    @abc.abstractmethod
+    def scale(self) -> Float[Array, " D"]:
+        """The relative noise of each row, by which it is divided."""
+
+    @property
+    @abc.abstractmethod
+    def count(self) -> int:
+        """How many of the N observations that λ is divided by these rows are."""
+
+    @abc.abstractmethod
+    def labels(self) -> Int[np.ndarray, " D"]:
+        """To which of `count` observations each row belongs."""
+
+    @abc.abstractmethod
+    def rows(self, values: Float[Array, "P *rest"]) -> Float[Array, "D *below"]:
+        """The rows of a field, (P, n, …) -> (D, …), or of a potential, (P, …) -> (D, …)."""
+
+    @abc.abstractmethod
+    def coefficients(self, c: Float[Array, " D"]) -> Float[Array, "P *n"]:
+        """The transpose of `rows`."""
+
+    @abc.abstractmethod
+    def then(self, other: "AbstractBlock") -> "AbstractBlock | None":
+        """One block of these rows and then the others; None if they are of another kind."""
+
+
+class Components(AbstractBlock):
+    """Components of the field at points.
+
+    Attributes:
+        kept: the rows that were measured, as indices into all P·n, shape (D,); None if all were.
+        noise: of each row that was measured; None if it is 1.
+    """
+
+    points: Float[Array, "P n"]
+    kept: Int[Array, " D"] | None = None
+    noise: Float[Array, " D"] | None = None
+    of_values: ClassVar[bool] = False
+
+    @property
+    def scale(self) -> Float[Array, " D"]:
+        size = self.points.size if self.kept is None else len(self.kept)
+        return jnp.ones(size, self.points.dtype) if self.noise is None else self.noise
+
+    @property
+    def count(self) -> int:
+        return len(self.points)
+
+    def labels(self) -> Int[np.ndarray, " D"]:
+        P, n = self.points.shape
+        return (np.arange(P * n) if self.kept is None else np.asarray(self.kept)) // n
+
+    def rows(self, values: Float[Array, "P n *rest"]) -> Float[Array, "D *rest"]:
+        rows = values.reshape(self.points.size, *values.shape[2:])
+        rows = rows if self.kept is None else rows[self.kept]
+        return rows if self.noise is None else rows / _along(self.noise, rows)
+
+    def coefficients(self, c: Float[Array, " D"]) -> Float[Array, "P n"]:
+        c = c if self.noise is None else c / self.noise
+        if self.kept is not None:
+            c = jnp.zeros(self.points.size, c.dtype).at[self.kept].set(c)
+        return c.reshape(self.points.shape)
+
+    def then(self, other: AbstractBlock) -> "Components | None":
+        if not isinstance(other, Components):
+            return None
+        kept = noise = None
+        if self.kept is not None or other.kept is not None:
+            own, others = (
+                jnp.arange(b.points.size) if b.kept is None else b.kept for b in (self, other)
+            )
+            kept = jnp.concatenate([own, others + self.points.size])
+        if self.noise is not None or other.noise is not None:
+            noise = jnp.concatenate([self.scale, other.scale])
+        return Components(jnp.concatenate([self.points, other.points]), kept, noise)
+
+
+class Combinations(AbstractBlock):
+    """Σ_q weights[s, r, q] · f(groups[s, q]), R rows for each of S groups of Q points."""
+
+    groups: Float[Array, "S Q n"]
+    weights: Float[Array, "S R Q n"]
+    of_values: ClassVar[bool] = False
+
+    @property
+    def points(self) -> Float[Array, "SQ n"]:
+        return self.groups.reshape(-1, self.groups.shape[2])
+
+    @property
+    def scale(self) -> Float[Array, " SR"]:
+        return jnp.ones(self.count, self.groups.dtype)
+
+    @property
+    def count(self) -> int:
+        return self.weights.shape[0] * self.weights.shape[1]
+
+    def labels(self) -> Int[np.ndarray, " SR"]:
+        return np.arange(self.count)
+
+    def rows(self, values: Float[Array, "SQ n *rest"]) -> Float[Array, "SR *rest"]:
+        rest = values.shape[2:]
+        S, R, Q, n = self.weights.shape
+        rows = self.weights.reshape(S, R, Q * n) @ values.reshape(S, Q * n, -1)  # (S, R, rest)
+        return rows.reshape(S * R, *rest)
+
+    def coefficients(self, c: Float[Array, " SR"]) -> Float[Array, "SQ n"]:
+        S, R, _, _ = self.weights.shape
+        return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(self.points.shape)
+
+    def then(self, other: AbstractBlock) -> "Combinations | None":
+        if not isinstance(other, Combinations) or self.weights.shape[1:] != other.weights.shape[1:]:
+            return None
+        pairs = (self.groups, other.groups), (self.weights, other.weights)
+        return Combinations(*map(jnp.concatenate, pairs))
+
+
+class Values(AbstractBlock):
+    """The potential at points; `noise` is that of each, None if it is 1."""
+
+    points: Float[Array, "E n"]
+    noise: Float[Array, " E"] | None = None
+    of_values: ClassVar[bool] = True
+
+    @property
+    def scale(self) -> Float[Array, " E"]:
+        return jnp.ones(len(self.points), self.points.dtype) if self.noise is None else self.noise
+
+    @property
+    def count(self) -> int:
+        return len(self.points)
+
+    def labels(self) -> Int[np.ndarray, " E"]:
+        return np.arange(len(self.points))
+
+    def rows(self, values: Float[Array, "E *rest"]) -> Float[Array, "E *rest"]:
+        return values if self.noise is None else values / _along(self.noise, values)
+
+    def coefficients(self, c: Float[Array, " E"]) -> Float[Array, " E"]:
+        return c if self.noise is None else c / self.noise
+
+    def then(self, other: AbstractBlock) -> "Values | None":
+        if not isinstance(other, Values):
+            return None
+        noise = None
+        if self.noise is not None or other.noise is not None:
+            noise = jnp.concatenate([self.scale, other.scale])
+        return Values(jnp.concatenate([self.points, other.points]), noise)
+
+
+def merged(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:
+    """The same rows in fewer blocks, where neighbours are of one kind: there is less to compile."""
+    found: list[AbstractBlock] = []
+    for block in blocks:
+        both = found[-1].then(block) if found else None
+        found = [*found[:-1], both] if both is not None else [*found, block]
+    return tuple(found)
+
+
+def _along(noise: Float[Array, " D"], rows: Float[Array, "D *rest"]) -> Array:
+    return noise.reshape(-1, *[1] * (rows.ndim - 1))

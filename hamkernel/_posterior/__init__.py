@@ -1,0 +1,1 @@
+"""What is known after measurements: fields and how far they may be off."""

@@ -1,0 +1,207 @@
+"""`condition`: from data to a field and how far it may be off.
+
+Read as a Gaussian process, the field is a priori f ~ GP(mean, K) and the rows of the data have
+independent noise of variance σ² = Nλ, times their squared relative noise. What is left after the
+data is Gaussian again. With c(x) the covariances of the rows with what is asked at x,
+
+    Cov[f(x), f(z) | y] = K(x, z) − c(x)ᵀ A⁻¹ c(z),     A = G + σ²I,
+
+and the same for differences of H, whose c and prior covariances come from k itself.
+"""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from hamkernel import _require as require
+from hamkernel._fields.base import AbstractField, potential_of, root
+from hamkernel._kernels.base import Invariance
+from hamkernel._kernels.transforms import symmetry_removed
+from hamkernel._machine.threads import one_blas_thread
+from hamkernel._observations.blocks import Components, Values
+from hamkernel._observations.kinds import AbstractObservations, observations, rows_of_data
+from hamkernel._show import text
+from hamkernel._solvers.cholesky import AbstractSolver, Cholesky
+from hamkernel._solvers.conditional import AbstractConditional
+from hamkernel._solvers.fit import check_solver, checked_rows
+from hamkernel._solvers.means import Mean, with_mean, without_mean
+from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+
+
+@one_blas_thread
+def condition(
+    K: AbstractMatrixKernel,
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
+    regularization: ArrayLike = 1e-4,
+    *,
+    solver: AbstractSolver | None = None,
+    mean: Mean | None = None,
+) -> Posterior:
+    """The Gaussian process with prior GP(mean, K), given data: `fit` that keeps its factor.
+
+    Its field is that of `fit`. How far that may be off is told in the units of the data, and only
+    as well as the amplitude of K and λ are: tune both by the marginal likelihood first,
+
+        tuned = hk.tune(hk.Symplectic(1.0 * k), X, Y, objective="marginal_likelihood")
+        posterior = hk.condition(tuned.kernel, X, Y, tuned.regularization)
+
+    They are plugged in as if they were known, so that bands are somewhat too narrow, and those of
+    orbits more than those of H.
+
+    Args:
+        K: a matrix-valued kernel, with an amplitude: `2.0 * k`.
+        X: states, shape (N, n); or observations, and then there is no Y.
+        Y: velocities, shape (N, n).
+        regularization: λ > 0; Nλ is the variance of the noise of a row of relative noise 1.
+        solver: `Cholesky()` if None, exact, or a solver of low rank: `Nystrom(…)`, whose field is
+            approximate where its landmarks are few, and which claims no knowledge far from them,
+            or `RandomFeatures(…)`, whose prior is that of its features.
+        mean: what is known already, x (n,) -> (n,), as in `fit`.
+
+    Returns:
+        The posterior. O(D³) time and O(D²) memory for D rows, with a solver of rank r O(D r²).
+
+    Raises:
+        TypeError: conjugate gradients, which keep no factor; else as in `fit`.
+        ValueError, AttributeError, RuntimeError: as in `fit`.
+
+    Warns:
+        UserWarning: the amplitude of K is exactly 1, as that of built-in kernels is before tuning.
+    """
+    K = matrix_kernel(K)
+    check_solver(solver)
+    solver = Cholesky() if solver is None else solver
+    if solver.no_factor:
+        raise TypeError(solver.no_factor)
+    rows, regularization, mean = checked_rows(K, X, Y, regularization, mean)
+    _warn_of_amplitude(K, rows.points)
+    given = solver._given(K, without_mean(K, rows, mean), regularization)
+    return Posterior(given, with_mean(given.field, mean))
+
+
+class Posterior(eqx.Module):
+    """A field learned from data, and how far it may be off; made by `condition`.
+
+    It is a PyTree. Its methods take one state, and work under jit, vmap and, with respect to
+    states, under grad.
+
+    Attributes:
+        given: what the solver keeps of the data, less the mean.
+        field: the mean of all fields that agree with the data, as `fit` gives it.
+    """
+
+    given: AbstractConditional
+    field: AbstractField
+
+    # For jax.jit of its methods, as of fields.
+    def __hash__(self) -> int:
+        return id(self)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def __repr__(self) -> str:
+        rows = self.given.rows
+        return f"Posterior(rows={rows.size}, dimension={rows.dimension}, field={text(self.field)})"
+
+    def covariance(self, x: Num[ArrayLike, " n"]) -> Float[Array, "n n"]:
+        """The covariance of the components of f(x), given the data, in squared units of Y.
+
+        Args:
+            x: one state, shape (n,).
+
+        Raises:
+            ValueError: x is no single state of this dimension.
+        """
+        x = self.field._state(x)
+        here = Components(x[None])
+        return self.given.covariance(here, here)
+
+    def deviation(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+        """The standard deviation of each component of f(x), given the data, in units of Y.
+
+        Of the field, not of a new measurement, which has the noise Nλ besides.
+
+        Args:
+            x: one state, shape (n,).
+
+        Raises:
+            ValueError: x is no single state of this dimension.
+        """
+        return jnp.stack([root(variance) for variance in jnp.diagonal(self.covariance(x))])
+
+    def energy_deviation(
+        self, x: Num[ArrayLike, " n"], x0: Num[ArrayLike, " n"]
+    ) -> Float[Array, ""]:
+        """The standard deviation of H(x) − H(x₀), or of that difference of another potential.
+
+        Args:
+            x: one state, shape (n,).
+            x0: the state that energies are counted from, shape (n,).
+
+        Raises:
+            AttributeError: the structure, or the mean, has no potential (with the reason).
+            ValueError: a state does not fit.
+        """
+        K = self.field.kernel
+        K.check_potential()
+        if self.field.mean is not None:
+            potential_of(self.field.mean, K)
+        both = Values(jnp.stack([self.field._state(x), self.field._state(x0)]))
+        change = jnp.array([1.0, -1.0], both.points.dtype)
+        return root(change @ self.given.covariance(both, both) @ change)
+
+    def updated(
+        self,
+        X: Num[ArrayLike, "M n"] | AbstractObservations,
+        Y: Num[ArrayLike, "M n"] | None = None,
+    ) -> Posterior:
+        """The posterior that has seen more data: that of conditioning on all, at less cost.
+
+        The variance of a row stays, σ² = Nλ, and so λ becomes σ² over the number of all
+        observations. O(D² M) time for M new rows.
+
+        Args:
+            X: states, shape (M, n), or observations, and then there is no Y.
+            Y: velocities, shape (M, n).
+
+        Raises:
+            ValueError: the new data has another n, or does not fit itself. RuntimeError: the new
+                rows are so close to the old ones that the factor fails.
+        """
+        data, old = observations(X, Y), self.given.rows
+        if data.dimension != old.dimension:
+            raise ValueError(
+                f"the new data has {data.dimension} coordinates and the posterior {old.dimension}: "
+                "both must be of one system."
+            )
+        new = rows_of_data(data, beside=old)
+        if new.targets.dtype != old.targets.dtype:
+            raise TypeError(
+                f"the new data is {new.targets.dtype} and the posterior {old.targets.dtype}: cast "
+                "one of them."
+            )
+        K, mean = self.field.kernel, self.field.mean
+        given = self.given.updated(without_mean(K, new, mean))
+        return Posterior(given, with_mean(given.field, mean))
+
+
+def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
+    """Say so where k(x, x) = 1 to the last digit, as of built-in kernels that nobody scaled."""
+    if not require.is_concrete(K, X):
+        return
+    x = X[0]
+    for k in K.scalar_kernels:
+        found = symmetry_removed(k)
+        k = k if found is None else found.kernel
+        if Invariance.TRANSLATION in k.invariance and np.asarray(k(x, x)) == 1.0:
+            require.warn(
+                f"the amplitude of {k!r} is exactly 1, that of a kernel nobody tuned, and "
+                "deviations are proportional to it. Write 1.0 * k and tune it by "
+                "hk.tune(..., objective='marginal_likelihood')."
+            )
+            return
