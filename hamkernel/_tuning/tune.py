@@ -61,7 +61,7 @@ class Tuned(eqx.Module):
         converged: whether the run that found the best point met the tolerances, shape ().
         steps: the number of its optimiser steps, shape ().
         at_bounds: the names of the hyperparameters that rest on a bound of the search box. The
-            data prefers values beyond it: see "How to choose" in the README.
+            data prefers values beyond it: see notebooks/guide_choose.ipynb.
         start_losses: the loss on all data at the end of the run from each start, shape (starts,):
             in the order of the starts, the caller's kernel first, or, where the runs were made on
             a subset or are finished with a low-rank loss, in ascending order before that.
@@ -197,7 +197,7 @@ def tune(
     if not found.value < np.inf:
         raise RuntimeError(
             "the objective is not finite at any start. Likely causes, in order: a kernel that "
-            "is not positive definite or not finite (hk.check_kernel(k, X) tells); bounds in "
+            "is not positive definite or not finite (hk.check_kernel(k, X) finds out); bounds in "
             "which no fit succeeds (pass bounds={'regularization': (low, high)} with a larger "
             "low); an objective of your own that returns NaN."
         )
