@@ -151,7 +151,7 @@ def solved(K, log_noise, S, rows: Rows, spread) -> Solution:
     inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype), lower=True)
     used = len(w) - jnp.sum(inverse**2)  # tr M̃ (I + M̃ᵀM̃)⁻¹ M̃ᵀ
     started = rows.counts.any(axis=(1, 2)).sum() * U.shape[1]
-    free = (rows.counts > 0).sum() - started - used
+    free = ((rows.counts > 0).sum() - started).astype(used.dtype) - used
     return Solution(w, (made.T @ w).reshape(S.shape), moves, free)
 
 

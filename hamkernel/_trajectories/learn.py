@@ -21,6 +21,7 @@ from hamkernel._trajectories.learned import (
     Learned,
     Step,
     empty,
+    explains,
     interpolated,
     misfits,
     warn_of_dropped,
@@ -28,12 +29,12 @@ from hamkernel._trajectories.learned import (
 )
 from hamkernel._trajectories.prepared import check_identifiable, prepared
 from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.shooting import LONG, SHORT, Piece, cuts, halved
+from hamkernel._trajectories.shooting import SHORT, Piece, cuts, grown, halved
 from hamkernel._trajectories.start import box_of, landmarks, sampled, with_amplitude
 
 _WIDE = 100.0  # standard deviations of the states: the prior of a start
 _SHORT_ROUNDS = 2  # iterations with short segments, in which a rough field stays near the samples
-_MOST = 10  # iterations; 4 or 5 are the rule
+_MOST = 8  # iterations; 4 or 5 are the rule
 _SETTLED = 0.01  # of log σ, and of the objective by degree of freedom
 
 
@@ -64,8 +65,8 @@ def learn(
         noise: the standard deviation of the sensor noise, in units of the states, a number or one
             for each coordinate, shape (n,), if it is known. Then a field that does not explain the
             runs is noticed. If None it is found.
-        solver: `hk.Nystrom(max_points=…)` sets how many landmarks carry the field; if None, 64 for
-            n = 2 and 128 for n = 4, which cover the paths evenly.
+        solver: `hk.Nystrom(max_points=…)` sets how many landmarks carry the field; if None, 48 for
+            n = 2 and 80 for n = 4, which cover the paths evenly.
         progress: show a progress bar (tqdm).
 
     Returns:
@@ -111,8 +112,10 @@ def _iterated(
     pieces: list[Piece] = []
     bar = tqdm(range(_MOST), "learning", disable=None if progress else True)
     for i in bar:
-        if i <= _SHORT_ROUNDS:
-            wanted = cuts(task.data.runs, SHORT if i < _SHORT_ROUNDS else LONG)
+        if i < _SHORT_ROUNDS:
+            wanted = cuts(task.data.runs, SHORT)
+        elif i == _SHORT_ROUNDS:
+            wanted = grown(task.data.runs, pieces, now.good)
         else:
             wanted = halved(pieces, now.good)
         before, same, pieces = now.model.log_noise, wanted == pieces, wanted
@@ -156,9 +159,10 @@ def _learned(
     misfit = misfits(runs, states, noise)
     chi_squared = now.squares / max(now.free, 1.0)
     warn_of_dropped(kept)
-    if given:
-        warn_of_misfit(chi_squared, now.free, misfit)
-    if not converged:
+    explained = not given or explains(chi_squared, now.free)
+    if not explained:
+        warn_of_misfit(chi_squared, misfit)
+    if explained and not converged:
         require.warn(
             f"learning stopped after {_MOST} iterations with noise or objective still moving: see "
             ".history. The field may be usable; more samples a swing, or a kernel closer to the "

@@ -100,27 +100,25 @@ def misfits(runs: Runs, states: list[np.ndarray], noise: np.ndarray) -> np.ndarr
     return np.array(out)
 
 
-def warn_of_misfit(chi_squared: float, free: float, misfit: np.ndarray) -> None:
-    """Say where the structure does not explain the runs at the noise that was given.
+def explains(chi_squared: float, free: float) -> bool:
+    """Whether χ² per degree of freedom is what noise of the given size leaves."""
+    return chi_squared <= 1 + _CURVATURE + _SIGMAS * np.sqrt(2 / max(free, 1.0))
 
-    Args:
-        chi_squared: per degree of freedom.
-        free: the degrees of freedom.
-        misfit: as in `Learned`.
-    """
+
+def warn_of_misfit(chi_squared: float, misfit: Float[np.ndarray, "R n"]) -> None:
+    """Say that the structure does not explain the runs at the noise that was given, and where."""
     causes = (
         "Likely causes, in order: a part of the motion that the kernel cannot have, such as "
         "friction (add hk.CurlFree or use hk.PortHamiltonian); (q, q̇) given where (q, p) is needed "
         "(masses=True finds the ratios of constant masses); units that do not fit each other; a jump "
         "or a push in a run."
     )
-    if chi_squared > 1 + _CURVATURE + _SIGMAS * np.sqrt(2 / max(free, 1.0)):
-        run, c = np.unravel_index(np.nanargmax(misfit), misfit.shape)
-        require.warn(
-            f"the structure does not explain the runs: χ² is {chi_squared:.3g} per degree of "
-            f"freedom at the noise given, and should be 1. The residuals are largest in coordinate "
-            f"{c} of run {run}, {misfit[run, c]:.2g} σ. {causes}"
-        )
+    run, c = np.unravel_index(np.nanargmax(misfit), misfit.shape)
+    require.warn(
+        f"the structure does not explain the runs: χ² is {chi_squared:.3g} per degree of freedom at "
+        f"the noise given, and should be 1. The residuals are largest in coordinate {c} of run "
+        f"{run}, {misfit[run, c]:.2g} σ. {causes}"
+    )
 
 
 def warn_of_dropped(kept: np.ndarray) -> None:

@@ -20,9 +20,9 @@ from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.smoothing import Coordinate, processes, smoothed
 
 # Of the lengthscale in time, between samples that are kept. A pendulum of frequency ω has a
-# lengthscale near 2.7/ω, so these are 15 samples a radian, where three Gauss nodes in an interval
-# and the average of a sine over it are exact to 1e-7 and 2e-4.
-_DENSE = 0.025
+# lengthscale near 2.7/ω, so these are 23 samples a swing; three Gauss nodes in such an interval are
+# exact to 1e-8, and samples at 5 Hz of a pendulum of period 2.6 are left as they are.
+_DENSE = 0.1
 
 
 class Run(NamedTuple):

@@ -38,6 +38,13 @@ def cuts(runs: list[Run], most: int) -> list[Piece]:
     return pieces
 
 
+def grown(runs: list[Run], pieces: list[Piece], good: Bool[np.ndarray, " S"]) -> list[Piece]:
+    """Runs of which all pieces are good as a whole, up to `LONG` samples; the others as they are."""
+    lost = {piece.run for piece, is_good in zip(pieces, good, strict=True) if not is_good}
+    whole = [piece for piece in cuts(runs, LONG) if piece.run not in lost]
+    return whole + [piece for piece in pieces if piece.run in lost]
+
+
 def halved(pieces: list[Piece], good: Bool[np.ndarray, " S"]) -> list[Piece]:
     """The pieces, those that are not good in halves where they are long."""
     out = []

@@ -1,0 +1,249 @@
+"""`learn`: its rows against generalised least squares, its fields against the truth."""
+
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.stats
+
+import hamkernel as hk
+from hamkernel._trajectories.evidence import Model, _loss, losses, solved
+from hamkernel._trajectories.flow import NODES, WEIGHTS, simulated
+from hamkernel._trajectories.rows import Segments, frozen, linearised
+
+K = hk.Symplectic(hk.Gaussian(1.0))
+PENDULUM = hk.systems.Pendulum(1.0, 1.0, 6.0)
+
+
+def logs(field=PENDULUM, noise=0.05, seed=0, count=6, samples=30, spread=2.0):
+    """Runs of 6 s: times, noisy states, true states."""
+    rng = np.random.default_rng(seed)
+    ts = np.linspace(0, 6, samples)
+    starts = jnp.asarray(rng.uniform(-spread, spread, (count, 2)))
+    true = jax.vmap(lambda x: hk.simulate(field, x, jnp.asarray(ts)).ys)(starts)
+    true = list(np.asarray(true))
+    return [ts] * count, [x + noise * rng.standard_normal(x.shape) for x in true], true
+
+
+def field_error(field, true, system=PENDULUM):
+    X = jnp.asarray(np.concatenate(true))
+    f, g = (np.asarray(jax.vmap(each)(X)) for each in (system, field))
+    return np.sqrt(np.mean((f - g) ** 2) / np.mean(f**2))
+
+
+# The rows.
+
+
+def one_segment(seed=0, T=7):
+    """A rough path, samples that have nothing to do with it, and rows with the identity for Φ."""
+    rng = np.random.default_rng(seed)
+    spans = rng.uniform(0.2, 0.5, (1, T - 1))
+    path = rng.standard_normal((1, T, 2))
+    nodes = rng.standard_normal((1, T - 1, 3, 2))
+    slopes = rng.standard_normal((1, T - 1, 3, 2))
+    measured = rng.standard_normal((1, T, 2))
+    arrays = (jnp.asarray(a) for a in (spans, measured, np.ones_like(path), path[:, 0]))
+    segments = Segments(*arrays)
+    none = jnp.zeros((1, T - 1, 2, 2))
+    as_path = frozen(jnp.asarray(path), jnp.asarray(nodes), segments.spans, none)
+    rows = linearised(
+        as_path,
+        jnp.asarray(slopes),
+        jnp.zeros_like(slopes),
+        segments,
+        jnp.array([True]),
+        is_solution=False,
+    )
+    return rows, spans[0], nodes[0].reshape(-1, 2), measured[0]
+
+
+def differences(kernel, sigma, spans, nodes, measured):
+    """Generalised least squares on differences: their Gram, their covariance and values."""
+    T = len(measured)
+    weights = np.kron(np.diag(spans) @ np.kron(np.eye(T - 1), WEIGHTS[None]), np.eye(2))
+    G = np.asarray(hk.gram(kernel, nodes)).reshape(nodes.size, nodes.size)
+    D = np.kron(np.diff(np.eye(T), axis=0), np.eye(2))
+    return G, weights, weights @ G @ weights.T + sigma**2 * D @ D.T, D @ measured.reshape(-1)
+
+
+def test_without_a_tangent_rows_are_generalised_least_squares_on_differences():
+    rows, spans, nodes, measured = one_segment()
+    kernel, sigma = hk.Symplectic(1.7 * hk.Gaussian(1.2)), 0.3
+    G, weights, A, d = differences(kernel, sigma, spans, nodes, measured)
+    expected = G @ weights.T @ scipy.linalg.solve(A, d, assume_a="pos")
+    S, spread = jnp.asarray(nodes), jnp.full(2, 1e4)
+    found = solved(kernel, jnp.full(2, np.log(sigma)), S, rows, spread)
+    field = np.einsum("iajb,jb->ia", hk.gram(kernel, nodes, nodes), found.coefficients)
+    np.testing.assert_allclose(field.reshape(-1), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_the_likelihood_is_that_of_the_differences_but_for_a_constant():
+    rows, spans, nodes, measured = one_segment()
+    pairs = [(1.2, 0.3), (0.8, 0.1), (2.5, 0.6)]
+    ours, theirs = [], []
+    for length, sigma in pairs:
+        kernel = hk.Symplectic(1.7 * hk.Gaussian(length))
+        A, d = differences(kernel, sigma, spans, nodes, measured)[2:]
+        theirs.append(-scipy.stats.multivariate_normal(np.zeros(len(d)), A).logpdf(d))
+        model = Model(kernel, jnp.full(2, np.log(sigma)))
+        S, spread = jnp.asarray(nodes), jnp.full(2, 1e4)
+        ours.append(float(losses(model, model.flat[None], S, rows, spread)[0]))
+    np.testing.assert_allclose(np.diff(ours), np.diff(theirs), rtol=1e-6)
+
+
+def test_the_gradient_of_the_likelihood_is_that_of_finite_differences():
+    rows, _, nodes, _ = one_segment(1)
+    model = Model(hk.Symplectic(1.7 * hk.Gaussian(1.2)), jnp.log(jnp.array([0.3, 0.2])))
+    S, spread = jnp.asarray(nodes[::2]), jnp.full(2, 100.0)
+    gradient = jax.grad(lambda h: _loss(model, h, S, rows, spread))(model.flat)
+    h = np.asarray(model.flat)
+    step = 1e-5 * np.eye(len(h))
+    design = jnp.asarray(np.concatenate([h[None] + step, h[None] - step]))
+    up, down = np.asarray(losses(model, design, S, rows, spread)).reshape(2, -1)
+    np.testing.assert_allclose(gradient, (up - down) / 2e-5, rtol=1e-5, atol=1e-6)
+
+
+def test_the_flow_and_its_tangent_are_exact_to_the_tolerance_of_the_integrator():
+    starts = jnp.array([[1.0, 0.5], [-0.3, 1.2]])
+    spans = np.full((2, 4), 0.2)
+    path = simulated(PENDULUM, starts, jnp.asarray(spans), jnp.full(4, 8))
+    ts = jnp.linspace(0, 0.8, 5)
+
+    def flow(x):
+        return hk.simulate(PENDULUM, x, ts).ys
+
+    np.testing.assert_allclose(path.x, jax.vmap(flow)(starts), atol=1e-9)
+    # The tangent of the first interval by central differences.
+    for s in range(2):
+        steps = 1e-5 * np.eye(2)
+        ends = [(flow(starts[s] + h)[1] - flow(starts[s] - h)[1]) / 2e-5 for h in steps]
+        np.testing.assert_allclose(path.across[s, 0], np.stack(ends, axis=1), atol=1e-7)
+        # From a node to the end: the tangent over what is left of the interval.
+        left = simulated(
+            PENDULUM, path.nodes[s, 0, 1][None], jnp.array([[0.2 * (1 - NODES[1])]]), jnp.array([8])
+        )
+        np.testing.assert_allclose(path.to_end[s, 0, 1], left.across[0, 0], atol=1e-9)
+
+
+# What is learned. One shape, so that it is compiled once.
+
+
+@pytest.fixture(scope="module")
+def learned():
+    times, states, true = logs()
+    return hk.learn(K, hk.Runs(times, states)), true
+
+
+def test_a_pendulum_is_learned_from_noisy_states(learned):
+    found, true = learned
+    assert found.converged
+    assert field_error(found.field, true) < 0.04
+    np.testing.assert_allclose(found.noise, 0.05, rtol=0.15)
+    assert np.asarray(found.kept).tolist() == [1.0] * 6
+    # The fitted states are closer to the truth than the measured ones, by far.
+    error = np.sqrt(np.mean((np.stack(found.states) - np.stack(true)) ** 2))
+    assert error < 0.5 * 0.05
+    assert np.nanmax(found.misfit) < 1.6
+    assert found.residuals[0].shape == (30, 2)
+    assert "Symplectic(" in repr(found.kernel)
+    x = jnp.array([0.3, 0.2])
+    gradient = jax.grad(found.field.hamiltonian)(x)
+    np.testing.assert_allclose(found.field(x), [gradient[1], -gradient[0]], atol=1e-10)
+
+
+def test_the_order_of_the_runs_does_not_matter(learned):
+    found, true = learned
+    times, states, _ = logs()
+    order = [3, 1, 5, 0, 2, 4]
+    other = hk.learn(K, hk.Runs(times, [states[i] for i in order]))
+    np.testing.assert_allclose(other.noise, found.noise, rtol=1e-3)
+    X = jnp.asarray(true[0])
+    np.testing.assert_allclose(
+        jax.vmap(other.field)(X), jax.vmap(found.field)(X), rtol=0.01, atol=0.01
+    )
+
+
+def test_a_run_that_is_garbage_is_dropped_and_named():
+    times, states, true = logs()
+    states[2] = 3 * np.random.default_rng(9).standard_normal(states[2].shape)
+    with pytest.warns(UserWarning, match=r"dropped from run 2 \(100%\)"):
+        found = hk.learn(K, hk.Runs(times, states))
+    assert np.asarray(found.kept).tolist() == [1, 1, 0, 1, 1, 1]
+    assert field_error(found.field, true) < 0.05
+    assert all(np.isfinite(x).all() for x in found.states)
+
+
+def damped(x):
+    return PENDULUM(x) - 0.05 * jnp.array([0.0, 1.0]) * x
+
+
+def test_friction_that_the_structure_lacks_is_noticed():
+    times, states, _ = logs(damped, noise=0.01)
+    with pytest.warns(UserWarning, match=r"χ² is .* friction .* unit"):
+        found = hk.learn(K, hk.Runs(times, states), noise=0.01)
+    assert found.chi_squared > 2
+    times, states, _ = logs(noise=0.01)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = hk.learn(K, hk.Runs(times, states), noise=0.01)
+    assert found.chi_squared < 1.2
+    np.testing.assert_array_equal(found.noise, 0.01)
+
+
+def test_two_samples_in_a_run_are_used_and_no_noise_is_no_nan():
+    times, states, true = logs(noise=0.0)
+    times, states = [*times[:5], times[5][:2]], [*states[:5], states[5][:2]]
+    found = hk.learn(K, hk.Runs(times, states))
+    assert field_error(found.field, true[:5]) < 1e-3
+    assert np.isfinite(found.noise).all()
+    assert found.states[5].shape == (2, 2)
+
+
+@pytest.mark.slow
+def test_a_kernel_that_contains_the_truth_finds_it_to_the_tolerance_of_the_integrator():
+    oscillator = hk.systems.HarmonicOscillator(mass=1.0, stiffness=1.5)
+    times, states, true = logs(oscillator, noise=0.0)
+    found = hk.learn(hk.Symplectic(hk.Polynomial(2)), hk.Runs(times, states))
+    assert field_error(found.field, true, oscillator) < 1e-5
+
+
+@pytest.mark.slow
+def test_positions_are_enough_where_the_kinetic_energy_is_known():
+    times, states, true = logs(noise=0.01)
+    only_q = [np.column_stack([x[:, 0], np.full(len(x), np.nan)]) for x in states]
+    U = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0))
+    found = hk.learn(U, hk.Runs(times, only_q), mean=moved_by_momentum)
+    assert field_error(found.field, true) < 0.01
+    assert np.isnan(found.noise[1])
+    p, q = (np.stack([x[:, c] for x in found.states]) for c in (1, 0))
+    assert np.sqrt(np.mean((p - np.stack(true)[:, :, 1]) ** 2)) < 0.02
+    assert np.sqrt(np.mean((q - np.stack(true)[:, :, 0]) ** 2)) < 0.01
+
+
+def moved_by_momentum(x):
+    return jnp.array([x[1], 0.0])
+
+
+def test_what_cannot_be_known_or_meant_is_refused():
+    times, states, _ = logs(samples=5)
+    runs = hk.Runs(times, states)
+    unseen = [np.column_stack([x[:, 0], np.full(len(x), np.nan)]) for x in states]
+    with pytest.raises(ValueError, match="coordinate 1 was measured in no run.*q̇ = p/m"):
+        hk.learn(K, hk.Runs(times, unseen))
+    with pytest.raises(ValueError, match="do not depend on it"):
+        hk.learn(K, hk.Runs(times, unseen), mean=lambda x: jnp.array([x[0], 0.0]))
+    with pytest.raises(TypeError, match=r"learn takes hk.Runs.*hk.fit or hk.tune"):
+        hk.learn(K, states)
+    with pytest.raises(TypeError, match="matrix-valued"):
+        hk.learn(hk.Gaussian(1.0), runs)
+    with pytest.raises(TypeError, match="Nystrom"):
+        hk.learn(K, runs, solver=hk.Cholesky())
+    with pytest.raises(ValueError, match="noise must be positive.*found from the runs"):
+        hk.learn(K, runs, noise=0.0)
+    with pytest.raises(ValueError, match=r"noise has shape \(3,\)"):
+        hk.learn(K, runs, noise=[0.1, 0.1, 0.1])
+    with pytest.raises(ValueError, match="even dimension"):
+        hk.learn(K, hk.Runs(times, [x[:, :1] for x in states]))

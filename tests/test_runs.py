@@ -1,0 +1,164 @@
+"""`Runs`: what is refused, what is said, and the smoother against dense Gaussian processes."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+import hamkernel as hk
+from hamkernel._trajectories.padding import half_octave, padded, power_of_two
+from hamkernel._trajectories.smoother import Process, negative_log_likelihood
+from hamkernel._trajectories.smoothing import centred, processes, smoothed
+
+
+def swings(count=3, noise=0.05, seed=0, missing=False):
+    """Noisy circles at uneven times, of lengths that differ."""
+    rng = np.random.default_rng(seed)
+    times = [np.sort(rng.uniform(0, 8, 25 + r)) for r in range(count)]
+    states = [np.column_stack([np.sin(t + r), np.cos(t + r)]) for r, t in enumerate(times)]
+    states = [x + noise * rng.standard_normal(x.shape) for x in states]
+    if missing:
+        states[0][5:8, 1] = np.nan
+        states[1][3] = np.nan
+    return times, states
+
+
+TIMES, STATES = swings()
+
+
+def changed(run, change):
+    times, states = [t.copy() for t in TIMES], [x.copy() for x in STATES]
+    change(times[run], states[run])
+    return times, states
+
+
+def test_runs_keep_what_came():
+    runs = hk.Runs(TIMES, STATES, inputs=[x[:, :1] for x in STATES])
+    assert len(runs) == 3
+    assert runs.dimension == 2
+    np.testing.assert_array_equal(runs.times[1], TIMES[1])
+    np.testing.assert_array_equal(runs.inputs[2], STATES[2][:, :1])
+    assert repr(runs) == "Runs(3 runs, 78 samples, n=2)"
+    assert len(hk.Runs(TIMES[0], STATES[0])) == 1  # one run as bare arrays
+
+
+def test_what_cannot_be_meant_is_refused():
+    with pytest.raises(ValueError, match="times has 3 runs and states has 2"):
+        hk.Runs(TIMES, STATES[:2])
+    with pytest.raises(ValueError, match="there are no runs"):
+        hk.Runs([], [])
+    with pytest.raises(ValueError, match="run 0 has 1 sample: .* Leave it out"):
+        hk.Runs([TIMES[0][:1]], [STATES[0][:1]])
+    with pytest.raises(ValueError, match=r"times\[1\] must increase; sample 4"):
+        hk.Runs(*changed(1, lambda t, x: t.__setitem__(4, t[3])))
+    with pytest.raises(ValueError, match=r"It seems transposed: states\[0\].T"):
+        hk.Runs([TIMES[0]], [STATES[0].T])
+    with pytest.raises(ValueError, match=r"states\[0\]\[:, None\]"):
+        hk.Runs([TIMES[0]], [STATES[0][:, 0]])
+    with pytest.raises(ValueError, match="contains inf"):
+        hk.Runs(*changed(2, lambda t, x: x.__setitem__((1, 1), np.inf)))
+    with pytest.raises(ValueError, match=r"times\[0\] contains NaN"):
+        hk.Runs(*changed(0, lambda t, x: t.__setitem__(2, np.nan)))
+    with pytest.raises(ValueError, match=r"\[1, 2\] coordinates"):
+        hk.Runs(TIMES, [STATES[0], STATES[1][:, :1], STATES[2]])
+    with pytest.raises(ValueError, match="nothing was measured in run 2"):
+        hk.Runs(*changed(2, lambda t, x: x.fill(np.nan)))
+    with pytest.raises(TypeError, match="must hold real numbers"):
+        hk.Runs([TIMES[0]], [np.full(STATES[0].shape, "a")])
+
+
+def test_a_wrapped_angle_is_named_with_its_cure():
+    t = np.linspace(0, 10, 60)
+    angle = np.column_stack([(2 * t) % (2 * np.pi), np.full(60, 2.0) + 0.1 * np.sin(t)])
+    with pytest.warns(UserWarning, match=r"coordinate 0 of run 0 jumps by about 2π.*np\.unwrap"):
+        hk.Runs(t, angle)
+    hk.Runs(t, np.column_stack([np.unwrap(angle[:, 0]), angle[:, 1]]))  # no warning: an error here
+
+
+def test_gaps_and_constant_columns_are_named():
+    t = np.concatenate([np.linspace(0, 1, 20), np.linspace(5, 6, 20)])
+    with pytest.warns(UserWarning, match=r"a gap of 4 in run 0, at a median spacing of 0\.0526"):
+        hk.Runs(t, np.column_stack([np.sin(t), np.cos(t)]))
+    with pytest.warns(UserWarning, match=r"constant in all runs: coordinate 1 \(always 3\)"):
+        hk.Runs(TIMES[0], np.column_stack([np.sin(TIMES[0]), np.full(len(TIMES[0]), 3.0)]))
+
+
+def dense(coordinate, t, s):
+    """The Matérn-7/2 kernel of a process, in closed form."""
+    r = np.exp(float(coordinate.process.log_rate)) * np.abs(t[:, None] - s[None])
+    k = np.exp(-r) * (1 + r + 2 * r**2 / 5 + r**3 / 15)
+    return np.exp(2 * float(coordinate.process.log_amplitude)) * k
+
+
+def test_the_smoother_is_a_dense_gaussian_process_with_missing_entries():
+    times, states = swings(missing=True)
+    found = processes(times, states)
+    paths = smoothed(found, times, states)
+    inside, means = centred(states)
+    for r, t in enumerate(times):
+        for c, coordinate in enumerate(found):
+            seen = np.isfinite(states[r][:, c])
+            y, own = inside[r][seen, c], t[seen]
+            A = dense(coordinate, own, own) + coordinate.noise**2 * np.eye(len(own))
+            to = dense(coordinate, t, own)
+            value = means[r, c] + to @ np.linalg.solve(A, y)
+            variance = np.diag(dense(coordinate, t, t) - to @ np.linalg.solve(A, to.T))
+            T = len(t)
+            np.testing.assert_allclose(paths.value[r, :T, c], value, atol=1e-9)
+            np.testing.assert_allclose(paths.deviation[r, :T, c] ** 2, variance, atol=1e-9)
+            # The slope, by differences of the dense mean.
+            later, sooner = (
+                dense(coordinate, t + h, own) @ np.linalg.solve(A, y) for h in (1e-5, -1e-5)
+            )
+            np.testing.assert_allclose(paths.slope[r, :T, c], (later - sooner) / 2e-5, atol=1e-6)
+
+
+def test_the_likelihood_is_that_of_scipy():
+    t, y = TIMES[0], STATES[0][:, 0]
+    process = Process(*(jnp.asarray(np.log(v)) for v in (0.9, 0.8, 0.07)))
+    coordinate = type("Coordinate", (), {"process": process})
+    A = dense(coordinate, t, t) + 0.07**2 * np.eye(len(t))
+    expected = -scipy.stats.multivariate_normal(np.zeros(len(t)), A).logpdf(y)
+    steps = np.diff(t, prepend=t[0])
+    seen = np.ones(len(t), bool)
+    args = (jnp.asarray(a)[None] for a in (steps, y, seen))
+    np.testing.assert_allclose(negative_log_likelihood(process, *args), expected, rtol=1e-9)
+
+
+def test_velocities_are_those_of_the_motion():
+    X, Y, labels = hk.Runs(TIMES, STATES).velocities()
+    true = np.concatenate(
+        [np.column_stack([np.cos(t + r), -np.sin(t + r)]) for r, t in enumerate(TIMES)]
+    )
+    assert X.shape == Y.shape == (78, 2)
+    np.testing.assert_array_equal(labels, np.repeat([0, 1, 2], [25, 26, 27]))
+    error = np.sqrt(np.mean((np.asarray(Y) - true) ** 2))
+    naive = np.concatenate([np.gradient(x, t, axis=0) for t, x in zip(TIMES, STATES, strict=True)])
+    assert error < 0.12
+    assert error < 0.3 * np.sqrt(np.mean((naive - true) ** 2))  # uneven times
+    noises = [c.noise for c in processes(TIMES, STATES)]
+    np.testing.assert_allclose(noises, 0.05, rtol=0.25)
+
+
+def test_velocities_of_what_was_never_measured_are_refused():
+    unseen = [np.column_stack([x[:, 0], np.full(len(x), np.nan)]) for x in STATES]
+    with pytest.raises(ValueError, match="coordinate 1 was measured in no run"):
+        hk.Runs(TIMES, unseen).velocities()
+
+
+def test_runs_are_padded_to_few_shapes():
+    assert [power_of_two(n) for n in (1, 2, 3, 33, 64)] == [1, 2, 4, 64, 64]
+    assert [half_octave(n) for n in (1, 3, 5, 6, 7, 9, 13, 50)] == [1, 3, 6, 6, 8, 12, 16, 64]
+    runs = padded(TIMES, STATES)
+    assert runs.states.shape == (3, 32, 2)
+    assert not runs.seen[0, 25:].any()
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_samples_are_smoothed():
+    t = np.arange(100_000) * 1e-3
+    x = np.column_stack([np.sin(t), np.cos(t)])
+    noisy = x + 0.01 * np.random.default_rng(0).standard_normal(x.shape)
+    X, Y, _ = hk.Runs(t, noisy).velocities()
+    assert np.abs(np.asarray(X) - x).max() < 5e-3
+    assert np.sqrt(np.mean((np.asarray(Y)[:, 0] - x[:, 1]) ** 2)) < 5e-3
