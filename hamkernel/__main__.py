@@ -49,10 +49,10 @@ def _plan(out: str, seeds: int, tune: bool) -> str:
     first = _FIXED_MINUTES + (_MINUTES - _FIXED_MINUTES) * seeds / 100
     lines = [
         f"Reproducing Smith & Egeland (2023) with {seeds} noise seed{'s' * (seeds > 1)}:",
-        f"  fits and tables, then figures: about {first:.1f} minutes",
+        f"  fits and tables, then figures: about {first:.1f} min",
     ]
     if tune:
-        lines.append(f"  hyperparameters tuned on their data: about {_TUNING_MINUTES:.1f} minute")
+        lines.append(f"  hyperparameters tuned on their data: about {_TUNING_MINUTES:.1f} min")
     lines.append(f"on two quiet cores. Files go to {out}/.")
     return "\n".join(lines)
 
