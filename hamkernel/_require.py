@@ -323,6 +323,12 @@ def data(X: ArrayLike, Y: ArrayLike) -> tuple[Float[Array, "N n"], Float[Array, 
             f"X has shape {X.shape} and Y has shape {Y.shape}: they must be equal, "
             "one velocity Y[i] for each state X[i]."
         )
+    N, n = X.shape
+    if N < n and N > 1:
+        warn(
+            f"X has shape {X.shape}: {N} points of {n} coordinates, fewer points than coordinates. "
+            "If it holds one coordinate a row, pass X.T and Y.T: shape (N, n), one state a row."
+        )
     X, Y = one_dtype(X, Y)
     single_or_double(X.dtype, "X and Y have")
     return finite(X, "X"), finite(Y, "Y")

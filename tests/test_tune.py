@@ -13,6 +13,8 @@ import optimistix as optx
 import pytest
 
 import hamkernel as hk
+from hamkernel._tuning.advice import warn_of_free_scale
+from hamkernel._tuning.objective import criterion_of
 from hamkernel._tuning.space import SearchSpace
 
 N = 15
@@ -397,6 +399,98 @@ def test_velocities_of_very_different_sizes_are_warned_of():
         hk.tune(SIMPLE, X, Y * scale, starts=1)
 
 
+def test_hyperparameters_have_the_names_of_the_bounds_and_the_values_of_the_kernel(rich):
+    _, _, _, tuned = rich
+    assert list(tuned.hyperparameters) == list(tuned.bounds)
+    inner = tuned.kernel.terms[0].kernel
+    np.testing.assert_allclose(
+        tuned.hyperparameters["terms[0].kernel.kernel.lengthscale"], inner.kernel.lengthscale
+    )
+    np.testing.assert_allclose(tuned.hyperparameters["terms[0].kernel.scale"], inner.scale)
+    np.testing.assert_allclose(
+        tuned.hyperparameters["terms[1].kernel.fn.w"], tuned.kernel.terms[1].kernel.fn.w
+    )
+    assert tuned.hyperparameters["regularization"] == tuned.regularization
+    for name, value in tuned.hyperparameters.items():
+        low, high = tuned.bounds[name]
+        assert (np.asarray(value) >= low * (1 - 1e-6) - 1e-6 * abs(low)).all()
+        assert (np.asarray(value) <= high * (1 + 1e-6)).all()
+
+
+def test_of_a_vector_the_coordinate_at_a_bound_is_named():
+    # H does not depend on q.
+    X, _ = scattered()
+    Y = np.stack([np.sin(X[:, 1]), np.zeros(N)], axis=1)
+    space = SearchSpace(
+        hk.Symplectic(hk.Gaussian(np.ones(2))),
+        jnp.asarray(X),
+        jnp.asarray(Y),
+        jnp.asarray(1e-3),
+        (),
+        {"lengthscale[1]": (0.1, 1.0)},
+    )
+    np.testing.assert_allclose(np.exp(space.high[1]), 1.0)
+    assert np.exp(space.high[0]) > 10
+    assert space.at_bounds(np.array([0.1, np.pi / 2, 0.0])) == ("kernel.lengthscale[1]",)
+    assert space.at_bounds(np.array([-np.pi / 2, 0.0, np.pi / 2])) == (
+        "kernel.lengthscale[0]",
+        "regularization",
+    )
+
+
+FREE = [
+    hk.Symplectic(2.0 * hk.Gaussian()),
+    hk.Symplectic(hk.Gaussian() * (2.0 * hk.Polynomial(1))),
+    hk.Odd(hk.Symplectic(2.0 * hk.Gaussian() + 3.0 * hk.Matern(2.5))),
+    hk.Sum(energy=hk.Symplectic(2.0 * hk.Gaussian()), rest=hk.CurlFree(1.0 * hk.Gaussian())),
+]
+FIXED = [SIMPLE, hk.Symplectic(2.0 * hk.Gaussian() + hk.Matern(2.5))]
+
+
+def test_a_scale_that_cross_validation_does_not_see_is_warned_of():
+    X, Y = map(jnp.asarray, scattered())
+
+    def said(K, frozen=(), objective="cross_validation", bounds=None):
+        space = SearchSpace(K, X, Y, jnp.asarray(1e-3), frozen, bounds or {})
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            warn_of_free_scale(space, criterion_of(objective, N, 5))
+        return [str(each.message) for each in caught]
+
+    for K in FREE:
+        (message,) = said(K)
+        assert "their ratios" in message
+        assert not said(K, frozen=("regularization",))
+        assert not said(K, frozen=("scale",))
+        assert not said(K, objective="marginal_likelihood")
+        assert not said(K, bounds={"regularization": (1e-3, 1e3)})
+    assert not any(map(said, FIXED))
+    # It is so: a factor of both changes no loss.
+    losses = [
+        hk.cross_validation_loss(hk.Symplectic(c * hk.Gaussian()), X, Y, 1e-3 * c) for c in (1, 7)
+    ]
+    np.testing.assert_allclose(*losses, rtol=1e-10)
+
+
+def test_few_labels_are_warned_of_with_the_alternatives(simple):
+    X, Y = scattered()
+    with pytest.warns(UserWarning, match=r"3 folds.*(.|\n)*'marginal_likelihood'.*'loo'"):
+        hk.tune(SIMPLE, X, Y, folds=np.arange(N) % 3, starts=1, max_steps=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # five blocks, and five labels
+        by_labels = hk.tune(SIMPLE, X, Y, folds=np.repeat(np.arange(5), 3))
+    assert float(by_labels.loss) == float(simple.loss)
+
+
+def test_a_search_that_will_take_long_says_so_and_how_to_shorten_it(monkeypatch, capsys):
+    monkeypatch.setattr("hamkernel._tuning.search._LONG", 1e-9)
+    with pytest.warns(UserWarning, match=r"minutes\. Pass fewer starts than 3"):
+        hk.tune(SIMPLE, *scattered(), starts=3, progress=True)
+    lines = capsys.readouterr().out.splitlines()
+    assert all(line.startswith(f"tune: {N} of {N} points, step ") for line in lines)
+    assert "of 3 runs, best loss 0.0" in lines[-1]
+
+
 def test_bounds_of_lambda_that_float64_cannot_carry_are_refused():
     with pytest.raises(ValueError, match=r"can be solved with in float64.*at least"):
         hk.tune(SIMPLE, *scattered(), bounds={"regularization": (1e-30, 1e-20)})
@@ -489,7 +583,7 @@ def test_an_objective_may_have_any_size(size, simple):
 @pytest.mark.slow
 def test_a_loss_may_be_given_by_its_function_and_keeps_the_folds():
     X, Y = scattered()
-    labels = np.arange(N) % 3
+    labels = np.arange(N) % 5
     named = hk.tune(SIMPLE, X, Y, folds=labels, starts=2)
     given = hk.tune(SIMPLE, X, Y, folds=labels, starts=2, objective=hk.cross_validation_loss)
     assert given.loss == named.loss

@@ -24,6 +24,7 @@ from hamkernel._dynamics.inputs import (
     refuse_missing,
     refuse_symplectic,
 )
+from hamkernel._dynamics.rounding import rounding
 
 if TYPE_CHECKING:
     import diffrax
@@ -90,7 +91,9 @@ def simulate(
             `GaussLegendre4`, `GaussLegendre6` for every H; `StormerVerlet`, `Yoshida4` for
             H = T(p) + U(q).
         dt: the largest step; required by a symplectic solver.
-        rtol: relative tolerance of the adaptive step: 1e-10 if None, 1e-5 in float32.
+        rtol: relative tolerance of the adaptive step. If None, 1e-10, and 1e-5 in float32; of a
+            learned field no less than its rounding at x0, ε ‖Σⱼ |K(x0, xⱼ) aⱼ|‖ / ‖f(x0)‖, and at
+            most 1e-6: steps that are asked for more digits than the field has are all rejected.
         atol: absolute tolerance, likewise, in the units of x.
         max_steps: the most steps of the whole solve, or between two saved times where `dt` is given
             and it or `ts` is traced. If None, enough where the number is known, else 2²⁰. It bounds
@@ -158,7 +161,9 @@ def simulate(
 
     if dt is None:
         counts = None
-        default = 1e-10 if x0.dtype == jnp.float64 else 1e-5
+        default = jnp.asarray(1e-10 if x0.dtype == jnp.float64 else 1e-5, x0.dtype)
+        if rtol is None or atol is None:
+            default = jnp.maximum(default, rounding(field, x0))
         # Steps end on ts: the interpolant of Dopri8 is of lower order, and was measured to break
         # the conservation of energy by 1e-7 where the steps themselves keep it to 1e-10.
         controller = diffrax.ClipStepSizeController(
@@ -286,9 +291,10 @@ def _check_solver(solver: Any, dt: Any, rtol: float | None, atol: float | None) 
         )
 
 
-def _tolerance(name: str, given: float | None, default: float, dtype: Any) -> Float[Array, ""]:
+def _tolerance(name: str, given: float | None, default: Array, dtype: Any) -> Float[Array, ""]:
     """An array, because a number in a compiled program would compile anew for every value."""
-    given = default if given is None else given
+    if given is None:
+        return default
     with _eager(given):
         return require.positive_scalar(given, name).astype(dtype)
 

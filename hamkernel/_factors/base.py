@@ -54,9 +54,17 @@ class AbstractInverse(eqx.Module, Generic[System]):
         groups: list[Group],
         V: list[Float[Array, "F s"]],
         R: list[Float[Array, "F s"]],
-        a_bar: Float[Array, " D"],
+        bars: tuple[Float[Array, " D"], Float[Array, " D"]],
     ) -> tuple[System, Float[Array, " D"]]:
-        """The cotangent for Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − w aᵀ, and w = C (v + ā)."""
+        """The cotangent for Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − w aᵀ, and w = C (v + ā).
+
+        Args:
+            a: A⁻¹y.
+            groups: of the folds S.
+            V: v_S = (C_SS)⁻¹ r̄_S.
+            R: r_S = (C_SS)⁻¹ a_S.
+            bars: r̄ and ā.
+        """
 
 
 class AbstractFactor(eqx.Module, Generic[System]):

@@ -164,13 +164,13 @@ class DenseInverse(AbstractInverse[DenseSystem]):
             A_bar = A_bar + square * (self.C @ self.C)
         return DenseSystem(A_bar)
 
-    def pulled_folds(self, a, groups, V, R, a_bar) -> tuple[DenseSystem, Float[Array, " D"]]:
+    def pulled_folds(self, a, groups, V, R, bars) -> tuple[DenseSystem, Float[Array, " D"]]:
         P, Q = [], []  # C_:S v_S and C_:S r_S, a column for each fold
         for group, v, r in zip(groups, V, R, strict=True):
             rows = group.gather(self.C)  # whose sums are three times faster than those of columns
             P.append(jnp.einsum("fid,fi->df", rows, v))
             Q.append(jnp.einsum("fid,fi->df", rows, r))
-        w = jnp.concatenate(P, axis=1).sum(axis=1) + self.C @ a_bar
+        w = jnp.concatenate(P, axis=1).sum(axis=1) + self.C @ bars[1]
         left, right = jnp.column_stack([*P, -w]), jnp.column_stack([*Q, a])
         # Else XLA computes these sums again for every entry of the product: 10 times slower.
         left, right, w = jax.lax.optimization_barrier((left, right, w))

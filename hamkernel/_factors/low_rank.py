@@ -121,7 +121,8 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
             ridge = ridge + square * trace
         return LowRankSystem(rows, ridge)
 
-    def pulled_folds(self, a, groups, V, R, a_bar) -> tuple[LowRankSystem, Float[Array, " D"]]:
+    def pulled_folds(self, a, groups, V, R, bars) -> tuple[LowRankSystem, Float[Array, " D"]]:
+        r_bar, a_bar = bars
         Q, T = self.Q, _right_solve(self.R, self.Q, transposed=True)
         P = jnp.sqrt(self.ridge) * backward(self.R, jnp.eye(len(self.R), dtype=Q.dtype))
         v_all, W, ridge = jnp.zeros_like(a), jnp.zeros_like(Q), jnp.zeros_like(self.ridge)
@@ -131,11 +132,13 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
             each_row = v[..., None] * along_r[:, None] + r[..., None] * along_v[:, None]
             W = group.scattered(each_row, into=W)
             v_all = group.scattered(v, into=v_all)
-            # (C_:S v_S)·(C_:S r_S), with QᵀQ = I − PᵀP
-            own = group.gather(Q)
-            v_Q, r_Q = (jnp.einsum("fsr,fs->fr", own, each) for each in (v, r))
-            dot = jnp.vdot(v, r) - jnp.vdot(v_Q, r_Q) - jnp.vdot(v_Q @ P.T, r_Q @ P.T)
-            ridge = ridge + dot / self.ridge**2
+            # (C_:S v_S)·(C_:S r_S), from C_SS v_S = r̄_S and C_SS r_S = a_S in S, and outside by
+            # t = Q_Sᵀv_S/δ and Q_SᵀQ_S; of v and r alone it would lose the square of the condition.
+            own, fold_a = group.gather(Q), group.gather(a)
+            v_Q, r_Q, a_Q = (jnp.einsum("fsr,fs->fr", own, each) for each in (v, r, fold_a))
+            t_v, t_r = v_Q / self.ridge, r_Q / self.ridge
+            inside = jnp.vdot(group.gather(r_bar), fold_a) + jnp.vdot(t_v, a_Q)
+            ridge = ridge + inside - jnp.vdot(t_v @ P.T, t_r @ P.T)
         w = self.solve(v_all + a_bar)
         less = self.pulled(w, a)
         return LowRankSystem(self.solve(W) - less.rows, ridge - less.ridge), w

@@ -2,9 +2,10 @@
 
 import operator
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -31,6 +32,8 @@ from hamkernel._kernels.groups import (
 )
 from hamkernel._kernels.unchanged import known_unchanged
 from hamkernel._show import call, text
+
+T = TypeVar("T")
 
 
 class Warp(AbstractScalarKernel):
@@ -208,6 +211,18 @@ class Symmetrised(AbstractScalarKernel):
             )
             for support in inner
         )
+
+
+def without_symmetry(tree: T) -> T:
+    """A kernel, or what holds some, before the terms of odd and even ones cancel: what rounds.
+
+    (k(x, z) − k(−x, z))/2 of a long lengthscale is the small difference of large numbers.
+    """
+
+    def is_mean(node: object) -> bool:
+        return isinstance(node, Symmetrised)
+
+    return jax.tree.map(lambda node: node.kernel if is_mean(node) else node, tree, is_leaf=is_mean)
 
 
 def _name_of(given: LinearMap) -> str:

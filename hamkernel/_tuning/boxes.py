@@ -20,7 +20,7 @@ from hamkernel._gram.dense import trace
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance
 from hamkernel._kernels.dot_products import Periodic
 from hamkernel._kernels.functions import Bound
-from hamkernel._kernels.transforms import Select, Symmetrised, Warp
+from hamkernel._kernels.transforms import Select, Warp, without_symmetry
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.controlled import Controlled
 from hamkernel._structures.port_hamiltonian import PortHamiltonian
@@ -86,15 +86,8 @@ gram_trace = eqx.filter_jit(trace)
 
 
 def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
-    """The trace of the Gram before the terms of an odd or even kernel cancel: what rounds.
-
-    (k(x, z) − k(−x, z))/2 of a long lengthscale is the small difference of large numbers.
-    """
-
-    def is_mean(node: object) -> bool:
-        return isinstance(node, Symmetrised)
-
-    terms = jax.tree.map(lambda node: node.kernel if is_mean(node) else node, K, is_leaf=is_mean)
+    """The trace of the Gram before the terms of an odd or even kernel cancel: what rounds."""
+    terms = without_symmetry(K)
     trace = gram_trace(terms, X)
     if Invariance.REFLECTION in terms.invariance:
         return trace  # that of the Gram is no larger
@@ -104,7 +97,8 @@ def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, 
 def _amplitude(K: AbstractMatrixKernel, X: Array, Y: Array) -> float:
     """The factor that gives K(x, x) the size of Y: mean Y² over the mean diagonal."""
     trace = float(gram_trace(K, X))
-    ratio = float(np.mean(np.asarray(Y) ** 2)) * Y.size / trace if trace > 0 else 0.0
+    rows = len(X) * Y.shape[1]
+    ratio = float(np.mean(np.asarray(Y) ** 2)) * rows / trace if trace > 0 else 0.0
     return ratio if np.isfinite(ratio) and ratio > 0 else 1.0
 
 

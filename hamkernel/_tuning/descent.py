@@ -53,15 +53,23 @@ class Descent:
         tolerance: of the value. The run has converged where what the quadratic model still
             promises is less.
         max_steps: of this descent.
+        max_trials: the points that it may ask for after the first, taken as steps or not.
         relative: whether the tolerance is a share of the first value.
     """
 
-    def __init__(self, run: Run, tolerance: float, max_steps: int, relative: bool = False):
+    def __init__(
+        self,
+        run: Run,
+        tolerance: float,
+        max_steps: int,
+        relative: bool = False,
+        max_trials: float = np.inf,
+    ):
         self.run = run
         self.going = True
         self.trial = run.u
         self._tolerance, self._relative = tolerance, relative
-        self._left = max_steps
+        self._left, self._trials = max_steps, max_trials
         self._step = np.zeros_like(run.u)
         if run.slope is not None:
             self._turn()
@@ -69,6 +77,7 @@ class Descent:
     def tell(self, value: float, loss: float, slope: Float[np.ndarray, " P"]) -> None:
         """Take the value at `trial`, and move on."""
         run = self.run
+        self._trials -= run.slope is not None
         if run.slope is None:
             run.value, run.loss, run.slope = value, loss, slope
             if self._relative and 0 < abs(value) < np.inf:
@@ -82,6 +91,7 @@ class Descent:
             self._turn()
         else:
             self._shorten(value)
+        self.going = self.going and self._trials > 0
 
     def _turn(self) -> None:
         """Choose the next direction, or stop."""

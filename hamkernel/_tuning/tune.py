@@ -58,13 +58,16 @@ class Tuned(eqx.Module):
         regularization: the tuned λ, shape ().
         loss: the objective there, shape (); for "marginal_likelihood" the NEGATIVE log density.
         field: the fit to all data with them.
-        converged: whether the run that found the best point met the tolerances, shape ().
+        hyperparameters: the tuned values by the names of `bounds`, in their units.
+        converged: whether the run that found the best point met the tolerance, shape ().
         steps: the number of its optimiser steps, shape ().
-        at_bounds: the names of the hyperparameters that rest on a bound of the search box. The
-            data prefers values beyond it: see notebooks/guide_choose.ipynb.
+        at_bounds: the names of the hyperparameters that rest on a bound of the search box, and of
+            which coordinate: `kernel.lengthscale[1]`. The data prefers values beyond it: see "How
+            to choose" in the README.
         start_losses: the loss on all data at the end of the run from each start, shape (starts,):
             in the order of the starts, the caller's kernel first, or, where the runs were made on
-            a subset or are finished with a low-rank loss, in ascending order before that.
+            a subset or are finished with a low-rank loss, in ascending order; inf of those that
+            were not looked at there.
         bounds: the box that was searched: for each name the lowest and highest value.
     """
 
@@ -104,12 +107,13 @@ def tune(
     """Tune every hyperparameter of K, and λ with them, down the gradient of a validation loss.
 
     The search starts from the given kernel and from `starts` − 1 further points, the best of a
-    space-filling design in the box. All run in one compiled call, on a subset of 64 points (of
-    256/n, with n > 4) if there are more; the best one is then finished on all data, and the best
-    point that any of them saw is returned, or the given one where that is better on all data. New
-    data of the same shape does not recompile, unless `Nystrom` takes another number of landmarks.
-    Data that is spread over devices is gathered on one of them for the search; the field is fitted
-    where the data lies.
+    space-filling design in the box, on a subset of 64 points (of 256/n, with n > 4) if there are
+    more. Where the runs end is compared on all data, together with the given point, and the best is
+    finished there. From 2048/n points on this is done on 1024/n of them, and the best is corrected
+    on all data by three more losses: each takes the time of some ten factorisations. New data of
+    the same shape does not recompile, unless `Nystrom` takes another number of landmarks. Data that
+    is spread over devices is gathered on one of them for the search; the field is fitted where the
+    data lies.
 
     Args:
         K: a matrix-valued kernel; every inexact array leaf is a hyperparameter, and no Python
@@ -117,7 +121,8 @@ def tune(
         X: states, shape (N, n).
         Y: measured velocities, shape (N, n).
         regularization: the first λ.
-        folds: as in `cross_validation_loss`; give trajectory labels for data from trajectories.
+        folds: as in `cross_validation_loss`; give trajectory labels for data from trajectories,
+            if there are five or more. JUDGES
         objective: "cross_validation", "generalized_cross_validation", "marginal_likelihood", or
             a function (K, X, Y, regularization) -> () to minimise. The second ignores fits that
             leave less than a fifth of the residuals free, tr(I − S) < 0.2 N n, since it is 0/0
@@ -133,15 +138,14 @@ def tune(
             the box h ± 10 max(1, |h|), which may be too small, and of both signs: store what is
             positive as `log_…`, whose box is a factor of 1000 to either side, or say its bounds.
         starts: the number of runs.
-        optimiser: an optimistix minimiser. If None, BFGS with tolerance 1e-3, on a subset 1e-2.
-        max_steps: the largest number of steps of one run.
+        optimiser: an optimistix minimiser. If None, BFGS until the loss falls by less than 0.01 %,
+            on the subset 0.1 %.
+        max_steps: the largest number of steps of one run, on each part of the data.
         solver: how the final field is fitted; see `fit`. With `Nystrom` and `RandomFeatures` the
             loss on all points is that of the low-rank fit, in O(N n r) memory; the landmarks are
             those of the best kernel on the subset, and of the tuned one for the field.
-        progress: print each step of the default optimiser, through optimistix's own hook (of one
-            of yours say verbose=True to itself): the logarithm of a loss, or the objective over
-            its first value, and the coordinates u of the search, whose sines go from one end of
-            the box to the other.
+        progress: print a line for each step: on how many points, how many runs go on, and the best
+            loss. Of an optimiser of yours say verbose=True to itself.
         inputs: of a `Controlled` kernel, shape (N, m). An objective of your own gets points (x, u)
             and passes them on, as `hk.fit(K, X, Y, λ)`.
 
@@ -159,11 +163,14 @@ def tune(
 
     Units. A warning comes where the velocities of two coordinates differ 100 times in size: the
     loss, a sum of their squares, hardly sees the smaller one. Another warning names the Python
-    floats in K, which are kept.
+    floats in K, which are kept, and another says that the scale is free, where every term of K has
+    an amplitude and the objective is one of cross-validation.
+
+    Time. A search that will take more than a minute says so before the long part of it.
 
     The ridge. λ is never searched where rounding would decide. Unless `bounds` say what it may be,
-    or it is frozen, it also stays so large that a field fitted to noise is smooth to about 1e-9
-    and can be integrated: a few runs tell how much that is, then all of them search above it.
+    or it is frozen, a wall also keeps cross-validation from fields that round so much that they
+    cannot be integrated, ‖a‖ tr(G) √ε > ‖y‖ for the coefficients a; the likelihood needs none.
     """
     K = matrix_kernel(K)
     frozen = (frozen,) if isinstance(frozen, str) else frozen
@@ -197,7 +204,7 @@ def tune(
     if not found.value < np.inf:
         raise RuntimeError(
             "the objective is not finite at any start. Likely causes, in order: a kernel that "
-            "is not positive definite or not finite (hk.check_kernel(k, X) finds out); bounds in "
+            "is not positive definite or not finite (hk.check_kernel(k, X) tells); bounds in "
             "which no fit succeeds (pass bounds={'regularization': (low, high)} with a larger "
             "low); an objective of your own that returns NaN."
         )

@@ -4,10 +4,13 @@ import abc
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from hamkernel._features.waves import features
+from hamkernel._gram.dense import assemble
+from hamkernel._gram.derivatives import constant
 from hamkernel._solvers.landmark_gram import Columns, whitening
 from hamkernel._solvers.landmarks import given_landmarks
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -42,11 +45,10 @@ class LandmarkBasis(AbstractBasis):
         S = self.points
         landmarks = given_landmarks(K, S)
         # Without a column a fit fails; its features would be those of the zero field.
-        T = jnp.where(landmarks.count == 0, jnp.nan, whitening(K, landmarks))
+        T = jnp.where(landmarks.count == 0, jnp.nan, whitening(constant(K), landmarks))
+        # Only F Fᵀ = G_XS T Tᵀ G_SX matters, and TTᵀ = G_SS⁻¹: dF = dG_XS T − ½ F (Tᵀ dG_SS T)
+        # changes it as the derivative of T would, which rounds by the condition of G_SS.
+        own = T.T @ assemble(K, S, S).reshape(S.size, S.size) @ T
+        T = T - 0.5 * T @ (own - jax.lax.stop_gradient(own))
         columns = Columns(K, S)
-
-        def orthonormal(x):
-            rows = columns(x)
-            return (rows.reshape(-1, rows.shape[-1]) @ T).reshape(rows.shape)
-
-        return orthonormal
+        return lambda x: (columns(x).reshape(x.size, S.size) @ T).reshape(*x.shape, S.size)

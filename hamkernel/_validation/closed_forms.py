@@ -62,12 +62,12 @@ def _held_out_forward(system, y, partition):
 def _held_out_backward(partition, saved, bars):
     C, a, blocks, r, ok = saved
     r_bar, a_bar = bars
-    V = []
+    V, bar = [], r_bar
     for group, own in zip(partition.groups, blocks, strict=True):
-        V.append(own.solve(group.gather(r_bar)))
-        r_bar = jax.lax.optimization_barrier((r_bar, V[-1]))[0]
+        V.append(own.solve(group.gather(bar)))
+        bar = jax.lax.optimization_barrier((bar, V[-1]))[0]
     R = [group.gather(r) for group in partition.groups]
-    return _or_zero(ok, C.pulled_folds(a, partition.groups, V, R, a_bar))
+    return _or_zero(ok, C.pulled_folds(a, partition.groups, V, R, (r_bar, a_bar)))
 
 
 held_out.defvjp(_held_out_forward, _held_out_backward)
