@@ -142,6 +142,8 @@ __all__ = [  # noqa: RUF022 - in reading order
     "paper",
 ]
 
+__version__ = "0.1.0"
+
 # Loaded when first asked for, so that `import hamkernel` loads neither diffrax nor matplotlib.
 _LAZY = {
     "ImplicitMidpoint": "_dynamics.gauss_legendre",

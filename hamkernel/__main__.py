@@ -4,6 +4,10 @@ import argparse
 
 import jax
 
+# Minutes on two quiet cores: reproducing with 100 seeds, of which compiling and drawing, and tuning
+# on 20 (README, "Install").
+_MINUTES, _FIXED_MINUTES, _TUNING_MINUTES = 1.0, 0.5, 1.0
+
 
 def main() -> None:
     """Reproduce the paper and print its tables beside the published ones."""
@@ -23,19 +27,34 @@ def main() -> None:
     if arguments.seeds < 1:
         parser.error("--seeds must be at least 1")
 
+    print(_plan(arguments.out, arguments.seeds, arguments.tune), flush=True)
     jax.config.update("jax_enable_x64", True)  # before any array is made
     from hamkernel.paper import reproduce, retune
 
+    def show(table: str) -> None:
+        print(f"\n{table}", flush=True)
+
     try:
-        text, files = reproduce(arguments.out, arguments.seeds)
+        _, files = reproduce(arguments.out, arguments.seeds, show=show)
     except OSError as error:
         parser.error(f"--out {arguments.out} cannot be written: {error}")
-    print(text, flush=True)
     if arguments.tune:
-        text, more = retune(arguments.out, arguments.seeds)
-        print(f"\n{text}")
+        _, more = retune(arguments.out, arguments.seeds, show=show)
         files += more[1:]  # results.json is there
     print("\nWritten:", *(f"  {file}" for file in files), sep="\n")
+
+
+def _plan(out: str, seeds: int, tune: bool) -> str:
+    """What will be done, and how long it takes on two quiet cores."""
+    first = _FIXED_MINUTES + (_MINUTES - _FIXED_MINUTES) * seeds / 100
+    lines = [
+        f"Reproducing Smith & Egeland (2023) with {seeds} noise seed{'s' * (seeds > 1)}:",
+        f"  fits and tables, then figures: about {first:.1f} min",
+    ]
+    if tune:
+        lines.append(f"  hyperparameters tuned on their data: about {_TUNING_MINUTES:.1f} min")
+    lines.append(f"on two quiet cores. Files go to {out}/.")
+    return "\n".join(lines)
 
 
 if __name__ == "__main__":

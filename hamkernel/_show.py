@@ -100,8 +100,20 @@ def text(value: Any) -> str:
         return f"({', '.join(items)}{',' if len(items) == 1 else ''})"
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key!r}: {text(item)}" for key, item in value.items()) + "}"
+    if isinstance(value, eqx.Module) and type(value).__repr__ is eqx.Module.__repr__:
+        return _module(value)
     name = getattr(getattr(value, "func", value), "__name__", None)
     return repr(value) if name is None else name
+
+
+def _module(module: eqx.Module) -> str:
+    """A module that does not print itself, such as a network: one line, however deep it is."""
+    line = described(module)
+    if _fits(line):
+        return line
+    arrays = [leaf for leaf in jax.tree.leaves(module) if eqx.is_array(leaf)]
+    count = sum(array.size for array in arrays)
+    return f"{type(module).__name__}({count} parameters in {len(arrays)} arrays)"
 
 
 def _number(value: float) -> str:

@@ -3,6 +3,7 @@
 import functools
 import itertools
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -166,3 +167,25 @@ def test_one_function_makes_the_same_kernel_again():
     one, other = made(2.0), made(2.0)
     same = [jax.tree.structure(hk.Symplectic(k)) for k in (one, one, other)]
     assert same[0] == same[1] != same[2]
+
+
+def network():
+    mlp = eqx.nn.MLP(2, 3, 4, 2, activation=jnp.tanh, key=jax.random.key(0))
+    return hk.Symplectic(hk.Warp(hk.Gaussian(1.0), mlp))
+
+
+def test_jax_grad_passes_the_functions_inside_a_kernel():
+    K, norm = network(), lambda K: hk.gram(K, X[:3])[0, 0, 0, 0]
+    gradient = jax.grad(norm)(K)
+    ahead, behind = (
+        eqx.tree_at(lambda K: K.kernel.fn.layers[0].bias, K, replace_fn=lambda b, s=s: b + s)
+        for s in (STEP, -STEP)
+    )
+    slope = (norm(ahead) - norm(behind)) / (2 * STEP)
+    np.testing.assert_allclose(gradient.kernel.fn.layers[0].bias.sum(), slope, atol=DIFFERENCES)
+    assert not [leaf for leaf in jax.tree.leaves(K) if not eqx.is_array(leaf)]
+
+
+def test_a_deep_kernel_prints_in_one_line():
+    line = "Symplectic(Warp(Gaussian(lengthscale=1), fn=MLP(47 parameters in 6 arrays)))"
+    assert repr(network()) == line

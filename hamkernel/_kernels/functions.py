@@ -15,14 +15,20 @@ from hamkernel._show import call, text
 
 
 def as_pytree(fn: Callable[..., Any]) -> Callable[..., Any]:
-    """`fn` as a PyTree; a bare function would be a leaf, which `jax.jit` refuses."""
+    """`fn` as a PyTree without functions as leaves, which `jax.jit` and `jax.grad` refuse."""
     if not jax.tree_util.all_leaves([fn]):
-        return fn
+        return jax.tree.map(_no_leaf, fn)
     if isinstance(fn, functools.partial):
         return Bound(fn)
     if isinstance(fn, types.FunctionType) and _holds_traced(fn):
         return Closure(fn)
     return jax.tree_util.Partial(fn)
+
+
+def _no_leaf(leaf: Any) -> Any:
+    """`leaf`, where it is a function, as a part of the structure: the activation of a network."""
+    is_function = callable(leaf) and not eqx.is_array_like(leaf)
+    return jax.tree_util.Partial(leaf) if is_function else leaf
 
 
 class Bound(eqx.Module):

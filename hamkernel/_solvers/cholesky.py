@@ -93,7 +93,7 @@ class Cholesky(AbstractSolver[KernelField]):
                 "small for this Gram (points that coincide or lie close together for the "
                 "lengthscale make it singular): raise it; float32 where float64 is needed: "
                 "jax.config.update('jax_enable_x64', True); a kernel that is not positive "
-                "definite or not finite: hk.check_kernel(k, X) tells."
+                "definite or not finite: hk.check_kernel(k, X) finds out."
             )
 
         failed = ~(require.on_host(left) <= _SOLVED)

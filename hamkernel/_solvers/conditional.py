@@ -237,7 +237,7 @@ def _solved(field: KernelField, left: Array, of: str, throw: bool = True) -> Ker
             "this Gram (points that coincide or lie close together for the lengthscale make it "
             "singular): raise it; noise levels that are too different; float32 where float64 is "
             "needed: jax.config.update('jax_enable_x64', True); a kernel that is not positive "
-            "definite or not finite: hk.check_kernel(k, X) tells."
+            "definite or not finite: hk.check_kernel(k, X) finds out."
         )
 
     def learned(f):

@@ -189,7 +189,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                 f"hk.Nystrom(tolerance=1.0, max_points=1000)); allow more with {more}. In float32 "
                 "a tolerance below 1e-5 is out of reach, and a small regularization is lost in "
                 "rounding: jax.config.update('jax_enable_x64', True). With 0 landmarks or a "
-                "residual that is NaN the kernel is at fault: hk.check_kernel(k, X) tells."
+                "residual that is NaN the kernel is at fault: hk.check_kernel(k, X) finds out."
             )
 
         failed = ~(require.on_host(left) <= tolerance)

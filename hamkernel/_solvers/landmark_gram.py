@@ -76,7 +76,7 @@ def checked(
     learned = require.value(learned, failed, message, RuntimeError, throw)
     indefinite = (
         "the low-rank Gram of the landmarks is larger than the Gram itself, so the kernel is not "
-        "positive definite: hk.check_kernel(k, X) tells."
+        "positive definite: hk.check_kernel(k, X) finds out."
     )
     return require.value(learned, require.not_finite(truncation), indefinite, RuntimeError, throw)
 
@@ -87,5 +87,5 @@ def singular(dtype: jnp.dtype) -> str:
         f"the low-rank system plus the ridge N * regularization is not positive definite to "
         f"rounding in {dtype}. Likely causes, in order: the regularization is too small: raise "
         "it; float32 where float64 is needed: jax.config.update('jax_enable_x64', True); a kernel "
-        "that is not positive definite or not finite: hk.check_kernel(k, X) tells."
+        "that is not positive definite or not finite: hk.check_kernel(k, X) finds out."
     )

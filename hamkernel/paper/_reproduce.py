@@ -2,7 +2,7 @@
 
 import json
 import pathlib
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,11 @@ TUNED_SEEDS = 20  # of the seeds: enough for a median
 
 
 def reproduce(
-    out: str | pathlib.Path = "results", seeds: int = 100, *, progress: bool = True
+    out: str | pathlib.Path = "results",
+    seeds: int = 100,
+    *,
+    progress: bool = True,
+    show: Callable[[str], None] | None = None,
 ) -> tuple[str, list[pathlib.Path]]:
     """Run the paper's experiments, write `results.json` and the figures, return a report.
 
@@ -36,6 +40,7 @@ def reproduce(
             `summarise`.
         seeds: number of noise seeds, ≥ 1.
         progress: show a progress bar where the standard error is a terminal.
+        show: called with the report as soon as it is there, before the figures are drawn.
 
     Returns:
         The report, for printing, and the files written.
@@ -50,6 +55,8 @@ def reproduce(
     results = summarise(outcomes)
     _write(results, path)
     text = report(results, experiments(), seeds)
+    if show is not None:
+        show(text)
     # matplotlib loads after the numbers are safe
     from hamkernel.paper._figures import paper_figures
 
@@ -57,7 +64,11 @@ def reproduce(
 
 
 def retune(
-    out: str | pathlib.Path = "results", seeds: int = 100, *, progress: bool = True
+    out: str | pathlib.Path = "results",
+    seeds: int = 100,
+    *,
+    progress: bool = True,
+    show: Callable[[str], None] | None = None,
 ) -> tuple[str, list[pathlib.Path]]:
     """Tune the hyperparameters on the data of `reproduce`, by grid search and by gradient.
 
@@ -67,6 +78,7 @@ def retune(
         out: folder that `reproduce` wrote its results to.
         seeds: number of noise seeds, ≥ 1.
         progress: show a progress bar where the standard error is a terminal.
+        show: called with the report as soon as it is there, before the figures are drawn.
 
     Returns:
         The report, for printing, and the files written.
@@ -85,6 +97,8 @@ def retune(
         results[name]["tuned"] = {model: _tuned(each) for model, each in models.items()}
     _write(results, path)
     text = tuning_report(results, experiments(), seeds)
+    if show is not None:
+        show(text)
     from hamkernel.paper._figures import tuning_figure
 
     return text, [path, tuning_figure(comparisons, path.parent)]

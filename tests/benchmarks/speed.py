@@ -1,6 +1,6 @@
 """All that the README says of speed, against the peers, in one run.
 
-    python tests/benchmarks/speed.py [--figure speed.png] [--quick]
+    python tests/benchmarks/speed.py [--figure cost.png] [--quick]
 
 float64, warm, in one process, peers in turn: the minimum and the median over repeats, never a
 single run. Same work and same precision; the results are checked to agree first. A peer that is not
