@@ -1,5 +1,10 @@
 """Losses and their gradients against 100 digits of Arb and refits of SciPy, where it is hard."""
 
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
+# pyright: reportOperatorIssue=false
+# Wrong types are refused here, and any field is looked into.
+
 import jax
 import jax.numpy as jnp
 import numpy as np

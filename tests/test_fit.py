@@ -238,7 +238,7 @@ def test_integers_and_lists_are_read_as_floats():
     X, Y = [[0, 1], [2, -1], [1, 1]], [[1, 0], [0, 1], [1, 1]]
     expected = hk.fit(K, np.array(X, float), np.array(Y, float), 1e-2)
     for convert in (np.array, jnp.array, list):
-        field = hk.fit(K, convert(X), convert(Y), 1e-2)  # pyright: ignore[reportArgumentType]
+        field = hk.fit(K, convert(X), convert(Y), 1e-2)  # pyright: ignore
         np.testing.assert_array_equal(field(X[0]), expected(X[0]))  # pyright: ignore
 
 

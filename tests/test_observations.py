@@ -1,5 +1,10 @@
 """Observations of every kind against closed forms solved by NumPy, and what they refuse."""
 
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
+# pyright: reportOperatorIssue=false
+# Wrong types are refused here, and any field is looked into.
+
 import re
 
 import jax

@@ -3,6 +3,11 @@
 The closed forms of means and variances for every kind of observation are in `test_observations.py`.
 """
 
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
+# pyright: reportOperatorIssue=false
+# Wrong types are refused here, and any field is looked into.
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -297,7 +302,7 @@ def test_an_amplitude_that_nobody_tuned_gets_a_warning(k):
 
 def test_a_scalar_case_is_that_of_scikit_learn():
     gaussian_process = pytest.importorskip("sklearn.gaussian_process")
-    from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+    from sklearn.gaussian_process.kernels import RBF, ConstantKernel  # pyright: ignore
 
     x = np.random.default_rng(0).uniform(-2, 2, (15, 1))
     y = np.sin(x)

@@ -1,5 +1,10 @@
 """`simulate` asks a learned field for no more digits than it has."""
 
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
+# pyright: reportOperatorIssue=false
+# Wrong types are refused here, and any field is looked into.
+
 import jax
 import jax.numpy as jnp
 import numpy as np

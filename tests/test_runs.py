@@ -1,5 +1,10 @@
 """`Runs`: what is refused, what is said, and the smoother against dense Gaussian processes."""
 
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
+# pyright: reportOperatorIssue=false
+# Wrong types are refused here, and any field is looked into.
+
 import jax.numpy as jnp
 import numpy as np
 import pytest

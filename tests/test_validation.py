@@ -443,7 +443,7 @@ def test_every_lapack_call_of_a_loss_and_its_gradient_waits_for_the_one_before()
     assert len(partition.groups) == 2
 
     def loss_and_gradient(A, y):
-        r, pull = jax.vjp(lambda A, y: held_out(DenseSystem(A), y, partition)[0], A, y)
+        r, pull = jax.vjp(lambda A, y: held_out(DenseSystem(A), y, partition)[0], A, y)  # pyright: ignore
         return r, pull(r)
 
     program = jax.make_jaxpr(loss_and_gradient)(jnp.eye(5 * N), jnp.ones(5 * N)).jaxpr

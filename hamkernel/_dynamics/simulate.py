@@ -148,7 +148,8 @@ def simulate(
         # Functions get the caller's time, samples have times of their own: those since the start.
         start = given[0].astype(x0.dtype) if callable(inputs) else jnp.zeros((), x0.dtype)
         held = dt is not None and between == "held" and not callable(inputs)
-        right_hand_side = Driven(field, inputs_of(inputs, ts, between), held)
+        driven: Any = field  # of x and u
+        right_hand_side = Driven(driven, inputs_of(inputs, ts, between), held)
         field = _At(right_hand_side, start)
     _check_field(field, x0)
     if max_steps is not None:

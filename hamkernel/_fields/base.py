@@ -227,7 +227,9 @@ class FieldSum(eqx.Module):
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         first, *rest = (term(x) for term in self.terms)
-        return sum((each.astype(first.dtype) for each in rest), start=first)
+        for each in rest:
+            first = first + each.astype(first.dtype)
+        return first
 
     @property
     def is_separable(self) -> bool:
@@ -339,7 +341,7 @@ class KernelField(AbstractField):
 
     def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         field = _expansion(self.kernel, x, self.points, self.coefficients)
-        if self.value_points is None:
+        if self.value_points is None or self.value_coefficients is None:
             return field
         return field + _of_values(self.kernel, x, self.value_points, self.value_coefficients)
 
@@ -352,7 +354,7 @@ class KernelField(AbstractField):
 
     def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         potential = _potential(self.kernel, x, self.points, self.coefficients)
-        if self.value_points is None:
+        if self.value_points is None or self.value_coefficients is None:
             return potential
         return potential + _values(self.kernel, x, self.value_points, self.value_coefficients)
 
@@ -360,7 +362,9 @@ class KernelField(AbstractField):
         term, Z, A = kernel.terms[position], self.points, self.coefficients
         square = jnp.sum(A * placed_product(term, Z, Z, A))  # ‖f‖² = aᵀGa
         bare = dataclasses.replace(self, kernel=term, offset=jnp.zeros_like(self.offset), mean=None)
-        if self.value_points is not None:  # 2 aᵀG_av b + bᵀG_vv b
+        if (
+            self.value_points is not None and self.value_coefficients is not None
+        ):  # 2 aᵀG_av b + bᵀG_vv b
             S, b = self.value_points, self.value_coefficients
             at = dataclasses.replace(bare, coefficients=2 * A)
             square = square + b @ at_points(at._learned_potential, S)

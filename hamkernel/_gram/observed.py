@@ -54,7 +54,8 @@ def between(
 
     def of_group(group):
         points, weights = group
-        return _mapped(K, Combinations(points[None], weights[None]), right)
+        one = Combinations(points[None], weights[None])  # pyright: ignore[reportCallIssue]
+        return _mapped(K, one, right)
 
     # One group after the other: the covariances of all points need not fit in memory.
     at_once = max(1, _ENTRIES // (left.groups[0].size * right.points.size))

@@ -69,7 +69,8 @@ def linear_maps(maps: Any) -> tuple[LinearMap, ...]:
             "maps must be a list of linear maps of the state, (n, n) arrays or functions "
             f"x -> S @ x; got {maps!r}."
         )
-    return tuple(each if callable(each) else _rows(each) for each in given)
+    rows: Any = tuple(each if callable(each) else _rows(each) for each in given)
+    return rows
 
 
 def _rows(matrix: Any) -> tuple[tuple[float, ...], ...]:

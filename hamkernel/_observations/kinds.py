@@ -265,7 +265,8 @@ class Functionals(AbstractObservations):
         return self.points.shape[2]
 
     def parts(self) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
-        yield Combinations(self.points, self.weights), self.targets
+        rows = Combinations(self.points, self.weights)  # pyright: ignore[reportCallIssue]
+        yield rows, self.targets
 
 
 def both(X: Any, Y: Any) -> tuple[Any, Any]:

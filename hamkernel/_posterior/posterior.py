@@ -232,7 +232,7 @@ class Posterior(eqx.Module):
         low, high = require.on_host(region)
         bad = ~((high > low) & (abs(low) < np.inf) & (abs(high) < np.inf))
         text = "region must be finite, its first row the lower corner in every coordinate."
-        region = require.value(region, bad, text)
+        region = jnp.asarray(require.value(region, bad, text))
         draws, mean = self.given.draws(key, count, region), self.field.mean
         if mean is None:
             return draws

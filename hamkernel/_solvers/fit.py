@@ -8,7 +8,7 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, KernelField, at_points
-from hamkernel._fields.controlled import with_inputs
+from hamkernel._fields.controlled import ControlledField, with_inputs
 from hamkernel._machine.devices import rows_of
 from hamkernel._machine.memory import dense_bytes, memory_bytes
 from hamkernel._machine.threads import one_blas_thread
@@ -25,9 +25,21 @@ from hamkernel._solvers.conditional import check_potential
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.means import Mean, checked_mean, with_mean, without_mean
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.controlled import joined_data
+from hamkernel._structures.controlled import Controlled, joined_data
 
 
+@overload
+def fit(
+    K: Controlled,
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N n"],
+    regularization: ArrayLike = 1e-4,
+    *,
+    solver: AbstractSolver | None = None,
+    mean: None = None,
+    throw: bool = True,
+    inputs: Num[ArrayLike, "N m"] | None = None,
+) -> ControlledField: ...
 @overload
 def fit(
     K: AbstractMatrixKernel,

@@ -143,8 +143,8 @@ class Controlled(AbstractMatrixKernel):
             )
         else:
             self.inputs = KnownMatrix(_entries(inputs))
-        known = isinstance(self.inputs, KnownMatrix)
-        self.count = self.inputs.matrix.shape[1] if known else count
+        known = self.inputs.matrix if isinstance(self.inputs, KnownMatrix) else None
+        self.count = count if known is None else known.shape[1]
 
     @property
     def no_potential(self) -> str | None:

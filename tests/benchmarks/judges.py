@@ -38,7 +38,7 @@ def runs_of(name: str, count: int, noise: float, seed: int) -> tuple[np.ndarray,
     X, Y = hk.systems.sample(
         system, jnp.asarray(starts), ts, noise, noise, key=jax.random.key(seed)
     )
-    return (np.asarray(each).reshape(-1, len(box)) for each in (X, Y))
+    return np.asarray(X).reshape(-1, len(box)), np.asarray(Y).reshape(-1, len(box))
 
 
 def tuned_by(judge: str, X: np.ndarray, Y: np.ndarray) -> hk.Tuned:

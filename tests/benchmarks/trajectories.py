@@ -122,7 +122,7 @@ def row(case, seed, baselines):
     begin = time.perf_counter()
     found = learned(case, times, states)
     took = time.perf_counter() - begin
-    out = {"learn": (*errors(found.field, system, X, tests), took, float(found.noise[0]))}
+    out: dict = {"learn": (*errors(found.field, system, X, tests), took, float(found.noise[0]))}
     if baselines and not CASES[case][-1]:
         out["np.gradient"] = errors(by_differences(times, states), system, X, tests)
         if not CASES[case][4]:
