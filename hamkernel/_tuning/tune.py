@@ -32,7 +32,7 @@ from hamkernel._solvers.fit import fit
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.controlled import joined_data
+from hamkernel._structures.joined import joined_data
 from hamkernel._tuning import advice
 from hamkernel._tuning.descent import Run
 from hamkernel._tuning.objective import (

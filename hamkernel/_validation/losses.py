@@ -18,7 +18,7 @@ from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.controlled import joined_data
+from hamkernel._structures.joined import joined_data
 from hamkernel._validation.bases import AbstractBasis
 from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
 from hamkernel._validation.folds import Folds, Partition
