@@ -46,6 +46,7 @@ def formula(name, x, u, z, v):
     return J @ curl_free(x, z) @ J.T + (u @ v) * PRIORS[name][1](x, z) * np.diag([0.0, 1.0])
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", PRIORS)
 def test_the_fit_is_the_regression_with_the_kernel_of_joined_points(name):
     blocks = [
@@ -182,6 +183,7 @@ DRIVES = {
 }
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", DRIVES)
 @pytest.mark.parametrize("steps", ["adaptive", "constant"])
 def test_driven_trajectories_are_those_of_scipy(name, steps):
@@ -219,6 +221,7 @@ def test_time_is_an_input():
     np.testing.assert_allclose(ys[-1], done.y[:, -1], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_learned_fields_are_driven_and_differentiated():
     field = hk.fit(kernel("state"), X, Y, 1e-1, inputs=U)
     ts = np.linspace(0, 0.5, 3)

@@ -76,6 +76,7 @@ def lost(field, x):
     return -jax.grad(field.hamiltonian)(x) @ field(x)
 
 
+@pytest.mark.few(2)
 @every_case
 def test_energy_is_lost_as_the_dissipation_says(name):
     K, B = CASES[name]

@@ -40,7 +40,7 @@ class Driven(eqx.Module):
     saved times, and inputs know the time of the caller.
     """
 
-    field: Callable[[Array, Array], Array]
+    field: Any  # x, u -> velocity
     inputs: Callable[[Array], Any]
     # Whether t is counted from the last of the saved times and inputs are held from there: the last
     # stage of a step would otherwise see the next ones.

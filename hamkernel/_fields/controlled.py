@@ -1,5 +1,6 @@
 """A learned field with inputs."""
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -39,7 +40,7 @@ class ControlledField(AbstractField):
     regularization: Float[Array, ""]
     offset: Float[Array, ""]
     info: SolverInfo
-    mean: None = None  # see `fit`
+    mean: Callable[..., Any] | None = None  # none yet with inputs, see `fit`
 
     @property
     def drift(self) -> KernelField:

@@ -25,7 +25,8 @@ from hamkernel._solvers.conditional import check_potential
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.means import Mean, checked_mean, with_mean, without_mean
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.controlled import Controlled, joined_data
+from hamkernel._structures.controlled import Controlled
+from hamkernel._structures.joined import joined_data
 
 
 @overload
@@ -170,7 +171,7 @@ def checked_rows(
 ) -> tuple[Rows, Float[Array, ""], Any]:
     """The rows of the data, λ and the mean, where they fit each other and the kernel."""
     rows = rows_of_data(observations(X, Y))
-    K.check_dimension(rows.dimension)
+    K.check_points(rows.points)
     check_potential(K, rows)
     require.warn_of_float32(rows.targets)
     regularization = require.ridge(regularization, rows.targets.dtype)

@@ -23,10 +23,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
-from hamkernel._kernels.groups import matrix_of
 from hamkernel._kernels.transforms import symmetries, symmetry_removed, with_parity
 from hamkernel._show import call, described
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.maps import check_symmetries
 
 
 class AbstractStructure(AbstractMatrixKernel):
@@ -179,28 +179,6 @@ class AbstractPotentialKernel(AbstractStructure):
                 check_symmetries(self, jnp.zeros((1, n)))
 
 
-def check_symmetries(K: AbstractPotentialKernel, X: Float[Array, "N n"]) -> None:
-    """ValueError unless B(Sx) = ± S B(x) Sᵀ for the maps S of the kernel, at these points."""
-    n = X.shape[1]
-    for mean in symmetries(K.kernel):
-        for each in mean.maps:
-            S = matrix_of(each, n)
-            here, there = (
-                np.asarray(jax.vmap(K.operator_at)(points))
-                for points in (X, jnp.asarray(np.asarray(X) @ S.T, X.dtype))
-            )
-            image = S @ here @ S.T
-            room = 1e-5 * np.abs(here).max()  # maps may come in float32
-            if min(np.abs(there - image).max(), np.abs(there + image).max()) > room:
-                raise ValueError(
-                    f"a map of the symmetry is not one of the fields of {type(K).__name__}: with "
-                    f"S = {np.round(S, 3).tolist()} neither B(Sx) = S B(x) Sᵀ nor -S B(x) Sᵀ holds."
-                    " For J∇H it must be symplectic or antisymplectic, SᵀJS = ±J, so momenta move "
-                    "with their positions; for gradients orthogonal. With friction time reversal "
-                    "is false."
-                )
-
-
 class CurlFree(AbstractPotentialKernel):
     """K(x, z) = ∂x ∂zᵀ k(x, z): gradient fields f = ∇u, so Df is symmetric.
 
@@ -329,36 +307,6 @@ class DivergenceFree(AbstractStructure):
                 "a DivergenceFree field gets no symmetry from its matrix potential but Odd and "
                 "Even: use Symplectic(Invariant(k, maps)) or CurlFree(Invariant(k, maps))."
             )
-
-
-def unfolded(
-    K: AbstractMatrixKernel, Z: Float[Array, "M n"], A: Float[Array, "M n"]
-) -> tuple[AbstractMatrixKernel, Float[Array, "L n"], Float[Array, "L n"]]:
-    """A kernel, points and coefficients with the expansion of K, Z, A, without its group.
-
-    A one-sided mean over |G| maps is a sum over |G| times the points: with B(hz)ᵀ = ± h B(z)ᵀ hᵀ
-
-        Σⱼ ∂x ∂zᵀ k(x, hzⱼ) B(zⱼ)ᵀ aⱼ = ± Σⱼ (∂x ∂₂ᵀ k)(x, hzⱼ) B(hzⱼ)ᵀ h⁻ᵀ aⱼ.
-
-    In a sum over many pairs this is cheaper than all terms at once, which fill the registers.
-    K, Z and A themselves where K is of another form.
-    """
-    if not isinstance(K, AbstractStructure):
-        return K, Z, A
-    found = symmetry_removed(K.kernel)
-    n = Z.shape[1]
-    if found is None or not found.is_one_sided(n):
-        return K, Z, A
-    group = found.group(n)
-    carried = [K.carried(h.matrix) for h in group]
-    known = [T for T in carried if T is not None]
-    if len(known) < len(group):
-        return K, Z, A
-    images = jnp.concatenate([jax.vmap(h)(Z) for h in group])
-    pairs = zip(group, known, strict=True)
-    moved = [jax.vmap(h._replace(matrix=h.character * T))(A) for h, T in pairs]
-    K = eqx.tree_at(lambda K: K.kernel, K, found.kernel)
-    return K, images, jnp.concatenate(moved) / len(group)
 
 
 def _row(k: AbstractScalarKernel, x: Float[Array, " n"], Z: Float[Array, "M n"]):

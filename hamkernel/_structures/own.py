@@ -12,7 +12,8 @@ from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._show import text
-from hamkernel._structures.operators import AbstractPotentialKernel, check_symmetries
+from hamkernel._structures.maps import check_symmetries
+from hamkernel._structures.operators import AbstractPotentialKernel
 
 Operator = Callable[[Float[Array, " n"]], Any]
 _SYMMETRIC = 1e-6  # of Π at the data: rounding in float32 leaves 1e-7, a wrong sign 1

@@ -35,7 +35,7 @@ from hamkernel._solvers.means import Mean, without_mean
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.controlled import joined_data
+from hamkernel._structures.joined import joined_data
 from hamkernel._tuning import advice
 from hamkernel._tuning.boxes import typical_velocities
 from hamkernel._tuning.descent import Run

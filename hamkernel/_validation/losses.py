@@ -22,7 +22,7 @@ from hamkernel._observations.kinds import AbstractObservations, as_states, both
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers.fit import checked_rows
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.controlled import joined_data
+from hamkernel._structures.joined import joined_data
 from hamkernel._validation.bases import AbstractBasis
 from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
 from hamkernel._validation.folds import Folds, Partition

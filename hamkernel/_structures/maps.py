@@ -1,0 +1,33 @@
+"""Whether the maps under which a potential is unchanged are symmetries of the field as well."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hamkernel._kernels.groups import matrix_of
+from hamkernel._kernels.transforms import symmetries
+
+
+def check_symmetries(K: Any, X: Float[Array, "N n"]) -> None:
+    """ValueError unless B(Sx) = ± S B(x) Sᵀ for the maps S of the kernel, at these points."""
+    n = X.shape[1]
+    for mean in symmetries(K.kernel):
+        for each in mean.maps:
+            S = matrix_of(each, n)
+            here, there = (
+                np.asarray(jax.vmap(K.operator_at)(points))
+                for points in (X, jnp.asarray(np.asarray(X) @ S.T, X.dtype))
+            )
+            image = S @ here @ S.T
+            room = 1e-5 * np.abs(here).max()  # maps may come in float32
+            if min(np.abs(there - image).max(), np.abs(there + image).max()) > room:
+                raise ValueError(
+                    f"a map of the symmetry is not one of the fields of {type(K).__name__}: with "
+                    f"S = {np.round(S, 3).tolist()} neither B(Sx) = S B(x) Sᵀ nor -S B(x) Sᵀ holds."
+                    " For J∇H it must be symplectic or antisymplectic, SᵀJS = ±J, so momenta move "
+                    "with their positions; for gradients orthogonal. With friction time reversal "
+                    "is false."
+                )
