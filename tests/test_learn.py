@@ -249,3 +249,14 @@ def test_what_cannot_be_known_or_meant_is_refused():
         hk.learn(K, runs, noise=[0.1, 0.1, 0.1])
     with pytest.raises(ValueError, match="even dimension"):
         hk.learn(K, hk.Runs(times, [x[:, :1] for x in states]))
+
+
+def test_the_posterior_is_that_of_the_last_rows(learned):
+    found, true = learned
+    posterior = found.posterior
+    X = jnp.asarray(np.concatenate(true)[::7])
+    exact, field = (np.asarray(jax.vmap(f)(X)) for f in (posterior.field, found.field))
+    np.testing.assert_allclose(exact, field, atol=0.02 * np.abs(field).max())
+    truth = np.asarray(jax.vmap(PENDULUM)(X))
+    z = (exact - truth) / np.asarray(jax.vmap(posterior.deviation)(X))
+    assert 0.3 < np.sqrt(np.mean(z**2)) < 2.0
