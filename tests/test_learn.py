@@ -154,6 +154,7 @@ def test_a_pendulum_is_learned_from_noisy_states(learned):
     np.testing.assert_allclose(found.field(x), [gradient[1], -gradient[0]], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_order_of_the_runs_does_not_matter(learned):
     found, true = learned
     times, states, _ = logs()
@@ -166,6 +167,7 @@ def test_the_order_of_the_runs_does_not_matter(learned):
     )
 
 
+@pytest.mark.slow
 def test_a_run_that_is_garbage_is_dropped_and_named():
     times, states, true = logs()
     states[2] = 3 * np.random.default_rng(9).standard_normal(states[2].shape)
@@ -195,6 +197,7 @@ def test_friction_that_the_structure_lacks_is_noticed():
     np.testing.assert_allclose(found.noise, 0.01, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_two_samples_in_a_run_are_used_and_no_noise_is_no_nan():
     times, states, true = logs(noise=0.0)
     times, states = [*times[:5], times[5][:2]], [*states[:5], states[5][:2]]
