@@ -159,6 +159,7 @@ def test_a_pendulum_is_learned_from_noisy_states(learned):
     np.testing.assert_allclose(found.field(x), [gradient[1], -gradient[0]], atol=1e-10)
 
 
+@pytest.mark.slow
 def test_the_order_of_the_runs_does_not_matter(learned):
     found, true = learned
     times, states, _ = logs()
@@ -171,6 +172,7 @@ def test_the_order_of_the_runs_does_not_matter(learned):
     )
 
 
+@pytest.mark.slow
 def test_a_run_that_is_garbage_is_dropped_and_named():
     times, states, true = logs()
     states[2] = 3 * np.random.default_rng(9).standard_normal(states[2].shape)
@@ -200,6 +202,7 @@ def test_friction_that_the_structure_lacks_is_noticed():
     np.testing.assert_allclose(found.noise, 0.01, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_two_samples_in_a_run_are_used_and_no_noise_is_no_nan():
     times, states, true = logs(noise=0.0)
     times, states = [*times[:5], times[5][:2]], [*states[:5], states[5][:2]]
@@ -254,3 +257,14 @@ def test_what_cannot_be_known_or_meant_is_refused():
         hk.learn(K, runs, noise=[0.1, 0.1, 0.1])
     with pytest.raises(ValueError, match="even dimension"):
         hk.learn(K, hk.Runs(times, [x[:, :1] for x in states]))
+
+
+def test_the_posterior_is_that_of_the_last_rows(learned):
+    found, true = learned
+    posterior = found.posterior
+    X = jnp.asarray(np.concatenate(true)[::7])
+    exact, field = (np.asarray(jax.vmap(f)(X)) for f in (posterior.field, found.field))
+    np.testing.assert_allclose(exact, field, atol=0.02 * np.abs(field).max())
+    truth = np.asarray(jax.vmap(PENDULUM)(X))
+    z = (exact - truth) / np.asarray(jax.vmap(posterior.deviation)(X))
+    assert 0.3 < np.sqrt(np.mean(z**2)) < 2.0

@@ -12,10 +12,13 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._fields.base import KernelField, SolverInfo
+from hamkernel._gram.operator import placed_product
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._trajectories.evidence import Model
+from hamkernel._trajectories.flow import Expansion
+from hamkernel._trajectories.functionals import functionals_of
 from hamkernel._trajectories.iteration import Current, Task, begin, changed, iterated
 from hamkernel._trajectories.learned import (
     Learned,
@@ -170,8 +173,9 @@ def _learned(
             ".history. The field may be usable; more samples a swing, or a kernel closer to the "
             "truth, help."
         )
-    count = sum(int(np.isfinite(np.asarray(x)).sum()) for x in runs.states)
-    regularization = jnp.asarray(np.nanmean(noise**2) / count)
+    observations = functionals_of(now.rows, now.model.log_noise, task.mean)
+    count = 1 if observations is None else sum(len(y) for _, y in observations.parts())
+    regularization = jnp.asarray(1 / count)
     return Learned(
         field=_field(field, regularization),
         kernel=field.kernel,
@@ -184,15 +188,15 @@ def _learned(
         history=tuple(history),
         converged=converged,
         runs=runs,
+        observations=observations,
+        mean=task.mean,
     )
 
 
-def _field(found: Any, regularization: Float[Array, ""]) -> Any:
-    """The field as one of the library; with a mean, as the sum of both."""
-    if found.mean is not None:
-        return found
+def _field(found: Expansion, regularization: Float[Array, ""]) -> KernelField:
+    """The field as one of the library."""
     S, A = found.points, found.coefficients
-    square = jnp.sum(A * jax.vmap(found)(S))
+    square = jnp.sum(A * placed_product(found.kernel, S, S, A))  # ‖f‖² = aᵀGa
     return KernelField(
         kernel=found.kernel,
         points=S,
@@ -202,6 +206,7 @@ def _field(found: Any, regularization: Float[Array, ""]) -> Any:
         regularization=regularization,
         offset=jnp.zeros((), S.dtype),
         info=SolverInfo("learn", landmarks=jnp.asarray(len(S))),
+        mean=found.mean,
     )
 
 

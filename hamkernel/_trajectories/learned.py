@@ -10,13 +10,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
+from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._posterior.posterior import Posterior, condition
 from hamkernel._show import described
+from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._trajectories.runs import Runs
 
 # χ² per degree of freedom has the standard deviation √(2/ν); five of them, and a tenth for the
 # curvature that a linearisation misses.
 _SIGMAS, _CURVATURE = 5.0, 0.1
+
+_EXACT = 3000  # rows of a posterior without approximation: some seconds
 
 
 class Step(eqx.Module):
@@ -50,8 +55,8 @@ class Learned(eqx.Module):
     Attributes:
         field: the learned field, the mean included.
         kernel: the kernel with its hyperparameters, and an amplitude.
-        regularization: λ with Nλ = σ², N the number of measured values and σ² the mean of their
-            variances, in squared units of the states; the amplitude of the field is in `kernel`.
+        regularization: λ with Nλ = 1, N the number of `observations`, which are divided by their
+            noise; the amplitude of the field is in `kernel`.
         noise: the standard deviation of the sensor noise of each coordinate, shape (n,); NaN where
             nothing was measured.
         states: the fitted path of each run at its times, missing coordinates filled in, (T, n).
@@ -63,6 +68,11 @@ class Learned(eqx.Module):
         history: one entry an iteration.
         converged: whether noise and objective settled.
         runs: what was given.
+        observations: what the runs say of the field near the fitted paths, starts projected out:
+            linear functionals of it, with independent noise of variance one. `hk.fit(kernel,
+            observations, regularization=regularization)` is the exact fit of which `field`
+            is the one on landmarks. None where there were too few samples.
+        mean: the known part of the field, if there is one.
     """
 
     field: Any
@@ -76,9 +86,34 @@ class Learned(eqx.Module):
     history: tuple[Step, ...]
     converged: bool = eqx.field(static=True)
     runs: Runs
+    observations: AbstractObservations | None
+    mean: Any
 
     def __repr__(self) -> str:
         return described(self)
+
+    @property
+    def posterior(self) -> Posterior:
+        """The Gaussian process of the field given the runs: bands, samples, updates.
+
+        As `hk.condition` on the observations, exact up to 3000 rows and on the landmarks of the
+        field above; starts are integrated out, hyperparameters plugged in. It is made anew with
+        every call: keep it.
+
+        Raises:
+            ValueError: the runs had too few samples to learn from.
+        """
+        if self.observations is None:
+            raise ValueError("no run had enough samples to say anything of the field.")
+        rows = sum(len(targets) for _, targets in self.observations.parts())
+        solver = None if rows <= _EXACT else Nystrom(points=self.field.points)
+        return condition(
+            self.kernel,
+            self.observations,
+            regularization=self.regularization,
+            solver=solver,
+            mean=self.mean,
+        )
 
     @property
     def residuals(self) -> tuple[Float[Array, "T n"], ...]:
@@ -110,7 +145,7 @@ def warn_of_misfit(chi_squared: float, misfit: Float[np.ndarray, "R n"]) -> None
     causes = (
         "Likely causes, in order: a part of the motion that the kernel cannot have, such as "
         "friction (add hk.CurlFree, or take hk.PortHamiltonian); (q, q̇) given where (q, p) is "
-        "needed (masses=True learns the ratios of masses); a wrong unit; a jump or push in a run."
+        "needed (p = m q̇, in one scale for all masses); a wrong unit; a jump or push in a run."
     )
     run, c = np.unravel_index(np.nanargmax(misfit), misfit.shape)
     require.warn(
