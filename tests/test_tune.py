@@ -392,6 +392,16 @@ def test_hyperparameters_that_are_complex_and_other_optimisers_are_refused():
             hk.tune(SIMPLE, *scattered(), optimiser=optimiser)
 
 
+def test_states_in_columns_are_warned_of():
+    X, Y = scattered()
+    with pytest.warns(UserWarning, match=r"shape \(4, 6\): 4 points of 6 coordinates.*X\.T"):
+        hk.fit(SIMPLE, X[:12].reshape(4, 6), Y[:12].reshape(4, 6))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        hk.fit(SIMPLE, X[:2], Y[:2])
+        hk.fit(SIMPLE, X[:1], Y[:1])
+
+
 def test_velocities_of_very_different_sizes_are_warned_of():
     X, Y = scattered()
     scale = np.array([30.0, 1 / 30])
