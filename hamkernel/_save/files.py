@@ -26,8 +26,8 @@ _SAME = 1e-3  # of a velocity computed elsewhere: fields of large coefficients r
 def save(path: str | os.PathLike[str], field: AbstractField) -> None:
     """Write a learned field to one file: kernel, hyperparameters, data, coefficients, version.
 
-    The file at `path` is replaced in one step, so that no reader ever sees half of it. A kernel of
-    your own (a function, the map of a `Warp`, a mean) is not written, only its arrays are: see `load`.
+    The file at `path` is replaced in one step, so that no reader ever sees half of it. Code of
+    your own (a kernel, the map of a `Warp`, a mean) is not written, only its arrays are: see `load`.
 
     If the rows of the field are spread over several processes, all of them must make the call;
     each writes the whole field, to a path of its own or to one that they share.
