@@ -401,6 +401,25 @@ def test_separability_needs_that_of_the_mean():
     assert jnp.isfinite(orbit.ys).all()
 
 
+def test_save_keeps_the_mean_and_the_values(tmp_path):
+    X, Y = pendulum_data(5, 0)
+    data = hk.Velocities(X, Y) + energies(1)[0]
+    for name in ("system", "field"):
+        field = hk.fit(K, data, regularization=RIDGE, mean=MEANS[name])
+        hk.save(tmp_path / name, field)
+        loaded = hk.load(tmp_path / name)
+        np.testing.assert_array_equal(loaded(ASKED[0]), field(ASKED[0]))
+        np.testing.assert_array_equal(loaded.hamiltonian(ASKED[0]), field.hamiltonian(ASKED[0]))
+    field = hk.fit(K, X, Y, RIDGE, mean=kinetic)
+    hk.save(tmp_path / "own", field)
+    with pytest.raises(ValueError, match=r"hk\.load\(path, mean=\.\.\.\)"):
+        hk.load(tmp_path / "own")
+    loaded = hk.load(tmp_path / "own", mean=kinetic)
+    np.testing.assert_array_equal(loaded(ASKED[0]), field(ASKED[0]))
+    with pytest.raises(ValueError, match="when it was saved"):
+        hk.load(tmp_path / "own", mean=lambda x: 2 * kinetic(x))
+
+
 # What is refused.
 
 GOOD = velocities(0)[0]

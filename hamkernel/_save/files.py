@@ -28,8 +28,9 @@ _SAME = 1e-3  # of a velocity computed elsewhere: fields of large coefficients r
 def save(path: str | os.PathLike[str], field: AbstractField) -> None:
     """Write a learned field to one file: kernel, hyperparameters, data, coefficients, version.
 
-    The file at `path` is replaced in one step, so that no reader ever sees half of it. A kernel of
-    your own (a function, the map of a `Warp`) is not written, only its arrays are: see `load`.
+    The file at `path` is replaced in one step, so that no reader ever sees half of it. Code of
+    your own (a kernel, the map of a `Warp`, a mean) is not written, only its arrays are: see
+    `load`.
 
     If the rows of the field are spread over several processes, all of them must make the call;
     each writes the whole field, to a path of its own or to one that they share.
@@ -70,7 +71,11 @@ def save(path: str | os.PathLike[str], field: AbstractField) -> None:
     write(pathlib.Path(path), packed(header, arrays))
 
 
-def load(path: str | os.PathLike[str], kernel: AbstractMatrixKernel | None = None) -> AbstractField:
+def load(
+    path: str | os.PathLike[str],
+    kernel: AbstractMatrixKernel | None = None,
+    mean: Callable[..., Any] | None = None,
+) -> AbstractField:
     """Read a field that `save` wrote: the same arrays bit by bit, so the same values of f.
 
     Nothing in the file is executed. Built-in kernels restore by themselves. For a kernel of your
@@ -80,6 +85,8 @@ def load(path: str | os.PathLike[str], kernel: AbstractMatrixKernel | None = Non
     Args:
         path: the file.
         kernel: the matrix-valued kernel, needed if a part of it is your own code.
+        mean: the prior mean, needed if it is your own code; a learned field and one of
+            `hk.systems` are in the file.
 
     Returns:
         The field, of the class that was saved.
@@ -99,7 +106,7 @@ def load(path: str | os.PathLike[str], kernel: AbstractMatrixKernel | None = Non
     source = str(path)
     header, arrays = unpacked(pathlib.Path(path).read_bytes(), source)
     reader = Reader(source, arrays)
-    field = reader.field(header["field"], kernel)
+    field = reader.field(header["field"], kernel, mean)
     try:
         _evaluable(field)
     except Exception as error:  # a kernel of the user may raise anything
@@ -108,7 +115,7 @@ def load(path: str | os.PathLike[str], kernel: AbstractMatrixKernel | None = Non
             + (" with this kernel" if kernel is not None else "")
             + f": {error}"
         ) from error
-    if kernel is not None:
+    if kernel is not None or mean is not None:
         _check_probe(field, header.get("probe"), source)
     return field
 

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import jaxtyped
 
+from hamkernel import systems
 from hamkernel._features.waves import (
     DivergenceFreeFeatures,
     GroupWaves,
@@ -32,11 +33,12 @@ from hamkernel._features.waves import (
     SumFeatures,
     Waves,
 )
-from hamkernel._fields.base import AbstractField, KernelField, SolverInfo
+from hamkernel._fields.base import AbstractField, FieldSum, KernelField, SolverInfo
 from hamkernel._fields.controlled import ControlledField
 from hamkernel._fields.features import FeatureField
 from hamkernel._kernels.base import ScalarProduct, ScalarSum, Scaled, UserKernel
 from hamkernel._kernels.dot_products import Periodic, Polynomial
+from hamkernel._kernels.functions import as_pytree
 from hamkernel._kernels.groups import identity, reflection, time_reversal
 from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._kernels.transforms import Select, Symmetrised, Warp
@@ -51,7 +53,7 @@ from hamkernel.poisson import ChargedParticleTensor, LotkaVolterraTensor, RigidB
 CLASSES: dict[str, type[eqx.Module]] = {
     cls.__name__: cls
     for cls in (
-        *(KernelField, FeatureField, ControlledField, SolverInfo),
+        *(KernelField, FeatureField, ControlledField, FieldSum, SolverInfo),
         *(
             Waves,
             GroupWaves,
@@ -60,6 +62,10 @@ CLASSES: dict[str, type[eqx.Module]] = {
             SeparableFeatures,
             SumFeatures,
         ),
+        *(systems.DoublePendulum, systems.Duffing, systems.HarmonicOscillator),
+        *(systems.HenonHeiles, systems.Kepler, systems.NBody, systems.Pendulum),
+        *(systems.PointVortices, systems.SpringChain, systems.Damped, systems.Driven),
+        *(systems.RigidBody, systems.LotkaVolterra, systems.ChargedParticle),
         *(Separable, CurlFree, DivergenceFree, Symplectic, Sum),
         *(PortHamiltonian, Poisson, Structured),
         *(Controlled, InputMatrix, KnownMatrix, Constant),
@@ -141,10 +147,11 @@ class Reader:
     def fail(self, reason: str) -> NoReturn:
         raise ValueError(f"{self.source} is not a valid file of hamkernel.save: {reason}.")
 
-    def field(self, node: Any, kernel: AbstractMatrixKernel | None) -> Any:
+    def field(self, node: Any, kernel: AbstractMatrixKernel | None, mean: Any) -> Any:
         if not isinstance(node, dict) or node.get("module") not in field_classes():
             self.fail("it holds no learned field")
-        field = self.module(node, 0, None, "field", kernel)
+        given = {"kernel": kernel, "mean": None if mean is None else as_pytree(mean)}
+        field = self.module(node, 0, None, "field", given)
         if len(self.used) != len(self.arrays):
             self.fail("it has arrays that belong to nothing")
         return field
@@ -159,7 +166,7 @@ class Reader:
         return read(self, node, depth + 1, like, where)
 
     def module(
-        self, node: Node, depth: int, like: Any, where: str, kernel: Any = None
+        self, node: Node, depth: int, like: Any, where: str, users: dict[str, Any] | None = None
     ) -> eqx.Module:
         name, nodes = node["module"], node["fields"]
         cls = CLASSES.get(name) if isinstance(name, str) else None
@@ -169,6 +176,11 @@ class Reader:
                 + ", ".join(CLASSES)
             )
         fields = {f.name: f.type for f in dataclasses.fields(cls)}
+        defaults = {f.name: f.default for f in dataclasses.fields(cls)}
+        if isinstance(nodes, dict):  # files of before have not the fields that came later
+            older = set(fields) - set(nodes)
+            later = {n for n in older if defaults[n] is None}
+            nodes = nodes | {n: {"value": None} for n in later}
         if not isinstance(nodes, dict) or set(nodes) != set(fields):
             self.fail(f"{where} has not the fields of {name}")
         self.same_type(cls, like, where)
@@ -176,8 +188,7 @@ class Reader:
         module = object.__new__(cls)
         with jaxtyped("context"):  # so that the axes of all arrays of a module must agree
             for key, annotation in fields.items():
-                given = kernel if key == "kernel" and kernel is not None else None
-                given = getattr(like, key) if like is not None else given
+                given = (users or {}).get(key) if like is None else getattr(like, key)
                 value = self.value(nodes[key], depth, given, f"{where}.{key}")
                 if not _fits(value, annotation):
                     self.fail(f"{where}.{key} is a {_shown(value)}, which {name} cannot have")
@@ -232,6 +243,11 @@ class Reader:
         if not isinstance(name, str) or not isinstance(nodes, list):
             self.fail(f"{where} is no code of a user")
         if like is None:
+            if where.startswith("field.mean"):
+                raise ValueError(
+                    f"{self.source}: {where} is {name[:80]!r}, code that is not in the file. Pass "
+                    "the mean that was given to fit: hk.load(path, mean=...)."
+                )
             raise ValueError(
                 f"{self.source}: {where} is {name[:80]!r}, code that is not in the file. Pass the "
                 "kernel that was given to fit, with any hyperparameters: "

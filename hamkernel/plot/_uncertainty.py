@@ -79,8 +79,8 @@ def ensemble(
     return ax
 
 
-# Standard deviations on either side that hold half and nine tenths of a normal variable.
-_SHARES = ((0.9, 1.645), (0.5, 0.674))
+# Standard deviations on either side that hold a share of a normal variable, and how it is shaded.
+_SHARES = ((0.9, 1.645, 0.18), (0.5, 0.674, 0.38))
 
 
 def band(
@@ -121,11 +121,11 @@ def band(
     if (deviation < 0).any():
         raise ValueError("deviation is negative somewhere: standard deviations are needed.")
     ax = axes(ax, figsize=(5.6, 3.6))
-    for share, width in _SHARES:
+    for share, width, shade in _SHARES:
         reach = width * deviation
         name = f"{share:.0%}"
         ax.fill_between(
-            ts, mean - reach, mean + reach, color=color, alpha=0.22, linewidth=0, label=name
+            ts, mean - reach, mean + reach, color=color, alpha=shade, linewidth=0, label=name
         )
     ax.plot(ts, mean, color=color, linewidth=1.4, label="mean")
     for values in rest:
@@ -179,7 +179,9 @@ def deviation(
     filled = ax.contourf(q, p, values.reshape(len(p), -1), 14, cmap="cividis")
     ax.figure.colorbar(filled, ax=ax, label=label)
     if X is not None:
-        ax.plot(*X.T, "o", color=DATA, mec="black", mew=0.6, ms=5, zorder=5, label="data")
+        ax.plot(
+            *X.T, "o", color=DATA, mec="black", mew=0.6, ms=5, zorder=5, clip_on=False, label="data"
+        )
     most = {"color": "white", "mec": "black", "mew": 0.8, "ms": 13, "linestyle": "none"}
     ax.plot(*points[values.argmax()], "*", label="largest", zorder=6, clip_on=False, **most)
     ax.set(title=title or "", xlim=xlim, ylim=ylim, **labels)
