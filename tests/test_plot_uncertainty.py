@@ -1,5 +1,10 @@
 """Pictures of what is not known, read back from the axes."""
 
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportIndexIssue=false, reportOptionalMemberAccess=false, reportOperatorIssue=false
+# pyright: reportOptionalOperand=false
+# What matplotlib returns has no types.
+
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np

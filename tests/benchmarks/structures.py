@@ -6,6 +6,8 @@ Errors are root mean square over fresh states, as a share of the field, medians 
 hyperparameters come from `tune(..., objective="marginal_likelihood")`.
 """
 
+# pyright: reportArgumentType=false, reportOptionalOperand=false, reportAttributeAccessIssue=false
+
 import argparse
 from collections.abc import Callable
 from typing import Any
