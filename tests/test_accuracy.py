@@ -13,7 +13,7 @@ import scipy.linalg
 from benchmarks.accuracy import allowed, bases, compiled, errors, orbit, problems
 
 import hamkernel as hk
-from hamkernel._validation.bases import LandmarkBasis, WaveBasis
+from hamkernel._solvers.bases import LandmarkBasis, WaveBasis
 
 CASES = {
     f"{problem.name}, {kind}": (problem, basis)

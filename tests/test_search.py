@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
+from hamkernel._solvers.bases import WaveBasis
 from hamkernel._tuning.boxes import full_trace, hyperparameters
 from hamkernel._tuning.descent import Descent, Run
 from hamkernel._tuning.objective import criterion_of
 from hamkernel._tuning.part import Part, rows_of_parts
 from hamkernel._tuning.space import SearchSpace
 from hamkernel._tuning.starts import design, shares_apart, spread_out
-from hamkernel._validation.bases import WaveBasis
 from hamkernel._validation.losses import generalized_loss
 
 N = 20

@@ -9,8 +9,8 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import hamkernel as hk
+from hamkernel._solvers.bases import LandmarkBasis, WaveBasis
 from hamkernel._solvers.landmarks import given_landmarks
-from hamkernel._validation.bases import LandmarkBasis, WaveBasis
 from hamkernel._validation.folds import Partition
 from hamkernel._validation.losses import generalized_loss, log_likelihood, partition_loss
 

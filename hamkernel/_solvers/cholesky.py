@@ -16,6 +16,7 @@ from hamkernel._gram.operator import product
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._observations.rows import Rows
+from hamkernel._solvers.bases import AbstractBasis
 from hamkernel._solvers.conditional import AbstractConditional, dense_conditional
 from hamkernel._structures.base import AbstractMatrixKernel
 
@@ -26,6 +27,14 @@ class AbstractSolver(eqx.Module, Generic[Learned]):
     """How `fit` finds the field."""
 
     no_factor: ClassVar[str | None] = None  # why it cannot say how far the field may be off
+    is_low_rank: ClassVar[bool] = False  # whether `tune` is to judge by the loss in its `_basis`
+
+    def _basis(
+        self, K: AbstractMatrixKernel, X: Float[Array, "N n"], regularization: Float[Array, ""]
+    ) -> AbstractBasis | None:
+        """The features of a fit of low rank, as functions of the hyperparameters."""
+        del K, X, regularization
+        return None
 
     @abc.abstractmethod
     def _fitted(

@@ -12,7 +12,7 @@ A stream is seen once and leaves no residual; `stream_sums.py` says how its sums
 """
 
 import numbers
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
@@ -27,6 +27,7 @@ from hamkernel._machine.devices import as_given, rows_of, split
 from hamkernel._observations.rows import Rows
 from hamkernel._show import text
 from hamkernel._solvers import stream_sums
+from hamkernel._solvers.bases import LandmarkBasis
 from hamkernel._solvers.landmark_gram import (
     Columns,
     checked,
@@ -85,6 +86,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
     Source: Chen, Epperly, Tropp & Webber (2023), arXiv 2207.06503; Björck (1987) for the solve.
     """
 
+    is_low_rank: ClassVar[bool] = True
     tolerance: float = eqx.field(static=True)
     max_points: int = eqx.field(static=True)
     candidates: int = eqx.field(static=True)
@@ -124,6 +126,11 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         key = jax.random.key(0) if self.key is None else self.key
         left = self.tolerance * regularization
         return choose_landmarks(K, X, left, self.max_points, self.candidates, key)
+
+    def _basis(
+        self, K: AbstractMatrixKernel, X: Float[Array, "N n"], regularization: Float[Array, ""]
+    ) -> LandmarkBasis:
+        return LandmarkBasis(self.landmarks(K, X, regularization).points)
 
     def _fitted(
         self,

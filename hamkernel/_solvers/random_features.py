@@ -1,5 +1,7 @@
 """Least squares in random Fourier features, in memory that does not grow with the points."""
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int, Key, Num, UInt32
@@ -12,6 +14,7 @@ from hamkernel._machine.devices import as_given, rows_of, split
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers import stream_sums
+from hamkernel._solvers.bases import WaveBasis
 from hamkernel._solvers.landmark_gram import singular
 from hamkernel._solvers.low_rank_conditional import (
     FeatureSpan,
@@ -58,12 +61,18 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
     Source: Rahimi & Recht (2007).
     """
 
+    is_low_rank: ClassVar[bool] = True
     count: int = eqx.field(static=True)
     key: Key[Array, ""]
 
     def __init__(self, count: int, key: Key[Array, ""] | UInt32[Array, "..."]):
         self.count = require.count(count, "count")
         self.key = require.key(key)
+
+    def _basis(
+        self, K: AbstractMatrixKernel, X: Float[Array, "N n"], regularization: Float[Array, ""]
+    ) -> WaveBasis:
+        return WaveBasis(self.key, self.count)
 
     def _fitted(
         self,

@@ -14,9 +14,8 @@ from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.rows import Rows
-from hamkernel._solvers.random_features import RandomFeatures
+from hamkernel._solvers.bases import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._validation.bases import AbstractBasis, LandmarkBasis, WaveBasis
 from hamkernel._validation.folds import Folds, Partition
 from hamkernel._validation.losses import (
     cross_validation_loss,
@@ -192,11 +191,3 @@ def _negative_log_likelihood_of(rows, K, X, Y, regularization):
 
 def _negative_log_likelihood(K, X, Y, regularization, basis=None):
     return -log_likelihood(K, X, Y, regularization, basis)
-
-
-def basis_of(solver, K, regularization, X) -> AbstractBasis:
-    """What the solver would take at the best kernel of the subset; it follows the kernel then."""
-    if isinstance(solver, RandomFeatures):
-        return WaveBasis(solver.key, solver.count)
-    landmarks = solver.landmarks(K, X, regularization)
-    return LandmarkBasis(landmarks.points)

@@ -32,8 +32,6 @@ from hamkernel._show import described
 from hamkernel._solvers.cholesky import AbstractSolver
 from hamkernel._solvers.fit import checked_rows, fit
 from hamkernel._solvers.means import Mean, without_mean
-from hamkernel._solvers.nystrom import Nystrom
-from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.joined import joined_data
 from hamkernel._tuning import advice
@@ -43,7 +41,6 @@ from hamkernel._tuning.objective import (
     Criterion,
     Objective,
     SearchCriterion,
-    basis_of,
     criterion_of,
     criterion_of_rows,
 )
@@ -215,7 +212,7 @@ def tune(
         ridge = require.ridge(regularization, X.dtype)
         criterion = criterion_of(objective, len(X), folds)
     advice.warn_of_few_folds(criterion, folds)
-    low_rank = isinstance(solver, Nystrom | RandomFeatures) and not criterion.own
+    low_rank = solver is not None and solver.is_low_rank and not criterion.own
     few = rows_of_parts(X, criterion, dense=True)[0]
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
     space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings, X[few])
@@ -226,7 +223,10 @@ def tune(
 
     def of_low_rank(run: Run) -> SearchCriterion:
         kernel, regularization, _ = decode(space, run.u)
-        return criterion.with_basis(basis_of(solver, kernel, regularization, X))
+        assert solver is not None
+        basis = solver._basis(kernel, X, regularization)
+        assert basis is not None
+        return criterion.with_basis(basis)
 
     runs = search.runs(of_low_rank if low_rank else None)
     found = best(runs)

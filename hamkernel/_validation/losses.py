@@ -20,10 +20,10 @@ from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations, as_states, both
 from hamkernel._observations.rows import Rows
+from hamkernel._solvers.bases import AbstractBasis
 from hamkernel._solvers.fit import checked_rows
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.joined import joined_data
-from hamkernel._validation.bases import AbstractBasis
 from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
 from hamkernel._validation.folds import Folds, Partition
 from hamkernel._validation.observed import (

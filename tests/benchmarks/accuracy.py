@@ -25,7 +25,7 @@ from flint import arb, arb_mat, ctx
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._validation.bases import LandmarkBasis, WaveBasis
+from hamkernel._solvers.bases import LandmarkBasis, WaveBasis
 from hamkernel._validation.folds import Partition
 from hamkernel._validation.losses import generalized_loss, log_likelihood, partition_loss
 
