@@ -1,9 +1,9 @@
 """The search of `tune`: many runs on few points, and few on many.
 
 The runs are made on a subset of the points. Their ends, those that differ, are compared on more
-points, and the best two are finished there, with the curvature that they have learned; and so on, up
-to all points. The price of a loss grows with the cube of the points, so that the last part takes
-most of the time although it looks at two points and takes few steps.
+points, and the best two are finished there, with the curvature that they have learned; and so on,
+up to all points. The price of a loss grows with the cube of the points, so that the last part takes
+most of the time although it looks at one or two points and takes few steps.
 """
 
 import sys
