@@ -1,0 +1,118 @@
+"""One thread of BLAS while the library computes, and the caller's number again afterwards."""
+
+import subprocess
+import sys
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from threadpoolctl import ThreadpoolController
+
+import hamkernel as hk
+from hamkernel._machine import threads
+from hamkernel._machine.threads import one_blas_thread
+
+X = np.random.default_rng(0).normal(size=(12, 2))
+Y = X @ np.array([[0.0, -1.0], [1.0, 0.0]])
+K = hk.Symplectic(hk.Gaussian(1.5))
+
+
+def now() -> list[int]:
+    pools = ThreadpoolController().select(user_api="blas").lib_controllers
+    return [pool.num_threads for pool in pools]
+
+
+@pytest.fixture(autouse=True)
+def two_threads():
+    """As many as a user has, although the tests run with one."""
+    controller = threads._controller()
+    with controller.limit(limits=2, user_api="blas"):
+        assert set(now()) == {2}
+        yield
+        assert set(now()) == {2}
+
+
+def test_inside_there_is_one_and_afterwards_as_many_as_before():
+    assert set(one_blas_thread(now)()) == {1}
+    assert set(now()) == {2}
+
+
+def test_after_an_error_too():
+    @one_blas_thread
+    def fails():
+        raise KeyError("x")
+
+    with pytest.raises(KeyError):
+        fails()
+    assert set(now()) == {2}
+
+
+def test_calls_inside_of_calls_restore_once():
+    @one_blas_thread
+    def outer():
+        before = one_blas_thread(now)()
+        return before, now()  # the inner call has not given the threads back
+
+    inner, after = outer()
+    assert set(inner) == set(after) == {1}
+
+
+def test_calls_of_several_threads_wait_for_the_last():
+    entered, leave = threading.Event(), threading.Event()
+
+    @one_blas_thread
+    def waits():
+        entered.set()
+        leave.wait(10)
+
+    other = threading.Thread(target=waits)
+    other.start()
+    assert entered.wait(10)
+    assert set(one_blas_thread(now)()) == {1}
+    assert set(now()) == {1}  # the other one still computes
+    leave.set()
+    other.join()
+    assert set(now()) == {2}
+
+
+CALLS = {
+    "fit": lambda: hk.fit(K, X, Y, 1e-3),
+    "condition": lambda: hk.condition(hk.Symplectic(2.0 * hk.Gaussian(1.5)), X, Y, 1e-3),
+    "loss": lambda: hk.cross_validation_loss(K, X, Y, 1e-3),
+    "likelihood": lambda: hk.log_marginal_likelihood(K, X, Y, 1e-3),
+    "tune": lambda: hk.tune(K, X, Y, starts=1, max_steps=1),
+}
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_public_calls_that_factor_run_on_one(name, monkeypatch):
+    seen = []
+    limited = threads._one_thread
+
+    def spied():
+        seen.append(True)
+        return limited()
+
+    monkeypatch.setattr(threads, "_one_thread", spied)
+    CALLS[name]()
+    assert seen
+
+
+def test_results_are_there_when_the_threads_are_given_back():
+    field = hk.fit(K, X, Y, 1e-3)
+    assert all(leaf.is_ready() for leaf in jax.tree.leaves(field) if isinstance(leaf, jax.Array))
+
+
+def test_under_the_callers_jit_nothing_is_limited_while_it_runs():
+    run = jax.jit(lambda ridge: hk.fit(K, X, Y, ridge).coefficients)
+    expected = hk.fit(K, X, Y, 1e-3).coefficients
+    np.testing.assert_allclose(run(jnp.asarray(1e-3)), expected, atol=1e-10)
+    assert set(now()) == {2}
+
+
+def test_importing_the_library_does_not_load_scipy_linear_algebra():
+    code = "import sys, hamkernel; print('threadpoolctl' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
