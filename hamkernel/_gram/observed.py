@@ -54,7 +54,7 @@ def between(
 
     def of_group(group):
         points, weights = group
-        return _mapped(K, Combinations(points[None], weights[None]), right)
+        return _mapped(K, Combinations(groups=points[None], weights=weights[None]), right)
 
     # One group after the other: the covariances of all points need not fit in memory.
     at_once = max(1, _ENTRIES // (left.groups[0].size * right.points.size))

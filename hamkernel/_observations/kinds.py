@@ -265,7 +265,7 @@ class Functionals(AbstractObservations):
         return self.points.shape[2]
 
     def parts(self) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
-        yield Combinations(self.points, self.weights), self.targets
+        yield Combinations(groups=self.points, weights=self.weights), self.targets
 
 
 def both(X: Any, Y: Any) -> tuple[Any, Any]:

@@ -110,4 +110,13 @@ def of_features(
     zero, infinite = jnp.zeros((), w.dtype), jnp.full((), jnp.inf, w.dtype)
     unknown = jnp.zeros((0, n), w.dtype)
     info = SolverInfo("draw")
-    return FeatureField(K, basis, w, unknown, infinite, zero, zero, info)
+    return FeatureField(
+        kernel=K,
+        features=basis,
+        weights=w,
+        residual=unknown,
+        norm=infinite,
+        regularization=zero,
+        offset=zero,
+        info=info,
+    )

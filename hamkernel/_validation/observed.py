@@ -39,7 +39,7 @@ class ContrastedSystem(AbstractSystem):
         rows = jax.lax.stop_gradient(self.rows)
         half = rows.contrast(self.matrix)
         inner = DenseFactor(rows.contrast(half.T))
-        return ContrastedFactor(inner, rows, inner.size)
+        return ContrastedFactor(inner=inner, rows=rows, size=inner.size)
 
 
 class ContrastedFactor(AbstractFactor[ContrastedSystem]):
