@@ -3,12 +3,12 @@
 import subprocess
 import sys
 import threading
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from threadpoolctl import ThreadpoolController
 
 import hamkernel as hk
 from hamkernel._machine import threads
@@ -20,8 +20,7 @@ K = hk.Symplectic(hk.Gaussian(1.5))
 
 
 def now() -> list[int]:
-    pools = ThreadpoolController().select(user_api="blas").lib_controllers
-    return [pool.num_threads for pool in pools]
+    return [pool.num_threads for pool in threads._controller().lib_controllers]
 
 
 @pytest.fixture(autouse=True)
@@ -102,7 +101,8 @@ def test_public_calls_that_factor_run_on_one(name, monkeypatch):
 
 def test_results_are_there_when_the_threads_are_given_back():
     field = hk.fit(K, X, Y, 1e-3)
-    assert all(leaf.is_ready() for leaf in jax.tree.leaves(field) if isinstance(leaf, jax.Array))
+    leaves: list[Any] = jax.tree.leaves(field)
+    assert all(leaf.is_ready() for leaf in leaves if isinstance(leaf, jax.Array))
 
 
 def test_under_the_callers_jit_nothing_is_limited_while_it_runs():

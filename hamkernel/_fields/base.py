@@ -226,10 +226,10 @@ class FieldSum(eqx.Module):
     terms: tuple[Callable[..., Any], ...]
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        first, *rest = (term(x) for term in self.terms)
-        for each in rest:
-            first = first + each.astype(first.dtype)
-        return first
+        total = self.terms[0](x)
+        for term in self.terms[1:]:
+            total = total + term(x).astype(total.dtype)
+        return total
 
     @property
     def is_separable(self) -> bool:
@@ -341,31 +341,27 @@ class KernelField(AbstractField):
 
     def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         field = _expansion(self.kernel, x, self.points, self.coefficients)
-        if self.value_points is None or self.value_coefficients is None:
-            return field
-        return field + _of_values(self.kernel, x, self.value_points, self.value_coefficients)
+        S, b = self.value_points, self.value_coefficients
+        return field if S is None or b is None else field + _of_values(self.kernel, x, S, b)
 
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         fields = placed_product(self.kernel, X, self.points, self.coefficients)
-        if self.value_points is None:
+        S, b = self.value_points, self.value_coefficients
+        if S is None or b is None:
             return fields
-        at = jax.tree_util.Partial(_value_field, self.kernel)
-        return fields + at_points(lambda x: at(x, self.value_points, self.value_coefficients), X)
+        return fields + _values_at_points(self.kernel, X, S, b)
 
     def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         potential = _potential(self.kernel, x, self.points, self.coefficients)
-        if self.value_points is None or self.value_coefficients is None:
-            return potential
-        return potential + _values(self.kernel, x, self.value_points, self.value_coefficients)
+        S, b = self.value_points, self.value_coefficients
+        return potential if S is None or b is None else potential + _values(self.kernel, x, S, b)
 
     def _term(self, kernel: Sum, position: int) -> "KernelField":
         term, Z, A = kernel.terms[position], self.points, self.coefficients
         square = jnp.sum(A * placed_product(term, Z, Z, A))  # ‖f‖² = aᵀGa
         bare = dataclasses.replace(self, kernel=term, offset=jnp.zeros_like(self.offset), mean=None)
-        if (
-            self.value_points is not None and self.value_coefficients is not None
-        ):  # 2 aᵀG_av b + bᵀG_vv b
-            S, b = self.value_points, self.value_coefficients
+        S, b = self.value_points, self.value_coefficients
+        if S is not None and b is not None:  # 2 aᵀG_av b + bᵀG_vv b
             at = dataclasses.replace(bare, coefficients=2 * A)
             square = square + b @ at_points(at._learned_potential, S)
         return dataclasses.replace(bare, norm=root(square))
@@ -411,6 +407,11 @@ def _value_field(
         return b @ jax.vmap(lambda s: K.potential(s, x[None], v[None]))(S)
 
     return jax.grad(along)(jnp.zeros_like(x))
+
+
+@eqx.filter_jit
+def _values_at_points(K, X, S, b):
+    return at_points(lambda x: _value_field(K, x, S, b), X)
 
 
 _of_values, _values = eqx.filter_jit(_value_field), eqx.filter_jit(_value_potential)

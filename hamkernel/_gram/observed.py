@@ -54,7 +54,7 @@ def between(
 
     def of_group(group):
         points, weights = group
-        one = Combinations(points[None], weights[None])  # pyright: ignore[reportCallIssue]
+        one = Combinations(groups=points[None], weights=weights[None])  # pyright: ignore[reportCallIssue]
         return _mapped(K, one, right)
 
     # One group after the other: the covariances of all points need not fit in memory.

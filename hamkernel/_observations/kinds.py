@@ -265,7 +265,7 @@ class Functionals(AbstractObservations):
         return self.points.shape[2]
 
     def parts(self) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
-        rows = Combinations(self.points, self.weights)  # pyright: ignore[reportCallIssue]
+        rows = Combinations(groups=self.points, weights=self.weights)  # pyright: ignore[reportCallIssue]
         yield rows, self.targets
 
 

@@ -223,17 +223,17 @@ class Posterior(eqx.Module):
         """
         key, count = require.key(key), require.count(count, "count")
         n, dtype = self.given.rows.dimension, self.given.rows.targets.dtype
-        region = require.floating(region, "region").astype(dtype)
-        if region.shape != (2, n):
+        box = require.floating(region, "region").astype(dtype)
+        if box.shape != (2, n):
             raise ValueError(
-                f"region has shape {region.shape}; the lowest and the highest corner of a box, "
+                f"region has shape {box.shape}; the lowest and the highest corner of a box, "
                 f"shape (2, {n}), are needed."
             )
-        low, high = require.on_host(region)
+        low, high = require.on_host(box)
         bad = ~((high > low) & (abs(low) < np.inf) & (abs(high) < np.inf))
-        text = "region must be finite, its first row the lower corner in every coordinate."
-        region = jnp.asarray(require.value(region, bad, text))
-        draws, mean = self.given.draws(key, count, region), self.field.mean
+        message = "region must be finite, its first row the lower corner in every coordinate."
+        box = require.value(box, bad, message)
+        draws, mean = self.given.draws(key, count, box), self.field.mean
         if mean is None:
             return draws
 

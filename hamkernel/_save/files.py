@@ -29,8 +29,7 @@ def save(path: str | os.PathLike[str], field: AbstractField) -> None:
     """Write a learned field to one file: kernel, hyperparameters, data, coefficients, version.
 
     The file at `path` is replaced in one step, so that no reader ever sees half of it. Code of
-    your own (a kernel, the map of a `Warp`, a mean) is not written, only its arrays are: see
-    `load`.
+    your own (kernels, maps of a `Warp`, a mean) is not written, only its arrays are: see `load`.
 
     If the rows of the field are spread over several processes, all of them must make the call;
     each writes the whole field, to a path of its own or to one that they share.
