@@ -11,11 +11,14 @@ from pathlib import Path
 # The number of the picture in the notebook, from the first, 0.
 CHOSEN = {
     "quickstart": -1,
-    "guide_data": 1,
-    "guide_choose": 0,
+    "uncertainty": 1,
+    "friction": 0,
+    "control": 0,
+    "poisson": 0,
     "your_kernel": 0,
     "planets": 0,
     "double_pendulum": 1,
+    "guide_choose": 0,
 }
 
 
