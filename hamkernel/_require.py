@@ -315,8 +315,13 @@ def one_dtype(X: Array, Z: Array) -> tuple[Array, Array]:
     return X.astype(dtype), Z.astype(dtype)
 
 
-def data(X: ArrayLike, Y: ArrayLike) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
-    """States and velocities: two finite float arrays of one shape (N, n) and one dtype."""
+def data(
+    X: ArrayLike, Y: ArrayLike, part: bool = False
+) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
+    """States and velocities: two finite float arrays of one shape (N, n) and one dtype.
+
+    A `part` of the data may have fewer points than coordinates; all of it is warned of then.
+    """
     X, Y = points(X, "X"), points(Y, "Y")
     if X.shape != Y.shape:
         raise ValueError(
@@ -324,7 +329,7 @@ def data(X: ArrayLike, Y: ArrayLike) -> tuple[Float[Array, "N n"], Float[Array, 
             "one velocity Y[i] for each state X[i]."
         )
     N, n = X.shape
-    if N < n and N > 1:
+    if 1 < N < n and not part:
         warn(
             f"X has shape {X.shape}: {N} points of {n} coordinates, fewer points than coordinates. "
             "If it holds one coordinate a row, pass X.T and Y.T: shape (N, n), one state a row."

@@ -286,10 +286,10 @@ def as_states(X: Any, Y: Any) -> tuple[Any, Any]:
     return X, Y
 
 
-def observations(X: Any, Y: Any) -> AbstractObservations:
+def observations(X: Any, Y: Any, part: bool = False) -> AbstractObservations:
     """`X` if it is observations, and then there is no Y; else the velocities Y at states X."""
     if not isinstance(X, AbstractObservations):
-        return Velocities(*require.data(*both(X, Y)))
+        return Velocities(*require.data(*both(X, Y), part=part))
     if Y is not None:
         raise TypeError(
             f"{type(X).__name__} is all of the data, and Y is not needed. Say the regularization "

@@ -174,7 +174,7 @@ class Posterior(eqx.Module):
             ValueError: the new data has another n, or does not fit itself. RuntimeError: the new
                 rows are so close to the old ones that the factor fails.
         """
-        data, old = observations(X, Y), self.given.rows
+        data, old = observations(X, Y, part=True), self.given.rows
         if data.dimension != old.dimension:
             raise ValueError(
                 f"the new data has {data.dimension} coordinates and the posterior {old.dimension}: "

@@ -75,7 +75,7 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
             ValueError: a shape does not fit, or the data is not finite. TypeError: its dtype, or
                 it has more digits than the fit.
         """
-        X, Y = require.data(X, Y)
+        X, Y = require.data(X, Y, part=True)
         if np.promote_types(X.dtype, self.dtype) != self.dtype:
             raise TypeError(
                 f"the data is {X.dtype} and the fit {self.dtype}, the dtype of the sample that it "
@@ -161,7 +161,7 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned]):
                         f"a pair (X, Y) is needed, got {reprlib.repr(chunk)}. All of the data in "
                         "one chunk is [(X, Y)]."
                     )
-                X, Y = require.data(*chunk)
+                X, Y = require.data(*chunk, part=True)
             if model is None:
                 model = self.start(K, X if sample is None else sample, regularization)
             # The next chunk is read while this one is added, and no further ones pile up.
