@@ -352,8 +352,8 @@ def measured(X: ArrayLike, Y: ArrayLike) -> tuple[Array, Array, np.ndarray | Non
             "nothing to learn from."
         )
     if not missing.any():
-        return *data(X, Y), None
-    X, filled = data(X, jnp.where(missing, jnp.zeros_like(Y), Y))
+        return *data(X, Y, part=True), None
+    X, filled = data(X, jnp.where(missing, jnp.zeros_like(Y), Y), part=True)
     return X, jnp.where(missing, jnp.nan, filled), np.flatnonzero(~missing.reshape(-1))
 
 
