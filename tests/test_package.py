@@ -220,7 +220,7 @@ for loss in (hk.cross_validation_loss, hk.generalized_cross_validation, hk.log_m
 hk.cross_validation_residuals(K, X, X, 1e-2, [0, 1, 1] * 4)
 for other, solver in ((K, None), (1.0 * hk.Gaussian(jnp.ones(2)), solvers[2]), (k, solvers[3])):
     other = other if other is K else hk.Odd(hk.Symplectic(other))
-    hk.tune(other, X, X, folds=[0, 1, 2] * 4, starts=2, max_steps=2, solver=solver)
+    hk.tune(other, X, X, folds=list(range(6)) * 2, starts=2, max_steps=2, solver=solver)
 hk.check_kernel(k, X), hk.gram_operator(K, X, X[:2]).mv(X[:2])
 pendulum = hk.systems.Pendulum()
 hk.systems.sample(pendulum, X[0], np.linspace(0, 1, 3), 0.1, key=key)

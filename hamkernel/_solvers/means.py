@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._fields.base import Field, at_points, potential_of
+from hamkernel._fields.base import at_points, potential_of
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._observations.rows import Rows
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -25,7 +25,7 @@ def checked_mean(mean: Any, n: int, dtype: Any) -> Any:
     return as_pytree(mean)
 
 
-def with_mean(field: Field, mean: Mean | None) -> Field:
+def with_mean(field: Any, mean: Mean | None) -> Any:
     """The field and the mean together."""
     return field if mean is None else dataclasses.replace(field, mean=mean)
 
