@@ -59,7 +59,7 @@ def _(saved, bar, perturbed, kernel_and_points, make, rowwise=False):
     return K_bar, pull(bar)[0]
 
 
-def _array(make, rowwise: bool, K, X: Float[Array, "N n"]) -> Array:
+def _array(make, rowwise: bool, K, X: Float[Array, "..."]) -> Array:
     made = make(K, X)
     return made(X) if rowwise else made
 
