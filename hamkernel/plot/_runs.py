@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 
-from hamkernel.plot._style import COLORS, DATA, coordinate, legend, with_unit
+from hamkernel._trajectories.learned import interpolated
+from hamkernel.plot._style import COLORS, DATA, coordinate, legend, on_points, with_unit
 
 if TYPE_CHECKING:
     from hamkernel._trajectories.learned import Learned
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
 
 _BLUE = "#0072B2"
 _SIGMAS = 2.0  # standard deviations on either side, which hold 95 % of a normal variable
-_BETWEEN = 9  # curves between two samples look smooth
+_BETWEEN = 9  # points a sample, between which a curve looks smooth
 
 
 def smoothing(
@@ -52,7 +53,7 @@ def smoothing(
     run, n = _position(run, len(runs)), runs.dimension
     labels = _labels(n, units, names)
     panels = _column(n, 1, ax)[:, 0]
-    curves = runs.smoothing(_BETWEEN)
+    curves = runs.smoothing(_BETWEEN - 1)
     ts, mean = np.asarray(curves.times[run]), np.asarray(curves.states[run])
     reach = _SIGMAS * np.asarray(curves.deviation[run])
     for c, panel in enumerate(panels):
@@ -102,14 +103,16 @@ def fitted(
     labels = _labels(n, units, names)
     panels = _column(n, 2, ax)
     ts, fit = np.asarray(learned.runs.times[run]), np.asarray(learned.states[run])
+    grid = np.interp(np.arange(_BETWEEN * (len(ts) - 1) + 1) / _BETWEEN, np.arange(len(ts)), ts)
+    path = interpolated(grid, ts, fit, on_points(learned.field, fit))
     residuals, misfit = np.asarray(learned.residuals[run]), np.asarray(learned.misfit[run])
     for c, (left, right) in enumerate(panels):
-        left.plot(ts, fit[:, c], color=_BLUE, linewidth=1.4, label="fitted")
+        left.plot(grid, path[:, c], color=_BLUE, linewidth=1.4, label="fitted")
         _samples(left, learned.runs, run, c)
         _over_time(left, ts, labels[c])
         right.axhspan(-_SIGMAS, _SIGMAS, color="0.9", linewidth=0)
         right.axhline(0.0, color="0.6", linewidth=0.8)
-        right.plot(ts, residuals[:, c], "o", color=COLORS["true"], ms=3)
+        right.plot(ts, residuals[:, c], "o", color=COLORS["true"], ms=3, clip_on=False)
         _over_time(right, ts, r"residual / $\sigma$")
         said = f"root mean square {misfit[c]:.2f}" if np.isfinite(misfit[c]) else "never measured"
         right.set_title(said, fontsize="small")
@@ -161,7 +164,14 @@ def _column(n: int, width: int, ax: object) -> np.ndarray:
 
 def _samples(panel: Axes, runs: Runs, run: int, c: int) -> None:
     ts, x = np.asarray(runs.times[run]), np.asarray(runs.states[run])[:, c]
-    style = {"mec": "black", "mew": 0.4, "ms": 4, "linestyle": "none", "zorder": 4}
+    style = {
+        "mec": "black",
+        "mew": 0.4,
+        "ms": 4,
+        "linestyle": "none",
+        "zorder": 4,
+        "clip_on": False,
+    }
     panel.plot(ts, x, "o", color=DATA, label="measured", **style)
 
 
