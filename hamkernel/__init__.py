@@ -48,6 +48,7 @@ from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
 from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
 from hamkernel._structures.base import Sum
 from hamkernel._structures.controlled import Controlled, InputMatrix
+from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.operators import CurlFree, DivergenceFree, Separable, Symplectic
 from hamkernel._structures.own import Poisson, Structured
 from hamkernel._structures.port_hamiltonian import PortHamiltonian
@@ -93,6 +94,7 @@ __all__ = [  # noqa: RUF022 - in reading order
     "Invariant",
     "Controlled",
     "InputMatrix",
+    "UnknownMasses",
     "Sum",
     # What was measured.
     "Velocities",

@@ -33,7 +33,13 @@ from hamkernel._trajectories.learned import (
 from hamkernel._trajectories.prepared import check_identifiable, prepared
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.shooting import SHORT, Piece, cuts, grown, halved
-from hamkernel._trajectories.start import box_of, landmarks, sampled, with_amplitude
+from hamkernel._trajectories.start import (
+    box_of,
+    landmarks,
+    sampled,
+    with_amplitude,
+    with_masses,
+)
 
 _WIDE = 100.0  # standard deviations of the states: the prior of a start
 _SHORT_ROUNDS = 2  # iterations with short segments, in which a rough field stays near the samples
@@ -49,6 +55,7 @@ def learn(
     noise: ArrayLike | None = None,
     solver: Nystrom | None = None,
     *,
+    masses: bool = False,
     progress: bool = False,
 ) -> Learned:
     """Learn a field from noisy states at times, without velocities.
@@ -71,6 +78,8 @@ def learn(
             runs is noticed. If None it is found.
         solver: `hk.Nystrom(max_points=…)` sets how many landmarks carry the field; if None, 48 for
             n = 2 and 80 for n = 4, which cover the paths evenly.
+        masses: whether states are (q, q̇) with unknown masses instead of (q, p). Their ratios are
+            then learned, `learned.kernel.masses`; see `UnknownMasses`, whose kernel K becomes.
         progress: show a progress bar (tqdm).
 
     Returns:
@@ -88,6 +97,8 @@ def learn(
     """
     K = with_amplitude(matrix_kernel(K))
     given = _check(K, runs, noise, solver)
+    if masses:
+        K = with_masses(K, runs.dimension)
     check_identifiable(runs, mean)
     mean = None if mean is None else as_pytree(mean)
     data = prepared(runs, mean)

@@ -145,7 +145,8 @@ def warn_of_misfit(chi_squared: float, misfit: Float[np.ndarray, "R n"]) -> None
     causes = (
         "Likely causes, in order: a part of the motion that the kernel cannot have, such as "
         "friction (add hk.CurlFree, or take hk.PortHamiltonian); (q, q̇) given where (q, p) is "
-        "needed (p = m q̇, in one scale for all masses); a wrong unit; a jump or push in a run."
+        "needed (p = m q̇, in one scale; masses=True finds their ratios); a wrong unit; a jump or "
+        "push in a run."
     )
     run, c = np.unravel_index(np.nanargmax(misfit), misfit.shape)
     require.warn(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Sequence
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
-from hamkernel._trajectories.smoothing import Coordinate, Paths, processes, smoothed
+from hamkernel._trajectories.smoothing import Smoothing, processes, smoothed, smoothing
 
 _GAP = 10.0  # times the median spacing: between such samples the path is a guess
 
@@ -96,11 +97,21 @@ class Runs(eqx.Module):
         )
         return X, Y, jnp.asarray(np.repeat(np.arange(len(times)), lengths))
 
-    def smoothed(self) -> tuple[list[Coordinate], Paths]:
-        """The processes of the coordinates, and the runs smoothed with them, padded."""
-        times, states = self.on_host()
-        found = processes(times, states)
-        return found, smoothed(found, times, states)
+    def smoothing(self, between: int = 0) -> Smoothing:
+        """The smoothed states and how far they may be off: what `hk.plot.smoothing` draws.
+
+        The processes in time are those of `velocities`.
+
+        Args:
+            between: how many times between each two samples are smoothed besides.
+
+        Raises:
+            ValueError: `between` is negative. TypeError: it is no integer.
+        """
+        between = operator.index(between)
+        if between < 0:
+            raise ValueError(f"between must be 0 or more, got {between}.")
+        return smoothing(*self.on_host(), between)
 
     def on_host(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Times and states as NumPy arrays of doubles."""

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hamkernel._show import described
 from hamkernel._trajectories.descent import minimise
 from hamkernel._trajectories.padding import cut, padded
 from hamkernel._trajectories.smoother import Process, Smoothed, negative_log_likelihood, smooth
@@ -148,3 +149,42 @@ def smoothed(
                 path[:, :, c] = np.asarray(values)
         paths.value[: len(means), :, c] += means[:, None, c]
     return paths
+
+
+class Smoothing(eqx.Module):
+    """Runs smoothed one coordinate at a time, for a look at them; no field is asked.
+
+    Attributes:
+        times: of each run, shape (P,): its samples and what was asked for between them.
+        states: the smoothed states there, shape (P, n); NaN where never measured.
+        deviation: the standard deviation of each coordinate, the sensor noise left out, (P, n).
+        noise: the standard deviation of the sensor noise of each coordinate, shape (n,).
+    """
+
+    times: tuple[Float[Array, " P"], ...]
+    states: tuple[Float[Array, "P n"], ...]
+    deviation: tuple[Float[Array, "P n"], ...]
+    noise: Float[Array, " n"]
+
+    def __repr__(self) -> str:
+        return described(self)
+
+
+def smoothing(times: Sequence[np.ndarray], states: Sequence[np.ndarray], between: int) -> Smoothing:
+    """The runs at their samples and at so many times between each two."""
+    found = processes(times, states)
+    grids, wide = [], []
+    for t, x in zip(times, states, strict=True):
+        shares = np.arange(between + 1) / (between + 1)
+        inside = t[:-1, None] + np.diff(t)[:, None] * shares[None]
+        grids.append(np.append(inside.ravel(), t[-1]))
+        spread = np.full((len(grids[-1]), x.shape[1]), np.nan)
+        spread[:: between + 1] = x
+        wide.append(spread)
+    paths = smoothed(found, grids, wide)
+    values, deviations = (
+        tuple(jnp.asarray(a[r, : len(t)]) for r, t in enumerate(grids))
+        for a in (paths.value, paths.deviation)
+    )
+    noise = jnp.asarray([c.noise if c.seen else np.nan for c in found])
+    return Smoothing(tuple(jnp.asarray(t) for t in grids), values, deviations, noise)

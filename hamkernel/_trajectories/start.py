@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 from hamkernel._kernels.base import ScalarSum, Scaled
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.operators import AbstractStructure
 from hamkernel._trajectories.evidence import Box, Model
 from hamkernel._trajectories.flow import WEIGHTS
@@ -36,6 +37,17 @@ def with_amplitude(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
         return eqx.tree_at(lambda node: node.kernel, node, Scaled(node.kernel, 1.0))
 
     return jax.tree.map(scaled, K, is_leaf=is_structure)
+
+
+def with_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
+    """K for states (q, q̇) of n coordinates, all masses equal at first."""
+    if n == 2:
+        raise ValueError(
+            "masses=True with one degree of freedom: every mass explains the same motion and is "
+            "only a unit of the energy, so there is nothing to find. Leave it out; (q, q̇) is "
+            "(q, p) of a mass of one."
+        )
+    return K if isinstance(K, UnknownMasses) else UnknownMasses(K, jnp.ones(n // 2))
 
 
 def _has_amplitude(k: object) -> bool:

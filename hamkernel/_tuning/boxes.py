@@ -25,6 +25,7 @@ from hamkernel._kernels.transforms import Select, Warp, without_symmetry
 from hamkernel._observations.rows import Rows
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.controlled import Controlled
+from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.port_hamiltonian import PortHamiltonian
 
 
@@ -121,6 +122,8 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
         X = X[:, list(node.dims)]
     if isinstance(node, Controlled):  # points are (x, u)
         X = X[:, : node.outputs(X.shape[1])]
+    if isinstance(node, UnknownMasses):
+        X = X * np.asarray(node.scales(X.dtype))[None]
     for key, child in _children(node):
         if eqx.is_inexact_array(child):
             name = keystr((*path, *key)).removeprefix(".")

@@ -8,6 +8,7 @@ every picture; the colours can be told apart by colour-blind readers and in grey
 from hamkernel.plot._contours import hamiltonian, loss_surface
 from hamkernel.plot._phase import phase_portrait, plane_slice, trajectories
 from hamkernel.plot._poincare import crossings, poincare_section
+from hamkernel.plot._runs import fitted, smoothing
 from hamkernel.plot._style import COLORS
 from hamkernel.plot._time import energy_drift, trajectory_error
 from hamkernel.plot._uncertainty import band, deviation, ensemble
@@ -19,11 +20,13 @@ __all__ = [
     "deviation",
     "energy_drift",
     "ensemble",
+    "fitted",
     "hamiltonian",
     "loss_surface",
     "phase_portrait",
     "plane_slice",
     "poincare_section",
+    "smoothing",
     "trajectories",
     "trajectory_error",
 ]

@@ -1,0 +1,101 @@
+"""Structures in positions and velocities: their masses are found, up to a common factor."""
+
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# Wrong types are refused here.
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hamkernel as hk
+
+RATIO = 2.5
+S = np.diag([1.0, 1.0, 1.0, RATIO])
+G = hk.Gaussian(1.3)
+K = hk.UnknownMasses(hk.Symplectic(G), [2.0, 2.0 * RATIO])
+
+
+def energy(y):
+    """Two masses on a hardening spring and between springs, in (q, q̇)."""
+    q, v = y[:2], y[2:]
+    kinetic = (v[0] ** 2 + RATIO * v[1] ** 2) / 2
+    return kinetic + q[0] ** 2 / 2 + q[0] ** 4 / 4 + 0.75 * (q[1] - q[0]) ** 2 + q[1] ** 2 / 2
+
+
+def moves(y):
+    force = -jax.grad(energy)(y)[:2]
+    return jnp.concatenate([y[2:], force / jnp.array([1.0, RATIO])])
+
+
+def states(count, seed=0):
+    return np.random.default_rng(seed).uniform(-1.5, 1.5, (count, 4))
+
+
+def test_the_gram_is_that_of_momenta_between_the_masses():
+    X, Z = states(5), states(3, 1)
+    inner = np.asarray(hk.gram(hk.Symplectic(G), X @ S, Z @ S))
+    inverse = np.linalg.inv(S)
+    expected = np.einsum("ab,ibjc,cd->iajd", inverse, inner, inverse)
+    np.testing.assert_allclose(hk.gram(K, X, Z), expected, atol=1e-12)
+    np.testing.assert_allclose(K.masses, [1.0, RATIO])
+    assert repr(K) == f"UnknownMasses({hk.Symplectic(G)!r}, masses=[2.5])"
+
+
+def test_a_field_with_the_right_masses_keeps_its_energy_and_others_cannot_fit():
+    X = states(80)
+    Y = np.asarray(jax.vmap(moves)(jnp.asarray(X)))
+    kernel = hk.Symplectic(100.0 * hk.Gaussian(4.0))
+    right = hk.fit(hk.UnknownMasses(kernel, [1.0, RATIO]), X, Y, 1e-8)
+    assert float(jnp.linalg.norm(right.residual)) < 0.01 * np.linalg.norm(Y)
+    x = jnp.asarray(X[3])
+    slope = jax.grad(right.hamiltonian)(x)
+    np.testing.assert_allclose(slope @ right(x), 0.0, atol=1e-9)
+    np.testing.assert_allclose(slope, jax.grad(energy)(x), atol=0.05)
+    wrong = hk.fit(kernel, X, Y, 1e-8)  # equal masses, and no H has this field
+    assert float(jnp.linalg.norm(wrong.residual)) > 10 * float(jnp.linalg.norm(right.residual))
+
+
+def test_friction_takes_energy_from_velocities_as_it_does_from_momenta():
+    X = states(30)
+    Y = np.asarray(jax.vmap(moves)(jnp.asarray(X))) - 0.3 * X * [0.0, 0.0, 1.0, 1.0]
+    damped = hk.PortHamiltonian(hk.Gaussian(4.0), 0.3)
+    field = hk.fit(hk.UnknownMasses(damped, [1.0, RATIO]), X, Y, 1e-8)
+    x = jnp.asarray(X[0])
+    lost = -jax.grad(field.hamiltonian)(x) @ field(x)
+    np.testing.assert_allclose(field.dissipation(x), lost, atol=1e-9)
+
+
+def test_tuning_finds_the_ratio():
+    X = states(60)
+    rng = np.random.default_rng(2)
+    Y = np.asarray(jax.vmap(moves)(jnp.asarray(X))) + 0.01 * rng.standard_normal(X.shape)
+    start = hk.UnknownMasses(hk.Symplectic(1.0 * hk.Gaussian(1.0)), [1.0, 1.0])
+    found = hk.tune(start, X, Y, objective="marginal_likelihood", starts=2)
+    np.testing.assert_allclose(found.kernel.masses, [1.0, RATIO], rtol=0.05)
+
+
+def test_what_has_no_masses_to_find_is_refused():
+    with pytest.raises(ValueError, match="one degree of freedom there is nothing to find"):
+        hk.UnknownMasses(hk.Symplectic(G), [1.0])
+    with pytest.raises(ValueError, match="masses must be positive"):
+        hk.UnknownMasses(hk.Symplectic(G), [1.0, -1.0])
+    with pytest.raises(TypeError, match="must be a matrix-valued kernel"):
+        hk.UnknownMasses(G, [1.0, 1.0])
+    with pytest.raises(ValueError, match="there are 2 masses: states"):
+        hk.fit(K, np.ones((9, 6)), np.ones((9, 6)))
+    t = np.linspace(0, 6, 20)
+    one = hk.Runs(t, np.column_stack([np.sin(t), np.cos(t)]))
+    with pytest.raises(ValueError, match="masses=True with one degree of freedom"):
+        hk.learn(hk.Symplectic(G), one, masses=True)
+
+
+@pytest.mark.slow
+def test_learning_from_states_finds_the_ratio():
+    rng = np.random.default_rng(0)
+    ts = np.linspace(0, 6, 31)
+    starts = jnp.asarray(rng.uniform(-1, 1, (6, 4)))
+    true = jax.vmap(lambda x: hk.simulate(moves, x, jnp.asarray(ts)).ys)(starts)
+    noisy = [x + 0.01 * rng.standard_normal(x.shape) for x in np.asarray(true)]
+    found = hk.learn(hk.Symplectic(hk.Gaussian(1.0)), hk.Runs([ts] * 6, noisy), masses=True)
+    np.testing.assert_allclose(found.kernel.masses, [1.0, RATIO], rtol=0.05)
