@@ -96,8 +96,8 @@ def test_public_calls_that_factor_run_on_one(name, monkeypatch):
 
 def test_results_are_there_when_the_threads_are_given_back():
     field = hk.fit(K, X, Y, 1e-3)
-    leaves: list[Any] = jax.tree.leaves(field)
-    assert all(leaf.is_ready() for leaf in leaves if isinstance(leaf, jax.Array))
+    arrays: list[Any] = [a for a in jax.tree.leaves(field) if isinstance(a, jax.Array)]
+    assert all(a.is_ready() for a in arrays)
 
 
 def test_under_the_callers_jit_nothing_is_limited_while_it_runs():
