@@ -2,25 +2,35 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hamkernel._kernels.base import Invariance
 from hamkernel._kernels.groups import matrix_of
 from hamkernel._kernels.transforms import symmetries
+
+
+@eqx.filter_jit
+def _operators(K: Any, X: Float[Array, "N n"]) -> Float[Array, "N n n"]:
+    return jax.vmap(K.operator_at)(X)
 
 
 def check_symmetries(K: Any, X: Float[Array, "N n"]) -> None:
     """ValueError unless B(Sx) = ± S B(x) Sᵀ for the maps S of the kernel, at these points."""
     n = X.shape[1]
-    for mean in symmetries(K.kernel):
-        for each in mean.maps:
-            S = matrix_of(each, n)
-            here, there = (
-                np.asarray(jax.vmap(K.operator_at)(points))
-                for points in (X, jnp.asarray(np.asarray(X) @ S.T, X.dtype))
-            )
+    constant = Invariance.TRANSLATION in K.operator_invariance
+    maps = dict.fromkeys(each for mean in symmetries(K.kernel) for each in mean.maps)
+    found = {each: matrix_of(each, n) for each in maps}
+    if constant:  # S = ±1 is a symmetry of every B
+        found = {e: S for e, S in found.items() if not np.array_equal(S, S[0, 0] * np.eye(n))}
+    if found:
+        here = np.asarray(_operators(K, X))
+        for S in found.values():
+            moved = jnp.asarray(np.asarray(X) @ S.T, X.dtype)
+            there = here if constant else np.asarray(_operators(K, moved))
             image = S @ here @ S.T
             room = 1e-5 * np.abs(here).max()  # maps may come in float32
             if min(np.abs(there - image).max(), np.abs(there + image).max()) > room:
