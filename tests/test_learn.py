@@ -5,6 +5,7 @@
 # pyright: reportOperatorIssue=false
 # Wrong types are refused here, and any field is looked into.
 
+import itertools
 import warnings
 
 import jax
@@ -17,7 +18,9 @@ import scipy.stats
 import hamkernel as hk
 from hamkernel._trajectories.evidence import Model, _loss, losses, solved
 from hamkernel._trajectories.flow import NODES, WEIGHTS, simulated
+from hamkernel._trajectories.prepared import prepared
 from hamkernel._trajectories.rows import Segments, frozen, linearised
+from hamkernel._trajectories.shooting import short_cuts
 
 K = hk.Symplectic(hk.Gaussian(1.0))
 PENDULUM = hk.systems.Pendulum(1.0, 1.0, 6.0)
@@ -235,6 +238,34 @@ def test_positions_are_enough_where_the_kinetic_energy_is_known():
 
 def moved_by_momentum(x):
     return jnp.array([x[1], 0.0])
+
+
+def with_a_gap(times, states):
+    """Logs of which the samples between 2.6 s and 4 s are lost."""
+    kept = (times[0] < 2.6) | (times[0] > 4.0)
+    return [t[kept] for t in times], [x[kept] for x in states]
+
+
+def test_no_short_piece_crosses_a_gap():
+    times, states, _ = logs(samples=31)
+    data = prepared(hk.Runs(*with_a_gap(times, states)), None)
+    pieces = [(p.start, p.stop) for p in short_cuts(data.runs) if p.run == 1]
+    (gap,) = data.runs[1].gaps
+    assert data.runs[1].times[gap] - data.runs[1].times[gap - 1] > 1.4
+    assert gap in [start for start, _ in pieces]
+    assert [pieces[0][0], pieces[-1][1]] == [0, len(data.runs[1].times)]
+    assert all(a[1] == b[0] for a, b in itertools.pairwise(pieces))
+    assert not prepared(hk.Runs(times, states), None).runs[1].gaps.size  # an even log has none
+
+
+@pytest.mark.slow
+def test_positions_with_gaps_leave_no_ripples_in_the_field():
+    times, states, true = logs(noise=0.01, samples=51)
+    times, only_q = with_a_gap(times, states)
+    only_q = [np.column_stack([x[:, 0], np.full(len(x), np.nan)]) for x in only_q]
+    U = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0))
+    found = hk.learn(U, hk.Runs(times, only_q), mean=moved_by_momentum)
+    assert field_error(found.field, true) < 0.01
 
 
 def test_what_cannot_be_known_or_meant_is_refused():

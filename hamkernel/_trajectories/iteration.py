@@ -14,12 +14,11 @@ from hamkernel._trajectories.learned import Step
 from hamkernel._trajectories.prepared import Prepared
 from hamkernel._trajectories.rows import Rows
 from hamkernel._trajectories.shooting import (
-    SHORT,
     Piece,
     Shot,
-    cuts,
     rows_along,
     segmented,
+    short_cuts,
     shot,
     trusted,
 )
@@ -70,7 +69,7 @@ def begin(task: Task, model: Model, design: np.ndarray) -> Current:
     """
     runs = task.data.runs
     paths = [run.path for run in runs]
-    pieces = cuts(runs, SHORT)
+    pieces = short_cuts(runs)
     segments = segmented(runs, pieces, paths)
     good = np.zeros(len(segments.starts), bool)
     good[: len(pieces)] = [task.data.usable[piece.run] for piece in pieces]

@@ -32,7 +32,7 @@ from hamkernel._trajectories.learned import (
 )
 from hamkernel._trajectories.prepared import check_identifiable, prepared
 from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.shooting import SHORT, Piece, cuts, grown, halved
+from hamkernel._trajectories.shooting import Piece, grown, halved, short_cuts
 from hamkernel._trajectories.start import (
     box_of,
     landmarks,
@@ -128,7 +128,7 @@ def _iterated(
     bar = tqdm(range(_MOST), "learning", disable=None if progress else True)
     for i in bar:
         if i < _SHORT_ROUNDS:
-            wanted = cuts(task.data.runs, SHORT)
+            wanted = short_cuts(task.data.runs)
         elif i == _SHORT_ROUNDS:
             wanted = grown(task.data.runs, pieces, now.good)
         else:

@@ -23,6 +23,10 @@ from hamkernel._trajectories.smoothing import Coordinate, processes, smoothed
 # lengthscale near 2.7/ω, so these are 23 samples a swing; three Gauss nodes in such an interval are
 # exact to 1e-8, and samples at 5 Hz of a pendulum of period 2.6 are left as they are.
 _DENSE = 0.1
+# A gap is longer than this share of that lengthscale, and than three intervals of its run: at 0.75,
+# two radians of a swing, three Gauss nodes are exact to 1e-4, and a smoothed path across 1.3 was
+# seen to lead to a field with ripples, which fitted the samples.
+_GAP, _INTERVALS = 0.75, 3.0
 
 
 class Run(NamedTuple):
@@ -35,6 +39,7 @@ class Run(NamedTuple):
         path: smoothed states at the times, no NaN, shape (T, n).
         nodes: the same at the Gauss nodes between them, shape (T − 1, 3, n).
         slopes: their velocities there.
+        gaps: the samples before which the path is a guess.
     """
 
     times: np.ndarray
@@ -43,6 +48,7 @@ class Run(NamedTuple):
     path: np.ndarray
     nodes: np.ndarray
     slopes: np.ndarray
+    gaps: np.ndarray
 
     @property
     def duration(self) -> float:
@@ -80,7 +86,7 @@ def prepared(runs: Runs, mean: Callable[[Array], Array] | None) -> Prepared:
             for r, (t, x) in enumerate(zip(times, states, strict=True))
         ]
         times, states, counts = (list(each) for each in zip(*condensed, strict=True))
-    path_runs = _with_paths(found, times, states, counts)
+    path_runs = _with_paths(found, times, states, counts, _GAP * min(lengths, default=np.inf))
     if not all(c.seen for c in found) or mean is not None:
         path_runs = [_completed(run, mean) for run in path_runs]
     noise = np.array([c.noise if c.seen else np.nan for c in found])
@@ -123,7 +129,7 @@ def _condensed(t, x, path, block: float):
     return middle, np.where(counts > 0, there + means, np.nan), counts
 
 
-def _with_paths(found, times, states, counts) -> list[Run]:
+def _with_paths(found, times, states, counts, gap: float) -> list[Run]:
     """The smoothed path at the samples and at the nodes between them."""
     grids, filled = [], []
     for t, x in zip(times, states, strict=True):
@@ -139,7 +145,9 @@ def _with_paths(found, times, states, counts) -> list[Run]:
         size = 4 * len(t) - 3
         value, slope = (a[r, :size] for a in (paths.value, paths.slope))
         inside = [a[:-1].reshape(len(t) - 1, 4, -1)[:, 1:] for a in (value, slope)]
-        out.append(Run(t, x, count, value[::4], *inside))
+        spans = np.diff(t)
+        gaps = 1 + np.flatnonzero((spans > gap) & (spans > _INTERVALS * np.median(spans)))
+        out.append(Run(t, x, count, value[::4], *inside, gaps))
     return out
 
 

@@ -16,6 +16,7 @@ from hamkernel._trajectories.prepared import Run
 from hamkernel._trajectories.rows import Rows, Segments, linearised, segments_of, tangents
 
 SHORT = 10  # samples in a segment while the field is rough
+_LEAST = 3  # samples of a piece: one more than its start takes
 LONG = 256  # at most: the tangent of a longer path says little more, and arrays stay small
 _GROWTH = 1e4  # of the tangent, beyond which a path says nothing of its start
 _FAR = 25.0  # times the median χ² per sample
@@ -31,12 +32,25 @@ class Piece(NamedTuple):
 
 def cuts(runs: list[Run], most: int) -> list[Piece]:
     """Every run in pieces of at most `most` samples, of nearly equal lengths."""
+    return [piece for r, run in enumerate(runs) for piece in _equal(r, 0, len(run.times), most)]
+
+
+def short_cuts(runs: list[Run]) -> list[Piece]:
+    """Short pieces, none of them across a gap, if it has three samples at least."""
     pieces = []
     for r, run in enumerate(runs):
-        T = len(run.times)
-        ends = np.linspace(0, T, -(-T // most) + 1).round().astype(int)
-        pieces += [Piece(r, int(a), int(b)) for a, b in itertools.pairwise(ends)]
+        start, T = 0, len(run.times)
+        for gap in run.gaps:
+            if gap - start >= _LEAST and T - gap >= _LEAST:
+                pieces += _equal(r, start, int(gap), SHORT)
+                start = int(gap)
+        pieces += _equal(r, start, T, SHORT)
     return pieces
+
+
+def _equal(run: int, start: int, stop: int, most: int) -> list[Piece]:
+    ends = np.linspace(start, stop, -((start - stop) // most) + 1).round().astype(int)
+    return [Piece(run, int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
 
 def grown(runs: list[Run], pieces: list[Piece], good: Bool[np.ndarray, " S"]) -> list[Piece]:
