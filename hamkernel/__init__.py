@@ -30,9 +30,10 @@ from typing import TYPE_CHECKING, Any
 from hamkernel import poisson, systems
 from hamkernel._checks.kernel import check_kernel
 from hamkernel._dynamics.simulate import simulate
-from hamkernel._fields.base import KernelField, SolverInfo
+from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.controlled import ControlledField
 from hamkernel._fields.features import FeatureField
+from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import gram
 from hamkernel._gram.operator import gram_operator
 from hamkernel._kernels.dot_products import Periodic, Polynomial

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hamkernel._fields.base import KernelField
+from hamkernel._fields.kernel_field import KernelField
 from hamkernel._kernels.transforms import without_symmetry
 from hamkernel._structures.base import AbstractMatrixKernel
 

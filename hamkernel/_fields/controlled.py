@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._fields.base import AbstractField, KernelField, SolverInfo
+from hamkernel._fields.base import AbstractField, SolverInfo
+from hamkernel._fields.kernel_field import KernelField
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.controlled import Controlled
 

@@ -33,9 +33,10 @@ from hamkernel._features.waves import (
     SumFeatures,
     Waves,
 )
-from hamkernel._fields.base import AbstractField, FieldSum, KernelField, SolverInfo
+from hamkernel._fields.base import AbstractField, FieldSum, SolverInfo
 from hamkernel._fields.controlled import ControlledField
 from hamkernel._fields.features import FeatureField
+from hamkernel._fields.kernel_field import KernelField
 from hamkernel._kernels.base import ScalarProduct, ScalarSum, Scaled, UserKernel
 from hamkernel._kernels.dot_products import Periodic, Polynomial
 from hamkernel._kernels.functions import as_pytree

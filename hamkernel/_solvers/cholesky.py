@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._factors.dense import DenseFactor
-from hamkernel._fields.base import AbstractField, KernelField, SolverInfo, root
+from hamkernel._fields.base import AbstractField, SolverInfo, root
+from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import assemble, plus_ridge
 from hamkernel._gram.operator import product
 from hamkernel._machine.devices import on_one_device

@@ -18,7 +18,8 @@ from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
 from hamkernel._factors.dense import DenseFactor, cholesky
-from hamkernel._fields.base import AbstractField, KernelField, SolverInfo, root
+from hamkernel._fields.base import AbstractField, SolverInfo, root
+from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import plus_ridge
 from hamkernel._gram.observed import between, gram_of_rows, rows_between
 from hamkernel._machine.memory import refuse_beyond_memory

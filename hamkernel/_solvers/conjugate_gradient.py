@@ -19,7 +19,8 @@ import lineax as lx
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._fields.base import KernelField, SolverInfo, at_points, root
+from hamkernel._fields.base import SolverInfo, at_points, root
+from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
 from hamkernel._gram.derivatives import constant
 from hamkernel._gram.operator import product

@@ -7,8 +7,9 @@ from typing import Any, overload
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._fields.base import AbstractField, KernelField, at_points
+from hamkernel._fields.base import AbstractField, at_points
 from hamkernel._fields.controlled import ControlledField, with_inputs
+from hamkernel._fields.kernel_field import KernelField
 from hamkernel._machine.devices import rows_of
 from hamkernel._machine.memory import dense_bytes, memory_bytes
 from hamkernel._machine.threads import one_blas_thread

@@ -19,8 +19,9 @@ from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
 from hamkernel._features.waves import AbstractFeatures
-from hamkernel._fields.base import AbstractField, KernelField, SolverInfo, root
+from hamkernel._fields.base import AbstractField, SolverInfo, root
 from hamkernel._fields.features import FeatureField
+from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.observed import between
 from hamkernel._observations.blocks import AbstractBlock, Components
 from hamkernel._observations.rows import Rows

@@ -11,7 +11,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._fields.base import KernelField, SolverInfo
+from hamkernel._fields.base import SolverInfo
+from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.operator import placed_product
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._solvers.nystrom import Nystrom

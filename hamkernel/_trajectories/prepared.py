@@ -144,10 +144,10 @@ def _with_paths(found, times, states, counts, gap: float) -> list[Run]:
     for r, (t, x, count) in enumerate(zip(times, states, counts, strict=True)):
         size = 4 * len(t) - 3
         value, slope = (a[r, :size] for a in (paths.value, paths.slope))
-        inside = [a[:-1].reshape(len(t) - 1, 4, -1)[:, 1:] for a in (value, slope)]
+        nodes, slopes = (a[:-1].reshape(len(t) - 1, 4, -1)[:, 1:] for a in (value, slope))
         spans = np.diff(t)
         gaps = 1 + np.flatnonzero((spans > gap) & (spans > _INTERVALS * np.median(spans)))
-        out.append(Run(t, x, count, value[::4], *inside, gaps))
+        out.append(Run(t, x, count, value[::4], nodes, slopes, gaps))
     return out
 
 

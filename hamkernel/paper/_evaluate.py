@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
 from hamkernel._dynamics.simulate import simulate
-from hamkernel._fields.base import KernelField
+from hamkernel._fields.kernel_field import KernelField
 from hamkernel._solvers.fit import fit
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel.paper._experiments import Experiment

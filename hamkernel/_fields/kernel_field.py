@@ -1,0 +1,133 @@
+"""The field of a kernel, Σⱼ K(x, zⱼ) aⱼ, after every solver but random features."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hamkernel._fields.base import AbstractField, SolverInfo, at_points, root
+from hamkernel._gram.dense import centred
+from hamkernel._gram.operator import placed_product
+from hamkernel._structures.base import AbstractMatrixKernel, Sum
+
+
+class KernelField(AbstractField):
+    """f(x) = Σⱼ K(x, zⱼ) aⱼ, the minimiser of the regularised least squares.
+
+    After energies the potential has the values Σₑ bₑ k(·, sₑ) besides, and a prior mean is added.
+    Evaluating f or its potential costs O(M n) for M points.
+
+    Attributes:
+        kernel: K.
+        points: zⱼ, shape (M, n): the data, or the landmarks of a low-rank solver.
+        coefficients: aⱼ, shape (M, n).
+        residual: yᵢ − f(xᵢ) at the training data, shape (N, n); of shape (0, n) after a fit to a
+            stream, which is not kept; of other observations that of each row, in its own units,
+            shape (D,).
+        norm: ‖f‖ in the RKHS of K, of f less its mean, shape ().
+        regularization: the λ of the fit, shape ().
+        offset: the constant in the potential, shape ().
+        info: how the solver went.
+        value_points: sₑ, shape (E, n); None without energies.
+        value_coefficients: bₑ, shape (E,); None without energies.
+        mean: the prior mean, x (n,) -> (n,), which is added; None if it is zero.
+    """
+
+    kernel: AbstractMatrixKernel
+    points: Float[Array, "M n"]
+    coefficients: Float[Array, "M n"]
+    residual: Float[Array, "..."]
+    norm: Float[Array, ""]
+    regularization: Float[Array, ""]
+    offset: Float[Array, ""]
+    info: SolverInfo = SolverInfo("none")
+    value_points: Float[Array, "E n"] | None = None
+    value_coefficients: Float[Array, " E"] | None = None
+    mean: Callable[..., Any] | None = None
+
+    @property
+    def dimension(self) -> int:
+        return self.points.shape[-1]
+
+    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        field = _expansion(self.kernel, x, self.points, self.coefficients)
+        S, b = self.value_points, self.value_coefficients
+        return field if S is None or b is None else field + _of_values(self.kernel, x, S, b)
+
+    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+        fields = placed_product(self.kernel, X, self.points, self.coefficients)
+        S, b = self.value_points, self.value_coefficients
+        if S is None or b is None:
+            return fields
+        return fields + _values_at_points(self.kernel, X, S, b)
+
+    def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+        potential = _potential(self.kernel, x, self.points, self.coefficients)
+        S, b = self.value_points, self.value_coefficients
+        return potential if S is None or b is None else potential + _values(self.kernel, x, S, b)
+
+    def _term(self, kernel: Sum, position: int) -> "KernelField":
+        term, Z, A = kernel.terms[position], self.points, self.coefficients
+        square = jnp.sum(A * placed_product(term, Z, Z, A))  # ‖f‖² = aᵀGa
+        bare = dataclasses.replace(self, kernel=term, offset=jnp.zeros_like(self.offset), mean=None)
+        S, b = self.value_points, self.value_coefficients
+        if S is not None and b is not None:  # 2 aᵀG_av b + bᵀG_vv b
+            at = dataclasses.replace(bare, coefficients=2 * A)
+            square = square + b @ at_points(at._learned_potential, S)
+        return dataclasses.replace(bare, norm=root(square))
+
+
+@eqx.filter_jit
+def _expansion(
+    K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
+) -> Float[Array, " n"]:
+    """f(x) = Σⱼ K(x, zⱼ) aⱼ through the potential, without (n, n) blocks."""
+    x, Z = centred(K, x, Z)
+    return K.expansion(x, Z, A)
+
+
+@eqx.filter_jit
+def _potential(
+    K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
+) -> Float[Array, ""]:
+    """The potential of `_expansion`."""
+    x, Z = centred(K, x, Z)
+    return K.potential(x, Z, A)
+
+
+def _value_potential(
+    K: AbstractMatrixKernel, x: Float[Array, " n"], S: Float[Array, "E n"], b: Float[Array, " E"]
+) -> Float[Array, ""]:
+    """Σₑ bₑ k(x, sₑ)."""
+    x, S = centred(K, x, S)
+    return b @ jax.vmap(K.potential_covariance, in_axes=(None, 0))(x, S)
+
+
+def _value_field(
+    K: AbstractMatrixKernel, x: Float[Array, " n"], S: Float[Array, "E n"], b: Float[Array, " E"]
+) -> Float[Array, " n"]:
+    """The field of `_value_potential`.
+
+    Its component along v is Cov(vᵀf(x), Σ bₑ u(sₑ)), the values at sₑ of the potential of K(·, x)v:
+    linear in v, so that its gradient is the field, and B need not be known.
+    """
+    x, S = centred(K, x, S)
+
+    def along(v):
+        return b @ jax.vmap(lambda s: K.potential(s, x[None], v[None]))(S)
+
+    return jax.grad(along)(jnp.zeros_like(x))
+
+
+@eqx.filter_jit
+def _values_at_points(K, X, S, b):
+    return at_points(lambda x: _value_field(K, x, S, b), X)
+
+
+_of_values, _values = eqx.filter_jit(_value_field), eqx.filter_jit(_value_potential)
