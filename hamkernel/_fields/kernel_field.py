@@ -1,7 +1,5 @@
 """The field of a kernel, Σⱼ K(x, zⱼ) aⱼ, after every solver but random features."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any
