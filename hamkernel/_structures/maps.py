@@ -8,14 +8,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hamkernel import _require as require
 from hamkernel._kernels.base import Invariance
 from hamkernel._kernels.groups import matrix_of
 from hamkernel._kernels.transforms import symmetries
 
 
-@eqx.filter_jit
-def _operators(K: Any, X: Float[Array, "N n"]) -> Float[Array, "N n n"]:
+def _operators(K: Any, X: Float[Array, "N n"]) -> Float[np.ndarray, "N n n"]:
+    # Compiled, 0.05 ms in place of 2; but of a traced K whose B is known that would be traced too.
+    evaluate = _compiled if require.is_concrete(K, X) else _evaluated
+    return np.asarray(evaluate(K, X))
+
+
+def _evaluated(K: Any, X: Float[Array, "N n"]) -> Float[Array, "N n n"]:
     return jax.vmap(K.operator_at)(X)
+
+
+_compiled = eqx.filter_jit(_evaluated)
 
 
 def check_symmetries(K: Any, X: Float[Array, "N n"]) -> None:
@@ -27,10 +36,10 @@ def check_symmetries(K: Any, X: Float[Array, "N n"]) -> None:
     if constant:  # S = ±1 is a symmetry of every B
         found = {e: S for e, S in found.items() if not np.array_equal(S, S[0, 0] * np.eye(n))}
     if found:
-        here = np.asarray(_operators(K, X))
+        here = _operators(K, X)
         for S in found.values():
             moved = jnp.asarray(np.asarray(X) @ S.T, X.dtype)
-            there = here if constant else np.asarray(_operators(K, moved))
+            there = here if constant else _operators(K, moved)
             image = S @ here @ S.T
             room = 1e-5 * np.abs(here).max()  # maps may come in float32
             if min(np.abs(there - image).max(), np.abs(there + image).max()) > room:
