@@ -68,11 +68,11 @@ def main() -> None:
     options = parser.parse_args()
     if options.threads:
         threads._one_thread = contextlib.nullcontext
-    print(f"{'':<14}{'alone':>18}{'beside one':>26}{'beside two':>26}")
+    print(f"{'':<14}{'alone':>18}{'beside one':>30}{'beside two':>30}")
     print(
         f"{'N':>5} {'call':<8}"
         + f"{'median  maximum':>18}"
-        + f"{'median  maximum  ratios':>26}" * 2
+        + f"{'median  maximum      ratios':>30}" * 2
     )
     for N in (100,) if options.quick else (24, 100, 300, 1000):
         for name, repeats, call in calls(N):
@@ -86,7 +86,7 @@ def main() -> None:
                 median, maximum = np.median(took), took.max()
                 alone = median if alone is None else alone
                 line += f"{median:9.1f}{maximum:9.1f}"
-                line += f"{median / alone:4.1f}{maximum / alone:4.1f}" if count else ""
+                line += f"{median / alone:6.1f}{maximum / alone:6.1f}" if count else ""
             print(line, flush=True)
 
 
