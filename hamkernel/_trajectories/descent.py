@@ -3,10 +3,11 @@
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Float
+
+from hamkernel._tuning.other_optimisers import with_slope_backward
 
 # Stands for a value that is not finite: the line search backs away from it.
 HUGE = 1e30
@@ -50,17 +51,7 @@ def minimise(
         value = fn(at(v))
         return jnp.where(jnp.isfinite(value), value, HUGE)
 
-    # optimistix linearises forward and transposes; derivatives here are written backward.
-    @jax.custom_jvp
-    def objective(v):
-        return value_at(v)
-
-    @objective.defjvp
-    def _(primals, tangents):
-        value, slope = jax.value_and_grad(value_at)(*primals)
-        slope = jnp.where(jnp.isfinite(slope), slope, jnp.zeros_like(slope))
-        return value, slope @ tangents[0]
-
+    objective = with_slope_backward(value_at)
     found = optx.minimise(
         lambda v, _: objective(v), _BFGS, jnp.zeros_like(start), max_steps=steps, throw=False
     )

@@ -1,10 +1,13 @@
 """Runs of an optimiser of optimistix that the caller has chosen."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jaxtyping import Array
 
 from hamkernel._tuning.descent import Run
 from hamkernel._tuning.part import SearchObjective
@@ -57,16 +60,7 @@ def _minimised(objective: SearchObjective, u, optimiser, max_steps: int):
         value = objective(v.astype(u.dtype))[0].astype(default)
         return jnp.where(value < jnp.inf, value / unit, _HUGE)
 
-    # optimistix linearises forward and transposes; our derivatives are written backward.
-    @jax.custom_jvp
-    def differentiable(v):
-        return in_default(v)
-
-    @differentiable.defjvp
-    def _(primals, tangents):
-        value, slope = jax.value_and_grad(in_default)(*primals)
-        slope = jnp.where(jnp.isfinite(slope), slope, jnp.zeros_like(slope))
-        return value, slope @ tangents[0]
+    differentiable = with_slope_backward(in_default)
 
     found = optx.minimise(
         lambda v, _: differentiable(v),
@@ -79,3 +73,22 @@ def _minimised(objective: SearchObjective, u, optimiser, max_steps: int):
     value, loss = objective(best)
     converged = found.result == optx.RESULTS.successful
     return best, value, loss, converged, found.stats["num_steps"]
+
+
+def with_slope_backward(fn: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """`fn` of a vector for optimistix, which linearises forward, and then transposes.
+
+    The derivatives of losses are written backward; a slope that is not finite counts as zero.
+    """
+
+    @jax.custom_jvp
+    def differentiable(v):
+        return fn(v)
+
+    @differentiable.defjvp
+    def _(primals, tangents):
+        value, slope = jax.value_and_grad(fn)(*primals)
+        slope = jnp.where(jnp.isfinite(slope), slope, jnp.zeros_like(slope))
+        return value, slope @ tangents[0]
+
+    return differentiable
