@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hamkernel._observations.blocks import AbstractBlock, merged
+from hamkernel._observations.blocks import AbstractBlock, Components, merged
 
 
 class Rows(eqx.Module):
@@ -120,8 +120,10 @@ class Rows(eqx.Module):
         Of velocities alone, all of which were measured, shape (N, n).
         """
         left = self.scale * self.uncontrasted(left)
-        whole = len(self.blocks) == 1 and left.size == self.points.size
-        return left.reshape(self.points.shape) if whole else left
+        block = self.blocks[0]
+        if len(self.blocks) > 1 or not isinstance(block, Components) or block.kept is not None:
+            return left
+        return left.reshape(block.values_shape)
 
     def contrast(self, rows: Float[Array, "M *rest"]) -> Float[Array, "D *rest"]:
         """The rows without the constant of the energies."""
