@@ -22,7 +22,12 @@ class AbstractBlock(eqx.Module):
 
     of_values: eqx.AbstractClassVar[bool]  # of the potential; else of the field
 
-    points: eqx.AbstractVar[Float[Array, "P n"]]
+    points: eqx.AbstractVar[Float[Array, "P d"]]
+
+    @property
+    @abc.abstractmethod
+    def dimension(self) -> int:
+        """n, the components of the field; points (x, u) have d = n + m coordinates."""
 
     @property
     @abc.abstractmethod
@@ -68,10 +73,13 @@ class Components(AbstractBlock):
     of_values: ClassVar[bool] = False
 
     @property
+    def dimension(self) -> int:
+        return self.points.shape[1] if self.outputs is None else self.outputs
+
+    @property
     def values_shape(self) -> tuple[int, int]:
         """That of the field at the points, (P, n)."""
-        P, n = self.points.shape
-        return P, n if self.outputs is None else self.outputs
+        return len(self.points), self.dimension
 
     @property
     def scale(self) -> Float[Array, " D"]:
@@ -116,12 +124,16 @@ class Components(AbstractBlock):
 class Combinations(AbstractBlock):
     """Σ_q weights[s, r, q] · f(groups[s, q]), R rows for each of S groups of Q points."""
 
-    groups: Float[Array, "S Q n"]
+    groups: Float[Array, "S Q d"]
     weights: Float[Array, "S R Q n"]
     of_values: ClassVar[bool] = False
 
     @property
-    def points(self) -> Float[Array, "SQ n"]:
+    def dimension(self) -> int:
+        return self.weights.shape[3]
+
+    @property
+    def points(self) -> Float[Array, "SQ d"]:
         return self.groups.reshape(-1, self.groups.shape[2])
 
     @property
@@ -142,8 +154,8 @@ class Combinations(AbstractBlock):
         return rows.reshape(S * R, *rest)
 
     def coefficients(self, c: Float[Array, " SR"]) -> Float[Array, "SQ n"]:
-        S, R, _, _ = self.weights.shape
-        return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(self.points.shape)
+        S, R, Q, n = self.weights.shape
+        return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(S * Q, n)
 
     def then(self, other: AbstractBlock) -> "Combinations | None":
         if not isinstance(other, Combinations) or self.weights.shape[1:] != other.weights.shape[1:]:
@@ -153,11 +165,19 @@ class Combinations(AbstractBlock):
 
 
 class Values(AbstractBlock):
-    """The potential at points; `noise` is that of each, None if it is 1."""
+    """The potential at points; `noise` is that of each, None if it is 1.
 
-    points: Float[Array, "E n"]
+    At points (x, u) it is the potential of the drift, and u has no effect.
+    """
+
+    points: Float[Array, "E d"]
     noise: Float[Array, " E"] | None = None
+    outputs: int | None = eqx.field(static=True, default=None)
     of_values: ClassVar[bool] = True
+
+    @property
+    def dimension(self) -> int:
+        return self.points.shape[1] if self.outputs is None else self.outputs
 
     @property
     def scale(self) -> Float[Array, " E"]:
@@ -182,7 +202,7 @@ class Values(AbstractBlock):
         noise = None
         if self.noise is not None or other.noise is not None:
             noise = jnp.concatenate([self.scale, other.scale])
-        return Values(jnp.concatenate([self.points, other.points]), noise)
+        return Values(jnp.concatenate([self.points, other.points]), noise, self.outputs)
 
 
 def merged(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:

@@ -41,8 +41,8 @@ class Rows(eqx.Module):
 
     @property
     def dimension(self) -> int:
-        """The number of coordinates of a state."""
-        return self.blocks[0].points.shape[1]
+        """n, the number of coordinates of a state."""
+        return self.blocks[0].dimension
 
     @property
     def scale(self) -> Float[Array, " M"]:
@@ -79,8 +79,8 @@ class Rows(eqx.Module):
         return np.concatenate([start + block.labels() for start, block in pairs])
 
     @property
-    def points(self) -> Float[Array, "P n"]:
-        """All points of all blocks."""
+    def points(self) -> Float[Array, "P d"]:
+        """All points of all blocks, (x, u) where there are inputs."""
         return jnp.concatenate([block.points for block in self.blocks])
 
     def of(
@@ -161,7 +161,7 @@ class Rows(eqx.Module):
 
     def coefficients(
         self, c: Float[Array, " D"]
-    ) -> tuple[Float[Array, "P n"], Float[Array, "P n"], Float[Array, "E n"], Float[Array, " E"]]:
+    ) -> tuple[Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]]:
         """Points and coefficients of the field Lᵀc, and those of its values.
 
         Of energies alone there is one point of the field, with coefficients of zero.
@@ -171,7 +171,7 @@ class Rows(eqx.Module):
         none = self.blocks[0].points[:1]
         fields = [(b.points, a) for b, a in pairs if not b.of_values]
         values = [(b.points, a) for b, a in pairs if b.of_values]
-        fields = fields or [(none, jnp.zeros_like(none))]
+        fields = fields or [(none, jnp.zeros((1, self.dimension), raw.dtype))]
         values = values or [(none[:0], jnp.zeros(0, raw.dtype))]
         Z, A = (jnp.concatenate(each) for each in zip(*fields, strict=True))
         S, b = (jnp.concatenate(each) for each in zip(*values, strict=True))

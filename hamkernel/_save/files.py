@@ -122,7 +122,7 @@ def load(
 def _of_state(field: AbstractField) -> Callable[[Array], Array]:
     """The field as a function of the state alone: where it has inputs, they are 1."""
     if isinstance(field, ControlledField):
-        u = jnp.ones(field.inputs.shape[-1], field.inputs.dtype)
+        u = jnp.ones(field.kernel.input_count, field.offset.dtype)
         return lambda x: field(x, u)
     return field
 

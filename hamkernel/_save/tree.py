@@ -26,6 +26,7 @@ from jaxtyping import jaxtyped
 
 from hamkernel import systems
 from hamkernel._features.waves import (
+    ControlledFeatures,
     DivergenceFreeFeatures,
     GroupWaves,
     PotentialFeatures,
@@ -37,6 +38,7 @@ from hamkernel._fields.base import AbstractField, FieldSum, SolverInfo
 from hamkernel._fields.controlled import ControlledField
 from hamkernel._fields.features import FeatureField
 from hamkernel._fields.kernel_field import KernelField
+from hamkernel._fields.known import AtRest, KnownPart
 from hamkernel._kernels.base import ScalarProduct, ScalarSum, Scaled, UserKernel
 from hamkernel._kernels.dot_products import Periodic, Polynomial
 from hamkernel._kernels.functions import as_pytree
@@ -54,7 +56,7 @@ from hamkernel.poisson import ChargedParticleTensor, LotkaVolterraTensor, RigidB
 CLASSES: dict[str, type[eqx.Module]] = {
     cls.__name__: cls
     for cls in (
-        *(KernelField, FeatureField, ControlledField, FieldSum, SolverInfo),
+        *(KernelField, FeatureField, ControlledField, FieldSum, KnownPart, AtRest, SolverInfo),
         *(
             Waves,
             GroupWaves,
@@ -62,6 +64,7 @@ CLASSES: dict[str, type[eqx.Module]] = {
             DivergenceFreeFeatures,
             SeparableFeatures,
             SumFeatures,
+            ControlledFeatures,
         ),
         *(systems.DoublePendulum, systems.Duffing, systems.HarmonicOscillator),
         *(systems.HenonHeiles, systems.Kepler, systems.NBody, systems.Pendulum),
@@ -79,6 +82,8 @@ FUNCTIONS: dict[str, Callable] = {
     function.__name__: function for function in (identity, reflection, time_reversal)
 }
 
+# Where the mean of the user is: of a field, of one with inputs, and of its drift.
+_MEANS = ("field.mean", "field.whole.mean.mean", "field.mean.field")
 _DEPTH = 64  # of the tree; kernels that people write have a depth below ten
 Node = dict[str, Any]
 
@@ -144,6 +149,7 @@ class Reader:
     def __init__(self, source: str, arrays: list[np.ndarray]):
         self.source, self.arrays = source, arrays
         self.used: set[int] = set()
+        self.given: dict[str, Any] = {}  # by the user, by path
 
     def fail(self, reason: str) -> NoReturn:
         raise ValueError(f"{self.source} is not a valid file of hamkernel.save: {reason}.")
@@ -151,11 +157,18 @@ class Reader:
     def field(self, node: Any, kernel: AbstractMatrixKernel | None, mean: Any) -> Any:
         if not isinstance(node, dict) or node.get("module") not in field_classes():
             self.fail("it holds no learned field")
-        given = {"kernel": kernel, "mean": None if mean is None else as_pytree(mean)}
-        field = self.module(node, 0, None, "field", given)
+        mean = None if mean is None else as_pytree(mean)
+        self.given |= dict.fromkeys(("field.kernel", "field.whole.kernel"), kernel)
+        self.given |= dict.fromkeys(_MEANS, mean)
+        field = self.module(node, 0, None, "field")
         if len(self.used) != len(self.arrays):
             self.fail("it has arrays that belong to nothing")
         return field
+
+    def beside(self, where: str, node: Any) -> Any:
+        """What the user gave for this place, if it is not further inside."""
+        name = node.get("module") if isinstance(node, dict) else None
+        return None if name in ("KnownPart", "AtRest") else self.given.get(where)
 
     def value(self, node: Any, depth: int, like: Any, where: str) -> Any:
         """The object of a node; `like` is its counterpart in the user's kernel, or None."""
@@ -166,9 +179,7 @@ class Reader:
             self.fail(f"{where} is no known kind of node")
         return read(self, node, depth + 1, like, where)
 
-    def module(
-        self, node: Node, depth: int, like: Any, where: str, users: dict[str, Any] | None = None
-    ) -> eqx.Module:
+    def module(self, node: Node, depth: int, like: Any, where: str) -> eqx.Module:
         name, nodes = node["module"], node["fields"]
         cls = CLASSES.get(name) if isinstance(name, str) else None
         if cls is None:
@@ -189,8 +200,9 @@ class Reader:
         module = object.__new__(cls)
         with jaxtyped("context"):  # so that the axes of all arrays of a module must agree
             for key, annotation in fields.items():
-                given = (users or {}).get(key) if like is None else getattr(like, key)
-                value = self.value(nodes[key], depth, given, f"{where}.{key}")
+                path = f"{where}.{key}"
+                given = self.beside(path, nodes[key]) if like is None else getattr(like, key)
+                value = self.value(nodes[key], depth, given, path)
                 if not _fits(value, annotation):
                     self.fail(f"{where}.{key} is a {_shown(value)}, which {name} cannot have")
                 object.__setattr__(module, key, value)
@@ -244,7 +256,7 @@ class Reader:
         if not isinstance(name, str) or not isinstance(nodes, list):
             self.fail(f"{where} is no code of a user")
         if like is None:
-            if where.startswith("field.mean"):
+            if where.startswith(("field.mean", "field.whole.mean")):
                 raise ValueError(
                     f"{self.source}: {where} is {name[:80]!r}, code that is not in the file. Pass "
                     "the mean that was given to fit: hk.load(path, mean=...)."
