@@ -15,7 +15,7 @@ from kernels import canonical, gaussian_profile, matern_profile, periodic, radia
 
 import hamkernel as hk
 from hamkernel._features.spectra import spectra
-from hamkernel._features.waves import features
+from hamkernel._features.structured import features
 from hamkernel._fields.features import FeatureField
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._solvers.tall_least_squares import ridge_regression, triangle

@@ -7,6 +7,7 @@ so to a field again, whatever was observed.
 """
 
 import abc
+import math
 from collections.abc import Iterable
 from typing import ClassVar
 
@@ -21,7 +22,12 @@ class AbstractBlock(eqx.Module):
 
     of_values: eqx.AbstractClassVar[bool]  # of the potential; else of the field
 
-    points: eqx.AbstractVar[Float[Array, "P n"]]
+    points: eqx.AbstractVar[Float[Array, "P d"]]
+
+    @property
+    @abc.abstractmethod
+    def dimension(self) -> int:
+        """n, the components of the field; points (x, u) have d = n + m coordinates."""
 
     @property
     @abc.abstractmethod
@@ -56,16 +62,28 @@ class Components(AbstractBlock):
     Attributes:
         kept: the rows that were measured, as indices into all P·n, shape (D,); None if all were.
         noise: of each row that was measured; None if it is 1.
+        outputs: the components of the field at a point, None if there are as many as coordinates;
+            fewer at points (x, u) of a field with inputs.
     """
 
     points: Float[Array, "P n"]
     kept: Int[Array, " D"] | None = None
     noise: Float[Array, " D"] | None = None
+    outputs: int | None = eqx.field(static=True, default=None)
     of_values: ClassVar[bool] = False
 
     @property
+    def dimension(self) -> int:
+        return self.points.shape[1] if self.outputs is None else self.outputs
+
+    @property
+    def values_shape(self) -> tuple[int, int]:
+        """That of the field at the points, (P, n)."""
+        return len(self.points), self.dimension
+
+    @property
     def scale(self) -> Float[Array, " D"]:
-        size = self.points.size if self.kept is None else len(self.kept)
+        size = math.prod(self.values_shape) if self.kept is None else len(self.kept)
         return jnp.ones(size, self.points.dtype) if self.noise is None else self.noise
 
     @property
@@ -73,43 +91,49 @@ class Components(AbstractBlock):
         return len(self.points)
 
     def labels(self) -> Int[np.ndarray, " D"]:
-        P, n = self.points.shape
+        P, n = self.values_shape
         return (np.arange(P * n) if self.kept is None else np.asarray(self.kept)) // n
 
     def rows(self, values: Float[Array, "P n *rest"]) -> Float[Array, "D *rest"]:
-        rows = values.reshape(self.points.size, *values.shape[2:])
+        rows = values.reshape(math.prod(values.shape[:2]), *values.shape[2:])
         rows = rows if self.kept is None else rows[self.kept]
         return rows if self.noise is None else rows / _along(self.noise, rows)
 
     def coefficients(self, c: Float[Array, " D"]) -> Float[Array, "P n"]:
         c = c if self.noise is None else c / self.noise
         if self.kept is not None:
-            c = jnp.zeros(self.points.size, c.dtype).at[self.kept].set(c)
-        return c.reshape(self.points.shape)
+            c = jnp.zeros(math.prod(self.values_shape), c.dtype).at[self.kept].set(c)
+        return c.reshape(self.values_shape)
 
     def then(self, other: AbstractBlock) -> "Components | None":
-        if not isinstance(other, Components):
+        if not isinstance(other, Components) or self.outputs != other.outputs:
             return None
         kept = noise = None
+        sizes = [math.prod(block.values_shape) for block in (self, other)]
         if self.kept is not None or other.kept is not None:
             own, others = (
-                jnp.arange(b.points.size) if b.kept is None else b.kept for b in (self, other)
+                jnp.arange(size) if b.kept is None else b.kept
+                for b, size in zip((self, other), sizes, strict=True)
             )
-            kept = jnp.concatenate([own, others + self.points.size])
+            kept = jnp.concatenate([own, others + sizes[0]])
         if self.noise is not None or other.noise is not None:
             noise = jnp.concatenate([self.scale, other.scale])
-        return Components(jnp.concatenate([self.points, other.points]), kept, noise)
+        return Components(jnp.concatenate([self.points, other.points]), kept, noise, self.outputs)
 
 
 class Combinations(AbstractBlock):
     """Σ_q weights[s, r, q] · f(groups[s, q]), R rows for each of S groups of Q points."""
 
-    groups: Float[Array, "S Q n"]
+    groups: Float[Array, "S Q d"]
     weights: Float[Array, "S R Q n"]
     of_values: ClassVar[bool] = False
 
     @property
-    def points(self) -> Float[Array, "SQ n"]:
+    def dimension(self) -> int:
+        return self.weights.shape[3]
+
+    @property
+    def points(self) -> Float[Array, "SQ d"]:
         return self.groups.reshape(-1, self.groups.shape[2])
 
     @property
@@ -130,8 +154,8 @@ class Combinations(AbstractBlock):
         return rows.reshape(S * R, *rest)
 
     def coefficients(self, c: Float[Array, " SR"]) -> Float[Array, "SQ n"]:
-        S, R, _, _ = self.weights.shape
-        return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(self.points.shape)
+        S, R, Q, n = self.weights.shape
+        return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(S * Q, n)
 
     def then(self, other: AbstractBlock) -> "Combinations | None":
         if not isinstance(other, Combinations) or self.weights.shape[1:] != other.weights.shape[1:]:
@@ -141,11 +165,19 @@ class Combinations(AbstractBlock):
 
 
 class Values(AbstractBlock):
-    """The potential at points; `noise` is that of each, None if it is 1."""
+    """The potential at points; `noise` is that of each, None if it is 1.
 
-    points: Float[Array, "E n"]
+    At points (x, u) it is the potential of the drift, and u has no effect.
+    """
+
+    points: Float[Array, "E d"]
     noise: Float[Array, " E"] | None = None
+    outputs: int | None = eqx.field(static=True, default=None)
     of_values: ClassVar[bool] = True
+
+    @property
+    def dimension(self) -> int:
+        return self.points.shape[1] if self.outputs is None else self.outputs
 
     @property
     def scale(self) -> Float[Array, " E"]:
@@ -170,7 +202,7 @@ class Values(AbstractBlock):
         noise = None
         if self.noise is not None or other.noise is not None:
             noise = jnp.concatenate([self.scale, other.scale])
-        return Values(jnp.concatenate([self.points, other.points]), noise)
+        return Values(jnp.concatenate([self.points, other.points]), noise, self.outputs)
 
 
 def merged(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:

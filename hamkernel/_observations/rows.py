@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hamkernel._observations.blocks import AbstractBlock, merged
+from hamkernel._observations.blocks import AbstractBlock, Components, merged
 
 
 class Rows(eqx.Module):
@@ -41,8 +41,8 @@ class Rows(eqx.Module):
 
     @property
     def dimension(self) -> int:
-        """The number of coordinates of a state."""
-        return self.blocks[0].points.shape[1]
+        """n, the number of coordinates of a state."""
+        return self.blocks[0].dimension
 
     @property
     def scale(self) -> Float[Array, " M"]:
@@ -79,8 +79,8 @@ class Rows(eqx.Module):
         return np.concatenate([start + block.labels() for start, block in pairs])
 
     @property
-    def points(self) -> Float[Array, "P n"]:
-        """All points of all blocks."""
+    def points(self) -> Float[Array, "P d"]:
+        """All points of all blocks, (x, u) where there are inputs."""
         return jnp.concatenate([block.points for block in self.blocks])
 
     def of(
@@ -120,8 +120,10 @@ class Rows(eqx.Module):
         Of velocities alone, all of which were measured, shape (N, n).
         """
         left = self.scale * self.uncontrasted(left)
-        whole = len(self.blocks) == 1 and left.size == self.points.size
-        return left.reshape(self.points.shape) if whole else left
+        block = self.blocks[0]
+        if len(self.blocks) > 1 or not isinstance(block, Components) or block.kept is not None:
+            return left
+        return left.reshape(block.values_shape)
 
     def contrast(self, rows: Float[Array, "M *rest"]) -> Float[Array, "D *rest"]:
         """The rows without the constant of the energies."""
@@ -159,7 +161,7 @@ class Rows(eqx.Module):
 
     def coefficients(
         self, c: Float[Array, " D"]
-    ) -> tuple[Float[Array, "P n"], Float[Array, "P n"], Float[Array, "E n"], Float[Array, " E"]]:
+    ) -> tuple[Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]]:
         """Points and coefficients of the field Lᵀc, and those of its values.
 
         Of energies alone there is one point of the field, with coefficients of zero.
@@ -169,7 +171,7 @@ class Rows(eqx.Module):
         none = self.blocks[0].points[:1]
         fields = [(b.points, a) for b, a in pairs if not b.of_values]
         values = [(b.points, a) for b, a in pairs if b.of_values]
-        fields = fields or [(none, jnp.zeros_like(none))]
+        fields = fields or [(none, jnp.zeros((1, self.dimension), raw.dtype))]
         values = values or [(none[:0], jnp.zeros(0, raw.dtype))]
         Z, A = (jnp.concatenate(each) for each in zip(*fields, strict=True))
         S, b = (jnp.concatenate(each) for each in zip(*values, strict=True))

@@ -13,7 +13,7 @@ evaluated or called by name.
 import dataclasses
 import functools
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -30,11 +30,17 @@ _ROOMS = tuple(
 _FUNCTIONS = {function.__name__: function for function in (identity, reflection, time_reversal)}
 
 Node = Any
-Given = Mapping[str, list[Any]]
 
 
-class MissingCode(ValueError):
-    """There is code in a field that the caller did not give."""
+class NotGiven(ValueError):
+    """What the caller gave is not what was saved, or lacks code that is in the field."""
+
+
+class Given(NamedTuple):
+    """What the caller gives for a part of a field: its description, if any, and the code in it."""
+
+    node: Node
+    codes: list[Any]
 
 
 def _ours(cls: type) -> bool:
@@ -87,18 +93,17 @@ def description(value: Any, codes: list[Any], where: str) -> Node:
     }
 
 
-def skeleton(node: Node, codes: list[Any], where: str, given: Given | None = None) -> Any:
-    """The object of a description, with shapes for arrays, and `codes` where there is code.
+def skeleton(node: Node, codes: list[Any], where: str, given: Mapping[str, Given]) -> Any:
+    """The object of a description, with shapes for arrays, and the caller's code in its places.
 
     Args:
         node: the description.
-        codes: what code there is below, in order.
+        codes: the code below, in order; it is used up.
         where: the name of the object.
-        given: the codes for the kernel, the features and the mean of a field, below any of which
-            there are no others.
+        given: what the caller gives for the parts of a field.
 
     Raises:
-        ValueError: it is no description. MissingCode: there is more code than `codes`.
+        NotGiven: the caller has not given the same. ValueError: it is no description.
     """
     match node:
         case {"class": str(name), **nodes}:
@@ -107,12 +112,16 @@ def skeleton(node: Node, codes: list[Any], where: str, given: Given | None = Non
                 raise ValueError(f"{where} is of the unknown class {name[:80]!r}")
             if nodes.keys() != {field.name for field in dataclasses.fields(cls)}:
                 raise ValueError(f"{where} does not have the fields of {name}")
-            own = given if given and issubclass(cls, AbstractField) else {}
+            own = given if issubclass(cls, AbstractField) else {}
             made = object.__new__(cls)  # past __init__, which takes no logarithms
             for key, child in nodes.items():
-                inside = (list(own[key]), None) if key in own else (codes, given)
-                value = skeleton(child, inside[0], f"{where}.{key}", inside[1])
-                object.__setattr__(made, key, value)
+                path, inside = f"{where}.{key}", (codes, given)
+                if key in own:
+                    differs = difference(child, own[key].node, path)
+                    if differs:
+                        raise NotGiven(differs)
+                    inside = list(own[key].codes), {}
+                object.__setattr__(made, key, skeleton(child, inside[0], path, inside[1]))
             return made
         case {"array": str(dtype), "shape": [*shape]}:
             return jax.ShapeDtypeStruct(tuple(shape), np.dtype(dtype))
@@ -120,7 +129,7 @@ def skeleton(node: Node, codes: list[Any], where: str, given: Given | None = Non
             return _FUNCTIONS[name]
         case {"code": str(name), "leaves": list()}:
             if not codes:
-                raise MissingCode(f"{where} is {name[:80]!r}, code that is not in the file")
+                raise NotGiven(f"{where} is {name[:80]!r}, code that is not in the file")
             return codes.pop(0)
         case list():
             below = enumerate(node)
@@ -144,7 +153,11 @@ def difference(saved: Node, given: Node, where: str) -> str | None:
             return next(filter(None, found), None)
         case _:
             same = given is None or (type(saved) is type(given) and saved == given)
-    return None if same else f"{where} is {_shown(saved)} in the file and {_shown(given)} here"
+    return (
+        None
+        if same
+        else f"{where} is {_shown(saved)} in the file and {_shown(given)} here: not the one saved"
+    )
 
 
 def _shown(node: Node) -> str:

@@ -27,7 +27,7 @@ from hamkernel._fields.base import AbstractField
 from hamkernel._fields.controlled import ControlledField
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._save.bytes import opened, sealed, write
-from hamkernel._save.description import MissingCode, classes, description, difference, skeleton
+from hamkernel._save.description import Given, NotGiven, classes, description, skeleton
 from hamkernel._structures.base import AbstractMatrixKernel
 
 _PROBES = 64  # points of the field, of which the one of the largest velocity is kept
@@ -143,23 +143,21 @@ def _read(node: Any, content: io.BytesIO, source: str, kernel: Any, mean: Any) -
         ValueError: code is missing or is not what was saved, or the parts do not fit each other.
     """
     codes: dict[str, list[Any]] = {"kernel": [], "mean": []}
-    for name, given in {"kernel": kernel, "mean": mean}.items():
-        if given is not None:
-            own = description(given, codes[name], f"field.{name}")
-            differs = difference(node.get(name), own, f"field.{name}")
-            if differs:
-                raise ValueError(
-                    f"the given {name} is not the one saved in {source}: {differs}. Pass the "
-                    f"{name} as it was given to fit."
-                )
+    own = None if kernel is None else description(kernel, codes["kernel"], "field.kernel")
+    if mean is not None:  # which may be a part of what was known before
+        description(mean, codes["mean"], "field.mean")
+    given = {
+        "kernel": Given(own, codes["kernel"]),
+        "features": Given(None, codes["kernel"]),  # which have the kernel again
+        "mean": Given(None, codes["mean"]),
+    }
     try:
-        # Features have the kernel again.
-        like = skeleton(node, [], "field", codes | {"features": codes["kernel"]})
+        like = skeleton(node, [], "field", given)
         field = eqx.tree_deserialise_leaves(content, like)
         if content.read():
             raise ValueError("it has arrays that belong to nothing")
         _check_evaluable(field)
-    except MissingCode as error:
+    except NotGiven as error:
         name = "mean" if ".mean" in str(error) else "kernel"
         raise ValueError(
             f"{source}: {error}. Pass the {name} that was given to fit, with any "
@@ -168,7 +166,7 @@ def _read(node: Any, content: io.BytesIO, source: str, kernel: Any, mean: Any) -
     except Exception as error:  # a kernel of the caller's may raise anything
         raise ValueError(
             f"{source} is not a valid file of hamkernel.save"
-            + (" for this kernel" if kernel is not None else "")
+            + (" with what was given" if kernel is not None or mean is not None else "")
             + f": {error}"
         ) from error
     return field
@@ -181,7 +179,7 @@ def _is_field(cls: Any) -> bool:
 def _of_state(field: AbstractField) -> Callable[[Array], Array]:
     """The field as a function of the state alone: where it has inputs, they are 1."""
     if isinstance(field, ControlledField):
-        u = jnp.ones(field.inputs.shape[-1], field.inputs.dtype)
+        u = jnp.ones(field.kernel.input_count, field.offset.dtype)
         return lambda x: field(x, u)
     return field
 

@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from hamkernel._features.waves import features
+from hamkernel._features.structured import features
 from hamkernel._gram.dense import assemble
 from hamkernel._gram.derivatives import constant
 from hamkernel._solvers.landmark_gram import Columns, whitening

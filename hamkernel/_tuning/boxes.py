@@ -99,9 +99,10 @@ def typical_velocities(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, "P n
     Their mean square is to the mean diagonal of the Gram of the points as that of the rows is to
     that of the rows: an amplitude then fits both.
     """
-    X = rows.points
+    X, n = rows.points, rows.dimension
     ratio = jnp.sum(rows.y**2) / jnp.trace(gram_of_rows(K, rows))
-    return jnp.full_like(X, jnp.sqrt(ratio * gram_trace(K, X) / X.size))
+    size = jnp.sqrt(ratio * gram_trace(K, X) / (len(X) * n))
+    return jnp.full((len(X), n), size, X.dtype)
 
 
 def _amplitude(K: AbstractMatrixKernel, X: Array, Y: Array) -> float:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._observations.base import AbstractObservations
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers.bases import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel

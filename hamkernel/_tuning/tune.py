@@ -15,7 +15,7 @@ the way along ℓ -> ∞, λ -> 0 until nothing is left of it but noise.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,15 +25,16 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
+from hamkernel._fields.known import Mean
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.kinds import AbstractObservations, as_states, both, observations
+from hamkernel._observations.base import AbstractObservations
+from hamkernel._observations.data import as_states, observations
 from hamkernel._show import described
 from hamkernel._solvers.cholesky import AbstractSolver
-from hamkernel._solvers.fit import checked_rows, fit
-from hamkernel._solvers.means import Mean, without_mean
+from hamkernel._solvers.fit import fit
+from hamkernel._solvers.given import checked_rows, checked_states
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.joined import joined_data
 from hamkernel._tuning import advice
 from hamkernel._tuning.boxes import typical_velocities
 from hamkernel._tuning.descent import Run
@@ -152,8 +153,8 @@ def tune(
             data.
         progress: print a line for each step: on how many points, how many runs go on, and the best
             loss. Of an optimiser of yours say verbose=True to itself.
-        inputs: of a `Controlled` kernel, shape (N, m). An objective of your own gets points (x, u)
-            and passes them on, as `hk.fit(K, X, Y, λ)`.
+        inputs: of a `Controlled` kernel, shape (N, m). An objective of your own is then called
+            with (K, data, None, regularization), data the velocities with their inputs.
 
     Returns:
         A `Tuned`. NaN never comes out: points where the objective is not finite cannot win.
@@ -193,23 +194,20 @@ def tune(
     if optimiser is not None:
         optimiser = checked_optimiser(optimiser, progress)
     advice.warn_of_constants(K)
-    X, Y = as_states(X, Y)
-    if isinstance(X, AbstractObservations) or mean is not None:
-        if inputs is not None:
-            raise ValueError("inputs= go with states and velocities (X, Y), and without a mean.")
-        given = observations(X, Y), None
-        rows, ridge, mean = checked_rows(K, *given, regularization, mean)
-        rows = without_mean(K, rows, mean)
+    X, Y, inputs = as_states(X, Y, inputs)
+    given = Given(X, Y, solver, mean, inputs)
+    # An objective of the caller's takes states or observations, and no points (x, u).
+    own = inputs is not None and callable(objective)
+    if isinstance(X, AbstractObservations) or mean is not None or own:
+        data = observations(X, Y, inputs)
+        K, rows, ridge, _ = checked_rows(K, data, None, regularization, mean)
         check_memory(rows.targets, _LOSS_COPIES)
         X, Y = rows.points, typical_velocities(K, rows)
-        criterion = criterion_of_rows(objective, given[0], rows, folds)
+        criterion = criterion_of_rows(objective, data, rows, folds)
     else:
-        K, X, Y = joined_data(K, *both(X, Y), inputs)
-        given = X, Y
+        K, X, Y, ridge, _ = checked_states(K, X, Y, regularization, None, inputs)
         X, Y = on_one_device("X", X), on_one_device("Y", Y)
-        K.check_points(X)
         advice.warn_of_unequal_sizes(Y)
-        ridge = require.ridge(regularization, X.dtype)
         criterion = criterion_of(objective, len(X), folds)
     advice.warn_of_few_folds(criterion, folds)
     low_rank = solver is not None and solver.is_low_rank and not criterion.own
@@ -237,22 +235,26 @@ def tune(
             "which no fit succeeds (pass bounds={'regularization': (low, high)} with a larger "
             "low); an objective of your own that returns NaN."
         )
-    return _tuned(space, runs, starts, given, solver, mean)
+    return _tuned(space, runs, starts, given)
 
 
-def _tuned(
-    space: SearchSpace,
-    runs: list[Run],
-    starts: int,
-    data: tuple[Any, Any],
-    solver: AbstractSolver | None,
-    mean: Mean | None,
-) -> Tuned:
+class Given(NamedTuple):
+    """What `fit` is given besides the hyperparameters."""
+
+    X: Any
+    Y: Any
+    solver: AbstractSolver | None
+    mean: Mean | None
+    inputs: Any
+
+
+def _tuned(space: SearchSpace, runs: list[Run], starts: int, given: Given) -> Tuned:
     """The fit at the best point, and what is to be said of the search."""
     found = best(runs)
     dtype = space.low.dtype
     kernel, regularization, size = decode(space, jnp.asarray(found.u, dtype))
-    field = fit(kernel, *data, regularization, solver=solver, mean=mean)
+    X, Y, solver, mean, inputs = given
+    field = fit(kernel, X, Y, regularization, solver=solver, mean=mean, inputs=inputs)
     if not space.allows(regularization):
         raise ValueError(
             f"no lambda within bounds={{'regularization': ...}} can be solved with in {dtype}: "

@@ -9,7 +9,6 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Num
 
-from hamkernel import _require as require
 from hamkernel._factors.base import AbstractSystem
 from hamkernel._factors.dense import DenseSystem
 from hamkernel._factors.low_rank import LowRankSystem
@@ -18,12 +17,12 @@ from hamkernel._gram.derivatives import trained
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.kinds import AbstractObservations, as_states, both
+from hamkernel._observations.base import AbstractObservations
+from hamkernel._observations.data import as_states
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers.bases import AbstractBasis
-from hamkernel._solvers.fit import checked_rows
+from hamkernel._solvers.given import checked_rows, checked_states
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.joined import joined_data
 from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
 from hamkernel._validation.folds import Folds, Partition
 from hamkernel._validation.observed import (
@@ -74,11 +73,10 @@ def cross_validation_loss(
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
             matrices that do not fit in memory.
     """
-    X, Y, rows, regularization = _rows(K, X, Y, regularization)
+    K, states, Y, rows, regularization = _checked(K, X, Y, regularization, inputs)
     if rows is not None:
         return rows_partition_loss(K, rows, regularization, rows_partition(rows, folds))
-    K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
-    return partition_loss(K, X, Y, regularization, Partition(len(X), folds))
+    return partition_loss(K, states, Y, regularization, Partition(len(states), folds))
 
 
 @one_blas_thread
@@ -100,12 +98,11 @@ def cross_validation_residuals(
         Shape (N, n), in units of Y; of observations one for each row, in its units; inf where the
         matrix is not positive definite to rounding.
     """
-    X, Y, rows, regularization = _rows(K, X, Y, regularization)
+    K, states, Y, rows, regularization = _checked(K, X, Y, regularization, inputs)
     if rows is not None:
         left = rows_residuals(K, rows, regularization, rows_partition(rows, folds))
         return rows.scale * left
-    K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
-    return _held_out(K, X, Y, regularization, Partition(len(X), folds))[0]
+    return _held_out(K, states, Y, regularization, Partition(len(states), folds))[0]
 
 
 @one_blas_thread
@@ -140,11 +137,10 @@ def generalized_cross_validation(
 
     Source: Golub, Heath & Wahba (1979), Technometrics 21.
     """
-    X, Y, rows, regularization = _rows(K, X, Y, regularization)
+    K, states, Y, rows, regularization = _checked(K, X, Y, regularization, inputs)
     if rows is not None:
         return rows_generalized_loss(K, rows, regularization)
-    K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
-    return generalized_loss(K, X, Y, regularization)
+    return generalized_loss(K, states, Y, regularization)
 
 
 @one_blas_thread
@@ -178,32 +174,25 @@ def log_marginal_likelihood(
 
     Source: Rasmussen & Williams (2006), eq. 2.30.
     """
-    X, Y, rows, regularization = _rows(K, X, Y, regularization)
+    K, states, Y, rows, regularization = _checked(K, X, Y, regularization, inputs)
     if rows is not None:
         return rows_log_likelihood(K, rows, regularization)
-    K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
-    return log_likelihood(K, X, Y, regularization)
+    return log_likelihood(K, states, Y, regularization)
 
 
-def _rows(K, X, Y, regularization) -> tuple[Any, Any, Rows | None, Any]:
-    """X, Y, the rows of observations, and λ; no rows of states X, whose losses are shorter."""
-    X, Y = as_states(X, Y)
-    if not isinstance(X, AbstractObservations):
-        return X, Y, None, regularization
-    rows, regularization, _ = checked_rows(matrix_kernel(K), X, Y, regularization, None)
-    check_memory(rows.targets, LOSS_COPIES)
-    return X, Y, rows, regularization
-
-
-def _checked(K, X, Y, regularization, inputs=None):
+def _checked(K, X, Y, regularization, inputs) -> tuple[Any, Any, Any, Rows | None, Any]:
+    """Kernel, X, Y, the rows of observations, and λ; states have no rows, and shorter losses."""
     K = matrix_kernel(K)
-    K, X, Y = joined_data(K, *both(X, Y), inputs)
+    X, Y, inputs = as_states(X, Y, inputs)
+    if isinstance(X, AbstractObservations):
+        K, rows, regularization, _ = checked_rows(K, X, Y, regularization)
+        check_memory(rows.targets, LOSS_COPIES)
+        return K, X, Y, rows, regularization
+    K, X, Y, regularization, _ = checked_states(K, X, Y, regularization, None, inputs)
     # LAPACK on every device at once was seen to stall, see `_factors/dense.py`.
     X, Y = on_one_device("X", X), on_one_device("Y", Y)
-    K.check_points(X)
-    regularization = require.ridge(regularization, X.dtype)
     check_memory(X, LOSS_COPIES)
-    return K, X, Y, regularization
+    return K, X, Y, None, regularization
 
 
 LOSS_COPIES = 3  # matrices of the size of the Gram that a loss holds, with its gradient

@@ -129,6 +129,11 @@ class Driven(eqx.Module):
                 )
 
     @property
+    def drift(self) -> System:
+        """The system without inputs."""
+        return self.system
+
+    @property
     def takes_inputs(self) -> bool:
         """That a velocity needs u as well: `hk.simulate` asks."""
         return True

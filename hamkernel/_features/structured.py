@@ -1,0 +1,236 @@
+"""Random Fourier features of structured kernels.
+
+Any structure is an operator on a potential u made of waves, f = B∇u, so the structure is exact for
+every number of frequencies; only the kernel is approximate.
+
+Source: the odd symplectic case: Smith & Egeland (2024), arXiv 2404.07703.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from hamkernel._features.waves import GroupWaves, Waves, waves_of
+from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.controlled import Controlled, KnownMatrix
+from hamkernel._structures.operators import AbstractPotentialKernel
+from hamkernel._structures.without_potential import DivergenceFree, Separable
+
+
+class AbstractFeatures(eqx.Module):
+    """Fields that span the features of a structured kernel: Σ of them with weights w is a field.
+
+    Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z), and each φ_r has the structure of K exactly.
+    """
+
+    @property
+    @abc.abstractmethod
+    def columns(self) -> int:
+        """r, the number of features."""
+
+    @abc.abstractmethod
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
+        """The features φ_r(x), side by side."""
+
+    @abc.abstractmethod
+    def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        """Σ_r w_r φ_r(x), without the rows."""
+
+    @abc.abstractmethod
+    def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
+        """The potential of `field`, for the structures that have one."""
+
+    def __call__(self, X: Float[Array, "t n"]) -> Float[Array, "t n r"]:
+        return jax.vmap(self.rows)(X)
+
+
+class PotentialFeatures(AbstractFeatures):
+    """φ = B∇(wave)."""
+
+    structure: AbstractPotentialKernel
+    waves: Waves | GroupWaves
+
+    @property
+    def columns(self) -> int:
+        return len(self.waves.amplitudes)
+
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
+        return self.structure.apply(x, self.waves.gradients(x))
+
+    def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        return self.structure.apply(x, self.waves.gradients(x) @ w)
+
+    def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
+        return self.waves.values(x) @ w
+
+
+class DivergenceFreeFeatures(AbstractFeatures):
+    """φ = e_a ∂_b(wave) − e_b ∂_a(wave) for each pair a < b: an antisymmetric matrix potential."""
+
+    waves: Waves | GroupWaves
+    dimension: int = eqx.field(static=True)
+
+    @property
+    def columns(self) -> int:
+        return len(self.waves.amplitudes) * self.dimension * (self.dimension - 1) // 2
+
+    def _pairs(self) -> Float[Array, "n P n"]:
+        a, b = np.triu_indices(self.dimension, 1)
+        pairs = np.zeros((self.dimension, len(a), self.dimension))
+        pairs[a, np.arange(len(a)), b] = 1.0
+        pairs[b, np.arange(len(a)), a] = -1.0
+        return jnp.asarray(pairs, self.waves.amplitudes.dtype)
+
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
+        rows = jnp.einsum("apb,bw->apw", self._pairs(), self.waves.gradients(x))
+        return rows.reshape(self.dimension, -1)
+
+    def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        pairs = self._pairs()
+        slopes = w.reshape(pairs.shape[1], -1) @ self.waves.gradients(x).T  # (P, n)
+        return jnp.einsum("apb,pb->a", pairs, slopes)
+
+    def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
+        raise AttributeError("a divergence-free field has a matrix potential, not a scalar one.")
+
+
+class SeparableFeatures(AbstractFeatures):
+    """φ = e_a (wave) for each component a."""
+
+    waves: Waves | GroupWaves
+    dimension: int = eqx.field(static=True)
+
+    @property
+    def columns(self) -> int:
+        return len(self.waves.amplitudes) * self.dimension
+
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
+        return jnp.kron(jnp.eye(self.dimension, dtype=x.dtype), self.waves.values(x)[None])
+
+    def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        return w.reshape(self.dimension, -1) @ self.waves.values(x)
+
+    def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
+        raise AttributeError("a field with independent components has no potential.")
+
+
+class ControlledFeatures(AbstractFeatures):
+    """Those φ(x) of the drift, and uⱼ e_a (wave)(x) for each input j and each coordinate a.
+
+    Attributes:
+        drift: the features of the drift.
+        waves: those of the kernel of the input matrix; None where that is known.
+        acts_on: the coordinates that inputs change.
+        count: m, the number of inputs; points are (x, u).
+    """
+
+    drift: AbstractFeatures
+    waves: Waves | GroupWaves | None
+    acts_on: tuple[int, ...] = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+
+    @property
+    def columns(self) -> int:
+        waves = 0 if self.waves is None else len(self.waves.amplitudes)
+        return self.drift.columns + len(self.acts_on) * self.count * waves
+
+    def rows(self, x: Float[Array, " d"]) -> Float[Array, "n r"]:
+        x, u = x[: -self.count], x[-self.count :]
+        drift = self.drift.rows(x)
+        if self.waves is None:
+            return drift
+        directions = jnp.eye(len(x), dtype=x.dtype)[:, np.asarray(self.acts_on)]  # (n, a)
+        gains = jnp.kron(directions, jnp.kron(u, self.waves.values(x))[None])
+        return jnp.concatenate([drift, gains], axis=1)
+
+    def field(self, x: Float[Array, " d"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        x, u = x[: -self.count], x[-self.count :]
+        r = self.drift.columns
+        drift = self.drift.field(x, w[:r])
+        if self.waves is None:
+            return drift
+        gains = w[r:].reshape(len(self.acts_on), self.count, -1) @ self.waves.values(x)  # (a, m)
+        return drift.at[np.asarray(self.acts_on)].add(gains @ u)
+
+    def potential(self, x: Float[Array, " d"], w: Float[Array, " r"]) -> Float[Array, ""]:
+        return self.drift.potential(x[: -self.count], w[: self.drift.columns])
+
+
+class SumFeatures(AbstractFeatures):
+    """The features of all terms, one after the other."""
+
+    terms: tuple[AbstractFeatures, ...]
+
+    @property
+    def columns(self) -> int:
+        return sum(term.columns for term in self.terms)
+
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
+        return jnp.concatenate([term.rows(x) for term in self.terms], axis=1)
+
+    def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        return sum(
+            (t.field(x, w[self.slice(i)]) for i, t in enumerate(self.terms)), jnp.zeros_like(x)
+        )
+
+    def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
+        return sum(
+            (t.potential(x, w[self.slice(i)]) for i, t in enumerate(self.terms)),
+            jnp.zeros((), x.dtype),
+        )
+
+    def slice(self, index: int) -> slice:
+        """Where the weights of one term stand."""
+        start = sum(term.columns for term in self.terms[:index])
+        return slice(start, start + self.terms[index].columns)
+
+
+def features(
+    K: AbstractMatrixKernel, n: int, count: int, key: Key[Array, ""], dtype: Any
+) -> AbstractFeatures:
+    """Random Fourier features of a structured kernel.
+
+    Args:
+        K: a structure, or a sum of structures, on shift-invariant scalar kernels.
+        n: the number of coordinates of a point, those of inputs too.
+        count: frequencies for each term of each scalar kernel.
+        key: the random key.
+        dtype: of the features.
+
+    Raises:
+        TypeError: a kernel without a known spectral density, or an unknown structure.
+    """
+    if isinstance(K, Controlled):
+        return _controlled(K, n, count, key, dtype)
+    if isinstance(K, Sum):
+        keys = jax.random.split(key, len(K.terms))
+        pairs = zip(K.terms, keys, strict=True)
+        return SumFeatures(tuple(features(term, n, count, key, dtype) for term, key in pairs))
+    if not isinstance(K, Separable | DivergenceFree | AbstractPotentialKernel):
+        raise TypeError(
+            f"RandomFeatures does not know the structure {type(K).__name__}. Use Symplectic, "
+            "CurlFree, DivergenceFree, Separable or sums of them, or another solver."
+        )
+    waves = waves_of(K.kernel, n, count, key, dtype)
+    if isinstance(K, AbstractPotentialKernel):
+        return PotentialFeatures(K, waves)
+    return (DivergenceFreeFeatures if isinstance(K, DivergenceFree) else SeparableFeatures)(
+        waves, n
+    )
+
+
+def _controlled(K: Controlled, n: int, count: int, key: Key[Array, ""], dtype: Any):
+    n, inputs = K.outputs(n), K.input_count
+    of_drift, of_matrix = jax.random.split(key)
+    drift, G = features(K.drift, n, count, of_drift, dtype), K.inputs
+    if isinstance(G, KnownMatrix):
+        return ControlledFeatures(drift, None, (), inputs)
+    acts_on = tuple(range(n)) if G.acts_on is None else G.acts_on
+    return ControlledFeatures(
+        drift, waves_of(G.kernel, n, count, of_matrix, dtype), acts_on, inputs
+    )
