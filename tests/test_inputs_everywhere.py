@@ -13,9 +13,8 @@ import pytest
 import hamkernel as hk
 from hamkernel._features.waves import features
 
-K = hk.Controlled(
-    hk.Symplectic(2.0 * hk.Gaussian(1.3)), hk.InputMatrix(0.8 * hk.Gaussian(0.9), acts_on=(1,))
-)
+GAIN = hk.InputMatrix(0.8 * hk.Gaussian(0.9), acts_on=(1,))
+K = hk.Controlled(hk.Symplectic(2.0 * hk.Gaussian(1.3)), GAIN)
 RNG = np.random.default_rng(0)
 X, Y = RNG.normal(size=(2, 9, 2))
 U = RNG.normal(size=(9, 2))
@@ -133,6 +132,7 @@ def test_all_observations_with_inputs_are_functionals_of_the_same_process():
 def test_random_features_are_those_of_drift_and_input_matrix():
     key = jax.random.key(0)
     T = jnp.asarray(S[:4])
+    K = hk.Controlled(hk.Symplectic(2.0 * hk.Gaussian(1.3)), GAIN, count=2)
     exact = hk.gram(K, T).reshape(8, 8)
 
     def error(K, count, exact):
@@ -212,7 +212,7 @@ def test_a_mean_is_taken_off_the_data_and_added_to_the_field(mean):
         np.testing.assert_allclose(field.hamiltonian(x), energy, atol=1e-12)
         assert posterior.energy_deviation(x, X[0]) > 0
     else:
-        with pytest.raises(AttributeError, match="the mean, .*, has no potential"):
+        with pytest.raises(AttributeError, match="has no potential"):
             field.hamiltonian(x)
 
 

@@ -68,6 +68,7 @@ CLASSES: dict[str, type[eqx.Module]] = {
         ),
         *(systems.DoublePendulum, systems.Duffing, systems.HarmonicOscillator),
         *(systems.HenonHeiles, systems.Kepler, systems.NBody, systems.Pendulum),
+        *(systems.CartPole, systems.Acrobot),
         *(systems.PointVortices, systems.SpringChain, systems.Damped, systems.Driven),
         *(systems.RigidBody, systems.LotkaVolterra, systems.ChargedParticle),
         *(Separable, CurlFree, DivergenceFree, Symplectic, Sum),

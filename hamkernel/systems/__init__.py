@@ -14,6 +14,7 @@ wrap a system, `Driven(Damped(Pendulum(), 0.1), [[0.0], [1.0]])`, and a driven o
 `system(x, u)`.
 """
 
+from hamkernel.systems._actuated import Acrobot, CartPole
 from hamkernel.systems._base import AbstractHamiltonianSystem
 from hamkernel.systems._mechanisms import DoublePendulum, Kepler, NBody, PointVortices
 from hamkernel.systems._oscillators import (
@@ -35,6 +36,8 @@ from hamkernel.systems._wrapped import Damped, Driven
 __all__ = [
     "AbstractHamiltonianSystem",
     "AbstractPoissonSystem",
+    "Acrobot",
+    "CartPole",
     "ChargedParticle",
     "Damped",
     "DoublePendulum",
