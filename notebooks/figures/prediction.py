@@ -50,7 +50,7 @@ def energy(ax, posterior, pendulum) -> None:
         transform=ax.get_xaxis_transform(),
     )
     ax.set(xlim=(-3.1, 3.1), xlabel="$q$ [rad], at rest")
-    ax.set(ylabel="error of $H(q, 0) - H(0, 0)$ [J]", title="energy: of 19.6 J at the top")
+    ax.set(ylabel="$\\Delta H$, learned − true [J]", title="error of the energy, 19.6 J at the top")
 
 
 def ensemble(ax, posterior, pendulum) -> None:
@@ -79,7 +79,7 @@ def main(folder: Path) -> None:
     left.set_title("prediction from (1.8, 0)")
     energy(middle, posterior, pendulum)
     ensemble(right, posterior, pendulum)
-    figure.legend(loc="outside lower center", ncols=3, frameon=False)
+    figure.legend(loc="outside lower center", ncols=4, frameon=False)
     figure.savefig(folder / "prediction.png", dpi=120)
 
 
