@@ -13,7 +13,7 @@ from kernels import BY_NAME, canonical, difference_mixed
 
 import hamkernel as hk
 from hamkernel._features.waves import features as features_of
-from hamkernel._kernels.transforms import symmetry_removed
+from hamkernel._kernels.symmetry import symmetry_removed
 from hamkernel._save.files import load, save
 
 SYMMETRY = 1e-12

@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, FieldSum, potential_of, root
 from hamkernel._kernels.base import Invariance
-from hamkernel._kernels.transforms import symmetry_removed
+from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._observations.blocks import Components, Values
 from hamkernel._observations.kinds import AbstractObservations, observations, rows_of_data
@@ -249,9 +249,7 @@ def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
     if not require.is_concrete(K, X):
         return
     x = X[0]
-    for k in K.scalar_kernels:
-        found = symmetry_removed(k)
-        k = k if found is None else found.kernel
+    for k in without_symmetry(K).scalar_kernels:
         if Invariance.TRANSLATION in k.invariance and np.asarray(k(x, x)) == 1.0:
             require.warn(
                 f"the amplitude of {k!r} is exactly 1, that of a kernel nobody tuned, and "
