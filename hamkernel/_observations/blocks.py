@@ -26,6 +26,11 @@ class AbstractBlock(eqx.Module):
 
     @property
     @abc.abstractmethod
+    def values_shape(self) -> tuple[int, ...]:
+        """That of the field, or of the potential, at the points."""
+
+    @property
+    @abc.abstractmethod
     def scale(self) -> Float[Array, " D"]:
         """The relative noise of each row, by which it is divided."""
 
@@ -50,6 +55,18 @@ class AbstractBlock(eqx.Module):
     def then(self, other: "AbstractBlock") -> "AbstractBlock | None":
         """One block of these rows and then the others; None if they are of another kind."""
 
+    @abc.abstractmethod
+    def at(self, points: Float[Array, "P n"]) -> "AbstractBlock":
+        """All components of the field, or the potential, at other points, without noise."""
+
+    @abc.abstractmethod
+    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+        """The block of some observations, counted from 0 and in order.
+
+        Returns:
+            It, which rows it has, and which observations those belong to.
+        """
+
 
 class Components(AbstractBlock):
     """Components of the field at points.
@@ -69,7 +86,6 @@ class Components(AbstractBlock):
 
     @property
     def values_shape(self) -> tuple[int, int]:
-        """That of the field at the points, (P, n)."""
         P, n = self.points.shape
         return P, n if self.outputs is None else self.outputs
 
@@ -112,6 +128,19 @@ class Components(AbstractBlock):
             noise = jnp.concatenate([self.scale, other.scale])
         return Components(jnp.concatenate([self.points, other.points]), kept, noise, self.outputs)
 
+    def at(self, points: Float[Array, "P n"]) -> "Components":
+        return Components(points, outputs=self.outputs)
+
+    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+        rows = np.flatnonzero(np.isin(self.labels(), chosen))
+        kept = self.kept
+        if kept is not None:
+            n = self.values_shape[1]
+            all_kept = np.asarray(kept)[rows]
+            kept = jnp.asarray(np.searchsorted(chosen, all_kept // n) * n + all_kept % n)
+        noise = None if self.noise is None else self.noise[rows]
+        return Components(self.points[chosen], kept, noise, self.outputs), rows, chosen
+
 
 class Combinations(AbstractBlock):
     """Σ_q weights[s, r, q] · f(groups[s, q]), R rows for each of S groups of Q points."""
@@ -123,6 +152,11 @@ class Combinations(AbstractBlock):
     @property
     def points(self) -> Float[Array, "SQ n"]:
         return self.groups.reshape(-1, self.groups.shape[2])
+
+    @property
+    def values_shape(self) -> tuple[int, int]:
+        S, _, Q, n = self.weights.shape
+        return S * Q, n
 
     @property
     def scale(self) -> Float[Array, " SR"]:
@@ -151,6 +185,17 @@ class Combinations(AbstractBlock):
         pairs = (self.groups, other.groups), (self.weights, other.weights)
         return Combinations(*map(jnp.concatenate, pairs))
 
+    def at(self, points: Float[Array, "P n"]) -> Components:
+        return Components(points, outputs=self.weights.shape[3])
+
+    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+        # Whole groups: the rows of one share its points.
+        R = self.weights.shape[1]
+        groups = np.unique(chosen // R)
+        rows = (groups[:, None] * R + np.arange(R)).reshape(-1)
+        part = Combinations(groups=self.groups[groups], weights=self.weights[groups])  # pyright: ignore[reportCallIssue]
+        return part, rows, rows
+
 
 class Values(AbstractBlock):
     """The potential at points; `noise` is that of each, None if it is 1."""
@@ -158,6 +203,10 @@ class Values(AbstractBlock):
     points: Float[Array, "E n"]
     noise: Float[Array, " E"] | None = None
     of_values: ClassVar[bool] = True
+
+    @property
+    def values_shape(self) -> tuple[int]:
+        return (len(self.points),)
 
     @property
     def scale(self) -> Float[Array, " E"]:
@@ -183,6 +232,16 @@ class Values(AbstractBlock):
         if self.noise is not None or other.noise is not None:
             noise = jnp.concatenate([self.scale, other.scale])
         return Values(jnp.concatenate([self.points, other.points]), noise)
+
+    def at(self, points: Float[Array, "E n"]) -> "Values":
+        return Values(points)
+
+    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+        noise = None if self.noise is None else self.noise[chosen]
+        return Values(self.points[chosen], noise), chosen, chosen
+
+
+Some = tuple[AbstractBlock, Int[np.ndarray, " rows"], Int[np.ndarray, " observations"]]
 
 
 def merged(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:

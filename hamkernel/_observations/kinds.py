@@ -298,6 +298,12 @@ def observations(X: Any, Y: Any, part: bool = False) -> AbstractObservations:
     return X
 
 
+def rows_of_states(X: Float[Array, "N d"], Y: Float[Array, "N n"]) -> Rows:
+    """Velocities, all measured with one noise; at points (x, u) of a field with inputs."""
+    outputs = None if X.shape == Y.shape else Y.shape[1]
+    return Rows((Components(X, outputs=outputs),), Y.reshape(-1))
+
+
 def rows_of_data(data: AbstractObservations, beside: Rows | None = None) -> Rows:
     """The normal form of the observations; `beside` is that of others that were there before."""
     blocks, targets = zip(*data.parts(), strict=True)

@@ -27,7 +27,13 @@ from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.kinds import AbstractObservations, as_states, both, observations
+from hamkernel._observations.kinds import (
+    AbstractObservations,
+    as_states,
+    both,
+    observations,
+    rows_of_states,
+)
 from hamkernel._show import described
 from hamkernel._solvers.cholesky import AbstractSolver
 from hamkernel._solvers.fit import checked_rows, fit
@@ -35,17 +41,16 @@ from hamkernel._solvers.means import Mean, without_mean
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.joined import joined_data
 from hamkernel._tuning import advice
-from hamkernel._tuning.boxes import typical_velocities
+from hamkernel._tuning.boxes import typical_speed
 from hamkernel._tuning.descent import Run
 from hamkernel._tuning.objective import (
     Criterion,
     Objective,
     SearchCriterion,
     criterion_of,
-    criterion_of_rows,
 )
 from hamkernel._tuning.other_optimisers import checked_optimiser
-from hamkernel._tuning.part import rows_of_parts
+from hamkernel._tuning.part import parts_of
 from hamkernel._tuning.search import Search, best
 from hamkernel._tuning.space import LOW_RANK_ROUNDINGS, ROUNDINGS, SearchSpace
 from hamkernel._validation.folds import Folds
@@ -200,31 +205,32 @@ def tune(
         given = observations(X, Y), None
         rows, ridge, mean = checked_rows(K, *given, regularization, mean)
         rows = without_mean(K, rows, mean)
-        check_memory(rows.targets, _LOSS_COPIES)
-        X, Y = rows.points, typical_velocities(K, rows)
-        criterion = criterion_of_rows(objective, given[0], rows, folds)
     else:
         K, X, Y = joined_data(K, *both(X, Y), inputs)
         given = X, Y
-        X, Y = on_one_device("X", X), on_one_device("Y", Y)
+        rows = rows_of_states(on_one_device("X", X), on_one_device("Y", Y))
         K.check_points(X)
         advice.warn_of_unequal_sizes(Y)
         ridge = require.ridge(regularization, X.dtype)
-        criterion = criterion_of(objective, len(X), folds)
+    criterion = criterion_of(objective, rows.count, folds, given)
     advice.warn_of_few_folds(criterion, folds)
     low_rank = solver is not None and solver.is_low_rank and not criterion.own
-    few = rows_of_parts(X, criterion, dense=True)[0]
+    parts = parts_of(rows, criterion, dense=True)
+    if not low_rank and not (criterion.own and given[1] is not None):
+        check_memory(rows, _LOSS_COPIES)
+    few = rows.some(parts[0])[0]
+    speed = typical_speed(K, few)
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
-    space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings, X[few])
+    space = SearchSpace(
+        K, rows.points, speed, ridge, tuple(frozen), bounds or {}, roundings, few.points
+    )
     advice.warn_of_free_scale(space, criterion)
-    if len(few) < len(X) and not low_rank:
-        check_memory(X, _LOSS_COPIES)
-    search = Search(space, criterion, X, Y, starts, max_steps, optimiser, progress)
+    search = Search(space, criterion, rows, speed, starts, max_steps, optimiser, progress)
 
     def of_low_rank(run: Run) -> SearchCriterion:
         kernel, regularization, _ = decode(space, run.u)
         assert solver is not None
-        basis = solver._basis(kernel, X, regularization)
+        basis = solver._basis(kernel, rows.points, regularization)
         assert basis is not None
         return criterion.with_basis(basis)
 
