@@ -9,7 +9,7 @@ import pytest
 import hamkernel as hk
 from hamkernel._gram.observed import gram_of_rows
 from hamkernel._observations.blocks import Components
-from hamkernel._observations.kinds import rows_of_data, rows_of_states
+from hamkernel._observations.data import rows_of_data, rows_of_states
 from hamkernel._solvers.spans import WaveBasis
 from hamkernel._tuning.boxes import full_trace, hyperparameters
 from hamkernel._tuning.descent import Descent, Run
@@ -209,7 +209,7 @@ def test_a_subset_of_observations_has_their_rows():
         + hk.Energies(X[:5], Y[:5, 0])
         + hk.Functionals(X[:6].reshape(3, 2, 2), rng.normal(size=(3, 2, 2, 2)), Y[:3])
     )
-    rows = rows_of_data(data)
+    rows = rows_of_data(K, data)[1]
     assert rows.count == N + 5 + 6
     some, which = rows.some(np.array([1, 4, 19, 21, 24, 27]))
     np.testing.assert_array_equal(which, [1, 4, 19, 21, 24, 27, 28])  # 28 shares the points of 27

@@ -140,7 +140,10 @@ def test_reversible_and_odd_go_together_in_either_order():
 def test_a_separable_hamiltonian_stays_one_when_it_is_made_reversible():
     k = hk.Select(G, (0, 1)) + hk.Select(hk.Polynomial(2), (2, 3))
     assert hk.fit(hk.Reversible(hk.Symplectic(k)), X, Y, 1e-2).is_separable
-    assert not hk.fit(hk.Reversible(hk.Symplectic(G)), X, Y, 1e-2).is_separable
+    alone = hk.fit(hk.Reversible(hk.Symplectic(G)), X, Y, 1e-2)
+    assert not alone.is_separable
+    assert off(alone, REVERSAL, -1.0) < SYMMETRY
+    assert off(alone, -REVERSAL, -1.0) > 1e-2
 
 
 def test_symmetry_helps_where_it_is_there():

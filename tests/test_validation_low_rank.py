@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 import hamkernel as hk
 from hamkernel._observations.blocks import Components
-from hamkernel._observations.kinds import rows_of_data, rows_of_states
+from hamkernel._observations.data import rows_of_data, rows_of_states
 from hamkernel._solvers.landmarks import given_landmarks
 from hamkernel._solvers.spans import LandmarkBasis, WaveBasis
 from hamkernel._validation.of_rows import (
@@ -120,12 +120,13 @@ def of_every_kind():
     V = np.array(Y[:14])
     V[3, 0], V[5] = np.nan, np.nan
     E = np.asarray(X[20:26, 1] ** 2 / 2 - jnp.cos(X[20:26, 0])) + 3.7
-    return rows_of_data(
+    data = (
         hk.Velocities(X[:14], V, noise=rng.uniform(0.5, 2, size=(14, 2)))
         + hk.Energies(X[20:26], E, noise=rng.uniform(0.5, 2, size=6))
         + hk.Functionals(X[:12].reshape(4, 3, 2), rng.normal(size=(4, 3, 2)), rng.normal(size=4))
         + hk.Equilibria(np.zeros(2))
     )
+    return rows_of_data(K, data)[1]
 
 
 @pytest.mark.parametrize(

@@ -18,9 +18,11 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._dynamics.inputs import (
+    AtStart,
     Between,
     Driven,
     inputs_of,
+    learned_at,
     refuse_missing,
     refuse_symplectic,
 )
@@ -45,16 +47,6 @@ class _Autonomous(eqx.Module):
     def __call__(self, t: Any, x: Float[Array, " n"], args: Any) -> Float[Array, " n"]:
         del t, args
         return self.field(x)
-
-
-class _At(eqx.Module):
-    """A driven field at the first time, to be looked at before the solve."""
-
-    driven: Driven
-    start: Float[Array, ""]
-
-    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self.driven(jnp.zeros_like(self.start), x, self.start)
 
 
 def simulate(
@@ -150,7 +142,7 @@ def simulate(
         held = dt is not None and between == "held" and not callable(inputs)
         driven: Any = field  # of x and u
         right_hand_side = Driven(driven, inputs_of(inputs, ts, between), held)
-        field = _At(right_hand_side, start)
+        field = AtStart(right_hand_side, start)
     _check_field(field, x0)
     if max_steps is not None:
         max_steps = require.count(max_steps, "max_steps")
@@ -164,7 +156,7 @@ def simulate(
         counts = None
         default = jnp.asarray(1e-10 if x0.dtype == jnp.float64 else 1e-5, x0.dtype)
         if rtol is None or atol is None:
-            default = jnp.maximum(default, rounding(field, x0))
+            default = jnp.maximum(default, rounding(*learned_at(field, x0)))
         # Steps end on ts: the interpolant of Dopri8 is of lower order, and was measured to break
         # the conservation of energy by 1e-7 where the steps themselves keep it to 1e-10.
         controller = diffrax.ClipStepSizeController(

@@ -9,7 +9,7 @@ so to a field again, whatever was observed.
 import abc
 import math
 from collections.abc import Iterable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -22,7 +22,12 @@ class AbstractBlock(eqx.Module):
 
     of_values: eqx.AbstractClassVar[bool]  # of the potential; else of the field
 
-    points: eqx.AbstractVar[Float[Array, "P n"]]
+    points: eqx.AbstractVar[Float[Array, "P d"]]
+
+    @property
+    @abc.abstractmethod
+    def dimension(self) -> int:
+        """n, the components of the field; points (x, u) have d = n + m coordinates."""
 
     @property
     @abc.abstractmethod
@@ -56,7 +61,7 @@ class AbstractBlock(eqx.Module):
         """One block of these rows and then the others; None if they are of another kind."""
 
     @abc.abstractmethod
-    def at(self, points: Float[Array, "P n"]) -> "AbstractBlock":
+    def at(self, points: Float[Array, "P d"]) -> "AbstractBlock":
         """All components of the field, or the potential, at other points, without noise."""
 
     @abc.abstractmethod
@@ -85,9 +90,12 @@ class Components(AbstractBlock):
     of_values: ClassVar[bool] = False
 
     @property
+    def dimension(self) -> int:
+        return self.points.shape[1] if self.outputs is None else self.outputs
+
+    @property
     def values_shape(self) -> tuple[int, int]:
-        P, n = self.points.shape
-        return P, n if self.outputs is None else self.outputs
+        return len(self.points), self.dimension
 
     @property
     def scale(self) -> Float[Array, " D"]:
@@ -128,7 +136,7 @@ class Components(AbstractBlock):
             noise = jnp.concatenate([self.scale, other.scale])
         return Components(jnp.concatenate([self.points, other.points]), kept, noise, self.outputs)
 
-    def at(self, points: Float[Array, "P n"]) -> "Components":
+    def at(self, points: Float[Array, "P d"]) -> "Components":
         return Components(points, outputs=self.outputs)
 
     def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
@@ -138,19 +146,23 @@ class Components(AbstractBlock):
             n = self.values_shape[1]
             all_kept = np.asarray(kept)[rows]
             kept = jnp.asarray(np.searchsorted(chosen, all_kept // n) * n + all_kept % n)
-        noise = None if self.noise is None else self.noise[rows]
-        return Components(self.points[chosen], kept, noise, self.outputs), rows, chosen
+        points, noise = _taken(self.points, chosen), _taken(self.noise, rows)
+        return Components(points, kept, noise, self.outputs), rows, chosen
 
 
 class Combinations(AbstractBlock):
     """Σ_q weights[s, r, q] · f(groups[s, q]), R rows for each of S groups of Q points."""
 
-    groups: Float[Array, "S Q n"]
+    groups: Float[Array, "S Q d"]
     weights: Float[Array, "S R Q n"]
     of_values: ClassVar[bool] = False
 
     @property
-    def points(self) -> Float[Array, "SQ n"]:
+    def dimension(self) -> int:
+        return self.weights.shape[3]
+
+    @property
+    def points(self) -> Float[Array, "SQ d"]:
         return self.groups.reshape(-1, self.groups.shape[2])
 
     @property
@@ -176,8 +188,8 @@ class Combinations(AbstractBlock):
         return rows.reshape(S * R, *rest)
 
     def coefficients(self, c: Float[Array, " SR"]) -> Float[Array, "SQ n"]:
-        S, R, _, _ = self.weights.shape
-        return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(self.points.shape)
+        S, R, Q, n = self.weights.shape
+        return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(S * Q, n)
 
     def then(self, other: AbstractBlock) -> "Combinations | None":
         if not isinstance(other, Combinations) or self.weights.shape[1:] != other.weights.shape[1:]:
@@ -185,7 +197,7 @@ class Combinations(AbstractBlock):
         pairs = (self.groups, other.groups), (self.weights, other.weights)
         return Combinations(*map(jnp.concatenate, pairs))
 
-    def at(self, points: Float[Array, "P n"]) -> Components:
+    def at(self, points: Float[Array, "P d"]) -> Components:
         return Components(points, outputs=self.weights.shape[3])
 
     def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
@@ -193,20 +205,28 @@ class Combinations(AbstractBlock):
         R = self.weights.shape[1]
         groups = np.unique(chosen // R)
         rows = (groups[:, None] * R + np.arange(R)).reshape(-1)
-        part = Combinations(groups=self.groups[groups], weights=self.weights[groups])  # pyright: ignore[reportCallIssue]
-        return part, rows, rows
+        own = {"groups": _taken(self.groups, groups), "weights": _taken(self.weights, groups)}
+        return Combinations(**own), rows, rows
 
 
 class Values(AbstractBlock):
-    """The potential at points; `noise` is that of each, None if it is 1."""
+    """The potential at points; `noise` is that of each, None if it is 1.
 
-    points: Float[Array, "E n"]
+    At points (x, u) it is the potential of the drift, and u has no effect.
+    """
+
+    points: Float[Array, "E d"]
     noise: Float[Array, " E"] | None = None
+    outputs: int | None = eqx.field(static=True, default=None)
     of_values: ClassVar[bool] = True
 
     @property
     def values_shape(self) -> tuple[int]:
         return (len(self.points),)
+
+    @property
+    def dimension(self) -> int:
+        return self.points.shape[1] if self.outputs is None else self.outputs
 
     @property
     def scale(self) -> Float[Array, " E"]:
@@ -231,14 +251,19 @@ class Values(AbstractBlock):
         noise = None
         if self.noise is not None or other.noise is not None:
             noise = jnp.concatenate([self.scale, other.scale])
-        return Values(jnp.concatenate([self.points, other.points]), noise)
+        return Values(jnp.concatenate([self.points, other.points]), noise, self.outputs)
 
-    def at(self, points: Float[Array, "E n"]) -> "Values":
-        return Values(points)
+    def at(self, points: Float[Array, "E d"]) -> "Values":
+        return Values(points, outputs=self.outputs)
 
     def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
-        noise = None if self.noise is None else self.noise[chosen]
-        return Values(self.points[chosen], noise), chosen, chosen
+        points, noise = _taken(self.points, chosen), _taken(self.noise, chosen)
+        return Values(points, noise, self.outputs), chosen, chosen
+
+
+def _taken(array: Array | None, index: Int[np.ndarray, " C"]) -> Any:
+    """Entries of an array, without compiling for how many they are."""
+    return None if array is None else jnp.asarray(np.asarray(array)[index])
 
 
 Some = tuple[AbstractBlock, Int[np.ndarray, " rows"], Int[np.ndarray, " observations"]]

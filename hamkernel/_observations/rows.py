@@ -41,8 +41,8 @@ class Rows(eqx.Module):
 
     @property
     def dimension(self) -> int:
-        """The number of coordinates of a state."""
-        return self.blocks[0].points.shape[1]
+        """n, the number of coordinates of a state."""
+        return self.blocks[0].dimension
 
     @property
     def scale(self) -> Float[Array, " M"]:
@@ -88,8 +88,8 @@ class Rows(eqx.Module):
         return np.concatenate([start + block.labels() for start, block in pairs])
 
     @property
-    def points(self) -> Float[Array, "P n"]:
-        """All points of all blocks."""
+    def points(self) -> Float[Array, "P d"]:
+        """All points of all blocks, (x, u) where there are inputs."""
         return jnp.concatenate([block.points for block in self.blocks])
 
     def of(
@@ -138,9 +138,9 @@ class Rows(eqx.Module):
             if len(each) and not (block.of_values and energies == 1):
                 part, rows, these = block.some(each)
                 blocks.append(part)
-                targets.append(self.targets[place][rows])
+                targets.append(np.asarray(self.targets)[place][rows])
                 taken.append(start + these)
-        return Rows(tuple(blocks), jnp.concatenate(targets)), np.concatenate(taken)
+        return Rows(tuple(blocks), jnp.asarray(np.concatenate(targets))), np.concatenate(taken)
 
     def residual(self, left: Float[Array, " D"]) -> Float[Array, "..."]:
         """What a fit leaves of the contrasted rows, in the units of what was measured.
@@ -192,7 +192,7 @@ class Rows(eqx.Module):
 
     def coefficients(
         self, c: Float[Array, " D"]
-    ) -> tuple[Float[Array, "P n"], Float[Array, "P n"], Float[Array, "E n"], Float[Array, " E"]]:
+    ) -> tuple[Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]]:
         """Points and coefficients of the field Lᵀc, and those of its values.
 
         Of energies alone there is one point of the field, with coefficients of zero.
@@ -202,7 +202,7 @@ class Rows(eqx.Module):
         none = self.blocks[0].points[:1]
         fields = [(b.points, a) for b, a in pairs if not b.of_values]
         values = [(b.points, a) for b, a in pairs if b.of_values]
-        fields = fields or [(none, jnp.zeros_like(none))]
+        fields = fields or [(none, jnp.zeros((1, self.dimension), raw.dtype))]
         values = values or [(none[:0], jnp.zeros(0, raw.dtype))]
         Z, A = (jnp.concatenate(each) for each in zip(*fields, strict=True))
         S, b = (jnp.concatenate(each) for each in zip(*values, strict=True))

@@ -162,6 +162,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         K: AbstractMatrixKernel,
         sample: Num[ArrayLike, "N n"],
         regularization: ArrayLike = 1e-4,
+        inputs: Num[ArrayLike, "N m"] | None = None,
     ) -> "LandmarkFit":
         """A fit without data yet, to which chunks are added: see `LandmarkFit`.
 
@@ -172,6 +173,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
                 first chunk is enough if all chunks look alike; one trajectory out of many is not.
             regularization: the smallest λ that will be asked for, since the tolerance is relative
                 to it, and so are the digits that are kept: a smaller one loses some.
+            inputs: of a `Controlled` kernel: those of the sample, shape (N, m).
 
         Where `field.info.truncation` of the data added exceeds the tolerance, start anew with a
         sample that looks like the data so far.
@@ -180,7 +182,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
             ValueError: a shape does not fit, or λ is not positive. TypeError: K is not
                 matrix-valued.
         """
-        K, sample, regularization = checked_start(K, sample, regularization)
+        K, sample, regularization = checked_start(K, sample, regularization, inputs)
         landmarks = self.landmarks(K, sample, regularization)
         some = thinned(sample, self.candidates)
         return _start(K, some, regularization, landmarks, self.tolerance)
@@ -324,7 +326,7 @@ def _start(K, sample, regularization, landmarks, tolerance):
         trace=jnp.zeros((), S.dtype),
         count=jnp.zeros((), int),
         regularization=regularization,
-        dimension=S.shape[1],
+        dimension=K.outputs(S.shape[1]),
         tolerance=tolerance,
     )
 
@@ -345,7 +347,7 @@ def _solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, norm, residual_norm = stream_sums.solve(fit.sums, ridge)
     return _Solution(
-        coefficients=weights.reshape(fit.landmarks.points.shape),
+        coefficients=weights.reshape(len(fit.landmarks.points), -1),
         residual=jnp.zeros((0, fit.dimension), weights.dtype),
         norm=norm,
         truncation=truncated(fit.trace, stream_sums.trace(fit.sums), ridge),

@@ -16,8 +16,8 @@ from hamkernel._features.waves import AbstractFeatures, features
 from hamkernel._fields.base import AbstractField, SolverInfo, root
 from hamkernel._fields.features import FeatureField
 from hamkernel._fields.kernel_field import KernelField
-from hamkernel._gram.observed import between
-from hamkernel._observations.blocks import AbstractBlock, Components
+from hamkernel._gram.observed import between, components
+from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers.landmark_gram import whitening
 from hamkernel._solvers.landmarks import Landmarks, given_landmarks
@@ -65,7 +65,7 @@ class LandmarkSpan(AbstractSpan):
     T: Float[Array, "r r"]
 
     def of(self, block: AbstractBlock) -> Float[Array, "d r"]:
-        return between(self.kernel, block, Components(self.landmarks.points)) @ self.T
+        return between(self.kernel, block, components(self.kernel, self.landmarks.points)) @ self.T
 
     def missing(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
         return between(self.kernel, left, right) - self.of(left) @ self.of(right).T
@@ -76,7 +76,7 @@ class LandmarkSpan(AbstractSpan):
         return KernelField(
             kernel=self.kernel,
             points=S,
-            coefficients=(self.T @ w).reshape(S.shape),
+            coefficients=(self.T @ w).reshape(len(S), -1),
             residual=residual,
             norm=root(w @ w),
             regularization=ridge / N,
@@ -93,22 +93,23 @@ class LandmarkSpan(AbstractSpan):
 
 @eqx.filter_jit
 def _on_landmarks(span: LandmarkSpan, weights, prior: Prior) -> KernelField:
-    S, T, n = span.landmarks.points, span.T, span.landmarks.points.shape[1]
+    S, T = span.landmarks.points, span.T
     # A draw of the prior less what it is in the span.
-    here = Rows((Components(S),), jnp.zeros(S.size, S.dtype))
+    here = Rows((components(span.kernel, S),), jnp.zeros(len(T), S.dtype))
+    n, d = here.dimension, S.shape[1]
     less = weights - prior.rows(here).T @ T
 
     def one(w, coefficients, basis, of_basis):
         return KernelField(
             kernel=span.kernel,
             points=jnp.concatenate([S, prior.points]),
-            coefficients=jnp.concatenate([(T @ w).reshape(S.shape), coefficients]),
+            coefficients=jnp.concatenate([(T @ w).reshape(len(S), n), coefficients]),
             residual=jnp.zeros((0, n), w.dtype),
             norm=jnp.full((), jnp.inf, w.dtype),
             regularization=jnp.zeros((), w.dtype),
             offset=jnp.zeros((), w.dtype),
             info=SolverInfo("draw"),
-            mean=None if basis is None else of_features(span.kernel, basis, of_basis, n),
+            mean=None if basis is None else of_features(span.kernel, basis, of_basis, d),
         )
 
     return jax.vmap(one)(less, prior.coefficients, prior.features, prior.weights)

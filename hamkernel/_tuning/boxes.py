@@ -108,7 +108,7 @@ def typical_speed(K: AbstractMatrixKernel, rows: Rows) -> float:
     if isinstance(rows.blocks[0], Components) and len(rows.blocks) == 1:
         return float(np.sqrt(np.mean(np.asarray(rows.measured()) ** 2)))
     ratio = np.sum(np.asarray(rows.y) ** 2) / np.trace(np.asarray(_gram_of_rows(K, rows)))
-    components = len(rows.points) * K.outputs(rows.dimension)
+    components = len(rows.points) * rows.dimension
     return float(np.sqrt(ratio * float(gram_trace(K, rows.points)) / components))
 
 

@@ -6,15 +6,14 @@ from typing import Any
 
 from jaxtyping import Array, ArrayLike, Float, Num
 
-from hamkernel import _require as require
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.kinds import AbstractObservations, as_states, both, rows_of_states
+from hamkernel._observations.base import AbstractObservations
+from hamkernel._observations.data import as_states, rows_of_states
 from hamkernel._observations.rows import Rows
-from hamkernel._solvers.fit import checked_rows
+from hamkernel._solvers.given import checked_rows, checked_states
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.joined import joined_data
 from hamkernel._validation.folds import Folds
 from hamkernel._validation.of_rows import (
     generalized_loss,
@@ -164,15 +163,13 @@ def log_marginal_likelihood(
 def _checked(K, X, Y, regularization, inputs) -> tuple[Any, Rows, Float[Array, ""]]:
     """Kernel, rows and λ."""
     K = matrix_kernel(K)
-    X, Y = as_states(X, Y)
+    X, Y, inputs = as_states(X, Y, inputs)
     if isinstance(X, AbstractObservations):
-        rows, regularization, _ = checked_rows(K, X, Y, regularization, None)
+        K, rows, regularization, _ = checked_rows(K, X, Y, regularization)
     else:
-        K, X, Y = joined_data(K, *both(X, Y), inputs)
+        K, points, V, regularization, _ = checked_states(K, X, Y, regularization, None, inputs)
         # LAPACK on every device at once was seen to stall, see `_factors/dense.py`.
-        rows = rows_of_states(on_one_device("X", X), on_one_device("Y", Y))
-        K.check_points(X)
-        regularization = require.ridge(regularization, X.dtype)
+        rows = rows_of_states(on_one_device("X", points), on_one_device("Y", V))
     check_memory(rows, LOSS_COPIES)
     return K, rows, regularization
 

@@ -26,7 +26,7 @@ from scipy.integrate import solve_ivp
 
 import hamkernel as hk
 from hamkernel._observations.blocks import Components
-from hamkernel._observations.kinds import rows_of_states
+from hamkernel._observations.data import rows_of_states
 from hamkernel._solvers.spans import LandmarkBasis, WaveBasis
 from hamkernel._validation.folds import Partition
 from hamkernel._validation.of_rows import (

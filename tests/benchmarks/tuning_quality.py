@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hamkernel as hk
-from hamkernel._observations.kinds import rows_of_states
+from hamkernel._observations.data import rows_of_states
 from hamkernel._tuning.objective import criterion_of
 from hamkernel._tuning.part import Part, SearchObjective
 from hamkernel._tuning.space import SearchSpace
