@@ -114,7 +114,9 @@ def test_along_a_true_path_rows_and_functionals_are_the_variation_of_constants()
     A, ts, n = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.linspace(0.0, 0.8, 9), 2
     mean = functools.partial(jnp.matmul, jnp.asarray(A))
     options = {"rtol": 1e-12, "atol": 1e-13, "dense_output": True}
-    true = solve_ivp(lambda t, x: np.asarray(PENDULUM(x)), (0, 0.8), [1.0, 0.5], "DOP853", **options)
+    true = solve_ivp(
+        lambda t, x: np.asarray(PENDULUM(x)), (0, 0.8), [1.0, 0.5], "DOP853", **options
+    )
     x = jnp.asarray(true.sol(ts).T[None])
     inner = (ts[:-1, None] + np.diff(ts)[:, None] * NODES).reshape(-1)
     nodes = jnp.asarray(true.sol(inner).T.reshape(1, 8, 3, n))
