@@ -13,9 +13,8 @@ import pytest
 import hamkernel as hk
 from hamkernel._features.structured import features
 
-K = hk.Controlled(
-    hk.Symplectic(2.0 * hk.Gaussian(1.3)), hk.InputMatrix(0.8 * hk.Gaussian(0.9), acts_on=(1,))
-)
+GAIN = hk.InputMatrix(0.8 * hk.Gaussian(0.9), acts_on=(1,))
+K = hk.Controlled(hk.Symplectic(2.0 * hk.Gaussian(1.3)), GAIN)
 RNG = np.random.default_rng(0)
 X, Y = RNG.normal(size=(2, 9, 2))
 U = RNG.normal(size=(9, 2))
@@ -133,6 +132,7 @@ def test_all_observations_with_inputs_are_functionals_of_the_same_process():
 def test_random_features_are_those_of_drift_and_input_matrix():
     key = jax.random.key(0)
     T = jnp.asarray(S[:4])
+    K = hk.Controlled(hk.Symplectic(2.0 * hk.Gaussian(1.3)), GAIN, count=2)
     exact = hk.gram(K, T).reshape(8, 8)
 
     def error(K, count, exact):
@@ -173,7 +173,7 @@ KNOWN = hk.Controlled(hk.Symplectic(hk.Gaussian(1.3)), [[0.0, 0.5], [1.0, -0.3]]
 
 def test_streams_on_landmarks_are_fits_on_the_same_landmarks():
     for kernel in (K, KNOWN):
-        solver = hk.Nystrom(points=S[:7])
+        solver = hk.Nystrom(100.0, points=S[:7])
         chunks = [(X[:4], Y[:4], U[:4]), (X[4:], Y[4:], U[4:])]
         field = solver.fit_chunks(kernel, chunks, RIDGE, sample=X, inputs=U)
         once = hk.fit(kernel, X, Y, RIDGE, inputs=U, solver=solver)
@@ -212,7 +212,7 @@ def test_a_mean_is_taken_off_the_data_and_added_to_the_field(mean):
         np.testing.assert_allclose(field.hamiltonian(x), energy, atol=1e-12)
         assert posterior.energy_deviation(x, X[0]) > 0
     else:
-        with pytest.raises(AttributeError, match=r"the mean, .*, has no potential"):
+        with pytest.raises(AttributeError, match="has no potential"):
             field.hamiltonian(x)
 
 
@@ -256,11 +256,11 @@ def test_draws_have_the_mean_and_the_covariance_of_the_posterior_at_every_input(
     mean, C = given(velocity_rows(9), Y.ravel(), np.full(18, 9 * RIDGE), S, [np.r_[x, far]])
     for solver in (hk.Cholesky(), hk.Nystrom(1e-8)):
         posterior = hk.condition(K, X, Y, RIDGE, inputs=U, solver=solver)
-        draws = posterior.sample(jax.random.key(0), 1500, region)
+        draws = posterior.sample(jax.random.key(0), 400, region)
         values = np.asarray(jax.vmap(lambda f: f(x, far))(draws))
         spread = np.sqrt(np.diag(C)[1:])
-        assert np.abs(values.mean(axis=0) - mean[1:]).max() < 4 * spread.max() / np.sqrt(1500)
-        np.testing.assert_allclose(values.std(axis=0), spread, rtol=0.08)
+        assert np.abs(values.mean(axis=0) - mean[1:]).max() < 4 * spread.max() / np.sqrt(400)
+        np.testing.assert_allclose(values.std(axis=0), spread, rtol=0.15)
         one = jax.tree.map(lambda leaf: leaf[0], draws)
         half = one(x, 0 * far) / 2 + one(x, far) / 2
         np.testing.assert_allclose(one(x, far / 2), half, atol=1e-9)
@@ -270,7 +270,6 @@ def test_draws_have_the_mean_and_the_covariance_of_the_posterior_at_every_input(
 
 SOLVERS = {
     "dense": None,
-    "gradients": hk.ConjugateGradient(),
     "landmarks": hk.Nystrom(1e-3),
     "features": hk.RandomFeatures(10, jax.random.key(0)),
 }

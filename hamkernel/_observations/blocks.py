@@ -9,7 +9,7 @@ so to a field again, whatever was observed.
 import abc
 import math
 from collections.abc import Iterable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -28,6 +28,11 @@ class AbstractBlock(eqx.Module):
     @abc.abstractmethod
     def dimension(self) -> int:
         """n, the components of the field; points (x, u) have d = n + m coordinates."""
+
+    @property
+    @abc.abstractmethod
+    def values_shape(self) -> tuple[int, ...]:
+        """That of the field, or of the potential, at the points."""
 
     @property
     @abc.abstractmethod
@@ -55,6 +60,18 @@ class AbstractBlock(eqx.Module):
     def then(self, other: "AbstractBlock") -> "AbstractBlock | None":
         """One block of these rows and then the others; None if they are of another kind."""
 
+    @abc.abstractmethod
+    def at(self, points: Float[Array, "P d"]) -> "AbstractBlock":
+        """All components of the field, or the potential, at other points, without noise."""
+
+    @abc.abstractmethod
+    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+        """The block of some observations, counted from 0 and in order.
+
+        Returns:
+            It, which rows it has, and which observations those belong to.
+        """
+
 
 class Components(AbstractBlock):
     """Components of the field at points.
@@ -78,7 +95,6 @@ class Components(AbstractBlock):
 
     @property
     def values_shape(self) -> tuple[int, int]:
-        """That of the field at the points, (P, n)."""
         return len(self.points), self.dimension
 
     @property
@@ -120,6 +136,19 @@ class Components(AbstractBlock):
             noise = jnp.concatenate([self.scale, other.scale])
         return Components(jnp.concatenate([self.points, other.points]), kept, noise, self.outputs)
 
+    def at(self, points: Float[Array, "P d"]) -> "Components":
+        return Components(points, outputs=self.outputs)
+
+    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+        rows = np.flatnonzero(np.isin(self.labels(), chosen))
+        kept = self.kept
+        if kept is not None:
+            n = self.values_shape[1]
+            all_kept = np.asarray(kept)[rows]
+            kept = jnp.asarray(np.searchsorted(chosen, all_kept // n) * n + all_kept % n)
+        points, noise = _taken(self.points, chosen), _taken(self.noise, rows)
+        return Components(points, kept, noise, self.outputs), rows, chosen
+
 
 class Combinations(AbstractBlock):
     """Σ_q weights[s, r, q] · f(groups[s, q]), R rows for each of S groups of Q points."""
@@ -135,6 +164,11 @@ class Combinations(AbstractBlock):
     @property
     def points(self) -> Float[Array, "SQ d"]:
         return self.groups.reshape(-1, self.groups.shape[2])
+
+    @property
+    def values_shape(self) -> tuple[int, int]:
+        S, _, Q, n = self.weights.shape
+        return S * Q, n
 
     @property
     def scale(self) -> Float[Array, " SR"]:
@@ -163,6 +197,17 @@ class Combinations(AbstractBlock):
         pairs = (self.groups, other.groups), (self.weights, other.weights)
         return Combinations(*map(jnp.concatenate, pairs))
 
+    def at(self, points: Float[Array, "P d"]) -> Components:
+        return Components(points, outputs=self.weights.shape[3])
+
+    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+        # Whole groups: the rows of one share its points.
+        R = self.weights.shape[1]
+        groups = np.unique(chosen // R)
+        rows = (groups[:, None] * R + np.arange(R)).reshape(-1)
+        own = {"groups": _taken(self.groups, groups), "weights": _taken(self.weights, groups)}
+        return Combinations(**own), rows, rows
+
 
 class Values(AbstractBlock):
     """The potential at points; `noise` is that of each, None if it is 1.
@@ -174,6 +219,10 @@ class Values(AbstractBlock):
     noise: Float[Array, " E"] | None = None
     outputs: int | None = eqx.field(static=True, default=None)
     of_values: ClassVar[bool] = True
+
+    @property
+    def values_shape(self) -> tuple[int]:
+        return (len(self.points),)
 
     @property
     def dimension(self) -> int:
@@ -203,6 +252,21 @@ class Values(AbstractBlock):
         if self.noise is not None or other.noise is not None:
             noise = jnp.concatenate([self.scale, other.scale])
         return Values(jnp.concatenate([self.points, other.points]), noise, self.outputs)
+
+    def at(self, points: Float[Array, "E d"]) -> "Values":
+        return Values(points, outputs=self.outputs)
+
+    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+        points, noise = _taken(self.points, chosen), _taken(self.noise, chosen)
+        return Values(points, noise, self.outputs), chosen, chosen
+
+
+def _taken(array: Array | None, index: Int[np.ndarray, " C"]) -> Any:
+    """Entries of an array, without compiling for how many they are."""
+    return None if array is None else jnp.asarray(np.asarray(array)[index])
+
+
+Some = tuple[AbstractBlock, Int[np.ndarray, " rows"], Int[np.ndarray, " observations"]]
 
 
 def merged(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:

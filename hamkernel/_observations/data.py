@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._observations.base import AbstractObservations, refuse_swapped
-from hamkernel._observations.blocks import AbstractBlock, merged
+from hamkernel._observations.blocks import AbstractBlock, Components, merged
 from hamkernel._observations.kinds import Equilibria, Velocities
 from hamkernel._observations.rows import Rows
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -94,6 +94,12 @@ def sampled_points(
     K = counted(K, data)
     (block, _), *_ = data.parts(inputs_of(K))
     return K, block.points
+
+
+def rows_of_states(X: Float[Array, "N d"], Y: Float[Array, "N n"]) -> Rows:
+    """Velocities at points, all measured with one noise."""
+    outputs = None if X.shape == Y.shape else Y.shape[1]
+    return Rows((Components(X, outputs=outputs),), Y.reshape(-1))
 
 
 def rows_of_data(

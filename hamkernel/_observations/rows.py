@@ -72,6 +72,15 @@ class Rows(eqx.Module):
         pairs = zip(self.slices, self.blocks, strict=True)
         return np.concatenate([M[rows] for rows, block in pairs if block.of_values] or [M[:0]])
 
+    @property
+    def constant(self) -> Float[Array, " M"] | None:
+        """The direction of the unknown constant, of norm 1; None without energies."""
+        where = self.energies
+        if not len(where):
+            return None
+        p = jnp.zeros_like(self.targets).at[where].set(1 / self.scale[where])
+        return p / jnp.linalg.norm(p)
+
     def labels(self) -> Int[np.ndarray, " M"]:
         """To which of the N observations each row belongs, before the contrast."""
         starts = np.cumsum([0, *(block.count for block in self.blocks)])
@@ -114,16 +123,38 @@ class Rows(eqx.Module):
         blocks, targets = (tuple(block for block, _ in old), [y for _, y in old])
         return Rows(blocks + new.blocks, jnp.concatenate([*targets, new.targets]))
 
+    def some(self, chosen: Int[np.ndarray, " C"]) -> tuple["Rows", Int[np.ndarray, " chosen"]]:
+        """The rows of some of the N observations, in order, and which observations those are.
+
+        Rows that share points come with each other, and one energy alone, which says nothing, is
+        left out.
+        """
+        ends = np.cumsum([0, *(block.count for block in self.blocks)]).tolist()
+        own = [chosen[(a <= chosen) & (chosen < b)] - a for a, b in itertools.pairwise(ends)]
+        pairs = list(zip(self.blocks, own, strict=True))
+        energies = sum(len(each) for block, each in pairs if block.of_values)
+        blocks, targets, taken = [], [], []
+        for (block, each), place, start in zip(pairs, self.slices, ends, strict=False):
+            if len(each) and not (block.of_values and energies == 1):
+                part, rows, these = block.some(each)
+                blocks.append(part)
+                targets.append(np.asarray(self.targets)[place][rows])
+                taken.append(start + these)
+        return Rows(tuple(blocks), jnp.asarray(np.concatenate(targets))), np.concatenate(taken)
+
     def residual(self, left: Float[Array, " D"]) -> Float[Array, "..."]:
         """What a fit leaves of the contrasted rows, in the units of what was measured.
 
         Of velocities alone, all of which were measured, shape (N, n).
         """
-        left = self.scale * self.uncontrasted(left)
+        return self.in_units(self.uncontrasted(left))
+
+    def in_units(self, left: Float[Array, " M"]) -> Float[Array, "..."]:
+        """Rows before the contrast in the units of what was measured, and in the shape of Y."""
         block = self.blocks[0]
-        if len(self.blocks) > 1 or not isinstance(block, Components) or block.kept is not None:
-            return left
-        return left.reshape(block.values_shape)
+        whole = len(self.blocks) == 1 and isinstance(block, Components) and block.kept is None
+        left = self.scale * left
+        return left.reshape(block.values_shape) if whole else left
 
     def contrast(self, rows: Float[Array, "M *rest"]) -> Float[Array, "D *rest"]:
         """The rows without the constant of the energies."""

@@ -28,7 +28,7 @@ from hamkernel._kernels.base import Invariance
 from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._observations.base import AbstractObservations
-from hamkernel._observations.blocks import Values
+from hamkernel._observations.blocks import AbstractBlock, Values
 from hamkernel._observations.data import inputs_of, observations
 from hamkernel._show import text
 from hamkernel._solvers.cholesky import AbstractSolver, Cholesky
@@ -131,8 +131,7 @@ class Posterior(eqx.Module):
             ValueError: x is no single state of this dimension, or u is missing. TypeError: the
                 field has no inputs.
         """
-        here = components(self.given.field.kernel, self._point(x, u)[None])
-        return self.given.covariance(here, here)
+        return _covariance(self.given, components(self.given.field.kernel, self._point(x, u)[None]))
 
     def _point(self, x: Any, u: Any) -> Float[Array, " d"]:
         if isinstance(self.field, ControlledField):
@@ -180,7 +179,7 @@ class Posterior(eqx.Module):
         points = jnp.pad(states, ((0, 0), (0, m))) if m else states
         both = Values(points, outputs=n if m else None)
         change = jnp.array([1.0, -1.0], both.points.dtype)
-        return root(change @ self.given.covariance(both, both) @ change)
+        return root(change @ _covariance(self.given, both) @ change)
 
     def updated(
         self,
@@ -274,6 +273,12 @@ class Posterior(eqx.Module):
             return learned_field(draw, both)
 
         return jax.vmap(one)(draws)
+
+
+# One by one its operations would be hundreds of small programs, which took 4 s to compile.
+@eqx.filter_jit
+def _covariance(given: AbstractConditional, block: AbstractBlock) -> Float[Array, "d d"]:
+    return given.covariance(block, block)
 
 
 def _range_of(U: Float[Array, "N m"]) -> Float[Array, "2 m"]:

@@ -28,7 +28,6 @@ from hamkernel._machine.devices import as_given, rows_of, split
 from hamkernel._observations.rows import Rows
 from hamkernel._show import text
 from hamkernel._solvers import stream_sums
-from hamkernel._solvers.bases import LandmarkBasis
 from hamkernel._solvers.landmark_gram import (
     Columns,
     checked,
@@ -40,9 +39,9 @@ from hamkernel._solvers.landmark_gram import (
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks
 from hamkernel._solvers.low_rank_conditional import (
     LowRankConditional,
-    landmark_span,
     low_rank_conditional,
 )
+from hamkernel._solvers.spans import LandmarkBasis, landmark_span
 from hamkernel._solvers.stream_sums import Sums
 from hamkernel._solvers.streaming import (
     AbstractStreamingFit,

@@ -14,13 +14,12 @@ from hamkernel._machine.devices import as_given, rows_of, split
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers import stream_sums
-from hamkernel._solvers.bases import WaveBasis
 from hamkernel._solvers.landmark_gram import singular
 from hamkernel._solvers.low_rank_conditional import (
-    FeatureSpan,
     LowRankConditional,
     low_rank_conditional,
 )
+from hamkernel._solvers.spans import FeatureSpan, WaveBasis
 from hamkernel._solvers.stream_sums import Sums
 from hamkernel._solvers.streaming import (
     AbstractStreamingFit,

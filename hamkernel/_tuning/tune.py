@@ -29,24 +29,23 @@ from hamkernel._fields.known import Mean
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._observations.base import AbstractObservations
-from hamkernel._observations.data import as_states, observations
+from hamkernel._observations.data import as_states, observations, rows_of_states
 from hamkernel._show import described
 from hamkernel._solvers.cholesky import AbstractSolver
 from hamkernel._solvers.fit import fit
 from hamkernel._solvers.given import checked_rows, checked_states
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._tuning import advice
-from hamkernel._tuning.boxes import typical_velocities
+from hamkernel._tuning.boxes import typical_speed
 from hamkernel._tuning.descent import Run
 from hamkernel._tuning.objective import (
     Criterion,
     Objective,
     SearchCriterion,
     criterion_of,
-    criterion_of_rows,
 )
 from hamkernel._tuning.other_optimisers import checked_optimiser
-from hamkernel._tuning.part import rows_of_parts
+from hamkernel._tuning.part import parts_of
 from hamkernel._tuning.search import Search, best
 from hamkernel._tuning.space import LOW_RANK_ROUNDINGS, ROUNDINGS, SearchSpace
 from hamkernel._validation.folds import Folds
@@ -196,33 +195,35 @@ def tune(
     advice.warn_of_constants(K)
     X, Y, inputs = as_states(X, Y, inputs)
     given = Given(X, Y, solver, mean, inputs)
-    # An objective of the caller's takes states or observations, and no points (x, u).
-    own = inputs is not None and callable(objective)
-    if isinstance(X, AbstractObservations) or mean is not None or own:
-        data = observations(X, Y, inputs)
-        K, rows, ridge, _ = checked_rows(K, data, None, regularization, mean)
-        check_memory(rows.targets, _LOSS_COPIES)
-        X, Y = rows.points, typical_velocities(K, rows)
-        criterion = criterion_of_rows(objective, data, rows, folds)
+    if isinstance(X, AbstractObservations):
+        K, rows, ridge, _ = checked_rows(K, X, Y, regularization, mean)
+        data = X, None
     else:
-        K, X, Y, ridge, _ = checked_states(K, X, Y, regularization, None, inputs)
-        X, Y = on_one_device("X", X), on_one_device("Y", Y)
-        advice.warn_of_unequal_sizes(Y)
-        criterion = criterion_of(objective, len(X), folds)
+        K, points, V, ridge, _ = checked_states(K, X, Y, regularization, mean, inputs)
+        data = points, V = on_one_device("X", points), on_one_device("Y", V)
+        rows = rows_of_states(points, V)
+        advice.warn_of_unequal_sizes(V)
+        if mean is not None or inputs is not None:  # an objective of the caller's takes no (x, u)
+            data = observations(X, Y, inputs), None
+    criterion = criterion_of(objective, rows.count, folds, data)
     advice.warn_of_few_folds(criterion, folds)
     low_rank = solver is not None and solver.is_low_rank and not criterion.own
-    few = rows_of_parts(X, criterion, dense=True)[0]
+    parts = parts_of(rows, criterion, dense=True)
+    if not low_rank and not criterion.own:
+        check_memory(rows, _LOSS_COPIES)
+    few = rows if len(parts) == 1 else rows.some(parts[0])[0]
+    speed = typical_speed(K, few)
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
-    space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings, X[few])
+    space = SearchSpace(
+        K, rows.points, speed, ridge, tuple(frozen), bounds or {}, roundings, few.points
+    )
     advice.warn_of_free_scale(space, criterion)
-    if len(few) < len(X) and not low_rank:
-        check_memory(X, _LOSS_COPIES)
-    search = Search(space, criterion, X, Y, starts, max_steps, optimiser, progress)
+    search = Search(space, criterion, rows, speed, starts, max_steps, optimiser, progress)
 
     def of_low_rank(run: Run) -> SearchCriterion:
         kernel, regularization, _ = decode(space, run.u)
         assert solver is not None
-        basis = solver._basis(kernel, X, regularization)
+        basis = solver._basis(kernel, rows.points, regularization)
         assert basis is not None
         return criterion.with_basis(basis)
 
