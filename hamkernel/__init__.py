@@ -52,7 +52,8 @@ from hamkernel._save.files import load, save
 from hamkernel._solvers.cholesky import Cholesky
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.fit import fit
-from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
+from hamkernel._solvers.landmark_fit import LandmarkFit
+from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
 from hamkernel._structures.base import Sum
 from hamkernel._structures.controlled import Controlled, InputMatrix

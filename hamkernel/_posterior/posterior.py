@@ -267,10 +267,9 @@ class Posterior(eqx.Module):
         draws, known = self.given.draws(key, count, box), known_of(self.field)
 
         def one(draw):
-            both = known
-            if draw.mean is not None:
-                both = draw.mean if known is None else FieldSum((known, draw.mean))
-            return learned_field(draw, both)
+            if draw.mean is None or known is None:
+                return learned_field(draw, known if draw.mean is None else draw.mean)
+            return learned_field(draw, FieldSum((known, draw.mean)))
 
         return jax.vmap(one)(draws)
 
@@ -283,18 +282,16 @@ def _covariance(given: AbstractConditional, block: AbstractBlock) -> Float[Array
 
 def _range_of(U: Float[Array, "N m"]) -> Float[Array, "2 m"]:
     """A box around zero as large as the inputs."""
-    largest = jnp.max(jnp.abs(U), axis=0)
-    largest = jnp.where(largest > 0, largest, jnp.ones_like(largest))
-    return jnp.stack([-largest, largest])
+    most = jnp.max(jnp.abs(U), axis=0)
+    return jnp.where(most > 0, most, jnp.ones_like(most)) * jnp.array([[-1.0], [1.0]], U.dtype)
 
 
 def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
     """Say so where k(x, x) = 1 to the last digit, as of built-in kernels that nobody scaled."""
     if not require.is_concrete(K, X):
         return
-    x = X[0]
     for k in without_symmetry(K).scalar_kernels:
-        if Invariance.TRANSLATION in k.invariance and np.asarray(k(x, x)) == 1.0:
+        if Invariance.TRANSLATION in k.invariance and np.asarray(k(X[0], X[0])) == 1.0:
             require.warn(
                 f"the amplitude of {k!r} is exactly 1, that of a kernel nobody tuned, and "
                 "deviations are proportional to it. Write 1.0 * k and tune it by "

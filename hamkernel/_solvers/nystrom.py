@@ -12,43 +12,28 @@ A stream is seen once and leaves no residual; `stream_sums.py` says how its sums
 """
 
 import numbers
-from typing import ClassVar, NamedTuple
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int, Key, Num, UInt32
+from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 
 from hamkernel import _require as require
-from hamkernel._fields.base import SolverInfo, root
+from hamkernel._fields.base import root
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
 from hamkernel._gram.operator import product
 from hamkernel._machine.devices import as_given, rows_of, split
 from hamkernel._observations.rows import Rows
-from hamkernel._show import text
-from hamkernel._solvers import stream_sums
-from hamkernel._solvers.landmark_gram import (
-    Columns,
-    checked,
-    factor,
-    singular,
-    truncated,
-    whitening,
-)
+from hamkernel._solvers import landmark_fit, stream_sums
+from hamkernel._solvers.landmark_field import CHOOSE, Solution, landmark_field
+from hamkernel._solvers.landmark_fit import LandmarkFit
+from hamkernel._solvers.landmark_gram import Columns, factor, truncated, whitening
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks
-from hamkernel._solvers.low_rank_conditional import (
-    LowRankConditional,
-    low_rank_conditional,
-)
+from hamkernel._solvers.low_rank_conditional import LowRankConditional, low_rank_conditional
 from hamkernel._solvers.spans import LandmarkBasis, landmark_span
-from hamkernel._solvers.stream_sums import Sums
-from hamkernel._solvers.streaming import (
-    AbstractStreamingFit,
-    AbstractStreamingSolver,
-    checked_start,
-    thinned,
-)
+from hamkernel._solvers.streaming import AbstractStreamingSolver, checked_start, thinned
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -145,7 +130,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         X, Y = split(spread, X), split(spread, Y)
         solution = _fit(K, X, Y, regularization, landmarks, spread)
         solution = solution._replace(residual=as_given(spread, solution.residual))
-        return _field(K, landmarks, solution, regularization, self.tolerance, _CHOOSE, throw)
+        return landmark_field(K, landmarks, solution, regularization, self.tolerance, CHOOSE, throw)
 
     def _given(
         self,
@@ -163,7 +148,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         sample: Num[ArrayLike, "N n"],
         regularization: ArrayLike = 1e-4,
         inputs: Num[ArrayLike, "N m"] | None = None,
-    ) -> "LandmarkFit":
+    ) -> LandmarkFit:
         """A fit without data yet, to which chunks are added: see `LandmarkFit`.
 
         Args:
@@ -185,7 +170,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         K, sample, regularization = checked_start(K, sample, regularization, inputs)
         landmarks = self.landmarks(K, sample, regularization)
         some = thinned(sample, self.candidates)
-        return _start(K, some, regularization, landmarks, self.tolerance)
+        return landmark_fit.start(K, some, regularization, landmarks, self.tolerance)
 
 
 @eqx.filter_jit
@@ -207,149 +192,4 @@ def _fit(K, X, Y, regularization, landmarks, spread):
     w, residual = step(w, Y - product(K, X, S, A, spread))
     truncation = truncated(trace(K, X, spread), jnp.trace(total.square), ridge)
     # ‖f‖² = αᵀ G_SS α = ‖w‖²
-    return _Solution((T @ w).reshape(len(S), -1), residual, root(w @ w), truncation)
-
-
-class _Solution(NamedTuple):
-    coefficients: Float[Array, "m n"]
-    residual: Float[Array, "N n"]
-    norm: Float[Array, ""]
-    truncation: Float[Array, ""]
-    residual_norm: Float[Array, ""] | None = None
-
-
-def _field(K, landmarks, solution, regularization, tolerance, cure, throw=True) -> KernelField:
-    dtype = landmarks.points.dtype
-    failed = require.not_finite(solution.coefficients).any()
-    solution = checked(solution, landmarks, solution.truncation, failed, singular(dtype), throw)
-    _warn_if_truncated(solution.truncation, landmarks.count, tolerance, cure)
-    return KernelField(
-        kernel=K,
-        points=landmarks.points,
-        coefficients=solution.coefficients,
-        residual=solution.residual,
-        norm=solution.norm,
-        regularization=regularization,
-        offset=jnp.zeros((), dtype),
-        info=SolverInfo(
-            "Nystrom",
-            landmarks=landmarks.count,
-            rank=landmarks.kept.sum(),
-            truncation=solution.truncation,
-            residual_norm=solution.residual_norm,
-        ),
-    )
-
-
-_CHOOSE = (
-    "Raise max_points, the tolerance or the regularization; let landmarks be chosen from more "
-    "candidates;"
-)
-_START_ANEW = (
-    "Start anew with landmarks from a sample that looks like the data so far, and a max_points "
-    "that suffices; or ask for a larger regularization;"
-)
-
-
-def _warn_if_truncated(truncation, count, tolerance, cure):
-    if not require.is_concrete(truncation, count):
-        return
-    # Twice: a random part of the data need not show all that the rest has.
-    if truncation > 2 * tolerance:
-        if truncation.dtype == jnp.float32:
-            cure = (
-                "In float32 rounding may have ended the choice of landmarks early: "
-                f"jax.config.update('jax_enable_x64', True). {cure}"
-            )
-        require.warn(
-            f"{int(count)} landmarks leave trace(G - Ĝ)/(N λ) = {float(truncation):.2g}, more than "
-            f"the tolerance {tolerance:.2g}. The field is the best one on these landmarks, but may "
-            f"be far from the exact fit. {cure} for a rough kernel or many dimensions take "
-            "hk.ConjugateGradient(), which is exact."
-        )
-
-
-class LandmarkFit(AbstractStreamingFit[KernelField]):
-    """A fit on landmarks to the data added so far, made by `Nystrom.start`.
-
-    It has a fixed size, 3r² numbers for r columns. `add` returns a new one, and `field` solves
-    for any λ:
-
-        model = hk.Nystrom().start(K, X, 1e-4).add(X, Y)
-        field = model.field()
-        better = model.add(X_new, Y_new).field()
-
-    `field.info.truncation` is that of all the data added: it shows whether the landmarks are still
-    enough.
-
-    Attributes:
-        kernel: K.
-        landmarks: the points that carry the field.
-        sums: what the least squares need of the points added.
-        trace: the trace of their Gram, shape ().
-        count: N, the number of points added, shape ().
-        regularization: the λ of `start`, shape ().
-        dimension: n, the number of coordinates of a state.
-        tolerance: of the solver, for its warning.
-    """
-
-    kernel: AbstractMatrixKernel
-    landmarks: Landmarks
-    sums: Sums
-    trace: Float[Array, ""]
-    count: Int[Array, ""]
-    regularization: Float[Array, ""]
-    dimension: int = eqx.field(static=True)
-    tolerance: float = eqx.field(static=True)
-
-    def _size(self) -> str:
-        return f"landmarks={text(self.landmarks.count)}"
-
-    def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "LandmarkFit":
-        spread = rows_of(X)
-        return _with_data(self, split(spread, X), split(spread, Y), spread)
-
-    def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
-        solution = _solution(self, count, regularization)
-        landmarks, tolerance = self.landmarks, self.tolerance
-        return _field(self.kernel, landmarks, solution, regularization, tolerance, _START_ANEW)
-
-
-@eqx.filter_jit
-def _start(K, sample, regularization, landmarks, tolerance):
-    S = landmarks.points
-    T = whitening(K, landmarks)
-    return LandmarkFit(
-        kernel=K,
-        landmarks=landmarks,
-        sums=stream_sums.start(Columns(K, S), T, sample, regularization),
-        trace=jnp.zeros((), S.dtype),
-        count=jnp.zeros((), int),
-        regularization=regularization,
-        dimension=K.outputs(S.shape[1]),
-        tolerance=tolerance,
-    )
-
-
-@eqx.filter_jit
-def _with_data(fit, X, Y, spread):
-    K = fit.kernel
-    new = (
-        stream_sums.add(fit.sums, Columns(K, fit.landmarks.points), X, Y, spread),
-        fit.trace + trace(K, X, spread),
-        fit.count + len(X),
-    )
-    return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), fit, new)
-
-
-@eqx.filter_jit
-def _solution(fit, count, regularization):
-    ridge = count.astype(regularization.dtype) * regularization
-    weights, norm, residual_norm = stream_sums.solve(fit.sums, ridge)
-    return _Solution(
-        coefficients=weights.reshape(len(fit.landmarks.points), -1),
-        residual=jnp.zeros((0, fit.dimension), weights.dtype),
-        norm=norm,
-        truncation=truncated(fit.trace, stream_sums.trace(fit.sums), ridge),
-        residual_norm=residual_norm,
-    )
+    return Solution((T @ w).reshape(len(S), -1), residual, root(w @ w), truncation)

@@ -214,21 +214,24 @@ def tune(
     few = rows if len(parts) == 1 else rows.some(parts[0])[0]
     speed = typical_speed(K, few)
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
-    space = SearchSpace(
-        K, rows.points, speed, ridge, tuple(frozen), bounds or {}, roundings, few.points
-    )
+    kept, points = tuple(frozen), rows.points
+    space = SearchSpace(K, points, speed, ridge, kept, bounds or {}, roundings, few.points)
     advice.warn_of_free_scale(space, criterion)
     search = Search(space, criterion, rows, speed, starts, max_steps, optimiser, progress)
 
     def of_low_rank(run: Run) -> SearchCriterion:
         kernel, regularization, _ = decode(space, run.u)
         assert solver is not None
-        basis = solver._basis(kernel, rows.points, regularization)
+        basis = solver._basis(kernel, points, regularization)
         assert basis is not None
         return criterion.with_basis(basis)
 
     runs = search.runs(of_low_rank if low_rank else None)
-    found = best(runs)
+    _check_found(best(runs))
+    return _tuned(space, runs, starts, given)
+
+
+def _check_found(found: Run) -> None:
     if not found.value < np.inf:
         raise RuntimeError(
             "the objective is not finite at any start. Likely causes, in order: a kernel that "
@@ -236,7 +239,6 @@ def tune(
             "which no fit succeeds (pass bounds={'regularization': (low, high)} with a larger "
             "low); an objective of your own that returns NaN."
         )
-    return _tuned(space, runs, starts, given)
 
 
 class Given(NamedTuple):
