@@ -137,8 +137,9 @@ def lengths(path):
     found = {}
     for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.FunctionDef):
-            lines = len(ast.unparse(node.body[0]).splitlines()) if ast.get_docstring(node) else 0
-            found[node.name] = (node.end_lineno or 0) - node.lineno + 1 - lines
+            start = node.body[0].end_lineno if ast.get_docstring(node) else node.body[0].lineno - 1
+            head = node.body[0].lineno - node.lineno
+            found[node.name] = head + (node.end_lineno or 0) - (start or 0)
     return len(text.splitlines()), found
 
 
