@@ -242,7 +242,7 @@ def test_an_objective_of_ones_own_gets_the_data_with_its_inputs():
         assert X.inputs.shape == (9, 2)
         return hk.cross_validation_loss(K, X, Y, regularization, folds="loo")
 
-    options = {"inputs": U, "starts": 1, "max_steps": 3, "folds": "loo"}
+    options = {"inputs": U, "starts": 1, "max_steps": 3, "folds": "loo", "frozen": "scale"}
     own = hk.tune(K, X, Y, objective=objective, **options)
     assert float(own.loss) <= float(hk.cross_validation_loss(K, X, Y, 1e-3, "loo", inputs=U))
     meant = hk.tune(K, X, Y, mean=push, **options)
