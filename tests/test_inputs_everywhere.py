@@ -250,6 +250,7 @@ def test_an_objective_of_ones_own_gets_the_data_with_its_inputs():
     np.testing.assert_allclose(meant.field(x, u), again(x, u), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_draws_have_the_mean_and_the_covariance_of_the_posterior_at_every_input():
     region = np.array([[-2.0, -2.0], [2.0, 2.0]])
     far = np.array([7.0, -5.0])  # far outside of the inputs seen: a draw is affine in u
