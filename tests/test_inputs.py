@@ -239,12 +239,16 @@ K = kernel("state")
 @pytest.mark.parametrize(
     ("call", "error", "match"),
     [
-        (lambda: hk.fit(K, X, Y), ValueError, "inputs are missing"),
-        (lambda: hk.tune(K, X, Y), ValueError, "inputs are missing"),
-        (lambda: hk.log_marginal_likelihood(K, X, Y, 1e-2), ValueError, "inputs are missing"),
+        (lambda: hk.fit(K, X, Y), ValueError, "inputs of Velocities are missing"),
+        (lambda: hk.tune(K, X, Y), ValueError, "inputs of Velocities are missing"),
+        (
+            lambda: hk.log_marginal_likelihood(K, X, Y, 1e-2),
+            ValueError,
+            "inputs of Velocities are missing",
+        ),
         (lambda: hk.fit(hk.Symplectic(G), X, Y, inputs=U), TypeError, "takes no inputs"),
         (lambda: hk.fit(K, X, Y, inputs=U[:, 0]), ValueError, r"write U\[:, None\]"),
-        (lambda: hk.fit(K, X, Y, inputs=U[:5]), ValueError, r"shape \(5, 2\).*N = 9"),
+        (lambda: hk.fit(K, X, Y, inputs=U[:5]), ValueError, r"shape \(5, 2\).*shape \(9, 2\)"),
         (
             lambda: hk.fit(K, X, Y, inputs=np.ones((9, 1))),
             ValueError,

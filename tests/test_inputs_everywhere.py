@@ -242,7 +242,7 @@ def test_an_objective_of_ones_own_gets_the_data_with_its_inputs():
         assert X.inputs.shape == (9, 2)
         return hk.cross_validation_loss(K, X, Y, regularization, folds="loo")
 
-    options = {"inputs": U, "starts": 1, "max_steps": 3, "folds": "loo"}
+    options = {"inputs": U, "starts": 1, "max_steps": 3, "folds": "loo", "frozen": "scale"}
     own = hk.tune(K, X, Y, objective=objective, **options)
     assert float(own.loss) <= float(hk.cross_validation_loss(K, X, Y, 1e-3, "loo", inputs=U))
     meant = hk.tune(K, X, Y, mean=push, **options)
@@ -250,6 +250,7 @@ def test_an_objective_of_ones_own_gets_the_data_with_its_inputs():
     np.testing.assert_allclose(meant.field(x, u), again(x, u), rtol=1e-9)
 
 
+@pytest.mark.slow
 def test_draws_have_the_mean_and_the_covariance_of_the_posterior_at_every_input():
     region = np.array([[-2.0, -2.0], [2.0, 2.0]])
     far = np.array([7.0, -5.0])  # far outside of the inputs seen: a draw is affine in u
@@ -353,3 +354,12 @@ def test_a_posterior_says_which_inputs_it_needs():
     plain = hk.condition(hk.Symplectic(2.0 * hk.Gaussian()), X, Y, RIDGE)
     with pytest.raises(TypeError, match="has no inputs"):
         plain.covariance(x, u)
+
+
+def test_learn_refuses_inputs_and_says_what_to_do():
+    ts = np.linspace(0, 1, 9)
+    runs = hk.Runs([ts], [X], [U])
+    with pytest.raises(TypeError, match=r"inputs=jnp\.concatenate\(runs\.inputs\)"):
+        hk.learn(K, runs)
+    with pytest.raises(TypeError, match="leave inputs out of"):
+        hk.learn(hk.Symplectic(hk.Gaussian()), runs)

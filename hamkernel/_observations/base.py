@@ -8,6 +8,7 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
@@ -84,9 +85,9 @@ def _terms(data: AbstractObservations) -> tuple[AbstractObservations, ...]:
 
 def refuse_swapped(X: Any, Y: Any, inputs: Any) -> None:
     """ValueError where X and the inputs have each the shape of the other."""
-    if inputs is not None and jnp.shape(X) != jnp.shape(Y) == jnp.shape(inputs):
+    if inputs is not None and np.shape(X) != np.shape(Y) == np.shape(inputs):
         raise ValueError(
-            f"X has shape {jnp.shape(X)}, inputs {jnp.shape(inputs)} and Y {jnp.shape(Y)}: X and "
+            f"X has shape {np.shape(X)}, inputs {np.shape(inputs)} and Y {np.shape(Y)}: X and "
             "the inputs seem to be swapped, hk.fit(K, X, Y, inputs=U)."
         )
 

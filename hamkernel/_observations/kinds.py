@@ -164,7 +164,7 @@ class Equilibria(AbstractObservations):
         inputs: Num[ArrayLike, "N m"] | Num[ArrayLike, " m"] | None = None,
     ):
         X = require.floating(X, "X")
-        if inputs is not None and X.ndim == jnp.ndim(inputs) == 1:
+        if inputs is not None and X.ndim == np.ndim(inputs) == 1:
             inputs = jnp.asarray(inputs)[None]
         self.X = require.finite(require.points(X[None] if X.ndim == 1 else X, "X"), "X")
         require.single_or_double(self.X.dtype, "X has")

@@ -34,8 +34,8 @@ class Columns(eqx.Module):
 
 def whitening(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r r"]:
     """T with T Tᵀ = G_SS⁻¹ on the kept columns, zero on the others."""
-    S = landmarks.points
-    return _inverse_root(assemble(K, S, S).reshape(S.size, -1), landmarks.kept.reshape(-1))
+    S, kept = landmarks.points, landmarks.kept.reshape(-1)
+    return _inverse_root(assemble(K, S, S).reshape(len(kept), -1), kept)
 
 
 @jax.custom_jvp

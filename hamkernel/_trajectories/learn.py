@@ -88,9 +88,10 @@ def learn(
         Runs of other lengths, in the same powers of two, do not compile anew.
 
     Raises:
-        TypeError: K is not matrix-valued, `runs` no Runs, or `solver` no Nystrom. ValueError: n is
-            not one that the structure allows; the noise is not positive; a coordinate was never
-            measured and no mean says how it moves the others; doubles are not enabled.
+        TypeError: there are inputs (the text says what to do), K is not matrix-valued, `runs` no
+            Runs, or `solver` no Nystrom. ValueError: n is not one that the structure allows; the
+            noise is not positive; a coordinate was never measured and no mean says how it moves
+            the others; doubles are not enabled.
 
     Warns:
         UserWarning: parts of runs were dropped, the structure does not explain the runs, or the
@@ -232,6 +233,13 @@ def _check(K: AbstractMatrixKernel, runs: Any, noise: Any, solver: Any) -> np.nd
     if not (solver is None or isinstance(solver, Nystrom)):
         raise TypeError(f"the solver of learn is hk.Nystrom(max_points=…) or None; got {solver!r}.")
     n = runs.dimension
+    if K.takes_inputs or runs.inputs is not None:
+        raise TypeError(
+            "learn does not know inputs yet. Smooth the runs and learn from their velocities: "
+            "X, Y, _ = runs.velocities(), and hk.tune(K, X, Y, inputs=jnp.concatenate(runs.inputs),"
+            " objective='marginal_likelihood'). To ignore what was applied, leave inputs out of "
+            "Runs."
+        )
     K.check_dimension(n)
     if jnp.zeros(()).dtype != jnp.float64:
         raise ValueError(
