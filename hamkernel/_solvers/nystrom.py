@@ -23,6 +23,7 @@ from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo, root
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
+from hamkernel._gram.observed import between, components, trace_of_rows
 from hamkernel._gram.operator import product
 from hamkernel._machine.devices import as_given, rows_of, split
 from hamkernel._observations.rows import Rows
@@ -309,6 +310,9 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         spread = rows_of(X)
         return _with_data(self, split(spread, X), split(spread, Y), spread)
 
+    def _added_rows(self, rows: Rows) -> "LandmarkFit":
+        return _with_rows(self, rows)
+
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
         solution = _solution(self, count, regularization)
         landmarks, tolerance = self.landmarks, self.tolerance
@@ -338,6 +342,18 @@ def _with_data(fit, X, Y, spread):
         stream_sums.add(fit.sums, Columns(K, fit.landmarks.points), X, Y, spread),
         fit.trace + trace(K, X, spread),
         fit.count + len(X),
+    )
+    return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), fit, new)
+
+
+@eqx.filter_jit
+def _with_rows(fit, rows):
+    K, S = fit.kernel, fit.landmarks.points
+    design = [between(K, block, components(K, S)) for block in rows.blocks]
+    new = (
+        stream_sums.add_rows(fit.sums, jnp.concatenate(design), rows.targets),
+        fit.trace + trace_of_rows(K, rows),
+        fit.count + rows.count,
     )
     return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), fit, new)
 
