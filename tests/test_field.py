@@ -337,6 +337,7 @@ Q = hk.Select(hk.Gaussian(), 0)
 P = hk.Select(hk.Polynomial(2), 1)
 
 
+THIRD = np.array([[-0.5, -(0.75**0.5)], [0.75**0.5, -0.5]])
 SEPARABLE = [
     hk.Symplectic(Q + P),
     hk.Symplectic(2.0 * Q + 0.5 * P),
@@ -351,6 +352,7 @@ NOT_SEPARABLE = [
     hk.Symplectic(lambda x, z: Q(x, z) + P(x, z)),  # true, but not known
     hk.CurlFree(Q + P),
     hk.Symplectic(Q) + hk.Separable(P),
+    hk.Symplectic(hk.Invariant(Q + P, [THIRD])),  # a turn mixes q and p
 ]
 
 

@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._kernels.transforms import Symmetrised, identity
+from hamkernel._kernels.groups import identity
+from hamkernel._kernels.symmetry import Symmetrised
 from hamkernel._save import description
 from hamkernel._save.bytes import sealed
 from hamkernel._save.files import load, save
@@ -167,6 +168,15 @@ def test_a_kernel_of_the_user_is_given_and_gets_the_saved_arrays(name, tmp_path)
     field = fitted(kernel)
     save(tmp_path / "f", field)
     assert same(field, load(tmp_path / "f", kernel=given))
+
+
+def test_a_learned_mean_of_the_user_s_kernel_is_given_beside_the_kernel(tmp_path):
+    K, mean = hk.Symplectic(turned()), fitted(hk.Symplectic(cosine))
+    field = hk.fit(K, X, Y, 1e-2, mean=mean)
+    save(tmp_path / "f", field)
+    with pytest.raises(ValueError, match=r"cosine.*mean=\.\.\."):
+        load(tmp_path / "f", kernel=K)
+    assert same(field, load(tmp_path / "f", kernel=K, mean=mean))
 
 
 @pytest.mark.parametrize("name", USERS)

@@ -456,7 +456,7 @@ FIXED = [SIMPLE, hk.Symplectic(2.0 * hk.Gaussian() + hk.Matern(2.5))]
 
 
 def test_a_scale_that_cross_validation_does_not_see_is_warned_of():
-    X, Y = map(jnp.asarray, scattered())
+    X, Y = (jnp.asarray(each) for each in scattered())
 
     def said(K, frozen=(), objective="cross_validation", bounds=None):
         space = SearchSpace(K, X, 1.0, jnp.asarray(1e-3), frozen, bounds or {})

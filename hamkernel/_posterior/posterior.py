@@ -25,10 +25,10 @@ from hamkernel._fields.controlled import ControlledField, known_of, learned_fiel
 from hamkernel._fields.known import Mean
 from hamkernel._gram.observed import components
 from hamkernel._kernels.base import Invariance
-from hamkernel._kernels.transforms import symmetry_removed
+from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._observations.base import AbstractObservations
-from hamkernel._observations.blocks import Values
+from hamkernel._observations.blocks import AbstractBlock, Values
 from hamkernel._observations.data import inputs_of, observations
 from hamkernel._show import text
 from hamkernel._solvers.cholesky import AbstractSolver, Cholesky
@@ -131,8 +131,7 @@ class Posterior(eqx.Module):
             ValueError: x is no single state of this dimension, or u is missing. TypeError: the
                 field has no inputs.
         """
-        here = components(self.given.field.kernel, self._point(x, u)[None])
-        return self.given.covariance(here, here)
+        return _covariance(self.given, components(self.given.field.kernel, self._point(x, u)[None]))
 
     def _point(self, x: Any, u: Any) -> Float[Array, " d"]:
         if isinstance(self.field, ControlledField):
@@ -180,7 +179,7 @@ class Posterior(eqx.Module):
         points = jnp.pad(states, ((0, 0), (0, m))) if m else states
         both = Values(points, outputs=n if m else None)
         change = jnp.array([1.0, -1.0], both.points.dtype)
-        return root(change @ self.given.covariance(both, both) @ change)
+        return root(change @ _covariance(self.given, both) @ change)
 
     def updated(
         self,
@@ -276,6 +275,12 @@ class Posterior(eqx.Module):
         return jax.vmap(one)(draws)
 
 
+# One by one its operations would be hundreds of small programs, which took 4 s to compile.
+@eqx.filter_jit
+def _covariance(given: AbstractConditional, block: AbstractBlock) -> Float[Array, "d d"]:
+    return given.covariance(block, block)
+
+
 def _range_of(U: Float[Array, "N m"]) -> Float[Array, "2 m"]:
     """A box around zero as large as the inputs."""
     largest = jnp.max(jnp.abs(U), axis=0)
@@ -288,9 +293,7 @@ def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
     if not require.is_concrete(K, X):
         return
     x = X[0]
-    for k in K.scalar_kernels:
-        found = symmetry_removed(k)
-        k = k if found is None else found.kernel
+    for k in without_symmetry(K).scalar_kernels:
         if Invariance.TRANSLATION in k.invariance and np.asarray(k(x, x)) == 1.0:
             require.warn(
                 f"the amplitude of {k!r} is exactly 1, that of a kernel nobody tuned, and "

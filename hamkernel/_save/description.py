@@ -12,12 +12,14 @@ evaluated or called by name.
 
 import dataclasses
 import functools
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
 
+from hamkernel._fields.base import AbstractField
 from hamkernel._kernels.functions import Bound, Closure
 from hamkernel._kernels.groups import identity, reflection, time_reversal
 
@@ -28,6 +30,11 @@ _ROOMS = tuple(
 _FUNCTIONS = {function.__name__: function for function in (identity, reflection, time_reversal)}
 
 Node = Any
+Given = Mapping[str, list[Any]]
+
+
+class MissingCode(ValueError):
+    """There is code in a field that the caller did not give."""
 
 
 def _ours(cls: type) -> bool:
@@ -80,42 +87,47 @@ def description(value: Any, codes: list[Any], where: str) -> Node:
     }
 
 
-def skeleton(node: Node, codes: list[Any], where: str) -> Any:
+def skeleton(node: Node, codes: list[Any], where: str, given: Given | None = None) -> Any:
     """The object of a description, with shapes for arrays, and `codes` where there is code.
 
+    Args:
+        node: the description.
+        codes: what code there is below, in order.
+        where: the name of the object.
+        given: the codes for the kernel, the features and the mean of a field, below any of which
+            there are no others.
+
     Raises:
-        ValueError: it is no description. LookupError: there is more code than `codes`.
+        ValueError: it is no description. MissingCode: there is more code than `codes`.
     """
     match node:
         case {"class": str(name), **nodes}:
-            fields = {key: skeleton(nodes[key], codes, f"{where}.{key}") for key in nodes}
-            return instance(name, fields, where)
+            cls = classes().get(name)
+            if cls is None:
+                raise ValueError(f"{where} is of the unknown class {name[:80]!r}")
+            if nodes.keys() != {field.name for field in dataclasses.fields(cls)}:
+                raise ValueError(f"{where} does not have the fields of {name}")
+            own = given if given and issubclass(cls, AbstractField) else {}
+            made = object.__new__(cls)  # past __init__, which takes no logarithms
+            for key, child in nodes.items():
+                inside = (list(own[key]), None) if key in own else (codes, given)
+                value = skeleton(child, inside[0], f"{where}.{key}", inside[1])
+                object.__setattr__(made, key, value)
+            return made
         case {"array": str(dtype), "shape": [*shape]}:
             return jax.ShapeDtypeStruct(tuple(shape), np.dtype(dtype))
         case {"function": str(name)} if name in _FUNCTIONS:
             return _FUNCTIONS[name]
         case {"code": str(name), "leaves": list()}:
             if not codes:
-                raise LookupError(f"{where} is {name[:80]!r}, code that is not in the file")
+                raise MissingCode(f"{where} is {name[:80]!r}, code that is not in the file")
             return codes.pop(0)
         case list():
-            return tuple(skeleton(child, codes, f"{where}[{i}]") for i, child in enumerate(node))
+            below = enumerate(node)
+            return tuple(skeleton(child, codes, f"{where}[{i}]", given) for i, child in below)
         case None | bool() | int() | float() | str():
             return node
     raise ValueError(f"{where} is {str(node)[:80]}, which is no part of a field")
-
-
-def instance(name: str, fields: dict[str, Any], where: str) -> Any:
-    """An object of the library with these fields; ValueError unless they are its fields."""
-    cls = classes().get(name)
-    if cls is None:
-        raise ValueError(f"{where} is of the unknown class {name[:80]!r}")
-    if fields.keys() != {field.name for field in dataclasses.fields(cls)}:
-        raise ValueError(f"{where} does not have the fields of {name}")
-    made = object.__new__(cls)  # past __init__, which takes lengthscales and not their logarithms
-    for key, value in fields.items():
-        object.__setattr__(made, key, value)
-    return made
 
 
 def difference(saved: Node, given: Node, where: str) -> str | None:

@@ -27,7 +27,7 @@ from hamkernel._fields.base import AbstractField
 from hamkernel._fields.controlled import ControlledField
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._save.bytes import opened, sealed, write
-from hamkernel._save.description import classes, description, difference, instance, skeleton
+from hamkernel._save.description import MissingCode, classes, description, difference, skeleton
 from hamkernel._structures.base import AbstractMatrixKernel
 
 _PROBES = 64  # points of the field, of which the one of the largest velocity is kept
@@ -136,24 +136,35 @@ def load(
     return field
 
 
-def _read(
-    node: dict[str, Any],
-    content: io.BytesIO,
-    source: str,
-    kernel: AbstractMatrixKernel | None,
-    mean: Any,
-) -> Any:
+def _read(node: Any, content: io.BytesIO, source: str, kernel: Any, mean: Any) -> Any:
     """The field of a description, with the code that the caller gives and the arrays of the file.
 
     Raises:
         ValueError: code is missing or is not what was saved, or the parts do not fit each other.
     """
-    made = _skeleton(node, source, kernel, mean)
+    codes: dict[str, list[Any]] = {"kernel": [], "mean": []}
+    for name, given in {"kernel": kernel, "mean": mean}.items():
+        if given is not None:
+            own = description(given, codes[name], f"field.{name}")
+            differs = difference(_given(node, name), own, f"field.{name}")
+            if differs:
+                raise ValueError(
+                    f"the given {name} is not the one saved in {source}: {differs}. Pass the "
+                    f"{name} as it was given to fit."
+                )
     try:
-        field = eqx.tree_deserialise_leaves(content, made)
+        # Features have the kernel again.
+        like = skeleton(node, [], "field", codes | {"features": codes["kernel"]})
+        field = eqx.tree_deserialise_leaves(content, like)
         if content.read():
             raise ValueError("it has arrays that belong to nothing")
         _check_evaluable(field)
+    except MissingCode as error:
+        name = "mean" if ".mean" in str(error) else "kernel"
+        raise ValueError(
+            f"{source}: {error}. Pass the {name} that was given to fit, with any "
+            f"hyperparameters: hk.load(path, {name}=...)."
+        ) from error
     except Exception as error:  # a kernel of the caller's may raise anything
         raise ValueError(
             f"{source} is not a valid file of hamkernel.save"
@@ -163,49 +174,16 @@ def _read(
     return field
 
 
-def _skeleton(
-    node: dict[str, Any], source: str, kernel: AbstractMatrixKernel | None, mean: Any
-) -> Any:
-    """The field of a description, with the code that the caller gives and no numbers yet.
+def _given(node: dict[str, Any], name: str) -> Any:
+    """What the caller gave as the kernel or the mean of a field, in the description of the field.
 
-    Raises:
-        ValueError: code is missing or is not what was saved.
+    A field with inputs has the `whole` one inside, and its mean is wrapped.
     """
-    fields = {}
-    for name, child in node.items():
-        if name == "class":
-            continue
-        if name == "whole":  # of a field with inputs
-            fields[name] = _skeleton(child, source, kernel, mean)
-            continue
-        whose = "mean" if name == "mean" else "kernel"  # features have the kernel again
-        given = mean if name == "mean" else kernel if name in ("kernel", "features") else None
-        codes: list[Any] = []
-        own = None if given is None else description(given, codes, f"field.{whose}")
-        differs = difference(_given(child), own, f"field.{name}") if name == whose else None
-        if differs:
-            raise ValueError(
-                f"the given {whose} is not the one saved in {source}: {differs}. Pass the {whose} "
-                "as it was given to fit."
-            )
-        try:
-            fields[name] = skeleton(child, codes, f"field.{name}")
-        except LookupError as error:  # there is more code than was given
-            raise ValueError(
-                f"{source}: {error}. Pass the {whose} that was given to fit, with any "
-                f"hyperparameters: hk.load(path, {whose}=...)."
-            ) from error
-        except Exception as error:
-            raise ValueError(f"{source} is not a valid file of hamkernel.save: {error}.") from error
-    return instance(node["class"], fields, "field")
-
-
-def _given(node: Any) -> Any:
-    """What the caller gave of this: a mean is wrapped where the field has inputs."""
-    match node:
+    match node.get("whole", node).get(name):
         case {"class": "KnownPart", "mean": inner} | {"class": "AtRest", "field": inner}:
             return inner
-    return node
+        case part:
+            return part
 
 
 def _is_field(cls: Any) -> bool:
