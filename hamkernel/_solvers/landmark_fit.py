@@ -6,7 +6,9 @@ from jaxtyping import Array, Float, Int
 
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
+from hamkernel._gram.observed import between, components, trace_of_rows
 from hamkernel._machine.devices import rows_of, split
+from hamkernel._observations.rows import Rows
 from hamkernel._show import text
 from hamkernel._solvers import stream_sums
 from hamkernel._solvers.landmark_field import START_ANEW, Solution, landmark_field
@@ -57,6 +59,9 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         spread = rows_of(X)
         return _with_data(self, split(spread, X), split(spread, Y), spread)
 
+    def _added_rows(self, rows: Rows) -> "LandmarkFit":
+        return _with_rows(self, rows)
+
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
         solution = _solution(self, count, regularization)
         landmarks, tolerance = self.landmarks, self.tolerance
@@ -88,6 +93,18 @@ def _with_data(fit, X, Y, spread):
         stream_sums.add(fit.sums, Columns(K, fit.landmarks.points), X, Y, spread),
         fit.trace + trace(K, X, spread),
         fit.count + len(X),
+    )
+    return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), fit, new)
+
+
+@eqx.filter_jit
+def _with_rows(fit, rows):
+    K, S = fit.kernel, fit.landmarks.points
+    design = [between(K, block, components(K, S)) for block in rows.blocks]
+    new = (
+        stream_sums.add_rows(fit.sums, jnp.concatenate(design), rows.targets),
+        fit.trace + trace_of_rows(K, rows),
+        fit.count + rows.count,
     )
     return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), fit, new)
 

@@ -209,6 +209,9 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
         sums = _add(self.sums, self.features, X, Y, spread)
         return eqx.tree_at(lambda f: (f.sums, f.count), self, (sums, self.count + len(X)))
 
+    def _added_rows(self, rows: Rows) -> "FeatureFit":
+        return _with_rows(self, rows)
+
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
         return _checked(_solution(self, count, regularization))
 
@@ -227,6 +230,13 @@ def _start(K, basis, sample, regularization):
 
 
 _add = eqx.filter_jit(stream_sums.add)
+
+
+@eqx.filter_jit
+def _with_rows(fit, rows):
+    design = FeatureSpan(fit.kernel, fit.features, fit.dimension).of_rows(rows)
+    new = stream_sums.add_rows(fit.sums, design, rows.targets), fit.count + rows.count
+    return eqx.tree_at(lambda f: (f.sums, f.count), fit, new)
 
 
 @eqx.filter_jit

@@ -80,6 +80,18 @@ def add(
     return Sums(sums.triangle, sums.basis, *jax.tree.map(jnp.add, old, new))
 
 
+def add_rows(sums: Sums, rows: Float[Array, "D r"], y: Float[Array, " D"]) -> Sums:
+    """The sums after rows of the design that were made already, with targets y."""
+    F = rows @ sums.basis
+    return Sums(
+        triangle=sums.triangle,
+        basis=sums.basis,
+        square=sums.square + F.T @ F,
+        moment=sums.moment + F.T @ y,
+        energy=sums.energy + y @ y,
+    )
+
+
 def normal(
     design: Design,
     basis: Float[Array, "r r"],

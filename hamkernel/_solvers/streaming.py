@@ -22,9 +22,18 @@ from hamkernel._fields.controlled import learned_field
 from hamkernel._fields.known import known_part
 from hamkernel._machine.devices import rows_of, split
 from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.data import points_and_velocities, sampled_points
+from hamkernel._observations.base import AbstractObservations
+from hamkernel._observations.data import (
+    as_states,
+    observations,
+    points_and_velocities,
+    rows_of_data,
+    sampled_points,
+)
+from hamkernel._observations.rows import Rows
 from hamkernel._show import call, text
 from hamkernel._solvers.cholesky import AbstractSolver, Learned
+from hamkernel._solvers.given import without_known
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 Fit = TypeVar("Fit", bound="AbstractStreamingFit")
@@ -65,36 +74,61 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
         """`add` for data that has been checked."""
 
     @abc.abstractmethod
+    def _added_rows(self: Fit, rows: Rows) -> Fit:
+        """`add` for observations that have been checked."""
+
+    @abc.abstractmethod
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> Learned:
         """`field` for a λ that has been checked, and the number of points, which is not 0."""
 
     def add(
         self: Fit,
-        X: Num[ArrayLike, "N n"],
-        Y: Num[ArrayLike, "N n"],
+        X: Num[ArrayLike, "N n"] | AbstractObservations,
+        Y: Num[ArrayLike, "N n"] | None = None,
         inputs: Num[ArrayLike, "N m"] | None = None,
     ) -> Fit:
         """The fit with more data.
 
         Args:
-            X: states, shape (N, n).
+            X: states, shape (N, n); or observations, and then there is no Y. The D rows of
+                observations take O(D r) memory, where velocities are seen tile by tile.
             Y: measured velocities, shape (N, n).
             inputs: of a `Controlled` kernel: u at each state, shape (N, m).
 
         Raises:
-            ValueError: a shape does not fit, or the data is not finite. TypeError: its dtype, or
-                it has more digits than the fit.
+            ValueError: a shape does not fit, the data is not finite, or there are energies, whose
+                constant all chunks would share: give differences of H as `hk.Functionals`, or fit
+                all data at once. TypeError: the dtype, or it has more digits than the fit.
         """
+        X, Y, inputs = as_states(X, Y, inputs)
+        if isinstance(X, AbstractObservations):
+            return self._added_rows(self._checked_rows(observations(X, Y)))
         _, X, Y = points_and_velocities(self.kernel, X, Y, inputs, part=True)
-        if np.promote_types(X.dtype, self.dtype) != self.dtype:
-            raise TypeError(
-                f"the data is {X.dtype} and the fit {self.dtype}, the dtype of the sample that it "
-                f"was started with: start it with a sample in {X.dtype}, or cast the data."
-            )
-        if Y.shape[1] != self.dimension:
-            raise ValueError(f"the data has {Y.shape[1]} coordinates and the fit {self.dimension}.")
+        self._check(X.dtype, Y.shape[1])
         X, Y, known = X.astype(self.dtype), Y.astype(self.dtype), self._known
         return self._added(X, Y if known is None else Y - at_points(known, X))
+
+    def _checked_rows(self, data: AbstractObservations) -> Rows:
+        nothing = Rows((), jnp.zeros(0, self.dtype))
+        self._check(None, data.dimension)
+        _, rows = rows_of_data(self.kernel, data, beside=nothing)
+        self._check(rows.targets.dtype, rows.dimension)
+        if len(rows.energies):
+            raise ValueError(
+                "a stream takes no energies: they are known up to a constant that all chunks would "
+                "share. Give differences of H as hk.Functionals, or fit all of the data at once."
+            )
+        return without_known(self.kernel, rows, self._known)
+
+    def _check(self, dtype: jnp.dtype | None, dimension: int) -> None:
+        """ValueError and TypeError unless the data is of this system, with no more digits."""
+        if dimension != self.dimension:
+            raise ValueError(f"the data has {dimension} coordinates and the fit {self.dimension}.")
+        if dtype is not None and np.promote_types(dtype, self.dtype) != self.dtype:
+            raise TypeError(
+                f"the data is {dtype} and the fit {self.dtype}, the dtype of the sample that it "
+                f"was started with: start it with a sample in {dtype}, or cast the data."
+            )
 
     @property
     def _known(self) -> Any:

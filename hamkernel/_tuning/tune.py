@@ -121,8 +121,8 @@ def tune(
     Args:
         K: a matrix-valued kernel; every inexact array leaf is a hyperparameter, and no Python
             float is one.
-        X: states, shape (N, n); or observations, and then there is no Y. Every run is on all of
-            them, with the dense loss.
+        X: states, shape (N, n); or observations, and then there is no Y, and N is the number of
+            all: points, energies, functionals.
         Y: measured velocities, shape (N, n).
         regularization: the first λ.
         folds: as in `cross_validation_loss`; give trajectory labels for data from trajectories,
@@ -148,8 +148,7 @@ def tune(
         solver: how the final field is fitted; see `fit`. With `Nystrom` and `RandomFeatures` the
             loss on all points is that of the low-rank fit, in O(N n r) memory; the landmarks are
             those of the best kernel on the subset, and of the tuned one for the field.
-        mean: what is known already, x (n,) -> (n,), as in `fit`; with it, too, every run is on all
-            data.
+        mean: what is known already, x (n,) -> (n,), as in `fit`.
         progress: print a line for each step: on how many points, how many runs go on, and the best
             loss. Of an optimiser of yours say verbose=True to itself.
         inputs: of a `Controlled` kernel, shape (N, m). An objective of your own is then called
@@ -172,14 +171,12 @@ def tune(
     floats in K, which are kept, and another says that the scale is free, where every term of K has
     an amplitude and the objective is one of cross-validation.
 
-    The judge. Field errors over noisy runs of eight points from random states, medians of six seeds
-    (`tests/benchmarks/judges.py`), by cross-validation over runs, leave-one-out, five blocks, and
-    the marginal likelihood with an amplitude: pendulum, 3 runs: 0.24, 0.33, 0.43, 0.23; 6 runs:
-    0.19, 0.17, 0.11, 0.075; 12 runs: 0.081, 0.068, 0.12, 0.038. Duffing, 3 runs: 0.27, 0.22, 0.18,
-    0.26; 12 runs: 0.070, 0.077, 0.070, 0.078. Hénon-Heiles, 3 runs: 0.10, 0.069, 0.091, 0.11; 12
-    runs: 0.025, 0.027, 0.025, 0.035. So the likelihood halves the error where noise and prior are
-    what it believes, and loses up to 40 % where they are not; runs as folds are safe from six on,
-    and with three were never the best. Fewer than five labels are warned of.
+    The judge. With an amplitude on the kernel and noise that is independent and of one size,
+    "marginal_likelihood" finds the better field, often by a factor of two. Where the noise or the
+    prior are not like that it can lose up to 40 %, and cross-validation is the safer judge: by
+    runs, if there are at least six of them, else by leave-one-out, folds="loo". With three runs no
+    judge is reliably better than another. `tests/benchmarks/judges.py` measures this; fewer than
+    five labels are warned of.
 
     Time. A search that will take more than a minute says so before the long part of it.
 
