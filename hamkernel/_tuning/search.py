@@ -22,7 +22,7 @@ from hamkernel._tuning.space import SearchSpace
 from hamkernel._tuning.starts import design, shares_apart, spread_out
 
 _TOLERANCE = 1e-4  # of the logarithm of a loss: what a run may still gain at its end
-# The same where it goes on with more points. On seven problems of 120 points this took 391 losses of
+# The same where it goes on with more points. On seven problems of 120 points it took 391 losses of
 # the subset and 23 of all points; 1e-2 took 328 and 29, 1e-4 476 and 22, with the same fields.
 _COARSE = 1e-3
 # Ends that are finished: with one, the better optimum of two that are within a few per cent on the
