@@ -34,7 +34,7 @@ def fitted(structure, kernel="gaussian", n=2, ridge=1e-3):
 # Derivatives.
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     "kernel", ["gaussian", "gaussian_ard", "matern2.5", "matern4.5", "periodic", "partial"]
 )

@@ -114,7 +114,9 @@ def test_along_a_true_path_rows_and_functionals_are_the_variation_of_constants()
     A, ts, n = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.linspace(0.0, 0.8, 9), 2
     mean = functools.partial(jnp.matmul, jnp.asarray(A))
     options = {"rtol": 1e-12, "atol": 1e-13, "dense_output": True}
-    true = solve_ivp(lambda t, x: np.asarray(PENDULUM(x)), (0, 0.8), [1.0, 0.5], "DOP853", **options)
+    true = solve_ivp(
+        lambda t, x: np.asarray(PENDULUM(x)), (0, 0.8), [1.0, 0.5], "DOP853", **options
+    )
     x = jnp.asarray(true.sol(ts).T[None])
     inner = (ts[:-1, None] + np.diff(ts)[:, None] * NODES).reshape(-1)
     nodes = jnp.asarray(true.sol(inner).T.reshape(1, 8, 3, n))
@@ -156,7 +158,7 @@ def test_the_gradient_of_the_likelihood_is_that_of_finite_differences():
     rows, _, nodes, _ = one_segment(1)
     model = Model(hk.Symplectic(1.7 * hk.Gaussian(1.2)), jnp.log(jnp.array([0.3, 0.2])))
     S, spread = jnp.asarray(nodes[::2]), jnp.full(2, 100.0)
-    gradient = jax.grad(lambda h: _loss(model, h, S, rows, spread))(model.flat)
+    gradient = jax.jit(jax.grad(lambda h: _loss(model, h, S, rows, spread)))(model.flat)
     h = np.asarray(model.flat)
     step = 1e-5 * np.eye(len(h))
     design = jnp.asarray(np.concatenate([h[None] + step, h[None] - step]))

@@ -288,7 +288,7 @@ def test_landmarks_precondition():
     assert counts[0] <= 15 < 2 * counts[0] < counts[1]
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("structure", [hk.Symplectic, hk.Separable])
 @pytest.mark.parametrize(
     "kernel", [lambda x, z: jnp.tanh(x @ z - 1.0), lambda x, z: jnp.tanh(0.1 * x @ z + 1.0)]
@@ -349,7 +349,7 @@ def test_a_kernel_may_have_leaves_that_are_no_arrays(solver):
     assert relative(fitted(field, Y), values) < 1e-5
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "solver",
     [hk.Cholesky(), Nystrom(), ConjugateGradient(), hk.RandomFeatures(20, jax.random.key(0))],

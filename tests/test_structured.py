@@ -158,6 +158,7 @@ def test_odd_dimensions_are_allowed_where_the_structure_allows_them(case):
     assert divergence(jacobian(hk.DivergenceFree, case, 3)) < STRUCTURE
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("n", [2, 4, 6])
 def test_other_structures_fail_the_same_checks(n):
     separable, symplectic = (jacobian(K, BARE, n) for K in (hk.Separable, hk.Symplectic))
@@ -220,6 +221,7 @@ def test_odd_fields_have_even_potentials_and_even_fields_odd_ones():
             np.testing.assert_allclose(H(-x), sign * H(x), rtol=STRUCTURE)
 
 
+@pytest.mark.few(6)
 @EVERYWHERE
 def test_the_field_is_the_gradient_of_its_own_potential(case, n):
     field = seen(hk.Symplectic, case, n)

@@ -45,7 +45,7 @@ def rows_of(basis):
     return np.asarray(basis.features(K, X)(X)).reshape(N * n, -1)
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("folds", FOLDS)
 @pytest.mark.parametrize("basis", BASES)
 def test_the_loss_is_that_of_refits(basis, folds):
