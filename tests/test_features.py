@@ -690,6 +690,7 @@ def test_what_makes_no_sense_is_refused(call, error, text, key):
         call(key)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("structure", "text"),
     [(hk.Separable, "components are independent"), (hk.DivergenceFree, "matrix potential")],

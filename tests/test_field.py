@@ -441,6 +441,7 @@ def test_a_field_of_matern_is_zero_where_the_distance_overflows():
         assert not jax.jacfwd(field)(x).any()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("solver", [None, hk.RandomFeatures(20, jax.random.key(0))], ids=str)
 def test_a_part_has_its_own_norm_and_no_anchor(solver):
     X, K = states(12), hk.Symplectic(hk.Gaussian(1.0)) + hk.Symplectic(hk.Gaussian(2.0))

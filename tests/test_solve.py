@@ -235,9 +235,10 @@ def test_second_derivatives_of_a_fit_on_landmarks_are_those_of_differences():
 
 def test_a_kernel_that_is_not_positive_is_refused():
     X, Y = swings(60)
-    for k in (lambda x, z: -jnp.exp(x @ z), lambda x, z: jnp.linalg.norm(x - z)):
-        with pytest.raises(RuntimeError, match="check_kernel"):
-            hk.fit(hk.CurlFree(k), X, Y, RIDGE, solver=Nystrom())
+    with pytest.raises(RuntimeError, match="check_kernel"):
+        hk.fit(hk.CurlFree(lambda x, z: jnp.linalg.norm(x - z)), X, Y, RIDGE, solver=Nystrom())
+    with pytest.raises(RuntimeError, match="did not converge"):
+        hk.fit(hk.CurlFree(lambda x, z: -x @ z), X, Y, RIDGE, solver=ConjugateGradient())
 
 
 # Conjugate gradients.
@@ -307,8 +308,6 @@ def test_conjugate_gradients_that_do_not_converge_say_so():
     solver = ConjugateGradient(1e-12, max_iterations=2, preconditioner=Nystrom(1e5, 1))
     with pytest.raises(RuntimeError, match=r"converge after 2 iterations.*max_iterations"):
         hk.fit(K, X, Y, RIDGE, solver=solver)
-    with pytest.raises(RuntimeError, match="did not converge"):
-        hk.fit(hk.CurlFree(lambda x, z: -jnp.exp(x @ z)), X, Y, RIDGE, solver=ConjugateGradient())
 
 
 @pytest.mark.slow

@@ -94,6 +94,7 @@ def test_products_without_the_group_are_those_of_the_gram(name):
     assert np.linalg.eigvalsh(matrix).min() > -1e-12
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("structure", [hk.CurlFree, hk.PortHamiltonian, hk.Separable])
 def test_other_structures_have_the_same_products(structure):
     K = structure(hk.Invariant(G, [C3, MIRROR]))

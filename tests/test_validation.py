@@ -465,6 +465,7 @@ def test_every_lapack_call_of_a_loss_and_its_gradient_waits_for_the_one_before()
     assert all(one in before for (one, _), (_, before) in itertools.pairwise(calls))
 
 
+@pytest.mark.few(1)
 @of_each_formula
 def test_float32_data_gives_float32_losses(name):
     X, Y = (each.astype(np.float32) for each in data())
