@@ -46,7 +46,7 @@ QUANTITIES = {
 SLOW = {("Nystrom", "nested"), ("Nystrom", "in a warp"), ("CG", "in a warp")}
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("quantity", "kernel"),
     [
@@ -132,6 +132,7 @@ def in_a_function_and_a_partial(width):
     return lambda x, z: gaussian(x, z)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("kernel", [in_a_partial, in_a_function, in_a_function_and_a_partial])
 def test_what_closes_over_the_differentiated_may_be_inside_of_a_partial_or_function(kernel):
     @jax.jit

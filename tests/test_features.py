@@ -102,7 +102,7 @@ def estimate(terms, d):
     return mean, np.sqrt(variance), total
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", KERNELS)
 def test_the_mean_of_the_waves_is_the_kernel(name, key):
     make, formula = KERNELS[name]
@@ -134,7 +134,7 @@ MARGINALS = {  # of one coordinate of ω
 }
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", MARGINALS)
 @pytest.mark.parametrize("n", [1, 3])
 def test_frequencies_have_the_spectral_density(name, n, key):
@@ -209,7 +209,7 @@ DEFECTS = {
 }
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", DEFECTS)
 @pytest.mark.parametrize(
     "count", [1, *(pytest.param(c, marks=pytest.mark.slow) for c in (2, 7, 300)), 60]
@@ -282,7 +282,7 @@ def test_the_gram_error_falls_as_the_root_of_the_count(name):
     assert errors[-1] < 0.1
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_the_field_is_the_sum_of_its_features(name, key):
     basis = features(STRUCTURES[name](hk.Gaussian(1.3)), 4, 5, key, jnp.float64)
@@ -302,7 +302,7 @@ def numpy_weights(rows, Y, ridge):
     return np.linalg.lstsq(np.concatenate([rows, below]), target)[0]
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", STRUCTURES)
 def test_weights_are_those_of_ridge_regression_in_numpy(name, key):
     X, Y = data()
@@ -690,6 +690,7 @@ def test_what_makes_no_sense_is_refused(call, error, text, key):
         call(key)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("structure", "text"),
     [(hk.Separable, "components are independent"), (hk.DivergenceFree, "matrix potential")],

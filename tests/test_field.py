@@ -34,7 +34,7 @@ def fitted(structure, kernel="gaussian", n=2, ridge=1e-3):
 # Derivatives.
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     "kernel", ["gaussian", "gaussian_ard", "matern2.5", "matern4.5", "periodic", "partial"]
 )
@@ -441,6 +441,7 @@ def test_a_field_of_matern_is_zero_where_the_distance_overflows():
         assert not jax.jacfwd(field)(x).any()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("solver", [None, hk.RandomFeatures(20, jax.random.key(0))], ids=str)
 def test_a_part_has_its_own_norm_and_no_anchor(solver):
     X, K = states(12), hk.Symplectic(hk.Gaussian(1.0)) + hk.Symplectic(hk.Gaussian(2.0))

@@ -167,7 +167,7 @@ def lengthscale_kernel(name, lengthscale):
     }[name]
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["gaussian", "matern", "warp"])
 def test_gradients_are_central_differences(name):
     X, Y = data(5, 2)

@@ -158,7 +158,7 @@ def test_the_gradient_of_the_likelihood_is_that_of_finite_differences():
     rows, _, nodes, _ = one_segment(1)
     model = Model(hk.Symplectic(1.7 * hk.Gaussian(1.2)), jnp.log(jnp.array([0.3, 0.2])))
     S, spread = jnp.asarray(nodes[::2]), jnp.full(2, 100.0)
-    gradient = jax.grad(lambda h: _loss(model, h, S, rows, spread))(model.flat)
+    gradient = jax.jit(jax.grad(lambda h: _loss(model, h, S, rows, spread)))(model.flat)
     h = np.asarray(model.flat)
     step = 1e-5 * np.eye(len(h))
     design = jnp.asarray(np.concatenate([h[None] + step, h[None] - step]))

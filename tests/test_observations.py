@@ -127,7 +127,7 @@ FIELD_ASKED = [[(0.0, e, x)] for x in ASKED for e in np.eye(2)]
 ENERGY_ASKED = [[(1.0, ZERO, ASKED[0]), (-1.0, ZERO, ASKED[1])]]
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(5)
 @pytest.mark.parametrize(("first", "second"), PAIRS, ids=lambda name: name)
 def test_fit_and_posterior_of_each_pair_of_kinds_are_the_closed_form(first, second):
     (a, rows_a, n_a), (b, rows_b, n_b) = KINDS[first](1), KINDS[second](2)

@@ -107,7 +107,7 @@ def saved(tmp_path):
     return path
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_built_in_kernels_restore_by_themselves(name, tmp_path):
     field = fitted(BUILT_IN[name])

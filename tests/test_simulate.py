@@ -128,6 +128,7 @@ def drift_and_wobble(energy):
     return abs(slope), np.std(energy - slope * time - offset)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "solver",
     [

@@ -235,9 +235,10 @@ def test_second_derivatives_of_a_fit_on_landmarks_are_those_of_differences():
 
 def test_a_kernel_that_is_not_positive_is_refused():
     X, Y = swings(60)
-    for k in (lambda x, z: -jnp.exp(x @ z), lambda x, z: jnp.linalg.norm(x - z)):
-        with pytest.raises(RuntimeError, match="check_kernel"):
-            hk.fit(hk.CurlFree(k), X, Y, RIDGE, solver=Nystrom())
+    with pytest.raises(RuntimeError, match="check_kernel"):
+        hk.fit(hk.CurlFree(lambda x, z: jnp.linalg.norm(x - z)), X, Y, RIDGE, solver=Nystrom())
+    with pytest.raises(RuntimeError, match="did not converge"):
+        hk.fit(hk.CurlFree(lambda x, z: -x @ z), X, Y, RIDGE, solver=ConjugateGradient())
 
 
 # Conjugate gradients.
@@ -288,7 +289,7 @@ def test_landmarks_precondition():
     assert counts[0] <= 15 < 2 * counts[0] < counts[1]
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("structure", [hk.Symplectic, hk.Separable])
 @pytest.mark.parametrize(
     "kernel", [lambda x, z: jnp.tanh(x @ z - 1.0), lambda x, z: jnp.tanh(0.1 * x @ z + 1.0)]
@@ -307,8 +308,6 @@ def test_conjugate_gradients_that_do_not_converge_say_so():
     solver = ConjugateGradient(1e-12, max_iterations=2, preconditioner=Nystrom(1e5, 1))
     with pytest.raises(RuntimeError, match=r"converge after 2 iterations.*max_iterations"):
         hk.fit(K, X, Y, RIDGE, solver=solver)
-    with pytest.raises(RuntimeError, match="did not converge"):
-        hk.fit(hk.CurlFree(lambda x, z: -jnp.exp(x @ z)), X, Y, RIDGE, solver=ConjugateGradient())
 
 
 @pytest.mark.slow
@@ -349,7 +348,7 @@ def test_a_kernel_may_have_leaves_that_are_no_arrays(solver):
     assert relative(fitted(field, Y), values) < 1e-5
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "solver",
     [hk.Cholesky(), Nystrom(), ConjugateGradient(), hk.RandomFeatures(20, jax.random.key(0))],

@@ -200,6 +200,7 @@ def test_the_ridge_is_that_of_the_start_unless_another_one_is_asked_for():
     assert model.field(1e-3).regularization == 1e-3
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("solver", "size"),
     [(given(S), "landmarks=30"), (hk.RandomFeatures(20, jax.random.key(0)), "features=40")],
@@ -334,6 +335,7 @@ def test_an_error_in_a_stream_says_in_which_chunk_it_is():
         given(S).fit_chunks(K, lambda: iter([good]))  # type: ignore[arg-type]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("solver", [given(S), hk.RandomFeatures(9, jax.random.key(0))])
 def test_a_stream_in_float32_warns_and_takes_no_data_with_more_digits(solver):
     few = X[:20].astype(np.float32), Y[:20].astype(np.float32)

@@ -132,7 +132,7 @@ def assert_close(ours, theirs):
 # The structure.
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(4)
 @EVERYWHERE
 def test_symplectic_fields_are_hamiltonian(case, n):
     Df = jacobian(hk.Symplectic, case, n)
@@ -158,6 +158,7 @@ def test_odd_dimensions_are_allowed_where_the_structure_allows_them(case):
     assert divergence(jacobian(hk.DivergenceFree, case, 3)) < STRUCTURE
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("n", [2, 4, 6])
 def test_other_structures_fail_the_same_checks(n):
     separable, symplectic = (jacobian(K, BARE, n) for K in (hk.Separable, hk.Symplectic))
@@ -171,7 +172,7 @@ def test_other_structures_fail_the_same_checks(n):
         assert divergence(Df) > 1e-2
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(4)
 @EVERYWHERE
 def test_odd_symplectic_fields_are_odd_and_hamiltonian(case, n):
     field = seen(odd_symplectic, case, n)
@@ -220,6 +221,7 @@ def test_odd_fields_have_even_potentials_and_even_fields_odd_ones():
             np.testing.assert_allclose(H(-x), sign * H(x), rtol=STRUCTURE)
 
 
+@pytest.mark.few(6)
 @EVERYWHERE
 def test_the_field_is_the_gradient_of_its_own_potential(case, n):
     field = seen(hk.Symplectic, case, n)
@@ -283,7 +285,7 @@ def test_blocks_are_b_times_the_mixed_derivative_times_b_transposed(case):
         np.testing.assert_allclose(block, expected, atol=tolerance * max(1.0, np.abs(M).max()))
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(4)
 @EVERY
 def test_blocks_of_swapped_points_are_transposed(case):
     x, z = states(4)[0], states(4, seed=2)[0]
@@ -407,6 +409,7 @@ class Skew(AbstractPotentialKernel):
         return self.apply(x, v)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("parity", [None, hk.Odd], ids=["bare", "odd"])
 def test_an_operator_may_depend_on_the_state(parity):
     rng = np.random.default_rng(0)

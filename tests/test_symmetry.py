@@ -63,7 +63,7 @@ def off(field, S, sign=1.0):
     return np.abs(there - sign * here @ S.T).max() / np.abs(here).max()
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @every_group
 def test_fields_have_the_symmetry_to_rounding_and_plain_ones_have_not(name):
     k, maps, same, reversed_, order, one_sided = GROUPS[name]
@@ -80,7 +80,7 @@ def test_fields_have_the_symmetry_to_rounding_and_plain_ones_have_not(name):
     assert found.is_one_sided(4) is one_sided
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @every_group
 def test_products_without_the_group_are_those_of_the_gram(name):
     k, maps, *_ = GROUPS[name]
@@ -94,6 +94,7 @@ def test_products_without_the_group_are_those_of_the_gram(name):
     assert np.linalg.eigvalsh(matrix).min() > -1e-12
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("structure", [hk.CurlFree, hk.PortHamiltonian, hk.Separable])
 def test_other_structures_have_the_same_products(structure):
     K = structure(hk.Invariant(G, [C3, MIRROR]))

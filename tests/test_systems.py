@@ -230,6 +230,7 @@ def test_oscillator_has_the_closed_form_solution():
     np.testing.assert_allclose(X, exact, rtol=0, atol=TRAJECTORY)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("amplitude", [1e-3, 1.0, 3.0])
 def test_pendulum_returns_after_its_exact_period(amplitude):
     small = 2 * np.pi * np.sqrt(LENGTH / GRAVITY)

@@ -615,6 +615,7 @@ def test_a_start_where_the_kernel_is_not_positive_definite_does_not_win():
     np.testing.assert_allclose(tuned.loss, fitted, rtol=SAME)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize(("copies", "solver"), [(1, None), (3, hk.Cholesky()), (3, hk.Nystrom())])
 def test_a_kernel_that_is_positive_definite_nowhere_is_named_as_the_cause(copies, solver):
     X, Y = (np.tile(values, (copies, 1)) for values in scattered())

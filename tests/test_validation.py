@@ -67,7 +67,7 @@ def regularised(K, X, ridge: float) -> np.ndarray:
 # The closed form.
 
 
-@pytest.mark.few(9)
+@pytest.mark.few(6)
 @pytest.mark.parametrize("structure", STRUCTURES)
 @pytest.mark.parametrize("folds", FOLDS)
 @pytest.mark.parametrize("n", [2, 4])
@@ -180,6 +180,7 @@ def test_loss_does_not_depend_on_the_order_of_points_that_keep_their_labels():
 # The other objectives.
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("structure", STRUCTURES)
 @pytest.mark.parametrize("n", [2, 4])
 def test_generalized_cross_validation_is_its_definition(structure, n):
@@ -193,6 +194,7 @@ def test_generalized_cross_validation_is_its_definition(structure, n):
     np.testing.assert_allclose(loss, expected, rtol=EXACT)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("structure", STRUCTURES)
 @pytest.mark.parametrize("n", [2, 4])
 def test_log_marginal_likelihood_is_the_density_of_scipy_with_noise_variance_n_lambda(structure, n):
@@ -352,6 +354,7 @@ def test_nan_hyperparameters_give_infinity():
 # Transformations.
 
 
+@pytest.mark.few(1)
 @of_each_formula
 def test_objectives_map_over_hyperparameters(name):
     X, Y = data()
@@ -366,6 +369,7 @@ def test_objectives_map_over_hyperparameters(name):
     np.testing.assert_allclose(np.diag(grid), expected, rtol=EXACT)
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_new_values_do_not_recompile(name):
     traced = []
@@ -461,6 +465,7 @@ def test_every_lapack_call_of_a_loss_and_its_gradient_waits_for_the_one_before()
     assert all(one in before for (one, _), (_, before) in itertools.pairwise(calls))
 
 
+@pytest.mark.few(1)
 @of_each_formula
 def test_float32_data_gives_float32_losses(name):
     X, Y = (each.astype(np.float32) for each in data())
@@ -523,8 +528,9 @@ def test_bad_kernels_data_and_ridges_are_refused(name):
         objective(K, X[:, :1], Y[:, :1], RIDGE)
 
 
-@pytest.mark.parametrize("count", [240, 243])  # strips of 60 points, and 3 that are left
+@pytest.mark.parametrize("count", [pytest.param(240, marks=pytest.mark.slow), 243])
 def test_the_gradient_over_many_strips_of_the_gram_is_that_of_differences(count):
+    # Strips of 60 points, and of 243 three that are left.
     rng = np.random.default_rng(0)
     X, Y = rng.uniform(-3, 3, size=(count, 2)), rng.normal(size=(count, 2))
 
