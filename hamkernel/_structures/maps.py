@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._kernels.base import Invariance
 from hamkernel._kernels.groups import matrix_of
-from hamkernel._kernels.transforms import symmetries
+from hamkernel._kernels.symmetry import symmetries
 
 
 def _operators(K: Any, X: Float[Array, "N n"]) -> Float[np.ndarray, "N n n"]:
@@ -27,7 +27,7 @@ def _evaluated(K: Any, X: Float[Array, "N n"]) -> Float[Array, "N n n"]:
 _compiled = eqx.filter_jit(_evaluated)
 
 
-def check_symmetries(K: Any, X: Float[Array, "N n"]) -> None:
+def check_symmetries(K: Any, X: Float[Array | np.ndarray, "N n"]) -> None:
     """ValueError unless B(Sx) = ± S B(x) Sᵀ for the maps S of the kernel, at these points."""
     n = X.shape[1]
     constant = Invariance.TRANSLATION in K.operator_invariance
@@ -35,7 +35,10 @@ def check_symmetries(K: Any, X: Float[Array, "N n"]) -> None:
     found = {each: matrix_of(each, n) for each in maps}
     if constant:  # S = ±1 is a symmetry of every B
         found = {e: S for e, S in found.items() if not np.array_equal(S, S[0, 0] * np.eye(n))}
-    if found:
+    if not found:
+        return
+    with jax.ensure_compile_time_eval():
+        X = jnp.asarray(X)
         here = _operators(K, X)
         for S in found.values():
             moved = jnp.asarray(np.asarray(X) @ S.T, X.dtype)
