@@ -34,7 +34,7 @@ def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
 def Even(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
     """The kernel of the even fields with the structure of K, f(−x) = f(x).
 
-    Like `Odd`, with an odd potential: H(−x) = −H(x).
+    As `Odd`, with an odd potential: H(−x) = −H(x).
 
     Raises:
         TypeError: K is not matrix-valued.
