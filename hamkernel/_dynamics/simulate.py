@@ -53,9 +53,9 @@ def simulate(
             `GaussLegendre4`, `GaussLegendre6` for every H; `StormerVerlet`, `Yoshida4` for
             H = T(p) + U(q).
         dt: the largest step; required by a symplectic solver.
-        rtol: relative tolerance of the adaptive step. If None, 1e-10, and 1e-5 in float32; of a
-            learned field no less than its rounding at x0, ε ‖Σⱼ |K(x0, xⱼ) aⱼ|‖ / ‖f(x0)‖, and at
-            most 1e-6: steps that are asked for more digits than the field has are all rejected.
+        rtol: relative tolerance of the adaptive step. If None, 1e-10, and 1e-5 in float32; for a
+            learned field at least its rounding at x0, ε ‖Σⱼ |K(x0, xⱼ) aⱼ|‖ / ‖f(x0)‖, and at most
+            1e-6: with a tolerance below the rounding every step would be rejected.
         atol: absolute tolerance, likewise, in the units of x.
         max_steps: the most steps of the whole solve, or between two saved times where `dt` is given
             and it or `ts` is traced. If None, enough where the number is known, else 2²⁰. It bounds
@@ -65,8 +65,8 @@ def simulate(
             For `jax.jvp` and `jax.jacfwd` pass `diffrax.ForwardMode()`, for `jax.hessian`
             `diffrax.DirectAdjoint()`.
         throw: raise if the solve fails. If False, look at `.result`.
-        inputs: u of a field (x, u) ↦ ẋ: a function t ↦ (m,) of the time as it is in ts, or samples
-            (T, m) at ts. An explicit time is one: `inputs=lambda t: jnp.array([t])`.
+        inputs: u of a field (x, u) ↦ ẋ: a function t ↦ (m,) of the time of ts, or samples (T, m) at
+            ts. For explicit time pass `inputs=lambda t: jnp.array([t])`.
         between: samples are "held" until the next one, or "linear" in between.
 
     Returns:
@@ -77,9 +77,9 @@ def simulate(
             that cannot estimate its error without `dt`; a splitting of a field that is not known to
             be separable; more steps of `dt` than `max_steps`; inputs that are missing, of another
             shape, or together with a symplectic solver.
-        TypeError: `field` is no function of one JAX array that returns one, of the same dtype;
-            `solver` or `adjoint` is none of Diffrax; x0 is of less precision than float32; forward
-            mode through the default adjoint.
+        TypeError: `field` does not map one JAX array to another of the same dtype; `solver` or
+            `adjoint` is not one of Diffrax; x0 has less precision than float32; forward mode
+            through the default adjoint.
         RuntimeError: the solve failed: too many steps, the implicit equations of a step did not
             converge, or the state overflowed. Usually the remedy is a smaller `dt`.
     """

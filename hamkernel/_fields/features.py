@@ -25,7 +25,8 @@ class FeatureField(AbstractField):
 
     Attributes:
         kernel: K, which the features approximate.
-        features: φ, with frequencies and amplitudes.
+        features: φ, with frequencies and amplitudes; `F = field.features(X)`, shape (N, n, r),
+            holds φ_r(xᵢ), so `jnp.einsum("iar,jbr->iajb", F, F)` is the Gram of the approximation.
         weights: w, shape (r,).
         residual: yᵢ − f(xᵢ) at the training data, shape (N, n); of shape (0, n) after a fit to a
             stream, which is not kept.

@@ -85,7 +85,7 @@ class Gaussian(AbstractRadialKernel):
     Raises:
         ValueError: a lengthscale is not positive and finite.
 
-    Source: Smith & Egeland (2023), eq. (scalar_gaussian_kernel).
+    Source: Smith & Egeland (2023), section 4.
     """
 
     log_lengthscale: Float[Array, "..."]

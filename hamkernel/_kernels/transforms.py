@@ -22,12 +22,12 @@ class Warp(AbstractScalarKernel):
     Args:
         kernel: a scalar kernel on the warped coordinates, shape (m,).
         fn: a smooth map (n,) -> (m,), written with jax.numpy; the array leaves of an Equinox
-            module are trained. Define it once: a lambda made anew for each kernel is another
-            function to JAX, and compiles anew.
+            module are trained. Define it once: JAX treats a new lambda as a new function and
+            compiles again.
 
     Raises:
-        TypeError: `kernel` is no scalar kernel, or `fn` no function. ValueError, when called: `fn`
-            returns no vector.
+        TypeError: `kernel` is not a scalar kernel, or `fn` not a function. ValueError, when called:
+            `fn` does not return a vector.
 
     Example: `Warp(Gaussian(1.0), lambda x: jnp.array([jnp.cos(x[0]), jnp.sin(x[0]), x[1]]))`
     for a state (angle, momentum) on a cylinder.
@@ -86,8 +86,8 @@ class Select(AbstractScalarKernel):
         dims: distinct coordinates, integers ≥ 0.
 
     Raises:
-        TypeError: `kernel` is no scalar kernel. ValueError: `dims` are no such coordinates, or,
-            when called, the points have none of that number.
+        TypeError: `kernel` is not a scalar kernel. ValueError: `dims` are not such coordinates, or,
+            when called, not those of the points.
     """
 
     kernel: AbstractScalarKernel

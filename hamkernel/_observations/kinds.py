@@ -36,8 +36,8 @@ class Velocities(AbstractObservations):
 
     Args:
         X: states, shape (N, n).
-        Y: velocities, shape (N, n), in units of X per unit of time. NaN is a component that was
-            not measured; it takes no row.
+        Y: velocities, shape (N, n), in units of X per unit of time. NaN marks a component that was
+            not measured; it adds no row.
         noise: relative standard deviations, positive: one number, one for each coordinate, shape
             (n,), or one for each component, shape (N, n); 1 if None. Those of components that
             were not measured have no effect.
@@ -88,7 +88,7 @@ class Velocities(AbstractObservations):
 
 
 class Energies(AbstractObservations):
-    """Values of the potential, Eᵢ = H(xᵢ) + c + noise, with one constant c that nobody knows.
+    """Values of the potential, Eᵢ = H(xᵢ) + c + noise, with one unknown constant c.
 
     The constant is estimated with the field, as generalised least squares do. It is the same for
     all energies in a sum of observations, and takes one of the rows. With a `Controlled` kernel H
@@ -98,7 +98,7 @@ class Energies(AbstractObservations):
         X: states, shape (N, n).
         E: energies there, shape (N,): of H for `Symplectic`, of the potential for `CurlFree`.
         noise: relative standard deviations, one number or shape (N,); 1 if None. A row has the
-            variance noise² Nλ in the squared units of E, so it says how energies weigh against
+            variance noise² Nλ in the squared units of E, which sets the weight of energies against
             velocities.
 
     Raises:

@@ -49,16 +49,16 @@ def condition(
     mean: Mean | None = None,
     inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Posterior:
-    """The Gaussian process with prior GP(mean, K), given data: `fit` that keeps its factor.
+    """Condition the Gaussian process GP(mean, K) on data: `fit` with error bars.
 
-    Its field is that of `fit`. How far that may be off is told in the units of the data, and only
-    as well as the amplitude of K and λ are: tune both by the marginal likelihood first,
+    The posterior mean is the field of `fit`. Its uncertainty is only as good as the amplitude of K
+    and λ, so tune both by the marginal likelihood first:
 
         tuned = hk.tune(hk.Symplectic(1.0 * k), X, Y, objective="marginal_likelihood")
         posterior = hk.condition(tuned.kernel, X, Y, tuned.regularization)
 
-    They are plugged in as if they were known, so that bands are somewhat too narrow, and those of
-    orbits more than those of H.
+    Hyperparameters are treated as known, so bands are somewhat too narrow, those of orbits more so
+    than those of H.
 
     Args:
         K: a matrix-valued kernel, with an amplitude: `2.0 * k`.
@@ -66,7 +66,8 @@ def condition(
         Y: velocities, shape (N, n).
         regularization: λ > 0; Nλ is the variance of the noise of a row of relative noise 1.
         solver: `Cholesky()` if None, exact, or a solver of low rank: `Nystrom(…)`, whose field is
-            approximate where its landmarks are few, and which claims no knowledge far from them,
+            approximate if its landmarks are few, and whose deviation far from them is that of the
+            prior,
             or `RandomFeatures(…)`, whose prior is that of its features.
         mean: what is known already, x (n,) -> (n,), as in `fit`.
         inputs: of a `Controlled` kernel: u at each state, shape (N, m). What is asked of f is then
@@ -94,14 +95,13 @@ def condition(
 
 
 class Posterior(eqx.Module):
-    """A field learned from data, and how far it may be off; made by `condition`.
+    """A field learned from data, with its uncertainty; made by `condition`.
 
-    It is a PyTree. Its methods take one state, and work under jit, vmap and, with respect to
-    states, under grad.
+    A PyTree. Its methods take one state and work under jit, vmap and, with respect to states, grad.
 
     Attributes:
-        given: what the solver keeps of the data, less the mean.
-        field: the mean of all fields that agree with the data, as `fit` gives it.
+        given: what the solver keeps of the data, minus the prior mean.
+        field: the posterior mean, the field that `fit` returns.
     """
 
     given: AbstractConditional
@@ -145,7 +145,7 @@ class Posterior(eqx.Module):
     ) -> Float[Array, " n"]:
         """The standard deviation of each component of f(x) or f(x, u), in units of Y.
 
-        Of the field, not of a new measurement, which has the noise Nλ besides.
+        This is that of the field, not of a new measurement, which adds noise of variance Nλ.
 
         Args:
             x: one state, shape (n,).
@@ -160,13 +160,13 @@ class Posterior(eqx.Module):
     def energy_deviation(
         self, x: Num[ArrayLike, " n"], x0: Num[ArrayLike, " n"]
     ) -> Float[Array, ""]:
-        """The standard deviation of H(x) − H(x₀), or of that difference of another potential.
+        """The standard deviation of H(x) − H(x₀), or of the difference of another potential.
 
-        Of a field with inputs it is the H of the drift.
+        For a field with inputs H is that of the drift.
 
         Args:
             x: one state, shape (n,).
-            x0: the state that energies are counted from, shape (n,).
+            x0: the reference state, shape (n,).
 
         Raises:
             AttributeError: the structure, or the mean, has no potential (with the reason).
@@ -188,10 +188,10 @@ class Posterior(eqx.Module):
         *,
         inputs: Num[ArrayLike, "M m"] | None = None,
     ) -> Posterior:
-        """The posterior that has seen more data: that of conditioning on all, at less cost.
+        """The posterior given more data: the same as conditioning on all of it, at less cost.
 
-        The variance of a row stays, σ² = Nλ, and so λ becomes σ² over the number of all
-        observations. O(D² M) time for M new rows.
+        The noise variance σ² = Nλ stays, so λ becomes σ² divided by the number of all observations.
+        O(D² M) time for M new rows.
 
         Args:
             X: states, shape (M, n), or observations, and then there is no Y.
@@ -225,7 +225,7 @@ class Posterior(eqx.Module):
         count: int,
         region: Num[ArrayLike, "2 n"],
     ) -> AbstractField:
-        """Draw whole fields that agree with the data: each an ordinary one, with one Hamiltonian.
+        """Draw whole fields that agree with the data, each with its own Hamiltonian.
 
         They come as one PyTree whose arrays have a leading axis, to be mapped over:
 
@@ -234,9 +234,9 @@ class Posterior(eqx.Module):
 
         In the region, and at the data, their mean and covariance are those of the posterior. Far
         outside they have errors of a few per cent for kernels with a spectrum, which are those
-        that `RandomFeatures` takes; of another kernel they are wrong there, with too little
-        spread, so take a region that the orbits do not leave. Fields with inputs are drawn whole,
-        drift and G, and are affine in u: the region is one of states, and u may be any.
+        that `RandomFeatures` takes; for other kernels they are wrong there, with too little spread,
+        so choose a region that the orbits do not leave. Fields with inputs are drawn whole, drift
+        and G, and are affine in u: the region is one of states, and u may be any.
 
         Args:
             key: the random key.

@@ -92,30 +92,30 @@ def fit(
 
     Args:
         K: a matrix-valued kernel, for example `Odd(Symplectic(Gaussian(3.0)))`.
-        X: states, shape (N, n); or observations of any kind, and then there is no Y:
+        X: states, shape (N, n); or observations of any kind, without Y:
             `hk.fit(K, hk.Velocities(X, Y) + hk.Energies(Z, E), regularization=1e-4)`. With X and Y
             they are `hk.Velocities(X, Y)`.
         Y: measured velocities, shape (N, n), in units of X per unit of time.
         regularization: λ > 0, in squared units of Y over those of the kernel. With other
             observations Nλ is the variance of a row of relative noise 1, and N counts points of
             velocities and equilibria, energies and functionals.
-        solver: if None, `Cholesky()` where its three matrices of (N n)² numbers take at most half
-            of the memory, else `ConjugateGradient()`; both are exact, and `field.info.solver` says
-            which it was. `Nystrom()` is faster, and approximate to a stated tolerance. Where the
-            rows of X are spread over a mesh of devices they stay there, and None is
+        solver: if None, `Cholesky()` if its three matrices of (N n)² numbers take at most half of
+            the memory, else `ConjugateGradient()`; both are exact, and `field.info.solver` names
+            the one used. `Nystrom()` is faster, and approximate to a stated tolerance. If the rows
+            of X are sharded over a mesh of devices they stay there, and None means
             `ConjugateGradient()`; only `Cholesky()` gathers them on one device.
-        mean: what is known already, x (n,) -> (n,): a learned field, one of `hk.systems`, any
-            function of one state. The kernel learns what is left, and the field has both; it has a
-            Hamiltonian where both have.
-        throw: whether a solve that fails raises. If not, what is learned is NaN, `field.norm` among
-            it: for `jax.vmap` over many hyperparameters, where one failure would end them all, and
-            for objectives of your own in `tune`, which steps back from NaN.
+        mean: the known part of the field, x (n,) -> (n,): a learned field, one of `hk.systems`, any
+            function of one state. The kernel learns the rest, and the field is the sum; it has a
+            Hamiltonian if both parts have one.
+        throw: whether a failed solve raises. If False, the learned field is NaN, and so is
+            `field.norm`: for `jax.vmap` over many hyperparameters, where one failure would end them
+            all, and for your own objectives in `tune`, which turns away from NaN.
         inputs: of a `Controlled` kernel: u at each state, shape (N, m). What is learned is then a
             `ControlledField`, field(x, u).
 
     Returns:
         The learned field. Works under jit, vmap and grad, with respect to every argument; new
-        values of hyperparameters or λ do not recompile, but for `Nystrom()` where they change the
+        values of hyperparameters or λ do not recompile, except with `Nystrom()` if they change the
         number of landmarks.
 
     Raises:
@@ -125,8 +125,7 @@ def fit(
             AttributeError: energies, of a structure or a mean that has no potential. RuntimeError:
             the ridge is too small for this Gram (the text says what to do).
 
-    Source: Smith & Egeland (2023), eq. (vector_valued_regular_least_squares_a_equation), where
-        "Nλ a_j" should read "Nλ a_i".
+    Source: Smith & Egeland (2023), section 3, where "Nλ a_j" should read "Nλ a_i".
     """
     K = matrix_kernel(K)
     check_solver(solver)

@@ -157,8 +157,8 @@ class AbstractMatrixKernel(eqx.Module):
 class Sum(AbstractMatrixKernel):
     """K₁(x, z) + K₂(x, z) + …: fields that are sums of fields with different structures.
 
-    `K1 + K2` makes one with positions; `Sum(conservative=K1, rest=K2)` one with names. After a
-    fit `field.part("rest")` or `field.part(1)` is the part alone.
+    `K1 + K2` numbers its parts; `Sum(conservative=K1, rest=K2)` names them. After a fit,
+    `field.part(1)` or `field.part("rest")` is one part alone.
 
     Args:
         terms: matrix-valued kernels; a sum among them is taken apart.

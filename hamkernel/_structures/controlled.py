@@ -45,7 +45,7 @@ class Constant(AbstractScalarKernel):
 
 
 class InputMatrix(eqx.Module):
-    """What is believed of an unknown input matrix G(x), shape (n, m).
+    """The prior of an unknown input matrix G(x), shape (n, m).
 
     Its entries are independent functions in the RKHS of one scalar kernel, in the rows `acts_on`;
     the other rows are zero: a torque changes momenta and not positions.
@@ -104,11 +104,11 @@ class Controlled(AbstractMatrixKernel):
     with U of shape (N, m). The field is `field(x, u)`; `field.drift(x)` is f, with its Hamiltonian
     and everything else that a field of K has, and `field.input_matrix(x)` is G.
 
-    Time is an input as any other: with U the values of t, or of cos ωt and sin ωt, the field is
+    Time is an input like any other: with U the values of t, or of cos ωt and sin ωt, the field is
     f(x) + G(x) u(t), and `hk.simulate(field, x0, ts, inputs=lambda t: jnp.array([t]))` follows it.
 
-    An input that is the same in all data cannot be told from the drift, and is refused unless G is
-    known: vary it.
+    An input that is constant over all data cannot be distinguished from the drift, and is refused
+    unless G is known: vary it.
 
     Args:
         drift: K, the structured kernel of f.

@@ -18,8 +18,8 @@ class UnknownMasses(AbstractMatrixKernel):
     """K′(y, z) = S⁻¹ K(Sy, Sz) S⁻ᵀ: states y = (q, q̇) of a structure for x = Sy = (q, p).
 
     S = diag(1, …, 1, m₁, …, mₘ), one mass for each degree of freedom, and a field f of K for (q, p)
-    is S⁻¹f(Sy) for (q, q̇). The masses are trained as every hyperparameter; only their ratios can
-    be found, since H and all masses times a number move nothing else, so the first one is 1.
+    is S⁻¹f(Sy) for (q, q̇). The masses are hyperparameters; only their ratios can be identified,
+    since scaling H and all masses together changes no motion, so the first one is 1.
     `field.hamiltonian(y)` is H in that unit.
 
     Args:

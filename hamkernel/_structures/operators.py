@@ -95,9 +95,9 @@ class CurlFree(AbstractPotentialKernel):
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
 
     Raises:
-        TypeError: `kernel` is no scalar kernel.
+        TypeError: `kernel` is not a scalar kernel.
 
-    Source: Smith & Egeland (2023), eq. (curl_free_kernel_base); Fuselier (2006).
+    Source: Smith & Egeland (2023), section 4; Fuselier (2006).
     """
 
     operator_invariance: ClassVar[Invariance] = Invariance.TRANSLATION
@@ -130,9 +130,9 @@ class Symplectic(AbstractPotentialKernel):
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
 
     Raises:
-        TypeError: `kernel` is no scalar kernel. ValueError, with data: n is odd.
+        TypeError: `kernel` is not a scalar kernel. ValueError, with data: n is odd.
 
-    Source: Smith & Egeland (2023), eq. (symplectic_kernel_base); Boffi, Tu & Slotine (2022).
+    Source: Smith & Egeland (2023), section 4; Boffi, Tu & Slotine (2022).
     """
 
     operator_invariance: ClassVar[Invariance] = Invariance.TRANSLATION

@@ -22,9 +22,9 @@ _SYMMETRIC = 1e-6  # of Π at the data: rounding in float32 leaves 1e-7, a wrong
 class Structured(AbstractPotentialKernel):
     """K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ: fields f = B(x)∇H for an operator B of your own.
 
-    Everything else of the library works with it: `tune` trains the arrays in B, a field has its
+    The rest of the library works with it: `tune` tunes the arrays in B, a field has its
     `.hamiltonian(x)` and its `.dissipation(x)` = −∇HᵀB∇H, and `save` keeps the arrays. As with
-    kernels of your own, `load` needs the kernel again, for the code is not in the file.
+    kernels of your own, `load` needs the kernel again, since the file does not contain its code.
 
     Args:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
@@ -32,8 +32,8 @@ class Structured(AbstractPotentialKernel):
             Equinox module are trained; store what is positive as `log_…`.
 
     Raises:
-        TypeError: `kernel` is no scalar kernel, or `operator` no function. ValueError, with data:
-            it does not return an (n, n) array, or is not finite there.
+        TypeError: `kernel` is not a scalar kernel, or `operator` not a function. ValueError, with
+            data: it does not return an (n, n) array, or is not finite there.
 
     Example: friction that grows with the height of a pendulum,
 
@@ -79,11 +79,11 @@ class Structured(AbstractPotentialKernel):
 class Poisson(AbstractPotentialKernel):
     """K(x, z) = Π(x) [∂x ∂zᵀ k(x, z)] Π(z)ᵀ: Poisson systems f = Π(x)∇H, Π antisymmetric.
 
-    Any n, odd as well: dH/dt = ∇HᵀΠ∇H = 0, and what Π(x)∇C = 0 holds for, a Casimir, is conserved
-    by every field. `field.hamiltonian(x)` is H, known up to functions of the Casimirs. Whether Π
-    obeys the identity of Jacobi is not asked for.
+    Any n, even or odd: dH/dt = ∇HᵀΠ∇H = 0, and every field conserves the Casimirs C, Π(x)∇C = 0.
+    `field.hamiltonian(x)` is H, known up to functions of the Casimirs. Π need not satisfy the
+    Jacobi identity.
 
-    `hk.poisson` has some: `rigid_body` (n = 3), `lotka_volterra` (n = 2), and
+    Ready-made tensors in `hk.poisson`: `rigid_body` (n = 3), `lotka_volterra` (n = 2), and
     `charged_particle(B)` (n = 4 or 6). Where H is harder than f, structure loses: Lotka-Volterra in
     populations is easier for `Separable`, since H has their logarithms.
 
@@ -93,8 +93,8 @@ class Poisson(AbstractPotentialKernel):
             Equinox module are trained.
 
     Raises:
-        TypeError: `kernel` is no scalar kernel, or `tensor` no function. ValueError, with data: Π
-            is no (n, n) array, or not antisymmetric there.
+        TypeError: `kernel` is not a scalar kernel, or `tensor` not a function. ValueError, with
+            data: Π is not an (n, n) array, or not antisymmetric there.
 
     Source: Hu, Ortega & Yin (2024), arXiv 2403.10070 and 2504.13396.
     """

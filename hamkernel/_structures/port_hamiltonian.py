@@ -26,9 +26,9 @@ class PortHamiltonian(AbstractPotentialKernel):
     flow dH/dt = −∇HᵀR∇H, `field.dissipation(x)`.
 
     The friction is a hyperparameter, found by every objective of `tune` and kept with
-    `frozen="friction"`. What can be told: friction on p with ∂²H/∂p² invertible is unique. Of a
-    (nearly) linear system only the sum of the frictions on q and p is seen. A friction at the
-    lower end of its box, see `tuned.at_bounds`, means that none was seen.
+    `frozen="friction"`. Friction on p is unique if ∂²H/∂p² is invertible. In a (nearly) linear
+    system only the sum of the frictions on q and p can be identified. A friction at the lower end
+    of its box, see `tuned.at_bounds`, means that none was found.
 
     Args:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
@@ -37,7 +37,7 @@ class PortHamiltonian(AbstractPotentialKernel):
         damped: the coordinates with friction, counted from 0; the momenta if None.
 
     Raises:
-        TypeError: `kernel` is no scalar kernel. ValueError: the friction is not positive, or not
+        TypeError: `kernel` is not a scalar kernel. ValueError: the friction is not positive, or not
             one number or one per damped coordinate; `damped` are no coordinates. With data: n is
             odd, or there is no such coordinate.
 

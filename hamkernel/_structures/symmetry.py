@@ -17,8 +17,8 @@ def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
     """The kernel of the odd fields with the structure of K, f(−x) = −f(x).
 
     The SCALAR kernel inside is symmetrised: a field B∇u is odd when u is even. Exact for every
-    kernel, also without k(−x, −z) = k(x, z); twice the cost of K where that is known, four times
-    where it is not. A sum is symmetrised part by part.
+    kernel; twice the cost of K if k(−x, −z) = k(x, z) is known, else four times. A sum is
+    symmetrised part by part.
 
     Args:
         K: a structured kernel whose B does not depend on x.
@@ -26,7 +26,7 @@ def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
     Raises:
         TypeError: K is not matrix-valued.
 
-    Source: Smith & Egeland (2023), eq. (odd_symplectic_kernel), there for k(x, z) = g(x − z).
+    Source: Smith & Egeland (2023), section 4, there for k(x, z) = g(x − z).
     """
     return matrix_kernel(K, "the argument of Odd", "Odd(Symplectic(k))").with_parity(-1)
 
@@ -43,12 +43,12 @@ def Even(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
 
 
 def Reversible(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
-    """The kernel of the reversible fields J∇H: H(q, −p) = H(q, p), a film that may run backwards.
+    """The kernel of the reversible fields J∇H: H(q, −p) = H(q, p), whose motions may run backwards.
 
-    With S = diag(I, −I) they obey f(Sx) = −S f(x). Right for every H = T(p) + U(q) with an even T,
-    and false with friction, with magnetic fields and in rotating frames. Twice the cost of K where
-    k(Sx, Sz) = k(x, z) is known, four times where it is not. `Reversible(Odd(K))` is both, with a
-    group of four.
+    With S = diag(I, −I) they obey f(Sx) = −S f(x). True for every H = T(p) + U(q) with an even T;
+    false with friction, in magnetic fields and in rotating frames. Twice the cost of K if
+    k(Sx, Sz) = k(x, z) is known, else four times. `Reversible(Odd(K))` is both, with a group of
+    four.
 
     Args:
         K: `Symplectic(k)`, an odd or even one, or a sum of them.

@@ -21,9 +21,9 @@ class Separable(AbstractStructure):
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
 
     Raises:
-        TypeError: `kernel` is no scalar kernel.
+        TypeError: `kernel` is not a scalar kernel.
 
-    Source: Smith & Egeland (2023), eq. (separable_gaussian_kernel).
+    Source: Smith & Egeland (2023), section 4.
     """
 
     field_parity: ClassVar[int] = 1
@@ -59,7 +59,7 @@ class DivergenceFree(AbstractStructure):
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
 
     Raises:
-        TypeError: `kernel` is no scalar kernel. ValueError, with data: n is 1.
+        TypeError: `kernel` is not a scalar kernel. ValueError, with data: n is 1.
 
     Source: Fuselier (2006); for n = 3 it is the curl of a vector potential.
     """

@@ -61,13 +61,12 @@ def learn(
 ) -> Learned:
     """Learn a field from noisy states at times, without velocities.
 
-    A sample is the start of its run plus the integral of the field along the path. First the path
-    is a smoothed one, and then that of the field found so far, whose tangent says how samples
-    change with the field and with the start (Gauss-Newton multiple shooting). Each iteration is one
-    closed form: starts are projected out, hyperparameters and the noise of each coordinate follow
-    from the marginal likelihood, and a line search looks at ‖W(x − x̂)‖² + ‖f‖² itself. Segments
-    are 10 samples long at first, and then whole runs; where a run cannot be followed as a whole,
-    parts of it are.
+    A sample is the start of its run plus the integral of the field along the path. The path is
+    first the smoothed one, then that of the current field, linearised in the field and the start
+    (Gauss-Newton multiple shooting). Each iteration is in closed form: starts are projected out,
+    hyperparameters and the noise of each coordinate follow from the marginal likelihood, and a line
+    search checks ‖W(x − x̂)‖² + ‖f‖² itself. Segments begin with 10 samples and grow to whole runs,
+    or to parts of a run that cannot be followed as a whole.
 
     Args:
         K: a matrix-valued kernel. Its hyperparameters are the first guess. A structure without an
@@ -75,8 +74,8 @@ def learn(
         runs: what was logged; see `Runs`.
         mean: a known part of the field, x (n,) -> (n,); K learns the rest.
         noise: the standard deviation of the sensor noise, in units of the states, a number or one
-            for each coordinate, shape (n,), if it is known. Then a field that does not explain the
-            runs is noticed. If None it is found.
+            for each coordinate, shape (n,), if it is known; then a field that does not explain the
+            runs is detected. If None, it is estimated.
         solver: `hk.Nystrom(max_points=…)` sets how many landmarks carry the field; if None, 48 for
             n = 2 and 80 for n = 4, which cover the paths evenly.
         masses: whether states are (q, q̇) with unknown masses instead of (q, p). Their ratios are

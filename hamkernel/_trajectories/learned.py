@@ -64,7 +64,7 @@ class Learned(eqx.Module):
         misfit: for each run and coordinate the root mean square of (measured − fitted)/σ, shape
             (R, n); about one where the structure explains the run, NaN where nothing was measured.
         chi_squared: the sum of squares of all of them over the degrees of freedom that the fit
-            leaves, shape (). It says nothing where σ was found from the same residuals.
+            leaves, shape (). It carries no information if σ was estimated from the same residuals.
         history: one entry an iteration.
         converged: whether noise and objective settled.
         runs: what was given.

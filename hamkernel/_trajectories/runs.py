@@ -20,19 +20,19 @@ _GAP = 10.0  # times the median spacing: between such samples the path is a gues
 class Runs(eqx.Module):
     """Logged runs of one system: states at times, with noise, gaps and uneven steps.
 
-    Everything is kept as it came, no run is resampled. NaN stands for what was not measured: a
-    whole coordinate, such as the momenta of a log of positions, or single entries.
+    Runs are kept as given; none is resampled. NaN means not measured: a whole coordinate, such as
+    the momenta of a log of positions, or single entries.
 
     Args:
         times: for each run the times of its samples, shape (T,), strictly increasing.
         states: for each run the states, shape (T, n). Angles must be continuous: `np.unwrap`.
         inputs: for each run what was applied, shape (T, m), kept with the times; None if nothing.
 
-    A single run may come as bare arrays (T,) and (T, n).
+    A single run may be given as bare arrays (T,) and (T, n).
 
     Raises:
         ValueError: shapes do not fit, a run has one sample only, times do not increase, or an entry
-            is infinite. TypeError: something is no array of real numbers.
+            is infinite. TypeError: something is not an array of real numbers.
 
     Warns:
         UserWarning: a jump of 2π, a long gap, a coordinate that never moves: once, with the run.

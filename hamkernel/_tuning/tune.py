@@ -114,8 +114,8 @@ def tune(
     more. Where the runs end is compared on all data, together with the given point, and the best is
     finished there. From 2048/n points on this is done on 1024/n of them, and the best is corrected
     on all data by three more losses: each takes the time of some ten factorisations. New data of
-    the same shape does not recompile, unless `Nystrom` takes another number of landmarks. Data that
-    is spread over devices is gathered on one of them for the search; the field is fitted where the
+    the same shape does not recompile, unless `Nystrom` takes another number of landmarks. Data
+    sharded over devices is gathered on one of them for the search; the field is fitted where the
     data lies.
 
     Args:
@@ -130,10 +130,10 @@ def tune(
         objective: "cross_validation", "generalized_cross_validation", "marginal_likelihood", or
             a function (K, X, Y, regularization) -> () to minimise. The second ignores fits that
             leave less than a fifth of the residuals free, tr(I − S) < 0.2 N n, since it is 0/0
-            where a fit interpolates. For the third give K an amplitude, `1.0 * k`: built-in
-            kernels have 1, and a signal that is larger than the prior's is explained as noise. In
-            a function of your own, `hk.fit` and `hk.simulate` want `throw=False`, and the latter a
-            constant `dt`: somewhere in the box they fail, and NaN is then a point that cannot win.
+            where a fit interpolates. For the third give K an amplitude, `1.0 * k`: built-in kernels
+            have amplitude 1, and a signal larger than that is taken for noise. In a function of
+            your own, call `hk.fit` and `hk.simulate` with `throw=False`, and the latter with a
+            constant `dt`: somewhere in the box they fail, and a point with NaN cannot win.
         frozen: names of what to keep: hyperparameters, such as "lengthscale", "regularization"
             or "terms[0].kernel.scale", and parts of K, such as "rest" of Sum(rest=…). A name
             means every hyperparameter that has it in its full name, at the end or before.
@@ -150,7 +150,7 @@ def tune(
             those of the best kernel on the subset, and of the tuned one for the field.
         mean: what is known already, x (n,) -> (n,), as in `fit`.
         progress: print a line for each step: on how many points, how many runs go on, and the best
-            loss. Of an optimiser of yours say verbose=True to itself.
+            loss. For your own optimiser pass it verbose=True instead.
         inputs: of a `Controlled` kernel, shape (N, m). An objective of your own is then called
             with (K, data, None, regularization), data the velocities with their inputs.
 
@@ -166,23 +166,23 @@ def tune(
     The flat limit. When λ rests on its lower bound and a lengthscale on its upper one, the data
     asks for a polynomial: the fit is good and its hyperparameters mean little.
 
-    Units. A warning comes where the velocities of two coordinates differ 100 times in size: the
-    loss, a sum of their squares, hardly sees the smaller one. Another warning names the Python
-    floats in K, which are kept, and another says that the scale is free, where every term of K has
-    an amplitude and the objective is one of cross-validation.
+    Units. `tune` warns if the velocities of two coordinates differ 100 times in size: the loss, a
+    sum of their squares, hardly depends on the smaller one. It also warns of Python floats in K,
+    which are not tuned, and of a free scale, if every term of K has an amplitude and the objective
+    is a cross-validation.
 
     The judge. With an amplitude on the kernel and noise that is independent and of one size,
     "marginal_likelihood" finds the better field, often by a factor of two. Where the noise or the
     prior are not like that it can lose up to 40 %, and cross-validation is the safer judge: by
     runs, if there are at least six of them, else by leave-one-out, folds="loo". With three runs no
-    judge is reliably better than another. `tests/benchmarks/judges.py` measures this; fewer than
-    five labels are warned of.
+    judge is reliably better than another. `tests/benchmarks/judges.py` measures this; `tune` warns of
+    fewer than five labels.
 
     Time. A search that will take more than a minute says so before the long part of it.
 
-    The ridge. λ is never searched where rounding would decide. Unless `bounds` say what it may be,
-    or it is frozen, a wall also keeps cross-validation from fields that round so much that they
-    cannot be integrated, ‖a‖ tr(G) √ε > ‖y‖ for the coefficients a; the likelihood needs none.
+    The ridge. λ is never searched where rounding would decide. Unless λ is frozen or has `bounds`,
+    a wall also keeps cross-validation away from fields with rounding errors too large to be
+    integrated, ‖a‖ tr(G) √ε > ‖y‖ for the coefficients a; the likelihood needs none.
     """
     K = matrix_kernel(K)
     frozen = (frozen,) if isinstance(frozen, str) else frozen
