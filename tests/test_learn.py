@@ -53,7 +53,7 @@ def one_segment(seed=0, T=7):
     nodes = rng.standard_normal((1, T - 1, 3, 2))
     slopes = rng.standard_normal((1, T - 1, 3, 2))
     measured = rng.standard_normal((1, T, 2))
-    arrays = (jnp.asarray(a) for a in (spans, measured, np.ones_like(path), path[:, 0]))
+    arrays = (jnp.asarray(a) for a in (spans, measured, np.ones_like(path), np.zeros_like(path), path[:, 0]))
     segments = Segments(*arrays)
     none = jnp.zeros((1, T - 1, 2, 2))
     as_path = frozen(jnp.asarray(path), jnp.asarray(nodes), segments.spans, none)

@@ -123,7 +123,7 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
     if isinstance(node, Controlled):  # points are (x, u)
         X = X[:, : node.outputs(X.shape[1])]
     if isinstance(node, UnknownMasses):
-        X = X * np.asarray(node.scales(X.dtype))[None]
+        X = np.asarray(node.to_momenta(jnp.asarray(X)))
     for key, child in _children(node):
         if eqx.is_inexact_array(child):
             name = keystr((*path, *key)).removeprefix(".")
