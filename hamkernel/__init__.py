@@ -1,27 +1,34 @@
 """Learn Hamiltonian dynamics with structured kernels, by automatic differentiation in JAX.
 
-Where things are, in the order of the data; a folder imports from itself and those above it:
+    field = hk.fit(hk.Symplectic(hk.Gaussian(2.0)), X, Y)    # from states and velocities
+    learned = hk.learn(K, hk.Runs(times, states))            # from noisy states alone
+    tuned = hk.tune(K, X, Y)                                 # with its hyperparameters
+    posterior = hk.condition(K, X, Y, 1e-4)                  # with error bars
+    orbit = hk.simulate(field, x0, ts).ys
+
+Data flows from kernels to fields through these folders; each imports only from itself and those
+above it:
 
     _kernels      scalar kernels k(x, z), and any callable as one
-    _structures   matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, symmetries; `poisson` has tensors
+    _structures   matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, symmetries; tensors in `poisson`
     _observations what is measured, as rows of linear functionals
     _gram         the Gram: dense, as an operator, and its derivatives
     _factors      factors of G + ridge I, dense and of low rank
     _features     random Fourier features
     _checks       the test of a kernel
     _fields       what is learned: f and its potential
-    _solvers      how it is found: dense, by conjugate gradients, of low rank, from streams
-    _posterior    a field and how far it may be off
-    _validation   the losses in closed form
-    _tuning       hyperparameters by their gradients
+    _solvers      how it is solved: dense, by conjugate gradients, of low rank, from streams
+    _posterior    a field with its uncertainty
+    _validation   validation losses in closed form
+    _tuning       hyperparameters, by gradients
     _trajectories from logged runs to a field
     _dynamics     simulation
     _save         fields in files
     systems, plot, paper
                   example systems, pictures, the paper's experiments
 
-`_require` says what is wrong with an argument, `_show` how things print, and `_machine` knows the
-devices, the memory and the threads.
+`_require` checks arguments, `_show` prints objects, and `_machine` knows devices, memory and
+threads.
 """
 
 import importlib
@@ -50,10 +57,11 @@ from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
 from hamkernel._structures.base import Sum
 from hamkernel._structures.controlled import Controlled, InputMatrix
 from hamkernel._structures.masses import UnknownMasses
-from hamkernel._structures.operators import CurlFree, DivergenceFree, Separable, Symplectic
+from hamkernel._structures.operators import CurlFree, Symplectic
 from hamkernel._structures.own import Poisson, Structured
 from hamkernel._structures.port_hamiltonian import PortHamiltonian
 from hamkernel._structures.symmetry import Even, Invariant, Odd, Reversible
+from hamkernel._structures.without_potential import DivergenceFree, Separable
 from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.runs import Runs

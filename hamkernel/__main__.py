@@ -4,8 +4,8 @@ import argparse
 
 import jax
 
-# Minutes on two quiet cores: reproducing with 100 seeds, of which compiling and drawing, and tuning
-# on 20 (README, "Install").
+# Minutes on two idle cores: reproducing with 100 seeds, the part of that for compiling and drawing,
+# and tuning on 20 (README, "Install").
 _MINUTES, _FIXED_MINUTES, _TUNING_MINUTES = 1.0, 0.5, 1.0
 
 
@@ -45,7 +45,7 @@ def main() -> None:
 
 
 def _plan(out: str, seeds: int, tune: bool) -> str:
-    """What will be done, and how long it takes on two quiet cores."""
+    """What will be done, and how long it takes on two idle cores."""
     first = _FIXED_MINUTES + (_MINUTES - _FIXED_MINUTES) * seeds / 100
     lines = [
         f"Reproducing Smith & Egeland (2023) with {seeds} noise seed{'s' * (seeds > 1)}:",
@@ -53,7 +53,7 @@ def _plan(out: str, seeds: int, tune: bool) -> str:
     ]
     if tune:
         lines.append(f"  hyperparameters tuned on their data: about {_TUNING_MINUTES:.1f} min")
-    lines.append(f"on two quiet cores. Files go to {out}/.")
+    lines.append(f"on two idle cores. Files go to {out}/.")
     return "\n".join(lines)
 
 

@@ -4,8 +4,8 @@
     hk.Poisson(k, hk.poisson.lotka_volterra)        # two populations, n = 2
     hk.Poisson(k, hk.poisson.charged_particle(B))   # in a magnetic field, n = 4 or 6
 
-Each is a function x (n,) -> (n, n), and is saved with a field by its name. One of your own is any
-such function.
+Each is a function x (n,) -> (n, n), which a saved field stores by name. Any such function of your
+own will do.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ class LotkaVolterraTensor(eqx.Module):
     """Π(x, y) = [[0, −xy], [xy, 0]]: prey x and predators y, n = 2.
 
     With H = δx − γ log x + βy − α log y it gives ẋ = αx − βxy and ẏ = δxy − γy. In the logarithms
-    of the populations it is J, up to its sign, and H is far easier to learn.
+    of the populations Π is J, up to its sign, and H is far easier to learn.
     """
 
     def __repr__(self) -> str:
@@ -56,7 +56,7 @@ class LotkaVolterraTensor(eqx.Module):
 class ChargedParticleTensor(eqx.Module):
     """Π(q, p) = [[0, I], [−I, F(q)]], F v = v × B: a charge in a magnetic field B, as e·B.
 
-    p is the kinetic momentum mq̇, so that H = |p|²/(2m) + U(q) has no vector potential in it.
+    p is the kinetic momentum mq̇, so that H = |p|²/(2m) + U(q) contains no vector potential.
     """
 
     field: Any  # numbers, which are static, or a function of q
@@ -110,10 +110,9 @@ def charged_particle(
     """The tensor of a charge in a magnetic field: q̇ = ∂H/∂p, ṗ = −∂H/∂q + ∂H/∂p × B.
 
     Args:
-        magnetic_field: e·B, the charge times the field: one number for states (q, p) in a plane
-            that it stands upright on, n = 4; three for states in space, n = 6; or a function of
-            the position q that returns as many. Numbers are known and not trained: the arrays of
-            an Equinox module are.
+        magnetic_field: e·B, the charge times the field: one number for motion in a plane normal to
+            the field, n = 4; three for motion in space, n = 6; or a function of the position q that
+            returns as many. Numbers are fixed; the arrays of an Equinox module are tuned.
 
     Returns:
         Π, for `hk.Poisson(k, hk.poisson.charged_particle(2.0))`. p is the KINETIC momentum mq̇.

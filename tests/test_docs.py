@@ -43,10 +43,12 @@ def broken(site):
 
 
 @pytest.mark.slow
+@pytest.mark.ci
 @pytest.mark.filterwarnings("default")
 def test_the_site_builds_without_a_warning_and_without_a_broken_link(tmp_path, monkeypatch):
     pytest.importorskip("pdoc")
     pytest.importorskip("nbconvert")
+    pytest.importorskip("latex2mathml")
     monkeypatch.syspath_prepend(ROOT / "docs")
     import build  # pyright: ignore[reportMissingImports]
 
@@ -58,6 +60,14 @@ def test_the_site_builds_without_a_warning_and_without_a_broken_link(tmp_path, m
     # Modules have pages of their own.
     assert all((site / "hamkernel" / f"{name}.html").exists() for name in missing)
     assert (site / "search.js").exists()
+    assert "_jax.Array" not in reference  # types as they stand in the source
+    pages = {path: path.read_text() for path in site.rglob("*.html")}
+    # What a page needs is in the site: no script, style or picture from a network.
+    outside = r'<(?:script|img)[^>]* src="https?:|<link[^>]* href="https?:'
+    assert [path.name for path, page in pages.items() if re.search(outside, page)] == []
+    assert "<math" in pages[site / "notebooks" / "quickstart.html"]
+    notebooks = [page for path, page in pages.items() if path.parent.name == "notebooks"]
+    assert all('href="../index.html"' in page for page in notebooks)
 
 
 def test_a_broken_link_is_found(tmp_path):

@@ -7,6 +7,8 @@ import pytest
 
 from hamkernel._factors.dense import DenseFactor, DenseSystem
 from hamkernel._factors.low_rank import LowRankSystem
+from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
+from hamkernel._validation.folds import Partition
 
 
 def positive(D: int) -> np.ndarray:
@@ -85,3 +87,35 @@ def test_derivatives_of_the_primitives_are_those_of_jax(mode):
         "twice": lambda f: jax.jacrev(jax.grad(f)),
     }[mode]
     np.testing.assert_allclose(derivative(ours)(0.1), derivative(reference)(0.1), rtol=1e-9)
+
+
+@pytest.mark.parametrize("kind", ["dense", "low rank"])
+def test_derivatives_of_losses_are_those_of_jax(kind):
+    # Of all of them at once, each with a weight of its own. One fold has more rows than features.
+    rows, ridge = tall(12, 3)
+    y, labels = jnp.cos(jnp.arange(12.0) ** 2), np.array([0, 0, 0, 0, 1, 2])
+    partition, weights = Partition(6, labels), np.sqrt([2, 3, 5, 7, 11])
+    folds = [np.flatnonzero(np.repeat(labels == each, 2)) for each in range(3)]
+
+    def ours(rows, ridge, y):
+        A = rows @ rows.T + ridge * jnp.eye(12)
+        system = DenseSystem(A) if kind == "dense" else LowRankSystem(rows, ridge)
+        residuals, a = held_out(system, y, partition)
+        squares, trace = free_residuals(system, y)
+        return jnp.sum(residuals**2), a @ a, squares, trace, log_density(system, y)
+
+    def reference(rows, ridge, y):
+        A = rows @ rows.T + ridge * jnp.eye(12)
+        C = jnp.linalg.inv(A)
+        a = C @ y
+        left = [jnp.linalg.solve(C[np.ix_(fold, fold)], a[fold]) for fold in folds]
+        squares = sum(residual @ residual for residual in left)
+        density = -(y @ a + jnp.linalg.slogdet(A)[1] + 12 * jnp.log(2 * jnp.pi)) / 2
+        return squares, a @ a, a @ a, jnp.trace(C), density
+
+    def slopes(of):
+        total = jax.grad(lambda *at: weights @ jnp.stack(of(*at)), (0, 1, 2))
+        return jax.jit(total)(rows, ridge, y)
+
+    for found, expected in zip(slopes(ours), slopes(reference), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)

@@ -129,6 +129,14 @@ def test_one_argument_is_the_gram_of_a_set_with_itself():
     np.testing.assert_allclose(hk.gram(K, X, Z), transposed, atol=1e-12)
 
 
+def test_a_rough_kernel_does_not_feel_the_rounding_of_the_distance_of_a_point_from_itself():
+    # Of M(x, x) = 3/ℓ² I a distance of 1e-8 would take 1e-8.
+    X = np.random.default_rng(0).normal(size=(40, 4))
+    G = hk.gram(hk.CurlFree(hk.Matern(1.5, 1.2)), X)
+    own = np.einsum("iaib->iab", G)
+    np.testing.assert_allclose(own - 3 / 1.2**2 * np.eye(4), 0.0, atol=SYMMETRY)
+
+
 @pytest.mark.parametrize("name", ["gaussian", "matern2.5", "periodic"])
 def test_shift_invariant_kernels_do_not_feel_the_origin(name):
     K, X = hk.Symplectic(BY_NAME[name].make(4)), states()

@@ -121,10 +121,10 @@ def test_error_falls_with_the_nominal_order(solver, order, steps):
 
 
 class Driven(Term):
-    """A spring with a force that depends on time."""
+    """A spring whose velocity and force both depend on time."""
 
     def __call__(self, t, x, args):
-        return jnp.stack([x[1], -x[0] + jnp.sin(3 * t)])
+        return jnp.stack([x[1] + jnp.cos(2 * t), -x[0] + jnp.sin(3 * t)])
 
 
 @pytest.mark.parametrize(
@@ -132,9 +132,13 @@ class Driven(Term):
     [(ImplicitMidpoint(), 5e-3), (GaussLegendre4(), 1e-6), (StormerVerlet(), 5e-3)],
     ids=lambda value: name(value) if isinstance(value, diffrax.AbstractSolver) else None,
 )
-def test_a_force_is_taken_at_the_times_of_the_stages(solver, error):
+def test_velocity_and_force_are_taken_at_the_times_of_the_stages(solver, error):
     exact = solve_ivp(
-        lambda t, x: [x[1], -x[0] + np.sin(3 * t)], (0, 2), [1.0, 0.0], "DOP853", rtol=1e-12
+        lambda t, x: [x[1] + np.cos(2 * t), -x[0] + np.sin(3 * t)],
+        (0, 2),
+        [1.0, 0.0],
+        "DOP853",
+        rtol=1e-12,
     ).y[:, -1]
     term = diffrax.ODETerm(Driven(HenonHeiles()))
     end = integrate(solver, term, jnp.array([1.0, 0.0]), 0.0, 2.0, 40)

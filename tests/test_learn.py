@@ -5,6 +5,7 @@
 # pyright: reportOperatorIssue=false
 # Wrong types are refused here, and any field is looked into.
 
+import functools
 import itertools
 import warnings
 
@@ -14,13 +15,23 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.stats
+from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._trajectories.evidence import Model, _loss, losses, solved
+from hamkernel._trajectories.evidence import (
+    Model,
+    _loss,
+    back_substituted,
+    losses,
+    orthonormal,
+    solved,
+)
 from hamkernel._trajectories.flow import NODES, WEIGHTS, simulated
+from hamkernel._trajectories.functionals import functionals_of
 from hamkernel._trajectories.prepared import prepared
 from hamkernel._trajectories.rows import Segments, frozen, linearised
-from hamkernel._trajectories.shooting import short_cuts
+from hamkernel._trajectories.shooting import means, short_cuts
+from hamkernel._trajectories.start import jacobians
 
 K = hk.Symplectic(hk.Gaussian(1.0))
 PENDULUM = hk.systems.Pendulum(1.0, 1.0, 6.0)
@@ -53,7 +64,10 @@ def one_segment(seed=0, T=7):
     nodes = rng.standard_normal((1, T - 1, 3, 2))
     slopes = rng.standard_normal((1, T - 1, 3, 2))
     measured = rng.standard_normal((1, T, 2))
-    arrays = (jnp.asarray(a) for a in (spans, measured, np.ones_like(path), np.zeros_like(path), path[:, 0]))
+    arrays = (
+        jnp.asarray(a)
+        for a in (spans, measured, np.ones_like(path), np.zeros_like(path), path[:, 0])
+    )
     segments = Segments(*arrays)
     none = jnp.zeros((1, T - 1, 2, 2))
     as_path = frozen(jnp.asarray(path), jnp.asarray(nodes), segments.spans, none)
@@ -86,6 +100,48 @@ def test_without_a_tangent_rows_are_generalised_least_squares_on_differences():
     found = solved(kernel, jnp.full(2, np.log(sigma)), S, rows, spread)
     field = np.einsum("iajb,jb->ia", hk.gram(kernel, nodes, nodes), found.coefficients)
     np.testing.assert_allclose(field.reshape(-1), expected, rtol=1e-5, atol=1e-6)
+    used = np.trace(np.linalg.solve(A, weights @ G @ weights.T))  # of the parameters
+    np.testing.assert_allclose(found.free, len(d) - used, rtol=1e-5)
+
+
+def test_starts_are_least_squares():
+    P, r = (np.random.default_rng(0).normal(size=shape) for shape in ((2, 7, 3), (2, 7)))
+    Q, U = orthonormal(jnp.asarray(P))
+    moves = back_substituted(U, jnp.einsum("sdn,sd->sn", Q, r))
+    expected = [np.linalg.lstsq(*pair)[0] for pair in zip(P, r, strict=True)]
+    np.testing.assert_allclose(moves, expected, rtol=1e-11)
+
+
+def test_along_a_true_path_rows_and_functionals_are_the_variation_of_constants():
+    """Of ẋ = Ax + g(x): x(t) − exp(At) x(0) is the integral of exp(A(t − s)) g(x(s))."""
+    A, ts, n = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.linspace(0.0, 0.8, 9), 2
+    mean = functools.partial(jnp.matmul, jnp.asarray(A))
+    options = {"rtol": 1e-12, "atol": 1e-13, "dense_output": True}
+    true = solve_ivp(
+        lambda t, x: np.asarray(PENDULUM(x)), (0, 0.8), [1.0, 0.5], "DOP853", **options
+    )
+    x = jnp.asarray(true.sol(ts).T[None])
+    inner = (ts[:-1, None] + np.diff(ts)[:, None] * NODES).reshape(-1)
+    nodes = jnp.asarray(true.sol(inner).T.reshape(1, 8, 3, n))
+    counts = jnp.full_like(x, 4.0)
+    segments = Segments(jnp.diff(ts)[None], x, counts, jnp.zeros_like(x), x[:, 0])
+    path = frozen(x, nodes, segments.spans, jacobians(mean, nodes))
+    slopes = jax.vmap(jax.vmap(jax.vmap(PENDULUM)))(nodes)
+    rows = linearised(
+        path, slopes, means(mean, nodes), segments, jnp.array([True]), is_solution=False
+    )
+    expected = [x[0, i] - scipy.linalg.expm(A * t) @ x[0, 0] for i, t in enumerate(ts)]
+    np.testing.assert_allclose(rows.target[0], expected, atol=1e-8)
+    assert np.abs(expected).max() > 0.1
+
+    found = functionals_of(rows, np.zeros(n), mean)
+    ((block, targets),) = found.parts()
+    np.testing.assert_allclose(block.rows(jax.vmap(PENDULUM)(block.points)), targets, atol=1e-8)
+    assert len(targets) == 9 * n - n
+    # Four samples in one are one of half the noise.
+    once = rows._replace(counts=rows.counts / 4)
+    ((_, halved),) = functionals_of(once, np.full(n, np.log(0.5)), mean).parts()
+    np.testing.assert_allclose(halved, targets, rtol=1e-12)
 
 
 def test_the_likelihood_is_that_of_the_differences_but_for_a_constant():
@@ -134,6 +190,19 @@ def test_the_flow_and_its_tangent_are_exact_to_the_tolerance_of_the_integrator()
             PENDULUM, path.nodes[s, 0, 1][None], jnp.array([[0.2 * (1 - NODES[1])]]), jnp.array([8])
         )
         np.testing.assert_allclose(path.to_end[s, 0, 1], left.across[0, 0], atol=1e-9)
+
+
+def test_averaged_samples_keep_what_they_say_of_the_noise():
+    t = np.linspace(0, 6, 3000)
+    x = np.column_stack([np.sin(t), np.cos(t)])
+    noise = np.array([0.02, 0.05])
+    data = prepared(hk.Runs(t, x + noise * np.random.default_rng(0).standard_normal(x.shape)), None)
+    run = data.runs[0]
+    assert run.counts.sum(axis=0).tolist() == [3000, 3000]
+    assert len(run.times) < 300
+    # Within blocks, with one degree of freedom less for each of their means: to 1/√6000.
+    pooled = np.sqrt(run.scatter.sum(axis=0) / (run.counts - 1).sum(axis=0))
+    np.testing.assert_allclose(pooled, noise, rtol=0.05)
 
 
 # What is learned. One shape, so that it is compiled once.

@@ -131,7 +131,7 @@ def test_what_has_no_masses_to_find_is_refused():
         hk.UnknownMasses(hk.Symplectic(G), [1.0, -1.0])
     with pytest.raises(ValueError, match="must be symmetric"):
         hk.UnknownMasses(hk.Symplectic(G), [[1.0, 0.5], [0.0, 1.0]])
-    with pytest.raises(ValueError, match="positive definite.* lowest eigenvalue is -1"):
+    with pytest.raises(ValueError, match=r"positive definite.* lowest eigenvalue is -1"):
         hk.UnknownMasses(hk.Symplectic(G), [[1.0, 2.0], [2.0, 1.0]])
     with pytest.raises(TypeError, match="must be a matrix-valued kernel"):
         hk.UnknownMasses(G, [1.0, 1.0])

@@ -244,6 +244,16 @@ def test_other_solvers_find_the_field_of_the_dense_one(name):
     np.testing.assert_allclose(*changes, atol=1e-4)
 
 
+def test_conjugate_gradients_of_rows_are_preconditioned():
+    X = np.random.default_rng(0).uniform(-2, 2, size=(40, 2))
+    data = hk.Velocities(X, np.sin(X[:, ::-1]), noise=np.array([1.0, 0.5]))
+    solver = hk.ConjugateGradient(tolerance=1e-10)
+    field = hk.fit(K, data, regularization=1e-4, solver=solver)
+    exact = hk.fit(K, data, regularization=1e-4)
+    np.testing.assert_allclose(field.evaluate(X), exact.evaluate(X), atol=1e-7)
+    assert field.info.iterations <= 16  # 8, and more than 100 without
+
+
 def test_random_features_learn_from_every_kind_what_their_own_kernel_learns(key):
     solver = hk.RandomFeatures(40, key)
     field = hk.fit(K, EVERYTHING, regularization=RIDGE, solver=solver)

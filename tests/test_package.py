@@ -128,6 +128,28 @@ def test_no_two_files_import_each_other():
     assert list(graphlib.TopologicalSorter(graph).static_order())  # raises on a cycle
 
 
+MOST_LINES, MOST_LINES_OF_A_FUNCTION = 300, 60
+
+
+def lengths(path):
+    """The lines of a file, and of each of its functions without the docstring."""
+    text = path.read_text()
+    found = {}
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.FunctionDef):
+            lines = len(ast.unparse(node.body[0]).splitlines()) if ast.get_docstring(node) else 0
+            found[node.name] = (node.end_lineno or 0) - node.lineno + 1 - lines
+    return len(text.splitlines()), found
+
+
+def test_files_and_functions_fit_on_a_few_screens():
+    for path in SOURCES:
+        lines, functions = lengths(path)
+        assert lines <= MOST_LINES, f"{path} has {lines} lines: it has more than one idea"
+        for name, length in functions.items():
+            assert length <= MOST_LINES_OF_A_FUNCTION, f"{path}: {name} has {length} lines"
+
+
 FORBIDDEN = ("jax._src", "equinox.internal", "jaxopt", "cola")
 
 

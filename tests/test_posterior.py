@@ -55,7 +55,7 @@ def test_the_covariance_of_energies_differentiated_twice_is_that_of_the_field(po
 
     J = canonical(2)
     x = jnp.asarray(INSIDE)
-    mixed = jax.jacfwd(jax.jacfwd(energies, 0), 1)(x, x)
+    mixed = jax.jit(jax.jacfwd(jax.jacfwd(energies, 0), 1))(x, x)
     np.testing.assert_allclose(J @ mixed @ J.T, posterior.covariance(x), atol=1e-8)
 
 

@@ -116,6 +116,12 @@ def test_the_smoother_is_a_dense_gaussian_process_with_missing_entries():
                 dense(coordinate, t + h, own) @ np.linalg.solve(A, y) for h in (1e-5, -1e-5)
             )
             np.testing.assert_allclose(paths.slope[r, :T, c], (later - sooner) / 2e-5, atol=1e-6)
+            # Of the slope a priori λ²σ²/5, the curvature of the kernel at r = 0.
+            prior = np.exp(2 * coordinate.process.log_rate) * dense(coordinate, t[:1], t[:1]) / 5
+            slopes = (dense(coordinate, t + 1e-5, own) - dense(coordinate, t - 1e-5, own)) / 2e-5
+            variance = np.diag(prior - slopes @ np.linalg.solve(A, slopes.T))
+            found_there = paths.slope_deviation[r, :T, c] ** 2
+            np.testing.assert_allclose(found_there, variance, atol=1e-6)
 
 
 def test_the_likelihood_is_that_of_scipy():

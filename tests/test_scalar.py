@@ -448,6 +448,15 @@ def test_select_takes_one_coordinate_or_several(dims):
     )
 
 
+def test_select_keeps_the_order_of_its_coordinates():
+    x, z = jnp.array([0.3, -1.0, 0.5]), jnp.array([0.8, -0.1, 0.4])
+    k = hk.Gaussian(np.array([1.0, 2.0]))
+    expected = math.exp(-(0.1**2 + 0.25**2) / 2)
+    np.testing.assert_allclose(hk.Select(k, (2, 0))(x, z), expected, rtol=ROUNDING)
+    expected = math.exp(-(0.9**2 + 0.25**2) / 2)
+    np.testing.assert_allclose(hk.Select(k, (1, 0))(x, z), expected, rtol=ROUNDING)
+
+
 def test_select_beyond_the_last_coordinate_is_refused():
     with pytest.raises(ValueError, match=r"coordinates \(0, 2\) and the point has 2"):
         hk.Select(hk.Gaussian(), (0, 2))(jnp.zeros(2), jnp.ones(2))

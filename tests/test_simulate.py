@@ -113,6 +113,7 @@ def test_saved_states_are_steps_and_not_interpolations():
     assert jnp.abs(field.hamiltonian(theirs) - energy).max() > 1e-5
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("solver", [diffrax.Heun(), diffrax.Tsit5()], ids=name)
 def test_any_solver_takes_constant_steps(solver):
     solution = simulate(Pendulum(), START, TIMES, solver, dt=0.01)
@@ -148,21 +149,6 @@ def test_energy_wobbles_without_drift_over_1e5_steps_only_if_symplectic(solver):
         assert drift < 3 * np.sqrt(12 / ts.size) * wobble + 1e-12
     else:
         assert drift > 2 * wobble
-
-
-def test_float32_in_is_float32_out():
-    for options in [{}, {"solver": GaussLegendre4(), "dt": 0.05}]:
-        ys = states(Pendulum(), START.astype(jnp.float32), TIMES, **options)
-        assert ys.dtype == jnp.float32
-        np.testing.assert_allclose(ys, reference(TIMES), atol=1e-4)
-
-
-def test_small_steps_survive_large_times_in_float32():
-    # Near t = 1e5 neighbouring float32 are 0.008 apart, about the step.
-    ts = 1e5 + np.linspace(0, 10, 11)
-    solution = simulate(Pendulum(), START.astype(jnp.float32), ts, GaussLegendre4(), dt=0.01)
-    assert solution.stats["num_steps"] == 1000
-    np.testing.assert_allclose(jnp.asarray(solution.ys), reference(ts - 1e5), atol=1e-4)
 
 
 @pytest.mark.few(1)
@@ -308,8 +294,8 @@ def test_splitting_of_a_bare_function_is_refused():
         with pytest.raises(ValueError, match="cannot be proved"):
             simulate(damped, START, TIMES, StormerVerlet(), dt=0.1)
 
-    ys = states(bare, START, TIMES, StormerVerlet(assume_separable=True), dt=0.1)
-    np.testing.assert_array_equal(ys, states(field, START, TIMES, StormerVerlet(), dt=0.1))
+    ys = states(bare, START, TIMES[:2], StormerVerlet(assume_separable=True), dt=0.1)
+    np.testing.assert_array_equal(ys, states(field, START, TIMES[:2], StormerVerlet(), dt=0.1))
 
 
 def test_a_compiled_field_is_the_field():
@@ -409,6 +395,7 @@ def test_failed_solves_raise_unless_told_not_to():
     assert not jnp.isfinite(jnp.asarray(stuck.ys)[1:]).any()
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("options", [{}, {"solver": Yoshida4(), "dt": 0.1}])
 def test_progress_shows_a_bar_and_changes_nothing(options, capsys):
     quiet = simulate(Pendulum(), START, TIMES, **options)
@@ -424,11 +411,14 @@ def test_diffrax_loads_only_when_a_simulation_runs():
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-@pytest.mark.parametrize("options", [{}, {"solver": GaussLegendre6(), "dt": 0.01}])
-def test_late_times_are_as_exact_as_early_ones_in_float32(options):
-    # The field does not depend on time. Near 1e5 neighbouring float32 are 0.008 apart.
+@pytest.mark.parametrize("options", [{}, {"solver": GaussLegendre4(), "dt": 0.01}])
+def test_float32_stays_float32_and_late_times_are_as_exact_as_early_ones(options):
+    # The field does not depend on time. Near 1e5 neighbouring float32 are 0.008 apart, about the
+    # constant step.
     ts = 1e5 + np.linspace(0, 5, 101)
     solution = simulate(Pendulum(), START.astype(jnp.float32), ts, **options)
+    assert jnp.asarray(solution.ys).dtype == jnp.float32
+    assert "dt" not in options or solution.stats["num_steps"] == 500
     np.testing.assert_allclose(jnp.asarray(solution.ys), reference(ts - ts[0]), atol=2e-5)
     np.testing.assert_array_equal(solution.ts, ts.astype(np.float32))
     assert (float(solution.t0), float(solution.t1)) == (ts[0], ts[-1])

@@ -13,7 +13,7 @@ from kernels import BY_NAME, canonical, difference_mixed
 
 import hamkernel as hk
 from hamkernel._features.waves import features as features_of
-from hamkernel._kernels.transforms import symmetry_removed
+from hamkernel._kernels.symmetry import symmetry_removed
 from hamkernel._save.files import load, save
 
 SYMMETRY = 1e-12
@@ -117,6 +117,29 @@ def test_the_mean_is_over_both_arguments():
     np.testing.assert_allclose(K(x, z), difference_mixed(mean, x, z), atol=1e-8)
 
 
+SHEAR = np.array([[1.0, 1.0], [0.0, -1.0]])  # its own inverse, and not orthogonal
+ALONG = hk.Select(hk.Gaussian(1.4), 0)  # depends on what the shear mixes
+
+
+@pytest.mark.parametrize(
+    ("k", "maps"),
+    [
+        (hk.Gaussian(1.4), [SHEAR]),
+        (ALONG, [SHEAR]),
+        (hk.Gaussian(np.array([0.8, 1.7])), [np.diag([1.0, -1.0]), np.eye(2)[::-1]]),
+    ],
+    ids=["shear", "a part", "one side for one map only"],
+)
+def test_any_group_of_linear_maps_gives_a_symmetric_kernel_with_the_symmetry(k, maps):
+    x, z = np.asarray(POINTS[0, :2]), np.asarray(POINTS[1, :2])
+    mean = hk.Invariant(k, maps)
+    here = mean(x, z)
+    np.testing.assert_allclose(mean(z, x), here, rtol=SYMMETRY)
+    for S in maps:
+        np.testing.assert_allclose(mean(S @ x, z), here, rtol=SYMMETRY)
+    assert abs(k(maps[0] @ x, z) - k(x, z)) > 1e-3
+
+
 def test_odd_and_even_are_the_group_of_two():
     reflected = hk.Invariant(G, [-np.eye(4)])
     np.testing.assert_allclose(
@@ -140,7 +163,10 @@ def test_reversible_and_odd_go_together_in_either_order():
 def test_a_separable_hamiltonian_stays_one_when_it_is_made_reversible():
     k = hk.Select(G, (0, 1)) + hk.Select(hk.Polynomial(2), (2, 3))
     assert hk.fit(hk.Reversible(hk.Symplectic(k)), X, Y, 1e-2).is_separable
-    assert not hk.fit(hk.Reversible(hk.Symplectic(G)), X, Y, 1e-2).is_separable
+    alone = hk.fit(hk.Reversible(hk.Symplectic(G)), X, Y, 1e-2)
+    assert not alone.is_separable
+    assert off(alone, REVERSAL, -1.0) < SYMMETRY
+    assert off(alone, -REVERSAL, -1.0) > 1e-2
 
 
 def test_symmetry_helps_where_it_is_there():

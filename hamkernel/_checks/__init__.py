@@ -1,1 +1,1 @@
-"""The test of a kernel of the user's own."""
+"""The test of a user's own kernel."""

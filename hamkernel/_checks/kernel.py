@@ -1,4 +1,4 @@
-"""Whether a scalar kernel may serve in the structured kernels, said with the cause and the cure.
+"""Whether a scalar kernel is fit for the structured kernels, and if not, the cause and the cure.
 
 Their blocks are M(x, z) = ∂x ∂zᵀ k(x, z), and every point meets itself on the diagonal of the
 Gram. There a kernel written with a distance ‖x − z‖ has a removable singularity that autodiff does
@@ -36,10 +36,10 @@ _GRAM_POINTS, _GRAM_ROWS = 64, 256  # caps on the Grams whose eigenvalues are ta
 def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     """Raise if the scalar kernel `k` is unfit for the structured kernels; return None if sound.
 
-    Looked for, in this order: a result that is not one differentiable real number; NaN or inf in
-    k, its gradient or M(x, z) = ∂x ∂zᵀ k(x, z); a block M(x, x) that is not the limit of its
-    neighbours M(x, x + h), whether zero, of rank one, or without a limit because the kernel is too
-    rough; k(x, z) ≠ k(z, x); a negative eigenvalue of the Gram of k or of M.
+    It looks for these faults, in this order: a result that is not one differentiable real number;
+    NaN or inf in k, its gradient or M(x, z) = ∂x ∂zᵀ k(x, z); a block M(x, x) that is not the limit
+    of its neighbours M(x, x + h), whether zero, of rank one, or without a limit because the kernel
+    is too rough; k(x, z) ≠ k(z, x); a negative eigenvalue of the Gram of k or of M.
 
     The neighbours are taken at 8 of the points, the eigenvalues from at most 64 of them (fewer
     where 64 n > 256, never fewer than 8), both evenly spaced in `points`, so the answer is
@@ -48,7 +48,7 @@ def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     Args:
         k: a kernel of this library or any callable (x, z) → scalar on two points of shape (n,);
             of a kernel object of tinygp, its method `evaluate`.
-        points: representative states, shape (N, n); N = 1 is enough to look at x = z only. Their
+        points: representative states, shape (N, n); N = 1 suffices to look only at x = z. Their
             spread sets the largest step h, their dtype the tolerances: an eigenvalue counts as
             negative below −ε^(2/3) of the trace (4e-11 in float64, 2e-5 in float32), or below
             the measured rounding noise of the kernel where that is larger.
@@ -200,7 +200,7 @@ def _check_symmetry(some: np.ndarray, gram: Pairs, noisy: Pairs, eps: float) -> 
 
 
 def _gap(values: np.ndarray, noisy: np.ndarray) -> float:
-    """Largest difference; a moved point that left the domain of k (NaN) says nothing."""
+    """Largest difference; a moved point that left the domain of k (NaN) does not count."""
     return float(np.abs(np.nan_to_num(noisy - values)).max())
 
 

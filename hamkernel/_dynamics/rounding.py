@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel._fields.kernel_field import KernelField
-from hamkernel._kernels.transforms import without_symmetry
+from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._structures.base import AbstractMatrixKernel
 
 # An equilibrium, where f is zero, would have no digits at all; with 1e-6 the states of a field that

@@ -22,9 +22,10 @@ from jaxtyping import Array, Float, Key
 
 from hamkernel._features.spectra import Spectrum, spectra
 from hamkernel._kernels.base import AbstractScalarKernel
-from hamkernel._kernels.transforms import symmetry_removed
+from hamkernel._kernels.symmetry import symmetry_removed
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
-from hamkernel._structures.operators import AbstractPotentialKernel, DivergenceFree, Separable
+from hamkernel._structures.operators import AbstractPotentialKernel
+from hamkernel._structures.without_potential import DivergenceFree, Separable
 
 
 class Waves(eqx.Module):

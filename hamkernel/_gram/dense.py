@@ -31,8 +31,8 @@ def gram(
         Shape (N, n, M, n). O(N M n²) time and memory: 8 (N n)² bytes in float64.
 
     Raises:
-        TypeError: K is not matrix-valued. ValueError: shapes do not fit, n is not one that the
-            structure allows, or the Gram does not fit in memory.
+        TypeError: K is not matrix-valued. ValueError: shapes do not fit, the structure does not
+            allow this n, or the Gram does not fit in memory.
     """
     K = matrix_kernel(K)
     X = require.points(X, "X")
@@ -55,8 +55,8 @@ def assemble(
     """`gram` without its checks and its own compilation."""
     X, Z = centred(K, X, Z)
     basis = jnp.eye(K.outputs(X.shape[1]), dtype=X.dtype)
-    # Entry by entry in the order of memory. Blocks of K that are then moved to their place were
-    # measured to take two to four times as long, most of it for a copy of the Gram.
+    # Entry by entry in the order of memory. Computing blocks of K and then moving them to their
+    # place was measured to take two to four times as long, most of it for a copy of the Gram.
     form = K.form
     for axis in (3, 2, 1, 0):  # b, zⱼ, a, xᵢ
         form = jax.vmap(form, in_axes=[0 if i == axis else None for i in range(4)])

@@ -36,12 +36,12 @@ def gram_operator(
     `gram_operator(K, X, Z).mv(A)[i] = Σⱼ K(xᵢ, zⱼ) aⱼ`, any kernel by automatic differentiation.
     It is a `lineax` operator: `.mv`, `.T`, `.as_matrix()` (which forms the Gram), algebra with
     other operators, and `lineax.linear_solve`. It works under jit, vmap and grad, with respect to
-    the kernel, the points and the coefficients, and derivatives need no more memory than values.
+    the kernel, the points and the coefficients; derivatives need no more memory than values.
 
     A learned field at many points is the same product: `field.evaluate(X)`.
 
-    Where the rows of X or Z are spread over a mesh of devices, each device keeps its own, and the
-    result is spread as X is.
+    If the rows of X or Z are sharded over a mesh of devices, each device keeps its own, and the
+    result is sharded like X.
 
     Args:
         K: a matrix-valued kernel.
@@ -52,8 +52,8 @@ def gram_operator(
         The operator. A product takes O(N M n) time and O((N + M) n) memory.
 
     Raises:
-        TypeError: K is not matrix-valued. ValueError: shapes do not fit, or n is not one that
-            the structure allows.
+        TypeError: K is not matrix-valued. ValueError: shapes do not fit, or the structure does
+            not allow this n.
 
     Source: the forward-over-reverse product of de Roos, Gessner & Hennig (2021) and Ament &
         Gomes (2022), here on the whole tile at once.

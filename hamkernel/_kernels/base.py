@@ -14,10 +14,12 @@ from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._kernels.ranges import by_name
 from hamkernel._show import described, exponential, in_brackets, joined, text
 
 
@@ -55,6 +57,41 @@ class AbstractScalarKernel(eqx.Module):
     @abc.abstractmethod
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
         """For each term of an additive kernel, the coordinates that it depends on."""
+
+    def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
+        """Whether k(Sx, Sz) = k(x, z) is known for ALL values of the hyperparameters.
+
+        Lengthscales that happen to be equal today say nothing, for training changes them.
+        """
+        identity = np.eye(len(S))
+        if np.array_equal(S, identity):
+            return True
+        return np.array_equal(S, -identity) and Invariance.REFLECTION in self.invariance
+
+    def summands(self, reflection: bool) -> "tuple[AbstractScalarKernel, ...]":
+        """The kernels inside that may be averaged over linear maps in place of this one.
+
+        That is so where k is linear in them; `reflection` says that x -> −x is the only map.
+        """
+        return ()
+
+    @property
+    def has_amplitude(self) -> bool:
+        """Whether a factor that is trained multiplies all of k; a None in its place is none."""
+        return False
+
+    def box(
+        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
+    ) -> tuple[ArrayLike, ArrayLike]:
+        """Where to look for the array `name`, as it is stored: the lower and the upper bound.
+
+        `X` are the data in the coordinates that k sees, and `amplitude` a fair factor before it.
+        """
+        return by_name(name, getattr(self, name), X, amplitude)
+
+    def seen(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
+        """The data in the coordinates that the kernels inside see."""
+        return X
 
     def __add__(self, other: Any) -> "ScalarSum":
         if not callable(other):
@@ -101,6 +138,16 @@ class ScalarSum(AbstractScalarKernel):
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
         return tuple(support for k in self.terms for support in k.supports(n))
 
+    def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
+        return all(k.is_unchanged_by(S) for k in self.terms)
+
+    def summands(self, reflection: bool) -> tuple[AbstractScalarKernel, ...]:
+        return self.terms
+
+    @property
+    def has_amplitude(self) -> bool:
+        return all(k.has_amplitude for k in self.terms)
+
 
 class ScalarProduct(AbstractScalarKernel):
     """k₁(x, z) k₂(x, z) …"""  # noqa: D415
@@ -122,6 +169,13 @@ class ScalarProduct(AbstractScalarKernel):
         for factor in rest:  # expand the product of the sums
             first = tuple(a | b for a in first for b in factor)
         return first
+
+    def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
+        return all(k.is_unchanged_by(S) for k in self.terms)
+
+    @property
+    def has_amplitude(self) -> bool:
+        return any(k.has_amplitude for k in self.terms)
 
 
 def common_invariance(terms: Iterable[Any]) -> Invariance:
@@ -159,6 +213,16 @@ class Scaled(AbstractScalarKernel):
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
         return self.kernel.supports(n)
+
+    def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
+        return self.kernel.is_unchanged_by(S)
+
+    def summands(self, reflection: bool) -> tuple[AbstractScalarKernel, ...]:
+        return (self.kernel,)
+
+    @property
+    def has_amplitude(self) -> bool:
+        return self.log_scale is not None or self.kernel.has_amplitude
 
 
 def _factor(kernel: AbstractScalarKernel) -> str:
@@ -206,38 +270,6 @@ def of_one_pair(fn: Callable[..., Any]) -> Callable[..., Any]:
     """`fn`; of a kernel of tinygp, which gives a whole Gram when called, the method for a pair."""
     families = {cls.__module__.partition(".")[0] for cls in type(fn).__mro__}
     return getattr(fn, "evaluate", fn) if "tinygp" in families else fn
-
-
-def one_point(x: ArrayLike) -> Float[Array, " n"]:
-    """`x` as a float array; a batch of points would silently give a wrong number."""
-    x = require.floating(x, "the point")
-    if x.ndim != 1:
-        raise ValueError(
-            f"the point has shape {x.shape}; a kernel takes one pair of points of shape (n,). Use "
-            "jax.vmap for many, or hk.gram for a Gram."
-        )
-    return x
-
-
-def divided(
-    x: Float[Array, " n"], scale: Float[Array, "..."], name: str = "lengthscale"
-) -> Float[Array, " n"]:
-    """x/scale in the dtype of x, for one point; the scale is a number, or one per coordinate."""
-    x = one_point(x)
-    if scale.ndim and scale.shape != x.shape:
-        raise ValueError(
-            f"the kernel has {scale.size} {name}s and the point has shape {x.shape}: "
-            "give one number, or one for each coordinate that the kernel sees."
-        )
-    return x / scale.astype(x.dtype)
-
-
-def log_per_coordinate(value: ArrayLike, name: str, cure: str = "") -> Float[Array, "..."]:
-    """The stored form of a positive hyperparameter that is a number, or one per coordinate."""
-    array = require.positive(value, name, cure)
-    if array.ndim > 1:
-        raise ValueError(f"{name} has shape {array.shape}; it must be a number or a vector (n,).")
-    return jnp.log(array)
 
 
 def _name(fn: Callable[..., Any]) -> str:

@@ -2,16 +2,14 @@
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import (
-    AbstractScalarKernel,
-    Invariance,
-    divided,
-    log_per_coordinate,
-    one_point,
-)
+from hamkernel._kernels.arguments import divided, log_per_coordinate, one_point
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance
+from hamkernel._kernels.groups import is_diagonal, is_orthogonal, is_permutation
+from hamkernel._kernels.ranges import by_name
 
 
 class Polynomial(AbstractScalarKernel):
@@ -49,6 +47,9 @@ class Polynomial(AbstractScalarKernel):
     @property
     def invariance(self) -> Invariance:
         return Invariance.REFLECTION
+
+    def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
+        return is_orthogonal(S)
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
         return (frozenset(range(n)),)
@@ -99,6 +100,18 @@ class Periodic(AbstractScalarKernel):
     @property
     def invariance(self) -> Invariance:
         return Invariance.TRANSLATION
+
+    def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
+        alike = self.log_lengthscale.ndim == self.log_period.ndim == 0
+        return is_permutation(S) and (alike or is_diagonal(S))
+
+    def box(
+        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
+    ) -> tuple[ArrayLike, ArrayLike]:
+        if name == "log_lengthscale":
+            # On a circle of radius 1; below 1/64 random features need too long a Fourier series.
+            return np.log(max(0.6 / len(X), 1 / 64)), np.log(60.0)
+        return by_name(name, self.log_period, X, amplitude)
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
         return (frozenset(range(n)),)

@@ -14,10 +14,13 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, divided, log_per_coordinate
+from hamkernel._kernels.arguments import divided, log_per_coordinate
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance
+from hamkernel._kernels.groups import is_diagonal, is_orthogonal
 
 _LENGTH = "It is a length in the units of the states."
 
@@ -63,6 +66,10 @@ class AbstractRadialKernel(AbstractScalarKernel):
     @property
     def invariance(self) -> Invariance:
         return Invariance.TRANSLATION
+
+    def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
+        """A lengthscale for each coordinate allows changes of sign, one for all every rotation."""
+        return is_orthogonal(S) and (self.log_lengthscale.ndim == 0 or is_diagonal(S))
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
         return (frozenset(range(n)),)

@@ -20,9 +20,9 @@ from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, FieldSum, potential_of, root
 from hamkernel._kernels.base import Invariance
-from hamkernel._kernels.transforms import symmetry_removed
+from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.blocks import Components, Values
+from hamkernel._observations.blocks import AbstractBlock, Components, Values
 from hamkernel._observations.kinds import AbstractObservations, observations, rows_of_data
 from hamkernel._show import text
 from hamkernel._solvers.cholesky import AbstractSolver, Cholesky
@@ -119,8 +119,7 @@ class Posterior(eqx.Module):
             ValueError: x is no single state of this dimension.
         """
         x = self.field._state(x)
-        here = Components(x[None])
-        return self.given.covariance(here, here)
+        return _covariance(self.given, Components(x[None]))
 
     def deviation(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
         """The standard deviation of each component of f(x), given the data, in units of Y.
@@ -154,7 +153,7 @@ class Posterior(eqx.Module):
             potential_of(self.field.mean, K)
         both = Values(jnp.stack([self.field._state(x), self.field._state(x0)]))
         change = jnp.array([1.0, -1.0], both.points.dtype)
-        return root(change @ self.given.covariance(both, both) @ change)
+        return root(change @ _covariance(self.given, both) @ change)
 
     def updated(
         self,
@@ -244,14 +243,18 @@ class Posterior(eqx.Module):
         return jax.vmap(one)(draws)
 
 
+# One by one its operations would be hundreds of small programs, which took 4 s to compile.
+@eqx.filter_jit
+def _covariance(given: AbstractConditional, block: AbstractBlock) -> Float[Array, "d d"]:
+    return given.covariance(block, block)
+
+
 def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
     """Say so where k(x, x) = 1 to the last digit, as of built-in kernels that nobody scaled."""
     if not require.is_concrete(K, X):
         return
     x = X[0]
-    for k in K.scalar_kernels:
-        found = symmetry_removed(k)
-        k = k if found is None else found.kernel
+    for k in without_symmetry(K).scalar_kernels:
         if Invariance.TRANSLATION in k.invariance and np.asarray(k(x, x)) == 1.0:
             require.warn(
                 f"the amplitude of {k!r} is exactly 1, that of a kernel nobody tuned, and "

@@ -1,42 +1,51 @@
-"""The bytes of a saved field: a zip of `.npy` arrays that ends in its own checksum.
+"""The file of a saved field: a first line with a version and a SHA-256, and the content.
 
-`numpy.load` opens it: `array_0`, `array_1`, … and `header`, a JSON text as bytes. The comment of
-the zip, the last 64 bytes, is the SHA-256 of all bytes before, so that a cut or changed file is
-found out before anything is parsed. A digest does not authenticate: whoever rewrites the file can
-rewrite its digest, so what is parsed is checked as well.
+A cut or changed file is found out before anything is parsed. A digest does not authenticate:
+whoever rewrites a file can rewrite its digest too, so what is parsed is checked as well.
 """
 
 import hashlib
-import io
-import json
-import math
 import os
 import pathlib
+import re
 import uuid
-import zipfile
 
-import numpy as np
-
-from hamkernel._save.tree import Node, allowed
-
-FORMAT, VERSION = "hamkernel field", 1
-
-_DIGEST = 64  # hexadecimal digits of SHA-256
+_VERSION = 2  # of the format; 1 was an archive of NumPy's, before the first release
+_FIRST_LINE = "hamkernel field, version {}, sha256 {}"
 
 
-def packed(header: Node, arrays: list[np.ndarray]) -> bytes:
-    text = json.dumps(header, ensure_ascii=False, allow_nan=False).encode()
-    entries = {"header": np.frombuffer(text, np.uint8)}
-    entries |= {f"array_{i}": array for i, array in enumerate(arrays)}
-    buffer = io.BytesIO()
-    np.savez(buffer, allow_pickle=False, **entries)
-    with zipfile.ZipFile(buffer, "a") as archive:
-        archive.comment = b"0" * _DIGEST  # takes the place of the digest
-    content = buffer.getvalue()[:-_DIGEST]
-    return content + hashlib.sha256(content).hexdigest().encode()
+def sealed(content: bytes) -> bytes:
+    """The file with this content."""
+    digest = hashlib.sha256(content).hexdigest()
+    return _FIRST_LINE.format(_VERSION, digest).encode() + b"\n" + content
+
+
+def opened(content: bytes, source: str) -> bytes:
+    """The content of a file of `save`.
+
+    Raises:
+        ValueError: the file is another one, or was cut or changed, or is of another version.
+    """
+    first, _, rest = content.partition(b"\n")
+    known = re.fullmatch(_FIRST_LINE.format("([0-9]+)", "([0-9a-f]{64})").encode(), first)
+    if known is None:
+        old = " It may be of a version before 0.1.0: fit again." * content.startswith(b"PK")
+        raise ValueError(f"{source} was not written by hamkernel.save, or is cut off.{old}")
+    if int(known[1]) != _VERSION:
+        raise ValueError(
+            f"{source} has version {int(known[1])} of the format and this library reads version "
+            f"{_VERSION}: load it with the hamkernel that wrote it."
+        )
+    if hashlib.sha256(rest).hexdigest().encode() != known[2]:
+        raise ValueError(
+            f"{source} is cut off or was changed after hamkernel.save wrote it: its checksum does "
+            "not fit. Take another copy, or save again."
+        )
+    return rest
 
 
 def write(path: pathlib.Path, content: bytes) -> None:
+    """Write all of the file or nothing: a new one takes the place of the old one at once."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder; save needs the name of a file.")
     if not path.parent.is_dir():
@@ -50,61 +59,3 @@ def write(path: pathlib.Path, content: bytes) -> None:
         temporary.replace(path)
     finally:
         temporary.unlink(missing_ok=True)
-
-
-def unpacked(content: bytes, source: str) -> tuple[Node, list[np.ndarray]]:
-    if not content.startswith(b"PK\x03\x04"):
-        raise ValueError(f"{source} was not written by hamkernel.save.")
-    digest = hashlib.sha256(content[:-_DIGEST]).hexdigest().encode()
-    if content[-_DIGEST:] != digest:
-        raise ValueError(
-            f"{source} is cut off, was changed after it was saved, or was not written by "
-            "hamkernel.save: its checksum does not fit. Take another copy, or save again."
-        )
-    try:
-        entries = _entries(content)
-        header = json.loads(entries.pop("header.npy").tobytes().decode())
-    except (zipfile.BadZipFile, ValueError, KeyError, NotImplementedError, RecursionError) as error:
-        raise ValueError(f"{source} is not a valid file of hamkernel.save: {error}.") from error
-    if not isinstance(header, dict) or header.get("format") != FORMAT:
-        raise ValueError(f"{source} was not written by hamkernel.save.")
-    if header.get("version") != VERSION:
-        raise ValueError(
-            f"{source} has version {header.get('version')!r} of the format, written by hamkernel "
-            f"{header.get('hamkernel')!r}; this library reads version {VERSION}. Update hamkernel."
-        )
-    names = [f"array_{i}.npy" for i in range(len(entries))]
-    if "field" not in header or set(entries) != set(names):
-        raise ValueError(f"{source} is not a valid file of hamkernel.save: parts are missing.")
-    return header, [entries[name] for name in names]
-
-
-def _entries(content: bytes) -> dict[str, np.ndarray]:
-    with zipfile.ZipFile(io.BytesIO(content)) as archive:
-        parts = archive.infolist()
-        # Stored as they are, all parts together cannot be larger than the file: no bombs.
-        if any(p.compress_type != zipfile.ZIP_STORED or p.flag_bits & 1 for p in parts):
-            raise ValueError("a part is compressed or encrypted")
-        if len({p.filename for p in parts}) < len(parts):
-            raise ValueError("two parts have one name")
-        if sum(p.file_size for p in parts) > len(content):
-            raise ValueError("its parts are larger than itself")
-        return {p.filename: _array(archive.read(p)) for p in parts}
-
-
-def _array(content: bytes) -> np.ndarray:
-    """An array in `.npy` format. NumPy's own reader allocates what the header claims."""
-    stream = io.BytesIO(content)
-    if np.lib.format.read_magic(stream) != (1, 0):
-        raise ValueError("an array has an unknown format")
-    try:
-        shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
-    except Exception as error:  # NumPy reads a literal, and lets the errors of its parser through
-        raise ValueError("an array has no readable header") from error
-    data = content[stream.tell() :]
-    if not allowed(dtype.newbyteorder("=")):
-        raise ValueError(f"an array has dtype {dtype}, which is not allowed")
-    if min(shape, default=0) < 0 or math.prod(shape) * dtype.itemsize != len(data):
-        raise ValueError("an array has not the size that it claims")
-    array = np.frombuffer(data, dtype).reshape(shape, order="F" if fortran else "C")
-    return array.astype(dtype.newbyteorder("="))

@@ -1,13 +1,21 @@
-"""`save` and `load`: a learned field in one file, which is read without running anything in it."""
+"""`save` and `load`: a learned field in one file, which is read without running anything in it.
+
+Its content is a line of JSON that says what the field is made of, see `description.py`, and then
+the arrays as Equinox writes the leaves of a PyTree: one after another in NumPy's `.npy` format.
+"""
 
 from __future__ import annotations
 
 import importlib.metadata
+import inspect
+import io
+import json
 import os
 import pathlib
 from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -17,8 +25,9 @@ from jax.experimental import multihost_utils
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._fields.controlled import ControlledField
-from hamkernel._save.bytes import FORMAT, VERSION, packed, unpacked, write
-from hamkernel._save.tree import CLASSES, Reader, encode, field_classes
+from hamkernel._kernels.functions import as_pytree
+from hamkernel._save.bytes import opened, sealed, write
+from hamkernel._save.description import MissingCode, classes, description, difference, skeleton
 from hamkernel._structures.base import AbstractMatrixKernel
 
 _PROBES = 64  # points of the field, of which the one of the largest velocity is kept
@@ -35,7 +44,7 @@ def save(path: str | os.PathLike[str], field: AbstractField) -> None:
     each writes the whole field, to a path of its own or to one that they share.
 
     Args:
-        path: the file. The name is taken as it is; `.npz` fits, since NumPy can open the file.
+        path: the file. The name is taken as it is.
         field: what `fit` returned, or `tune(...).field`.
 
     Raises:
@@ -44,30 +53,35 @@ def save(path: str | os.PathLike[str], field: AbstractField) -> None:
             finite.
         OSError: the file cannot be written; an older one at `path` is left as it was.
     """
-    if not isinstance(field, AbstractField) or type(field).__name__ not in CLASSES:
+    if not isinstance(field, AbstractField):
+        names = [name for name, cls in classes().items() if _is_field(cls)]
         raise TypeError(
-            f"save writes learned fields ({', '.join(field_classes())}), got "
-            f"{type(field).__name__}. For the result of tune pass tuned.field."
+            f"save writes learned fields ({', '.join(names)}), got {type(field).__name__}. For "
+            "the result of tune pass tuned.field."
         )
     if not require.is_concrete(field):
         raise ValueError("save writes numbers and cannot run under jax.jit, grad or vmap.")
     field = jax.tree.map(_whole, field)
+    described = description(field, [], "field")
     try:
-        _evaluable(field)
-    except Exception as error:  # a kernel of the user may raise anything
+        _check_evaluable(field)
+    except Exception as error:  # a kernel of the caller's may raise anything
         raise ValueError(
             "save writes one field that can be evaluated, and this one cannot (of a batch made by "
             f"jax.vmap save each field): {error}"
         ) from error
-    arrays: list[np.ndarray] = []
     header = {
-        "format": FORMAT,
-        "version": VERSION,
         "hamkernel": _library_version(),
+        "x64": any(
+            leaf.dtype.itemsize == 8 for leaf in jax.tree.leaves(field) if eqx.is_array(leaf)
+        ),
         "probe": _probe(field),
-        "field": encode(field, arrays, "field"),
+        "field": described,
     }
-    write(pathlib.Path(path), packed(header, arrays))
+    content = io.BytesIO()
+    content.write(json.dumps(header, ensure_ascii=False, allow_nan=False).encode() + b"\n")
+    eqx.tree_serialise_leaves(content, field)
+    write(pathlib.Path(path), sealed(content.getvalue()))
 
 
 def load(
@@ -91,32 +105,77 @@ def load(
         The field, of the class that was saved.
 
     Raises:
-        ValueError: the file is no such file, cut off, changed, of a newer version, or in float64
+        ValueError: the file is no such file, cut off, changed, of another version, or in float64
             while JAX is not; or `kernel` is missing or is not the one that was saved, which a
             velocity in the file tells.
         TypeError: `kernel` is not matrix-valued. OSError: the file cannot be read.
 
-    Example: `field = hk.load("pendulum.npz", kernel=hk.Symplectic(hk.Warp(hk.Gaussian(), fn)))`
+    Example: `field = hk.load("pendulum", kernel=hk.Symplectic(hk.Warp(hk.Gaussian(), fn)))`
     """
     if kernel is not None and not isinstance(kernel, AbstractMatrixKernel):
         raise TypeError(
             f"kernel must be the matrix-valued kernel that was given to fit; got {kernel!r}."
         )
     source = str(path)
-    header, arrays = unpacked(pathlib.Path(path).read_bytes(), source)
-    reader = Reader(source, arrays)
-    field = reader.field(header["field"], kernel, mean)
+    content = io.BytesIO(opened(pathlib.Path(path).read_bytes(), source))
     try:
-        _evaluable(field)
-    except Exception as error:  # a kernel of the user may raise anything
+        header = json.loads(content.readline())
+        node, probe, needs_x64 = header["field"], header["probe"], header["x64"]
+        if not _is_field(classes().get(node["class"])):
+            raise ValueError("it holds no learned field")
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
+        raise ValueError(f"{source} is not a valid file of hamkernel.save: {error}.") from error
+    if needs_x64 and jnp.result_type(float) != jnp.float64:
         raise ValueError(
-            f"{source} holds a field that cannot be evaluated"
-            + (" with this kernel" if kernel is not None else "")
+            f"{source} has numbers of 64 bits, which JAX would cut to 32: run "
+            "jax.config.update('jax_enable_x64', True) first."
+        )
+    field = _read(node, content, source, kernel, None if mean is None else as_pytree(mean))
+    if kernel is not None or mean is not None:
+        _check_probe(field, probe, source)
+    return field
+
+
+def _read(node: Any, content: io.BytesIO, source: str, kernel: Any, mean: Any) -> Any:
+    """The field of a description, with the code that the caller gives and the arrays of the file.
+
+    Raises:
+        ValueError: code is missing or is not what was saved, or the parts do not fit each other.
+    """
+    codes: dict[str, list[Any]] = {"kernel": [], "mean": []}
+    for name, given in {"kernel": kernel, "mean": mean}.items():
+        if given is not None:
+            own = description(given, codes[name], f"field.{name}")
+            differs = difference(node.get(name), own, f"field.{name}")
+            if differs:
+                raise ValueError(
+                    f"the given {name} is not the one saved in {source}: {differs}. Pass the "
+                    f"{name} as it was given to fit."
+                )
+    try:
+        # Features have the kernel again.
+        like = skeleton(node, [], "field", codes | {"features": codes["kernel"]})
+        field = eqx.tree_deserialise_leaves(content, like)
+        if content.read():
+            raise ValueError("it has arrays that belong to nothing")
+        _check_evaluable(field)
+    except MissingCode as error:
+        name = "mean" if ".mean" in str(error) else "kernel"
+        raise ValueError(
+            f"{source}: {error}. Pass the {name} that was given to fit, with any "
+            f"hyperparameters: hk.load(path, {name}=...)."
+        ) from error
+    except Exception as error:  # a kernel of the caller's may raise anything
+        raise ValueError(
+            f"{source} is not a valid file of hamkernel.save"
+            + (" for this kernel" if kernel is not None else "")
             + f": {error}"
         ) from error
-    if kernel is not None or mean is not None:
-        _check_probe(field, header.get("probe"), source)
     return field
+
+
+def _is_field(cls: Any) -> bool:
+    return isinstance(cls, type) and issubclass(cls, AbstractField) and not inspect.isabstract(cls)
 
 
 def _of_state(field: AbstractField) -> Callable[[Array], Array]:
@@ -127,7 +186,7 @@ def _of_state(field: AbstractField) -> Callable[[Array], Array]:
     return field
 
 
-def _evaluable(field: AbstractField) -> None:
+def _check_evaluable(field: AbstractField) -> None:
     """Raise unless the parts fit each other: as many lengthscales as coordinates, and the like."""
     state = jax.ShapeDtypeStruct((field.dimension,), field.offset.dtype)
     if field.offset.shape or jax.eval_shape(_of_state(field), state).shape != state.shape:
@@ -135,7 +194,7 @@ def _evaluable(field: AbstractField) -> None:
 
 
 def _probe(field: AbstractField) -> list[list[float]]:
-    """A state and the velocity there, by which a kernel of the user's own code is known again."""
+    """A state and the velocity there, by which a kernel of the caller's code is known again."""
     points = np.asarray(getattr(field, "points", np.zeros((1, field.dimension))))[:_PROBES]
     velocities = np.asarray(jax.vmap(_of_state(field))(jnp.asarray(points)))
     if not np.isfinite(velocities).all():
@@ -148,13 +207,9 @@ def _probe(field: AbstractField) -> list[list[float]]:
 
 
 def _check_probe(field: AbstractField, probe: Any, source: str) -> None:
-    try:
-        state, saved = np.asarray(probe, float)
-        velocity = np.asarray(_of_state(field)(jnp.asarray(state)))
-        same = np.linalg.norm(velocity - saved) <= _SAME * np.linalg.norm(saved)
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{source} is not a valid file of hamkernel.save: {error}.") from error
-    if not same:
+    state, saved = np.asarray(probe, float)
+    velocity = np.asarray(_of_state(field)(jnp.asarray(state)))
+    if not np.linalg.norm(velocity - saved) <= _SAME * np.linalg.norm(saved):
         raise ValueError(
             f"with this kernel the field in {source} has the velocity {velocity} at the state "
             f"{state}, and it had {saved} when it was saved: a function in the kernel is not the "

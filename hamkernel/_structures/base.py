@@ -1,6 +1,8 @@
 """What a matrix-valued kernel is, and sums of them."""
 
 import abc
+import functools
+import operator
 import reprlib
 from collections.abc import Iterator
 from typing import Any, ClassVar
@@ -8,10 +10,14 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, common_invariance, one_point
+from hamkernel._kernels.arguments import one_point
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance, common_invariance
+from hamkernel._kernels.groups import LinearMap
+from hamkernel._kernels.ranges import by_value
 from hamkernel._show import call, described, joined
 
 
@@ -105,6 +111,23 @@ class AbstractMatrixKernel(eqx.Module):
     def with_parity(self, parity: int) -> "AbstractMatrixKernel":
         """The kernel of the even (+1) or odd (−1) FIELDS with this structure."""
 
+    @abc.abstractmethod
+    def averaged(self, maps: tuple[LinearMap, ...]) -> "AbstractMatrixKernel":
+        """The kernel of the fields whose potential none of these maps changes."""
+
+    def box(
+        self, name: str, X: Float[np.ndarray, "N d"], amplitude: float
+    ) -> tuple[ArrayLike, ArrayLike]:
+        """Where to look for the array `name`, as it is stored: the lower and the upper bound.
+
+        `X` are the data, and `amplitude` a fair factor before the kernel.
+        """
+        return by_value(name, getattr(self, name))
+
+    def seen(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
+        """The data in the coordinates that the kernels inside see."""
+        return X
+
     @property
     @abc.abstractmethod
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
@@ -171,28 +194,18 @@ class Sum(AbstractMatrixKernel):
         return call("Sum", [f"{name}={K!r}" if name else repr(K) for name, K in pairs])
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
-        first, *rest = (K.form(x, u, z, v) for K in self.terms)
-        return sum(rest, start=first)
+        return functools.reduce(operator.add, [K.form(x, u, z, v) for K in self.terms])
 
-    def expansion(
-        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-    ) -> Float[Array, " n"]:
-        first, *rest = (K.expansion(x, Z, A) for K in self.terms)
-        return sum(rest, start=first)
+    def expansion(self, x: Array, Z: Array, A: Array) -> Float[Array, " n"]:
+        return functools.reduce(operator.add, [K.expansion(x, Z, A) for K in self.terms])
 
-    def potential(
-        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-    ) -> Float[Array, ""]:
+    def potential(self, x: Array, Z: Array, A: Array) -> Float[Array, ""]:
         self.check_potential()
-        first, *rest = (K.potential(x, Z, A) for K in self.terms)
-        return sum(rest, start=first)
+        return functools.reduce(operator.add, [K.potential(x, Z, A) for K in self.terms])
 
-    def potential_covariance(
-        self, x: Float[Array, " n"], z: Float[Array, " n"]
-    ) -> Float[Array, ""]:
+    def potential_covariance(self, x: Array, z: Array) -> Float[Array, ""]:
         self.check_potential()
-        first, *rest = (K.potential_covariance(x, z) for K in self.terms)
-        return sum(rest, start=first)
+        return functools.reduce(operator.add, [K.potential_covariance(x, z) for K in self.terms])
 
     @property
     def no_potential(self) -> str | None:
@@ -240,6 +253,9 @@ class Sum(AbstractMatrixKernel):
     def with_parity(self, parity: int) -> "Sum":
         parts = tuple(K.with_parity(parity) for K in self.terms)
         return eqx.tree_at(lambda s: s.terms, self, parts)
+
+    def averaged(self, maps: tuple[LinearMap, ...]) -> "Sum":
+        return eqx.tree_at(lambda s: s.terms, self, tuple(K.averaged(maps) for K in self.terms))
 
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:

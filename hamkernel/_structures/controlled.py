@@ -17,13 +17,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
+from hamkernel._kernels.arguments import one_point
 from hamkernel._kernels.base import (
     AbstractScalarKernel,
     Invariance,
     Scaled,
     as_scalar_kernel,
-    one_point,
 )
+from hamkernel._kernels.groups import LinearMap
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.port_hamiltonian import distinct_coordinates
@@ -175,7 +176,7 @@ class Controlled(AbstractMatrixKernel):
             )
         return self.count
 
-    def _split(self, s: Array) -> tuple[Array, Array]:
+    def _split(self, s: Any) -> tuple[Any, Any]:
         """X and U of joined points, or x and u of one."""
         n = self.outputs(s.shape[-1])
         return s[..., :n], s[..., n:]
@@ -251,6 +252,12 @@ class Controlled(AbstractMatrixKernel):
 
     def with_parity(self, parity: int) -> "AbstractMatrixKernel":
         raise TypeError("say the symmetry of the drift: Controlled(Odd(K), inputs=…).")
+
+    def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
+        raise TypeError("say the symmetry of the drift: Controlled(Invariant(K, maps), inputs=…).")
+
+    def seen(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
+        return self._split(X)[0]
 
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._kernels.base import Invariance
 from hamkernel._kernels.groups import matrix_of
-from hamkernel._kernels.transforms import symmetries
+from hamkernel._kernels.symmetry import symmetries
 
 
 def _operators(K: Any, X: Float[Array, "N n"]) -> Float[np.ndarray, "N n n"]:

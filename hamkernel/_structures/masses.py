@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance
+from hamkernel._kernels.groups import LinearMap
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
@@ -155,6 +156,12 @@ class UnknownMasses(AbstractMatrixKernel):
 
     def with_parity(self, parity: int) -> "UnknownMasses":
         return eqx.tree_at(lambda K: K.kernel, self, self.kernel.with_parity(parity))
+
+    def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
+        raise TypeError("say the symmetry inside: UnknownMasses(Invariant(K, maps), masses).")
+
+    def seen(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
+        return np.asarray(self.to_momenta(jnp.asarray(X)))
 
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:

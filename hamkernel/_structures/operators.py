@@ -13,108 +13,16 @@ the case k(x, z) = g(x − z); the mixed derivative is the one that is positive 
 """
 
 import abc
-import dataclasses
-from typing import Any, ClassVar
+from typing import ClassVar
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
-from hamkernel._kernels.transforms import symmetries, symmetry_removed, with_parity
-from hamkernel._show import call, described
-from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._kernels.base import Invariance
 from hamkernel._structures.maps import check_symmetries
-
-
-class AbstractStructure(AbstractMatrixKernel):
-    """A structure made from one scalar kernel k."""
-
-    kernel: AbstractScalarKernel = eqx.field(converter=as_scalar_kernel)
-    # 1 if the fields have the parity of the functions of k, −1 if the other; a derivative flips it.
-    field_parity: eqx.AbstractClassVar[int]
-    # Of the operator: TRANSLATION where B is constant, REFLECTION where B(−x) = B(x).
-    operator_invariance: eqx.AbstractClassVar[Invariance]
-
-    def __repr__(self) -> str:
-        found = symmetry_removed(self.kernel)
-        if found is None or found.parity is None:
-            return described(self, positional=("kernel",))
-        symmetry = "Odd" if self.field_parity * found.parity < 0 else "Even"
-        return call(symmetry, [repr(eqx.tree_at(lambda K: K.kernel, self, found.kernel))])
-
-    def with_parity(self, parity: int) -> "AbstractStructure":
-        if Invariance.REFLECTION not in self.operator_invariance:
-            raise TypeError(
-                f"the fields of {type(self).__name__} have no parity with any potential: its "
-                "operator B(x) is another one at -x."
-            )
-        kernel = with_parity(self.kernel, self.field_parity * parity)
-        return eqx.tree_at(lambda K: K.kernel, self, kernel)
-
-    def shares_potential(self, other: AbstractMatrixKernel) -> bool:
-        """By what the operators hold: two with arrays, which are trained, are never the same."""
-        if type(self) is not type(other):
-            return False
-        (own, tree), (others, other_tree) = (jax.tree.flatten(_operator(K)) for K in (self, other))
-        return tree == other_tree and not any(map(eqx.is_array, own)) and own == others
-
-    @abc.abstractmethod
-    def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"] | None:
-        """T such that what k(x, Sz) in place of k(x, z) makes of a is the same of Sz and Ta."""
-
-    @property
-    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
-        return (self.kernel,)
-
-    @property
-    def invariance(self) -> Invariance:
-        return self.kernel.invariance & self.operator_invariance
-
-
-def _operator(K: AbstractMatrixKernel) -> dict[str, Any]:
-    """What a structure has beside its scalar kernel."""
-    fields = dataclasses.fields(K)
-    return {field.name: getattr(K, field.name) for field in fields if field.name != "kernel"}
-
-
-class Separable(AbstractStructure):
-    """K(x, z) = k(x, z) I: the components share a kernel and no structure.
-
-    The baseline of the paper. Works in every dimension; fields have no potential.
-
-    Args:
-        kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
-
-    Raises:
-        TypeError: `kernel` is no scalar kernel.
-
-    Source: Smith & Egeland (2023), eq. (separable_gaussian_kernel).
-    """
-
-    field_parity: ClassVar[int] = 1
-    operator_invariance: ClassVar[Invariance] = Invariance.TRANSLATION
-    symplectic: ClassVar[bool] = False
-    no_potential: ClassVar[str | None] = (
-        "a field of a Separable kernel has no potential: its components are independent. "
-        "Use Symplectic or CurlFree to learn one."
-    )
-
-    def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
-        return self.kernel(x, z) * (u @ v)
-
-    def expansion(
-        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-    ) -> Float[Array, " n"]:
-        return _row(self.kernel, x, Z) @ A
-
-    def potential(self, x: Array, Z: Array, A: Array) -> Float[Array, ""]:
-        raise AttributeError(self.no_potential)
-
-    def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-        return np.eye(len(S))
+from hamkernel._structures.structure import AbstractStructure, mixed, row
 
 
 class AbstractPotentialKernel(AbstractStructure):
@@ -135,13 +43,13 @@ class AbstractPotentialKernel(AbstractStructure):
         """B(x)ᵀ v."""
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
-        return _mixed(self.kernel, x, self.apply_transpose(x, u), z, self.apply_transpose(z, v))
+        return mixed(self.kernel, x, self.apply_transpose(x, u), z, self.apply_transpose(z, v))
 
     def potential(
         self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
     ) -> Float[Array, ""]:
         directions = jax.vmap(self.apply_transpose)(Z, A)
-        _, slopes = jax.jvp(lambda Z: _row(self.kernel, x, Z), (Z,), (directions,))
+        _, slopes = jax.jvp(lambda Z: row(self.kernel, x, Z), (Z,), (directions,))
         return slopes.sum()
 
     def potential_covariance(
@@ -242,85 +150,3 @@ class Symplectic(AbstractPotentialKernel):
     def check_dimension(self, n: int) -> None:
         check_even(n, "a Symplectic kernel")
         super().check_dimension(n)
-
-
-class DivergenceFree(AbstractStructure):
-    """K(x, z) = tr(M) I − Mᵀ with M = ∂x ∂zᵀ k(x, z): fields with div f = 0, any n ≥ 2.
-
-    The fields are f_a = Σ_b ∂_b Ψ_ab of an antisymmetric matrix Ψ whose entries above the
-    diagonal are independent functions in the RKHS of k. For n = 2, K = J M Jᵀ.
-
-    Args:
-        kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
-
-    Raises:
-        TypeError: `kernel` is no scalar kernel. ValueError, with data: n is 1.
-
-    Source: Fuselier (2006); for n = 3 it is the curl of a vector potential.
-    """
-
-    field_parity: ClassVar[int] = -1
-    operator_invariance: ClassVar[Invariance] = Invariance.TRANSLATION
-    symplectic: ClassVar[bool] = False
-    no_potential: ClassVar[str | None] = (
-        "a field of a DivergenceFree kernel has a matrix potential, not a scalar one. In the plane "
-        "use Symplectic(k), the same kernel, whose potential is the stream function."
-    )
-
-    def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
-        along_both = jax.vmap(lambda e: _mixed(self.kernel, x, e, z, e))
-        trace = along_both(jnp.eye(len(x), dtype=x.dtype)).sum()
-        return trace * (u @ v) - _mixed(self.kernel, x, v, z, u)
-
-    def expansion(
-        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-    ) -> Float[Array, " n"]:
-        # W_ba(x) = Σⱼ ∂_{z_b} k(x, zⱼ) a_ja, Ψ = Wᵀ − W, and f_a = Σ_b ∂_b Ψ_ab. The slopes
-        # ∂_{z_b} k(x, zⱼ) of all j come from one forward derivative along e_b.
-        def slopes(x, e):
-            return jax.jvp(lambda Z: _row(self.kernel, x, Z), (Z,), (jnp.broadcast_to(e, Z.shape),))
-
-        def term(e):  # ∂_b (W_b: − W_:b)
-            def row_minus_column(x):
-                W = jax.vmap(lambda d: slopes(x, d)[1] @ A)(basis)
-                return e @ W - W @ e
-
-            return jax.jvp(row_minus_column, (x,), (e,))[1]
-
-        basis = jnp.eye(len(x), dtype=x.dtype)
-        return jax.vmap(term)(basis).sum(axis=0)
-
-    def potential(self, x: Array, Z: Array, A: Array) -> Float[Array, ""]:
-        raise AttributeError(self.no_potential)
-
-    def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-        return S  # ±1, see `check_dimension`
-
-    def check_dimension(self, n: int) -> None:
-        if n < 2:
-            raise ValueError(
-                f"a DivergenceFree kernel needs n >= 2, got n = {n}: on a line such a field "
-                "is constant."
-            )
-        if any(mean.parity is None for mean in symmetries(self.kernel)):
-            raise ValueError(
-                "a DivergenceFree field gets no symmetry from its matrix potential but Odd and "
-                "Even: use Symplectic(Invariant(k, maps)) or CurlFree(Invariant(k, maps))."
-            )
-
-
-def _row(k: AbstractScalarKernel, x: Float[Array, " n"], Z: Float[Array, "M n"]):
-    return jax.vmap(k, in_axes=(None, 0))(x, Z)
-
-
-def _mixed(k: AbstractScalarKernel, x, u, z, v) -> Float[Array, ""]:
-    """uᵀ [∂x ∂zᵀ k(x, z)] v, forward in both arguments.
-
-    For k(x, z) = φ(s) this is φ″(s) ds(u) ds(v) + φ′(s) dds(u, v): in a Gram an entry costs a few
-    multiplications, since what belongs to one point or to the pair alone is made once.
-    """
-
-    def slope(x):
-        return jax.jvp(lambda z: k(x, z), (z,), (v,))[1]
-
-    return jax.jvp(slope, (x,), (u,))[1]

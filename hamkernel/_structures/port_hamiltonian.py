@@ -13,6 +13,10 @@ from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
 from hamkernel._structures.operators import AbstractPotentialKernel, check_even
 
+# Of the damping ratio, r over the critical friction: from 1e-5, at which an oscillation loses 6e-5
+# of its amplitude in a period and far less than can be seen, to overdamped 30 times over.
+_LEAST_DAMPING, _MOST_DAMPING = 1e-5, 30.0
+
 
 class PortHamiltonian(AbstractPotentialKernel):
     """K(x, z) = (J − R) [∂x ∂zᵀ k(x, z)] (J − R)ᵀ: fields f = (J − R)∇H with friction R ≥ 0.
@@ -109,6 +113,19 @@ class PortHamiltonian(AbstractPotentialKernel):
         stand_in = jnp.log(apart.reshape(self.log_friction.shape))
         general = eqx.tree_at(lambda K: K.log_friction, self, stand_in)
         return general.apply(x, jnp.eye(len(x), dtype=x.dtype))
+
+    def box(
+        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
+    ) -> tuple[ArrayLike, ArrayLike]:
+        """Bounds for log r: an oscillation of extents (Δq, Δp) in X is critical near r = Δp/Δq."""
+        n = X.shape[1]
+        damped = np.asarray(self._coordinates(n))
+        extent = np.ptp(X, axis=0)
+        extent = np.where(extent > 0, extent, 1.0)
+        critical = np.log(extent[damped] / extent[(damped + n // 2) % n])
+        if self.log_friction.ndim == 0:
+            critical = critical.mean()
+        return critical + np.log(_LEAST_DAMPING), critical + np.log(_MOST_DAMPING)
 
     def check_dimension(self, n: int) -> None:
         check_even(n, "a PortHamiltonian kernel")

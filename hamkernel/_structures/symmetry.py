@@ -7,13 +7,10 @@ f(Sx) = ± S f(x).
 
 from typing import Any, overload
 
-import equinox as eqx
-
 from hamkernel._kernels.base import AbstractScalarKernel, as_scalar_kernel
 from hamkernel._kernels.groups import linear_maps, time_reversal
-from hamkernel._kernels.transforms import symmetrised
-from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel
-from hamkernel._structures.operators import AbstractStructure
+from hamkernel._kernels.symmetry import symmetrised
+from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 
 def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
@@ -68,7 +65,7 @@ def Reversible(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
             "Reversible(Symplectic(k)), and not with friction, magnetic fields or in rotating "
             "frames. In a sum say it of the part: Reversible(Symplectic(k)) + CurlFree(k)."
         )
-    return _averaged(K, (time_reversal,))
+    return K.averaged((time_reversal,))
 
 
 @overload
@@ -105,13 +102,5 @@ def Invariant(k: Any, maps: Any) -> Any:
     """
     given = linear_maps(maps)
     if isinstance(k, AbstractMatrixKernel):
-        return _averaged(k, given)
+        return k.averaged(given)
     return symmetrised(as_scalar_kernel(k), given, (1.0,) * len(given))
-
-
-def _averaged(K: AbstractMatrixKernel, maps: tuple) -> AbstractMatrixKernel:
-    if isinstance(K, Sum):
-        return eqx.tree_at(lambda s: s.terms, K, tuple(_averaged(term, maps) for term in K.terms))
-    assert isinstance(K, AbstractStructure)
-    kernel = symmetrised(K.kernel, maps, (1.0,) * len(maps))
-    return eqx.tree_at(lambda K: K.kernel, K, kernel)

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hamkernel._kernels.transforms import symmetry_removed
+from hamkernel._kernels.symmetry import symmetry_removed
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.operators import AbstractStructure
+from hamkernel._structures.structure import AbstractStructure
 
 
 def unfolded(

@@ -7,7 +7,7 @@ from jaxtyping import Float
 def interpolated(
     times: np.ndarray, at: np.ndarray, x: np.ndarray, slopes: np.ndarray
 ) -> Float[np.ndarray, "T n"]:
-    """Hermite's cubic through the states x at the times `at`, where their velocities are `slopes`."""
+    """Hermite's cubic through the states x at the times `at`, with their velocities `slopes`."""
     i = np.clip(np.searchsorted(at, times) - 1, 0, len(at) - 2)
     h = (at[i + 1] - at[i])[:, None]
     s = ((times - at[i])[:, None]) / h

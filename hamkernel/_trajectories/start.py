@@ -6,10 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hamkernel._kernels.base import ScalarSum, Scaled
+from hamkernel._kernels.base import Scaled
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.masses import UnknownMasses
-from hamkernel._structures.operators import AbstractStructure
+from hamkernel._structures.structure import AbstractStructure
 from hamkernel._trajectories.evidence import Box, Model
 from hamkernel._trajectories.flow import WEIGHTS
 from hamkernel._trajectories.prepared import Prepared
@@ -32,7 +32,7 @@ def with_amplitude(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
         return isinstance(node, AbstractStructure)
 
     def scaled(node):
-        if not is_structure(node) or _has_amplitude(node.kernel):
+        if not is_structure(node) or node.kernel.has_amplitude:
             return node
         return eqx.tree_at(lambda node: node.kernel, node, Scaled(node.kernel, 1.0))
 
@@ -48,13 +48,6 @@ def with_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
             "(q, p) of a mass of one."
         )
     return K if isinstance(K, UnknownMasses) else UnknownMasses(K, jnp.ones(n // 2))
-
-
-def _has_amplitude(k: object) -> bool:
-    if isinstance(k, ScalarSum):
-        return all(_has_amplitude(term) for term in k.terms)
-    nodes = jax.tree.leaves(k, is_leaf=lambda node: isinstance(node, Scaled))
-    return any(isinstance(node, Scaled) for node in nodes)
 
 
 def sampled(data: Prepared) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]]:

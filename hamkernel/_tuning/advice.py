@@ -1,10 +1,11 @@
 """What `tune` warns of before it searches: data and kernels whose best values mean little."""
 
+import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Array
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import ScalarProduct, Scaled
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._tuning.boxes import constants
 from hamkernel._tuning.objective import SearchCriterion
@@ -58,7 +59,7 @@ def warn_of_free_scale(space: SearchSpace, criterion: SearchCriterion) -> None:
     free = {space.names[i] for i in space.free}
     if not criterion.logarithmic or RIDGE not in free or space.given_ridge is not None:
         return
-    if _has_amplitude(space.kernel, "", free):
+    if _has_amplitude(space):
         require.warn(
             "every term of this kernel has an amplitude, and cross-validation does not see a "
             "factor that is common to all of them and to lambda: their values mean nothing but "
@@ -67,17 +68,10 @@ def warn_of_free_scale(space: SearchSpace, criterion: SearchCriterion) -> None:
         )
 
 
-def _has_amplitude(node: object, path: str, free: set[str]) -> bool:
-    """Whether a factor that is searched multiplies all of this kernel."""
-    if isinstance(node, Scaled) and f"{path}.scale".removeprefix(".") in free:
-        return True
-    terms = getattr(node, "terms", None)
-    if terms is not None:
-        names = getattr(node, "names", None) or [""] * len(terms)
-        found = [
-            _has_amplitude(term, f"{path}.{name}" if name else f"{path}.terms[{i}]", free)
-            for i, (term, name) in enumerate(zip(terms, names, strict=True))
-        ]
-        return any(found) if isinstance(node, ScalarProduct) else all(found)
-    inner = getattr(node, "kernel", None)
-    return inner is not None and _has_amplitude(inner, f"{path}.kernel", free)
+def _has_amplitude(space: SearchSpace) -> bool:
+    """Whether factors that are searched multiply all of the kernel."""
+    leaves, structure = jax.tree.flatten(eqx.filter(space.kernel, eqx.is_inexact_array))
+    last = np.cumsum([leaf.size for leaf in leaves]) - 1
+    free = [leaf if i in space.free else None for leaf, i in zip(leaves, last, strict=True)]
+    terms = jax.tree.unflatten(structure, free).scalar_kernels
+    return bool(terms) and all(k.has_amplitude for k in terms)

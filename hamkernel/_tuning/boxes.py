@@ -1,8 +1,7 @@
-"""Where to look for hyperparameters: a box from the data.
+"""The hyperparameters of a kernel, with the boxes that it takes from the data.
 
-A lengthscale far below the distance between neighbours, or far above the extent of the data,
-changes nothing but rounding; an amplitude is compared with the scale of Y. Coordinates are those
-that the kernel sees: behind a `Select` or a `Warp` the data is transformed first.
+Every kernel says of its own arrays where to look for them, `box`, and what data the kernels inside
+it see, `seen`: behind a `Select` or a `Warp` it is transformed first.
 """
 
 import dataclasses
@@ -14,19 +13,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import GetAttrKey, SequenceKey, keystr, tree_flatten_with_path
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from hamkernel._gram.dense import trace
 from hamkernel._gram.observed import gram_of_rows
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance
-from hamkernel._kernels.dot_products import Periodic
 from hamkernel._kernels.functions import Bound
-from hamkernel._kernels.transforms import Select, Warp, without_symmetry
+from hamkernel._kernels.ranges import by_value
+from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._observations.rows import Rows
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
-from hamkernel._structures.controlled import Controlled
-from hamkernel._structures.masses import UnknownMasses
-from hamkernel._structures.port_hamiltonian import PortHamiltonian
 
 
 @dataclasses.dataclass(frozen=True)
@@ -118,12 +114,8 @@ def _amplitude(K: AbstractMatrixKernel, X: Array, Y: Array) -> float:
 
 def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterator[Hyperparameter]:
     """Walk the kernel; X is the data in the coordinates that `node` sees."""
-    if isinstance(node, Select):
-        X = X[:, list(node.dims)]
-    if isinstance(node, Controlled):  # points are (x, u)
-        X = X[:, : node.outputs(X.shape[1])]
-    if isinstance(node, UnknownMasses):
-        X = np.asarray(node.to_momenta(jnp.asarray(X)))
+    kernel = node if isinstance(node, AbstractScalarKernel | AbstractMatrixKernel) else None
+    inside = X if kernel is None else kernel.seen(X)
     for key, child in _children(node):
         if eqx.is_inexact_array(child):
             name = keystr((*path, *key)).removeprefix(".")
@@ -133,19 +125,16 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
                     "real and imaginary parts as two arrays."
                 )
             head, dot, last = name.rpartition(".")
-            low, high = _box(node, last, child, X, amplitude)
+            box = by_value(last, child) if kernel is None else kernel.box(last, X, amplitude)
             yield Hyperparameter(
                 # `terms[0].kernel.lengthscale` for the leaf `.terms[0].kernel.log_lengthscale`
                 name=head + dot + last.removeprefix("log_"),
                 logarithmic=last.startswith("log_"),
-                low=np.broadcast_to(low, child.shape),
-                high=np.broadcast_to(high, child.shape),
+                low=np.broadcast_to(box[0], child.shape),
+                high=np.broadcast_to(box[1], child.shape),
             )
         elif child is not node:  # else a leaf that is no array: a degree, an activation
-            seen = X
-            if isinstance(node, Warp) and isinstance(child, AbstractScalarKernel):
-                seen = np.asarray(jax.vmap(node.warped)(jnp.asarray(X)))
-            yield from _walk((*path, *key), child, seen, amplitude)
+            yield from _walk((*path, *key), child, inside, amplitude)
 
 
 def _children(node: object) -> list[tuple[tuple, Any]]:
@@ -157,60 +146,3 @@ def _children(node: object) -> list[tuple[tuple, Any]]:
         ]
         return list(zip(keys, node.terms, strict=True))
     return tree_flatten_with_path(node, is_leaf=lambda sub: sub is not node)[0]
-
-
-def _box(
-    node: object, name: str, leaf: Array, X: np.ndarray, amplitude: float
-) -> tuple[ArrayLike, ArrayLike]:
-    """Bounds for the leaf `name` of `node`, in its stored coordinates."""
-    ours = isinstance(node, AbstractScalarKernel)
-    if isinstance(node, Periodic) and name == "log_lengthscale":
-        # On a circle of radius 1; below 1/64 its Fourier series is too long for random features.
-        return np.log(max(0.6 / len(X), 1 / 64)), np.log(60.0)
-    if ours and name == "log_lengthscale":
-        spacing, extent = _spacing_and_extent(X, per_coordinate=leaf.ndim > 0)
-        return np.log(0.3 * spacing), np.log(30 * extent)
-    if ours and name == "log_period":
-        spacing, extent = _spacing_and_extent(X, per_coordinate=leaf.ndim > 0)
-        return np.log(2 * spacing), np.log(10 * extent)
-    if ours and name == "log_scale":
-        return np.log(1e-5 * amplitude), np.log(1e5 * amplitude)
-    if ours and name == "log_offset":
-        square = np.mean(np.sum(X**2, axis=1)) or 1.0
-        return np.log(1e-4 * square), np.log(1e4 * square)
-    if isinstance(node, PortHamiltonian) and name == "log_friction":
-        return _friction_box(node, X)
-    value = np.asarray(leaf)
-    if name.startswith("log_"):
-        return value - np.log(1e3), value + np.log(1e3)
-    reach = 10 * np.maximum(1.0, np.abs(value))  # a number of unknown meaning
-    return value - reach, value + reach
-
-
-# Of the damping ratio, r over the critical friction: from 1e-5, at which an oscillation loses 6e-5
-# of its amplitude in a period and far less than can be seen, to overdamped 30 times over.
-_LEAST_DAMPING, _MOST_DAMPING = 1e-5, 30.0
-
-
-def _friction_box(node: PortHamiltonian, X: np.ndarray) -> tuple[ArrayLike, ArrayLike]:
-    """Bounds for log r: an oscillation of extents (Δq, Δp) in X is critical near r = Δp/Δq."""
-    n = X.shape[1]
-    damped = np.asarray(range(n // 2, n) if node.damped is None else node.damped)
-    extent = np.ptp(X, axis=0)
-    extent = np.where(extent > 0, extent, 1.0)
-    critical = np.log(extent[damped] / extent[(damped + n // 2) % n])
-    if node.log_friction.ndim == 0:
-        critical = critical.mean()
-    return critical + np.log(_LEAST_DAMPING), critical + np.log(_MOST_DAMPING)
-
-
-def _spacing_and_extent(X: np.ndarray, per_coordinate: bool) -> tuple[ArrayLike, ArrayLike]:
-    """The typical distance of nearest neighbours and the extent of the data, 1 where it is 0.
-
-    The distance of N points in an extent L is taken as L / N: a fair lower bound in any dimension,
-    since points on a few trajectories lie close together along them.
-    """
-    ranges = np.ptp(X, axis=0)
-    extent = ranges if per_coordinate else np.asarray(np.linalg.norm(ranges))
-    extent = np.where(extent > 0, extent, 1.0)
-    return extent / max(len(X), 2), extent

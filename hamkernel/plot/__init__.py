@@ -1,8 +1,8 @@
 """Pictures of fields, trajectories, energies and searches.
 
-Every function draws on the Matplotlib axes `ax`, makes them if they are None, and returns them.
-Several curves come as a mapping from names to arrays. A name in `COLORS` has the same colour in
-every picture; the colours can be told apart by colour-blind readers and in grey.
+Every function draws on the Matplotlib axes `ax`, or on new ones if None, and returns them. Pass
+several curves as a mapping from names to arrays. A name in `COLORS` has the same colour in every
+picture; the colours stay distinct for colour-blind readers and in grey.
 """
 
 from hamkernel.plot._contours import hamiltonian, loss_surface

@@ -31,9 +31,9 @@ def hamiltonian(
 ) -> tuple[Axes, Axes]:
     """Draw the true and the learned Hamiltonian side by side, on the same contours.
 
-    Velocities determine H up to a constant: the learned one is shifted by the mean difference
-    over the grid, then both are drawn less the minimum of the true one. Where a function is not
-    finite the picture is left white. A learned one alone is drawn by
+    Velocities determine H up to a constant, so the learned one is shifted by the mean difference
+    over the grid; both are drawn relative to the minimum of the true one. Where a function is not
+    finite the picture stays white. To draw a learned H alone, use
     `plane_slice(field.hamiltonian, jnp.zeros(2), (0, 1), xlim, ylim)`.
 
     Args:
@@ -46,7 +46,7 @@ def hamiltonian(
         units: of q and p.
         names: of the coordinates; q and p if None.
         energy_unit: of H.
-        levels: number of contours at most, or the levels themselves.
+        levels: the largest number of contours, or the levels themselves.
         resolution: points on each axis of the grid.
 
     Returns:
@@ -54,7 +54,7 @@ def hamiltonian(
 
     Raises:
         ValueError: a function is not scalar or not one of the plane, nowhere on the grid are both
-            finite, or an argument is no pair.
+            finite, or an argument is not a pair.
     """
     titles, labels = two("titles", titles), plane_labels((0, 1), 2, units, names)
     panels = None if ax is None else two("ax", ax)
@@ -102,14 +102,15 @@ def loss_surface(
 ) -> Axes:
     """Draw a loss over two positive hyperparameters, and the path of an optimiser on it.
 
-    All three axes are logarithmic. Losses that are not finite and positive are left white.
+    All three axes are logarithmic. Where the loss is not finite and positive, the picture stays
+    white.
 
     Args:
         first: values of the first hyperparameter, shape (A,).
         second: values of the second, shape (B,).
         losses: shape (A, B).
-        path: the optimiser's steps (first, second), shape (K, 2), from start to end; of one
-            row if the end alone is to be shown.
+        path: the optimiser's steps (first, second), shape (K, 2), from start to end; one row to
+            show only the end.
         ax: axes to draw on; new ones if None.
         names: of the hyperparameters.
         label: of the loss.
@@ -118,7 +119,7 @@ def loss_surface(
 
     Raises:
         ValueError: the shapes do not fit, a hyperparameter is not positive, no loss is finite and
-            positive, or `names` is no pair.
+            positive, or `names` is not a pair.
     """
     names = two("names", names)
     first, second, losses = np.asarray(first), np.asarray(second), np.asarray(losses)
@@ -162,7 +163,7 @@ def loss_surface(
 
 
 def _in_one_format(values: list[float]) -> list[str]:
-    """Numbers all with or all without an exponent, with digits enough to tell them apart."""
+    """Numbers all with or all without an exponent, with enough digits to distinguish them."""
     plain = 1e-3 <= values[0] and values[-1] < 1e5
     for digits in range(2, 8):
         texts = [f"{value:.{digits - 1}e}" for value in values]

@@ -62,7 +62,7 @@ def phase_portrait(
 
     Raises:
         ValueError: the field, the data or a trajectory is not in the plane, the limits do not
-            rise, or an argument is no pair.
+            rise, or an argument is not a pair.
     """
     labels = plane_labels((0, 1), 2, units, names)
     q, p, points = grid(xlim, ylim, resolution)
@@ -96,7 +96,7 @@ def trajectories(
 
     Args:
         ys: shape (T, n) or (B, T, n), or a mapping from names to such arrays. A dot marks where
-            each starts. Of several names "true", or else the first, is wide beneath the others.
+            each starts. "true", or else the first name, is drawn wide, beneath the others.
         ax: axes to draw on; new ones if None.
         dims: the two coordinates, counted from 0.
         title: of the axes.
@@ -106,7 +106,7 @@ def trajectories(
 
     Raises:
         ValueError: an array is of another shape, there is none, `dims` are not two of the
-            coordinates, or an argument is no pair.
+            coordinates, or an argument is not a pair.
     """
     curves = _checked(ys)
     n = next(iter(curves.values())).shape[-1]
@@ -135,9 +135,10 @@ def plane_slice(
 ) -> Axes:
     """Draw a function of n coordinates on the plane through a point along two of them.
 
-    A scalar function, such as H, becomes filled contours less its minimum there; a field becomes
-    the stream lines of its two components in the plane, over its speed out of the plane. Where a
-    function is not finite, such as at the centre of Kepler's problem, the picture is left white.
+    A scalar function, such as H, is drawn as filled contours relative to its minimum on the plane;
+    a field as the stream lines of its two components in the plane, over its speed out of the plane.
+    Where a function is not finite, such as at the centre of Kepler's problem, the picture stays
+    white.
 
     Args:
         fn: x (n,) -> () or (n,).
@@ -150,13 +151,13 @@ def plane_slice(
         units: of the two coordinates.
         names: of the two coordinates, if they are not q and p.
         label: of the colours; H − min H, or the speed out of the plane, if None.
-        levels: number of contours, or the levels themselves; colours go on beyond them.
+        levels: number of contours, or the levels themselves; colours continue beyond them.
         resolution: points on each axis of the grid.
 
     Raises:
-        ValueError: the function is neither scalar nor a field on n coordinates, it is finite
-            nowhere on the grid, `dims` are not two of the coordinates, the limits do not rise, or
-            an argument is no pair.
+        ValueError: the function is neither scalar nor a field on n coordinates, it is nowhere
+            finite on the grid, `dims` are not two of the coordinates, the limits do not rise, or
+            an argument is not a pair.
     """
     point = np.asarray(point, float)
     labels = plane_labels(dims, len(point), units, names)

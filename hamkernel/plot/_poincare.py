@@ -18,7 +18,7 @@ def crossings(
 ) -> Float[np.ndarray, "M n"]:
     """Return the points where a trajectory crosses the plane x[coordinate] = value.
 
-    Interpolated linearly between neighbouring states, so with an error of second order in their
+    Interpolation between neighbouring states is linear, with an error of second order in their
     distance: save the trajectory densely.
 
     Args:
@@ -28,7 +28,7 @@ def crossings(
         direction: +1 for crossings from below, −1 from above, 0 for both.
 
     Returns:
-        States, shape (M, n), in the order in which they are met; M may be 0.
+        States, shape (M, n), in order of time; M may be 0.
 
     Raises:
         ValueError: ys is not one trajectory, or has no such coordinate.
@@ -60,8 +60,8 @@ def poincare_section(
     """Draw the points of a Poincaré section in the plane of two coordinates.
 
     Args:
-        points: of one trajectory, shape (M, n); a list of such arrays, which get one colour each;
-            or a mapping from names to arrays, with a legend.
+        points: of one trajectory, shape (M, n); a list of such arrays, each in its own colour; or
+            a mapping from names to arrays, which adds a legend.
         dims: the two coordinates, counted from 0.
         ax: axes to draw on; new ones if None.
         title: of the axes.
@@ -71,7 +71,7 @@ def poincare_section(
 
     Raises:
         ValueError: there is no trajectory to draw, `dims` are not two of the coordinates, or an
-            argument is no pair.
+            argument is not a pair.
     """
     dots: dict[str, Any] = {"linestyle": "none", "marker": ".", "ms": size, "mew": 0}
     if isinstance(points, list | tuple):

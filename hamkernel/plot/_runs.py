@@ -1,4 +1,4 @@
-"""Logged runs: what was measured, how it is smoothed, and how a learned field fits it."""
+"""Logged runs: the samples, the smoothed states, and the fit of a learned field."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 
-from hamkernel._trajectories.learned import interpolated
+from hamkernel._trajectories.hermite import interpolated
 from hamkernel.plot._style import COLORS, DATA, coordinate, legend, on_points, with_unit
 
 if TYPE_CHECKING:
@@ -30,14 +30,14 @@ def smoothing(
     time_unit: str | None = None,
     title: str | None = None,
 ) -> tuple[Axes, ...]:
-    """Draw one logged run: the samples, the smoothed states, and two standard deviations of them.
+    """Draw one logged run: the samples, and the smoothed states within two standard deviations.
 
-    One panel for each coordinate, over each other. The band is that of the state, not of a new
-    sample, which has the noise besides. A coordinate that was never measured is left empty.
+    One panel per coordinate, stacked. The band is that of the state, not of a new sample, which
+    has noise on top. The panel of a coordinate that was never measured stays empty.
 
     Args:
         runs: what was logged.
-        run: which of them, counted from 0, or from the end where negative.
+        run: which of them, counted from 0, or from the end if negative.
         ax: n axes, one for each coordinate; new ones if None.
         units: of the coordinates.
         names: of the coordinates, if they are not q and p.
@@ -48,7 +48,7 @@ def smoothing(
         The n axes.
 
     Raises:
-        ValueError: there is no such run, or an argument has not one entry for each coordinate.
+        ValueError: there is no such run, or an argument does not have one entry per coordinate.
     """
     run, n = _position(run, len(runs)), runs.dimension
     labels = _labels(n, units, names)
@@ -76,28 +76,28 @@ def fitted(
     time_unit: str | None = None,
     title: str | None = None,
 ) -> tuple[tuple[Axes, Axes], ...]:
-    """Draw one run as it was measured and as the learned field explains it, with the residuals.
+    """Draw one run as measured and as the learned field explains it, with the residuals.
 
-    One row of panels for each coordinate: on the left the samples and the fitted states; on the
-    right (measured − fitted)/σ, of which about one in twenty lies outside the grey band of ±2. A
-    wave in them says that the structure lacks a part of the motion, a single one far away that a
-    sample is wrong. A coordinate that was never measured has no residuals.
+    One row of panels per coordinate: on the left the samples and the fitted states; on the right
+    (measured − fitted)/σ, of which about one in twenty lies outside the grey band of ±2. A wave in
+    the residuals means that the structure misses part of the motion; a single outlier means that
+    the sample is wrong. A coordinate that was never measured has no residuals.
 
     Args:
         learned: what `hk.learn` found.
-        run: which run, counted from 0, or from the end where negative.
+        run: which run, counted from 0, or from the end if negative.
         ax: n pairs of axes; new ones if None.
         units: of the coordinates.
         names: of the coordinates, if they are not q and p.
         time_unit: of the times.
-        title: above the first panel; the number of the run, and the share of it that the field is
-            learned from, if None.
+        title: above the first panel; if None, the number of the run and the share of it from which
+            the field was learned.
 
     Returns:
         The axes, a pair for each coordinate.
 
     Raises:
-        ValueError: there is no such run, or an argument has not one entry for each coordinate.
+        ValueError: there is no such run, or an argument does not have one entry per coordinate.
     """
     run, n = _position(run, len(learned.runs)), learned.runs.dimension
     labels = _labels(n, units, names)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.axes import Axes
 
-# Okabe & Ito's palette, which stays apart under every form of colour blindness.
+# Okabe & Ito's palette, which stays distinct under every form of colour blindness.
 COLORS: Mapping[str, str] = {
     "true": "#000000",
     "separable": "#D55E00",
@@ -33,7 +33,7 @@ Texts = tuple[str | None, str | None]  # the units, or the names, of two coordin
 
 
 def two(name: str, values: Any) -> tuple[Any, Any]:
-    """The entries of an argument that is a pair; a string is no pair of its letters."""
+    """The entries of an argument that must be a pair; a string of two letters is not one."""
     entries = () if isinstance(values, str) or not np.iterable(values) else tuple(values)
     if len(entries) != 2:
         raise ValueError(f"{name} must be a pair (first, second), got {values!r}.")

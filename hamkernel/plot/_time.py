@@ -27,15 +27,15 @@ def trajectory_error(
     title: str | None = None,
     show_legend: bool = True,
 ) -> Axes:
-    """Draw the error of trajectories over time; of several seeds, the median and a band.
+    """Draw the error of trajectories over time; for several seeds, their median and a band.
 
-    Seeds with a value that is not finite are left out, with a warning.
+    Seeds with a value that is not finite are omitted, with a warning.
 
     Args:
         ts: times, shape (T,).
         errors: ‖x_true(t) − x(t)‖, shape (T,) or (S, T), or a mapping from names to such arrays.
         ax: axes to draw on; new ones if None.
-        log: logarithmic axis of the error. Zeros, such as the start, are left out.
+        log: whether the axis of the error is logarithmic. Zeros, as at the start, are omitted.
         quantiles: the band over seeds.
         unit: of the error.
         time_unit: of `ts`.
@@ -43,7 +43,7 @@ def trajectory_error(
         show_legend: whether named curves get a legend.
 
     Raises:
-        ValueError: a curve has not one value for each time, or no seed of it is finite.
+        ValueError: a curve does not have one value per time, or no seed of it is finite.
     """
     curves = _checked(ts, errors)
     ax = axes(ax, figsize=(5.6, 3.8))
@@ -72,7 +72,7 @@ def energy_drift(
         energies: H(x(t)), shape (T,) or (S, T), or a mapping from names to such arrays.
         ax: axes to draw on; new ones if None.
         relative: divide by |H(x(0))|.
-        log: draw the absolute change on a logarithmic axis. Zeros are left out.
+        log: draw the absolute change on a logarithmic axis. Zeros are omitted.
         quantiles: the band over seeds.
         unit: of the energy; unused if `relative`.
         time_unit: of `ts`.
@@ -80,7 +80,7 @@ def energy_drift(
         show_legend: whether named curves get a legend.
 
     Raises:
-        ValueError: a curve has not one value for each time, or no seed of it is finite; or
+        ValueError: a curve does not have one value per time, or no seed of it is finite; or
             `relative`, and an energy is zero at the start.
     """
     changes = {}

@@ -1,4 +1,4 @@
-"""What is not known: ensembles of orbits, bands, and deviations over a phase plane."""
+"""Uncertainty: ensembles of orbits, bands, and deviations over a phase plane."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ def ensemble(
     names: Texts | None = None,
     label: str | None = "draws",
 ) -> Axes:
-    """Draw many orbits, thin and transparent and in one colour: dark where most of them are.
+    """Draw many orbits, thin and transparent: the picture is dark where most of them pass.
 
     Args:
-        ys: an orbit of each field drawn, shape (S, T, n):
+        ys: an orbit of each sampled field, shape (S, T, n):
             `jax.vmap(lambda f: hk.simulate(f, x0, ts).ys)(posterior.sample(key, S, region))`.
-        true: the orbit that happened, shape (T, n), drawn over them.
+        true: the true orbit, shape (T, n), drawn on top.
         ax: axes to draw on; new ones if None.
         dims: the two coordinates, counted from 0.
         color: of the ensemble.
@@ -54,7 +54,7 @@ def ensemble(
 
     Raises:
         ValueError: an array is of another shape, `dims` are not two of the coordinates, or an
-            argument is no pair.
+            argument is not a pair.
     """
     ys = np.asarray(ys)
     if ys.ndim != 3:
@@ -63,7 +63,7 @@ def ensemble(
         raise ValueError(f"true has shape {np.shape(true)}; (T, {ys.shape[2]}) is needed.")
     labels = plane_labels(dims, ys.shape[2], units, names)
     ax = axes(ax, figsize=(4.8, 4.4))
-    # As dark where all of them lie as one line, but never invisible.
+    # Where all of them coincide they are as dark as one line; a single one stays visible.
     alpha = float(np.clip(8 / len(ys), 0.06, 0.6))
     for i, orbit in enumerate(ys):
         name = label if i == 0 else None
@@ -96,18 +96,18 @@ def band(
     unit: str | None = None,
     title: str | None = None,
 ) -> Axes:
-    """Draw what is expected, with bands that hold it with 50 and 90 per cent.
+    """Draw a mean with the bands that contain the truth with a probability of 50 and 90 %.
 
     Args:
-        ts: times, or whatever it is over, shape (T,).
+        ts: times, or another abscissa, shape (T,).
         mean: shape (T,).
         deviation: standard deviations, shape (T,), such as those of `posterior.energy_deviation`.
-        true: what happened, shape (T,).
+        true: the truth, shape (T,).
         ax: axes to draw on; new ones if None.
         color: of the mean and the bands.
-        xlabel: of what it is over.
-        ylabel: of what is shown.
-        unit: of what is shown.
+        xlabel: of the abscissa.
+        ylabel: of the mean.
+        unit: of the mean.
         title: of the axes.
 
     Raises:
@@ -149,10 +149,10 @@ def deviation(
     names: Texts | None = None,
     resolution: int = 41,
 ) -> Axes:
-    """Draw how far a learned field or H may be off over the plane, and where that is most.
+    """Draw the standard deviation of a learned field or H over the plane, and mark its maximum.
 
     Args:
-        fn: x (2,) -> () or (2,), of which the length is drawn: `posterior.deviation`, or
+        fn: x (2,) -> (), or (2,) to draw its length: `posterior.deviation`, or
             `lambda x: posterior.energy_deviation(x, x0)`.
         xlim: limits of q.
         ylim: limits of p.
@@ -166,7 +166,7 @@ def deviation(
 
     Raises:
         ValueError: the function or the data is not in the plane, the limits do not rise, or an
-            argument is no pair.
+            argument is not a pair.
     """
     labels = plane_labels((0, 1), 2, units, names)
     q, p, points = grid(xlim, ylim, resolution)

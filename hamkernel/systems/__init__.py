@@ -1,17 +1,17 @@
 """Example systems with a known Hamiltonian, and noisy data sampled from them.
 
-A system is a field like a learned one: `system(x)` is the velocity of one state, `jax.vmap(system)`
-that of many, and `system.hamiltonian(x)` the energy. States are x = (q₁…q_m, p₁…p_m), velocities
-ẋ = J∇H with J = [[0, I], [−I, 0]]. Units are free but must agree; those named below are SI.
+A system is a field, like a learned one: `system(x)` is the velocity of one state,
+`jax.vmap(system)` that of many, and `system.hamiltonian(x)` the energy. States are
+x = (q₁…q_m, p₁…p_m), velocities ẋ = J∇H with J = [[0, I], [−I, 0]]. Units are free but must agree;
+those named below are SI.
 
 Positive parameters are stored as logarithms (`log_mass`) and read through properties (`mass`),
 signed ones as they are: every array leaf is an unconstrained real, and everything is
 differentiable with respect to it.
 
-A system only states H, and the field follows from it here and nowhere else: J∇H, or Π(x)∇H of
-`RigidBody`, `LotkaVolterra` and `ChargedParticle`. Friction and inputs are added by modules that
-wrap a system, `Driven(Damped(Pendulum(), 0.1), [[0.0], [1.0]])`, and a driven one is called as
-`system(x, u)`.
+A system states only H, and the field follows from it: J∇H, or Π(x)∇H for `RigidBody`,
+`LotkaVolterra` and `ChargedParticle`. Friction and inputs come from modules that wrap a system,
+as in `Driven(Damped(Pendulum(), 0.1), [[0.0], [1.0]])`; call a driven system as `system(x, u)`.
 """
 
 from hamkernel.systems._base import AbstractHamiltonianSystem

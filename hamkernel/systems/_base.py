@@ -20,8 +20,8 @@ Field = TypeVar("Field", bound=Callable[[Array], Array])
 class AbstractHamiltonianSystem(eqx.Module):
     """A Hamiltonian H(x), and the field J∇H that follows from it.
 
-    A final class whose H is T(p) + U(q) says so by `is_separable = True`: explicit symplectic
-    integrators ask for it.
+    A final class with H = T(p) + U(q) sets `is_separable = True`, which explicit symplectic
+    integrators require.
     """
 
     is_separable: ClassVar[bool] = False

@@ -1,4 +1,4 @@
-"""Systems whose equations are ẋ = Π(x)∇H with another Π than J."""
+"""Systems ẋ = Π(x)∇H whose Π is not J."""
 
 import abc
 
@@ -53,7 +53,7 @@ class RigidBody(AbstractPoissonSystem):
     """A body that turns freely: H = Σᵢ Lᵢ²/(2Iᵢ), L̇ = L × ω with ω = ∇H, n = 3.
 
     L is the angular momentum along the principal axes of the body [kg m²/s]. |L|² is a Casimir.
-    With three different moments the turn about the middle axis is unstable.
+    With three different moments the rotation about the middle axis is unstable.
 
     Args:
         inertia: the principal moments (I₁, I₂, I₃), positive [kg m²].
@@ -137,10 +137,10 @@ class LotkaVolterra(AbstractPoissonSystem):
 
 
 class ChargedParticle(AbstractPoissonSystem):
-    """A charge in a plane, in a spring and an upright magnetic field: n = 4.
+    """A charge in a plane, held by a spring, in a magnetic field normal to the plane: n = 4.
 
     q̇ = p/m, ṗ = −κq + (b/m)(p₂, −p₁) with H = |p|²/(2m) + κ|q|²/2, p = mq̇ the KINETIC momentum.
-    Without a spring it circles with the frequency b/m.
+    Without a spring it circles at the angular frequency b/m.
 
     Args:
         mass: m > 0 [kg].

@@ -38,7 +38,7 @@ def sample(
     Args:
         system: any traceable field, (n,) -> (n,); one of this module, a learned one, a function.
         x0: states at time ts[0], shape (B, n), or (n,) for a single trajectory. Its dtype is that
-            of the results and of the integration, for which the arrays of `system` are cast to it.
+            of the integration and the results; the arrays of `system` are cast to it.
         ts: times, shape (T,), strictly increasing.
         state_noise: standard deviation of the noise on X, shape () or (n,), in units of the state.
         velocity_noise: standard deviation of the noise on Y, shape () or (n,), per unit of time.
@@ -46,15 +46,15 @@ def sample(
             `jax.vmap(lambda key: sample(..., key=key))(keys)` integrates once.
 
     Returns:
-        X and Y, each of shape (B, T, n), or (T, n) where x0 is a single state. `hk.fit` takes
+        X and Y, each of shape (B, T, n), or (T, n) if x0 is a single state. `hk.fit` takes
         them as `X.reshape(-1, n)` and `Y.reshape(-1, n)`.
 
     Raises:
         ValueError: a shape is wrong; x0 or ts is not finite; ts does not increase; a noise level
             is negative or not finite; there is noise but no key, or more than one.
-        TypeError: `system` is no function of one JAX array that returns one; x0 is of less
-            precision than float32; the key is none of JAX.
-        RuntimeError: a trajectory left the finite numbers or needed too many steps.
+        TypeError: `system` does not map one JAX array to another; x0 has less precision than
+            float32; the key is not a JAX key.
+        RuntimeError: a trajectory diverged or needed too many steps.
 
     Source: Smith & Egeland (2023), section Experiments, where both levels are one number.
     """

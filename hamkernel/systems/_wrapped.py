@@ -1,4 +1,4 @@
-"""What is not B∇H: damping, and inputs, of any system."""
+"""Damping and inputs, added to any system."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, cast
@@ -29,8 +29,8 @@ class Damped(eqx.Module):
         damped: the coordinates with friction, from 0; the momenta, the second half, if None.
 
     Raises:
-        ValueError: the damping is not positive, or of another shape; `damped` are no coordinates,
-            or, when called, the states have none of that number. TypeError: the system has no
+        ValueError: the damping is not positive or has the wrong shape; `damped` are not
+            coordinates, or, when called, not those of the state. TypeError: the system has no
             Hamiltonian.
 
     Example: `hk.systems.Damped(hk.systems.Pendulum(), 0.1)`.
@@ -60,11 +60,11 @@ class Damped(eqx.Module):
         return jnp.exp(self.log_damping)
 
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """Return the energy H(x), which is lost, shape ()."""
+        """Return the energy H(x), which decreases, shape ()."""
         return self.system.hamiltonian(x)
 
     def dissipation(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """Return the power that is lost, ∇HᵀR∇H ≥ 0, shape ()."""
+        """Return the power lost, ∇HᵀR∇H ≥ 0, shape ()."""
         x = require.floating(x, "x")
         slope = jax.grad(in_precision(self, x.dtype).hamiltonian)(x)
         return self._resistance(x) @ slope**2
@@ -104,8 +104,8 @@ class Driven(eqx.Module):
         inputs: G, an array (n, m), or a function x -> (n, m).
 
     Raises:
-        TypeError: `system` is no function. ValueError: G is no matrix, or, when called, x or u do
-            not fit it.
+        TypeError: `system` is not a function. ValueError: G is not a matrix, or, when called, x or
+            u does not fit it.
 
     Example: a torque on a pendulum with friction,
         `hk.systems.Driven(hk.systems.Damped(hk.systems.Pendulum()), [[0.0], [1.0]])`.
@@ -130,7 +130,7 @@ class Driven(eqx.Module):
 
     @property
     def takes_inputs(self) -> bool:
-        """That a velocity needs u as well: `hk.simulate` asks."""
+        """Whether a velocity needs u as well; `hk.simulate` reads this."""
         return True
 
     def input_matrix(self, x: Num[ArrayLike, " n"]) -> Float[Array, "n m"]:

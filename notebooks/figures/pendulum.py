@@ -47,7 +47,7 @@ def main(folder: Path) -> None:
 
     figure = Figure(figsize=(8.0, 4.6), layout="constrained", facecolor="white")
     left, right = figure.subplots(1, 2, sharey=True)
-    titles = ("no structure", "energy, and left equals right")
+    titles = ("no structure", "energy conserved, mirror-symmetric")
     for ax, (name, tuned), color, title in zip(
         (left, right), found.items(), (WITHOUT, WITH), titles, strict=True
     ):
@@ -68,7 +68,7 @@ def main(folder: Path) -> None:
     names = ["24 noisy points", "true motion", "learned, no structure", "learned, with structure"]
     figure.legend(legend, names, loc="outside lower center", ncols=4, frameon=False, fontsize=9.5)
     figure.suptitle(
-        r"hk.fit solves $(G + N\lambda I)\,a = y$; lengthscale and $\lambda$ tuned by hk.tune, one fold a run",
+        r"hk.fit solves $(G + N\lambda I)\,a = y$; lengthscale and $\lambda$ tuned by hk.tune, one fold per run",
         fontsize=10.5,
     )
     figure.savefig(folder / "pendulum.png", dpi=150)
