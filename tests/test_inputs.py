@@ -90,8 +90,6 @@ def test_losses_and_solvers_take_inputs():
     for solver in (hk.ConjugateGradient(), hk.Nystrom(1e-6)):
         other = hk.fit(K, X, Y, 1e-2, inputs=U, solver=solver)(x, u)
         np.testing.assert_allclose(other, dense, atol=1e-6)
-    with pytest.raises(TypeError, match="does not know the structure Controlled"):
-        hk.fit(K, X, Y, inputs=U, solver=hk.RandomFeatures(8, jax.random.key(0)))
 
 
 def torque(X, U):

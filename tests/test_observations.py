@@ -251,7 +251,7 @@ def test_conjugate_gradients_of_rows_are_preconditioned():
     field = hk.fit(K, data, regularization=1e-4, solver=solver)
     exact = hk.fit(K, data, regularization=1e-4)
     np.testing.assert_allclose(field.evaluate(X), exact.evaluate(X), atol=1e-7)
-    assert field.info.iterations <= 16  # 8, and more than 100 without
+    assert int(field.info.iterations or 0) in range(1, 17)  # 8, and more than 100 without
 
 
 def test_random_features_learn_from_every_kind_what_their_own_kernel_learns(key):

@@ -7,14 +7,17 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._solvers.bases import WaveBasis
+from hamkernel._gram.observed import gram_of_rows
+from hamkernel._observations.blocks import Components
+from hamkernel._observations.data import rows_of_data, rows_of_states
+from hamkernel._solvers.spans import WaveBasis
 from hamkernel._tuning.boxes import full_trace, hyperparameters
 from hamkernel._tuning.descent import Descent, Run
 from hamkernel._tuning.objective import criterion_of
-from hamkernel._tuning.part import Part, rows_of_parts
+from hamkernel._tuning.part import Part, parts_of
 from hamkernel._tuning.space import SearchSpace
 from hamkernel._tuning.starts import design, shares_apart, spread_out
-from hamkernel._validation.losses import generalized_loss
+from hamkernel._validation.of_rows import generalized_loss
 
 N = 20
 RNG = np.random.default_rng(0)
@@ -67,8 +70,16 @@ BOXES = {
 
 
 def boxes(k, X, Y):
-    X, Y = jnp.asarray(X), jnp.asarray(Y)
-    return hyperparameters(hk.Separable(k), X, Y, X)
+    X = jnp.asarray(X)
+    return hyperparameters(hk.Separable(k), X, speed(Y), X)
+
+
+def speed(Y):
+    return float(np.sqrt(np.mean(np.asarray(Y) ** 2)))
+
+
+def zeros(N, n):
+    return rows_of_states(jnp.zeros((N, n)), jnp.zeros((N, n)))
 
 
 @pytest.mark.parametrize("name", BOXES)
@@ -139,7 +150,7 @@ def test_rounding_is_that_of_the_terms_before_they_cancel():
 
 
 def space(kernel=K, bounds=None):
-    return SearchSpace(kernel, jnp.asarray(X), jnp.asarray(Y), jnp.asarray(1e-3), (), bounds or {})
+    return SearchSpace(kernel, jnp.asarray(X), speed(Y), jnp.asarray(1e-3), (), bounds or {})
 
 
 def test_a_start_whose_kernel_is_not_positive_is_in_the_box():
@@ -150,7 +161,7 @@ def test_a_start_whose_kernel_is_not_positive_is_in_the_box():
 def test_the_subset_has_its_share_of_every_fold():
     labels = np.where(np.arange(400) % 12 == 0, 1, 0)
     criterion = criterion_of("cross_validation", 400, labels)
-    rows, everything = rows_of_parts(jnp.zeros((400, 2)), criterion, dense=True)
+    rows, everything = parts_of(zeros(400, 2), criterion, dense=True)
     assert (len(rows), len(everything)) == (64, 400)
     assert abs(labels[rows].mean() - labels.mean()) < 1 / len(rows)
 
@@ -158,7 +169,8 @@ def test_the_subset_has_its_share_of_every_fold():
 def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free():
     few, states, ridge = jnp.asarray(Y[:6]), jnp.asarray(X[:6]), jnp.asarray(1e-3)
     waves = WaveBasis(jax.random.key(0), 3)
-    features, gram = waves.features(K, states)(states), hk.gram(K, states)
+    features, gram = waves.span(K, 2, states.dtype).of(Components(states)), hk.gram(K, states)
+    rows = rows_of_states(states, few)
     F, G = (np.asarray(each).reshape(12, -1) for each in (features, gram))
 
     def free(matrix):
@@ -166,25 +178,51 @@ def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free
 
     low_rank, dense = free(F @ F.T), free(G)
     for more, judged in ((-1e-6, np.isfinite), (1e-6, np.isinf)):
-        assert judged(generalized_loss(K, states, few, ridge, waves, low_rank + more))
-        assert judged(generalized_loss(K, states, few, ridge, None, dense + more))
+        assert judged(generalized_loss(K, rows, ridge, waves, low_rank + more))
+        assert judged(generalized_loss(K, rows, ridge, None, dense + more))
     criterion = criterion_of("generalized_cross_validation", 6, 5)
-    assert criterion.loss(K, states, few, jnp.asarray(1e-12))[0] == np.inf
-    assert criterion.with_basis(waves).loss(K, states, few, jnp.asarray(1.0))[0] < np.inf
+    assert criterion.loss(K, rows, jnp.asarray(1e-12))[0] == np.inf
+    assert criterion.with_basis(waves).loss(K, rows, jnp.asarray(1.0))[0] < np.inf
 
 
 @pytest.mark.parametrize(("N", "n", "parts"), [(64, 2, 1), (65, 2, 2), (2000, 2, 3), (600, 8, 3)])
 def test_many_points_are_searched_in_parts_that_grow_and_end_with_all(N, n, parts):
     criterion = criterion_of("cross_validation", N, 5)
-    rows = rows_of_parts(jnp.zeros((N, n)), criterion, dense=True)
+    rows = parts_of(zeros(N, n), criterion, dense=True)
     sizes = [len(each) for each in rows]
     assert len(rows) == parts
     assert sizes == sorted(sizes)
     np.testing.assert_array_equal(rows[-1], np.arange(N))
     for some in rows:
         assert len(set(some.tolist())) == len(some)
-    few = rows_of_parts(jnp.zeros((N, n)), criterion, dense=False)
+    few = parts_of(zeros(N, n), criterion, dense=False)
     assert len(few) == max(parts - 1, 1)
+
+
+def test_a_subset_of_observations_has_their_rows():
+    half, rng = (
+        np.where(np.arange(2 * N).reshape(N, 2) % 3 == 0, np.nan, Y),
+        np.random.default_rng(1),
+    )
+    data = (
+        hk.Velocities(X, half, noise=rng.uniform(0.5, 2, size=(N, 2)))
+        + hk.Energies(X[:5], Y[:5, 0])
+        + hk.Functionals(X[:6].reshape(3, 2, 2), rng.normal(size=(3, 2, 2, 2)), Y[:3])
+    )
+    rows = rows_of_data(K, data)[1]
+    assert rows.count == N + 5 + 6
+    some, which = rows.some(np.array([1, 4, 19, 21, 24, 27]))
+    np.testing.assert_array_equal(which, [1, 4, 19, 21, 24, 27, 28])  # 28 shares the points of 27
+    inside = np.isin(rows.labels(), which)
+    np.testing.assert_array_equal(some.targets, rows.targets[inside])
+    np.testing.assert_array_equal(which[some.labels()], rows.labels()[inside])
+    G, own = (np.asarray(gram_of_rows(K, each)) for each in (rows, some))
+    of_velocities = np.flatnonzero(inside[: rows.slices[0].stop])
+    expected = G[np.ix_(of_velocities, of_velocities)]
+    np.testing.assert_allclose(own[: len(expected), : len(expected)], expected, atol=1e-12)
+    lone, which = rows.some(np.array([0, 1, 21]))
+    np.testing.assert_array_equal(which, [0, 1])
+    assert not len(lone.energies)
 
 
 def test_starts_are_no_neighbours():
@@ -259,9 +297,10 @@ def test_a_run_takes_its_curvature_along():
 
 def whole(kernel, Y, bounds=None):
     """The objective of the search on all of X."""
-    given = SearchSpace(kernel, jnp.asarray(X), jnp.asarray(Y), jnp.asarray(1e-3), (), bounds or {})
+    rows, typical = rows_of_states(jnp.asarray(X), jnp.asarray(Y)), speed(Y)
+    given = SearchSpace(kernel, rows.points, typical, jnp.asarray(1e-3), (), bounds or {})
     criterion = criterion_of("cross_validation", N, 5)
-    return Part(given, criterion, jnp.asarray(X), jnp.asarray(Y), np.arange(N))
+    return Part(given, criterion, rows, typical, np.arange(N))
 
 
 @pytest.mark.parametrize("share", [0.3, 0.7])

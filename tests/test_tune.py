@@ -133,10 +133,10 @@ def test_tuned_point_is_no_worse_than_any_start_and_than_the_callers(rich):
 
 
 def test_a_warp_has_the_same_box_however_its_map_returns_its_numbers():
-    X, Y = map(jnp.asarray, scattered())
+    X = jnp.asarray(scattered()[0])
     listed, stacked = (
         SearchSpace(
-            hk.Symplectic(hk.Warp(hk.Gaussian(jnp.ones(3)), fn)), X, Y, jnp.asarray(1e-3), (), {}
+            hk.Symplectic(hk.Warp(hk.Gaussian(jnp.ones(3)), fn)), X, 1.0, jnp.asarray(1e-3), (), {}
         )
         for fn in (
             lambda x: (jnp.cos(x[0]), jnp.sin(x[0]), x[1]),
@@ -428,13 +428,11 @@ def test_hyperparameters_have_the_names_of_the_bounds_and_the_values_of_the_kern
 
 
 def test_of_a_vector_the_coordinate_at_a_bound_is_named():
-    # H does not depend on q.
     X, _ = scattered()
-    Y = np.stack([np.sin(X[:, 1]), np.zeros(N)], axis=1)
     space = SearchSpace(
         hk.Symplectic(hk.Gaussian(np.ones(2))),
         jnp.asarray(X),
-        jnp.asarray(Y),
+        1.0,
         jnp.asarray(1e-3),
         (),
         {"lengthscale[1]": (0.1, 1.0)},
@@ -458,10 +456,10 @@ FIXED = [SIMPLE, hk.Symplectic(2.0 * hk.Gaussian() + hk.Matern(2.5))]
 
 
 def test_a_scale_that_cross_validation_does_not_see_is_warned_of():
-    X, Y = map(jnp.asarray, scattered())
+    X, Y = (jnp.asarray(each) for each in scattered())
 
     def said(K, frozen=(), objective="cross_validation", bounds=None):
-        space = SearchSpace(K, X, Y, jnp.asarray(1e-3), frozen, bounds or {})
+        space = SearchSpace(K, X, 1.0, jnp.asarray(1e-3), frozen, bounds or {})
         with warnings.catch_warnings(record=True) as caught:
             warnings.simplefilter("always")
             warn_of_free_scale(space, criterion_of(objective, N, 5))  # pyright: ignore

@@ -9,10 +9,18 @@ import pytest
 from scipy.stats import multivariate_normal
 
 import hamkernel as hk
-from hamkernel._solvers.bases import LandmarkBasis, WaveBasis
+from hamkernel._observations.blocks import Components
+from hamkernel._observations.data import rows_of_data, rows_of_states
 from hamkernel._solvers.landmarks import given_landmarks
-from hamkernel._validation.folds import Partition
-from hamkernel._validation.losses import generalized_loss, log_likelihood, partition_loss
+from hamkernel._solvers.spans import LandmarkBasis, WaveBasis
+from hamkernel._validation.of_rows import (
+    features_of_rows,
+    generalized_loss,
+    held_out_rows,
+    log_likelihood,
+    partition_loss,
+    partition_of_rows,
+)
 
 N, n, RIDGE = 30, 2, 1e-3
 # Systems of condition 1e4.
@@ -28,6 +36,7 @@ def data(N=N, seed=0):
 
 K = hk.Odd(hk.Symplectic(hk.Gaussian(1.2)))
 X, Y = map(jnp.asarray, data())
+ROWS = rows_of_states(X, Y)
 BASES = {
     "landmarks": LandmarkBasis(X[::5]),
     "waves": WaveBasis(jax.random.key(3), 7),
@@ -42,24 +51,24 @@ FOLDS = {
 
 
 def rows_of(basis):
-    return np.asarray(basis.features(K, X)(X)).reshape(N * n, -1)
+    return np.asarray(basis.span(K, n, X.dtype).of(Components(X)))
 
 
 @pytest.mark.few(4)
 @pytest.mark.parametrize("folds", FOLDS)
 @pytest.mark.parametrize("basis", BASES)
 def test_the_loss_is_that_of_refits(basis, folds):
-    partition = Partition(N, FOLDS[folds])
+    partition = partition_of_rows(ROWS, FOLDS[folds])
     rows, y = rows_of(BASES[basis]), np.asarray(Y).ravel()
     names = np.unique(partition.labels)
     ridge = (N - N / len(names)) * RIDGE
     losses = []
     for name in names:
-        out = np.repeat(partition.labels == name, n)
+        out = partition.labels == name
         F, t = rows[~out], y[~out]
         w = np.linalg.solve(F.T @ F + ridge * np.eye(F.shape[1]), F.T @ t)
         losses.append(np.mean((y[out] - rows[out] @ w) ** 2))
-    loss = partition_loss(K, X, Y, jnp.asarray(RIDGE), partition, BASES[basis])
+    loss = partition_loss(K, ROWS, jnp.asarray(RIDGE), partition, BASES[basis])
     np.testing.assert_allclose(loss, np.mean(losses), rtol=ROUNDING)
     w = np.linalg.solve(rows.T @ rows + N * RIDGE * np.eye(rows.shape[1]), rows.T @ y)
     assert abs(np.mean((y - rows @ w) ** 2) / loss - 1) > 0.01  # the training error is another
@@ -70,20 +79,20 @@ def test_likelihood_and_gcv_are_those_of_the_low_rank_gram(basis):
     rows, y = rows_of(BASES[basis]), np.asarray(Y).ravel()
     A = rows @ rows.T + N * RIDGE * np.eye(N * n)
     expected = multivariate_normal(np.zeros(N * n), A).logpdf(y)  # type: ignore[arg-type]
-    found = log_likelihood(K, X, Y, jnp.asarray(RIDGE), BASES[basis])
+    found = log_likelihood(K, ROWS, jnp.asarray(RIDGE), BASES[basis])
     np.testing.assert_allclose(found, expected, rtol=ROUNDING)
     a, trace = np.linalg.solve(A, y), np.trace(np.linalg.inv(A))
-    found = generalized_loss(K, X, Y, jnp.asarray(RIDGE), BASES[basis])
+    found = generalized_loss(K, ROWS, jnp.asarray(RIDGE), BASES[basis])
     np.testing.assert_allclose(found, N * n * (a @ a) / trace**2, rtol=ROUNDING)
 
 
 def test_with_all_points_as_landmarks_it_is_the_dense_loss():
     # A ridge far above what the columns left out as dependent carry.
-    partition = Partition(N, 5)
+    partition = partition_of_rows(ROWS, 5)
     basis = LandmarkBasis(X)
-    found = partition_loss(K, X, Y, jnp.asarray(RIDGE), partition, basis)
+    found = partition_loss(K, ROWS, jnp.asarray(RIDGE), partition, basis)
     np.testing.assert_allclose(found, hk.cross_validation_loss(K, X, Y, RIDGE, 5), rtol=1e-7)
-    few = partition_loss(K, X, Y, jnp.asarray(RIDGE), partition, LandmarkBasis(X[:2]))
+    few = partition_loss(K, ROWS, jnp.asarray(RIDGE), partition, LandmarkBasis(X[:2]))
     assert abs(few / found - 1) > 0.1
 
 
@@ -91,17 +100,77 @@ def test_with_all_points_as_landmarks_it_is_the_dense_loss():
 @pytest.mark.parametrize("folds", ["one long", "5", "2"])
 @pytest.mark.parametrize("basis", BASES)
 def test_gradients_are_those_of_finite_differences(basis, folds):
-    partition = Partition(N, FOLDS[folds])
+    partition = partition_of_rows(ROWS, FOLDS[folds])
 
     def loss(log_scale, log_ridge):
         kernel = hk.Odd(hk.Symplectic(hk.Gaussian(jnp.exp(log_scale))))
-        return partition_loss(kernel, X, Y, jnp.exp(log_ridge), partition, BASES[basis])
+        return partition_loss(kernel, ROWS, jnp.exp(log_ridge), partition, BASES[basis])
 
     at = jnp.log(1.2), jnp.log(RIDGE)
     slopes = jax.grad(loss, (0, 1))(*at)
     h = 1e-5
     for i, slope in enumerate(slopes):
         up, down = (loss(*(v + s * h * (i == j) for j, v in enumerate(at))) for s in (1, -1))
+        np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-5)
+
+
+def of_every_kind():
+    """Rows of masked and noisy velocities, noisy energies, functionals and an equilibrium."""
+    rng = np.random.default_rng(0)
+    V = np.array(Y[:14])
+    V[3, 0], V[5] = np.nan, np.nan
+    E = np.asarray(X[20:26, 1] ** 2 / 2 - jnp.cos(X[20:26, 0])) + 3.7
+    data = (
+        hk.Velocities(X[:14], V, noise=rng.uniform(0.5, 2, size=(14, 2)))
+        + hk.Energies(X[20:26], E, noise=rng.uniform(0.5, 2, size=6))
+        + hk.Functionals(X[:12].reshape(4, 3, 2), rng.normal(size=(4, 3, 2)), rng.normal(size=4))
+        + hk.Equilibria(np.zeros(2))
+    )
+    return rows_of_data(K, data)[1]
+
+
+@pytest.mark.parametrize(
+    "basis", [WaveBasis(jax.random.key(0), 4), WaveBasis(jax.random.key(0), 30)]
+)
+def test_held_out_observations_are_those_of_refits_with_a_constant_of_their_own(basis):
+    rows, K = of_every_kind(), hk.Symplectic(1.3 * hk.Gaussian(1.2))
+    partition = partition_of_rows(rows, 5)
+    ridge, y = rows.count * (1 - 1 / 5) * RIDGE, np.asarray(rows.targets)
+    F = np.asarray(features_of_rows(K, rows, basis))
+    # The energies have one more column, whose weight costs nothing.
+    columns = np.column_stack([F, np.zeros(len(y))])
+    columns[rows.energies, -1] = 1 / np.asarray(rows.scale)[rows.energies]
+    penalty = np.diag(np.append(np.full(F.shape[1], ridge), 0.0))
+    expected = np.zeros_like(y)
+    for fold in range(5):
+        out = partition.labels == fold
+        A, t = columns[~out], y[~out]
+        expected[out] = y[out] - columns[out] @ np.linalg.solve(A.T @ A + penalty, A.T @ t)
+    found, _ = held_out_rows(K, rows, jnp.asarray(RIDGE), partition, basis)
+    np.testing.assert_allclose(found, expected, atol=ROUNDING * abs(expected).max())
+
+
+LOSSES = {
+    "folds": lambda K, rows, ridge, basis: partition_loss(
+        K, rows, ridge, partition_of_rows(rows, 5), basis
+    ),
+    "generalized": generalized_loss,
+    "likelihood": log_likelihood,
+}
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("loss", LOSSES)
+def test_gradients_of_observations_are_those_of_finite_differences(loss):
+    rows, basis = of_every_kind(), LandmarkBasis(X[::8])
+
+    def value(log_scale, log_ridge):
+        K = hk.Symplectic(1.3 * hk.Gaussian(jnp.exp(log_scale)))
+        return LOSSES[loss](K, rows, jnp.exp(log_ridge), basis)
+
+    at, h = (jnp.log(1.2), jnp.log(RIDGE)), 1e-5
+    for i, slope in enumerate(jax.grad(value, (0, 1))(*at)):
+        up, down = (value(*(v + s * h * (i == j) for j, v in enumerate(at))) for s in (1, -1))
         np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-5)
 
 
@@ -130,8 +199,8 @@ def test_where_no_landmark_can_be_used_the_losses_are_infinite():
     # A fit is refused then; without columns it would be the zero field.
     for sign in (1.0, -1.0):
         K = hk.Symplectic(lambda x, z, sign=sign: sign * jnp.exp(-((x - z) @ (x - z))))
-        given, basis = (K, X, Y, jnp.asarray(1e-3)), LandmarkBasis(X[:3])
-        folds = partition_loss(*given, Partition(N, 3), basis)
+        given, basis = (K, ROWS, jnp.asarray(1e-3)), LandmarkBasis(X[:3])
+        folds = partition_loss(*given, partition_of_rows(ROWS, 3), basis)
         losses = folds, generalized_loss(*given, basis), -log_likelihood(*given, basis)
         assert all(np.isfinite(loss) if sign > 0 else loss == np.inf for loss in losses)
 
@@ -184,6 +253,27 @@ def test_the_loss_of_few_points_is_that_of_the_low_rank_fit_too():
         field = hk.fit(tuned.kernel, X[rest], Y[rest], tuned.regularization, solver=solver)
         losses.append(np.mean((field.evaluate(X[out]) - Y[out]) ** 2))
     np.testing.assert_allclose(tuned.loss, np.mean(losses), rtol=1e-6)
+
+
+def test_observations_are_tuned_in_low_rank_where_the_dense_loss_does_not_fit(monkeypatch):
+    # Half of the components, and energies: 260 rows.
+    X, Y = data(200, seed=3)
+    masked = np.where(np.arange(Y.size).reshape(Y.shape) % 2 == 0, Y, np.nan)
+    observed = hk.Velocities(X, masked) + hk.Energies(
+        X[:60], X[:60, 1] ** 2 / 2 - np.cos(X[:60, 0])
+    )
+    monkeypatch.setattr("hamkernel._machine.memory.memory_bytes", lambda: 1_500_000)
+    start, solver = hk.Symplectic(hk.Gaussian(0.4)), hk.RandomFeatures(60, jax.random.key(0))
+    tuned = hk.tune(start, observed, regularization=0.1, starts=2, solver=solver)
+    new = data(200, seed=5)[0]
+    truth = np.stack([new[:, 1], -np.sin(new[:, 0])], axis=1)
+    errors = [
+        np.linalg.norm(f.evaluate(new) - truth) / np.linalg.norm(truth)
+        for f in (tuned.field, hk.fit(start, observed, regularization=0.1, solver=solver))
+    ]
+    assert errors[0] < 0.05 < errors[1]
+    with pytest.raises(ValueError, match=r"hk.Nystrom\(\)"):
+        hk.tune(start, observed, regularization=0.1, starts=2)
 
 
 def test_a_dense_loss_that_does_not_fit_is_refused_before_the_search(monkeypatch):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
+from hamkernel._fields.controlled import ControlledField
 from hamkernel._kernels.functions import as_pytree
 
 Between = Literal["held", "linear"]
@@ -49,6 +50,24 @@ class Driven(eqx.Module):
     def __call__(self, t: Any, x: Float[Array, " n"], args: Any) -> Float[Array, " n"]:
         u = self.inputs(args if self.held_from_args else args + t)
         return self.field(x, require.floating(u, "the value of inputs").astype(x.dtype))
+
+
+class AtStart(eqx.Module):
+    """A driven field at the first time, to be looked at before the solve."""
+
+    driven: Driven
+    start: Float[Array, ""]
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.driven(jnp.zeros_like(self.start), x, self.start)
+
+
+def learned_at(field: Any, x: Float[Array, " n"]) -> tuple[Any, Float[Array, " d"]]:
+    """What was learned and the point where it is asked first, (x, u) where there are inputs."""
+    if isinstance(field, AtStart) and isinstance(field.driven.field, ControlledField):
+        learned, u = field.driven.field, field.driven.inputs(field.start)
+        return learned.whole, learned.joined(x, u)
+    return field, x
 
 
 def inputs_of(given: Any, ts: Float[Array, " T"], between: Between) -> Callable[[Array], Any]:

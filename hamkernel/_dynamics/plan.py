@@ -13,7 +13,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 
 from hamkernel import _require as require
 from hamkernel._dynamics.equal_steps import AbstractSymplecticSolver, EqualSteps, step_counts
-from hamkernel._dynamics.inputs import refuse_symplectic
+from hamkernel._dynamics.inputs import learned_at, refuse_symplectic
 from hamkernel._dynamics.rounding import rounding
 
 # Bounds the loop where the number of steps is not known beforehand: some seconds of a cheap field.
@@ -56,7 +56,7 @@ def tolerances(
     """The relative and the absolute tolerance, by default no less than the field rounds."""
     default = jnp.asarray(1e-10 if x0.dtype == jnp.float64 else 1e-5, x0.dtype)
     if rtol is None or atol is None:
-        default = jnp.maximum(default, rounding(field, x0))
+        default = jnp.maximum(default, rounding(*learned_at(field, x0)))
     return _tolerance("rtol", rtol, default), _tolerance("atol", atol, default)
 
 

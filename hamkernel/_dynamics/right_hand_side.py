@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._dynamics.inputs import Between, Driven, inputs_of, refuse_missing
+from hamkernel._dynamics.inputs import AtStart, Between, Driven, inputs_of, refuse_missing
 
 
 class _Autonomous(eqx.Module):
@@ -26,16 +26,6 @@ class _Autonomous(eqx.Module):
     def __call__(self, t: Any, x: Float[Array, " n"], args: Any) -> Float[Array, " n"]:
         del t, args
         return self.field(x)
-
-
-class _At(eqx.Module):
-    """A driven field at the first time, to be looked at before the solve."""
-
-    driven: Driven
-    start: Float[Array, ""]
-
-    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self.driven(jnp.zeros_like(self.start), x, self.start)
 
 
 class RightHandSide(NamedTuple):
@@ -63,7 +53,7 @@ def right_hand_side(
     start = first.astype(ts.dtype) if callable(inputs) else jnp.zeros((), ts.dtype)
     held = constant_steps and between == "held" and not callable(inputs)
     driven = Driven(field, inputs_of(inputs, ts, between), held)
-    return RightHandSide(driven, start, _At(driven, start))
+    return RightHandSide(driven, start, AtStart(driven, start))
 
 
 def check_field(field: Callable[[Array], Array], x0: Float[Array, " n"]) -> None:

@@ -12,6 +12,10 @@ twice: products of matrices only, and Q orthonormal to rounding where the condit
 
 The derivatives use CΦ = ΦM⁻¹ and C²Φ = ΦM⁻².
 
+Of rows that see an unknown constant, in the direction p with ‖p‖ = 1, C is that of
+`contrasted.py`. With Φ − ppᵀΦ in the place of Φ it is (I − ppᵀ − QQᵀ)/δ: the constant is one more
+orthonormal column beside Q, whose weight is free.
+
 Source: Yamamoto, Nakatsukasa, Yanagisawa & Fukaya (2015), ETNA 44, on the second pass.
 """
 
@@ -37,13 +41,15 @@ class LowRankSystem(AbstractSystem):
     Attributes:
         rows: Φ, shape (D, r).
         ridge: δ, shape ().
+        constant: p, shape (D,), which is not differentiated; None if there is none.
     """
 
     rows: Float[Array, "D r"]
     ridge: Float[Array, ""]
+    constant: Float[Array, " D"] | None = None
 
     def factor(self) -> "LowRankFactor":
-        return LowRankFactor(self.rows, self.ridge)
+        return LowRankFactor(self)
 
 
 class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem]):
@@ -52,27 +58,42 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
     Attributes:
         rows: Φ.
         ridge: δ.
-        Q: the rows of the orthonormal factor that belong to Φ, shape (D, r).
+        Q: the rows of the orthonormal factor that belong to Φ, shape (D, r), and p beside them.
         R: its triangular factor, shape (r, r).
         size: ‖M‖ in the Frobenius norm, as that of A but for the directions without features.
     """
 
     rows: Float[Array, "D r"]
     ridge: Float[Array, ""]
-    Q: Float[Array, "D r"]
+    Q: Float[Array, "D q"]
     R: Float[Array, "r r"]
     size: Float[Array, ""]
 
-    def __init__(self, rows: Float[Array, "D r"], ridge: Float[Array, ""]):
-        self.rows, self.ridge = rows, ridge
-        square = plus_ridge(gram_of_columns(rows), ridge)
+    def __init__(self, system: LowRankSystem):
+        self.rows, self.ridge, p = system.rows, system.ridge, system.constant
+        rows = self.rows
+        if p is not None:
+            p = jax.lax.stop_gradient(p)
+            rows = rows - jnp.outer(p, p @ rows)
+        square = plus_ridge(gram_of_columns(rows), self.ridge)
         self.size = jnp.linalg.norm(square)
         first = cholesky(square)
         Q = _right_solve(first, rows)
-        P = jnp.sqrt(ridge) * backward(first, jnp.eye(len(first), dtype=rows.dtype))
+        P = jnp.sqrt(self.ridge) * backward(first, jnp.eye(len(first), dtype=rows.dtype))
         second = cholesky(gram_of_columns(Q) + gram_of_columns(P))
-        self.Q = _right_solve(second, Q)
+        Q = _right_solve(second, Q)
+        self.Q = Q if p is None else jnp.column_stack([Q, p])
         self.R = second @ first
+
+    @property
+    def _free(self) -> int:
+        """The directions without features: of D rows, less the constant."""
+        return len(self.rows) - self.Q.shape[1]
+
+    @property
+    def _images(self) -> Float[Array, "D r"]:
+        """CΦ = Q R⁻ᵀ."""
+        return _right_solve(self.R, self.Q[:, : len(self.R)], transposed=True)
 
     def solve(self, b: Float[Array, "D *m"]) -> Float[Array, "D *m"]:
         return (b - self.Q @ (self.Q.T @ b)) / self.ridge
@@ -80,20 +101,19 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
     def solved(self, y: Float[Array, " D"]) -> tuple[Float[Array, " D"], Float[Array, ""]]:
         # yᵀA⁻¹y = ‖y − Φw‖²/δ + ‖w‖² with the weights w of the fit
         rotated = self.Q.T @ y
-        left, w = y - self.Q @ rotated, backward(self.R, rotated[:, None])[:, 0]
+        left = y - self.Q @ rotated
+        w = backward(self.R, rotated[: len(self.R), None])[:, 0]
         return left / self.ridge, left @ left / self.ridge + w @ w
 
     @property
     def log_det(self) -> Float[Array, ""]:
-        D, r = self.rows.shape
-        return 2 * jnp.sum(jnp.log(jnp.diagonal(self.R))) + (D - r) * jnp.log(self.ridge)
+        return 2 * jnp.sum(jnp.log(jnp.diagonal(self.R))) + self._free * jnp.log(self.ridge)
 
     @property
     def inverse_trace(self) -> Float[Array, ""]:
-        # (D − ‖Q‖²)/δ with ‖Q‖² + ‖P‖² = r and P = √δ R⁻¹
-        D, r = self.rows.shape
-        root = backward(self.R, jnp.eye(r, dtype=self.R.dtype))
-        return (D - r) / self.ridge + jnp.sum(root**2)
+        # (D − ‖Q‖²)/δ with ‖Q‖² + ‖P‖² = q and P = √δ R⁻¹
+        root = backward(self.R, jnp.eye(len(self.R), dtype=self.R.dtype))
+        return self._free / self.ridge + jnp.sum(root**2)
 
     def inverse(self) -> "LowRankFactor":
         return self
@@ -108,24 +128,23 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
     def pulled(self, u, w, inverse=None, square=None) -> LowRankSystem:
         rows = u[:, None] * (w @ self.rows)[None, :] + w[:, None] * (u @ self.rows)[None, :]
         ridge = u @ w
-        D, r = self.rows.shape
-        T = _right_solve(self.R, self.Q, transposed=True)  # CΦ = QR⁻ᵀ
+        T = self._images
         if inverse is not None:
             rows = rows + 2 * inverse * T
             ridge = ridge + inverse * self.inverse_trace
         if square is not None:
-            root = backward(self.R, jnp.eye(r, dtype=T.dtype))
+            root = backward(self.R, jnp.eye(len(self.R), dtype=T.dtype))
             C_squared = _right_solve(self.R, _right_solve(self.R, T), transposed=True)  # C²Φ
             rows = rows + 2 * square * C_squared
-            trace = (D - r) / self.ridge**2 + jnp.sum((root @ root.T) ** 2)
+            trace = self._free / self.ridge**2 + jnp.sum((root @ root.T) ** 2)
             ridge = ridge + square * trace
-        return LowRankSystem(rows, ridge)
+        return self._cotangent(rows, ridge)
 
     def pulled_folds(self, a, groups, V, R, bars) -> tuple[LowRankSystem, Float[Array, " D"]]:
         r_bar, a_bar = bars
-        Q, T = self.Q, _right_solve(self.R, self.Q, transposed=True)
-        P = jnp.sqrt(self.ridge) * backward(self.R, jnp.eye(len(self.R), dtype=Q.dtype))
-        v_all, W, ridge = jnp.zeros_like(a), jnp.zeros_like(Q), jnp.zeros_like(self.ridge)
+        Q, T, r_own = self.Q, self._images, len(self.R)
+        P = jnp.sqrt(self.ridge) * backward(self.R, jnp.eye(r_own, dtype=Q.dtype))
+        v_all, W, ridge = jnp.zeros_like(a), jnp.zeros_like(T), jnp.zeros_like(self.ridge)
         for group, v, r in zip(groups, V, R, strict=True):
             own = group.gather(T)
             along_v, along_r = (jnp.einsum("fsr,fs->fr", own, each) for each in (v, r))
@@ -138,10 +157,14 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
             v_Q, r_Q, a_Q = (jnp.einsum("fsr,fs->fr", own, each) for each in (v, r, fold_a))
             t_v, t_r = v_Q / self.ridge, r_Q / self.ridge
             inside = jnp.vdot(group.gather(r_bar), fold_a) + jnp.vdot(t_v, a_Q)
-            ridge = ridge + inside - jnp.vdot(t_v @ P.T, t_r @ P.T)
+            ridge = ridge + inside - jnp.vdot(t_v[:, :r_own] @ P.T, t_r[:, :r_own] @ P.T)
         w = self.solve(v_all + a_bar)
         less = self.pulled(w, a)
-        return LowRankSystem(self.solve(W) - less.rows, ridge - less.ridge), w
+        return self._cotangent(self.solve(W) - less.rows, ridge - less.ridge), w
+
+    def _cotangent(self, rows: Float[Array, "D r"], ridge: Float[Array, ""]) -> LowRankSystem:
+        has_constant = self.Q.shape[1] > len(self.R)
+        return LowRankSystem(rows, ridge, jnp.zeros_like(self.Q[:, 0]) if has_constant else None)
 
 
 class _ManyRows(AbstractBlocks):

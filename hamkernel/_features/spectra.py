@@ -28,6 +28,7 @@ from hamkernel._kernels.dot_products import Periodic
 from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._kernels.symmetry import Symmetrised
 from hamkernel._kernels.transforms import Select
+from hamkernel._structures.controlled import Constant
 
 
 class Spectrum(eqx.Module):
@@ -156,6 +157,12 @@ def _(k: Periodic, n: int, count: int, key, dtype):
     harmonic = (index - _HARMONICS // 2).astype(dtype).T  # (F, n)
     frequencies = jax.vmap(lambda j: divided(2 * jnp.pi * j, k.period, "period"))(harmonic)
     return _one(frequencies, jnp.prod(ratio, axis=0))
+
+
+@spectra.register
+def _(k: Constant, n: int, count: int, key, dtype):
+    """The one frequency 0, exactly."""
+    return (Spectrum(jnp.zeros((1, n), dtype), jnp.ones(1, dtype), parity=1),)
 
 
 @spectra.register

@@ -24,6 +24,7 @@ from hamkernel._features.spectra import Spectrum, spectra
 from hamkernel._kernels.base import AbstractScalarKernel
 from hamkernel._kernels.symmetry import symmetry_removed
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.controlled import Controlled, KnownMatrix
 from hamkernel._structures.operators import AbstractPotentialKernel
 from hamkernel._structures.without_potential import DivergenceFree, Separable
 
@@ -193,6 +194,48 @@ class SeparableFeatures(AbstractFeatures):
         raise AttributeError("a field with independent components has no potential.")
 
 
+class ControlledFeatures(AbstractFeatures):
+    """Those φ(x) of the drift, and uⱼ e_a (wave)(x) for each input j and each coordinate a.
+
+    Attributes:
+        drift: the features of the drift.
+        waves: those of the kernel of the input matrix; None where that is known.
+        acts_on: the coordinates that inputs change.
+        count: m, the number of inputs; points are (x, u).
+    """
+
+    drift: AbstractFeatures
+    waves: Waves | GroupWaves | None
+    acts_on: tuple[int, ...] = eqx.field(static=True)
+    count: int = eqx.field(static=True)
+
+    @property
+    def columns(self) -> int:
+        waves = 0 if self.waves is None else len(self.waves.amplitudes)
+        return self.drift.columns + len(self.acts_on) * self.count * waves
+
+    def rows(self, x: Float[Array, " d"]) -> Float[Array, "n r"]:
+        x, u = x[: -self.count], x[-self.count :]
+        drift = self.drift.rows(x)
+        if self.waves is None:
+            return drift
+        directions = jnp.eye(len(x), dtype=x.dtype)[:, np.asarray(self.acts_on)]  # (n, a)
+        gains = jnp.kron(directions, jnp.kron(u, self.waves.values(x))[None])
+        return jnp.concatenate([drift, gains], axis=1)
+
+    def field(self, x: Float[Array, " d"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        x, u = x[: -self.count], x[-self.count :]
+        r = self.drift.columns
+        drift = self.drift.field(x, w[:r])
+        if self.waves is None:
+            return drift
+        gains = w[r:].reshape(len(self.acts_on), self.count, -1) @ self.waves.values(x)  # (a, m)
+        return drift.at[np.asarray(self.acts_on)].add(gains @ u)
+
+    def potential(self, x: Float[Array, " d"], w: Float[Array, " r"]) -> Float[Array, ""]:
+        return self.drift.potential(x[: -self.count], w[: self.drift.columns])
+
+
 class SumFeatures(AbstractFeatures):
     """The features of all terms, one after the other."""
 
@@ -229,7 +272,7 @@ def features(
 
     Args:
         K: a structure, or a sum of structures, on shift-invariant scalar kernels.
-        n: the number of coordinates.
+        n: the number of coordinates of a point, those of inputs too.
         count: frequencies for each term of each scalar kernel.
         key: the random key.
         dtype: of the features.
@@ -237,6 +280,8 @@ def features(
     Raises:
         TypeError: a kernel without a known spectral density, or an unknown structure.
     """
+    if isinstance(K, Controlled):
+        return _controlled(K, n, count, key, dtype)
     if isinstance(K, Sum):
         keys = jax.random.split(key, len(K.terms))
         pairs = zip(K.terms, keys, strict=True)
@@ -251,4 +296,16 @@ def features(
         return PotentialFeatures(K, waves)
     return (DivergenceFreeFeatures if isinstance(K, DivergenceFree) else SeparableFeatures)(
         waves, n
+    )
+
+
+def _controlled(K: Controlled, n: int, count: int, key: Key[Array, ""], dtype: Any):
+    n, inputs = K.outputs(n), K.input_count
+    of_drift, of_matrix = jax.random.split(key)
+    drift, G = features(K.drift, n, count, of_drift, dtype), K.inputs
+    if isinstance(G, KnownMatrix):
+        return ControlledFeatures(drift, None, (), inputs)
+    acts_on = tuple(range(n)) if G.acts_on is None else G.acts_on
+    return ControlledFeatures(
+        drift, waves_of(G.kernel, n, count, of_matrix, dtype), acts_on, inputs
     )

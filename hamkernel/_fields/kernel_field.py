@@ -120,7 +120,7 @@ def _value_field(
     def along(v):
         return b @ jax.vmap(lambda s: K.potential(s, x[None], v[None]))(S)
 
-    return jax.grad(along)(jnp.zeros_like(x))
+    return jax.grad(along)(jnp.zeros(K.outputs(len(x)), x.dtype))
 
 
 @eqx.filter_jit

@@ -16,27 +16,29 @@ _STRIP = 200_000  # entries of rows at once; their derivatives hold up to 13 arr
 
 
 @eqx.filter_custom_vjp
-def trained(kernel_and_points, make, rowwise: bool = False):
-    """make(K, X), an array, cheap to differentiate with respect to K.
+def trained(kernel_and_data, make, rowwise: bool = False):
+    """make(K, data), an array, cheap to differentiate with respect to K.
 
-    If `rowwise` then make(K, X) is a function instead, which makes of points a row for each, and
-    the array is its value at X. Its derivatives take the memory of a strip of rows.
+    If `rowwise` then make(K, data) is a function and points instead. The function makes of points
+    a row for each, and the array is its value there. Derivatives take the memory of a strip of it.
     """
-    return _array(make, rowwise, *kernel_and_points)
+    return _array(make, rowwise, *kernel_and_data)
 
 
 @trained.def_fwd
-def _(perturbed, kernel_and_points, make, rowwise=False):
-    return trained(kernel_and_points, make, rowwise), None
+def _(perturbed, kernel_and_data, make, rowwise=False):
+    return trained(kernel_and_data, make, rowwise), None
 
 
 @trained.def_bwd
-def _(saved, bar, perturbed, kernel_and_points, make, rowwise=False):
-    K, X = kernel_and_points
+def _(saved, bar, perturbed, kernel_and_data, make, rowwise=False):
+    K, data = kernel_and_data
 
-    def paired(K, X, bar):
-        made = make(K, X)
-        return _paired_by_rows(made, X, bar) if rowwise else jnp.vdot(bar, made)
+    def paired(K, data, bar):
+        if not rowwise:
+            return jnp.vdot(bar, make(K, data))
+        rows, X = make(K, data)
+        return _paired_by_rows(rows, X, bar)
 
     params, static = eqx.partition(K, eqx.is_inexact_array)
     flat, unravel = ravel_pytree(params)
@@ -45,23 +47,27 @@ def _(saved, bar, perturbed, kernel_and_points, make, rowwise=False):
         # What does not depend on the direction depends on it now: XLA would else compute it ahead
         # of the loop and keep it, several arrays of the size of the Gram.
         here, direction = jax.lax.optimization_barrier((flat, direction))
-        at = lambda h: paired(eqx.combine(unravel(h), static), X, bar)  # noqa: E731
+        at = lambda h: paired(eqx.combine(unravel(h), static), data, bar)  # noqa: E731
         return jax.jvp(at, (here,), (direction,))[1]
 
     # Side by side the directions share what does not depend on them, at the price of memory.
-    together = min(flat.size, _ENTRIES // max(bar.size, X.size))
+    arrays, rest = eqx.partition(data, eqx.is_inexact_array)
+    largest = max(each.size for each in [bar, *jax.tree.leaves(arrays)])
+    together = min(flat.size, _ENTRIES // largest)
     directions = jnp.eye(flat.size, dtype=flat.dtype)
     slopes = jax.lax.map(slope, directions, batch_size=together if together > 1 else None)
     K_bar = unravel(slopes.astype(flat.dtype))
-    if not perturbed[1]:
-        return K_bar, None
-    _, pull = jax.vjp(lambda X: _array(make, rowwise, K, X), X)
+    if not any(jax.tree.leaves(perturbed[1])):
+        return K_bar, jax.tree.map(lambda _: None, arrays)
+    _, pull = jax.vjp(lambda arrays: _array(make, rowwise, K, eqx.combine(arrays, rest)), arrays)
     return K_bar, pull(bar)[0]
 
 
-def _array(make, rowwise: bool, K, X: Float[Array, "..."]) -> Array:
-    made = make(K, X)
-    return made(X) if rowwise else made
+def _array(make, rowwise: bool, K, data) -> Array:
+    if not rowwise:
+        return make(K, data)
+    rows, X = make(K, data)
+    return rows(X)
 
 
 def _paired_by_rows(rows, X: Float[Array, "N n"], bar: Float[Array, "N ..."]) -> Float[Array, ""]:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel._gram.dense import assemble, centred
-from hamkernel._observations.blocks import AbstractBlock, Combinations
+from hamkernel._observations.blocks import AbstractBlock, Combinations, Components
 from hamkernel._observations.rows import Rows
 from hamkernel._structures.base import AbstractMatrixKernel
 
@@ -41,6 +41,12 @@ def gram_before_contrast(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, "M
 def rows_between(K: AbstractMatrixKernel, rows: Rows, block: AbstractBlock) -> Float[Array, "D d"]:
     """The covariances of all rows with those of a block."""
     return rows.contrast(jnp.concatenate([between(K, each, block) for each in rows.blocks]))
+
+
+def components(K: AbstractMatrixKernel, points: Float[Array, "P d"]) -> Components:
+    """All components of the field at points, (x, u) of a kernel with inputs."""
+    n = K.outputs(points.shape[1])
+    return Components(points, outputs=None if n == points.shape[1] else n)
 
 
 def between(
@@ -80,7 +86,7 @@ def _at_points(K: AbstractMatrixKernel, left: AbstractBlock, right: AbstractBloc
     if right.of_values:
         pair = jax.vmap(K.potential_covariance, in_axes=(None, 0))
         return jax.vmap(pair, in_axes=(0, None))(X, Z)  # (P, P′)
-    basis = jnp.eye(X.shape[1], dtype=X.dtype)
+    basis = jnp.eye(K.outputs(X.shape[1]), dtype=X.dtype)
 
     def entry(x, z, e):
         return K.potential(x, z[None], e[None])

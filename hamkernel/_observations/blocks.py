@@ -7,8 +7,9 @@ so to a field again, whatever was observed.
 """
 
 import abc
+import math
 from collections.abc import Iterable
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -21,7 +22,17 @@ class AbstractBlock(eqx.Module):
 
     of_values: eqx.AbstractClassVar[bool]  # of the potential; else of the field
 
-    points: eqx.AbstractVar[Float[Array, "P n"]]
+    points: eqx.AbstractVar[Float[Array, "P d"]]
+
+    @property
+    @abc.abstractmethod
+    def dimension(self) -> int:
+        """n, the components of the field; points (x, u) have d = n + m coordinates."""
+
+    @property
+    @abc.abstractmethod
+    def values_shape(self) -> tuple[int, ...]:
+        """That of the field, or of the potential, at the points."""
 
     @property
     @abc.abstractmethod
@@ -49,6 +60,18 @@ class AbstractBlock(eqx.Module):
     def then(self, other: "AbstractBlock") -> "AbstractBlock | None":
         """One block of these rows and then the others; None if they are of another kind."""
 
+    @abc.abstractmethod
+    def at(self, points: Float[Array, "P d"]) -> "AbstractBlock":
+        """All components of the field, or the potential, at other points, without noise."""
+
+    @abc.abstractmethod
+    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+        """The block of some observations, counted from 0 and in order.
+
+        Returns:
+            It, which rows it has, and which observations those belong to.
+        """
+
 
 class Components(AbstractBlock):
     """Components of the field at points.
@@ -56,16 +79,27 @@ class Components(AbstractBlock):
     Attributes:
         kept: the rows that were measured, as indices into all P·n, shape (D,); None if all were.
         noise: of each row that was measured; None if it is 1.
+        outputs: the components of the field at a point, None if there are as many as coordinates;
+            fewer at points (x, u) of a field with inputs.
     """
 
     points: Float[Array, "P n"]
     kept: Int[Array, " D"] | None = None
     noise: Float[Array, " D"] | None = None
+    outputs: int | None = eqx.field(static=True, default=None)
     of_values: ClassVar[bool] = False
 
     @property
+    def dimension(self) -> int:
+        return self.points.shape[1] if self.outputs is None else self.outputs
+
+    @property
+    def values_shape(self) -> tuple[int, int]:
+        return len(self.points), self.dimension
+
+    @property
     def scale(self) -> Float[Array, " D"]:
-        size = self.points.size if self.kept is None else len(self.kept)
+        size = math.prod(self.values_shape) if self.kept is None else len(self.kept)
         return jnp.ones(size, self.points.dtype) if self.noise is None else self.noise
 
     @property
@@ -73,44 +107,68 @@ class Components(AbstractBlock):
         return len(self.points)
 
     def labels(self) -> Int[np.ndarray, " D"]:
-        P, n = self.points.shape
+        P, n = self.values_shape
         return (np.arange(P * n) if self.kept is None else np.asarray(self.kept)) // n
 
     def rows(self, values: Float[Array, "P n *rest"]) -> Float[Array, "D *rest"]:
-        rows = values.reshape(self.points.size, *values.shape[2:])
+        rows = values.reshape(math.prod(values.shape[:2]), *values.shape[2:])
         rows = rows if self.kept is None else rows[self.kept]
         return rows if self.noise is None else rows / _along(self.noise, rows)
 
     def coefficients(self, c: Float[Array, " D"]) -> Float[Array, "P n"]:
         c = c if self.noise is None else c / self.noise
         if self.kept is not None:
-            c = jnp.zeros(self.points.size, c.dtype).at[self.kept].set(c)
-        return c.reshape(self.points.shape)
+            c = jnp.zeros(math.prod(self.values_shape), c.dtype).at[self.kept].set(c)
+        return c.reshape(self.values_shape)
 
     def then(self, other: AbstractBlock) -> "Components | None":
-        if not isinstance(other, Components):
+        if not isinstance(other, Components) or self.outputs != other.outputs:
             return None
         kept = noise = None
+        sizes = [math.prod(block.values_shape) for block in (self, other)]
         if self.kept is not None or other.kept is not None:
             own, others = (
-                jnp.arange(b.points.size) if b.kept is None else b.kept for b in (self, other)
+                jnp.arange(size) if b.kept is None else b.kept
+                for b, size in zip((self, other), sizes, strict=True)
             )
-            kept = jnp.concatenate([own, others + self.points.size])
+            kept = jnp.concatenate([own, others + sizes[0]])
         if self.noise is not None or other.noise is not None:
             noise = jnp.concatenate([self.scale, other.scale])
-        return Components(jnp.concatenate([self.points, other.points]), kept, noise)
+        return Components(jnp.concatenate([self.points, other.points]), kept, noise, self.outputs)
+
+    def at(self, points: Float[Array, "P d"]) -> "Components":
+        return Components(points, outputs=self.outputs)
+
+    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+        rows = np.flatnonzero(np.isin(self.labels(), chosen))
+        kept = self.kept
+        if kept is not None:
+            n = self.values_shape[1]
+            all_kept = np.asarray(kept)[rows]
+            kept = jnp.asarray(np.searchsorted(chosen, all_kept // n) * n + all_kept % n)
+        points, noise = _taken(self.points, chosen), _taken(self.noise, rows)
+        return Components(points, kept, noise, self.outputs), rows, chosen
 
 
 class Combinations(AbstractBlock):
     """Σ_q weights[s, r, q] · f(groups[s, q]), R rows for each of S groups of Q points."""
 
-    groups: Float[Array, "S Q n"]
+    groups: Float[Array, "S Q d"]
     weights: Float[Array, "S R Q n"]
     of_values: ClassVar[bool] = False
 
     @property
-    def points(self) -> Float[Array, "SQ n"]:
+    def dimension(self) -> int:
+        return self.weights.shape[3]
+
+    @property
+    def points(self) -> Float[Array, "SQ d"]:
         return self.groups.reshape(-1, self.groups.shape[2])
+
+    @property
+    def values_shape(self) -> tuple[int, int]:
+        S, _, Q, n = self.weights.shape
+        return S * Q, n
 
     @property
     def scale(self) -> Float[Array, " SR"]:
@@ -130,8 +188,8 @@ class Combinations(AbstractBlock):
         return rows.reshape(S * R, *rest)
 
     def coefficients(self, c: Float[Array, " SR"]) -> Float[Array, "SQ n"]:
-        S, R, _, _ = self.weights.shape
-        return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(self.points.shape)
+        S, R, Q, n = self.weights.shape
+        return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(S * Q, n)
 
     def then(self, other: AbstractBlock) -> "Combinations | None":
         if not isinstance(other, Combinations) or self.weights.shape[1:] != other.weights.shape[1:]:
@@ -139,13 +197,36 @@ class Combinations(AbstractBlock):
         pairs = (self.groups, other.groups), (self.weights, other.weights)
         return Combinations(*map(jnp.concatenate, pairs))
 
+    def at(self, points: Float[Array, "P d"]) -> Components:
+        return Components(points, outputs=self.weights.shape[3])
+
+    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+        # Whole groups: the rows of one share its points.
+        R = self.weights.shape[1]
+        groups = np.unique(chosen // R)
+        rows = (groups[:, None] * R + np.arange(R)).reshape(-1)
+        own = {"groups": _taken(self.groups, groups), "weights": _taken(self.weights, groups)}
+        return Combinations(**own), rows, rows
+
 
 class Values(AbstractBlock):
-    """The potential at points; `noise` is that of each, None if it is 1."""
+    """The potential at points; `noise` is that of each, None if it is 1.
 
-    points: Float[Array, "E n"]
+    At points (x, u) it is the potential of the drift, and u has no effect.
+    """
+
+    points: Float[Array, "E d"]
     noise: Float[Array, " E"] | None = None
+    outputs: int | None = eqx.field(static=True, default=None)
     of_values: ClassVar[bool] = True
+
+    @property
+    def values_shape(self) -> tuple[int]:
+        return (len(self.points),)
+
+    @property
+    def dimension(self) -> int:
+        return self.points.shape[1] if self.outputs is None else self.outputs
 
     @property
     def scale(self) -> Float[Array, " E"]:
@@ -170,7 +251,22 @@ class Values(AbstractBlock):
         noise = None
         if self.noise is not None or other.noise is not None:
             noise = jnp.concatenate([self.scale, other.scale])
-        return Values(jnp.concatenate([self.points, other.points]), noise)
+        return Values(jnp.concatenate([self.points, other.points]), noise, self.outputs)
+
+    def at(self, points: Float[Array, "E d"]) -> "Values":
+        return Values(points, outputs=self.outputs)
+
+    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+        points, noise = _taken(self.points, chosen), _taken(self.noise, chosen)
+        return Values(points, noise, self.outputs), chosen, chosen
+
+
+def _taken(array: Array | None, index: Int[np.ndarray, " C"]) -> Any:
+    """Entries of an array, without compiling for how many they are."""
+    return None if array is None else jnp.asarray(np.asarray(array)[index])
+
+
+Some = tuple[AbstractBlock, Int[np.ndarray, " rows"], Int[np.ndarray, " observations"]]
 
 
 def merged(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:

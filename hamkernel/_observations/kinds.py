@@ -7,77 +7,28 @@ Every kind is values of linear functionals, and any of them can be added:
 
 The noise is relative: a row of noise s has the variance s² Nλ, with N the number of all
 observations: points of velocities and equilibria, energies and functionals.
+
+With inputs each kind of values of f says u at its points, and its blocks have points (x, u). An
+energy is one of the drift and has none.
 """
 
 from __future__ import annotations
 
-import abc
 from collections.abc import Iterator
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
-from hamkernel._observations.blocks import AbstractBlock, Combinations, Components, Values, merged
-from hamkernel._observations.rows import Rows
-from hamkernel._show import described, joined
-
-
-class AbstractObservations(eqx.Module):
-    """Measured values of linear functionals of a field; those of two add up."""
-
-    def __repr__(self) -> str:
-        return described(self)
-
-    @property
-    @abc.abstractmethod
-    def dimension(self) -> int:
-        """n, the number of coordinates of a state."""
-
-    @abc.abstractmethod
-    def parts(self) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
-        """The rows of one kind after the other, and what was measured, in the units it has."""
-
-    def __add__(self, other: Any) -> AbstractObservations:
-        if not isinstance(other, AbstractObservations):
-            return NotImplemented
-        return Together(_terms(self) + _terms(other))
-
-    def __radd__(self, other: Any) -> AbstractObservations:
-        return self if isinstance(other, int) and other == 0 else NotImplemented
-
-
-class Together(AbstractObservations):
-    """Observations of several kinds or places; made by `a + b`."""
-
-    terms: tuple[AbstractObservations, ...]
-
-    def __check_init__(self):
-        dimensions = [term.dimension for term in self.terms]
-        if len(set(dimensions)) > 1:
-            raise ValueError(
-                f"the observations in a sum are of states of {dimensions} coordinates: all must be "
-                "of one system, with the same n."
-            )
-
-    def __repr__(self) -> str:
-        return joined("+", [repr(term) for term in self.terms])
-
-    @property
-    def dimension(self) -> int:
-        return self.terms[0].dimension
-
-    def parts(self) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
-        for term in self.terms:
-            yield from term.parts()
-
-
-def _terms(data: AbstractObservations) -> tuple[AbstractObservations, ...]:
-    return data.terms if isinstance(data, Together) else (data,)
+from hamkernel._observations.base import (
+    AbstractObservations,
+    inputs_at,
+    joined_points,
+    refuse_swapped,
+)
+from hamkernel._observations.blocks import AbstractBlock, Combinations, Components, Values
 
 
 class Velocities(AbstractObservations):
@@ -90,6 +41,7 @@ class Velocities(AbstractObservations):
         noise: relative standard deviations, positive: one number, one for each coordinate, shape
             (n,), or one for each component, shape (N, n); 1 if None. Those of components that
             were not measured have no effect.
+        inputs: u at each state, shape (N, m), for a `Controlled` kernel.
 
     Raises:
         ValueError: shapes do not fit, no component was measured, X or a noise is not finite, or a
@@ -100,14 +52,18 @@ class Velocities(AbstractObservations):
     Y: Float[Array, "N n"]
     noise: Float[Array, "..."] | None
     kept: Int[Array, " D"] | None  # the components that were measured, None if all were
+    inputs: Float[Array, "N m"] | None
 
     def __init__(
         self,
         X: Num[ArrayLike, "N n"],
         Y: Num[ArrayLike, "N n"],
         noise: ArrayLike | None = None,
+        inputs: Num[ArrayLike, "N m"] | None = None,
     ):
+        refuse_swapped(X, Y, inputs)
         self.X, self.Y, kept = require.measured(X, Y)
+        self.inputs = inputs_at(self.X, inputs)
         self.kept = None if kept is None else jnp.asarray(kept)
         N, n = self.X.shape
         self.noise = _noise(noise, [(), (n,), (N, n)], "(), (n,) or (N, n)", self.X)
@@ -116,21 +72,27 @@ class Velocities(AbstractObservations):
     def dimension(self) -> int:
         return self.X.shape[1]
 
-    def parts(self) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+    def driven(self) -> Iterator[Float[Array, "N m"]]:
+        if self.inputs is not None:
+            yield self.inputs
+
+    def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
         y, noise = self.Y.reshape(-1), self.noise
         if noise is not None:
             noise = noise.reshape((1,) * (2 - noise.ndim) + noise.shape)
             noise = jnp.broadcast_to(noise, self.X.shape).reshape(-1)
         if self.kept is not None:
             y, noise = y[self.kept], None if noise is None else noise[self.kept]
-        yield Components(self.X, self.kept, noise), y
+        points, outputs = joined_points(self, self.X, count)
+        yield Components(points, self.kept, noise, outputs), y
 
 
 class Energies(AbstractObservations):
     """Values of the potential, Eᵢ = H(xᵢ) + c + noise, with one constant c that nobody knows.
 
     The constant is estimated with the field, as generalised least squares do. It is the same for
-    all energies in a sum of observations, and takes one of the rows.
+    all energies in a sum of observations, and takes one of the rows. With a `Controlled` kernel H
+    is that of the drift, whatever the inputs are.
 
     Args:
         X: states, shape (N, n).
@@ -170,34 +132,55 @@ class Energies(AbstractObservations):
     def dimension(self) -> int:
         return self.X.shape[1]
 
-    def parts(self) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+    def driven(self) -> Iterator[Float[Array, "N m"]]:
+        yield from ()
+
+    def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
         noise = None if self.noise is None else jnp.broadcast_to(self.noise, self.E.shape)
-        yield Values(self.X, noise), self.E
+        if not count:
+            yield Values(self.X, noise), self.E
+        else:
+            u = jnp.zeros((len(self.X), count), self.X.dtype)
+            yield Values(jnp.concatenate([self.X, u], axis=1), noise, self.dimension), self.E
 
 
 class Equilibria(AbstractObservations):
-    """States where nothing moves, f(xᵢ) = 0, with the noise of a velocity.
+    """States where nothing moves, f(xᵢ) = 0 or f(xᵢ, uᵢ) = 0, with the noise of a velocity.
 
     Args:
         X: states, shape (N, n), or one of shape (n,).
+        inputs: of a `Controlled` kernel: those that hold the states, shape (N, m) or (m,).
 
     Raises:
-        ValueError: the shape does not fit, or a state is not finite.
+        ValueError: a shape does not fit, or a value is not finite.
     """
 
     X: Float[Array, "N n"]
+    inputs: Float[Array, "N m"] | None
 
-    def __init__(self, X: Num[ArrayLike, "N n"] | Num[ArrayLike, " n"]):
+    def __init__(
+        self,
+        X: Num[ArrayLike, "N n"] | Num[ArrayLike, " n"],
+        inputs: Num[ArrayLike, "N m"] | Num[ArrayLike, " m"] | None = None,
+    ):
         X = require.floating(X, "X")
+        if inputs is not None and X.ndim == jnp.ndim(inputs) == 1:
+            inputs = jnp.asarray(inputs)[None]
         self.X = require.finite(require.points(X[None] if X.ndim == 1 else X, "X"), "X")
         require.single_or_double(self.X.dtype, "X has")
+        self.inputs = inputs_at(self.X, inputs)
 
     @property
     def dimension(self) -> int:
         return self.X.shape[1]
 
-    def parts(self) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
-        yield Components(self.X), jnp.zeros(self.X.size, self.X.dtype)
+    def driven(self) -> Iterator[Float[Array, "N m"]]:
+        if self.inputs is not None:
+            yield self.inputs
+
+    def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+        points, outputs = joined_points(self, self.X, count)
+        yield Components(points, outputs=outputs), jnp.zeros(self.X.size, self.X.dtype)
 
 
 class Functionals(AbstractObservations):
@@ -216,6 +199,7 @@ class Functionals(AbstractObservations):
         points: shape (R, Q, n): the Q points of each of R rows.
         weights: shape (R, Q, n): a vector for each of them, which multiplies f there.
         targets: shape (R,).
+        inputs: of a `Controlled` kernel: u at each point, shape (R, Q, m), or (S, Q, m).
 
     Raises:
         ValueError: shapes do not fit, a value is not finite, or a row has weights that are all
@@ -225,12 +209,14 @@ class Functionals(AbstractObservations):
     points: Float[Array, "S Q n"]
     weights: Float[Array, "S R Q n"]
     targets: Float[Array, " D"]
+    inputs: Float[Array, "S Q m"] | None
 
     def __init__(
         self,
         points: Num[ArrayLike, "S Q n"],
         weights: Num[ArrayLike, "S Q n"] | Num[ArrayLike, "S R Q n"],
         targets: Num[ArrayLike, " S"] | Num[ArrayLike, "S R"],
+        inputs: Num[ArrayLike, "S Q m"] | None = None,
     ):
         named = {"points": points, "weights": weights, "targets": targets}
         arrays = [require.floating(array, name) for name, array in named.items()]
@@ -259,65 +245,20 @@ class Functionals(AbstractObservations):
             ),
         )
         self.points, self.targets = points, targets.reshape(-1)
+        self.inputs = inputs_at(points, inputs)
 
     @property
     def dimension(self) -> int:
         return self.points.shape[2]
 
-    def parts(self) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
-        rows = Combinations(groups=self.points, weights=self.weights)  # pyright: ignore[reportCallIssue]
+    def driven(self) -> Iterator[Float[Array, "S Q m"]]:
+        if self.inputs is not None:
+            yield self.inputs
+
+    def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+        points, _ = joined_points(self, self.points, count)
+        rows = Combinations(groups=points, weights=self.weights)  # pyright: ignore[reportCallIssue]
         yield rows, self.targets
-
-
-def both(X: Any, Y: Any) -> tuple[Any, Any]:
-    """States and velocities, if there are both."""
-    if Y is None:
-        raise TypeError(
-            "with states X the velocities Y are needed, of the same shape (N, n); or observations "
-            f"in the place of both, hk.Velocities(X, Y); got {type(X).__name__} and nothing."
-        )
-    return X, Y
-
-
-def as_states(X: Any, Y: Any) -> tuple[Any, Any]:
-    """X and Y of velocities that were all measured with one noise, for which less is to be done."""
-    if isinstance(X, Velocities) and Y is None and X.kept is None and X.noise is None:
-        return X.X, X.Y
-    return X, Y
-
-
-def observations(X: Any, Y: Any, part: bool = False) -> AbstractObservations:
-    """`X` if it is observations, and then there is no Y; else the velocities Y at states X."""
-    if not isinstance(X, AbstractObservations):
-        return Velocities(*require.data(*both(X, Y), part=part))
-    if Y is not None:
-        raise TypeError(
-            f"{type(X).__name__} is all of the data, and Y is not needed. Say the regularization "
-            "by name: hk.fit(K, data, regularization=1e-4)."
-        )
-    return X
-
-
-def rows_of_data(data: AbstractObservations, beside: Rows | None = None) -> Rows:
-    """The normal form of the observations; `beside` is that of others that were there before."""
-    blocks, targets = zip(*data.parts(), strict=True)
-    dtype = np.result_type(*[block.points.dtype for block in blocks])
-    blocks = tuple(_cast(block, dtype) for block in blocks)
-    pairs = zip(blocks, targets, strict=True)
-    divided = jnp.concatenate([y.astype(dtype) / block.scale for block, y in pairs])
-    rows = Rows(merged(blocks), divided)
-    before = 0 if beside is None else len(beside.energies)
-    if before + len(rows.energies) == 1:
-        raise ValueError(
-            "there is one energy, and energies are known up to a constant: two are needed to say "
-            "something."
-        )
-    return rows
-
-
-def _cast(block: AbstractBlock, dtype: Any) -> AbstractBlock:
-    arrays, rest = eqx.partition(block, eqx.is_inexact_array)
-    return eqx.combine(jax.tree.map(lambda a: a.astype(dtype), arrays), rest)
 
 
 def _noise(noise: Any, shapes: list[tuple[int, ...]], needed: str, X: Array) -> Array | None:

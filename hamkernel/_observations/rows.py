@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hamkernel._observations.blocks import AbstractBlock, merged
+from hamkernel._observations.blocks import AbstractBlock, Components, merged
 
 
 class Rows(eqx.Module):
@@ -41,8 +41,8 @@ class Rows(eqx.Module):
 
     @property
     def dimension(self) -> int:
-        """The number of coordinates of a state."""
-        return self.blocks[0].points.shape[1]
+        """n, the number of coordinates of a state."""
+        return self.blocks[0].dimension
 
     @property
     def scale(self) -> Float[Array, " M"]:
@@ -72,6 +72,15 @@ class Rows(eqx.Module):
         pairs = zip(self.slices, self.blocks, strict=True)
         return np.concatenate([M[rows] for rows, block in pairs if block.of_values] or [M[:0]])
 
+    @property
+    def constant(self) -> Float[Array, " M"] | None:
+        """The direction of the unknown constant, of norm 1; None without energies."""
+        where = self.energies
+        if not len(where):
+            return None
+        p = jnp.zeros_like(self.targets).at[where].set(1 / self.scale[where])
+        return p / jnp.linalg.norm(p)
+
     def labels(self) -> Int[np.ndarray, " M"]:
         """To which of the N observations each row belongs, before the contrast."""
         starts = np.cumsum([0, *(block.count for block in self.blocks)])
@@ -79,8 +88,8 @@ class Rows(eqx.Module):
         return np.concatenate([start + block.labels() for start, block in pairs])
 
     @property
-    def points(self) -> Float[Array, "P n"]:
-        """All points of all blocks."""
+    def points(self) -> Float[Array, "P d"]:
+        """All points of all blocks, (x, u) where there are inputs."""
         return jnp.concatenate([block.points for block in self.blocks])
 
     def of(
@@ -114,14 +123,38 @@ class Rows(eqx.Module):
         blocks, targets = (tuple(block for block, _ in old), [y for _, y in old])
         return Rows(blocks + new.blocks, jnp.concatenate([*targets, new.targets]))
 
+    def some(self, chosen: Int[np.ndarray, " C"]) -> tuple["Rows", Int[np.ndarray, " chosen"]]:
+        """The rows of some of the N observations, in order, and which observations those are.
+
+        Rows that share points come with each other, and one energy alone, which says nothing, is
+        left out.
+        """
+        ends = np.cumsum([0, *(block.count for block in self.blocks)]).tolist()
+        own = [chosen[(a <= chosen) & (chosen < b)] - a for a, b in itertools.pairwise(ends)]
+        pairs = list(zip(self.blocks, own, strict=True))
+        energies = sum(len(each) for block, each in pairs if block.of_values)
+        blocks, targets, taken = [], [], []
+        for (block, each), place, start in zip(pairs, self.slices, ends, strict=False):
+            if len(each) and not (block.of_values and energies == 1):
+                part, rows, these = block.some(each)
+                blocks.append(part)
+                targets.append(np.asarray(self.targets)[place][rows])
+                taken.append(start + these)
+        return Rows(tuple(blocks), jnp.asarray(np.concatenate(targets))), np.concatenate(taken)
+
     def residual(self, left: Float[Array, " D"]) -> Float[Array, "..."]:
         """What a fit leaves of the contrasted rows, in the units of what was measured.
 
         Of velocities alone, all of which were measured, shape (N, n).
         """
-        left = self.scale * self.uncontrasted(left)
-        whole = len(self.blocks) == 1 and left.size == self.points.size
-        return left.reshape(self.points.shape) if whole else left
+        return self.in_units(self.uncontrasted(left))
+
+    def in_units(self, left: Float[Array, " M"]) -> Float[Array, "..."]:
+        """Rows before the contrast in the units of what was measured, and in the shape of Y."""
+        block = self.blocks[0]
+        whole = len(self.blocks) == 1 and isinstance(block, Components) and block.kept is None
+        left = self.scale * left
+        return left.reshape(block.values_shape) if whole else left
 
     def contrast(self, rows: Float[Array, "M *rest"]) -> Float[Array, "D *rest"]:
         """The rows without the constant of the energies."""
@@ -159,7 +192,7 @@ class Rows(eqx.Module):
 
     def coefficients(
         self, c: Float[Array, " D"]
-    ) -> tuple[Float[Array, "P n"], Float[Array, "P n"], Float[Array, "E n"], Float[Array, " E"]]:
+    ) -> tuple[Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]]:
         """Points and coefficients of the field Lᵀc, and those of its values.
 
         Of energies alone there is one point of the field, with coefficients of zero.
@@ -169,7 +202,7 @@ class Rows(eqx.Module):
         none = self.blocks[0].points[:1]
         fields = [(b.points, a) for b, a in pairs if not b.of_values]
         values = [(b.points, a) for b, a in pairs if b.of_values]
-        fields = fields or [(none, jnp.zeros_like(none))]
+        fields = fields or [(none, jnp.zeros((1, self.dimension), raw.dtype))]
         values = values or [(none[:0], jnp.zeros(0, raw.dtype))]
         Z, A = (jnp.concatenate(each) for each in zip(*fields, strict=True))
         S, b = (jnp.concatenate(each) for each in zip(*values, strict=True))

@@ -11,6 +11,8 @@ and the same for differences of H, whose c and prior covariances come from k its
 
 from __future__ import annotations
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,17 +20,21 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 
 from hamkernel import _require as require
-from hamkernel._fields.base import AbstractField, FieldSum, potential_of, root
+from hamkernel._fields.base import AbstractField, FieldSum, root
+from hamkernel._fields.controlled import ControlledField, known_of, learned_field
+from hamkernel._fields.known import Mean
+from hamkernel._gram.observed import components
 from hamkernel._kernels.base import Invariance
 from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.blocks import AbstractBlock, Components, Values
-from hamkernel._observations.kinds import AbstractObservations, observations, rows_of_data
+from hamkernel._observations.base import AbstractObservations
+from hamkernel._observations.blocks import AbstractBlock, Values
+from hamkernel._observations.data import inputs_of, observations
 from hamkernel._show import text
 from hamkernel._solvers.cholesky import AbstractSolver, Cholesky
 from hamkernel._solvers.conditional import AbstractConditional
-from hamkernel._solvers.fit import check_solver, checked_rows
-from hamkernel._solvers.means import Mean, with_mean, without_mean
+from hamkernel._solvers.fit import check_solver
+from hamkernel._solvers.given import checked_rows, new_rows
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 
@@ -41,6 +47,7 @@ def condition(
     *,
     solver: AbstractSolver | None = None,
     mean: Mean | None = None,
+    inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Posterior:
     """The Gaussian process with prior GP(mean, K), given data: `fit` that keeps its factor.
 
@@ -62,6 +69,8 @@ def condition(
             approximate where its landmarks are few, and which claims no knowledge far from them,
             or `RandomFeatures(…)`, whose prior is that of its features.
         mean: what is known already, x (n,) -> (n,), as in `fit`.
+        inputs: of a `Controlled` kernel: u at each state, shape (N, m). What is asked of f is then
+            asked at (x, u): `posterior.deviation(x, u)`.
 
     Returns:
         The posterior. O(D³) time and O(D²) memory for D rows, with a solver of rank r O(D r²).
@@ -78,10 +87,10 @@ def condition(
     solver = Cholesky() if solver is None else solver
     if solver.no_factor:
         raise TypeError(solver.no_factor)
-    rows, regularization, mean = checked_rows(K, X, Y, regularization, mean)
+    K, rows, regularization, known = checked_rows(K, X, Y, regularization, mean, inputs)
     _warn_of_amplitude(K, rows.points)
-    given = solver._given(K, without_mean(K, rows, mean), regularization)
-    return Posterior(given, with_mean(given.field, mean))
+    given = solver._given(K, rows, regularization)
+    return Posterior(given, learned_field(given.field, known))
 
 
 class Posterior(eqx.Module):
@@ -109,35 +118,51 @@ class Posterior(eqx.Module):
         rows = self.given.rows
         return f"Posterior(rows={rows.size}, dimension={rows.dimension}, field={text(self.field)})"
 
-    def covariance(self, x: Num[ArrayLike, " n"]) -> Float[Array, "n n"]:
-        """The covariance of the components of f(x), given the data, in squared units of Y.
+    def covariance(
+        self, x: Num[ArrayLike, " n"], u: Num[ArrayLike, " m"] | None = None
+    ) -> Float[Array, "n n"]:
+        """The covariance of the components of f(x) or f(x, u), given the data, in squared units.
 
         Args:
             x: one state, shape (n,).
+            u: its inputs, shape (m,), where the field has inputs; zeros for the drift.
 
         Raises:
-            ValueError: x is no single state of this dimension.
+            ValueError: x is no single state of this dimension, or u is missing. TypeError: the
+                field has no inputs.
         """
-        x = self.field._state(x)
-        return _covariance(self.given, Components(x[None]))
+        return _covariance(self.given, components(self.given.field.kernel, self._point(x, u)[None]))
 
-    def deviation(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
-        """The standard deviation of each component of f(x), given the data, in units of Y.
+    def _point(self, x: Any, u: Any) -> Float[Array, " d"]:
+        if isinstance(self.field, ControlledField):
+            return self.field.joined(x, u)
+        if u is not None:
+            raise TypeError("the field has no inputs: leave out u.")
+        return self.field._state(x)
+
+    def deviation(
+        self, x: Num[ArrayLike, " n"], u: Num[ArrayLike, " m"] | None = None
+    ) -> Float[Array, " n"]:
+        """The standard deviation of each component of f(x) or f(x, u), in units of Y.
 
         Of the field, not of a new measurement, which has the noise Nλ besides.
 
         Args:
             x: one state, shape (n,).
+            u: its inputs, shape (m,), where the field has inputs; zeros for the drift.
 
         Raises:
-            ValueError: x is no single state of this dimension.
+            ValueError: x is no single state of this dimension, or u is missing. TypeError: the
+                field has no inputs.
         """
-        return jnp.stack([root(variance) for variance in jnp.diagonal(self.covariance(x))])
+        return jnp.stack([root(variance) for variance in jnp.diagonal(self.covariance(x, u))])
 
     def energy_deviation(
         self, x: Num[ArrayLike, " n"], x0: Num[ArrayLike, " n"]
     ) -> Float[Array, ""]:
         """The standard deviation of H(x) − H(x₀), or of that difference of another potential.
+
+        Of a field with inputs it is the H of the drift.
 
         Args:
             x: one state, shape (n,).
@@ -147,11 +172,12 @@ class Posterior(eqx.Module):
             AttributeError: the structure, or the mean, has no potential (with the reason).
             ValueError: a state does not fit.
         """
-        K = self.field.kernel
-        K.check_potential()
-        if self.field.mean is not None:
-            potential_of(self.field.mean, K)
-        both = Values(jnp.stack([self.field._state(x), self.field._state(x0)]))
+        _ = self.field.potential  # raises where there is none
+        K = self.given.field.kernel
+        states = jnp.stack([self.field._state(x), self.field._state(x0)])
+        n, m = states.shape[1], inputs_of(K)
+        points = jnp.pad(states, ((0, 0), (0, m))) if m else states
+        both = Values(points, outputs=n if m else None)
         change = jnp.array([1.0, -1.0], both.points.dtype)
         return root(change @ _covariance(self.given, both) @ change)
 
@@ -159,6 +185,8 @@ class Posterior(eqx.Module):
         self,
         X: Num[ArrayLike, "M n"] | AbstractObservations,
         Y: Num[ArrayLike, "M n"] | None = None,
+        *,
+        inputs: Num[ArrayLike, "M m"] | None = None,
     ) -> Posterior:
         """The posterior that has seen more data: that of conditioning on all, at less cost.
 
@@ -168,26 +196,27 @@ class Posterior(eqx.Module):
         Args:
             X: states, shape (M, n), or observations, and then there is no Y.
             Y: velocities, shape (M, n).
+            inputs: of a `Controlled` kernel: u at each state, shape (M, m).
 
         Raises:
             ValueError: the new data has another n, or does not fit itself. RuntimeError: the new
                 rows are so close to the old ones that the factor fails.
         """
-        data, old = observations(X, Y, part=True), self.given.rows
+        data, old = observations(X, Y, inputs, part=True), self.given.rows
         if data.dimension != old.dimension:
             raise ValueError(
                 f"the new data has {data.dimension} coordinates and the posterior {old.dimension}: "
                 "both must be of one system."
             )
-        new = rows_of_data(data, beside=old)
+        known = known_of(self.field)
+        new = new_rows(self.given.field.kernel, data, old, known)
         if new.targets.dtype != old.targets.dtype:
             raise TypeError(
                 f"the new data is {new.targets.dtype} and the posterior {old.targets.dtype}: cast "
                 "one of them."
             )
-        K, mean = self.field.kernel, self.field.mean
-        given = self.given.updated(without_mean(K, new, mean))
-        return Posterior(given, with_mean(given.field, mean))
+        given = self.given.updated(new)
+        return Posterior(given, learned_field(given.field, known))
 
     @one_blas_thread
     def sample(
@@ -206,7 +235,8 @@ class Posterior(eqx.Module):
         In the region, and at the data, their mean and covariance are those of the posterior. Far
         outside they have errors of a few per cent for kernels with a spectrum, which are those
         that `RandomFeatures` takes; of another kernel they are wrong there, with too little
-        spread, so take a region that the orbits do not leave.
+        spread, so take a region that the orbits do not leave. Fields with inputs are drawn whole,
+        drift and G, and are affine in u: the region is one of states, and u may be any.
 
         Args:
             key: the random key.
@@ -221,7 +251,8 @@ class Posterior(eqx.Module):
                 positive number. TypeError: key is no key of JAX.
         """
         key, count = require.key(key), require.count(count, "count")
-        n, dtype = self.given.rows.dimension, self.given.rows.targets.dtype
+        rows = self.given.rows
+        n, dtype = rows.dimension, rows.targets.dtype
         box = require.floating(region, "region").astype(dtype)
         if box.shape != (2, n):
             raise ValueError(
@@ -232,13 +263,14 @@ class Posterior(eqx.Module):
         bad = ~((high > low) & (abs(low) < np.inf) & (abs(high) < np.inf))
         message = "region must be finite, its first row the lower corner in every coordinate."
         box = require.value(box, bad, message)
-        draws, mean = self.given.draws(key, count, box), self.field.mean
-        if mean is None:
-            return draws
+        box = jnp.concatenate([box, _range_of(rows.points[:, n:])], axis=1)
+        draws, known = self.given.draws(key, count, box), known_of(self.field)
 
         def one(draw):
-            both = mean if draw.mean is None else FieldSum((mean, draw.mean))
-            return with_mean(draw, both)
+            both = known
+            if draw.mean is not None:
+                both = draw.mean if known is None else FieldSum((known, draw.mean))
+            return learned_field(draw, both)
 
         return jax.vmap(one)(draws)
 
@@ -247,6 +279,13 @@ class Posterior(eqx.Module):
 @eqx.filter_jit
 def _covariance(given: AbstractConditional, block: AbstractBlock) -> Float[Array, "d d"]:
     return given.covariance(block, block)
+
+
+def _range_of(U: Float[Array, "N m"]) -> Float[Array, "2 m"]:
+    """A box around zero as large as the inputs."""
+    largest = jnp.max(jnp.abs(U), axis=0)
+    largest = jnp.where(largest > 0, largest, jnp.ones_like(largest))
+    return jnp.stack([-largest, largest])
 
 
 def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:

@@ -40,14 +40,15 @@ def floating(x: Any, name: str) -> Array:
     if isinstance(x, bool | int | float):
         x = np.asarray(x, float)
     try:
-        array = jnp.asarray(x)
+        array = x if isinstance(x, jax.Array) else jnp.asarray(x)
     except (TypeError, ValueError) as error:
         raise TypeError(
             f"{name} must hold real numbers; got {reprlib.repr(x)}. Pass floats, a NumPy or JAX "
             "array of them (of objects: .astype(float)), or lists with rows of equal length."
         ) from error
     if jnp.issubdtype(array.dtype, jnp.floating):
-        return array.astype(array.dtype)  # no weak type: a Python float must not recompile
+        # No weak type: a Python float must not recompile.
+        return array.astype(array.dtype) if array.weak_type else array
     if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
         return array.astype(float)
     raise TypeError(

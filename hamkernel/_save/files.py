@@ -146,7 +146,7 @@ def _read(node: Any, content: io.BytesIO, source: str, kernel: Any, mean: Any) -
     for name, given in {"kernel": kernel, "mean": mean}.items():
         if given is not None:
             own = description(given, codes[name], f"field.{name}")
-            differs = difference(node.get(name), own, f"field.{name}")
+            differs = difference(_given(node, name), own, f"field.{name}")
             if differs:
                 raise ValueError(
                     f"the given {name} is not the one saved in {source}: {differs}. Pass the "
@@ -174,6 +174,18 @@ def _read(node: Any, content: io.BytesIO, source: str, kernel: Any, mean: Any) -
     return field
 
 
+def _given(node: dict[str, Any], name: str) -> Any:
+    """What the caller gave as the kernel or the mean of a field, in the description of the field.
+
+    A field with inputs has the `whole` one inside, and its mean is wrapped.
+    """
+    match node.get("whole", node).get(name):
+        case {"class": "KnownPart", "mean": inner} | {"class": "AtRest", "field": inner}:
+            return inner
+        case part:
+            return part
+
+
 def _is_field(cls: Any) -> bool:
     return isinstance(cls, type) and issubclass(cls, AbstractField) and not inspect.isabstract(cls)
 
@@ -181,7 +193,7 @@ def _is_field(cls: Any) -> bool:
 def _of_state(field: AbstractField) -> Callable[[Array], Array]:
     """The field as a function of the state alone: where it has inputs, they are 1."""
     if isinstance(field, ControlledField):
-        u = jnp.ones(field.inputs.shape[-1], field.inputs.dtype)
+        u = jnp.ones(field.kernel.input_count, field.offset.dtype)
         return lambda x: field(x, u)
     return field
 

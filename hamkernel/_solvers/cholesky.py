@@ -17,8 +17,8 @@ from hamkernel._gram.operator import product
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._observations.rows import Rows
-from hamkernel._solvers.bases import AbstractBasis
 from hamkernel._solvers.conditional import AbstractConditional, dense_conditional
+from hamkernel._solvers.spans import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
 
 Learned = TypeVar("Learned", bound=AbstractField, covariant=True)
@@ -90,7 +90,7 @@ class Cholesky(AbstractSolver[KernelField]):
     ) -> KernelField:
         _check_memory(X)
         X, Y = on_one_device("X", X), on_one_device("Y", Y)
-        A, residual, norm, left = _representer(K, X, Y, regularization)
+        A, residual, norm, left, zero = _representer(K, X, Y, regularization)
 
         def message() -> str:
             known = require.is_concrete(regularization, left)
@@ -116,7 +116,7 @@ class Cholesky(AbstractSolver[KernelField]):
             residual=residual,
             norm=norm,
             regularization=regularization,
-            offset=jnp.zeros((), X.dtype),
+            offset=zero,
             info=SolverInfo("Cholesky", relative_residual=left),
         )
 
@@ -141,7 +141,7 @@ def _check_memory(X: Float[Array, "N n"]) -> None:
 
 @eqx.filter_jit
 def _representer(K, X, Y, regularization):
-    """Coefficients, residual y − Ga = Nλa, the norm with ‖f‖² = aᵀGa, and the relative residual."""
+    """Coefficients, residual y − Ga = Nλa, the norm with ‖f‖² = aᵀGa, the relative residual, 0."""
     N, n = Y.shape
     G = assemble(K, X, X).reshape(N * n, N * n)
     ridge = N * regularization
@@ -149,7 +149,7 @@ def _representer(K, X, Y, regularization):
     values = product(K, X, X, A)  # without the Gram, which the factor has overwritten
     residual = ridge * A
     left = relative(Y - values - residual, Y)
-    return A, residual, root(jnp.sum(A * values)), left
+    return A, residual, root(jnp.sum(A * values)), left, jnp.zeros((), X.dtype)
 
 
 def relative(error: Array, of: Array) -> Float[Array, ""]:

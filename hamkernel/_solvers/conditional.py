@@ -179,6 +179,7 @@ def _extended(old: DenseConditional, new: Rows):
 def _corrected(given: DenseConditional, prior: Prior, key) -> KernelField:
     """Matheron's rule, for every draw of the prior."""
     rows, n = given.rows, given.rows.dimension
+    d = rows.points.shape[1]
     would = prior.rows(rows)  # (D, count)
     noise = jnp.sqrt(given.ridge) * jax.random.normal(key, would.shape, would.dtype)
     c = given.factor.solve(rows.y[:, None] - would - noise)
@@ -196,7 +197,7 @@ def _corrected(given: DenseConditional, prior: Prior, key) -> KernelField:
             info=SolverInfo("draw"),
             value_points=S if len(S) else None,
             value_coefficients=b if len(S) else None,
-            mean=None if basis is None else of_features(prior.kernel, basis, w, n),
+            mean=None if basis is None else of_features(prior.kernel, basis, w, d),
         )
 
     return jax.vmap(one)(c.T, prior.coefficients, prior.features, prior.weights)

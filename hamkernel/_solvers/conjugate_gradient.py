@@ -29,8 +29,8 @@ from hamkernel._observations.rows import Rows
 from hamkernel._solvers.cholesky import AbstractSolver, relative
 from hamkernel._solvers.conditional import NO_FACTOR, FieldAlone, check_potential, field_of_rows
 from hamkernel._solvers.landmark_gram import Columns, checked, factor, truncated, whitening
-from hamkernel._solvers.low_rank_conditional import landmark_span
 from hamkernel._solvers.nystrom import Nystrom
+from hamkernel._solvers.spans import landmark_span
 from hamkernel._solvers.stream_sums import normal
 from hamkernel._structures.base import AbstractMatrixKernel
 

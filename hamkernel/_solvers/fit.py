@@ -4,41 +4,34 @@ from __future__ import annotations
 
 from typing import Any, overload
 
-from jaxtyping import Array, ArrayLike, Float, Num
+from jaxtyping import ArrayLike, Num
 
 from hamkernel import _require as require
-from hamkernel._fields.base import AbstractField, at_points
-from hamkernel._fields.controlled import ControlledField, with_inputs
+from hamkernel._fields.base import AbstractField
+from hamkernel._fields.controlled import ControlledField, learned_field
 from hamkernel._fields.kernel_field import KernelField
+from hamkernel._fields.known import Mean
 from hamkernel._machine.devices import rows_of
 from hamkernel._machine.memory import dense_bytes, memory_bytes
 from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.kinds import (
-    AbstractObservations,
-    as_states,
-    both,
-    observations,
-    rows_of_data,
-)
-from hamkernel._observations.rows import Rows
+from hamkernel._observations.base import AbstractObservations
+from hamkernel._observations.data import as_states
 from hamkernel._solvers.cholesky import COPIES, AbstractSolver, Cholesky, Learned
-from hamkernel._solvers.conditional import check_potential
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
-from hamkernel._solvers.means import Mean, checked_mean, with_mean, without_mean
+from hamkernel._solvers.given import checked_rows, checked_states
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.controlled import Controlled
-from hamkernel._structures.joined import joined_data
 
 
 @overload
 def fit(
     K: Controlled,
-    X: Num[ArrayLike, "N n"],
-    Y: Num[ArrayLike, "N n"],
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
     regularization: ArrayLike = 1e-4,
     *,
     solver: AbstractSolver | None = None,
-    mean: None = None,
+    mean: Mean | None = None,
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> ControlledField: ...
@@ -137,46 +130,23 @@ def fit(
     """
     K = matrix_kernel(K)
     check_solver(solver)
-    X, Y = as_states(X, Y)
+    X, Y, inputs = as_states(X, Y, inputs)
     if isinstance(X, AbstractObservations):
-        rows, regularization, mean = checked_rows(K, X, Y, regularization, mean)
+        K, rows, regularization, known = checked_rows(K, X, Y, regularization, mean)
         solver = default_solver(rows.size, rows.targets.dtype) if solver is None else solver
-        field = solver._given(K, without_mean(K, rows, mean), regularization, throw).field
-        return with_mean(field, mean)
-    if mean is not None and inputs is not None:
-        raise ValueError(
-            "mean= and inputs= cannot be given together: subtract the known part from Y, and add "
-            "it to the field that is learned."
-        )
-    K, X, Y = joined_data(K, *both(X, Y), inputs)
-    K.check_points(X)
-    regularization = require.ridge(regularization, X.dtype)
+        field = solver._given(K, rows, regularization, throw).field
+        return learned_field(field, known)
+    K, X, Y, regularization, known = checked_states(K, X, Y, regularization, mean, inputs)
     require.warn_of_float32(X)
-    mean = checked_mean(mean, X.shape[1], X.dtype)
-    if mean is not None:
-        Y = Y - at_points(mean, X)
     if solver is None:
         solver = default_solver(Y.size, X.dtype) if rows_of(X) is None else ConjugateGradient()
-    field = with_mean(solver._fitted(K, X, Y, regularization, throw), mean)
-    return with_inputs(K, field)
+    return learned_field(solver._fitted(K, X, Y, regularization, throw), known)
 
 
 def check_solver(solver: Any) -> None:
     """TypeError if it is no solver, nor None."""
     if not (solver is None or isinstance(solver, AbstractSolver)):
         raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
-
-
-def checked_rows(
-    K: AbstractMatrixKernel, X: Any, Y: Any, regularization: ArrayLike, mean: Any
-) -> tuple[Rows, Float[Array, ""], Any]:
-    """The rows of the data, λ and the mean, where they fit each other and the kernel."""
-    rows = rows_of_data(observations(X, Y))
-    K.check_points(rows.points)
-    check_potential(K, rows)
-    require.warn_of_float32(rows.targets)
-    regularization = require.ridge(regularization, rows.targets.dtype)
-    return rows, regularization, checked_mean(mean, rows.dimension, rows.targets.dtype)
 
 
 def default_solver(rows: int, dtype: Any) -> AbstractSolver[KernelField]:

@@ -33,13 +33,26 @@ class Columns(eqx.Module):
 
 
 def whitening(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r r"]:
-    """T = L⁻ᵀ with L Lᵀ = G_SS on the kept columns, zero on the others."""
-    S, kept = landmarks.points, landmarks.kept.reshape(-1)
-    r = len(kept)
-    L = jnp.linalg.cholesky(masked(assemble(K, S, S).reshape(r, r), kept))
-    T = jax.scipy.linalg.solve_triangular(L, jnp.eye(r, dtype=S.dtype), lower=True).T
+    """T with T Tᵀ = G_SS⁻¹ on the kept columns, zero on the others."""
+    S = landmarks.points
+    return _inverse_root(assemble(K, S, S).reshape(S.size, -1), landmarks.kept.reshape(-1))
+
+
+@jax.custom_jvp
+def _inverse_root(G: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[Array, "r r"]:
+    L = jnp.linalg.cholesky(masked(G, kept))
+    T = jax.scipy.linalg.solve_triangular(L, jnp.eye(len(G), dtype=G.dtype), lower=True).T
     both = kept[:, None] & kept[None, :]
     return jnp.where(both, T, jnp.zeros_like(T))
+
+
+@_inverse_root.defjvp
+def _(primals, tangents):
+    # Only T Tᵀ = G⁻¹ matters, which this dT changes as that of the Cholesky factor would; that one
+    # rounds by the condition of G.
+    (G, kept), (dG, _) = primals, tangents
+    T = _inverse_root(G, kept)
+    return T, -0.5 * T @ (T.T @ dG @ T)
 
 
 def factor(square: Float[Array, "r r"], ridge: Float[Array, ""]) -> Float[Array, "r r"]:

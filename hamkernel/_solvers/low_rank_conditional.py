@@ -9,8 +9,6 @@ with it.
 Source: Quiñonero-Candela & Rasmussen (2005), section 5, the deterministic training conditional.
 """
 
-import abc
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -18,145 +16,12 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
-from hamkernel._features.waves import AbstractFeatures
-from hamkernel._fields.base import AbstractField, SolverInfo, root
-from hamkernel._fields.features import FeatureField
-from hamkernel._fields.kernel_field import KernelField
-from hamkernel._gram.observed import between
-from hamkernel._observations.blocks import AbstractBlock, Components
+from hamkernel._fields.base import AbstractField
+from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers.conditional import AbstractConditional, check_potential
-from hamkernel._solvers.landmark_gram import singular, whitening
-from hamkernel._solvers.landmarks import Landmarks
-from hamkernel._solvers.prior import Prior, of_features, prior_draws
-from hamkernel._structures.base import AbstractMatrixKernel
-
-
-class AbstractSpan(eqx.Module):
-    """r functions with Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z)."""
-
-    kernel: eqx.AbstractVar[AbstractMatrixKernel]
-
-    @abc.abstractmethod
-    def of(self, block: AbstractBlock) -> Float[Array, "d r"]:
-        """The rows of a block of each function."""
-
-    @abc.abstractmethod
-    def missing(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
-        """What they leave of the prior covariance of the rows of two blocks."""
-
-    @abc.abstractmethod
-    def field(self, w: Float[Array, " r"], residual: Array, ridge: Array, N: int) -> AbstractField:
-        """The function with these weights."""
-
-    @abc.abstractmethod
-    def draws(
-        self,
-        weights: Float[Array, "count r"],
-        rows: Rows,
-        key: Key[Array, ""],
-        region: Float[Array, "2 n"],
-    ) -> AbstractField:
-        """The functions with these weights, and what they leave of the prior, as a batch."""
-
-    def of_rows(self, rows: Rows) -> Float[Array, "D r"]:
-        """The rows of observations of each function."""
-        return rows.contrast(jnp.concatenate([self.of(block) for block in rows.blocks]))
-
-
-class LandmarkSpan(AbstractSpan):
-    """The columns K(·, s) of landmarks, times T, which makes them orthonormal."""
-
-    kernel: AbstractMatrixKernel
-    landmarks: Landmarks
-    T: Float[Array, "r r"]
-
-    def of(self, block: AbstractBlock) -> Float[Array, "d r"]:
-        return between(self.kernel, block, Components(self.landmarks.points)) @ self.T
-
-    def missing(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
-        return between(self.kernel, left, right) - self.of(left) @ self.of(right).T
-
-    def field(self, w, residual, ridge, N) -> KernelField:
-        S = self.landmarks.points
-        info = SolverInfo("Nystrom", landmarks=self.landmarks.count, rank=self.landmarks.kept.sum())
-        return KernelField(
-            kernel=self.kernel,
-            points=S,
-            coefficients=(self.T @ w).reshape(S.shape),
-            residual=residual,
-            norm=root(w @ w),
-            regularization=ridge / N,
-            offset=jnp.zeros((), S.dtype),
-            info=info,
-        )
-
-    def draws(self, weights, rows, key, region) -> KernelField:
-        count, S = len(weights), self.landmarks.points
-        everywhere = jnp.concatenate([S, rows.points])
-        prior = prior_draws(self.kernel, everywhere, region, key, count)
-        return _on_landmarks(self, weights, prior)
-
-
-@eqx.filter_jit
-def _on_landmarks(span: LandmarkSpan, weights, prior: Prior) -> KernelField:
-    S, T, n = span.landmarks.points, span.T, span.landmarks.points.shape[1]
-    # A draw of the prior less what it is in the span.
-    here = Rows((Components(S),), jnp.zeros(S.size, S.dtype))
-    less = weights - prior.rows(here).T @ T
-
-    def one(w, coefficients, basis, of_basis):
-        return KernelField(
-            kernel=span.kernel,
-            points=jnp.concatenate([S, prior.points]),
-            coefficients=jnp.concatenate([(T @ w).reshape(S.shape), coefficients]),
-            residual=jnp.zeros((0, n), w.dtype),
-            norm=jnp.full((), jnp.inf, w.dtype),
-            regularization=jnp.zeros((), w.dtype),
-            offset=jnp.zeros((), w.dtype),
-            info=SolverInfo("draw"),
-            mean=None if basis is None else of_features(span.kernel, basis, of_basis, n),
-        )
-
-    return jax.vmap(one)(less, prior.coefficients, prior.features, prior.weights)
-
-
-class FeatureSpan(AbstractSpan):
-    """Random Fourier features, which stand for a kernel of their own."""
-
-    kernel: AbstractMatrixKernel
-    features: AbstractFeatures
-    dimension: int = eqx.field(static=True)
-
-    def of(self, block: AbstractBlock) -> Float[Array, "d r"]:
-        if not block.of_values:
-            return block.rows(self.features(block.points))
-        none = jnp.zeros(self.features.columns, block.points.dtype)
-        values = jax.vmap(lambda x: jax.grad(lambda w: self.features.potential(x, w))(none))
-        return block.rows(values(block.points))
-
-    def missing(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
-        return jnp.zeros((len(left.scale), len(right.scale)), left.points.dtype)
-
-    def field(self, w, residual, ridge, N) -> FeatureField:
-        left = jnp.linalg.norm(residual)
-        unknown = jnp.zeros((0, self.dimension), w.dtype)
-        return FeatureField(
-            kernel=self.kernel,
-            features=self.features,
-            weights=w,
-            residual=residual if residual.ndim == 2 else unknown,
-            norm=root(w @ w),
-            regularization=ridge / N,
-            offset=jnp.zeros((), w.dtype),
-            info=SolverInfo("RandomFeatures", rank=jnp.asarray(len(w)), residual_norm=left),
-        )
-
-    def draws(self, weights, rows, key, region) -> FeatureField:
-        def one(w):
-            return of_features(self.kernel, self.features, w, self.dimension)
-
-        return jax.vmap(one)(weights)
+from hamkernel._solvers.landmark_gram import singular
+from hamkernel._solvers.spans import AbstractSpan
 
 
 class LowRankConditional(AbstractConditional):
@@ -231,8 +96,3 @@ def _conditional(span, rows, ridge, R, rotated):
     left = rows.y - span.of_rows(rows) @ w
     field = span.field(w, rows.residual(left), ridge, rows.count)
     return LowRankConditional(field, rows, ridge, span, R, rotated)
-
-
-def landmark_span(K: AbstractMatrixKernel, landmarks: Landmarks) -> LandmarkSpan:
-    """The span of the kept columns of landmarks."""
-    return LandmarkSpan(K, landmarks, whitening(K, landmarks))

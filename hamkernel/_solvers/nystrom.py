@@ -28,7 +28,6 @@ from hamkernel._machine.devices import as_given, rows_of, split
 from hamkernel._observations.rows import Rows
 from hamkernel._show import text
 from hamkernel._solvers import stream_sums
-from hamkernel._solvers.bases import LandmarkBasis
 from hamkernel._solvers.landmark_gram import (
     Columns,
     checked,
@@ -40,9 +39,9 @@ from hamkernel._solvers.landmark_gram import (
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks
 from hamkernel._solvers.low_rank_conditional import (
     LowRankConditional,
-    landmark_span,
     low_rank_conditional,
 )
+from hamkernel._solvers.spans import LandmarkBasis, landmark_span
 from hamkernel._solvers.stream_sums import Sums
 from hamkernel._solvers.streaming import (
     AbstractStreamingFit,
@@ -163,6 +162,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         K: AbstractMatrixKernel,
         sample: Num[ArrayLike, "N n"],
         regularization: ArrayLike = 1e-4,
+        inputs: Num[ArrayLike, "N m"] | None = None,
     ) -> "LandmarkFit":
         """A fit without data yet, to which chunks are added: see `LandmarkFit`.
 
@@ -173,6 +173,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
                 first chunk is enough if all chunks look alike; one trajectory out of many is not.
             regularization: the smallest λ that will be asked for, since the tolerance is relative
                 to it, and so are the digits that are kept: a smaller one loses some.
+            inputs: of a `Controlled` kernel: those of the sample, shape (N, m).
 
         Where `field.info.truncation` of the data added exceeds the tolerance, start anew with a
         sample that looks like the data so far.
@@ -181,7 +182,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
             ValueError: a shape does not fit, or λ is not positive. TypeError: K is not
                 matrix-valued.
         """
-        K, sample, regularization = checked_start(K, sample, regularization)
+        K, sample, regularization = checked_start(K, sample, regularization, inputs)
         landmarks = self.landmarks(K, sample, regularization)
         some = thinned(sample, self.candidates)
         return _start(K, some, regularization, landmarks, self.tolerance)
@@ -325,7 +326,7 @@ def _start(K, sample, regularization, landmarks, tolerance):
         trace=jnp.zeros((), S.dtype),
         count=jnp.zeros((), int),
         regularization=regularization,
-        dimension=S.shape[1],
+        dimension=K.outputs(S.shape[1]),
         tolerance=tolerance,
     )
 
@@ -346,7 +347,7 @@ def _solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, norm, residual_norm = stream_sums.solve(fit.sums, ridge)
     return _Solution(
-        coefficients=weights.reshape(fit.landmarks.points.shape),
+        coefficients=weights.reshape(len(fit.landmarks.points), -1),
         residual=jnp.zeros((0, fit.dimension), weights.dtype),
         norm=norm,
         truncation=truncated(fit.trace, stream_sums.trace(fit.sums), ridge),

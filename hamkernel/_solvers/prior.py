@@ -25,8 +25,7 @@ from hamkernel._features.waves import AbstractFeatures, features
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.features import FeatureField
 from hamkernel._gram.dense import block_traces
-from hamkernel._gram.observed import rows_between
-from hamkernel._observations.blocks import Components
+from hamkernel._gram.observed import components, rows_between
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers.landmark_gram import whitening
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks
@@ -43,14 +42,14 @@ class Prior(eqx.Module):
     """Draws f₀: coefficients at points that all share, and weights of features or None."""
 
     kernel: AbstractMatrixKernel
-    points: Float[Array, "m n"]
+    points: Float[Array, "m d"]
     coefficients: Float[Array, "count m n"]
     features: AbstractFeatures | None
     weights: Float[Array, "count r"] | None
 
     def rows(self, rows: Rows) -> Float[Array, "D count"]:
         """The rows of all draws."""
-        across = rows_between(self.kernel, rows, Components(self.points))
+        across = rows_between(self.kernel, rows, components(self.kernel, self.points))
         own = across @ self.coefficients.reshape(len(self.coefficients), -1).T
         if self.features is None:
             return own
@@ -64,12 +63,15 @@ class Prior(eqx.Module):
 
 def prior_draws(
     K: AbstractMatrixKernel,
-    X: Float[Array, "P n"],
-    region: Float[Array, "2 n"],
+    X: Float[Array, "P d"],
+    region: Float[Array, "2 d"],
     key: Key[Array, ""],
     count: int,
 ) -> Prior:
-    """Draws from GP(0, K) that are right in the region and at the points X."""
+    """Draws from GP(0, K) that are right in the region and at the points X.
+
+    A draw with inputs is affine in u, and right for every u if it is for those of the region.
+    """
     of_region, of_landmarks, of_draws = jax.random.split(key, 3)
     low, high = region
     share = jax.random.uniform(of_region, (_CANDIDATES, len(low)), X.dtype)
@@ -82,12 +84,13 @@ def prior_draws(
 @eqx.filter_jit
 def _drawn(K, landmarks: Landmarks, key, count: int) -> Prior:
     S, T = landmarks.points, whitening(K, landmarks)
-    m, n = S.shape
+    m, d = S.shape
+    n = K.outputs(d)
     on_landmarks, of_frequencies, of_weights = jax.random.split(key, 3)
     w = jax.random.normal(on_landmarks, (count, m * n), S.dtype)
 
     def basis(key):
-        return features(K, n, _FREQUENCIES, key, S.dtype)
+        return features(K, d, _FREQUENCIES, key, S.dtype)
 
     try:
         columns = eqx.filter_eval_shape(basis, key).columns

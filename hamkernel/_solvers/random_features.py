@@ -14,13 +14,12 @@ from hamkernel._machine.devices import as_given, rows_of, split
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers import stream_sums
-from hamkernel._solvers.bases import WaveBasis
 from hamkernel._solvers.landmark_gram import singular
 from hamkernel._solvers.low_rank_conditional import (
-    FeatureSpan,
     LowRankConditional,
     low_rank_conditional,
 )
+from hamkernel._solvers.spans import FeatureSpan, WaveBasis
 from hamkernel._solvers.stream_sums import Sums
 from hamkernel._solvers.streaming import (
     AbstractStreamingFit,
@@ -97,12 +96,12 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
         regularization: Float[Array, ""],
         throw: bool = True,
     ) -> LowRankConditional:
-        n = rows.dimension
-        span = FeatureSpan(K, self._features(K, n, rows.targets.dtype), n)
+        basis = self._features(K, rows.points.shape[1], rows.targets.dtype)
+        span = FeatureSpan(K, basis, rows.dimension)
         return low_rank_conditional(span, rows, regularization, throw)
 
     def _features(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> AbstractFeatures:
-        """The features of K for n coordinates, if a fit in them fits in memory."""
+        """The features of K for points of n coordinates, if a fit in them fits in memory."""
 
         def of_kernel(K, key):
             return features(K, n, self.count, key, dtype)
@@ -117,6 +116,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
         K: AbstractMatrixKernel,
         sample: Num[ArrayLike, "N n"],
         regularization: ArrayLike = 1e-4,
+        inputs: Num[ArrayLike, "N m"] | None = None,
     ) -> "FeatureFit":
         """A fit without data yet, to which chunks are added: see `FeatureFit`.
 
@@ -125,12 +125,13 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
             sample: states that look like all of the data, shape (N, n). The features do not depend
                 on them, only the rounding of the sums does. They are not added to the fit.
             regularization: the smallest λ that will be asked for; a smaller one loses digits.
+            inputs: of a `Controlled` kernel: those of the sample, shape (N, m).
 
         Raises:
             TypeError: a kernel without a known spectral density. ValueError: n is not allowed by
                 the structure, the sample is not finite, or λ is not positive.
         """
-        K, sample, regularization = checked_start(K, sample, regularization)
+        K, sample, regularization = checked_start(K, sample, regularization, inputs)
         basis = self._features(K, sample.shape[1], sample.dtype)
         return _start(K, basis, thinned(sample, _SAMPLE), regularization)
 
@@ -221,7 +222,7 @@ def _start(K, basis, sample, regularization):
         sums=stream_sums.start(basis, identity, sample, regularization),
         count=jnp.zeros((), int),
         regularization=regularization,
-        dimension=sample.shape[1],
+        dimension=K.outputs(sample.shape[1]),
     )
 
 

@@ -61,7 +61,8 @@ def start(
     NaN where the kernel is not finite, or λ below rounding.
     """
     zero = jnp.zeros_like(W)
-    seen = normal(design, W, sample, jnp.zeros_like(sample))
+    n = jax.eval_shape(design, sample[:1]).shape[1]
+    seen = normal(design, W, sample, jnp.zeros((len(sample), n), sample.dtype))
     R = jnp.linalg.cholesky(plus_ridge(seen.square / len(sample), ridge)).T
     return Sums(R, solve_triangular(R, W.T, trans="T").T, zero, zero[0], zero[0, 0])
 

@@ -8,7 +8,7 @@ import abc
 import contextlib
 import reprlib
 from collections.abc import Iterable, Iterator
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import equinox as eqx
 import jax
@@ -17,8 +17,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
+from hamkernel._fields.base import at_points
+from hamkernel._fields.controlled import learned_field
+from hamkernel._fields.known import known_part
 from hamkernel._machine.devices import rows_of, split
 from hamkernel._machine.threads import one_blas_thread
+from hamkernel._observations.data import points_and_velocities, sampled_points
 from hamkernel._show import call, text
 from hamkernel._solvers.cholesky import AbstractSolver, Learned
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
@@ -64,29 +68,41 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> Learned:
         """`field` for a λ that has been checked, and the number of points, which is not 0."""
 
-    def add(self: Fit, X: Num[ArrayLike, "N n"], Y: Num[ArrayLike, "N n"]) -> Fit:
+    def add(
+        self: Fit,
+        X: Num[ArrayLike, "N n"],
+        Y: Num[ArrayLike, "N n"],
+        inputs: Num[ArrayLike, "N m"] | None = None,
+    ) -> Fit:
         """The fit with more data.
 
         Args:
             X: states, shape (N, n).
             Y: measured velocities, shape (N, n).
+            inputs: of a `Controlled` kernel: u at each state, shape (N, m).
 
         Raises:
             ValueError: a shape does not fit, or the data is not finite. TypeError: its dtype, or
                 it has more digits than the fit.
         """
-        X, Y = require.data(X, Y, part=True)
+        _, X, Y = points_and_velocities(self.kernel, X, Y, inputs, part=True)
         if np.promote_types(X.dtype, self.dtype) != self.dtype:
             raise TypeError(
                 f"the data is {X.dtype} and the fit {self.dtype}, the dtype of the sample that it "
                 f"was started with: start it with a sample in {X.dtype}, or cast the data."
             )
-        if X.shape[1] != self.dimension:
-            raise ValueError(f"the data has {X.shape[1]} coordinates and the fit {self.dimension}.")
-        return self._added(X.astype(self.dtype), Y.astype(self.dtype))
+        if Y.shape[1] != self.dimension:
+            raise ValueError(f"the data has {Y.shape[1]} coordinates and the fit {self.dimension}.")
+        X, Y, known = X.astype(self.dtype), Y.astype(self.dtype), self._known
+        return self._added(X, Y if known is None else Y - at_points(known, X))
+
+    @property
+    def _known(self) -> Any:
+        """The part of the field that is known: G u of a known input matrix."""
+        return known_part(self.kernel, None, self.dimension, self.dtype)
 
     @one_blas_thread
-    def field(self, regularization: ArrayLike | None = None) -> Learned:
+    def field(self, regularization: ArrayLike | None = None) -> Any:
         """The field learned from all data added so far; O(r³), and no pass over the data.
 
         Args:
@@ -103,7 +119,7 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
         count = require.value(
             self.count, none, "no data yet: add(X, Y) before asking for the field."
         )
-        return self._solved(count, regularization)
+        return learned_field(self._solved(count, regularization), self._known)
 
 
 class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned]):
@@ -115,6 +131,7 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned]):
         K: AbstractMatrixKernel,
         sample: Num[ArrayLike, "N n"],
         regularization: ArrayLike = 1e-4,
+        inputs: Num[ArrayLike, "N m"] | None = None,
     ) -> AbstractStreamingFit[Learned]:
         """A fit without data yet, to which chunks are added."""
 
@@ -122,11 +139,12 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned]):
     def fit_chunks(
         self,
         K: AbstractMatrixKernel,
-        chunks: Iterable[tuple[Num[ArrayLike, "N n"], Num[ArrayLike, "N n"]]],
+        chunks: Iterable[tuple[Num[ArrayLike, "N _"], ...]],
         regularization: ArrayLike = 1e-4,
         sample: Num[ArrayLike, "S n"] | None = None,
         progress: bool = False,
-    ) -> Learned:
+        inputs: Num[ArrayLike, "S m"] | None = None,
+    ) -> Any:
         """`hk.fit` to data that comes in chunks, in one pass and with memory for two chunks.
 
         The field is that of one fit to all the data: to rounding for `RandomFeatures`, and for
@@ -138,10 +156,12 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned]):
         Args:
             K: a matrix-valued kernel.
             chunks: pairs (X, Y) of states and velocities, shape (Nᵢ, n) each: a generator, or
-                slices of memory-mapped files. Every new Nᵢ compiles anew: equal ones are fast.
+                slices of memory-mapped files. Every new Nᵢ compiles anew: equal ones are fast. Of a
+                `Controlled` kernel (X, Y, U), with inputs of shape (Nᵢ, m).
             regularization: λ > 0, as in `hk.fit`, with N the number of all points.
             sample: states that look like all of the data, for `start`; the first chunk if None.
             progress: show a progress bar where the standard error is a terminal.
+            inputs: of a `Controlled` kernel: those of the sample, shape (S, m).
 
         Raises:
             ValueError: there is no chunk, or as `hk.fit` for one of them. TypeError: as `hk.fit`.
@@ -156,18 +176,22 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned]):
         model = None
         for i, chunk in enumerate(tqdm(chunks, "chunks", disable=None if progress else True)):
             with _naming(i):
-                if not isinstance(chunk, tuple | list) or len(chunk) != 2:
+                if not isinstance(chunk, tuple | list) or len(chunk) not in (2, 3):
                     raise TypeError(
-                        f"a pair (X, Y) is needed, got {reprlib.repr(chunk)}. All of the data in "
-                        "one chunk is [(X, Y)]."
+                        f"a pair (X, Y) is needed, or (X, Y, U) of a field with inputs; got "
+                        f"{reprlib.repr(chunk)}. All of the data in one chunk is [(X, Y)]."
                     )
-                X, Y = require.data(*chunk, part=True)
+                X, Y = require.data(*chunk[:2], part=True)
+            U = chunk[2] if len(chunk) == 3 else None
             if model is None:
-                model = self.start(K, X if sample is None else sample, regularization)
+                first = (
+                    (X, regularization, U) if sample is None else (sample, regularization, inputs)
+                )
+                model = self.start(K, *first)
             # The next chunk is read while this one is added, and no further ones pile up.
             jax.block_until_ready(model)
             with _naming(i):
-                model = model.add(X, Y)
+                model = model.add(X, Y, U)
         if model is None:
             raise ValueError("fit_chunks needs at least one chunk (X, Y); the iterator was empty.")
         return model.field()
@@ -184,11 +208,15 @@ def _naming(chunk: int) -> Iterator[None]:
 
 
 def checked_start(
-    K: AbstractMatrixKernel, sample: Num[ArrayLike, "N n"], regularization: ArrayLike
-) -> tuple[AbstractMatrixKernel, Float[Array, "N n"], Float[Array, ""]]:
-    """The arguments of `start`, if they are what it says."""
+    K: AbstractMatrixKernel,
+    sample: Num[ArrayLike, "N n"],
+    regularization: ArrayLike,
+    inputs: Num[ArrayLike, "N m"] | None = None,
+) -> tuple[AbstractMatrixKernel, Float[Array, "N d"], Float[Array, ""]]:
+    """The arguments of `start`, if they are what it says; points (x, u) of a field with inputs."""
     K = matrix_kernel(K)
     sample = require.finite(require.points(sample, "sample"), "sample")
+    K, sample = sampled_points(K, sample, inputs)
     K.check_dimension(sample.shape[1])
     require.warn_of_float32(sample)
     return K, sample, require.ridge(regularization, sample.dtype)

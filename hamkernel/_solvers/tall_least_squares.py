@@ -150,13 +150,13 @@ def over_tiles(step, carry, data: tuple[Array, Array], rows: int):
     x = z, and second derivatives are NaN: where one tile will do there is none. Derivatives
     recompute the rows of a tile: they are not kept.
     """
-    N, n = data[0].shape
+    N, n = data[1].shape
     size = rows // n + 1
     full = (N - 1) // size
     step = jax.checkpoint(step)
     outs = []
     if full:
-        tiles = jax.tree.map(lambda a: a[: full * size].reshape(full, size, n), data)
+        tiles = jax.tree.map(lambda a: a[: full * size].reshape(full, size, -1), data)
         carry, out = jax.lax.scan(step, carry, tiles)
         outs.append(jax.tree.map(lambda a: a.reshape(-1, n), out))
     carry, out = step(carry, jax.tree.map(lambda a: a[full * size :], data))

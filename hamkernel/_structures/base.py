@@ -25,6 +25,7 @@ class AbstractMatrixKernel(eqx.Module):
     """A positive definite kernel K(x, z) -> (n, n) of fields ℝⁿ -> ℝⁿ."""
 
     matrix_valued: ClassVar[bool] = True
+    takes_inputs: ClassVar[bool] = False  # whether its points are (x, u)
     symplectic: eqx.AbstractVar[bool]  # whether flows keep dq ∧ dp, as those of J∇H do
     no_potential: eqx.AbstractVar[str | None]  # why its fields have none; None if they have one
 
@@ -178,7 +179,8 @@ class Sum(AbstractMatrixKernel):
             flat += zip(term.names, term.terms, strict=True) if is_sum else [(None, term)]
         flat += named.items()
         for _, term in flat:
-            matrix_kernel(term, "a term of a Sum", "Symplectic(k) + CurlFree(k)")
+            if matrix_kernel(term, "a term of a Sum", "Symplectic(k) + CurlFree(k)").takes_inputs:
+                raise TypeError("add the drifts of fields with inputs: Controlled(K1 + K2, …).")
         names = [name for name, _ in flat if name is not None]
         if "regularization" in names:
             raise ValueError("a part cannot be called regularization: tune calls λ so.")

@@ -130,6 +130,7 @@ class Controlled(AbstractMatrixKernel):
     count: int | None = eqx.field(static=True)
 
     symplectic: ClassVar[bool] = False
+    takes_inputs: ClassVar[bool] = True
 
     def __init__(self, drift: AbstractMatrixKernel, inputs: Any, count: int | None = None):
         self.drift = matrix_kernel(drift, "the drift of Controlled", "Controlled(Symplectic(k), …)")
@@ -165,10 +166,11 @@ class Controlled(AbstractMatrixKernel):
         return self.drift.dissipated(x, slope)
 
     def outputs(self, inputs: int) -> int:
-        return inputs - self._count
+        return inputs - self.input_count
 
     @property
-    def _count(self) -> int:
+    def input_count(self) -> int:
+        """m, the number of inputs; ValueError while nobody has said it."""
         if self.count is None:
             raise ValueError(
                 "this Controlled kernel does not know how many inputs there are: give them, "
@@ -204,32 +206,27 @@ class Controlled(AbstractMatrixKernel):
         drift = self.drift.expansion(x, Z, A)
         if isinstance(self.inputs, KnownMatrix):
             return drift
-        return drift + self.input_matrix(x, Z, A, U) @ u
-
-    def input_matrix(
-        self,
-        x: Float[Array, " n"],
-        Z: Float[Array, "M n"],
-        A: Float[Array, "M n"],
-        U: Float[Array, "M m"],
-    ) -> Float[Array, "n m"]:
-        """G(x) of the field Σⱼ K(·, (zⱼ, uⱼ)) aⱼ."""
-        if isinstance(self.inputs, KnownMatrix):
-            return jnp.asarray(self.inputs.matrix, x.dtype)
         row = jax.vmap(self.inputs.kernel, in_axes=(None, 0))(x, Z)
-        rows = self.inputs.rows(len(x), x.dtype)
-        return rows[:, None] * (A.T @ (row[:, None] * U))
+        G = A.T @ (row[:, None] * U)  # (n, m)
+        return drift + self.inputs.rows(len(x), x.dtype) * (G @ u)
 
     def potential(
         self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Float[Array, "M n"]
     ) -> Float[Array, ""]:
         return self.drift.potential(self._split(x)[0], self._split(Z)[0], A)
 
+    def potential_covariance(
+        self, x: Float[Array, " d"], z: Float[Array, " d"]
+    ) -> Float[Array, ""]:
+        return self.drift.potential_covariance(self._split(x)[0], self._split(z)[0])
+
     def check_dimension(self, n: int) -> None:
         """`n` counts the inputs, too."""
         n = self.outputs(n)
         if n < 1:
-            raise ValueError(f"points (x, u) with {self._count} inputs have no coordinates left.")
+            raise ValueError(
+                f"points (x, u) with {self.input_count} inputs have no coordinates left."
+            )
         self.drift.check_dimension(n)
         if isinstance(self.inputs, KnownMatrix):
             if len(self.inputs.matrix) != n:

@@ -27,7 +27,7 @@ def _evaluated(K: Any, X: Float[Array, "N n"]) -> Float[Array, "N n n"]:
 _compiled = eqx.filter_jit(_evaluated)
 
 
-def check_symmetries(K: Any, X: Float[Array, "N n"]) -> None:
+def check_symmetries(K: Any, X: Float[Array | np.ndarray, "N n"]) -> None:
     """ValueError unless B(Sx) = ± S B(x) Sᵀ for the maps S of the kernel, at these points."""
     n = X.shape[1]
     constant = Invariance.TRANSLATION in K.operator_invariance
@@ -35,7 +35,10 @@ def check_symmetries(K: Any, X: Float[Array, "N n"]) -> None:
     found = {each: matrix_of(each, n) for each in maps}
     if constant:  # S = ±1 is a symmetry of every B
         found = {e: S for e, S in found.items() if not np.array_equal(S, S[0, 0] * np.eye(n))}
-    if found:
+    if not found:
+        return
+    with jax.ensure_compile_time_eval():
+        X = jnp.asarray(X)
         here = _operators(K, X)
         for S in found.values():
             moved = jnp.asarray(np.asarray(X) @ S.T, X.dtype)

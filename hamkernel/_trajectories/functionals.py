@@ -7,7 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hamkernel._observations.kinds import Functionals, Together
+from hamkernel._observations.base import Together
+from hamkernel._observations.kinds import Functionals
 from hamkernel._trajectories.rows import Rows
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._observations.base import AbstractObservations
 from hamkernel._posterior.posterior import Posterior, condition
 from hamkernel._show import described
 from hamkernel._solvers.nystrom import Nystrom

@@ -89,7 +89,8 @@ def box_of(
         scale: the standard deviations of the coordinates.
         moves: the coordinates whose noise is looked for.
     """
-    leaves = hyperparameters(model.kernel, jnp.asarray(X), jnp.asarray(Y), jnp.asarray(X))
+    speed = float(np.sqrt(np.mean(Y**2)))
+    leaves = hyperparameters(model.kernel, jnp.asarray(X), speed, jnp.asarray(X))
     start = np.asarray(model.flat)
     size = len(start) - len(scale)
     low = np.concatenate([*(p.low.ravel() for p in leaves), np.log(1e-7 * scale)])

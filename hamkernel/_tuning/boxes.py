@@ -21,6 +21,7 @@ from hamkernel._kernels.base import AbstractScalarKernel, Invariance
 from hamkernel._kernels.functions import Bound
 from hamkernel._kernels.ranges import by_value
 from hamkernel._kernels.symmetry import without_symmetry
+from hamkernel._observations.blocks import Components
 from hamkernel._observations.rows import Rows
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 
@@ -51,12 +52,13 @@ class Hyperparameter:
 def hyperparameters(
     K: AbstractMatrixKernel,
     X: Float[Array, "N n"],
-    Y: Float[Array, "N n"],
+    speed: float,
     states: Float[Array, "M n"],
 ) -> list[Hyperparameter]:
     """The trainable leaves of K, in the order of its leaves, with their boxes from the data.
 
-    The size of K(x, x) is that at `states`, some of X or all.
+    The size of K(x, x) is that at `states`, some of X or all, and `speed` that of velocities, the
+    root of the mean square of their components.
     """
     seen = np.asarray(X)
     # What is a fair amplitude depends on the lengthscales: it is that in the middle of their boxes.
@@ -67,7 +69,7 @@ def hyperparameters(
         for p, leaf in zip(_walk((), K, seen, 1.0), leaves, strict=True)
     ]
     K_middle = eqx.combine(jax.tree.unflatten(structure, middle), rest)
-    return list(_walk((), K, seen, _amplitude(K_middle, states, Y)))
+    return list(_walk((), K, seen, _amplitude(K_middle, states, speed)))
 
 
 def constants(K: AbstractMatrixKernel) -> dict[str, float]:
@@ -93,22 +95,26 @@ def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, 
     return jnp.maximum(trace, gram_trace(K, X))
 
 
-def typical_velocities(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, "P n"]:
-    """Velocities of one size at the points of observations, of which K explains as much.
+def typical_speed(K: AbstractMatrixKernel, rows: Rows) -> float:
+    """The root of the mean square of a component of a velocity, as far as the rows tell.
 
-    Their mean square is to the mean diagonal of the Gram of the points as that of the rows is to
-    that of the rows: an amplitude then fits both.
+    It is to the mean diagonal of the Gram of the points as the mean square of the rows is to that
+    of theirs: an amplitude then fits both.
     """
-    X = rows.points
-    ratio = jnp.sum(rows.y**2) / jnp.trace(gram_of_rows(K, rows))
-    return jnp.full_like(X, jnp.sqrt(ratio * gram_trace(K, X) / X.size))
+    if isinstance(rows.blocks[0], Components) and len(rows.blocks) == 1:
+        return float(np.sqrt(np.mean(np.asarray(rows.measured()) ** 2)))
+    ratio = np.sum(np.asarray(rows.y) ** 2) / np.trace(np.asarray(_gram_of_rows(K, rows)))
+    components = len(rows.points) * rows.dimension
+    return float(np.sqrt(ratio * float(gram_trace(K, rows.points)) / components))
 
 
-def _amplitude(K: AbstractMatrixKernel, X: Array, Y: Array) -> float:
-    """The factor that gives K(x, x) the size of Y: mean Y² over the mean diagonal."""
+_gram_of_rows = eqx.filter_jit(gram_of_rows)
+
+
+def _amplitude(K: AbstractMatrixKernel, X: Array, speed: float) -> float:
+    """The factor that gives K(x, x) the size of velocities squared: over its mean diagonal."""
     trace = float(gram_trace(K, X))
-    rows = len(X) * Y.shape[1]
-    ratio = float(np.mean(np.asarray(Y) ** 2)) * rows / trace if trace > 0 else 0.0
+    ratio = speed**2 * len(X) * K.outputs(X.shape[1]) / trace if trace > 0 else 0.0
     return ratio if np.isfinite(ratio) and ratio > 0 else 1.0
 
 

@@ -12,24 +12,20 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.rows import Rows
-from hamkernel._solvers.bases import AbstractBasis
+from hamkernel._solvers.spans import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._validation.folds import Folds, Partition
 from hamkernel._validation.losses import (
     cross_validation_loss,
     generalized_cross_validation,
+    log_marginal_likelihood,
+)
+from hamkernel._validation.of_rows import (
     generalized_loss_and_square,
     log_likelihood,
-    log_marginal_likelihood,
     partition_loss_and_square,
-)
-from hamkernel._validation.observed import (
-    rows_generalized_loss_and_square,
-    rows_log_likelihood,
-    rows_partition,
-    rows_partition_loss_and_square,
+    partition_of_rows,
 )
 
 Objective = Callable[[AbstractMatrixKernel, Array, Array, Array], Float[Array, ""]]
@@ -48,15 +44,17 @@ class SearchCriterion(eqx.Module):
     """
 
     fn: Any  # a function, or the `Partial` of one of ours
-    partition: Partition | None = eqx.field(static=True)
+    partition: Partition | None = eqx.field(static=True)  # of the observations; see `on`
     logarithmic: bool = eqx.field(static=True)
     own: bool = eqx.field(static=True)  # the caller's, which may need all the data
 
-    def loss(self, K, X, Y, regularization) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
+    def loss(
+        self, K: AbstractMatrixKernel, rows: Rows, regularization: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
         """The objective, as `tune` reports it, and ‖a‖² of the fit where there is a wall for it."""
         extra = () if self.partition is None else (self.partition,)
         with require.traceable("the objective"):
-            value = self.fn(K, X, Y, regularization, *extra)
+            value = self.fn(K, rows, regularization, *extra)
         value, square = value if self.logarithmic else (value, None)
         value = require.floating(value, "the value of the objective")
         if jnp.shape(value) != ():
@@ -65,7 +63,7 @@ class SearchCriterion(eqx.Module):
             )
         return value, square
 
-    def searched(self, loss, square, Y, size) -> Float[Array, ""]:
+    def searched(self, loss, square, rows: Rows, wall) -> Float[Array, ""]:
         """What the search minimises: the loss in its units, and the wall.
 
         The wall keeps away from fields that rounding makes rough where the loss is still right.
@@ -79,20 +77,20 @@ class SearchCriterion(eqx.Module):
         Args:
             loss: the value of `loss`, shape ().
             square: ‖a‖², shape ().
-            Y: velocities.
-            size: tr(G) of all points; None where the caller has said what λ may be.
+            rows: what the loss is of.
+            wall: tr(G)² over ‖y‖², of velocities at all points of the rows; None where the caller
+                has said what λ may be.
         """
         value = loss
         if self.logarithmic:
             tiny = jnp.finfo(loss.dtype).tiny
             value = jnp.log(jnp.maximum(loss, tiny))
-            if size is not None:
-                relative = jnp.maximum(square, tiny) / jnp.maximum(jnp.sum(Y**2), tiny)
+            if wall is not None:
                 eps = jnp.log(jnp.finfo(loss.dtype).eps).astype(loss.dtype)
-                beyond = (jnp.log(relative) + eps) / 2 + jnp.log(size)
+                beyond = (jnp.log(jnp.maximum(square, tiny)) + jnp.log(wall) + eps) / 2
                 value = value + jnp.maximum(beyond, 0) ** 2
         elif not self.own:
-            value = value * (2 / Y.size)
+            value = value * (2 / rows.size)
         return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
     def with_basis(self, basis: AbstractBasis) -> "SearchCriterion":
@@ -101,18 +99,22 @@ class SearchCriterion(eqx.Module):
         fn = jax.tree_util.Partial(self.fn.func, **self.fn.keywords, basis=basis)
         return dataclasses.replace(self, fn=fn)
 
-    def on(self, rows: np.ndarray) -> "SearchCriterion":
-        """The same criterion for a subset of the points."""
+    def on(self, rows: Rows, chosen: np.ndarray) -> "SearchCriterion":
+        """The same criterion for the rows of some observations."""
         if self.partition is None:
             return self
-        partition = Partition(len(rows), self.partition.labels[rows])
+        partition = partition_of_rows(rows, self.partition.labels[chosen])
         return dataclasses.replace(self, partition=partition)
 
 
-def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> SearchCriterion:
-    """What the objective of `tune` means for N points.
+def criterion_of(
+    objective: Criterion | Objective, N: int, folds: Folds, data: tuple[Any, Any] = (None, None)
+) -> SearchCriterion:
+    """What the objective of `tune` means for N observations.
 
-    A public loss is what its name is: it takes the folds and is searched by its logarithm.
+    A public loss is what its name is: it takes the folds and is searched by its logarithm. A
+    function of the caller's is called with what the caller gave, states and velocities, or
+    observations and None.
     """
     partial = jax.tree_util.Partial
     if objective == "cross_validation" or objective is cross_validation_loss:
@@ -143,51 +145,13 @@ def criterion_of(objective: Criterion | Objective, N: int, folds: Folds) -> Sear
             "an objective is called with (K, X, Y, regularization), by position, and returns one "
             f"number; this one takes ({other})."
         )
-    return SearchCriterion(as_pytree(objective), None, logarithmic=False, own=True)
+    fn = partial(_own_of_data, as_pytree(objective), data)
+    return SearchCriterion(fn, None, logarithmic=False, own=True)
 
 
-def criterion_of_rows(
-    objective: Criterion | Objective, data: AbstractObservations, rows: Rows, folds: Folds
-) -> SearchCriterion:
-    """The same of observations, for all of them at once: what it is called with is not looked at.
-
-    A function of the caller's is called with (K, data, None, regularization).
-    """
-    named = criterion_of(objective, rows.count, folds)
-    if named.own:
-        fn = jax.tree_util.Partial(_own_of_data, named.fn, data)
-    elif named.partition is not None:
-        fn = jax.tree_util.Partial(
-            _partition_loss_of, rows, partition=_Kept(rows_partition(rows, folds))
-        )
-    elif named.logarithmic:
-        fn = jax.tree_util.Partial(_generalized_loss_of, rows)
-    else:
-        fn = jax.tree_util.Partial(_negative_log_likelihood_of, rows)
-    return SearchCriterion(fn, None, logarithmic=named.logarithmic, own=True)
+def _own_of_data(fn, data, K, rows, regularization):
+    return fn(K, *data, regularization)
 
 
-class _Kept(eqx.Module):
-    """A partition as a PyTree without leaves."""
-
-    value: Partition = eqx.field(static=True)
-
-
-def _own_of_data(fn, data, K, X, Y, regularization):
-    return fn(K, data, None, regularization)
-
-
-def _partition_loss_of(rows, K, X, Y, regularization, *, partition):
-    return rows_partition_loss_and_square(K, rows, regularization, partition.value)
-
-
-def _generalized_loss_of(rows, K, X, Y, regularization):
-    return rows_generalized_loss_and_square(K, rows, regularization, LEAST_FREE)
-
-
-def _negative_log_likelihood_of(rows, K, X, Y, regularization):
-    return -rows_log_likelihood(K, rows, regularization)
-
-
-def _negative_log_likelihood(K, X, Y, regularization, basis=None):
-    return -log_likelihood(K, X, Y, regularization, basis)
+def _negative_log_likelihood(K, rows, regularization, basis=None):
+    return -log_likelihood(K, rows, regularization, basis)

@@ -38,7 +38,7 @@ def minimised(
     # The wrapper's last point is the best it has seen; that of BFGS is so by itself.
     if not isinstance(optimiser, optx.BFGS):
         optimiser = optx.BestSoFarMinimiser(optimiser)
-    dtype = objective.X.dtype
+    dtype = objective.speed.dtype
     u, value, loss, converged, steps = _minimised(
         objective, jnp.asarray(run.u, dtype), optimiser, max_steps
     )

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from hamkernel._observations.rows import Rows
 from hamkernel._tuning.objective import SearchCriterion
 from hamkernel._tuning.space import SearchSpace
 
@@ -18,29 +19,28 @@ FIRST_POINTS, FIRST_ROWS, SECOND_ROWS = 64, 256, 1024
 _BATCH = 16  # points that one call takes: as many as there are starts
 
 
-def rows_of_parts(
-    X: Float[Array, "N n"], criterion: SearchCriterion, dense: bool
-) -> list[Int[np.ndarray, " _"]]:
-    """The rows of the points of each part; all of them at last, where the loss is dense."""
-    N, n = X.shape
+def parts_of(rows: Rows, criterion: SearchCriterion, dense: bool) -> list[Int[np.ndarray, " _"]]:
+    """The observations of each part; all of them at last, where the loss is dense."""
+    N, n = rows.count, len(rows.targets) / rows.count
     if criterion.own:  # it may need all the data
         return [np.arange(N)]
-    counts = [min(FIRST_POINTS, max(FIRST_ROWS // n, 2)), SECOND_ROWS // n]
+    counts = [min(FIRST_POINTS, max(int(FIRST_ROWS / n), 2)), int(SECOND_ROWS / n)]
     if 2 * counts[1] > N:
         del counts[1]
     if counts[0] >= N:
         return [np.arange(N)]
     labels = np.zeros(N) if criterion.partition is None else criterion.partition.labels
     order = np.argsort(labels, kind="stable")
-    # Spread evenly over the folds, and over the points of each.
+    # Spread evenly over the folds, and over the observations of each.
     few = [np.sort(order[np.linspace(0, N - 1, count).round().astype(int)]) for count in counts]
     return [*few, np.arange(N)] if dense else few
 
 
 class Part:
-    """The objective on some of the points, as a function of u.
+    """The objective on some of the observations, as a function of u.
 
     Attributes:
+        count: how many there are.
         seconds: what one value with its slope took, the least seen.
     """
 
@@ -48,32 +48,41 @@ class Part:
         self,
         space: SearchSpace,
         criterion: SearchCriterion,
-        X: Float[Array, "N n"],
-        Y: Float[Array, "N n"],
-        rows: Int[np.ndarray, " M"],
+        rows: Rows,
+        speed: float,
+        chosen: Int[np.ndarray, " C"],
     ):
-        """Take `rows` of all points X, Y, to which the criterion belongs."""
-        self.whole = len(rows) == len(X)
-        self.seconds = np.inf
-        thinning = jnp.asarray(len(X) / len(rows), X.dtype)
-        if not self.whole:
-            X, Y = (jnp.asarray(np.asarray(each)[rows]) for each in (X, Y))
-            criterion = criterion.on(rows)
-        self.objective = SearchObjective(space, criterion, X, Y, thinning)
+        """Take those `chosen` of all that the criterion belongs to.
 
-    @property
-    def points(self) -> int:
-        """How many there are."""
-        return len(self.objective.X)
+        Args:
+            space: of u.
+            criterion: of all observations.
+            rows: all.
+            speed: the root of the mean square of the components of velocities, as they are typical.
+            chosen: which of them, counted from 0 and in order.
+        """
+        self.seconds = np.inf
+        N = rows.count
+        if len(chosen) < N:
+            rows, chosen = rows.some(chosen)
+        self.count = rows.count
+        dtype = rows.targets.dtype
+        thinning = jnp.asarray(N / self.count, dtype)
+        criterion = criterion.on(rows, chosen)
+        self.objective = SearchObjective(
+            space, criterion, rows, thinning, jnp.asarray(speed, dtype)
+        )
 
     def __call__(self, us: Float[np.ndarray, "count P"]) -> list[tuple[float, float, np.ndarray]]:
         """Value, loss and slope at each; inf and a slope of zero where there is no value."""
         # On a CPU one after the other took two thirds of the time; elsewhere a lane costs nothing.
-        side_by_side = jax.default_backend() != "cpu" and self.objective.X.size <= FIRST_ROWS
+        side_by_side = (
+            jax.default_backend() != "cpu" and len(self.objective.rows.targets) <= FIRST_ROWS
+        )
         found = []
         for start in range(0, len(us), _BATCH):
             some = us[start : start + _BATCH]
-            padded = np.zeros((_BATCH, us.shape[1]), self.objective.X.dtype)
+            padded = np.zeros((_BATCH, us.shape[1]), self.objective.speed.dtype)
             padded[: len(some)] = some
             began = time.perf_counter()
             arrays = _evaluated(self.objective, padded, np.asarray(len(some)), side_by_side)
@@ -86,22 +95,28 @@ class Part:
 
 
 class SearchObjective(eqx.Module):
-    """u -> what is minimised, and the loss. The ridge Nλ is that of all points."""
+    """u -> what is minimised, and the loss. The ridge Nλ is that of all observations."""
 
     space: SearchSpace
     criterion: SearchCriterion
-    X: Float[Array, "M n"]
-    Y: Float[Array, "M n"]
-    thinning: Float[Array, ""]  # the number of all points over M
+    rows: Rows
+    thinning: Float[Array, ""]  # the number of all observations over that of these
+    speed: Float[Array, ""]
 
     def __call__(self, u: Float[Array, " P"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         kernel, regularization, size = self.space.decode(u)
-        ridge = self.thinning * regularization
-        loss, square = self.criterion.loss(kernel, self.X, self.Y, ridge)
-        # Of noise a is as large at every point as it is of all of them.
-        trace = self.thinning * len(self.X) * size if self.space.chooses_ridge else None
-        value = self.criterion.searched(loss, square, self.Y, trace)
+        loss, square = self.criterion.loss(kernel, self.rows, self.thinning * regularization)
+        value = self.criterion.searched(loss, square, self.rows, self.wall(size))
         return value.astype(u.dtype), loss.astype(u.dtype)
+
+    def wall(self, size: Float[Array, ""]) -> Float[Array, ""] | None:
+        """What `searched` takes, given tr(G)/N; None where there is no wall."""
+        if not self.space.chooses_ridge:
+            return None
+        X = self.rows.points
+        trace = self.thinning * len(X) * size  # of noise a is as large at every point
+        square = self.speed**2 * (len(X) * self.space.kernel.outputs(X.shape[1]))
+        return trace**2 / jnp.maximum(square, jnp.finfo(square.dtype).tiny)
 
 
 @eqx.filter_jit

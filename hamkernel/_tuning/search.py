@@ -11,13 +11,13 @@ from collections.abc import Callable
 
 import numpy as np
 import optimistix as optx
-from jaxtyping import Array, Float
 
 from hamkernel import _require as require
+from hamkernel._observations.rows import Rows
 from hamkernel._tuning.descent import Descent, Run
 from hamkernel._tuning.objective import SearchCriterion
 from hamkernel._tuning.other_optimisers import minimised
-from hamkernel._tuning.part import Part, rows_of_parts
+from hamkernel._tuning.part import Part, parts_of
 from hamkernel._tuning.space import SearchSpace
 from hamkernel._tuning.starts import design, shares_apart, spread_out
 
@@ -40,9 +40,9 @@ class Search:
 
     Args:
         space: where.
-        criterion: of all points.
-        X: states, shape (N, n), on one device.
-        Y: velocities, shape (N, n).
+        criterion: of all observations.
+        rows: their rows, on one device.
+        speed: see `Part`.
         starts: the number of runs.
         max_steps: of one run, on each part.
         optimiser: one of optimistix, or None for BFGS.
@@ -53,14 +53,14 @@ class Search:
         self,
         space: SearchSpace,
         criterion: SearchCriterion,
-        X: Float[Array, "N n"],
-        Y: Float[Array, "N n"],
+        rows: Rows,
+        speed: float,
         starts: int,
         max_steps: int,
         optimiser: optx.AbstractMinimiser | None,
         progress: bool,
     ):
-        self.space, self.criterion, self.X, self.Y = space, criterion, X, Y
+        self.space, self.criterion, self.rows, self.speed = space, criterion, rows, speed
         self.starts, self.max_steps = starts, max_steps
         self.optimiser, self.progress = optimiser, progress
         self._given = np.asarray(space.encode_start(), float)
@@ -71,25 +71,25 @@ class Search:
         Args:
             low_rank: the criterion of the last part, given the best run before; None if dense.
         """
-        rows = rows_of_parts(self.X, self.criterion, dense=low_rank is None)
-        part = self._part(self.criterion, rows[0])
-        only = len(rows) == 1 and low_rank is None
+        parts = parts_of(self.rows, self.criterion, dense=low_rank is None)
+        part = self._part(self.criterion, parts[0])
+        only = len(parts) == 1 and low_rank is None
         runs = self._first(part, _TOLERANCE if only else _COARSE)
         ends = [*_different(runs), Run(self._given)]
-        last = rows[-1] if len(rows) > 2 else None
-        for more in rows[1:]:
+        last = parts[-1] if len(parts) > 2 else None
+        for more in parts[1:]:
             trials = _LAST_TRIALS if more is last else np.inf
-            growth = (len(more) / part.points) ** 3
+            growth = (len(more) / part.count) ** 3
             self._warn_of_waiting(part.seconds * growth * _CALLS_OF_THE_LAST, _SMALLER)
             part = self._part(self.criterion, more)
             runs, ends = self._finished(part, ends, trials)
         if low_rank is not None and best(runs).value < np.inf:
-            part = self._part(low_rank(best(runs)), np.arange(len(self.X)))
+            part = self._part(low_rank(best(runs)), np.arange(self.rows.count))
             runs, _ = self._finished(part, ends)
         return runs
 
-    def _part(self, criterion: SearchCriterion, rows: np.ndarray) -> Part:
-        return Part(self.space, criterion, self.X, self.Y, rows)
+    def _part(self, criterion: SearchCriterion, chosen: np.ndarray) -> Part:
+        return Part(self.space, criterion, self.rows, self.speed, chosen)
 
     def _first(self, part: Part, tolerance: float) -> list[Run]:
         """A run from the caller's point, and from the best points of a design."""
@@ -145,7 +145,7 @@ class Search:
 
     def _say(self, part: Part, runs: list[Run], going: int) -> None:
         sys.stdout.write(
-            f"tune: {part.points} of {len(self.X)} points, "
+            f"tune: {part.count} of {self.rows.count} points, "
             f"step {max(run.steps for run in runs)}, {going} of {len(runs)} runs, "
             f"best loss {best(runs).loss:.6g}\n"
         )

@@ -43,18 +43,21 @@ class SearchSpace(eqx.Module):
         self,
         K: AbstractMatrixKernel,
         X: Float[Array, "N n"],
-        Y: Float[Array, "N n"],
+        speed: float,
         regularization: Float[Array, ""],
         frozen: tuple[str, ...],
         bounds: Mapping[str, tuple[ArrayLike, ArrayLike]],
         roundings: float = ROUNDINGS,
         states: Float[Array, "M n"] | None = None,
     ):
-        """Make the space for the data X, Y; the size of the Gram is taken on `states`, or X."""
+        """Make the space for data at X; the size of the Gram is taken on `states`, or X.
+
+        `speed` is that of velocities, see `boxes.typical_speed`.
+        """
         dtype = X.dtype
         self.roundings = roundings
         self.states = X if states is None else states
-        params = hyperparameters(K, X, Y, self.states)
+        params = hyperparameters(K, X, speed, self.states)
         sizes = [param.low.size for param in params]
         self.names = (*np.repeat([p.name for p in params], sizes).tolist(), RIDGE)
         self.entries = (*(entry for p in params for entry in p.entries), RIDGE)

@@ -15,7 +15,7 @@ the way along ℓ -> ∞, λ -> 0 until nothing is left of it but noise.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,27 +25,27 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
+from hamkernel._fields.known import Mean
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.kinds import AbstractObservations, as_states, both, observations
+from hamkernel._observations.base import AbstractObservations
+from hamkernel._observations.data import as_states, observations, rows_of_states
 from hamkernel._show import described
 from hamkernel._solvers.cholesky import AbstractSolver
-from hamkernel._solvers.fit import checked_rows, fit
-from hamkernel._solvers.means import Mean, without_mean
+from hamkernel._solvers.fit import fit
+from hamkernel._solvers.given import checked_rows, checked_states
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.joined import joined_data
 from hamkernel._tuning import advice
-from hamkernel._tuning.boxes import typical_velocities
+from hamkernel._tuning.boxes import typical_speed
 from hamkernel._tuning.descent import Run
 from hamkernel._tuning.objective import (
     Criterion,
     Objective,
     SearchCriterion,
     criterion_of,
-    criterion_of_rows,
 )
 from hamkernel._tuning.other_optimisers import checked_optimiser
-from hamkernel._tuning.part import rows_of_parts
+from hamkernel._tuning.part import parts_of
 from hamkernel._tuning.search import Search, best
 from hamkernel._tuning.space import LOW_RANK_ROUNDINGS, ROUNDINGS, SearchSpace
 from hamkernel._validation.folds import Folds
@@ -152,8 +152,8 @@ def tune(
             data.
         progress: print a line for each step: on how many points, how many runs go on, and the best
             loss. Of an optimiser of yours say verbose=True to itself.
-        inputs: of a `Controlled` kernel, shape (N, m). An objective of your own gets points (x, u)
-            and passes them on, as `hk.fit(K, X, Y, λ)`.
+        inputs: of a `Controlled` kernel, shape (N, m). An objective of your own is then called
+            with (K, data, None, regularization), data the velocities with their inputs.
 
     Returns:
         A `Tuned`. NaN never comes out: points where the objective is not finite cannot win.
@@ -193,38 +193,37 @@ def tune(
     if optimiser is not None:
         optimiser = checked_optimiser(optimiser, progress)
     advice.warn_of_constants(K)
-    X, Y = as_states(X, Y)
-    if isinstance(X, AbstractObservations) or mean is not None:
-        if inputs is not None:
-            raise ValueError("inputs= go with states and velocities (X, Y), and without a mean.")
-        given = observations(X, Y), None
-        rows, ridge, mean = checked_rows(K, *given, regularization, mean)
-        rows = without_mean(K, rows, mean)
-        check_memory(rows.targets, _LOSS_COPIES)
-        X, Y = rows.points, typical_velocities(K, rows)
-        criterion = criterion_of_rows(objective, given[0], rows, folds)
+    X, Y, inputs = as_states(X, Y, inputs)
+    given = Given(X, Y, solver, mean, inputs)
+    if isinstance(X, AbstractObservations):
+        K, rows, ridge, _ = checked_rows(K, X, Y, regularization, mean)
+        data = X, None
     else:
-        K, X, Y = joined_data(K, *both(X, Y), inputs)
-        given = X, Y
-        X, Y = on_one_device("X", X), on_one_device("Y", Y)
-        K.check_points(X)
-        advice.warn_of_unequal_sizes(Y)
-        ridge = require.ridge(regularization, X.dtype)
-        criterion = criterion_of(objective, len(X), folds)
+        K, points, V, ridge, _ = checked_states(K, X, Y, regularization, mean, inputs)
+        data = points, V = on_one_device("X", points), on_one_device("Y", V)
+        rows = rows_of_states(points, V)
+        advice.warn_of_unequal_sizes(V)
+        if mean is not None or inputs is not None:  # an objective of the caller's takes no (x, u)
+            data = observations(X, Y, inputs), None
+    criterion = criterion_of(objective, rows.count, folds, data)
     advice.warn_of_few_folds(criterion, folds)
     low_rank = solver is not None and solver.is_low_rank and not criterion.own
-    few = rows_of_parts(X, criterion, dense=True)[0]
+    parts = parts_of(rows, criterion, dense=True)
+    if not low_rank and not criterion.own:
+        check_memory(rows, _LOSS_COPIES)
+    few = rows if len(parts) == 1 else rows.some(parts[0])[0]
+    speed = typical_speed(K, few)
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
-    space = SearchSpace(K, X, Y, ridge, tuple(frozen), bounds or {}, roundings, X[few])
+    space = SearchSpace(
+        K, rows.points, speed, ridge, tuple(frozen), bounds or {}, roundings, few.points
+    )
     advice.warn_of_free_scale(space, criterion)
-    if len(few) < len(X) and not low_rank:
-        check_memory(X, _LOSS_COPIES)
-    search = Search(space, criterion, X, Y, starts, max_steps, optimiser, progress)
+    search = Search(space, criterion, rows, speed, starts, max_steps, optimiser, progress)
 
     def of_low_rank(run: Run) -> SearchCriterion:
         kernel, regularization, _ = decode(space, run.u)
         assert solver is not None
-        basis = solver._basis(kernel, X, regularization)
+        basis = solver._basis(kernel, rows.points, regularization)
         assert basis is not None
         return criterion.with_basis(basis)
 
@@ -237,22 +236,26 @@ def tune(
             "which no fit succeeds (pass bounds={'regularization': (low, high)} with a larger "
             "low); an objective of your own that returns NaN."
         )
-    return _tuned(space, runs, starts, given, solver, mean)
+    return _tuned(space, runs, starts, given)
 
 
-def _tuned(
-    space: SearchSpace,
-    runs: list[Run],
-    starts: int,
-    data: tuple[Any, Any],
-    solver: AbstractSolver | None,
-    mean: Mean | None,
-) -> Tuned:
+class Given(NamedTuple):
+    """What `fit` is given besides the hyperparameters."""
+
+    X: Any
+    Y: Any
+    solver: AbstractSolver | None
+    mean: Mean | None
+    inputs: Any
+
+
+def _tuned(space: SearchSpace, runs: list[Run], starts: int, given: Given) -> Tuned:
     """The fit at the best point, and what is to be said of the search."""
     found = best(runs)
     dtype = space.low.dtype
     kernel, regularization, size = decode(space, jnp.asarray(found.u, dtype))
-    field = fit(kernel, *data, regularization, solver=solver, mean=mean)
+    X, Y, solver, mean, inputs = given
+    field = fit(kernel, X, Y, regularization, solver=solver, mean=mean, inputs=inputs)
     if not space.allows(regularization):
         raise ValueError(
             f"no lambda within bounds={{'regularization': ...}} can be solved with in {dtype}: "

@@ -2,36 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
-import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Num
 
-from hamkernel import _require as require
-from hamkernel._factors.base import AbstractSystem
-from hamkernel._factors.dense import DenseSystem
-from hamkernel._factors.low_rank import LowRankSystem
-from hamkernel._gram.dense import assemble, plus_ridge
-from hamkernel._gram.derivatives import trained
 from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.kinds import AbstractObservations, as_states, both
+from hamkernel._observations.base import AbstractObservations
+from hamkernel._observations.data import as_states, rows_of_states
 from hamkernel._observations.rows import Rows
-from hamkernel._solvers.bases import AbstractBasis
-from hamkernel._solvers.fit import checked_rows
+from hamkernel._solvers.given import checked_rows, checked_states
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.joined import joined_data
-from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
-from hamkernel._validation.folds import Folds, Partition
-from hamkernel._validation.observed import (
-    rows_generalized_loss,
-    rows_log_likelihood,
-    rows_partition,
-    rows_partition_loss,
-    rows_residuals,
+from hamkernel._validation.folds import Folds
+from hamkernel._validation.of_rows import (
+    generalized_loss,
+    held_out_rows,
+    log_likelihood,
+    partition_loss,
+    partition_of_rows,
 )
 
 
@@ -74,11 +63,8 @@ def cross_validation_loss(
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
             matrices that do not fit in memory.
     """
-    X, Y, rows, regularization = _rows(K, X, Y, regularization)
-    if rows is not None:
-        return rows_partition_loss(K, rows, regularization, rows_partition(rows, folds))
-    K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
-    return partition_loss(K, X, Y, regularization, Partition(len(X), folds))
+    K, rows, regularization = _checked(K, X, Y, regularization, inputs)
+    return partition_loss(K, rows, regularization, partition_of_rows(rows, folds))
 
 
 @one_blas_thread
@@ -100,12 +86,9 @@ def cross_validation_residuals(
         Shape (N, n), in units of Y; of observations one for each row, in its units; inf where the
         matrix is not positive definite to rounding.
     """
-    X, Y, rows, regularization = _rows(K, X, Y, regularization)
-    if rows is not None:
-        left = rows_residuals(K, rows, regularization, rows_partition(rows, folds))
-        return rows.scale * left
-    K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
-    return _held_out(K, X, Y, regularization, Partition(len(X), folds))[0]
+    K, rows, regularization = _checked(K, X, Y, regularization, inputs)
+    left = held_out_rows(K, rows, regularization, partition_of_rows(rows, folds))[0]
+    return rows.in_units(left)
 
 
 @one_blas_thread
@@ -140,11 +123,7 @@ def generalized_cross_validation(
 
     Source: Golub, Heath & Wahba (1979), Technometrics 21.
     """
-    X, Y, rows, regularization = _rows(K, X, Y, regularization)
-    if rows is not None:
-        return rows_generalized_loss(K, rows, regularization)
-    K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
-    return generalized_loss(K, X, Y, regularization)
+    return generalized_loss(*_checked(K, X, Y, regularization, inputs))
 
 
 @one_blas_thread
@@ -178,104 +157,31 @@ def log_marginal_likelihood(
 
     Source: Rasmussen & Williams (2006), eq. 2.30.
     """
-    X, Y, rows, regularization = _rows(K, X, Y, regularization)
-    if rows is not None:
-        return rows_log_likelihood(K, rows, regularization)
-    K, X, Y, regularization = _checked(K, X, Y, regularization, inputs)
-    return log_likelihood(K, X, Y, regularization)
+    return log_likelihood(*_checked(K, X, Y, regularization, inputs))
 
 
-def _rows(K, X, Y, regularization) -> tuple[Any, Any, Rows | None, Any]:
-    """X, Y, the rows of observations, and λ; no rows of states X, whose losses are shorter."""
-    X, Y = as_states(X, Y)
-    if not isinstance(X, AbstractObservations):
-        return X, Y, None, regularization
-    rows, regularization, _ = checked_rows(matrix_kernel(K), X, Y, regularization, None)
-    check_memory(rows.targets, LOSS_COPIES)
-    return X, Y, rows, regularization
-
-
-def _checked(K, X, Y, regularization, inputs=None):
+def _checked(K, X, Y, regularization, inputs) -> tuple[Any, Rows, Float[Array, ""]]:
+    """Kernel, rows and λ."""
     K = matrix_kernel(K)
-    K, X, Y = joined_data(K, *both(X, Y), inputs)
-    # LAPACK on every device at once was seen to stall, see `_factors/dense.py`.
-    X, Y = on_one_device("X", X), on_one_device("Y", Y)
-    K.check_points(X)
-    regularization = require.ridge(regularization, X.dtype)
-    check_memory(X, LOSS_COPIES)
-    return K, X, Y, regularization
+    X, Y, inputs = as_states(X, Y, inputs)
+    if isinstance(X, AbstractObservations):
+        K, rows, regularization, _ = checked_rows(K, X, Y, regularization)
+    else:
+        K, points, V, regularization, _ = checked_states(K, X, Y, regularization, None, inputs)
+        # LAPACK on every device at once was seen to stall, see `_factors/dense.py`.
+        rows = rows_of_states(on_one_device("X", points), on_one_device("Y", V))
+    check_memory(rows, LOSS_COPIES)
+    return K, rows, regularization
 
 
 LOSS_COPIES = 3  # matrices of the size of the Gram that a loss holds, with its gradient
 
 
-def check_memory(X: Float[Array, "..."], copies: int) -> None:
+def check_memory(rows: Rows, copies: int) -> None:
     """Refuse a dense loss that does not fit in memory."""
-    what = f"the loss of {X.size} rows"
+    M = len(rows.targets)
     cure = (
         "Use hk.tune(..., solver=hk.Nystrom()) or solver=hk.RandomFeatures(count, key), whose loss "
         "is of low rank too, or a part of the data."
     )
-    refuse_beyond_memory(what, X.size, X.size, X.dtype, copies, cure)
-
-
-# The losses of the dense fit, where `basis` is None, and of the low-rank fit in a basis.
-
-
-# Where ‖a‖² comes with them it tells `tune` how far the field will round.
-
-
-def partition_loss(K, X, Y, regularization, partition, basis=None):
-    return partition_loss_and_square(K, X, Y, regularization, partition, basis)[0]
-
-
-@eqx.filter_jit
-def partition_loss_and_square(K, X, Y, regularization, partition, basis=None):
-    residuals, a = _held_out(K, X, Y, regularization, partition, basis)
-    squares = jnp.mean(residuals**2, axis=1)
-    return jnp.asarray(partition.weights, squares.dtype) @ squares, a @ a
-
-
-@eqx.filter_jit
-def _held_out(K, X, Y, regularization, partition: Partition, basis=None):
-    N = len(X)
-    system = _system(K, X, (N - N / len(partition.folds)) * regularization, basis)
-    rows_left = (N - max(map(len, partition.folds))) * (Y.size // N)
-    if isinstance(system, LowRankSystem) and system.rows.shape[1] > rows_left:
-        # A fold interpolates the rest, and its coefficients are the difference of those of all:
-        # the gradient lost the square of the condition, 5 times itself at 1e10. Such data are few.
-        A = plus_ridge(system.rows @ system.rows.T, system.ridge)
-        system = DenseSystem(A)
-    residuals, a = held_out(system, Y.reshape(Y.size), partition)  # pyright: ignore
-    return residuals.reshape(Y.shape), a
-
-
-def generalized_loss(K, X, Y, regularization, basis=None, least_free=0.0):
-    return generalized_loss_and_square(K, X, Y, regularization, basis, least_free)[0]
-
-
-@eqx.filter_jit
-def generalized_loss_and_square(K, X, Y, regularization, basis=None, least_free=0.0):
-    # Infinite where less than the share `least_free` of the residuals is free, tr(I − S)/D.
-    ridge = len(X) * regularization
-    squares, trace = free_residuals(_system(K, X, ridge, basis), Y.reshape(Y.size))
-    enough = ridge * trace >= least_free * Y.size  # tr(I − S) = ridge tr A⁻¹
-    return jnp.where(enough, squares * Y.size / trace**2, jnp.inf), squares
-
-
-@eqx.filter_jit
-def log_likelihood(K, X, Y, regularization, basis=None):
-    return log_density(_system(K, X, len(X) * regularization, basis), Y.reshape(Y.size))
-
-
-def _system(K, X: Array, ridge: Array, basis: AbstractBasis | None) -> AbstractSystem:
-    if basis is None:
-        G = trained((K, X), _rows_of_gram, rowwise=True)
-        D = G.shape[0] * G.shape[1]
-        return DenseSystem(plus_ridge(G.reshape(D, D), ridge))
-    rows = trained((K, X), basis.features, rowwise=True)
-    return LowRankSystem(rows.reshape(-1, rows.shape[-1]), ridge)
-
-
-def _rows_of_gram(K, X: Float[Array, "N n"]) -> Callable[[Array], Float[Array, "t n N n"]]:
-    return lambda x: assemble(K, x, X)
+    refuse_beyond_memory(f"the loss of {M} rows", M, M, rows.targets.dtype, copies, cure)

@@ -101,11 +101,12 @@ class Driven(eqx.Module):
 
     Args:
         system: any field x (n,) -> (n,), such as one of this module.
-        inputs: G, an array (n, m), or a function x -> (n, m).
+        inputs: G, an array (n, m), or a function x -> (n, m); if None that of the system's motors,
+            which `CartPole` and `Acrobot` know.
 
     Raises:
-        TypeError: `system` is not a function. ValueError: G is not a matrix, or, when called, x or
-            u does not fit it.
+        TypeError: `system` is not a function, or knows of no motors. ValueError: G is not a matrix,
+            or, when called, x or u does not fit it.
 
     Example: a torque on a pendulum with friction,
         `hk.systems.Driven(hk.systems.Damped(hk.systems.Pendulum()), [[0.0], [1.0]])`.
@@ -114,9 +115,16 @@ class Driven(eqx.Module):
     system: System
     inputs: Any
 
-    def __init__(self, system: System, inputs: ArrayLike | Callable[[Array], Any]):
+    def __init__(self, system: System, inputs: ArrayLike | Callable[[Array], Any] | None = None):
         if not callable(system):
             raise TypeError(f"Driven needs a system x -> (n,) first; got {system!r}.")
+        if inputs is None:
+            inputs = getattr(system, "actuation", None)
+        if inputs is None:
+            raise TypeError(
+                f"{system!r} does not say where its motors act: give the input matrix, such as "
+                "Driven(system, [[0.0], [1.0]])."
+            )
         self.system = as_pytree(system)
         if callable(inputs):
             self.inputs = as_pytree(inputs)
@@ -127,6 +135,11 @@ class Driven(eqx.Module):
                     f"inputs has shape {self.inputs.shape}; a matrix G of shape (n, m) is needed, "
                     "such as [[0.0], [1.0]] for one force on the momentum."
                 )
+
+    @property
+    def drift(self) -> System:
+        """The system without inputs."""
+        return self.system
 
     @property
     def takes_inputs(self) -> bool:

@@ -25,9 +25,16 @@ from flint import arb, arb_mat, ctx
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._solvers.bases import LandmarkBasis, WaveBasis
+from hamkernel._observations.blocks import Components
+from hamkernel._observations.data import rows_of_states
+from hamkernel._solvers.spans import LandmarkBasis, WaveBasis
 from hamkernel._validation.folds import Partition
-from hamkernel._validation.losses import generalized_loss, log_likelihood, partition_loss
+from hamkernel._validation.of_rows import (
+    generalized_loss,
+    log_likelihood,
+    partition_loss,
+    partition_of_rows,
+)
 
 EPS = np.finfo(float).eps
 ctx.prec = 400  # bits
@@ -162,19 +169,19 @@ def gram_of(basis, make, X):
 
     def low_rank(t):
         K = make(t)
-        return basis.features(K, X)(X).reshape(X.size, -1)
+        return basis.span(K, X.shape[1], X.dtype).of(Components(X))
 
     return low_rank
 
 
 def compiled(problem: Problem, basis) -> dict[str, Any]:
     """Each loss with its gradient, as functions of the hyperparameter and λ."""
-    X, Y = map(jnp.asarray, problem.data)
-    partition = Partition(len(X), problem.folds)
+    rows = rows_of_states(*map(jnp.asarray, problem.data))
+    partition = partition_of_rows(rows, problem.folds)
 
     def with_gradient(loss, *extra):
         def value(t, regularization):
-            return loss(problem.make(t), X, Y, regularization, *extra, basis=basis)
+            return loss(problem.make(t), rows, regularization, *extra, basis=basis)
 
         return jax.jit(jax.value_and_grad(value, argnums=(0, 1)))
 

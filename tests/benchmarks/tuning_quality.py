@@ -7,7 +7,7 @@ Five systems, four kernels, noise seeds, and poor starting points (lengthscale 0
 lengthscale by λ, where λ runs upwards from the rounding of the Gram at each lengthscale. Prints the
 ratio of the tuned loss, with the wall, to the grid's best. `--times 4` has four times the points on
 each trajectory, so that the runs are on a subset; the grid then takes most of the time, minutes
-with n = 4. `--noiseless` leaves the noise away.
+with n = 4. `--noiseless` takes data without noise.
 """
 
 import argparse
@@ -21,13 +21,13 @@ import jax.numpy as jnp
 import numpy as np
 
 import hamkernel as hk
+from hamkernel._observations.data import rows_of_states
 from hamkernel._tuning.objective import criterion_of
-from hamkernel._tuning.part import SearchObjective
+from hamkernel._tuning.part import Part, SearchObjective
 from hamkernel._tuning.space import SearchSpace
-from hamkernel._validation.folds import Partition
 
 GRID = 60
-START_RIDGE = 0.1
+START_RIDGE, FOLDS = 0.1, 5
 
 # name: system, initial states, end time, points per trajectory, noise on states and velocities
 SYSTEMS = {
@@ -80,25 +80,28 @@ def data(system: str, seed: int, times: int, noiseless: bool) -> tuple[jax.Array
 
 
 @eqx.filter_jit
-def searched_on_grid(space, X, Y, partition) -> jax.Array:
+def searched_on_grid(objective: SearchObjective) -> jax.Array:
     """What is minimised, at GRID × GRID points of the box: the logarithm of the loss, walled."""
-    criterion = criterion_of("cross_validation", len(X), partition.labels)
-    objective = SearchObjective(space, criterion, X, Y, jnp.ones((), X.dtype))
     shares = jnp.linspace(0.0, 1.0, GRID)
     u = jnp.arcsin(2 * jnp.stack(jnp.meshgrid(shares, shares), -1).reshape(-1, 2) - 1)
     return jax.lax.map(lambda u: objective(u)[0], u)
 
 
-def space_of(K, X, Y) -> SearchSpace:
-    return SearchSpace(K, X, Y, jnp.asarray(START_RIDGE), (), {})
+def objective_of(K, X, Y) -> SearchObjective:
+    """That of the search, on all points."""
+    rows, speed = rows_of_states(X, Y), float(jnp.sqrt(jnp.mean(Y**2)))
+    space = SearchSpace(K, X, speed, jnp.asarray(START_RIDGE), (), {})
+    criterion = criterion_of("cross_validation", len(X), FOLDS)
+    return Part(space, criterion, rows, speed, np.arange(len(X))).objective
 
 
 @eqx.filter_jit
-def searched(space, tuned, X, Y, partition) -> jax.Array:
+def searched(objective: SearchObjective, tuned) -> jax.Array:
     """The same for what was tuned."""
-    criterion = criterion_of("cross_validation", len(X), partition.labels)
-    loss, square = criterion.loss(tuned.kernel, X, Y, tuned.regularization)
-    return criterion.searched(loss, square, Y, len(X) * space.size_of_gram(tuned.kernel))
+    criterion, rows = objective.criterion, objective.rows
+    loss, square = criterion.loss(tuned.kernel, rows, tuned.regularization)
+    wall = objective.wall(objective.space.size_of_gram(tuned.kernel))
+    return criterion.searched(loss, square, rows, wall)
 
 
 def main() -> None:
@@ -113,11 +116,11 @@ def main() -> None:
         for name, make in KERNELS.items():
             for seed in range(options.seeds):
                 X, Y = data(system, seed, options.times, options.noiseless)
-                partition, space = Partition(len(X), 5), space_of(make(1.0), X, Y)
-                best = float(np.nanmin(searched_on_grid(space, X, Y, partition)))
+                objective = objective_of(make(1.0), X, Y)
+                best = float(np.nanmin(searched_on_grid(objective)))
                 for start in LENGTHSCALES:
-                    tuned = hk.tune(make(start), X, Y, regularization=START_RIDGE, folds=5)
-                    value = float(searched(space, tuned, X, Y, partition))
+                    tuned = hk.tune(make(start), X, Y, regularization=START_RIDGE, folds=FOLDS)
+                    value = float(searched(objective, tuned))
                     ratios[system, name, seed, start] = np.exp(value - best)
         here = np.array([r for key, r in ratios.items() if key[0] == system])
         print(f"{system:16s} median {np.median(here):.4f}  worst {here.max():.4f}", flush=True)

@@ -1,0 +1,80 @@
+"""What is known of a field before, where it has inputs: a function of the points (x, u)."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hamkernel import _require as require
+from hamkernel._kernels.functions import as_pytree
+from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.controlled import Controlled, KnownMatrix
+
+Mean = Callable[..., Float[Array, " n"]]
+
+
+class KnownPart(eqx.Module):
+    """A mean of x, or of x and u, plus G u where G is known; as a function of a point (x, u)."""
+
+    mean: Callable[..., Any] | None
+    matrix: KnownMatrix | None
+    count: int = eqx.field(static=True)
+    of_inputs: bool = eqx.field(static=True)  # whether the mean is one of x and u
+
+    def __call__(self, s: Float[Array, " d"]) -> Float[Array, " n"]:
+        x, u = s[: -self.count], s[-self.count :]
+        known = jnp.zeros_like(x)
+        if self.matrix is not None:
+            known = jnp.asarray(self.matrix.matrix, x.dtype) @ u
+        if self.mean is None:
+            return known
+        value = self.mean(x, u) if self.of_inputs else self.mean(x)
+        return known + value.astype(x.dtype)
+
+
+class AtRest(eqx.Module):
+    """f(x, 0) of a function f(x, u)."""
+
+    field: Callable[..., Any]
+    count: int = eqx.field(static=True)
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.field(x, jnp.zeros(self.count, x.dtype))
+
+
+def known_part(K: AbstractMatrixKernel, mean: Any, n: int, dtype: Any) -> Any:
+    """What is known at the points of K: the mean, and the input matrix if that is known.
+
+    Args:
+        K: the kernel.
+        mean: x (n,) -> (n,); of a controlled kernel it may be x, u -> (n,) too.
+        n: the number of coordinates of a state.
+        dtype: of the states.
+
+    Returns:
+        A PyTree that maps one point to one velocity; None if nothing is known.
+
+    Raises:
+        TypeError, ValueError: the mean does not map one state to one velocity.
+    """
+    x = jnp.zeros(n, dtype)
+    if not isinstance(K, Controlled):
+        if mean is not None:
+            require.velocity(mean, x, "mean")
+        return None if mean is None else as_pytree(mean)
+    matrix = K.inputs if isinstance(K.inputs, KnownMatrix) else None
+    if mean is None:
+        return None if matrix is None else KnownPart(None, matrix, K.input_count, of_inputs=False)
+    of_inputs = _takes_inputs(mean, x)
+    require.velocity(AtRest(mean, K.input_count) if of_inputs else mean, x, "mean")
+    return KnownPart(as_pytree(mean), matrix, K.input_count, of_inputs)
+
+
+def _takes_inputs(mean: Any, x: Float[Array, " n"]) -> bool:
+    """Whether the mean is one of x and u; of a second argument with a default it is not."""
+    if getattr(mean, "takes_inputs", False):
+        return True
+    alone, both = (require.other_arguments(mean, *args) for args in ((x,), (x, x)))
+    return callable(mean) and alone is not None and both is None

@@ -1,0 +1,139 @@
+"""The losses of rows of observations: of the dense fit, and in a basis of the low-rank fit.
+
+Residuals count in units of their relative noise. Velocities X, Y that were all measured are the
+rows of one block, and pass through here as they are.
+"""
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hamkernel._factors.base import AbstractSystem
+from hamkernel._factors.contrasted import ContrastedSystem
+from hamkernel._factors.dense import DenseSystem
+from hamkernel._factors.low_rank import LowRankSystem
+from hamkernel._gram.dense import plus_ridge
+from hamkernel._gram.derivatives import trained
+from hamkernel._gram.observed import between
+from hamkernel._observations.blocks import AbstractBlock, Combinations
+from hamkernel._observations.rows import Rows
+from hamkernel._solvers.spans import AbstractBasis
+from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
+from hamkernel._validation.folds import Folds, Partition
+
+
+def partition_of_rows(rows: Rows, folds: Folds) -> Partition:
+    """The folds of the rows from those of the observations that they belong to."""
+    labels = Partition(rows.count, folds).labels
+    return Partition(len(rows.targets), labels[rows.labels()])
+
+
+# Where ‖a‖² comes with them it tells `tune` how far the field will round.
+
+
+def partition_loss(K, rows: Rows, regularization, partition: Partition, basis=None):
+    """`cross_validation_loss`: the mean over folds of the mean over their rows."""
+    return partition_loss_and_square(K, rows, regularization, partition, basis)[0]
+
+
+@eqx.filter_jit
+def partition_loss_and_square(K, rows: Rows, regularization, partition: Partition, basis=None):
+    left, a = held_out_rows(K, rows, regularization, partition, basis)
+    return jnp.asarray(partition.weights, left.dtype) @ left**2, a @ a
+
+
+@eqx.filter_jit
+def held_out_rows(K, rows: Rows, regularization, partition: Partition, basis=None):
+    """What a fit without their fold leaves of the rows, in units of their noise, and A⁻¹y."""
+    F, M = len(partition.folds), len(rows.targets)
+    ridge = (rows.count - rows.count / F) * regularization
+    if basis is None:
+        return held_out(_dense(gram(K, rows), ridge, rows), rows.targets, partition)
+    features = features_of_rows(K, rows, basis)
+    if features.shape[1] > M - max(map(len, partition.folds)):
+        # A fold interpolates the rest, and its coefficients are the difference of those of all:
+        # the gradient lost the square of the condition, 5 times itself at 1e10. Such data are few.
+        return held_out(_dense(features @ features.T, ridge, rows), rows.targets, partition)
+    return held_out(LowRankSystem(features, ridge, rows.constant), rows.targets, partition)
+
+
+def _dense(G: Float[Array, "M M"], ridge: Float[Array, ""], rows: Rows) -> AbstractSystem:
+    A, p = plus_ridge(G, ridge), rows.constant
+    return DenseSystem(A) if p is None else ContrastedSystem(A, p)
+
+
+def generalized_loss(K, rows: Rows, regularization, basis=None, least_free=0.0):
+    """`generalized_cross_validation` of the rows."""
+    return generalized_loss_and_square(K, rows, regularization, basis, least_free)[0]
+
+
+@eqx.filter_jit
+def generalized_loss_and_square(K, rows: Rows, regularization, basis=None, least_free=0.0):
+    # Infinite where less than the share `least_free` of the residuals is free, tr(I − S)/D.
+    ridge = rows.count * regularization
+    squares, trace = free_residuals(_of_contrasts(K, rows, ridge, basis), rows.y)
+    enough = ridge * trace >= least_free * rows.size  # tr(I − S) = ridge tr A⁻¹
+    return jnp.where(enough, squares * rows.size / trace**2, jnp.inf), squares
+
+
+@eqx.filter_jit
+def log_likelihood(K, rows: Rows, regularization, basis=None):
+    """`log_marginal_likelihood`: with energies, of a flat prior of their constant."""
+    ridge = rows.count * regularization
+    density = log_density(_of_contrasts(K, rows, ridge, basis), rows.y)
+    density = density - jnp.sum(jnp.log(rows.scale))
+    if not len(rows.energies):
+        return density
+    return density - 0.5 * jnp.log(jnp.sum(rows.scale[rows.energies] ** -2))
+
+
+def _of_contrasts(K, rows: Rows, ridge, basis: AbstractBasis | None) -> AbstractSystem:
+    """A of the rows that do not see the constant, whose y is `rows.y`."""
+    if basis is not None:
+        return LowRankSystem(rows.contrast(features_of_rows(K, rows, basis)), ridge)
+    G = gram(K, rows)
+    if len(rows.energies):
+        G = rows.contrast(rows.contrast(G).T)
+    return DenseSystem(plus_ridge(G, ridge))
+
+
+# The Gram and the features of the rows, cheap to differentiate with respect to K.
+
+
+def features_of_rows(K, rows: Rows, basis: AbstractBasis) -> Float[Array, "M r"]:
+    """Φ before the contrast."""
+    like = rows.blocks[0].points
+
+    def of(K, basis):
+        return basis.span(K, like.shape[1], like.dtype).of
+
+    return jnp.concatenate([_by_points(K, block, basis, of) for block in rows.blocks])
+
+
+def gram(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, "M M"]:
+    """G before the contrast, from the blocks on and right of the diagonal."""
+
+    def of(K, others):
+        return lambda block: jnp.concatenate([between(K, block, b) for b in others], axis=1)
+
+    found = []
+    for i, (block, place) in enumerate(zip(rows.blocks, rows.slices, strict=True)):
+        left = [above[:, place].T for above in found]
+        found.append(jnp.concatenate([*left, _by_points(K, block, rows.blocks[i:], of)], axis=1))
+    return jnp.concatenate(found)
+
+
+def _by_points(K, block: AbstractBlock, data, of) -> Float[Array, "d e"]:
+    """What `of(K, data)` makes of a block, a row for each of its rows.
+
+    Point by point: combinations of many would be larger than their rows, and are made at once.
+    """
+    if isinstance(block, Combinations):
+        return trained((K, (block, data)), lambda K, both: of(K, both[1])(both[0]))
+
+    def make(K, both):
+        rows = of(K, both[1])
+        return lambda x: rows(at := block.at(x)).reshape(*at.values_shape, -1), both[0]
+
+    return block.rows(trained((K, (block.points, data)), make, rowwise=True))
