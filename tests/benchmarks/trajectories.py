@@ -13,8 +13,6 @@ with the lowest and highest in brackets.
 The kernel of all methods is `Symplectic(Gaussian)` with one lengthscale for each coordinate: q and
 p have different units. The window of Savitzky and Golay is chosen by the TRUE error, which nobody
 knows. With four coordinates their fields, and those of differences, are fitted on landmarks.
-What is no table of errors (masses, wrong structures, friction, an arm at 1 kHz) follows in
-`trajectory_claims.py`.
 """
 
 import argparse
