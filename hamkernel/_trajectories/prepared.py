@@ -149,13 +149,13 @@ def _with_paths(found, times, states, counts, scatter, gap: float) -> list[Run]:
         filled.append(wide)
     paths = smoothed(found, grids, filled)
     out = []
-    for r, (t, x, *sizes) in enumerate(zip(times, states, counts, scatter, strict=True)):
+    for r, (t, x, count, about) in enumerate(zip(times, states, counts, scatter, strict=True)):
         size = 4 * len(t) - 3
         value, slope = (a[r, :size] for a in (paths.value, paths.slope))
         nodes, slopes = (a[:-1].reshape(len(t) - 1, 4, -1)[:, 1:] for a in (value, slope))
         spans = np.diff(t)
         gaps = 1 + np.flatnonzero((spans > gap) & (spans > _INTERVALS * np.median(spans)))
-        out.append(Run(t, x, *sizes, value[::4], nodes, slopes, gaps))
+        out.append(Run(t, x, count, about, value[::4], nodes, slopes, gaps))
     return out
 
 
