@@ -43,7 +43,7 @@ class UnknownMasses(AbstractMatrixKernel):
 
     kernel: AbstractMatrixKernel
     log_masses: Float[Array, " m-1"]  # the diagonal of D, over its first entry
-    coupling: Float[Array, " m(m-1)/2"] | None  # L below its diagonal, row by row
+    coupling: Float[Array, " c"] | None  # the m(m − 1)/2 entries of L below its diagonal, by row
 
     symplectic: ClassVar[bool] = False  # dq ∧ dp is kept, dq ∧ dq̇ is not
 
@@ -79,7 +79,8 @@ class UnknownMasses(AbstractMatrixKernel):
 
     def _triangle(self, dtype: Any) -> Float[Array, "m m"]:
         m = len(self.log_masses) + 1
-        return jnp.eye(m, dtype=dtype).at[jnp.tril_indices(m, -1)].set(self.coupling.astype(dtype))
+        below = jnp.asarray(self.coupling, dtype)
+        return jnp.eye(m, dtype=dtype).at[jnp.tril_indices(m, -1)].set(below)
 
     def to_momenta(self, y: Float[Array, "... n"]) -> Float[Array, "... n"]:
         """S y, for one state or many."""
@@ -173,7 +174,7 @@ class UnknownMasses(AbstractMatrixKernel):
         return self.kernel.invariance  # S is linear
 
 
-def _factors(M: Array) -> tuple[Float[Array, " m"], Float[Array, " m(m-1)/2"]]:
+def _factors(M: Array) -> tuple[Float[Array, " m"], Float[Array, " c"]]:
     """D and L below its diagonal, of M = L D Lᵀ."""
     guess = np.asarray(M)
     if not np.isfinite(guess).all() or np.abs(guess - guess.T).max() > 1e-6 * np.abs(guess).max():
