@@ -64,7 +64,10 @@ def one_segment(seed=0, T=7):
     nodes = rng.standard_normal((1, T - 1, 3, 2))
     slopes = rng.standard_normal((1, T - 1, 3, 2))
     measured = rng.standard_normal((1, T, 2))
-    arrays = (jnp.asarray(a) for a in (spans, measured, np.ones_like(path), path[:, 0]))
+    arrays = (
+        jnp.asarray(a)
+        for a in (spans, measured, np.ones_like(path), np.zeros_like(path), path[:, 0])
+    )
     segments = Segments(*arrays)
     none = jnp.zeros((1, T - 1, 2, 2))
     as_path = frozen(jnp.asarray(path), jnp.asarray(nodes), segments.spans, none)
@@ -120,7 +123,8 @@ def test_along_a_true_path_rows_and_functionals_are_the_variation_of_constants()
     x = jnp.asarray(true.sol(ts).T[None])
     inner = (ts[:-1, None] + np.diff(ts)[:, None] * NODES).reshape(-1)
     nodes = jnp.asarray(true.sol(inner).T.reshape(1, 8, 3, n))
-    segments = Segments(jnp.diff(ts)[None], x, jnp.full_like(x, 4.0), x[:, 0])
+    counts = jnp.full_like(x, 4.0)
+    segments = Segments(jnp.diff(ts)[None], x, counts, jnp.zeros_like(x), x[:, 0])
     path = frozen(x, nodes, segments.spans, jacobians(mean, nodes))
     slopes = jax.vmap(jax.vmap(jax.vmap(PENDULUM)))(nodes)
     rows = linearised(
@@ -186,6 +190,19 @@ def test_the_flow_and_its_tangent_are_exact_to_the_tolerance_of_the_integrator()
             PENDULUM, path.nodes[s, 0, 1][None], jnp.array([[0.2 * (1 - NODES[1])]]), jnp.array([8])
         )
         np.testing.assert_allclose(path.to_end[s, 0, 1], left.across[0, 0], atol=1e-9)
+
+
+def test_averaged_samples_keep_what_they_say_of_the_noise():
+    t = np.linspace(0, 6, 3000)
+    x = np.column_stack([np.sin(t), np.cos(t)])
+    noise = np.array([0.02, 0.05])
+    data = prepared(hk.Runs(t, x + noise * np.random.default_rng(0).standard_normal(x.shape)), None)
+    run = data.runs[0]
+    assert run.counts.sum(axis=0).tolist() == [3000, 3000]
+    assert len(run.times) < 300
+    # Within blocks, with one degree of freedom less for each of their means: to 1/√6000.
+    pooled = np.sqrt(run.scatter.sum(axis=0) / (run.counts - 1).sum(axis=0))
+    np.testing.assert_allclose(pooled, noise, rtol=0.05)
 
 
 # What is learned. One shape, so that it is compiled once.

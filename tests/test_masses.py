@@ -42,6 +42,44 @@ def test_the_gram_is_that_of_momenta_between_the_masses():
     assert repr(K) == f"UnknownMasses({hk.Symplectic(G)!r}, masses=[2.5])"
 
 
+M = np.array([[1.0, 0.4], [0.4, 2.5]])
+FULL = hk.UnknownMasses(hk.Symplectic(G), 2.0 * M)
+
+
+def test_a_full_mass_matrix_is_kept_over_its_first_entry():
+    np.testing.assert_allclose(FULL.masses, M, atol=1e-12)
+    X, Z = states(5), states(3, 1)
+    full = np.block([[np.eye(2), np.zeros((2, 2))], [np.zeros((2, 2)), M]])
+    inner = np.asarray(hk.gram(hk.Symplectic(G), X @ full, Z @ full))
+    inverse = np.linalg.inv(full)
+    expected = np.einsum("ab,ibjc,cd->iajd", inverse, inner, inverse)
+    np.testing.assert_allclose(hk.gram(FULL, X, Z), expected, atol=1e-12)
+    np.testing.assert_allclose(FULL.to_velocities(FULL.to_momenta(X)), X, atol=1e-12)
+    diagonal = hk.UnknownMasses(hk.Symplectic(G), np.diag([1.0, RATIO]))
+    np.testing.assert_allclose(hk.gram(diagonal, X, Z), hk.gram(K, X, Z), atol=1e-12)
+
+
+def coupled(y):
+    """Two unlike springs that harden, and masses that pull at each other: q̈ = −M⁻¹∇U."""
+    q = y[:2]
+    force = -jnp.array([1.0, 2.0]) * q - jnp.array([1.0, 0.5]) * q**3
+    return jnp.concatenate([y[2:], jnp.linalg.solve(jnp.asarray(M), force)])
+
+
+def test_a_field_with_the_right_matrix_keeps_its_energy_and_the_diagonal_cannot_fit():
+    X = states(80)
+    Y = np.asarray(jax.vmap(coupled)(jnp.asarray(X)))
+    kernel = hk.Symplectic(100.0 * hk.Gaussian(4.0))
+    right = hk.fit(hk.UnknownMasses(kernel, M), X, Y, 1e-8)
+    assert float(jnp.linalg.norm(right.residual)) < 0.01 * np.linalg.norm(Y)
+    x = jnp.asarray(X[3])
+    slope = jax.grad(right.hamiltonian)(x)
+    np.testing.assert_allclose(slope @ right(x), 0.0, atol=1e-9)
+    np.testing.assert_allclose(slope[2:], M @ X[3, 2:], atol=0.05)  # ∂H/∂q̇ = M q̇
+    diagonal = hk.fit(hk.UnknownMasses(kernel, np.diag(M)), X, Y, 1e-8)
+    assert float(jnp.linalg.norm(diagonal.residual)) > 10 * float(jnp.linalg.norm(right.residual))
+
+
 def test_a_field_with_the_right_masses_keeps_its_energy_and_others_cannot_fit():
     X = states(80)
     Y = np.asarray(jax.vmap(moves)(jnp.asarray(X)))
@@ -75,11 +113,25 @@ def test_tuning_finds_the_ratio():
     np.testing.assert_allclose(found.kernel.masses, [1.0, RATIO], rtol=0.05)
 
 
+@pytest.mark.slow
+def test_tuning_finds_a_full_matrix():
+    X = states(60)
+    rng = np.random.default_rng(2)
+    Y = np.asarray(jax.vmap(coupled)(jnp.asarray(X))) + 0.01 * rng.standard_normal(X.shape)
+    start = hk.UnknownMasses(hk.Symplectic(1.0 * hk.Gaussian(1.0)), np.eye(2))
+    found = hk.tune(start, X, Y, objective="marginal_likelihood", starts=2)
+    np.testing.assert_allclose(found.kernel.masses, M, atol=0.1)
+
+
 def test_what_has_no_masses_to_find_is_refused():
     with pytest.raises(ValueError, match="one degree of freedom there is nothing to find"):
         hk.UnknownMasses(hk.Symplectic(G), [1.0])
     with pytest.raises(ValueError, match="masses must be positive"):
         hk.UnknownMasses(hk.Symplectic(G), [1.0, -1.0])
+    with pytest.raises(ValueError, match="must be symmetric"):
+        hk.UnknownMasses(hk.Symplectic(G), [[1.0, 0.5], [0.0, 1.0]])
+    with pytest.raises(ValueError, match=r"positive definite.* lowest eigenvalue is -1"):
+        hk.UnknownMasses(hk.Symplectic(G), [[1.0, 2.0], [2.0, 1.0]])
     with pytest.raises(TypeError, match="must be a matrix-valued kernel"):
         hk.UnknownMasses(G, [1.0, 1.0])
     with pytest.raises(ValueError, match="there are 2 masses: states"):
@@ -99,3 +151,15 @@ def test_learning_from_states_finds_the_ratio():
     noisy = [x + 0.01 * rng.standard_normal(x.shape) for x in np.asarray(true)]
     found = hk.learn(hk.Symplectic(hk.Gaussian(1.0)), hk.Runs([ts] * 6, noisy), masses=True)
     np.testing.assert_allclose(found.kernel.masses, [1.0, RATIO], rtol=0.05)
+
+
+@pytest.mark.slow
+def test_learning_from_states_finds_a_full_matrix():
+    rng = np.random.default_rng(0)
+    ts = np.linspace(0, 6, 31)
+    starts = jnp.asarray(rng.uniform(-1.5, 1.5, (6, 4)))
+    true = jax.vmap(lambda x: hk.simulate(coupled, x, jnp.asarray(ts)).ys)(starts)
+    noisy = [x + 0.01 * rng.standard_normal(x.shape) for x in np.asarray(true)]
+    start = hk.UnknownMasses(hk.Symplectic(hk.Gaussian(1.0)), np.eye(2))
+    found = hk.learn(start, hk.Runs([ts] * 6, noisy))
+    np.testing.assert_allclose(found.kernel.masses, M, atol=0.15)

@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
@@ -17,78 +18,114 @@ from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 class UnknownMasses(AbstractMatrixKernel):
     """K′(y, z) = S⁻¹ K(Sy, Sz) S⁻ᵀ: states y = (q, q̇) of a structure for x = Sy = (q, p).
 
-    S = diag(1, …, 1, m₁, …, mₘ), one mass for each degree of freedom, and a field f of K for (q, p)
-    is S⁻¹f(Sy) for (q, q̇). The masses are hyperparameters; only their ratios can be identified,
-    since scaling H and all masses together changes no motion, so the first one is 1.
-    `field.hamiltonian(y)` is H in that unit.
+    S = diag(I, M) with a constant mass matrix M, so p = M q̇, and a field f of K for (q, p) is
+    S⁻¹f(Sy) for (q, q̇). M is a hyperparameter: diagonal, or a full matrix that stays symmetric and
+    positive, M = L D Lᵀ with a unit lower triangle L. Its first entry is 1, since scaling H and M
+    together changes no motion; `field.hamiltonian(y)` is H in that unit.
+
+    What can be identified: with q̈ = −M⁻¹∇U(q), every M that makes M ∂q̈/∂q symmetric at all q
+    explains the motion. The ratio of two masses is seen only where the motion of one depends on the
+    other. A full matrix needs nonlinear forces: for linear oscillations every M under which their
+    modes are orthogonal explains the motion.
 
     Args:
         kernel: K, a matrix-valued kernel, such as `Symplectic(k)`.
-        masses: the first guess, one for each degree of freedom, shape (m,), m ≥ 2. Its unit does
-            not matter.
+        masses: the first guess, m ≥ 2 degrees of freedom: shape (m,) for a diagonal M, (m, m) for a
+            full one, symmetric and positive definite. Its unit does not matter.
 
     Raises:
-        TypeError: K is not matrix-valued. ValueError: a mass is not positive and finite, or there
-            is one degree of freedom only.
+        TypeError: K is not matrix-valued. ValueError: a mass is not positive and finite, a matrix
+            is not symmetric and positive definite, or there is one degree of freedom only.
 
     Example: `hk.tune(hk.UnknownMasses(hk.Symplectic(k), [1.0, 1.0]), X, Y)`, or
-    `hk.learn(hk.Symplectic(k), runs, masses=True)`.
+    `hk.learn(hk.UnknownMasses(hk.Symplectic(k), np.eye(2)), runs)`.
     """
 
     kernel: AbstractMatrixKernel
-    log_masses: Float[Array, " m-1"]  # over the first
+    log_masses: Float[Array, " m-1"]  # the diagonal of D, over its first entry
+    coupling: Float[Array, " c"] | None  # the m(m − 1)/2 entries of L below its diagonal, by row
 
     symplectic: ClassVar[bool] = False  # dq ∧ dp is kept, dq ∧ dq̇ is not
 
     def __init__(self, kernel: AbstractMatrixKernel, masses: ArrayLike):
         self.kernel = matrix_kernel(kernel, "the kernel of UnknownMasses", "Symplectic(k)")
-        masses = jnp.asarray(require.positive(masses, "masses", "One for each degree of freedom."))
-        if masses.ndim != 1 or len(masses) < 2:
+        guess = require.floating(masses, "masses")
+        if guess.shape not in ((len(guess),) * k for k in (1, 2)) or len(guess) < 2:
             raise ValueError(
-                f"masses has shape {masses.shape}; two or more, shape (m,), are needed. With one "
-                "degree of freedom there is nothing to find: every mass explains the same motion, "
-                "and is only a unit of the energy. Leave UnknownMasses out."
+                f"masses has shape {guess.shape}; two or more, shape (m,), or a matrix (m, m) are "
+                "needed. With one degree of freedom there is nothing to find: every mass explains "
+                "the same motion, and is only a unit of the energy. Leave UnknownMasses out."
             )
-        self.log_masses = jnp.log(masses[1:] / masses[0])
+        self.coupling = None
+        if guess.ndim == 2:
+            guess, self.coupling = _factors(guess)
+        else:
+            guess = jnp.asarray(
+                require.positive(guess, "masses", "One for each degree of freedom.")
+            )
+        self.log_masses = jnp.log(guess[1:] / guess[0])
 
     def __repr__(self) -> str:
         return described(self, positional=("kernel",))
 
     @property
-    def masses(self) -> Float[Array, " m"]:
-        """The masses over the first one, shape (m,)."""
-        return jnp.concatenate([jnp.ones(1, self.log_masses.dtype), jnp.exp(self.log_masses)])
+    def masses(self) -> Float[Array, " m"] | Float[Array, "m m"]:
+        """The masses over the first one, shape (m,), or M over its first entry, (m, m)."""
+        D = jnp.concatenate([jnp.ones(1, self.log_masses.dtype), jnp.exp(self.log_masses)])
+        if self.coupling is None:
+            return D
+        L = self._triangle(D.dtype)
+        return jnp.einsum("ab,b,cb->ac", L, D, L)
 
-    def scales(self, dtype: Any) -> Float[Array, " n"]:
-        """The diagonal of S."""
-        masses = self.masses.astype(dtype)
-        return jnp.concatenate([jnp.ones_like(masses), masses])
+    def _triangle(self, dtype: Any) -> Float[Array, "m m"]:
+        m = len(self.log_masses) + 1
+        below = jnp.asarray(self.coupling, dtype)
+        return jnp.eye(m, dtype=dtype).at[jnp.tril_indices(m, -1)].set(below)
+
+    def to_momenta(self, y: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """S y, for one state or many."""
+        q, v = jnp.split(y, 2, axis=-1)
+        M = self.masses.astype(y.dtype)
+        p = v * M.reshape((1,) * (v.ndim - 1) + M.shape) if M.ndim == 1 else v @ M
+        return jnp.concatenate([q, p], axis=-1)
+
+    def to_velocities(self, x: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """S⁻¹ x, and S⁻ᵀ x, which is the same; for one state or many."""
+        q, p = jnp.split(x, 2, axis=-1)
+        M = self.masses.astype(x.dtype)
+        if M.ndim == 1:
+            return jnp.concatenate([q, p / M.reshape((1,) * (p.ndim - 1) + M.shape)], axis=-1)
+        eye = jnp.eye(len(M), dtype=M.dtype)
+        inverse = solve_triangular(self._triangle(M.dtype), eye, lower=True, unit_diagonal=True)
+        scaled = inverse / jnp.concatenate(
+            [jnp.ones(1, M.dtype), jnp.exp(self.log_masses.astype(M.dtype))]
+        ).reshape(-1, 1)
+        return jnp.concatenate([q, p @ (inverse.T @ scaled)], axis=-1)
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
-        s = self.scales(x.dtype)
-        return self.kernel.form(s * x, u / s, s * z, v / s)
+        u, v = self.to_velocities(u), self.to_velocities(v)
+        return self.kernel.form(self.to_momenta(x), u, self.to_momenta(z), v)
 
     def expansion(
         self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
     ) -> Float[Array, " n"]:
-        s = self.scales(x.dtype)
-        return self.kernel.expansion(s * x, s[None] * Z, A / s[None]) / s
+        x, Z, A = self.to_momenta(x), self.to_momenta(Z), self.to_velocities(A)
+        return self.to_velocities(self.kernel.expansion(x, Z, A))
 
     def potential(
         self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
     ) -> Float[Array, ""]:
-        s = self.scales(x.dtype)
-        return self.kernel.potential(s * x, s[None] * Z, A / s[None])
+        x, Z, A = self.to_momenta(x), self.to_momenta(Z), self.to_velocities(A)
+        return self.kernel.potential(x, Z, A)
 
     def potential_covariance(
         self, x: Float[Array, " n"], z: Float[Array, " n"]
     ) -> Float[Array, ""]:
-        s = self.scales(x.dtype)
-        return self.kernel.potential_covariance(s * x, s * z)
+        return self.kernel.potential_covariance(self.to_momenta(x), self.to_momenta(z))
 
     def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
-        s = self.scales(x.dtype)
-        return self.kernel.dissipated(s * x, slope / s)  # ∂H/∂x = S⁻ᵀ ∂H/∂y
+        # ∂H/∂x = S⁻ᵀ ∂H/∂y
+        return self.kernel.dissipated(self.to_momenta(x), self.to_velocities(slope))
 
     @property
     def no_potential(self) -> str | None:
@@ -113,7 +150,7 @@ class UnknownMasses(AbstractMatrixKernel):
 
     def check_points(self, X: Float[Array, "N n"]) -> None:
         self.check_dimension(X.shape[1])
-        self.kernel.check_points(self.scales(X.dtype)[None] * X)
+        self.kernel.check_points(self.to_momenta(X))
 
     def shares_potential(self, other: AbstractMatrixKernel) -> bool:
         return False
@@ -125,7 +162,7 @@ class UnknownMasses(AbstractMatrixKernel):
         raise TypeError("say the symmetry inside: UnknownMasses(Invariant(K, maps), masses).")
 
     def seen(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
-        return X * np.asarray(self.scales(X.dtype))[None]
+        return np.asarray(self.to_momenta(jnp.asarray(X)))
 
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
@@ -135,3 +172,21 @@ class UnknownMasses(AbstractMatrixKernel):
     @property
     def invariance(self) -> Invariance:
         return self.kernel.invariance  # S is linear
+
+
+def _factors(M: Array) -> tuple[Float[Array, " m"], Float[Array, " c"]]:
+    """D and L below its diagonal, of M = L D Lᵀ."""
+    guess = np.asarray(M)
+    if not np.isfinite(guess).all() or np.abs(guess - guess.T).max() > 1e-6 * np.abs(guess).max():
+        raise ValueError("masses, as a matrix, must be symmetric and finite.")
+    try:
+        C = np.linalg.cholesky(guess)
+    except np.linalg.LinAlgError:
+        lowest = np.linalg.eigvalsh(guess)[0]
+        raise ValueError(
+            f"masses, as a matrix, must be positive definite, as kinetic energy is; its lowest "
+            f"eigenvalue is {lowest:.3g}."
+        ) from None
+    diagonal = np.diag(C)
+    L = C / diagonal[None]
+    return jnp.asarray(diagonal**2), jnp.asarray(L[np.tril_indices(len(L), -1)])

@@ -54,7 +54,7 @@ class Projected(NamedTuple):
 
     M: Float[Array, "D q"]
     r: Float[Array, " D"]
-    log_det: Float[Array, ""]  # log det U − log det W
+    constant: Float[Array, ""]  # what M̃ has no part in: log det U − log det W and the scatter
     T: Float[Array, "q q"]
     start: tuple[Array, Array, Array]  # QᵀM, Qᵀr and U of each segment
 
@@ -84,9 +84,11 @@ def projected(
     QM, Qr = jnp.einsum("sdn,sdq->snq", Q, M), jnp.einsum("sdn,sd->sn", Q, r)
     M = M - jnp.einsum("sdn,snq->sdq", Q, QM)
     r = r - jnp.einsum("sdn,sn->sd", Q, Qr)
-    seen = (rows.counts > 0).astype(M.dtype)
-    log_det = jnp.log(jnp.diagonal(U, axis1=1, axis2=2)).sum() + (seen.sum(axis=(0, 1)) @ log_noise)
-    return Projected(M.reshape(-1, q), r.reshape(-1), log_det, T, (QM, Qr, U))
+    constant = jnp.log(jnp.diagonal(U, axis1=1, axis2=2)).sum()
+    # All samples that a row is the mean of: what they scatter about it knows σ, and not the field.
+    samples, scatter = (a.sum(axis=(0, 1)) for a in (rows.counts, rows.scatter))
+    constant = constant + samples @ log_noise + 0.5 * scatter @ jnp.exp(-2 * log_noise)
+    return Projected(M.reshape(-1, q), r.reshape(-1), constant, T, (QM, Qr, U))
 
 
 def orthonormal(
@@ -116,7 +118,7 @@ def negative_log_likelihood(rows: Projected) -> Float[Array, ""]:
     R, w = _weights(rows)
     misfit = rows.r - rows.M @ w
     log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(R)))
-    return 0.5 * (misfit @ misfit + w @ w + log_det) + rows.log_det
+    return 0.5 * (misfit @ misfit + w @ w + log_det) + rows.constant
 
 
 def _weights(rows: Projected) -> tuple[Float[Array, "q q"], Float[Array, " q"]]:
@@ -213,7 +215,7 @@ def _best(model: Model, S, rows: Rows, spread, low, high, free, steps):
         return _loss(model, jnp.where(free, h, start), S, rows, spread)
 
     # Of log σ a sample of N knows 1/√(2N); a lengthscale or an amplitude is known to some tenths.
-    count = jnp.maximum((rows.counts > 0).sum(axis=(0, 1)), 1).astype(start.dtype)
+    count = jnp.maximum(rows.counts.sum(axis=(0, 1)), 1)
     kernel = jnp.full(start.size - count.size, 0.2, start.dtype)
     sizes = jnp.concatenate([kernel, 1 / jnp.sqrt(2 * count)])
     found, value = minimise(loss, start, low, high, sizes, steps)

@@ -20,13 +20,13 @@ from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._trajectories.evidence import Model
 from hamkernel._trajectories.flow import Expansion
 from hamkernel._trajectories.functionals import functionals_of
+from hamkernel._trajectories.hermite import interpolated
 from hamkernel._trajectories.iteration import Current, Task, begin, changed, iterated
 from hamkernel._trajectories.learned import (
     Learned,
     Step,
     empty,
     explains,
-    interpolated,
     misfits,
     warn_of_dropped,
     warn_of_misfit,

@@ -168,23 +168,6 @@ def warn_of_dropped(kept: np.ndarray) -> None:
         )
 
 
-def interpolated(
-    times: np.ndarray, at: np.ndarray, x: np.ndarray, slopes: np.ndarray
-) -> Float[np.ndarray, "T n"]:
-    """Hermite's cubic through states and velocities, at the times of the log."""
-    if len(at) == len(times):
-        return x
-    i = np.clip(np.searchsorted(at, times) - 1, 0, len(at) - 2)
-    h = (at[i + 1] - at[i])[:, None]
-    s = ((times - at[i])[:, None]) / h
-    return (
-        (1 + 2 * s) * (1 - s) ** 2 * x[i]
-        + s * (1 - s) ** 2 * h * slopes[i]
-        + s**2 * (3 - 2 * s) * x[i + 1]
-        + s**2 * (s - 1) * h * slopes[i + 1]
-    )
-
-
 def empty(n: int) -> Float[Array, "0 n"]:
     """The residual of velocities, of which there were none."""
     return jnp.zeros((0, n))

@@ -1,8 +1,9 @@
 """The runs before anything is learned of the field: condensed, smoothed, completed.
 
-Samples that are much closer than the motion needs are averaged: what they say together is the
-smoothed path in their middle plus the mean of their residuals, with the noise of so many. The bias
-of this is of the second order in what smoothing missed.
+Samples that are much closer than the motion needs are averaged: what they say together of the
+motion is the smoothed path in their middle plus the mean of their residuals, with the noise of so
+many; the bias of this is of second order in what the smoothing missed. What they say of the noise
+is how they scatter about that mean.
 """
 
 from collections.abc import Callable
@@ -16,6 +17,7 @@ from jaxtyping import Array, Bool, Float
 
 from hamkernel import _require as require
 from hamkernel._trajectories.flow import NODES
+from hamkernel._trajectories.hermite import interpolated
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.smoothing import Coordinate, processes, smoothed
 
@@ -36,6 +38,7 @@ class Run(NamedTuple):
         times: since the first sample, shape (T,).
         states: NaN where nothing was measured, shape (T, n).
         counts: of the samples that an entry is the mean of, shape (T, n).
+        scatter: the sum of their squared distances from it, shape (T, n).
         path: smoothed states at the times, no NaN, shape (T, n).
         nodes: the same at the Gauss nodes between them, shape (T − 1, 3, n).
         slopes: their velocities there.
@@ -45,6 +48,7 @@ class Run(NamedTuple):
     times: np.ndarray
     states: np.ndarray
     counts: np.ndarray
+    scatter: np.ndarray
     path: np.ndarray
     nodes: np.ndarray
     slopes: np.ndarray
@@ -77,16 +81,18 @@ def prepared(runs: Runs, mean: Callable[[Array], Array] | None) -> Prepared:
     times = [t - t[0] for t in times]
     found, usable = _robust_processes(times, states)
     counts = [np.isfinite(x).astype(float) for x in states]
+    scatter = [np.zeros_like(x) for x in states]
     lengths = [c.lengthscale for c in found if np.isfinite(c.process.log_amplitude)]
     block = _DENSE * min(lengths, default=np.inf)
     if any(2 * np.median(np.diff(t)) < block for t in times):
         paths = smoothed(found, times, states)
         condensed = [
-            _condensed(t, x, paths.value[r, : len(t)], block)
+            _condensed(t, x, paths.value[r, : len(t)], paths.slope[r, : len(t)], block)
             for r, (t, x) in enumerate(zip(times, states, strict=True))
         ]
-        times, states, counts = (list(each) for each in zip(*condensed, strict=True))
-    path_runs = _with_paths(found, times, states, counts, _GAP * min(lengths, default=np.inf))
+        times, states, counts, scatter = (list(each) for each in zip(*condensed, strict=True))
+    gap = _GAP * min(lengths, default=np.inf)
+    path_runs = _with_paths(found, times, states, counts, scatter, gap)
     if not all(c.seen for c in found) or mean is not None:
         path_runs = [_completed(run, mean) for run in path_runs]
     noise = np.array([c.noise if c.seen else np.nan for c in found])
@@ -111,8 +117,8 @@ def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:
     return processes([times[r] for r in chosen], [states[r] for r in chosen]), usable
 
 
-def _condensed(t, x, path, block: float):
-    """Times, means and counts of blocks of samples that span at most `block`."""
+def _condensed(t, x, path, slope, block: float):
+    """Times, means, counts and scatter of blocks of samples that span at most `block`."""
     edges = [0]
     for i in range(1, len(t)):
         if t[i] - t[edges[-1]] >= block:
@@ -125,11 +131,13 @@ def _condensed(t, x, path, block: float):
     sizes = np.diff([*edges, len(t)])
     middle = np.add.reduceat(t, edges) / sizes
     means = np.add.reduceat(residual, edges, axis=0) / np.maximum(counts, 1)
-    there = np.stack([np.interp(middle, t, path[:, c]) for c in range(x.shape[1])], axis=1)
-    return middle, np.where(counts > 0, there + means, np.nan), counts
+    there = interpolated(middle, t, path, slope)
+    about = np.where(seen, residual - np.repeat(means, sizes, axis=0), 0.0)
+    scatter = np.add.reduceat(about**2, edges, axis=0)
+    return middle, np.where(counts > 0, there + means, np.nan), counts, scatter
 
 
-def _with_paths(found, times, states, counts, gap: float) -> list[Run]:
+def _with_paths(found, times, states, counts, scatter, gap: float) -> list[Run]:
     """The smoothed path at the samples and at the nodes between them."""
     grids, filled = [], []
     for t, x in zip(times, states, strict=True):
@@ -141,13 +149,13 @@ def _with_paths(found, times, states, counts, gap: float) -> list[Run]:
         filled.append(wide)
     paths = smoothed(found, grids, filled)
     out = []
-    for r, (t, x, count) in enumerate(zip(times, states, counts, strict=True)):
+    for r, (t, x, count, about) in enumerate(zip(times, states, counts, scatter, strict=True)):
         size = 4 * len(t) - 3
         value, slope = (a[r, :size] for a in (paths.value, paths.slope))
         nodes, slopes = (a[:-1].reshape(len(t) - 1, 4, -1)[:, 1:] for a in (value, slope))
         spans = np.diff(t)
         gaps = 1 + np.flatnonzero((spans > gap) & (spans > _INTERVALS * np.median(spans)))
-        out.append(Run(t, x, count, value[::4], nodes, slopes, gaps))
+        out.append(Run(t, x, count, about, value[::4], nodes, slopes, gaps))
     return out
 
 

@@ -29,12 +29,14 @@ class Segments(NamedTuple):
         spans: the lengths of the intervals, shape (S, L).
         measured: the states, zero where nothing was seen, shape (S, L + 1, n).
         counts: how many samples an entry stands for, 0 where nothing was seen, the same shape.
+        scatter: the sum of squares of those samples about the entry, the same shape.
         starts: where the segments may begin, shape (S, n).
     """
 
     spans: Float[Array, "S L"]
     measured: Float[Array, "S L+1 n"]
     counts: Float[Array, "S L+1 n"]
+    scatter: Float[Array, "S L+1 n"]
     starts: Float[Array, "S n"]
 
 
@@ -49,6 +51,7 @@ class Rows(NamedTuple):
         target: x − x̂ + ô, shape (S, L + 1, n).
         along: ô, what the rows would be if x̂ were right, the same shape.
         counts: those of the segments, zero on what was dropped.
+        scatter: those of the segments, zero on what was dropped.
         displaced: where the prior of the start has its middle, relative to x̂, shape (S, n).
     """
 
@@ -59,6 +62,7 @@ class Rows(NamedTuple):
     target: Float[Array, "S L+1 n"]
     along: Float[Array, "S L+1 n"]
     counts: Float[Array, "S L+1 n"]
+    scatter: Float[Array, "S L+1 n"]
     displaced: Float[Array, "S n"]
 
 
@@ -132,7 +136,8 @@ def linearised(
         tangent=tangents(across),
         target=segments.measured - x + offset,
         along=offset,
-        counts=jnp.where(keep, segments.counts, jnp.zeros_like(segments.counts)),
+        counts=_where(good, segments.counts),
+        scatter=_where(good, segments.scatter),
         displaced=_where(good, segments.starts - x[:, 0]),
     )
 
@@ -164,20 +169,21 @@ def frozen(
 
 
 def segments_of(
-    pieces: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]],
+    pieces: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]],
     size: int,
     length: int,
 ) -> Segments:
-    """Pieces (times, states, counts, start) as `size` segments of `length` samples, padded."""
+    """Pieces (times, states, counts, scatter, start) as `size` segments of `length` samples."""
     n = pieces[0][1].shape[1]
     spans = np.zeros((size, length - 1))
-    measured, counts = np.zeros((size, length, n)), np.zeros((size, length, n))
+    measured, counts, scatter = np.zeros((3, size, length, n))
     starts = np.zeros((size, n))
-    for s, (t, x, count, start) in enumerate(pieces):
+    for s, (t, x, count, squares, start) in enumerate(pieces):
         T = len(t)
         spans[s, : T - 1] = np.diff(t)
         seen = np.isfinite(x)
         measured[s, :T] = np.where(seen, x, 0.0)
         counts[s, :T] = np.where(seen, count, 0.0)
+        scatter[s, :T] = np.where(seen, squares, 0.0)
         starts[s] = start
-    return Segments(*(jnp.asarray(a) for a in (spans, measured, counts, starts)))
+    return Segments(*(jnp.asarray(a) for a in (spans, measured, counts, scatter, starts)))

@@ -79,7 +79,8 @@ def segmented(runs: list[Run], pieces: list[Piece], paths: list[np.ndarray]) -> 
     filled = []
     for r, start, stop in pieces:
         run, part = runs[r], slice(start, stop)
-        filled.append((run.times[part], run.states[part], run.counts[part], paths[r][start]))
+        own = run.times, run.states, run.counts, run.scatter
+        filled.append((*(a[part] for a in own), paths[r][start]))
     return segments_of(filled, half_octave(len(pieces)), length)
 
 

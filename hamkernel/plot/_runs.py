@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 
-from hamkernel._trajectories.learned import interpolated
+from hamkernel._trajectories.hermite import interpolated
 from hamkernel.plot._style import COLORS, DATA, coordinate, legend, on_points, with_unit
 
 if TYPE_CHECKING:
