@@ -175,8 +175,8 @@ def tune(
     "marginal_likelihood" finds the better field, often by a factor of two. Where the noise or the
     prior are not like that it can lose up to 40 %, and cross-validation is the safer judge: by
     runs, if there are at least six of them, else by leave-one-out, folds="loo". With three runs no
-    judge is reliably better than another. `tests/benchmarks/judges.py` measures this; `tune` warns of
-    fewer than five labels.
+    judge is reliably better than another (`tests/benchmarks/judges.py`). `tune` warns of fewer than
+    five labels.
 
     Time. A search that will take more than a minute says so before the long part of it.
 
