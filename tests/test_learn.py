@@ -28,6 +28,7 @@ from hamkernel._trajectories.evidence import (
 )
 from hamkernel._trajectories.flow import NODES, WEIGHTS, simulated
 from hamkernel._trajectories.functionals import functionals_of
+from hamkernel._trajectories.learned import warn_of_noise
 from hamkernel._trajectories.prepared import prepared
 from hamkernel._trajectories.rows import Segments, frozen, linearised
 from hamkernel._trajectories.shooting import means, short_cuts
@@ -37,10 +38,10 @@ K = hk.Symplectic(hk.Gaussian(1.0))
 PENDULUM = hk.systems.Pendulum(1.0, 1.0, 6.0)
 
 
-def logs(field=PENDULUM, noise=0.05, seed=0, count=6, samples=30, spread=2.0):
+def logs(field=PENDULUM, noise=0.05, seed=0, count=6, samples=30, spread=2.0, length=6.0):
     """Runs of 6 s: times, noisy states, true states."""
     rng = np.random.default_rng(seed)
-    ts = np.linspace(0, 6, samples)
+    ts = np.linspace(0, length, samples)
     starts = jnp.asarray(rng.uniform(-spread, spread, (count, 2)))
     true = jax.vmap(lambda x: hk.simulate(field, x, jnp.asarray(ts)).ys)(starts)
     true = list(np.asarray(true))
@@ -229,6 +230,27 @@ def test_a_pendulum_is_learned_from_noisy_states(learned):
     x = jnp.array([0.3, 0.2])
     gradient = jax.grad(found.field.hamiltonian)(x)
     np.testing.assert_allclose(found.field(x), [gradient[1], -gradient[0]], atol=1e-10)
+
+
+def test_five_samples_a_swing_are_enough():
+    """Smoothing finds no noise at all in either coordinate: it must not be where learning ends."""
+    times, states, true = logs(length=15.0)
+    runs = hk.Runs(times, states)
+    assert (prepared(runs, None).noise < 0.001).all()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        found = hk.learn(K, runs)
+    assert field_error(found.field, true) < 0.04
+    np.testing.assert_allclose(found.noise, 0.05, rtol=0.2)
+
+
+def test_a_field_that_explains_nothing_says_so():
+    scale = np.array([1.3, 1.2])
+    with pytest.warns(UserWarning, match=r"explains little of the runs.* coordinate 1 is 1\.1"):
+        assert warn_of_noise(np.array([0.1, 1.1]), scale)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert not warn_of_noise(np.array([0.4, np.nan]), scale)
 
 
 @pytest.mark.slow

@@ -30,6 +30,7 @@ from hamkernel._trajectories.learned import (
     misfits,
     warn_of_dropped,
     warn_of_misfit,
+    warn_of_noise,
 )
 from hamkernel._trajectories.prepared import check_identifiable, prepared
 from hamkernel._trajectories.runs import Runs
@@ -179,6 +180,8 @@ def _learned(
     explained = not given or explains(chi_squared, now.free)
     if not explained:
         warn_of_misfit(chi_squared, misfit)
+    elif not given:
+        explained = not warn_of_noise(noise, data.scale)
     if explained and not converged:
         require.warn(
             f"learning stopped after {_MOST} iterations with noise or objective still moving: see "

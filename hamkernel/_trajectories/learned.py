@@ -21,6 +21,9 @@ from hamkernel._trajectories.runs import Runs
 # curvature that a linearisation misses.
 _SIGMAS, _CURVATURE = 5.0, 0.1
 
+# Noise of half the motion or more: where learning failed, it was found 0.9 to 1.1 times the motion.
+_ALL_NOISE = 0.5
+
 _EXACT = 3000  # rows of a posterior without approximation: some seconds
 
 
@@ -154,6 +157,21 @@ def warn_of_misfit(chi_squared: float, misfit: Float[np.ndarray, "R n"]) -> None
         f"at the noise given, and should be 1. The residuals are largest in coordinate {c} of run "
         f"{run}, {misfit[run, c]:.2g} standard deviations. {causes}"
     )
+
+
+def warn_of_noise(noise: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"]) -> bool:
+    """Say where nearly all of the motion was taken for noise, and whether it was."""
+    share = np.nan_to_num(noise / scale)
+    c = int(np.argmax(share))
+    if share[c] < _ALL_NOISE:
+        return False
+    require.warn(
+        f"the field explains little of the runs: the noise found in coordinate {c} is "
+        f"{noise[c]:.3g}, and its states vary by {scale[c]:.3g} (standard deviations). Causes: "
+        "fewer than about five samples a swing, a structure that the motion does not have, or "
+        "sensors that are indeed so noisy. If you know the noise, pass noise=…; see hk.plot.fitted."
+    )
+    return True
 
 
 def warn_of_dropped(kept: np.ndarray) -> None:

@@ -9,10 +9,15 @@ the true runs, relative to its root mean square, and of the mean squared error o
 with the lowest and highest in brackets.
 
     python tests/benchmarks/trajectories.py [case …] [--seeds 5] [--one-lengthscale]
+    python tests/benchmarks/trajectories.py --claims [claim …] [--seeds 10]
 
 The kernel of all methods is `Symplectic(Gaussian)` with one lengthscale for each coordinate: q and
 p have different units. The window of Savitzky and Golay is chosen by the TRUE error, which nobody
 knows. With four coordinates their fields, and those of differences, are fitted on landmarks.
+
+Claims: how often a wrong and a right structure warn when the noise is given, for a pendulum with
+friction and for two unequal masses in (q, q̇); the ratio of those masses; and the friction that is
+found, true .05, as 1000 times the mean of squared errors.
 """
 
 import argparse
@@ -177,6 +182,77 @@ def row(case: Case, seed: int, baselines: bool, one: bool):
     return out
 
 
+FRICTION = 0.05
+DAMPED_PENDULUM = PENDULUM_CASE._replace(system=hk.systems.Damped(PENDULUM, FRICTION))
+DAMPED_DUFFING = DUFFING_CASE._replace(system=hk.systems.Damped(DUFFING, FRICTION))
+
+
+def masses(y):
+    """Masses of 1 and 2.5 on a hardening spring and between springs, in (q, q̇)."""
+    a, b = y[:2]
+    force = jnp.array([-a - a**3 + 1.5 * (b - a), -1.5 * (b - a) - b])
+    return jnp.concatenate([y[2:], force / jnp.array([1.0, 2.5])])
+
+
+def warns(K, runs, noise, **options):
+    """What was learned, and whether it warned that the structure does not explain the runs."""
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        found = hk.learn(K, runs, noise=noise, **options)
+    return found, any("does not explain" in str(each.message) for each in seen)
+
+
+def friction_is_noticed(seed):
+    """A pendulum with friction as without, and as what it is."""
+    times, states, _, _ = logs(DAMPED_PENDULUM, seed)
+    runs, k = hk.Runs(times, states), gaussian(2)
+    wrong, right = (warns(K, runs, 0.1) for K in (hk.Symplectic(k), hk.PortHamiltonian(k, 0.1)))
+    return {"wrong": wrong[1], "right": right[1], "wrong χ²": float(wrong[0].chi_squared)}
+
+
+def masses_are_noticed(seed):
+    """Two unequal masses in (q, q̇) as if they were equal, and unknown; the ratio is 2.5."""
+    rng, ts = np.random.default_rng(seed), np.linspace(0, 6, 31)
+    true = paths(masses, rng.uniform(-1, 1, (6, 4)), ts)
+    runs = hk.Runs([ts] * 6, list(true + 0.01 * rng.standard_normal(true.shape)))
+    K = hk.Symplectic(hk.Gaussian(1.0))
+    wrong, right = warns(K, runs, 0.01), warns(K, runs, 0.01, masses=True)
+    ratio = float(right[0].kernel.masses[1])
+    return {"wrong": wrong[1], "right": right[1], "ratio": ratio}
+
+
+def friction_of(case: Case) -> Callable:
+    def found(seed):
+        times, states, _, _ = logs(case, seed)
+        K = hk.PortHamiltonian(gaussian(2), 0.1)
+        friction = float(hk.learn(K, hk.Runs(times, states)).kernel.friction)
+        return {"friction": friction, "squared error times 1000": 1e3 * (friction - FRICTION) ** 2}
+
+    return found
+
+
+CLAIMS = {
+    "friction noticed": friction_is_noticed,
+    "masses noticed": masses_are_noticed,
+    "friction of the pendulum": friction_of(DAMPED_PENDULUM),
+    "friction of Duffing": friction_of(DAMPED_DUFFING),
+}
+
+
+def claim(name, seeds):
+    rows = [CLAIMS[name](seed) for seed in range(seeds)]
+    for what in rows[0]:
+        values = np.array([row[what] for row in rows])
+        if values.dtype == bool:
+            print(f"| {name} | {what} | warns in {values.sum()} of {seeds} |", flush=True)
+        else:
+            print(
+                f"| {name} | {what} | mean {values.mean():.4g}, median {np.median(values):.4g} "
+                f"({values.min():.4g} to {values.max():.4g}) |",
+                flush=True,
+            )
+
+
 def cell(values):
     values = np.array([v[:2] for v in values])
     (e, r), low, high = np.median(values, axis=0), values.min(axis=0), values.max(axis=0)
@@ -192,8 +268,13 @@ def main():
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--baselines", type=int, default=5, help="seeds of the other methods")
     parser.add_argument("--one-lengthscale", action="store_true", help="for all coordinates")
+    parser.add_argument("--claims", nargs="*", help="claims instead of cases; all if none is named")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
+    if options.claims is not None:
+        for name in options.claims or CLAIMS:
+            claim(name, options.seeds)
+        return
     for case in options.cases:
         rows = [
             row(CASES[case], seed, seed < options.baselines, options.one_lengthscale)
