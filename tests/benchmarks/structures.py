@@ -7,6 +7,7 @@ hyperparameters come from `tune(..., objective="marginal_likelihood")`.
 """
 
 # pyright: reportArgumentType=false, reportOptionalOperand=false, reportAttributeAccessIssue=false
+# pyright: reportCallIssue=false
 
 import argparse
 from collections.abc import Callable
