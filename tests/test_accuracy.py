@@ -23,7 +23,7 @@ CASES = {
 }
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("case", CASES)
 def test_every_loss_and_gradient_is_right_or_says_that_it_cannot_tell(case):
     problem, basis = CASES[case]

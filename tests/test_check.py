@@ -104,7 +104,7 @@ NOT_STATIONARY = {
 # No false alarm
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", SOUND)
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_sound_kernels_pass_at_every_lengthscale_amplitude_and_dimension(name, dtype):

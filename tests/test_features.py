@@ -102,7 +102,7 @@ def estimate(terms, d):
     return mean, np.sqrt(variance), total
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", KERNELS)
 def test_the_mean_of_the_waves_is_the_kernel(name, key):
     make, formula = KERNELS[name]
@@ -356,6 +356,7 @@ def test_the_field_comes_from_its_potential(name, key):
         assert float(anchored.hamiltonian(x)) == float(anchored.potential(x))
 
 
+@pytest.mark.slow
 def test_parts_add_up_to_the_field(key):
     X, Y = data()
     k = hk.Gaussian(1.3)
@@ -380,6 +381,7 @@ def test_a_separable_hamiltonian_is_recognised_and_learned_exactly_so(key):
     assert abs(float(mixed)) < STRUCTURE
 
 
+@pytest.mark.slow
 def test_many_features_give_the_field_of_the_exact_kernel(key):
     X, Y = data(n=2)
     K, new = odd_symplectic(hk.Gaussian(1.5)), points(50, 2, seed=5)
@@ -452,6 +454,7 @@ def test_gradients_with_respect_to_hyperparameters_are_differences(make, key):
     np.testing.assert_allclose(curvatures[1], second, rtol=10 * DIFFERENCES)
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("make", "formula"),
@@ -494,6 +497,7 @@ def test_fits_run_under_jit_and_vmap_and_new_values_do_not_recompile(key):
     np.testing.assert_allclose(together, alone, rtol=SOLVE)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:fitting in float32")
 def test_float32_stays_float32(key):
     X, Y = (a.astype(jnp.float32) for a in data(n=2))
@@ -571,6 +575,7 @@ def test_the_triangle_of_many_tiles_is_least_squares_in_numpy():
     np.testing.assert_allclose(abs(factor[6, 6]), np.sqrt(square[0]), rtol=ROUNDING)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("repeated", [1, 40])
 def test_features_may_be_many_more_than_rows(key, repeated):
     X, Y = (jnp.tile(each, (repeated, 1)) for each in data(N=6, n=2))

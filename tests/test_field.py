@@ -34,7 +34,7 @@ def fitted(structure, kernel="gaussian", n=2, ridge=1e-3):
 # Derivatives.
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize(
     "kernel", ["gaussian", "gaussian_ard", "matern2.5", "matern4.5", "periodic", "partial"]
 )
@@ -401,6 +401,7 @@ def henon_heiles(x):
     return jnp.stack([p1, p2, -q1 - 2 * q1 * q2, -q2 - q1**2 + q2**2])
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("system", "n"), [(pendulum, 2), (henon_heiles, 4)], ids=["pendulum", "henon_heiles"]

@@ -60,7 +60,7 @@ def reference_gram(block, X, Z):
     return np.block([[block(x, z) for z in Z] for x in X])
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", REFERENCES)
 @pytest.mark.parametrize("n", [2, 4])
 def test_coefficients_and_field_are_those_of_numpy(name, n):
@@ -325,6 +325,7 @@ def test_what_rounding_spoils_is_refused_and_never_a_wrong_field(dtype, ridges):
     assert 0 < len(residuals) < len(ridges)  # both happen
 
 
+@pytest.mark.slow
 def test_data_of_zeros_give_the_zero_field_and_finite_derivatives():
     X, Y = data(6, 2)
     for solver in (hk.Cholesky(), hk.ConjugateGradient(), hk.Nystrom()):
@@ -394,6 +395,7 @@ def test_every_field_says_how_it_was_found(kind):
     np.testing.assert_allclose(field.residual_norm, np.linalg.norm(field.residual))
 
 
+@pytest.mark.slow
 def test_an_iteration_that_does_not_converge_is_nan_where_it_does_not_raise():
     solver = hk.ConjugateGradient(1e-12, 2, hk.Nystrom(max_points=2))
     field: Any = hk.fit(K, *data(30), 1e-6, solver=solver, throw=False)

@@ -171,6 +171,7 @@ def temporaries(function, *arguments):
     return analysis.temp_size_in_bytes
 
 
+@pytest.mark.slow
 def test_second_derivatives_of_a_matern_product_are_the_same_forward_and_backward():
     rng = np.random.default_rng(0)
     X, A = rng.normal(size=(2, 30, 2))

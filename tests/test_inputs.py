@@ -98,6 +98,7 @@ def torque(X, U):
     return np.stack([X[:, 1], force], axis=1)
 
 
+@pytest.mark.slow
 def test_tune_learns_friction_and_input_matrix_together():
     rng = np.random.default_rng(1)
     X, U = rng.uniform(-2.5, 2.5, size=(40, 2)), rng.uniform(-2, 2, size=(40, 1))
@@ -194,6 +195,7 @@ def test_driven_trajectories_are_those_of_scipy(name, steps):
     np.testing.assert_allclose(ys, reference(force), atol=2e-8)
 
 
+@pytest.mark.slow
 def test_constant_steps_keep_their_order_across_held_inputs():
     """Were the last stage to see the next sample, Dopri5 would be of first order."""
     exact = reference(DRIVES["held"][2])[-1]

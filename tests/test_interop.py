@@ -54,6 +54,7 @@ structures = pytest.mark.parametrize(
 )
 
 
+@pytest.mark.few(2)
 @packages
 @structures
 def test_their_gaussian_learns_the_field_of_ours(package, structure):

@@ -383,6 +383,7 @@ def test_what_cannot_be_known_or_meant_is_refused():
         hk.learn(K, hk.Runs(times, [x[:, :1] for x in states]))
 
 
+@pytest.mark.slow
 def test_the_posterior_is_that_of_the_last_rows(learned):
     found, true = learned
     posterior = found.posterior

@@ -231,6 +231,7 @@ SOLVERS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize("name", SOLVERS)
 def test_other_solvers_find_the_field_of_the_dense_one(name):

@@ -196,6 +196,7 @@ def test_the_friction_has_the_gradient_of_the_loss():
     np.testing.assert_allclose(jax.jit(jax.grad(loss))(at), slope, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_saved_fields_come_back(tmp_path):
     file = tmp_path / "field.npz"
     for K in (hk.PortHamiltonian(G, [0.3, 0.1], damped=(3, 0)), hk.Odd(hk.PortHamiltonian(G))):

@@ -121,6 +121,7 @@ def test_rows_one_by_one_are_all_rows():
 GRID = np.stack(np.meshgrid(*[np.linspace(-3, 3, 9)] * 2), axis=-1).reshape(-1, 2)
 
 
+@pytest.mark.slow
 def test_landmarks_tell_what_the_dense_posterior_tells_where_they_are():
     solver = hk.Nystrom(points=GRID)
     posterior = hk.condition(K, hk.Velocities(X, Y) + ENERGIES, regularization=RIDGE, solver=solver)

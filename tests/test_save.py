@@ -107,7 +107,7 @@ def saved(tmp_path):
     return path
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", BUILT_IN)
 def test_built_in_kernels_restore_by_themselves(name, tmp_path):
     field = fitted(BUILT_IN[name])
@@ -128,6 +128,7 @@ def test_the_kernel_may_be_given_for_a_built_in_one_too(name, tmp_path):
     assert same(field, load(tmp_path / "f", kernel=other))
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "K",
     [
@@ -161,7 +162,7 @@ def test_a_field_without_stored_residuals_restores(tmp_path):
     assert same(field, load(tmp_path / "f"))
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", USERS)
 def test_a_kernel_of_the_user_is_given_and_gets_the_saved_arrays(name, tmp_path):
     kernel, given = USERS[name]

@@ -122,7 +122,7 @@ def test_third_derivatives_at_coincident_points_are_the_limit_from_neighbours(ca
         np.testing.assert_allclose(here, 0.0, atol=ROUNDING)
 
 
-@pytest.mark.few(7)
+@pytest.mark.few(3)
 @pytest.mark.parametrize(
     "case", [c for c in CASES if c.name not in ("function", "lambda")], ids=str
 )

@@ -152,6 +152,7 @@ def test_energy_wobbles_without_drift_over_1e5_steps_only_if_symplectic(solver):
         assert drift > 2 * wobble
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize("options", [{}, {"solver": ImplicitMidpoint(), "dt": 0.1}])
 def test_batch_by_vmap_is_the_loop(options):
@@ -248,6 +249,7 @@ def test_forward_mode_through_the_default_adjoint_says_which_to_pass(derivative,
         derivative(end)(START)
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("derivative", "adjoint"),
@@ -425,6 +427,7 @@ def test_float32_stays_float32_and_late_times_are_as_exact_as_early_ones(options
     assert (float(solution.t0), float(solution.t1)) == (ts[0], ts[-1])
 
 
+@pytest.mark.slow
 def test_a_state_that_overflows_in_constant_steps_is_no_success():
     def run(throw):
         return simulate(lambda x: x**2, np.ones(1), np.array([0.0, 0.5, 2.0]), dt=0.01, throw=throw)

@@ -124,6 +124,7 @@ def test_the_number_of_landmarks_is_near_the_best_rank():
     assert best / 2 < int(chosen.kept.sum()) < 2 * best  # points have two columns each
 
 
+@pytest.mark.slow
 def test_repeated_and_mirrored_points_are_taken_once():
     X, Y = swings(40)
     X, Y = np.concatenate([X, X, -X]), np.concatenate([Y, Y, -Y])
@@ -233,6 +234,7 @@ def test_second_derivatives_of_a_fit_on_landmarks_are_those_of_differences():
     np.testing.assert_allclose(jax.hessian(norm)(1.2), expected, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_kernel_that_is_not_positive_is_refused():
     X, Y = swings(60)
     with pytest.raises(RuntimeError, match="check_kernel"):
@@ -289,7 +291,7 @@ def test_landmarks_precondition():
     assert counts[0] <= 15 < 2 * counts[0] < counts[1]
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("structure", [hk.Symplectic, hk.Separable])
 @pytest.mark.parametrize(
     "kernel", [lambda x, z: jnp.tanh(x @ z - 1.0), lambda x, z: jnp.tanh(0.1 * x @ z + 1.0)]
@@ -325,6 +327,7 @@ def test_the_gradient_of_conjugate_gradients_is_that_of_cholesky():
     np.testing.assert_allclose(slope, jax.grad(lambda s: loss(s, hk.Cholesky()))(start), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_gradient_of_conjugate_gradients_in_the_velocities_is_that_of_cholesky():
     X, Y = swings(40)
     iterative = ConjugateGradient(1e-10, preconditioner=Nystrom(10.0, 16))
@@ -337,6 +340,7 @@ def test_the_gradient_of_conjugate_gradients_in_the_velocities_is_that_of_choles
     np.testing.assert_allclose(slope(iterative), expected, atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize("solver", [Nystrom(1e-6), ConjugateGradient(1e-10)], ids=["low", "cg"])
 def test_a_kernel_may_have_leaves_that_are_no_arrays(solver):
@@ -375,6 +379,7 @@ def test_conjugate_gradients_refuse_what_makes_no_sense():
 # The choice.
 
 
+@pytest.mark.slow
 def test_a_dense_fit_is_chosen_where_it_takes_half_of_the_memory(monkeypatch):
     X, Y = swings(20)
     need = 3 * 40**2 * 8
@@ -445,6 +450,7 @@ def test_what_just_fits_is_not_refused_and_a_byte_less_is_with_its_size(monkeypa
             _memory.refuse_beyond_memory(*problem)
 
 
+@pytest.mark.slow
 def test_landmarks_beyond_the_first_buffer_are_all_different():
     X = np.random.default_rng(0).normal(size=(400, 4))
     with warnings.catch_warnings():
@@ -457,7 +463,7 @@ def test_landmarks_beyond_the_first_buffer_are_all_different():
 SOLVERS = [None, Nystrom(), ConjugateGradient(), hk.RandomFeatures(20, jax.random.key(0))]
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("solver", SOLVERS, ids=lambda solver: type(solver).__name__)
 def test_data_at_the_centre_of_an_odd_kernel_has_the_zero_field(solver):
     field = hk.fit(hk.Odd(K), np.zeros((3, 2)), np.ones((3, 2)), RIDGE, solver=solver)
@@ -465,6 +471,7 @@ def test_data_at_the_centre_of_an_odd_kernel_has_the_zero_field(solver):
     np.testing.assert_allclose(field.residual_norm, 6**0.5, rtol=1e-12)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("solver", SOLVERS[1:3], ids=lambda solver: type(solver).__name__)
 def test_a_gram_without_any_column_above_rounding_is_no_zero_gram(solver):
     X, Y = swings(20)
@@ -472,6 +479,7 @@ def test_a_gram_without_any_column_above_rounding_is_no_zero_gram(solver):
         hk.fit(hk.CurlFree(lambda x, z: -(x @ z)), X, Y, RIDGE, solver=solver)
 
 
+@pytest.mark.slow
 def test_gradients_in_single_precision_ask_for_what_it_can_give():
     X, Y = (each.astype(np.float32) for each in swings(20))
     with pytest.warns(UserWarning, match="float32"):
@@ -497,6 +505,7 @@ def test_a_key_is_one_key_of_jax(key):
         Nystrom(key=jax.random.split(jax.random.key(0), 3))
 
 
+@pytest.mark.slow
 def test_warnings_name_the_line_of_the_user():
     X, Y = (each.astype(np.float32) for each in swings(20))
     calls = [

@@ -77,6 +77,7 @@ def test_a_fit_to_chunks_is_the_fit_to_all(name):
         np.testing.assert_allclose(streamed(x), [p_slope, -q_slope], atol=1e-12)
 
 
+@pytest.mark.slow
 def test_landmarks_chosen_from_a_sample_are_those_chosen_from_the_data():
     whole: Any = hk.fit(K, X, Y, RIDGE, solver=Nystrom())
     streamed: Any = Nystrom().fit_chunks(K, chunks(X, Y, 200), RIDGE, sample=X)
@@ -222,6 +223,7 @@ def test_both_solvers_stream_with_the_same_words(solver: AbstractStreamingSolver
     np.testing.assert_array_equal(streamed.evaluate(NEW), field.evaluate(NEW))
 
 
+@pytest.mark.slow
 def test_landmarks_of_the_first_chunk_do_where_chunks_are_alike():
     field: Any = Nystrom(tolerance=0.01).fit_chunks(K, chunks(X, Y, 200), RIDGE)
     assert field.info.truncation < 0.2  # seen on all of the data

@@ -158,7 +158,7 @@ def test_odd_dimensions_are_allowed_where_the_structure_allows_them(case):
     assert divergence(jacobian(hk.DivergenceFree, case, 3)) < STRUCTURE
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("n", [2, 4, 6])
 def test_other_structures_fail_the_same_checks(n):
     separable, symplectic = (jacobian(K, BARE, n) for K in (hk.Separable, hk.Symplectic))
@@ -172,7 +172,7 @@ def test_other_structures_fail_the_same_checks(n):
         assert divergence(Df) > 1e-2
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @EVERYWHERE
 def test_odd_symplectic_fields_are_odd_and_hamiltonian(case, n):
     field = seen(odd_symplectic, case, n)
@@ -200,7 +200,7 @@ ANY_STRUCTURE = [
 STRUCTURE_NAMES = ["Separable", "CurlFree", "Symplectic", "DivergenceFree", "Sum"]
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["partial", "select"])
 @pytest.mark.parametrize("structure", ANY_STRUCTURE, ids=STRUCTURE_NAMES)
 def test_every_structure_can_be_made_odd_or_even(structure, name):

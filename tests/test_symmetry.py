@@ -63,7 +63,7 @@ def off(field, S, sign=1.0):
     return np.abs(there - sign * here @ S.T).max() / np.abs(here).max()
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @every_group
 def test_fields_have_the_symmetry_to_rounding_and_plain_ones_have_not(name):
     k, maps, same, reversed_, order, one_sided = GROUPS[name]
@@ -94,7 +94,7 @@ def test_products_without_the_group_are_those_of_the_gram(name):
     assert np.linalg.eigvalsh(matrix).min() > -1e-12
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("structure", [hk.CurlFree, hk.PortHamiltonian, hk.Separable])
 def test_other_structures_have_the_same_products(structure):
     K = structure(hk.Invariant(G, [C3, MIRROR]))
@@ -183,6 +183,7 @@ def test_symmetry_helps_where_it_is_there():
     assert errors[1] < 0.2 * errors[0]
 
 
+@pytest.mark.slow
 def test_random_features_know_the_group():
     K = hk.Symplectic(hk.Invariant(hk.Gaussian(2.0), [C3, MIRROR, REVERSAL]))
     solver = hk.RandomFeatures(200, jax.random.key(0))
@@ -200,6 +201,7 @@ def test_random_features_know_the_group():
     np.testing.assert_allclose(field(x0), canonical(4) @ slope, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_saved_fields_come_back(tmp_path):
     file = tmp_path / "field.npz"
     fields = [

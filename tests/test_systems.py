@@ -186,7 +186,7 @@ def test_float32_states_have_float32_velocities_and_energies(system, motion, sta
 
 
 # The other systems are sampled below, where something about their trajectories is known exactly.
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["duffing", "henon_heiles", "double_pendulum", "spring_chain"])
 def test_sample_follows_the_reference_trajectory(name):
     system, motion, start = CASES[name]
@@ -482,6 +482,7 @@ START = np.array([[1.0, 0.0], [2.2, -0.5], [-0.3, 0.4]])
 TS = np.linspace(0.0, 1.0, 5)
 
 
+@pytest.mark.slow
 def test_a_single_state_gives_a_single_trajectory():
     X, Y = systems.sample(PENDULUM, START, TS)
     assert X.shape == Y.shape == (3, 5, 2)
@@ -648,6 +649,7 @@ def test_times_that_single_precision_cannot_tell_apart_are_refused():
         systems.sample(PENDULUM, START[0].astype(np.float32), ts)
 
 
+@pytest.mark.slow
 def test_trajectories_without_an_end_are_errors_that_name_the_row():
     fall = np.array([[1.0, 0.0, 0.0, 1.0], [1.0, 0.0, 0.0, 0.0]])  # the second meets the centre
     with pytest.raises(RuntimeError, match="row 1 could not be integrated"):

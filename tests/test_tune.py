@@ -328,6 +328,7 @@ def test_kernels_without_structure_and_functions_to_maximise_are_refused():
 # Objectives and optimisers.
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize("folds", ["loo", np.repeat([7, 3, 9], 5)], ids=["loo", "labels"])
 def test_folds_of_every_kind_are_tuned(folds):
@@ -615,7 +616,7 @@ def test_a_start_where_the_kernel_is_not_positive_definite_does_not_win():
     np.testing.assert_allclose(tuned.loss, fitted, rtol=SAME)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(("copies", "solver"), [(1, None), (3, hk.Cholesky()), (3, hk.Nystrom())])
 def test_a_kernel_that_is_positive_definite_nowhere_is_named_as_the_cause(copies, solver):
     X, Y = (np.tile(values, (copies, 1)) for values in scattered())
@@ -624,6 +625,7 @@ def test_a_kernel_that_is_positive_definite_nowhere_is_named_as_the_cause(copies
         hk.tune(nowhere, X, Y, solver=solver)
 
 
+@pytest.mark.slow
 def test_a_fit_or_a_simulation_that_fails_in_an_objective_is_a_point_that_cannot_win():
     X, Y = scattered()
 
@@ -788,6 +790,7 @@ def test_new_data_of_the_same_shape_does_not_recompile():
     assert len(traced) == count
 
 
+@pytest.mark.slow
 def test_a_second_search_with_features_compiles_nothing(caplog):
     solver = hk.RandomFeatures(20, jax.random.key(0))
 
@@ -821,6 +824,7 @@ def test_data_that_is_searched_on_a_subset_is_finished_on_all_of_it():
         assert refit_loss(tuned.kernel, X, Y, factor * tuned.regularization) > best * (1 - FLOOR)
 
 
+@pytest.mark.slow
 def test_conjugate_gradients_solve_what_was_tuned_on_noisy_data(simple):
     # Where the caller has said what λ is they may fail.
     X, Y = scattered()
@@ -902,6 +906,7 @@ def test_a_python_float_is_kept_with_a_warning(k, name):
     assert set(found.bounds) == {"regularization"}
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("k", "name"),

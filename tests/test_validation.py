@@ -304,6 +304,7 @@ def test_gradient_is_that_of_differences_right_before_the_factorisation_fails(na
     np.testing.assert_allclose(jax.grad(value)(u), expected, rtol=DIFFERENCES)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["cross-validation labels", "cross-validation loo"])
 def test_gradient_is_that_of_differences_where_points_coincide_and_the_ridge_is_small(name):
     X, Y = data()
@@ -319,6 +320,7 @@ def test_gradient_is_that_of_differences_where_points_coincide_and_the_ridge_is_
 # Failure.
 
 
+@pytest.mark.few(1)
 @of_each_formula
 def test_value_is_infinite_and_its_gradient_zero_where_the_factorisation_fails(name):
     X, Y = data()
@@ -369,7 +371,7 @@ def test_objectives_map_over_hyperparameters(name):
     np.testing.assert_allclose(np.diag(grid), expected, rtol=EXACT)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", OBJECTIVES)
 def test_new_values_do_not_recompile(name):
     traced = []
@@ -409,6 +411,7 @@ def test_labels_equal_in_value_do_not_recompile_and_others_do():
 ONE_LONG = np.append(np.zeros(240, int), 1 + np.arange(160) // 10)  # and sixteen short runs
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize(
     "folds", [5, "loo", np.arange(400) % 7, ONE_LONG], ids=["5", "loo", "labels", "one long"]
@@ -428,6 +431,7 @@ def test_loss_and_its_gradient_take_the_memory_of_three_grams(folds):
         assert gram < analysis.temp_size_in_bytes <= 3 * gram + small
 
 
+@pytest.mark.slow
 def test_many_hyperparameters_do_not_take_the_memory_of_many_grams():
     X, Y = data(16, count=100)
     k = hk.Gaussian(np.ones(16))

@@ -86,6 +86,7 @@ def test_likelihood_and_gcv_are_those_of_the_low_rank_gram(basis):
     np.testing.assert_allclose(found, N * n * (a @ a) / trace**2, rtol=ROUNDING)
 
 
+@pytest.mark.slow
 def test_with_all_points_as_landmarks_it_is_the_dense_loss():
     # A ridge far above what the columns left out as dependent carry.
     partition = partition_of_rows(ROWS, 5)
@@ -195,6 +196,7 @@ def test_columns_kept_of_many_close_points_are_independent_and_span_the_others()
     assert 50 < kept.sum() < 200
 
 
+@pytest.mark.slow
 def test_where_no_landmark_can_be_used_the_losses_are_infinite():
     # A fit is refused then; without columns it would be the zero field.
     for sign in (1.0, -1.0):
@@ -243,6 +245,7 @@ def test_tuning_with_low_rank_comes_to_the_optimum_of_the_dense_loss(
     assert type(tuned.field) is type(hk.fit(start, X, Y, 0.1, solver=SOLVERS[solver]))
 
 
+@pytest.mark.slow
 def test_the_loss_of_few_points_is_that_of_the_low_rank_fit_too():
     solver = hk.RandomFeatures(5, jax.random.key(1))
     tuned = hk.tune(hk.Symplectic(hk.Gaussian(1.0)), X, Y, 1e-2, 5, starts=1, solver=solver)

@@ -283,7 +283,7 @@ def _covariance(given: AbstractConditional, block: AbstractBlock) -> Float[Array
 def _range_of(U: Float[Array, "N m"]) -> Float[Array, "2 m"]:
     """A box around zero as large as the inputs."""
     most = jnp.max(jnp.abs(U), axis=0)
-    return jnp.where(most > 0, most, jnp.ones_like(most)) * jnp.array([[-1.0], [1.0]], U.dtype)
+    return jnp.array([[-1.0], [1.0]], U.dtype) * jnp.where(most > 0, most, 1)[None]
 
 
 def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
