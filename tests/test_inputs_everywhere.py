@@ -354,12 +354,3 @@ def test_a_posterior_says_which_inputs_it_needs():
     plain = hk.condition(hk.Symplectic(2.0 * hk.Gaussian()), X, Y, RIDGE)
     with pytest.raises(TypeError, match="has no inputs"):
         plain.covariance(x, u)
-
-
-def test_learn_refuses_inputs_and_says_what_to_do():
-    ts = np.linspace(0, 1, 9)
-    runs = hk.Runs([ts], [X], [U])
-    with pytest.raises(TypeError, match=r"inputs=jnp\.concatenate\(runs\.inputs\)"):
-        hk.learn(K, runs)
-    with pytest.raises(TypeError, match="leave inputs out of"):
-        hk.learn(hk.Symplectic(hk.Gaussian()), runs)

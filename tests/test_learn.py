@@ -67,7 +67,10 @@ def one_segment(seed=0, T=7):
     measured = rng.standard_normal((1, T, 2))
     arrays = (
         jnp.asarray(a)
-        for a in (spans, measured, np.ones_like(path), np.zeros_like(path), path[:, 0])
+        for a in (
+            *(spans, measured, np.ones_like(path), np.zeros_like(path), path[:, 0]),
+            np.zeros((1, T - 1, 2, 0)),
+        )
     )
     segments = Segments(*arrays)
     none = jnp.zeros((1, T - 1, 2, 2))
@@ -125,11 +128,12 @@ def test_along_a_true_path_rows_and_functionals_are_the_variation_of_constants()
     inner = (ts[:-1, None] + np.diff(ts)[:, None] * NODES).reshape(-1)
     nodes = jnp.asarray(true.sol(inner).T.reshape(1, 8, 3, n))
     counts = jnp.full_like(x, 4.0)
-    segments = Segments(jnp.diff(ts)[None], x, counts, jnp.zeros_like(x), x[:, 0])
-    path = frozen(x, nodes, segments.spans, jacobians(mean, nodes))
+    none = jnp.zeros((1, 8, 2, 0))
+    segments = Segments(jnp.diff(ts)[None], x, counts, jnp.zeros_like(x), x[:, 0], none)
+    path = frozen(x, nodes, segments.spans, jacobians(mean, nodes, n))
     slopes = jax.vmap(jax.vmap(jax.vmap(PENDULUM)))(nodes)
     rows = linearised(
-        path, slopes, means(mean, nodes), segments, jnp.array([True]), is_solution=False
+        path, slopes, means(mean, nodes, slopes), segments, jnp.array([True]), is_solution=False
     )
     expected = [x[0, i] - scipy.linalg.expm(A * t) @ x[0, 0] for i, t in enumerate(ts)]
     np.testing.assert_allclose(rows.target[0], expected, atol=1e-8)
@@ -174,7 +178,7 @@ def test_the_gradient_of_the_likelihood_is_that_of_finite_differences():
 def test_the_flow_and_its_tangent_are_exact_to_the_tolerance_of_the_integrator():
     starts = jnp.array([[1.0, 0.5], [-0.3, 1.2]])
     spans = np.full((2, 4), 0.2)
-    path = simulated(PENDULUM, starts, jnp.asarray(spans), jnp.full(4, 8))
+    path = simulated(PENDULUM, starts, jnp.asarray(spans), jnp.full(4, 8), jnp.zeros((2, 4, 2, 0)))
     ts = jnp.linspace(0, 0.8, 5)
 
     def flow(x):
@@ -188,7 +192,11 @@ def test_the_flow_and_its_tangent_are_exact_to_the_tolerance_of_the_integrator()
         np.testing.assert_allclose(path.across[s, 0], np.stack(ends, axis=1), atol=1e-7)
         # From a node to the end: the tangent over what is left of the interval.
         left = simulated(
-            PENDULUM, path.nodes[s, 0, 1][None], jnp.array([[0.2 * (1 - NODES[1])]]), jnp.array([8])
+            PENDULUM,
+            path.nodes[s, 0, 1][None],
+            jnp.array([[0.2 * (1 - NODES[1])]]),
+            jnp.array([8]),
+            jnp.zeros((1, 1, 2, 0)),
         )
         np.testing.assert_allclose(path.to_end[s, 0, 1], left.across[0, 0], atol=1e-9)
 

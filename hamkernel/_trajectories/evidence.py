@@ -35,13 +35,14 @@ _ROUNDINGS = 100.0
 class Columns(eqx.Module):
     """K(x, S) for many points x, as rows."""
 
-    points: Float[Array, "m n"]
+    points: Float[Array, "m d"]
 
-    def __call__(self, K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, "Nn q"]:
-        return assemble(K, X, self.points).reshape(X.size, self.points.size)
+    def __call__(self, K: AbstractMatrixKernel, X: Float[Array, "N d"]) -> Float[Array, "Nn q"]:
+        n = K.outputs(X.shape[1])
+        return assemble(K, X, self.points).reshape(len(X) * n, len(self.points) * n)
 
 
-def whitening(K: AbstractMatrixKernel, S: Float[Array, "m n"]) -> Float[Array, "q q"]:
+def whitening(K: AbstractMatrixKernel, S: Float[Array, "m d"]) -> Float[Array, "q q"]:
     """T = L⁻ᵀ with L Lᵀ = K(S, S), q = m n."""
     G = trained((K, S), Columns(S))
     rounding = _ROUNDINGS * jnp.finfo(G.dtype).eps * jnp.trace(G)
@@ -62,16 +63,16 @@ class Projected(NamedTuple):
 def projected(
     K: AbstractMatrixKernel,
     log_noise: Float[Array, " n"],
-    S: Float[Array, "m n"],
+    S: Float[Array, "m d"],
     rows: Rows,
     spread: Float[Array, " n"],
 ) -> Projected:
     """The rows for these hyperparameters; `spread` is the standard deviation of the starts."""
-    n, q = rows.nodes.shape[-1], S.size
-    size = len(rows.counts)
-    raw = trained((K, rows.nodes.reshape(-1, n)), Columns(S))
+    (*nodes, d), n = rows.nodes.shape, rows.target.shape[-1]
+    size, q = len(rows.counts), len(S) * n
+    raw = trained((K, rows.nodes.reshape(-1, d)), Columns(S))
     T = whitening(K, S)
-    M = accumulated(rows.across, rows.weights, raw.reshape(*rows.nodes.shape, q)) @ T
+    M = accumulated(rows.across, rows.weights, raw.reshape(*nodes, n, q)) @ T
     W = jnp.sqrt(rows.counts) * jnp.exp(-log_noise)[None, None]  # (S, L + 1, n)
     none = jnp.zeros((size, n, q), M.dtype)
     M = jnp.concatenate([(W[..., None] * M).reshape(size, -1, q), none], axis=1)
@@ -155,7 +156,7 @@ def solved(K, log_noise, S, rows: Rows, spread) -> Solution:
     used = len(w) - jnp.sum(inverse**2)  # tr M̃ (I + M̃ᵀM̃)⁻¹ M̃ᵀ
     started = rows.counts.any(axis=(1, 2)).sum() * U.shape[1]
     free = ((rows.counts > 0).sum() - started).astype(used.dtype) - used
-    return Solution(w, (made.T @ w).reshape(S.shape), moves, free)
+    return Solution(w, (made.T @ w).reshape(len(S), -1), moves, free)
 
 
 def back_substituted(U: Float[Array, "S n n"], b: Float[Array, "S n"]) -> Float[Array, "S n"]:

@@ -23,16 +23,30 @@ _MOST = 64  # steps between two nodes
 
 
 class Expansion(eqx.Module):
-    """f(x) = mean(x) + Σⱼ K(x, sⱼ) aⱼ."""
+    """f(x) = mean(x) + Σⱼ K(x, sⱼ) aⱼ; with inputs x and sⱼ are points (x, u)."""
 
     kernel: AbstractMatrixKernel
-    points: Float[Array, "m n"]
+    points: Float[Array, "m d"]
     coefficients: Float[Array, "m n"]
     mean: Callable[[Array], Array] | None
 
-    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    def __call__(self, x: Float[Array, " d"]) -> Float[Array, " n"]:
         learned = self.kernel.expansion(*centred(self.kernel, x, self.points), self.coefficients)
         return learned if self.mean is None else self.mean(x).astype(x.dtype) + learned
+
+
+def with_tangent(
+    field: Callable[[Array], Array], s: Float[Array, " d"], n: int
+) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
+    """F and ∂f/∂x at a point s = (x, u) with n coordinates of x."""
+    u = s[n:]
+
+    def twice(x):
+        f = field(jnp.concatenate([x, u]))
+        return f, f
+
+    tangent, f = jax.jacfwd(twice, has_aux=True)(s[:n])
+    return f, tangent
 
 
 class Path(NamedTuple):
@@ -40,13 +54,13 @@ class Path(NamedTuple):
 
     Attributes:
         x: states at the samples, shape (S, L + 1, n).
-        nodes: states at the Gauss nodes, shape (S, L, 3, n).
+        nodes: points at the Gauss nodes, (x, u) with inputs, shape (S, L, 3, d).
         to_end: the tangent from the nodes of an interval to its end, shape (S, L, 3, n, n).
         across: the tangent across an interval, shape (S, L, n, n).
     """
 
     x: Float[Array, "S L+1 n"]
-    nodes: Float[Array, "S L 3 n"]
+    nodes: Float[Array, "S L 3 d"]
     to_end: Float[Array, "S L 3 n n"]
     across: Float[Array, "S L n n"]
 
@@ -63,48 +77,50 @@ def simulated(
     starts: Float[Array, "S n"],
     spans: Float[Array, "S L"],
     steps: Int[Array, " L"],
+    inputs: Float[Array, "S L 2 m"],
 ) -> Path:
     """The path of each segment from its start, and its tangents.
 
-    Not finite from where the field is not.
+    Not finite from where the field is not. In shares of an interval of length h the point (x, u)
+    moves by (h f, u₁ − u₀), from the input u₀ at its beginning to u₁ at its end.
     """
     n = starts.shape[1]
 
-    def slope(x, V):
-        jacobian, f = jax.jacfwd(lambda x: (field(x),) * 2, has_aux=True)(x)
-        return f, jacobian @ V
+    def piece(s, V, h, rise, share, count):
+        part = share / count.astype(share.dtype)
 
-    def piece(x, V, dt, count):
-        dt = dt / count.astype(dt.dtype)
+        def slope(s, V):
+            f, D = with_tangent(field, s, n)
+            return jnp.concatenate([h * f, rise]), h * D @ V
 
         def step(_, at):
-            x, V = at
-            f1, D1 = slope(x, V)
-            f2, D2 = slope(x + dt / 2 * f1, V + dt / 2 * D1)
-            f3, D3 = slope(x + dt / 2 * f2, V + dt / 2 * D2)
-            f4, D4 = slope(x + dt * f3, V + dt * D3)
+            s, V = at
+            f1, D1 = slope(s, V)
+            f2, D2 = slope(s + part / 2 * f1, V + part / 2 * D1)
+            f3, D3 = slope(s + part / 2 * f2, V + part / 2 * D2)
+            f4, D4 = slope(s + part * f3, V + part * D3)
             return (
-                x + dt / 6 * (f1 + 2 * f2 + 2 * f3 + f4),
-                V + dt / 6 * (D1 + 2 * D2 + 2 * D3 + D4),
+                s + part / 6 * (f1 + 2 * f2 + 2 * f3 + f4),
+                V + part / 6 * (D1 + 2 * D2 + 2 * D3 + D4),
             )
 
-        return jax.lax.fori_loop(0, count, step, (x, V))
+        return jax.lax.fori_loop(0, count, step, (s, V))
 
-    def interval(x, h, count):
-        def part(x, share):
-            x, V = piece(x, jnp.eye(n, dtype=x.dtype), share * h, count)
-            return x, (x, V)
+    def interval(x, h, ends, count):
+        def part(s, share):
+            s, V = piece(s, jnp.eye(n, dtype=x.dtype), h, ends[1] - ends[0], share, count)
+            return s, (s, V)
 
-        end, (nodes, V) = jax.lax.scan(part, x, jnp.asarray(_PIECES, x.dtype))
+        start = jnp.concatenate([x, ends[0]])
+        end, (nodes, V) = jax.lax.scan(part, start, jnp.asarray(_PIECES, x.dtype))
         to_end = [V[3]]  # products from the end, so that nothing is inverted
         for tangent in (V[2], V[1], V[0]):
             to_end.append(to_end[-1] @ tangent)
-        return end, (end, nodes[:3], jnp.stack(to_end[2::-1]), to_end[3])
+        return end[:n], (end[:n], nodes[:3], jnp.stack(to_end[2::-1]), to_end[3])
 
-    def forward(x, inputs):
-        h, count = inputs
-        return jax.vmap(interval, in_axes=(0, 0, None))(x, h, count)
+    def forward(x, given):
+        return jax.vmap(interval, in_axes=(0, 0, 0, None))(x, *given)
 
-    _, out = jax.lax.scan(forward, starts, (spans.T, steps))
+    _, out = jax.lax.scan(forward, starts, (spans.T, jnp.moveaxis(inputs, 1, 0), steps))
     ends, nodes, to_end, across = (jnp.moveaxis(a, 0, 1) for a in out)
     return Path(jnp.concatenate([starts[:, None], ends], axis=1), nodes, to_end, across)

@@ -26,7 +26,7 @@ def functionals_of(rows: Rows, log_noise: Float[Array, " n"], mean: Any) -> Toge
             continue
         last = int(np.flatnonzero(counts.any(axis=1))[-1])  # padding follows
         B = _sums(np.asarray(rows.across[s, :last]), np.asarray(rows.weights[s, :last]))
-        nodes = np.asarray(rows.nodes[s, :last]).reshape(-1, counts.shape[1])
+        nodes = np.asarray(rows.nodes[s, :last]).reshape(-1, rows.nodes.shape[-1])
         seen = counts[: last + 1].reshape(-1) > 0
         W = (np.sqrt(counts[: last + 1]) / sigma[None]).reshape(-1)[seen]
         P = W[:, None] * np.asarray(rows.tangent[s, : last + 1]).reshape(-1, len(sigma))[seen]
@@ -37,8 +37,9 @@ def functionals_of(rows: Rows, log_noise: Float[Array, " n"], mean: Any) -> Toge
         target = C.T @ (W * np.asarray(rows.target[s, : last + 1]).reshape(-1)[seen])
         if mean is not None:
             target = target + B @ np.asarray(jax.vmap(mean)(jnp.asarray(nodes))).reshape(-1)
-        weights = B.reshape(1, len(B), *nodes.shape)
-        found.append(Functionals(nodes[None], weights, target[None]))
+        x, u = np.split(nodes[None], [len(sigma)], axis=2)
+        weights = B.reshape(1, len(B), *x.shape[1:])
+        found.append(Functionals(x, weights, target[None], u if u.size else None))
     return Together(tuple(found)) if found else None
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._trajectories.evidence import Box, Model, losses, most_likely, solved, whitening
-from hamkernel._trajectories.flow import Expansion, steps_for
+from hamkernel._trajectories.flow import Expansion, steps_for, with_tangent
 from hamkernel._trajectories.learned import Step
 from hamkernel._trajectories.prepared import Prepared
 from hamkernel._trajectories.rows import Rows
@@ -35,7 +35,7 @@ class Task(NamedTuple):
 
     data: Prepared
     mean: Any
-    S: Float[Array, "m n"]
+    S: Float[Array, "m d"]
     box: Box
     spread: Float[Array, " n"]
 
@@ -86,7 +86,7 @@ def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, St
     """GN: one linearisation along the current field, one closed form, one line search."""
     runs = task.data.runs
     segments = segmented(runs, pieces, now.paths)
-    count = steps_for(np.asarray(segments.spans), _stiffness(now.field, now.paths))
+    count = steps_for(np.asarray(segments.spans), _stiffness(now.field, task.data, now.paths))
     steps = jnp.asarray(count)
     before = shot(
         now.field, segments, now.model.log_noise, task.spread, steps, segments.starts, _ROUNDS
@@ -103,7 +103,7 @@ def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, St
 
     def trial(share: float) -> _Trial:
         weights = (1 - share) * old + share * found.weights
-        field = Expansion(model.kernel, task.S, (T @ weights).reshape(task.S.shape), task.mean)
+        field = Expansion(model.kernel, task.S, (T @ weights).reshape(len(task.S), -1), task.mean)
         starts = before.starts + share * found.moves
         there = shot(field, segments, model.log_noise, task.spread, steps, starts, _ROUNDS)
         squares = float(np.asarray(there.squares)[good].sum())
@@ -150,15 +150,15 @@ _whitening = eqx.filter_jit(whitening)
 
 
 @eqx.filter_jit
-def _norms(field, X: Float[Array, "N n"]) -> Float[Array, " N"]:
-    return jax.vmap(lambda x: jnp.linalg.norm(jax.jacfwd(field)(x)))(X)
+def _norms(field, X: Float[Array, "N d"], n: int) -> Float[Array, " N"]:
+    return jax.vmap(lambda s: jnp.linalg.norm(with_tangent(field, s, n)[1]))(X)
 
 
-def _stiffness(field: Expansion, paths: list[np.ndarray]) -> float:
-    """‖Df‖ along the paths, but for the largest twentieth."""
-    X = np.concatenate(paths)
+def _stiffness(field: Expansion, data: Prepared, paths: list[np.ndarray]) -> float:
+    """‖∂f/∂x‖ along the paths, but for the largest twentieth."""
+    X = np.concatenate([run.joined(path) for run, path in zip(data.runs, paths, strict=True)])
     X = X[np.linspace(0, len(X) - 1, 256).round().astype(int)]
-    norms = np.asarray(_norms(field, jnp.asarray(X)))
+    norms = np.asarray(_norms(field, jnp.asarray(X), len(data.scale)))
     return float(np.nanquantile(np.where(np.isfinite(norms), norms, 0.0), 0.95))
 
 

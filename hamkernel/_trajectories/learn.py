@@ -12,9 +12,12 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo
+from hamkernel._fields.controlled import learned_field
 from hamkernel._fields.kernel_field import KernelField
+from hamkernel._fields.known import known_part
 from hamkernel._gram.operator import placed_product
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._observations.data import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._trajectories.evidence import Model
@@ -53,7 +56,7 @@ _UNCHANGED = 1e-4  # of the field: without noise its digits end before the objec
 def learn(
     K: AbstractMatrixKernel,
     runs: Runs,
-    mean: Callable[[Array], Array] | None = None,
+    mean: Callable[..., Array] | None = None,
     noise: ArrayLike | None = None,
     solver: Nystrom | None = None,
     *,
@@ -71,14 +74,16 @@ def learn(
 
     Args:
         K: a matrix-valued kernel. Its hyperparameters are the first guess. A structure without an
-            amplitude gets one, `Symplectic(k)` becomes `Symplectic(1.0 * k)`.
-        runs: what was logged; see `Runs`.
-        mean: a known part of the field, x (n,) -> (n,); K learns the rest.
+            amplitude gets one, `Symplectic(k)` becomes `Symplectic(1.0 * k)`. Runs with inputs need
+            a `Controlled` one.
+        runs: what was logged; see `Runs`, and there how inputs go on between samples.
+        mean: a known part of the field, x (n,) -> (n,), or with inputs x, u -> (n,) too; K learns
+            the rest.
         noise: the standard deviation of the sensor noise, in units of the states, a number or one
             for each coordinate, shape (n,), if it is known; then a field that does not explain the
             runs is detected. If None, it is estimated.
         solver: `hk.Nystrom(max_points=…)` sets how many landmarks carry the field; if None, 48 for
-            n = 2 and 80 for n = 4, which cover the paths evenly.
+            n = 2 and 80 for n = 4, which cover the paths evenly. Inputs count as coordinates.
         masses: whether states are (q, q̇) with unknown masses instead of (q, p). Their ratios are
             then learned, `learned.kernel.masses`; see `UnknownMasses`, whose kernel K becomes.
         progress: show a progress bar (tqdm).
@@ -88,35 +93,36 @@ def learn(
         Runs of other lengths, in the same powers of two, do not compile anew.
 
     Raises:
-        TypeError: there are inputs (the text says what to do), K is not matrix-valued, `runs` no
-            Runs, or `solver` no Nystrom. ValueError: n is not one that the structure allows; the
-            noise is not positive; a coordinate was never measured and no mean says how it moves
-            the others; doubles are not enabled.
+        TypeError: the runs have inputs and K takes none, or the other way round; K is not
+            matrix-valued, `runs` no Runs, or `solver` no Nystrom. ValueError: n is not one that the
+            structure allows; the inputs cannot be told from the drift; the noise is not positive; a
+            coordinate was never measured and no mean says how it moves the others; doubles are not
+            enabled.
 
     Warns:
         UserWarning: parts of runs were dropped, the structure does not explain the runs, or the
             iterations did not settle.
     """
-    K = with_amplitude(matrix_kernel(K))
-    given = _check(K, runs, noise, solver)
+    K, given = _check(with_amplitude(matrix_kernel(K)), runs, noise, solver)
     if masses:
         K = with_masses(K, runs.dimension)
-    check_identifiable(runs, mean)
-    mean = None if mean is None else as_pytree(mean)
-    data = prepared(runs, mean)
+    known = known_part(K, mean, runs.dimension, jnp.float64)
+    check_identifiable(runs, known)
+    data = prepared(runs, known)
     measured = np.isfinite(data.noise)
     X, Y = sampled(data)
-    if mean is not None:
-        Y = Y - np.asarray(jax.vmap(mean)(jnp.asarray(X)))
+    if known is not None:
+        Y = Y - np.asarray(jax.vmap(known)(jnp.asarray(X)))
     # Smoothing may find no noise at all; a share of 1e-7 is what the digits of a log leave.
     level = np.maximum(np.where(measured, data.noise, data.scale), 1e-6 * data.scale)
     model = Model(K, jnp.log(jnp.asarray(level if given is None else given)))
     moves = measured & (given is None)
     box, design = box_of(model, X, Y, data.scale, moves)
     S = landmarks(X, data.scale, None if solver is None else solver.max_points)
-    task = Task(data, mean, S, box, jnp.asarray(_WIDE * data.scale))
+    task = Task(data, known, S, box, jnp.asarray(_WIDE * data.scale))
     now, pieces, history, converged = _iterated(task, begin(task, model, design), progress)
-    return _learned(runs, task, now, pieces, history, converged, given is not None, measured)
+    mean = None if mean is None else as_pytree(mean)
+    return _learned(runs, mean, task, now, pieces, history, converged, given is not None, measured)
 
 
 def _iterated(
@@ -152,6 +158,7 @@ def _iterated(
 
 def _learned(
     runs: Runs,
+    mean: Any,
     task: Task,
     now: Current,
     pieces: list[Piece],
@@ -167,7 +174,7 @@ def _learned(
     states = [
         path
         if len(path) == len(t)
-        else interpolated(t - t[0], run.times, path, np.asarray(velocity(jnp.asarray(path))))
+        else interpolated(t - t[0], run.times, path, np.asarray(velocity(run.joined(path))))
         for t, run, path in zip(times, data.runs, now.paths, strict=True)
     ]
     kept = np.zeros(len(data.runs))
@@ -204,29 +211,32 @@ def _learned(
         converged=converged,
         runs=runs,
         observations=observations,
-        mean=task.mean,
+        mean=mean,
     )
 
 
-def _field(found: Expansion, regularization: Float[Array, ""]) -> KernelField:
+def _field(found: Expansion, regularization: Float[Array, ""]) -> Any:
     """The field as one of the library."""
     S, A = found.points, found.coefficients
     square = jnp.sum(A * placed_product(found.kernel, S, S, A))  # ‖f‖² = aᵀGa
-    return KernelField(
+    field = KernelField(
         kernel=found.kernel,
         points=S,
         coefficients=A,
-        residual=empty(S.shape[1]),
+        residual=empty(A.shape[1]),
         norm=jnp.sqrt(jnp.maximum(square, 0.0)),
         regularization=regularization,
         offset=jnp.zeros((), S.dtype),
         info=SolverInfo("learn", landmarks=jnp.asarray(len(S))),
-        mean=found.mean,
+        mean=None,
     )
+    return learned_field(field, found.mean)
 
 
-def _check(K: AbstractMatrixKernel, runs: Any, noise: Any, solver: Any) -> np.ndarray | None:
-    """The noise that was given, for each coordinate; what is wrong with the arguments is said."""
+def _check(
+    K: AbstractMatrixKernel, runs: Any, noise: Any, solver: Any
+) -> tuple[AbstractMatrixKernel, np.ndarray | None]:
+    """The kernel, which knows how many inputs there are, and the noise that was given, (n,)."""
     if not isinstance(runs, Runs):
         raise TypeError(
             f"learn takes hk.Runs(times, states), lists of arrays, one entry a run; got a "
@@ -235,24 +245,32 @@ def _check(K: AbstractMatrixKernel, runs: Any, noise: Any, solver: Any) -> np.nd
     if not (solver is None or isinstance(solver, Nystrom)):
         raise TypeError(f"the solver of learn is hk.Nystrom(max_points=…) or None; got {solver!r}.")
     n = runs.dimension
-    if K.takes_inputs or runs.inputs is not None:
+    if K.takes_inputs and runs.inputs is None:
         raise TypeError(
-            "learn does not know inputs yet. Smooth the runs and learn from their velocities: "
-            "X, Y, _ = runs.velocities(), and hk.tune(K, X, Y, inputs=jnp.concatenate(runs.inputs),"
-            " objective='marginal_likelihood'). To ignore what was applied, leave inputs out of "
-            "Runs."
+            f"{type(K).__name__} needs what was applied: hk.Runs(times, states, inputs), for each "
+            "run u at its times, shape (T, m)."
         )
-    K.check_dimension(n)
+    if runs.inputs is not None and not K.takes_inputs:
+        raise TypeError(
+            f"the runs have inputs and {type(K).__name__} takes none: say how they act, "
+            "hk.Controlled(K, inputs=hk.InputMatrix(1.0, acts_on=(1,))). To ignore what was applied"
+            ", leave inputs out of Runs."
+        )
+    if runs.inputs is None:
+        K.check_dimension(n)
+    else:
+        U = jnp.concatenate(runs.inputs)
+        K, _ = sampled_points(K, jnp.zeros((len(U), n), U.dtype), U)
     if jnp.zeros(()).dtype != jnp.float64:
         raise ValueError(
             "learn needs doubles, since paths and their tangents are compared over many steps: "
             "jax.config.update('jax_enable_x64', True) first."
         )
     if noise is None:
-        return None
+        return K, None
     given = np.asarray(
         require.positive(noise, "noise", "Leave it out to have it found from the runs.")
     )
     if given.shape not in ((), (n,)):
         raise ValueError(f"noise has shape {given.shape}; a number or shape ({n},) is needed.")
-    return np.broadcast_to(given, (n,))
+    return K, np.broadcast_to(given, (n,))

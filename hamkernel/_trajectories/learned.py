@@ -75,7 +75,7 @@ class Learned(eqx.Module):
             linear functionals of it, with independent noise of variance one. `hk.fit(kernel,
             observations, regularization=regularization)` is the exact fit of which `field`
             is the one on landmarks. None where there were too few samples.
-        mean: the known part of the field, if there is one.
+        mean: the known part of the field, if one was given.
     """
 
     field: Any
@@ -109,7 +109,8 @@ class Learned(eqx.Module):
         if self.observations is None:
             raise ValueError("no run had enough samples to say anything of the field.")
         rows = sum(len(targets) for _, targets in self.observations.parts())
-        solver = None if rows <= _EXACT else Nystrom(points=self.field.points)
+        whole = getattr(self.field, "whole", self.field)  # of the points (x, u) with inputs
+        solver = None if rows <= _EXACT else Nystrom(points=whole.points)
         return condition(
             self.kernel,
             self.observations,

@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel import _require as require
-from hamkernel._trajectories.flow import NODES
+from hamkernel._trajectories.flow import NODES, with_tangent
 from hamkernel._trajectories.hermite import interpolated
+from hamkernel._trajectories.inputs import at_nodes, at_samples, in_intervals
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.smoothing import Coordinate, processes, smoothed
 
@@ -43,6 +44,7 @@ class Run(NamedTuple):
         nodes: the same at the Gauss nodes between them, shape (T − 1, 3, n).
         slopes: their velocities there.
         gaps: the samples before which the path is a guess.
+        inputs: at both ends of each interval, shape (T − 1, 2, m); m is 0 where there are none.
     """
 
     times: np.ndarray
@@ -53,10 +55,15 @@ class Run(NamedTuple):
     nodes: np.ndarray
     slopes: np.ndarray
     gaps: np.ndarray
+    inputs: np.ndarray
 
     @property
     def duration(self) -> float:
         return float(self.times[-1] - self.times[0])
+
+    def joined(self, path: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T d"]:
+        """Points (x, u) at the samples, for a path there."""
+        return np.concatenate([path, at_samples(self.inputs)], axis=1)
 
 
 class Prepared(NamedTuple):
@@ -76,9 +83,12 @@ class Prepared(NamedTuple):
 
 
 def prepared(runs: Runs, mean: Callable[[Array], Array] | None) -> Prepared:
-    """Condense, smooth and complete the runs; `mean` fills in what was never measured."""
+    """Condense, smooth and complete the runs; `mean` fills in what was never measured.
+
+    With inputs it is a function of the points (x, u).
+    """
     times, states = runs.on_host()
-    times = [t - t[0] for t in times]
+    logged = times = [t - t[0] for t in times]
     found, usable = _robust_processes(times, states)
     counts = [np.isfinite(x).astype(float) for x in states]
     scatter = [np.zeros_like(x) for x in states]
@@ -92,7 +102,11 @@ def prepared(runs: Runs, mean: Callable[[Array], Array] | None) -> Prepared:
         ]
         times, states, counts, scatter = (list(each) for each in zip(*condensed, strict=True))
     gap = _GAP * min(lengths, default=np.inf)
-    path_runs = _with_paths(found, times, states, counts, scatter, gap)
+    inputs = [
+        in_intervals(t, u, at, runs.between == "held")
+        for t, u, at in zip(logged, runs.applied(), times, strict=True)
+    ]
+    path_runs = _with_paths(found, times, states, counts, scatter, inputs, gap)
     if not all(c.seen for c in found) or mean is not None:
         path_runs = [_completed(run, mean) for run in path_runs]
     noise = np.array([c.noise if c.seen else np.nan for c in found])
@@ -137,7 +151,7 @@ def _condensed(t, x, path, slope, block: float):
     return middle, np.where(counts > 0, there + means, np.nan), counts, scatter
 
 
-def _with_paths(found, times, states, counts, scatter, gap: float) -> list[Run]:
+def _with_paths(found, times, states, counts, scatter, inputs, gap: float) -> list[Run]:
     """The smoothed path at the samples and at the nodes between them."""
     grids, filled = [], []
     for t, x in zip(times, states, strict=True):
@@ -149,13 +163,14 @@ def _with_paths(found, times, states, counts, scatter, gap: float) -> list[Run]:
         filled.append(wide)
     paths = smoothed(found, grids, filled)
     out = []
-    for r, (t, x, count, about) in enumerate(zip(times, states, counts, scatter, strict=True)):
+    each = zip(times, states, counts, scatter, inputs, strict=True)
+    for r, (t, x, count, about, ends) in enumerate(each):
         size = 4 * len(t) - 3
         value, slope = (a[r, :size] for a in (paths.value, paths.slope))
         nodes, slopes = (a[:-1].reshape(len(t) - 1, 4, -1)[:, 1:] for a in (value, slope))
         spans = np.diff(t)
         gaps = 1 + np.flatnonzero((spans > gap) & (spans > _INTERVALS * np.median(spans)))
-        out.append(Run(t, x, count, about, value[::4], nodes, slopes, gaps))
+        out.append(Run(t, x, count, about, value[::4], nodes, slopes, gaps, ends))
     return out
 
 
@@ -176,27 +191,29 @@ def _completed(run: Run, mean: Callable[[Array], Array] | None) -> Run:
         )
     n = run.states.shape[1]
     nodes, slopes = run.nodes.reshape(-1, n), run.slopes.reshape(-1, n)
-    there = np.array(_solved_for(mean, np.nan_to_num(nodes), np.nan_to_num(slopes), missing))
+    u = np.asarray(at_nodes(run.inputs)).reshape(len(nodes), -1)
+    there = np.array(_solved_for(mean, np.nan_to_num(nodes), u, np.nan_to_num(slopes), missing))
     span = np.diff(run.times)
-    at_nodes = (run.times[:-1, None] + span[:, None] * NODES[None]).ravel()
+    inner = (run.times[:-1, None] + span[:, None] * NODES[None]).ravel()
     path, found_slopes = run.path.copy(), slopes.copy()
     for c in np.flatnonzero(missing):
-        path[:, c] = np.interp(run.times, at_nodes, there[:, c])
-        gradient = np.gradient(there[:, c], at_nodes) if len(at_nodes) > 1 else 0.0
+        path[:, c] = np.interp(run.times, inner, there[:, c])
+        gradient = np.gradient(there[:, c], inner) if len(inner) > 1 else 0.0
         found_slopes[:, c] = gradient
     shape = run.nodes.shape
     return run._replace(path=path, nodes=there.reshape(shape), slopes=found_slopes.reshape(shape))
 
 
 @eqx.filter_jit
-def _solved_for(mean, X, slopes, missing):
+def _solved_for(mean, X, U, slopes, missing):
     """X with its missing coordinates such that the mean has the slopes of the others."""
     on = jnp.asarray(missing)
 
-    def one(x, slope):
+    def one(x, u, slope):
         def step(x, _):
-            D = jnp.where(on[None, :] & ~on[:, None], jax.jacfwd(mean)(x), 0.0)
-            wrong = jnp.where(on, 0.0, slope - mean(x))
+            f, D = with_tangent(mean, jnp.concatenate([x, u]), len(x))
+            D = jnp.where(on[None, :] & ~on[:, None], D, 0.0)
+            wrong = jnp.where(on, 0.0, slope - f)
             A = D.T @ D
             # The smallest ridge that keeps coordinates that move nothing where they are.
             A = A + 1e-9 * (1 + jnp.trace(A)) * jnp.eye(len(x), dtype=x.dtype)
@@ -204,11 +221,11 @@ def _solved_for(mean, X, slopes, missing):
 
         return jax.lax.scan(step, x, length=5)[0]
 
-    return jax.lax.map(lambda pair: one(*pair), (X, slopes))
+    return jax.lax.map(lambda each: one(*each), (X, U, slopes))
 
 
 def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> None:
-    """A coordinate that no run measured must be known through a mean."""
+    """A coordinate that no run measured must be known through a mean, of the points (x, u)."""
     never = ~np.any([np.isfinite(np.asarray(x)).any(axis=0) for x in runs.states], axis=0)
     if not never.any():
         return
@@ -221,10 +238,10 @@ def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> Non
             "and K a kernel for the rest, such as hk.Symplectic(hk.Select(k, 0)) for ṗ = -U'(q). "
             "Or log it."
         )
-    n = runs.dimension
-    points = np.random.default_rng(0).standard_normal((8, n))
+    d = runs.dimension + runs.applied()[0].shape[1]
+    points = np.random.default_rng(0).standard_normal((8, d))
     with require.traceable("mean"):
-        D = np.asarray(jax.vmap(jax.jacfwd(mean))(jnp.asarray(points)))
+        D = np.asarray(jax.vmap(jax.jacfwd(mean))(jnp.asarray(points)))  # (8, n, d)
     blind = [c for c in np.flatnonzero(never) if not np.abs(D[:, ~never, c]).max() > 0]
     if blind:
         raise ValueError(

@@ -31,6 +31,7 @@ class Segments(NamedTuple):
         counts: how many samples an entry stands for, 0 where nothing was seen, the same shape.
         scatter: the sum of squares of those samples about the entry, the same shape.
         starts: where the segments may begin, shape (S, n).
+        inputs: at both ends of each interval, shape (S, L, 2, m); m is 0 where there are none.
     """
 
     spans: Float[Array, "S L"]
@@ -38,13 +39,14 @@ class Segments(NamedTuple):
     counts: Float[Array, "S L+1 n"]
     scatter: Float[Array, "S L+1 n"]
     starts: Float[Array, "S n"]
+    inputs: Float[Array, "S L 2 m"]
 
 
 class Rows(NamedTuple):
     """What the samples say of g = f − m, before the starts are projected out.
 
     Attributes:
-        nodes: where g is asked for, shape (S, L, 3, n).
+        nodes: where g is asked for, shape (S, L, 3, d), d = n + m with inputs: points (x, u).
         across: Ψ, shape (S, L, n, n).
         weights: Γ, shape (S, L, 3, n, n).
         tangent: Φ at the samples, shape (S, L + 1, n, n).
@@ -55,7 +57,7 @@ class Rows(NamedTuple):
         displaced: where the prior of the start has its middle, relative to x̂, shape (S, n).
     """
 
-    nodes: Float[Array, "S L 3 n"]
+    nodes: Float[Array, "S L 3 d"]
     across: Float[Array, "S L n n"]
     weights: Float[Array, "S L 3 n n"]
     tangent: Float[Array, "S L+1 n n"]
@@ -149,7 +151,7 @@ def _where(good, a):
 
 def frozen(
     x: Float[Array, "S L+1 n"],
-    nodes: Float[Array, "S L 3 n"],
+    nodes: Float[Array, "S L 3 d"],
     spans: Float[Array, "S L"],
     jacobians: Float[Array, "S L n n"],
 ) -> Path:
@@ -169,21 +171,22 @@ def frozen(
 
 
 def segments_of(
-    pieces: list[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]],
+    pieces: list[tuple[np.ndarray, ...]],
     size: int,
     length: int,
 ) -> Segments:
-    """Pieces (times, states, counts, scatter, start) as `size` segments of `length` samples."""
-    n = pieces[0][1].shape[1]
+    """`size` segments of `length` samples of pieces (times, states, counts, scatter, start, u)."""
+    n, m = pieces[0][1].shape[1], pieces[0][5].shape[2]
     spans = np.zeros((size, length - 1))
     measured, counts, scatter = np.zeros((3, size, length, n))
-    starts = np.zeros((size, n))
-    for s, (t, x, count, squares, start) in enumerate(pieces):
+    starts, inputs = np.zeros((size, n)), np.zeros((size, length - 1, 2, m))
+    for s, (t, x, count, squares, start, ends) in enumerate(pieces):
         T = len(t)
         spans[s, : T - 1] = np.diff(t)
         seen = np.isfinite(x)
         measured[s, :T] = np.where(seen, x, 0.0)
         counts[s, :T] = np.where(seen, count, 0.0)
         scatter[s, :T] = np.where(seen, squares, 0.0)
-        starts[s] = start
-    return Segments(*(jnp.asarray(a) for a in (spans, measured, counts, scatter, starts)))
+        starts[s], inputs[s, : T - 1] = start, ends
+    arrays = spans, measured, counts, scatter, starts, inputs
+    return Segments(*(jnp.asarray(a) for a in arrays))

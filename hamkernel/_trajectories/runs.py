@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, Literal
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,13 +26,18 @@ class Runs(eqx.Module):
     Args:
         times: for each run the times of its samples, shape (T,), strictly increasing.
         states: for each run the states, shape (T, n). Angles must be continuous: `np.unwrap`.
-        inputs: for each run what was applied, shape (T, m), kept with the times; None if nothing.
+        inputs: for each run what was applied, u at the times, shape (T, m), for `learn` with a
+            `Controlled` kernel; None if nothing.
+        between: how inputs go on from a sample, as in `simulate`: "held" until the next, as a
+            digital controller holds its command, or "linear", for a measured force or a smooth one.
+            Where they were held and are taken for linear, they come half a sample early.
 
     A single run may be given as bare arrays (T,) and (T, n).
 
     Raises:
-        ValueError: shapes do not fit, a run has one sample only, times do not increase, or an entry
-            is infinite. TypeError: something is not an array of real numbers.
+        ValueError: shapes do not fit, a run has one sample only, times do not increase, an entry is
+            infinite, an input is NaN, or `between` is unknown. TypeError: something is not an array
+            of real numbers.
 
     Warns:
         UserWarning: a jump of 2π, a long gap, a coordinate that never moves: once, with the run.
@@ -41,8 +46,15 @@ class Runs(eqx.Module):
     times: tuple[Float[Array, " T"], ...]
     states: tuple[Float[Array, "T n"], ...]
     inputs: tuple[Float[Array, "T m"], ...] | None
+    between: Literal["held", "linear"] = eqx.field(static=True)
 
-    def __init__(self, times: Any, states: Any, inputs: Any = None):
+    def __init__(
+        self,
+        times: Any,
+        states: Any,
+        inputs: Any = None,
+        between: Literal["held", "linear"] = "held",
+    ):
         if hasattr(times, "ndim") and times.ndim == 1:  # one run
             times, states = [times], [states]
             inputs = None if inputs is None else [inputs]
@@ -57,6 +69,10 @@ class Runs(eqx.Module):
         if inputs is not None:
             pairs = zip(inputs, self.times, strict=True)
             self.inputs = tuple(_rows(u, t, r, "inputs") for r, (u, t) in enumerate(pairs))
+            _check_inputs(self.inputs)
+        if between not in ("held", "linear"):
+            raise ValueError(f"between must be 'held' or 'linear'; got {between!r}.")
+        self.between = between
         _check_coordinates(self.states)
         _warn_of_oddities(self.times, self.states)
 
@@ -118,6 +134,12 @@ class Runs(eqx.Module):
         return [np.asarray(t, float) for t in self.times], [
             np.asarray(x, float) for x in self.states
         ]
+
+    def applied(self) -> list[np.ndarray]:
+        """The inputs as NumPy arrays of doubles, shape (T, 0) where there are none."""
+        if self.inputs is None:
+            return [np.zeros((len(t), 0)) for t in self.times]
+        return [np.asarray(u, float) for u in self.inputs]
 
     def _check_measured(self) -> None:
         for c in range(self.dimension):
@@ -191,6 +213,19 @@ def _check_coordinates(states: tuple[Array, ...]) -> None:
     for run, x in enumerate(states):
         if not np.isfinite(np.asarray(x)).any():
             raise ValueError(f"nothing was measured in run {run}: leave it out.")
+
+
+def _check_inputs(inputs: tuple[Array, ...]) -> None:
+    sizes = {u.shape[1] for u in inputs}
+    if len(sizes) > 1:
+        raise ValueError(f"the runs have {sorted(sizes)} inputs: all need the same m.")
+    for run, u in enumerate(inputs):
+        if np.isnan(np.asarray(u)).any():
+            raise ValueError(
+                f"inputs[{run}] contains NaN at sample {np.argwhere(np.isnan(np.asarray(u)))[0][0]}"
+                ": what was applied must be known at every sample. Repeat the command that was held"
+                ", interpolate, or cut the run there."
+            )
 
 
 def _warn_of_oddities(times: tuple[Array, ...], states: tuple[Array, ...]) -> None:

@@ -80,7 +80,7 @@ def segmented(runs: list[Run], pieces: list[Piece], paths: list[np.ndarray]) -> 
     for r, start, stop in pieces:
         run, part = runs[r], slice(start, stop)
         own = run.times, run.states, run.counts, run.scatter
-        filled.append((*(a[part] for a in own), paths[r][start]))
+        filled.append((*(a[part] for a in own), paths[r][start], run.inputs[start : stop - 1]))
     return segments_of(filled, half_octave(len(pieces)), length)
 
 
@@ -118,7 +118,7 @@ def shot(
     prior = jnp.broadcast_to(jnp.diag(1 / spread), (S, n, n))
 
     def at(z):
-        path = simulated(field, z, segments.spans, steps)
+        path = simulated(field, z, segments.spans, steps, segments.inputs)
         r = (W * (segments.measured - path.x)).reshape(S, -1)
         r = jnp.concatenate([r, (segments.starts - z) / spread[None]], axis=1)
         squares = jnp.sum(r**2, axis=1)
@@ -185,11 +185,15 @@ def rows_along(field: Expansion, path: Path, segments: Segments, good) -> Rows:
     """The rows along the path of the current field."""
     nodes = jnp.where(good[:, None, None, None], path.nodes, jnp.zeros_like(path.nodes))
     slopes = jax.vmap(jax.vmap(jax.vmap(field)))(nodes)
-    return linearised(path, slopes, means(field.mean, nodes), segments, good, is_solution=True)
+    return linearised(
+        path, slopes, means(field.mean, nodes, slopes), segments, good, is_solution=True
+    )
 
 
-def means(mean, nodes: Float[Array, "S L 3 n"]) -> Float[Array, "S L 3 n"]:
-    """The prior mean at the nodes."""
+def means(
+    mean, nodes: Float[Array, "S L 3 d"], slopes: Float[Array, "S L 3 n"]
+) -> Float[Array, "S L 3 n"]:
+    """The prior mean at the nodes, whose slopes have its shape."""
     if mean is None:
-        return jnp.zeros_like(nodes)
+        return jnp.zeros_like(slopes)
     return jax.vmap(jax.vmap(jax.vmap(mean)))(nodes).astype(nodes.dtype)

@@ -8,10 +8,12 @@ from jaxtyping import Array, Float
 
 from hamkernel._kernels.base import Scaled
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.controlled import Controlled, InputMatrix
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import AbstractStructure
 from hamkernel._trajectories.evidence import Box, Model
-from hamkernel._trajectories.flow import WEIGHTS
+from hamkernel._trajectories.flow import WEIGHTS, with_tangent
+from hamkernel._trajectories.inputs import at_nodes
 from hamkernel._trajectories.prepared import Prepared
 from hamkernel._trajectories.rows import Rows, Segments, frozen, linearised
 from hamkernel._trajectories.shooting import Piece, means
@@ -26,13 +28,13 @@ _NOISES = (0.01, 0.1)
 
 
 def with_amplitude(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
-    """K, every structure in it scaled; a likelihood needs amplitudes.
+    """K, every structure and input matrix in it scaled; a likelihood needs amplitudes.
 
     `Symplectic(Gaussian(2.0))` becomes `Symplectic(1.0 * Gaussian(2.0))`.
     """
 
     def is_structure(node: object) -> bool:
-        return isinstance(node, AbstractStructure)
+        return isinstance(node, AbstractStructure | InputMatrix)
 
     def scaled(node):
         if not is_structure(node) or node.kernel.has_amplitude:
@@ -50,26 +52,30 @@ def with_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
             "only a unit of the energy, so there is nothing to find. Leave it out; (q, q̇) is "
             "(q, p) of a mass of one."
         )
+    if isinstance(K, Controlled):
+        return Controlled(with_masses(K.drift, n), K.inputs, K.count)
     return K if isinstance(K, UnknownMasses) else UnknownMasses(K, jnp.ones(n // 2))
 
 
-def sampled(data: Prepared) -> tuple[Float[np.ndarray, "N n"], Float[np.ndarray, "N n"]]:
-    """States and velocities of the smoothed runs at some of their nodes."""
+def sampled(data: Prepared) -> tuple[Float[np.ndarray, "N d"], Float[np.ndarray, "N n"]]:
+    """Points, (x, u) with inputs, and velocities of the smoothed runs at some of their nodes."""
     n = len(data.scale)
     runs = [run for run, use in zip(data.runs, data.usable, strict=True) if use]
-    X = np.concatenate([run.nodes.reshape(-1, n) for run in runs])
+    points = [np.concatenate([run.nodes, at_nodes(run.inputs)], axis=-1) for run in runs]
+    X = np.concatenate([each.reshape(-1, each.shape[-1]) for each in points])
     Y = np.concatenate([run.slopes.reshape(-1, n) for run in runs])
     chosen = np.unique(np.linspace(0, len(X) - 1, min(len(X), _POINTS)).round().astype(int))
     return X[chosen], Y[chosen]
 
 
-def landmarks(X: Float[np.ndarray, "N n"], scale, count: int | None) -> Float[Array, "m n"]:
+def landmarks(X: Float[np.ndarray, "N d"], scale, count: int | None) -> Float[Array, "m d"]:
     """Points of X that cover it: each the one farthest from those before, in standard deviations.
 
     They do not depend on hyperparameters, which are not known yet.
     """
     count = _FEWEST.get(X.shape[1], 128) if count is None else count
-    points = X / scale[None]
+    spread = X[:, len(scale) :].std(axis=0)  # of the inputs
+    points = X / np.concatenate([scale, np.where(spread > 0, spread, 1.0)])[None]
     chosen = [int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
     distance = np.full(len(points), np.inf)
     while len(chosen) < min(count, len(points)):
@@ -87,7 +93,7 @@ def box_of(
 
     Args:
         model: the caller's kernel and the noise of the smoothed runs.
-        X: states.
+        X: states, with inputs the points (x, u).
         Y: their velocities.
         scale: the standard deviations of the coordinates.
         moves: the coordinates whose noise is looked for.
@@ -105,7 +111,7 @@ def box_of(
     none = np.zeros(len(scale), bool)
     lengths = np.append([name.endswith("lengthscale") for name in names], none).astype(bool)
     scales = np.append([name.split(".")[-1] == "scale" for name in names], none).astype(bool)
-    extent = np.log(np.linalg.norm(np.ptp(X, axis=0)))
+    extent = np.log(np.linalg.norm(np.ptp(X[:, : len(scale)], axis=0)))
     design = [start]
     for shift in (None, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0):
         point = start.copy()
@@ -149,19 +155,17 @@ def smooth_rows(
         x[s, :T] = run.path[start:stop]
         nodes[s, : T - 1] = run.nodes[start : stop - 1]
         slopes[s, : T - 1] = run.slopes[start : stop - 1]
-    x, nodes, slopes = jnp.asarray(x), jnp.asarray(nodes), jnp.asarray(slopes)
-    D = jacobians(mean, nodes)
-    path = frozen(x, nodes, segments.spans, D)
-    return linearised(
-        path, slopes, means(mean, nodes), segments, jnp.asarray(good), is_solution=False
-    )
+    x, slopes = jnp.asarray(x), jnp.asarray(slopes)
+    points = jnp.concatenate([jnp.asarray(nodes), at_nodes(segments.inputs)], axis=-1)
+    path = frozen(x, points, segments.spans, jacobians(mean, points, n))
+    mean_there = means(mean, points, slopes)
+    return linearised(path, slopes, mean_there, segments, jnp.asarray(good), is_solution=False)
 
 
 @eqx.filter_jit
-def jacobians(mean, nodes: Float[Array, "S L 3 n"]) -> Float[Array, "S L n n"]:
-    """The Jacobian of the mean in each interval, averaged over its nodes."""
-    n = nodes.shape[-1]
+def jacobians(mean, nodes: Float[Array, "S L 3 d"], n: int) -> Float[Array, "S L n n"]:
+    """∂m/∂x of the mean in each interval, averaged over its nodes."""
     if mean is None:
         return jnp.zeros((*nodes.shape[:2], n, n), nodes.dtype)
-    D = jax.vmap(jax.vmap(jax.vmap(jax.jacfwd(mean))))(nodes)
+    D = jax.vmap(jax.vmap(jax.vmap(lambda s: with_tangent(mean, s, n)[1])))(nodes)
     return jnp.einsum("slkab,k->slab", D, jnp.asarray(WEIGHTS, nodes.dtype))

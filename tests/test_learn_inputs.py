@@ -1,0 +1,236 @@
+"""Runs with inputs: what was applied between samples, and what is learned of it."""
+
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# Wrong types are refused here, and any field is looked into.
+
+import functools
+import itertools
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+from scipy.integrate import solve_ivp
+
+import hamkernel as hk
+from hamkernel._trajectories.flow import NODES, simulated
+from hamkernel._trajectories.functionals import functionals_of
+from hamkernel._trajectories.inputs import at_nodes, at_samples, in_intervals
+from hamkernel._trajectories.rows import Segments, frozen, linearised
+from hamkernel._trajectories.shooting import means
+from hamkernel._trajectories.start import jacobians
+
+FRICTION, GAIN = 0.2, 1.5
+PENDULUM = hk.systems.Damped(hk.systems.Pendulum(1.0, 1.0, 6.0), FRICTION)
+PLANT = hk.systems.Driven(PENDULUM, [[0.0], [GAIN]])
+K = hk.Controlled(hk.PortHamiltonian(hk.Gaussian(2.0), 0.1), hk.InputMatrix(1.0, acts_on=(1,)))
+
+
+def joined(s):
+    return PLANT(s[:2], s[2:])
+
+
+# What was applied.
+
+
+def held(t, u, at):
+    return u[np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)]
+
+
+@pytest.mark.parametrize("is_held", [True, False])
+def test_inputs_of_intervals_are_the_best_lines_in_the_mean_square(is_held):
+    rng = np.random.default_rng(0)
+    t, u = np.sort(rng.uniform(0, 1, 12)), rng.normal(size=12)
+    at = np.array([t[0], 0.3, 0.55, t[-1]])
+    found = in_intervals(t, u[:, None], at, is_held)[..., 0]
+    for (a, b), ends in zip(itertools.pairwise(at), found, strict=True):
+        fine = np.linspace(a, b, 200_001)
+        fine = (fine[1:] + fine[:-1]) / 2
+        values = held(t, u, fine) if is_held else np.interp(fine, t, u)
+        slope, middle = np.polyfit(2 * (fine - a) / (b - a) - 1, values, 1)
+        np.testing.assert_allclose(ends, [middle - slope, middle + slope], atol=1e-4)
+
+
+def test_inputs_between_the_samples_of_a_log_are_as_they_were_said():
+    t, u = np.array([0.0, 0.3, 0.4, 1.0]), np.random.default_rng(0).normal(size=(4, 2))
+    lines = in_intervals(t, u, t, held=False)
+    np.testing.assert_allclose(lines, np.stack([u[:-1], u[1:]], axis=1), atol=1e-14)
+    np.testing.assert_allclose(at_samples(lines), u, atol=1e-14)
+    nodes = t[:-1, None] + np.diff(t)[:, None] * NODES
+    expected = np.stack([np.interp(nodes, t, u[:, c]) for c in range(2)], axis=-1)
+    np.testing.assert_allclose(at_nodes(lines), expected, atol=1e-14)
+    steps = in_intervals(t, u, t, held=True)
+    np.testing.assert_allclose(steps, np.repeat(u[:-1, None], 2, axis=1), atol=1e-14)
+    assert in_intervals(t, u[:, :0], t, held=True).shape == (3, 2, 0)
+
+
+# The flow and the rows.
+
+
+def driven_path(ts, u, slope):
+    """A true path under u(t) = u + slope t, as a function of t."""
+    options = {"rtol": 1e-12, "atol": 1e-13, "dense_output": True}
+    true = solve_ivp(
+        lambda t, x: PLANT(x, jnp.array([u + slope * t])),
+        (ts[0], ts[-1]),
+        [1.0, 0.5],
+        "DOP853",
+        **options,
+    )
+    return lambda at: true.sol(at).T
+
+
+def test_the_flow_is_driven_to_the_tolerance_of_the_integrator():
+    ts, (u, slope) = np.linspace(0.0, 0.8, 5), (0.7, -2.0)
+    true = driven_path(ts, u, slope)
+    ends = u + slope * np.column_stack([ts[:-1], ts[1:]])[None, ..., None]
+    spans, steps = jnp.diff(ts)[None], jnp.full(4, 8)
+    path = simulated(joined, jnp.array([[1.0, 0.5]]), spans, steps, jnp.asarray(ends))
+    np.testing.assert_allclose(path.x[0], true(ts), atol=1e-8)
+    inner = ts[:-1, None] + np.diff(ts)[:, None] * NODES
+    np.testing.assert_allclose(
+        path.nodes[0, ..., :2], true(inner.ravel()).reshape(4, 3, 2), atol=1e-8
+    )
+    np.testing.assert_allclose(path.nodes[0, ..., 2], u + slope * inner, atol=1e-12)
+
+
+def test_along_a_true_path_rows_are_exact_with_inputs():
+    """Of ẋ = Ax + g(x, u): x(t) − exp(At) x(0) is the integral of exp(A(t − s)) g(x(s), u(s))."""
+    A, ts, (u, slope) = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.linspace(0.0, 0.8, 9), (0.7, -2.0)
+    true = driven_path(ts, u, slope)
+    x = jnp.asarray(true(ts)[None])
+    ends = jnp.asarray(u + slope * np.column_stack([ts[:-1], ts[1:]])[None, ..., None])
+    inner = (ts[:-1, None] + np.diff(ts)[:, None] * NODES).reshape(-1)
+    states = jnp.asarray(true(inner).reshape(1, 8, 3, 2))
+    segments = Segments(jnp.diff(ts)[None], x, jnp.ones_like(x), jnp.zeros_like(x), x[:, 0], ends)
+
+    def mean(s):
+        return jnp.asarray(A) @ s[:2]
+
+    def rows(ends):
+        nodes = jnp.concatenate([states, at_nodes(ends)], axis=-1)
+        path = frozen(x, nodes, segments.spans, jacobians(mean, nodes, 2))
+        slopes = jax.vmap(jax.vmap(jax.vmap(joined)))(nodes)
+        there = means(mean, nodes, slopes)
+        return linearised(path, slopes, there, segments, jnp.array([True]), is_solution=True)
+
+    expected = [x[0, i] - scipy.linalg.expm(A * t) @ x[0, 0] for i, t in enumerate(ts)]
+    found = rows(ends)
+    np.testing.assert_allclose(found.target[0], expected, atol=1e-8)
+    observations = functionals_of(found, np.zeros(2), mean)
+    assert observations is not None
+    ((block, targets),) = observations.parts(1)
+    np.testing.assert_allclose(block.rows(jax.vmap(joined)(block.points)), targets, atol=1e-8)
+    # The control: other inputs do not explain the same samples.
+    wrong = np.asarray(rows(0 * ends).target[0]) - expected
+    assert np.abs(wrong).max() > 0.1
+
+
+# What is learned.
+
+
+def logs(seed=0, count=6, samples=40, between="held", step=1):
+    """Runs of 6 s with a torque that changes every `step` samples, noise .05."""
+    rng = np.random.default_rng(seed)
+    ts = np.linspace(0, 6, samples)
+    U = np.repeat(rng.uniform(-2, 2, (count, -(-samples // step), 1)), step, axis=1)[:, :samples]
+    starts = jnp.asarray(rng.uniform(-1.5, 1.5, (count, 2)))
+
+    def run(x, u):
+        return hk.simulate(PLANT, x, jnp.asarray(ts), inputs=u, between=between).ys
+
+    true = np.asarray(jax.vmap(run)(starts, jnp.asarray(U)))
+    noisy = true + 0.05 * rng.standard_normal(true.shape)
+    return [ts] * count, list(noisy), list(U), true
+
+
+@functools.cache
+def learned():
+    times, states, inputs, true = logs()
+    return hk.learn(K, hk.Runs(times, states, inputs)), true, inputs
+
+
+@pytest.mark.slow
+def test_friction_and_gain_are_found_from_noisy_states():
+    found, true, inputs = learned()
+    np.testing.assert_allclose(found.kernel.drift.friction, FRICTION, rtol=0.06)
+    x = jnp.array([0.3, 0.2])
+    np.testing.assert_allclose(found.field.input_matrix(x), [[0.0], [GAIN]], rtol=0.03)
+    np.testing.assert_allclose(found.noise, 0.05, rtol=0.1)
+    X, U = jnp.asarray(np.concatenate(true)), jnp.asarray(np.concatenate(inputs))
+    f, g = jax.vmap(PLANT)(X, U), found.field.evaluate(X, U)
+    assert np.linalg.norm(f - g) < 0.03 * np.linalg.norm(f)
+    # It is a field as any other: driven again from where a run began, it goes where that went.
+    times, _, _, _ = logs()
+    again = hk.simulate(found.field, true[0][0], times[0], inputs=inputs[0]).ys
+    assert np.sqrt(np.mean((again - true[0]) ** 2)) < 0.1
+    exact = hk.fit(found.kernel, found.observations, regularization=found.regularization)
+    np.testing.assert_allclose(exact(x, x[:1]), found.field(x, x[:1]), atol=0.02)
+    assert float(found.posterior.deviation(x, x[:1]).max()) < 0.1
+
+
+@pytest.mark.slow
+def test_inputs_that_are_ignored_or_of_the_wrong_time_are_taken_for_noise():
+    times, states, inputs, _ = logs()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        ignored = hk.learn(K.drift, hk.Runs(times, states))
+        early = hk.learn(K, hk.Runs(times, states, inputs, between="linear"))
+    assert ignored.noise.min() > 2 * 0.05
+    assert abs(float(ignored.kernel.friction) / FRICTION - 1) > 0.3
+    assert early.noise[1] > 1.5 * 0.05
+
+
+@pytest.mark.slow
+def test_inputs_of_averaged_samples_and_a_known_matrix():
+    times, states, inputs, _ = logs(samples=1200, step=30)
+    known = hk.Controlled(K.drift, [[0.0], [GAIN]])
+    for kernel in (K, known):
+        found = hk.learn(kernel, hk.Runs(times, states, inputs))
+        np.testing.assert_allclose(found.kernel.drift.friction, FRICTION, rtol=0.03)
+        np.testing.assert_allclose(found.noise, 0.05, rtol=0.05)
+        gain = found.field.input_matrix(jnp.array([0.3, 0.2]))
+        np.testing.assert_allclose(gain, [[0.0], [GAIN]], rtol=0.01)
+
+
+# What is refused.
+
+
+def runs(u=None, **options):
+    ts = np.linspace(0, 1, 9)
+    x = np.column_stack([np.sin(ts), np.cos(ts)])
+    return hk.Runs([ts], [x], None if u is None else [u], **options)
+
+
+VARIED = np.sin(np.arange(9.0))[:, None]
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "match"),
+    [
+        (
+            lambda: hk.learn(K, runs()),
+            TypeError,
+            r"needs what was applied: hk\.Runs\(times, states, ",
+        ),
+        (lambda: hk.learn(K.drift, runs(VARIED)), TypeError, "leave inputs out of Runs"),
+        (lambda: hk.learn(K, runs(np.ones((9, 1)))), ValueError, "have rank 0"),
+        (
+            lambda: hk.learn(hk.Controlled(K.drift, np.eye(2)), runs(VARIED)),
+            ValueError,
+            "1 columns and the kernel 2 inputs",
+        ),
+        (lambda: runs(np.where(VARIED > 0.9, np.nan, VARIED)), ValueError, "NaN at sample 2"),
+        (lambda: runs(VARIED, between="cubic"), ValueError, "'held' or 'linear'; got 'cubic'"),
+        (
+            lambda: hk.Runs([[0.0, 1.0]] * 2, [np.eye(2)] * 2, [np.eye(2), np.ones((2, 1))]),
+            ValueError,
+            r"\[1, 2\] inputs",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(call, error, match):
+    with pytest.raises(error, match=match):
+        call()
