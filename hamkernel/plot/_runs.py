@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hamkernel._trajectories.flow import simulated
+from hamkernel._trajectories.inputs import in_intervals
 from hamkernel.plot._style import COLORS, DATA, coordinate, legend, with_unit
 
 if TYPE_CHECKING:
@@ -106,7 +107,11 @@ def fitted(
     ts, fit = np.asarray(learned.runs.times[run]), np.asarray(learned.states[run])
     grid = np.interp(np.arange(_BETWEEN * (len(ts) - 1) + 1) / _BETWEEN, np.arange(len(ts)), ts)
     spans = np.repeat(np.diff(ts)[:, None] / _BETWEEN, _BETWEEN, axis=1)
-    between = simulated(learned.field, fit[:-1], spans, np.ones(_BETWEEN, int)).x
+    applied = learned.runs.applied()[run]
+    ends = in_intervals(ts, applied, grid, learned.runs.between == "held")
+    ends = ends.reshape(*spans.shape, 2, applied.shape[1])
+    field = getattr(learned.field, "whole", learned.field)  # of the points (x, u) with inputs
+    between = simulated(field, fit[:-1], spans, np.ones(_BETWEEN, int), ends).x
     path = np.concatenate([np.asarray(between[:, :-1]).reshape(-1, n), fit[-1:]])
     residuals, misfit = np.asarray(learned.residuals[run]), np.asarray(learned.misfit[run])
     for c, (left, right) in enumerate(panels):
