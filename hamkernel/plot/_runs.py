@@ -8,8 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from matplotlib.axes import Axes
 
-from hamkernel._trajectories.hermite import interpolated
-from hamkernel.plot._style import COLORS, DATA, coordinate, legend, on_points, with_unit
+from hamkernel._trajectories.flow import simulated
+from hamkernel._trajectories.inputs import in_intervals
+from hamkernel.plot._style import COLORS, DATA, coordinate, legend, with_unit
 
 if TYPE_CHECKING:
     from hamkernel._trajectories.learned import Learned
@@ -78,7 +79,8 @@ def fitted(
 ) -> tuple[tuple[Axes, Axes], ...]:
     """Draw one run as measured and as the learned field explains it, with the residuals.
 
-    One row of panels per coordinate: on the left the samples and the fitted states; on the right
+    One row of panels per coordinate: on the left the samples and the fitted states, between which
+    the field moves, across gaps too; on the right
     (measured − fitted)/σ, of which about one in twenty lies outside the grey band of ±2. A wave in
     the residuals means that the structure misses part of the motion; a single outlier means that
     the sample is wrong. A coordinate that was never measured has no residuals.
@@ -104,7 +106,13 @@ def fitted(
     panels = _column(n, 2, ax)
     ts, fit = np.asarray(learned.runs.times[run]), np.asarray(learned.states[run])
     grid = np.interp(np.arange(_BETWEEN * (len(ts) - 1) + 1) / _BETWEEN, np.arange(len(ts)), ts)
-    path = interpolated(grid, ts, fit, on_points(learned.field, fit))
+    spans = np.repeat(np.diff(ts)[:, None] / _BETWEEN, _BETWEEN, axis=1)
+    applied = learned.runs.applied()[run]
+    ends = in_intervals(ts, applied, grid, learned.runs.between == "held")
+    ends = ends.reshape(*spans.shape, 2, applied.shape[1])
+    field = getattr(learned.field, "whole", learned.field)  # of the points (x, u) with inputs
+    between = simulated(field, fit[:-1], spans, np.ones(_BETWEEN, int), ends).x
+    path = np.concatenate([np.asarray(between[:, :-1]).reshape(-1, n), fit[-1:]])
     residuals, misfit = np.asarray(learned.residuals[run]), np.asarray(learned.misfit[run])
     for c, (left, right) in enumerate(panels):
         left.plot(grid, path[:, c], color=_BLUE, linewidth=1.4, label="fitted")

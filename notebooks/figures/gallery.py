@@ -19,6 +19,9 @@ CHOSEN = {
     "planets": 0,
     "double_pendulum": 1,
     "guide_choose": 0,
+    "logs": 2,
+    "guide_data": 0,
+    "paper": 0,
 }
 
 
