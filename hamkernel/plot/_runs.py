@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 
@@ -111,7 +112,8 @@ def fitted(
     ends = in_intervals(ts, applied, grid, learned.runs.between == "held")
     ends = ends.reshape(*spans.shape, 2, applied.shape[1])
     field = getattr(learned.field, "whole", learned.field)  # of the points (x, u) with inputs
-    between = simulated(field, fit[:-1], spans, np.ones(_BETWEEN, int), ends).x
+    steps, starts = jnp.ones(_BETWEEN, int), jnp.asarray(fit[:-1])
+    between = simulated(field, starts, jnp.asarray(spans), steps, jnp.asarray(ends)).x
     path = np.concatenate([np.asarray(between[:, :-1]).reshape(-1, n), fit[-1:]])
     residuals, misfit = np.asarray(learned.residuals[run]), np.asarray(learned.misfit[run])
     for c, (left, right) in enumerate(panels):

@@ -217,6 +217,7 @@ def masses_are_noticed(seed):
     runs = hk.Runs([ts] * 6, list(true + 0.01 * rng.standard_normal(true.shape)))
     K = hk.Symplectic(hk.Gaussian(1.0))
     wrong, right = warns(K, runs, 0.01), warns(K, runs, 0.01, masses=True)
+    assert isinstance(right[0].kernel, hk.UnknownMasses)
     ratio = float(right[0].kernel.masses[1])
     return {"wrong": wrong[1], "right": right[1], "ratio": ratio}
 
@@ -225,7 +226,9 @@ def friction_of(case: Case) -> Callable:
     def found(seed):
         times, states, _, _ = logs(case, seed)
         K = hk.PortHamiltonian(gaussian(2), 0.1)
-        friction = float(hk.learn(K, hk.Runs(times, states)).kernel.friction)
+        kernel = hk.learn(K, hk.Runs(times, states)).kernel
+        assert isinstance(kernel, hk.PortHamiltonian)
+        friction = float(kernel.friction)
         return {"friction": friction, "squared error times 1000": 1e3 * (friction - FRICTION) ** 2}
 
     return found
