@@ -100,6 +100,7 @@ def test_the_name_of_a_traced_closure_is_in_its_errors():
         jax.grad(no_scalar)(1.0)
 
 
+@pytest.mark.slow
 def test_a_function_that_closes_over_itself_is_left_alone():
     def polynomial(width):
         def power(s, exponent):

@@ -52,6 +52,7 @@ def close(actual, expected):
     np.testing.assert_allclose(actual, expected, rtol=0, atol=ROUNDING * np.abs(expected).max())
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", KERNELS)
 def test_a_field_is_jitted_as_it_is(name):
     field = hk.fit(KERNELS[name], X, Y, 1e-2)

@@ -29,6 +29,7 @@ def test_the_dense_inverse_and_factor_are_those_of_numpy(D):
     np.testing.assert_allclose(factor.R, np.linalg.cholesky(A).T, atol=1e-11)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("shape", [(40, 7), (7, 12)], ids=["tall", "wide"])
 @pytest.mark.parametrize("kind", ["dense", "low rank"])
 def test_every_primitive_is_that_of_numpy(kind, shape):

@@ -148,6 +148,7 @@ def test_frequencies_have_the_spectral_density(name, n, key):
     assert scipy.stats.kstest(draws[:, 0], wrong.cdf).pvalue < 1e-4
 
 
+@pytest.mark.slow
 def test_harmonics_of_a_periodic_kernel_have_its_fourier_coefficients(key):
     (s,) = spectra(hk.Periodic(2 * np.pi, 0.8), 1, 100_000, key, jnp.float64)
     harmonics = np.asarray(s.frequencies)[:, 0]

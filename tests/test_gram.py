@@ -164,6 +164,7 @@ def test_gram_works_under_jit_vmap_and_grad():
     np.testing.assert_allclose(several, [6.0, 1.5], rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_the_trace_takes_memory_linear_in_the_points_for_a_kernel_with_a_network():
     weights = jnp.asarray(np.random.default_rng(0).normal(size=(30, 2)))
     K = hk.Symplectic(hk.Warp(hk.Gaussian(2.0), lambda x: jnp.tanh(weights @ x)))

@@ -182,7 +182,7 @@ DRIVES = {
 }
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", DRIVES)
 @pytest.mark.parametrize("steps", ["adaptive", "constant"])
 def test_driven_trajectories_are_those_of_scipy(name, steps):

@@ -130,6 +130,7 @@ def test_all_observations_with_inputs_are_functionals_of_the_same_process():
     np.testing.assert_allclose(found(x, u), exact[0][1:3], atol=1e-8)
 
 
+@pytest.mark.slow
 def test_random_features_are_those_of_drift_and_input_matrix():
     key = jax.random.key(0)
     T = jnp.asarray(S[:4])
@@ -172,6 +173,7 @@ def test_a_field_of_random_features_is_the_ridge_regression_in_them():
 KNOWN = hk.Controlled(hk.Symplectic(hk.Gaussian(1.3)), [[0.0, 0.5], [1.0, -0.3]])
 
 
+@pytest.mark.slow
 def test_streams_on_landmarks_are_fits_on_the_same_landmarks():
     for kernel in (K, KNOWN):
         solver = hk.Nystrom(100.0, points=S[:7])
@@ -237,6 +239,7 @@ def test_a_known_input_matrix_is_a_mean():
     )
 
 
+@pytest.mark.slow
 def test_an_objective_of_ones_own_gets_the_data_with_its_inputs():
     def objective(K, X, Y, regularization):
         assert Y is None

@@ -86,6 +86,8 @@ def check_layout(results, readings):
                     assert spread["p10"] <= spread["median"] <= spread["p90"]
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_results_have_every_experiment_reading_model_quantity_and_spread(results):
     check_layout(results, {"lambda", "N*lambda"})
 
@@ -101,6 +103,8 @@ def test_results_have_the_tuned_hyperparameters_too(tuned_results, results):
             assert again == pytest.approx(error, rel=1e-6)
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_oscillator_with_lambda_has_the_published_learned_hamiltonian(results):
     # Published: −108.54, of one seed; the spread over seeds is about ±3.
     value = median(
@@ -109,6 +113,8 @@ def test_oscillator_with_lambda_has_the_published_learned_hamiltonian(results):
     assert abs(value + 108) < 10
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_oscillator_with_n_lambda_as_the_text_says_has_another_one(results):
     value = median(
         results, "harmonic_oscillator", "N*lambda", "odd_symplectic", "learned_hamiltonian_mean"
@@ -117,6 +123,8 @@ def test_oscillator_with_n_lambda_as_the_text_says_has_another_one(results):
     assert abs(value + 78) < 5
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_odd_symplectic_beats_separable_on_the_oscillator_only_with_lambda(results):
     error = {
         (reading, model): median(
@@ -129,6 +137,8 @@ def test_odd_symplectic_beats_separable_on_the_oscillator_only_with_lambda(resul
     assert error["N*lambda", "odd_symplectic"] > error["N*lambda", "separable"]
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_pendulum_of_mass_one_with_lambda_has_the_published_numbers(results):
     # Published: −16.85, 9.81, 7.87 and 1.49.
     at = ("pendulum_m1", "lambda")
@@ -138,12 +148,16 @@ def test_pendulum_of_mass_one_with_lambda_has_the_published_numbers(results):
     assert abs(median(results, *at, "separable", "odd_error_variance") - 1.49) < 0.4
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_pendulum_of_mass_one_half_does_not_have_the_published_hamiltonians(results):
     at = ("pendulum_m0.5", "lambda", "odd_symplectic")
     assert abs(median(results, *at, "learned_hamiltonian_mean") + 17) > 1.5
     assert abs(median(results, *at, "true_hamiltonian_mean") - 4.905) < 0.01
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_separable_is_thirty_times_worse_on_the_pendulum_of_mass_one(results):
     error = {
         model: median(results, "pendulum_m1", "lambda", model, "trajectory_error_mean")
@@ -152,6 +166,8 @@ def test_separable_is_thirty_times_worse_on_the_pendulum_of_mass_one(results):
     assert error["separable"] > 30 * error["odd_symplectic"]
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_only_the_odd_kernel_is_odd_and_symplectic_fields_keep_their_hamiltonian(results):
     for readings in results.values():
         for models in readings.values():
@@ -185,6 +201,8 @@ def test_report_compares_grid_and_gradient(tuned_run):
     assert "Of 9 pairs of system and kernel the gradient finds the lower median loss in" in text
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_report_says_which_reading_fits_and_names_files_that_exist(run):
     text, out = run
     assert "Table I is closest to lambda for the harmonic oscillator" in text
@@ -194,6 +212,8 @@ def test_report_says_which_reading_fits_and_names_files_that_exist(run):
     assert named == {str(path) for path in out.iterdir()}
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_figures_are_written_and_not_blank(run):
     figures = sorted(run[1].glob("*.png"))
     assert len(figures) == 3 * 2 * 2  # experiments, readings, portraits and test trajectory
@@ -203,6 +223,8 @@ def test_figures_are_written_and_not_blank(run):
         assert 0.01 < np.mean(np.any(pixels < 0.95, axis=2)) < 0.9
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_verdict_is_computed_from_the_results(results):
     swapped = copy.deepcopy(results)
     for readings in swapped.values():

@@ -160,6 +160,7 @@ def test_damping_and_inputs_wrap_any_system():
 # Saving.
 
 
+@pytest.mark.slow
 def test_saved_fields_come_back_and_bring_the_ready_made_tensors(tmp_path):
     file = tmp_path / "field.npz"
     for name in ("rigid_body", "lotka_volterra", "plane"):

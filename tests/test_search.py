@@ -199,6 +199,7 @@ def test_many_points_are_searched_in_parts_that_grow_and_end_with_all(N, n, part
     assert len(few) == max(parts - 1, 1)
 
 
+@pytest.mark.slow
 def test_a_subset_of_observations_has_their_rows():
     half, rng = (
         np.where(np.arange(2 * N).reshape(N, 2) % 3 == 0, np.nan, Y),

@@ -74,6 +74,7 @@ def test_default_solver_agrees_with_scipy():
     np.testing.assert_allclose(jnp.asarray(solution.ys), reference(times), atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("solver", "error"),

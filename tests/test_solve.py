@@ -268,6 +268,7 @@ def test_conjugate_gradients_find_the_exact_coefficients(name):
     assert 1 <= int(info(field).iterations) <= 30
 
 
+@pytest.mark.slow
 def test_a_new_tolerance_of_conjugate_gradients_compiles_nothing():
     traces = []
 
@@ -519,6 +520,7 @@ def test_warnings_name_the_line_of_the_user():
         assert {each.filename for each in seen} == {__file__}
 
 
+@pytest.mark.slow
 def test_landmarks_depend_on_the_key():
     X, Y = swings(60)
     keys = None, jax.random.key(0), jax.random.key(1)

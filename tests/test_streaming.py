@@ -231,6 +231,7 @@ def test_landmarks_of_the_first_chunk_do_where_chunks_are_alike():
     assert relative(field.evaluate(NEW), exact.evaluate(NEW)) < 1e-3  # a tenth of the noise
 
 
+@pytest.mark.slow
 def test_a_first_chunk_that_is_not_like_the_rest_is_said():
     order = np.argsort(X[:, 0])
     with pytest.warns(UserWarning, match="from a sample that looks like the data so far"):
@@ -389,6 +390,7 @@ def test_memory_ignores_the_number_of_points():
     assert many - few < 8e6
 
 
+@pytest.mark.slow
 def test_chunks_of_fewer_digits_are_added_to_a_fit_of_more():
     X, Y = swings(60)
     low = [each.astype(np.float32) for each in (X, Y)]

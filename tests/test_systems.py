@@ -297,6 +297,7 @@ def test_kepler_orbit_is_an_ellipse_with_its_period():
     assert_changes(distance)
 
 
+@pytest.mark.slow
 def test_n_body_conserves_momentum_and_angular_momentum_in_total_only():
     system, _, start = CASES["n_body"]
     ts = np.linspace(0, 3, 7)

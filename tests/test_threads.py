@@ -80,6 +80,7 @@ CALLS = {
 }
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", CALLS)
 def test_public_calls_that_factor_run_on_one(name, monkeypatch):
     seen = []

@@ -641,6 +641,7 @@ def test_a_fit_or_a_simulation_that_fails_in_an_objective_is_a_point_that_cannot
         hk.tune(long, X, Y, 1e-11, objective=raising, bounds=bounds, starts=1)
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize("unit", [1e-4, 1e4])
 def test_the_amplitude_is_searched_in_any_units(unit):

@@ -67,7 +67,7 @@ def regularised(K, X, ridge: float) -> np.ndarray:
 # The closed form.
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("structure", STRUCTURES)
 @pytest.mark.parametrize("folds", FOLDS)
 @pytest.mark.parametrize("n", [2, 4])

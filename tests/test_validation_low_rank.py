@@ -54,7 +54,7 @@ def rows_of(basis):
     return np.asarray(basis.span(K, n, X.dtype).of(Components(X)))
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("folds", FOLDS)
 @pytest.mark.parametrize("basis", BASES)
 def test_the_loss_is_that_of_refits(basis, folds):
@@ -130,6 +130,7 @@ def of_every_kind():
     return rows_of_data(K, data)[1]
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "basis", [WaveBasis(jax.random.key(0), 4), WaveBasis(jax.random.key(0), 30)]
 )
@@ -258,6 +259,7 @@ def test_the_loss_of_few_points_is_that_of_the_low_rank_fit_too():
     np.testing.assert_allclose(tuned.loss, np.mean(losses), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_observations_are_tuned_in_low_rank_where_the_dense_loss_does_not_fit(monkeypatch):
     # Half of the components, and energies: 260 rows.
     X, Y = data(200, seed=3)
