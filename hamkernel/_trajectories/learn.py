@@ -86,6 +86,7 @@ def learn(
             n = 2 and 80 for n = 4, which cover the paths evenly. Inputs count as coordinates.
         masses: whether states are (q, q̇) with unknown masses instead of (q, p). Their ratios are
             then learned, `learned.kernel.masses`; see `UnknownMasses`, whose kernel K becomes.
+            With inputs they are those of the drift, `learned.kernel.drift.masses`.
         progress: show a progress bar (tqdm).
 
     Returns:
