@@ -266,6 +266,8 @@ def test_friction_knows_no_time_reversal():
 def test_other_refusals():
     with pytest.raises(TypeError, match="list of linear maps"):
         hk.Invariant(G, 3.0)
+    with pytest.raises(ValueError, match="not invertible"):
+        hk.fit(hk.Separable(hk.Invariant(G, [np.diag([1.0, 0.0, 1.0, 1.0])])), X, Y)
     with pytest.raises(ValueError, match="finite matrix"):
         hk.Invariant(G, [np.ones((2, 3))])
     with pytest.raises(TypeError, match="Reversible must be a matrix-valued"):
