@@ -100,6 +100,10 @@ class AbstractMatrixKernel(eqx.Module):
         """ValueError if the structure cannot hold at these points, whose values may be traced."""
         self.check_dimension(X.shape[1])
 
+    def centre(self, Z: Float[Array, "M d"]) -> Float[Array, " d"] | None:
+        """The mean of Z, as far as K does not change when it is taken off both arguments."""
+        return Z.mean(axis=0) if Invariance.TRANSLATION in self.invariance else None
+
     def outputs(self, inputs: int) -> int:
         """The number of components of a field at points of so many coordinates."""
         return inputs
