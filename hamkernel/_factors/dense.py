@@ -150,6 +150,14 @@ class DenseFactor(AbstractFactor[DenseSystem]):
         return U
 
 
+def solution(
+    A: Float[Array, "D D"], y: Float[Array, " D"]
+) -> tuple[DenseFactor, Float[Array, " D"]]:
+    """The factor of A, and A⁻¹y, differentiated implicitly: by one more solve with the factor."""
+    factor, solve = DenseFactor(A), jax.lax.custom_linear_solve
+    return factor, solve(lambda x: A @ x, y, lambda _, b: factor.solve(b), symmetric=True)
+
+
 class DenseInverse(AbstractInverse[DenseSystem]):
     """C as a matrix."""
 

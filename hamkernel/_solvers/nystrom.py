@@ -25,7 +25,6 @@ from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
 from hamkernel._gram.operator import product
 from hamkernel._machine.devices import as_given, rows_of, split
-from hamkernel._observations.rows import Rows
 from hamkernel._solvers import landmark_fit, stream_sums
 from hamkernel._solvers.landmark_field import CHOOSE, Solution, landmark_field
 from hamkernel._solvers.landmark_fit import LandmarkFit
@@ -117,14 +116,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
     ) -> LandmarkBasis:
         return LandmarkBasis(self.landmarks(K, X, regularization).points)
 
-    def _fitted(
-        self,
-        K: AbstractMatrixKernel,
-        X: Float[Array, "N n"],
-        Y: Float[Array, "N n"],
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> KernelField:
+    def _fitted(self, K, X, Y, regularization, throw=True) -> KernelField:
         landmarks = self.landmarks(K, X, regularization)
         spread = rows_of(X)
         X, Y = split(spread, X), split(spread, Y)
@@ -132,13 +124,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         solution = solution._replace(residual=as_given(spread, solution.residual))
         return landmark_field(K, landmarks, solution, regularization, self.tolerance, CHOOSE, throw)
 
-    def _given(
-        self,
-        K: AbstractMatrixKernel,
-        rows: Rows,
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> LowRankConditional:
+    def _given(self, K, rows, regularization, throw=True) -> LowRankConditional:
         span = landmark_span(K, self.landmarks(K, rows.points, regularization))
         return low_rank_conditional(span, rows, regularization, throw)
 

@@ -8,8 +8,8 @@ from jaxtyping import Array, ArrayLike, Float, Int, Key, Num, UInt32
 
 from hamkernel import _require as require
 from hamkernel._features.structured import AbstractFeatures, features
-from hamkernel._fields.base import SolverInfo, root
-from hamkernel._fields.features import FeatureField
+from hamkernel._fields.base import SolverInfo
+from hamkernel._fields.features import FeatureField, feature_field
 from hamkernel._machine.devices import as_given, rows_of, split
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._observations.rows import Rows
@@ -73,14 +73,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
     ) -> WaveBasis:
         return WaveBasis(self.key, self.count)
 
-    def _fitted(
-        self,
-        K: AbstractMatrixKernel,
-        X: Float[Array, "N n"],
-        Y: Float[Array, "N n"],
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> FeatureField:
+    def _fitted(self, K, X, Y, regularization, throw=True) -> FeatureField:
         spread = rows_of(X)
         field = _fit(K, self, split(spread, X), split(spread, Y), regularization, spread)
         field = _checked(field, throw)
@@ -89,13 +82,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
         residual = as_given(spread, field.residual)
         return eqx.tree_at(lambda f: f.residual, field, residual)
 
-    def _given(
-        self,
-        K: AbstractMatrixKernel,
-        rows: Rows,
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> LowRankConditional:
+    def _given(self, K, rows, regularization, throw=True) -> LowRankConditional:
         basis = self._features(K, rows.points.shape[1], rows.targets.dtype)
         span = FeatureSpan(K, basis, rows.dimension)
         return low_rank_conditional(span, rows, regularization, throw)
@@ -147,19 +134,10 @@ def _fit(K, solver, X, Y, regularization, spread):
     return _field(K, basis, weights, residual, regularization)
 
 
-def _field(K, basis, weights, residual, regularization, residual_norm=None):
-    return FeatureField(
-        kernel=K,
-        features=basis,
-        weights=weights,
-        residual=residual,
-        norm=root(weights @ weights),
-        regularization=regularization,
-        offset=jnp.zeros((), weights.dtype),
-        info=SolverInfo(
-            "RandomFeatures", rank=jnp.asarray(len(weights)), residual_norm=residual_norm
-        ),
-    )
+def _field(K, basis, w, residual, regularization, residual_norm=None):
+    rank = jnp.asarray(len(w))
+    info = SolverInfo("RandomFeatures", rank=rank, residual_norm=residual_norm)
+    return feature_field(K, basis, w, residual, regularization, info)
 
 
 def _checked(field: FeatureField, throw: bool = True) -> FeatureField:
