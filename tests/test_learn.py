@@ -7,6 +7,7 @@
 
 import functools
 import itertools
+import re
 import warnings
 
 import jax
@@ -238,6 +239,18 @@ def test_a_pendulum_is_learned_from_noisy_states(learned):
     x = jnp.array([0.3, 0.2])
     gradient = jax.grad(found.field.hamiltonian)(x)
     np.testing.assert_allclose(found.field(x), [gradient[1], -gradient[0]], atol=1e-10)
+
+
+def test_runs_of_other_lengths_do_not_compile_anew(learned, caplog):
+    times, states, _ = logs()
+    lengths = (30, 21, 24, 27, 22, 28)
+    shorter = hk.Runs(
+        *([a[:m] for a, m in zip(each, lengths, strict=True)] for each in (times, states))
+    )
+    with jax.log_compiles():
+        hk.learn(K, shorter)
+    programs = re.findall(r"XLA compilation of jit\((\w+)\)", caplog.text)
+    assert set(programs) <= {"stage", "reshape"}  # data on its way to the device
 
 
 def test_five_samples_a_swing_are_enough():
