@@ -159,12 +159,13 @@ def smooth_rows(
         nodes[s, : T - 1] = run.nodes[start : stop - 1]
         slopes[s, : T - 1] = run.slopes[start : stop - 1]
     points = np.concatenate([nodes, at_nodes(np.asarray(segments.inputs))], axis=-1)
-    arrays = (jnp.asarray(a) for a in (x, points, slopes, good))
-    return _smooth_rows(mean, *arrays, segments)
+    along = jnp.asarray(x), jnp.asarray(points), jnp.asarray(slopes)
+    return _smooth_rows(mean, along, jnp.asarray(good), segments)
 
 
 @eqx.filter_jit
-def _smooth_rows(mean, x, points, slopes, good, segments: Segments) -> Rows:
+def _smooth_rows(mean, along, good, segments: Segments) -> Rows:
+    x, points, slopes = along
     path = frozen(x, points, segments.spans, jacobians(mean, points, x.shape[-1]))
     there = means(mean, points, slopes)
     return linearised(path, slopes, there, segments, good, is_solution=False)
