@@ -18,6 +18,7 @@ import scipy.stats
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
+from hamkernel._trajectories import evidence, shooting, smoothing
 from hamkernel._trajectories.evidence import (
     Model,
     _loss,
@@ -259,6 +260,32 @@ def test_a_field_that_explains_nothing_says_so():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not warn_of_noise(np.array([0.4, np.nan]), scale)
+
+
+def test_runs_of_other_lengths_do_not_compile_anew(learned, monkeypatch):
+    """Of 17 to 32 samples, as all are that were compiled for."""
+    traced: list[str] = []
+
+    def counted(module, name):
+        function = getattr(module, name)
+
+        def traces(*args, **options):
+            traced.append(name)
+            return function(*args, **options)
+
+        monkeypatch.setattr(module, name, traces)
+
+    # What the programs are made of; it is called while they are traced.
+    counted(evidence, "projected")
+    counted(shooting, "simulated")
+    counted(smoothing, "smooth")
+    counted(smoothing, "negative_log_likelihood")
+    times, states, true = logs()
+    lengths = [18, 30, 20, 27, 24, 30]
+    times, states = ([a[:T] for a, T in zip(x, lengths, strict=True)] for x in (times, states))
+    found = hk.learn(K, hk.Runs(times, states))
+    assert not traced
+    assert field_error(found.field, true) < 0.06
 
 
 @pytest.mark.slow

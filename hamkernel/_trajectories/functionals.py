@@ -19,22 +19,23 @@ def functionals_of(rows: Rows, log_noise: Float[Array, " n"], mean: Any) -> Toge
     no segment has more samples than its start takes.
     """
     sigma = np.exp(np.asarray(log_noise))
+    rows = Rows(*map(np.asarray, rows))  # pyright: ignore[reportArgumentType]
     found = []
     for s in range(len(rows.counts)):
-        counts = np.asarray(rows.counts[s])
+        counts = rows.counts[s]
         if not counts.any():
             continue
         last = int(np.flatnonzero(counts.any(axis=1))[-1])  # padding follows
-        B = _sums(np.asarray(rows.across[s, :last]), np.asarray(rows.weights[s, :last]))
-        nodes = np.asarray(rows.nodes[s, :last]).reshape(-1, rows.nodes.shape[-1])
+        B = _sums(rows.across[s, :last], rows.weights[s, :last])
+        nodes = rows.nodes[s, :last].reshape(-1, rows.nodes.shape[-1])
         seen = counts[: last + 1].reshape(-1) > 0
         W = (np.sqrt(counts[: last + 1]) / sigma[None]).reshape(-1)[seen]
-        P = W[:, None] * np.asarray(rows.tangent[s, : last + 1]).reshape(-1, len(sigma))[seen]
+        P = W[:, None] * rows.tangent[s, : last + 1].reshape(-1, len(sigma))[seen]
         if len(P) <= P.shape[1]:
             continue
         C = np.linalg.qr(P, mode="complete")[0][:, P.shape[1] :]
         B = C.T @ (W[:, None] * B[seen])
-        target = C.T @ (W * np.asarray(rows.target[s, : last + 1]).reshape(-1)[seen])
+        target = C.T @ (W * rows.target[s, : last + 1].reshape(-1)[seen])
         if mean is not None:
             target = target + B @ np.asarray(jax.vmap(mean)(jnp.asarray(nodes))).reshape(-1)
         x, u = np.split(nodes[None], [len(sigma)], axis=2)
