@@ -114,14 +114,14 @@ def box_of(
     none = np.zeros(len(scale), bool)
     lengths = np.append([name.endswith("lengthscale") for name in names], none).astype(bool)
     scales = np.append([name.split(".")[-1] == "scale" for name in names], none).astype(bool)
-    extent = np.log(np.linalg.norm(np.ptp(X[:, : len(scale)], axis=0)))
+    extents = np.concatenate([*(_extents(p.low, X[:, : len(scale)]) for p in leaves), none])
     design = [start]
     for shift in (None, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0):
         point = start.copy()
         if shift is not None:
             if not lengths.any():
                 continue
-            point[lengths] = np.clip(extent - 0.7 + shift, low[lengths], high[lengths])
+            point[lengths] = np.clip(extents - 0.7 + shift, low, high)[lengths]
         design.append(_amplified(model, point, scales, X, Y))
     design = np.array(design)
     noisy = [design]
@@ -129,6 +129,14 @@ def box_of(
         noisy.append(design.copy())
         noisy[-1][:, size:] = np.where(moves, np.log(share * scale), start[size:])
     return Box(low, high, free), np.clip(np.concatenate(noisy), low, high)
+
+
+def _extents(leaf: np.ndarray, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, " size"]:
+    """The logarithm of the extent of X, for each coordinate where the leaf has as many entries."""
+    ranges = np.maximum(np.ptp(X, axis=0), np.finfo(float).tiny)
+    if leaf.shape == ranges.shape:
+        return np.log(ranges * np.sqrt(len(ranges)))
+    return np.full(leaf.size, np.log(np.linalg.norm(ranges)))
 
 
 def _amplified(model: Model, h, scales, X, Y):
