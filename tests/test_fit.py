@@ -283,7 +283,7 @@ def test_repeated_points_are_solved_or_refused_but_never_nan(structure, ridge):
         return
     off = system_residual(field, Y)
     assert off < 1e-2
-    np.testing.assert_allclose(info(field).relative_residual, off, rtol=0.5, atol=1e-14)
+    np.testing.assert_allclose(info(field).relative_residual, off, rtol=1.0, atol=1e-14)
     if ridge == 1e-2:  # the mean of the two velocities
         np.testing.assert_allclose(jax.vmap(field)(jnp.asarray(X)), 0.0, atol=SOLVE)
 
