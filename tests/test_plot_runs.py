@@ -110,6 +110,35 @@ def test_a_fitted_run_shows_samples_curve_and_residuals(runs):
         assert right.get_title() == f"root mean square {float(learned.misfit[0, c]):.2f}"
 
 
+@pytest.mark.parametrize("between", ["held", "linear"])
+def test_between_samples_the_fitted_curve_is_driven_by_what_was_applied(between):
+    """A unit mass under a force u: q̈ = u, so q is a parabola, or a cubic where u is a line."""
+    t, u = np.array([0.0, 0.5, 0.8, 2.0]), np.array([1.0, -2.0, 4.0, 0.0])
+    h = np.diff(t)
+    rise = np.diff(u) / h if between == "linear" else np.zeros(3)
+
+    def after(x, k, s):
+        q = x[0] + s * x[1] + s**2 / 2 * u[k] + s**3 / 6 * rise[k]
+        return np.array([q, x[1] + s * u[k] + s**2 / 2 * rise[k]])
+
+    x = [np.array([0.3, -0.1])]
+    for k in range(3):
+        x.append(after(x[k], k, h[k]))
+    driven = hk.Runs([t], [np.stack(x)], [u[:, None]], between=between)
+    learned = SimpleNamespace(
+        runs=driven,
+        field=SimpleNamespace(whole=lambda s: s[1:]),  # of the points (q, p, u)
+        states=driven.states,
+        residuals=[np.zeros((4, 2))],
+        misfit=np.zeros((1, 2)),
+        kept=np.ones(1),
+    )
+    curve = line(plot.fitted(learned)[0][0], "fitted")
+    k = np.clip(np.searchsorted(t, curve[:, 0], side="right") - 1, 0, 2)
+    expected = [after(x[j], j, s - t[j])[0] for j, s in zip(k, curve[:, 0], strict=True)]
+    np.testing.assert_allclose(curve[:, 1], expected, atol=1e-12)
+
+
 def test_a_coordinate_that_was_never_measured_has_no_residuals(runs):
     unseen = [np.column_stack([x[:, 0], np.full(len(x), np.nan)]) for x in runs.states]
     only_q = hk.Runs(runs.times, unseen)

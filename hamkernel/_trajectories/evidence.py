@@ -12,6 +12,7 @@ generalised least squares with the starts integrated out; no complete QR is need
 for P = QU, but for a constant.
 """
 
+import functools
 from typing import NamedTuple
 
 import equinox as eqx
@@ -37,14 +38,17 @@ class Columns(eqx.Module):
 
     points: Float[Array, "m d"]
 
-    def __call__(self, K: AbstractMatrixKernel, X: Float[Array, "N d"]) -> Float[Array, "Nn q"]:
-        n = K.outputs(X.shape[1])
-        return assemble(K, X, self.points).reshape(len(X) * n, len(self.points) * n)
+    def __call__(self, K: AbstractMatrixKernel, X: Float[Array, "N d"]):
+        return functools.partial(self.rows, K), X
+
+    def rows(self, K: AbstractMatrixKernel, X: Float[Array, "N d"]) -> Float[Array, "N n q"]:
+        return assemble(K, X, self.points).reshape(len(X), K.outputs(X.shape[1]), -1)
 
 
 def whitening(K: AbstractMatrixKernel, S: Float[Array, "m d"]) -> Float[Array, "q q"]:
     """T = L⁻ᵀ with L Lᵀ = K(S, S), q = m n."""
-    G = trained((K, S), Columns(S))
+    G = trained((K, S), Columns(S), rowwise=True)
+    G = G.reshape(-1, G.shape[-1])
     rounding = _ROUNDINGS * jnp.finfo(G.dtype).eps * jnp.trace(G)
     eye = jnp.eye(len(G), dtype=G.dtype)
     return solve_triangular(jnp.linalg.cholesky(G + rounding * eye), eye, lower=True).T
@@ -70,7 +74,7 @@ def projected(
     """The rows for these hyperparameters; `spread` is the standard deviation of the starts."""
     (*nodes, d), n = rows.nodes.shape, rows.target.shape[-1]
     size, q = len(rows.counts), len(S) * n
-    raw = trained((K, rows.nodes.reshape(-1, d)), Columns(S))
+    raw = trained((K, rows.nodes.reshape(-1, d)), Columns(S), rowwise=True)
     T = whitening(K, S)
     M = accumulated(rows.across, rows.weights, raw.reshape(*nodes, n, q)) @ T
     W = jnp.sqrt(rows.counts) * jnp.exp(-log_noise)[None, None]  # (S, L + 1, n)

@@ -69,8 +69,8 @@ def learn(
     first the smoothed one, then that of the current field, linearised in the field and the start
     (Gauss-Newton multiple shooting). Each iteration is in closed form: starts are projected out,
     hyperparameters and the noise of each coordinate follow from the marginal likelihood, and a line
-    search checks ‖W(x − x̂)‖² + ‖f‖² itself. Segments begin with 10 samples and grow to whole runs,
-    or to parts of a run that cannot be followed as a whole.
+    search checks ‖W(x − x̂)‖² + ‖f‖² itself. Segments begin with up to 12 samples and grow to runs,
+    or to parts of them where a whole run cannot be followed.
 
     Args:
         K: a matrix-valued kernel. Its hyperparameters are the first guess. A structure without an
@@ -141,7 +141,7 @@ def _iterated(
         elif i == _SHORT_ROUNDS:
             wanted = grown(task.data.runs, pieces, now.good)
         else:
-            wanted = halved(pieces, now.good)
+            wanted = halved(task.data.runs, pieces, now.good)
         before, same, pieces = now, wanted == pieces, wanted
         now, step = iterated(task, now, pieces)
         history.append(step)

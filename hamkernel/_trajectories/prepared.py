@@ -214,10 +214,13 @@ def _solved_for(mean, X, U, slopes, missing):
             f, D = with_tangent(mean, jnp.concatenate([x, u]), len(x))
             D = jnp.where(on[None, :] & ~on[:, None], D, 0.0)
             wrong = jnp.where(on, 0.0, slope - f)
-            A = D.T @ D
-            # The smallest ridge that keeps coordinates that move nothing where they are.
-            A = A + 1e-9 * (1 + jnp.trace(A)) * jnp.eye(len(x), dtype=x.dtype)
-            return x + jnp.linalg.solve(A, D.T @ wrong), None
+            # In units in which every coordinate moves the others by as much; one that moves none
+            # of them stays where it is.
+            unit = jnp.linalg.norm(D, axis=0)
+            unit = jnp.where(unit > 0, unit, jnp.ones_like(unit))
+            D = D / unit[None]
+            A = D.T @ D + 1e-9 * jnp.eye(len(x), dtype=x.dtype)
+            return x + jnp.linalg.solve(A, D.T @ wrong) / unit, None
 
         return jax.lax.scan(step, x, length=5)[0]
 

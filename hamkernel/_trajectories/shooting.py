@@ -11,11 +11,11 @@ from jaxtyping import Array, Bool, Float
 
 from hamkernel._trajectories.evidence import back_substituted, orthonormal
 from hamkernel._trajectories.flow import Expansion, Path, simulated
-from hamkernel._trajectories.padding import half_octave, power_of_two
+from hamkernel._trajectories.padding import power_of_two
 from hamkernel._trajectories.prepared import Run
 from hamkernel._trajectories.rows import Rows, Segments, linearised, segments_of, tangents
 
-SHORT = 10  # samples in a segment while the field is rough
+SHORT = 12  # samples at most in a segment while the field is rough
 _LEAST = 3  # samples of a piece: one more than its start takes
 LONG = 256  # at most: the tangent of a longer path says little more, and arrays stay small
 _GROWTH = 1e4  # of the tangent, beyond which a path says nothing of its start
@@ -49,7 +49,9 @@ def short_cuts(runs: list[Run]) -> list[Piece]:
 
 
 def _equal(run: int, start: int, stop: int, most: int) -> list[Piece]:
-    ends = np.linspace(start, stop, -((start - stop) // most) + 1).round().astype(int)
+    # As many as the next power of two needs: runs of other lengths then have as many pieces.
+    count = -(-power_of_two(stop - start) // most)
+    ends = np.linspace(start, stop, count + 1).round().astype(int)
     return [Piece(run, int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
 
@@ -60,28 +62,30 @@ def grown(runs: list[Run], pieces: list[Piece], good: Bool[np.ndarray, " S"]) ->
     return whole + [piece for piece in pieces if piece.run in lost]
 
 
-def halved(pieces: list[Piece], good: Bool[np.ndarray, " S"]) -> list[Piece]:
-    """The pieces, those that are not good in halves where they are long."""
+def halved(runs: list[Run], pieces: list[Piece], good: Bool[np.ndarray, " S"]) -> list[Piece]:
+    """The pieces, those that are not good cut at the gap in their middle, or in halves if long."""
     out = []
     for piece, is_good in zip(pieces, good, strict=True):
         middle = (piece.start + piece.stop) // 2
-        if is_good or piece.stop - piece.start <= SHORT:
+        gaps = [int(g) for g in runs[piece.run].gaps if piece.start < g < piece.stop]
+        if is_good or (not gaps and piece.stop - piece.start <= SHORT):
             out.append(piece)
-        else:
-            out += [piece._replace(stop=middle), piece._replace(start=middle)]
+            continue
+        middle = min(gaps, key=lambda gap: abs(gap - middle), default=middle)
+        out += [piece._replace(stop=middle), piece._replace(start=middle)]
     return out
 
 
 def segmented(runs: list[Run], pieces: list[Piece], paths: list[np.ndarray]) -> Segments:
     """The pieces as arrays of a few shapes; they start on `paths`."""
     longest = max(piece.stop - piece.start for piece in pieces)
-    length = half_octave(longest) if longest <= 2 * SHORT else power_of_two(longest)
+    length = SHORT if longest <= SHORT else power_of_two(longest)
     filled = []
     for r, start, stop in pieces:
         run, part = runs[r], slice(start, stop)
         own = run.times, run.states, run.counts, run.scatter
         filled.append((*(a[part] for a in own), paths[r][start], run.inputs[start : stop - 1]))
-    return segments_of(filled, half_octave(len(pieces)), length)
+    return segments_of(filled, power_of_two(len(pieces)), length)
 
 
 class Shot(NamedTuple):
