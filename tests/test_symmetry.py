@@ -107,6 +107,14 @@ def test_other_structures_have_the_same_products(structure):
         assert off(field, C3) < SYMMETRY
 
 
+@pytest.mark.parametrize("B", [hk.poisson.rigid_body, lambda x: hk.poisson.rigid_body(x**2)])
+def test_products_are_those_of_the_gram_where_the_operator_is_odd_or_even(B):
+    Z, A = np.random.default_rng(5).normal(size=(2, 7, 3))
+    K = hk.Poisson(hk.Invariant(G, [-np.eye(3)]), B)
+    expected = np.einsum("iajb,jb->ia", hk.gram(K, Z), A)
+    np.testing.assert_allclose(hk.gram_operator(K, Z).mv(A), expected, rtol=1e-11, atol=1e-12)
+
+
 def test_the_mean_is_over_both_arguments():
     k, maps = BY_NAME["partial"].formula(4), [np.eye(4), MIRROR]
 
