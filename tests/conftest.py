@@ -7,6 +7,9 @@ import zlib
 # Before NumPy loads. The threads of BLAS in two workers on two cores wait for each other: half of
 # the time of test_validation_low_rank.py.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# Most programs run once, and compiling them as for a user takes a third of the suite's time more.
+# `.ci/run` does that for its slow tests and those of rounding, with an empty XLA_FLAGS.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 
 import jax
 import pytest

@@ -69,6 +69,18 @@ def test_the_fit_is_the_regression_with_the_kernel_of_joined_points(name):
     np.testing.assert_allclose(Y - field.evaluate(X, U), field.residual, atol=1e-10)
 
 
+@pytest.mark.filterwarnings("ignore:fitting in float32")
+def test_digits_are_not_lost_far_from_the_origin():
+    def velocity(shift, dtype):
+        states = (X + shift).astype(dtype)
+        field = hk.fit(kernel("state"), states, Y.astype(dtype), 1e-2, inputs=U.astype(dtype))
+        return field.evaluate(states, U.astype(dtype))
+
+    expected = velocity(0.0, float)
+    # States of size 1000 are known to 6e-5 in float32, and their squares are not at all.
+    np.testing.assert_allclose(velocity(1000.0, np.float32), expected, atol=2e-3)
+
+
 def test_losses_and_solvers_take_inputs():
     K = kernel("state")
     blocks = [

@@ -505,21 +505,29 @@ def mixed():
     return v + e + f, Reference(rows_v, rows_e, rows_f), v
 
 
-def test_held_out_rows_are_those_of_refits():
+# Of 5 velocities, 5 energies and 3 functionals; in the second one fold has all energies.
+FOLDS = {"mixed": np.arange(13) % 3, "energies": np.repeat([0, 1, 2, 0, 1], [3, 2, 6, 1, 1])}
+
+
+@pytest.mark.parametrize("name", FOLDS)
+def test_held_out_rows_are_those_of_refits(name):
     data, reference, v = mixed()
     point = np.concatenate([np.asarray(v.kept) // 2, np.arange(5, 13)])  # of each row
-    folds = np.arange(13) % 3
+    folds = FOLDS[name]
     sigma2 = 13 * (1 - 1 / 3) * RIDGE
     A = reference.matrix(reference.rows, reference.rows) + sigma2 * np.diag(reference.noise**2)
     expected = np.zeros(len(A))
     for fold in range(3):
         out = folds[point] == fold
         # Generalised least squares with the constant, from the rows that are left.
-        P, y = reference.constant[:, None], reference.targets
-        C = np.linalg.inv(A[~out][:, ~out])
-        constant = np.linalg.solve(P[~out].T @ C @ P[~out], P[~out].T @ C @ y[~out])
-        off = y - P @ constant
-        expected[out] = off[out] - A[out][:, ~out] @ C @ off[~out]
+        p, y, C = reference.constant, reference.targets, np.linalg.inv(A[~out][:, ~out])
+        across = A[out][:, ~out] @ C
+        if p[~out].any():
+            off = y - p * (p[~out] @ C @ y[~out]) / (p[~out] @ C @ p[~out])
+            expected[out] = off[out] - across @ off[~out]
+        else:  # then the constant that suits the energies held out best
+            off, weights = y[out] - across @ y[~out], p[out] / reference.noise[out] ** 2
+            expected[out] = off - p[out] * (weights @ off) / weights.sum()
     residuals = hk.cross_validation_residuals(K, data, regularization=RIDGE, folds=folds)
     np.testing.assert_allclose(residuals, expected, atol=1e-8)
     squares = (expected / reference.noise) ** 2
@@ -569,3 +577,18 @@ def test_derivatives_of_losses_of_observations_are_those_of_differences(loss):
 
     at, h = jnp.asarray(1.4), 1e-5
     np.testing.assert_allclose(jax.grad(of)(at), (of(at + h) - of(at - h)) / (2 * h), rtol=1e-5)
+
+
+@pytest.mark.few(1)
+@pytest.mark.parametrize("name", FOLDS)
+def test_the_noise_of_energies_may_be_learned(name):
+    v, e, folds = velocities(1, N=5)[0], energies(2)[0], FOLDS[name][:10]
+    direction = np.array([1.0, -0.5, 0.3, 0.2, -1.0])
+
+    def of(h):
+        noisy = hk.Energies(e.X, e.E, np.linspace(0.5, 2, 5) + h * direction)
+        return hk.cross_validation_loss(K, v + noisy, None, RIDGE, folds)
+
+    of, h = jax.jit(jax.value_and_grad(of)), 1e-5
+    slope = (of(h)[0] - of(-h)[0]) / (2 * h)
+    np.testing.assert_allclose(of(0.0)[1], slope, rtol=1e-6)

@@ -76,15 +76,7 @@ def states(n, seed=1, N=3):
     return jnp.asarray(np.random.default_rng(seed).normal(size=(N, n)))
 
 
-# These programs run once each, so compiling them well costs more than it saves.
-QUICKLY = {"xla_backend_optimization_level": 0}
-
-
-def quickly(fn):
-    return jax.jit(fn, compiler_options=QUICKLY)
-
-
-@quickly
+@jax.jit
 def _observe(field, X):
     def observe(x):
         try:
@@ -106,7 +98,7 @@ def seen(structure, case, n):
     return observed(random_field(structure(case.make(n)), n), states(n))
 
 
-@quickly
+@jax.jit
 def mirrored(field, X):
     """f(x) and f(−x)."""
     return jax.vmap(field)(X), jax.vmap(field)(-X)
@@ -241,7 +233,7 @@ def block_structures(k):
     return (*plain, odd_symplectic(k), even_curl_free(k))
 
 
-@quickly
+@jax.jit
 def all_blocks(kernels, x, z):
     return [K(x, z) for K in kernels]
 
@@ -295,7 +287,7 @@ def test_blocks_of_swapped_points_are_transposed(case):
         np.testing.assert_allclose(block, swapped.T, atol=ROUNDING * np.abs(block).max())
 
 
-@quickly
+@jax.jit
 def blocks_of_the_profile(K, x, z):
     """K(x, z) and −∇∇ᵀg(x − z) with g(d) = k(d, 0)."""
     return K(x, z), -jax.hessian(lambda d: K.kernel(d, jnp.zeros_like(d)))(x - z)

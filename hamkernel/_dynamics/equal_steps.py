@@ -10,8 +10,8 @@ Two families, both with x = (q, p) in one array of shape (n,):
 - Gauss collocation solves implicit equations and is symplectic for every Hamiltonian.
 - Splitting is explicit, and needs H = T(p) + U(q).
 
-Diffrax owns the loop over steps, what is saved and the gradients; Optimistix owns the loop of the
-implicit equations and their derivative by the implicit function theorem.
+Diffrax owns the loop over steps, the output and the gradients; Optimistix the implicit equations
+and their derivative by the implicit function theorem.
 
 Source: "HLW" below is Hairer, Lubich & Wanner, Geometric Numerical Integration, 2nd ed. (2006).
 """
@@ -95,9 +95,9 @@ class EqualSteps(diffrax.AbstractSolver):
     """One long step made of ⌈(t1 − t0)/dt⌉ equal steps of another solver.
 
     With `diffrax.StepTo(ts)` every time in `ts` is the end of a step: nothing is interpolated, and
-    memory is that of the saved points. The steps between two times are all of one size, at most
-    `dt`, and do not depend on the state. Each long step starts at time 0, so that a small step is
-    not lost in the rounding of a large time; the `args` of a field with inputs say when that is.
+    memory is that of the saved points. The steps between two times have one size, at most `dt`,
+    whatever the state. Each long step starts at time 0, so that a small step is not lost in the
+    rounding of a large time; the `args` of a field with inputs are that time.
     """
 
     solver: diffrax.AbstractSolver
@@ -153,7 +153,7 @@ def step_counts(ts: Float[Array, " T"], dt: Float[Array, ""]) -> Int[Array, " T-
 def equal_steps(span: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:
     """The number of equal steps of at most `dt` that fill `span`: whole, at least 1.
 
-    √eps of slack, for a span of 10 dt that rounding made a little longer is 10 steps and not 11.
+    With √eps of slack: a span of 10 dt that rounding made longer is 10 steps and not 11.
     """
     slack = 1 - float(jnp.finfo(span.dtype).eps) ** 0.5
     return jnp.maximum(jnp.ceil(span / jnp.asarray(dt, span.dtype) * slack), 1)

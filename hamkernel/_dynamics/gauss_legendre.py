@@ -17,17 +17,15 @@ from hamkernel._dynamics.equal_steps import AbstractSymplecticSolver, Step
 class FixedPointToRounding(optx.AbstractFixedPointSolver):
     """Iterate y ← f(y) until the increments are rounding errors.
 
-    Stops when the increment is at most `rtol · max|y| + atol`, with the defaults when it is zero;
-    or when it is below √eps · max|y| and has not reached a new minimum for three iterations, which
-    is where the rounding errors of f end the descent. Those of a kernel sum with coefficients of
-    1e11, as noise-free data asks for, end it earlier: below ∛eps · max|y| it stops as well, but
-    after nine such iterations. At an equilibrium f is nothing but rounding, and no part of max|y|
-    is small: `options["rounding"]` is a size below which nine iterations are enough anyway.
+    Stops when the increment is at most `rtol · max|y| + atol`, by default zero; or when it is below
+    √eps · max|y| without a new minimum for three iterations, where the rounding of f ends the
+    descent. That of a kernel sum with coefficients of 1e11, as of noise-free data, ends it earlier:
+    below ∛eps · max|y| nine such iterations suffice, and so they do below `options["rounding"]`,
+    since at an equilibrium f is nothing but rounding and no part of max|y| is small.
 
     Any tolerance, even eps, leaves an error of one sign in every step, and H drifts: in 3e6 steps
-    the midpoint rule was measured to change an oscillator's energy by 1.6e-11 with eps and by less
-    than 1e-12 with zero, in the same time. Linear convergence, no Jacobian: for small steps of a
-    non-stiff field it is cheaper than Newton.
+    the midpoint rule changed an oscillator's energy by 1.6e-11 with eps and by less than 1e-12 with
+    zero, in the same time. For small steps of a non-stiff field it is cheaper than Newton.
 
     Source: HLW, VIII.6; Hairer, McLachlan & Razakarivony (2008), BIT 48, 231-243.
     """

@@ -37,14 +37,12 @@ class Samples(eqx.Module):
 class Driven(eqx.Module):
     """The field x -> f(x, u(t)) as Diffrax calls it, f(t, x, args).
 
-    `args` is the time at which t is zero: steps are counted from the start, or from the last of the
-    saved times, and inputs know the time of the caller.
+    `args` is the caller's time at t = 0: the start, or the last of the saved times.
     """
 
     field: Any  # x, u -> velocity
     inputs: Callable[[Array], Any]
-    # Whether t is counted from the last of the saved times and inputs are held from there: the last
-    # stage of a step would otherwise see the next ones.
+    # Whether inputs are held from t = 0 on: the last stage of a step would else see the next ones.
     held_from_args: bool = eqx.field(static=True)
 
     def __call__(self, t: Any, x: Float[Array, " n"], args: Any) -> Float[Array, " n"]:
@@ -63,7 +61,7 @@ class AtStart(eqx.Module):
 
 
 def learned_at(field: Any, x: Float[Array, " n"]) -> tuple[Any, Float[Array, " d"]]:
-    """What was learned and the point where it is asked first, (x, u) where there are inputs."""
+    """The learned field and its first point, (x, u) where there are inputs."""
     if isinstance(field, AtStart) and isinstance(field.driven.field, ControlledField):
         learned, u = field.driven.field, field.driven.inputs(field.start)
         return learned.whole, learned.joined(x, u)

@@ -16,8 +16,8 @@ RESULTS: Any = diffrax.RESULTS
 def finished(solution: Any, ts: Float[Array, " T"]) -> tuple[Any, Bool[Array, ""]]:
     """The solution with the caller's times, and whether it failed.
 
-    Times that it did not reach stay infinite. Where a state is not finite the result says so:
-    adaptive steps reject such states, constant ones go through them.
+    Times that it did not reach stay infinite. A state that is not finite is a failure: adaptive
+    steps reject such states, constant ones go through them.
     """
     reached_end = solution.result == RESULTS.successful
     overflowed = reached_end & ~jnp.isfinite(solution.ys).all()

@@ -110,7 +110,7 @@ def check_solver(
 
 
 def _tolerance(name: str, given: float | None, default: Array) -> Float[Array, ""]:
-    """An array, because a number in a compiled program would compile anew for every value."""
+    """As an array: every new Python number would compile anew."""
     if given is None:
         return default
     with eager(given):
@@ -139,7 +139,7 @@ def _bound(counts: Int[Array, " intervals"], max_steps: int | None) -> int:
 
 
 def eager(*values: Any) -> AbstractContextManager[None]:
-    """Operations on constants happen at once, also under jit: they are checked and counted."""
+    """Operations on constants happen at once, also under jit, so that they can be checked."""
     if require.is_concrete(*values):
         return jax.ensure_compile_time_eval()
     return nullcontext()

@@ -15,7 +15,7 @@ from hamkernel._dynamics.inputs import AtStart, Between, Driven, inputs_of, refu
 
 
 class _Autonomous(eqx.Module):
-    """The field as Diffrax calls it, f(t, x, args); it keeps what the field knows of itself."""
+    """The field as Diffrax calls it, f(t, x, args), and whether it is separable."""
 
     field: Callable[[Array], Array]
 
@@ -69,7 +69,7 @@ _FilterJit: Any = type(eqx.filter_jit(abs))  # Equinox does not name it
 
 
 def _uncompiled(field: Any) -> Any:
-    """What a compiled field compiles: it knows what it is, and the loop around it is compiled."""
+    """The function inside of `jax.jit`: it knows what it is, and the loop is compiled anyway."""
     # Not behind every `__wrapped__`: what functools.wraps names is another field.
     while isinstance(field, (jax.stages.Wrapped, _FilterJit)):
         field = field.__wrapped__

@@ -1,4 +1,4 @@
-"""How many digits of a learned field there are, which an adaptive step must not ask beyond."""
+"""How many digits a learned field has: an adaptive step must not ask for more."""
 
 from typing import Any
 
@@ -11,8 +11,7 @@ from hamkernel._fields.kernel_field import KernelField
 from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._structures.base import AbstractMatrixKernel
 
-# An equilibrium, where f is zero, would have no digits at all; with 1e-6 the states of a field that
-# can be integrated are still right to a few.
+# At an equilibrium f is zero and has no digits at all; with 1e-6 states are right to a few digits.
 _FEWEST = 1e-6
 
 

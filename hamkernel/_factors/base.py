@@ -1,8 +1,8 @@
 """What every factor of A = G + ridge I offers: each loss and posterior is written once on top.
 
-A *system* says what A is and is differentiated: its cotangent has its own type. Its *factor* solves
-with it, and the *inverse* C = A⁻¹, which need not be a matrix, has what validation losses and their
-derivatives ask for.
+A *system* says what A is; its cotangent has the same type. Its *factor* solves with it, and the
+*inverse* C = A⁻¹, which need not be a matrix, has what validation losses and their derivatives
+need.
 """
 
 import abc
@@ -32,7 +32,7 @@ class AbstractBlocks(eqx.Module):
 
 
 class AbstractInverse(eqx.Module, Generic[System]):
-    """C = A⁻¹, with the cotangents of A that the losses give rise to."""
+    """C = A⁻¹, with the cotangents of A that the losses need."""
 
     @abc.abstractmethod
     def blocks(self, group: Group) -> AbstractBlocks:
@@ -98,7 +98,7 @@ class AbstractFactor(eqx.Module, Generic[System]):
     def trusted(self, y: Float[Array, " D"]) -> Bool[Array, ""]:
         """Whether ε cond(A) leaves digits, with ‖A⁻¹‖ from two steps of the power method.
 
-        They start where y has no say, for y may be an eigenvector.
+        They do not start from y, which may be an eigenvector.
         """
         b = jnp.cos(jnp.arange(len(y), dtype=y.dtype) ** 2)
         c = self.solve(b / jnp.linalg.norm(b))

@@ -1,12 +1,12 @@
 """A dense A of rows some of which see an unknown constant, in the direction p with ‖p‖ = 1.
 
-Where the constant is estimated with the rest, C = A⁻¹ becomes
+With the constant estimated as well, C = A⁻¹ becomes
 
     C = A⁻¹ − A⁻¹p (pᵀA⁻¹p)⁻¹ pᵀA⁻¹ = Tᵀ (T A Tᵀ)⁻¹ T,
 
-the rows of T an orthonormal basis of what is orthogonal to p. Then dC = −C dA C holds still, and so
-do the residuals of held-out rows, (C_SS)⁻¹ (C y)_S, and their derivatives: each fit without a fold
-finds the constant anew. T is all but the first row of the reflection of p to the first axis.
+the rows of T an orthonormal basis of the complement of p. dC = −C dA C still holds, and so do the
+residuals of held-out rows, (C_SS)⁻¹ (C y)_S, and their derivatives: each fit without a fold finds
+the constant anew. T is the reflection of p to the first axis, without its first row.
 
 Source: Dubrule (1983), Mathematical Geology 15, for held-out points with an unknown trend.
 """

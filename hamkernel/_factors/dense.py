@@ -4,9 +4,9 @@ A = RᵀR by LAPACK, U = R⁻¹ from blocks of columns,
 
     U_<j,j = −(U_<j,<j R_<j,j) U_jj,        C = A⁻¹ = U Uᵀ,
 
-and every quadratic form as ‖R⁻ᵀy‖². C is then positive by construction. A faster inversion, with
-blocks of C itself in place of U, was wrong by a factor of 1e14 at condition 1e13; this one is
-compared with 100 digits from condition 1e2 to 1e14 in `tests/benchmarks/accuracy.py`.
+and quadratic forms as ‖R⁻ᵀy‖². C is then positive by construction. A faster inversion by blocks of
+C itself was wrong by a factor of 1e14 at condition 1e13; `tests/benchmarks/accuracy.py` compares
+this one with 100 digits from condition 1e2 to 1e14.
 
 Source: Du Croz & Higham (1992), IMA J. Numer. Anal. 12, method 2, on the stability of inversions.
 """
@@ -148,6 +148,14 @@ class DenseFactor(AbstractFactor[DenseSystem]):
             U = U.at[j, j].set(own)
             U = U.at[before, j].set(-(U[before, before] @ R[before, j]) @ own)
         return U
+
+
+def solution(
+    A: Float[Array, "D D"], y: Float[Array, " D"]
+) -> tuple[DenseFactor, Float[Array, " D"]]:
+    """The factor of A, and A⁻¹y, differentiated implicitly: by one more solve with the factor."""
+    factor, solve = DenseFactor(A), jax.lax.custom_linear_solve
+    return factor, solve(lambda x: A @ x, y, lambda _, b: factor.solve(b), symmetric=True)
 
 
 class DenseInverse(AbstractInverse[DenseSystem]):

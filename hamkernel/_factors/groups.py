@@ -6,11 +6,10 @@ from jaxtyping import Array, Float, Int
 
 
 class Group:
-    """F folds of similar size, S points at most, padded so that they are worked on side by side.
+    """F folds of similar size, padded to S points each so that they can be worked on together.
 
     Attributes:
-        members: the points of each fold, shape (F, S); the rows of smaller folds end in N, which
-            is no point.
+        members: the points of each fold, shape (F, S), padded with N, which is no point.
     """
 
     def __init__(self, N: int, folds: list[Int[np.ndarray, " _"]]):
@@ -19,15 +18,12 @@ class Group:
         for row, fold in zip(self.members, folds, strict=True):
             row[: len(fold)] = fold
 
-    def gather(self, array: Float[Array, "..."], axis: int = 0) -> Float[Array, "..."]:
-        """The axis of all rows as two, (…, Nn, …) -> (…, F, Sn, …); zeros in the padding."""
-        before, after = array.shape[:axis], array.shape[axis + 1 :]
-        by_point = array.reshape(*before, self.N, -1, *after)
-        if not np.array_equal(self.members.reshape(-1), np.arange(self.N)):
-            by_point = jnp.take(
-                by_point, self.members.reshape(-1), axis=axis, mode="fill", fill_value=0
-            )
-        return by_point.reshape(*before, len(self.members), -1, *after)
+    def gather(self, array: Float[Array, "Nn *r"]) -> Float[Array, "F Sn *r"]:
+        """The rows of each fold; zeros in the padding."""
+        by_point, points = array.reshape(self.N, -1, *array.shape[1:]), self.members.reshape(-1)
+        if not np.array_equal(points, np.arange(self.N)):
+            by_point = jnp.take(by_point, points, axis=0, mode="fill", fill_value=0)
+        return by_point.reshape(len(self.members), -1, *array.shape[1:])
 
     def scattered(
         self, values: Float[Array, "F Sn *r"], into: Float[Array, "Nn *r"]

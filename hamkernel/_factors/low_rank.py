@@ -60,7 +60,7 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
         ridge: δ.
         Q: the rows of the orthonormal factor that belong to Φ, shape (D, r), and p beside them.
         R: its triangular factor, shape (r, r).
-        size: ‖M‖ in the Frobenius norm, as that of A but for the directions without features.
+        size: ‖M‖ in the Frobenius norm: that of A without the directions that have no features.
     """
 
     rows: Float[Array, "D r"]
@@ -87,7 +87,7 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
 
     @property
     def _free(self) -> int:
-        """The directions without features: of D rows, less the constant."""
+        """The number of directions without features or constant."""
         return len(self.rows) - self.Q.shape[1]
 
     @property

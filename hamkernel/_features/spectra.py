@@ -3,11 +3,10 @@
 Bochner: k(x, z) = κ(x − z) is the mean of cos(ω·(x − z)) over its spectral measure, so that with F
 frequencies drawn from it k(x, z) ≈ Σ_r c_r cos(ω_r·(x − z)), to F^(−1/2).
 
-Frequencies are smooth functions of the hyperparameters and of base samples which depend on the key
-alone (reparametrisation), so that fits are differentiable and losses comparable between steps. Two
-hyperparameters change the law of the base samples, α of RationalQuadratic and the lengthscale of
-Periodic: there the derivative is that of the measure, right in the mean over keys, and not exactly
-the slope of the loss of one key.
+Frequencies are smooth functions of the hyperparameters and of base samples that depend on the key
+alone, so fits are differentiable and losses comparable between steps. α of RationalQuadratic and
+the lengthscale of Periodic change the law of the base samples: there the derivative is that of the
+measure, right in the mean over keys but not the exact slope for one key.
 
 Source: Rahimi & Recht (2007); Yu et al. (2016).
 """
@@ -84,8 +83,8 @@ def _one(frequencies: Float[Array, "F n"], weights: Float[Array, " F"] | None = 
 def _normal(key: Key[Array, ""], count: int, n: int, dtype: Any) -> Float[Array, "F n"]:
     """Standard normal vectors, independent but for directions orthogonal in blocks of n.
 
-    Each is normal, and the mean over a block has less variance (Yu et al. (2016), "Orthogonal
-    random features"): on the pendulum of the paper a quarter less error than by independent ones.
+    Means over a block then have less variance (Yu et al. (2016), "Orthogonal random features"): a
+    quarter less error on the pendulum of the paper.
     """
     directions, lengths = jax.random.split(key)
     blocks = -(-count // n)
@@ -120,7 +119,7 @@ def _(k: RationalQuadratic, n: int, count: int, key, dtype):
     normal, mixture = jax.random.split(key)
     base = _normal(normal, count, n, dtype)
     alpha = k.alpha.astype(dtype)
-    # Its logarithm: for small α the sample itself underflows, and √ has no derivative at 0.
+    # The logarithm, since for small α the sample underflows, and √ has no derivative at 0.
     log_g = jax.random.loggamma(mixture, alpha, (count, 1), dtype)
     return _one(_over_lengthscale(base * jnp.exp((log_g - jnp.log(alpha)) / 2), k.lengthscale))
 

@@ -23,7 +23,7 @@ from hamkernel._structures.without_potential import DivergenceFree, Separable
 
 
 class AbstractFeatures(eqx.Module):
-    """Fields that span the features of a structured kernel: Σ of them with weights w is a field.
+    """Fields φ_r whose weighted sums approximate those of a structured kernel.
 
     Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z), and each φ_r has the structure of K exactly.
     """
@@ -41,9 +41,9 @@ class AbstractFeatures(eqx.Module):
     def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
         """Σ_r w_r φ_r(x), without the rows."""
 
-    @abc.abstractmethod
     def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
-        """The potential of `field`, for the structures that have one."""
+        """The potential of `field`; AttributeError if there is none."""
+        raise AttributeError(f"{type(self).__name__} have no potential.")
 
     def __call__(self, X: Float[Array, "t n"]) -> Float[Array, "t n r"]:
         return jax.vmap(self.rows)(X)
@@ -95,9 +95,6 @@ class DivergenceFreeFeatures(AbstractFeatures):
         slopes = w.reshape(pairs.shape[1], -1) @ self.waves.gradients(x).T  # (P, n)
         return jnp.einsum("apb,pb->a", pairs, slopes)
 
-    def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
-        raise AttributeError("a divergence-free field has a matrix potential, not a scalar one.")
-
 
 class SeparableFeatures(AbstractFeatures):
     """φ = e_a (wave) for each component a."""
@@ -115,16 +112,13 @@ class SeparableFeatures(AbstractFeatures):
     def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
         return w.reshape(self.dimension, -1) @ self.waves.values(x)
 
-    def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
-        raise AttributeError("a field with independent components has no potential.")
-
 
 class ControlledFeatures(AbstractFeatures):
-    """Those φ(x) of the drift, and uⱼ e_a (wave)(x) for each input j and each coordinate a.
+    """φ(x) of the drift, and uⱼ e_a (wave)(x) for each input j and each coordinate a.
 
     Attributes:
         drift: the features of the drift.
-        waves: those of the kernel of the input matrix; None where that is known.
+        waves: those of the input matrix; None if it is known.
         acts_on: the coordinates that inputs change.
         count: m, the number of inputs; points are (x, u).
     """

@@ -24,7 +24,7 @@ from hamkernel._kernels.symmetry import symmetry_removed
 
 
 class Waves(eqx.Module):
-    """Functions amplitude·cos(ω·x), and after the first `cosines` of them amplitude·sin(ω·x)."""
+    """amplitude·cos(ω·x) for the first `cosines` waves, amplitude·sin(ω·x) for the others."""
 
     frequencies: Float[Array, "w n"]
     amplitudes: Float[Array, " w"]
@@ -49,10 +49,7 @@ class Waves(eqx.Module):
 
 
 class GroupWaves(eqx.Module):
-    """The means of waves over a finite group, Σ_g χ(g) wave(g x)/|G|.
-
-    They are the features of the mean of a kernel over the group in both arguments.
-    """
+    """Means of waves over a finite group, Σ_g χ(g) wave(g x)/|G|: features of the mean kernel."""
 
     waves: Waves
     matrices: Float[Array, "G n n"]

@@ -76,6 +76,27 @@ class FeatureField(AbstractField):
         )
 
 
+def feature_field(
+    K: AbstractMatrixKernel,
+    features: AbstractFeatures,
+    w: Float[Array, " r"],
+    residual: Float[Array, "N n"],
+    regularization: Float[Array, ""],
+    info: SolverInfo,
+) -> FeatureField:
+    """Σ_r w_r φ_r."""
+    return FeatureField(
+        kernel=K,
+        features=features,
+        weights=w,
+        residual=residual,
+        norm=root(w @ w),
+        regularization=regularization,
+        offset=jnp.zeros((), w.dtype),
+        info=info,
+    )
+
+
 @eqx.filter_jit
 def _field_at(features, x, weights):
     return features.field(x, weights)

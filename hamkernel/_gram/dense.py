@@ -67,6 +67,7 @@ def diagonals(
     K: AbstractMatrixKernel, X: Float[Array, "N n"], Z: Float[Array, "N n"]
 ) -> Float[Array, "N n"]:
     """The diagonals of the blocks K(xᵢ, zᵢ)."""
+    X, Z = centred(K, X, Z)
     basis = jnp.eye(K.outputs(X.shape[1]), dtype=X.dtype)
     over_basis = jax.vmap(K.form, in_axes=(None, 0, None, 0))
     return jax.vmap(over_basis, in_axes=(0, None, 0, None))(X, basis, Z, basis)
@@ -102,14 +103,12 @@ def centred(K: AbstractMatrixKernel, x: Array, Z: Float[Array, "M n"]) -> tuple[
     """Both arguments relative to the mean of Z, where K allows it.
 
     The product form x·x + z·z − 2x·z loses the digits of (‖x‖/ℓ)²: far from the origin and in
-    float32 that is all of them. A shift-invariant kernel may have its origin among the data.
+    float32 that is all of them.
     """
-    if Invariance.TRANSLATION not in K.invariance:
+    centre = jax.lax.stop_gradient(K.centre(Z))
+    if centre is None:
         return x, Z
-    centre = jax.lax.stop_gradient(Z.mean(axis=0))
-    if x.ndim == 1:
-        return x - centre, Z - centre[None]
-    return x - centre[None], Z - centre[None]
+    return x - centre.reshape((1,) * (x.ndim - 1) + centre.shape), Z - centre[None]
 
 
 def plus_ridge(G: Float[Array, "D D"], ridge: Float[Array, ""]) -> Float[Array, "D D"]:

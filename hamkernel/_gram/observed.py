@@ -24,18 +24,13 @@ _ENTRIES = 1_000_000
 
 def gram_of_rows(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, "D D"]:
     """The Gram of all rows, without the constant of the energies."""
-    G = gram_before_contrast(K, rows)
-    return rows.contrast(rows.contrast(G).T) if len(rows.energies) else G
-
-
-def gram_before_contrast(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, "M M"]:
-    """The Gram of all rows before the contrast of the energies."""
-    blocks = rows.blocks
-    if len(blocks) == 1:
-        return between(K, *blocks, *blocks)
-    places = range(len(blocks))
+    blocks, places = rows.blocks, range(len(rows.blocks))
     upper = {(i, j): between(K, blocks[i], blocks[j]) for j in places for i in range(j + 1)}
-    return jnp.block([[upper[i, j] if i <= j else upper[j, i].T for j in places] for i in places])
+    if len(blocks) == 1:
+        G = upper[0, 0]
+    else:
+        G = jnp.block([[upper[i, j] if i <= j else upper[j, i].T for j in places] for i in places])
+    return rows.contrast(rows.contrast(G).T) if len(rows.energies) else G
 
 
 def rows_between(K: AbstractMatrixKernel, rows: Rows, block: AbstractBlock) -> Float[Array, "D d"]:

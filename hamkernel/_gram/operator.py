@@ -227,5 +227,4 @@ def _(operator: GramOperator) -> lx.PyTreeLinearOperator:
 
 @lx.diagonal.register
 def _(operator: GramOperator) -> Float[Array, " Nn"]:
-    K = operator.kernel
-    return diagonals(K, *centred(K, operator.X, operator.columns)).reshape(-1)
+    return diagonals(operator.kernel, operator.X, operator.columns).reshape(-1)

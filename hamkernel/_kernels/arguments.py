@@ -7,7 +7,7 @@ from hamkernel import _require as require
 
 
 def one_point(x: ArrayLike) -> Float[Array, " n"]:
-    """`x` as a float array; a batch of points would silently give a wrong number."""
+    """`x` as a float array; a batch would silently give a wrong number."""
     x = require.floating(x, "the point")
     if x.ndim != 1:
         raise ValueError(
@@ -31,7 +31,7 @@ def divided(
 
 
 def log_per_coordinate(value: ArrayLike, name: str, cure: str = "") -> Float[Array, "..."]:
-    """The stored form of a positive hyperparameter that is a number, or one per coordinate."""
+    """The logarithm of a positive hyperparameter, one number or one per coordinate."""
     array = require.positive(value, name, cure)
     if array.ndim > 1:
         raise ValueError(f"{name} has shape {array.shape}; it must be a number or a vector (n,).")

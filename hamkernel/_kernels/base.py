@@ -50,13 +50,13 @@ class AbstractScalarKernel(eqx.Module):
         """k(x, z) for one pair of points."""
 
     @property
-    @abc.abstractmethod
     def invariance(self) -> Invariance:
-        """The transformations of both arguments that leave k unchanged."""
+        """The transformations of both arguments that leave k unchanged, as far as is known."""
+        return Invariance.NONE
 
-    @abc.abstractmethod
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
-        """For each term of an additive kernel, the coordinates that it depends on."""
+        """For each term of an additive kernel, the coordinates that it may depend on."""
+        return (frozenset(range(n)),)
 
     def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
         """Whether k(Sx, Sz) = k(x, z) is known for ALL values of the hyperparameters.
@@ -77,20 +77,20 @@ class AbstractScalarKernel(eqx.Module):
 
     @property
     def has_amplitude(self) -> bool:
-        """Whether a factor that is trained multiplies all of k; a None in its place is none."""
+        """Whether a trained factor multiplies all of k; None in its place does not count."""
         return False
 
     def box(
         self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
     ) -> tuple[ArrayLike, ArrayLike]:
-        """Where to look for the array `name`, as it is stored: the lower and the upper bound.
+        """The lower and upper bound of the array `name`, as stored.
 
-        `X` are the data in the coordinates that k sees, and `amplitude` a fair factor before it.
+        `X` is the data in the coordinates that k sees, and `amplitude` a plausible factor of k.
         """
         return by_name(name, getattr(self, name), X, amplitude)
 
     def seen(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
-        """The data in the coordinates that the kernels inside see."""
+        """The data in the coordinates of the kernels inside."""
         return X
 
     def __add__(self, other: Any) -> "ScalarSum":
@@ -258,16 +258,9 @@ class UserKernel(AbstractScalarKernel):
         # Its parameters may be more precise than the data.
         return value.astype(require.floating(x, "the point").dtype)
 
-    @property
-    def invariance(self) -> Invariance:
-        return Invariance.NONE
-
-    def supports(self, n: int) -> tuple[frozenset[int], ...]:
-        return (frozenset(range(n)),)
-
 
 def of_one_pair(fn: Callable[..., Any]) -> Callable[..., Any]:
-    """`fn`; of a kernel of tinygp, which gives a whole Gram when called, the method for a pair."""
+    """`fn`, or the method for one pair of a tinygp kernel, which makes a Gram when called."""
     families = {cls.__module__.partition(".")[0] for cls in type(fn).__mro__}
     return getattr(fn, "evaluate", fn) if "tinygp" in families else fn
 

@@ -51,9 +51,6 @@ class Polynomial(AbstractScalarKernel):
     def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
         return is_orthogonal(S)
 
-    def supports(self, n: int) -> tuple[frozenset[int], ...]:
-        return (frozenset(range(n)),)
-
 
 class Periodic(AbstractScalarKernel):
     """The periodic kernel, k(x, z) = exp(−2 Σₐ sin²(π(xₐ − zₐ)/Tₐ)/ℓₐ²).
@@ -112,6 +109,3 @@ class Periodic(AbstractScalarKernel):
             # On a circle of radius 1; below 1/64 random features need too long a Fourier series.
             return np.log(max(0.6 / len(X), 1 / 64)), np.log(60.0)
         return by_name(name, self.log_period, X, amplitude)
-
-    def supports(self, n: int) -> tuple[frozenset[int], ...]:
-        return (frozenset(range(n)),)

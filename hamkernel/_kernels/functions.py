@@ -26,13 +26,13 @@ def as_pytree(fn: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _no_leaf(leaf: Any) -> Any:
-    """`leaf`, where it is a function, as a part of the structure: the activation of a network."""
+    """A function, such as the activation of a network, as structure instead of a leaf."""
     is_function = callable(leaf) and not eqx.is_array_like(leaf)
     return jax.tree_util.Partial(leaf) if is_function else leaf
 
 
 class Bound(eqx.Module):
-    """A `functools.partial` whose arrays are leaves; what else it binds is static."""
+    """A `functools.partial` with its arrays as leaves and the rest static."""
 
     func: Callable[..., Any]
     arrays: tuple[Array | None, ...]
@@ -58,7 +58,7 @@ class Bound(eqx.Module):
 
     @property
     def floats(self) -> dict[str, float]:
-        """The Python floats that it binds, by their keywords or positions."""
+        """The Python floats that it binds, by keyword or position."""
         args, keywords = self._bound()
         bound = {f"argument {i}": value for i, value in enumerate(args)} | keywords
         return {name: value for name, value in bound.items() if isinstance(value, float)}
@@ -70,10 +70,9 @@ class Bound(eqx.Module):
 
 
 class Closure(eqx.Module):
-    """A function that closes over traced values, with these as leaves.
+    """A function with the traced values that it closes over as leaves.
 
-    Derivatives with respect to them are then seen by rules of our own, which JAX does not allow to
-    depend on what is not among their arguments.
+    A custom derivative rule sees its arguments only, so they must be among them.
     """
 
     func: Any = eqx.field(static=True)  # with nothing in the cells of `traced`
@@ -121,7 +120,7 @@ def _holds_traced(value: Any, outer: tuple[Any, ...] = ()) -> bool:
 def _content(cell: types.CellType) -> Any:
     try:
         return cell.cell_contents
-    except ValueError:  # nothing yet
+    except ValueError:  # an empty cell
         return None
 
 

@@ -1,7 +1,7 @@
 """Finite groups of linear maps of the states, from a few of their elements.
 
-A map is written as a function (n,) -> (n,) or as an (n, n) array, which is kept as nested tuples
-of numbers so that kernels stay hashable. The group is closed when the dimension is known.
+A map is a function (n,) -> (n,) or an (n, n) array, kept as nested tuples so that kernels stay
+hashable. The group is closed once the dimension is known.
 """
 
 import functools
@@ -56,7 +56,7 @@ class Element(NamedTuple):
 
 
 def linear_maps(maps: Any) -> tuple[LinearMap, ...]:
-    """The generators of a group as the caller gives them: a list of arrays and functions.
+    """The generators of a group, a list of arrays and functions.
 
     Raises:
         TypeError: `maps` is no list of maps. ValueError: a matrix is not square, finite and
@@ -150,7 +150,7 @@ def closed(
 
 
 def _clean(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """The matrix with whole numbers in place of those that rounding has moved from them."""
+    """The matrix with entries within rounding of a whole number replaced by it."""
     whole = np.round(matrix)
     return np.where(np.abs(matrix - whole) < 1e-14, whole, matrix) + 0.0
 

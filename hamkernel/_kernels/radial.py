@@ -71,9 +71,6 @@ class AbstractRadialKernel(AbstractScalarKernel):
         """A lengthscale for each coordinate allows changes of sign, one for all every rotation."""
         return is_orthogonal(S) and (self.log_lengthscale.ndim == 0 or is_diagonal(S))
 
-    def supports(self, n: int) -> tuple[frozenset[int], ...]:
-        return (frozenset(range(n)),)
-
 
 class Gaussian(AbstractRadialKernel):
     """The Gaussian kernel, k(x, z) = exp(−‖(x − z)/ℓ‖²/2).

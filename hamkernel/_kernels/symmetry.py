@@ -36,8 +36,8 @@ class Symmetrised(AbstractScalarKernel):
         kernel: the scalar kernel k.
         maps: linear maps that generate the group, functions (n,) -> (n,) or the rows of matrices.
         characters: χ(g) = ±1 for each map.
-        one_sided: whether k(gx, gz) = k(x, z) is known to hold for all g; if None, that is found
-            out once the dimension is known.
+        one_sided: whether k(gx, gz) = k(x, z) for all g; None to find out once the dimension is
+            known.
 
     Source: Krejník & Tyutin (2012) for the odd kernel k(x, z) − k(−x, z); the two-sided mean is
     the projection of the feature map onto the functions with the symmetry.
@@ -99,7 +99,7 @@ class Symmetrised(AbstractScalarKernel):
 
 
 def without_symmetry(tree: T) -> T:
-    """A kernel, or what holds some, before the terms of odd and even ones cancel: what rounds.
+    """The tree with every mean over a group replaced by its kernel: the size of what rounds.
 
     (k(x, z) − k(−x, z))/2 of a long lengthscale is the small difference of large numbers.
     """
@@ -119,8 +119,8 @@ def symmetrised(
 ) -> AbstractScalarKernel:
     """The kernel of the functions u(gx) = χ(g) u(x) of the RKHS of `kernel`, g in the maps.
 
-    A sum is symmetrised term by term, so that its terms stay visible, and what has a symmetry
-    already gets the group of both.
+    A sum is symmetrised term by term, so that its terms stay visible; a kernel with a symmetry
+    gets the group of both.
 
     Raises:
         ValueError: a map has the other sign already, so that only zero is left.
@@ -154,7 +154,7 @@ def with_parity(kernel: AbstractScalarKernel, parity: int) -> AbstractScalarKern
 
 
 class Removed(NamedTuple):
-    """The kernel of which another one is the mean over a group."""
+    """A kernel, and the means over a group that were taken off it."""
 
     kernel: AbstractScalarKernel
     means: tuple[Symmetrised, ...]  # over one group; the terms of a sum have one each
@@ -190,7 +190,7 @@ def symmetry_removed(kernel: AbstractScalarKernel) -> Removed | None:
 
 
 def symmetries(kernel: AbstractScalarKernel) -> Iterator[Symmetrised]:
-    """The groups over which terms of the kernel are means, in the coordinates of the states."""
+    """All means over groups in a kernel, in the coordinates of the states."""
     if isinstance(kernel, Symmetrised):
         yield kernel
     terms = kernel.terms if isinstance(kernel, ScalarProduct) else kernel.summands(False)

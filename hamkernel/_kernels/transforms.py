@@ -61,13 +61,6 @@ class Warp(AbstractScalarKernel):
         return require.floating(warped, "the value of the map of Warp").astype(x.dtype)
 
     @property
-    def invariance(self) -> Invariance:
-        return Invariance.NONE
-
-    def supports(self, n: int) -> tuple[frozenset[int], ...]:
-        return (frozenset(range(n)),)
-
-    @property
     def has_amplitude(self) -> bool:
         return self.kernel.has_amplitude
 

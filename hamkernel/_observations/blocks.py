@@ -36,6 +36,11 @@ class AbstractBlock(eqx.Module):
 
     @property
     @abc.abstractmethod
+    def size(self) -> int:
+        """D, the number of rows."""
+
+    @property
+    @abc.abstractmethod
     def scale(self) -> Float[Array, " D"]:
         """The relative noise of each row, by which it is divided."""
 
@@ -98,9 +103,12 @@ class Components(AbstractBlock):
         return len(self.points), self.dimension
 
     @property
+    def size(self) -> int:
+        return math.prod(self.values_shape) if self.kept is None else len(self.kept)
+
+    @property
     def scale(self) -> Float[Array, " D"]:
-        size = math.prod(self.values_shape) if self.kept is None else len(self.kept)
-        return jnp.ones(size, self.points.dtype) if self.noise is None else self.noise
+        return jnp.ones(self.size, self.points.dtype) if self.noise is None else self.noise
 
     @property
     def count(self) -> int:
@@ -171,12 +179,16 @@ class Combinations(AbstractBlock):
         return S * Q, n
 
     @property
+    def size(self) -> int:
+        return self.weights.shape[0] * self.weights.shape[1]
+
+    @property
     def scale(self) -> Float[Array, " SR"]:
-        return jnp.ones(self.count, self.groups.dtype)
+        return jnp.ones(self.size, self.groups.dtype)
 
     @property
     def count(self) -> int:
-        return self.weights.shape[0] * self.weights.shape[1]
+        return self.size
 
     def labels(self) -> Int[np.ndarray, " SR"]:
         return np.arange(self.count)
@@ -229,12 +241,16 @@ class Values(AbstractBlock):
         return self.points.shape[1] if self.outputs is None else self.outputs
 
     @property
+    def size(self) -> int:
+        return len(self.points)
+
+    @property
     def scale(self) -> Float[Array, " E"]:
-        return jnp.ones(len(self.points), self.points.dtype) if self.noise is None else self.noise
+        return jnp.ones(self.size, self.points.dtype) if self.noise is None else self.noise
 
     @property
     def count(self) -> int:
-        return len(self.points)
+        return self.size
 
     def labels(self) -> Int[np.ndarray, " E"]:
         return np.arange(len(self.points))

@@ -72,10 +72,6 @@ class Velocities(AbstractObservations):
     def dimension(self) -> int:
         return self.X.shape[1]
 
-    def driven(self) -> Iterator[Float[Array, "N m"]]:
-        if self.inputs is not None:
-            yield self.inputs
-
     def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
         y, noise = self.Y.reshape(-1), self.noise
         if noise is not None:
@@ -132,9 +128,6 @@ class Energies(AbstractObservations):
     def dimension(self) -> int:
         return self.X.shape[1]
 
-    def driven(self) -> Iterator[Float[Array, "N m"]]:
-        yield from ()
-
     def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
         noise = None if self.noise is None else jnp.broadcast_to(self.noise, self.E.shape)
         if not count:
@@ -173,10 +166,6 @@ class Equilibria(AbstractObservations):
     @property
     def dimension(self) -> int:
         return self.X.shape[1]
-
-    def driven(self) -> Iterator[Float[Array, "N m"]]:
-        if self.inputs is not None:
-            yield self.inputs
 
     def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
         points, outputs = joined_points(self, self.X, count)
@@ -250,10 +239,6 @@ class Functionals(AbstractObservations):
     @property
     def dimension(self) -> int:
         return self.points.shape[2]
-
-    def driven(self) -> Iterator[Float[Array, "S Q m"]]:
-        if self.inputs is not None:
-            yield self.inputs
 
     def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
         points, _ = joined_points(self, self.points, count)

@@ -62,7 +62,7 @@ class Rows(eqx.Module):
     @property
     def slices(self) -> list[slice]:
         """Where the rows of each block stand before the contrast."""
-        ends = np.cumsum([0, *(len(block.scale) for block in self.blocks)]).tolist()
+        ends = np.cumsum([0, *(block.size for block in self.blocks)]).tolist()
         return [slice(a, b) for a, b in itertools.pairwise(ends)]
 
     @property

@@ -10,33 +10,38 @@ whose F = G_XS T is applied as a product with the Gram, so that it needs no memo
 trace(G − Ĝ) ≤ τρ the condition is at most 1 + τ and the iterations do not depend on N.
 """
 
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import lineax as lx
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
-from hamkernel._fields.base import SolverInfo, at_points, root
+from hamkernel._fields.base import SolverInfo, root
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
 from hamkernel._gram.derivatives import constant
 from hamkernel._gram.operator import product
 from hamkernel._machine.devices import as_given, rows_of, split
-from hamkernel._observations.rows import Rows
-from hamkernel._solvers.cholesky import AbstractSolver, relative
-from hamkernel._solvers.conditional import NO_FACTOR, FieldAlone, check_potential, field_of_rows
+from hamkernel._solvers.cholesky import AbstractSolver
+from hamkernel._solvers.conditional import field_of_rows, gram_product, relative
 from hamkernel._solvers.landmark_gram import Columns, checked, factor, truncated, whitening
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.spans import landmark_span
 from hamkernel._solvers.stream_sums import normal
-from hamkernel._structures.base import AbstractMatrixKernel
 
 # Nλ in units of ε trace(G) below which a failure is one of rounding. On 87 points of an orbit they
 # converged at 3e4 and did not at 3e2, where Cholesky left a residual of 4e-12.
 _DIGITS = 1e4
+
+
+class _Found(NamedTuple):
+    learned: tuple[Array, Array, Array]  # coefficients, residual and norm
+    iterations: Int[Array, ""]
+    left: Float[Array, ""]  # the relative residual of the system
+    truncation: Float[Array, ""] | None  # of the preconditioner
 
 
 class ConjugateGradient(AbstractSolver[KernelField]):
@@ -62,7 +67,11 @@ class ConjugateGradient(AbstractSolver[KernelField]):
         arXiv 2304.12465, for randomly pivoted Cholesky in it.
     """
 
-    no_factor: ClassVar[str | None] = NO_FACTOR
+    no_factor: ClassVar[str | None] = (
+        "conjugate gradients find a field and keep no factor, so they cannot say how far it may be "
+        "off. Use hk.condition(..., solver=hk.Cholesky()), which is exact, or solver=hk.Nystrom(), "
+        "whose factor is small; for the field alone hk.fit."
+    )
     tolerance: float | None = eqx.field(static=True)
     max_iterations: int = eqx.field(static=True)
     preconditioner: Nystrom
@@ -84,93 +93,52 @@ class ConjugateGradient(AbstractSolver[KernelField]):
             )
         self.preconditioner = preconditioner
 
-    def _fitted(
-        self,
-        K: AbstractMatrixKernel,
-        X: Float[Array, "N n"],
-        Y: Float[Array, "N n"],
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> KernelField:
+    def _fitted(self, K, X, Y, regularization, throw=True) -> KernelField:
         landmarks = self.preconditioner.landmarks(K, X, regularization)
-        ridge = len(X) * regularization
-        spread = rows_of(X)
+        ridge, spread = len(X) * regularization, rows_of(X)
         X, Y = split(spread, X), split(spread, Y)
-        within = jnp.asarray(self._tolerance(X.dtype), X.dtype)  # a Python float would compile anew
-        learned, iterations, left, truncation = _solve(
-            K, X, Y, ridge, landmarks, within, self.max_iterations, spread
-        )
-
-        learned = self._converged(
-            K, X, ridge, learned, iterations, left, truncation, landmarks, throw
-        )
-        coefficients, residual, norm = learned
+        tolerance = self._tolerance(X.dtype)
+        found = _solve(K, X, Y, ridge, landmarks, tolerance, self.max_iterations, spread)
+        (A, residual, norm), info = self._converged(K, X, ridge, landmarks, found, throw)
         return KernelField(
             kernel=K,
             points=X,
-            coefficients=coefficients,
+            coefficients=A,
             residual=as_given(spread, residual),
             norm=norm,
             regularization=regularization,
             offset=jnp.zeros((), X.dtype),
-            info=SolverInfo(
-                "ConjugateGradient",
-                landmarks=landmarks.count,
-                rank=landmarks.kept.sum(),
-                truncation=truncation,
-                iterations=iterations,
-                relative_residual=left,
-            ),
+            info=info,
         )
 
-    def _given(
-        self,
-        K: AbstractMatrixKernel,
-        rows: Rows,
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> FieldAlone:
-        check_potential(K, rows)
-        dtype = rows.targets.dtype
-        landmarks = self.preconditioner.landmarks(K, rows.points, regularization)
-        ridge = rows.count * regularization
-        within = jnp.asarray(self._tolerance(dtype), dtype)
-        learned, iterations, left, truncation = _solve_rows(
-            K, rows, ridge, landmarks, within, self.max_iterations
-        )
-        C, residual, norm = self._converged(
-            K, rows.points, ridge, learned, iterations, left, truncation, landmarks, throw
-        )
-        info = SolverInfo(
-            "ConjugateGradient",
-            landmarks=landmarks.count,
-            rank=landmarks.kept.sum(),
-            iterations=iterations,
-            relative_residual=left,
-        )
-        field = field_of_rows(K, rows, C, residual, norm, regularization, info)
-        return FieldAlone(field, rows, ridge)
+    def _fitted_rows(self, K, rows, regularization, throw=True) -> KernelField:
+        X, ridge = rows.points, rows.count * regularization
+        landmarks = self.preconditioner.landmarks(K, X, regularization)
+        tolerance = self._tolerance(rows.targets.dtype)
+        found = _solve_rows(K, rows, ridge, landmarks, tolerance, self.max_iterations)
+        (c, residual, norm), info = self._converged(K, X, ridge, landmarks, found, throw)
+        residual = rows.residual(residual)
+        return field_of_rows(K, rows, c, residual, norm, regularization, info)
 
-    def _tolerance(self, dtype: jnp.dtype) -> float:
-        if self.tolerance is not None:
-            return self.tolerance
-        return 1e-8 if dtype == jnp.float64 else 1e-5
+    def _tolerance(self, dtype: jnp.dtype) -> Float[Array, ""]:
+        own = self.tolerance
+        default = 1e-8 if dtype == jnp.float64 else 1e-5
+        # As a Python float it would compile anew.
+        return jnp.asarray(default if own is None else own, dtype)
 
-    def _converged(
-        self, K, X, ridge, learned, iterations, left, truncation, landmarks, throw: bool
-    ):
-        """What was learned, if the iterations converged."""
+    def _converged(self, K, X, ridge, landmarks, found: _Found, throw: bool):
+        """What was learned, if the iterations converged, and how."""
+        learned, iterations, left, truncation = found
         tolerance = self._tolerance(X.dtype)
 
         def message() -> str:
             reached = ""
             if require.is_concrete(left, iterations, truncation):
+                cut = "" if truncation is None else f", truncation {float(truncation):.1e}"
                 reached = (
                     f" after {int(iterations)} iterations: the relative residual is "
-                    f"{float(left):.1e} and the tolerance {tolerance:.1e}"
-                )
-                reached += (
-                    f" ({int(landmarks.count)} landmarks, truncation {float(truncation):.1e})"
+                    f"{float(left):.1e} and the tolerance {tolerance:.1e} "
+                    f"({int(landmarks.count)} landmarks{cut})"
                 )
                 rounding = float(jnp.finfo(X.dtype).eps * trace(K, X, rows_of(X)))
                 if ridge < _DIGITS * rounding:
@@ -193,8 +161,16 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                 "residual that is NaN the kernel is at fault: hk.check_kernel(k, X) finds out."
             )
 
-        failed = ~(require.on_host(left) <= tolerance)
-        return checked(learned, landmarks, truncation, failed, message, throw)
+        failed = ~(require.on_host(left) <= require.on_host(tolerance))
+        info = SolverInfo(
+            "ConjugateGradient",
+            landmarks=landmarks.count,
+            rank=landmarks.kept.sum(),
+            truncation=truncation,
+            iterations=iterations,
+            relative_residual=left,
+        )
+        return checked(learned, landmarks, truncation, failed, message, throw), info
 
 
 @eqx.filter_jit
@@ -214,12 +190,8 @@ def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
     def gram(c):
         return product(K, X, X, c, spread, spread)
 
-    C, steps = _iterated(gram, preconditioned, Y, ridge, tolerance, max_iterations)
-    values = gram(C) / ridge  # f(X)
-    left = relative(Y - C - values, Y)
     truncation = truncated(trace(K_, X_, spread), jnp.trace(square), ridge_)
-    norm = root(jnp.sum(C * values) / ridge)  # ‖f‖² = aᵀGa
-    return (C / ridge, Y - values, norm), steps, left, truncation
+    return _iterated(gram, preconditioned, Y, ridge, tolerance, max_iterations, truncation)
 
 
 @eqx.filter_jit
@@ -231,22 +203,16 @@ def _solve_rows(K, rows, ridge, landmarks, tolerance, max_iterations):
     R = factor(F.T @ F, ridge_)
 
     def gram(c):
-        field = field_of_rows(K, rows, c, c, ridge, ridge, SolverInfo("none"))
-        potential = jax.tree_util.Partial(at_points, field._learned_potential)
-        return rows.contrast(rows.of(field._evaluated, potential))
+        return gram_product(K, rows, c)
 
     def preconditioned(c):
         return c - F @ jax.scipy.linalg.cho_solve((R, True), F.T @ c)
 
-    C, steps = _iterated(gram, preconditioned, y, ridge, tolerance, max_iterations)
-    values = gram(C) / ridge
-    left = relative(y - C - values, y)
-    norm = root(C @ values / ridge)
-    return (C / ridge, rows.residual(C), norm), steps, left, jnp.zeros((), y.dtype)
+    return _iterated(gram, preconditioned, y, ridge, tolerance, max_iterations, None)
 
 
-def _iterated(gram, preconditioned, y, ridge, tolerance, max_iterations):
-    """The solution of (I + G/ridge) c = y, and the number of iterations."""
+def _iterated(gram, preconditioned, y, ridge, tolerance, max_iterations, truncation) -> _Found:
+    """The solution of (I + G/ridge) c = y."""
     structure = jax.ShapeDtypeStruct(y.shape, y.dtype)
     positive = lx.positive_semidefinite_tag
     system = lx.FunctionLinearOperator(lambda c: c + gram(c) / ridge, structure, positive)
@@ -263,4 +229,8 @@ def _iterated(gram, preconditioned, y, ridge, tolerance, max_iterations):
     )
     options = {"preconditioner": preconditioner}
     solution = lx.linear_solve(system, y, solver, options=options, throw=False)
-    return solution.value, solution.stats["num_steps"]
+    c = solution.value
+    values = gram(c) / ridge  # f(X)
+    norm = root(jnp.sum(c * values) / ridge)  # ‖f‖² = aᵀGa
+    learned = c / ridge, y - values, norm
+    return _Found(learned, solution.stats["num_steps"], relative(y - c - values, y), truncation)

@@ -16,7 +16,8 @@ from hamkernel._machine.memory import dense_bytes, memory_bytes
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._observations.base import AbstractObservations
 from hamkernel._observations.data import as_states
-from hamkernel._solvers.cholesky import COPIES, AbstractSolver, Cholesky, Learned
+from hamkernel._solvers.cholesky import AbstractSolver, Cholesky, Learned
+from hamkernel._solvers.conditional import COPIES
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.given import checked_rows, checked_states
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
@@ -59,18 +60,6 @@ def fit(
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
 ) -> Learned: ...
-@overload
-def fit(
-    K: AbstractMatrixKernel,
-    X: Num[ArrayLike, "N n"] | AbstractObservations,
-    Y: Num[ArrayLike, "N n"] | None = None,
-    regularization: ArrayLike = 1e-4,
-    *,
-    solver: AbstractSolver | None,
-    mean: Mean | None = None,
-    throw: bool = True,
-    inputs: Num[ArrayLike, "N m"] | None = None,
-) -> AbstractField: ...
 
 
 @one_blas_thread
@@ -133,7 +122,7 @@ def fit(
     if isinstance(X, AbstractObservations):
         K, rows, regularization, known = checked_rows(K, X, Y, regularization, mean)
         solver = default_solver(rows.size, rows.targets.dtype) if solver is None else solver
-        field = solver._given(K, rows, regularization, throw).field
+        field = solver._fitted_rows(K, rows, regularization, throw)
         return learned_field(field, known)
     K, X, Y, regularization, known = checked_states(K, X, Y, regularization, mean, inputs)
     require.warn_of_float32(X)

@@ -14,7 +14,6 @@ from hamkernel._fields.known import KnownPart, known_part
 from hamkernel._observations.base import AbstractObservations
 from hamkernel._observations.data import observations, points_and_velocities, rows_of_data
 from hamkernel._observations.rows import Rows
-from hamkernel._solvers.conditional import check_potential
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.controlled import Controlled
 
@@ -46,7 +45,8 @@ def checked_rows(
     """Kernel, the rows of the data less what is known of them, λ, and what is known."""
     K, rows = rows_of_data(K, observations(X, Y, inputs))
     K.check_points(rows.points)
-    check_potential(K, rows)
+    if len(rows.energies) and K.no_potential:
+        raise AttributeError(f"energies were given, and {K.no_potential}")
     require.warn_of_float32(rows.targets)
     regularization = require.ridge(regularization, rows.targets.dtype)
     known = known_part(K, mean, rows.dimension, rows.targets.dtype)

@@ -59,8 +59,16 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         spread = rows_of(X)
         return _with_data(self, split(spread, X), split(spread, Y), spread)
 
+    @eqx.filter_jit
     def _added_rows(self, rows: Rows) -> "LandmarkFit":
-        return _with_rows(self, rows)
+        K, S = self.kernel, self.landmarks.points
+        design = [between(K, block, components(K, S)) for block in rows.blocks]
+        new = (
+            stream_sums.add_rows(self.sums, jnp.concatenate(design), rows.targets),
+            self.trace + trace_of_rows(K, rows),
+            self.count + rows.count,
+        )
+        return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), self, new)
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
         solution = _solution(self, count, regularization)
@@ -93,18 +101,6 @@ def _with_data(fit, X, Y, spread):
         stream_sums.add(fit.sums, Columns(K, fit.landmarks.points), X, Y, spread),
         fit.trace + trace(K, X, spread),
         fit.count + len(X),
-    )
-    return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), fit, new)
-
-
-@eqx.filter_jit
-def _with_rows(fit, rows):
-    K, S = fit.kernel, fit.landmarks.points
-    design = [between(K, block, components(K, S)) for block in rows.blocks]
-    new = (
-        stream_sums.add_rows(fit.sums, jnp.concatenate(design), rows.targets),
-        fit.trace + trace_of_rows(K, rows),
-        fit.count + rows.count,
     )
     return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), fit, new)
 

@@ -75,7 +75,7 @@ def truncated(
 def checked(
     learned: Learned,
     landmarks: Landmarks,
-    truncation: Float[Array, ""],
+    truncation: Float[Array, ""] | None,
     failed: Bool[ArrayLike, ""],
     message: str | Callable[[], str],
     throw: bool,
@@ -84,6 +84,8 @@ def checked(
 
     Without landmarks all of the Gram must be missing, unless it is zero, and so is the field.
     """
+    if truncation is None:
+        return require.value(learned, failed, message, RuntimeError, throw)
     none = require.on_host(landmarks.count) == 0
     failed = failed | (none & (require.on_host(truncation) != 0))
     learned = require.value(learned, failed, message, RuntimeError, throw)

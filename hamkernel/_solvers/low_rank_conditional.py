@@ -19,7 +19,7 @@ from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.rows import Rows
-from hamkernel._solvers.conditional import AbstractConditional, check_potential
+from hamkernel._solvers.conditional import AbstractConditional
 from hamkernel._solvers.landmark_gram import singular
 from hamkernel._solvers.spans import AbstractSpan
 
@@ -62,10 +62,8 @@ def low_rank_conditional(
     """The field given the rows in the span of some functions: O(D r²) time, O(D r) memory.
 
     Raises:
-        RuntimeError: the least squares have no solution to rounding. AttributeError: energies of a
-            structure without potential.
+        RuntimeError: the least squares have no solution to rounding.
     """
-    check_potential(span.kernel, rows)
     conditional = _least_squares(span, rows, rows.count * regularization)
     field = conditional.field
     cause = singular(field.offset.dtype)

@@ -25,7 +25,6 @@ from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
 from hamkernel._gram.operator import product
 from hamkernel._machine.devices import as_given, rows_of, split
-from hamkernel._observations.rows import Rows
 from hamkernel._solvers import landmark_fit, stream_sums
 from hamkernel._solvers.landmark_field import CHOOSE, Solution, landmark_field
 from hamkernel._solvers.landmark_fit import LandmarkFit
@@ -33,11 +32,11 @@ from hamkernel._solvers.landmark_gram import Columns, factor, truncated, whiteni
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks
 from hamkernel._solvers.low_rank_conditional import LowRankConditional, low_rank_conditional
 from hamkernel._solvers.spans import LandmarkBasis, landmark_span
-from hamkernel._solvers.streaming import AbstractStreamingSolver, checked_start, thinned
+from hamkernel._solvers.streaming import AbstractStreamingSolver, thinned
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
-class Nystrom(AbstractStreamingSolver[KernelField]):
+class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
     """A low-rank fit: the field lives on a few landmarks, chosen from the data.
 
     Landmarks are drawn by randomly pivoted Cholesky until trace(G − Ĝ) ≤ tolerance · Nλ. Then the
@@ -117,14 +116,7 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
     ) -> LandmarkBasis:
         return LandmarkBasis(self.landmarks(K, X, regularization).points)
 
-    def _fitted(
-        self,
-        K: AbstractMatrixKernel,
-        X: Float[Array, "N n"],
-        Y: Float[Array, "N n"],
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> KernelField:
+    def _fitted(self, K, X, Y, regularization, throw=True) -> KernelField:
         landmarks = self.landmarks(K, X, regularization)
         spread = rows_of(X)
         X, Y = split(spread, X), split(spread, Y)
@@ -132,42 +124,11 @@ class Nystrom(AbstractStreamingSolver[KernelField]):
         solution = solution._replace(residual=as_given(spread, solution.residual))
         return landmark_field(K, landmarks, solution, regularization, self.tolerance, CHOOSE, throw)
 
-    def _given(
-        self,
-        K: AbstractMatrixKernel,
-        rows: Rows,
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> LowRankConditional:
+    def _given(self, K, rows, regularization, throw=True) -> LowRankConditional:
         span = landmark_span(K, self.landmarks(K, rows.points, regularization))
         return low_rank_conditional(span, rows, regularization, throw)
 
-    def start(
-        self,
-        K: AbstractMatrixKernel,
-        sample: Num[ArrayLike, "N n"],
-        regularization: ArrayLike = 1e-4,
-        inputs: Num[ArrayLike, "N m"] | None = None,
-    ) -> LandmarkFit:
-        """A fit without data yet, to which chunks are added: see `LandmarkFit`.
-
-        Args:
-            K: a matrix-valued kernel.
-            sample: states that look like all of the data, shape (N, n), from which the landmarks
-                are chosen now; later data does not move them. They are not added to the fit. The
-                first chunk is enough if all chunks look alike; one trajectory out of many is not.
-            regularization: the smallest λ that will be asked for, since the tolerance is relative
-                to it, and so are the digits that are kept: a smaller one loses some.
-            inputs: of a `Controlled` kernel: those of the sample, shape (N, m).
-
-        Where `field.info.truncation` of the data added exceeds the tolerance, start anew with a
-        sample that looks like the data so far.
-
-        Raises:
-            ValueError: a shape does not fit, or λ is not positive. TypeError: K is not
-                matrix-valued.
-        """
-        K, sample, regularization = checked_start(K, sample, regularization, inputs)
+    def _started(self, K, sample, regularization) -> LandmarkFit:
         landmarks = self.landmarks(K, sample, regularization)
         some = thinned(sample, self.candidates)
         return landmark_fit.start(K, some, regularization, landmarks, self.tolerance)

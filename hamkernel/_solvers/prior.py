@@ -16,6 +16,8 @@ in frequencies of its own for every draw, so that the covariance over draws has 
 Source: Wilson, Borovitskiy, Terenin, Mostowsky & Deisenroth (2020), arXiv 2002.09309.
 """
 
+import dataclasses
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -23,7 +25,8 @@ from jaxtyping import Array, Float, Key
 
 from hamkernel._features.structured import AbstractFeatures, features
 from hamkernel._fields.base import SolverInfo
-from hamkernel._fields.features import FeatureField
+from hamkernel._fields.features import FeatureField, feature_field
+from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import block_traces
 from hamkernel._gram.observed import components, rows_between
 from hamkernel._observations.rows import Rows
@@ -59,6 +62,44 @@ class Prior(eqx.Module):
             return rows.contrast(rows.of(field, jax.vmap(lambda x: basis.potential(x, w))))
 
         return own + jax.vmap(of_features, out_axes=1)(self.features, self.weights)
+
+    def plus(
+        self,
+        Z: Float[Array, "P d"],
+        A: Float[Array, "count P n"],
+        S: Float[Array, "E d"] | None = None,
+        b: Float[Array, "count E"] | None = None,
+    ) -> KernelField:
+        """The fields f₀ + Σ K(·, z) a + Σ b k(·, s), with coefficients of each draw."""
+        K, points = self.kernel, jnp.concatenate([Z, self.points])
+        zero, unknown = jnp.zeros((), A.dtype), jnp.zeros((0, A.shape[-1]), A.dtype)
+        info = SolverInfo("draw")
+
+        def one(A, b, own, basis, w) -> KernelField:
+            return KernelField(
+                kernel=K,
+                points=points,
+                coefficients=jnp.concatenate([A, own]),
+                residual=unknown,
+                norm=jnp.full_like(zero, jnp.inf),  # a draw of a Gaussian field has no finite norm
+                regularization=zero,
+                offset=zero,
+                info=info,
+                value_points=S,
+                value_coefficients=b,
+                mean=None if basis is None else drawn(K, basis, w, Z.shape[1]),
+            )
+
+        return jax.vmap(one)(A, b, self.coefficients, self.features, self.weights)
+
+
+def drawn(
+    K: AbstractMatrixKernel, basis: AbstractFeatures, w: Float[Array, " r"], n: int
+) -> FeatureField:
+    """The field of one draw of features, at points of n coordinates."""
+    zero, unknown = jnp.zeros((), w.dtype), jnp.zeros((0, n), w.dtype)
+    field = feature_field(K, basis, w, unknown, zero, SolverInfo("draw"))
+    return dataclasses.replace(field, norm=jnp.full_like(zero, jnp.inf))
 
 
 def prior_draws(
@@ -104,22 +145,3 @@ def _drawn(K, landmarks: Landmarks, key, count: int) -> Prior:
 
     g = jax.vmap(at_landmarks)(waves, weights)  # (count, m n)
     return Prior(K, S, ((w - g @ T) @ T.T).reshape(count, m, n), waves, weights)
-
-
-def of_features(
-    K: AbstractMatrixKernel, basis: AbstractFeatures, w: Float[Array, " r"], n: int
-) -> FeatureField:
-    """The field of one draw of features; a draw of a Gaussian field has no finite norm."""
-    zero, infinite = jnp.zeros((), w.dtype), jnp.full((), jnp.inf, w.dtype)
-    unknown = jnp.zeros((0, n), w.dtype)
-    info = SolverInfo("draw")
-    return FeatureField(
-        kernel=K,
-        features=basis,
-        weights=w,
-        residual=unknown,
-        norm=infinite,
-        regularization=zero,
-        offset=zero,
-        info=info,
-    )

@@ -4,12 +4,12 @@ from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int, Key, Num, UInt32
+from jaxtyping import Array, Float, Int, Key, UInt32
 
 from hamkernel import _require as require
 from hamkernel._features.structured import AbstractFeatures, features
-from hamkernel._fields.base import SolverInfo, root
-from hamkernel._fields.features import FeatureField
+from hamkernel._fields.base import SolverInfo
+from hamkernel._fields.features import FeatureField, feature_field
 from hamkernel._machine.devices import as_given, rows_of, split
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._observations.rows import Rows
@@ -24,7 +24,6 @@ from hamkernel._solvers.stream_sums import Sums
 from hamkernel._solvers.streaming import (
     AbstractStreamingFit,
     AbstractStreamingSolver,
-    checked_start,
     thinned,
 )
 from hamkernel._solvers.tall_least_squares import ridge_regression
@@ -33,7 +32,7 @@ from hamkernel._structures.base import AbstractMatrixKernel
 _SAMPLE = 4096  # points of a sample that are looked at
 
 
-class RandomFeatures(AbstractStreamingSolver[FeatureField]):
+class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
     """Ridge regression in random Fourier features: O(N n r²) time, O(r²) memory beside the data.
 
     Solves for the weights of r features by QR, tile by tile, never through the normal equations.
@@ -73,14 +72,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
     ) -> WaveBasis:
         return WaveBasis(self.key, self.count)
 
-    def _fitted(
-        self,
-        K: AbstractMatrixKernel,
-        X: Float[Array, "N n"],
-        Y: Float[Array, "N n"],
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> FeatureField:
+    def _fitted(self, K, X, Y, regularization, throw=True) -> FeatureField:
         spread = rows_of(X)
         field = _fit(K, self, split(spread, X), split(spread, Y), regularization, spread)
         field = _checked(field, throw)
@@ -89,13 +81,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
         residual = as_given(spread, field.residual)
         return eqx.tree_at(lambda f: f.residual, field, residual)
 
-    def _given(
-        self,
-        K: AbstractMatrixKernel,
-        rows: Rows,
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> LowRankConditional:
+    def _given(self, K, rows, regularization, throw=True) -> LowRankConditional:
         basis = self._features(K, rows.points.shape[1], rows.targets.dtype)
         span = FeatureSpan(K, basis, rows.dimension)
         return low_rank_conditional(span, rows, regularization, throw)
@@ -111,27 +97,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField]):
         refuse_beyond_memory(what, r, r, dtype, _COPIES, cure)
         return of_kernel(K, self.key)
 
-    def start(
-        self,
-        K: AbstractMatrixKernel,
-        sample: Num[ArrayLike, "N n"],
-        regularization: ArrayLike = 1e-4,
-        inputs: Num[ArrayLike, "N m"] | None = None,
-    ) -> "FeatureFit":
-        """A fit without data yet, to which chunks are added: see `FeatureFit`.
-
-        Args:
-            K: a matrix-valued kernel.
-            sample: states that look like all of the data, shape (N, n). The features do not depend
-                on them, only the rounding of the sums does. They are not added to the fit.
-            regularization: the smallest λ that will be asked for; a smaller one loses digits.
-            inputs: of a `Controlled` kernel: those of the sample, shape (N, m).
-
-        Raises:
-            TypeError: a kernel without a known spectral density. ValueError: n is not allowed by
-                the structure, the sample is not finite, or λ is not positive.
-        """
-        K, sample, regularization = checked_start(K, sample, regularization, inputs)
+    def _started(self, K, sample, regularization) -> "FeatureFit":
         basis = self._features(K, sample.shape[1], sample.dtype)
         return _start(K, basis, thinned(sample, _SAMPLE), regularization)
 
@@ -147,19 +113,10 @@ def _fit(K, solver, X, Y, regularization, spread):
     return _field(K, basis, weights, residual, regularization)
 
 
-def _field(K, basis, weights, residual, regularization, residual_norm=None):
-    return FeatureField(
-        kernel=K,
-        features=basis,
-        weights=weights,
-        residual=residual,
-        norm=root(weights @ weights),
-        regularization=regularization,
-        offset=jnp.zeros((), weights.dtype),
-        info=SolverInfo(
-            "RandomFeatures", rank=jnp.asarray(len(weights)), residual_norm=residual_norm
-        ),
-    )
+def _field(K, basis, w, residual, regularization, residual_norm=None):
+    rank = jnp.asarray(len(w))
+    info = SolverInfo("RandomFeatures", rank=rank, residual_norm=residual_norm)
+    return feature_field(K, basis, w, residual, regularization, info)
 
 
 def _checked(field: FeatureField, throw: bool = True) -> FeatureField:
@@ -201,7 +158,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     dimension: int = eqx.field(static=True)
 
     def _size(self) -> str:
-        return f"features={len(self.sums.moment)}"
+        return f"features={len(self.sums.basis)}"
 
     def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "FeatureFit":
         spread = rows_of(X)
@@ -209,8 +166,11 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
         sums = _add(self.sums, self.features, X, Y, spread)
         return eqx.tree_at(lambda f: (f.sums, f.count), self, (sums, self.count + len(X)))
 
+    @eqx.filter_jit
     def _added_rows(self, rows: Rows) -> "FeatureFit":
-        return _with_rows(self, rows)
+        design = FeatureSpan(self.kernel, self.features, self.dimension).of_rows(rows)
+        new = stream_sums.add_rows(self.sums, design, rows.targets), self.count + rows.count
+        return eqx.tree_at(lambda f: (f.sums, f.count), self, new)
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
         return _checked(_solution(self, count, regularization))
@@ -230,13 +190,6 @@ def _start(K, basis, sample, regularization):
 
 
 _add = eqx.filter_jit(stream_sums.add)
-
-
-@eqx.filter_jit
-def _with_rows(fit, rows):
-    design = FeatureSpan(fit.kernel, fit.features, fit.dimension).of_rows(rows)
-    new = stream_sums.add_rows(fit.sums, design, rows.targets), fit.count + rows.count
-    return eqx.tree_at(lambda f: (f.sums, f.count), fit, new)
 
 
 @eqx.filter_jit

@@ -14,14 +14,14 @@ from jaxtyping import Array, Float, Key
 
 from hamkernel._features.structured import AbstractFeatures, features
 from hamkernel._fields.base import AbstractField, SolverInfo, root
-from hamkernel._fields.features import FeatureField
+from hamkernel._fields.features import FeatureField, feature_field
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.observed import between, components
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers.landmark_gram import whitening
 from hamkernel._solvers.landmarks import Landmarks, given_landmarks
-from hamkernel._solvers.prior import Prior, of_features, prior_draws
+from hamkernel._solvers.prior import Prior, drawn, prior_draws
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -96,23 +96,8 @@ def _on_landmarks(span: LandmarkSpan, weights, prior: Prior) -> KernelField:
     S, T = span.landmarks.points, span.T
     # A draw of the prior less what it is in the span.
     here = Rows((components(span.kernel, S),), jnp.zeros(len(T), S.dtype))
-    n, d = here.dimension, S.shape[1]
     less = weights - prior.rows(here).T @ T
-
-    def one(w, coefficients, basis, of_basis):
-        return KernelField(
-            kernel=span.kernel,
-            points=jnp.concatenate([S, prior.points]),
-            coefficients=jnp.concatenate([(T @ w).reshape(len(S), n), coefficients]),
-            residual=jnp.zeros((0, n), w.dtype),
-            norm=jnp.full((), jnp.inf, w.dtype),
-            regularization=jnp.zeros((), w.dtype),
-            offset=jnp.zeros((), w.dtype),
-            info=SolverInfo("draw"),
-            mean=None if basis is None else of_features(span.kernel, basis, of_basis, d),
-        )
-
-    return jax.vmap(one)(less, prior.coefficients, prior.features, prior.weights)
+    return prior.plus(S, (less @ T.T).reshape(len(less), len(S), -1))
 
 
 class FeatureSpan(AbstractSpan):
@@ -130,25 +115,17 @@ class FeatureSpan(AbstractSpan):
         return block.rows(values(block.points))
 
     def missing(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
-        return jnp.zeros((len(left.scale), len(right.scale)), left.points.dtype)
+        return jnp.zeros((left.size, right.size), left.points.dtype)
 
     def field(self, w, residual, ridge, N) -> FeatureField:
         left = jnp.linalg.norm(residual)
-        unknown = jnp.zeros((0, self.dimension), w.dtype)
-        return FeatureField(
-            kernel=self.kernel,
-            features=self.features,
-            weights=w,
-            residual=residual if residual.ndim == 2 else unknown,
-            norm=root(w @ w),
-            regularization=ridge / N,
-            offset=jnp.zeros((), w.dtype),
-            info=SolverInfo("RandomFeatures", rank=jnp.asarray(len(w)), residual_norm=left),
-        )
+        info = SolverInfo("RandomFeatures", rank=jnp.asarray(len(w)), residual_norm=left)
+        known = residual if residual.ndim == 2 else jnp.zeros((0, self.dimension), w.dtype)
+        return feature_field(self.kernel, self.features, w, known, ridge / N, info)
 
     def draws(self, weights, rows, key, region) -> FeatureField:
         def one(w):
-            return of_features(self.kernel, self.features, w, self.dimension)
+            return drawn(self.kernel, self.features, w, self.dimension)
 
         return jax.vmap(one)(weights)
 

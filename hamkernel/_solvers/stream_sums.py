@@ -34,6 +34,10 @@ class Normal(NamedTuple):
     moment: Float[Array, " r"]  # Fᵀy
     energy: Float[Array, ""]  # yᵀy
 
+    def plus(self, F: Float[Array, "D r"], y: Float[Array, " D"]) -> "Normal":
+        """The sums with more rows."""
+        return Normal(self.square + F.T @ F, self.moment + F.T @ y, self.energy + y @ y)
+
 
 class Sums(eqx.Module):
     """What has been seen, in r² numbers. Rows are those of a design, times `basis`.
@@ -41,16 +45,12 @@ class Sums(eqx.Module):
     Attributes:
         triangle: R, upper triangular, shape (r, r).
         basis: R⁻¹, or WR⁻¹ if Φ is a design times W, shape (r, r).
-        square: R⁻ᵀΦᵀΦR⁻¹, shape (r, r).
-        moment: R⁻ᵀΦᵀy, shape (r,).
-        energy: yᵀy, shape ().
+        seen: the sums over ΦR⁻¹ and y.
     """
 
     triangle: Float[Array, "r r"]
     basis: Float[Array, "r r"]
-    square: Float[Array, "r r"]
-    moment: Float[Array, " r"]
-    energy: Float[Array, ""]
+    seen: Normal
 
 
 def start(
@@ -60,11 +60,11 @@ def start(
 
     NaN where the kernel is not finite, or λ below rounding.
     """
-    zero = jnp.zeros_like(W)
     n = jax.eval_shape(design, sample[:1]).shape[1]
     seen = normal(design, W, sample, jnp.zeros((len(sample), n), sample.dtype))
     R = jnp.linalg.cholesky(plus_ridge(seen.square / len(sample), ridge)).T
-    return Sums(R, solve_triangular(R, W.T, trans="T").T, zero, zero[0], zero[0, 0])
+    nothing = jax.tree.map(jnp.zeros_like, seen)
+    return Sums(R, solve_triangular(R, W.T, trans="T").T, nothing)
 
 
 def add(
@@ -75,21 +75,13 @@ def add(
     spread: Rows | None = None,
 ) -> Sums:
     """The sums after the rows design(X) with targets Y."""
-    old = Normal(sums.square, sums.moment, sums.energy)
     new = normal(design, sums.basis, X, Y, spread)
-    return Sums(sums.triangle, sums.basis, *jax.tree.map(jnp.add, old, new))
+    return Sums(sums.triangle, sums.basis, jax.tree.map(jnp.add, sums.seen, new))
 
 
 def add_rows(sums: Sums, rows: Float[Array, "D r"], y: Float[Array, " D"]) -> Sums:
     """The sums after rows of the design that were made already, with targets y."""
-    F = rows @ sums.basis
-    return Sums(
-        triangle=sums.triangle,
-        basis=sums.basis,
-        square=sums.square + F.T @ F,
-        moment=sums.moment + F.T @ y,
-        energy=sums.energy + y @ y,
-    )
+    return Sums(sums.triangle, sums.basis, sums.seen.plus(rows @ sums.basis, y))
 
 
 def normal(
@@ -110,8 +102,7 @@ def normal(
 
     def step(total, tile):
         rows = design(tile[0])  # (t, n, r)
-        F, y = rows.reshape(-1, rows.shape[-1]) @ basis, tile[1].reshape(-1)
-        return jax.tree.map(jnp.add, total, Normal(F.T @ F, F.T @ y, y @ y)), None
+        return total.plus(rows.reshape(-1, rows.shape[-1]) @ basis, tile[1].reshape(-1)), None
 
     zero = jnp.zeros_like(basis)
     empty = Normal(zero, zero[0], zero[0, 0])
@@ -125,15 +116,15 @@ def solve(
 
     The last one has the digits of a difference of squares: it is good to 1e-8 ‖y‖ in float64.
     """
-    R = sums.triangle
+    R, seen = sums.triangle, sums.seen
     inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype))
-    L = jnp.linalg.cholesky(sums.square + ridge * inverse.T @ inverse)
-    v = cho_solve((L, True), sums.moment)
+    L = jnp.linalg.cholesky(seen.square + ridge * inverse.T @ inverse)
+    v = cho_solve((L, True), seen.moment)
     norm = jnp.linalg.norm(inverse @ v)
-    left = sums.energy - sums.moment @ v - ridge * norm**2
+    left = seen.energy - seen.moment @ v - ridge * norm**2
     return sums.basis @ v, norm, jnp.sqrt(jnp.maximum(left, jnp.zeros_like(left)))
 
 
 def trace(sums: Sums) -> Float[Array, ""]:
     """The trace of ΦᵀΦ."""
-    return jnp.sum((sums.square @ sums.triangle) * sums.triangle)
+    return jnp.sum((sums.seen.square @ sums.triangle) * sums.triangle)

@@ -156,18 +156,48 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
         return learned_field(self._solved(count, regularization), self._known)
 
 
-class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned]):
+class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
     """A solver whose fit to all the data can be made from chunks of it."""
 
     @abc.abstractmethod
+    def _started(
+        self, K: AbstractMatrixKernel, sample: Float[Array, "N d"], regularization: Float[Array, ""]
+    ) -> Fit:
+        """`start` for arguments that have been checked."""
+
     def start(
         self,
         K: AbstractMatrixKernel,
         sample: Num[ArrayLike, "N n"],
         regularization: ArrayLike = 1e-4,
         inputs: Num[ArrayLike, "N m"] | None = None,
-    ) -> AbstractStreamingFit[Learned]:
-        """A fit without data yet, to which chunks are added."""
+    ) -> Fit:
+        """A fit without data yet, to which chunks are added: a `LandmarkFit` or a `FeatureFit`.
+
+        Args:
+            K: a matrix-valued kernel.
+            sample: states that look like all of the data, shape (N, n). They are not added to the
+                fit. The landmarks of `Nystrom` are chosen from them now, and later data does not
+                move them: the first chunk is enough if all chunks look alike, one trajectory out of
+                many is not. Of `RandomFeatures` only the rounding of the sums depends on them.
+            regularization: the smallest λ that will be asked for, since the tolerance of `Nystrom`
+                is relative to it, and so are the digits that are kept: a smaller one loses some.
+            inputs: of a `Controlled` kernel: those of the sample, shape (N, m).
+
+        Where `field.info.truncation` of the data added exceeds the tolerance of `Nystrom`, start
+        anew with a sample that looks like the data so far.
+
+        Raises:
+            ValueError: a shape does not fit, n is not allowed by the structure, the sample is not
+                finite, or λ is not positive. TypeError: K is not matrix-valued, or, for
+                `RandomFeatures`, has no known spectral density.
+        """
+        K = matrix_kernel(K)
+        sample = require.finite(require.points(sample, "sample"), "sample")
+        K, sample = sampled_points(K, sample, inputs)
+        K.check_dimension(sample.shape[1])
+        require.warn_of_float32(sample)
+        return self._started(K, sample, require.ridge(regularization, sample.dtype))
 
     @one_blas_thread
     def fit_chunks(
@@ -239,21 +269,6 @@ def _naming(chunk: int) -> Iterator[None]:
     except (TypeError, ValueError) as error:
         kind = TypeError if isinstance(error, TypeError) else ValueError
         raise kind(f"chunk {chunk}, counted from 0: {error}") from error
-
-
-def checked_start(
-    K: AbstractMatrixKernel,
-    sample: Num[ArrayLike, "N n"],
-    regularization: ArrayLike,
-    inputs: Num[ArrayLike, "N m"] | None = None,
-) -> tuple[AbstractMatrixKernel, Float[Array, "N d"], Float[Array, ""]]:
-    """The arguments of `start`, if they are what it says; points (x, u) of a field with inputs."""
-    K = matrix_kernel(K)
-    sample = require.finite(require.points(sample, "sample"), "sample")
-    K, sample = sampled_points(K, sample, inputs)
-    K.check_dimension(sample.shape[1])
-    require.warn_of_float32(sample)
-    return K, sample, require.ridge(regularization, sample.dtype)
 
 
 def thinned(sample: Float[Array, "N n"], most: int) -> Float[Array, "M n"]:

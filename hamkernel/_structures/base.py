@@ -71,17 +71,16 @@ class AbstractMatrixKernel(eqx.Module):
     ) -> Float[Array, " n"]:
         """Σⱼ K(x, zⱼ) aⱼ, without the blocks."""
 
-    @abc.abstractmethod
     def potential(
         self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
     ) -> Float[Array, ""]:
-        """The potential of `expansion`; AttributeError with `no_potential` if there is none."""
+        """The potential of `expansion`; AttributeError if there is none."""
+        raise AttributeError(self.no_potential)
 
     def potential_covariance(
         self, x: Float[Array, " n"], z: Float[Array, " n"]
     ) -> Float[Array, ""]:
         """The kernel of the potential, of which K is B ∂x∂zᵀ(·) Bᵀ; AttributeError if none."""
-        del x, z
         raise AttributeError(self.no_potential)
 
     def check_potential(self) -> None:
@@ -99,6 +98,10 @@ class AbstractMatrixKernel(eqx.Module):
     def check_points(self, X: Float[Array, "N d"]) -> None:
         """ValueError if the structure cannot hold at these points, whose values may be traced."""
         self.check_dimension(X.shape[1])
+
+    def centre(self, Z: Float[Array, "M d"]) -> Float[Array, " d"] | None:
+        """The mean of Z, as far as K does not change when it is taken off both arguments."""
+        return Z.mean(axis=0) if Invariance.TRANSLATION in self.invariance else None
 
     def outputs(self, inputs: int) -> int:
         """The number of components of a field at points of so many coordinates."""
@@ -119,14 +122,11 @@ class AbstractMatrixKernel(eqx.Module):
     def box(
         self, name: str, X: Float[np.ndarray, "N d"], amplitude: float
     ) -> tuple[ArrayLike, ArrayLike]:
-        """Where to look for the array `name`, as it is stored: the lower and the upper bound.
-
-        `X` are the data, and `amplitude` a fair factor before the kernel.
-        """
+        """The lower and upper bound of the array `name`, as stored, as those of scalar kernels."""
         return by_value(name, getattr(self, name))
 
     def seen(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
-        """The data in the coordinates that the kernels inside see."""
+        """The data in the coordinates of the kernels inside."""
         return X
 
     @property

@@ -220,6 +220,14 @@ class Controlled(AbstractMatrixKernel):
     ) -> Float[Array, ""]:
         return self.drift.potential_covariance(self._split(x)[0], self._split(z)[0])
 
+    def centre(self, Z: Float[Array, "M d"]) -> Float[Array, " d"] | None:
+        states, inputs = self._split(Z)
+        centre, G = self.drift.centre(states), self.inputs
+        shifts = isinstance(G, KnownMatrix) or Invariance.TRANSLATION in G.kernel.invariance
+        if centre is None or not shifts:
+            return None
+        return jnp.concatenate([centre, jnp.zeros_like(inputs[0])])
+
     def check_dimension(self, n: int) -> None:
         """`n` counts the inputs, too."""
         n = self.outputs(n)

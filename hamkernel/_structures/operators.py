@@ -121,6 +121,12 @@ def check_even(n: int, whose: str) -> None:
         )
 
 
+def canonical(v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    """J v."""
+    dq, dp = jnp.split(v, 2)
+    return jnp.concatenate([dp, -dq])
+
+
 class Symplectic(AbstractPotentialKernel):
     """K(x, z) = J [∂x ∂zᵀ k(x, z)] Jᵀ: Hamiltonian fields f = J∇H, J = [[0, I], [−I, 0]].
 
@@ -139,12 +145,10 @@ class Symplectic(AbstractPotentialKernel):
     symplectic: ClassVar[bool] = True
 
     def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-        dq, dp = jnp.split(v, 2)
-        return jnp.concatenate([dp, -dq])
+        return canonical(v)
 
     def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
-        dq, dp = jnp.split(v, 2)
-        return jnp.concatenate([-dp, dq])
+        return -canonical(v)
 
     def check_dimension(self, n: int) -> None:
         check_even(n, "a Symplectic kernel")

@@ -1,11 +1,13 @@
 """Fields B(x)∇H with an operator of the caller's; where it is antisymmetric, Poisson systems."""
 
+import abc
 from collections.abc import Callable
 from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from equinox import AbstractClassVar
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
@@ -16,10 +18,65 @@ from hamkernel._structures.maps import check_symmetries
 from hamkernel._structures.operators import AbstractPotentialKernel
 
 Operator = Callable[[Float[Array, " n"]], Any]
+_FEW = 16  # points at which a symmetry of B is checked: one would do, but for zeros
 _SYMMETRIC = 1e-6  # of Π at the data: rounding in float32 leaves 1e-7, a wrong sign 1
 
 
-class Structured(AbstractPotentialKernel):
+class AbstractOwnOperator(AbstractPotentialKernel):
+    """B(x) is a function of the caller's, the attribute that `role` names."""
+
+    role: AbstractClassVar[str]
+
+    operator_invariance: ClassVar[Invariance] = Invariance.NONE
+    symplectic: ClassVar[bool] = False
+    has_hamiltonian: ClassVar[bool] = True
+
+    @abc.abstractmethod
+    def _check_values(self, matrices: Float[np.ndarray, "N n n"], X: Float[Array, "N n"]) -> None:
+        """ValueError unless B(x) is what the structure asks for at these points."""
+
+    def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+        return self._matrix(x) @ v
+
+    def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
+        return v @ self._matrix(x)
+
+    def _matrix(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+        """B(x), in the dtype of x."""
+        value, name, n = (
+            getattr(self, self.role)(x),
+            f"{self.role} of {type(self).__name__}",
+            len(x),
+        )
+        if jnp.shape(value) != (n, n):
+            raise ValueError(
+                f"the {name} returned shape {jnp.shape(value)} for a state of shape ({n},); an "
+                f"array of shape ({n}, {n}) is needed, such as jnp.array([[...], [...]]). It was "
+                "written for states of another dimension, or for many at once."
+            )
+        return require.floating(value, f"the {name}").astype(x.dtype)
+
+    def check_dimension(self, n: int) -> None:
+        with require.traceable(f"the {self.role} of {type(self).__name__}"):
+            state = jax.ShapeDtypeStruct((n,), jnp.result_type(float))
+            jax.eval_shape(lambda x: self.operator_at(x), state)
+
+    def check_points(self, X: Float[Array, "N n"]) -> None:
+        self.check_dimension(X.shape[1])
+        if not require.is_concrete(X, self):
+            return
+        matrices = np.asarray(jax.vmap(self.operator_at)(X))
+        bad = ~np.isfinite(matrices).all(axis=(1, 2))
+        if bad.any():
+            raise ValueError(
+                f"{text(getattr(self, self.role))} of {type(self).__name__} is NaN or infinite at "
+                f"X[{int(bad.argmax())}]: it must be defined at every state of the data."
+            )
+        self._check_values(matrices, X)
+        check_symmetries(self, X[:_FEW])
+
+
+class Structured(AbstractOwnOperator):
     """K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ: fields f = B(x)∇H for an operator B of your own.
 
     The rest of the library works with it: `tune` tunes the arrays in B, a field has its
@@ -51,32 +108,18 @@ class Structured(AbstractPotentialKernel):
     kernel: AbstractScalarKernel
     operator: Operator
 
-    operator_invariance: ClassVar[Invariance] = Invariance.NONE
-    symplectic: ClassVar[bool] = False
-    has_hamiltonian: ClassVar[bool] = True
+    role: ClassVar[str] = "operator"
     conserves: ClassVar[bool] = False
 
     def __init__(self, kernel: Any, operator: Operator):
         self.kernel = as_scalar_kernel(kernel)
         self.operator = _checked(operator, "Structured", "operator")
 
-    def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-        return _matrix(self.operator, x, "operator of Structured") @ v
-
-    def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
-        return v @ _matrix(self.operator, x, "operator of Structured")
-
-    def check_dimension(self, n: int) -> None:
-        _check_shape(self, n)
-
-    def check_points(self, X: Float[Array, "N n"]) -> None:
-        self.check_dimension(X.shape[1])
-        if require.is_concrete(X, self):
-            _finite_matrices(self, X)
-            check_symmetries(self, X[:_FEW])
+    def _check_values(self, matrices, X) -> None:
+        del matrices, X
 
 
-class Poisson(AbstractPotentialKernel):
+class Poisson(AbstractOwnOperator):
     """K(x, z) = Π(x) [∂x ∂zᵀ k(x, z)] Π(z)ᵀ: Poisson systems f = Π(x)∇H, Π antisymmetric.
 
     Any n, even or odd: dH/dt = ∇HᵀΠ∇H = 0, and every field conserves the Casimirs C, Π(x)∇C = 0.
@@ -102,31 +145,16 @@ class Poisson(AbstractPotentialKernel):
     kernel: AbstractScalarKernel
     tensor: Operator
 
-    operator_invariance: ClassVar[Invariance] = Invariance.NONE
-    symplectic: ClassVar[bool] = False
-    has_hamiltonian: ClassVar[bool] = True
+    role: ClassVar[str] = "tensor"
     conserves: ClassVar[bool] = True
 
     def __init__(self, kernel: Any, tensor: Operator):
         self.kernel = as_scalar_kernel(kernel)
         self.tensor = _checked(tensor, "Poisson", "tensor")
 
-    def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-        return _matrix(self.tensor, x, "tensor of Poisson") @ v
-
-    def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
-        return v @ _matrix(self.tensor, x, "tensor of Poisson")
-
-    def check_dimension(self, n: int) -> None:
-        _check_shape(self, n)
-
-    def check_points(self, X: Float[Array, "N n"]) -> None:
-        self.check_dimension(X.shape[1])
-        if not require.is_concrete(X, self):
-            return
-        tensors = _finite_matrices(self, X)
-        size = np.abs(tensors).max(axis=(1, 2))
-        symmetric = np.abs(tensors + np.swapaxes(tensors, 1, 2)).max(axis=(1, 2)) / 2
+    def _check_values(self, matrices, X) -> None:
+        size = np.abs(matrices).max(axis=(1, 2))
+        symmetric = np.abs(matrices + np.swapaxes(matrices, 1, 2)).max(axis=(1, 2)) / 2
         worst = int(np.argmax(symmetric - _SYMMETRIC * size))
         if symmetric[worst] > _SYMMETRIC * size[worst]:
             raise ValueError(
@@ -135,10 +163,6 @@ class Poisson(AbstractPotentialKernel):
                 f"{symmetric[worst]:.3g}, beside entries of {size[worst]:.3g}. Energy would not be "
                 "conserved. For B(x) with friction use Structured(k, operator) or PortHamiltonian."
             )
-        check_symmetries(self, X[:_FEW])
-
-
-_FEW = 16  # points at which a symmetry of B is checked: one would do, but for zeros
 
 
 def _checked(fn: Any, whose: str, name: str) -> Operator:
@@ -148,36 +172,3 @@ def _checked(fn: Any, whose: str, name: str) -> Operator:
             "constant matrix M is `lambda x: M`."
         )
     return as_pytree(fn)
-
-
-def _matrix(fn: Operator, x: Float[Array, " n"], name: str) -> Float[Array, "n n"]:
-    """The matrix at x, in the dtype of x."""
-    value = fn(x)
-    n = len(x)
-    if jnp.shape(value) != (n, n):
-        raise ValueError(
-            f"the {name} returned shape {jnp.shape(value)} for a state of shape ({n},); an array "
-            f"of shape ({n}, {n}) is needed, such as jnp.array([[...], [...]]). It was written for "
-            "states of another dimension, or for many at once."
-        )
-    return require.floating(value, f"the {name}").astype(x.dtype)
-
-
-def _check_shape(K: Structured | Poisson, n: int) -> None:
-    name = "operator" if isinstance(K, Structured) else "tensor"
-    with require.traceable(f"the {name} of {type(K).__name__}"):
-        jax.eval_shape(
-            lambda x: K.operator_at(x), jax.ShapeDtypeStruct((n,), jnp.result_type(float))
-        )
-
-
-def _finite_matrices(K: Structured | Poisson, X: Float[Array, "N n"]) -> np.ndarray:
-    matrices = np.asarray(jax.vmap(K.operator_at)(X))
-    bad = ~np.isfinite(matrices).all(axis=(1, 2))
-    if bad.any():
-        what = K.operator if isinstance(K, Structured) else K.tensor
-        raise ValueError(
-            f"{text(what)} of {type(K).__name__} is NaN or infinite at X[{int(bad.argmax())}]: it "
-            "must be defined at every state of the data."
-        )
-    return matrices

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
-from hamkernel._structures.operators import AbstractPotentialKernel, check_even
+from hamkernel._structures.operators import AbstractPotentialKernel, canonical, check_even
 
 # Of the damping ratio, r over the critical friction: from 1e-5, at which an oscillation loses 6e-5
 # of its amplitude in a period and far less than can be seen, to overdamped 30 times over.
@@ -84,12 +84,10 @@ class PortHamiltonian(AbstractPotentialKernel):
         return jnp.exp(self.log_friction)
 
     def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-        dq, dp = jnp.split(v, 2)
-        return jnp.concatenate([dp, -dq]) - self._rubbed(v)
+        return canonical(v) - self._rubbed(v)
 
     def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
-        dq, dp = jnp.split(v, 2)
-        return jnp.concatenate([-dp, dq]) - self._rubbed(v)
+        return -canonical(v) - self._rubbed(v)
 
     def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
         """∇HᵀR∇H, a sum of squares."""

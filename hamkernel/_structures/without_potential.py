@@ -42,9 +42,6 @@ class Separable(AbstractStructure):
     ) -> Float[Array, " n"]:
         return row(self.kernel, x, Z) @ A
 
-    def potential(self, x: Array, Z: Array, A: Array) -> Float[Array, ""]:
-        raise AttributeError(self.no_potential)
-
     def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
         return np.eye(len(S))
 
@@ -94,9 +91,6 @@ class DivergenceFree(AbstractStructure):
 
         basis = jnp.eye(len(x), dtype=x.dtype)
         return jax.vmap(term)(basis).sum(axis=0)
-
-    def potential(self, x: Array, Z: Array, A: Array) -> Float[Array, ""]:
-        raise AttributeError(self.no_potential)
 
     def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
         return S  # ±1, see `check_dimension`

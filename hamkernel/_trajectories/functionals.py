@@ -2,14 +2,15 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel._observations.base import Together
 from hamkernel._observations.kinds import Functionals
 from hamkernel._trajectories.rows import Rows
+from hamkernel._trajectories.shooting import means
 
 
 def functionals_of(rows: Rows, log_noise: Float[Array, " n"], mean: Any) -> Together | None:
@@ -19,29 +20,39 @@ def functionals_of(rows: Rows, log_noise: Float[Array, " n"], mean: Any) -> Toge
     no segment has more samples than its start takes.
     """
     sigma = np.exp(np.asarray(log_noise))
-    rows = Rows(*map(np.asarray, rows))  # pyright: ignore[reportArgumentType]
-    found = []
-    for s in range(len(rows.counts)):
-        counts = rows.counts[s]
-        if not counts.any():
-            continue
-        last = int(np.flatnonzero(counts.any(axis=1))[-1])  # padding follows
-        B = _sums(rows.across[s, :last], rows.weights[s, :last])
-        nodes = rows.nodes[s, :last].reshape(-1, rows.nodes.shape[-1])
-        seen = counts[: last + 1].reshape(-1) > 0
-        W = (np.sqrt(counts[: last + 1]) / sigma[None]).reshape(-1)[seen]
-        P = W[:, None] * rows.tangent[s, : last + 1].reshape(-1, len(sigma))[seen]
-        if len(P) <= P.shape[1]:
-            continue
-        C = np.linalg.qr(P, mode="complete")[0][:, P.shape[1] :]
-        B = C.T @ (W[:, None] * B[seen])
-        target = C.T @ (W * rows.target[s, : last + 1].reshape(-1)[seen])
-        if mean is not None:
-            target = target + B @ np.asarray(jax.vmap(mean)(jnp.asarray(nodes))).reshape(-1)
-        x, u = np.split(nodes[None], [len(sigma)], axis=2)
-        weights = B.reshape(1, len(B), *x.shape[1:])
-        found.append(Functionals(x, weights, target[None], u if u.size else None))
-    return Together(tuple(found)) if found else None
+    at_nodes = _at_nodes(mean, rows.nodes, len(sigma))
+    every = jax.tree.map(np.asarray, (rows, at_nodes))  # one segment of a JAX array compiles
+    segments = (jax.tree.map(lambda a, s=s: a[s], every) for s in range(len(rows.counts)))
+    found = [_of_segment(segment, at_nodes, sigma) for segment, at_nodes in segments]
+    parts = tuple(part for part in found if part is not None)
+    return Together(parts) if parts else None
+
+
+@eqx.filter_jit
+def _at_nodes(mean, nodes: Float[Array, "S L 3 d"], n: int) -> Float[Array, "S L 3 n"]:
+    return means(mean, nodes, nodes[..., :n])
+
+
+def _of_segment(
+    rows: Any, mean: Float[np.ndarray, "L 3 n"], sigma: Float[np.ndarray, " n"]
+) -> Functionals | None:
+    """The block of one segment, `rows` without their first axis; None if it says nothing."""
+    n = len(sigma)
+    if not rows.counts.any():
+        return None
+    last = int(np.flatnonzero(rows.counts.any(axis=1))[-1])  # padding follows
+    B = _sums(rows.across[:last], rows.weights[:last])
+    counts = rows.counts[: last + 1]
+    seen = counts.reshape(-1) > 0
+    W = (np.sqrt(counts) / sigma[None]).reshape(-1)[seen]
+    P = W[:, None] * rows.tangent[: last + 1].reshape(-1, n)[seen]
+    if len(P) <= n:
+        return None
+    C = np.linalg.qr(P, mode="complete")[0][:, n:]
+    B = C.T @ (W[:, None] * B[seen])
+    target = C.T @ (W * rows.target[: last + 1].reshape(-1)[seen]) + B @ mean[:last].reshape(-1)
+    x, u = np.split(rows.nodes[:last].reshape(1, 3 * last, -1), [n], axis=2)
+    return Functionals(x, B.reshape(1, len(B), 3 * last, n), target[None], u if u.size else None)
 
 
 def _sums(

@@ -28,15 +28,9 @@ def power_of_two(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
 
 
-def half_octave(count: int) -> int:
-    """The least of 1, 2, 3, 4, 6, 8, 12, 16, 24, … that is not below `count`."""
-    above = power_of_two(count)
-    return above * 3 // 4 if above >= 4 and 4 * count <= 3 * above else above
-
-
 def padded(times: Sequence[np.ndarray], states: Sequence[np.ndarray], least: int = 8) -> Padded:
     """Runs of any lengths as arrays; T is a power of two, at least `least`."""
-    R = half_octave(len(times))
+    R = power_of_two(len(times))
     T = max(power_of_two(max(len(t) for t in times)), least)
     n = states[0].shape[1]
     out = Padded(np.zeros((R, T)), np.zeros((R, T, n)), np.zeros((R, T, n), bool), np.zeros(R, int))

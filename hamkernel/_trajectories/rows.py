@@ -86,7 +86,7 @@ def accumulated(
     return jnp.concatenate([start[:, None], jnp.moveaxis(sums, 0, 1)], axis=1)
 
 
-@eqx.filter_jit  # without it the loop compiles at each call
+@jax.jit
 def tangents(across: Float[Array, "S L n n"]) -> Float[Array, "S L+1 n n"]:
     """Φ at the samples, from the tangents across the intervals."""
     S, _, n, _ = across.shape
@@ -150,6 +150,7 @@ def _where(good, a):
     return jnp.where(mask, a, jnp.zeros_like(a))
 
 
+@jax.jit
 def frozen(
     x: Float[Array, "S L+1 n"],
     nodes: Float[Array, "S L 3 d"],

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 
 from hamkernel._trajectories.evidence import back_substituted, orthonormal
 from hamkernel._trajectories.flow import Expansion, Path, simulated
-from hamkernel._trajectories.padding import half_octave, power_of_two
+from hamkernel._trajectories.padding import power_of_two
 from hamkernel._trajectories.prepared import Run
 from hamkernel._trajectories.rows import Rows, Segments, linearised, segments_of, tangents
 
@@ -85,7 +85,7 @@ def segmented(runs: list[Run], pieces: list[Piece], paths: list[np.ndarray]) -> 
         run, part = runs[r], slice(start, stop)
         own = run.times, run.states, run.counts, run.scatter
         filled.append((*(a[part] for a in own), paths[r][start], run.inputs[start : stop - 1]))
-    return segments_of(filled, half_octave(len(pieces)), length)
+    return segments_of(filled, power_of_two(len(pieces)), length)
 
 
 class Shot(NamedTuple):

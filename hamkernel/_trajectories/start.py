@@ -21,7 +21,7 @@ from hamkernel._tuning.boxes import gram_trace, hyperparameters
 
 # Landmarks for n coordinates, 128 for more. 45 for n = 2 and 80 for n = 4 were as good as all.
 _FEWEST = {1: 24, 2: 48, 3: 64, 4: 80}
-_POINTS = 1024  # of the smoothed runs, from which boxes and landmarks are taken
+_POINTS = 1024  # from which boxes and landmarks are taken
 # Noise to begin with, of the standard deviations, besides that of smoothing. With five samples a
 # swing smoothing cannot know it: it found none at all in 3 of 5 logs with noise of 8 %.
 _NOISES = (0.01, 0.1)
@@ -58,13 +58,15 @@ def with_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
 
 
 def sampled(data: Prepared) -> tuple[Float[np.ndarray, "N d"], Float[np.ndarray, "N n"]]:
-    """Points, (x, u) with inputs, and velocities of the smoothed runs at some of their nodes."""
+    """Points, (x, u) with inputs, and velocities of the smoothed runs at some of their nodes.
+
+    Always as many, if need be some of them twice, so that other lengths do not compile anew.
+    """
     n = len(data.scale)
     runs = [run for run, use in zip(data.runs, data.usable, strict=True) if use]
     points = [np.concatenate([run.nodes, at_nodes(run.inputs)], axis=-1) for run in runs]
     X = np.concatenate([each.reshape(-1, each.shape[-1]) for each in points])
     Y = np.concatenate([run.slopes.reshape(-1, n) for run in runs])
-    # Always as many, so that other runs do not compile anew.
     chosen = np.linspace(0, len(X) - 1, _POINTS).round().astype(int)
     return X[chosen], Y[chosen]
 
@@ -164,14 +166,19 @@ def smooth_rows(
         x[s, :T] = run.path[start:stop]
         nodes[s, : T - 1] = run.nodes[start : stop - 1]
         slopes[s, : T - 1] = run.slopes[start : stop - 1]
-    x, slopes = jnp.asarray(x), jnp.asarray(slopes)
-    points = jnp.concatenate([jnp.asarray(nodes), at_nodes(segments.inputs)], axis=-1)
-    path = frozen(x, points, segments.spans, jacobians(mean, points, n))
-    mean_there = means(mean, points, slopes)
-    return linearised(path, slopes, mean_there, segments, jnp.asarray(good), is_solution=False)
+    points = np.concatenate([nodes, at_nodes(np.asarray(segments.inputs))], axis=-1)
+    along = jnp.asarray(x), jnp.asarray(points), jnp.asarray(slopes)
+    return _smooth_rows(mean, along, jnp.asarray(good), segments)
 
 
 @eqx.filter_jit
+def _smooth_rows(mean, along, good, segments: Segments) -> Rows:
+    x, points, slopes = along
+    path = frozen(x, points, segments.spans, jacobians(mean, points, x.shape[-1]))
+    there = means(mean, points, slopes)
+    return linearised(path, slopes, there, segments, good, is_solution=False)
+
+
 def jacobians(mean, nodes: Float[Array, "S L 3 d"], n: int) -> Float[Array, "S L n n"]:
     """∂m/∂x of the mean in each interval, averaged over its nodes."""
     if mean is None:

@@ -113,7 +113,7 @@ def tune(
     space-filling design in the box, on a subset of 64 points (of 256/n, with n > 4) if there are
     more. Where the runs end is compared on all data, together with the given point, and the best is
     finished there. From 2048/n points on this is done on 1024/n of them, and the best is corrected
-    on all data by three more losses: each takes the time of some ten factorisations. New data of
+    on all data by two more steps: each takes the time of some ten factorisations. New data of
     the same shape does not recompile, unless `Nystrom` takes another number of landmarks. Data
     sharded over devices is gathered on one of them for the search; the field is fitted where the
     data lies.

@@ -49,7 +49,8 @@ def cross_validation_loss(
             for one point per fold; or an integer label for each point, shape (N,), to hold out,
             say, one trajectory at a time. A fold always holds out whole points: leaving out
             single components would leak their siblings. Labels must be concrete under jit. Of
-            observations N is the number of all: points, energies, functionals, in their order.
+            observations N is the number of all: points, energies, functionals, in their order. A
+            fold with all energies is compared up to their constant.
         inputs: of a `Controlled` kernel, shape (N, m).
 
     Returns:

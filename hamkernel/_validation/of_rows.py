@@ -4,8 +4,11 @@ Residuals count in units of their relative noise. Velocities X, Y that were all 
 rows of one block, and pass through here as they are.
 """
 
+from typing import Any
+
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel._factors.base import AbstractSystem
@@ -45,22 +48,41 @@ def partition_loss_and_square(K, rows: Rows, regularization, partition: Partitio
 
 @eqx.filter_jit
 def held_out_rows(K, rows: Rows, regularization, partition: Partition, basis=None):
-    """What a fit without their fold leaves of the rows, in units of their noise, and A⁻¹y."""
-    F, M = len(partition.folds), len(rows.targets)
+    """What a fit without their fold leaves of the rows, in units of their noise, and A⁻¹y.
+
+    Of a fold with all energies it is what their constant does not explain.
+    """
+    energies, F = rows.energies, len(partition.folds)
     ridge = (rows.count - rows.count / F) * regularization
-    if basis is None:
-        return held_out(_dense(gram(K, rows), ridge, rows), rows.targets, partition)
-    features = features_of_rows(K, rows, basis)
-    if features.shape[1] > M - max(map(len, partition.folds)):
+    y, p = rows.targets, rows.constant
+    contrasted = any(len(energies) and np.isin(energies, fold).all() for fold in partition.folds)
+    if contrasted:  # no other fold sees the constant: rows that do not see it are held out
+        y, p = rows.y, None
+        partition = Partition(rows.size, np.delete(partition.labels, energies[0]))
+    features = None if basis is None else features_of_rows(K, rows, basis, contrasted)
+    found: Any
+    if features is None:
+        found = _dense_held_out(gram(K, rows, contrasted), ridge, y, p, rows, partition)
+    elif features.shape[1] > len(y) - max(map(len, partition.folds)):
         # A fold interpolates the rest, and its coefficients are the difference of those of all:
         # the gradient lost the square of the condition, 5 times itself at 1e10. Such data are few.
-        return held_out(_dense(features @ features.T, ridge, rows), rows.targets, partition)
-    return held_out(LowRankSystem(features, ridge, rows.constant), rows.targets, partition)
+        found = _dense_held_out(features @ features.T, ridge, y, p, rows, partition)
+    else:
+        found = held_out(LowRankSystem(features, ridge, p), y, partition)
+    return tuple(map(rows.uncontrasted, found)) if contrasted else found
 
 
-def _dense(G: Float[Array, "M M"], ridge: Float[Array, ""], rows: Rows) -> AbstractSystem:
-    A, p = plus_ridge(G, ridge), rows.constant
-    return DenseSystem(A) if p is None else ContrastedSystem(A, p)
+def _dense_held_out(G, ridge, y, p, rows: Rows, partition: Partition):
+    A = plus_ridge(G, ridge)
+    if p is None:
+        return held_out(DenseSystem(A), y, partition)
+    # In the units of the energies the direction of their constant does not depend on the noise, so
+    # that nothing is missing from the derivative.
+    units = jnp.where(p == 0, jnp.ones_like(p), rows.scale)
+    equal = jnp.where(p == 0, p, len(rows.energies) ** -0.5)
+    system = ContrastedSystem(units[:, None] * A * units[None], equal)
+    found: Any = held_out(system, units * y, partition)
+    return found[0] / units, units * found[1]
 
 
 def generalized_loss(K, rows: Rows, regularization, basis=None, least_free=0.0):
@@ -91,28 +113,28 @@ def log_likelihood(K, rows: Rows, regularization, basis=None):
 def _of_contrasts(K, rows: Rows, ridge, basis: AbstractBasis | None) -> AbstractSystem:
     """A of the rows that do not see the constant, whose y is `rows.y`."""
     if basis is not None:
-        return LowRankSystem(rows.contrast(features_of_rows(K, rows, basis)), ridge)
-    G = gram(K, rows)
-    if len(rows.energies):
-        G = rows.contrast(rows.contrast(G).T)
-    return DenseSystem(plus_ridge(G, ridge))
+        return LowRankSystem(features_of_rows(K, rows, basis, contrasted=True), ridge)
+    return DenseSystem(plus_ridge(gram(K, rows, contrasted=True), ridge))
 
 
 # The Gram and the features of the rows, cheap to differentiate with respect to K.
 
 
-def features_of_rows(K, rows: Rows, basis: AbstractBasis) -> Float[Array, "M r"]:
-    """Φ before the contrast."""
+def features_of_rows(
+    K, rows: Rows, basis: AbstractBasis, contrasted: bool = False
+) -> Float[Array, "M r"]:
+    """Φ, before the contrast or after it."""
     like = rows.blocks[0].points
 
     def of(K, basis):
         return basis.span(K, like.shape[1], like.dtype).of
 
-    return jnp.concatenate([_by_points(K, block, basis, of) for block in rows.blocks])
+    features = jnp.concatenate([_by_points(K, block, basis, of) for block in rows.blocks])
+    return rows.contrast(features) if contrasted else features
 
 
-def gram(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, "M M"]:
-    """G before the contrast, from the blocks on and right of the diagonal."""
+def gram(K: AbstractMatrixKernel, rows: Rows, contrasted: bool = False) -> Float[Array, "M M"]:
+    """G, before the contrast or after it, from the blocks on and right of the diagonal."""
 
     def of(K, others):
         return lambda block: jnp.concatenate([between(K, block, b) for b in others], axis=1)
@@ -121,7 +143,8 @@ def gram(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, "M M"]:
     for i, (block, place) in enumerate(zip(rows.blocks, rows.slices, strict=True)):
         left = [above[:, place].T for above in found]
         found.append(jnp.concatenate([*left, _by_points(K, block, rows.blocks[i:], of)], axis=1))
-    return jnp.concatenate(found)
+    G = jnp.concatenate(found)
+    return rows.contrast(rows.contrast(G).T) if contrasted and len(rows.energies) else G
 
 
 def _by_points(K, block: AbstractBlock, data, of) -> Float[Array, "d e"]:

@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hamkernel._gram.dense import assemble
+from hamkernel._factors.dense import solution
+from hamkernel._gram.dense import assemble, plus_ridge
 from hamkernel._kernels.radial import Gaussian
-from hamkernel._solvers.cholesky import solve_positive
 from hamkernel._tuning.tune import tune
 from hamkernel._validation.folds import Partition
 from hamkernel.paper._evaluate import evaluate
@@ -169,7 +169,7 @@ def grid_losses(
         rest = np.setdiff1d(np.arange(N), held_out)
         trained = G[rest][:, :, rest].reshape(len(rest) * n, len(rest) * n)
         across = G[held_out][:, :, rest].reshape(len(held_out) * n, len(rest) * n)
-        a = solve_positive(trained, ridge, Y[rest].reshape(-1))
+        _, a = solution(plus_ridge(trained, ridge), Y[rest].reshape(-1))
         return jnp.mean((Y[held_out].reshape(-1) - across @ a) ** 2)
 
     def row(lengthscale):

@@ -10,15 +10,16 @@ from matplotlib.axes import Axes
 
 from hamkernel.plot._style import (
     BENEATH,
-    DATA,
     STREAM,
     Limits,
     Texts,
     axes,
+    dots,
     grid,
     in_plane,
     legend,
     line_styles,
+    measured,
     named,
     on_points,
     plane_labels,
@@ -67,15 +68,12 @@ def phase_portrait(
     labels = plane_labels((0, 1), 2, units, names)
     q, p, points = grid(xlim, ylim, resolution)
     velocities = in_plane(field, points, (2,), "a field")
-    X = None if data is None else np.asarray(data)
-    if X is not None and (X.ndim != 2 or X.shape[1] != 2):
-        raise ValueError(f"data has shape {X.shape}; measured states (N, 2) are needed.")
+    X = measured(data)
     curves = {} if trajectories is None else _checked(trajectories, 2)
     ax = axes(ax, figsize=(5.2, 4.6))
     _stream(ax, q, p, velocities, density)
     _curves(ax, curves, (0, 1))
-    if X is not None:
-        ax.plot(*X.T, "o", color=DATA, mec="black", mew=0.6, ms=5, zorder=5, label="data")
+    dots(ax, X)
     _finish(ax, labels, title, xlim, ylim)
     if show_legend:
         legend(ax, loc=_widest_corner(ax))

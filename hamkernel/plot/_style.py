@@ -99,6 +99,22 @@ def plane_labels(
     }
 
 
+def measured(data: Any) -> np.ndarray | None:
+    """Measured states in the plane, if there are any."""
+    X = None if data is None else np.asarray(data)
+    if X is not None and (X.ndim != 2 or X.shape[1] != 2):
+        raise ValueError(f"data has shape {X.shape}; measured states (N, 2) are needed.")
+    return X
+
+
+def dots(ax: Axes, X: np.ndarray | None, **options: Any) -> None:
+    """What `measured` found, on top."""
+    if X is not None:
+        ax.plot(
+            *X.T, "o", color=DATA, mec="black", mew=0.6, ms=5, zorder=5, label="data", **options
+        )
+
+
 def legend(ax: Axes, **options: Any) -> None:
     """A legend, if there is anything to name."""
     if ax.get_legend_handles_labels()[0]:

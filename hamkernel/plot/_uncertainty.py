@@ -12,13 +12,14 @@ from matplotlib.axes import Axes
 
 from hamkernel.plot._style import (
     COLORS,
-    DATA,
     Limits,
     Texts,
     axes,
+    dots,
     grid,
     in_plane,
     legend,
+    measured,
     plane_labels,
     with_unit,
 )
@@ -170,18 +171,13 @@ def deviation(
     """
     labels = plane_labels((0, 1), 2, units, names)
     q, p, points = grid(xlim, ylim, resolution)
-    X = None if data is None else np.asarray(data)
-    if X is not None and (X.ndim != 2 or X.shape[1] != 2):
-        raise ValueError(f"data has shape {X.shape}; measured states (N, 2) are needed.")
+    X = measured(data)
     length = jax.tree_util.Partial(_length, fn)
     values = in_plane(length, points, (), "a deviation")
     ax = axes(ax, figsize=(5.4, 4.4))
     filled = ax.contourf(q, p, values.reshape(len(p), -1), 14, cmap="cividis")
     ax.figure.colorbar(filled, ax=ax, label=label)
-    if X is not None:
-        ax.plot(
-            *X.T, "o", color=DATA, mec="black", mew=0.6, ms=5, zorder=5, clip_on=False, label="data"
-        )
+    dots(ax, X, clip_on=False)
     most = {"color": "white", "mec": "black", "mew": 0.8, "ms": 13, "linestyle": "none"}
     ax.plot(*points[values.argmax()], "*", label="largest", zorder=6, clip_on=False, **most)
     ax.set(title=title or "", xlim=xlim, ylim=ylim, **labels)

@@ -5,7 +5,13 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Num
 
-from hamkernel.systems._base import AbstractHamiltonianSystem, Numbers, at, log_parameter
+from hamkernel.systems._base import (
+    AbstractHamiltonianSystem,
+    Numbers,
+    at,
+    log_parameter,
+    positive,
+)
 
 
 class CartPole(AbstractHamiltonianSystem):
@@ -35,6 +41,9 @@ class CartPole(AbstractHamiltonianSystem):
     log_masses: Float[Array, "2"]
     log_length: Float[Array, ""]
     log_gravity: Float[Array, ""]
+    masses = positive("masses", "The masses (M, m).")
+    length = positive("length", "Half of the length of the pole, l.")
+    gravity = positive("gravity", "The acceleration of gravity g.")
 
     def __init__(
         self, masses: Numbers = (0.5, 0.1), length: ArrayLike = 0.5, gravity: ArrayLike = 9.81
@@ -42,21 +51,6 @@ class CartPole(AbstractHamiltonianSystem):
         self.log_masses = log_parameter(masses, "masses", (2,))
         self.log_length = log_parameter(length, "length")
         self.log_gravity = log_parameter(gravity, "gravity")
-
-    @property
-    def masses(self) -> Float[Array, "2"]:
-        """The masses (M, m)."""
-        return jnp.exp(self.log_masses)
-
-    @property
-    def length(self) -> Float[Array, ""]:
-        """Half of the length of the pole, l."""
-        return jnp.exp(self.log_length)
-
-    @property
-    def gravity(self) -> Float[Array, ""]:
-        """The acceleration of gravity g."""
-        return jnp.exp(self.log_gravity)
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
@@ -100,6 +94,11 @@ class Acrobot(AbstractHamiltonianSystem):
     log_centres: Float[Array, "2"]
     log_inertias: Float[Array, "2"]
     log_gravity: Float[Array, ""]
+    masses = positive("masses", "The masses (m₁, m₂).")
+    length = positive("length", "The length l of the first link.")
+    centres = positive("centres", "Where the centres of mass are, (c₁, c₂).")
+    inertias = positive("inertias", "The moments of inertia (I₁, I₂).")
+    gravity = positive("gravity", "The acceleration of gravity g.")
 
     def __init__(
         self,
@@ -114,31 +113,6 @@ class Acrobot(AbstractHamiltonianSystem):
         self.log_centres = log_parameter(centres, "centres", (2,))
         self.log_inertias = log_parameter(inertias, "inertias", (2,))
         self.log_gravity = log_parameter(gravity, "gravity")
-
-    @property
-    def masses(self) -> Float[Array, "2"]:
-        """The masses (m₁, m₂)."""
-        return jnp.exp(self.log_masses)
-
-    @property
-    def length(self) -> Float[Array, ""]:
-        """The length l of the first link."""
-        return jnp.exp(self.log_length)
-
-    @property
-    def centres(self) -> Float[Array, "2"]:
-        """Where the centres of mass are, (c₁, c₂)."""
-        return jnp.exp(self.log_centres)
-
-    @property
-    def inertias(self) -> Float[Array, "2"]:
-        """The moments of inertia (I₁, I₂)."""
-        return jnp.exp(self.log_inertias)
-
-    @property
-    def gravity(self) -> Float[Array, ""]:
-        """The acceleration of gravity g."""
-        return jnp.exp(self.log_gravity)
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4,)."""

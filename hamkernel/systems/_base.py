@@ -2,7 +2,7 @@
 
 import abc
 from collections.abc import Callable, Sequence
-from typing import ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar
 
 import equinox as eqx
 import jax
@@ -88,6 +88,11 @@ def log_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:
     """The logarithm of a positive parameter, by default a scalar."""
     array = require.positive(x, name)
     return jnp.log(shaped(array, name, *(shapes or ((),))))
+
+
+def positive(name: str, doc: str) -> Any:
+    """The property that reads the positive parameter stored as the logarithm `log_<name>`."""
+    return property(lambda system: jnp.exp(getattr(system, f"log_{name}")), doc=doc)
 
 
 def signed_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:

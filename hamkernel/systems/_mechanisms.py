@@ -13,6 +13,7 @@ from hamkernel.systems._base import (
     count_of,
     in_precision,
     log_parameter,
+    positive,
     shaped,
     signed_parameter,
     squared_distances,
@@ -44,6 +45,9 @@ class DoublePendulum(AbstractHamiltonianSystem):
     log_masses: Float[Array, "2"]
     log_lengths: Float[Array, "2"]
     log_gravity: Float[Array, ""]
+    masses = positive("masses", "The masses (m₁, m₂).")
+    lengths = positive("lengths", "The lengths (l₁, l₂) of the rods.")
+    gravity = positive("gravity", "The acceleration of gravity g.")
 
     def __init__(
         self,
@@ -54,21 +58,6 @@ class DoublePendulum(AbstractHamiltonianSystem):
         self.log_masses = log_parameter(masses, "masses", (2,))
         self.log_lengths = log_parameter(lengths, "lengths", (2,))
         self.log_gravity = log_parameter(gravity, "gravity")
-
-    @property
-    def masses(self) -> Float[Array, "2"]:
-        """The masses (m₁, m₂)."""
-        return jnp.exp(self.log_masses)
-
-    @property
-    def lengths(self) -> Float[Array, "2"]:
-        """The lengths (l₁, l₂) of the rods."""
-        return jnp.exp(self.log_lengths)
-
-    @property
-    def gravity(self) -> Float[Array, ""]:
-        """The acceleration of gravity g."""
-        return jnp.exp(self.log_gravity)
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
@@ -103,22 +92,14 @@ class Kepler(AbstractHamiltonianSystem):
 
     log_reduced_mass: Float[Array, ""]
     log_gravitational_parameter: Float[Array, ""]
+    reduced_mass = positive("reduced_mass", "The reduced mass μ.")
+    gravitational_parameter = positive("gravitational_parameter", "The gravitational parameter GM.")
 
     def __init__(self, reduced_mass: ArrayLike = 1.0, gravitational_parameter: ArrayLike = 1.0):
         self.log_reduced_mass = log_parameter(reduced_mass, "reduced_mass")
         self.log_gravitational_parameter = log_parameter(
             gravitational_parameter, "gravitational_parameter"
         )
-
-    @property
-    def reduced_mass(self) -> Float[Array, ""]:
-        """The reduced mass μ."""
-        return jnp.exp(self.log_reduced_mass)
-
-    @property
-    def gravitational_parameter(self) -> Float[Array, ""]:
-        """The gravitational parameter GM."""
-        return jnp.exp(self.log_gravitational_parameter)
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
@@ -151,22 +132,14 @@ class NBody(AbstractHamiltonianSystem):
 
     log_masses: Float[Array, " bodies"]
     log_gravitational_constant: Float[Array, ""]
+    masses = positive("masses", "The masses mᵢ.")
+    gravitational_constant = positive("gravitational_constant", "The gravitational constant G.")
 
     def __init__(self, masses: Numbers = (1.0, 1.0), gravitational_constant: ArrayLike = 1.0):
         self.log_masses = log_parameter(masses, "masses", (count_of(masses, "masses"),))
         self.log_gravitational_constant = log_parameter(
             gravitational_constant, "gravitational_constant"
         )
-
-    @property
-    def masses(self) -> Float[Array, " bodies"]:
-        """The masses mᵢ."""
-        return jnp.exp(self.log_masses)
-
-    @property
-    def gravitational_constant(self) -> Float[Array, ""]:
-        """The gravitational constant G."""
-        return jnp.exp(self.log_gravitational_constant)
 
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4·bodies,)."""

@@ -12,6 +12,7 @@ from hamkernel.systems._base import (
     Numbers,
     at,
     log_parameter,
+    positive,
     signed_parameter,
 )
 
@@ -35,20 +36,12 @@ class HarmonicOscillator(AbstractHamiltonianSystem):
 
     log_mass: Float[Array, ""]
     log_stiffness: Float[Array, ""]
+    mass = positive("mass", "The mass m.")
+    stiffness = positive("stiffness", "The spring constant k.")
 
     def __init__(self, mass: ArrayLike = 0.5, stiffness: ArrayLike = 1.0):
         self.log_mass = log_parameter(mass, "mass")
         self.log_stiffness = log_parameter(stiffness, "stiffness")
-
-    @property
-    def mass(self) -> Float[Array, ""]:
-        """The mass m."""
-        return jnp.exp(self.log_mass)
-
-    @property
-    def stiffness(self) -> Float[Array, ""]:
-        """The spring constant k."""
-        return jnp.exp(self.log_stiffness)
 
     def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2,)."""
@@ -78,26 +71,14 @@ class Pendulum(AbstractHamiltonianSystem):
     log_mass: Float[Array, ""]
     log_length: Float[Array, ""]
     log_gravity: Float[Array, ""]
+    mass = positive("mass", "The mass m.")
+    length = positive("length", "The length l of the rod.")
+    gravity = positive("gravity", "The acceleration of gravity g.")
 
     def __init__(self, mass: ArrayLike = 0.5, length: ArrayLike = 1.0, gravity: ArrayLike = 9.81):
         self.log_mass = log_parameter(mass, "mass")
         self.log_length = log_parameter(length, "length")
         self.log_gravity = log_parameter(gravity, "gravity")
-
-    @property
-    def mass(self) -> Float[Array, ""]:
-        """The mass m."""
-        return jnp.exp(self.log_mass)
-
-    @property
-    def length(self) -> Float[Array, ""]:
-        """The length l of the rod."""
-        return jnp.exp(self.log_length)
-
-    @property
-    def gravity(self) -> Float[Array, ""]:
-        """The acceleration of gravity g."""
-        return jnp.exp(self.log_gravity)
 
     def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2,)."""
@@ -129,6 +110,7 @@ class Duffing(AbstractHamiltonianSystem):
     log_mass: Float[Array, ""]
     linear_stiffness: Float[Array, ""]
     cubic_stiffness: Float[Array, ""]
+    mass = positive("mass", "The mass m.")
 
     def __init__(
         self,
@@ -139,11 +121,6 @@ class Duffing(AbstractHamiltonianSystem):
         self.log_mass = log_parameter(mass, "mass")
         self.linear_stiffness = signed_parameter(linear_stiffness, "linear_stiffness")
         self.cubic_stiffness = signed_parameter(cubic_stiffness, "cubic_stiffness")
-
-    @property
-    def mass(self) -> Float[Array, ""]:
-        """The mass m."""
-        return jnp.exp(self.log_mass)
 
     def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2,)."""
@@ -206,21 +183,13 @@ class SpringChain(AbstractHamiltonianSystem):
     count: int = eqx.field(static=True)
     log_mass: Float[Array, "*count"]
     log_stiffness: Float[Array, "*springs"]
+    mass = positive("mass", "The masses m, shape () or (count,).")
+    stiffness = positive("stiffness", "The spring constants k, shape () or (count + 1,).")
 
     def __init__(self, count: int = 10, mass: Numbers = 1.0, stiffness: Numbers = 1.0):
         self.count = require.count(count, "count")
         self.log_mass = log_parameter(mass, "mass", (), (self.count,))
         self.log_stiffness = log_parameter(stiffness, "stiffness", (), (self.count + 1,))
-
-    @property
-    def mass(self) -> Float[Array, "*count"]:
-        """The masses m, shape () or (count,)."""
-        return jnp.exp(self.log_mass)
-
-    @property
-    def stiffness(self) -> Float[Array, "*springs"]:
-        """The spring constants k, shape () or (count + 1,)."""
-        return jnp.exp(self.log_stiffness)
 
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2·count,)."""

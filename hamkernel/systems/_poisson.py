@@ -10,7 +10,14 @@ from jaxtyping import Array, ArrayLike, Float, Num
 from hamkernel import _require as require
 from hamkernel._show import described
 from hamkernel.poisson import charged_particle, lotka_volterra, rigid_body
-from hamkernel.systems._base import Numbers, at, in_precision, log_parameter, signed_parameter
+from hamkernel.systems._base import (
+    Numbers,
+    at,
+    in_precision,
+    log_parameter,
+    positive,
+    signed_parameter,
+)
 
 
 class AbstractPoissonSystem(eqx.Module):
@@ -65,14 +72,10 @@ class RigidBody(AbstractPoissonSystem):
     """
 
     log_inertia: Float[Array, "3"]
+    inertia = positive("inertia", "The principal moments of inertia.")
 
     def __init__(self, inertia: Numbers = (1.0, 2.0, 3.0)):
         self.log_inertia = log_parameter(inertia, "inertia", (3,))
-
-    @property
-    def inertia(self) -> Float[Array, "3"]:
-        """The principal moments of inertia."""
-        return jnp.exp(self.log_inertia)
 
     def hamiltonian(self, x: Num[ArrayLike, "3"]) -> Float[Array, ""]:
         """Return H(L), shape (); ValueError unless L has shape (3,)."""
@@ -110,6 +113,10 @@ class LotkaVolterra(AbstractPoissonSystem):
     log_predation: Float[Array, ""]
     log_death: Float[Array, ""]
     log_reproduction: Float[Array, ""]
+    growth = positive("growth", "The growth of the prey.")
+    predation = positive("predation", "What each predator takes of the prey.")
+    death = positive("death", "The death rate of the predators.")
+    reproduction = positive("reproduction", "The growth of the predators by each prey.")
 
     def __init__(
         self,
@@ -126,10 +133,8 @@ class LotkaVolterra(AbstractPoissonSystem):
     def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
         """Return H(x, y), shape (); NaN where a population is negative."""
         self, (prey, predators) = at(self, x, 2)
-        a, b, c, d = jnp.exp(
-            jnp.stack([self.log_growth, self.log_predation, self.log_death, self.log_reproduction])
-        )
-        return d * prey - c * jnp.log(prey) + b * predators - a * jnp.log(predators)
+        of_prey = self.reproduction * prey - self.death * jnp.log(prey)
+        return of_prey + self.predation * predators - self.growth * jnp.log(predators)
 
     def tensor(self, x: Num[ArrayLike, "2"]) -> Float[Array, "2 2"]:
         """Return [[0, −xy], [xy, 0]]."""
@@ -156,6 +161,7 @@ class ChargedParticle(AbstractPoissonSystem):
     log_mass: Float[Array, ""]
     stiffness: Float[Array, ""]
     magnetic_field: Float[Array, ""]
+    mass = positive("mass", "The mass m.")
 
     def __init__(
         self, mass: ArrayLike = 1.0, stiffness: ArrayLike = 1.0, magnetic_field: ArrayLike = 1.0
@@ -163,11 +169,6 @@ class ChargedParticle(AbstractPoissonSystem):
         self.log_mass = log_parameter(mass, "mass")
         self.stiffness = signed_parameter(stiffness, "stiffness")
         self.magnetic_field = signed_parameter(magnetic_field, "magnetic_field")
-
-    @property
-    def mass(self) -> Float[Array, ""]:
-        """The mass m."""
-        return jnp.exp(self.log_mass)
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(q, p), shape (); ValueError unless x has shape (4,)."""

@@ -33,8 +33,8 @@ from dynamics import TWO_BODIES, near_circular
 from timing import Timed, environment, in_turn, timed
 
 import hamkernel as hk
-from hamkernel._gram.dense import assemble
-from hamkernel._solvers.cholesky import solve_positive
+from hamkernel._factors.dense import solution
+from hamkernel._gram.dense import assemble, plus_ridge
 from hamkernel._validation.folds import Partition
 from hamkernel.paper._tuned import grid_losses
 
@@ -168,7 +168,7 @@ def one_refit(K, X, Y, ridge, out):
     N, n = X.shape
     rest = jnp.where(jnp.arange(N - 1) < out, jnp.arange(N - 1), jnp.arange(1, N))
     G = assemble(K, X[rest], X[rest]).reshape((N - 1) * n, (N - 1) * n)
-    a = solve_positive(G, ridge, Y[rest].reshape(-1))
+    _, a = solution(plus_ridge(G, ridge), Y[rest].reshape(-1))
     value = assemble(K, X[out][None], X[rest]).reshape(n, -1) @ a
     return jnp.mean((Y[out] - value) ** 2)
 
