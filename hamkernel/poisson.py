@@ -33,7 +33,7 @@ class RigidBodyTensor(eqx.Module):
         return "rigid_body"
 
     def __call__(self, x: Float[Array, "3"]) -> Float[Array, "3 3"]:
-        return _cross(require.point(x, 3))
+        return _cross(require.point(x, 3, "the state of rigid_body"))
 
 
 class LotkaVolterraTensor(eqx.Module):
@@ -47,7 +47,7 @@ class LotkaVolterraTensor(eqx.Module):
         return "lotka_volterra"
 
     def __call__(self, x: Float[Array, "2"]) -> Float[Array, "2 2"]:
-        prey, predators = require.point(x, 2)
+        prey, predators = require.point(x, 2, "the state of lotka_volterra")
         product = prey * predators
         zero = jnp.zeros_like(product)
         return jnp.stack([jnp.stack([zero, -product]), jnp.stack([product, zero])])
@@ -118,10 +118,16 @@ def charged_particle(
         Π, for `hk.Poisson(k, hk.poisson.charged_particle(2.0))`. p is the KINETIC momentum mq̇.
 
     Raises:
-        ValueError: the field has another number of components, or is not finite.
+        ValueError: the field has another number of components, or is not finite. TypeError: it is
+            traced by JAX, as a state is where `charged_particle` itself is given as the tensor.
 
     Source: Littlejohn (1979), J. Math. Phys. 20, 2445, eq. (5).
     """
+    if not require.is_concrete(magnetic_field):
+        raise TypeError(
+            "charged_particle makes a tensor and is not one itself: give it the magnetic field, "
+            "hk.Poisson(k, hk.poisson.charged_particle(1.0))."
+        )
     if callable(magnetic_field):
         return ChargedParticleTensor(as_pytree(magnetic_field), None)
     array = np.atleast_1d(np.asarray(require.floating(magnetic_field, "the magnetic field"), float))

@@ -14,7 +14,7 @@ import scipy.stats
 from kernels import canonical, gaussian_profile, matern_profile, periodic, radial, rational_profile
 
 import hamkernel as hk
-from hamkernel._features.spectra import spectra
+from hamkernel._features.spectra import _orthonormal, spectra
 from hamkernel._features.structured import features
 from hamkernel._fields.features import FeatureField
 from hamkernel._solvers.random_features import RandomFeatures
@@ -146,6 +146,23 @@ def test_frequencies_have_the_spectral_density(name, n, key):
         assert scipy.stats.kstest(draws[:, a], marginal.cdf).pvalue > 1e-4
     wrong = scipy.stats.cauchy(scale=1 / 0.7)
     assert scipy.stats.kstest(draws[:, 0], wrong.cdf).pvalue < 1e-4
+
+
+def test_directions_are_those_of_qr_without_its_program(key):
+    """Two batches of `qr` in one program hang on two cores, as for draws with inputs they did."""
+    A = jax.random.normal(key, (5, 7, 7))
+    Q, R = np.linalg.qr(np.asarray(A))
+    signs = np.sign(np.diagonal(R, axis1=1, axis2=2))
+    np.testing.assert_allclose(_orthonormal(A), Q * signs[:, None], atol=1e-13)
+    K = hk.Controlled(hk.Symplectic(hk.Gaussian()), hk.InputMatrix(hk.Gaussian()), count=1)
+
+    def draws(keys):
+        kept = jax.vmap(lambda key: features(K, 3, 8, key, jnp.dtype(float)))(keys)
+        return eqx.filter(kept, eqx.is_array)
+
+    program = str(jax.make_jaxpr(draws)(jax.random.split(key, 2)))
+    assert "random_bits" in program
+    assert not re.search(r"\b(qr|geqrf|householder_product)\b", program)
 
 
 @pytest.mark.slow

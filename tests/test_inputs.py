@@ -263,6 +263,7 @@ K = kernel("state")
         (lambda: hk.fit(hk.Symplectic(G), X, Y, inputs=U), TypeError, "takes no inputs"),
         (lambda: hk.fit(K, X, Y, inputs=U[:, 0]), ValueError, r"write U\[:, None\]"),
         (lambda: hk.fit(K, X, Y, inputs=U[:5]), ValueError, r"shape \(5, 2\).*shape \(9, 2\)"),
+        (lambda: hk.fit(K, X, Y, inputs=U.T), ValueError, r"transposed: U\.T"),
         (
             lambda: hk.fit(K, X, Y, inputs=np.ones((9, 1))),
             ValueError,
@@ -278,6 +279,7 @@ K = kernel("state")
             "acts_on = .* does not exist",
         ),
         (lambda: hk.Controlled(hk.Symplectic(G), V), TypeError, "hk.InputMatrix"),
+        (lambda: hk.Controlled(hk.Symplectic(G), lambda x: x), TypeError, "mean=lambda x, u: G"),
         (lambda: hk.Controlled(hk.Symplectic(G), [1.0, 2.0]), ValueError, "one column"),
         (lambda: hk.Controlled(G, hk.InputMatrix(V)), TypeError, "drift of Controlled"),
         (lambda: hk.InputMatrix(-1.0), ValueError, "variance .* must be positive"),
@@ -289,6 +291,13 @@ K = kernel("state")
             r"samples \(T, m\)",
         ),
         (lambda: hk.simulate(DRIVEN, START, TS, inputs=lambda t: t), ValueError, "one vector u"),
+        (lambda: hk.simulate(DRIVEN, START, TS, inputs=[1.0]), ValueError, "A constant input is"),
+        (lambda: hk.simulate(DRIVEN, START, TS, inputs=lambda t, x: x), TypeError, "the loop"),
+        (
+            lambda: hk.simulate(DRIVEN.drift, START, TS, inputs=SAMPLES),
+            TypeError,
+            r"takes \(x\); with inputs",
+        ),
         (
             lambda: hk.simulate(DRIVEN, START, TS, inputs=SAMPLES, between="spline"),
             ValueError,
@@ -315,6 +324,10 @@ def test_a_field_says_what_it_needs():
     one = hk.fit(kernel("state"), X, Y, 1e-2, inputs=U[:, :1])
     with pytest.raises(ValueError, match="x and u are swapped"):
         one(u[:1], x)
+    with pytest.raises(ValueError, match="X and U are swapped"):
+        one.evaluate(U[:, :1], X)
+    with pytest.raises(KeyError, match=r"field\.drift\.part"):
+        field.part("friction")
     with pytest.raises(ValueError, match="needs the inputs of every state"):
         field.evaluate(X)
     with pytest.raises(ValueError, match=r"field\.drift"):

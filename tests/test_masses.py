@@ -104,6 +104,27 @@ def test_friction_takes_energy_from_velocities_as_it_does_from_momenta():
     np.testing.assert_allclose(field.dissipation(x), lost, atol=1e-9)
 
 
+PUSHED = hk.systems.Driven(moves, [[0.0], [0.0], [0.7], [0.0]])
+GAIN = hk.InputMatrix(1.0, acts_on=(2, 3))
+
+
+def test_masses_are_those_of_a_drift_as_well():
+    X, U = states(80), np.random.default_rng(3).uniform(-2, 2, (80, 1))
+    Y = np.asarray(jax.vmap(PUSHED)(jnp.asarray(X), jnp.asarray(U)))
+    kernel = hk.Symplectic(100.0 * hk.Gaussian(4.0))
+    unequal = hk.UnknownMasses(kernel, [1.0, RATIO])
+    field = hk.fit(hk.Controlled(unequal, GAIN), X, Y, 1e-8, inputs=U)
+    assert float(jnp.linalg.norm(field.residual)) < 0.01 * np.linalg.norm(Y)
+    x, u = jnp.asarray(X[3]), jnp.asarray(U[3])
+    np.testing.assert_allclose(field.input_matrix(x), [[0], [0], [0.7], [0]], atol=0.01)
+    slope = jax.grad(field.hamiltonian)(x)
+    np.testing.assert_allclose(slope @ field(x, u), slope @ field.input_matrix(x) @ u, atol=1e-9)
+    wrong = hk.fit(hk.Controlled(kernel, GAIN), X, Y, 1e-8, inputs=U)
+    assert float(jnp.linalg.norm(wrong.residual)) > 10 * float(jnp.linalg.norm(field.residual))
+    with pytest.raises(TypeError, match="those of the drift"):
+        hk.UnknownMasses(hk.Controlled(kernel, GAIN), [1.0, RATIO])
+
+
 def test_tuning_finds_the_ratio():
     X = states(60)
     rng = np.random.default_rng(2)
@@ -152,6 +173,24 @@ def test_learning_from_states_finds_the_ratio():
     noisy = [x + 0.01 * rng.standard_normal(x.shape) for x in np.asarray(true)]
     found = hk.learn(hk.Symplectic(hk.Gaussian(1.0)), hk.Runs([ts] * 6, noisy), masses=True)
     np.testing.assert_allclose(found.kernel.masses, [1.0, RATIO], rtol=0.05)
+
+
+@pytest.mark.slow
+def test_learning_from_driven_states_finds_the_ratio_and_the_gain():
+    rng = np.random.default_rng(0)
+    ts, starts = np.linspace(0, 6, 31), jnp.asarray(rng.uniform(-1, 1, (6, 4)))
+    U = rng.uniform(-2, 2, (6, 31, 1))
+
+    def path(x, u):
+        return hk.simulate(PUSHED, x, jnp.asarray(ts), inputs=u).ys
+
+    true = np.asarray(jax.vmap(path)(starts, jnp.asarray(U)))
+    noisy = [x + 0.01 * rng.standard_normal(x.shape) for x in true]
+    K = hk.Controlled(hk.Symplectic(hk.Gaussian(1.0)), GAIN)
+    found = hk.learn(K, hk.Runs([ts] * 6, noisy, list(U)), masses=True)
+    np.testing.assert_allclose(found.kernel.drift.masses, [1.0, RATIO], rtol=0.05)
+    gain = found.field.input_matrix(jnp.zeros(4))
+    np.testing.assert_allclose(gain, [[0], [0], [0.7], [0]], atol=0.03)
 
 
 @pytest.mark.slow

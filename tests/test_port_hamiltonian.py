@@ -226,7 +226,10 @@ def test_saved_fields_come_back(tmp_path):
             lambda: hk.fit(hk.PortHamiltonian(G, damped=4), X, Y),
             "does not exist: the states have 4",
         ),
-        (lambda: hk.fit(hk.PortHamiltonian(G, [0.1] * 3), X, Y), "3 numbers and the states have 2"),
+        (
+            lambda: hk.fit(hk.PortHamiltonian(G, [0.1] * 3), X, Y),
+            "3 numbers: give one for all momenta",
+        ),
         (lambda: hk.fit(hk.PortHamiltonian(G), X[:, :3], Y[:, :3]), "even dimension, got n = 3"),
         (lambda: hk.fit(hk.Symplectic(G), X[:, :3], Y[:, :3]), r"Poisson\(k, tensor\)"),
         (

@@ -107,6 +107,14 @@ def test_other_structures_have_the_same_products(structure):
         assert off(field, C3) < SYMMETRY
 
 
+@pytest.mark.parametrize("B", [hk.poisson.rigid_body, lambda x: hk.poisson.rigid_body(x**2)])
+def test_products_are_those_of_the_gram_where_the_operator_is_odd_or_even(B):
+    Z, A = np.random.default_rng(5).normal(size=(2, 7, 3))
+    K = hk.Poisson(hk.Invariant(G, [-np.eye(3)]), B)
+    expected = np.einsum("iajb,jb->ia", hk.gram(K, Z), A)
+    np.testing.assert_allclose(hk.gram_operator(K, Z).mv(A), expected, rtol=1e-11, atol=1e-12)
+
+
 def test_the_mean_is_over_both_arguments():
     k, maps = BY_NAME["partial"].formula(4), [np.eye(4), MIRROR]
 
@@ -266,6 +274,8 @@ def test_friction_knows_no_time_reversal():
 def test_other_refusals():
     with pytest.raises(TypeError, match="list of linear maps"):
         hk.Invariant(G, 3.0)
+    with pytest.raises(ValueError, match="not invertible"):
+        hk.fit(hk.Separable(hk.Invariant(G, [np.diag([1.0, 0.0, 1.0, 1.0])])), X, Y)
     with pytest.raises(ValueError, match="finite matrix"):
         hk.Invariant(G, [np.ones((2, 3))])
     with pytest.raises(TypeError, match="Reversible must be a matrix-valued"):

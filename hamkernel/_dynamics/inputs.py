@@ -78,6 +78,12 @@ def inputs_of(given: Any, ts: Float[Array, " T"], between: Between) -> Callable[
     if between not in ("held", "linear"):
         raise ValueError(f"between must be 'held' or 'linear'; got {between!r}.")
     if callable(given):
+        others = require.other_arguments(given, ts[0])
+        if others is not None:
+            raise TypeError(
+                f"inputs takes ({others}); it is called with one argument, the time. Feedback "
+                "closes the loop instead: hk.simulate(lambda x: field(x, law(x)), x0, ts)."
+            )
         shape = jax.eval_shape(given, jax.ShapeDtypeStruct((), ts.dtype))
         if len(getattr(shape, "shape", (0, 0))) != 1:
             raise ValueError(
@@ -87,7 +93,10 @@ def inputs_of(given: Any, ts: Float[Array, " T"], between: Between) -> Callable[
         return as_pytree(given)
     values = require.floating(given, "inputs")
     if values.ndim != 2 or len(values) != len(ts):
-        hint = " For one input write U[:, None]." if values.ndim == 1 else ""
+        one = values.ndim == 1 and len(values) == len(ts)
+        hint = " For one input write U[:, None]." if one else ""
+        if values.ndim < 2 and not one:
+            hint = " A constant input is lambda t: jnp.array([…])."
         raise ValueError(
             f"inputs has shape {values.shape}; a function t -> (m,) is needed, or samples (T, m) at"
             f" the T = {len(ts)} times ts.{hint}"

@@ -49,6 +49,13 @@ def right_hand_side(
     if inputs is None:
         refuse_missing(field)
         return RightHandSide(_Autonomous(field), None, field)
+    only = require.other_arguments(field, ts, ts)
+    if only is not None:
+        raise TypeError(
+            f"field takes ({only}); with inputs it is called with two arguments, the state x and "
+            "its inputs u: a field of a Controlled kernel, hk.systems.Driven(system, G), or a "
+            "function of yours. To follow it without inputs, leave them out."
+        )
     # Functions get the caller's time, samples have times of their own: those since the start.
     start = first.astype(ts.dtype) if callable(inputs) else jnp.zeros((), ts.dtype)
     held = constant_steps and between == "held" and not callable(inputs)

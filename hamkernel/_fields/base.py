@@ -115,7 +115,8 @@ class AbstractField(eqx.Module):
             return self._term(self.kernel, self.kernel.position(which))
         if which == 0:
             return self
-        raise KeyError(f"no part {which!r}: {type(self.kernel).__name__} is not a sum.")
+        cure = " The drift may be one: field.drift.part(…)." if self.kernel.takes_inputs else ""
+        raise KeyError(f"no part {which!r}: {type(self.kernel).__name__} is not a sum.{cure}")
 
     @abc.abstractmethod
     def _term(self: Field, kernel: Sum, position: int) -> Field:

@@ -121,13 +121,19 @@ def closed(
     """The group that the maps generate on states of n coordinates, the identity first.
 
     Raises:
-        ValueError: there are more than 64 elements; or one of them comes with both signs, so that
-            zero is the only function with the symmetry.
+        ValueError: a map is not invertible; there are more than 64 elements; or one of them comes
+            with both signs, so that zero is the only function with the symmetry.
     """
     generators = [
         Element(_clean(matrix_of(each, n)), sign)
         for each, sign in zip(maps, characters, strict=True)
     ]
+    for g in generators:
+        if abs(np.linalg.det(g.matrix)) < _SAME:
+            raise ValueError(
+                "a map of the symmetry is not invertible, so it is no element of a group: "
+                f"S = {np.round(g.matrix, 3).tolist()}. To ignore a coordinate use Select(k, dims)."
+            )
     group = [Element(np.eye(n), 1.0)]
     for known in group:  # which grows
         for g in generators:

@@ -100,8 +100,11 @@ def inputs_at(X: Float[Array, "*points n"], inputs: Any) -> Float[Array, "*point
         return None
     U = require.floating(inputs, "inputs")
     if U.ndim != X.ndim or U.shape[:-1] != X.shape[:-1] or U.shape[-1] == 0:
-        one = U.shape == X.shape[:-1]
-        hint = f" For one input write U[{':, ' * U.ndim}None]." if one else ""
+        hint = ""
+        if U.shape == X.shape[:-1]:
+            hint = f" For one input write U[{':, ' * U.ndim}None]."
+        elif U.ndim == X.ndim == 2 and U.shape[1] == len(X):
+            hint = " They seem to be transposed: U.T."
         raise ValueError(
             f"inputs has shape {U.shape}; m inputs for each of the states are needed, which have "
             f"shape {X.shape}.{hint}"

@@ -141,7 +141,8 @@ class Controlled(AbstractMatrixKernel):
         elif callable(inputs) or isinstance(inputs, str):
             raise TypeError(
                 "inputs must be hk.InputMatrix(k, acts_on=(1,)), for an unknown input matrix, or a "
-                f"known one as an array (n, m); got {inputs!r}."
+                f"known one as an array (n, m); got {inputs!r}. Where G(x) is a known function, fit"
+                " with mean=lambda x, u: G(x) @ u, and an array of zeros here."
             )
         else:
             self.inputs = KnownMatrix(_entries(inputs))

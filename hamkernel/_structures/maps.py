@@ -50,6 +50,6 @@ def check_symmetries(K: Any, X: Float[Array | np.ndarray, "N n"]) -> None:
                     f"a map of the symmetry is not one of the fields of {type(K).__name__}: with "
                     f"S = {np.round(S, 3).tolist()} neither B(Sx) = S B(x) Sᵀ nor -S B(x) Sᵀ holds."
                     " For J∇H it must be symplectic or antisymplectic, SᵀJS = ±J, so momenta move "
-                    "with their positions; for gradients orthogonal. With friction time reversal "
-                    "is false."
+                    "with their positions; for gradients orthogonal; with all its digits, not 0.866"
+                    " for √3/2. With friction time reversal is false."
                 )

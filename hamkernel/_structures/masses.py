@@ -28,14 +28,18 @@ class UnknownMasses(AbstractMatrixKernel):
     other. A full matrix needs nonlinear forces: for linear oscillations every M under which their
     modes are orthogonal explains the motion.
 
+    As the drift of `Controlled` it leaves the inputs in (q, q̇): G holds accelerations, M⁻¹ times
+    the forces, so a force on one coordinate moves several where M is full.
+
     Args:
         kernel: K, a matrix-valued kernel, such as `Symplectic(k)`.
         masses: the first guess, m ≥ 2 degrees of freedom: shape (m,) for a diagonal M, (m, m) for a
             full one, symmetric and positive definite. Its unit does not matter.
 
     Raises:
-        TypeError: K is not matrix-valued. ValueError: a mass is not positive and finite, a matrix
-            is not symmetric and positive definite, or there is one degree of freedom only.
+        TypeError: K is not matrix-valued, or it is `Controlled`. ValueError: a mass is not positive
+            and finite, a matrix is not symmetric and positive definite, or there is one degree of
+            freedom only.
 
     Example: `hk.tune(hk.UnknownMasses(hk.Symplectic(k), [1.0, 1.0]), X, Y)`, or
     `hk.learn(hk.UnknownMasses(hk.Symplectic(k), np.eye(2)), runs)`.
@@ -49,6 +53,10 @@ class UnknownMasses(AbstractMatrixKernel):
 
     def __init__(self, kernel: AbstractMatrixKernel, masses: ArrayLike):
         self.kernel = matrix_kernel(kernel, "the kernel of UnknownMasses", "Symplectic(k)")
+        if self.kernel.takes_inputs:
+            raise TypeError(
+                "the masses are those of the drift: Controlled(UnknownMasses(K, masses), …)."
+            )
         guess = require.floating(masses, "masses")
         if guess.shape not in ((len(guess),) * k for k in (1, 2)) or len(guess) < 2:
             raise ValueError(

@@ -72,9 +72,9 @@ class AbstractPotentialKernel(AbstractStructure):
         return self.apply(x, jnp.eye(len(x), dtype=x.dtype))
 
     def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"] | None:
-        # S B(z)ᵀ = ± B(Sz)ᵀ S⁻ᵀ, where B(Sz) = ± S B(z) Sᵀ
+        # S B(z)ᵀ = ± B(Sz)ᵀ S⁻ᵀ, where B(Sz) = ± S B(z) Sᵀ: of a B(x) the sign is not known here.
         if Invariance.TRANSLATION not in self.operator_invariance:
-            return S if np.array_equal(S, S[0, 0] * np.eye(len(S))) else None
+            return S if np.array_equal(S, np.eye(len(S))) else None
         with jax.ensure_compile_time_eval():
             B = np.asarray(self.operator_at(jnp.zeros(len(S))))
         image = S @ B @ S.T

@@ -65,8 +65,8 @@ class PortHamiltonian(AbstractPotentialKernel):
     ):
         self.kernel = as_scalar_kernel(kernel)
         cure = (
-            "Energy that grows is no friction; of a system without friction use Symplectic(k), and "
-            "for other damping a Structured(k, operator)."
+            "Energy that grows is no friction; for a system without friction use Symplectic(k), "
+            "and for other damping Structured(k, operator)."
         )
         array = require.positive(friction, "friction", cure)
         self.damped = None if damped is None else distinct_coordinates(damped, "damped")
@@ -131,12 +131,12 @@ class PortHamiltonian(AbstractPotentialKernel):
         if max(coordinates) >= n:
             raise ValueError(
                 f"damped = {self.damped} names a coordinate that does not exist: the states have "
-                f"{n}, counted from 0, and the momenta are {n // 2} to {n - 1}."
+                f"{n}, counted from 0, and the momenta are {tuple(range(n // 2, n))}."
             )
         if self.log_friction.ndim and self.log_friction.size != len(coordinates):
             raise ValueError(
-                f"friction has {self.log_friction.size} numbers and the states have "
-                f"{len(coordinates)} momenta: give one number, or one for each of them."
+                f"friction has {self.log_friction.size} numbers: give one for all momenta, or one "
+                f"for each; states of n = {n} coordinates have {len(coordinates)}."
             )
         super().check_dimension(n)
 

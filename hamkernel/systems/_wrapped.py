@@ -165,7 +165,7 @@ class Driven(eqx.Module):
         if u is None:
             raise ValueError(
                 "a driven system needs its inputs: system(x, u), and hk.simulate(system, x0, ts, "
-                "inputs=u). Without inputs it is system.system."
+                "inputs=u). Without inputs it is system.drift."
             )
         x, G = require.floating(x, "x"), self.input_matrix(x)
         u = require.floating(u, "u")

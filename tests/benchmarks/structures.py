@@ -10,6 +10,7 @@ hyperparameters come from `tune(..., objective="marginal_likelihood")`.
 # pyright: reportCallIssue=false
 
 import argparse
+import time
 from collections.abc import Callable
 from typing import Any
 
@@ -194,8 +195,13 @@ def symmetry(seeds: int) -> None:
         return {"none": K, "time reversal": hk.Reversible(K), "odd": hk.Odd(K), "both": both}
 
     tables = {
-        "Pendulum, 24 points of 3 runs, one lengthscale": (pendulum, four(K), "both ≤ 2.5e-2"),
-        "Pendulum, a lengthscale for each coordinate": (pendulum, four(each), "both ≤ 2.5e-2"),
+        "Pendulum, 24 points of 3 runs, a lengthscale for q and one for p": (
+            pendulum,
+            four(each),
+            "both ≤ 2.5e-2",
+        ),
+        # The unit of p is not that of q: in this box p goes to 8 and q to 3.
+        "The same with one lengthscale for both": (pendulum, four(K), "no claim"),
         "Hénon-Heiles, 48 points of 6 runs": (
             galaxy,
             {
@@ -212,7 +218,7 @@ def symmetry(seeds: int) -> None:
         print(f"\n{title}, noise {NOISE}: {bound}")
         for name, kernel in kernels.items():
             row(name, [errors_of(problem, kernel, seed) for seed in range(seeds)])
-    print("\nTime of a product, 3000 points, over that of the plain kernel: at most |G|")
+    print("\nCPU time of a product, 3000 points, over that of the plain kernel: at most |G|")
     X = jax.random.normal(jax.random.key(0), (3000, 4))
     named = {
         "plain": K,
@@ -221,9 +227,10 @@ def symmetry(seeds: int) -> None:
         "all, 12": hk.Reversible(triangle),
     }
     operators = {name: hk.gram_operator(kernel, X) for name, kernel in named.items()}
-    times = in_turn(5, {name: (lambda op=op: op.mv(X)) for name, op in operators.items()})
+    runs = {name: (lambda op=op: op.mv(X)) for name, op in operators.items()}
+    times = in_turn(9, runs, clock=time.process_time)
     for name, taken in times.items():
-        print(f"  {name:44s} {taken.least / times['plain'].least:.2f}")
+        print(f"  {name:44s} {taken.median / times['plain'].median:.2f}")
 
 
 # Inputs.
