@@ -14,6 +14,9 @@ _SIGMAS, _CURVATURE = 5.0, 0.1
 # Noise of half the motion or more: where learning failed, it was found 0.9 to 1.1 times the motion.
 _ALL_NOISE = 0.5
 
+# Of the states: without noise the averages of samples are off by more than is found of it.
+_NEGLIGIBLE = 1e-3
+
 _FEW = 10  # degrees of freedom, from which σ is known to a fifth
 
 
@@ -55,7 +58,8 @@ def judged(
     if given and not explained:
         warn_of_misfit(fit.chi_squared, fit.misfit)
         return fit.settled
-    converged = fit.settled and explained
+    left = np.sqrt(fit.chi_squared) * np.nanmax(noise / scale)
+    converged = fit.settled and (explained or bool(left < _NEGLIGIBLE))
     said = not given and (warn_of_few(fit.free) or warn_of_noise(noise, scale))
     if not (converged or said):
         warn_of_unsettled(fit.count, fit.chi_squared)
@@ -93,9 +97,9 @@ def warn_of_noise(noise: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"]
         f"the field explains little of the runs: the noise found in coordinate {c} is "
         f"{noise[c]:.3g}, and its states vary by {scale[c]:.3g} (standard deviations). Causes: "
         "fewer than about five samples a swing, one lengthscale for coordinates of different sizes "
-        f"(hk.Gaussian(np.ones({len(noise)})) has one for each), a structure that the motion does "
-        "not have, or sensors that are indeed so noisy. If you know the noise, pass noise=…; see "
-        "hk.plot.fitted."
+        f"(hk.Gaussian(np.ones({len(noise)})) has one for each), a jump in a run, a structure that "
+        "the motion does not have, or sensors that are indeed so noisy. If you know the noise, "
+        "pass noise=…; see hk.plot.fitted."
     )
     return True
 
