@@ -11,7 +11,7 @@ import pytest
 from kernels import BY_NAME, canonical
 
 import hamkernel as hk
-from hamkernel._solvers.cholesky import AbstractSolver
+from hamkernel._solvers.base import AbstractSolver
 
 SIGMA, RIDGE = 1.3, 1e-3
 # The condition of the system, trace / Nλ ~ 1e3, times rounding.

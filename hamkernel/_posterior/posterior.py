@@ -2,11 +2,10 @@
 
 Read as a Gaussian process, the field is a priori f ~ GP(mean, K) and the rows of the data have
 independent noise of variance σ² = Nλ, times their squared relative noise. What is left after the
-data is Gaussian again. With c(x) the covariances of the rows with what is asked at x,
+data is Gaussian again: with c(x) the covariances of the rows with what is asked at x, of f or of
+differences of H,
 
-    Cov[f(x), f(z) | y] = K(x, z) − c(x)ᵀ A⁻¹ c(z),     A = G + σ²I,
-
-and the same for differences of H, whose c and prior covariances come from k itself.
+    Cov[f(x), f(z) | y] = K(x, z) − c(x)ᵀ A⁻¹ c(z),     A = G + σ²I.
 """
 
 from __future__ import annotations
@@ -31,7 +30,8 @@ from hamkernel._observations.base import AbstractObservations
 from hamkernel._observations.blocks import AbstractBlock, Values
 from hamkernel._observations.data import inputs_of, observations
 from hamkernel._show import text
-from hamkernel._solvers.cholesky import AbstractSolver, Cholesky
+from hamkernel._solvers.base import AbstractSolver
+from hamkernel._solvers.cholesky import Cholesky
 from hamkernel._solvers.conditional import AbstractConditional
 from hamkernel._solvers.fit import check_solver
 from hamkernel._solvers.given import checked_rows, new_rows

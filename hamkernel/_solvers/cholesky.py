@@ -1,71 +1,9 @@
 """Regularised least squares by a dense factorisation: (G + NλI) a = y."""
 
-import abc
-from typing import ClassVar, Generic, TypeVar
-
-import equinox as eqx
-from jaxtyping import Array, Float
-
-from hamkernel._fields.base import AbstractField
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._machine.devices import on_one_device
-from hamkernel._observations.rows import Rows
-from hamkernel._solvers.conditional import (
-    AbstractConditional,
-    DenseConditional,
-    dense_conditional,
-    dense_field,
-)
-from hamkernel._solvers.spans import AbstractBasis
-from hamkernel._structures.base import AbstractMatrixKernel
-
-Learned = TypeVar("Learned", bound=AbstractField, covariant=True)
-
-
-class AbstractSolver(eqx.Module, Generic[Learned]):
-    """How `fit` finds the field."""
-
-    no_factor: ClassVar[str | None] = None  # why it cannot say how far the field may be off
-    is_low_rank: ClassVar[bool] = False  # whether `tune` is to judge by the loss in its `_basis`
-
-    def _basis(
-        self, K: AbstractMatrixKernel, X: Float[Array, "N n"], regularization: Float[Array, ""]
-    ) -> AbstractBasis | None:
-        """The features of a fit of low rank, as functions of the hyperparameters."""
-        del K, X, regularization
-        return None
-
-    @abc.abstractmethod
-    def _fitted(
-        self,
-        K: AbstractMatrixKernel,
-        X: Float[Array, "N n"],
-        Y: Float[Array, "N n"],
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> Learned:
-        """The field for data that has been checked; of NaN if it fails and does not `throw`."""
-
-    def _fitted_rows(
-        self,
-        K: AbstractMatrixKernel,
-        rows: Rows,
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> AbstractField:
-        """The same for any observations."""
-        return self._given(K, rows, regularization, throw).field
-
-    def _given(
-        self,
-        K: AbstractMatrixKernel,
-        rows: Rows,
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> AbstractConditional:
-        """The same with what the solver keeps, to say how far the field may be off."""
-        del K, rows, regularization, throw
-        raise TypeError(self.no_factor)
+from hamkernel._solvers.base import AbstractSolver
+from hamkernel._solvers.conditional import DenseConditional, dense_conditional, dense_field
 
 
 class Cholesky(AbstractSolver[KernelField]):

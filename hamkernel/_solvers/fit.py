@@ -16,7 +16,8 @@ from hamkernel._machine.memory import dense_bytes, memory_bytes
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._observations.base import AbstractObservations
 from hamkernel._observations.data import as_states
-from hamkernel._solvers.cholesky import AbstractSolver, Cholesky, Learned
+from hamkernel._solvers.base import AbstractSolver, Learned
+from hamkernel._solvers.cholesky import Cholesky
 from hamkernel._solvers.conditional import COPIES
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.given import checked_rows, checked_states

@@ -32,7 +32,7 @@ from hamkernel._observations.data import (
 )
 from hamkernel._observations.rows import Rows
 from hamkernel._show import call, text
-from hamkernel._solvers.cholesky import AbstractSolver, Learned
+from hamkernel._solvers.base import AbstractSolver, Learned
 from hamkernel._solvers.given import without_known
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 

@@ -31,7 +31,7 @@ from hamkernel._machine.threads import one_blas_thread
 from hamkernel._observations.base import AbstractObservations
 from hamkernel._observations.data import as_states, observations, rows_of_states
 from hamkernel._show import described
-from hamkernel._solvers.cholesky import AbstractSolver
+from hamkernel._solvers.base import AbstractSolver
 from hamkernel._solvers.fit import fit
 from hamkernel._solvers.given import checked_rows, checked_states
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
