@@ -400,6 +400,7 @@ def test_no_short_piece_crosses_a_gap():
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:a gap of")
+@pytest.mark.filterwarnings("ignore:learning did not converge")  # at 8 iterations it still moves
 def test_positions_with_gaps_leave_no_ripples_in_the_field():
     times, states, true = logs(noise=0.01, samples=51)
     times, only_q = with_a_gap(times, states)

@@ -62,7 +62,7 @@ def judged(
     converged = fit.settled and (explained or bool(left < _NEGLIGIBLE))
     said = not given and (warn_of_few(fit.free) or warn_of_noise(noise, scale))
     if not (converged or said):
-        warn_of_unsettled(fit.count, fit.chi_squared)
+        warn_of_unsettled(fit.count, fit.chi_squared, explained)
     return converged
 
 
@@ -115,13 +115,13 @@ def warn_of_few(free: float) -> bool:
     return True
 
 
-def warn_of_unsettled(count: int, chi_squared: float) -> None:
+def warn_of_unsettled(count: int, chi_squared: float, explained: bool) -> None:
     """Say that the iterations did not end where the field explains the runs."""
+    why = f"residuals are {np.sqrt(chi_squared):.2g} times the noise found"
     require.warn(
-        f"learning did not converge in {count} iterations: residuals are "
-        f"{np.sqrt(chi_squared):.2g} times the noise found, or noise or objective still move; see "
-        ".history and hk.plot.fitted. More samples a swing help, shorter runs, or a kernel closer "
-        "to the truth."
+        f"learning did not converge in {count} iterations: "
+        f"{'noise or objective still move' if explained else why}; see .history and "
+        "hk.plot.fitted. More samples a swing help, shorter runs, or a kernel closer to the truth."
     )
 
 
