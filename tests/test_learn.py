@@ -26,10 +26,11 @@ from hamkernel._trajectories.evidence import (
     losses,
     orthonormal,
     solved,
+    whitening,
 )
 from hamkernel._trajectories.flow import NODES, WEIGHTS, simulated
 from hamkernel._trajectories.functionals import functionals_of
-from hamkernel._trajectories.learned import warn_of_noise
+from hamkernel._trajectories.judged import warn_of_few, warn_of_noise
 from hamkernel._trajectories.prepared import prepared
 from hamkernel._trajectories.rows import Segments, frozen, linearised
 from hamkernel._trajectories.shooting import means, short_cuts
@@ -176,6 +177,15 @@ def test_the_gradient_of_the_likelihood_is_that_of_finite_differences():
     np.testing.assert_allclose(gradient, (up - down) / 2e-5, rtol=1e-5, atol=1e-6)
 
 
+def test_landmarks_resolve_components_of_any_unit():
+    D = np.array([1.0, 1e8])
+    S = np.random.default_rng(0).uniform(-1, 1, (8, 2))
+    kernel = hk.Symplectic(3.0 * hk.Gaussian(D))
+    T = np.asarray(whitening(kernel, jnp.asarray(S * D[None])))
+    G = np.asarray(hk.gram(kernel, S * D[None])).reshape(16, 16)
+    np.testing.assert_allclose(T.T @ G @ T, np.eye(16), atol=1e-6)
+
+
 def test_the_flow_and_its_tangent_are_exact_to_the_tolerance_of_the_integrator():
     starts = jnp.array([[1.0, 0.5], [-0.3, 1.2]])
     spans = np.full((2, 4), 0.2)
@@ -272,6 +282,9 @@ def test_a_field_that_explains_nothing_says_so():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert not warn_of_noise(np.array([0.4, np.nan]), scale)
+        assert not warn_of_few(10.0)
+    with pytest.warns(UserWarning, match=r"leave 3\.2 degrees of freedom .* are a guess"):
+        assert warn_of_few(3.2)
 
 
 @pytest.mark.slow
@@ -296,6 +309,21 @@ def test_a_run_that_is_garbage_is_dropped_and_named():
     assert np.asarray(found.kept).tolist() == [1, 1, 0, 1, 1, 1]
     assert field_error(found.field, true) < 0.05
     assert all(np.isfinite(x).all() for x in found.states)
+
+
+@pytest.mark.slow
+def test_the_units_of_the_momenta_do_not_matter():
+    times, states, true = logs()
+    kernel, D = hk.Symplectic(hk.Gaussian(np.ones(2))), np.array([1.0, 1e6])
+    found = hk.learn(kernel, hk.Runs(times, states))
+    scaled = hk.learn(kernel, hk.Runs(times, [x * D[None] for x in states]))
+    np.testing.assert_allclose(scaled.noise / D, found.noise, rtol=1e-5)
+    X = true[0]
+    field, expected = (
+        np.asarray(jax.vmap(each.field)(jnp.asarray(X * unit))) / unit
+        for each, unit in ((scaled, D[None]), (found, np.ones((1, 2))))
+    )
+    np.testing.assert_allclose(field, expected, atol=1e-5)
 
 
 def damped(x):

@@ -80,6 +80,15 @@ def test_a_wrapped_angle_is_named_with_its_cure():
     hk.Runs(t, np.column_stack([np.unwrap(angle[:, 0]), angle[:, 1]]))  # no warning: an error here
 
 
+def test_a_fast_wrapped_angle_is_named_and_a_momentum_across_a_gap_is_not():
+    t = np.linspace(0, 6, 30)
+    turning = (6.0 * t + np.pi) % (2 * np.pi) - np.pi  # 1.2 rad between samples
+    with pytest.warns(UserWarning, match="coordinate 0 of run 0 jumps by about 2π"):
+        hk.Runs(t, np.column_stack([turning, np.sin(t)]))
+    far = np.append(t[:15], t[15:] + 1.5)
+    hk.Runs(far, np.column_stack([np.where(t < 3, 0.0, 6.2) + 0.1 * t, np.sin(t)]))
+
+
 def test_gaps_and_constant_columns_are_named():
     t = np.concatenate([np.linspace(0, 1, 20), np.linspace(5, 6, 20)])
     with pytest.warns(UserWarning, match=r"a gap of 4 in run 0, at a median spacing of 0\.0526"):

@@ -8,6 +8,8 @@ the second of which is the potential of the representer K(·, z)v, and the third
 of observations maps such covariances at its points to rows.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -22,15 +24,23 @@ from hamkernel._structures.base import AbstractMatrixKernel
 _ENTRIES = 1_000_000
 
 
-def gram_of_rows(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, "D D"]:
-    """The Gram of all rows, without the constant of the energies."""
-    blocks, places = rows.blocks, range(len(rows.blocks))
-    upper = {(i, j): between(K, blocks[i], blocks[j]) for j in places for i in range(j + 1)}
-    if len(blocks) == 1:
-        G = upper[0, 0]
-    else:
-        G = jnp.block([[upper[i, j] if i <= j else upper[j, i].T for j in places] for i in places])
-    return rows.contrast(rows.contrast(G).T) if len(rows.energies) else G
+def between_all(
+    K: AbstractMatrixKernel, block: AbstractBlock, others: tuple[AbstractBlock, ...]
+) -> Float[Array, "d e"]:
+    """The covariances of the rows of a block with those of others."""
+    return jnp.concatenate([between(K, block, other) for other in others], axis=1)
+
+
+def gram_of_rows(
+    K: AbstractMatrixKernel, rows: Rows, contrasted: bool = True, between_all: Any = between_all
+) -> Float[Array, "D D"]:
+    """The Gram of all rows, after the contrast of the energies or before it."""
+    found = []
+    for i, (block, place) in enumerate(zip(rows.blocks, rows.slices, strict=True)):
+        left = [above[:, place].T for above in found]
+        found.append(jnp.concatenate([*left, between_all(K, block, rows.blocks[i:])], axis=1))
+    G = jnp.concatenate(found)
+    return rows.contrast(rows.contrast(G).T) if contrasted and len(rows.energies) else G
 
 
 def rows_between(K: AbstractMatrixKernel, rows: Rows, block: AbstractBlock) -> Float[Array, "D d"]:

@@ -49,9 +49,11 @@ def whitening(K: AbstractMatrixKernel, S: Float[Array, "m d"]) -> Float[Array, "
     """T = L⁻ᵀ with L Lᵀ = K(S, S), q = m n."""
     G = trained((K, S), Columns(S), rowwise=True)
     G = G.reshape(-1, G.shape[-1])
-    rounding = _ROUNDINGS * jnp.finfo(G.dtype).eps * jnp.trace(G)
+    # Of each component by itself, which have different units; some are zero, as q̇ of a U(q).
+    d = jnp.diagonal(G)
+    rounding = _ROUNDINGS * jnp.finfo(G.dtype).eps * len(G) * jnp.where(d > 0, d, d.mean())
     eye = jnp.eye(len(G), dtype=G.dtype)
-    return solve_triangular(jnp.linalg.cholesky(G + rounding * eye), eye, lower=True).T
+    return solve_triangular(jnp.linalg.cholesky(G + jnp.diag(rounding)), eye, lower=True).T
 
 
 class Projected(NamedTuple):

@@ -92,7 +92,7 @@ def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, St
         now.field, segments, now.model.log_noise, task.spread, steps, segments.starts, _ROUNDS
     )
     least = _NEGLIGIBLE * task.data.scale
-    good = trusted(before, segments, np.maximum(np.exp(np.asarray(now.model.log_noise)), least))
+    good = trusted(before, segments, np.exp(np.asarray(now.model.log_noise)), least)
     rows = rows_along(now.field, before.path, segments, jnp.asarray(good))
     model, loss = most_likely(now.model, task.S, rows, task.spread, task.box, _SEARCH)
     found = solved(model.kernel, model.log_noise, task.S, rows, task.spread)
@@ -150,21 +150,27 @@ _whitening = eqx.filter_jit(whitening)
 
 
 @eqx.filter_jit
-def _norms(field, X: Float[Array, "N d"], n: int) -> Float[Array, " N"]:
-    return jax.vmap(lambda s: jnp.linalg.norm(with_tangent(field, s, n)[1]))(X)
+def _norms(field, X: Float[Array, "N d"], scale: Float[Array, " n"]) -> Float[Array, " N"]:
+    def norm(s):
+        D = with_tangent(field, s, len(scale))[1]
+        return jnp.linalg.norm(D * scale[None] / scale[:, None])
+
+    return jax.vmap(norm)(X)
 
 
 def _stiffness(field: Expansion, data: Prepared, paths: list[np.ndarray]) -> float:
-    """‖∂f/∂x‖ along the paths, but for the largest twentieth."""
+    """‖∂f/∂x‖ in standard deviations along the paths, but for the largest twentieth."""
     X = np.concatenate([run.joined(path) for run, path in zip(data.runs, paths, strict=True)])
     X = X[np.linspace(0, len(X) - 1, 256).round().astype(int)]
-    norms = np.asarray(_norms(field, jnp.asarray(X), len(data.scale)))
+    norms = np.asarray(_norms(field, jnp.asarray(X), jnp.asarray(data.scale)))
     return float(np.nanquantile(np.where(np.isfinite(norms), norms, 0.0), 0.95))
 
 
 def changed(task: Task, before: Current, now: Current) -> float:
     """By how much the field has changed at the landmarks, relative to its size there."""
-    old, new = (np.asarray(_values(each.field, task.S)) for each in (before, now))
+    old, new = (
+        np.asarray(_values(each.field, task.S)) / task.data.scale[None] for each in (before, now)
+    )
     return float(np.linalg.norm(new - old) / max(np.linalg.norm(new), np.finfo(float).tiny))
 
 

@@ -25,16 +25,8 @@ from hamkernel._trajectories.flow import Expansion
 from hamkernel._trajectories.functionals import functionals_of
 from hamkernel._trajectories.hermite import interpolated
 from hamkernel._trajectories.iteration import Current, Task, begin, changed, iterated
-from hamkernel._trajectories.learned import (
-    Learned,
-    Step,
-    empty,
-    explains,
-    misfits,
-    warn_of_dropped,
-    warn_of_misfit,
-    warn_of_noise,
-)
+from hamkernel._trajectories.judged import Fit, judged
+from hamkernel._trajectories.learned import Learned, Step, empty, misfits
 from hamkernel._trajectories.prepared import check_identifiable, prepared
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.shooting import Piece, grown, halved, short_cuts
@@ -101,8 +93,8 @@ def learn(
             enabled.
 
     Warns:
-        UserWarning: parts of runs were dropped, the structure does not explain the runs, or the
-            iterations did not settle.
+        UserWarning: parts of runs were dropped, the structure does not explain the runs, the runs
+            are too few to find the noise, or the iterations did not settle.
     """
     K, given = _check(with_amplitude(matrix_kernel(K)), runs, noise, solver)
     if masses:
@@ -184,18 +176,8 @@ def _learned(
     noise = np.where(measured, np.exp(np.asarray(now.model.log_noise)), np.nan)
     misfit = misfits(runs, states, noise)
     chi_squared = now.squares / max(now.free, 1.0)
-    warn_of_dropped(kept)
-    explained = not given or explains(chi_squared, now.free)
-    if not explained:
-        warn_of_misfit(chi_squared, misfit)
-    elif not given:
-        explained = not warn_of_noise(noise, data.scale)
-    if explained and not converged:
-        require.warn(
-            f"learning stopped after {_MOST} iterations with noise or objective still moving: see "
-            ".history. The field may be usable; more samples a swing, or a kernel closer to the "
-            "truth, help."
-        )
+    fit = Fit(kept, misfit, chi_squared, now.free, len(history), converged)
+    converged = judged(fit, noise, data.scale, given)
     observations = functionals_of(now.rows, now.model.log_noise, task.mean)
     count = 1 if observations is None else sum(len(y) for _, y in observations.parts())
     regularization = jnp.asarray(1 / count)

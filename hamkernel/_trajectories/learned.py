@@ -9,20 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hamkernel import _require as require
 from hamkernel._observations.base import AbstractObservations
 from hamkernel._posterior.posterior import Posterior, condition
 from hamkernel._show import described
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._trajectories.runs import Runs
-
-# χ² per degree of freedom has the standard deviation √(2/ν); five of them, and a tenth for the
-# curvature that a linearisation misses.
-_SIGMAS, _CURVATURE = 5.0, 0.1
-
-# Noise of half the motion or more: where learning failed, it was found 0.9 to 1.1 times the motion.
-_ALL_NOISE = 0.5
 
 _EXACT = 3000  # rows of a posterior without approximation: some seconds
 
@@ -69,7 +61,8 @@ class Learned(eqx.Module):
         chi_squared: the sum of squares of all of them over the degrees of freedom that the fit
             leaves, shape (). It carries no information if σ was estimated from the same residuals.
         history: one entry an iteration.
-        converged: whether noise and objective settled.
+        converged: whether noise and objective settled, where the field explains the runs at the
+            noise found.
         runs: what was given.
         observations: what the runs say of the field near the fitted paths, starts projected out:
             linear functionals of it, with independent noise of variance one. `hk.fit(kernel,
@@ -137,54 +130,6 @@ def misfits(runs: Runs, states: list[np.ndarray], noise: np.ndarray) -> np.ndarr
             np.where(seen.any(axis=0), np.sqrt(total / np.maximum(seen.sum(axis=0), 1)), np.nan)
         )
     return np.array(out)
-
-
-def explains(chi_squared: float, free: float) -> bool:
-    """Whether χ² per degree of freedom is what noise of the given size leaves."""
-    return chi_squared <= 1 + _CURVATURE + _SIGMAS * np.sqrt(2 / max(free, 1.0))
-
-
-def warn_of_misfit(chi_squared: float, misfit: Float[np.ndarray, "R n"]) -> None:
-    """Say that the structure does not explain the runs at the noise that was given, and where."""
-    causes = (
-        "Likely causes, in order: a part of the motion that the kernel cannot have, such as "
-        "friction (add hk.CurlFree, or take hk.PortHamiltonian); (q, q̇) given where (q, p) is "
-        "needed (p = m q̇, in one scale; masses=True finds their ratios); a wrong unit; a jump or "
-        "push in a run."
-    )
-    run, c = np.unravel_index(np.nanargmax(misfit), misfit.shape)
-    require.warn(
-        f"the structure does not explain the runs: χ² is {chi_squared:.3g} per degree of freedom "
-        f"at the noise given, and should be 1. The residuals are largest in coordinate {c} of run "
-        f"{run}, {misfit[run, c]:.2g} standard deviations. {causes}"
-    )
-
-
-def warn_of_noise(noise: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"]) -> bool:
-    """Say where nearly all of the motion was taken for noise, and whether it was."""
-    share = np.nan_to_num(noise / scale)
-    c = int(np.argmax(share))
-    if share[c] < _ALL_NOISE:
-        return False
-    require.warn(
-        f"the field explains little of the runs: the noise found in coordinate {c} is "
-        f"{noise[c]:.3g}, and its states vary by {scale[c]:.3g} (standard deviations). Causes: "
-        "fewer than about five samples a swing, a structure that the motion does not have, or "
-        "sensors that are indeed so noisy. If you know the noise, pass noise=…; see hk.plot.fitted."
-    )
-    return True
-
-
-def warn_of_dropped(kept: np.ndarray) -> None:
-    """Name the runs that the field is not learned from."""
-    lost = [f"{r} ({1 - share:.0%})" for r, share in enumerate(kept) if share < 1]
-    if lost:
-        more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
-        require.warn(
-            f"dropped from run {', '.join(lost[:5])}{more}: the field does not follow the samples "
-            "there (a χ² above 25 times the median, or a tangent above 1e4). Look at these runs: a "
-            "jump, another system, or chaos with samples too far apart."
-        )
 
 
 def empty(n: int) -> Float[Array, "0 n"]:

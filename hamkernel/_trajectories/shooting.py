@@ -160,26 +160,42 @@ def shot(
 
 
 def trusted(
-    found: Shot, segments: Segments, sigma: Float[np.ndarray, " n"]
+    found: Shot,
+    segments: Segments,
+    noise: Float[np.ndarray, " n"],
+    least: Float[np.ndarray, " n"],
 ) -> Bool[np.ndarray, " S"]:
     """Which segments the field follows well enough to learn from them.
+
+    Residuals are compared with the noise, or with those of half of the segments where they are
+    less: a jump in one of them may have been taken for noise in all.
 
     Args:
         found: the paths.
         segments: the samples.
-        sigma: what residuals are compared with: the noise, or a thousandth of the states where that
-            is more, since a field that is not yet exact leaves more than no noise at all.
+        noise: the noise as far as it is known.
+        least: what a field that is not yet exact may leave where there is no noise at all, a share
+            of the states.
     """
     counts = np.asarray(segments.counts)
-    samples = (counts > 0).sum(axis=(1, 2))
+    samples = (counts > 0).sum(axis=1)  # (S, n)
     with np.errstate(all="ignore"):  # a path that is lost is infinite
-        growth = np.abs(np.asarray(tangents(found.path.across))).max(axis=(1, 2, 3))
-        residual = (np.asarray(segments.measured) - np.asarray(found.path.x)) / sigma[None, None]
-        squares = np.where(counts > 0, counts * residual**2, 0.0).sum(axis=(1, 2))
-    good = (samples > 0) & np.isfinite(found.squares) & np.isfinite(squares) & (growth < _GROWTH)
+        growth = np.abs(np.asarray(tangents(found.path.across))) * (least / least[:, None])
+        residual = np.asarray(segments.measured) - np.asarray(found.path.x)
+        squares = np.where(counts > 0, counts * residual**2, 0.0).sum(axis=1)  # (S, n)
+    whole = np.isfinite(found.squares) & np.isfinite(squares).all(axis=1)
+    # A start takes a sample; of one that stands alone nothing is left to compare.
+    typical = np.array(
+        [
+            np.median(s[use] / (t[use] - 1)) if (use := whole & (t > 1)).any() else np.inf
+            for s, t in zip(squares.T, samples.T, strict=True)
+        ]
+    )
+    sigma = np.maximum(np.minimum(noise, np.sqrt(typical)), least)
+    good = whole & samples.any(axis=1) & (growth.max(axis=(1, 2, 3)) < _GROWTH)
     if good.any():
-        each = squares / np.maximum(samples, 1)
-        # Where half of them are better than their noise, that is no reason to drop the others.
+        each = (squares / sigma[None] ** 2).sum(axis=1) / np.maximum(samples.sum(axis=1), 1)
+        # Where half of them are better than that, it is no reason to drop the others.
         good &= each < _FAR * max(np.median(each[good]), 1.0)
     return good
 

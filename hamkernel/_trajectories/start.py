@@ -105,10 +105,10 @@ def box_of(
     leaves = hyperparameters(model.kernel, jnp.asarray(X), speed, jnp.asarray(X))
     start = np.asarray(model.flat)
     size = len(start) - len(scale)
+    most = np.maximum(scale, np.exp(start[size:]))  # where next to nothing moves
     low = np.concatenate([*(p.low.ravel() for p in leaves), np.log(1e-7 * scale)])
-    high = np.concatenate([*(p.high.ravel() for p in leaves), np.log(2 * scale)])
-    low[:size] = np.minimum(low[:size], start[:size])
-    high[:size] = np.maximum(high[:size], start[:size])
+    high = np.concatenate([*(p.high.ravel() for p in leaves), np.log(2 * most)])
+    low, high = np.minimum(low, start), np.maximum(high, start)
     free = np.concatenate([np.ones(size, bool), moves])
     names = [p.name for p in leaves for _ in range(p.low.size)]
     none = np.zeros(len(scale), bool)
@@ -136,7 +136,7 @@ def _extents(leaf: np.ndarray, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray,
     ranges = np.maximum(np.ptp(X, axis=0), np.finfo(float).tiny)
     if leaf.shape == ranges.shape:
         return np.log(ranges * np.sqrt(len(ranges)))
-    return np.full(leaf.size, np.log(np.linalg.norm(ranges)))
+    return np.full(leaf.size, np.log(np.hypot.reduce(ranges)))
 
 
 def _amplified(model: Model, h, scales, X, Y):

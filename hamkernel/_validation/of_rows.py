@@ -17,7 +17,7 @@ from hamkernel._factors.dense import DenseSystem
 from hamkernel._factors.low_rank import LowRankSystem
 from hamkernel._gram.dense import plus_ridge
 from hamkernel._gram.derivatives import trained
-from hamkernel._gram.observed import between
+from hamkernel._gram.observed import between_all, gram_of_rows
 from hamkernel._observations.blocks import AbstractBlock, Combinations
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers.spans import AbstractBasis
@@ -134,17 +134,15 @@ def features_of_rows(
 
 
 def gram(K: AbstractMatrixKernel, rows: Rows, contrasted: bool = False) -> Float[Array, "M M"]:
-    """G, before the contrast or after it, from the blocks on and right of the diagonal."""
+    """G, before the contrast or after it."""
 
     def of(K, others):
-        return lambda block: jnp.concatenate([between(K, block, b) for b in others], axis=1)
+        return lambda block: between_all(K, block, others)
 
-    found = []
-    for i, (block, place) in enumerate(zip(rows.blocks, rows.slices, strict=True)):
-        left = [above[:, place].T for above in found]
-        found.append(jnp.concatenate([*left, _by_points(K, block, rows.blocks[i:], of)], axis=1))
-    G = jnp.concatenate(found)
-    return rows.contrast(rows.contrast(G).T) if contrasted and len(rows.energies) else G
+    def by_points(K, block, others):
+        return _by_points(K, block, others, of)
+
+    return gram_of_rows(K, rows, contrasted, by_points)
 
 
 def _by_points(K, block: AbstractBlock, data, of) -> Float[Array, "d e"]:

@@ -106,8 +106,10 @@ def gaussian(n, one=False):
 
 
 def paths(system, starts, ts):
+    options = {"rtol": 1e-6, "atol": 1e-6, "max_steps": 4000 + 4 * len(ts), "throw": False}
+
     def one(x):
-        return hk.simulate(system, x, ts, rtol=1e-6, atol=1e-6, max_steps=4000, throw=False).ys
+        return hk.simulate(system, x, ts, **options).ys
 
     return np.asarray(jax.vmap(one)(jnp.asarray(starts)))
 
