@@ -18,7 +18,7 @@ import hamkernel as hk
 from hamkernel._trajectories.flow import NODES, simulated
 from hamkernel._trajectories.functionals import functionals_of
 from hamkernel._trajectories.inputs import at_nodes, at_samples, in_intervals
-from hamkernel._trajectories.rows import Segments, frozen, linearised
+from hamkernel._trajectories.rows import Segments, frozen, linearised, segments_of
 from hamkernel._trajectories.shooting import means
 from hamkernel._trajectories.start import jacobians
 
@@ -133,6 +133,19 @@ def test_along_a_true_path_rows_are_exact_with_inputs():
     assert np.abs(wrong).max() > 0.1
 
 
+def test_segments_that_are_not_kept_stay_at_states_of_the_runs():
+    """Elsewhere a field may be NaN, as one of the logarithm of populations is at zero."""
+    ts, x = np.arange(3.0), np.full((3, 2), 2.0)
+    piece = (ts, x, np.ones((3, 2)), np.zeros((3, 2)), x[0], np.ones((2, 2, 1)))
+    segments = segments_of([piece], 2, 4)
+    nodes = jnp.full((2, 3, 3, 3), jnp.nan)
+    path = frozen(jnp.full((2, 4, 2), 2.0), nodes, segments.spans, jnp.zeros((2, 3, 2, 2)))
+    zero, none = jnp.zeros((2, 3, 3, 2)), jnp.zeros(2, bool)
+    rows = linearised(path, zero, zero, segments, none, is_solution=False)
+    np.testing.assert_array_equal(rows.nodes[..., :2], 2.0)
+    np.testing.assert_array_equal(rows.counts, 0.0)
+
+
 # What is learned.
 
 
@@ -198,6 +211,18 @@ def test_inputs_of_averaged_samples_and_a_known_matrix():
         np.testing.assert_allclose(found.noise, 0.05, rtol=0.05)
         gain = found.field.input_matrix(jnp.array([0.3, 0.2]))
         np.testing.assert_allclose(gain, [[0.0], [GAIN]], rtol=0.01)
+
+
+@pytest.mark.slow
+def test_populations_are_learned_through_their_logarithms():
+    rng, animals = np.random.default_rng(0), hk.systems.LotkaVolterra()
+    ts = jnp.linspace(0, 12, 61)
+    starts = np.array([[1.5, 1.0], [0.5, 0.8], [1.0, 0.5]])
+    *true, unseen = (np.asarray(hk.simulate(animals, x, ts).ys) for x in starts)
+    noisy = [x * np.exp(0.03 * rng.normal(size=x.shape)) for x in true]
+    kernel = hk.Poisson(hk.Warp(hk.Gaussian(1.0), jnp.log), hk.poisson.lotka_volterra)
+    found = hk.learn(kernel, hk.Runs([ts, ts], noisy))
+    np.testing.assert_allclose(hk.simulate(found.field, starts[2], ts).ys, unseen, atol=0.1)
 
 
 # What is refused.

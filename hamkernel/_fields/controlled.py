@@ -157,7 +157,7 @@ class ControlledField(AbstractField):
         X = require.points(X, "X").astype(self.offset.dtype)
         n, m = self.dimension, self.kernel.input_count
         if X.shape[1] != n:
-            is_swapped = U is not None and jnp.shape(U) == (len(X), n)
+            is_swapped = getattr(U, "shape", None) == (len(X), n)
             swapped = " X and U are swapped." if is_swapped else ""
             raise ValueError(f"X has {X.shape[1]} coordinates and the field {n}.{swapped}")
         inputs = None if U is None else require.points(U, "U").astype(X.dtype)

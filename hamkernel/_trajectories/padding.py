@@ -28,10 +28,10 @@ def power_of_two(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
 
 
-def padded(times: Sequence[np.ndarray], states: Sequence[np.ndarray], least: int = 8) -> Padded:
-    """Runs of any lengths as arrays; T is a power of two, at least `least`."""
+def padded(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> Padded:
+    """Runs of any lengths as arrays; T is a power of two, at least 8."""
     R = power_of_two(len(times))
-    T = max(power_of_two(max(len(t) for t in times)), least)
+    T = max(power_of_two(max(len(t) for t in times)), 8)
     n = states[0].shape[1]
     out = Padded(np.zeros((R, T)), np.zeros((R, T, n)), np.zeros((R, T, n), bool), np.zeros(R, int))
     for r, (t, x) in enumerate(zip(times, states, strict=True)):

@@ -123,6 +123,9 @@ def linearised(
     keep = good[:, None, None]
     x, nodes, to_end, across = (_where(good, a) for a in path)
     n = x.shape[-1]
+    # Where nothing is kept the field is still asked: at the starts, which are states of the runs.
+    still = jnp.pad(segments.starts, ((0, 0), (0, nodes.shape[-1] - n)))
+    nodes = jnp.where(keep[..., None], nodes, still[:, None, None])
     eye = jnp.broadcast_to(jnp.eye(n, dtype=x.dtype), across.shape)
     across = jnp.where(keep[..., None], across, eye)
     shares = segments.spans[:, :, None] * jnp.asarray(WEIGHTS, x.dtype)[None, None]
@@ -181,7 +184,9 @@ def segments_of(
     n, m = pieces[0][1].shape[1], pieces[0][5].shape[2]
     spans = np.zeros((size, length - 1))
     measured, counts, scatter = np.zeros((3, size, length, n))
-    starts, inputs = np.zeros((size, n)), np.zeros((size, length - 1, 2, m))
+    # Segments that are padding stay at a state of the runs: another one may be where none is
+    # possible, as a population of zero in a kernel of its logarithm.
+    starts, inputs = np.tile(pieces[0][4], (size, 1)), np.zeros((size, length - 1, 2, m))
     for s, (t, x, count, squares, start, ends) in enumerate(pieces):
         T = len(t)
         spans[s, : T - 1] = np.diff(t)

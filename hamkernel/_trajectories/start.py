@@ -157,7 +157,8 @@ def smooth_rows(
     """The rows along the smoothed runs, whose tangent is that of the mean."""
     S, L = segments.spans.shape
     n = len(data.scale)
-    x, nodes = np.zeros((S, L + 1, n)), np.zeros((S, L, 3, n))
+    first = data.runs[pieces[0][0]].path[pieces[0][1]]  # where padding stays
+    x, nodes = np.tile(first, (S, L + 1, 1)), np.tile(first, (S, L, 3, 1))
     slopes = np.zeros((S, L, 3, n))
     for s, (r, start, stop) in enumerate(pieces):
         run, T = data.runs[r], stop - start
