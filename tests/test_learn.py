@@ -19,12 +19,12 @@ import scipy.stats
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
+from hamkernel._machine.batches import orthonormal
 from hamkernel._trajectories.evidence import (
     Model,
     _loss,
     back_substituted,
     losses,
-    orthonormal,
     solved,
     whitening,
 )

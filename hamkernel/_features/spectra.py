@@ -27,6 +27,7 @@ from hamkernel._kernels.dot_products import Periodic
 from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._kernels.symmetry import Symmetrised
 from hamkernel._kernels.transforms import Select
+from hamkernel._machine.batches import orthonormal
 from hamkernel._structures.controlled import Constant
 
 
@@ -88,26 +89,10 @@ def _normal(key: Key[Array, ""], count: int, n: int, dtype: Any) -> Float[Array,
     """
     directions, lengths = jax.random.split(key)
     blocks = -(-count // n)
-    Q = _orthonormal(jax.random.normal(directions, (blocks, n, n), dtype))
+    # With a positive diagonal of U the directions are uniform.
+    Q, _ = orthonormal(jax.random.normal(directions, (blocks, n, n), dtype))
     rows = Q.reshape(blocks * n, n)[:count]
     return rows * jnp.linalg.norm(jax.random.normal(lengths, (count, n), dtype), axis=1)[:, None]
-
-
-def _orthonormal(A: Float[Array, "B n n"]) -> Float[Array, "B n n"]:
-    """Columns made orthonormal one after the other: uniform if they are normal.
-
-    By Gram and Schmidt, twice, since two batches of `jnp.linalg.qr` in one program wait for each
-    other for ever on two cores (jax 0.10.2: `jit(lambda a, b: (qr(a), qr(b)))` of (64, 48, 48)).
-    """
-
-    def column(j, Q):
-        v, before = Q[:, :, j], jnp.arange(Q.shape[2]) < j
-        for _ in range(2):
-            along = jnp.where(before[None], jnp.einsum("bac,ba->bc", Q, v), 0.0)
-            v = v - jnp.einsum("bac,bc->ba", Q, along)
-        return Q.at[:, :, j].set(v / jnp.linalg.norm(v, axis=1, keepdims=True))
-
-    return jax.lax.fori_loop(0, A.shape[2], column, A)
 
 
 def _over_lengthscale(base: Float[Array, "F n"], lengthscale: Float[Array, "..."]):

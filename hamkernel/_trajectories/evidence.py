@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from hamkernel._gram.dense import assemble
 from hamkernel._gram.derivatives import trained
+from hamkernel._machine.batches import orthonormal
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._trajectories.descent import HUGE, minimise
 from hamkernel._trajectories.rows import Rows, accumulated
@@ -96,28 +97,6 @@ def projected(
     samples, scatter = (a.sum(axis=(0, 1)) for a in (rows.counts, rows.scatter))
     constant = constant + samples @ log_noise + 0.5 * scatter @ jnp.exp(-2 * log_noise)
     return Projected(M.reshape(-1, q), r.reshape(-1), constant, T, (QM, Qr, U))
-
-
-def orthonormal(
-    P: Float[Array, "S D n"],
-) -> tuple[Float[Array, "S D n"], Float[Array, "S n n"]]:
-    """Q and U of P = QU for a batch, by Gram-Schmidt done twice, which is as good as Householder.
-
-    Batches of LAPACK calls stall under XLA on two cores; n is small.
-    """
-    n = P.shape[2]
-    columns: list[Array] = []
-    U = [[jnp.zeros_like(P[:, 0, 0])] * n for _ in range(n)]
-    for j in range(n):
-        column = P[:, :, j]
-        for _ in range(2):
-            for i, q in enumerate(columns):
-                part = jnp.einsum("sd,sd->s", q, column)
-                U[i][j] = U[i][j] + part
-                column = column - part[:, None] * q
-        U[j][j] = jnp.sqrt(jnp.einsum("sd,sd->s", column, column))
-        columns.append(column / U[j][j][:, None])
-    return jnp.stack(columns, axis=2), jnp.stack([jnp.stack(row, axis=1) for row in U], axis=1)
 
 
 def negative_log_likelihood(rows: Projected) -> Float[Array, ""]:
