@@ -2,7 +2,7 @@
 
 python notebooks/figures/speed.py [folder]
 
-The numbers are those that `tests/benchmarks/speed.py` printed on 2026-11-23.
+The numbers are those that `tests/benchmarks/speed.py` printed on 2026-11-24.
 """
 
 import sys
@@ -14,15 +14,15 @@ OURS, PEER = "#0072B2", "0.65"
 MILLISECONDS = {
     "dense Gram\nN = 1000, n = 4": {
         "hamkernel": 35,
-        "NumPy, closed form": 152,
-        "GPyTorch": 1120,
+        "NumPy, closed form": 327,
+        "GPyTorch": 1250,
     },
-    "product with the Gram\nN = 20 000, n = 4": {"hamkernel": 500, "KeOps": 2190},
-    "product with the Gram\nN = 20 000, n = 20": {"hamkernel": 800, "KeOps": 9400},
+    "product with the Gram\nN = 20 000, n = 4": {"hamkernel": 870, "KeOps": 3180},
+    "product with the Gram\nN = 20 000, n = 20": {"hamkernel": 1370, "KeOps": 8880},
     "exact fit, N n = 4000": {
-        "hamkernel, with its Gram": 330,
-        "SciPy, Gram given": 279,
-        "scikit-learn, Gram given": 500,
+        "hamkernel, with its Gram": 445,
+        "SciPy, Gram given": 380,
+        "scikit-learn, Gram given": 565,
     },
 }
 
