@@ -27,8 +27,8 @@ above it:
     systems, plot, paper
                   example systems, pictures, the paper's experiments
 
-`_require` checks arguments, `_show` prints objects, and `_machine` knows devices, memory and
-threads.
+`_require` checks arguments, `_show` prints objects, and `_machine` knows devices, memory,
+threads, and what stalls.
 """
 
 import importlib

@@ -267,7 +267,11 @@ def test_float32_agrees_to_three_digits_and_says_so():
     np.testing.assert_allclose(ours, theirs, atol=1e-3 * np.abs(theirs).max())
 
 
-@pytest.mark.parametrize("ridge", [1e-2, 1e-14, 1e-17, 1e-22])
+# At 1e-14 both residuals are rounding, and compiled as for a user they are alike.
+AS_FOR_A_USER = pytest.param(1e-14, marks=[pytest.mark.slow, pytest.mark.ci])
+
+
+@pytest.mark.parametrize("ridge", [1e-2, AS_FOR_A_USER, 1e-17, 1e-22])
 @pytest.mark.parametrize("structure", [hk.Symplectic, hk.Separable])
 def test_repeated_points_are_solved_or_refused_but_never_nan(structure, ridge):
     X, Y = data(6, 2)
@@ -283,7 +287,7 @@ def test_repeated_points_are_solved_or_refused_but_never_nan(structure, ridge):
         return
     off = system_residual(field, Y)
     assert off < 1e-2
-    np.testing.assert_allclose(info(field).relative_residual, off, rtol=1.0, atol=1e-14)
+    np.testing.assert_allclose(info(field).relative_residual, off, rtol=0.5, atol=1e-14)
     if ridge == 1e-2:  # the mean of the two velocities
         np.testing.assert_allclose(jax.vmap(field)(jnp.asarray(X)), 0.0, atol=SOLVE)
 

@@ -59,17 +59,15 @@ def known_part(K: AbstractMatrixKernel, mean: Any, n: int, dtype: Any) -> Any:
     Raises:
         TypeError, ValueError: the mean does not map one state to one velocity.
     """
-    matrix = K.inputs if isinstance(K, Controlled) and isinstance(K.inputs, KnownMatrix) else None
-    if mean is None:
-        return (
-            None
-            if matrix is None
-            else KnownPart(None, matrix, matrix.matrix.shape[1], of_inputs=False)
-        )
-    x = jnp.zeros(n, dtype)
     if not isinstance(K, Controlled):
-        require.velocity(mean, x, "mean")
+        if mean is None:
+            return None
+        require.velocity(mean, jnp.zeros(n, dtype), "mean")
         return as_pytree(mean)
+    matrix = K.inputs if isinstance(K.inputs, KnownMatrix) else None
+    if mean is None:
+        return None if matrix is None else KnownPart(None, matrix, K.input_count, of_inputs=False)
+    x = jnp.zeros(n, dtype)
     of_inputs = _takes_inputs(mean, x)
     require.velocity(AtRest(mean, K.input_count) if of_inputs else mean, x, "mean")
     return KnownPart(as_pytree(mean), matrix, K.input_count, of_inputs)

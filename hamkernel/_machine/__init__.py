@@ -1,1 +1,1 @@
-"""The devices, memory and threads that there are."""
+"""Devices, memory and threads, and batches of small matrices that do not stall."""

@@ -43,11 +43,8 @@ class AbstractOwnOperator(AbstractPotentialKernel):
 
     def _matrix(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
         """B(x), in the dtype of x."""
-        value, name, n = (
-            getattr(self, self.role)(x),
-            f"{self.role} of {type(self).__name__}",
-            len(x),
-        )
+        value, n = getattr(self, self.role)(x), len(x)
+        name = f"{self.role} of {type(self).__name__}"
         if jnp.shape(value) != (n, n):
             raise ValueError(
                 f"the {name} returned shape {jnp.shape(value)} for a state of shape ({n},); an "

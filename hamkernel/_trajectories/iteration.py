@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float
 
 from hamkernel._trajectories.evidence import Box, Model, losses, most_likely, solved, whitening
 from hamkernel._trajectories.flow import Expansion, steps_for, with_tangent
+from hamkernel._trajectories.judged import NEGLIGIBLE
 from hamkernel._trajectories.learned import Step
 from hamkernel._trajectories.prepared import Prepared
 from hamkernel._trajectories.rows import Rows
@@ -26,7 +27,6 @@ from hamkernel._trajectories.start import smooth_rows
 
 _ROUNDS = 4  # Levenberg steps before a segment is judged: without them up to 40 % were lost
 _SEARCH = 25  # steps of BFGS, which go on in the next iteration
-_NEGLIGIBLE = 1e-3  # of the states: no residual that drops a segment
 _SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a step, until one makes the objective smaller
 
 
@@ -91,7 +91,7 @@ def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, St
     before = shot(
         now.field, segments, now.model.log_noise, task.spread, steps, segments.starts, _ROUNDS
     )
-    least = _NEGLIGIBLE * task.data.scale
+    least = NEGLIGIBLE * task.data.scale
     good = trusted(before, segments, np.exp(np.asarray(now.model.log_noise)), least)
     rows = rows_along(now.field, before.path, segments, jnp.asarray(good))
     model, loss = most_likely(now.model, task.S, rows, task.spread, task.box, _SEARCH)

@@ -14,8 +14,8 @@ _SIGMAS, _CURVATURE = 5.0, 0.1
 # Noise of half the motion or more: where learning failed, it was found 0.9 to 1.1 times the motion.
 _ALL_NOISE = 0.5
 
-# Of the states: without noise the averages of samples are off by more than is found of it.
-_NEGLIGIBLE = 1e-3
+# Of the states: what a field that is not yet exact leaves, and averages of samples without noise.
+NEGLIGIBLE = 1e-3
 
 _FEW = 10  # degrees of freedom, from which σ is known to a fifth
 
@@ -59,7 +59,7 @@ def judged(
         warn_of_misfit(fit.chi_squared, fit.misfit)
         return fit.settled
     left = np.sqrt(fit.chi_squared) * np.nanmax(noise / scale)
-    converged = fit.settled and (explained or bool(left < _NEGLIGIBLE))
+    converged = fit.settled and (explained or bool(left < NEGLIGIBLE))
     said = not given and (warn_of_few(fit.free) or warn_of_noise(noise, scale))
     if not (converged or said):
         warn_of_unsettled(fit.count, fit.chi_squared, explained)

@@ -153,7 +153,6 @@ def _where(good, a):
     return jnp.where(mask, a, jnp.zeros_like(a))
 
 
-@jax.jit
 def frozen(
     x: Float[Array, "S L+1 n"],
     nodes: Float[Array, "S L 3 d"],

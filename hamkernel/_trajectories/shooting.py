@@ -16,7 +16,7 @@ from hamkernel._trajectories.padding import power_of_two
 from hamkernel._trajectories.prepared import Run
 from hamkernel._trajectories.rows import Rows, Segments, linearised, segments_of, tangents
 
-SHORT = 12  # samples at most in a segment while the field is rough
+SHORT = 12  # samples at most in a segment while the field is rough; 10 gave the same errors
 _LEAST = 3  # samples of a piece: one more than its start takes
 LONG = 256  # at most: the tangent of a longer path says little more, and arrays stay small
 _GROWTH = 1e4  # of the tangent, beyond which a path says nothing of its start
