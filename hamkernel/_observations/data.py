@@ -23,24 +23,6 @@ from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.controlled import Controlled, KnownMatrix
 
 
-def as_states(X: Any, Y: Any, inputs: Any = None) -> tuple[Any, Any, Any]:
-    """X, Y and U, of velocities that were all measured with one noise: they take less work.
-
-    Raises:
-        TypeError: observations and, beside them, inputs.
-    """
-    if not isinstance(X, AbstractObservations):
-        return X, Y, inputs
-    if inputs is not None:
-        raise TypeError(
-            "observations hold their inputs themselves: hk.Velocities(X, Y, inputs=U), and "
-            "likewise hk.Equilibria and hk.Functionals."
-        )
-    if isinstance(X, Velocities) and Y is None and X.kept is None and X.noise is None:
-        return X.X, X.Y, X.inputs
-    return X, Y, None
-
-
 def observations(X: Any, Y: Any, inputs: Any = None, part: bool = False) -> AbstractObservations:
     """`X` if it is observations, and then there is no Y; else the velocities Y at states X."""
     if not isinstance(X, AbstractObservations):
@@ -51,7 +33,11 @@ def observations(X: Any, Y: Any, inputs: Any = None, part: bool = False) -> Abst
             f"{type(X).__name__} is all of the data, and Y is not needed. Say the regularization "
             "by name: hk.fit(K, data, regularization=1e-4)."
         )
-    as_states(X, Y, inputs)
+    if inputs is not None:
+        raise TypeError(
+            "observations hold their inputs themselves: hk.Velocities(X, Y, inputs=U), and "
+            "likewise hk.Equilibria and hk.Functionals."
+        )
     return X
 
 
@@ -64,26 +50,6 @@ def _both(X: Any, Y: Any, inputs: Any, part: bool) -> tuple[Array, Array]:
         )
     refuse_swapped(X, Y, inputs)
     return require.data(X, Y, part=part)
-
-
-def points_and_velocities(
-    K: AbstractMatrixKernel, X: Any, Y: Any, inputs: Any = None, part: bool = False
-) -> tuple[AbstractMatrixKernel, Float[Array, "N d"], Float[Array, "N n"]]:
-    """The kernel, which knows how many inputs there are, points (x, u), and Y.
-
-    Without inputs these are K, X and Y as they came, checked.
-
-    Raises:
-        ValueError: shapes do not fit, the inputs are missing, or they cannot be told from the
-            drift. TypeError: K takes no inputs.
-    """
-    if inputs is None and not isinstance(K, Controlled):
-        return K, *_both(X, Y, inputs, part)
-    data = observations(X, Y, inputs, part)
-    assert isinstance(data, Velocities)
-    K = counted(K, data, part)
-    (block, _), *_ = data.parts(inputs_of(K))
-    return K, block.points, data.Y
 
 
 def sampled_points(

@@ -81,6 +81,15 @@ class Rows(eqx.Module):
         p = jnp.zeros_like(self.targets).at[where].set(1 / self.scale[where])
         return p / jnp.linalg.norm(p)
 
+    @property
+    def states(self) -> tuple[Float[Array, "N d"], Float[Array, "N n"]] | None:
+        """Points and velocities, where all were measured with one noise; None of other rows."""
+        block = self.blocks[0]
+        plain = len(self.blocks) == 1 and isinstance(block, Components)
+        if not plain or block.kept is not None or block.noise is not None:
+            return None
+        return block.points, self.targets.reshape(block.values_shape)
+
     def labels(self) -> Int[np.ndarray, " M"]:
         """To which of the N observations each row belongs, before the contrast."""
         starts = np.cumsum([0, *(block.count for block in self.blocks)])

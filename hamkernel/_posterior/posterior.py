@@ -34,8 +34,8 @@ from hamkernel._solvers.base import AbstractSolver
 from hamkernel._solvers.cholesky import Cholesky
 from hamkernel._solvers.conditional import AbstractConditional
 from hamkernel._solvers.fit import check_solver
-from hamkernel._solvers.given import checked_rows, new_rows
-from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._solvers.problem import new_rows, problem
+from hamkernel._structures.base import AbstractMatrixKernel
 
 
 @one_blas_thread
@@ -83,15 +83,15 @@ def condition(
     Warns:
         UserWarning: the amplitude of K is exactly 1, as that of built-in kernels is before tuning.
     """
-    K = matrix_kernel(K)
     check_solver(solver)
     solver = Cholesky() if solver is None else solver
     if solver.no_factor:
         raise TypeError(solver.no_factor)
-    K, rows, regularization, known = checked_rows(K, X, Y, regularization, mean, inputs)
-    _warn_of_amplitude(K, rows.points)
-    given = solver._given(K, rows, regularization)
-    return Posterior(given, learned_field(given.field, known))
+    asked = problem(K, X, Y, regularization, mean, inputs)
+    require.warn_of_float32(asked.rows.targets)
+    _warn_of_amplitude(asked.kernel, asked.rows.points)
+    given = solver._given(asked)
+    return Posterior(given, learned_field(given.field, asked.known))
 
 
 class Posterior(eqx.Module):

@@ -7,8 +7,8 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from hamkernel._fields.base import AbstractField
-from hamkernel._observations.rows import Rows
 from hamkernel._solvers.conditional import AbstractConditional
+from hamkernel._solvers.problem import Problem
 from hamkernel._solvers.spans import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
 
@@ -29,33 +29,10 @@ class AbstractSolver(eqx.Module, Generic[Learned]):
         return None
 
     @abc.abstractmethod
-    def _fitted(
-        self,
-        K: AbstractMatrixKernel,
-        X: Float[Array, "N n"],
-        Y: Float[Array, "N n"],
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> Learned:
-        """The field for data that has been checked; of NaN if it fails and does not `throw`."""
+    def _fitted(self, problem: Problem, throw: bool = True) -> Learned:
+        """The field; of NaN if the solve fails and does not `throw`."""
 
-    def _fitted_rows(
-        self,
-        K: AbstractMatrixKernel,
-        rows: Rows,
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> AbstractField:
-        """The same for any observations."""
-        return self._given(K, rows, regularization, throw).field
-
-    def _given(
-        self,
-        K: AbstractMatrixKernel,
-        rows: Rows,
-        regularization: Float[Array, ""],
-        throw: bool = True,
-    ) -> AbstractConditional:
+    def _given(self, problem: Problem, throw: bool = True) -> AbstractConditional:
         """The same with what the solver keeps, to say how far the field may be off."""
-        del K, rows, regularization, throw
+        del problem, throw
         raise TypeError(self.no_factor)

@@ -1,7 +1,6 @@
 """Regularised least squares by a dense factorisation: (G + NλI) a = y."""
 
 from hamkernel._fields.kernel_field import KernelField
-from hamkernel._machine.devices import on_one_device
 from hamkernel._solvers.base import AbstractSolver
 from hamkernel._solvers.conditional import DenseConditional, dense_conditional, dense_field
 
@@ -17,9 +16,8 @@ class Cholesky(AbstractSolver[KernelField]):
             ridge is too small for this Gram (the text says what to do).
     """
 
-    def _fitted(self, K, X, Y, regularization, throw=True) -> KernelField:
-        X, Y = on_one_device("X", X), on_one_device("Y", Y)
-        return dense_field(K, X, Y, regularization, throw)
+    def _fitted(self, problem, throw=True) -> KernelField:
+        return dense_field(problem.on_one_device(), throw)
 
-    def _given(self, K, rows, regularization, throw=True) -> DenseConditional:
-        return dense_conditional(K, rows, regularization, throw)
+    def _given(self, problem, throw=True) -> DenseConditional:
+        return dense_conditional(problem, throw)

@@ -24,9 +24,9 @@ from hamkernel._gram.dense import plus_ridge
 from hamkernel._gram.observed import between, gram_of_rows, rows_between
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock
-from hamkernel._observations.data import rows_of_states
 from hamkernel._observations.rows import Rows
 from hamkernel._solvers.prior import Prior, prior_draws
+from hamkernel._solvers.problem import Problem
 from hamkernel._structures.base import AbstractMatrixKernel
 
 Own = TypeVar("Own", bound="AbstractConditional")
@@ -89,30 +89,24 @@ class DenseConditional(AbstractConditional):
         return _corrected(self, prior, noise)
 
 
-def dense_conditional(
-    K: AbstractMatrixKernel, rows: Rows, regularization: Float[Array, ""], throw: bool = True
-) -> DenseConditional:
+def dense_conditional(problem: Problem, throw: bool = True) -> DenseConditional:
     """The field given the rows, by the dense Gram of them: O(D³) time and O(D²) memory.
 
     Raises:
         ValueError: the matrices do not fit in memory. RuntimeError: A is not positive definite to
             rounding.
     """
+    rows = problem.rows
     check_memory(len(rows.targets), rows.targets.dtype)
-    factor, c, ridge, field, left = _conditional(K, rows, regularization)
+    factor, c, ridge, field, left = _conditional(problem.kernel, rows, problem.regularization)
     return DenseConditional(_solved(field, left, rows.count, throw), rows, ridge, factor, c)
 
 
-def dense_field(
-    K: AbstractMatrixKernel,
-    X: Float[Array, "N d"],
-    Y: Float[Array, "N n"],
-    regularization: Float[Array, ""],
-    throw: bool = True,
-) -> KernelField:
-    """The field of `dense_conditional` given velocities, in less time where they are few."""
-    check_memory(Y.size, Y.dtype)
-    return _solved(*_field(K, X, Y, regularization), len(X), throw)
+def dense_field(problem: Problem, throw: bool = True) -> KernelField:
+    """The field of `dense_conditional` alone."""
+    rows = problem.rows
+    check_memory(len(rows.targets), rows.targets.dtype)
+    return _solved(*_field(problem.kernel, rows, problem.regularization), rows.count, throw)
 
 
 COPIES = 3  # of A: the Gram, A, and its factor
@@ -140,9 +134,7 @@ def _dense(K, rows: Rows, regularization):
 
 
 _conditional = eqx.filter_jit(_dense)
-_field = eqx.filter_jit(
-    lambda K, X, Y, regularization: _dense(K, rows_of_states(X, Y), regularization)[-2:]
-)
+_field = eqx.filter_jit(lambda *problem: _dense(*problem)[-2:])
 
 
 def relative(error: Array, of: Array) -> Float[Array, ""]:

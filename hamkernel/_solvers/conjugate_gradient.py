@@ -93,32 +93,19 @@ class ConjugateGradient(AbstractSolver[KernelField]):
             )
         self.preconditioner = preconditioner
 
-    def _fitted(self, K, X, Y, regularization, throw=True) -> KernelField:
-        landmarks = self.preconditioner.landmarks(K, X, regularization)
-        ridge, spread = len(X) * regularization, rows_of(X)
-        X, Y = split(spread, X), split(spread, Y)
-        tolerance = self._tolerance(X.dtype)
-        found = _solve(K, X, Y, ridge, landmarks, tolerance, self.max_iterations, spread)
-        (A, residual, norm), info = self._converged(K, X, ridge, landmarks, found, throw)
-        return KernelField(
-            kernel=K,
-            points=X,
-            coefficients=A,
-            residual=as_given(spread, residual),
-            norm=norm,
-            regularization=regularization,
-            offset=jnp.zeros((), X.dtype),
-            info=info,
-        )
-
-    def _fitted_rows(self, K, rows, regularization, throw=True) -> KernelField:
-        X, ridge = rows.points, rows.count * regularization
-        landmarks = self.preconditioner.landmarks(K, X, regularization)
-        tolerance = self._tolerance(rows.targets.dtype)
-        found = _solve_rows(K, rows, ridge, landmarks, tolerance, self.max_iterations)
-        (c, residual, norm), info = self._converged(K, X, ridge, landmarks, found, throw)
-        residual = rows.residual(residual)
-        return field_of_rows(K, rows, c, residual, norm, regularization, info)
+    def _fitted(self, problem, throw=True) -> KernelField:
+        K, rows, ridge = problem.kernel, problem.rows, problem.ridge
+        X, spread = rows.points, rows_of(rows.points)
+        landmarks = self.preconditioner.landmarks(K, X, problem.regularization)
+        limits = landmarks, self._tolerance(rows.targets.dtype), self.max_iterations
+        if problem.states is None:
+            found = _solve_rows(K, rows, ridge, *limits)
+        else:
+            X, Y = (split(spread, each) for each in problem.states)
+            found = _solve(K, X, Y, ridge, *limits, spread)
+        (c, left, norm), info = self._converged(K, X, ridge, landmarks, found, throw)
+        left = as_given(spread, rows.residual(left.reshape(-1)))
+        return field_of_rows(K, rows, c.reshape(-1), left, norm, problem.regularization, info)
 
     def _tolerance(self, dtype: jnp.dtype) -> Float[Array, ""]:
         own = self.tolerance

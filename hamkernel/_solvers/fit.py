@@ -15,13 +15,13 @@ from hamkernel._machine.devices import rows_of
 from hamkernel._machine.memory import dense_bytes, memory_bytes
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._observations.base import AbstractObservations
-from hamkernel._observations.data import as_states
+from hamkernel._observations.rows import Rows
 from hamkernel._solvers.base import AbstractSolver, Learned
 from hamkernel._solvers.cholesky import Cholesky
 from hamkernel._solvers.conditional import COPIES
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
-from hamkernel._solvers.given import checked_rows, checked_states
-from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._solvers.problem import Problem, problem
+from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.controlled import Controlled
 
 
@@ -117,19 +117,17 @@ def fit(
 
     Source: Smith & Egeland (2023), section 3, where "Nλ a_j" should read "Nλ a_i".
     """
-    K = matrix_kernel(K)
     check_solver(solver)
-    X, Y, inputs = as_states(X, Y, inputs)
-    if isinstance(X, AbstractObservations):
-        K, rows, regularization, known = checked_rows(K, X, Y, regularization, mean)
-        solver = default_solver(rows.size, rows.targets.dtype) if solver is None else solver
-        field = solver._fitted_rows(K, rows, regularization, throw)
-        return learned_field(field, known)
-    K, X, Y, regularization, known = checked_states(K, X, Y, regularization, mean, inputs)
-    require.warn_of_float32(X)
+    return solved(problem(K, X, Y, regularization, mean, inputs), solver, throw)
+
+
+def solved(given: Problem, solver: AbstractSolver | None, throw: bool = True) -> AbstractField:
+    """The field, by the default solver if there is none."""
+    require.warn_of_float32(given.rows.targets)
     if solver is None:
-        solver = default_solver(Y.size, X.dtype) if rows_of(X) is None else ConjugateGradient()
-    return learned_field(solver._fitted(K, X, Y, regularization, throw), known)
+        spread = rows_of(given.rows.points) is not None
+        solver = ConjugateGradient() if spread else default_solver(given.rows)
+    return learned_field(solver._fitted(given, throw), given.known)
 
 
 def check_solver(solver: Any) -> None:
@@ -138,7 +136,8 @@ def check_solver(solver: Any) -> None:
         raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
 
 
-def default_solver(rows: int, dtype: Any) -> AbstractSolver[KernelField]:
+def default_solver(rows: Rows) -> AbstractSolver[KernelField]:
     """Cholesky where it takes at most half of the memory of one device, which has all the data."""
-    needed, memory = dense_bytes(rows, rows, dtype, COPIES), memory_bytes()
+    needed = dense_bytes(rows.size, rows.size, rows.targets.dtype, COPIES)
+    memory = memory_bytes()
     return Cholesky() if memory is None or needed <= memory / 2 else ConjugateGradient()

@@ -116,7 +116,10 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
     ) -> LandmarkBasis:
         return LandmarkBasis(self.landmarks(K, X, regularization).points)
 
-    def _fitted(self, K, X, Y, regularization, throw=True) -> KernelField:
+    def _fitted(self, problem, throw=True) -> KernelField:
+        if problem.states is None:
+            return self._given(problem, throw).field
+        K, (X, Y), regularization = problem.kernel, problem.states, problem.regularization
         landmarks = self.landmarks(K, X, regularization)
         spread = rows_of(X)
         X, Y = split(spread, X), split(spread, Y)
@@ -124,7 +127,8 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
         solution = solution._replace(residual=as_given(spread, solution.residual))
         return landmark_field(K, landmarks, solution, regularization, self.tolerance, CHOOSE, throw)
 
-    def _given(self, K, rows, regularization, throw=True) -> LowRankConditional:
+    def _given(self, problem, throw=True) -> LowRankConditional:
+        K, rows, regularization = problem.kernel, problem.rows, problem.regularization
         span = landmark_span(K, self.landmarks(K, rows.points, regularization))
         return low_rank_conditional(span, rows, regularization, throw)
 

@@ -72,16 +72,20 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
     ) -> WaveBasis:
         return WaveBasis(self.key, self.count)
 
-    def _fitted(self, K, X, Y, regularization, throw=True) -> FeatureField:
-        spread = rows_of(X)
-        field = _fit(K, self, split(spread, X), split(spread, Y), regularization, spread)
+    def _fitted(self, problem, throw=True) -> FeatureField:
+        if problem.states is None:
+            return self._given(problem, throw).field
+        spread = rows_of(problem.rows.points)
+        X, Y = (split(spread, each) for each in problem.states)
+        field = _fit(problem.kernel, self, X, Y, problem.regularization, spread)
         field = _checked(field, throw)
         if spread is None:
             return field
         residual = as_given(spread, field.residual)
         return eqx.tree_at(lambda f: f.residual, field, residual)
 
-    def _given(self, K, rows, regularization, throw=True) -> LowRankConditional:
+    def _given(self, problem, throw=True) -> LowRankConditional:
+        K, rows, regularization = problem.kernel, problem.rows, problem.regularization
         basis = self._features(K, rows.points.shape[1], rows.targets.dtype)
         span = FeatureSpan(K, basis, rows.dimension)
         return low_rank_conditional(span, rows, regularization, throw)

@@ -17,23 +17,20 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
-from hamkernel._fields.base import at_points
 from hamkernel._fields.controlled import learned_field
 from hamkernel._fields.known import known_part
 from hamkernel._machine.devices import rows_of, split
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._observations.base import AbstractObservations
 from hamkernel._observations.data import (
-    as_states,
     observations,
-    points_and_velocities,
     rows_of_data,
     sampled_points,
 )
 from hamkernel._observations.rows import Rows
 from hamkernel._show import call, text
 from hamkernel._solvers.base import AbstractSolver, Learned
-from hamkernel._solvers.given import without_known
+from hamkernel._solvers.problem import without_known
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 Fit = TypeVar("Fit", bound="AbstractStreamingFit")
@@ -100,13 +97,10 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
                 constant all chunks would share: give differences of H as `hk.Functionals`, or fit
                 all data at once. TypeError: the dtype, or it has more digits than the fit.
         """
-        X, Y, inputs = as_states(X, Y, inputs)
-        if isinstance(X, AbstractObservations):
-            return self._added_rows(self._checked_rows(observations(X, Y)))
-        _, X, Y = points_and_velocities(self.kernel, X, Y, inputs, part=True)
-        self._check(X.dtype, Y.shape[1])
-        X, Y, known = X.astype(self.dtype), Y.astype(self.dtype), self._known
-        return self._added(X, Y if known is None else Y - at_points(known, X))
+        rows = self._checked_rows(observations(X, Y, inputs, part=True))
+        if rows.states is None:
+            return self._added_rows(rows)
+        return self._added(*(each.astype(self.dtype) for each in rows.states))
 
     def _checked_rows(self, data: AbstractObservations) -> Rows:
         nothing = Rows((), jnp.zeros(0, self.dtype))

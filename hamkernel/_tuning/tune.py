@@ -14,8 +14,9 @@ the way along ℓ -> ∞, λ -> 0 until nothing is left of it but noise.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -26,15 +27,14 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._fields.known import Mean
-from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._observations.base import AbstractObservations
-from hamkernel._observations.data import as_states, observations, rows_of_states
+from hamkernel._observations.data import observations
 from hamkernel._show import described
 from hamkernel._solvers.base import AbstractSolver
-from hamkernel._solvers.fit import fit
-from hamkernel._solvers.given import checked_rows, checked_states
-from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._solvers.fit import check_solver, solved
+from hamkernel._solvers.problem import Problem, problem
+from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._tuning import advice
 from hamkernel._tuning.boxes import typical_speed
 from hamkernel._tuning.descent import Run
@@ -184,24 +184,18 @@ def tune(
     a wall also keeps cross-validation away from fields with rounding errors too large to be
     integrated, ‖a‖ tr(G) √ε > ‖y‖ for the coefficients a; the likelihood needs none.
     """
-    K = matrix_kernel(K)
     frozen = (frozen,) if isinstance(frozen, str) else frozen
     _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
     if optimiser is not None:
         optimiser = checked_optimiser(optimiser, progress)
+    check_solver(solver)
     advice.warn_of_constants(K)
-    X, Y, inputs = as_states(X, Y, inputs)
-    given = Given(X, Y, solver, mean, inputs)
-    if isinstance(X, AbstractObservations):
-        K, rows, ridge, _ = checked_rows(K, X, Y, regularization, mean)
-        data = X, None
-    else:
-        K, points, V, ridge, _ = checked_states(K, X, Y, regularization, mean, inputs)
-        data = points, V = on_one_device("X", points), on_one_device("Y", V)
-        rows = rows_of_states(points, V)
-        advice.warn_of_unequal_sizes(V)
-        if mean is not None or inputs is not None:  # an objective of the caller's takes no (x, u)
-            data = observations(X, Y, inputs), None
+    given = problem(K, X, Y, regularization, mean, inputs)
+    K, rows = given.kernel, given.on_one_device().rows
+    if rows.states is not None:
+        advice.warn_of_unequal_sizes(rows.states[1])
+    own = mean is None and inputs is None and not isinstance(X, AbstractObservations)
+    data = rows.states if own else (observations(X, Y, inputs), None)
     criterion = criterion_of(objective, rows.count, folds, data)
     advice.warn_of_few_folds(criterion, folds)
     low_rank = solver is not None and solver.is_low_rank and not criterion.own
@@ -212,7 +206,7 @@ def tune(
     speed = typical_speed(K, few)
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
     kept, points = tuple(frozen), rows.points
-    space = SearchSpace(K, points, speed, ridge, kept, bounds or {}, roundings, few.points)
+    space = SearchSpace(K, points, speed, given.regularization, kept, bounds or {}, roundings, few.points)
     advice.warn_of_free_scale(space, criterion)
     search = Search(space, criterion, rows, speed, starts, max_steps, optimiser, progress)
 
@@ -225,7 +219,7 @@ def tune(
 
     runs = search.runs(of_low_rank if low_rank else None)
     _check_found(best(runs))
-    return _tuned(space, runs, starts, given)
+    return _tuned(space, runs, starts, given, solver)
 
 
 def _check_found(found: Run) -> None:
@@ -238,23 +232,19 @@ def _check_found(found: Run) -> None:
         )
 
 
-class Given(NamedTuple):
-    """What `fit` is given besides the hyperparameters."""
-
-    X: Any
-    Y: Any
-    solver: AbstractSolver | None
-    mean: Mean | None
-    inputs: Any
-
-
-def _tuned(space: SearchSpace, runs: list[Run], starts: int, given: Given) -> Tuned:
+def _tuned(
+    space: SearchSpace,
+    runs: list[Run],
+    starts: int,
+    given: Problem,
+    solver: AbstractSolver | None,
+) -> Tuned:
     """The fit at the best point, and what is to be said of the search."""
     found = best(runs)
     dtype = space.low.dtype
     kernel, regularization, size = decode(space, jnp.asarray(found.u, dtype))
-    X, Y, solver, mean, inputs = given
-    field = fit(kernel, X, Y, regularization, solver=solver, mean=mean, inputs=inputs)
+    given = dataclasses.replace(given, kernel=kernel, regularization=regularization)
+    field = solved(given, solver)
     if not space.allows(regularization):
         raise ValueError(
             f"no lambda within bounds={{'regularization': ...}} can be solved with in {dtype}: "

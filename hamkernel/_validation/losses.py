@@ -6,14 +6,12 @@ from typing import Any
 
 from jaxtyping import Array, ArrayLike, Float, Num
 
-from hamkernel._machine.devices import on_one_device
 from hamkernel._machine.memory import refuse_beyond_memory
 from hamkernel._machine.threads import one_blas_thread
 from hamkernel._observations.base import AbstractObservations
-from hamkernel._observations.data import as_states, rows_of_states
 from hamkernel._observations.rows import Rows
-from hamkernel._solvers.given import checked_rows, checked_states
-from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._solvers.problem import problem
+from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._validation.folds import Folds
 from hamkernel._validation.of_rows import (
     generalized_loss,
@@ -163,16 +161,10 @@ def log_marginal_likelihood(
 
 def _checked(K, X, Y, regularization, inputs) -> tuple[Any, Rows, Float[Array, ""]]:
     """Kernel, rows and λ."""
-    K = matrix_kernel(K)
-    X, Y, inputs = as_states(X, Y, inputs)
-    if isinstance(X, AbstractObservations):
-        K, rows, regularization, _ = checked_rows(K, X, Y, regularization)
-    else:
-        K, points, V, regularization, _ = checked_states(K, X, Y, regularization, None, inputs)
-        # LAPACK on every device at once was seen to stall, see `_factors/dense.py`.
-        rows = rows_of_states(on_one_device("X", points), on_one_device("Y", V))
-    check_memory(rows, LOSS_COPIES)
-    return K, rows, regularization
+    # LAPACK on every device at once was seen to stall, see `_factors/dense.py`.
+    given = problem(K, X, Y, regularization, inputs=inputs).on_one_device()
+    check_memory(given.rows, LOSS_COPIES)
+    return given.kernel, given.rows, given.regularization
 
 
 LOSS_COPIES = 3  # matrices of the size of the Gram that a loss holds, with its gradient

@@ -12,7 +12,6 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 
 from hamkernel import _require as require
-from hamkernel._dynamics.simulate import simulate
 from hamkernel.systems._base import in_precision, shaped
 
 
@@ -120,6 +119,8 @@ def _trajectories(
 
     def velocity(x):
         return field(x).astype(x.dtype)
+
+    from hamkernel._dynamics.simulate import simulate  # which loads diffrax
 
     def trajectory(x0):
         if ts.size == 1:

@@ -1,0 +1,95 @@
+"""What is solved: rows of observations for a kernel, a ridge, and what was known before.
+
+`fit`, `condition`, `tune` and every loss begin here, and nothing after it asks what was measured.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, ArrayLike, Float
+
+from hamkernel import _require as require
+from hamkernel._fields.base import at_points, potential_of
+from hamkernel._fields.controlled import without_inputs
+from hamkernel._fields.known import KnownPart, known_part
+from hamkernel._machine.devices import on_one_device
+from hamkernel._observations.base import AbstractObservations
+from hamkernel._observations.data import observations, rows_of_data
+from hamkernel._observations.rows import Rows
+from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._structures.controlled import Controlled
+
+
+class Problem(eqx.Module):
+    """y = L f + ε for f ~ GP(known, kernel), y less the rows of what is known."""
+
+    kernel: AbstractMatrixKernel
+    rows: Rows
+    regularization: Float[Array, ""]
+    known: Any = None
+
+    @property
+    def ridge(self) -> Float[Array, ""]:
+        """Nλ, the variance of a row of relative noise 1."""
+        return self.rows.count * self.regularization
+
+    @property
+    def states(self) -> tuple[Float[Array, "N d"], Float[Array, "N n"]] | None:
+        """Points and velocities, where these are all the rows: they can be seen tile by tile."""
+        return self.rows.states
+
+    def on_one_device(self) -> Problem:
+        """The same with the rows on one device."""
+        move = jax.tree.map(lambda array: on_one_device("the data", array), self.rows)
+        return dataclasses.replace(self, rows=move)
+
+
+def problem(
+    K: Any,
+    X: Any,
+    Y: Any,
+    regularization: ArrayLike,
+    mean: Any = None,
+    inputs: Any = None,
+) -> Problem:
+    """The problem of the data, checked; X and Y are `Velocities(X, Y)`.
+
+    Raises:
+        TypeError, ValueError: as `fit` says. AttributeError: energies without a potential.
+    """
+    K, rows = rows_of_data(matrix_kernel(K), observations(X, Y, inputs))
+    K.check_points(rows.points)
+    if len(rows.energies) and K.no_potential:
+        raise AttributeError(f"energies were given, and {K.no_potential}")
+    regularization = require.ridge(regularization, rows.targets.dtype)
+    known = known_part(K, mean, rows.dimension, rows.targets.dtype)
+    return Problem(K, without_known(K, rows, known), regularization, known)
+
+
+def new_rows(K: AbstractMatrixKernel, data: AbstractObservations, old: Rows, known: Any) -> Rows:
+    """The rows of data that is added to other rows, less what is known of them."""
+    return without_known(K, rows_of_data(K, data, beside=old)[1], known)
+
+
+def without_known(K: AbstractMatrixKernel, rows: Rows, known: Any) -> Rows:
+    """The rows of f less what is known; AttributeError for energies if that has no potential."""
+    if known is None:
+        return rows
+    potential = _known_potential(K, known) if len(rows.energies) else known
+    field, potential = (jax.tree_util.Partial(at_points, each) for each in (known, potential))
+    return rows.less(rows.of(field, potential))
+
+
+def _known_potential(K: AbstractMatrixKernel, known: Any):
+    """The potential of what is known, as a function of the points of K."""
+    if not isinstance(known, KnownPart) or not isinstance(K, Controlled):
+        return potential_of(known, K)
+    drift = without_inputs(known, 0)
+    if drift is None:  # G u, which is no part of the drift
+        return lambda s: 0 * s[0]
+    of_drift = potential_of(drift, K.drift)
+    return lambda s: of_drift(s[: -known.count])
