@@ -20,21 +20,19 @@ from scipy.integrate import solve_ivp
 
 import hamkernel as hk
 from hamkernel._machine.batches import orthonormal
-from hamkernel._trajectories.evidence import (
+from hamkernel._trajectories.diagnostics import warn_of_few, warn_of_noise
+from hamkernel._trajectories.flow import NODES, WEIGHTS, jacobians, means, simulated
+from hamkernel._trajectories.likelihood import (
     Model,
     _loss,
+    as_observations,
     back_substituted,
+    closed_form,
+    landmark_whitening,
     losses,
-    solved,
-    whitening,
 )
-from hamkernel._trajectories.flow import NODES, WEIGHTS, simulated
-from hamkernel._trajectories.functionals import functionals_of
-from hamkernel._trajectories.judged import warn_of_few, warn_of_noise
-from hamkernel._trajectories.prepared import prepared
-from hamkernel._trajectories.rows import Segments, frozen, linearised
-from hamkernel._trajectories.shooting import means, short_cuts
-from hamkernel._trajectories.start import jacobians
+from hamkernel._trajectories.preprocessing import preprocess
+from hamkernel._trajectories.segments import Segments, given_path, linearised, short_pieces
 
 K = hk.Symplectic(hk.Gaussian(1.0))
 PENDULUM = hk.systems.Pendulum(1.0, 1.0, 6.0)
@@ -76,7 +74,7 @@ def one_segment(seed=0, T=7):
     )
     segments = Segments(*arrays)
     none = jnp.zeros((1, T - 1, 2, 2))
-    as_path = frozen(jnp.asarray(path), jnp.asarray(nodes), segments.spans, none)
+    as_path = given_path(jnp.asarray(path), jnp.asarray(nodes), segments.spans, none)
     rows = linearised(
         as_path,
         jnp.asarray(slopes),
@@ -103,7 +101,7 @@ def test_without_a_tangent_rows_are_generalised_least_squares_on_differences():
     G, weights, A, d = differences(kernel, sigma, spans, nodes, measured)
     expected = G @ weights.T @ scipy.linalg.solve(A, d, assume_a="pos")
     S, spread = jnp.asarray(nodes), jnp.full(2, 1e4)
-    found = solved(kernel, jnp.full(2, np.log(sigma)), S, rows, spread)
+    found = closed_form(kernel, jnp.full(2, np.log(sigma)), S, rows, spread)
     field = np.einsum("iajb,jb->ia", hk.gram(kernel, nodes, nodes), found.coefficients)
     np.testing.assert_allclose(field.reshape(-1), expected, rtol=1e-5, atol=1e-6)
     used = np.trace(np.linalg.solve(A, weights @ G @ weights.T))  # of the parameters
@@ -132,7 +130,7 @@ def test_along_a_true_path_rows_and_functionals_are_the_variation_of_constants()
     counts = jnp.full_like(x, 4.0)
     none = jnp.zeros((1, 8, 2, 0))
     segments = Segments(jnp.diff(ts)[None], x, counts, jnp.zeros_like(x), x[:, 0], none)
-    path = frozen(x, nodes, segments.spans, jacobians(mean, nodes, n))
+    path = given_path(x, nodes, segments.spans, jacobians(mean, nodes, n))
     slopes = jax.vmap(jax.vmap(jax.vmap(PENDULUM)))(nodes)
     rows = linearised(
         path, slopes, means(mean, nodes, slopes), segments, jnp.array([True]), is_solution=False
@@ -141,13 +139,13 @@ def test_along_a_true_path_rows_and_functionals_are_the_variation_of_constants()
     np.testing.assert_allclose(rows.target[0], expected, atol=1e-8)
     assert np.abs(expected).max() > 0.1
 
-    found = functionals_of(rows, np.zeros(n), mean)
+    found = as_observations(rows, np.zeros(n), mean)
     ((block, targets),) = found.parts()
     np.testing.assert_allclose(block.rows(jax.vmap(PENDULUM)(block.points)), targets, atol=1e-8)
     assert len(targets) == 9 * n - n
     # Four samples in one are one of half the noise.
     once = rows._replace(counts=rows.counts / 4)
-    ((_, halved),) = functionals_of(once, np.full(n, np.log(0.5)), mean).parts()
+    ((_, halved),) = as_observations(once, np.full(n, np.log(0.5)), mean).parts()
     np.testing.assert_allclose(halved, targets, rtol=1e-12)
 
 
@@ -181,7 +179,7 @@ def test_landmarks_resolve_components_of_any_unit():
     D = np.array([1.0, 1e8])
     S = np.random.default_rng(0).uniform(-1, 1, (8, 2))
     kernel = hk.Symplectic(3.0 * hk.Gaussian(D))
-    T = np.asarray(whitening(kernel, jnp.asarray(S * D[None])))
+    T = np.asarray(landmark_whitening(kernel, jnp.asarray(S * D[None])))
     G = np.asarray(hk.gram(kernel, S * D[None])).reshape(16, 16)
     np.testing.assert_allclose(T.T @ G @ T, np.eye(16), atol=1e-6)
 
@@ -216,7 +214,9 @@ def test_averaged_samples_keep_what_they_say_of_the_noise():
     t = np.linspace(0, 6, 3000)
     x = np.column_stack([np.sin(t), np.cos(t)])
     noise = np.array([0.02, 0.05])
-    data = prepared(hk.Runs(t, x + noise * np.random.default_rng(0).standard_normal(x.shape)), None)
+    data = preprocess(
+        hk.Runs(t, x + noise * np.random.default_rng(0).standard_normal(x.shape)), None
+    )
     run = data.runs[0]
     assert run.counts.sum(axis=0).tolist() == [3000, 3000]
     assert len(run.times) < 300
@@ -267,7 +267,7 @@ def test_five_samples_a_swing_are_enough():
     """Smoothing finds no noise at all in either coordinate: it must not be where learning ends."""
     times, states, true = logs(length=15.0)
     runs = hk.Runs(times, states)
-    assert (prepared(runs, None).noise < 0.001).all()
+    assert (preprocess(runs, None).noise < 0.001).all()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = hk.learn(K, runs)
@@ -388,14 +388,14 @@ def with_a_gap(times, states):
 
 def test_no_short_piece_crosses_a_gap():
     times, states, _ = logs(samples=31)
-    data = prepared(hk.Runs(*with_a_gap(times, states)), None)
-    pieces = [(p.start, p.stop) for p in short_cuts(data.runs) if p.run == 1]
+    data = preprocess(hk.Runs(*with_a_gap(times, states)), None)
+    pieces = [(p.start, p.stop) for p in short_pieces(data.runs) if p.run == 1]
     (gap,) = data.runs[1].gaps
     assert data.runs[1].times[gap] - data.runs[1].times[gap - 1] > 1.4
     assert gap in [start for start, _ in pieces]
     assert [pieces[0][0], pieces[-1][1]] == [0, len(data.runs[1].times)]
     assert all(a[1] == b[0] for a, b in itertools.pairwise(pieces))
-    assert not prepared(hk.Runs(times, states), None).runs[1].gaps.size  # an even log has none
+    assert not preprocess(hk.Runs(times, states), None).runs[1].gaps.size  # an even log has none
 
 
 @pytest.mark.slow

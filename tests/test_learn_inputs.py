@@ -15,12 +15,10 @@ import scipy.linalg
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._trajectories.flow import NODES, simulated
-from hamkernel._trajectories.functionals import functionals_of
+from hamkernel._trajectories.flow import NODES, jacobians, means, simulated
 from hamkernel._trajectories.inputs import at_nodes, at_samples, in_intervals
-from hamkernel._trajectories.rows import Segments, frozen, linearised, segments_of
-from hamkernel._trajectories.shooting import means
-from hamkernel._trajectories.start import jacobians
+from hamkernel._trajectories.likelihood import as_observations
+from hamkernel._trajectories.segments import Segments, given_path, linearised, segments_of
 
 FRICTION, GAIN = 0.2, 1.5
 PENDULUM = hk.systems.Damped(hk.systems.Pendulum(1.0, 1.0, 6.0), FRICTION)
@@ -112,7 +110,7 @@ def test_along_a_true_path_rows_are_exact_with_inputs():
     @jax.jit
     def rows(ends):
         nodes = jnp.concatenate([states, at_nodes(ends)], axis=-1)
-        path = frozen(x, nodes, segments.spans, jacobians(mean, nodes, 2))
+        path = given_path(x, nodes, segments.spans, jacobians(mean, nodes, 2))
         slopes = jax.vmap(jax.vmap(jax.vmap(joined)))(nodes)
         there = means(mean, nodes, slopes)
         return linearised(path, slopes, there, segments, jnp.array([True]), is_solution=True)
@@ -122,7 +120,7 @@ def test_along_a_true_path_rows_are_exact_with_inputs():
     ]
     found = rows(ends)
     np.testing.assert_allclose(found.target[0], expected, atol=1e-8)
-    observations = functionals_of(found, np.zeros(2), mean)
+    observations = as_observations(found, np.zeros(2), mean)
     assert observations is not None
     ((block, targets),) = observations.parts(1)
     np.testing.assert_allclose(
@@ -139,7 +137,7 @@ def test_segments_that_are_not_kept_stay_at_states_of_the_runs():
     piece = (ts, x, np.ones((3, 2)), np.zeros((3, 2)), x[0], np.ones((2, 2, 1)))
     segments = segments_of([piece], 2, 4)
     nodes = jnp.full((2, 3, 3, 3), jnp.nan)
-    path = frozen(jnp.full((2, 4, 2), 2.0), nodes, segments.spans, jnp.zeros((2, 3, 2, 2)))
+    path = given_path(jnp.full((2, 4, 2), 2.0), nodes, segments.spans, jnp.zeros((2, 3, 2, 2)))
     zero, none = jnp.zeros((2, 3, 3, 2)), jnp.zeros(2, bool)
     rows = linearised(path, zero, zero, segments, none, is_solution=False)
     np.testing.assert_array_equal(rows.nodes[..., :2], 2.0)

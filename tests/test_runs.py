@@ -11,9 +11,15 @@ import pytest
 import scipy.stats
 
 import hamkernel as hk
-from hamkernel._trajectories.padding import padded, power_of_two
-from hamkernel._trajectories.smoother import Process, negative_log_likelihood
-from hamkernel._trajectories.smoothing import centred, processes, smoothed
+from hamkernel._trajectories.smoothing import (
+    Process,
+    centred,
+    negative_log_likelihood,
+    padded,
+    power_of_two,
+    processes,
+    smoothed,
+)
 
 
 def swings(count=3, noise=0.05, seed=0, missing=False):

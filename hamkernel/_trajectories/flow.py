@@ -124,3 +124,20 @@ def simulated(
     _, out = jax.lax.scan(forward, starts, (spans.T, jnp.moveaxis(inputs, 1, 0), steps))
     ends, nodes, to_end, across = (jnp.moveaxis(a, 0, 1) for a in out)
     return Path(jnp.concatenate([starts[:, None], ends], axis=1), nodes, to_end, across)
+
+
+def jacobians(mean, nodes: Float[Array, "S L 3 d"], n: int) -> Float[Array, "S L n n"]:
+    """∂m/∂x of the mean in each interval, averaged over its nodes."""
+    if mean is None:
+        return jnp.zeros((*nodes.shape[:2], n, n), nodes.dtype)
+    D = jax.vmap(jax.vmap(jax.vmap(lambda s: with_tangent(mean, s, n)[1])))(nodes)
+    return jnp.einsum("slkab,k->slab", D, jnp.asarray(WEIGHTS, nodes.dtype))
+
+
+def means(
+    mean, nodes: Float[Array, "S L 3 d"], slopes: Float[Array, "S L 3 n"]
+) -> Float[Array, "S L 3 n"]:
+    """The prior mean at the nodes, whose slopes have its shape."""
+    if mean is None:
+        return jnp.zeros_like(slopes)
+    return jax.vmap(jax.vmap(jax.vmap(mean)))(nodes).astype(nodes.dtype)

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo
@@ -16,28 +17,47 @@ from hamkernel._fields.controlled import learned_field
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._fields.known import known_part
 from hamkernel._gram.operator import placed_product
+from hamkernel._kernels.base import Scaled
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._observations.data import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._trajectories.evidence import Model
-from hamkernel._trajectories.flow import Expansion
-from hamkernel._trajectories.functionals import functionals_of
-from hamkernel._trajectories.hermite import interpolated
-from hamkernel._trajectories.iteration import Current, Task, begin, changed, iterated
-from hamkernel._trajectories.judged import Fit, judged
-from hamkernel._trajectories.learned import Learned, Step, empty, misfits
-from hamkernel._trajectories.prepared import check_identifiable, prepared
-from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.shooting import Piece, grown, halved, short_cuts
-from hamkernel._trajectories.start import (
-    box_of,
-    landmarks,
-    sampled,
-    with_amplitude,
-    with_masses,
+from hamkernel._structures.controlled import Controlled, InputMatrix
+from hamkernel._structures.masses import UnknownMasses
+from hamkernel._structures.structure import AbstractStructure
+from hamkernel._trajectories.diagnostics import NEGLIGIBLE, FitQuality, check_identifiable, diagnose
+from hamkernel._trajectories.flow import Expansion, steps_for, with_tangent
+from hamkernel._trajectories.learned import Iteration, Learned, empty, misfits
+from hamkernel._trajectories.likelihood import (
+    Bounds,
+    Model,
+    as_observations,
+    bounds_and_design,
+    closed_form,
+    landmark_whitening,
+    losses,
+    most_likely,
 )
+from hamkernel._trajectories.preprocessing import Preprocessed, landmarks, preprocess, sampled
+from hamkernel._trajectories.runs import Runs
+from hamkernel._trajectories.segments import (
+    LinearisedSegments,
+    Piece,
+    Shooting,
+    grown,
+    halved,
+    linearised_along_field,
+    linearised_along_smoothed,
+    segmented,
+    shoot,
+    short_pieces,
+    trusted,
+)
+from hamkernel._trajectories.smoothing import interpolated
 
+_ROUNDS = 4  # Levenberg steps before a segment is diagnose: without them up to 40 % were lost
+_SEARCH = 25  # steps of BFGS, which go on in the next iteration
+_SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a step, until one makes the objective smaller
 _WIDE = 100.0  # standard deviations of the states: the prior of a start
 _SHORT_ROUNDS = 2  # iterations with short segments, in which a rough field stays near the samples
 _MOST = 8  # iterations; 4 or 5 are the rule
@@ -101,7 +121,7 @@ def learn(
         K = with_masses(K, runs.dimension)
     known = known_part(K, mean, runs.dimension, jnp.float64)
     check_identifiable(runs, known)
-    data = prepared(runs, known)
+    data = preprocess(runs, known)
     measured = np.isfinite(data.noise)
     X, Y = sampled(data)
     if known is not None:
@@ -110,9 +130,9 @@ def learn(
     level = np.maximum(np.where(measured, data.noise, data.scale), 1e-6 * data.scale)
     model = Model(K, jnp.log(jnp.asarray(level if given is None else given)))
     moves = measured & (given is None)
-    box, design = box_of(model, X, Y, data.scale, moves)
+    bounds, design = bounds_and_design(model, X, Y, data.scale, moves)
     S = landmarks(X, data.scale, None if solver is None else solver.max_points)
-    task = Task(data, known, S, box, jnp.asarray(_WIDE * data.scale))
+    task = Task(data, known, S, bounds, jnp.asarray(_WIDE * data.scale))
     now, pieces, history, converged = _iterated(task, begin(task, model, design), progress)
     mean = None if mean is None else as_pytree(mean)
     return _learned(runs, mean, task, now, pieces, history, converged, given is not None, measured)
@@ -120,16 +140,16 @@ def learn(
 
 def _iterated(
     task: Task, now: Current, progress: bool
-) -> tuple[Current, list[Piece], list[Step], bool]:
+) -> tuple[Current, list[Piece], list[Iteration], bool]:
     """Gauss-Newton steps until noise and objective settle."""
     from tqdm import tqdm  # so that importing the package does not load it
 
-    history: list[Step] = []
+    history: list[Iteration] = []
     pieces: list[Piece] = []
     bar = tqdm(range(_MOST), "learning", disable=None if progress else True)
     for i in bar:
         if i < _SHORT_ROUNDS:
-            wanted = short_cuts(task.data.runs)
+            wanted = short_pieces(task.data.runs)
         elif i == _SHORT_ROUNDS:
             wanted = grown(task.data.runs, pieces, now.good)
         else:
@@ -155,7 +175,7 @@ def _learned(
     task: Task,
     now: Current,
     pieces: list[Piece],
-    history: list[Step],
+    history: list[Iteration],
     converged: bool,
     given: bool,
     measured: np.ndarray,
@@ -176,9 +196,9 @@ def _learned(
     noise = np.where(measured, np.exp(np.asarray(now.model.log_noise)), np.nan)
     misfit = misfits(runs, states, noise)
     chi_squared = now.squares / max(now.free, 1.0)
-    fit = Fit(kept, misfit, chi_squared, now.free, len(history), converged)
-    converged = judged(fit, noise, data.scale, given)
-    observations = functionals_of(now.rows, now.model.log_noise, task.mean)
+    fit = FitQuality(kept, misfit, chi_squared, now.free, len(history), converged)
+    converged = diagnose(fit, noise, data.scale, given)
+    observations = as_observations(now.rows, now.model.log_noise, task.mean)
     count = 1 if observations is None else sum(len(y) for _, y in observations.parts())
     regularization = jnp.asarray(1 / count)
     return Learned(
@@ -257,3 +277,188 @@ def _check(
     if given.shape not in ((), (n,)):
         raise ValueError(f"noise has shape {given.shape}; a number or shape ({n},) is needed.")
     return K, np.broadcast_to(given, (n,))
+
+
+def with_amplitude(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
+    """K, every structure and input matrix in it scaled; a likelihood needs amplitudes.
+
+    `Symplectic(Gaussian(2.0))` becomes `Symplectic(1.0 * Gaussian(2.0))`.
+    """
+
+    def is_structure(node: object) -> bool:
+        return isinstance(node, AbstractStructure | InputMatrix)
+
+    def scaled(node):
+        if not is_structure(node) or node.kernel.has_amplitude:
+            return node
+        return eqx.tree_at(lambda node: node.kernel, node, Scaled(node.kernel, 1.0))
+
+    return jax.tree.map(scaled, K, is_leaf=is_structure)
+
+
+def with_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
+    """K for states (q, q̇) of n coordinates, all masses equal at first."""
+    if n == 2:
+        raise ValueError(
+            "masses=True with one degree of freedom: every mass explains the same motion and is "
+            "only a unit of the energy, so there is nothing to find. Leave it out; (q, q̇) is "
+            "(q, p) of a mass of one."
+        )
+    if isinstance(K, Controlled):
+        return Controlled(with_masses(K.drift, n), K.inputs, K.count)
+    return K if isinstance(K, UnknownMasses) else UnknownMasses(K, jnp.ones(n // 2))
+
+
+class Task(NamedTuple):
+    """What does not change: the runs, the mean, landmarks, the box and the prior of starts."""
+
+    data: Preprocessed
+    mean: Any
+    S: Float[Array, "m d"]
+    bounds: Bounds
+    start_deviation: Float[Array, " n"]
+
+
+class Current(NamedTuple):
+    """Where learning stands.
+
+    Attributes:
+        model: kernel and noise.
+        field: the field.
+        rows: what it was learned from.
+        paths: of each run at its samples.
+        good: which pieces were kept.
+        squares: the sum of their squared normalised residuals.
+        free: the degrees of freedom that are left.
+    """
+
+    model: Model
+    field: Expansion
+    rows: LinearisedSegments
+    paths: list[np.ndarray]
+    good: Bool[np.ndarray, " S"]
+    squares: float
+    free: float
+
+
+def begin(task: Task, model: Model, design: np.ndarray) -> Current:
+    """INT: rows along the smoothed runs, with the tangent of the mean.
+
+    In short segments: the errors of the smoothed path add up along a run.
+    """
+    runs = task.data.runs
+    paths = [run.path for run in runs]
+    pieces = short_pieces(runs)
+    segments = segmented(runs, pieces, paths)
+    good = np.zeros(len(segments.starts), bool)
+    good[: len(pieces)] = [task.data.usable[piece.run] for piece in pieces]
+    rows = linearised_along_smoothed(task.data, pieces, segments, task.mean, good)
+    values = np.asarray(losses(model, jnp.asarray(design), task.S, rows, task.start_deviation))
+    model = model.at(jnp.asarray(design[int(np.argmin(values))]))
+    model, _ = most_likely(model, task.S, rows, task.start_deviation, task.bounds, _SEARCH)
+    found = closed_form(model.kernel, model.log_noise, task.S, rows, task.start_deviation)
+    field = Expansion(model.kernel, task.S, found.coefficients, task.mean)
+    return Current(model, field, rows, paths, good[: len(pieces)], np.inf, float(found.free))
+
+
+def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, Iteration]:
+    """GN: one linearisation along the current field, one closed form, one line search."""
+    runs = task.data.runs
+    segments = segmented(runs, pieces, now.paths)
+    count = steps_for(np.asarray(segments.spans), _stiffness(now.field, task.data, now.paths))
+    steps = jnp.asarray(count)
+    before = shoot(
+        now.field,
+        segments,
+        now.model.log_noise,
+        task.start_deviation,
+        steps,
+        segments.starts,
+        _ROUNDS,
+    )
+    least = NEGLIGIBLE * task.data.scale
+    good = trusted(before, segments, np.exp(np.asarray(now.model.log_noise)), least)
+    rows = linearised_along_field(now.field, before.path, segments, jnp.asarray(good))
+    model, loss = most_likely(now.model, task.S, rows, task.start_deviation, task.bounds, _SEARCH)
+    found = closed_form(model.kernel, model.log_noise, task.S, rows, task.start_deviation)
+    # The current field in the new basis, by what it says of the same rows.
+    known = rows._replace(target=rows.along, prior_offset=jnp.zeros_like(rows.prior_offset))
+    old = closed_form(model.kernel, model.log_noise, task.S, known, task.start_deviation).weights
+    T = _landmark_whitening(model.kernel, task.S)
+
+    def trial(share: float) -> _Trial:
+        weights = (1 - share) * old + share * found.weights
+        field = Expansion(model.kernel, task.S, (T @ weights).reshape(len(task.S), -1), task.mean)
+        starts = before.starts + share * found.moves
+        there = shoot(
+            field, segments, model.log_noise, task.start_deviation, steps, starts, _ROUNDS
+        )
+        squares = float(np.asarray(there.squares)[good].sum())
+        return _Trial(squares + float(weights @ weights), squares, field, there)
+
+    at_old = trial(0.0)
+    taken, best = 0.0, at_old
+    for share in _SHARES if good.any() else ():
+        there = trial(share)
+        if there.objective < best.objective:
+            taken, best = share, there
+            break
+    good = good[: len(pieces)]
+    paths = _updated(now.paths, pieces, good, best.shooting)
+    samples = sum(len(run.times) for run in runs)
+    kept = sum(piece.stop - piece.start for piece, ok in zip(pieces, good, strict=True) if ok)
+    gain = at_old.objective - best.objective
+    numbers = (best.objective, gain if taken else 0.0, taken, kept / samples, loss)
+    objective, gain, taken, kept, loss = (jnp.asarray(value) for value in numbers)
+    longest = max(piece.stop - piece.start for piece in pieces)
+    noise = jnp.exp(model.log_noise)
+    step = Iteration(longest, objective, gain, taken, noise, kept, loss)
+    free = float(found.free)
+    return Current(model, best.field, rows, paths, good, best.squares, free), step
+
+
+class _Trial(NamedTuple):
+    objective: float
+    squares: float
+    field: Expansion
+    shooting: Shooting
+
+
+def _updated(paths, pieces: list[Piece], good, there: Shooting) -> list[np.ndarray]:
+    """The paths, those of the pieces that were kept along the field."""
+    new, x = [path.copy() for path in paths], np.asarray(there.path.x)
+    for s, (r, start, stop) in enumerate(pieces):
+        if good[s] and np.isfinite(x[s]).all():
+            new[r][start:stop] = x[s, : stop - start]
+    return new
+
+
+_landmark_whitening = eqx.filter_jit(landmark_whitening)
+
+
+@eqx.filter_jit
+def _norms(field, X: Float[Array, "N d"], scale: Float[Array, " n"]) -> Float[Array, " N"]:
+    def norm(s):
+        D = with_tangent(field, s, len(scale))[1]
+        return jnp.linalg.norm(D * scale[None] / scale[:, None])
+
+    return jax.vmap(norm)(X)
+
+
+def _stiffness(field: Expansion, data: Preprocessed, paths: list[np.ndarray]) -> float:
+    """‖∂f/∂x‖ in standard deviations along the paths, but for the largest twentieth."""
+    X = np.concatenate([run.joined(path) for run, path in zip(data.runs, paths, strict=True)])
+    X = X[np.linspace(0, len(X) - 1, 256).round().astype(int)]
+    norms = np.asarray(_norms(field, jnp.asarray(X), jnp.asarray(data.scale)))
+    return float(np.nanquantile(np.where(np.isfinite(norms), norms, 0.0), 0.95))
+
+
+def changed(task: Task, before: Current, now: Current) -> float:
+    """By how much the field has changed at the landmarks, relative to its size there."""
+    old, new = (
+        np.asarray(_values(each.field, task.S)) / task.data.scale[None] for each in (before, now)
+    )
+    return float(np.linalg.norm(new - old) / max(np.linalg.norm(new), np.finfo(float).tiny))
+
+
+_values = eqx.filter_jit(lambda field, S: jax.vmap(field)(S))

@@ -1,4 +1,4 @@
-"""What `learn` returns, and whether the structure explains the runs."""
+"""`Learned`: what `learn` returns."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from hamkernel._trajectories.runs import Runs
 _EXACT = 3000  # rows of a posterior without approximation: some seconds
 
 
-class Step(eqx.Module):
+class Iteration(eqx.Module):
     """One iteration.
 
     Attributes:
@@ -79,7 +79,7 @@ class Learned(eqx.Module):
     kept: Float[Array, " R"]
     misfit: Float[Array, "R n"]
     chi_squared: Float[Array, ""]
-    history: tuple[Step, ...]
+    history: tuple[Iteration, ...]
     converged: bool = eqx.field(static=True)
     runs: Runs
     observations: AbstractObservations | None

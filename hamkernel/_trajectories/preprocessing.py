@@ -15,24 +15,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hamkernel import _require as require
 from hamkernel._trajectories.flow import NODES, with_tangent
-from hamkernel._trajectories.hermite import interpolated
 from hamkernel._trajectories.inputs import at_nodes, at_samples, in_intervals
 from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.smoothing import Coordinate, processes, smoothed
+from hamkernel._trajectories.smoothing import Coordinate, interpolated, processes, smoothed
+
+# Landmarks for n coordinates, 128 for more. 45 for n = 2 and 80 for n = 4 were as good as all.
+_FEWEST = {1: 24, 2: 48, 3: 64, 4: 80}
+_POINTS = 1024  # from which boxes and landmarks are taken
 
 # Of the lengthscale in time, between samples that are kept. A pendulum of frequency ω has a
 # lengthscale near 2.7/ω, so these are 23 samples a swing; three Gauss nodes in such an interval are
 # exact to 1e-8, and samples at 5 Hz of a pendulum of period 2.6 are left as they are.
 _DENSE = 0.1
+
 # A gap is longer than this share of that lengthscale, and than three intervals of its run: at 0.75,
 # two radians of a swing, three Gauss nodes are exact to 1e-4, and a smoothed path across 1.3 was
 # seen to lead to a field with ripples, which fitted the samples.
 _GAP, _INTERVALS = 0.75, 3.0
 
 
-class Run(NamedTuple):
+class PreprocessedRun(NamedTuple):
     """One run, condensed.
 
     Attributes:
@@ -66,7 +69,7 @@ class Run(NamedTuple):
         return np.concatenate([path, at_samples(self.inputs)], axis=1)
 
 
-class Prepared(NamedTuple):
+class Preprocessed(NamedTuple):
     """All runs, with the processes of their coordinates.
 
     Attributes:
@@ -76,13 +79,13 @@ class Prepared(NamedTuple):
         usable: which runs look like the others, shape (R,).
     """
 
-    runs: list[Run]
+    runs: list[PreprocessedRun]
     noise: Float[np.ndarray, " n"]
     scale: Float[np.ndarray, " n"]
     usable: Bool[np.ndarray, " R"]
 
 
-def prepared(runs: Runs, mean: Callable[[Array], Array] | None) -> Prepared:
+def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocessed:
     """Condense, smooth and complete the runs; `mean` fills in what was never measured.
 
     With inputs it is a function of the points (x, u).
@@ -112,7 +115,7 @@ def prepared(runs: Runs, mean: Callable[[Array], Array] | None) -> Prepared:
     noise = np.array([c.noise if c.seen else np.nan for c in found])
     good = [run.path for run, use in zip(path_runs, usable, strict=True) if use]
     scale = np.concatenate(good).std(axis=0)
-    return Prepared(path_runs, noise, np.where(scale > 0, scale, 1.0), usable)
+    return Preprocessed(path_runs, noise, np.where(scale > 0, scale, 1.0), usable)
 
 
 def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:
@@ -151,7 +154,7 @@ def _condensed(t, x, path, slope, block: float):
     return middle, np.where(counts > 0, there + means, np.nan), counts, scatter
 
 
-def _with_paths(found, times, states, counts, scatter, inputs, gap: float) -> list[Run]:
+def _with_paths(found, times, states, counts, scatter, inputs, gap: float) -> list[PreprocessedRun]:
     """The smoothed path at the samples and at the nodes between them."""
     grids, filled = [], []
     for t, x in zip(times, states, strict=True):
@@ -170,11 +173,11 @@ def _with_paths(found, times, states, counts, scatter, inputs, gap: float) -> li
         nodes, slopes = (a[:-1].reshape(len(t) - 1, 4, -1)[:, 1:] for a in (value, slope))
         spans = np.diff(t)
         gaps = 1 + np.flatnonzero((spans > gap) & (spans > _INTERVALS * np.median(spans)))
-        out.append(Run(t, x, count, about, value[::4], nodes, slopes, gaps, ends))
+        out.append(PreprocessedRun(t, x, count, about, value[::4], nodes, slopes, gaps, ends))
     return out
 
 
-def _completed(run: Run, mean: Callable[[Array], Array] | None) -> Run:
+def _completed(run: PreprocessedRun, mean: Callable[[Array], Array] | None) -> PreprocessedRun:
     """The run with coordinates that it never measured found from how they move the others.
 
     Given q̇ and a mean with q̇ = p/m, that is p = m q̇; in general Newton's method for the
@@ -227,27 +230,33 @@ def _solved_for(mean, X, U, slopes, missing):
     return jax.lax.map(lambda each: one(*each), (X, U, slopes))
 
 
-def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> None:
-    """A coordinate that no run measured must be known through a mean, of the points (x, u)."""
-    never = ~np.any([np.isfinite(np.asarray(x)).any(axis=0) for x in runs.states], axis=0)
-    if not never.any():
-        return
-    which = ", ".join(str(c) for c in np.flatnonzero(never))
-    if mean is None:
-        raise ValueError(
-            f"coordinate {which} was measured in no run. From the others alone it is known only up "
-            "to any change of coordinates, p -> g(q, p), so there is nothing to learn it from. "
-            "Say how it moves the others: mean=lambda x: jnp.array([x[1] / m, 0.0]) for q̇ = p/m "
-            "and K a kernel for the rest, such as hk.Symplectic(hk.Select(k, 0)) for ṗ = -U'(q). "
-            "Or log it."
-        )
-    d = runs.dimension + runs.applied()[0].shape[1]
-    points = np.random.default_rng(0).standard_normal((8, d))
-    with require.traceable("mean"):
-        D = np.asarray(jax.vmap(jax.jacfwd(mean))(jnp.asarray(points)))  # (8, n, d)
-    blind = [c for c in np.flatnonzero(never) if not np.abs(D[:, ~never, c]).max() > 0]
-    if blind:
-        raise ValueError(
-            f"coordinate {blind[0]} was measured in no run, and the velocities of the mean do not "
-            "depend on it: give a mean that says how it moves the others, such as q̇ = p/m."
-        )
+def sampled(data: Preprocessed) -> tuple[Float[np.ndarray, "N d"], Float[np.ndarray, "N n"]]:
+    """Points, (x, u) with inputs, and velocities of the smoothed runs at some of their nodes.
+
+    Always as many, if need be some of them twice, so that other lengths do not compile anew.
+    """
+    n = len(data.scale)
+    runs = [run for run, use in zip(data.runs, data.usable, strict=True) if use]
+    points = [np.concatenate([run.nodes, at_nodes(run.inputs)], axis=-1) for run in runs]
+    X = np.concatenate([each.reshape(-1, each.shape[-1]) for each in points])
+    Y = np.concatenate([run.slopes.reshape(-1, n) for run in runs])
+    chosen = np.linspace(0, len(X) - 1, _POINTS).round().astype(int)
+    return X[chosen], Y[chosen]
+
+
+def landmarks(X: Float[np.ndarray, "N d"], scale, count: int | None) -> Float[Array, "m d"]:
+    """Points of X that cover it: each the one farthest from those before, in standard deviations.
+
+    They do not depend on hyperparameters, which are not known yet.
+    """
+    count = _FEWEST.get(X.shape[1], 128) if count is None else count
+    spread = X[:, len(scale) :].std(axis=0)  # of the inputs
+    points = X / np.concatenate([scale, np.where(spread > 0, spread, 1.0)])[None]
+    chosen = [int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
+    distance = np.full(len(points), np.inf)
+    while len(chosen) < min(count, len(points)):
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        if not distance.max() > 0:
+            break
+        chosen.append(int(np.argmax(distance)))
+    return jnp.asarray(X[chosen])

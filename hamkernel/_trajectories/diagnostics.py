@@ -1,11 +1,15 @@
 """Whether what was learned explains the runs, and what to say where it does not."""
 
+from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from hamkernel import _require as require
+from hamkernel._trajectories.runs import Runs
 
 # χ² per degree of freedom has the standard deviation √(2/ν); five of them, and a tenth for the
 # curvature that a linearisation misses.
@@ -16,11 +20,10 @@ _ALL_NOISE = 0.5
 
 # Of the states: what a field that is not yet exact leaves, and averages of samples without noise.
 NEGLIGIBLE = 1e-3
-
 _FEW = 10  # degrees of freedom, from which σ is known to a fifth
 
 
-class Fit(NamedTuple):
+class FitQuality(NamedTuple):
     """How well the field follows the runs.
 
     Attributes:
@@ -40,8 +43,8 @@ class Fit(NamedTuple):
     settled: bool
 
 
-def judged(
-    fit: Fit, noise: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"], given: bool
+def diagnose(
+    fit: FitQuality, noise: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"], given: bool
 ) -> bool:
     """Warn of what is wrong, and say whether learning converged.
 
@@ -140,4 +143,30 @@ def warn_of_dropped(kept: np.ndarray) -> None:
             f"dropped from run {', '.join(lost[:5])}{more}: the field does not follow the samples "
             "there (a χ² above 25 times the median, or a tangent above 1e4). Look at these runs: a "
             "jump, another system, or chaos with samples too far apart."
+        )
+
+
+def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> None:
+    """A coordinate that no run measured must be known through a mean, of the points (x, u)."""
+    never = ~np.any([np.isfinite(np.asarray(x)).any(axis=0) for x in runs.states], axis=0)
+    if not never.any():
+        return
+    which = ", ".join(str(c) for c in np.flatnonzero(never))
+    if mean is None:
+        raise ValueError(
+            f"coordinate {which} was measured in no run. From the others alone it is known only up "
+            "to any change of coordinates, p -> g(q, p), so there is nothing to learn it from. "
+            "Say how it moves the others: mean=lambda x: jnp.array([x[1] / m, 0.0]) for q̇ = p/m "
+            "and K a kernel for the rest, such as hk.Symplectic(hk.Select(k, 0)) for ṗ = -U'(q). "
+            "Or log it."
+        )
+    d = runs.dimension + runs.applied()[0].shape[1]
+    points = np.random.default_rng(0).standard_normal((8, d))
+    with require.traceable("mean"):
+        D = np.asarray(jax.vmap(jax.jacfwd(mean))(jnp.asarray(points)))  # (8, n, d)
+    blind = [c for c in np.flatnonzero(never) if not np.abs(D[:, ~never, c]).max() > 0]
+    if blind:
+        raise ValueError(
+            f"coordinate {blind[0]} was measured in no run, and the velocities of the mean do not "
+            "depend on it: give a mean that says how it moves the others, such as q̇ = p/m."
         )

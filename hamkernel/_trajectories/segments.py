@@ -1,0 +1,454 @@
+"""Measured states as linear functionals of the field, along a path that is nearly right.
+
+With x̂ the path, Φ its tangent, m the mean and τ_k Gauss nodes with weights w_k, a sample is
+
+    x(tᵢ) ≈ x̂(tᵢ) + Φᵢ δz + Σ_{τ_k < tᵢ} w_k Φᵢ Φ_k⁻¹ (f(x̂(τ_k)) − d x̂/dt(τ_k)),
+
+so with g = f − m, and ô the same sum of d x̂/dt − m, xᵢ − x̂ᵢ + ôᵢ = Φᵢ δz + (B g)ᵢ. The sums run
+from interval to interval, sᵢ₊₁ = Ψᵢ sᵢ + Σ_k Γ_ik (…)_k, and no matrix B is stored.
+
+The path is that of the current field, or any other, such as a smoothed one: then Φ is the tangent
+of the mean alone, the identity where there is none.
+"""
+
+import itertools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hamkernel._machine.batches import orthonormal
+from hamkernel._trajectories.flow import (
+    NODES,
+    WEIGHTS,
+    Expansion,
+    Path,
+    jacobians,
+    means,
+    simulated,
+)
+from hamkernel._trajectories.inputs import at_nodes
+from hamkernel._trajectories.preprocessing import Preprocessed, PreprocessedRun
+from hamkernel._trajectories.smoothing import power_of_two
+
+
+class Piece(NamedTuple):
+    """Samples `start` to `stop` of one run."""
+
+    run: int
+    start: int
+    stop: int
+
+
+class Segments(NamedTuple):
+    """Measured samples on S segments of at most L intervals; padding has no weight and no length.
+
+    Attributes:
+        spans: the lengths of the intervals, shape (S, L).
+        measured: the states, zero where nothing was seen, shape (S, L + 1, n).
+        counts: how many samples an entry stands for, 0 where nothing was seen, the same shape.
+        scatter: the sum of squares of those samples about the entry, the same shape.
+        starts: where the segments may begin, shape (S, n).
+        inputs: at both ends of each interval, shape (S, L, 2, m); m is 0 where there are none.
+    """
+
+    spans: Float[Array, "S L"]
+    measured: Float[Array, "S L+1 n"]
+    counts: Float[Array, "S L+1 n"]
+    scatter: Float[Array, "S L+1 n"]
+    starts: Float[Array, "S n"]
+    inputs: Float[Array, "S L 2 m"]
+
+
+class LinearisedSegments(NamedTuple):
+    """What the samples say of g = f − m, before the starts are projected out.
+
+    Attributes:
+        nodes: where g is asked for, shape (S, L, 3, d), d = n + m with inputs: points (x, u).
+        across: Ψ, shape (S, L, n, n).
+        weights: Γ, shape (S, L, 3, n, n).
+        tangent: Φ at the samples, shape (S, L + 1, n, n).
+        target: x − x̂ + ô, shape (S, L + 1, n).
+        along: ô, what the rows would be if x̂ were right, the same shape.
+        counts: those of the segments, zero on what was dropped.
+        scatter: those of the segments, zero on what was dropped.
+        prior_offset: where the prior of the start has its middle, relative to x̂, shape (S, n).
+    """
+
+    nodes: Float[Array, "S L 3 d"]
+    across: Float[Array, "S L n n"]
+    weights: Float[Array, "S L 3 n n"]
+    tangent: Float[Array, "S L+1 n n"]
+    target: Float[Array, "S L+1 n"]
+    along: Float[Array, "S L+1 n"]
+    counts: Float[Array, "S L+1 n"]
+    scatter: Float[Array, "S L+1 n"]
+    prior_offset: Float[Array, "S n"]
+
+
+def accumulated(
+    across: Float[Array, "S L n n"],
+    weights: Float[Array, "S L 3 n n"],
+    values: Float[Array, "S L 3 n q"],
+) -> Float[Array, "S L+1 n q"]:
+    """Bv for each column of values at the nodes."""
+    local = jnp.einsum("slkab,slkbq->slaq", weights, values)
+
+    def step(s, at):
+        transition, own = at
+        s = jnp.einsum("sab,sbq->saq", transition, s) + own
+        return s, s
+
+    start = jnp.zeros_like(local[:, 0])
+    _, sums = jax.lax.scan(step, start, (jnp.moveaxis(across, 1, 0), jnp.moveaxis(local, 1, 0)))
+    return jnp.concatenate([start[:, None], jnp.moveaxis(sums, 0, 1)], axis=1)
+
+
+@jax.jit
+def tangents(across: Float[Array, "S L n n"]) -> Float[Array, "S L+1 n n"]:
+    """Φ at the samples, from the tangents across the intervals."""
+    S, _, n, _ = across.shape
+    first = jnp.broadcast_to(jnp.eye(n, dtype=across.dtype), (S, n, n))
+
+    def step(V, transition):
+        V = jnp.einsum("sab,sbc->sac", transition, V)
+        return V, V
+
+    _, rest = jax.lax.scan(step, first, jnp.moveaxis(across, 1, 0))
+    return jnp.concatenate([first[:, None], jnp.moveaxis(rest, 0, 1)], axis=1)
+
+
+@eqx.filter_jit
+def linearised(
+    path: Path,
+    slopes: Float[Array, "S L 3 n"],
+    mean: Float[Array, "S L 3 n"],
+    segments: Segments,
+    good: Bool[Array, " S"],
+    is_solution: bool,
+) -> LinearisedSegments:
+    """The rows along a path of which the slopes and the mean at the nodes are known.
+
+    Args:
+        path: a path, with tangents of the field along it or of the mean.
+        slopes: d x̂/dt.
+        mean: m.
+        segments: the samples.
+        good: which segments to keep.
+        is_solution: whether the path solves ẋ = slope. If not, what the Gauss rule misses of its
+            increments is put back: for Φ = I the rows are then exact differences of the samples.
+    """
+    keep = good[:, None, None]
+    x, nodes, to_end, across = (_where(good, a) for a in path)
+    n = x.shape[-1]
+    # Where nothing is kept the field is still asked: at the starts, which are states of the runs.
+    still = jnp.pad(segments.starts, ((0, 0), (0, nodes.shape[-1] - n)))
+    nodes = jnp.where(keep[..., None], nodes, still[:, None, None])
+    eye = jnp.broadcast_to(jnp.eye(n, dtype=x.dtype), across.shape)
+    across = jnp.where(keep[..., None], across, eye)
+    shares = segments.spans[:, :, None] * jnp.asarray(WEIGHTS, x.dtype)[None, None]
+    weights = shares[..., None, None] * to_end  # Γ_k = h w_k Ψ Φ_k⁻¹
+    slopes, mean = _where(good, slopes), _where(good, mean)
+    offset = accumulated(across, weights, (slopes - mean)[..., None])[..., 0]
+    if not is_solution:
+        missed = jnp.diff(x, axis=1) - (shares[..., None] * slopes).sum(axis=2)
+        offset = offset + accumulated(across, eye[:, :, None], missed[:, :, None, :, None])[..., 0]
+    return LinearisedSegments(
+        nodes=nodes,
+        across=across,
+        weights=weights,
+        tangent=tangents(across),
+        target=segments.measured - x + offset,
+        along=offset,
+        counts=_where(good, segments.counts),
+        scatter=_where(good, segments.scatter),
+        prior_offset=_where(good, segments.starts - x[:, 0]),
+    )
+
+
+def _where(good, a):
+    mask = good.reshape(-1, *([1] * (a.ndim - 1)))
+    return jnp.where(mask, a, jnp.zeros_like(a))
+
+
+def given_path(
+    x: Float[Array, "S L+1 n"],
+    nodes: Float[Array, "S L 3 d"],
+    spans: Float[Array, "S L"],
+    jacobians: Float[Array, "S L n n"],
+) -> Path:
+    """A given path with the tangent of ẏ = D y, D the Jacobian of the mean in each interval."""
+    D = spans[..., None, None] * jacobians
+    eye = jnp.broadcast_to(jnp.eye(x.shape[-1], dtype=x.dtype), D.shape)
+
+    def exponential(share: float):
+        term = total = eye
+        for j in range(1, 9):  # ‖D h‖ is below one or two where samples see the motion
+            term = share / j * jnp.einsum("slab,slbc->slac", D, term)
+            total = total + term
+        return total
+
+    to_end = jnp.stack([exponential(1 - float(c)) for c in NODES], axis=2)
+    return Path(x, nodes, to_end, exponential(1.0))
+
+
+def segments_of(
+    pieces: list[tuple[np.ndarray, ...]],
+    size: int,
+    length: int,
+) -> Segments:
+    """`size` segments of `length` samples of pieces (times, states, counts, scatter, start, u)."""
+    n, m = pieces[0][1].shape[1], pieces[0][5].shape[2]
+    spans = np.zeros((size, length - 1))
+    measured, counts, scatter = np.zeros((3, size, length, n))
+    # Segments that are padding stay at a state of the runs: another one may be where none is
+    # possible, as a population of zero in a kernel of its logarithm.
+    starts, inputs = np.tile(pieces[0][4], (size, 1)), np.zeros((size, length - 1, 2, m))
+    for s, (t, x, count, squares, start, ends) in enumerate(pieces):
+        T = len(t)
+        spans[s, : T - 1] = np.diff(t)
+        seen = np.isfinite(x)
+        measured[s, :T] = np.where(seen, x, 0.0)
+        counts[s, :T] = np.where(seen, count, 0.0)
+        scatter[s, :T] = np.where(seen, squares, 0.0)
+        starts[s], inputs[s, : T - 1] = start, ends
+    arrays = spans, measured, counts, scatter, starts, inputs
+    return Segments(*(jnp.asarray(a) for a in arrays))
+
+
+def linearised_along_smoothed(
+    data: Preprocessed, pieces: list[Piece], segments: Segments, mean, good: np.ndarray
+) -> LinearisedSegments:
+    """The rows along the smoothed runs, whose tangent is that of the mean."""
+    S, L = segments.spans.shape
+    n = len(data.scale)
+    first = data.runs[pieces[0][0]].path[pieces[0][1]]  # where padding stays
+    x, nodes = np.tile(first, (S, L + 1, 1)), np.tile(first, (S, L, 3, 1))
+    slopes = np.zeros((S, L, 3, n))
+    for s, (r, start, stop) in enumerate(pieces):
+        run, T = data.runs[r], stop - start
+        x[s] = run.path[stop - 1]
+        nodes[s] = run.path[stop - 1]
+        x[s, :T] = run.path[start:stop]
+        nodes[s, : T - 1] = run.nodes[start : stop - 1]
+        slopes[s, : T - 1] = run.slopes[start : stop - 1]
+    points = np.concatenate([nodes, at_nodes(np.asarray(segments.inputs))], axis=-1)
+    along = jnp.asarray(x), jnp.asarray(points), jnp.asarray(slopes)
+    return _linearised_along_smoothed(mean, along, jnp.asarray(good), segments)
+
+
+@eqx.filter_jit
+def _linearised_along_smoothed(mean, along, good, segments: Segments) -> LinearisedSegments:
+    x, points, slopes = along
+    path = given_path(x, points, segments.spans, jacobians(mean, points, x.shape[-1]))
+    there = means(mean, points, slopes)
+    return linearised(path, slopes, there, segments, good, is_solution=False)
+
+
+def back_substituted(U: Float[Array, "S n n"], b: Float[Array, "S n"]) -> Float[Array, "S n"]:
+    n = b.shape[1]
+    out: list[Array] = [b[:, 0]] * n
+    for i in reversed(range(n)):
+        left = b[:, i]
+        for j in range(i + 1, n):
+            left = left - U[:, i, j] * out[j]
+        out[i] = left / U[:, i, i]
+    return jnp.stack(out, axis=1)
+
+
+SHORT = 12  # samples at most in a segment while the field is rough; 10 gave the same errors
+_LEAST = 3  # samples of a piece: one more than its start takes
+LONG = 256  # at most: the tangent of a longer path says little more, and arrays stay small
+_GROWTH = 1e4  # of the tangent, beyond which a path says nothing of its start
+_FAR = 25.0  # times the median χ² per sample
+
+
+def equal_pieces(runs: list[PreprocessedRun], most: int) -> list[Piece]:
+    """Every run in pieces of at most `most` samples, of nearly equal lengths."""
+    return [piece for r, run in enumerate(runs) for piece in _equal(r, 0, len(run.times), most)]
+
+
+def short_pieces(runs: list[PreprocessedRun]) -> list[Piece]:
+    """Short pieces, none of them across a gap, if it has three samples at least."""
+    pieces = []
+    for r, run in enumerate(runs):
+        start, T = 0, len(run.times)
+        for gap in run.gaps:
+            if gap - start >= _LEAST and T - gap >= _LEAST:
+                pieces += _equal(r, start, int(gap), SHORT)
+                start = int(gap)
+        pieces += _equal(r, start, T, SHORT)
+    return pieces
+
+
+def _equal(run: int, start: int, stop: int, most: int) -> list[Piece]:
+    # As many as the next power of two needs: runs of other lengths then have as many pieces.
+    count = -(-power_of_two(stop - start) // most)
+    ends = np.linspace(start, stop, count + 1).round().astype(int)
+    return [Piece(run, int(a), int(b)) for a, b in itertools.pairwise(ends)]
+
+
+def grown(
+    runs: list[PreprocessedRun], pieces: list[Piece], good: Bool[np.ndarray, " S"]
+) -> list[Piece]:
+    """Runs of which all pieces are good in one piece, up to `LONG` samples; others as they are."""
+    lost = {piece.run for piece, is_good in zip(pieces, good, strict=True) if not is_good}
+    whole = [piece for piece in equal_pieces(runs, LONG) if piece.run not in lost]
+    return whole + [piece for piece in pieces if piece.run in lost]
+
+
+def halved(
+    runs: list[PreprocessedRun], pieces: list[Piece], good: Bool[np.ndarray, " S"]
+) -> list[Piece]:
+    """The pieces, those that are not good cut at the gap in their middle, or in halves if long."""
+    out = []
+    for piece, is_good in zip(pieces, good, strict=True):
+        middle = (piece.start + piece.stop) // 2
+        gaps = [int(g) for g in runs[piece.run].gaps if piece.start < g < piece.stop]
+        if is_good or (not gaps and piece.stop - piece.start <= SHORT):
+            out.append(piece)
+            continue
+        middle = min(gaps, key=lambda gap: abs(gap - middle), default=middle)
+        out += [piece._replace(stop=middle), piece._replace(start=middle)]
+    return out
+
+
+def segmented(
+    runs: list[PreprocessedRun], pieces: list[Piece], paths: list[np.ndarray]
+) -> Segments:
+    """The pieces as arrays of a few shapes; they start on `paths`."""
+    longest = max(piece.stop - piece.start for piece in pieces)
+    length = SHORT if longest <= SHORT else power_of_two(longest)
+    filled = []
+    for r, start, stop in pieces:
+        run, part = runs[r], slice(start, stop)
+        own = run.times, run.states, run.counts, run.scatter
+        filled.append((*(a[part] for a in own), paths[r][start], run.inputs[start : stop - 1]))
+    return segments_of(filled, power_of_two(len(pieces)), length)
+
+
+class Shooting(NamedTuple):
+    """The path of the current field through every segment.
+
+    Attributes:
+        starts: where it starts, shape (S, n).
+        path: the path.
+        squares: χ² of each segment, inf where the path is lost.
+    """
+
+    starts: Float[Array, "S n"]
+    path: Path
+    squares: Float[Array, " S"]
+
+
+@eqx.filter_jit
+def shoot(
+    field: Any,
+    segments: Segments,
+    log_noise: Float[Array, " n"],
+    start_deviation: Float[Array, " n"],
+    steps,
+    starts: Float[Array, "S n"],
+    rounds: int,
+) -> Shooting:
+    """The starts after some Levenberg steps from `starts`, of each segment on its own.
+
+    δz minimises ‖r − Pδz‖² + μ‖U δz‖², where P = QU scales the coordinates; μ goes down by ten
+    after a step that was better, and up after one that was worse.
+    """
+    W = jnp.sqrt(segments.counts) * jnp.exp(-log_noise)[None, None]
+    S, n = starts.shape
+    prior = jnp.broadcast_to(jnp.diag(1 / start_deviation), (S, n, n))
+
+    def at(z):
+        path = simulated(field, z, segments.spans, steps, segments.inputs)
+        r = (W * (segments.measured - path.x)).reshape(S, -1)
+        r = jnp.concatenate([r, (segments.starts - z) / start_deviation[None]], axis=1)
+        squares = jnp.sum(r**2, axis=1)
+        squares = jnp.where(jnp.isfinite(squares), squares, jnp.inf)
+        return path, r, squares
+
+    def move(path, r, squares):
+        P = (W[..., None] * tangents(path.across)).reshape(S, -1, n)
+        P = jnp.concatenate([P, prior], axis=1)
+        P = jnp.where(jnp.isfinite(P), P, jnp.zeros_like(P))
+        Q, U = orthonormal(P)
+        return back_substituted(U, jnp.einsum("sdn,sd->sn", Q, jnp.where(jnp.isfinite(r), r, 0.0)))
+
+    def step(carry, _):
+        best, least, way, mu = carry
+        z = best + way / (1 + mu)[:, None]
+        path, r, squares = at(z)
+        better = squares < least
+        new = jnp.where(better[:, None], move(path, r, squares), way)
+        new = jnp.where(jnp.isfinite(new), new, jnp.zeros_like(new))
+        best = jnp.where(better[:, None], z, best)
+        mu = jnp.where(better, mu / 10, mu * 10 + 1)
+        return (best, jnp.minimum(squares, least), new, mu), None
+
+    # The first step goes nowhere: it finds the way from the given starts.
+    begin = (
+        starts,
+        jnp.full(S, jnp.inf, starts.dtype),
+        jnp.zeros_like(starts),
+        jnp.zeros_like(starts[:, 0]),
+    )
+    (best, _, _, _), _ = jax.lax.scan(step, begin, length=rounds + 1)
+    path, _, squares = at(best)
+    return Shooting(best, path, squares)
+
+
+def trusted(
+    found: Shooting,
+    segments: Segments,
+    noise: Float[np.ndarray, " n"],
+    least: Float[np.ndarray, " n"],
+) -> Bool[np.ndarray, " S"]:
+    """Which segments the field follows well enough to learn from them.
+
+    Residuals are compared with the noise, or with those of half of the segments where they are
+    less: a jump in one of them may have been taken for noise in all.
+
+    Args:
+        found: the paths.
+        segments: the samples.
+        noise: the noise as far as it is known.
+        least: what a field that is not yet exact may leave where there is no noise at all, a share
+            of the states.
+    """
+    counts = np.asarray(segments.counts)
+    samples = (counts > 0).sum(axis=1)  # (S, n)
+    with np.errstate(all="ignore"):  # a path that is lost is infinite
+        growth = np.abs(np.asarray(tangents(found.path.across))) * (least / least[:, None])
+        residual = np.asarray(segments.measured) - np.asarray(found.path.x)
+        squares = np.where(counts > 0, counts * residual**2, 0.0).sum(axis=1)  # (S, n)
+    whole = np.isfinite(found.squares) & np.isfinite(squares).all(axis=1)
+    # A start takes a sample; of one that stands alone nothing is left to compare.
+    typical = np.array(
+        [
+            np.median(s[use] / (t[use] - 1)) if (use := whole & (t > 1)).any() else np.inf
+            for s, t in zip(squares.T, samples.T, strict=True)
+        ]
+    )
+    sigma = np.maximum(np.minimum(noise, np.sqrt(typical)), least)
+    good = whole & samples.any(axis=1) & (growth.max(axis=(1, 2, 3)) < _GROWTH)
+    if good.any():
+        each = (squares / sigma[None] ** 2).sum(axis=1) / np.maximum(samples.sum(axis=1), 1)
+        # Where half of them are better than that, it is no reason to drop the others.
+        good &= each < _FAR * max(np.median(each[good]), 1.0)
+    return good
+
+
+@eqx.filter_jit
+def linearised_along_field(
+    field: Expansion, path: Path, segments: Segments, good
+) -> LinearisedSegments:
+    """The rows along the path of the current field."""
+    nodes = jnp.where(good[:, None, None, None], path.nodes, jnp.zeros_like(path.nodes))
+    slopes = jax.vmap(jax.vmap(jax.vmap(field)))(nodes)
+    return linearised(
+        path, slopes, means(field.mean, nodes, slopes), segments, good, is_solution=True
+    )
