@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
-from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
+from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import Array, Float
 
 
@@ -92,6 +92,11 @@ def _on_mesh(array: Array) -> Any:
 def _automatic(mesh: Mesh) -> Mesh:
     types = (AxisType.Auto,) * len(mesh.axis_names)
     return Mesh(np.asarray(mesh.devices), mesh.axis_names, axis_types=types)
+
+
+def is_on_one_device(array: Array) -> bool:
+    """Whether `array` lies on one device and on no mesh; a traced one is left to the compiler."""
+    return isinstance(array, Tracer) or isinstance(array.sharding, SingleDeviceSharding)
 
 
 def on_one_device(name: str, array: Array) -> Array:

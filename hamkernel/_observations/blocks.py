@@ -23,6 +23,7 @@ class AbstractBlock(eqx.Module):
     of_values: eqx.AbstractClassVar[bool]  # of the potential; else of the field
 
     points: eqx.AbstractVar[Float[Array, "P d"]]
+    noise: eqx.AbstractVar[Float[Array, " D"] | None]  # of each row; None if it is 1
 
     @property
     @abc.abstractmethod
@@ -40,9 +41,9 @@ class AbstractBlock(eqx.Module):
         """D, the number of rows."""
 
     @property
-    @abc.abstractmethod
     def scale(self) -> Float[Array, " D"]:
         """The relative noise of each row, by which it is divided."""
+        return jnp.ones(self.size, self.points.dtype) if self.noise is None else self.noise
 
     @property
     @abc.abstractmethod
@@ -105,10 +106,6 @@ class Components(AbstractBlock):
     @property
     def size(self) -> int:
         return math.prod(self.values_shape) if self.kept is None else len(self.kept)
-
-    @property
-    def scale(self) -> Float[Array, " D"]:
-        return jnp.ones(self.size, self.points.dtype) if self.noise is None else self.noise
 
     @property
     def count(self) -> int:
@@ -183,8 +180,8 @@ class Combinations(AbstractBlock):
         return self.weights.shape[0] * self.weights.shape[1]
 
     @property
-    def scale(self) -> Float[Array, " SR"]:
-        return jnp.ones(self.size, self.groups.dtype)
+    def noise(self) -> None:
+        return None
 
     @property
     def count(self) -> int:
@@ -243,10 +240,6 @@ class Values(AbstractBlock):
     @property
     def size(self) -> int:
         return len(self.points)
-
-    @property
-    def scale(self) -> Float[Array, " E"]:
-        return jnp.ones(self.size, self.points.dtype) if self.noise is None else self.noise
 
     @property
     def count(self) -> int:

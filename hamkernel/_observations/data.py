@@ -12,10 +12,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from hamkernel import _require as require
-from hamkernel._observations.base import AbstractObservations, refuse_swapped
+from hamkernel._observations.base import AbstractObservations
 from hamkernel._observations.blocks import AbstractBlock, Components, merged
 from hamkernel._observations.kinds import Equilibria, Velocities
 from hamkernel._observations.rows import Rows
@@ -26,8 +26,7 @@ from hamkernel._structures.controlled import Controlled, KnownMatrix
 def observations(X: Any, Y: Any, inputs: Any = None, part: bool = False) -> AbstractObservations:
     """`X` if it is observations, and then there is no Y; else the velocities Y at states X."""
     if not isinstance(X, AbstractObservations):
-        X, Y = _both(X, Y, inputs, part)
-        return Velocities(X, Y, inputs=inputs)
+        return _velocities(X, Y, inputs, part)
     if Y is not None:
         raise TypeError(
             f"{type(X).__name__} is all of the data, and Y is not needed. Say the regularization "
@@ -41,15 +40,28 @@ def observations(X: Any, Y: Any, inputs: Any = None, part: bool = False) -> Abst
     return X
 
 
-def _both(X: Any, Y: Any, inputs: Any, part: bool) -> tuple[Array, Array]:
-    """States and velocities, if there are both."""
+def _velocities(X: Any, Y: Any, inputs: Any, part: bool) -> Velocities:
+    """The velocities Y at the states X, all of which were measured.
+
+    Raises:
+        TypeError: there is no Y. ValueError: a component of Y is NaN.
+    """
     if Y is None:
         raise TypeError(
             "with states X the velocities Y are needed, of the same shape (N, n); or observations "
             f"in the place of both, hk.Velocities(X, Y); got {type(X).__name__} and nothing."
         )
-    refuse_swapped(X, Y, inputs)
-    return require.data(X, Y, part=part)
+    data = Velocities(X, Y, inputs=inputs)
+    if data.kept is not None:
+        rows = np.flatnonzero(np.isnan(np.asarray(data.Y)).any(axis=1))
+        raise ValueError(
+            f"Y contains NaN in {require.listed(rows)}: remove or repair those points; or, if NaN "
+            "means that a component was not measured, say so: hk.Velocities(X, Y) in the place of "
+            "X and Y."
+        )
+    if not part:
+        require.warn_of_few_points(data.X)
+    return data
 
 
 def sampled_points(
@@ -84,8 +96,11 @@ def rows_of_data(
     dtype = np.result_type(*[block.points.dtype for block in blocks])
     blocks = tuple(_cast(block, dtype) for block in blocks)
     pairs = zip(blocks, targets, strict=True)
-    divided = jnp.concatenate([y.astype(dtype) / block.scale for block, y in pairs])
-    rows = Rows(merged(blocks), divided)
+    divided = [
+        y.astype(dtype) if block.noise is None else y.astype(dtype) / block.noise
+        for block, y in pairs
+    ]
+    rows = Rows(merged(blocks), divided[0] if len(divided) == 1 else jnp.concatenate(divided))
     before = 0 if beside is None else len(beside.energies)
     if before + len(rows.energies) == 1:
         raise ValueError(
@@ -147,5 +162,7 @@ def _check_identified(given: list[Float[Array, "_ m"]]) -> None:
 
 
 def _cast(block: AbstractBlock, dtype: Any) -> AbstractBlock:
+    if block.points.dtype == dtype:
+        return block
     arrays, rest = eqx.partition(block, eqx.is_inexact_array)
     return eqx.combine(jax.tree.map(lambda a: a.astype(dtype), arrays), rest)

@@ -68,6 +68,8 @@ class Rows(eqx.Module):
     @property
     def energies(self) -> Int[np.ndarray, " E"]:
         """The rows that see the unknown constant."""
+        if not any(block.of_values for block in self.blocks):
+            return np.arange(0)
         M = np.arange(len(self.targets))
         pairs = zip(self.slices, self.blocks, strict=True)
         return np.concatenate([M[rows] for rows, block in pairs if block.of_values] or [M[:0]])

@@ -13,6 +13,7 @@ from hamkernel._require.numbers import (
     finite,
     floating,
     key,
+    listed,
     positive,
     positive_number,
     positive_scalar,
@@ -26,6 +27,7 @@ from hamkernel._require.states import (
     point,
     points,
     same_space,
+    warn_of_few_points,
     warn_of_float32,
 )
 from hamkernel._require.values import is_concrete, not_finite, on_host, traceable, value, warn

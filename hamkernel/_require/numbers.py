@@ -99,11 +99,15 @@ def finite(x: Array, name: str) -> Array:
         if not is_concrete(x):
             return f"{name} contains NaN or inf: remove or repair those points first."
         rows = np.flatnonzero(~np.isfinite(x).reshape(len(x), -1).all(axis=1))
-        shown = ", ".join(str(row) for row in rows[:5])
-        more = f" and {rows.size - 5} more" if rows.size > 5 else ""
-        return f"{name} contains NaN or inf in row {shown}{more}: remove or repair those points."
+        return f"{name} contains NaN or inf in {listed(rows)}: remove or repair those points."
 
     return value(x, not_finite(x), message)
+
+
+def listed(rows: np.ndarray) -> str:
+    """`row 1, 2, 3, 4, 5 and 7 more`."""
+    shown = ", ".join(str(row) for row in rows[:5])
+    return f"row {shown}" + (f" and {rows.size - 5} more" if rows.size > 5 else "")
 
 
 def key(key: Any) -> Key[Array, ""]:

@@ -5,7 +5,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel._require.numbers import finite, floating, single_or_double
-from hamkernel._require.values import is_concrete, warn
+from hamkernel._require.values import is_concrete, on_host, warn
 
 
 def one_dtype(X: Array, Z: Array) -> tuple[Array, Array]:
@@ -69,15 +69,21 @@ def data(
             f"X has shape {X.shape} and Y has shape {Y.shape}: they must be equal, "
             "one velocity Y[i] for each state X[i]."
         )
+    if not part:
+        warn_of_few_points(X)
+    X, Y = one_dtype(X, Y)
+    single_or_double(X.dtype, "X and Y have")
+    return finite(X, "X"), finite(Y, "Y")
+
+
+def warn_of_few_points(X: Float[Array, "N n"]) -> None:
+    """Warn of data that is probably transposed."""
     N, n = X.shape
-    if 1 < N < n and not part:
+    if 1 < N < n:
         warn(
             f"X has shape {X.shape}: {N} points of {n} coordinates, fewer points than coordinates. "
             "If it holds one coordinate a row, pass X.T and Y.T: shape (N, n), one state a row."
         )
-    X, Y = one_dtype(X, Y)
-    single_or_double(X.dtype, "X and Y have")
-    return finite(X, "X"), finite(Y, "Y")
 
 
 def measured(X: ArrayLike, Y: ArrayLike) -> tuple[Array, Array, np.ndarray | None]:
@@ -85,15 +91,21 @@ def measured(X: ArrayLike, Y: ArrayLike) -> tuple[Array, Array, np.ndarray | Non
 
     Not everywhere, and not under jit, where it is not known which.
     """
-    Y = points(Y, "Y")
-    missing = np.isnan(np.asarray(Y)) if is_concrete(Y) else np.zeros(Y.shape, bool)
+    X, Y = points(X, "X"), points(Y, "Y")
+    seen = on_host(Y)
+    if not is_concrete(Y) or not (seen != seen).any():
+        return *data(X, Y, part=True), None
+    if not Y.is_fully_addressable:
+        raise ValueError(
+            "Y contains NaN and is spread over several processes, where components that were not "
+            "measured cannot be left out: remove those points."
+        )
+    missing = np.isnan(np.asarray(Y))
     if missing.all():
         raise ValueError(
             f"all {missing.size} components of Y are NaN, which says not measured: there is "
             "nothing to learn from."
         )
-    if not missing.any():
-        return *data(X, Y, part=True), None
     X, filled = data(X, jnp.where(missing, jnp.zeros_like(Y), Y), part=True)
     return X, jnp.where(missing, jnp.nan, filled), np.flatnonzero(~missing.reshape(-1))
 

@@ -16,7 +16,8 @@ from hamkernel import _require as require
 from hamkernel._fields.base import at_points, potential_of
 from hamkernel._fields.controlled import without_inputs
 from hamkernel._fields.known import KnownPart, known_part
-from hamkernel._machine.devices import on_one_device
+from hamkernel._machine.devices import Rows as Sharding
+from hamkernel._machine.devices import automatic, is_on_one_device, on_one_device, rows_of
 from hamkernel._observations.base import AbstractObservations
 from hamkernel._observations.data import observations, rows_of_data
 from hamkernel._observations.rows import Rows
@@ -25,12 +26,22 @@ from hamkernel._structures.controlled import Controlled
 
 
 class Problem(eqx.Module):
-    """y = L f + ε for f ~ GP(known, kernel), y less the rows of what is known."""
+    """y = L f + ε for f ~ GP(known, kernel), y less the rows of what is known.
+
+    Attributes:
+        kernel: K.
+        rows: the observations less what is known of them, on automatic axes of a mesh of devices.
+        regularization: λ, shape ().
+        known: the mean at the points of the rows; None if it is zero.
+        spread: how the rows of the states that were given are spread over devices; None if they
+            are not.
+    """
 
     kernel: AbstractMatrixKernel
     rows: Rows
     regularization: Float[Array, ""]
     known: Any = None
+    spread: Sharding | None = eqx.field(static=True, default=None)
 
     @property
     def ridge(self) -> Float[Array, ""]:
@@ -44,6 +55,8 @@ class Problem(eqx.Module):
 
     def on_one_device(self) -> Problem:
         """The same with the rows on one device."""
+        if all(is_on_one_device(array) for array in jax.tree.leaves(self.rows)):
+            return self
         move = jax.tree.map(lambda array: on_one_device("the data", array), self.rows)
         return dataclasses.replace(self, rows=move)
 
@@ -61,13 +74,17 @@ def problem(
     Raises:
         TypeError, ValueError: as `fit` says. AttributeError: energies without a potential.
     """
-    K, rows = rows_of_data(matrix_kernel(K), observations(X, Y, inputs))
+    data = observations(X, Y, inputs)
+    spread = rows_of(X) if isinstance(X, jax.Array) else None
+    if not all(is_on_one_device(array) for array in jax.tree.leaves(data)):
+        data = jax.tree.map(automatic, data)
+    K, rows = rows_of_data(matrix_kernel(K), data)
     K.check_points(rows.points)
     if len(rows.energies) and K.no_potential:
         raise AttributeError(f"energies were given, and {K.no_potential}")
     regularization = require.ridge(regularization, rows.targets.dtype)
     known = known_part(K, mean, rows.dimension, rows.targets.dtype)
-    return Problem(K, without_known(K, rows, known), regularization, known)
+    return Problem(K, without_known(K, rows, known), regularization, known, spread)
 
 
 def new_rows(K: AbstractMatrixKernel, data: AbstractObservations, old: Rows, known: Any) -> Rows:
