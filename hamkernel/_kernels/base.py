@@ -13,6 +13,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -44,6 +45,10 @@ class AbstractScalarKernel(eqx.Module):
 
     def __repr__(self) -> str:
         return described(self, positional=("kernel",))
+
+    def __hash__(self) -> int:
+        # Arrays have no hash. Equal kernels have equal structure, so this one fits `==`.
+        return hash(jax.tree.structure(self))
 
     @abc.abstractmethod
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:

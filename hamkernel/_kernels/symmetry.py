@@ -127,7 +127,7 @@ def symmetrised(
     """
     reflects = set(maps) <= {identity, reflection}
     if kernel.summands(reflects):
-        inner = [symmetrised(k, maps, characters) for k in kernel.summands(reflects)]
+        inner = tuple(symmetrised(k, maps, characters) for k in kernel.summands(reflects))
         return eqx.tree_at(lambda k: k.summands(reflects), kernel, inner)
     if isinstance(kernel, Symmetrised):
         known = dict(zip(kernel.maps, kernel.characters, strict=True))
@@ -185,7 +185,7 @@ def symmetry_removed(kernel: AbstractScalarKernel) -> Removed | None:
     reflects = means[0].parity is not None
     if not kernel.summands(reflects):
         return None
-    inner = [each.kernel for each in known]
+    inner = tuple(each.kernel for each in known)
     return Removed(eqx.tree_at(lambda k: k.summands(reflects), kernel, inner), means)
 
 

@@ -42,6 +42,10 @@ class AbstractMatrixKernel(eqx.Module):
     def __repr__(self) -> str:
         return described(self)
 
+    def __hash__(self) -> int:
+        # Arrays have no hash. Equal kernels have equal structure, so this one fits `==`.
+        return hash(jax.tree.structure(self))
+
     @abc.abstractmethod
     def form(
         self,
