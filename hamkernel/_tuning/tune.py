@@ -206,7 +206,9 @@ def tune(
     speed = typical_speed(K, few)
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
     kept, points = tuple(frozen), rows.points
-    space = SearchSpace(K, points, speed, given.regularization, kept, bounds or {}, roundings, few.points)
+    space = SearchSpace(
+        K, points, speed, given.regularization, kept, bounds or {}, roundings, few.points
+    )
     advice.warn_of_free_scale(space, criterion)
     search = Search(space, criterion, rows, speed, starts, max_steps, optimiser, progress)
 
