@@ -18,8 +18,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._kernels.groups import identity
-from hamkernel._kernels.symmetry import Symmetrised
+from hamkernel._kernels.symmetry import Symmetrised, identity
 from hamkernel._save import description
 from hamkernel._save.bytes import sealed
 from hamkernel._save.files import load, save
