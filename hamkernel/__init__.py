@@ -57,12 +57,11 @@ from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
 from hamkernel._structures.base import Sum
 from hamkernel._structures.controlled import Controlled, InputMatrix
+from hamkernel._structures.custom_operator import Poisson, Structured
 from hamkernel._structures.masses import UnknownMasses
-from hamkernel._structures.operators import CurlFree, Symplectic
-from hamkernel._structures.own import Poisson, Structured
 from hamkernel._structures.port_hamiltonian import PortHamiltonian
+from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
 from hamkernel._structures.symmetry import Even, Invariant, Odd, Reversible
-from hamkernel._structures.without_potential import DivergenceFree, Separable
 from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.runs import Runs

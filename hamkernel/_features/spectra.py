@@ -21,8 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
-from hamkernel._kernels.arguments import divided
-from hamkernel._kernels.base import AbstractScalarKernel, ScalarProduct, ScalarSum, Scaled
+from hamkernel._kernels.base import AbstractScalarKernel, ScalarProduct, ScalarSum, Scaled, divided
 from hamkernel._kernels.dot_products import Periodic
 from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._kernels.symmetry import Symmetrised

@@ -21,7 +21,7 @@ from hamkernel._gram.dense import centred, diagonals, gram
 from hamkernel._machine.devices import Rows, as_given, rows_of, split, sum_of_columns
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.unfolded import unfolded
+from hamkernel._structures.structure import unfolded
 
 # Pairs in one tile, rows × columns: 1000 × 1000 doubles are 8 MB. Measured on two cores between
 # 125 × 4000 and 2000 × 1000, with n = 4 and 20; half and twice cost up to 15 % more.

@@ -13,14 +13,81 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._kernels.ranges import by_name
 from hamkernel._show import described, exponential, in_brackets, joined, text
+
+
+def one_point(x: ArrayLike) -> Float[Array, " n"]:
+    """`x` as a float array; a batch would silently give a wrong number."""
+    x = require.floating(x, "the point")
+    if x.ndim != 1:
+        raise ValueError(
+            f"the point has shape {x.shape}; a kernel takes one pair of points of shape (n,). Use "
+            "jax.vmap for many, or hk.gram for a Gram."
+        )
+    return x
+
+
+def divided(
+    x: Float[Array, " n"], scale: Float[Array, "..."], name: str = "lengthscale"
+) -> Float[Array, " n"]:
+    """x/scale in the dtype of x, for one point; the scale is a number, or one per coordinate."""
+    x = one_point(x)
+    if scale.ndim and scale.shape != x.shape:
+        raise ValueError(
+            f"the kernel has {scale.size} {name}s and the point has shape {x.shape}: "
+            "give one number, or one for each coordinate that the kernel sees."
+        )
+    return x / scale.astype(x.dtype)
+
+
+def log_per_coordinate(value: ArrayLike, name: str, cure: str = "") -> Float[Array, "..."]:
+    """The logarithm of a positive hyperparameter, one number or one per coordinate."""
+    array = require.positive(value, name, cure)
+    if array.ndim > 1:
+        raise ValueError(f"{name} has shape {array.shape}; it must be a number or a vector (n,).")
+    return jnp.log(array)
+
+
+def by_name(
+    name: str, leaf: Any, X: Float[np.ndarray, "N n"], amplitude: float
+) -> tuple[ArrayLike, ArrayLike]:
+    """The box of a hyperparameter of a scalar kernel, whose name says what it is."""
+    if name in ("log_lengthscale", "log_period"):
+        spacing, extent = _spacing_and_extent(X, per_coordinate=leaf.ndim > 0)
+        least, most = (0.3, 30) if name == "log_lengthscale" else (2, 10)
+        return np.log(least * spacing), np.log(most * extent)
+    if name == "log_scale":
+        return np.log(1e-5 * amplitude), np.log(1e5 * amplitude)
+    if name == "log_offset":
+        square = np.mean(np.sum(X**2, axis=1)) or 1.0
+        return np.log(1e-4 * square), np.log(1e4 * square)
+    return by_value(name, leaf)
+
+
+def by_value(name: str, leaf: Any) -> tuple[ArrayLike, ArrayLike]:
+    """The box of a number of unknown meaning, around its value."""
+    value = np.asarray(leaf)
+    reach = np.log(1e3) if name.startswith("log_") else 10 * np.maximum(1.0, np.abs(value))
+    return value - reach, value + reach
+
+
+def _spacing_and_extent(X: np.ndarray, per_coordinate: bool) -> tuple[ArrayLike, ArrayLike]:
+    """The typical distance of nearest neighbours and the extent of the data, 1 where it is 0.
+
+    The distance of N points in an extent L is taken as L / N: a fair lower bound in any dimension,
+    since points on a few trajectories lie close together along them.
+    """
+    ranges = np.ptp(X, axis=0)
+    extent = ranges if per_coordinate else np.asarray(np.linalg.norm(ranges))
+    extent = np.where(extent > 0, extent, 1.0)
+    return extent / max(len(X), 2), extent
 
 
 class Invariance(enum.Flag):
@@ -44,6 +111,10 @@ class AbstractScalarKernel(eqx.Module):
 
     def __repr__(self) -> str:
         return described(self, positional=("kernel",))
+
+    def __hash__(self) -> int:
+        # Arrays have no hash. Equal kernels have equal structure, so this one fits `==`.
+        return hash(jax.tree.structure(self))
 
     @abc.abstractmethod
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:

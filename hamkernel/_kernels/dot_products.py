@@ -6,10 +6,15 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.arguments import divided, log_per_coordinate, one_point
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance
-from hamkernel._kernels.groups import is_diagonal, is_orthogonal, is_permutation
-from hamkernel._kernels.ranges import by_name
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Invariance,
+    by_name,
+    divided,
+    log_per_coordinate,
+    one_point,
+)
+from hamkernel._kernels.symmetry import is_diagonal, is_orthogonal, is_permutation
 
 
 class Polynomial(AbstractScalarKernel):

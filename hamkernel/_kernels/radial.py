@@ -18,9 +18,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.arguments import divided, log_per_coordinate
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance
-from hamkernel._kernels.groups import is_diagonal, is_orthogonal
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance, divided, log_per_coordinate
+from hamkernel._kernels.symmetry import is_diagonal, is_orthogonal
 
 _LENGTH = "It is a length in the units of the states."
 

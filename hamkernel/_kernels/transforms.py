@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.arguments import one_point
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel, one_point
 from hamkernel._kernels.functions import as_pytree
 
 

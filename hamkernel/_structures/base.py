@@ -14,10 +14,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.arguments import one_point
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, common_invariance
-from hamkernel._kernels.groups import LinearMap
-from hamkernel._kernels.ranges import by_value
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Invariance,
+    by_value,
+    common_invariance,
+    one_point,
+)
+from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._show import call, described, joined
 
 
@@ -41,6 +45,10 @@ class AbstractMatrixKernel(eqx.Module):
 
     def __repr__(self) -> str:
         return described(self)
+
+    def __hash__(self) -> int:
+        # Arrays have no hash. Equal kernels have equal structure, so this one fits `==`.
+        return hash(jax.tree.structure(self))
 
     @abc.abstractmethod
     def form(

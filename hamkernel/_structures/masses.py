@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance
-from hamkernel._kernels.groups import LinearMap
+from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 

@@ -17,9 +17,8 @@ from jaxtyping import Array, Float
 
 from hamkernel._gram.dense import trace
 from hamkernel._gram.observed import gram_of_rows
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance, by_value
 from hamkernel._kernels.functions import Bound
-from hamkernel._kernels.ranges import by_value
 from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.rows import Rows
