@@ -23,6 +23,7 @@ above it:
     _tuning       hyperparameters, by gradients
     _trajectories from logged runs to a field
     _dynamics     simulation
+    _discovery    a formula read off the data, and which physics they obey
     _save         fields in files
     systems, plot, paper
                   example systems, pictures, the paper's experiments
@@ -36,6 +37,7 @@ from typing import TYPE_CHECKING, Any
 
 from hamkernel import poisson, systems
 from hamkernel._checks.kernel import check_kernel
+from hamkernel._discovery.readout import Formula, readout
 from hamkernel._dynamics.simulate import simulate
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.controlled import ControlledField
@@ -140,6 +142,9 @@ __all__ = [  # noqa: RUF022 - in reading order
     "Runs",
     "learn",
     "Learned",
+    # What the data say beyond the field.
+    "readout",
+    "Formula",
     # Simulation.
     "simulate",
     "ImplicitMidpoint",

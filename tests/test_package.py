@@ -31,6 +31,7 @@ ROOMS = [
     {"_validation"},
     {"_tuning"},
     {"_trajectories"},
+    {"_discovery"},
     {"_dynamics", "_save", "systems"},
     {"plot"},
     {"paper"},
