@@ -69,7 +69,7 @@ def sampled_points(
 ) -> tuple[AbstractMatrixKernel, Float[Array, "N d"]]:
     """The kernel, which knows how many inputs there are, and points (x, u), without velocities."""
     data = Equilibria(X, inputs)
-    K = counted(K, data)
+    K = with_input_count(K, data)
     (block, _), *_ = data.parts(inputs_of(K))
     return K, block.points
 
@@ -91,7 +91,7 @@ def rows_of_data(
         ValueError: inputs are missing, or cannot be told from the drift; there is one energy.
             TypeError: K takes no inputs.
     """
-    K = counted(K, data, part=beside is not None)
+    K = with_input_count(K, data, part=beside is not None)
     blocks, targets = zip(*data.parts(inputs_of(K)), strict=True)
     dtype = np.result_type(*[block.points.dtype for block in blocks])
     blocks = tuple(_cast(block, dtype) for block in blocks)
@@ -115,7 +115,7 @@ def inputs_of(K: AbstractMatrixKernel) -> int:
     return K.input_count if isinstance(K, Controlled) else 0
 
 
-def counted(
+def with_input_count(
     K: AbstractMatrixKernel, data: AbstractObservations, part: bool = False
 ) -> AbstractMatrixKernel:
     """The kernel that knows the number of inputs of the data.
