@@ -37,7 +37,8 @@ from typing import TYPE_CHECKING, Any
 
 from hamkernel import poisson, systems
 from hamkernel._checks.kernel import check_kernel
-from hamkernel._discovery.readout import Formula, readout
+from hamkernel._discovery.formula import Formula
+from hamkernel._discovery.readout import readout
 from hamkernel._dynamics.simulate import simulate
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.controlled import ControlledField

@@ -24,18 +24,17 @@ from __future__ import annotations
 
 import itertools
 import math
-import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Num
+from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._fields.base import potential_of
+from hamkernel._discovery.formula import Formula, operator_of
 from hamkernel._fields.controlled import known_of, without_inputs
 from hamkernel._gram.observed import gram_of_rows
 from hamkernel._kernels.functions import as_pytree
@@ -43,128 +42,16 @@ from hamkernel._kernels.symmetry import symmetry_removed
 from hamkernel._observations.data import inputs_of
 from hamkernel._posterior.posterior import Posterior
 from hamkernel._solvers.problem import problem
-from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.controlled import Controlled, InputMatrix
 from hamkernel._structures.masses import UnknownMasses
-from hamkernel._structures.structure import AbstractPotentialKernel, CurlFree
+from hamkernel._structures.structure import CurlFree
 from hamkernel._trajectories.learned import Learned
 
 _SUBSETS = 1_000_000  # 4 s of CPU time and 150 MB
 _AT_ONCE = 20_000  # subsets in one stack of QR factorisations
 _SAME = 1e-6  # of a function and its image under a symmetry, between rounding and a wrong sign
 _POOR = 2.0  # the misfit of a formula that leaves three quarters of its residuals unexplained
-
-
-class Formula(eqx.Module):
-    """u(x) = Σ θ_k φ_k(x), the potential as a formula; made by `readout`.
-
-    It is a field: `formula(x)` is the velocity B∇u of one state, so `hk.simulate(formula, x0, ts)`
-    follows it, and `formula.potential(x)`, of structures with an energy `formula.hamiltonian(x)`,
-    is u. A PyTree.
-
-    Attributes:
-        terms: the names of the functions that were selected, in the order of the dictionary.
-        coefficients: θ, shape (k,).
-        deviations: the standard deviations of θ, shape (k,). They count the noise and the selection
-            of the terms; the hyperparameters of the kernel, such as friction, are plugged in.
-        misfit: the root mean square of the residuals over the standard deviation √(Nλ) of the noise
-            that the fit assumed, shape (): about one where the formula explains the data as well as
-            the kernel does, larger where a term is missing.
-        probability: that of these terms among all subsets that were compared, shape ().
-        rows: the number of rows.
-        functions: the φ_k of the terms.
-        kernel: the kernel, whose B makes velocities from gradients.
-        mean: the known part of the field, to which B∇u is added; None if there is none.
-    """
-
-    terms: tuple[str, ...] = eqx.field(static=True)
-    coefficients: Float[Array, " k"]
-    deviations: Float[Array, " k"]
-    misfit: Float[Array, ""]
-    probability: Float[Array, ""]
-    rows: int = eqx.field(static=True)
-    functions: tuple[Callable[..., Any], ...]
-    kernel: AbstractMatrixKernel
-    mean: Any
-
-    # For jax.jit(formula), as of fields.
-    def __hash__(self) -> int:
-        return id(self)
-
-    def __eq__(self, other: object) -> bool:
-        return self is other
-
-    def __repr__(self) -> str:
-        signed = [
-            ("- " if value < 0 else "+ ") + f"{_with_deviation(abs(value), deviation)} {name}"
-            for name, value, deviation in self._triples()
-        ]
-        if self.mean is not None:
-            signed = ["+ (that of the mean)", *signed]
-        total = " ".join(signed)
-        total = total.removeprefix("+ ") if total.startswith("+") else "-" + total[2:]
-        return (
-            f"{self._symbol} = {total}    [misfit {float(self.misfit):.3g} of {self.rows} rows, "
-            f"probability {float(self.probability):.2f}]"
-        )
-
-    def latex(self) -> str:
-        r"""The formula in LaTeX, such as `H = 0.5002(12)\,p^{2} - 0.981(4)\,\cos(q)`.
-
-        A coefficient comes with its deviation in units of the last digit. The names of the terms
-        are written as Python and translated: powers, products, indices and common functions. A name
-        that contains a backslash is taken as LaTeX.
-        """
-        total = ""
-        for name, value, deviation in self._triples():
-            sign = "-" if value < 0 else "+" if total else ""
-            term = rf"{_with_deviation(abs(value), deviation)}\,{_latex(name)}"
-            total += f" {sign} {term}" if total else f"{sign}{term}"
-        mean = r"H_\mathrm{mean} + " if self.mean is not None and self._symbol == "H" else ""
-        mean = r"u_\mathrm{mean} + " if self.mean is not None and not mean else mean
-        return f"{self._symbol} = {mean}{total}".replace("+ -", "- ")
-
-    def _triples(self) -> Iterator[tuple[str, float, float]]:
-        values = np.asarray(self.coefficients, float), np.asarray(self.deviations, float)
-        for name, value, deviation in zip(self.terms, *values, strict=True):
-            yield name, float(value), float(deviation)
-
-    @property
-    def _symbol(self) -> str:
-        return "H" if self.kernel.has_hamiltonian else "u"
-
-    def _formula(self, x: Float[Array, " n"]) -> Float[Array, ""]:
-        theta = self.coefficients
-        values = [jnp.asarray(fn(x)).astype(theta.dtype) for fn in self.functions]
-        return theta @ jnp.stack(values)
-
-    def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
-        """The velocity B(x)∇u(x), that of the mean included; without inputs."""
-        x = require.floating(x, "x")
-        velocity = _operator(self.kernel)(x, jax.grad(self._formula)(x))
-        return velocity if self.mean is None else velocity + self.mean(x).astype(velocity.dtype)
-
-    def potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """The potential u(x), that of the mean included.
-
-        Raises:
-            AttributeError: the mean has no potential of this structure.
-        """
-        x = require.floating(x, "x")
-        value = self._formula(x)
-        return value if self.mean is None else value + potential_of(self.mean, self.kernel)(x)
-
-    def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """The energy H(x), that of the mean included.
-
-        Raises:
-            AttributeError: the structure has no energy, or the mean has none.
-        """
-        if not self.kernel.has_hamiltonian:
-            raise AttributeError(
-                f"the fields of {type(self.kernel).__name__} have no energy: ask for potential(x)."
-            )
-        return self.potential(x)
 
 
 def readout(
@@ -290,20 +177,6 @@ def _checked(terms: Any, rows: Any) -> tuple[list[str], list[Callable[..., Any]]
     return list(terms), [as_pytree(fn) for fn in terms.values()]
 
 
-def _operator(K: AbstractMatrixKernel) -> Callable[[Array, Array], Array]:
-    """(x, v) -> B(x) v."""
-    if isinstance(K, Controlled):
-        return _operator(K.drift)
-    if isinstance(K, Sum):  # its terms share one operator, or it would have no potential
-        return _operator(K.terms[0])
-    if isinstance(K, UnknownMasses):  # S⁻¹ B S⁻ᵀ in the coordinates y = S⁻¹x
-        inner = _operator(K.kernel)
-        return lambda y, v: K.to_velocities(inner(K.to_momenta(y), K.to_velocities(v)))
-    if isinstance(K, AbstractPotentialKernel):
-        return K.apply
-    raise TypeError(f"{type(K).__name__} does not say by which operator its fields are made.")
-
-
 def _check_symmetry(K: Any, names: list[str], functions: list[Any], rows: Any) -> None:
     """ValueError where the symmetry of the kernel forbids a term."""
     K = K.drift if isinstance(K, Controlled) else K
@@ -344,7 +217,7 @@ def _regression(
     With an unknown input matrix the rows of G(x)u have the covariance C, and rows are multiplied
     by R⁻ᵀ with RᵀR = I + C/ridge: generalised least squares, with G integrated out.
     """
-    of_fields, of_values = _of_dictionary(_operator(K), tuple(functions), rows.dimension)
+    of_fields, of_values = _of_dictionary(operator_of(K), tuple(functions), rows.dimension)
     columns, typical = [], []
     for block in rows.blocks:
         values = (of_values if block.of_values else of_fields)(block.points)
@@ -462,7 +335,7 @@ def _selected(columns: np.ndarray, y: np.ndarray, most: int) -> _Selection:
             f"terms or a smaller `most`, for at most {_SUBSETS} subsets."
         )
     sizes = np.linalg.norm(columns, axis=0)
-    T = np.linalg.qr(np.column_stack([columns / sizes, y]), mode="r")
+    T = np.asarray(np.linalg.qr(np.column_stack([columns / sizes, y]), mode="r"))
     # Below the rounding of y there is no residual that could be compared.
     floor = (np.finfo(float).eps * np.linalg.norm(y)) ** 2 * R
     scores, every = [], []
@@ -503,34 +376,9 @@ def _least_squares(T: np.ndarray, some: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Coefficients (c, k), the diagonals of (ΦᵀΦ)⁻¹ (c, k), and residual squares (c,)."""
     c, k = some.shape
     y = np.broadcast_to(T[:, -1:], (c, len(T), 1))
-    triangle = np.linalg.qr(np.concatenate([np.moveaxis(T[:, some], 0, 1), y], axis=2), mode="r")
+    stack = np.concatenate([np.moveaxis(T[:, some], 0, 1), y], axis=2)
+    triangle = np.asarray(np.linalg.qr(stack, mode="r"))
     left = triangle[:, :k, :k]
     inverse = np.linalg.inv(left)
     theta = (inverse @ triangle[:, :k, k:])[..., 0]
     return theta, (inverse**2).sum(axis=2), triangle[:, k, k] ** 2
-
-
-def _with_deviation(value: float, deviation: float) -> str:
-    """`0.981(4)`: a positive number with its deviation in units of the last digit shown."""
-    if not (deviation > 0 and math.isfinite(deviation)) or deviation < 1e-12 * value:
-        return f"{value:.6g}"
-    power = math.floor(math.log10(deviation))
-    digits = round(deviation / 10.0**power)
-    if digits < 3:  # 0.981(12), and not 0.98(1), which is off by half
-        power, digits = power - 1, round(deviation / 10.0 ** (power - 1))
-    if power > 0:
-        return f"{round(value, -power):.0f}({digits * 10**power})"
-    return f"{value:.{-power}f}({digits})"
-
-
-_FUNCTIONS = "sin|cos|tan|sinh|cosh|tanh|exp|log|sqrt|arctan"
-
-
-def _latex(name: str) -> str:
-    """A name written as Python, in LaTeX."""
-    if "\\" in name:
-        return name
-    name = re.sub(r"\*\*\s*\(([^()]*)\)|\*\*\s*(-?[\w.]+)", lambda m: f"^{{{m[1] or m[2]}}}", name)
-    name = re.sub(rf"\b({_FUNCTIONS})\b", r"\\\1", name)
-    name = re.sub(r"(?<![\\\w])([A-Za-z])_?(\d+)\b", r"\1_{\2}", name)
-    return re.sub(r"\s*\*\s*", r"\\,", name)
