@@ -294,7 +294,7 @@ def test_what_has_no_measurements_no_potential_or_too_many_subsets_is_refused():
 def test_the_hamiltonian_of_a_pendulum_is_read_off_noisy_runs():
     system = hk.systems.Pendulum(mass=1.0, length=1.0, gravity=1.0)
     times = np.linspace(0.0, 9.0, 61)
-    paths = np.asarray(hk.systems.sample(system, [[2.2, 0.0], [0.0, 1.2]], times)[0])
+    paths = np.asarray(hk.systems.sample(system, np.array([[2.2, 0.0], [0.0, 1.2]]), times)[0])
     states = paths + 0.01 * np.random.default_rng(0).normal(size=paths.shape)
     learned = hk.learn(hk.Symplectic(hk.Gaussian(1.0)), hk.Runs([times] * 2, list(states)))
     found = hk.readout(learned, TERMS)
