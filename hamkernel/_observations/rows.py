@@ -15,7 +15,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable
 
-import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -23,7 +23,9 @@ from jaxtyping import Array, Float, Int
 from hamkernel._observations.blocks import AbstractBlock, Components, merged
 
 
-class Rows(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Rows:
     """All rows of some observations.
 
     Attributes:

@@ -25,7 +25,9 @@ from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.controlled import Controlled
 
 
-class Problem(eqx.Module):
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Problem:
     """y = L f + ε for f ~ GP(known, kernel), y less the rows of what is known.
 
     Attributes:
