@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._machine import threads
-from hamkernel._machine.threads import one_blas_thread
+from hamkernel._machine import one_blas_thread, threads
 
 X = np.random.default_rng(0).normal(size=(12, 2))
 Y = X @ np.array([[0.0, -1.0], [1.0, 0.0]])

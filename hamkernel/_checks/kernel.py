@@ -26,7 +26,7 @@ from hamkernel import _require as require
 from hamkernel._checks.limit import PROFILE, check_limit, near_blocks, neighbours_of
 from hamkernel._checks.pairs import Pairs, evaluate, lowest, mixed
 from hamkernel._kernels.base import UserKernel, as_scalar_kernel
-from hamkernel._machine.threads import one_blas_thread
+from hamkernel._machine import one_blas_thread
 
 _NEAR_POINTS = 8  # points whose diagonal block is compared with its neighbours
 _GRAM_POINTS, _GRAM_ROWS = 64, 256  # caps on the Grams whose eigenvalues are taken
