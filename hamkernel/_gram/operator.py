@@ -21,7 +21,7 @@ from hamkernel._gram.dense import centred, diagonals, gram
 from hamkernel._machine import RowSharding, as_given, rows_of, split, sum_of_columns
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.structure import unfolded
+from hamkernel._structures.structure import group_expanded
 
 # Pairs in one tile, rows × columns: 1000 × 1000 doubles are 8 MB. Measured on two cores between
 # 125 × 4000 and 2000 × 1000, with n = 4 and 20; half and twice cost up to 15 % more.
@@ -156,7 +156,7 @@ _product = eqx.filter_jit(product)
 
 def _tiled(K, X, Z, A):
     """`product` on one device."""
-    K, Z, A = unfolded(K, Z, A.astype(X.dtype))
+    K, Z, A = group_expanded(K, Z, A.astype(X.dtype))
     X, Z = centred(K, X, Z)
     rows = tiles(X, X[:1], ROWS)
     columns = (tiles(Z, Z[:1], COLUMNS), tiles(A, jnp.zeros_like(A[:1]), COLUMNS))

@@ -55,39 +55,28 @@ def log_per_coordinate(value: ArrayLike, name: str, cure: str = "") -> Float[Arr
     return jnp.log(array)
 
 
-def by_name(
-    name: str, leaf: Any, X: Float[np.ndarray, "N n"], amplitude: float
-) -> tuple[ArrayLike, ArrayLike]:
-    """The box of a hyperparameter of a scalar kernel, whose name says what it is."""
-    if name in ("log_lengthscale", "log_period"):
-        spacing, extent = _spacing_and_extent(X, per_coordinate=leaf.ndim > 0)
-        least, most = (0.3, 30) if name == "log_lengthscale" else (2, 10)
-        return np.log(least * spacing), np.log(most * extent)
-    if name == "log_scale":
-        return np.log(1e-5 * amplitude), np.log(1e5 * amplitude)
-    if name == "log_offset":
-        square = np.mean(np.sum(X**2, axis=1)) or 1.0
-        return np.log(1e-4 * square), np.log(1e4 * square)
-    return by_value(name, leaf)
+def bounds_by_value(name: str, leaf: Any) -> tuple[ArrayLike, ArrayLike]:
+    """The bounds of a number of unknown meaning, around its value: its logarithm by three decades.
 
-
-def by_value(name: str, leaf: Any) -> tuple[ArrayLike, ArrayLike]:
-    """The box of a number of unknown meaning, around its value."""
+    Numbers that are stored as they are may move by ten times their size, or by ten.
+    """
     value = np.asarray(leaf)
     reach = np.log(1e3) if name.startswith("log_") else 10 * np.maximum(1.0, np.abs(value))
     return value - reach, value + reach
 
 
-def _spacing_and_extent(X: np.ndarray, per_coordinate: bool) -> tuple[ArrayLike, ArrayLike]:
-    """The typical distance of nearest neighbours and the extent of the data, 1 where it is 0.
+def bounds_of_length(
+    leaf: Any, X: Float[np.ndarray, "N n"], least: float, most: float
+) -> tuple[ArrayLike, ArrayLike]:
+    """The bounds of the logarithm of a length, from `least` spacings to `most` extents of the data.
 
-    The distance of N points in an extent L is taken as L / N: a fair lower bound in any dimension,
-    since points on a few trajectories lie close together along them.
+    The spacing of N points in an extent L is taken as L / N: a fair lower bound in any dimension,
+    since points on a few trajectories lie close together along them. An extent of 0 counts as 1.
     """
     ranges = np.ptp(X, axis=0)
-    extent = ranges if per_coordinate else np.asarray(np.linalg.norm(ranges))
+    extent = ranges if leaf.ndim > 0 else np.asarray(np.linalg.norm(ranges))
     extent = np.where(extent > 0, extent, 1.0)
-    return extent / max(len(X), 2), extent
+    return np.log(least * extent / max(len(X), 2)), np.log(most * extent)
 
 
 class Invariance(enum.Flag):
@@ -151,16 +140,19 @@ class AbstractScalarKernel(eqx.Module):
         """Whether a trained factor multiplies all of k; None in its place does not count."""
         return False
 
-    def box(
+    def bounds(
         self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
     ) -> tuple[ArrayLike, ArrayLike]:
-        """The lower and upper bound of the array `name`, as stored.
+        """The lower and upper bound of the array `name`, as stored, for `tune`.
 
-        `X` is the data in the coordinates that k sees, and `amplitude` a plausible factor of k.
+        Args:
+            name: an attribute, such as `log_lengthscale`.
+            X: the data in the coordinates that k sees.
+            amplitude: a plausible factor of k, which gives fields the size of the velocities.
         """
-        return by_name(name, getattr(self, name), X, amplitude)
+        return bounds_by_value(name, getattr(self, name))
 
-    def seen(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
+    def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
         """The data in the coordinates of the kernels inside."""
         return X
 
@@ -273,6 +265,11 @@ class Scaled(AbstractScalarKernel):
     @property
     def scale(self) -> Float[Array, ""]:
         return jnp.exp(self.log_scale)
+
+    def bounds(
+        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
+    ) -> tuple[ArrayLike, ArrayLike]:
+        return np.log(1e-5 * amplitude), np.log(1e5 * amplitude)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         value = self.kernel(x, z)

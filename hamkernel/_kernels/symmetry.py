@@ -301,9 +301,17 @@ def symmetrised(
         if given.keys() <= known.keys():
             return kernel
         both = known | given
-        return Symmetrised(kernel.kernel, tuple(both), tuple(both.values()))
+        return _checked(Symmetrised(kernel.kernel, tuple(both), tuple(both.values())))
     known = Invariance.REFLECTION in kernel.invariance if reflects else None
-    return Symmetrised(kernel, maps, characters, known)
+    return _checked(Symmetrised(kernel, maps, characters, known))
+
+
+def _checked(kernel: Symmetrised) -> Symmetrised:
+    """The kernel, once its group closes; maps that are functions tell no dimension to check in."""
+    matrices = [each for each in kernel.maps if not callable(each)]
+    if matrices:
+        kernel.group(len(matrices[0]))
+    return kernel
 
 
 def with_parity(kernel: AbstractScalarKernel, parity: int) -> AbstractScalarKernel:

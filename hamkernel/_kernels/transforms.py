@@ -63,7 +63,7 @@ class Warp(AbstractScalarKernel):
     def has_amplitude(self) -> bool:
         return self.kernel.has_amplitude
 
-    def seen(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
+    def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
         return np.asarray(jax.vmap(self.warped)(jnp.asarray(X)))
 
 
@@ -134,5 +134,5 @@ class Select(AbstractScalarKernel):
     def has_amplitude(self) -> bool:
         return self.kernel.has_amplitude
 
-    def seen(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
+    def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
         return X[:, list(self.dims)]

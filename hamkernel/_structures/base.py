@@ -17,7 +17,7 @@ from hamkernel import _require as require
 from hamkernel._kernels.base import (
     AbstractScalarKernel,
     Invariance,
-    by_value,
+    bounds_by_value,
     common_invariance,
     one_point,
 )
@@ -127,13 +127,13 @@ class AbstractMatrixKernel(eqx.Module):
     def averaged(self, maps: tuple[LinearMap, ...]) -> "AbstractMatrixKernel":
         """The kernel of the fields whose potential none of these maps changes."""
 
-    def box(
+    def bounds(
         self, name: str, X: Float[np.ndarray, "N d"], amplitude: float
     ) -> tuple[ArrayLike, ArrayLike]:
         """The lower and upper bound of the array `name`, as stored, as those of scalar kernels."""
-        return by_value(name, getattr(self, name))
+        return bounds_by_value(name, getattr(self, name))
 
-    def seen(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
+    def transform_inputs(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
         """The data in the coordinates of the kernels inside."""
         return X
 

@@ -262,7 +262,7 @@ class Controlled(AbstractMatrixKernel):
     def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
         raise TypeError("say the symmetry of the drift: Controlled(Invariant(K, maps), inputs=…).")
 
-    def seen(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
+    def transform_inputs(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
         return self._split(X)[0]
 
     @property

@@ -22,7 +22,7 @@ _FEW = 16  # points at which a symmetry of B is checked: one would do, but for z
 _SYMMETRIC = 1e-6  # of Π at the data: rounding in float32 leaves 1e-7, a wrong sign 1
 
 
-class AbstractOwnOperator(AbstractPotentialKernel):
+class AbstractCustomOperator(AbstractPotentialKernel):
     """B(x) is a function of the caller's, the attribute that `role` names."""
 
     role: AbstractClassVar[str]
@@ -73,7 +73,7 @@ class AbstractOwnOperator(AbstractPotentialKernel):
         check_symmetries(self, X[:_FEW])
 
 
-class Structured(AbstractOwnOperator):
+class Structured(AbstractCustomOperator):
     """K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ: fields f = B(x)∇H for an operator B of your own.
 
     The rest of the library works with it: `tune` tunes the arrays in B, a field has its
@@ -116,7 +116,7 @@ class Structured(AbstractOwnOperator):
         del matrices, X
 
 
-class Poisson(AbstractOwnOperator):
+class Poisson(AbstractCustomOperator):
     """K(x, z) = Π(x) [∂x ∂zᵀ k(x, z)] Π(z)ᵀ: Poisson systems f = Π(x)∇H, Π antisymmetric.
 
     Any n, even or odd: dH/dt = ∇HᵀΠ∇H = 0, and every field conserves the Casimirs C, Π(x)∇C = 0.
@@ -163,6 +163,8 @@ class Poisson(AbstractOwnOperator):
 
 
 def _checked(fn: Any, whose: str, name: str) -> Operator:
+    if fn is charged_particle:
+        raise TypeError(_NO_TENSOR)
     if isinstance(fn, type) or not callable(fn):
         raise TypeError(
             f"{whose}(k, {name}) needs a function x (n,) -> (n, n) as {name}; got {fn!r}. A "
@@ -171,7 +173,29 @@ def _checked(fn: Any, whose: str, name: str) -> Operator:
     return as_pytree(fn)
 
 
-class RigidBodyTensor(eqx.Module):
+_NO_TENSOR = (
+    "charged_particle makes a tensor and is not one itself: give it the magnetic field, "
+    "hk.Poisson(k, hk.poisson.charged_particle(1.0))."
+)
+
+
+class _AbstractTensor(eqx.Module):
+    """A tensor Π of this library."""
+
+    @abc.abstractmethod
+    def _at(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+        """Π(x) at one state."""
+
+    def __call__(self, *x: Float[Array, " n"]) -> Float[Array, "n n"]:
+        if len(x) != 1 or jnp.ndim(x[0]) == 0:
+            raise TypeError(
+                f"{self!r} is a tensor itself, a function of one state (n,), and makes none: write "
+                f"hk.Poisson(k, hk.poisson.{self!r}), without brackets or parameters after it."
+            )
+        return self._at(x[0])
+
+
+class RigidBodyTensor(_AbstractTensor):
     """Π(L) v = L × v: the free rigid body, L̇ = L × ∇H(L), L the angular momentum in the body.
 
     n = 3. The Casimir is |L|². ∇H is the angular velocity.
@@ -180,11 +204,11 @@ class RigidBodyTensor(eqx.Module):
     def __repr__(self) -> str:
         return "rigid_body"
 
-    def __call__(self, x: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    def _at(self, x: Float[Array, "3"]) -> Float[Array, "3 3"]:
         return _cross(require.point(x, 3, "the state of rigid_body"))
 
 
-class LotkaVolterraTensor(eqx.Module):
+class LotkaVolterraTensor(_AbstractTensor):
     """Π(x, y) = [[0, −xy], [xy, 0]]: prey x and predators y, n = 2.
 
     With H = δx − γ log x + βy − α log y it gives ẋ = αx − βxy and ẏ = δxy − γy. In the logarithms
@@ -194,14 +218,14 @@ class LotkaVolterraTensor(eqx.Module):
     def __repr__(self) -> str:
         return "lotka_volterra"
 
-    def __call__(self, x: Float[Array, "2"]) -> Float[Array, "2 2"]:
+    def _at(self, x: Float[Array, "2"]) -> Float[Array, "2 2"]:
         prey, predators = require.point(x, 2, "the state of lotka_volterra")
         product = prey * predators
         zero = jnp.zeros_like(product)
         return jnp.stack([jnp.stack([zero, -product]), jnp.stack([product, zero])])
 
 
-class ChargedParticleTensor(eqx.Module):
+class ChargedParticleTensor(_AbstractTensor):
     """Π(q, p) = [[0, I], [−I, F(q)]], F v = v × B: a charge in a magnetic field B, as e·B.
 
     p is the kinetic momentum mq̇, so that H = |p|²/(2m) + U(q) contains no vector potential.
@@ -215,7 +239,7 @@ class ChargedParticleTensor(eqx.Module):
             "charged_particle", [text(self.field if self.constant is None else self.constant)]
         )
 
-    def __call__(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+    def _at(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
         n = len(x)
         if n not in (4, 6):
             raise ValueError(
@@ -272,10 +296,7 @@ def charged_particle(
     Source: Littlejohn (1979), J. Math. Phys. 20, 2445, eq. (5).
     """
     if not require.is_concrete(magnetic_field):
-        raise TypeError(
-            "charged_particle makes a tensor and is not one itself: give it the magnetic field, "
-            "hk.Poisson(k, hk.poisson.charged_particle(1.0))."
-        )
+        raise TypeError(_NO_TENSOR)
     if callable(magnetic_field):
         return ChargedParticleTensor(as_pytree(magnetic_field), None)
     array = np.atleast_1d(np.asarray(require.floating(magnetic_field, "the magnetic field"), float))

@@ -169,7 +169,7 @@ class UnknownMasses(AbstractMatrixKernel):
     def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
         raise TypeError("say the symmetry inside: UnknownMasses(Invariant(K, maps), masses).")
 
-    def seen(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
+    def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
         return np.asarray(self.to_momenta(jnp.asarray(X)))
 
     @property

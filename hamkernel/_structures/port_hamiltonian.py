@@ -112,7 +112,7 @@ class PortHamiltonian(AbstractPotentialKernel):
         general = eqx.tree_at(lambda K: K.log_friction, self, stand_in)
         return general.apply(x, jnp.eye(len(x), dtype=x.dtype))
 
-    def box(
+    def bounds(
         self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
     ) -> tuple[ArrayLike, ArrayLike]:
         """Bounds for log r: an oscillation of extents (Δq, Δp) in X is critical near r = Δp/Δq."""

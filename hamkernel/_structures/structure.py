@@ -73,8 +73,13 @@ class AbstractStructure(AbstractMatrixKernel):
         return tree == other_tree and not any(map(eqx.is_array, own)) and own == others
 
     @abc.abstractmethod
-    def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"] | None:
-        """T such that what k(x, Sz) in place of k(x, z) makes of a is the same of Sz and Ta."""
+    def transformed_coefficients(
+        self, S: Float[np.ndarray, "n n"]
+    ) -> Float[np.ndarray, "n n"] | None:
+        """The matrix T that turns the coefficient a of a point z into that of its image S z.
+
+        K built from k(x, Sz), times a, is K(x, Sz) built from k, times Ta. None if T is unknown.
+        """
 
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
@@ -195,7 +200,9 @@ class AbstractPotentialKernel(AbstractStructure):
         """B(x) for all values of what is trained in it: where a symmetry of B must hold."""
         return self.apply(x, jnp.eye(len(x), dtype=x.dtype))
 
-    def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"] | None:
+    def transformed_coefficients(
+        self, S: Float[np.ndarray, "n n"]
+    ) -> Float[np.ndarray, "n n"] | None:
         # S B(z)ᵀ = ± B(Sz)ᵀ S⁻ᵀ, where B(Sz) = ± S B(z) Sᵀ: of a B(x) the sign is not known here.
         if Invariance.TRANSLATION not in self.operator_invariance:
             return S if np.array_equal(S, np.eye(len(S))) else None
@@ -309,7 +316,7 @@ class Separable(AbstractStructure):
     ) -> Float[Array, " n"]:
         return row(self.kernel, x, Z) @ A
 
-    def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    def transformed_coefficients(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
         return np.eye(len(S))
 
 
@@ -359,8 +366,18 @@ class DivergenceFree(AbstractStructure):
         basis = jnp.eye(len(x), dtype=x.dtype)
         return jax.vmap(term)(basis).sum(axis=0)
 
-    def carried(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-        return S  # ±1, see `check_dimension`
+    def transformed_coefficients(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+        return S  # ±1, see `__check_init__`
+
+    def __check_init__(self):
+        if any(mean.parity is None for mean in symmetries(self.kernel)):
+            self.averaged(())
+
+    def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractStructure:
+        raise ValueError(
+            "a DivergenceFree field gets no symmetry from its matrix potential but Odd and Even: "
+            "use Symplectic(Invariant(k, maps)) or CurlFree(Invariant(k, maps))."
+        )
 
     def check_dimension(self, n: int) -> None:
         if n < 2:
@@ -368,24 +385,20 @@ class DivergenceFree(AbstractStructure):
                 f"a DivergenceFree kernel needs n >= 2, got n = {n}: on a line such a field "
                 "is constant."
             )
-        if any(mean.parity is None for mean in symmetries(self.kernel)):
-            raise ValueError(
-                "a DivergenceFree field gets no symmetry from its matrix potential but Odd and "
-                "Even: use Symplectic(Invariant(k, maps)) or CurlFree(Invariant(k, maps))."
-            )
 
 
-def unfolded(
+def group_expanded(
     K: AbstractMatrixKernel, Z: Float[Array, "M n"], A: Float[Array, "M n"]
 ) -> tuple[AbstractMatrixKernel, Float[Array, "L n"], Float[Array, "L n"]]:
-    """A kernel, points and coefficients with the expansion of K, Z, A, without its group.
+    """The kernel without its group, with the images of the points and their coefficients.
 
-    A one-sided mean over |G| maps is a sum over |G| times the points: with B(hz)ᵀ = ± h B(z)ᵀ hᵀ
+    The expansion Σ K(x, zⱼ) aⱼ stays the same. A one-sided mean over |G| maps is a sum over |G|
+    times as many points: with B(hz)ᵀ = ± h B(z)ᵀ hᵀ
 
         Σⱼ ∂x ∂zᵀ k(x, hzⱼ) B(zⱼ)ᵀ aⱼ = ± Σⱼ (∂x ∂₂ᵀ k)(x, hzⱼ) B(hzⱼ)ᵀ h⁻ᵀ aⱼ.
 
     In a sum over many pairs this is cheaper than all terms at once, which fill the registers.
-    K, Z and A themselves where K is of another form.
+    K, Z and A come back as they are where K has no group, or one that is not one-sided.
     """
     if not isinstance(K, AbstractStructure):
         return K, Z, A
@@ -394,12 +407,12 @@ def unfolded(
     if found is None or not found.is_one_sided(n):
         return K, Z, A
     group = found.group(n)
-    carried = [K.carried(h.matrix) for h in group]
-    known = [T for T in carried if T is not None]
-    if len(known) < len(group):
-        return K, Z, A
-    images = jnp.concatenate([jax.vmap(h)(Z) for h in group])
-    pairs = zip(group, known, strict=True)
-    moved = [jax.vmap(h._replace(matrix=h.character * T))(A) for h, T in pairs]
+    images, coefficients = [], []
+    for h in group:
+        T = K.transformed_coefficients(h.matrix)
+        if T is None:
+            return K, Z, A
+        images.append(jax.vmap(h)(Z))
+        coefficients.append(jax.vmap(h._replace(matrix=h.character * T))(A))
     K = eqx.tree_at(lambda K: K.kernel, K, found.kernel)
-    return K, images, jnp.concatenate(moved) / len(group)
+    return K, jnp.concatenate(images), jnp.concatenate(coefficients) / len(group)

@@ -1,7 +1,7 @@
 """The hyperparameters of a kernel, with the boxes that it takes from the data.
 
-Every kernel says of its own arrays where to look for them, `box`, and what data the kernels inside
-it see, `seen`: behind a `Select` or a `Warp` it is transformed first.
+Every kernel gives the bounds of its own arrays, `bounds`, and the data in the coordinates that the
+kernels inside it see, `transform_inputs`: a `Select` or a `Warp` transforms them first.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from hamkernel._gram.dense import trace
 from hamkernel._gram.observed import gram_of_rows
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, by_value
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance, bounds_by_value
 from hamkernel._kernels.functions import Bound
 from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._observations.blocks import Components
@@ -120,7 +120,7 @@ def _amplitude(K: AbstractMatrixKernel, X: Array, speed: float) -> float:
 def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterator[Hyperparameter]:
     """Walk the kernel; X is the data in the coordinates that `node` sees."""
     kernel = node if isinstance(node, AbstractScalarKernel | AbstractMatrixKernel) else None
-    inside = X if kernel is None else kernel.seen(X)
+    inside = X if kernel is None else kernel.transform_inputs(X)
     for key, child in _children(node):
         if eqx.is_inexact_array(child):
             name = keystr((*path, *key)).removeprefix(".")
@@ -130,7 +130,11 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
                     "real and imaginary parts as two arrays."
                 )
             head, dot, last = name.rpartition(".")
-            box = by_value(last, child) if kernel is None else kernel.box(last, X, amplitude)
+            box = (
+                bounds_by_value(last, child)
+                if kernel is None
+                else kernel.bounds(last, X, amplitude)
+            )
             yield Hyperparameter(
                 # `terms[0].kernel.lengthscale` for the leaf `.terms[0].kernel.log_lengthscale`
                 name=head + dot + last.removeprefix("log_"),
