@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Num
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import UserKernel, as_scalar_kernel
-from hamkernel._machine.threads import one_blas_thread
+from hamkernel._machine import one_blas_thread
 
 _POINTS, _GRAM_ROWS = 8, 256  # points that meet neighbours; rows of the Gram of blocks
 # Between M(x, x) and all of its near neighbours, relative to the larger of both: a sound kernel
