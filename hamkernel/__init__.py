@@ -15,7 +15,6 @@ above it:
     _gram         the Gram: dense, as an operator, and its derivatives
     _factors      factors of G + ridge I, dense and of low rank
     _features     random Fourier features
-    _checks       the test of a kernel
     _fields       what is learned: f and its potential
     _solvers      how it is solved: dense, by conjugate gradients, of low rank, from streams
     _posterior    a field with its uncertainty
@@ -36,7 +35,6 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from hamkernel import poisson, systems
-from hamkernel._checks.kernel import check_kernel
 from hamkernel._discovery.formula import Formula
 from hamkernel._discovery.readout import readout
 from hamkernel._dynamics.simulate import simulate
@@ -46,6 +44,7 @@ from hamkernel._fields.features import FeatureField
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import gram
 from hamkernel._gram.operator import gram_operator
+from hamkernel._kernels.check import check_kernel
 from hamkernel._kernels.dot_products import Periodic, Polynomial
 from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._kernels.transforms import Select, Warp

@@ -19,7 +19,7 @@ import scipy.stats
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._machine.batches import orthonormal
+from hamkernel._machine import orthonormal
 from hamkernel._trajectories.evidence import (
     Model,
     _loss,

@@ -24,7 +24,7 @@ ROOMS = [
     {"_observations"},
     {"_gram"},
     {"_factors"},
-    {"_features", "_checks"},
+    {"_features"},
     {"_fields"},
     {"_solvers"},
     {"_posterior"},

@@ -26,7 +26,7 @@ from hamkernel._kernels.dot_products import Periodic
 from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._kernels.symmetry import Symmetrised
 from hamkernel._kernels.transforms import Select
-from hamkernel._machine.batches import orthonormal
+from hamkernel._machine import orthonormal
 from hamkernel._structures.controlled import Constant
 
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._gram.dense import centred, diagonals, gram
-from hamkernel._machine.devices import Rows, as_given, rows_of, split, sum_of_columns
+from hamkernel._machine import RowSharding, as_given, rows_of, split, sum_of_columns
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.structure import group_expanded
@@ -75,8 +75,8 @@ class GramOperator(lx.AbstractLinearOperator):
     kernel: AbstractMatrixKernel
     X: Float[Array, "N n"]
     Z: Float[Array, "M n"] | None
-    X_rows: Rows | None = eqx.field(static=True, default=None)
-    Z_rows: Rows | None = eqx.field(static=True, default=None)
+    X_rows: RowSharding | None = eqx.field(static=True, default=None)
+    Z_rows: RowSharding | None = eqx.field(static=True, default=None)
 
     def __repr__(self) -> str:
         return described(self)
@@ -127,8 +127,8 @@ def product(
     X: Float[Array, "N n"],
     Z: Float[Array, "M n"],
     A: Float[Array, "M n"],
-    X_rows: Rows | None = None,
-    Z_rows: Rows | None = None,
+    X_rows: RowSharding | None = None,
+    Z_rows: RowSharding | None = None,
 ) -> Float[Array, "N n"]:
     """Σⱼ K(xᵢ, zⱼ) aⱼ for all i, tile by tile, on the devices where the rows are."""
     return sum_of_columns(_tiled, K, X, Z, A, X_rows, Z_rows)

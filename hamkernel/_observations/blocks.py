@@ -63,15 +63,15 @@ class AbstractBlock(eqx.Module):
         """The transpose of `rows`."""
 
     @abc.abstractmethod
-    def then(self, other: "AbstractBlock") -> "AbstractBlock | None":
+    def merge(self, other: "AbstractBlock") -> "AbstractBlock | None":
         """One block of these rows and then the others; None if they are of another kind."""
 
     @abc.abstractmethod
-    def at(self, points: Float[Array, "P d"]) -> "AbstractBlock":
+    def with_points(self, points: Float[Array, "P d"]) -> "AbstractBlock":
         """All components of the field, or the potential, at other points, without noise."""
 
     @abc.abstractmethod
-    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+    def subset(self, chosen: Int[np.ndarray, " C"]) -> "Subset":
         """The block of some observations, counted from 0 and in order.
 
         Returns:
@@ -126,7 +126,7 @@ class Components(AbstractBlock):
             c = jnp.zeros(math.prod(self.values_shape), c.dtype).at[self.kept].set(c)
         return c.reshape(self.values_shape)
 
-    def then(self, other: AbstractBlock) -> "Components | None":
+    def merge(self, other: AbstractBlock) -> "Components | None":
         if not isinstance(other, Components) or self.outputs != other.outputs:
             return None
         kept = noise = None
@@ -141,10 +141,10 @@ class Components(AbstractBlock):
             noise = jnp.concatenate([self.scale, other.scale])
         return Components(jnp.concatenate([self.points, other.points]), kept, noise, self.outputs)
 
-    def at(self, points: Float[Array, "P d"]) -> "Components":
+    def with_points(self, points: Float[Array, "P d"]) -> "Components":
         return Components(points, outputs=self.outputs)
 
-    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+    def subset(self, chosen: Int[np.ndarray, " C"]) -> "Subset":
         rows = np.flatnonzero(np.isin(self.labels(), chosen))
         kept = self.kept
         if kept is not None:
@@ -200,16 +200,16 @@ class Combinations(AbstractBlock):
         S, R, Q, n = self.weights.shape
         return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(S * Q, n)
 
-    def then(self, other: AbstractBlock) -> "Combinations | None":
+    def merge(self, other: AbstractBlock) -> "Combinations | None":
         if not isinstance(other, Combinations) or self.weights.shape[1:] != other.weights.shape[1:]:
             return None
         pairs = (self.groups, other.groups), (self.weights, other.weights)
         return Combinations(*map(jnp.concatenate, pairs))
 
-    def at(self, points: Float[Array, "P d"]) -> Components:
+    def with_points(self, points: Float[Array, "P d"]) -> Components:
         return Components(points, outputs=self.weights.shape[3])
 
-    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+    def subset(self, chosen: Int[np.ndarray, " C"]) -> "Subset":
         # Whole groups: the rows of one share its points.
         R = self.weights.shape[1]
         groups = np.unique(chosen // R)
@@ -254,7 +254,7 @@ class Values(AbstractBlock):
     def coefficients(self, c: Float[Array, " E"]) -> Float[Array, " E"]:
         return c if self.noise is None else c / self.noise
 
-    def then(self, other: AbstractBlock) -> "Values | None":
+    def merge(self, other: AbstractBlock) -> "Values | None":
         if not isinstance(other, Values):
             return None
         noise = None
@@ -262,10 +262,10 @@ class Values(AbstractBlock):
             noise = jnp.concatenate([self.scale, other.scale])
         return Values(jnp.concatenate([self.points, other.points]), noise, self.outputs)
 
-    def at(self, points: Float[Array, "E d"]) -> "Values":
+    def with_points(self, points: Float[Array, "E d"]) -> "Values":
         return Values(points, outputs=self.outputs)
 
-    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+    def subset(self, chosen: Int[np.ndarray, " C"]) -> "Subset":
         points, noise = _taken(self.points, chosen), _taken(self.noise, chosen)
         return Values(points, noise, self.outputs), chosen, chosen
 
@@ -275,14 +275,14 @@ def _taken(array: Array | None, index: Int[np.ndarray, " C"]) -> Any:
     return None if array is None else jnp.asarray(np.asarray(array)[index])
 
 
-Some = tuple[AbstractBlock, Int[np.ndarray, " rows"], Int[np.ndarray, " observations"]]
+Subset = tuple[AbstractBlock, Int[np.ndarray, " rows"], Int[np.ndarray, " observations"]]
 
 
 def merged(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:
     """The same rows in fewer blocks, where neighbours are of one kind: there is less to compile."""
     found: list[AbstractBlock] = []
     for block in blocks:
-        both = found[-1].then(block) if found else None
+        both = found[-1].merge(block) if found else None
         found = [*found[:-1], both] if both is not None else [*found, block]
     return tuple(found)
 

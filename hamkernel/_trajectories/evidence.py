@@ -24,8 +24,8 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._gram.dense import assemble
-from hamkernel._gram.derivatives import trained
-from hamkernel._machine.batches import orthonormal
+from hamkernel._gram.derivatives import forward_differentiated
+from hamkernel._machine import orthonormal
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._trajectories.descent import HUGE, minimise
 from hamkernel._trajectories.rows import Rows, accumulated
@@ -48,7 +48,7 @@ class Columns(eqx.Module):
 
 def whitening(K: AbstractMatrixKernel, S: Float[Array, "m d"]) -> Float[Array, "q q"]:
     """T = L⁻ᵀ with L Lᵀ = K(S, S), q = m n."""
-    G = trained((K, S), Columns(S), rowwise=True)
+    G = forward_differentiated((K, S), Columns(S), rowwise=True)
     G = G.reshape(-1, G.shape[-1])
     # Of each component by itself, which have different units; some are zero, as q̇ of a U(q).
     d = jnp.diagonal(G)
@@ -77,7 +77,7 @@ def projected(
     """The rows for these hyperparameters; `spread` is the standard deviation of the starts."""
     (*nodes, d), n = rows.nodes.shape, rows.target.shape[-1]
     size, q = len(rows.counts), len(S) * n
-    raw = trained((K, rows.nodes.reshape(-1, d)), Columns(S), rowwise=True)
+    raw = forward_differentiated((K, rows.nodes.reshape(-1, d)), Columns(S), rowwise=True)
     T = whitening(K, S)
     M = accumulated(rows.across, rows.weights, raw.reshape(*nodes, n, q)) @ T
     W = jnp.sqrt(rows.counts) * jnp.exp(-log_noise)[None, None]  # (S, L + 1, n)

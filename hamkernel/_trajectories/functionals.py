@@ -7,8 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from hamkernel._observations.base import Together
-from hamkernel._observations.kinds import Functionals
+from hamkernel._observations.kinds import Functionals, Together
 from hamkernel._trajectories.rows import Rows
 from hamkernel._trajectories.shooting import means
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hamkernel._machine.batches import orthonormal
+from hamkernel._machine import orthonormal
 from hamkernel._trajectories.evidence import back_substituted
 from hamkernel._trajectories.flow import Expansion, Path, simulated
 from hamkernel._trajectories.padding import power_of_two

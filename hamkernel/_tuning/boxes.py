@@ -21,7 +21,7 @@ from hamkernel._kernels.base import AbstractScalarKernel, Invariance, bounds_by_
 from hamkernel._kernels.functions import Bound
 from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._observations.blocks import Components
-from hamkernel._observations.rows import Rows
+from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 
 
@@ -94,7 +94,7 @@ def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, 
     return jnp.maximum(trace, gram_trace(K, X))
 
 
-def typical_speed(K: AbstractMatrixKernel, rows: Rows) -> float:
+def typical_speed(K: AbstractMatrixKernel, rows: Measurements) -> float:
     """The root of the mean square of a component of a velocity, as far as the rows tell.
 
     It is to the mean diagonal of the Gram of the points as the mean square of the rows is to that
