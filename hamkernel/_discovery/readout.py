@@ -39,7 +39,7 @@ from hamkernel._fields.controlled import known_of, without_inputs
 from hamkernel._gram.observed import gram_of_rows
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._kernels.symmetry import symmetry_removed
-from hamkernel._observations.data import inputs_of
+from hamkernel._observations.measurements import inputs_of
 from hamkernel._posterior.posterior import Posterior
 from hamkernel._solvers.problem import problem
 from hamkernel._structures.base import AbstractMatrixKernel
