@@ -15,7 +15,6 @@ above it:
     _gram         the Gram: dense, as an operator, and its derivatives
     _factors      factors of G + ridge I, dense and of low rank
     _features     random Fourier features
-    _checks       the test of a kernel
     _fields       what is learned: f and its potential
     _solvers      how it is solved: dense, by conjugate gradients, of low rank, from streams
     _posterior    a field with its uncertainty
@@ -23,6 +22,7 @@ above it:
     _tuning       hyperparameters, by gradients
     _trajectories from logged runs to a field
     _dynamics     simulation
+    _discovery    a formula read off the data, and which physics they obey
     _save         fields in files
     systems, plot, paper
                   example systems, pictures, the paper's experiments
@@ -35,7 +35,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from hamkernel import poisson, systems
-from hamkernel._checks.kernel import check_kernel
+from hamkernel._discovery.formula import Formula
+from hamkernel._discovery.readout import readout
 from hamkernel._dynamics.simulate import simulate
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.controlled import ControlledField
@@ -43,6 +44,7 @@ from hamkernel._fields.features import FeatureField
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import gram
 from hamkernel._gram.operator import gram_operator
+from hamkernel._kernels.check import check_kernel
 from hamkernel._kernels.dot_products import Periodic, Polynomial
 from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._kernels.transforms import Select, Warp
@@ -57,12 +59,11 @@ from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
 from hamkernel._structures.base import Sum
 from hamkernel._structures.controlled import Controlled, InputMatrix
+from hamkernel._structures.custom_operator import Poisson, Structured
 from hamkernel._structures.masses import UnknownMasses
-from hamkernel._structures.operators import CurlFree, Symplectic
-from hamkernel._structures.own import Poisson, Structured
 from hamkernel._structures.port_hamiltonian import PortHamiltonian
+from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
 from hamkernel._structures.symmetry import Even, Invariant, Odd, Reversible
-from hamkernel._structures.without_potential import DivergenceFree, Separable
 from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.runs import Runs
@@ -141,6 +142,9 @@ __all__ = [  # noqa: RUF022 - in reading order
     "Runs",
     "learn",
     "Learned",
+    # What the data say beyond the field.
+    "readout",
+    "Formula",
     # Simulation.
     "simulate",
     "ImplicitMidpoint",

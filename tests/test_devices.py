@@ -52,7 +52,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec as P
 import hamkernel as hk
-from hamkernel._machine.devices import Rows
+from hamkernel._machine import RowSharding
 
 rng = np.random.default_rng(0)
 X = rng.uniform(-2, 2, size=(160, 2))
@@ -100,7 +100,7 @@ def memory(function, mesh, N):
     # Of a program for N points that is compiled and not run; in bytes of one device.
     sharding = NamedSharding(mesh, P("data"))
     data = jax.ShapeDtypeStruct((N, 2), jnp.float64, sharding=sharding)
-    rows = Rows(mesh, ("data",), sharding) if mesh.size > 1 else None
+    rows = RowSharding(mesh, ("data",), sharding) if mesh.size > 1 else None
     compiled = jax.jit(lambda *data: function(*data, rows)).lower(data, data).compile()
     used = compiled.memory_analysis()
     sizes = (used.argument_size_in_bytes, used.output_size_in_bytes, used.temp_size_in_bytes)

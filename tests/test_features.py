@@ -17,7 +17,7 @@ import hamkernel as hk
 from hamkernel._features.spectra import spectra
 from hamkernel._features.structured import features
 from hamkernel._fields.features import FeatureField
-from hamkernel._machine.batches import orthonormal
+from hamkernel._machine import orthonormal
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._solvers.tall_least_squares import ridge_regression, triangle
 from hamkernel.paper import datasets, experiments

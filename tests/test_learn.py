@@ -19,7 +19,7 @@ import scipy.stats
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._machine.batches import orthonormal
+from hamkernel._machine import orthonormal
 from hamkernel._trajectories.diagnostics import warn_of_few, warn_of_noise
 from hamkernel._trajectories.flow import NODES, WEIGHTS, jacobians, means, simulated
 from hamkernel._trajectories.likelihood import (

@@ -2,6 +2,7 @@
 
 import copy
 import io
+import itertools
 import json
 import os
 import pickle
@@ -17,8 +18,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._kernels.groups import identity
-from hamkernel._kernels.symmetry import Symmetrised
+from hamkernel._kernels.symmetry import Symmetrised, identity
 from hamkernel._save import description
 from hamkernel._save.bytes import sealed
 from hamkernel._save.files import load, save
@@ -126,6 +126,70 @@ def test_the_kernel_may_be_given_for_a_built_in_one_too(name, tmp_path):
     save(tmp_path / "f", field)
     other = jax.tree.map(lambda leaf: leaf + 1, BUILT_IN[name])
     assert same(field, load(tmp_path / "f", kernel=other))
+
+
+SCALAR = {
+    "one": hk.Gaussian(1.1),
+    "a sum": hk.Gaussian(1.1) + hk.Matern(2.5, 0.9),
+    "a product": hk.Gaussian(1.1) * hk.Polynomial(2),
+    "scaled": 2.0 * (hk.Gaussian(1.1) + 3.0 * hk.Matern(2.5)),
+    "selected": hk.Select(hk.Gaussian(), 0) + hk.Select(hk.Matern(), 1),
+    "warped": hk.Warp(hk.Gaussian() + hk.Matern(), on_cylinder),
+    "the user's": hk.Gaussian() + turned(),
+}
+STRUCTURES = {
+    "Symplectic": hk.Symplectic,
+    "CurlFree": hk.CurlFree,
+    "DivergenceFree": hk.DivergenceFree,
+    "Separable": hk.Separable,
+    "PortHamiltonian": hk.PortHamiltonian,
+    "Poisson": lambda k: hk.Poisson(k, hk.poisson.lotka_volterra),
+    "UnknownMasses": lambda k: hk.UnknownMasses(hk.Symplectic(k), [1.0, 2.0]),
+    "Sum": lambda k: hk.Sum(hk.Symplectic(k), rest=hk.CurlFree(k)),
+}
+SYMMETRIES = {
+    "no symmetry": lambda K: K,
+    "Odd": hk.Odd,
+    "Even": hk.Even,
+    "Reversible": hk.Reversible,
+    "Odd and Reversible": lambda K: hk.Reversible(hk.Odd(K)),
+    "Invariant": lambda K: hk.Invariant(K, [np.diag([1.0, -1.0])]),
+}
+NOT_SYMMETRIC = {"Poisson", "UnknownMasses", "Sum", "CurlFree", "DivergenceFree", "Separable"}
+
+
+def combined(structure, symmetry, scalar):
+    """The kernel, and as the drift of one with inputs; nothing where there is no such kernel."""
+    try:
+        K = SYMMETRIES[symmetry](STRUCTURES[structure](SCALAR[scalar]))
+    except (TypeError, ValueError):
+        assert structure in (*NOT_SYMMETRIC, "PortHamiltonian")
+        assert symmetry != "no symmetry"
+        return []
+    return [K, hk.Controlled(K, hk.InputMatrix(SCALAR[scalar]), count=1)]
+
+
+@pytest.mark.parametrize("structure", STRUCTURES)
+def test_every_symmetry_of_every_scalar_kernel_is_stored_hashed_and_added(structure):
+    for symmetry, scalar in itertools.product(SYMMETRIES, SCALAR):
+        for K in combined(structure, symmetry, scalar):
+            codes = []  # what `save` writes, without a field to evaluate
+            node = json.loads(json.dumps(description.description(K, codes, "field")))
+            like = description.skeleton(node, codes, "field", {})
+            again = jax.tree.map(lambda _, array: array, like, K)
+            assert same(again, K)
+            assert hash(again) == hash(K)
+            for k in K.scalar_kernels:
+                assert hash(k) == hash(sum([k]))
+                more = k + hk.Matern()
+                assert repr(more)
+                assert more.terms[-1] == hk.Matern()
+
+
+def test_a_symmetry_over_a_sum_of_scalar_kernels_is_saved(tmp_path):
+    field = fitted(hk.Odd(hk.Symplectic(hk.Gaussian(1.0) + hk.Matern(2.5, 1.0))))
+    save(tmp_path / "f", field)
+    assert same(field, load(tmp_path / "f"))
 
 
 @pytest.mark.few(1)

@@ -9,7 +9,7 @@ import pytest
 import hamkernel as hk
 from hamkernel._gram.observed import gram_of_rows
 from hamkernel._observations.blocks import Components
-from hamkernel._observations.data import rows_of_data, rows_of_states
+from hamkernel._observations.measurements import measurements_of, measurements_of_states
 from hamkernel._solvers.spans import WaveBasis
 from hamkernel._tuning.boxes import full_trace, hyperparameters
 from hamkernel._tuning.descent import Descent, Run
@@ -79,7 +79,7 @@ def speed(Y):
 
 
 def zeros(N, n):
-    return rows_of_states(jnp.zeros((N, n)), jnp.zeros((N, n)))
+    return measurements_of_states(jnp.zeros((N, n)), jnp.zeros((N, n)))
 
 
 @pytest.mark.parametrize("name", BOXES)
@@ -170,7 +170,7 @@ def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free
     few, states, ridge = jnp.asarray(Y[:6]), jnp.asarray(X[:6]), jnp.asarray(1e-3)
     waves = WaveBasis(jax.random.key(0), 3)
     features, gram = waves.span(K, 2, states.dtype).of(Components(states)), hk.gram(K, states)
-    rows = rows_of_states(states, few)
+    rows = measurements_of_states(states, few)
     F, G = (np.asarray(each).reshape(12, -1) for each in (features, gram))
 
     def free(matrix):
@@ -210,9 +210,9 @@ def test_a_subset_of_observations_has_their_rows():
         + hk.Energies(X[:5], Y[:5, 0])
         + hk.Functionals(X[:6].reshape(3, 2, 2), rng.normal(size=(3, 2, 2, 2)), Y[:3])
     )
-    rows = rows_of_data(K, data)[1]
+    rows = measurements_of(K, data)[1]
     assert rows.count == N + 5 + 6
-    some, which = rows.some(np.array([1, 4, 19, 21, 24, 27]))
+    some, which = rows.subset(np.array([1, 4, 19, 21, 24, 27]))
     np.testing.assert_array_equal(which, [1, 4, 19, 21, 24, 27, 28])  # 28 shares the points of 27
     inside = np.isin(rows.labels(), which)
     np.testing.assert_array_equal(some.targets, rows.targets[inside])
@@ -221,7 +221,7 @@ def test_a_subset_of_observations_has_their_rows():
     of_velocities = np.flatnonzero(inside[: rows.slices[0].stop])
     expected = G[np.ix_(of_velocities, of_velocities)]
     np.testing.assert_allclose(own[: len(expected), : len(expected)], expected, atol=1e-12)
-    lone, which = rows.some(np.array([0, 1, 21]))
+    lone, which = rows.subset(np.array([0, 1, 21]))
     np.testing.assert_array_equal(which, [0, 1])
     assert not len(lone.energies)
 
@@ -298,7 +298,7 @@ def test_a_run_takes_its_curvature_along():
 
 def whole(kernel, Y, bounds=None):
     """The objective of the search on all of X."""
-    rows, typical = rows_of_states(jnp.asarray(X), jnp.asarray(Y)), speed(Y)
+    rows, typical = measurements_of_states(jnp.asarray(X), jnp.asarray(Y)), speed(Y)
     given = SearchSpace(kernel, rows.points, typical, jnp.asarray(1e-3), (), bounds or {})
     criterion = criterion_of("cross_validation", N, 5)
     return Part(given, criterion, rows, typical, np.arange(N))

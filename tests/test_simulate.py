@@ -21,7 +21,7 @@ from hamkernel._dynamics.gauss_legendre import GaussLegendre4, GaussLegendre6, I
 from hamkernel._dynamics.simulate import simulate
 from hamkernel._dynamics.splitting import StormerVerlet, Yoshida4
 from hamkernel._kernels.radial import Gaussian
-from hamkernel._structures.operators import Symplectic
+from hamkernel._structures.structure import Symplectic
 
 SYMPLECTIC = [
     ImplicitMidpoint(),

@@ -13,7 +13,7 @@ import pytest
 from data import swings
 
 import hamkernel as hk
-from hamkernel._machine import memory as _memory
+from hamkernel import _machine as _memory
 from hamkernel._solvers import fit as _fit
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.landmarks import choose_landmarks

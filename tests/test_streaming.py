@@ -14,7 +14,7 @@ from data import swings
 import hamkernel as hk
 from hamkernel._gram.observed import gram_of_rows, rows_between
 from hamkernel._observations.blocks import Components
-from hamkernel._observations.data import rows_of_data
+from hamkernel._observations.measurements import measurements_of
 from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
 from hamkernel._solvers.streaming import AbstractStreamingSolver
 
@@ -169,7 +169,7 @@ def test_observations_in_chunks_are_the_fit_to_their_sum(solver):
     assert relative(part.evaluate(NEW), whole.evaluate(NEW)) > 1e-4
     assert int(model.count) == 100 + 40 + 1 + 200
     if field.info.truncation is not None:
-        rows = rows_of_data(K, every)[1]
+        rows = measurements_of(K, every)[1]
         G, C = gram_of_rows(K, rows), rows_between(K, rows, Components(jnp.asarray(S)))
         G_SS = np.asarray(hk.gram(K, S)).reshape(S.size, -1)
         covered = np.trace(C @ np.linalg.pinv(G_SS, rcond=1e-13, hermitian=True) @ C.T)

@@ -13,7 +13,7 @@ from kernels import BY_NAME, CASES, canonical, difference_mixed, mixed
 
 import hamkernel as hk
 from hamkernel._kernels.base import Invariance
-from hamkernel._structures.operators import AbstractPotentialKernel
+from hamkernel._structures.structure import AbstractPotentialKernel
 
 STRUCTURE = 1e-9  # relative; what sums of a few dozen rounded terms leave of an exact zero
 ROUNDING = 1e-12

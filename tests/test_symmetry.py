@@ -275,13 +275,19 @@ def test_other_refusals():
     with pytest.raises(TypeError, match="list of linear maps"):
         hk.Invariant(G, 3.0)
     with pytest.raises(ValueError, match="not invertible"):
-        hk.fit(hk.Separable(hk.Invariant(G, [np.diag([1.0, 0.0, 1.0, 1.0])])), X, Y)
+        hk.Invariant(G, [np.diag([1.0, 0.0, 1.0, 1.0])])
+    with pytest.raises(ValueError, match="do not close to a finite group"):
+        hk.Invariant(G, [[[1, 1], [0, 1]]])
     with pytest.raises(ValueError, match="finite matrix"):
         hk.Invariant(G, [np.ones((2, 3))])
     with pytest.raises(TypeError, match="Reversible must be a matrix-valued"):
         hk.Reversible(G)
-    with pytest.raises(ValueError, match="no symmetry from its matrix potential"):
-        hk.fit(hk.DivergenceFree(hk.Invariant(G, [C3])), X, Y)
-    K = hk.Invariant(hk.Even(hk.Symplectic(G)), [-np.eye(4)])  # H odd and even
+    for make in (
+        lambda: hk.DivergenceFree(hk.Invariant(G, [C3])),
+        lambda: hk.Invariant(hk.DivergenceFree(G), [C3]),
+        lambda: hk.Invariant(hk.DivergenceFree(G) + hk.CurlFree(G), [C3]),
+    ):
+        with pytest.raises(ValueError, match="no symmetry from its matrix potential"):
+            make()
     with pytest.raises(ValueError, match="no function but zero"):
-        hk.fit(K, X, Y)
+        hk.Invariant(hk.Even(hk.Symplectic(G)), [-np.eye(4)])  # H odd and even

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._machine import threads
-from hamkernel._machine.threads import one_blas_thread
+from hamkernel import _machine
+from hamkernel._machine import one_blas_thread
 
 X = np.random.default_rng(0).normal(size=(12, 2))
 Y = X @ np.array([[0.0, -1.0], [1.0, 0.0]])
@@ -20,13 +20,13 @@ K = hk.Symplectic(hk.Gaussian(1.5))
 
 
 def now() -> list[int]:
-    return [pool.num_threads for pool in threads._controller().lib_controllers]
+    return [pool.num_threads for pool in _machine._controller().lib_controllers]
 
 
 @pytest.fixture(autouse=True)
 def two_threads():
     """As many as a user has, although the tests run with one."""
-    controller = threads._controller()
+    controller = _machine._controller()
     with controller.limit(limits=2, user_api="blas"):
         assert set(now()) == {2}
         yield
@@ -84,13 +84,13 @@ CALLS = {
 @pytest.mark.parametrize("name", CALLS)
 def test_public_calls_that_factor_run_on_one(name, monkeypatch):
     seen = []
-    limited = threads._one_thread
+    limited = _machine._one_thread
 
     def spied():
         seen.append(True)
         return limited()
 
-    monkeypatch.setattr(threads, "_one_thread", spied)
+    monkeypatch.setattr(_machine, "_one_thread", spied)
     CALLS[name]()
     assert seen
 

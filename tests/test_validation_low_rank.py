@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 
 import hamkernel as hk
 from hamkernel._observations.blocks import Components
-from hamkernel._observations.data import rows_of_data, rows_of_states
+from hamkernel._observations.measurements import measurements_of, measurements_of_states
 from hamkernel._solvers.landmarks import given_landmarks
 from hamkernel._solvers.spans import LandmarkBasis, WaveBasis
 from hamkernel._validation.of_rows import (
@@ -36,7 +36,7 @@ def data(N=N, seed=0):
 
 K = hk.Odd(hk.Symplectic(hk.Gaussian(1.2)))
 X, Y = map(jnp.asarray, data())
-ROWS = rows_of_states(X, Y)
+ROWS = measurements_of_states(X, Y)
 BASES = {
     "landmarks": LandmarkBasis(X[::5]),
     "waves": WaveBasis(jax.random.key(3), 7),
@@ -127,7 +127,7 @@ def of_every_kind():
         + hk.Functionals(X[:12].reshape(4, 3, 2), rng.normal(size=(4, 3, 2)), rng.normal(size=4))
         + hk.Equilibria(np.zeros(2))
     )
-    return rows_of_data(K, data)[1]
+    return measurements_of(K, data)[1]
 
 
 ENERGIES_TOGETHER = np.repeat([0, 1, 2, 3, 4], [6, 4, 10, 3, 2])  # of 14 + 6 + 4 + 1
@@ -232,7 +232,7 @@ def test_tuning_with_low_rank_comes_to_the_optimum_of_the_dense_loss(
     X, Y = data(120, seed=2)
     start = hk.Symplectic(hk.Gaussian(0.4))
     with monkeypatch.context() as small:  # too small for the dense loss
-        small.setattr("hamkernel._machine.memory.memory_bytes", lambda: 1_500_000)
+        small.setattr("hamkernel._machine.memory_bytes", lambda: 1_500_000)
         options: Any = {"objective": objective, "starts": 3}
         tuned = hk.tune(start, X, Y, 0.1, 5, solver=SOLVERS[solver], **options)
     dense = hk.tune(start, X, Y, 0.1, 5, **options)
@@ -274,7 +274,7 @@ def test_observations_are_tuned_in_low_rank_where_the_dense_loss_does_not_fit(mo
     observed = hk.Velocities(X, masked) + hk.Energies(
         X[:60], X[:60, 1] ** 2 / 2 - np.cos(X[:60, 0])
     )
-    monkeypatch.setattr("hamkernel._machine.memory.memory_bytes", lambda: 1_500_000)
+    monkeypatch.setattr("hamkernel._machine.memory_bytes", lambda: 1_500_000)
     start, solver = hk.Symplectic(hk.Gaussian(0.4)), hk.RandomFeatures(60, jax.random.key(0))
     tuned = hk.tune(start, observed, regularization=0.1, starts=2, solver=solver)
     new = data(200, seed=5)[0]
@@ -290,7 +290,7 @@ def test_observations_are_tuned_in_low_rank_where_the_dense_loss_does_not_fit(mo
 
 def test_a_dense_loss_that_does_not_fit_is_refused_before_the_search(monkeypatch):
     X, Y = data(120)
-    monkeypatch.setattr("hamkernel._machine.memory.memory_bytes", lambda: 100_000)
+    monkeypatch.setattr("hamkernel._machine.memory_bytes", lambda: 100_000)
     with pytest.raises(ValueError, match=r"hk.Nystrom\(\)"):
         hk.tune(K, X, Y, 1e-3, 5)
     with pytest.raises(ValueError, match="3 matrices of 240 by 240"):
@@ -300,5 +300,5 @@ def test_a_dense_loss_that_does_not_fit_is_refused_before_the_search(monkeypatch
 @pytest.mark.slow
 def test_what_does_not_fit_densely_is_tuned_with_low_rank(monkeypatch):
     X, Y = data(120)
-    monkeypatch.setattr("hamkernel._machine.memory.memory_bytes", lambda: 100_000)
+    monkeypatch.setattr("hamkernel._machine.memory_bytes", lambda: 100_000)
     assert np.isfinite(hk.tune(K, X, Y, 1e-3, 5, starts=2, solver=hk.Nystrom()).loss)

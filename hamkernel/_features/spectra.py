@@ -21,13 +21,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
-from hamkernel._kernels.arguments import divided
-from hamkernel._kernels.base import AbstractScalarKernel, ScalarProduct, ScalarSum, Scaled
+from hamkernel._kernels.base import AbstractScalarKernel, ScalarProduct, ScalarSum, Scaled, divided
 from hamkernel._kernels.dot_products import Periodic
 from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._kernels.symmetry import Symmetrised
 from hamkernel._kernels.transforms import Select
-from hamkernel._machine.batches import orthonormal
+from hamkernel._machine import orthonormal
 from hamkernel._structures.controlled import Constant
 
 

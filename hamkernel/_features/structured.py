@@ -18,8 +18,7 @@ from jaxtyping import Array, Float, Key
 from hamkernel._features.waves import GroupWaves, Waves, waves_of
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.controlled import Controlled, KnownMatrix
-from hamkernel._structures.operators import AbstractPotentialKernel
-from hamkernel._structures.without_potential import DivergenceFree, Separable
+from hamkernel._structures.structure import AbstractPotentialKernel, DivergenceFree, Separable
 
 
 class AbstractFeatures(eqx.Module):

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from hamkernel._features.structured import AbstractFeatures, SumFeatures
 from hamkernel._fields.base import AbstractField, SolverInfo, root
-from hamkernel._machine.devices import as_given, on_each, rows_of, split
+from hamkernel._machine import as_given, on_each, rows_of, split
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 
 _BATCH = 1024  # points evaluated at once: 8 MB of waves for 1000 features

@@ -9,8 +9,7 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import Invariance
-from hamkernel._machine.devices import Rows, automatic, on_each
-from hamkernel._machine.memory import refuse_beyond_memory
+from hamkernel._machine import RowSharding, automatic, on_each, refuse_beyond_memory
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 
@@ -84,7 +83,7 @@ _POINTS = 1024
 
 
 def trace(
-    K: AbstractMatrixKernel, X: Float[Array, "N n"], spread: Rows | None = None
+    K: AbstractMatrixKernel, X: Float[Array, "N n"], spread: RowSharding | None = None
 ) -> Float[Array, ""]:
     """The trace of the Gram, in O(N n) memory for every kernel, where the rows are."""
     if Invariance.TRANSLATION in K.invariance:  # all blocks on the diagonal are K(0, 0)

@@ -16,7 +16,7 @@ _STRIP = 200_000  # entries of rows at once; their derivatives hold up to 13 arr
 
 
 @eqx.filter_custom_vjp
-def trained(kernel_and_data, make, rowwise: bool = False):
+def forward_differentiated(kernel_and_data, make, rowwise: bool = False):
     """make(K, data), an array, cheap to differentiate with respect to K.
 
     If `rowwise` then make(K, data) is a function and points instead. The function makes of points
@@ -25,12 +25,12 @@ def trained(kernel_and_data, make, rowwise: bool = False):
     return _array(make, rowwise, *kernel_and_data)
 
 
-@trained.def_fwd
+@forward_differentiated.def_fwd
 def _(perturbed, kernel_and_data, make, rowwise=False):
-    return trained(kernel_and_data, make, rowwise), None
+    return forward_differentiated(kernel_and_data, make, rowwise), None
 
 
-@trained.def_bwd
+@forward_differentiated.def_bwd
 def _(saved, bar, perturbed, kernel_and_data, make, rowwise=False):
     K, data = kernel_and_data
 

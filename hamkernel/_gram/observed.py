@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from hamkernel._gram.dense import assemble, centred, diagonals
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components
-from hamkernel._observations.rows import Rows
+from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel
 
 # Groups of combinations whose points are made at once, for each of which there are Q n rows as long
@@ -32,7 +32,10 @@ def between_all(
 
 
 def gram_of_rows(
-    K: AbstractMatrixKernel, rows: Rows, contrasted: bool = True, between_all: Any = between_all
+    K: AbstractMatrixKernel,
+    rows: Measurements,
+    contrasted: bool = True,
+    between_all: Any = between_all,
 ) -> Float[Array, "D D"]:
     """The Gram of all rows, after the contrast of the energies or before it."""
     found = []
@@ -43,12 +46,14 @@ def gram_of_rows(
     return rows.contrast(rows.contrast(G).T) if contrasted and len(rows.energies) else G
 
 
-def rows_between(K: AbstractMatrixKernel, rows: Rows, block: AbstractBlock) -> Float[Array, "D d"]:
+def rows_between(
+    K: AbstractMatrixKernel, rows: Measurements, block: AbstractBlock
+) -> Float[Array, "D d"]:
     """The covariances of all rows with those of a block."""
     return rows.contrast(jnp.concatenate([between(K, each, block) for each in rows.blocks]))
 
 
-def trace_of_rows(K: AbstractMatrixKernel, rows: Rows) -> Float[Array, ""]:
+def trace_of_rows(K: AbstractMatrixKernel, rows: Measurements) -> Float[Array, ""]:
     """The trace of the Gram of rows without energies."""
     return sum((_trace(K, block) for block in rows.blocks), jnp.zeros((), rows.targets.dtype))
 

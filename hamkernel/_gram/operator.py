@@ -18,10 +18,10 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._gram.dense import centred, diagonals, gram
-from hamkernel._machine.devices import Rows, as_given, rows_of, split, sum_of_columns
+from hamkernel._machine import RowSharding, as_given, rows_of, split, sum_of_columns
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.unfolded import unfolded
+from hamkernel._structures.structure import group_expanded
 
 # Pairs in one tile, rows × columns: 1000 × 1000 doubles are 8 MB. Measured on two cores between
 # 125 × 4000 and 2000 × 1000, with n = 4 and 20; half and twice cost up to 15 % more.
@@ -75,8 +75,8 @@ class GramOperator(lx.AbstractLinearOperator):
     kernel: AbstractMatrixKernel
     X: Float[Array, "N n"]
     Z: Float[Array, "M n"] | None
-    X_rows: Rows | None = eqx.field(static=True, default=None)
-    Z_rows: Rows | None = eqx.field(static=True, default=None)
+    X_rows: RowSharding | None = eqx.field(static=True, default=None)
+    Z_rows: RowSharding | None = eqx.field(static=True, default=None)
 
     def __repr__(self) -> str:
         return described(self)
@@ -127,8 +127,8 @@ def product(
     X: Float[Array, "N n"],
     Z: Float[Array, "M n"],
     A: Float[Array, "M n"],
-    X_rows: Rows | None = None,
-    Z_rows: Rows | None = None,
+    X_rows: RowSharding | None = None,
+    Z_rows: RowSharding | None = None,
 ) -> Float[Array, "N n"]:
     """Σⱼ K(xᵢ, zⱼ) aⱼ for all i, tile by tile, on the devices where the rows are."""
     return sum_of_columns(_tiled, K, X, Z, A, X_rows, Z_rows)
@@ -156,7 +156,7 @@ _product = eqx.filter_jit(product)
 
 def _tiled(K, X, Z, A):
     """`product` on one device."""
-    K, Z, A = unfolded(K, Z, A.astype(X.dtype))
+    K, Z, A = group_expanded(K, Z, A.astype(X.dtype))
     X, Z = centred(K, X, Z)
     rows = tiles(X, X[:1], ROWS)
     columns = (tiles(Z, Z[:1], COLUMNS), tiles(A, jnp.zeros_like(A[:1]), COLUMNS))

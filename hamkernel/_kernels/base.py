@@ -13,14 +13,70 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._kernels.ranges import by_name
 from hamkernel._show import described, exponential, in_brackets, joined, text
+
+
+def one_point(x: ArrayLike) -> Float[Array, " n"]:
+    """`x` as a float array; a batch would silently give a wrong number."""
+    x = require.floating(x, "the point")
+    if x.ndim != 1:
+        raise ValueError(
+            f"the point has shape {x.shape}; a kernel takes one pair of points of shape (n,). Use "
+            "jax.vmap for many, or hk.gram for a Gram."
+        )
+    return x
+
+
+def divided(
+    x: Float[Array, " n"], scale: Float[Array, "..."], name: str = "lengthscale"
+) -> Float[Array, " n"]:
+    """x/scale in the dtype of x, for one point; the scale is a number, or one per coordinate."""
+    x = one_point(x)
+    if scale.ndim and scale.shape != x.shape:
+        raise ValueError(
+            f"the kernel has {scale.size} {name}s and the point has shape {x.shape}: "
+            "give one number, or one for each coordinate that the kernel sees."
+        )
+    return x / scale.astype(x.dtype)
+
+
+def log_per_coordinate(value: ArrayLike, name: str, cure: str = "") -> Float[Array, "..."]:
+    """The logarithm of a positive hyperparameter, one number or one per coordinate."""
+    array = require.positive(value, name, cure)
+    if array.ndim > 1:
+        raise ValueError(f"{name} has shape {array.shape}; it must be a number or a vector (n,).")
+    return jnp.log(array)
+
+
+def bounds_by_value(name: str, leaf: Any) -> tuple[ArrayLike, ArrayLike]:
+    """The bounds of a number of unknown meaning, around its value: its logarithm by three decades.
+
+    Numbers that are stored as they are may move by ten times their size, or by ten.
+    """
+    value = np.asarray(leaf)
+    reach = np.log(1e3) if name.startswith("log_") else 10 * np.maximum(1.0, np.abs(value))
+    return value - reach, value + reach
+
+
+def bounds_of_length(
+    leaf: Any, X: Float[np.ndarray, "N n"], least: float, most: float
+) -> tuple[ArrayLike, ArrayLike]:
+    """The bounds of the logarithm of a length, from `least` spacings to `most` extents of the data.
+
+    The spacing of N points in an extent L is taken as L / N: a fair lower bound in any dimension,
+    since points on a few trajectories lie close together along them. An extent of 0 counts as 1.
+    """
+    ranges = np.ptp(X, axis=0)
+    extent = ranges if leaf.ndim > 0 else np.asarray(np.linalg.norm(ranges))
+    extent = np.where(extent > 0, extent, 1.0)
+    return np.log(least * extent / max(len(X), 2)), np.log(most * extent)
 
 
 class Invariance(enum.Flag):
@@ -44,6 +100,10 @@ class AbstractScalarKernel(eqx.Module):
 
     def __repr__(self) -> str:
         return described(self, positional=("kernel",))
+
+    def __hash__(self) -> int:
+        # Arrays have no hash. Equal kernels have equal structure, so this one fits `==`.
+        return hash(jax.tree.structure(self))
 
     @abc.abstractmethod
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
@@ -80,16 +140,19 @@ class AbstractScalarKernel(eqx.Module):
         """Whether a trained factor multiplies all of k; None in its place does not count."""
         return False
 
-    def box(
+    def bounds(
         self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
     ) -> tuple[ArrayLike, ArrayLike]:
-        """The lower and upper bound of the array `name`, as stored.
+        """The lower and upper bound of the array `name`, as stored, for `tune`.
 
-        `X` is the data in the coordinates that k sees, and `amplitude` a plausible factor of k.
+        Args:
+            name: an attribute, such as `log_lengthscale`.
+            X: the data in the coordinates that k sees.
+            amplitude: a plausible factor of k, which gives fields the size of the velocities.
         """
-        return by_name(name, getattr(self, name), X, amplitude)
+        return bounds_by_value(name, getattr(self, name))
 
-    def seen(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
+    def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
         """The data in the coordinates of the kernels inside."""
         return X
 
@@ -202,6 +265,11 @@ class Scaled(AbstractScalarKernel):
     @property
     def scale(self) -> Float[Array, ""]:
         return jnp.exp(self.log_scale)
+
+    def bounds(
+        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
+    ) -> tuple[ArrayLike, ArrayLike]:
+        return np.log(1e-5 * amplitude), np.log(1e5 * amplitude)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         value = self.kernel(x, z)

@@ -6,10 +6,15 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.arguments import divided, log_per_coordinate, one_point
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance
-from hamkernel._kernels.groups import is_diagonal, is_orthogonal, is_permutation
-from hamkernel._kernels.ranges import by_name
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Invariance,
+    bounds_of_length,
+    divided,
+    log_per_coordinate,
+    one_point,
+)
+from hamkernel._kernels.symmetry import is_diagonal, is_orthogonal, is_permutation
 
 
 class Polynomial(AbstractScalarKernel):
@@ -43,6 +48,12 @@ class Polynomial(AbstractScalarKernel):
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         product = one_point(x) @ one_point(z)
         return (product + self.offset.astype(product.dtype)) ** self.degree
+
+    def bounds(
+        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
+    ) -> tuple[ArrayLike, ArrayLike]:
+        square = np.mean(np.sum(X**2, axis=1)) or 1.0
+        return np.log(1e-4 * square), np.log(1e4 * square)
 
     @property
     def invariance(self) -> Invariance:
@@ -102,10 +113,10 @@ class Periodic(AbstractScalarKernel):
         alike = self.log_lengthscale.ndim == self.log_period.ndim == 0
         return is_permutation(S) and (alike or is_diagonal(S))
 
-    def box(
+    def bounds(
         self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
     ) -> tuple[ArrayLike, ArrayLike]:
         if name == "log_lengthscale":
             # On a circle of radius 1; below 1/64 random features need too long a Fourier series.
             return np.log(max(0.6 / len(X), 1 / 64)), np.log(60.0)
-        return by_name(name, self.log_period, X, amplitude)
+        return bounds_of_length(self.log_period, X, 2.0, 10.0)

@@ -18,9 +18,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.arguments import divided, log_per_coordinate
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance
-from hamkernel._kernels.groups import is_diagonal, is_orthogonal
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Invariance,
+    bounds_of_length,
+    divided,
+    log_per_coordinate,
+)
+from hamkernel._kernels.symmetry import is_diagonal, is_orthogonal
 
 _LENGTH = "It is a length in the units of the states."
 
@@ -62,6 +67,14 @@ class AbstractRadialKernel(AbstractScalarKernel):
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         x, z = divided(x, self.lengthscale), divided(z, self.lengthscale)
         return self.profile(squared_distance(x, z, cut=self.cuts_rounding))
+
+    def bounds(
+        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
+    ) -> tuple[ArrayLike, ArrayLike]:
+        """A lengthscale far below the spacing or above the extent changes nothing but rounding."""
+        if name == "log_lengthscale":
+            return bounds_of_length(self.log_lengthscale, X, 0.3, 30.0)
+        return super().bounds(name, X, amplitude)
 
     @property
     def invariance(self) -> Invariance:

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.arguments import one_point
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel, one_point
 from hamkernel._kernels.functions import as_pytree
 
 
@@ -64,7 +63,7 @@ class Warp(AbstractScalarKernel):
     def has_amplitude(self) -> bool:
         return self.kernel.has_amplitude
 
-    def seen(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
+    def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
         return np.asarray(jax.vmap(self.warped)(jnp.asarray(X)))
 
 
@@ -135,5 +134,5 @@ class Select(AbstractScalarKernel):
     def has_amplitude(self) -> bool:
         return self.kernel.has_amplitude
 
-    def seen(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
+    def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
         return X[:, list(self.dims)]

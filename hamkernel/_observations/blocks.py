@@ -23,6 +23,7 @@ class AbstractBlock(eqx.Module):
     of_values: eqx.AbstractClassVar[bool]  # of the potential; else of the field
 
     points: eqx.AbstractVar[Float[Array, "P d"]]
+    noise: eqx.AbstractVar[Float[Array, " D"] | None]  # of each row; None if it is 1
 
     @property
     @abc.abstractmethod
@@ -40,9 +41,9 @@ class AbstractBlock(eqx.Module):
         """D, the number of rows."""
 
     @property
-    @abc.abstractmethod
     def scale(self) -> Float[Array, " D"]:
         """The relative noise of each row, by which it is divided."""
+        return jnp.ones(self.size, self.points.dtype) if self.noise is None else self.noise
 
     @property
     @abc.abstractmethod
@@ -62,15 +63,15 @@ class AbstractBlock(eqx.Module):
         """The transpose of `rows`."""
 
     @abc.abstractmethod
-    def then(self, other: "AbstractBlock") -> "AbstractBlock | None":
+    def merge(self, other: "AbstractBlock") -> "AbstractBlock | None":
         """One block of these rows and then the others; None if they are of another kind."""
 
     @abc.abstractmethod
-    def at(self, points: Float[Array, "P d"]) -> "AbstractBlock":
+    def with_points(self, points: Float[Array, "P d"]) -> "AbstractBlock":
         """All components of the field, or the potential, at other points, without noise."""
 
     @abc.abstractmethod
-    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+    def subset(self, chosen: Int[np.ndarray, " C"]) -> "Subset":
         """The block of some observations, counted from 0 and in order.
 
         Returns:
@@ -107,10 +108,6 @@ class Components(AbstractBlock):
         return math.prod(self.values_shape) if self.kept is None else len(self.kept)
 
     @property
-    def scale(self) -> Float[Array, " D"]:
-        return jnp.ones(self.size, self.points.dtype) if self.noise is None else self.noise
-
-    @property
     def count(self) -> int:
         return len(self.points)
 
@@ -129,7 +126,7 @@ class Components(AbstractBlock):
             c = jnp.zeros(math.prod(self.values_shape), c.dtype).at[self.kept].set(c)
         return c.reshape(self.values_shape)
 
-    def then(self, other: AbstractBlock) -> "Components | None":
+    def merge(self, other: AbstractBlock) -> "Components | None":
         if not isinstance(other, Components) or self.outputs != other.outputs:
             return None
         kept = noise = None
@@ -144,10 +141,10 @@ class Components(AbstractBlock):
             noise = jnp.concatenate([self.scale, other.scale])
         return Components(jnp.concatenate([self.points, other.points]), kept, noise, self.outputs)
 
-    def at(self, points: Float[Array, "P d"]) -> "Components":
+    def with_points(self, points: Float[Array, "P d"]) -> "Components":
         return Components(points, outputs=self.outputs)
 
-    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+    def subset(self, chosen: Int[np.ndarray, " C"]) -> "Subset":
         rows = np.flatnonzero(np.isin(self.labels(), chosen))
         kept = self.kept
         if kept is not None:
@@ -183,8 +180,8 @@ class Combinations(AbstractBlock):
         return self.weights.shape[0] * self.weights.shape[1]
 
     @property
-    def scale(self) -> Float[Array, " SR"]:
-        return jnp.ones(self.size, self.groups.dtype)
+    def noise(self) -> None:
+        return None
 
     @property
     def count(self) -> int:
@@ -203,16 +200,16 @@ class Combinations(AbstractBlock):
         S, R, Q, n = self.weights.shape
         return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(S * Q, n)
 
-    def then(self, other: AbstractBlock) -> "Combinations | None":
+    def merge(self, other: AbstractBlock) -> "Combinations | None":
         if not isinstance(other, Combinations) or self.weights.shape[1:] != other.weights.shape[1:]:
             return None
         pairs = (self.groups, other.groups), (self.weights, other.weights)
         return Combinations(*map(jnp.concatenate, pairs))
 
-    def at(self, points: Float[Array, "P d"]) -> Components:
+    def with_points(self, points: Float[Array, "P d"]) -> Components:
         return Components(points, outputs=self.weights.shape[3])
 
-    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+    def subset(self, chosen: Int[np.ndarray, " C"]) -> "Subset":
         # Whole groups: the rows of one share its points.
         R = self.weights.shape[1]
         groups = np.unique(chosen // R)
@@ -245,10 +242,6 @@ class Values(AbstractBlock):
         return len(self.points)
 
     @property
-    def scale(self) -> Float[Array, " E"]:
-        return jnp.ones(self.size, self.points.dtype) if self.noise is None else self.noise
-
-    @property
     def count(self) -> int:
         return self.size
 
@@ -261,7 +254,7 @@ class Values(AbstractBlock):
     def coefficients(self, c: Float[Array, " E"]) -> Float[Array, " E"]:
         return c if self.noise is None else c / self.noise
 
-    def then(self, other: AbstractBlock) -> "Values | None":
+    def merge(self, other: AbstractBlock) -> "Values | None":
         if not isinstance(other, Values):
             return None
         noise = None
@@ -269,10 +262,10 @@ class Values(AbstractBlock):
             noise = jnp.concatenate([self.scale, other.scale])
         return Values(jnp.concatenate([self.points, other.points]), noise, self.outputs)
 
-    def at(self, points: Float[Array, "E d"]) -> "Values":
+    def with_points(self, points: Float[Array, "E d"]) -> "Values":
         return Values(points, outputs=self.outputs)
 
-    def some(self, chosen: Int[np.ndarray, " C"]) -> "Some":
+    def subset(self, chosen: Int[np.ndarray, " C"]) -> "Subset":
         points, noise = _taken(self.points, chosen), _taken(self.noise, chosen)
         return Values(points, noise, self.outputs), chosen, chosen
 
@@ -282,14 +275,14 @@ def _taken(array: Array | None, index: Int[np.ndarray, " C"]) -> Any:
     return None if array is None else jnp.asarray(np.asarray(array)[index])
 
 
-Some = tuple[AbstractBlock, Int[np.ndarray, " rows"], Int[np.ndarray, " observations"]]
+Subset = tuple[AbstractBlock, Int[np.ndarray, " rows"], Int[np.ndarray, " observations"]]
 
 
 def merged(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:
     """The same rows in fewer blocks, where neighbours are of one kind: there is less to compile."""
     found: list[AbstractBlock] = []
     for block in blocks:
-        both = found[-1].then(block) if found else None
+        both = found[-1].merge(block) if found else None
         found = [*found[:-1], both] if both is not None else [*found, block]
     return tuple(found)
 

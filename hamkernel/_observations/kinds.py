@@ -1,34 +1,153 @@
 """What can be measured of a field and its potential: velocities, energies, equilibria, integrals.
 
-Every kind is values of linear functionals, and any of them can be added:
+Observations of every kind are values of linear functionals of (u, f), and any of them add up:
 
     data = hk.Velocities(X, Y) + hk.Energies(Z, E) + hk.Equilibria(X0)
     field = hk.fit(K, data, regularization=1e-4)
 
-The noise is relative: a row of noise s has the variance s² Nλ, with N the number of all
+The noise is relative: a row of relative noise s has the variance s² Nλ, where N counts all
 observations: points of velocities and equilibria, energies and functionals.
 
-With inputs each kind of values of f says u at its points, and its blocks have points (x, u). An
-energy is one of the drift and has none.
+A field with inputs is observed at points (x, u), and each kind but the energies, which are those of
+the drift, holds the inputs u of its points.
 """
 
 from __future__ import annotations
 
+import abc
 from collections.abc import Iterator
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
-from hamkernel._observations.base import (
-    AbstractObservations,
-    inputs_at,
-    joined_points,
-    refuse_swapped,
-)
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components, Values
+from hamkernel._show import described, joined
+
+
+class AbstractObservations(eqx.Module):
+    """Measured values of linear functionals of a field; a + b are the observations of both."""
+
+    def __repr__(self) -> str:
+        return described(self)
+
+    @property
+    @abc.abstractmethod
+    def dimension(self) -> int:
+        """n, the number of coordinates of a state."""
+
+    def given_inputs(self) -> Iterator[Float[Array, "*points m"]]:
+        """The inputs of each kind that has them."""
+        inputs = getattr(self, "inputs", None)  # energies have none
+        if inputs is not None:
+            yield inputs
+
+    @abc.abstractmethod
+    def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+        """The blocks of rows, one for each kind, and the values that were measured.
+
+        Args:
+            count: m, the number of inputs of the kernel. If it is not 0 the points are (x, u).
+
+        Raises:
+            ValueError: the inputs are needed and were not given.
+        """
+
+    def __add__(self, other: Any) -> AbstractObservations:
+        if not isinstance(other, AbstractObservations):
+            raise TypeError(_not_observations(self, other))
+        return Together(_terms(self) + _terms(other))
+
+    def __radd__(self, other: Any) -> AbstractObservations:
+        if isinstance(other, int) and other == 0:  # so that sum(data) works
+            return self
+        raise TypeError(_not_observations(self, other))
+
+    __array_ufunc__ = None  # so that NumPy leaves array + observations to __radd__
+
+
+def _not_observations(data: AbstractObservations, other: Any) -> str:
+    return (
+        f"{type(data).__name__} was added to {type(other).__name__}: only observations add up. "
+        "Give an array its meaning first, for example hk.Velocities(X, Y) + hk.Energies(Z, E)."
+    )
+
+
+class Together(AbstractObservations):
+    """The sum a + b of observations, of several kinds or of several places."""
+
+    terms: tuple[AbstractObservations, ...]
+
+    def __check_init__(self):
+        dimensions = [term.dimension for term in self.terms]
+        if len(set(dimensions)) > 1:
+            raise ValueError(
+                f"the observations in a sum are of states of {dimensions} coordinates: all must be "
+                "of one system, with the same n."
+            )
+
+    def __repr__(self) -> str:
+        return joined("+", [repr(term) for term in self.terms])
+
+    @property
+    def dimension(self) -> int:
+        return self.terms[0].dimension
+
+    def given_inputs(self) -> Iterator[Float[Array, "*points m"]]:
+        for term in self.terms:
+            yield from term.given_inputs()
+
+    def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+        for term in self.terms:
+            yield from term.parts(count)
+
+
+def _terms(data: AbstractObservations) -> tuple[AbstractObservations, ...]:
+    return data.terms if isinstance(data, Together) else (data,)
+
+
+def refuse_swapped(X: Any, Y: Any, inputs: Any) -> None:
+    """Refuse X and inputs that seem to have changed places."""
+    if inputs is not None and np.shape(X) != np.shape(Y) == np.shape(inputs):
+        raise ValueError(
+            f"X has shape {np.shape(X)}, inputs {np.shape(inputs)} and Y {np.shape(Y)}: X and "
+            "the inputs seem to be swapped, hk.fit(K, X, Y, inputs=U)."
+        )
+
+
+def inputs_at(X: Float[Array, "*points n"], inputs: Any) -> Float[Array, "*points m"] | None:
+    """The inputs of every state, finite and in the dtype of the states; None if none are given."""
+    if inputs is None:
+        return None
+    U = require.floating(inputs, "inputs")
+    if U.ndim != X.ndim or U.shape[:-1] != X.shape[:-1] or U.shape[-1] == 0:
+        hint = ""
+        if U.shape == X.shape[:-1]:
+            hint = f" For one input write U[{':, ' * U.ndim}None]."
+        elif U.ndim == X.ndim == 2 and U.shape[1] == len(X):
+            hint = " They seem to be transposed: U.T."
+        raise ValueError(
+            f"inputs has shape {U.shape}; m inputs for each of the states are needed, which have "
+            f"shape {X.shape}.{hint}"
+        )
+    return require.finite(U.astype(X.dtype), "inputs")
+
+
+def joined_points(
+    data: Any, X: Float[Array, "*points n"], count: int
+) -> tuple[Float[Array, "*points d"], int | None]:
+    """The points (x, u) and n, where `count` > 0; X and None else."""
+    if not count:
+        return X, None
+    if data.inputs is None:
+        raise ValueError(
+            f"the inputs of {type(data).__name__} are missing: a Controlled kernel needs inputs=U, "
+            "one row of shape (m,) for each state."
+        )
+    return jnp.concatenate([X, data.inputs], axis=-1), X.shape[-1]
 
 
 class Velocities(AbstractObservations):
@@ -51,7 +170,7 @@ class Velocities(AbstractObservations):
     X: Float[Array, "N n"]
     Y: Float[Array, "N n"]
     noise: Float[Array, "..."] | None
-    kept: Int[Array, " D"] | None  # the components that were measured, None if all were
+    kept: Int[Array, " D"] | None  # indices of the measured components; None if all were
     inputs: Float[Array, "N m"] | None
 
     def __init__(
@@ -247,7 +366,7 @@ class Functionals(AbstractObservations):
 
 
 def _noise(noise: Any, shapes: list[tuple[int, ...]], needed: str, X: Array) -> Array | None:
-    """Relative standard deviations of one of these shapes, in the dtype of X."""
+    """The relative standard deviations, of one of these shapes, in the dtype of X."""
     if noise is None:
         return None
     array = require.floating(noise, "noise")

@@ -25,10 +25,10 @@ from hamkernel._fields.known import Mean
 from hamkernel._gram.observed import components
 from hamkernel._kernels.base import Invariance
 from hamkernel._kernels.symmetry import without_symmetry
-from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.base import AbstractObservations
+from hamkernel._machine import one_blas_thread
 from hamkernel._observations.blocks import AbstractBlock, Values
-from hamkernel._observations.data import inputs_of, observations
+from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._observations.measurements import inputs_of, observations
 from hamkernel._show import text
 from hamkernel._solvers.base import AbstractSolver
 from hamkernel._solvers.cholesky import Cholesky

@@ -21,11 +21,11 @@ import numpy as np
 
 from hamkernel._fields.base import AbstractField
 from hamkernel._kernels.functions import Bound, Closure
-from hamkernel._kernels.groups import identity, reflection, time_reversal
+from hamkernel._kernels.symmetry import identity, reflection, time_reversal
 
 _ROOMS = tuple(
     f"hamkernel.{room}"
-    for room in ("_kernels.", "_structures.", "_features.", "_fields.", "systems.", "poisson")
+    for room in ("_kernels.", "_structures.", "_features.", "_fields.", "systems.")
 )
 _FUNCTIONS = {function.__name__: function for function in (identity, reflection, time_reversal)}
 

@@ -22,9 +22,9 @@ from hamkernel._fields.base import AbstractField, SolverInfo, at_points, root
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import plus_ridge
 from hamkernel._gram.observed import between, gram_of_rows, rows_between
-from hamkernel._machine.memory import refuse_beyond_memory
+from hamkernel._machine import refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock
-from hamkernel._observations.rows import Rows
+from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.prior import Prior, prior_draws
 from hamkernel._solvers.problem import Problem
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -42,7 +42,7 @@ class AbstractConditional(eqx.Module):
     """
 
     field: eqx.AbstractVar[AbstractField]
-    rows: eqx.AbstractVar[Rows]
+    rows: eqx.AbstractVar[Measurements]
     ridge: eqx.AbstractVar[Float[Array, ""]]
 
     @abc.abstractmethod
@@ -50,7 +50,7 @@ class AbstractConditional(eqx.Module):
         """The covariance of the rows of two blocks, given the data."""
 
     @abc.abstractmethod
-    def updated(self: Own, new: Rows) -> Own:
+    def updated(self: Own, new: Measurements) -> Own:
         """The same given new rows too, with the same σ²."""
 
     @abc.abstractmethod
@@ -62,21 +62,21 @@ class DenseConditional(AbstractConditional):
     """By the Cholesky factor of A; `representer` is c = A⁻¹y."""
 
     field: KernelField
-    rows: Rows
+    rows: Measurements
     ridge: Float[Array, ""]
     factor: DenseFactor
     representer: Float[Array, " D"]
 
     def covariance(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
-        told = self._told(left)
-        other = told if right is left else self._told(right)
-        return between(self.field.kernel, left, right) - told.T @ other
+        whitened = self._whitened_covariance(left)
+        other = whitened if right is left else self._whitened_covariance(right)
+        return between(self.field.kernel, left, right) - whitened.T @ other
 
-    def _told(self, block: AbstractBlock) -> Float[Array, "D d"]:
+    def _whitened_covariance(self, block: AbstractBlock) -> Float[Array, "D d"]:
         """R⁻ᵀ c."""
         return self.factor.whiten(rows_between(self.field.kernel, self.rows, block))
 
-    def updated(self, new: Rows) -> "DenseConditional":
+    def updated(self, new: Measurements) -> "DenseConditional":
         factor, c, field = _extended(self, new)
         rows = self.rows.joined(new)
         return DenseConditional(
@@ -121,7 +121,7 @@ def check_memory(D: int, dtype: jnp.dtype) -> None:
     refuse_beyond_memory(f"a dense fit of {D} rows", D, D, dtype, COPIES, cure)
 
 
-def _dense(K, rows: Rows, regularization):
+def _dense(K, rows: Measurements, regularization):
     """The factor, c, the ridge, the field, and the relative residual."""
     y, ridge = rows.y, rows.count * regularization
     factor, c = solution(plus_ridge(gram_of_rows(K, rows), ridge), y)
@@ -145,10 +145,10 @@ def relative(error: Array, of: Array) -> Float[Array, ""]:
 
 
 @eqx.filter_jit
-def _extended(old: DenseConditional, new: Rows):
+def _extended(old: DenseConditional, new: Measurements):
     K, R, rows = old.field.kernel, old.factor.R, old.rows.joined(new)
     # The contrasts of new energies reach back to the old ones.
-    beside, fresh = old.rows.beside(new), rows.size - old.rows.size
+    beside, fresh = old.rows.with_previous(new), rows.size - old.rows.size
     across = [rows_between(K, old.rows, block) for block in beside.blocks]
     across = beside.contrast(jnp.concatenate(across, axis=1).T)[-fresh:].T  # (D, fresh)
     B = old.factor.whiten(across)
@@ -181,7 +181,7 @@ def _corrected(given: DenseConditional, prior: Prior, key) -> KernelField:
 
 def field_of_rows(
     K: AbstractMatrixKernel,
-    rows: Rows,
+    rows: Measurements,
     c: Float[Array, " D"],
     residual: Float[Array, "..."],
     norm: Float[Array, ""],
@@ -204,7 +204,9 @@ def field_of_rows(
     )
 
 
-def gram_product(K: AbstractMatrixKernel, rows: Rows, c: Float[Array, " D"]) -> Float[Array, " D"]:
+def gram_product(
+    K: AbstractMatrixKernel, rows: Measurements, c: Float[Array, " D"]
+) -> Float[Array, " D"]:
     """G c: the rows of the field with these coefficients, by products without the Gram."""
     zero = jnp.zeros((), c.dtype)
     field = field_of_rows(K, rows, c, c, zero, zero, SolverInfo("none"))

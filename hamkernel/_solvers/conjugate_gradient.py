@@ -24,7 +24,7 @@ from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
 from hamkernel._gram.derivatives import constant
 from hamkernel._gram.operator import product
-from hamkernel._machine.devices import as_given, rows_of, split
+from hamkernel._machine import as_given, rows_of, split
 from hamkernel._solvers.base import AbstractSolver
 from hamkernel._solvers.conditional import field_of_rows, gram_product, relative
 from hamkernel._solvers.landmark_gram import Columns, checked, factor, truncated, whitening

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from typing import Any, overload
 
 from jaxtyping import ArrayLike, Num
@@ -11,11 +12,9 @@ from hamkernel._fields.base import AbstractField
 from hamkernel._fields.controlled import ControlledField, learned_field
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._fields.known import Mean
-from hamkernel._machine.devices import rows_of
-from hamkernel._machine.memory import dense_bytes, memory_bytes
-from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.base import AbstractObservations
-from hamkernel._observations.rows import Rows
+from hamkernel._machine import as_given, dense_bytes, memory_bytes, one_blas_thread, rows_of
+from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.base import AbstractSolver, Learned
 from hamkernel._solvers.cholesky import Cholesky
 from hamkernel._solvers.conditional import COPIES
@@ -127,7 +126,10 @@ def solved(given: Problem, solver: AbstractSolver | None, throw: bool = True) ->
     if solver is None:
         spread = rows_of(given.rows.points) is not None
         solver = ConjugateGradient() if spread else default_solver(given.rows)
-    return learned_field(solver._fitted(given, throw), given.known)
+    field = solver._fitted(given, throw)
+    if given.spread is not None and given.states is not None:
+        field = dataclasses.replace(field, residual=as_given(given.spread, field.residual))
+    return learned_field(field, given.known)
 
 
 def check_solver(solver: Any) -> None:
@@ -136,7 +138,7 @@ def check_solver(solver: Any) -> None:
         raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
 
 
-def default_solver(rows: Rows) -> AbstractSolver[KernelField]:
+def default_solver(rows: Measurements) -> AbstractSolver[KernelField]:
     """Cholesky where it takes at most half of the memory of one device, which has all the data."""
     needed = dense_bytes(rows.size, rows.size, rows.targets.dtype, COPIES)
     memory = memory_bytes()

@@ -7,8 +7,8 @@ from jaxtyping import Array, Float, Int
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
 from hamkernel._gram.observed import between, components, trace_of_rows
-from hamkernel._machine.devices import rows_of, split
-from hamkernel._observations.rows import Rows
+from hamkernel._machine import rows_of, split
+from hamkernel._observations.measurements import Measurements
 from hamkernel._show import text
 from hamkernel._solvers import stream_sums
 from hamkernel._solvers.landmark_field import START_ANEW, Solution, landmark_field
@@ -60,7 +60,7 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         return _with_data(self, split(spread, X), split(spread, Y), spread)
 
     @eqx.filter_jit
-    def _added_rows(self, rows: Rows) -> "LandmarkFit":
+    def _added_rows(self, rows: Measurements) -> "LandmarkFit":
         K, S = self.kernel, self.landmarks.points
         design = [between(K, block, components(K, S)) for block in rows.blocks]
         new = (

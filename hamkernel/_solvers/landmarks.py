@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from hamkernel import _require as require
 from hamkernel._gram.dense import assemble, block_traces
 from hamkernel._gram.derivatives import constant
-from hamkernel._machine.devices import rows_of, split
+from hamkernel._machine import rows_of, split
 from hamkernel._structures.base import AbstractMatrixKernel
 
 BLOCK = 16  # points drawn at once

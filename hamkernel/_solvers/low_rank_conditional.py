@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Key
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._observations.blocks import AbstractBlock
-from hamkernel._observations.rows import Rows
+from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.conditional import AbstractConditional
 from hamkernel._solvers.landmark_gram import singular
 from hamkernel._solvers.spans import AbstractSpan
@@ -28,23 +28,23 @@ class LowRankConditional(AbstractConditional):
     """By R with RᵀR = FᵀF + σ²I; the weights are w = R⁻¹ `rotated`."""
 
     field: AbstractField
-    rows: Rows
+    rows: Measurements
     ridge: Float[Array, ""]
     span: AbstractSpan
     R: Float[Array, "r r"]
     rotated: Float[Array, " r"]
 
     def covariance(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
-        own = self._told(left)
-        other = own if right is left else self._told(right)
+        own = self._whitened_covariance(left)
+        other = own if right is left else self._whitened_covariance(right)
         return self.span.missing(left, right) + self.ridge * own.T @ other
 
-    def _told(self, block: AbstractBlock) -> Float[Array, "r d"]:
+    def _whitened_covariance(self, block: AbstractBlock) -> Float[Array, "r d"]:
         return solve_triangular(self.R, self.span.of(block).T, trans="T")
 
-    def updated(self, new: Rows) -> "LowRankConditional":
+    def updated(self, new: Measurements) -> "LowRankConditional":
         rows = self.rows.joined(new)
-        beside, fresh = self.rows.beside(new), rows.size - self.rows.size
+        beside, fresh = self.rows.with_previous(new), rows.size - self.rows.size
         own = self.span.of_rows(beside)[-fresh:], rows.y[-fresh:]
         R, rotated = _below(self.R, self.rotated, *own)
         return _conditional(self.span, rows, self.ridge, R, rotated)
@@ -57,7 +57,7 @@ class LowRankConditional(AbstractConditional):
 
 
 def low_rank_conditional(
-    span: AbstractSpan, rows: Rows, regularization: Float[Array, ""], throw: bool = True
+    span: AbstractSpan, rows: Measurements, regularization: Float[Array, ""], throw: bool = True
 ) -> LowRankConditional:
     """The field given the rows in the span of some functions: O(D r²) time, O(D r) memory.
 

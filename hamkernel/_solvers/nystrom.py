@@ -24,7 +24,7 @@ from hamkernel._fields.base import root
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
 from hamkernel._gram.operator import product
-from hamkernel._machine.devices import as_given, rows_of, split
+from hamkernel._machine import as_given, rows_of, split
 from hamkernel._solvers import landmark_fit, stream_sums
 from hamkernel._solvers.landmark_field import CHOOSE, Solution, landmark_field
 from hamkernel._solvers.landmark_fit import LandmarkFit

@@ -29,7 +29,7 @@ from hamkernel._fields.features import FeatureField, feature_field
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import block_traces
 from hamkernel._gram.observed import components, rows_between
-from hamkernel._observations.rows import Rows
+from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmark_gram import whitening
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -51,7 +51,7 @@ class Prior(eqx.Module):
     features: AbstractFeatures | None
     weights: Float[Array, "count r"] | None
 
-    def rows(self, rows: Rows) -> Float[Array, "D count"]:
+    def rows(self, rows: Measurements) -> Float[Array, "D count"]:
         """The rows of all draws."""
         across = rows_between(self.kernel, rows, components(self.kernel, self.points))
         own = across @ self.coefficients.reshape(len(self.coefficients), -1).T

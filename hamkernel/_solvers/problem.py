@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 from typing import Any
 
-import equinox as eqx
 import jax
 from jaxtyping import Array, ArrayLike, Float
 
@@ -16,21 +15,32 @@ from hamkernel import _require as require
 from hamkernel._fields.base import at_points, potential_of
 from hamkernel._fields.controlled import without_inputs
 from hamkernel._fields.known import KnownPart, known_part
-from hamkernel._machine.devices import on_one_device
-from hamkernel._observations.base import AbstractObservations
-from hamkernel._observations.data import observations, rows_of_data
-from hamkernel._observations.rows import Rows
+from hamkernel._machine import RowSharding, is_on_one_device, on_one_device, rows_of
+from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._observations.measurements import Measurements, measurements, measurements_of
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.controlled import Controlled
 
 
-class Problem(eqx.Module):
-    """y = L f + ε for f ~ GP(known, kernel), y less the rows of what is known."""
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Problem:
+    """y = L f + ε for f ~ GP(known, kernel), y less the rows of what is known.
+
+    Attributes:
+        kernel: K.
+        rows: the observations less what is known of them, on automatic axes of a mesh of devices.
+        regularization: λ, shape ().
+        known: the mean at the points of the rows; None if it is zero.
+        spread: how the rows of the states that were given are spread over devices; None if they
+            are not.
+    """
 
     kernel: AbstractMatrixKernel
-    rows: Rows
+    rows: Measurements
     regularization: Float[Array, ""]
     known: Any = None
+    spread: RowSharding | None = dataclasses.field(metadata={"static": True}, default=None)
 
     @property
     def ridge(self) -> Float[Array, ""]:
@@ -44,6 +54,8 @@ class Problem(eqx.Module):
 
     def on_one_device(self) -> Problem:
         """The same with the rows on one device."""
+        if all(is_on_one_device(array) for array in jax.tree.leaves(self.rows)):
+            return self
         move = jax.tree.map(lambda array: on_one_device("the data", array), self.rows)
         return dataclasses.replace(self, rows=move)
 
@@ -61,27 +73,30 @@ def problem(
     Raises:
         TypeError, ValueError: as `fit` says. AttributeError: energies without a potential.
     """
-    K, rows = rows_of_data(matrix_kernel(K), observations(X, Y, inputs))
+    spread = rows_of(X) if isinstance(X, jax.Array) else None
+    K, rows = measurements(matrix_kernel(K), X, Y, inputs)
     K.check_points(rows.points)
     if len(rows.energies) and K.no_potential:
         raise AttributeError(f"energies were given, and {K.no_potential}")
     regularization = require.ridge(regularization, rows.targets.dtype)
     known = known_part(K, mean, rows.dimension, rows.targets.dtype)
-    return Problem(K, without_known(K, rows, known), regularization, known)
+    return Problem(K, without_known(K, rows, known), regularization, known, spread)
 
 
-def new_rows(K: AbstractMatrixKernel, data: AbstractObservations, old: Rows, known: Any) -> Rows:
+def new_rows(
+    K: AbstractMatrixKernel, data: AbstractObservations, old: Measurements, known: Any
+) -> Measurements:
     """The rows of data that is added to other rows, less what is known of them."""
-    return without_known(K, rows_of_data(K, data, beside=old)[1], known)
+    return without_known(K, measurements_of(K, data, previous=old)[1], known)
 
 
-def without_known(K: AbstractMatrixKernel, rows: Rows, known: Any) -> Rows:
+def without_known(K: AbstractMatrixKernel, rows: Measurements, known: Any) -> Measurements:
     """The rows of f less what is known; AttributeError for energies if that has no potential."""
     if known is None:
         return rows
     potential = _known_potential(K, known) if len(rows.energies) else known
     field, potential = (jax.tree_util.Partial(at_points, each) for each in (known, potential))
-    return rows.less(rows.of(field, potential))
+    return rows.subtract(rows.of(field, potential))
 
 
 def _known_potential(K: AbstractMatrixKernel, known: Any):

@@ -10,9 +10,8 @@ from hamkernel import _require as require
 from hamkernel._features.structured import AbstractFeatures, features
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.features import FeatureField, feature_field
-from hamkernel._machine.devices import as_given, rows_of, split
-from hamkernel._machine.memory import refuse_beyond_memory
-from hamkernel._observations.rows import Rows
+from hamkernel._machine import as_given, refuse_beyond_memory, rows_of, split
+from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers import stream_sums
 from hamkernel._solvers.landmark_gram import singular
 from hamkernel._solvers.low_rank_conditional import (
@@ -171,7 +170,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
         return eqx.tree_at(lambda f: (f.sums, f.count), self, (sums, self.count + len(X)))
 
     @eqx.filter_jit
-    def _added_rows(self, rows: Rows) -> "FeatureFit":
+    def _added_rows(self, rows: Measurements) -> "FeatureFit":
         design = FeatureSpan(self.kernel, self.features, self.dimension).of_rows(rows)
         new = stream_sums.add_rows(self.sums, design, rows.targets), self.count + rows.count
         return eqx.tree_at(lambda f: (f.sums, f.count), self, new)

@@ -18,7 +18,7 @@ from hamkernel._fields.features import FeatureField, feature_field
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.observed import between, components
 from hamkernel._observations.blocks import AbstractBlock
-from hamkernel._observations.rows import Rows
+from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmark_gram import whitening
 from hamkernel._solvers.landmarks import Landmarks, given_landmarks
 from hamkernel._solvers.prior import Prior, drawn, prior_draws
@@ -46,13 +46,13 @@ class AbstractSpan(eqx.Module):
     def draws(
         self,
         weights: Float[Array, "count r"],
-        rows: Rows,
+        rows: Measurements,
         key: Key[Array, ""],
         region: Float[Array, "2 n"],
     ) -> AbstractField:
         """The functions with these weights, and what they leave of the prior, as a batch."""
 
-    def of_rows(self, rows: Rows) -> Float[Array, "D r"]:
+    def of_rows(self, rows: Measurements) -> Float[Array, "D r"]:
         """The rows of observations of each function."""
         return rows.contrast(jnp.concatenate([self.of(block) for block in rows.blocks]))
 
@@ -95,7 +95,7 @@ class LandmarkSpan(AbstractSpan):
 def _on_landmarks(span: LandmarkSpan, weights, prior: Prior) -> KernelField:
     S, T = span.landmarks.points, span.T
     # A draw of the prior less what it is in the span.
-    here = Rows((components(span.kernel, S),), jnp.zeros(len(T), S.dtype))
+    here = Measurements((components(span.kernel, S),), jnp.zeros(len(T), S.dtype))
     less = weights - prior.rows(here).T @ T
     return prior.plus(S, (less @ T.T).reshape(len(less), len(S), -1))
 

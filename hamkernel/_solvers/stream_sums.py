@@ -20,7 +20,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
 from hamkernel._gram.dense import plus_ridge
-from hamkernel._machine.devices import Rows, on_each
+from hamkernel._machine import RowSharding, on_each
 from hamkernel._solvers.tall_least_squares import Design, over_tiles
 
 # Numbers in the tile of rows that is held at once; see `_gram/operator.py`.
@@ -72,7 +72,7 @@ def add(
     design: Design,
     X: Float[Array, "N n"],
     Y: Float[Array, "N n"],
-    spread: Rows | None = None,
+    spread: RowSharding | None = None,
 ) -> Sums:
     """The sums after the rows design(X) with targets Y."""
     new = normal(design, sums.basis, X, Y, spread)
@@ -89,7 +89,7 @@ def normal(
     basis: Float[Array, "r r"],
     X: Float[Array, "N n"],
     Y: Float[Array, "N n"],
-    spread: Rows | None = None,
+    spread: RowSharding | None = None,
 ) -> Normal:
     """The sums over the rows F = design(X) basis, tile by tile, on the devices where they are."""
     if spread is not None:

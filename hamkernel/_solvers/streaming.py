@@ -19,15 +19,14 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 from hamkernel import _require as require
 from hamkernel._fields.controlled import learned_field
 from hamkernel._fields.known import known_part
-from hamkernel._machine.devices import rows_of, split
-from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.base import AbstractObservations
-from hamkernel._observations.data import (
+from hamkernel._machine import one_blas_thread, rows_of, split
+from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._observations.measurements import (
+    Measurements,
+    measurements_of,
     observations,
-    rows_of_data,
     sampled_points,
 )
-from hamkernel._observations.rows import Rows
 from hamkernel._show import call, text
 from hamkernel._solvers.base import AbstractSolver, Learned
 from hamkernel._solvers.problem import without_known
@@ -71,7 +70,7 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
         """`add` for data that has been checked."""
 
     @abc.abstractmethod
-    def _added_rows(self: Fit, rows: Rows) -> Fit:
+    def _added_rows(self: Fit, rows: Measurements) -> Fit:
         """`add` for observations that have been checked."""
 
     @abc.abstractmethod
@@ -102,10 +101,10 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
             return self._added_rows(rows)
         return self._added(*(each.astype(self.dtype) for each in rows.states))
 
-    def _checked_rows(self, data: AbstractObservations) -> Rows:
-        nothing = Rows((), jnp.zeros(0, self.dtype))
+    def _checked_rows(self, data: AbstractObservations) -> Measurements:
+        nothing = Measurements((), jnp.zeros(0, self.dtype))
         self._check(None, data.dimension)
-        _, rows = rows_of_data(self.kernel, data, beside=nothing)
+        _, rows = measurements_of(self.kernel, data, previous=nothing)
         self._check(rows.targets.dtype, rows.dimension)
         if len(rows.energies):
             raise ValueError(

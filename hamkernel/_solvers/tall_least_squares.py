@@ -15,7 +15,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from hamkernel._gram.derivatives import constant
-from hamkernel._machine.devices import Rows, on_each
+from hamkernel._machine import RowSharding, on_each
 
 # A design gives the rows of some points at once: (t, n) -> (t, n, r), row (i, a) of a field's
 # component a at point i.
@@ -28,7 +28,7 @@ def triangle(
     X: Float[Array, "N n"],
     Y: Float[Array, "N n"],
     ridge: Float[Array, ""],
-    spread: Rows | None = None,
+    spread: RowSharding | None = None,
 ) -> Float[Array, "k k"]:
     """The upper triangular factor of √ridge [I 0] above [Φ y]: R, and Qᵀy beside it.
 
@@ -52,7 +52,7 @@ def triangle(
     return over_tiles(step, jnp.diag(on_diagonal), (X, Y), _rows(columns))[0]
 
 
-def _joined(spread: Rows, own: Float[Array, "k k"]) -> Float[Array, "k k"]:
+def _joined(spread: RowSharding, own: Float[Array, "k k"]) -> Float[Array, "k k"]:
     """The factor of the rows of all devices, of which each has its `own`.
 
     One factor after the other, so that no device holds more than two, and all get the same.
@@ -72,7 +72,7 @@ def ridge_regression(
     X: Float[Array, "N n"],
     Y: Float[Array, "N n"],
     ridge: Float[Array, ""],
-    spread: Rows | None = None,
+    spread: RowSharding | None = None,
 ) -> tuple[Float[Array, " r"], Float[Array, "N n"]]:
     """The minimiser w of ‖Y − Φw‖² + ridge ‖w‖², and the residual Y − Φw.
 
@@ -111,7 +111,7 @@ def residual(
     X: Float[Array, "N n"],
     Y: Float[Array, "N n"],
     w: Float[Array, " r"],
-    spread: Rows | None = None,
+    spread: RowSharding | None = None,
 ) -> Float[Array, "N n"]:
     """Y − Φw, tile by tile, where the rows are."""
     if spread is not None:
@@ -127,7 +127,7 @@ def residual(
     return over_tiles(step, None, (X, Y), _rows(len(w)))[1]
 
 
-def _correlations(design, X, Y, w, spread: Rows | None) -> Float[Array, " r"]:
+def _correlations(design, X, Y, w, spread: RowSharding | None) -> Float[Array, " r"]:
     """Φᵀ(Y − Φw)."""
     if spread is not None:
 

@@ -14,10 +14,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.arguments import one_point
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, common_invariance
-from hamkernel._kernels.groups import LinearMap
-from hamkernel._kernels.ranges import by_value
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Invariance,
+    bounds_by_value,
+    common_invariance,
+    one_point,
+)
+from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._show import call, described, joined
 
 
@@ -41,6 +45,10 @@ class AbstractMatrixKernel(eqx.Module):
 
     def __repr__(self) -> str:
         return described(self)
+
+    def __hash__(self) -> int:
+        # Arrays have no hash. Equal kernels have equal structure, so this one fits `==`.
+        return hash(jax.tree.structure(self))
 
     @abc.abstractmethod
     def form(
@@ -119,13 +127,13 @@ class AbstractMatrixKernel(eqx.Module):
     def averaged(self, maps: tuple[LinearMap, ...]) -> "AbstractMatrixKernel":
         """The kernel of the fields whose potential none of these maps changes."""
 
-    def box(
+    def bounds(
         self, name: str, X: Float[np.ndarray, "N d"], amplitude: float
     ) -> tuple[ArrayLike, ArrayLike]:
         """The lower and upper bound of the array `name`, as stored, as those of scalar kernels."""
-        return by_value(name, getattr(self, name))
+        return bounds_by_value(name, getattr(self, name))
 
-    def seen(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
+    def transform_inputs(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
         """The data in the coordinates of the kernels inside."""
         return X
 

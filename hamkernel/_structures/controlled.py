@@ -17,14 +17,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.arguments import one_point
 from hamkernel._kernels.base import (
     AbstractScalarKernel,
     Invariance,
     Scaled,
     as_scalar_kernel,
+    one_point,
 )
-from hamkernel._kernels.groups import LinearMap
+from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.port_hamiltonian import distinct_coordinates
@@ -262,7 +262,7 @@ class Controlled(AbstractMatrixKernel):
     def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
         raise TypeError("say the symmetry of the drift: Controlled(Invariant(K, maps), inputs=…).")
 
-    def seen(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
+    def transform_inputs(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
         return self._split(X)[0]
 
     @property

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance
-from hamkernel._kernels.groups import LinearMap
+from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
@@ -169,7 +169,7 @@ class UnknownMasses(AbstractMatrixKernel):
     def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
         raise TypeError("say the symmetry inside: UnknownMasses(Invariant(K, maps), masses).")
 
-    def seen(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
+    def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
         return np.asarray(self.to_momenta(jnp.asarray(X)))
 
     @property

@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
-from hamkernel._structures.operators import AbstractPotentialKernel, canonical, check_even
+from hamkernel._structures.structure import AbstractPotentialKernel, canonical, check_even
 
 # Of the damping ratio, r over the critical friction: from 1e-5, at which an oscillation loses 6e-5
 # of its amplitude in a period and far less than can be seen, to overdamped 30 times over.
@@ -112,7 +112,7 @@ class PortHamiltonian(AbstractPotentialKernel):
         general = eqx.tree_at(lambda K: K.log_friction, self, stand_in)
         return general.apply(x, jnp.eye(len(x), dtype=x.dtype))
 
-    def box(
+    def bounds(
         self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
     ) -> tuple[ArrayLike, ArrayLike]:
         """Bounds for log r: an oscillation of extents (Δq, Δp) in X is critical near r = Δp/Δq."""

@@ -8,8 +8,7 @@ f(Sx) = ± S f(x).
 from typing import Any, overload
 
 from hamkernel._kernels.base import AbstractScalarKernel, as_scalar_kernel
-from hamkernel._kernels.groups import linear_maps, time_reversal
-from hamkernel._kernels.symmetry import symmetrised
+from hamkernel._kernels.symmetry import linear_maps, symmetrised, time_reversal
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 

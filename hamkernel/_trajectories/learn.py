@@ -19,7 +19,7 @@ from hamkernel._fields.known import known_part
 from hamkernel._gram.operator import placed_product
 from hamkernel._kernels.base import Scaled
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._observations.data import sampled_points
+from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.controlled import Controlled, InputMatrix

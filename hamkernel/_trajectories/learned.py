@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hamkernel._observations.base import AbstractObservations
+from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._posterior.posterior import Posterior, condition
 from hamkernel._show import described
 from hamkernel._solvers.nystrom import Nystrom

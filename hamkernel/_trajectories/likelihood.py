@@ -24,10 +24,9 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._gram.dense import assemble
-from hamkernel._gram.derivatives import trained
-from hamkernel._machine.batches import orthonormal
-from hamkernel._observations.base import Together
-from hamkernel._observations.kinds import Functionals
+from hamkernel._gram.derivatives import forward_differentiated
+from hamkernel._machine import orthonormal
+from hamkernel._observations.kinds import Functionals, Together
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._trajectories.descent import HUGE, minimise
 from hamkernel._trajectories.flow import means
@@ -52,7 +51,7 @@ class KernelRows(eqx.Module):
 
 def landmark_whitening(K: AbstractMatrixKernel, S: Float[Array, "m d"]) -> Float[Array, "q q"]:
     """T = L⁻ᵀ with L Lᵀ = K(S, S), q = m n."""
-    G = trained((K, S), KernelRows(S), rowwise=True)
+    G = forward_differentiated((K, S), KernelRows(S), rowwise=True)
     G = G.reshape(-1, G.shape[-1])
     # Of each component by itself, which have different units; some are zero, as q̇ of a U(q).
     d = jnp.diagonal(G)
@@ -81,7 +80,7 @@ def project_out_starts(
     """The rows at these hyperparameters; the starts have the prior N(·, diag(start_deviation²))."""
     (*nodes, d), n = rows.nodes.shape, rows.target.shape[-1]
     size, q = len(rows.counts), len(S) * n
-    raw = trained((K, rows.nodes.reshape(-1, d)), KernelRows(S), rowwise=True)
+    raw = forward_differentiated((K, rows.nodes.reshape(-1, d)), KernelRows(S), rowwise=True)
     T = landmark_whitening(K, S)
     M = accumulated(rows.across, rows.weights, raw.reshape(*nodes, n, q)) @ T
     W = jnp.sqrt(rows.counts) * jnp.exp(-log_noise)[None, None]  # (S, L + 1, n)

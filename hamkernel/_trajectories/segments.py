@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hamkernel._machine.batches import orthonormal
+from hamkernel._machine import orthonormal
 from hamkernel._trajectories.flow import (
     NODES,
     WEIGHTS,

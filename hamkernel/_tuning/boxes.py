@@ -1,7 +1,7 @@
 """The hyperparameters of a kernel, with the boxes that it takes from the data.
 
-Every kernel says of its own arrays where to look for them, `box`, and what data the kernels inside
-it see, `seen`: behind a `Select` or a `Warp` it is transformed first.
+Every kernel gives the bounds of its own arrays, `bounds`, and the data in the coordinates that the
+kernels inside it see, `transform_inputs`: a `Select` or a `Warp` transforms them first.
 """
 
 import dataclasses
@@ -17,12 +17,11 @@ from jaxtyping import Array, Float
 
 from hamkernel._gram.dense import trace
 from hamkernel._gram.observed import gram_of_rows
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance, bounds_by_value
 from hamkernel._kernels.functions import Bound
-from hamkernel._kernels.ranges import by_value
 from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._observations.blocks import Components
-from hamkernel._observations.rows import Rows
+from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 
 
@@ -95,7 +94,7 @@ def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, 
     return jnp.maximum(trace, gram_trace(K, X))
 
 
-def typical_speed(K: AbstractMatrixKernel, rows: Rows) -> float:
+def typical_speed(K: AbstractMatrixKernel, rows: Measurements) -> float:
     """The root of the mean square of a component of a velocity, as far as the rows tell.
 
     It is to the mean diagonal of the Gram of the points as the mean square of the rows is to that
@@ -121,7 +120,7 @@ def _amplitude(K: AbstractMatrixKernel, X: Array, speed: float) -> float:
 def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterator[Hyperparameter]:
     """Walk the kernel; X is the data in the coordinates that `node` sees."""
     kernel = node if isinstance(node, AbstractScalarKernel | AbstractMatrixKernel) else None
-    inside = X if kernel is None else kernel.seen(X)
+    inside = X if kernel is None else kernel.transform_inputs(X)
     for key, child in _children(node):
         if eqx.is_inexact_array(child):
             name = keystr((*path, *key)).removeprefix(".")
@@ -131,7 +130,11 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
                     "real and imaginary parts as two arrays."
                 )
             head, dot, last = name.rpartition(".")
-            box = by_value(last, child) if kernel is None else kernel.box(last, X, amplitude)
+            box = (
+                bounds_by_value(last, child)
+                if kernel is None
+                else kernel.bounds(last, X, amplitude)
+            )
             yield Hyperparameter(
                 # `terms[0].kernel.lengthscale` for the leaf `.terms[0].kernel.log_lengthscale`
                 name=head + dot + last.removeprefix("log_"),

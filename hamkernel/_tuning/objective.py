@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._observations.rows import Rows
+from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.spans import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._validation.folds import Folds, Partition
@@ -49,7 +49,7 @@ class SearchCriterion(eqx.Module):
     own: bool = eqx.field(static=True)  # the caller's, which may need all the data
 
     def loss(
-        self, K: AbstractMatrixKernel, rows: Rows, regularization: Float[Array, ""]
+        self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
         """The objective, as `tune` reports it, and ‖a‖² of the fit where there is a wall for it."""
         extra = () if self.partition is None else (self.partition,)
@@ -63,7 +63,7 @@ class SearchCriterion(eqx.Module):
             )
         return value, square
 
-    def searched(self, loss, square, rows: Rows, wall) -> Float[Array, ""]:
+    def searched(self, loss, square, rows: Measurements, wall) -> Float[Array, ""]:
         """What the search minimises: the loss in its units, and the wall.
 
         The wall keeps away from fields that rounding makes rough where the loss is still right.
@@ -99,7 +99,7 @@ class SearchCriterion(eqx.Module):
         fn = jax.tree_util.Partial(self.fn.func, **self.fn.keywords, basis=basis)
         return dataclasses.replace(self, fn=fn)
 
-    def on(self, rows: Rows, chosen: np.ndarray) -> "SearchCriterion":
+    def on(self, rows: Measurements, chosen: np.ndarray) -> "SearchCriterion":
         """The same criterion for the rows of some observations."""
         if self.partition is None:
             return self

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from hamkernel._observations.rows import Rows
+from hamkernel._observations.measurements import Measurements
 from hamkernel._tuning.objective import SearchCriterion
 from hamkernel._tuning.space import SearchSpace
 
@@ -19,7 +19,9 @@ FIRST_POINTS, FIRST_ROWS, SECOND_ROWS = 64, 256, 1024
 _BATCH = 16  # points that one call takes: as many as there are starts
 
 
-def parts_of(rows: Rows, criterion: SearchCriterion, dense: bool) -> list[Int[np.ndarray, " _"]]:
+def parts_of(
+    rows: Measurements, criterion: SearchCriterion, dense: bool
+) -> list[Int[np.ndarray, " _"]]:
     """The observations of each part; all of them at last, where the loss is dense."""
     N, n = rows.count, len(rows.targets) / rows.count
     if criterion.own:  # it may need all the data
@@ -48,7 +50,7 @@ class Part:
         self,
         space: SearchSpace,
         criterion: SearchCriterion,
-        rows: Rows,
+        rows: Measurements,
         speed: float,
         chosen: Int[np.ndarray, " C"],
     ):
@@ -64,7 +66,7 @@ class Part:
         self.seconds = np.inf
         N = rows.count
         if len(chosen) < N:
-            rows, chosen = rows.some(chosen)
+            rows, chosen = rows.subset(chosen)
         self.count = rows.count
         dtype = rows.targets.dtype
         thinning = jnp.asarray(N / self.count, dtype)
@@ -99,7 +101,7 @@ class SearchObjective(eqx.Module):
 
     space: SearchSpace
     criterion: SearchCriterion
-    rows: Rows
+    rows: Measurements
     thinning: Float[Array, ""]  # the number of all observations over that of these
     speed: Float[Array, ""]
 

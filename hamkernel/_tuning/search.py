@@ -13,7 +13,7 @@ import numpy as np
 import optimistix as optx
 
 from hamkernel import _require as require
-from hamkernel._observations.rows import Rows
+from hamkernel._observations.measurements import Measurements
 from hamkernel._tuning.descent import Descent, Run
 from hamkernel._tuning.objective import SearchCriterion
 from hamkernel._tuning.other_optimisers import minimised
@@ -57,7 +57,7 @@ class Search:
         self,
         space: SearchSpace,
         criterion: SearchCriterion,
-        rows: Rows,
+        rows: Measurements,
         speed: float,
         starts: int,
         max_steps: int,

@@ -9,7 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float
 
-from hamkernel._gram.derivatives import trained
+from hamkernel._gram.derivatives import forward_differentiated
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._tuning.boxes import full_trace, hyperparameters
 
@@ -122,7 +122,7 @@ class SearchSpace(eqx.Module):
 
     def size_of_gram(self, kernel: AbstractMatrixKernel) -> Float[Array, ""]:
         """tr(G)/N, before the terms of an odd or even kernel cancel."""
-        return trained((kernel, self.states), full_trace) / len(self.states)
+        return forward_differentiated((kernel, self.states), full_trace) / len(self.states)
 
     def ridge_box(self, size: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """The bounds of log λ: from the rounding of the Gram to where the field is almost zero.

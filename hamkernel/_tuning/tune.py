@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -27,9 +26,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._fields.known import Mean
-from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.base import AbstractObservations
-from hamkernel._observations.data import observations
+from hamkernel._machine import one_blas_thread
+from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._observations.measurements import observations
 from hamkernel._show import described
 from hamkernel._solvers.base import AbstractSolver
 from hamkernel._solvers.fit import check_solver, solved
@@ -202,11 +201,13 @@ def tune(
     parts = parts_of(rows, criterion, dense=True)
     if not low_rank and not criterion.own:
         check_memory(rows, _LOSS_COPIES)
-    few = rows if len(parts) == 1 else rows.some(parts[0])[0]
+    few = rows if len(parts) == 1 else rows.subset(parts[0])[0]
     speed = typical_speed(K, few)
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
     kept, points = tuple(frozen), rows.points
-    space = SearchSpace(K, points, speed, given.regularization, kept, bounds or {}, roundings, few.points)
+    space = SearchSpace(
+        K, points, speed, given.regularization, kept, bounds or {}, roundings, few.points
+    )
     advice.warn_of_free_scale(space, criterion)
     search = Search(space, criterion, rows, speed, starts, max_steps, optimiser, progress)
 

@@ -6,10 +6,9 @@ from typing import Any
 
 from jaxtyping import Array, ArrayLike, Float, Num
 
-from hamkernel._machine.memory import refuse_beyond_memory
-from hamkernel._machine.threads import one_blas_thread
-from hamkernel._observations.base import AbstractObservations
-from hamkernel._observations.rows import Rows
+from hamkernel._machine import one_blas_thread, refuse_beyond_memory
+from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.problem import problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._validation.folds import Folds
@@ -159,7 +158,7 @@ def log_marginal_likelihood(
     return log_likelihood(*_checked(K, X, Y, regularization, inputs))
 
 
-def _checked(K, X, Y, regularization, inputs) -> tuple[Any, Rows, Float[Array, ""]]:
+def _checked(K, X, Y, regularization, inputs) -> tuple[Any, Measurements, Float[Array, ""]]:
     """Kernel, rows and λ."""
     # LAPACK on every device at once was seen to stall, see `_factors/dense.py`.
     given = problem(K, X, Y, regularization, inputs=inputs).on_one_device()
@@ -170,7 +169,7 @@ def _checked(K, X, Y, regularization, inputs) -> tuple[Any, Rows, Float[Array, "
 LOSS_COPIES = 3  # matrices of the size of the Gram that a loss holds, with its gradient
 
 
-def check_memory(rows: Rows, copies: int) -> None:
+def check_memory(rows: Measurements, copies: int) -> None:
     """Refuse a dense loss that does not fit in memory."""
     M = len(rows.targets)
     cure = (

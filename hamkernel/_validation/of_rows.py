@@ -16,17 +16,17 @@ from hamkernel._factors.contrasted import ContrastedSystem
 from hamkernel._factors.dense import DenseSystem
 from hamkernel._factors.low_rank import LowRankSystem
 from hamkernel._gram.dense import plus_ridge
-from hamkernel._gram.derivatives import trained
+from hamkernel._gram.derivatives import forward_differentiated
 from hamkernel._gram.observed import between_all, gram_of_rows
 from hamkernel._observations.blocks import AbstractBlock, Combinations
-from hamkernel._observations.rows import Rows
+from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.spans import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
 from hamkernel._validation.folds import Folds, Partition
 
 
-def partition_of_rows(rows: Rows, folds: Folds) -> Partition:
+def partition_of_rows(rows: Measurements, folds: Folds) -> Partition:
     """The folds of the rows from those of the observations that they belong to."""
     labels = Partition(rows.count, folds).labels
     return Partition(len(rows.targets), labels[rows.labels()])
@@ -35,19 +35,21 @@ def partition_of_rows(rows: Rows, folds: Folds) -> Partition:
 # Where ‖a‖² comes with them it tells `tune` how far the field will round.
 
 
-def partition_loss(K, rows: Rows, regularization, partition: Partition, basis=None):
+def partition_loss(K, rows: Measurements, regularization, partition: Partition, basis=None):
     """`cross_validation_loss`: the mean over folds of the mean over their rows."""
     return partition_loss_and_square(K, rows, regularization, partition, basis)[0]
 
 
 @eqx.filter_jit
-def partition_loss_and_square(K, rows: Rows, regularization, partition: Partition, basis=None):
+def partition_loss_and_square(
+    K, rows: Measurements, regularization, partition: Partition, basis=None
+):
     left, a = held_out_rows(K, rows, regularization, partition, basis)
     return jnp.asarray(partition.weights, left.dtype) @ left**2, a @ a
 
 
 @eqx.filter_jit
-def held_out_rows(K, rows: Rows, regularization, partition: Partition, basis=None):
+def held_out_rows(K, rows: Measurements, regularization, partition: Partition, basis=None):
     """What a fit without their fold leaves of the rows, in units of their noise, and A⁻¹y.
 
     Of a fold with all energies it is what their constant does not explain.
@@ -69,10 +71,10 @@ def held_out_rows(K, rows: Rows, regularization, partition: Partition, basis=Non
         found = _dense_held_out(features @ features.T, ridge, y, p, rows, partition)
     else:
         found = held_out(LowRankSystem(features, ridge, p), y, partition)
-    return tuple(map(rows.uncontrasted, found)) if contrasted else found
+    return tuple(map(rows.contrast_transpose, found)) if contrasted else found
 
 
-def _dense_held_out(G, ridge, y, p, rows: Rows, partition: Partition):
+def _dense_held_out(G, ridge, y, p, rows: Measurements, partition: Partition):
     A = plus_ridge(G, ridge)
     if p is None:
         return held_out(DenseSystem(A), y, partition)
@@ -85,13 +87,13 @@ def _dense_held_out(G, ridge, y, p, rows: Rows, partition: Partition):
     return found[0] / units, units * found[1]
 
 
-def generalized_loss(K, rows: Rows, regularization, basis=None, least_free=0.0):
+def generalized_loss(K, rows: Measurements, regularization, basis=None, least_free=0.0):
     """`generalized_cross_validation` of the rows."""
     return generalized_loss_and_square(K, rows, regularization, basis, least_free)[0]
 
 
 @eqx.filter_jit
-def generalized_loss_and_square(K, rows: Rows, regularization, basis=None, least_free=0.0):
+def generalized_loss_and_square(K, rows: Measurements, regularization, basis=None, least_free=0.0):
     # Infinite where less than the share `least_free` of the residuals is free, tr(I − S)/D.
     ridge = rows.count * regularization
     squares, trace = free_residuals(_of_contrasts(K, rows, ridge, basis), rows.y)
@@ -100,7 +102,7 @@ def generalized_loss_and_square(K, rows: Rows, regularization, basis=None, least
 
 
 @eqx.filter_jit
-def log_likelihood(K, rows: Rows, regularization, basis=None):
+def log_likelihood(K, rows: Measurements, regularization, basis=None):
     """`log_marginal_likelihood`: with energies, of a flat prior of their constant."""
     ridge = rows.count * regularization
     density = log_density(_of_contrasts(K, rows, ridge, basis), rows.y)
@@ -110,7 +112,7 @@ def log_likelihood(K, rows: Rows, regularization, basis=None):
     return density - 0.5 * jnp.log(jnp.sum(rows.scale[rows.energies] ** -2))
 
 
-def _of_contrasts(K, rows: Rows, ridge, basis: AbstractBasis | None) -> AbstractSystem:
+def _of_contrasts(K, rows: Measurements, ridge, basis: AbstractBasis | None) -> AbstractSystem:
     """A of the rows that do not see the constant, whose y is `rows.y`."""
     if basis is not None:
         return LowRankSystem(features_of_rows(K, rows, basis, contrasted=True), ridge)
@@ -121,7 +123,7 @@ def _of_contrasts(K, rows: Rows, ridge, basis: AbstractBasis | None) -> Abstract
 
 
 def features_of_rows(
-    K, rows: Rows, basis: AbstractBasis, contrasted: bool = False
+    K, rows: Measurements, basis: AbstractBasis, contrasted: bool = False
 ) -> Float[Array, "M r"]:
     """Φ, before the contrast or after it."""
     like = rows.blocks[0].points
@@ -133,7 +135,9 @@ def features_of_rows(
     return rows.contrast(features) if contrasted else features
 
 
-def gram(K: AbstractMatrixKernel, rows: Rows, contrasted: bool = False) -> Float[Array, "M M"]:
+def gram(
+    K: AbstractMatrixKernel, rows: Measurements, contrasted: bool = False
+) -> Float[Array, "M M"]:
     """G, before the contrast or after it."""
 
     def of(K, others):
@@ -151,10 +155,10 @@ def _by_points(K, block: AbstractBlock, data, of) -> Float[Array, "d e"]:
     Point by point: combinations of many would be larger than their rows, and are made at once.
     """
     if isinstance(block, Combinations):
-        return trained((K, (block, data)), lambda K, both: of(K, both[1])(both[0]))
+        return forward_differentiated((K, (block, data)), lambda K, both: of(K, both[1])(both[0]))
 
     def make(K, both):
         rows = of(K, both[1])
-        return lambda x: rows(at := block.at(x)).reshape(*at.values_shape, -1), both[0]
+        return lambda x: rows(at := block.with_points(x)).reshape(*at.values_shape, -1), both[0]
 
-    return block.rows(trained((K, (block.points, data)), make, rowwise=True))
+    return block.rows(forward_differentiated((K, (block.points, data)), make, rowwise=True))

@@ -6,9 +6,8 @@ from collections.abc import Callable, Mapping
 
 from hamkernel._kernels.radial import Gaussian
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.operators import Symplectic
+from hamkernel._structures.structure import Separable, Symplectic
 from hamkernel._structures.symmetry import Odd
-from hamkernel._structures.without_potential import Separable
 from hamkernel.systems import AbstractHamiltonianSystem, HarmonicOscillator, Pendulum
 
 # What `fit` must be given, whose ridge is N · regularization, for the ridge that is meant.

@@ -26,7 +26,7 @@ from scipy.integrate import solve_ivp
 
 import hamkernel as hk
 from hamkernel._observations.blocks import Components
-from hamkernel._observations.data import rows_of_states
+from hamkernel._observations.measurements import measurements_of_states
 from hamkernel._solvers.spans import LandmarkBasis, WaveBasis
 from hamkernel._validation.folds import Partition
 from hamkernel._validation.of_rows import (
@@ -176,7 +176,7 @@ def gram_of(basis, make, X):
 
 def compiled(problem: Problem, basis) -> dict[str, Any]:
     """Each loss with its gradient, as functions of the hyperparameter and λ."""
-    rows = rows_of_states(*map(jnp.asarray, problem.data))
+    rows = measurements_of_states(*map(jnp.asarray, problem.data))
     partition = partition_of_rows(rows, problem.folds)
 
     def with_gradient(loss, *extra):

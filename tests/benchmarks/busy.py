@@ -4,7 +4,7 @@
 
 A busy process spins on one core. Medians and maxima of 20 calls (5 of `tune`), in milliseconds, and
 their ratio to the median alone. The column "threads" is the median alone, in turn with the other,
-where the library leaves BLAS all its threads, as it would without `hamkernel/_machine/threads.py`;
+where the library leaves BLAS all its threads, as it would without `hamkernel/_machine.py`;
 with --threads all columns are. Wanted on two cores: medians at most 2.5 times and maxima at most 6
 times the median alone, and alone at most 1.15 times that with threads.
 """
@@ -22,7 +22,7 @@ jax.config.update("jax_enable_x64", True)
 import numpy as np
 
 import hamkernel as hk
-from hamkernel._machine import threads
+from hamkernel import _machine
 
 K = hk.Symplectic(hk.Gaussian(1.0))
 CALLS, SEARCHES = 20, 5
@@ -54,9 +54,9 @@ def milliseconds(call) -> float:
 
 def free(call) -> float:
     """The same with all threads of BLAS."""
-    limited, threads._one_thread = threads._one_thread, contextlib.nullcontext
+    limited, _machine._one_thread = _machine._one_thread, contextlib.nullcontext
     took = milliseconds(call)
-    threads._one_thread = limited
+    _machine._one_thread = limited
     return took
 
 
@@ -73,7 +73,7 @@ def main() -> None:
     parser.add_argument("--threads", action="store_true", help="leave BLAS its threads")
     options = parser.parse_args()
     if options.threads:
-        threads._one_thread = contextlib.nullcontext
+        _machine._one_thread = contextlib.nullcontext
     print(f"{'':<14}{'alone':>34}{'beside one':>30}{'beside two':>30}")
     print(
         f"{'N':>5} {'call':<8}"

@@ -22,7 +22,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import hamkernel as hk
 from hamkernel._gram.operator import product
-from hamkernel._machine.devices import Rows
+from hamkernel._machine import RowSharding
 from hamkernel._solvers import conjugate_gradient, nystrom, random_features
 
 KERNEL = hk.Symplectic(hk.Gaussian(1.5))
@@ -75,7 +75,7 @@ def bytes_of_a_device(function, points, devices):
     mesh = mesh_of(devices)
     sharding = NamedSharding(mesh, PartitionSpec("data"))
     data = jax.ShapeDtypeStruct((points, 2), jnp.float64, sharding=sharding)
-    rows = Rows(mesh, ("data",), sharding) if devices > 1 else None
+    rows = RowSharding(mesh, ("data",), sharding) if devices > 1 else None
     compiled = jax.jit(lambda X, Y: function(X, Y, rows)).lower(data, data).compile()
     used: Any = compiled.memory_analysis()
     return used.argument_size_in_bytes + used.output_size_in_bytes + used.temp_size_in_bytes

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import hamkernel as hk
-from hamkernel._observations.data import rows_of_states
+from hamkernel._observations.measurements import measurements_of_states
 from hamkernel._tuning.objective import criterion_of
 from hamkernel._tuning.part import Part, SearchObjective
 from hamkernel._tuning.space import SearchSpace
@@ -89,7 +89,7 @@ def searched_on_grid(objective: SearchObjective) -> jax.Array:
 
 def objective_of(K, X, Y) -> SearchObjective:
     """That of the search, on all points."""
-    rows, speed = rows_of_states(X, Y), float(jnp.sqrt(jnp.mean(Y**2)))
+    rows, speed = measurements_of_states(X, Y), float(jnp.sqrt(jnp.mean(Y**2)))
     space = SearchSpace(K, X, speed, jnp.asarray(START_RIDGE), (), {})
     criterion = criterion_of("cross_validation", len(X), FOLDS)
     return Part(space, criterion, rows, speed, np.arange(len(X))).objective

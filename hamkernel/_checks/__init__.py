@@ -1,1 +1,0 @@
-"""The test of a user's own kernel."""

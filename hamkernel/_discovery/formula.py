@@ -1,0 +1,173 @@
+"""A formula of the potential, as a field and as text."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from hamkernel import _require as require
+from hamkernel._fields.base import potential_of
+from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.controlled import Controlled
+from hamkernel._structures.masses import UnknownMasses
+from hamkernel._structures.structure import AbstractPotentialKernel
+
+
+class Formula(eqx.Module):
+    """u(x) = Σ θ_k φ_k(x), the potential as a formula; made by `readout`.
+
+    It is a field: `formula(x)` is the velocity B∇u of one state, so `hk.simulate(formula, x0, ts)`
+    follows it, and `formula.potential(x)`, of structures with an energy `formula.hamiltonian(x)`,
+    is u. A PyTree.
+
+    Attributes:
+        terms: the names of the functions that were selected, in the order of the dictionary.
+        coefficients: θ, shape (k,).
+        deviations: the standard deviations of θ, shape (k,). They count the noise and the selection
+            of the terms; the hyperparameters of the kernel, such as friction, are plugged in.
+        misfit: the root mean square of the residuals over the standard deviation √(Nλ) of the noise
+            that the fit assumed, shape (): about one where the formula explains the data as well as
+            the kernel does, larger where a term is missing.
+        probability: that of these terms among all subsets that were compared, shape ().
+        rows: the number of rows.
+        functions: the φ_k of the terms.
+        kernel: the kernel, whose B makes velocities from gradients.
+        mean: the known part of the field, to which B∇u is added; None if there is none.
+    """
+
+    terms: tuple[str, ...] = eqx.field(static=True)
+    coefficients: Float[Array, " k"]
+    deviations: Float[Array, " k"]
+    misfit: Float[Array, ""]
+    probability: Float[Array, ""]
+    rows: int = eqx.field(static=True)
+    functions: tuple[Callable[..., Any], ...]
+    kernel: AbstractMatrixKernel
+    mean: Any
+
+    # For jax.jit(formula), as of fields.
+    def __hash__(self) -> int:
+        return id(self)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+    def __repr__(self) -> str:
+        signed = [
+            ("- " if value < 0 else "+ ") + f"{_with_deviation(abs(value), deviation)} {name}"
+            for name, value, deviation in self._triples()
+        ]
+        if self.mean is not None:
+            signed = ["+ (that of the mean)", *signed]
+        total = " ".join(signed)
+        total = total.removeprefix("+ ") if total.startswith("+") else "-" + total[2:]
+        return (
+            f"{self._symbol} = {total}    [misfit {float(self.misfit):.3g} of {self.rows} rows, "
+            f"probability {float(self.probability):.2f}]"
+        )
+
+    def latex(self) -> str:
+        r"""The formula in LaTeX, such as `H = 0.5002(12)\,p^{2} - 0.981(4)\,\cos(q)`.
+
+        A coefficient comes with its deviation in units of the last digit. The names of the terms
+        are written as Python and translated: powers, products, indices and common functions. A name
+        that contains a backslash is taken as LaTeX.
+        """
+        total = ""
+        for name, value, deviation in self._triples():
+            sign = "-" if value < 0 else "+" if total else ""
+            term = rf"{_with_deviation(abs(value), deviation)}\,{_latex(name)}"
+            total += f" {sign} {term}" if total else f"{sign}{term}"
+        mean = r"H_\mathrm{mean} + " if self.mean is not None and self._symbol == "H" else ""
+        mean = r"u_\mathrm{mean} + " if self.mean is not None and not mean else mean
+        return f"{self._symbol} = {mean}{total}".replace("+ -", "- ")
+
+    def _triples(self) -> Iterator[tuple[str, float, float]]:
+        values = np.asarray(self.coefficients, float), np.asarray(self.deviations, float)
+        for name, value, deviation in zip(self.terms, *values, strict=True):
+            yield name, float(value), float(deviation)
+
+    @property
+    def _symbol(self) -> str:
+        return "H" if self.kernel.has_hamiltonian else "u"
+
+    def _formula(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+        theta = self.coefficients
+        values = [jnp.asarray(fn(x)).astype(theta.dtype) for fn in self.functions]
+        return theta @ jnp.stack(values)
+
+    def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+        """The velocity B(x)∇u(x), that of the mean included; without inputs."""
+        x = require.floating(x, "x")
+        velocity = operator_of(self.kernel)(x, jax.grad(self._formula)(x))
+        return velocity if self.mean is None else velocity + self.mean(x).astype(velocity.dtype)
+
+    def potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        """The potential u(x), that of the mean included.
+
+        Raises:
+            AttributeError: the mean has no potential of this structure.
+        """
+        x = require.floating(x, "x")
+        value = self._formula(x)
+        return value if self.mean is None else value + potential_of(self.mean, self.kernel)(x)
+
+    def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        """The energy H(x), that of the mean included.
+
+        Raises:
+            AttributeError: the structure has no energy, or the mean has none.
+        """
+        if not self.kernel.has_hamiltonian:
+            raise AttributeError(
+                f"the fields of {type(self.kernel).__name__} have no energy: ask for potential(x)."
+            )
+        return self.potential(x)
+
+
+def operator_of(K: AbstractMatrixKernel) -> Callable[[Array, Array], Array]:
+    """(x, v) -> B(x) v."""
+    if isinstance(K, Controlled):
+        return operator_of(K.drift)
+    if isinstance(K, Sum):  # its terms share one operator, or it would have no potential
+        return operator_of(K.terms[0])
+    if isinstance(K, UnknownMasses):  # S⁻¹ B S⁻ᵀ in the coordinates y = S⁻¹x
+        inner = operator_of(K.kernel)
+        return lambda y, v: K.to_velocities(inner(K.to_momenta(y), K.to_velocities(v)))
+    if isinstance(K, AbstractPotentialKernel):
+        return K.apply
+    raise TypeError(f"{type(K).__name__} does not say by which operator its fields are made.")
+
+
+def _with_deviation(value: float, deviation: float) -> str:
+    """`0.981(4)`: a positive number with its deviation in units of the last digit shown."""
+    if not (deviation > 0 and math.isfinite(deviation)) or deviation < 1e-12 * value:
+        return f"{value:.6g}"
+    power = math.floor(math.log10(deviation))
+    digits = round(deviation / 10.0**power)
+    if digits < 3:  # 0.981(12), and not 0.98(1), which is off by half
+        power, digits = power - 1, round(deviation / 10.0 ** (power - 1))
+    if power > 0:
+        return f"{round(value, -power):.0f}({digits * 10**power})"
+    return f"{value:.{-power}f}({digits})"
+
+
+_FUNCTIONS = "sin|cos|tan|sinh|cosh|tanh|exp|log|sqrt|arctan"
+
+
+def _latex(name: str) -> str:
+    """A name written as Python, in LaTeX."""
+    if "\\" in name:
+        return name
+    name = re.sub(r"\*\*\s*\(([^()]*)\)|\*\*\s*(-?[\w.]+)", lambda m: f"^{{{m[1] or m[2]}}}", name)
+    name = re.sub(rf"\b({_FUNCTIONS})\b", r"\\\1", name)
+    name = re.sub(r"(?<![\\\w])([A-Za-z])_?(\d+)\b", r"\1_{\2}", name)
+    return re.sub(r"\s*\*\s*", r"\\,", name)

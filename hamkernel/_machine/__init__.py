@@ -1,1 +1,0 @@
-"""Devices, memory and threads, and batches of small matrices that do not stall."""

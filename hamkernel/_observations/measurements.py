@@ -1,0 +1,411 @@
+"""The normal form of all observations: y_r = L_r u + ε_r with one variance Nλ of all rows.
+
+Only in this file do inputs join their states. With inputs a point is (x, u), of d = n + m
+coordinates, and the field there has n components; the Gram, the solvers and the losses know no
+more.
+
+Energies are known up to one constant c, the same for all of them: E = u(z) + c. In rows divided by
+their noise the constant has the direction p = 1/noise, and rows orthogonal to p do not depend on
+it. Such rows are the contrasts of each energy with the weighted mean of those before it,
+
+    q_i = (n_{i−1} e_i − (p_i/n_{i−1}) Σ_{j<i} p_j e_j)/n_i,   n_i² = Σ_{j≤i} p_j².
+
+The contrasts are orthonormal, so their noise is independent again: this is generalised least
+squares with the constant estimated, exactly, in one row less. They are Helmert's contrasts, with
+weights, and a cumulative sum computes them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from hamkernel import _require as require
+from hamkernel._machine import automatic, is_on_one_device
+from hamkernel._observations.blocks import AbstractBlock, Components, merged
+from hamkernel._observations.kinds import (
+    AbstractObservations,
+    Equilibria,
+    Velocities,
+    refuse_swapped,
+)
+from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.controlled import Controlled, KnownMatrix
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class Measurements:
+    """The rows of observations: the map L in blocks, and the targets y.
+
+    There are M rows before the contrast of the energies and D ≤ M after it.
+
+    Attributes:
+        blocks: the M rows of L, one block for each kind of observation.
+        targets: the M measured values, each divided by its relative noise, shape (M,).
+    """
+
+    blocks: tuple[AbstractBlock, ...]
+    targets: Float[Array, " M"]
+
+    @property
+    def count(self) -> int:
+        """N, the number of points of velocities and equilibria, of energies and of functionals."""
+        return sum(block.count for block in self.blocks)
+
+    @property
+    def dimension(self) -> int:
+        """n, the number of coordinates of a state."""
+        return self.blocks[0].dimension
+
+    @property
+    def scale(self) -> Float[Array, " M"]:
+        """The relative noise of each of the M rows."""
+        return jnp.concatenate([block.scale for block in self.blocks])
+
+    @property
+    def size(self) -> int:
+        """D, the number of rows after the contrast."""
+        return len(self.targets) - (len(self.energies) > 0)
+
+    @property
+    def y(self) -> Float[Array, " D"]:
+        """The targets after the contrast."""
+        return self.contrast(self.targets)
+
+    @property
+    def slices(self) -> list[slice]:
+        """The positions of the rows of each block among the M rows."""
+        ends = np.cumsum([0, *(block.size for block in self.blocks)]).tolist()
+        return [slice(a, b) for a, b in itertools.pairwise(ends)]
+
+    @property
+    def energies(self) -> Int[np.ndarray, " E"]:
+        """The positions of the rows that depend on the unknown constant, among the M rows."""
+        if not any(block.of_values for block in self.blocks):
+            return np.arange(0)
+        M = np.arange(len(self.targets))
+        pairs = zip(self.slices, self.blocks, strict=True)
+        return np.concatenate([M[rows] for rows, block in pairs if block.of_values] or [M[:0]])
+
+    @property
+    def constant(self) -> Float[Array, " M"] | None:
+        """The direction of the unknown constant, of norm 1; None without energies."""
+        where = self.energies
+        if not len(where):
+            return None
+        p = jnp.zeros_like(self.targets).at[where].set(1 / self.scale[where])
+        return p / jnp.linalg.norm(p)
+
+    @property
+    def states(self) -> tuple[Float[Array, "N d"], Float[Array, "N n"]] | None:
+        """Points and velocities, if all rows are velocities of one noise; else None."""
+        block = self.blocks[0]
+        plain = len(self.blocks) == 1 and isinstance(block, Components)
+        if not plain or block.kept is not None or block.noise is not None:
+            return None
+        return block.points, self.targets.reshape(block.values_shape)
+
+    def labels(self) -> Int[np.ndarray, " M"]:
+        """The observation, of N, that each of the M rows belongs to."""
+        starts = np.cumsum([0, *(block.count for block in self.blocks)])
+        pairs = zip(starts, self.blocks, strict=False)
+        return np.concatenate([start + block.labels() for start, block in pairs])
+
+    @property
+    def points(self) -> Float[Array, "P d"]:
+        """All points of all blocks, (x, u) where there are inputs."""
+        return jnp.concatenate([block.points for block in self.blocks])
+
+    def of(
+        self,
+        field: Callable[[Float[Array, "P n"]], Float[Array, "P n"]],
+        potential: Callable[[Float[Array, "E n"]], Float[Array, " E"]],
+    ) -> Float[Array, " M"]:
+        """The M rows of a field and its potential, which are functions of many points."""
+        blocks = self.blocks
+        return jnp.concatenate(
+            [b.rows((potential if b.of_values else field)(b.points)) for b in blocks]
+        )
+
+    def subtract(self, known: Float[Array, " M"]) -> Measurements:
+        """The measurements of f − g, where `known` are the M rows of a known field g."""
+        return dataclasses.replace(self, targets=self.targets - known)
+
+    def measured(self) -> Float[Array, " M"]:
+        """The targets in the units of the data, energies less their weighted mean."""
+        return self.scale * self.contrast_transpose(self.y)
+
+    def joined(self, new: Measurements) -> Measurements:
+        """These rows followed by the new ones."""
+        blocks = merged(self.blocks + new.blocks)
+        return Measurements(blocks, jnp.concatenate([self.targets, new.targets]))
+
+    def with_previous(self, new: Measurements) -> Measurements:
+        """The new rows, preceded by the energies among these, if the new rows have energies.
+
+        The contrasts of new energies need the old ones.
+        """
+        pairs = [(b, self.targets[rows]) for b, rows in zip(self.blocks, self.slices, strict=True)]
+        old = [(b, y) for b, y in pairs if b.of_values and len(new.energies)]
+        blocks, targets = (tuple(block for block, _ in old), [y for _, y in old])
+        return Measurements(blocks + new.blocks, jnp.concatenate([*targets, new.targets]))
+
+    def subset(
+        self, chosen: Int[np.ndarray, " C"]
+    ) -> tuple[Measurements, Int[np.ndarray, " chosen"]]:
+        """The rows of some of the N observations, and the indices of these observations.
+
+        The indices `chosen` are in increasing order. Rows that share points stay together, and a
+        single energy, which says nothing, is left out.
+        """
+        ends = np.cumsum([0, *(block.count for block in self.blocks)]).tolist()
+        own = [chosen[(a <= chosen) & (chosen < b)] - a for a, b in itertools.pairwise(ends)]
+        pairs = list(zip(self.blocks, own, strict=True))
+        energies = sum(len(each) for block, each in pairs if block.of_values)
+        blocks, targets, taken = [], [], []
+        for (block, each), place, start in zip(pairs, self.slices, ends, strict=False):
+            if len(each) and not (block.of_values and energies == 1):
+                part, rows, these = block.subset(each)
+                blocks.append(part)
+                targets.append(np.asarray(self.targets)[place][rows])
+                taken.append(start + these)
+        return Measurements(tuple(blocks), jnp.asarray(np.concatenate(targets))), np.concatenate(
+            taken
+        )
+
+    def residual(self, left: Float[Array, " D"]) -> Float[Array, "..."]:
+        """The residual y − f in the units of the data, from that of the D rows of the contrast.
+
+        Its shape is (N, n) if the data are velocities that were all measured, else (M,).
+        """
+        return self.in_units(self.contrast_transpose(left))
+
+    def in_units(self, left: Float[Array, " M"]) -> Float[Array, "..."]:
+        """M rows in the units of the data; of shape (N, n) for velocities all measured."""
+        block = self.blocks[0]
+        whole = len(self.blocks) == 1 and isinstance(block, Components) and block.kept is None
+        left = self.scale * left
+        return left.reshape(block.values_shape) if whole else left
+
+    def contrast(self, rows: Float[Array, "M *rest"]) -> Float[Array, "D *rest"]:
+        """The D contrasts of M rows, which do not depend on the constant of the energies."""
+        where = self.energies
+        if not len(where):
+            return rows
+        p, sizes = self._constant(rows)
+        energies = rows[where]
+        before = jnp.cumsum(p * energies, axis=0)[:-1] / sizes[:-1]
+        contrasts = (sizes[:-1] * energies[1:] - p[1:] * before) / sizes[1:]
+        kept = np.delete(np.arange(len(rows)), where[0])
+        return rows.at[where[1:]].set(contrasts)[kept]
+
+    def contrast_transpose(self, c: Float[Array, "D *rest"]) -> Float[Array, "M *rest"]:
+        """The transpose of the linear map `contrast`."""
+        where = self.energies
+        if not len(where):
+            return c
+        rows = jnp.zeros((len(self.targets), *c.shape[1:]), c.dtype)
+        rows = rows.at[np.delete(np.arange(len(rows)), where[0])].set(c)
+        p, sizes = self._constant(rows)
+        energies = rows[where][1:] / sizes[1:]
+        # The sums over i > j, accumulated from the last contrast on.
+        after = jnp.cumsum((p[1:] / sizes[:-1] * energies)[::-1], axis=0)[::-1]
+        none = jnp.zeros_like(after[:1])
+        own = jnp.concatenate([none, sizes[:-1] * energies])
+        return rows.at[where].set(own - p * jnp.concatenate([after, none]))
+
+    def _constant(self, rows: Float[Array, "M *rest"]) -> tuple[Array, Array]:
+        """P and n_i of the energies, shaped to multiply rows."""
+        p = 1 / self.scale[self.energies]
+        sizes = jnp.sqrt(jnp.cumsum(p**2))
+        beside = (-1, *[1] * (rows.ndim - 1))
+        return p.reshape(beside), sizes.reshape(beside)
+
+    def coefficients(
+        self, c: Float[Array, " D"]
+    ) -> tuple[Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]]:
+        """The representer Lᵀc: points z and coefficients a of the field, s and b of the values.
+
+        Energies alone give one point of the field, with a = 0.
+        """
+        raw = self.contrast_transpose(c)
+        pairs = [(b, b.coefficients(raw[s])) for b, s in zip(self.blocks, self.slices, strict=True)]
+        none = self.blocks[0].points[:1]
+        fields = [(b.points, a) for b, a in pairs if not b.of_values]
+        values = [(b.points, a) for b, a in pairs if b.of_values]
+        fields = fields or [(none, jnp.zeros((1, self.dimension), raw.dtype))]
+        values = values or [(none[:0], jnp.zeros(0, raw.dtype))]
+        Z, A = (jnp.concatenate(each) for each in zip(*fields, strict=True))
+        S, b = (jnp.concatenate(each) for each in zip(*values, strict=True))
+        return Z, A, S, b
+
+
+def measurements(
+    K: AbstractMatrixKernel, X: Any, Y: Any = None, inputs: Any = None
+) -> tuple[AbstractMatrixKernel, Measurements]:
+    """The kernel with its number of inputs, and the rows of the data, checked.
+
+    Args:
+        K: the kernel.
+        X: states, shape (N, n), or observations, and then there are no Y and no inputs.
+        Y: velocities, shape (N, n).
+        inputs: of a `Controlled` kernel: u at each state, shape (N, m).
+
+    Raises:
+        TypeError, ValueError: as `fit` says.
+    """
+    if inputs is None and not isinstance(X, AbstractObservations) and not isinstance(K, Controlled):
+        return K, measurements_of_states(*placed(velocities_at(X, Y)))
+    return measurements_of(K, placed(observations(X, Y, inputs)))
+
+
+def observations(X: Any, Y: Any, inputs: Any = None, part: bool = False) -> AbstractObservations:
+    """X, if it is observations, and then there is no Y; else the velocities Y at the states X."""
+    if not isinstance(X, AbstractObservations):
+        return Velocities(*velocities_at(X, Y, inputs, part), inputs=inputs)
+    if Y is not None:
+        raise TypeError(
+            f"{type(X).__name__} is all of the data, and Y is not needed. Say the regularization "
+            "by name: hk.fit(K, data, regularization=1e-4)."
+        )
+    if inputs is not None:
+        raise TypeError(
+            "observations hold their inputs themselves: hk.Velocities(X, Y, inputs=U), and "
+            "likewise hk.Equilibria and hk.Functionals."
+        )
+    return X
+
+
+def velocities_at(
+    X: Any, Y: Any, inputs: Any = None, part: bool = False
+) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
+    """States and velocities, finite and of one shape and dtype."""
+    if Y is None:
+        raise TypeError(
+            "with states X the velocities Y are needed, of the same shape (N, n); or observations "
+            f"in the place of both, hk.Velocities(X, Y); got {type(X).__name__} and nothing."
+        )
+    refuse_swapped(X, Y, inputs)
+    return require.data(X, Y, part=part)
+
+
+def placed(data: Any) -> Any:
+    """The data with arrays that lie on a mesh of devices on automatic axes of it."""
+    if all(is_on_one_device(array) for array in jax.tree.leaves(data)):
+        return data
+    return jax.tree.map(automatic, data)
+
+
+def measurements_of_states(X: Float[Array, "N d"], Y: Float[Array, "N n"]) -> Measurements:
+    """The rows of velocities at points, all of one noise."""
+    outputs = None if X.shape == Y.shape else Y.shape[1]
+    return Measurements((Components(X, outputs=outputs),), Y.reshape(-1))
+
+
+def measurements_of(
+    K: AbstractMatrixKernel, data: AbstractObservations, previous: Measurements | None = None
+) -> tuple[AbstractMatrixKernel, Measurements]:
+    """The kernel with its number of inputs, and the rows of observations.
+
+    Args:
+        K: the kernel.
+        data: the observations.
+        previous: the rows that `data` is added to, if any.
+
+    Raises:
+        ValueError: inputs are missing, or cannot be told from the drift; there is one energy.
+            TypeError: K takes no inputs.
+    """
+    K = with_input_count(K, data, part=previous is not None)
+    blocks, targets = zip(*data.parts(inputs_of(K)), strict=True)
+    dtype = np.result_type(*[block.points.dtype for block in blocks])
+    blocks = tuple(_cast(block, dtype) for block in blocks)
+    divided = [
+        y.astype(dtype) if block.noise is None else y.astype(dtype) / block.noise
+        for block, y in zip(blocks, targets, strict=True)
+    ]
+    rows = Measurements(merged(blocks), jnp.concatenate(divided))
+    before = 0 if previous is None else len(previous.energies)
+    if before + len(rows.energies) == 1:
+        raise ValueError(
+            "there is one energy, and energies are known up to a constant: two are needed to say "
+            "something."
+        )
+    return K, rows
+
+
+def sampled_points(
+    K: AbstractMatrixKernel, X: Float[Array, "N n"], inputs: Any
+) -> tuple[AbstractMatrixKernel, Float[Array, "N d"]]:
+    """The kernel with its number of inputs, and the points (x, u), where nothing is measured."""
+    data = Equilibria(X, inputs)
+    K = with_input_count(K, data)
+    (block, _), *_ = data.parts(inputs_of(K))
+    return K, block.points
+
+
+def inputs_of(K: AbstractMatrixKernel) -> int:
+    """m, the number of inputs; 0 for a kernel that takes none."""
+    return K.input_count if isinstance(K, Controlled) else 0
+
+
+def with_input_count(
+    K: AbstractMatrixKernel, data: AbstractObservations, part: bool = False
+) -> AbstractMatrixKernel:
+    """The kernel with its number of inputs, taken from the data.
+
+    The inputs of all data must vary; those of a `part` of the data may be constant.
+    """
+    given = list(data.given_inputs())
+    if not isinstance(K, Controlled):
+        if given:
+            raise TypeError(
+                f"{type(K).__name__} takes no inputs: say how they act, hk.Controlled(K, "
+                "inputs=hk.InputMatrix(k, acts_on=(1,)))."
+            )
+        return K
+    counts = {u.shape[-1] for u in given}
+    if len(counts) > 1:
+        raise ValueError(f"the observations have {sorted(counts)} inputs: all need the same m.")
+    if not counts:
+        list(data.parts(1))  # raises where inputs are needed
+        return K
+    count = counts.pop()
+    if K.count is not None and K.count != count:
+        raise ValueError(f"inputs has {count} columns and the kernel {K.count} inputs.")
+    K = Controlled(K.drift, K.inputs, count)
+    K.check_dimension(data.dimension + count)
+    if not isinstance(K.inputs, KnownMatrix) and not part:
+        _check_identified([u.reshape(-1, count) for u in given])
+    return K
+
+
+def _check_identified(given: list[Float[Array, "_ m"]]) -> None:
+    """Refuse inputs a combination of which is the same at all points."""
+    if not require.is_concrete(given):
+        return
+    values = np.concatenate([np.asarray(u) for u in given])
+    rank = int(np.linalg.matrix_rank(values - values.mean(axis=0)))
+    if rank < values.shape[1]:
+        raise ValueError(
+            f"the inputs, less their means, have rank {rank} and there are {values.shape[1]}: a "
+            "combination of them is the same at all points, and cannot be told from the drift. "
+            "Vary every input on its own, leave out those that repeat others, or give the matrix "
+            "that is known, Controlled(K, inputs=G)."
+        )
+
+
+def _cast(block: AbstractBlock, dtype: Any) -> AbstractBlock:
+    if block.points.dtype == dtype:
+        return block
+    arrays, rest = eqx.partition(block, eqx.is_inexact_array)
+    return eqx.combine(jax.tree.map(lambda a: a.astype(dtype), arrays), rest)

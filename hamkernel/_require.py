@@ -1,0 +1,377 @@
+"""What the public functions require of their arguments, said before any long computation.
+
+Shapes, dtypes and configuration are known while tracing and raise at once. Values are checked
+by NumPy when they are concrete, for it compiles nothing; under `jax.jit` the same check becomes
+`equinox.error_if` on the value that is returned, so it must be used by the caller.
+"""
+
+import inspect
+import operator
+import reprlib
+import sys
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Bool, Float, Key
+
+
+def is_concrete(*values: object) -> bool:
+    """Whether no leaf of `values` is a tracer, so that Python may branch on them."""
+    return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
+
+
+def on_host(x: Array) -> Any:
+    """`x` as a NumPy array, where it is concrete and on one device; else `x` itself."""
+    if is_concrete(x) and len(x.sharding.device_set) == 1:
+        return np.asarray(x)
+    return x
+
+
+def not_finite(x: Array) -> Any:
+    """Where `x` is NaN or infinite, for `value`."""
+    return ~(abs(on_host(x)) < np.inf)
+
+
+def value(
+    x: Any,
+    bad: Bool[ArrayLike, "..."],
+    message: str | Callable[[], str],
+    error: type[Exception] = ValueError,
+    throw: bool = True,
+) -> Any:
+    """Return `x`, or fail where `bad` holds: `error` on concrete values, at run time under jit.
+
+    If not `throw`, `x` is NaN there.
+
+    `x` is an array or a PyTree of them: everything that would be wrong, for under jit a check is
+    dropped together with the value it hangs on.
+    Computed with `on_host`, `bad` is known wherever it can be, also for constants under jit.
+    """
+    bad = bad.any()  # type: ignore[union-attr]
+    if not throw:
+        return jax.tree.map(lambda a: jnp.where(bad, jnp.full_like(a, jnp.nan), a), x)
+    if not is_concrete(bad):
+        return eqx.error_if(x, bad, message if isinstance(message, str) else message())
+    if bad:
+        raise error(message if isinstance(message, str) else message())
+    return x
+
+
+def warn(message: str) -> None:
+    """Warn, with the line of the user.
+
+    Equinox puts frames of its own between methods, so that the level is no constant. From Python
+    3.12 on `skip_file_prefixes` of `warnings.warn` does this.
+    """
+    level, frame = 1, sys._getframe()
+    while frame.f_back:
+        package = frame.f_globals.get("__name__", "").split(".")[0]
+        if package not in ("hamkernel", "equinox"):
+            break
+        level, frame = level + 1, frame.f_back
+    warnings.warn(message, stacklevel=level)
+
+
+@contextmanager
+def traceable(name: str) -> Iterator[None]:
+    """A TypeError that says what to do, in place of JAX's own where `name` is traced inside."""
+    try:
+        yield
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+        raise TypeError(
+            f"{name} asks for numbers while JAX traces it, when only shapes are known: write it "
+            "with jax.numpy in place of numpy and math, and with jnp.where in place of if."
+        ) from error
+
+
+def count(number: Any, name: str) -> int:
+    """`number` as a Python integer, at least 1."""
+    message = f"{name} must be a whole number, at least 1; got {number!r}."
+    if isinstance(number, bool) or not hasattr(number, "__index__"):
+        raise TypeError(message)
+    if operator.index(number) < 1:
+        raise ValueError(message)
+    return operator.index(number)
+
+
+def positive_number(number: Any, name: str) -> float:
+    """`number` as a Python float, positive and finite: one that is compiled in."""
+    try:
+        converted = float(number)
+    except (TypeError, ValueError):
+        converted = None
+    if converted is None or isinstance(number, bool | str):
+        raise TypeError(f"{name} must be a number; got {number!r}.")
+    if not 0 < converted < np.inf:
+        raise ValueError(f"{name} must be positive and finite, got {number}.")
+    return converted
+
+
+def floating(x: Any, name: str) -> Array:
+    """`x` as a JAX array of real floats: integers and booleans become the default float."""
+    if isinstance(x, bool | int | float):
+        x = np.asarray(x, float)
+    try:
+        array = x if isinstance(x, jax.Array) else jnp.asarray(x)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"{name} must hold real numbers; got {reprlib.repr(x)}. Pass floats, a NumPy or JAX "
+            "array of them (of objects: .astype(float)), or lists with rows of equal length."
+        ) from error
+    if jnp.issubdtype(array.dtype, jnp.floating):
+        # No weak type: a Python float must not recompile.
+        return array.astype(array.dtype) if array.weak_type else array
+    if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
+        return array.astype(float)
+    raise TypeError(
+        f"{name} has dtype {array.dtype}; real numbers are needed. "
+        f"Pass floats or integers (for complex data, stack real and imaginary parts)."
+    )
+
+
+def single_or_double(dtype: Any, whose: str) -> None:
+    """Refuse a dtype with fewer digits than float32."""
+    if jnp.finfo(dtype).bits < 32:
+        raise TypeError(f"{whose} dtype {dtype}: float32 or float64 is needed.")
+
+
+def positive(x: Any, name: str, cure: str = "") -> Array:
+    """`x` as a float array whose every entry is finite and larger than zero."""
+    array = floating(x, name)
+    seen = on_host(array)
+    return value(
+        array,
+        ~((seen > 0) & (seen < np.inf)),
+        lambda: (
+            f"{name} must be positive and finite"
+            + (f", got {array}." if is_concrete(array) else ".")
+            + (f" {cure}" if cure else "")
+        ),
+    )
+
+
+def positive_scalar(x: ArrayLike, name: str, cure: str = "") -> Float[Array, ""]:
+    """`x` as a positive float array of shape ()."""
+    array = floating(x, name)
+    if array.shape:
+        raise ValueError(f"{name} has shape {array.shape}; one number is needed.")
+    return positive(array, name, cure)
+
+
+def ridge(x: ArrayLike, dtype: jnp.dtype) -> Float[Array, ""]:
+    """The λ of a fit, positive in the dtype of the data too: 1e-50 is zero in float32."""
+    cure = "Data without noise still need a small one, such as 1e-8; hk.tune finds a good one."
+    return positive_scalar(floating(x, "regularization").astype(dtype), "regularization", cure)
+
+
+def finite(x: Array, name: str, cure: str = "") -> Array:
+    """`x`, in which every entry must be finite."""
+
+    def message() -> str:
+        if not is_concrete(x):
+            return f"{name} contains NaN or inf: remove or repair those points first.{cure}"
+        rows = np.flatnonzero(~np.isfinite(x).reshape(len(x), -1).all(axis=1))
+        shown = ", ".join(str(row) for row in rows[:5])
+        more = f" and {rows.size - 5} more" if rows.size > 5 else ""
+        where = f"in row {shown}{more}"
+        return f"{name} contains NaN or inf {where}: remove or repair those points.{cure}"
+
+    return value(x, not_finite(x), message)
+
+
+def key(key: Any) -> Key[Array, ""]:
+    """One random key, of the newer kind also where one of the older, `jax.random.PRNGKey`, came."""
+    if getattr(key, "dtype", None) == jnp.uint32 and jnp.ndim(key):
+        key = jax.random.wrap_key_data(key)
+    dtype = getattr(key, "dtype", None)
+    if dtype is None or not jnp.issubdtype(dtype, jax.dtypes.prng_key):
+        raise TypeError(f"key must be a key of JAX, such as jax.random.key(0); got {key!r}.")
+    if key.shape:
+        raise ValueError(
+            f"key is an array of keys of shape {key.shape}; one is needed. For many seeds map over "
+            "them, jax.vmap(lambda key: ...)(keys)."
+        )
+    return key
+
+
+def one_dtype(X: Array, Z: Array) -> tuple[Array, Array]:
+    """Both in the wider of their dtypes, under strict promotion too."""
+    dtype = np.promote_types(X.dtype, Z.dtype)
+    return X.astype(dtype), Z.astype(dtype)
+
+
+def same_space(X: Array, Z: Array) -> tuple[Array, Array]:
+    """Both in one dtype, if they hold states of the same number of coordinates."""
+    if X.shape[1] != Z.shape[1]:
+        raise ValueError(
+            f"X has {X.shape[1]} coordinates and Z has {Z.shape[1]}: both must be states of one "
+            "system, shapes (N, n) and (M, n)."
+        )
+    return one_dtype(X, Z)
+
+
+def points(X: ArrayLike, name: str = "X") -> Float[Array, "N n"]:
+    """States as a float array of shape (N, n) with N ≥ 1; their values are not looked at."""
+    array = floating(X, name)
+    if 0 in array.shape:
+        raise ValueError(
+            f"{name} has shape {array.shape}: at least one point is needed, shape (N, n). Look at "
+            "how the data was read or selected."
+        )
+    if array.ndim != 2:
+        hint = (
+            f" One state per row: `{name}[:, None]` for N states of one coordinate, "
+            f"`{name}[None]` for one state."
+            if array.ndim == 1
+            else f" Join trajectories with `{name}.reshape(-1, {name}.shape[-1])`."
+            if array.ndim > 2
+            else ""
+        )
+        raise ValueError(f"{name} has shape {array.shape}; it must be (N, n).{hint}")
+    return array
+
+
+def point(x: ArrayLike, n: int, name: str = "x") -> Float[Array, " n"]:
+    """One state of `n` coordinates; for many, the caller is pointed to `jax.vmap`."""
+    array = floating(x, name)
+    if array.shape != (n,):
+        hint = " Use `jax.vmap(...)` for a batch of states." if array.ndim > 1 else ""
+        raise ValueError(
+            f"{name} has shape {array.shape}; one state of shape ({n},) is needed.{hint}"
+        )
+    return array
+
+
+def data(
+    X: ArrayLike, Y: ArrayLike, part: bool = False
+) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
+    """States and velocities: two finite float arrays of one shape (N, n) and one dtype.
+
+    A `part` of the data may have fewer points than coordinates; all of it is warned of then.
+    """
+    X, Y = points(X, "X"), points(Y, "Y")
+    if X.shape != Y.shape:
+        raise ValueError(
+            f"X has shape {X.shape} and Y has shape {Y.shape}: they must be equal, "
+            "one velocity Y[i] for each state X[i]."
+        )
+    N, n = X.shape
+    if 1 < N < n and not part:
+        warn(
+            f"X has shape {X.shape}: {N} points of {n} coordinates, fewer points than coordinates. "
+            "If it holds one coordinate a row, pass X.T and Y.T: shape (N, n), one state a row."
+        )
+    X, Y = one_dtype(X, Y)
+    single_or_double(X.dtype, "X and Y have")
+    cure = " Where NaN means that a component was not measured, pass hk.Velocities(X, Y)."
+    return finite(X, "X"), finite(Y, "Y", cure)
+
+
+def measured(X: ArrayLike, Y: ArrayLike) -> tuple[Array, Array, np.ndarray | None]:
+    """`data` with NaN in Y where nothing was measured, and which entries were; None if all were.
+
+    Not everywhere, and not under jit, where it is not known which.
+    """
+    X, Y = points(X, "X"), points(Y, "Y")
+    seen = on_host(Y)
+    if not is_concrete(Y) or not (seen != seen).any():
+        return *data(X, Y, part=True), None
+    if not Y.is_fully_addressable:
+        raise ValueError(
+            "Y contains NaN and is spread over several processes, where components that were not "
+            "measured cannot be left out: remove those points."
+        )
+    missing = np.isnan(np.asarray(Y))
+    if missing.all():
+        raise ValueError(
+            f"all {missing.size} components of Y are NaN, which says not measured: there is "
+            "nothing to learn from."
+        )
+    X, filled = data(X, jnp.where(missing, jnp.zeros_like(Y), Y), part=True)
+    return X, jnp.where(missing, jnp.nan, filled), np.flatnonzero(~missing.reshape(-1))
+
+
+def warn_of_float32(X: Array) -> None:
+    """Say what a fit in float32 may be expected to do."""
+    if X.dtype == jnp.float32:
+        warn(
+            "fitting in float32: expect three digits, and a failed factorisation for a ridge "
+            "below about 1e-6 of the Gram. For float64 run "
+            "jax.config.update('jax_enable_x64', True) first and pass float64 data."
+        )
+
+
+def times(ts: ArrayLike, least: int) -> Float[Array, " T"]:
+    """Finite times, at least `least` of them, as a float array of shape (T,)."""
+    array = floating(ts, "ts")
+    if array.ndim != 1 or array.size < least:
+        raise ValueError(
+            f"ts has shape {array.shape}; times of shape (T,), T ≥ {least}, are needed, the first "
+            "that of x0."
+        )
+    return finite(array, "ts")
+
+
+def elapsed(ts: Float[Array, " T"], dtype: Any) -> Float[Array, " T"]:
+    """The times since the first one, which must increase, in the dtype of the states.
+
+    A field does not depend on time. Late times that come in float64 keep their distances so,
+    however large they are in float32.
+    """
+    ts = on_host(ts)
+    since = jnp.asarray((ts - ts[0]).astype(dtype))
+    seen = on_host(since)
+    return value(
+        since,
+        seen[1:] <= seen[:-1],
+        f"ts, the argument after x0, must be strictly increasing in {dtype}, the dtype of x0: sort "
+        "the times and drop repeated ones. To go back in time, "
+        "hk.simulate(lambda x: -field(x), ...).",
+    )
+
+
+def velocity(field: Any, x: Float[Array, " n"], name: str = "field") -> jax.ShapeDtypeStruct:
+    """Shape and dtype of `field(x)`, which must be one velocity; what it raises itself passes."""
+    if not callable(field):
+        hint = " Pass its .field." if hasattr(field, "field") else ""
+        raise TypeError(
+            f"{name} is a {type(field).__name__}; a callable x (n,) -> (n,) is needed.{hint}"
+        )
+    other = other_arguments(field, x)
+    if other is not None:
+        raise TypeError(
+            f"{name} takes ({other}); it is called with one argument, the state x of shape (n,). "
+            "Bind the others, as in `lambda x: f(0.0, x)` where time does not enter. A kernel "
+            "becomes a field by hk.fit."
+        )
+    with traceable(name):
+        out = eqx.filter_eval_shape(field, x)
+    if not hasattr(out, "shape"):
+        raise TypeError(
+            f"{name} returns {type(out).__name__}; one velocity is needed, a JAX array of shape "
+            f"{x.shape}, such as jnp.array([...])."
+        )
+    if out.shape != x.shape:
+        raise ValueError(
+            f"{name} maps a state of shape {x.shape} to shape {out.shape}; one velocity for each "
+            "coordinate is needed. Is x0 of the dimension it was made for?"
+        )
+    return out
+
+
+def other_arguments(function: Any, *arguments: Any) -> str | None:
+    """What `function` takes, by name, if it does not take these arguments."""
+    with suppress(ValueError):  # raised for a builtin without a signature
+        signature = inspect.signature(function)
+        try:
+            signature.bind(*arguments)
+        except TypeError:
+            return ", ".join(signature.parameters)
+    return None
