@@ -10,7 +10,7 @@ import abc
 import enum
 import math
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -91,6 +91,17 @@ class Invariance(enum.Flag):
     TRANSLATION = 3
 
 
+class Descriptor(NamedTuple):
+    """A map d of points and a kernel κ of its values, k(x, z) = κ(d(x), d(z)).
+
+    The derivatives of k follow from those of κ and the Jacobian of d, which each point needs once.
+    """
+
+    map: Callable[[Float[Array, " n"]], Float[Array, " m"]]
+    kernel: "AbstractScalarKernel"
+    directions: Callable[[Float[Array, " n"]], Float[Array, "n n"]] = lambda x: jnp.eye(len(x))
+
+
 class AbstractScalarKernel(eqx.Module):
     """A positive definite function k(x, z) -> () of two points of shape (n,).
 
@@ -134,6 +145,10 @@ class AbstractScalarKernel(eqx.Module):
         That is so where k is linear in them; `reflection` says that x -> −x is the only map.
         """
         return ()
+
+    def through_descriptor(self, n: int) -> Descriptor | None:
+        """The descriptor through which k sees points of n coordinates, if it has one."""
+        return None
 
     @property
     def has_amplitude(self) -> bool:
@@ -287,6 +302,12 @@ class Scaled(AbstractScalarKernel):
 
     def summands(self, reflection: bool) -> tuple[AbstractScalarKernel, ...]:
         return (self.kernel,)
+
+    def through_descriptor(self, n: int) -> Descriptor | None:
+        found = self.kernel.through_descriptor(n)
+        if found is None:
+            return None
+        return found._replace(kernel=eqx.tree_at(lambda k: k.kernel, self, found.kernel))
 
     @property
     def has_amplitude(self) -> bool:

@@ -16,7 +16,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, ScalarProduct, one_point
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Descriptor,
+    Invariance,
+    ScalarProduct,
+    one_point,
+)
+from hamkernel._kernels.transforms import Warp
 from hamkernel._show import call, text
 
 # A function, or the rows of a matrix.
@@ -220,6 +227,9 @@ class Symmetrised(AbstractScalarKernel):
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         x, z = one_point(x), one_point(z)
+        found = self.through_descriptor(len(x))
+        if found is not None:
+            return found.kernel(found.map(x), found.map(z))
         terms = pairs(self.group(len(x)), self.is_one_sided(len(x)))
         values = [sign * self.kernel(g(x), h(z)) for g, h, sign in terms]
         return sum(values[1:], start=values[0]) / len(values)
@@ -227,6 +237,16 @@ class Symmetrised(AbstractScalarKernel):
     def group(self, n: int) -> tuple[Element, ...]:
         """All maps of the group on states of n coordinates, the identity first."""
         return closed(self.maps, self.characters, n)
+
+    def through_descriptor(self, n: int) -> Descriptor | None:
+        """The mean over the images of the maps, where these permute the entries of a warp."""
+        if not isinstance(self.kernel, Warp):
+            return None
+        images = [self.kernel.image(matrix_of(each, n)) for each in self.maps]
+        if any(image is None for image in images):
+            return None
+        inner = Symmetrised(self.kernel.kernel, tuple(map(_rows, images)), self.characters)
+        return Descriptor(self.kernel.warped, inner)
 
     def is_one_sided(self, n: int) -> bool:
         """Whether k(gx, gz) = k(x, z) is known to hold for all g."""

@@ -11,8 +11,15 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel, one_point
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Descriptor,
+    Invariance,
+    as_scalar_kernel,
+    one_point,
+)
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._show import call, text
 
 
 class Warp(AbstractScalarKernel):
@@ -23,28 +30,47 @@ class Warp(AbstractScalarKernel):
         fn: a smooth map (n,) -> (m,), written with jax.numpy; the array leaves of an Equinox
             module are trained. Define it once: JAX treats a new lambda as a new function and
             compiles again.
+        equivariant: whether the maps of a symmetry only permute the entries of `fn`, as a
+            permutation of like atoms permutes the distances between atoms. `Invariant` then takes
+            its mean in the warped coordinates, over |G| terms in place of |G|².
 
     Raises:
         TypeError: `kernel` is not a scalar kernel, or `fn` not a function. ValueError, when called:
-            `fn` does not return a vector.
+            `fn` does not return a vector, or is said to be equivariant and is not.
 
     Example: `Warp(Gaussian(1.0), lambda x: jnp.array([jnp.cos(x[0]), jnp.sin(x[0]), x[1]]))`
-    for a state (angle, momentum) on a cylinder.
+    for a state (angle, momentum) on a cylinder. `CurlFree(Warp(Matern(2.5, 10.0), fn))` with the
+    inverse distances between atoms as `fn`, averaged over the permutations of like atoms, is the
+    force field sGDML of Chmiela et al. (2018).
     """
 
     kernel: AbstractScalarKernel
     fn: Callable[[Float[Array, " n"]], Any]
+    equivariant: bool = eqx.field(static=True, default=False)
 
-    def __init__(self, kernel: Any, fn: Callable[[Array], Array | Sequence[Array]]):
+    def __init__(
+        self,
+        kernel: Any,
+        fn: Callable[[Array], Array | Sequence[Array]],
+        equivariant: bool = False,
+    ):
         if not callable(fn) or isinstance(fn, AbstractScalarKernel):
             raise TypeError(
                 f"Warp needs a kernel and then a map (n,) -> (m,), Warp(k, fn); got {fn!r} as map."
             )
         self.kernel = as_scalar_kernel(kernel)
         self.fn = as_pytree(fn)
+        self.equivariant = bool(equivariant)
+
+    def __repr__(self) -> str:
+        said = ["equivariant=True"] if self.equivariant else []
+        return call("Warp", [repr(self.kernel), text(self.fn), *said])
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         return self.kernel(self.warped(x), self.warped(z))
+
+    def through_descriptor(self, n: int) -> Descriptor:
+        return Descriptor(self.warped, self.kernel)
 
     def warped(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """fn(x), as a vector."""
@@ -58,6 +84,35 @@ class Warp(AbstractScalarKernel):
             )
         # The map's parameters may be more precise than the data.
         return require.floating(warped, "the value of the map of Warp").astype(x.dtype)
+
+    def image(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "m m"] | None:
+        """The permutation P with fn(Sx) = P fn(x); None if the map is not said to be equivariant.
+
+        Raises:
+            ValueError: there is no such permutation.
+        """
+        if not self.equivariant or not require.is_concrete(self.fn):
+            return None
+        # Entries of an analytic map that agree at four points of no symmetry agree everywhere.
+        probes = np.cos(1.0 + np.arange(4.0 * len(S))).reshape(4, -1)
+        with jax.ensure_compile_time_eval():
+            here, there = (self.transform_inputs(each).T for each in (probes, probes @ S.T))
+        apart = np.abs(there[:, None] - here[None]).max(axis=2)  # (m, m)
+        P = np.eye(len(here))[apart.argmin(axis=1)]
+        close = apart.min(axis=1).max() <= 1e-5 * np.abs(here).max()  # float32 without x64
+        if not (close and (P.sum(axis=0) == 1).all()):
+            raise ValueError(
+                "Warp(..., equivariant=True) says that the maps of a symmetry permute the entries "
+                f"of fn(x), and with S = {np.round(S, 3).tolist()} the entries of fn(Sx) are no "
+                "permutation of them. Leave equivariant=True away: the mean is then taken over "
+                "both arguments, which is right for every map."
+            )
+        return P
+
+    def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
+        image = self.image(S)
+        known = image is not None and self.kernel.is_unchanged_by(image)
+        return known or super().is_unchanged_by(S)
 
     @property
     def has_amplitude(self) -> bool:

@@ -16,6 +16,7 @@ from jaxtyping import Array, ArrayLike, Float
 from hamkernel import _require as require
 from hamkernel._kernels.base import (
     AbstractScalarKernel,
+    Descriptor,
     Invariance,
     bounds_by_value,
     common_invariance,
@@ -110,6 +111,10 @@ class AbstractMatrixKernel(eqx.Module):
     def centre(self, Z: Float[Array, "M d"]) -> Float[Array, " d"] | None:
         """The mean of Z, as far as K does not change when it is taken off both arguments."""
         return Z.mean(axis=0) if Invariance.TRANSLATION in self.invariance else None
+
+    def through_descriptor(self, n: int) -> Descriptor | None:
+        """The descriptor and the directions along which K differentiates, where it has one."""
+        return None
 
     def outputs(self, inputs: int) -> int:
         """The number of components of a field at points of so many coordinates."""

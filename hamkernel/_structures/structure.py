@@ -23,7 +23,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Descriptor,
+    Invariance,
+    as_scalar_kernel,
+)
 from hamkernel._kernels.symmetry import (
     LinearMap,
     matrix_of,
@@ -173,6 +178,16 @@ class AbstractPotentialKernel(AbstractStructure):
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
         return mixed(self.kernel, x, self.apply_transpose(x, u), z, self.apply_transpose(z, v))
+
+    def through_descriptor(self, n: int) -> Descriptor | None:
+        found = self.kernel.through_descriptor(n)
+        if found is None:
+            return None
+
+        def directions(x):
+            return jax.vmap(lambda v: self.apply_transpose(x, v))(jnp.eye(n, dtype=x.dtype)).T
+
+        return found._replace(directions=directions)
 
     def potential(
         self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]

@@ -1,0 +1,111 @@
+"""Kernels that see points through a descriptor: the Gram by Jacobians, and equivariant warps."""
+
+import itertools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hamkernel as hk
+
+ATOMS = np.triu_indices(4, 1)  # of a molecule of four atoms, the last three alike
+
+
+def inverse_distances(x):
+    r = x.reshape(-1, 3)
+    return 1 / jnp.linalg.norm(r[ATOMS[0]] - r[ATOMS[1]], axis=1)
+
+
+def angles(x):
+    return jnp.array([jnp.cos(x[0]), jnp.sin(x[0]), x[1]])
+
+
+def moved(order):
+    """The matrix that puts atom order[i] in place i."""
+    return np.kron(np.eye(4)[list(order)], np.eye(3))
+
+
+GENERATORS = [moved((0, 2, 1, 3)), moved((0, 2, 3, 1))]
+GROUP = [moved((0, *rest)) for rest in itertools.permutations((1, 2, 3))]
+
+
+@pytest.fixture(scope="module")
+def molecules():
+    ideal = np.array([[0, 0, 0], [1.1, 0, 0], [0, 1.1, 0], [0, 0, 1.1]]).reshape(-1)
+    return ideal + 0.1 * np.random.default_rng(0).normal(size=(14, 12))
+
+
+def by_hand(k, X, B=None):
+    """The Gram from the second derivatives of k, pair by pair."""
+    pair = jax.jit(jax.jacfwd(jax.jacrev(k, 0), 1))
+    blocks = np.array([[pair(x, z) for z in X] for x in X])  # (N, N, n, n)
+    blocks = blocks if B is None else B @ blocks @ B.T
+    return blocks.transpose(0, 2, 1, 3)
+
+
+@pytest.mark.parametrize("inner", [hk.Gaussian(1.3), 2.0 * hk.Matern(2.5, 0.9)])
+def test_the_gram_of_a_warp_is_that_of_its_second_derivatives(inner, key):
+    X = jax.random.normal(key, (5, 2))
+    K = hk.Symplectic(3.0 * hk.Warp(inner, angles))
+    J = np.array([[0.0, 1.0], [-1.0, 0.0]])
+    expected = by_hand(lambda x, z: 3.0 * inner(angles(x), angles(z)), X, J)
+    np.testing.assert_allclose(hk.gram(K, X), expected, atol=1e-13 * np.abs(expected).max())
+    np.testing.assert_allclose(hk.gram(K, X)[1, :, 2], K(X[1], X[2]), atol=1e-13)
+
+
+def test_an_equivariant_warp_has_the_mean_over_both_arguments(molecules):
+    """Against the mean over all pairs of permutations, written out."""
+    inner = hk.Matern(2.5, 0.5)
+    K = hk.Invariant(hk.CurlFree(hk.Warp(inner, inverse_distances, equivariant=True)), GENERATORS)
+
+    def mean(x, z):
+        pairs = itertools.product(GROUP, GROUP)
+        values = [inner(inverse_distances(g @ x), inverse_distances(h @ z)) for g, h in pairs]
+        return sum(values[1:], start=values[0]) / 36
+
+    X = jnp.asarray(molecules[:3])
+    expected = by_hand(mean, X)
+    np.testing.assert_allclose(hk.gram(K, X), expected, atol=1e-12 * np.abs(expected).max())
+    np.testing.assert_allclose(K.kernel(X[0], X[1]), mean(X[0], X[1]), rtol=1e-13)
+
+
+def test_forces_on_permuted_atoms_are_permuted_forces(molecules):
+    warp = hk.Warp(hk.Gaussian(0.5), inverse_distances, equivariant=True)
+    forces = np.random.default_rng(1).normal(size=molecules.shape)
+    invariant = hk.fit(hk.Invariant(hk.CurlFree(warp), GENERATORS), molecules, forces, 1e-6)
+    plain = hk.fit(hk.CurlFree(warp), molecules, forces, 1e-6)
+    S, x = GROUP[4], jnp.asarray(molecules[0]) + 0.05
+    np.testing.assert_allclose(invariant(S @ x), S @ invariant(x), rtol=1e-8)
+    assert np.abs(plain(S @ x) - S @ plain(x)).max() > 0.1  # the negative control
+
+
+def test_a_map_that_is_not_equivariant_is_refused(molecules):
+    def weighted(x):
+        return inverse_distances(x) * jnp.arange(1.0, 7.0)
+
+    K = hk.Invariant(hk.CurlFree(hk.Warp(hk.Gaussian(1.0), weighted, equivariant=True)), GENERATORS)
+    with pytest.raises(ValueError, match=r"no permutation of them\. Leave equivariant=True away"):
+        hk.gram(K, molecules)
+
+
+def test_losses_through_a_descriptor_have_their_derivatives(molecules):
+    forces = np.random.default_rng(1).normal(size=molecules.shape)
+
+    def loss(log_lengthscale):
+        warp = hk.Warp(hk.Gaussian(jnp.exp(log_lengthscale)), inverse_distances, equivariant=True)
+        K = hk.Invariant(hk.CurlFree(warp), GENERATORS)
+        return hk.log_marginal_likelihood(K, molecules, forces, 1e-2)
+
+    here, step = jnp.log(0.7), 1e-4
+    difference = (loss(here + step) - loss(here - step)) / (2 * step)
+    np.testing.assert_allclose(jax.grad(loss)(here), difference, rtol=1e-6)
+
+
+def test_an_equivariant_warp_comes_back_from_a_file(molecules, tmp_path):
+    warp = hk.Warp(hk.Gaussian(0.5), inverse_distances, equivariant=True)
+    field = hk.fit(hk.Invariant(hk.CurlFree(warp), GENERATORS), molecules, molecules, 1e-6)
+    hk.save(tmp_path / "field", field)
+    loaded = hk.load(tmp_path / "field", field.kernel)
+    np.testing.assert_allclose(loaded(molecules[1]), field(molecules[1]))
+    assert "equivariant=True" in repr(field.kernel)
