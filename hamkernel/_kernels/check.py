@@ -234,7 +234,8 @@ def _diagnosis(own, limits, steady: bool, where: str, unit) -> str:
     if len(limits) == 2 and _size(limits[0] - limits[1]) > 0.2 * scale:
         return (
             f"k has no second derivative at x = z: {where} the limit of M(x, x + h) depends on the "
-            f"direction of h, {told[0]} and {told[1]}; a kink, as in Σ|x_a - z_a|. {_CURE}"
+            f"direction of h, {told[0]} and {told[1]}; a kink, as in the L1 distance "
+            f"Σ|x_a - z_a|. {_CURE}"
         )
     if not np.isfinite(own).all():
         return f"NaN or inf in the derivatives of k {said} Likely the square root of zero. {_CURE}"

@@ -64,7 +64,7 @@ class Warp(AbstractScalarKernel):
 
     def __repr__(self) -> str:
         said = ["equivariant=True"] if self.equivariant else []
-        return call("Warp", [repr(self.kernel), text(self.fn), *said])
+        return call("Warp", [repr(self.kernel), f"fn={text(self.fn)}", *said])
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         return self.kernel(self.warped(x), self.warped(z))
