@@ -2,49 +2,58 @@
 
     pip install -e ".[docs]" && python docs/build.py [folder]
 
-The reference comes from the docstrings by pdoc, with search; README and notebooks, with the outputs
-that they hold, by nbconvert. Formulas become MathML, which browsers render without a network.
-Warnings are errors.
+The reference comes from the docstrings by pdoc, with search; README, reading list and notebooks,
+with the outputs that they hold, by nbconvert. Formulas become MathML, which browsers render without
+a network. Warnings are errors, and a build that fails leaves the site as it was.
 """
 
 import inspect
+import json
 import re
 import shutil
 import sys
+import tempfile
 import warnings
+from collections.abc import Sequence
+from itertools import pairwise
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 TEMPLATES = ROOT / "docs" / "templates"
+READING = ROOT / "docs" / "reading.md"  # what to read, and in which order
 COPIED = ["CHANGELOG.md", "CITATION.cff", "LICENSE"]
 # At the top of every page, from the root of the site.
 LINKS = {
     "hamkernel": "index.html",
-    "Quickstart": "notebooks/quickstart.html",
+    "What to read": "reading.html",
     "Your data": "notebooks/guide_data.html",
     "How to choose": "notebooks/guide_choose.html",
     "Sharp bits": "notebooks/guide_sharp_bits.html",
-    "Large data": "notebooks/guide_large.html",
-    "Deploy": "notebooks/guide_deploy.html",
     "Reference and search": "hamkernel.html",
 }
 
 
 def build(site: Path) -> None:
     """Write the site to the folder `site`, replacing what is there."""
-    shutil.rmtree(site, ignore_errors=True)
-    (site / "notebooks").mkdir(parents=True)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        write_reference(site)
-        write_notebooks(site)
-    shutil.copytree(
-        ROOT / "notebooks" / "figures",
-        site / "notebooks" / "figures",
-        ignore=shutil.ignore_patterns("*.py", "__pycache__"),
-    )
-    for name in COPIED:
-        shutil.copy(ROOT / name, site / name)
+    site.parent.mkdir(parents=True, exist_ok=True)
+    # In the same folder, so that the finished site needs no more than a new name.
+    with tempfile.TemporaryDirectory(dir=site.parent) as folder:
+        new = Path(folder) / "new"
+        (new / "notebooks").mkdir(parents=True)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            write_reference(new)
+            write_pages(new)
+        shutil.copytree(
+            ROOT / "notebooks" / "figures",
+            new / "notebooks" / "figures",
+            ignore=shutil.ignore_patterns("*.py", "__pycache__"),
+        )
+        for name in COPIED:
+            shutil.copy(ROOT / name, new / name)
+        if site.exists():
+            site.rename(Path(folder) / "old")
+        new.rename(site)
 
 
 def write_reference(site: Path) -> None:
@@ -57,28 +66,60 @@ def write_reference(site: Path) -> None:
     for name in hamkernel.__all__:  # pdoc does not see what is loaded when first asked for
         setattr(hamkernel, name, getattr(hamkernel, name))
     pdoc.render.configure(docformat="google", template_directory=TEMPLATES / "pdoc")
-    pdoc.doc.formatannotation = short_annotation  # for pages and search alike
+    # Of parameters, and of what is returned; for pages and search alike.
+    inspect.formatannotation = pdoc.doc.formatannotation = short_annotation
     pdoc.pdoc("hamkernel", output_directory=site)
     for path in site.rglob("*.html"):
         path.write_text(without_dead_anchors(path.read_text()))
 
 
-def write_notebooks(site: Path) -> None:
-    """Write a page for each notebook, and the README as index.html."""
+def write_pages(site: Path) -> None:
+    """Write a page for each notebook, one for the reading list, and the README as index.html."""
     import nbformat
 
-    for path in sorted((ROOT / "notebooks").glob("*.ipynb")):
-        page = rendered(nbformat.read(path, as_version=4), path.stem, "../")
-        (site / "notebooks" / f"{path.stem}.html").write_text(page)
-    readme = nbformat.v4.new_markdown_cell((ROOT / "README.md").read_text())
-    page = rendered(nbformat.v4.new_notebook(cells=[readme]), "hamkernel", "")
-    (site / "index.html").write_text(page)
+    for text, name, title in (
+        ((ROOT / "README.md").read_text(), "index", "hamkernel"),
+        (READING.read_text().replace("](../", "]("), "reading", "What to read"),
+    ):
+        cell = nbformat.v4.new_markdown_cell(text)
+        page = rendered(nbformat.v4.new_notebook(cells=[cell]), title, "")
+        (site / f"{name}.html").write_text(page)
+    order = notebooks_in_order()
+    turns: dict[str, list] = {name: [] for name in order}
+    for one, other in pairwise(order):
+        turns[one].append((f"Next: {heading(other)}", f"{other}.html"))
+        turns[other].insert(0, (f"Before: {heading(one)}", f"{one}.html"))
+    for name in order:
+        notebook = nbformat.read(ROOT / "notebooks" / f"{name}.ipynb", as_version=4)
+        page = rendered(notebook, heading(name), "../", turns[name])
+        (site / "notebooks" / f"{name}.html").write_text(page)
 
 
-def rendered(notebook, title: str, root: str) -> str:
-    """The page of a notebook; `root` leads from its folder to that of the site."""
+def notebooks_in_order() -> list[str]:
+    """The names of all notebooks, in the order of the reading list."""
+    listed = re.findall(r"notebooks/(\w+)\.ipynb", READING.read_text())
+    order = list(dict.fromkeys(listed))
+    missing = {path.stem for path in (ROOT / "notebooks").glob("*.ipynb")} ^ set(order)
+    if missing:
+        raise ValueError(f"{READING.name} and the folder of notebooks differ: {sorted(missing)}")
+    return order
+
+
+def heading(name: str) -> str:
+    """The first heading of a notebook."""
+    cells = json.loads((ROOT / "notebooks" / f"{name}.ipynb").read_text())["cells"]
+    return "".join(cells[0]["source"]).splitlines()[0].lstrip("# ")
+
+
+def rendered(notebook, title: str, root: str, turns: Sequence = ()) -> str:
+    """The page of a notebook; `root` leads from its folder to that of the site.
+
+    `turns` are the links at its end, to the notebooks before and after it.
+    """
     from nbconvert import HTMLExporter
 
+    # Cells are plain Python; the lexer of IPython would need IPython.
+    notebook.metadata["language_info"] = {"name": "python", "pygments_lexer": "python"}
     for cell in notebook.cells:
         if cell.cell_type == "markdown":
             cell.source = with_mathml(cell.source)
@@ -86,7 +127,7 @@ def rendered(notebook, title: str, root: str) -> str:
         template_name="site", extra_template_basedirs=[str(TEMPLATES / "nbconvert")]
     )
     links = [(text, root + target) for text, target in LINKS.items()]
-    resources = {"metadata": {"name": title}, "site_links": links}
+    resources = {"metadata": {"name": title}, "site_links": links, "site_turns": list(turns)}
     page, _ = exporter.from_notebook_node(notebook, resources=resources)
     return linked(page)
 
@@ -106,9 +147,9 @@ def with_mathml(text: str) -> str:
     return re.sub(pattern, converted, text, flags=re.DOTALL)
 
 
-def short_annotation(annotation, *arguments) -> str:
+def short_annotation(annotation, *arguments, format=inspect.formatannotation, **options) -> str:
     """A type as it stands in the source, without the modules in which Python finds its parts."""
-    text = inspect.formatannotation(annotation)
+    text = format(annotation)
     text = re.sub(r"Union\[[^\[\]]*numpy\.ndarray[^\[\]]*\]", "ArrayLike", text)
     return re.sub(r"\b(?:[a-z_]\w*\.)+(?=[A-Za-z])", "", text)
 
@@ -117,6 +158,8 @@ def linked(page: str) -> str:
     """The page with links to files of the repository made links to pages of the site."""
     page = re.sub(r'href="((?:notebooks/)?\w+)\.ipynb', r'href="\1.html', page)
     page = page.replace('href="hamkernel/__init__.py"', 'href="hamkernel.html"')
+    page = page.replace('href="docs/reading.md"', 'href="reading.html"')
+    page = page.replace('href="README.md', 'href="index.html')
     # nbconvert makes the ids of headings with their capitals, GitHub those of README without.
     ids = re.findall(r'<h\d id="([^"]+)"', page)
     for heading in ids:

@@ -44,6 +44,12 @@ def test_is_short_and_begins_in_float64(path):
 
 
 @every_notebook
+def test_no_line_of_code_is_cut_in_the_page(path):
+    lines = [line for cell in code_cells(read(path)) for line in cell.source.splitlines()]
+    assert [line for line in lines if len(line) > 88] == []
+
+
+@every_notebook
 def test_keeps_the_outputs_and_pictures_of_one_run_in_order(path):
     cells = code_cells(read(path))
     assert [cell.execution_count for cell in cells] == list(range(1, len(cells) + 1))

@@ -13,6 +13,7 @@ import hamkernel as hk
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+READING = (ROOT / "docs" / "reading.md").read_text()
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
@@ -63,6 +64,7 @@ def test_the_readme_has_the_two_commands_that_ci_runs():
 
 def test_every_local_link_of_readme_and_notebooks_leads_to_a_file_and_a_heading():
     texts = {ROOT / "README.md": README, **{path: markdown(path) for path in NOTEBOOKS}}
+    texts[ROOT / "docs" / "reading.md"] = READING
     headings = {
         path: {
             re.sub(r"\s+", "-", title.strip())
@@ -93,7 +95,7 @@ def test_every_notebook_is_linked_from_the_readme():
 
 
 def test_plain_english():
-    text = README + "".join(markdown(path) for path in NOTEBOOKS)
+    text = README + READING + "".join(markdown(path) for path in NOTEBOOKS)
     odd = ("tells", "leave away", "leaves away", "what is dense", "says nothing of", "finds out")
     odd += ("is told", "cannot tell its", "it is worth to", "as any other", "no matter of")
     assert [phrase for phrase in odd if phrase in text.lower()] == []
