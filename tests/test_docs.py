@@ -78,7 +78,9 @@ def test_the_site_has_every_page_and_no_broken_link(site):
     assert "<math" in pages[site / "notebooks" / "quickstart.html"]
     notebooks = {path.stem: page for path, page in pages.items() if path.parent.name == "notebooks"}
     assert all('href="../reading.html"' in page for page in notebooks.values())
-    assert all(f'href="notebooks/{name}.html"' in pages[site / "reading.html"] for name in notebooks)
+    assert all(
+        f'href="notebooks/{name}.html"' in pages[site / "reading.html"] for name in notebooks
+    )
 
 
 @pytest.fixture
