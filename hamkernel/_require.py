@@ -11,7 +11,7 @@ import reprlib
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
 from typing import Any
 
 import equinox as eqx
@@ -25,6 +25,14 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key
 def is_concrete(*values: object) -> bool:
     """Whether no leaf of `values` is a tracer, so that Python may branch on them."""
     return not any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(values))
+
+
+def eager(*values: object) -> AbstractContextManager[None]:
+    """The context in which operations on constants happen at once, also while JAX traces.
+
+    Without it `jax.jit` makes a tracer of the sum of two constants, whose value nobody can check.
+    """
+    return jax.ensure_compile_time_eval() if is_concrete(*values) else nullcontext()
 
 
 def on_host(x: Array) -> Any:
@@ -118,6 +126,11 @@ def floating(x: Any, name: str) -> Array:
     """`x` as a JAX array of real floats: integers and booleans become the default float."""
     if isinstance(x, bool | int | float):
         x = np.asarray(x, float)
+    with eager(x):
+        return _floating(x, name)
+
+
+def _floating(x: Any, name: str) -> Array:
     try:
         array = x if isinstance(x, jax.Array) else jnp.asarray(x)
     except (TypeError, ValueError) as error:
@@ -204,7 +217,8 @@ def key(key: Any) -> Key[Array, ""]:
 def one_dtype(X: Array, Z: Array) -> tuple[Array, Array]:
     """Both in the wider of their dtypes, under strict promotion too."""
     dtype = np.promote_types(X.dtype, Z.dtype)
-    return X.astype(dtype), Z.astype(dtype)
+    with eager(X, Z):
+        return X.astype(dtype), Z.astype(dtype)
 
 
 def same_space(X: Array, Z: Array) -> tuple[Array, Array]:
@@ -249,12 +263,20 @@ def point(x: ArrayLike, n: int, name: str = "x") -> Float[Array, " n"]:
     return array
 
 
+_NOT_MEASURED = " Where NaN means that a component was not measured, pass hk.Velocities(X, Y)."
+_TRACED = (
+    " Where NaN means that a component was not measured, make hk.Velocities(X, Y) outside of "
+    "jax.jit: inside, it is not known which they are."
+)
+
+
 def data(
-    X: ArrayLike, Y: ArrayLike, part: bool = False
+    X: ArrayLike, Y: ArrayLike, part: bool = False, cure: str = _NOT_MEASURED
 ) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
     """States and velocities: two finite float arrays of one shape (N, n) and one dtype.
 
-    A `part` of the data may have fewer points than coordinates; all of it is warned of then.
+    A `part` of the data may have fewer points than coordinates; of all of it that is warned of.
+    `cure` is added to the error about NaN in Y.
     """
     X, Y = points(X, "X"), points(Y, "Y")
     if X.shape != Y.shape:
@@ -270,7 +292,6 @@ def data(
         )
     X, Y = one_dtype(X, Y)
     single_or_double(X.dtype, "X and Y have")
-    cure = " Where NaN means that a component was not measured, pass hk.Velocities(X, Y)."
     return finite(X, "X"), finite(Y, "Y", cure)
 
 
@@ -281,7 +302,9 @@ def measured(X: ArrayLike, Y: ArrayLike) -> tuple[Array, Array, np.ndarray | Non
     """
     X, Y = points(X, "X"), points(Y, "Y")
     seen = on_host(Y)
-    if not is_concrete(Y) or not (seen != seen).any():
+    if not is_concrete(Y):
+        return *data(X, Y, part=True, cure=_TRACED), None
+    if not (seen != seen).any():
         return *data(X, Y, part=True), None
     if not Y.is_fully_addressable:
         raise ValueError(

@@ -7,6 +7,7 @@
 
 import re
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -388,8 +389,19 @@ def test_a_mean_with_a_hamiltonian_is_in_that_of_the_field():
         np.testing.assert_allclose(J @ jax.grad(field.hamiltonian)(x), field(x), atol=SOLVE)
         assert field.anchored(x, 2.0).hamiltonian(x) == pytest.approx(2.0)
     field = hk.fit(MODEL, X, Y, RIDGE, mean=kinetic)
-    with pytest.raises(AttributeError, match=r"the mean, .* has no potential"):
+    with pytest.raises(AttributeError, match=r"the mean, kinetic, has no potential.*hk\.systems"):
         _ = field.hamiltonian
+
+
+def test_a_system_of_another_structure_is_not_told_to_be_a_system():
+    X, Y = pendulum_data(8, 0)
+    field = hk.fit(hk.CurlFree(hk.Gaussian(1.5)), X, Y, RIDGE, mean=MEANS["system"])
+    with pytest.raises(AttributeError, match=r"f = J∇H, and CurlFree.*take Symplectic\(k\)"):
+        _ = field.potential
+    learned = hk.fit(MODEL, X, Y, RIDGE)
+    field = hk.fit(hk.CurlFree(hk.Gaussian(1.5)), X, Y, RIDGE, mean=learned)
+    with pytest.raises(AttributeError, match=r"was learned with Symplectic: learn both with one"):
+        _ = field.potential
 
 
 def test_energies_with_a_mean_are_the_closed_form():
@@ -484,8 +496,25 @@ def test_arguments_that_do_not_belong_together_are_refused():
         hk.fit(K, GOOD.X)
     with pytest.raises(ValueError, match=r"mean maps a state of shape \(2,\) to shape \(\)"):
         hk.fit(K, GOOD, regularization=RIDGE, mean=lambda x: x.sum())
-    with pytest.raises(TypeError):
-        _ = GOOD + 1.0
+    for sum_of in (lambda: GOOD + 1.0, lambda: GOOD + GOOD.X, lambda: np.ones((2, 2)) + GOOD):
+        with pytest.raises(TypeError, match=r"only observations add up.*hk\.Velocities\(X, Y\) \+"):
+            sum_of()
+
+
+def test_what_is_not_measured_is_known_inside_jit_where_the_data_is_a_constant():
+    X, Y = pendulum_data(8, 0)
+    Y = np.where(np.arange(16).reshape(8, 2) == 5, np.nan, Y)
+    expected = hk.fit(K, hk.Velocities(X, Y), regularization=RIDGE)(ASKED[0])
+
+    def learned(ridge):
+        return hk.fit(K, hk.Velocities(X, Y), regularization=ridge)(ASKED[0])
+
+    np.testing.assert_allclose(jax.jit(learned)(RIDGE), expected, atol=SOLVE)
+    with pytest.raises(ValueError, match=r"Y contains NaN or inf in row 2.*hk\.Velocities"):
+        jax.jit(lambda ridge: hk.fit(K, X, Y, ridge)(ASKED[0]))(RIDGE)  # while tracing
+    traced = eqx.filter_jit(lambda Y: hk.fit(K, hk.Velocities(X, Y), regularization=RIDGE))
+    with pytest.raises(RuntimeError, match=r"make hk\.Velocities\(X, Y\) outside of jax\.jit"):
+        traced(jnp.asarray(Y))
 
 
 def test_observations_are_pytrees_that_cross_jit_and_print():

@@ -47,6 +47,33 @@ def test_the_variance_is_the_recipe_of_the_readme():
 
 
 @pytest.mark.few(1)
+@pytest.mark.parametrize("solver", [None, hk.Nystrom()], ids=["exact", "low rank"])
+def test_the_covariance_of_two_states_is_the_recipe_of_the_readme(solver):
+    """K(x, x₂) − K(x, X)(G + NλI)⁻¹K(X, x₂), by the Gram and NumPy."""
+    A = np.asarray(hk.gram(K, X)).reshape(24, 24) + 12 * RIDGE * np.eye(24)
+    left, right = (hk.gram(K, at[None], X)[0].reshape(2, -1) for at in (INSIDE, OUTSIDE))
+    expected = np.asarray(K(INSIDE, OUTSIDE)) - left @ np.linalg.solve(A, right.T)
+    posterior = POSTERIOR if solver is None else hk.condition(K, X, Y, RIDGE, solver=solver)
+    found = posterior.covariance(INSIDE, x2=OUTSIDE)
+    np.testing.assert_allclose(found, expected, atol=1e-10 if solver is None else 1e-5)
+    np.testing.assert_allclose(posterior.covariance(OUTSIDE, x2=INSIDE), found.T, atol=1e-12)
+
+
+def test_a_second_state_in_the_place_of_inputs_is_refused_with_the_keyword():
+    with pytest.raises(TypeError, match=r"has no inputs.*posterior\.covariance\(x, x2=z\)"):
+        POSTERIOR.covariance(INSIDE, OUTSIDE)
+    with pytest.raises(TypeError, match="u2 came without x2"):
+        POSTERIOR.covariance(INSIDE, u2=OUTSIDE)
+
+
+def test_the_warning_of_an_amplitude_of_one_is_told_to_scale_only_what_is_not_scaled():
+    with pytest.warns(UserWarning, match=r"Tune that of 1\.0 \* Gaussian"):
+        hk.condition(hk.Symplectic(hk.Gaussian(1.5)), X, Y, RIDGE)
+    with pytest.warns(UserWarning, match=r"1 \* Gaussian.* is exactly 1.*Tune it by"):
+        hk.condition(hk.Symplectic(1.0 * hk.Gaussian(1.5)), X, Y, RIDGE)
+
+
+@pytest.mark.few(1)
 @pytest.mark.parametrize("posterior", [POSTERIOR, BOTH], ids=["velocities", "energies"])
 def test_the_covariance_of_energies_differentiated_twice_is_that_of_the_field(posterior):
     def energies(x, z):

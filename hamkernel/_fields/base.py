@@ -245,10 +245,23 @@ def potential_of(field: Callable[..., Any], kernel: AbstractMatrixKernel) -> Sca
             return field.potential
     elif kernel.symplectic and callable(getattr(field, "hamiltonian", None)):
         return field.hamiltonian  # type: ignore[attr-defined]
+    name = getattr(getattr(field, "func", field), "__name__", type(field).__name__)
+    structure = type(kernel).__name__
+    if isinstance(field, AbstractField):
+        why = f"was learned with {type(field.kernel).__name__}: learn both with one structure."
+    elif hasattr(field, "hamiltonian"):
+        why = (
+            f"has a Hamiltonian H with f = J∇H, and {structure} makes fields B∇u of another B: "
+            "take Symplectic(k), or use velocities alone."
+        )
+    else:
+        why = (
+            "has no attribute hamiltonian: pass a system of hk.systems, a field learned with the "
+            "same structure, or, for Symplectic, an object of yours with a method hamiltonian(x)."
+        )
     raise AttributeError(
-        f"the mean, {type(field).__name__}, has no potential of this structure, so neither has the "
-        "field. A mean with a Hamiltonian is one of hk.systems, a field learned with the same "
-        "structure, or, for Symplectic, an object of yours with a method hamiltonian(x)."
+        f"the mean, {name}, has no potential of the structure {structure}, so neither has the "
+        f"field. The mean {why}"
     )
 
 

@@ -23,7 +23,7 @@ from hamkernel._fields.base import AbstractField, FieldSum, root
 from hamkernel._fields.controlled import ControlledField, known_of, learned_field
 from hamkernel._fields.known import Mean
 from hamkernel._gram.observed import components
-from hamkernel._kernels.base import Invariance
+from hamkernel._kernels.base import Invariance, Scaled
 from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._machine import one_blas_thread
 from hamkernel._observations.blocks import AbstractBlock, Values
@@ -119,25 +119,43 @@ class Posterior(eqx.Module):
         return f"Posterior(rows={rows.size}, dimension={rows.dimension}, field={text(self.field)})"
 
     def covariance(
-        self, x: Num[ArrayLike, " n"], u: Num[ArrayLike, " m"] | None = None
+        self,
+        x: Num[ArrayLike, " n"],
+        u: Num[ArrayLike, " m"] | None = None,
+        *,
+        x2: Num[ArrayLike, " n"] | None = None,
+        u2: Num[ArrayLike, " m"] | None = None,
     ) -> Float[Array, "n n"]:
-        """The covariance of the components of f(x) or f(x, u), given the data, in squared units.
+        """The covariance of f(x) with itself or with f(x₂), given the data, in squared units of Y.
+
+        K(x, x₂) − K(x, X) A⁻¹ K(X, x₂): entry (i, j) is the covariance of the component i of f at x
+        and the component j of f at x₂, which is x if it is not given.
 
         Args:
             x: one state, shape (n,).
             u: its inputs, shape (m,), where the field has inputs; zeros for the drift.
+            x2: the other state, shape (n,); by keyword.
+            u2: the inputs of the other state, where the field has inputs.
 
         Raises:
             ValueError: x is no single state of this dimension, or u is missing. TypeError: the
-                field has no inputs.
+                field has no inputs, or u2 comes without x2.
         """
-        return _covariance(self.given, components(self.given.field.kernel, self._point(x, u)[None]))
+        if x2 is None and u2 is not None:
+            raise TypeError("u2 came without x2: posterior.covariance(x, u, x2=z, u2=v).")
+        K = self.given.field.kernel
+        here = components(K, self._point(x, u)[None])
+        there = None if x2 is None else components(K, self._point(x2, u2)[None])
+        return _covariance(self.given, here, there)
 
     def _point(self, x: Any, u: Any) -> Float[Array, " d"]:
         if isinstance(self.field, ControlledField):
             return self.field.joined(x, u)
         if u is not None:
-            raise TypeError("the field has no inputs: leave out u.")
+            raise TypeError(
+                "the second argument is u, and this field has no inputs: leave it out. The "
+                "covariance of f at two states is posterior.covariance(x, x2=z)."
+            )
         return self.field._state(x)
 
     def deviation(
@@ -276,8 +294,10 @@ class Posterior(eqx.Module):
 
 # One by one its operations would be hundreds of small programs, which took 4 s to compile.
 @eqx.filter_jit
-def _covariance(given: AbstractConditional, block: AbstractBlock) -> Float[Array, "d d"]:
-    return given.covariance(block, block)
+def _covariance(
+    given: AbstractConditional, left: AbstractBlock, right: AbstractBlock | None = None
+) -> Float[Array, "d e"]:
+    return given.covariance(left, left if right is None else right)
 
 
 def _range_of(U: Float[Array, "N m"]) -> Float[Array, "2 m"]:
@@ -292,9 +312,10 @@ def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
         return
     for k in without_symmetry(K).scalar_kernels:
         if Invariance.TRANSLATION in k.invariance and np.asarray(k(X[0], X[0])) == 1.0:
+            scaled = "it" if isinstance(k, Scaled) else f"that of 1.0 * {k!r}"
             require.warn(
-                f"the amplitude of {k!r} is exactly 1, that of a kernel nobody tuned, and "
-                "deviations are proportional to it. Write 1.0 * k and tune it by "
+                f"the amplitude of {k!r} is exactly 1, as it is before tuning, and deviations are "
+                f"proportional to it. Tune {scaled} by "
                 "hk.tune(..., objective='marginal_likelihood')."
             )
             return
