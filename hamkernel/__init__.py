@@ -37,7 +37,6 @@ from typing import TYPE_CHECKING, Any
 from hamkernel import poisson, systems
 from hamkernel._discovery.formula import Formula
 from hamkernel._discovery.readout import readout
-from hamkernel._dynamics.simulate import simulate
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.controlled import ControlledField
 from hamkernel._fields.features import FeatureField
@@ -50,7 +49,7 @@ from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._kernels.transforms import Select, Warp
 from hamkernel._observations.kinds import Energies, Equilibria, Functionals, Velocities
 from hamkernel._posterior.posterior import Posterior, condition
-from hamkernel._save.files import load, save
+from hamkernel._save import load, save
 from hamkernel._solvers.cholesky import Cholesky
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.fit import fit
@@ -77,8 +76,14 @@ from hamkernel._validation.losses import (
 
 if TYPE_CHECKING:
     from hamkernel import paper, plot
-    from hamkernel._dynamics.gauss_legendre import GaussLegendre4, GaussLegendre6, ImplicitMidpoint
-    from hamkernel._dynamics.splitting import StormerVerlet, Yoshida4
+    from hamkernel._dynamics.simulate import simulate
+    from hamkernel._dynamics.symplectic import (
+        GaussLegendre4,
+        GaussLegendre6,
+        ImplicitMidpoint,
+        StormerVerlet,
+        Yoshida4,
+    )
 
 __all__ = [  # noqa: RUF022 - in reading order
     # Scalar kernels.
@@ -162,11 +167,12 @@ __version__ = "0.1.0"
 
 # Loaded when first asked for, so that `import hamkernel` loads neither diffrax nor matplotlib.
 _LAZY = {
-    "ImplicitMidpoint": "_dynamics.gauss_legendre",
-    "GaussLegendre4": "_dynamics.gauss_legendre",
-    "GaussLegendre6": "_dynamics.gauss_legendre",
-    "StormerVerlet": "_dynamics.splitting",
-    "Yoshida4": "_dynamics.splitting",
+    "simulate": "_dynamics.simulate",
+    "ImplicitMidpoint": "_dynamics.symplectic",
+    "GaussLegendre4": "_dynamics.symplectic",
+    "GaussLegendre6": "_dynamics.symplectic",
+    "StormerVerlet": "_dynamics.symplectic",
+    "Yoshida4": "_dynamics.symplectic",
 }
 
 

@@ -11,13 +11,14 @@ from jax.test_util import check_grads
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._dynamics.gauss_legendre import (
+from hamkernel._dynamics.symplectic import (
     FixedPointToRounding,
     GaussLegendre4,
     GaussLegendre6,
     ImplicitMidpoint,
+    StormerVerlet,
+    Yoshida4,
 )
-from hamkernel._dynamics.splitting import StormerVerlet, Yoshida4
 
 GAUSS = [ImplicitMidpoint(), GaussLegendre4(), GaussLegendre6()]
 SPLITTING = [StormerVerlet(), Yoshida4()]

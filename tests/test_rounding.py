@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._dynamics.rounding import rounding
+from hamkernel._gram.rounding import field_rounding
 
 HENON_HEILES = hk.systems.HenonHeiles()
 START = jnp.array([0.1, 0.2, 0.3, 0.1])
@@ -24,6 +24,10 @@ def learned():
     """From 100 exact velocities, with the hyperparameters that `tune` finds for them."""
     X = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, size=(100, 4)))
     return hk.fit(hk.Symplectic(hk.Gaussian(7.776)), X, jax.vmap(HENON_HEILES)(X), 4.2e-15)
+
+
+def rounding(field, x):
+    return field_rounding(field.kernel, x, field.points, field.coefficients, field(x))
 
 
 def terms(K, x, field):
@@ -51,12 +55,16 @@ def test_of_an_odd_kernel_it_is_that_of_the_terms_before_they_cancel():
     )
 
 
-def test_an_equilibrium_keeps_six_digits_and_other_fields_all():
+def test_an_equilibrium_has_no_digits_and_is_simulated_to_six():
     X = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, size=(20, 2)))
     field = hk.fit(hk.Odd(hk.Symplectic(hk.Gaussian(2.0))), X, jnp.stack([X[:, 1], -X[:, 0]], 1))
-    assert rounding(field, jnp.zeros(2)) == 1e-6
-    assert rounding(lambda x: field(x), jnp.zeros(2)) == 0.0
-    assert rounding(HENON_HEILES, START) == 0.0
+    assert rounding(field, jnp.zeros(2)) > 1e-6
+    away = hk.simulate(field, jnp.array([1e-9, 0.0]), jnp.linspace(0, 6, 3)).ys
+    np.testing.assert_allclose(away, 0.0, atol=1e-5)
+    for known in (HENON_HEILES, lambda x: HENON_HEILES(x)):  # 1e-10, as of every other field
+        end = hk.simulate(known, START, jnp.array([0.0, 5.0])).ys[-1]
+        tight = hk.simulate(HENON_HEILES, START, jnp.array([0.0, 5.0]), rtol=1e-13, atol=1e-13)
+        np.testing.assert_allclose(end, tight.ys[-1], atol=1e-8)
 
 
 def test_a_field_from_exact_data_is_simulated_in_few_steps_with_the_same_drift(learned):

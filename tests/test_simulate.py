@@ -17,9 +17,14 @@ from scipy.integrate import solve_ivp
 
 import hamkernel as hk
 from hamkernel._dynamics.equal_steps import equal_steps
-from hamkernel._dynamics.gauss_legendre import GaussLegendre4, GaussLegendre6, ImplicitMidpoint
 from hamkernel._dynamics.simulate import simulate
-from hamkernel._dynamics.splitting import StormerVerlet, Yoshida4
+from hamkernel._dynamics.symplectic import (
+    GaussLegendre4,
+    GaussLegendre6,
+    ImplicitMidpoint,
+    StormerVerlet,
+    Yoshida4,
+)
 from hamkernel._kernels.radial import Gaussian
 from hamkernel._structures.structure import Symplectic
 
@@ -411,7 +416,7 @@ def test_progress_shows_a_bar_and_changes_nothing(options, capsys):
 
 
 def test_diffrax_loads_only_when_a_simulation_runs():
-    code = "import hamkernel._dynamics.simulate, sys; assert 'diffrax' not in sys.modules"
+    code = "import hamkernel, sys; hamkernel.systems; assert 'diffrax' not in sys.modules"
     subprocess.run([sys.executable, "-c", code], check=True)
 
 

@@ -1,22 +1,33 @@
-"""Trajectories of any vector field, by Diffrax.
-
-Diffrax takes most of a second to import, so it loads when `simulate` is called and not with the
-package.
-"""
+"""Trajectories of any vector field, by Diffrax: `hk.simulate`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any
+from typing import Any, Literal, NamedTuple
 
-from jaxtyping import Array, ArrayLike, Float, Num
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
-from hamkernel._dynamics.inputs import Between
-from hamkernel._dynamics.right_hand_side import check_field, right_hand_side
+from hamkernel._dynamics.equal_steps import EqualSteps, step_counts
+from hamkernel._dynamics.symplectic import AbstractSymplecticSolver
+from hamkernel._fields.controlled import ControlledField
+from hamkernel._fields.kernel_field import KernelField
+from hamkernel._gram.rounding import field_rounding
+from hamkernel._kernels.functions import as_pytree
 
-if TYPE_CHECKING:
-    import diffrax
+Between = Literal["held", "linear"]
+
+# Bounds the loop where the number of steps is not known beforehand: some seconds of a cheap field.
+_MAX_STEPS = 2**20
+# The loosest default tolerance. At an equilibrium f is zero and has no digits at all; with 1e-6
+# states are right to a few digits.
+_LOOSEST = 1e-6
+_RESULTS: Any = diffrax.RESULTS
 
 
 def simulate(
@@ -83,46 +94,387 @@ def simulate(
         RuntimeError: the solve failed: too many steps, the implicit equations of a step did not
             converge, or the state overflowed. Usually the remedy is a smaller `dt`.
     """
-    import diffrax
-
-    from hamkernel._dynamics.outcome import counted, finished, successful
-    from hamkernel._dynamics.plan import adaptive, check_solver, eager, equal, tolerances
-    from hamkernel._dynamics.solve import checked_adjoint, followed
-
-    with eager(x0):
+    with require.eager(x0):
         x0 = _initial_state(x0)
-    with eager(ts):
+    with require.eager(ts):
         given = require.times(ts, least=2)
         ts = require.elapsed(given, x0.dtype)
     solver = diffrax.Dopri8() if solver is None else solver
-    check_solver(solver, dt, rtol, atol, inputs is not None)
-    rhs = right_hand_side(field, inputs, ts, given[0], between, dt is not None)
-    check_field(rhs.at_start, x0)
+    _check_solver(solver, dt, rtol, atol, inputs is not None)
+    rhs, start = _right_hand_side(field, inputs, ts, given[0], between, dt is not None)
+    at_start = rhs.field if inputs is None else _AtStart(rhs, start)
+    _check_field(at_start, x0)
     if max_steps is not None:
         max_steps = require.count(max_steps, "max_steps")
-    adjoint = checked_adjoint(adjoint)
+    adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+    if not isinstance(adjoint, diffrax.AbstractAdjoint):
+        raise TypeError(
+            f"adjoint must be one of Diffrax, such as diffrax.ForwardMode(); got {adjoint!r}."
+        )
     if dt is None:
         jumps = inputs is not None and not callable(inputs)
-        plan = adaptive(solver, ts, tolerances(rhs.at_start, x0, rtol, atol), max_steps, jumps)
+        steps = _adaptive(solver, ts, _tolerances(rhs, start, x0, rtol, atol), max_steps, jumps)
     else:
-        plan = equal(solver, ts, dt, adjoint, max_steps)
-    solution = followed(rhs, plan, ts, x0, adjoint, progress)
-    solution, failed = finished(solution, given.astype(x0.dtype))
-    if plan.counts is not None:
-        solution = counted(solution, plan.counts)
+        steps = _equal(solver, ts, dt, adjoint, max_steps)
+    solution = _solve(rhs, steps, ts, x0, start, adjoint, progress)
+    solution, failed = _finished(solution, given.astype(x0.dtype))
+    if steps.counts is not None:  # Diffrax counted the intervals around the equal steps
+        total = jnp.asarray(require.on_host(steps.counts).sum())
+        stats = {**solution.stats, "num_steps": total, "num_accepted_steps": total}
+        solution = eqx.tree_at(lambda s: s.stats, solution, stats)
     if not throw:
         return solution
-    return successful(solution, failed, rhs.at_start, x0, dt is not None)
+    message = jax.tree_util.Partial(_failure, solution, at_start, x0, dt is None)
+    ys = require.value(solution.ys, require.on_host(failed), message, RuntimeError)
+    return eqx.tree_at(lambda s: s.ys, solution, ys)
 
 
 def _initial_state(x0: ArrayLike) -> Float[Array, " n"]:
     x0 = require.floating(x0, "x0")
     if x0.ndim != 1 or x0.size == 0:
-        hint = (
-            " For a batch, use `jax.vmap(lambda x: hk.simulate(field, x, ts).ys)(x0)`."
-            if x0.ndim > 1
-            else ""
+        batch = " For a batch, use `jax.vmap(lambda x: hk.simulate(field, x, ts).ys)(x0)`."
+        raise ValueError(
+            f"x0 has shape {x0.shape}; one state of shape (n,) is needed.{batch * (x0.ndim > 1)}"
         )
-        raise ValueError(f"x0 has shape {x0.shape}; one state of shape (n,) is needed.{hint}")
     require.single_or_double(x0.dtype, "x0 has")
     return require.finite(x0, "x0")
+
+
+# The field and its inputs.
+
+
+class Samples(eqx.Module):
+    """u(t) from its values at times ts: the last one before t, or on the line between two."""
+
+    ts: Float[Array, " T"]
+    values: Float[Array, "T m"]
+    held: bool = eqx.field(static=True)
+
+    def __call__(self, t: Float[Array, ""]) -> Float[Array, " m"]:
+        last = len(self.ts) - 2
+        index = jnp.clip(jnp.searchsorted(self.ts, t, side="right") - 1, 0, last)
+        before = self.values[index]
+        if self.held:
+            return before
+        share = (t - self.ts[index]) / (self.ts[index + 1] - self.ts[index])
+        return before + share * (self.values[index + 1] - before)
+
+
+class RightHandSide(eqx.Module):
+    """The field as Diffrax calls it, f(t, x, args); with inputs `args` is the time at t = 0."""
+
+    field: Any  # x -> velocity; or x, u -> velocity
+    inputs: Callable[[Array], Any] | None
+    # Whether u is that of t = 0 over a whole step, whose last stage would else see the next one.
+    held: bool = eqx.field(static=True)
+
+    @property
+    def is_separable(self) -> bool:
+        """Whether H = T(p) + U(q), as the field says of itself."""
+        return self.inputs is None and bool(getattr(self.field, "is_separable", False))
+
+    def __call__(self, t: Any, x: Float[Array, " n"], args: Any) -> Float[Array, " n"]:
+        if self.inputs is None:
+            return self.field(x)
+        u = self.inputs(args if self.held else args + t)
+        return self.field(x, require.floating(u, "the value of inputs").astype(x.dtype))
+
+
+class _AtStart(eqx.Module):
+    """x -> f(x, u) with the inputs u of the first time."""
+
+    rhs: RightHandSide
+    start: Float[Array, ""]
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.rhs(jnp.zeros_like(self.start), x, self.start)
+
+
+_FilterJit: Any = type(eqx.filter_jit(abs))  # Equinox does not name it
+
+
+def _right_hand_side(
+    field: Any,
+    inputs: Any,
+    ts: Float[Array, " T"],
+    first: Float[Array, ""],
+    between: Between,
+    constant_steps: bool,
+) -> tuple[RightHandSide, Float[Array, ""] | None]:
+    """The field with its inputs, and the time of the inputs at ts[0] = 0, for `args`."""
+    # A function inside of `jax.jit` says what it is, and the loop is compiled anyway. Not behind
+    # every `__wrapped__`: what functools.wraps names is another field.
+    while isinstance(field, (jax.stages.Wrapped, _FilterJit)):
+        field = field.__wrapped__
+    if inputs is None:
+        if getattr(field, "takes_inputs", False):
+            raise ValueError(
+                f"this {type(field).__name__} has inputs: hk.simulate(field, x0, ts, inputs=u), u "
+                "a function t -> (m,) or samples (T, m) at ts. Without inputs simulate its drift, "
+                "field.drift."
+            )
+        return RightHandSide(field, None, held=False), None
+    others = require.other_arguments(field, ts, ts)
+    if others is not None:
+        raise TypeError(
+            f"field takes ({others}); with inputs it is called with two arguments, the state x and "
+            "its inputs u: a field of a Controlled kernel, hk.systems.Driven(system, G), or a "
+            "function of yours. To simulate it without inputs, leave them out."
+        )
+    # Functions get the caller's time, samples have times of their own: those since the start.
+    start = first.astype(ts.dtype) if callable(inputs) else jnp.zeros((), ts.dtype)
+    held = constant_steps and between == "held" and not callable(inputs)
+    return RightHandSide(field, _inputs(inputs, ts, between), held), start
+
+
+def _inputs(given: Any, ts: Float[Array, " T"], between: Between) -> Callable[[Array], Any]:
+    """The inputs u as a function of the time; samples are at the times ts."""
+    if between not in ("held", "linear"):
+        raise ValueError(f"between must be 'held' or 'linear'; got {between!r}.")
+    if callable(given):
+        others = require.other_arguments(given, ts[0])
+        if others is not None:
+            raise TypeError(
+                f"inputs takes ({others}); it is called with one argument, the time. Feedback "
+                "closes the loop instead: hk.simulate(lambda x: field(x, law(x)), x0, ts)."
+            )
+        out = jax.eval_shape(given, jax.ShapeDtypeStruct((), ts.dtype))
+        shape = getattr(out, "shape", type(out).__name__)
+        if not isinstance(shape, tuple) or len(shape) != 1:
+            raise ValueError(
+                f"inputs(t) returns shape {shape}; one vector u of shape (m,) is needed, such as "
+                "jnp.array([jnp.sin(t)])."
+            )
+        return as_pytree(given)
+    values = require.floating(given, "inputs")
+    if values.ndim != 2 or len(values) != len(ts):
+        hint = ""
+        if values.ndim == 1 and len(values) == len(ts):
+            hint = " For one input write U[:, None]."
+        elif values.ndim < 2:
+            hint = " A constant input is lambda t: jnp.array([…])."
+        raise ValueError(
+            f"inputs has shape {values.shape}; a function t -> (m,) is needed, or samples (T, m) at"
+            f" the T = {len(ts)} times ts.{hint}"
+        )
+    return Samples(ts, require.finite(values, "inputs").astype(ts.dtype), between == "held")
+
+
+def _check_field(field: Callable[[Array], Array], x0: Float[Array, " n"]) -> None:
+    dtype = require.velocity(field, x0).dtype
+    if dtype != x0.dtype:
+        cure = f"Pass x0 as {dtype}, or cast the output of the field."
+        if not jnp.issubdtype(dtype, jnp.floating):
+            cure = "Let it return floats."
+        raise TypeError(f"field maps {x0.dtype} to {dtype}; the solution has one dtype. {cure}")
+
+
+# The steps.
+
+
+class _Steps(NamedTuple):
+    """What Diffrax is told of the steps, and their number in each interval where it is known."""
+
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController
+    saveat: diffrax.SaveAt
+    max_steps: int
+    counts: Int[Array, " intervals"] | None = None
+
+
+def _adaptive(
+    solver: diffrax.AbstractSolver,
+    ts: Float[Array, " T"],
+    tolerances: tuple[Float[Array, ""], Float[Array, ""]],
+    max_steps: int | None,
+    jumps: bool,
+) -> _Steps:
+    """Steps of these tolerances, rtol and atol; with `jumps` the field jumps at the saved times."""
+    # Steps end on ts: the interpolant of Dopri8 is of lower order, and was measured to break
+    # the conservation of energy by 1e-7 where the steps themselves keep it to 1e-10.
+    controller = diffrax.ClipStepSizeController(
+        diffrax.PIDController(*tolerances),
+        step_ts=ts,
+        # No step may have a stage on the other side of a jump.
+        jump_ts=ts[1:-1] if jumps else None,
+    )
+    most = _MAX_STEPS + ts.size if max_steps is None else max_steps
+    return _Steps(solver, controller, diffrax.SaveAt(ts=ts), most)
+
+
+def _tolerances(
+    rhs: RightHandSide, start: Any, x0: Float[Array, " n"], rtol: Any, atol: Any
+) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The relative and the absolute tolerance, by default no less than the field rounds."""
+    default = jnp.asarray(1e-10 if x0.dtype == jnp.float64 else 1e-5, x0.dtype)
+    if rtol is None or atol is None:
+        learned, point = rhs.field, x0
+        if isinstance(learned, ControlledField) and rhs.inputs is not None:
+            learned, point = learned.whole, learned.joined(x0, rhs.inputs(start))
+        if isinstance(learned, KernelField):
+            Z, A = learned.points, learned.coefficients
+            share = field_rounding(learned.kernel, point, Z, A, learned(point))
+            default = jnp.maximum(default, jnp.minimum(share, _LOOSEST).astype(x0.dtype))
+
+    def tolerance(name: str, given: Any) -> Float[Array, ""]:
+        if given is None:
+            return default
+        with require.eager(given):  # as an array: every new Python number would compile anew
+            return require.positive_scalar(given, name).astype(default.dtype)
+
+    return tolerance("rtol", rtol), tolerance("atol", atol)
+
+
+def _equal(
+    solver: diffrax.AbstractSolver,
+    ts: Float[Array, " T"],
+    dt: ArrayLike,
+    adjoint: diffrax.AbstractAdjoint,
+    max_steps: int | None,
+) -> _Steps:
+    """The fewest equal steps of at most dt in every interval."""
+    with require.eager(dt):
+        dt = require.positive_scalar(dt, "dt")
+    with require.eager(ts, dt):
+        counts = step_counts(ts, dt)
+        bound = _bound(counts, max_steps)
+    steps = EqualSteps(solver, dt, adjoint, bound)
+    saveat = diffrax.SaveAt(t0=True, steps=True)
+    return _Steps(steps, diffrax.StepTo(ts), saveat, ts.size - 1, counts)
+
+
+def _bound(counts: Int[Array, " intervals"], max_steps: int | None) -> int:
+    """A number of steps that no save interval exceeds, where the counts are known."""
+    if not require.is_concrete(counts):
+        return max_steps or _MAX_STEPS
+    each = np.asarray(counts)
+    most = int(each.max())
+    if most >= np.iinfo(np.int32).max:
+        raise ValueError(
+            "dt is so small that more than two thousand million steps lie between two of ts: "
+            "take a larger dt, in the unit of time of ts."
+        )
+    if max_steps is None:  # A power of two: neighbouring values of dt share one compiled loop.
+        return 2 ** (most - 1).bit_length()
+    if each.sum() > max_steps:
+        raise ValueError(
+            f"dt cuts ts into {each.sum()} steps, more than max_steps={max_steps}: take a larger "
+            "dt, or leave max_steps None."
+        )
+    return max_steps
+
+
+def _check_solver(solver: Any, dt: Any, rtol: Any, atol: Any, has_inputs: bool) -> None:
+    """Refuse what is no solver, and what it cannot do."""
+    name = solver.__name__ if isinstance(solver, type) else type(solver).__name__
+    symplectic = isinstance(solver, AbstractSymplecticSolver)
+    if isinstance(solver, type) or not isinstance(solver, diffrax.AbstractSolver):
+        raise TypeError(f"solver is {name}; an instance is needed, such as hk.ImplicitMidpoint().")
+    if isinstance(solver, diffrax.SemiImplicitEuler):
+        raise ValueError(
+            "SemiImplicitEuler takes two vector fields, one for q and one for p; simulate has one. "
+            "hk.StormerVerlet() is symplectic too, of order 2, and takes the whole field."
+        )
+    if dt is not None and not (rtol is None and atol is None):
+        raise ValueError("rtol and atol belong to adaptive steps, but dt sets constant ones.")
+    if dt is None and symplectic:
+        raise ValueError(
+            f"{name} is symplectic and needs a constant step: pass dt=... An adaptive step would "
+            "destroy symplecticity, since a step chosen from the state is a different map at every "
+            "state, and the energy would drift as with any other method. A tenth of the shortest "
+            "period or less is a start."
+        )
+    if dt is None and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+        raise ValueError(
+            f"{name} estimates no error, so the step cannot adapt to one: pass dt=... for constant "
+            "steps, or use a solver such as diffrax.Dopri8()."
+        )
+    if has_inputs and symplectic:
+        raise ValueError(
+            f"{name} is symplectic, and a field with inputs is not the flow of one H: the energy "
+            "that it keeps bounded is not conserved while inputs do work. Use the default solver, "
+            "or diffrax.Dopri5() with dt=..."
+        )
+
+
+# The solve and its outcome.
+
+
+def _solve(
+    rhs: RightHandSide,
+    steps: _Steps,
+    ts: Float[Array, " T"],
+    x0: Float[Array, " n"],
+    start: Float[Array, ""] | None,
+    adjoint: diffrax.AbstractAdjoint,
+    progress: bool,
+) -> diffrax.Solution:
+    """The solution, whether it reached its end or not."""
+    try:
+        return diffrax.diffeqsolve(
+            diffrax.ODETerm(rhs),
+            steps.solver,
+            ts[0],
+            ts[-1],
+            None,
+            x0,
+            start,
+            saveat=steps.saveat,
+            stepsize_controller=steps.controller,
+            adjoint=adjoint,
+            max_steps=steps.max_steps,
+            throw=False,
+            progress_meter=diffrax.TqdmProgressMeter() if progress else diffrax.NoProgressMeter(),
+        )
+    except TypeError as error:
+        if "forward-mode" not in str(error) or isinstance(adjoint, diffrax.ForwardMode):
+            raise
+        raise TypeError(
+            f"{type(adjoint).__name__} is for reverse mode alone: pass adjoint="
+            "diffrax.ForwardMode() for jax.jvp and jax.jacfwd, adjoint=diffrax.DirectAdjoint() for "
+            "jax.hessian."
+        ) from error
+
+
+@eqx.filter_jit
+def _finished(solution: Any, ts: Float[Array, " T"]) -> tuple[Any, Bool[Array, ""]]:
+    """The solution at the caller's times, and whether it failed.
+
+    Times that the solve did not reach stay infinite. A state that is not finite is a failure:
+    adaptive steps reject such states, constant ones go through them.
+    """
+    reached_end = solution.result == _RESULTS.successful
+    overflowed = reached_end & ~jnp.isfinite(solution.ys).all()
+    result = _RESULTS.where(overflowed, _RESULTS.nonfinite, solution.result)
+    reached = jnp.where(jnp.isfinite(solution.ts), ts, solution.ts.astype(ts.dtype))
+    new = ts[0], ts[-1], reached, result
+    solution = eqx.tree_at(lambda s: (s.t0, s.t1, s.ts, s.result), solution, new)
+    return solution, result != _RESULTS.successful
+
+
+def _failure(solution: Any, field: Any, x0: Float[Array, " n"], adapts: bool) -> str:
+    """Why a solve failed, and what to do."""
+    reason = (
+        "Too many steps, a step whose equations could not be solved, or a state that "
+        "overflowed or became NaN."
+    )
+    if require.is_concrete(solution.result):
+        if require.is_concrete(field, x0) and not jnp.isfinite(field(x0)).all():
+            return (
+                "The solve failed: the field is NaN or infinite at x0 already. So is one from "
+                "a fit that failed with throw=False."
+            )
+        if solution.result == _RESULTS.nonfinite:
+            return (
+                "The state overflowed or became NaN. The step is too large for the solver, or "
+                "the field has no solution over this time. Take a smaller dt, or a shorter time."
+            )
+        reason = _RESULTS[solution.result]
+    cure = "Take a smaller dt."
+    if adapts:
+        cure = (
+            "Pass larger tolerances, such as rtol=1e-6, atol=1e-6: a learned field rounds, the "
+            "more the smaller its regularization, and an adaptive step that is asked for more "
+            "digits shrinks without end. Or allow more with max_steps."
+        )
+    return f"The solve failed: {reason} {cure} It may also be that the field has no solution."

@@ -1,9 +1,26 @@
-"""Gauss collocation: implicit, symplectic for every Hamiltonian. See `equal_steps.py`."""
+"""Symplectic integrators as Diffrax solvers, with constant steps chosen beforehand.
+
+A one-step map x₁ = Ψ_h(x₀) is symplectic if (∂Ψ)ᵀ J ∂Ψ = J. Then, but for terms exponentially small
+in 1/h, it follows the flow of a nearby Hamiltonian H + O(hᵖ): the error in H stays bounded instead
+of growing (HLW, IX.8). That holds for one fixed map, so for a CONSTANT step: a step chosen from
+the state makes a different map at every state, and the property is gone (HLW, VIII.1).
+
+Two families, both with x = (q, p) in one array of shape (n,):
+
+- Gauss collocation solves implicit equations and is symplectic for every Hamiltonian.
+- Splitting is explicit, and needs H = T(p) + U(q).
+
+Diffrax owns the loop over steps, the output and the gradients; Optimistix the implicit equations
+and their derivative by the implicit function theorem.
+
+Source: "HLW" below is Hairer, Lubich & Wanner, Geometric Numerical Integration, 2nd ed. (2006).
+"""
 
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +28,72 @@ import optimistix as optx
 from equinox import AbstractClassVar, AbstractVar
 from jaxtyping import Array, Bool, Float, Scalar
 
-from hamkernel._dynamics.equal_steps import AbstractSymplecticSolver, Step
+
+class Step(eqx.Module):
+    """What one step from (t0, y0) to t1 needs: its signed size h and the field f(t, y)."""
+
+    terms: Any
+    args: Any
+    t0: Array
+    t1: Array
+    y0: Float[Array, " n"]
+    h: Float[Array, ""]
+
+    def __init__(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any):
+        if jax.tree.structure(y0) != jax.tree.structure(0) or jnp.ndim(y0) != 1:
+            raise ValueError(
+                f"A symplectic solver got a state of shape {jax.tree.map(jnp.shape, y0)}; it needs "
+                "one array of shape (n,). For a batch, use `jax.vmap` over the initial states."
+            )
+        self.terms, self.args = terms, args
+        self.t0, self.t1, self.y0 = jnp.asarray(t0), jnp.asarray(t1), jnp.asarray(y0)
+        # The control carries the direction of time; its dtype may be narrower than the state's.
+        self.h = jnp.asarray(terms.contr(t0, t1), self.y0.dtype)
+
+    def field(self, t: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.terms.vf(t, y, self.args)
+
+    def time(self, fraction: float | np.ndarray) -> Array:
+        return self.t0 + jnp.asarray(fraction, self.t0.dtype) * (self.t1 - self.t0)
+
+
+class AbstractSymplecticSolver(diffrax.AbstractSolver):
+    """A Diffrax solver whose step is a symplectic map for every constant step size.
+
+    It gives no error estimate, so Diffrax refuses it together with an adaptive step size.
+    """
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+    nominal_order: AbstractClassVar[int]
+
+    @property
+    def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Between steps, as `SaveAt(ts=...)` asks: linear at order 2, else cubic Hermite.
+
+        Neither is symplectic; make steps onto the times of interest, as `simulate` does.
+        """
+        if self.nominal_order == 2:
+            return diffrax.LocalLinearInterpolation
+        return diffrax.ThirdOrderHermitePolynomialInterpolation
+
+    def order(self, terms: Any) -> int:
+        """Return the order p: the error at a fixed time is O(hᵖ)."""
+        del terms
+        return self.nominal_order
+
+    def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
+        """Return the vector field at one point."""
+        return terms.vf(t0, y0, args)
+
+    def _dense_info(self, step: Step, y1: Float[Array, " n"]) -> dict[str, Array]:
+        info = {"y0": step.y0, "y1": y1}
+        if self.nominal_order > 2:  # XLA drops these two evaluations where nothing is interpolated.
+            info["k0"] = step.h * step.field(step.t0, step.y0)
+            info["k1"] = step.h * step.field(step.t1, y1)
+        return info
+
+
+# Gauss collocation.
 
 
 class FixedPointToRounding(optx.AbstractFixedPointSolver):
@@ -215,3 +297,111 @@ class GaussLegendre6(AbstractGauss):
     tableau: ClassVar[GaussTableau] = _gauss(3)
     root_finder: Any = FixedPointToRounding()
     root_find_max_steps: int = 100
+
+
+# Splitting.
+
+_TRIPLE_JUMP = 1 / (2 - 2 ** (1 / 3))
+
+
+def is_separable(terms: Any) -> bool:
+    """Whether the field under a Diffrax term says of itself that H = T(p) + U(q)."""
+    while not hasattr(terms, "vector_field") and hasattr(terms, "term"):
+        terms = terms.term  # Diffrax wraps the user's term to set the direction of time.
+    return bool(getattr(getattr(terms, "vector_field", None), "is_separable", False))
+
+
+class AbstractSplitting(AbstractSymplecticSolver):
+    """Kick, drift, kick with h replaced by w_1 h, …, w_s h in turn (w = `weights`, Σ w = 1).
+
+    One such substep of size h, where q̇ = f_q depends on p alone and ṗ = f_p on q alone:
+
+        p½ = p + h/2 f_p(q),   q₁ = q + h f_q(p½),   p₁ = p½ + h/2 f_p(q₁)
+
+    For any other field this is not symplectic, nor even consistent with order 2, and nothing in its
+    output shows it. So the field must have an attribute `is_separable` that is True, or the caller
+    must say so by `assume_separable=True`. f is evaluated whole, twice in every substep; the state
+    carried between steps is f_p(q₁), with which the next step begins.
+    """
+
+    weights: AbstractClassVar[tuple[float, ...]]
+    assume_separable: AbstractVar[bool]
+
+    def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Float[Array, " m"]:
+        """Return the force f_p at the start."""
+        step = Step(terms, t0, t1, y0, args)
+        self._require_separable(terms, step.y0.size)
+        return step.field(t0, step.y0)[step.y0.size // 2 :]
+
+    def step(
+        self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
+    ) -> tuple[Float[Array, " n"], None, dict[str, Array], Float[Array, " m"], diffrax.RESULTS]:
+        """Make one step of s kicks and s drifts."""
+        step = Step(terms, t0, t1, y0, args)
+        self._require_separable(terms, step.y0.size)
+        q, p = jnp.split(step.y0, 2)
+        force = solver_state
+        if made_jump is not False:
+            fresh = self.init(terms, t0, t1, y0, args)
+            force = jnp.where(made_jump, fresh, force)
+        begin = 0.0
+        for weight in self.weights:
+            h = weight * step.h
+            p = p + h / 2 * force
+            velocity = step.field(step.time(begin + weight / 2), jnp.concatenate([q, p]))
+            q = q + h * velocity[: q.size]
+            begin += weight
+            force = step.field(step.time(begin), jnp.concatenate([q, p]))[q.size :]
+            p = p + h / 2 * force
+        y1 = jnp.concatenate([q, p])
+        return y1, None, self._dense_info(step, y1), force, diffrax.RESULTS.successful
+
+    def _require_separable(self, terms: Any, n: int) -> None:
+        name = type(self).__name__
+        if n % 2:
+            raise ValueError(f"{name} got {n} coordinates: x = (q, p) has an even number.")
+        if not (self.assume_separable or is_separable(terms)):
+            raise ValueError(
+                f"{name} needs a separable Hamiltonian H = T(p) + U(q), and this field cannot be "
+                "proved to have one: it has no attribute `is_separable` that is True. A learned H "
+                "is separable if its kernel is, hk.Select(k1, (0, 1)) + hk.Select(k2, (2, 3)) for "
+                "four coordinates; for every other use hk.ImplicitMidpoint() or "
+                "hk.GaussLegendre4(). "
+                f"If you know that it is, say so with hk.{name}(assume_separable=True)."
+            )
+
+
+class StormerVerlet(AbstractSplitting):
+    """Störmer–Verlet (leapfrog, velocity Verlet): the kick–drift–kick of `AbstractSplitting`.
+
+    Order 2; symplectic if H = T(p) + U(q); symmetric, so time-reversible where the field is;
+    explicit, two evaluations per step.
+
+    Args:
+        assume_separable: take the caller's word for H = T(p) + U(q). False: the field must have an
+            attribute `is_separable` that is True.
+
+    Raises:
+        ValueError: the field is not known to be separable, n is odd, or the state is not (n,).
+
+    Source: HLW, I.1.4 and VI.3 (theorem 3.4).
+    """
+
+    nominal_order: ClassVar[int] = 2
+    weights: ClassVar[tuple[float, ...]] = (1.0,)
+    assume_separable: bool = False
+
+
+class Yoshida4(AbstractSplitting):
+    """Yoshida's triple jump: three `StormerVerlet` steps of sizes γh, (1 − 2γ)h, γh.
+
+    γ = 1/(2 − 2^{1/3}) ≈ 1.35, so the middle step runs backwards. Order 4; symplectic if
+    H = T(p) + U(q); symmetric; explicit, six evaluations per step. Arguments and errors are those
+    of `StormerVerlet`.
+
+    Source: Yoshida (1990), Phys. Lett. A 150, 262–268; HLW, II.4 (example 4.2).
+    """
+
+    nominal_order: ClassVar[int] = 4
+    weights: ClassVar[tuple[float, ...]] = (_TRIPLE_JUMP, 1 - 2 * _TRIPLE_JUMP, _TRIPLE_JUMP)
+    assume_separable: bool = False
