@@ -1,0 +1,428 @@
+"""`save` and `load`: a learned field in one file, which is read without running anything in it.
+
+A file is a line with the version of the format and the SHA-256 of the rest, a line of JSON that
+describes the field, and its arrays as Equinox writes the leaves of a PyTree, one after another in
+NumPy's `.npy` format. The digest finds a cut or changed file before anything is parsed. It does
+not authenticate: whoever rewrites a file can rewrite its digest, so what is parsed is checked too.
+
+The description has these nodes:
+
+    {"class": name, field: …}            an object of the library, by its fields
+    {"array": "float64", "shape": […]}   an array, without its entries
+    {"function": name}                   one of the functions in `_FUNCTIONS`
+    {"code": name, "leaves": […]}        code of the caller's, which only the caller can give
+    […]  0.5  "text"  true  null         a tuple, and plain values
+
+A name is looked up among the classes that this library has loaded: nothing is imported,
+evaluated or called by name.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import importlib.metadata
+import inspect
+import io
+import json
+import os
+import pathlib
+import re
+import uuid
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.experimental import multihost_utils
+
+from hamkernel import _require as require
+from hamkernel._fields.base import AbstractField
+from hamkernel._fields.controlled import ControlledField
+from hamkernel._kernels.functions import Bound, Closure, as_pytree
+from hamkernel._kernels.symmetry import identity, reflection, time_reversal
+from hamkernel._structures.base import AbstractMatrixKernel
+
+_VERSION = 2  # of the format; 1 was an archive of NumPy's, before the first release
+_FIRST_LINE = "hamkernel field, version {}, sha256 {}"
+_PROBES = 64  # points of the field, of which the one of the largest velocity is kept
+_SAME = 1e-3  # of a velocity computed elsewhere: fields of large coefficients round at 1e-5
+
+
+def save(path: str | os.PathLike[str], field: AbstractField) -> None:
+    """Write a learned field to one file: kernel, hyperparameters, data, coefficients, version.
+
+    The file at `path` is replaced in one step, so that no reader ever sees half of it. Code of
+    your own (kernels, maps of a `Warp`, a mean) is not written, only its arrays are: see `load`.
+
+    If the rows of the field are spread over several processes, all of them must make the call;
+    each writes the whole field, to a path of its own or to one that they share.
+
+    Args:
+        path: the file. The name is taken as it is.
+        field: what `fit` returned, or `tune(...).field`.
+
+    Raises:
+        TypeError: `field` is no field of this library, or holds something that cannot be stored.
+        ValueError: the call is inside `jax.jit`, where there are no numbers yet; the field is not
+            finite.
+        OSError: the file cannot be written; an older one at `path` is left as it was.
+    """
+    if not isinstance(field, AbstractField):
+        names = [name for name, cls in _classes().items() if _is_field(cls)]
+        raise TypeError(
+            f"save writes learned fields ({', '.join(names)}), got {type(field).__name__}. For "
+            "the result of tune pass tuned.field."
+        )
+    if not require.is_concrete(field):
+        raise ValueError("save writes numbers and cannot run under jax.jit, grad or vmap.")
+    field = jax.tree.map(_whole, field)
+    described = description(field, [], "field")
+    try:
+        _check_evaluable(field)
+    except Exception as error:  # a kernel of the caller's may raise anything
+        raise ValueError(
+            "save writes one field that can be evaluated, and this one cannot (of a batch made by "
+            f"jax.vmap save each field): {error}"
+        ) from error
+    header = {
+        "hamkernel": _library_version(),
+        "x64": any(
+            leaf.dtype.itemsize == 8 for leaf in jax.tree.leaves(field) if eqx.is_array(leaf)
+        ),
+        "probe": _probe(field),
+        "field": described,
+    }
+    content = io.BytesIO()
+    content.write(json.dumps(header, ensure_ascii=False, allow_nan=False).encode() + b"\n")
+    eqx.tree_serialise_leaves(content, field)
+    _write(pathlib.Path(path), sealed(content.getvalue()))
+
+
+def load(
+    path: str | os.PathLike[str],
+    kernel: AbstractMatrixKernel | None = None,
+    mean: Callable[..., Any] | None = None,
+) -> AbstractField:
+    """Read a field that `save` wrote: the same arrays bit by bit, so the same values of f.
+
+    Nothing in the file is executed. Built-in kernels restore by themselves. For a kernel of your
+    own the file has the arrays but not the code: pass the kernel as it was given to `fit`, with
+    any values of its hyperparameters, and those of the file are put in.
+
+    Args:
+        path: the file.
+        kernel: the matrix-valued kernel, needed if a part of it is your own code.
+        mean: the prior mean, needed if it is your own code; a learned field and one of
+            `hk.systems` are in the file.
+
+    Returns:
+        The field, of the class that was saved.
+
+    Raises:
+        ValueError: the file is no such file, cut off, changed, of another version, or in float64
+            while JAX is not; or `kernel` is missing or is not the one that was saved, which a
+            velocity in the file tells.
+        TypeError: `kernel` is not matrix-valued. OSError: the file cannot be read.
+
+    Example: `field = hk.load("pendulum", kernel=hk.Symplectic(hk.Warp(hk.Gaussian(), fn)))`
+    """
+    if kernel is not None and not isinstance(kernel, AbstractMatrixKernel):
+        raise TypeError(
+            f"kernel must be the matrix-valued kernel that was given to fit; got {kernel!r}."
+        )
+    source = str(path)
+    content = io.BytesIO(_opened(pathlib.Path(path).read_bytes(), source))
+    try:
+        header = json.loads(content.readline())
+        node, probe, needs_x64 = header["field"], header["probe"], header["x64"]
+        if not _is_field(_classes().get(node["class"])):
+            raise ValueError("it holds no learned field")
+    except (ValueError, LookupError, TypeError, RecursionError) as error:
+        raise ValueError(f"{source} is not a valid file of hamkernel.save: {error}.") from error
+    if needs_x64 and jnp.result_type(float) != jnp.float64:
+        raise ValueError(
+            f"{source} has numbers of 64 bits, which JAX would cut to 32: run "
+            "jax.config.update('jax_enable_x64', True) first."
+        )
+    given = kernel is not None or mean is not None
+    try:
+        like = skeleton(node, [], "field", _given(kernel, mean))
+        field = eqx.tree_deserialise_leaves(content, like)
+        if content.read():
+            raise ValueError("it has arrays that belong to nothing")
+        _check_evaluable(field)
+    except _NotGiven as error:
+        name = "mean" if ".mean" in str(error) else "kernel"
+        raise ValueError(
+            f"{source}: {error}. Pass the {name} that was given to fit, with any "
+            f"hyperparameters: hk.load(path, {name}=...)."
+        ) from error
+    except Exception as error:  # a kernel of the caller's may raise anything
+        with_given = " with what was given" if given else ""
+        raise ValueError(
+            f"{source} is not a valid file of hamkernel.save{with_given}: {error}"
+        ) from error
+    if given:
+        _check_probe(field, probe, source)
+    return field
+
+
+def _is_field(cls: Any) -> bool:
+    return isinstance(cls, type) and issubclass(cls, AbstractField) and not inspect.isabstract(cls)
+
+
+def _of_state(field: AbstractField) -> Callable[[Array], Array]:
+    """The field as a function of the state alone: where it has inputs, they are 1."""
+    if isinstance(field, ControlledField):
+        u = jnp.ones(field.kernel.input_count, field.offset.dtype)
+        return lambda x: field(x, u)
+    return field
+
+
+def _check_evaluable(field: AbstractField) -> None:
+    """Raise unless the parts fit each other: as many lengthscales as coordinates, and the like."""
+    state = jax.ShapeDtypeStruct((field.dimension,), field.offset.dtype)
+    if field.offset.shape or jax.eval_shape(_of_state(field), state).shape != state.shape:
+        raise ValueError("its arrays have an axis more than those of one field.")
+
+
+def _probe(field: AbstractField) -> list[list[float]]:
+    """A state and the velocity there, by which a kernel of the caller's code is known again."""
+    points = np.asarray(getattr(field, "points", np.zeros((1, field.dimension))))[:_PROBES]
+    velocities = np.asarray(jax.vmap(_of_state(field))(jnp.asarray(points)))
+    if not np.isfinite(velocities).all():
+        raise ValueError(
+            "the field is NaN or infinite at its own points, as one is from a fit that failed with "
+            "throw=False: there is nothing to save."
+        )
+    fastest = np.linalg.norm(velocities, axis=1).argmax()  # at an equilibrium all kernels agree
+    return [points[fastest].tolist(), velocities[fastest].tolist()]
+
+
+def _check_probe(field: AbstractField, probe: Any, source: str) -> None:
+    state, saved = np.asarray(probe, float)
+    velocity = np.asarray(_of_state(field)(jnp.asarray(state)))
+    if not np.linalg.norm(velocity - saved) <= _SAME * np.linalg.norm(saved):
+        raise ValueError(
+            f"with this kernel the field in {source} has the velocity {velocity} at the state "
+            f"{state}, and it had {saved} when it was saved: a function in the kernel is not the "
+            "one that was given to fit."
+        )
+
+
+def _whole(leaf):
+    """An array of this process for one whose rows are spread over several."""
+    if not isinstance(leaf, jax.Array) or leaf.is_fully_addressable or leaf.is_fully_replicated:
+        return leaf
+    return multihost_utils.process_allgather(leaf, tiled=True)
+
+
+def _library_version() -> str:
+    try:
+        return importlib.metadata.version("hamkernel")
+    except importlib.metadata.PackageNotFoundError:  # run from a folder, not installed
+        return "unknown"
+
+
+# The description.
+
+_ROOMS = tuple(
+    f"hamkernel.{room}"
+    for room in ("_kernels.", "_structures.", "_features.", "_fields.", "systems.")
+)
+_FUNCTIONS = {function.__name__: function for function in (identity, reflection, time_reversal)}
+
+Node = Any
+Given = Mapping[str, tuple[Node, list[Any]]]
+
+
+class _NotGiven(ValueError):
+    """The caller gave another kernel or mean than the saved one, or code is missing in it."""
+
+
+def _given(kernel: Any, mean: Any) -> Given:
+    """For each part of a field what the caller gave: its description or None, and its code."""
+    of_kernel, of_mean = [], []
+    node = None if kernel is None else description(kernel, of_kernel, "field.kernel")
+    if mean is not None:  # which may be a term of the mean of the field
+        description(as_pytree(mean), of_mean, "field.mean")
+    # Features hold the kernel again.
+    return {"kernel": (node, of_kernel), "features": (None, of_kernel), "mean": (None, of_mean)}
+
+
+def _ours(cls: type) -> bool:
+    """Whether a file may name the class; `Bound` and `Closure` only carry code of the caller's."""
+    found = issubclass(cls, eqx.Module) and cls.__module__.startswith(_ROOMS)
+    return found and cls not in (Bound, Closure)
+
+
+@functools.cache
+def _classes() -> dict[str, type[eqx.Module]]:
+    """What a file may name."""
+    found: dict[str, type[eqx.Module]] = {}
+    left = [eqx.Module]
+    for cls in left:  # which grows
+        left += cls.__subclasses__()
+        if _ours(cls):
+            found[cls.__name__] = cls
+    return found
+
+
+def description(value: Any, codes: list[Any], where: str) -> Node:
+    """The JSON of `value`; code of the caller's is appended to `codes`, in order.
+
+    Raises:
+        TypeError: something in it cannot be stored; `where` is its name.
+    """
+    cls = type(value)
+    if _ours(cls):
+        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(cls)}
+        nodes = {name: description(v, codes, f"{where}.{name}") for name, v in fields.items()}
+        return {"class": cls.__name__, **nodes}
+    if eqx.is_array(value) or isinstance(value, np.ndarray):
+        if np.dtype(value.dtype).kind not in "biuf":
+            raise TypeError(f"{where} has dtype {value.dtype}, which cannot be stored.")
+        return {"array": str(value.dtype), "shape": list(value.shape)}
+    if isinstance(value, tuple):
+        return [description(v, codes, f"{where}[{i}]") for i, v in enumerate(value)]
+    if value is None or cls in (bool, int, float, str):
+        return value
+    if any(value is function for function in _FUNCTIONS.values()):
+        return {"function": value.__name__}
+    if not callable(value):
+        raise TypeError(f"{where} is a {cls.__name__}, which cannot be stored.")
+    codes.append(value)
+    leaves = [leaf for leaf in jax.tree.leaves(value) if eqx.is_array_like(leaf)]
+    named = getattr(value, "func", value)
+    return {
+        "code": str(getattr(named, "__qualname__", cls.__qualname__)),
+        "leaves": [description(leaf, [], where) for leaf in leaves],
+    }
+
+
+def skeleton(node: Node, codes: list[Any], where: str, given: Given) -> Any:
+    """The object of a description, with shapes for arrays, and the caller's code in its places.
+
+    Args:
+        node: the description.
+        codes: the code below, in order; it is used up.
+        where: the name of the object.
+        given: what the caller gives for the parts of a field.
+
+    Raises:
+        _NotGiven: the caller has not given the same. ValueError: it is no description.
+    """
+    match node:
+        case {"class": str(name), **nodes}:
+            cls = _classes().get(name)
+            if cls is None:
+                raise ValueError(f"{where} is of the unknown class {name[:80]!r}")
+            if nodes.keys() != {field.name for field in dataclasses.fields(cls)}:
+                raise ValueError(f"{where} does not have the fields of {name}")
+            replaced = given if issubclass(cls, AbstractField) else {}
+            made = object.__new__(cls)  # past __init__, which takes no logarithms
+            for key, child in nodes.items():
+                path, inside = f"{where}.{key}", (codes, given)
+                if key in replaced:
+                    differs = _difference(child, replaced[key][0], path)
+                    if differs:
+                        raise _NotGiven(differs)
+                    inside = list(replaced[key][1]), {}
+                object.__setattr__(made, key, skeleton(child, inside[0], path, inside[1]))
+            return made
+        case {"array": str(dtype), "shape": [*shape]}:
+            return jax.ShapeDtypeStruct(tuple(shape), np.dtype(dtype))
+        case {"function": str(name)} if name in _FUNCTIONS:
+            return _FUNCTIONS[name]
+        case {"code": str(name), "leaves": list()}:
+            if not codes:
+                raise _NotGiven(f"{where} is {name[:80]!r}, code that is not in the file")
+            return codes.pop(0)
+        case list():
+            below = enumerate(node)
+            return tuple(skeleton(child, codes, f"{where}[{i}]", given) for i, child in below)
+        case None | bool() | int() | float() | str():
+            return node
+    raise ValueError(f"{where} is {str(node)[:80]}, which is no part of a field")
+
+
+def _difference(saved: Node, given: Node, where: str) -> str | None:
+    """Where two descriptions differ first, in words. What the given one leaves open may differ."""
+    match saved, given:
+        case {"class": name, **nodes}, {"class": other, **others} if name == other:
+            pairs = [(nodes[key], others[key], f"{where}.{key}") for key in nodes]
+        case [*nodes], [*others] if len(nodes) == len(others):
+            both = enumerate(zip(nodes, others, strict=True))
+            pairs = [(*pair, f"{where}[{i}]") for i, pair in both]
+        case {"code": _, "leaves": first}, {"code": _, "leaves": second} if first == second:
+            return None  # code of whatever name
+        case _ if given is None or (type(saved) is type(given) and saved == given):
+            return None
+        case _:
+            here = f"{_shown(saved)} in the file and {_shown(given)} here"
+            return f"{where} is {here}: not the one saved"
+    return next(filter(None, (_difference(*pair) for pair in pairs)), None)
+
+
+def _shown(node: Node) -> str:
+    match node:
+        case {"class": str(name)} | {"function": str(name)}:
+            return name
+        case list():
+            return f"{len(node)} terms"
+    return json.dumps(node)
+
+
+# The file.
+
+
+def sealed(content: bytes) -> bytes:
+    """The file with this content."""
+    digest = hashlib.sha256(content).hexdigest()
+    return _FIRST_LINE.format(_VERSION, digest).encode() + b"\n" + content
+
+
+def _opened(content: bytes, source: str) -> bytes:
+    """The content of a file of `save`.
+
+    Raises:
+        ValueError: the file is another one, or was cut or changed, or is of another version.
+    """
+    first, _, rest = content.partition(b"\n")
+    known = re.fullmatch(_FIRST_LINE.format("([0-9]+)", "([0-9a-f]{64})").encode(), first)
+    if known is None:
+        old = " It may be of a version before 0.1.0: fit again." * content.startswith(b"PK")
+        raise ValueError(f"{source} was not written by hamkernel.save, or is cut off.{old}")
+    if int(known[1]) != _VERSION:
+        raise ValueError(
+            f"{source} has version {int(known[1])} of the format and this library reads version "
+            f"{_VERSION}: load it with the hamkernel that wrote it."
+        )
+    if hashlib.sha256(rest).hexdigest().encode() != known[2]:
+        raise ValueError(
+            f"{source} is cut off or was changed after hamkernel.save wrote it: its checksum does "
+            "not fit. Take another copy, or save again."
+        )
+    return rest
+
+
+def _write(path: pathlib.Path, content: bytes) -> None:
+    """Write all of the file or nothing: a new one takes the place of the old one at once."""
+    if path.is_dir():
+        raise IsADirectoryError(f"{path} is a folder; save needs the name of a file.")
+    if not path.parent.is_dir():
+        raise FileNotFoundError(f"there is no folder {path.parent} to write {path.name} to.")
+    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
+    try:
+        with temporary.open("xb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())  # else a crash could leave the new name on an empty file
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)

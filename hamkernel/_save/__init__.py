@@ -1,1 +1,0 @@
-"""Learned fields in files."""
