@@ -48,7 +48,7 @@ from hamkernel._kernels.dot_products import Periodic, Polynomial
 from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._kernels.transforms import Select, Warp
 from hamkernel._observations.kinds import Energies, Equilibria, Functionals, Velocities
-from hamkernel._posterior.posterior import Posterior, condition
+from hamkernel._posterior import Posterior, condition
 from hamkernel._save import load, save
 from hamkernel._solvers.cholesky import Cholesky
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient

@@ -1,9 +1,8 @@
 """The machine: devices, memory, the threads of BLAS, and batches of small matrices.
 
-Data whose rows lie on many devices, of one machine or of many, stay there: `jax.sharding` says
-where they are, each device runs the loops over its own rows, and only sums leave it. A product of
-all points with all points needs the rows of the others too, which travel around the ring of
-devices, one part at a time.
+Data whose rows are spread over devices, of one machine or of many, stay there. Each device runs
+the loops over its own rows, and only sums leave it. A product of all points with all points needs
+the rows of the other devices too: they travel around the ring of devices, one part at a time.
 
 The compiler would shard these loops by itself, but a loop over tiles of the rows makes it gather
 all rows on every device first. Hence `jax.shard_map` around the loops, and the compiler for the
@@ -47,7 +46,7 @@ class RowSharding:
         return PartitionSpec(self.axes)
 
     def whole(self, array: Array) -> Array:
-        """`array` with all rows on every device."""
+        """The array with all rows on every device."""
         return jax.device_put(array, NamedSharding(self.mesh, PartitionSpec()))
 
     def sum(self, tree: Any) -> Any:
@@ -56,7 +55,7 @@ class RowSharding:
 
 
 def rows_of(array: Array) -> RowSharding | None:
-    """How the rows of `array` are spread over devices; None if they are not, or under tracing.
+    """How the rows of `array` are spread over devices; None if they are not, or if it is traced.
 
     A traced array does not say where it lies, so inside `jax.jit` the compiler shards the loops:
     the results are right, but every device holds all rows.

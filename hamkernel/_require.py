@@ -73,7 +73,7 @@ def value(
 
 
 def warn(message: str) -> None:
-    """Warn, with the line of the user.
+    """Issue a UserWarning that names the line of the caller outside of this library.
 
     Equinox puts frames of its own between methods, so that the level is no constant. From Python
     3.12 on `skip_file_prefixes` of `warnings.warn` does this.
@@ -232,7 +232,7 @@ def same_space(X: Array, Z: Array) -> tuple[Array, Array]:
 
 
 def points(X: ArrayLike, name: str = "X") -> Float[Array, "N n"]:
-    """States as a float array of shape (N, n) with N ≥ 1; their values are not looked at."""
+    """States as a float array of shape (N, n), N ≥ 1, whose values are not checked."""
     array = floating(X, name)
     if 0 in array.shape:
         raise ValueError(
@@ -275,8 +275,8 @@ def data(
 ) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
     """States and velocities: two finite float arrays of one shape (N, n) and one dtype.
 
-    A `part` of the data may have fewer points than coordinates; of all of it that is warned of.
-    `cure` is added to the error about NaN in Y.
+    Data with fewer points than coordinates is warned of, unless it is a `part` of the data. The
+    error about NaN in Y ends with `cure`.
     """
     X, Y = points(X, "X"), points(Y, "Y")
     if X.shape != Y.shape:
@@ -296,9 +296,10 @@ def data(
 
 
 def measured(X: ArrayLike, Y: ArrayLike) -> tuple[Array, Array, np.ndarray | None]:
-    """`data` with NaN in Y where nothing was measured, and which entries were; None if all were.
+    """States, velocities with NaN where a component was not measured, and the measured indices.
 
-    Not everywhere, and not under jit, where it is not known which.
+    The indices count the components of all points, and are None if all were measured. NaN is
+    refused under jit where Y is traced, since it is not known which components were measured.
     """
     X, Y = points(X, "X"), points(Y, "Y")
     seen = on_host(Y)
@@ -322,7 +323,7 @@ def measured(X: ArrayLike, Y: ArrayLike) -> tuple[Array, Array, np.ndarray | Non
 
 
 def warn_of_float32(X: Array) -> None:
-    """Say what a fit in float32 may be expected to do."""
+    """Warn where X is in float32, with the accuracy to expect."""
     if X.dtype == jnp.float32:
         warn(
             "fitting in float32: expect three digits, and a failed factorisation for a ridge "
@@ -345,8 +346,8 @@ def times(ts: ArrayLike, least: int) -> Float[Array, " T"]:
 def elapsed(ts: Float[Array, " T"], dtype: Any) -> Float[Array, " T"]:
     """The times since the first one, which must increase, in the dtype of the states.
 
-    A field does not depend on time. Late times that come in float64 keep their distances so,
-    however large they are in float32.
+    A field does not depend on time, so the first time may be taken off. The difference is taken in
+    the dtype of `ts`: late times in float64 keep their distances when the states are in float32.
     """
     ts = on_host(ts)
     since = jnp.asarray((ts - ts[0]).astype(dtype))
@@ -361,7 +362,7 @@ def elapsed(ts: Float[Array, " T"], dtype: Any) -> Float[Array, " T"]:
 
 
 def velocity(field: Any, x: Float[Array, " n"], name: str = "field") -> jax.ShapeDtypeStruct:
-    """Shape and dtype of `field(x)`, which must be one velocity; what it raises itself passes."""
+    """Shape and dtype of `field(x)`, which must be one velocity. Errors inside `field` pass on."""
     if not callable(field):
         hint = " Pass its .field." if hasattr(field, "field") else ""
         raise TypeError(
@@ -390,7 +391,7 @@ def velocity(field: Any, x: Float[Array, " n"], name: str = "field") -> jax.Shap
 
 
 def other_arguments(function: Any, *arguments: Any) -> str | None:
-    """What `function` takes, by name, if it does not take these arguments."""
+    """The names of the parameters of `function` if it cannot take these arguments; else None."""
     with suppress(ValueError):  # raised for a builtin without a signature
         signature = inspect.signature(function)
         try:

@@ -216,7 +216,7 @@ def _check_probe(field: AbstractField, probe: Any, source: str) -> None:
 
 
 def _whole(leaf):
-    """An array of this process for one whose rows are spread over several."""
+    """The whole array, on this process, of one whose rows are spread over several processes."""
     if not isinstance(leaf, jax.Array) or leaf.is_fully_addressable or leaf.is_fully_replicated:
         return leaf
     return multihost_utils.process_allgather(leaf, tiled=True)

@@ -18,8 +18,8 @@ _FEW = 16  # numbers of a vector that are printed
 def described(module: Any, positional: tuple[str, ...] = ()) -> str:
     """`Gaussian(lengthscale=3.28)`: the attributes as they are read, few numbers as values.
 
-    Those in `positional` are shown without their names. What does not apply, and so is left at
-    None, is left out.
+    Attributes in `positional` are shown without their names. Attributes that are None, since they
+    do not apply, are left out.
     """
     names = [f.name for f in dataclasses.fields(module) if getattr(module, f.name) is not None]
     return call(
@@ -47,7 +47,7 @@ def joined(sign: str, terms: list[str]) -> str:
 
 
 def in_brackets(sum_of_terms: str) -> str:
-    """What is to be multiplied."""
+    """The sum in brackets, to stand as a factor of a product."""
     if _fits(sum_of_terms):
         return f"({sum_of_terms})"
     return f"(\n{_indented(sum_of_terms)}\n)"
@@ -69,7 +69,7 @@ def _attribute(module: Any, name: str) -> str:
 
 
 def exponential(log_value: Array) -> str:
-    """What is stored as its logarithm; by its shape where it has no value, as while traced."""
+    """exp(log_value) as text; its shape where it has no value, as while JAX traces."""
     short = _is_short(log_value)
     with np.errstate(over="ignore"):  # a gradient, in the place of the hyperparameter
         return text(np.asarray(np.exp(np.asarray(log_value))) if short else log_value)

@@ -142,7 +142,7 @@ STRUCTURES = {
     "Separable": hk.Separable,
     "PortHamiltonian": hk.PortHamiltonian,
     "Poisson": lambda k: hk.Poisson(k, hk.poisson.lotka_volterra),
-    "UnknownMasses": lambda k: hk.UnknownMasses(hk.Symplectic(k), [1.0, 2.0]),
+    "UnknownMasses": lambda k: hk.UnknownMasses(hk.Symplectic(k), np.array([1.0, 2.0])),
     "Sum": lambda k: hk.Sum(hk.Symplectic(k), rest=hk.CurlFree(k)),
 }
 SYMMETRIES = {
@@ -189,8 +189,8 @@ def test_a_symmetry_over_a_sum_of_scalar_kernels_is_saved(tmp_path):
     for field in (fitted(K), hk.tune(K, X, Y, starts=1, max_steps=1, solver=hk.Cholesky()).field):
         save(tmp_path / "f", field)
         assert same(field, load(tmp_path / "f"))
-        assert hash(field.kernel.kernel)
-        assert repr(field.kernel.kernel + hk.Gaussian())
+        assert hash(field.kernel.scalar_kernels[0])
+        assert repr(field.kernel.scalar_kernels[0] + hk.Gaussian())
 
 
 @pytest.mark.few(1)

@@ -40,7 +40,7 @@ from hamkernel._gram.observed import gram_of_rows
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._kernels.symmetry import symmetry_removed
 from hamkernel._observations.measurements import inputs_of
-from hamkernel._posterior.posterior import Posterior
+from hamkernel._posterior import Posterior
 from hamkernel._solvers.problem import problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.controlled import Controlled, InputMatrix

@@ -30,7 +30,7 @@ from jaxtyping import Array, Bool, Float, Scalar
 
 
 class Step(eqx.Module):
-    """What one step from (t0, y0) to t1 needs: its signed size h and the field f(t, y)."""
+    """One step from (t0, y0) to t1, with its signed size h and the field f(t, y)."""
 
     terms: Any
     args: Any

@@ -219,7 +219,7 @@ class AbstractField(eqx.Module):
 
 
 class FieldSum(eqx.Module):
-    """x -> Σ f(x) of fields, such as a mean and what is added to it."""
+    """The sum of fields, x -> Σ f(x), such as two prior means."""
 
     terms: tuple[Callable[..., Any], ...]
 
@@ -265,16 +265,16 @@ def potential_of(field: Callable[..., Any], kernel: AbstractMatrixKernel) -> Sca
     )
 
 
-_BATCH = 1024  # states at which a mean is evaluated at once
+BATCH = 1024  # states at which a field is evaluated at once: 8 MB of waves for 1000 features
 
 
 def at_points(fn: Callable[..., Any], X: Float[Array, "N n"]) -> Float[Array, "N *out"]:
     """fn(x) at many states, in bounded memory, in their dtype."""
-    return jax.lax.map(lambda x: jnp.asarray(fn(x)).astype(X.dtype), X, batch_size=_BATCH)
+    return jax.lax.map(lambda x: jnp.asarray(fn(x)).astype(X.dtype), X, batch_size=BATCH)
 
 
 def root(square: Float[Array, ""]) -> Float[Array, ""]:
-    """√square, zero with a derivative of zero where rounding or zero data leave no square."""
+    """√square; zero, with a zero derivative, where rounding or data of zeros leave it ≤ 0."""
     nothing = square <= 0
     return jnp.where(nothing, 0.0, jnp.sqrt(jnp.where(nothing, jnp.ones_like(square), square)))
 

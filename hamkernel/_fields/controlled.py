@@ -1,4 +1,4 @@
-"""A learned field with inputs: that of the points (x, u), taken apart again."""
+"""Learned fields with inputs, f(x, u) = f(x) + G(x) u."""
 
 import dataclasses
 from collections.abc import Callable
@@ -240,7 +240,7 @@ def _of_drift(K: Any):
 
 
 def learned_field(field: Any, known: Any) -> Any:
-    """The field of a solver with what was known before; of a controlled kernel that of x and u."""
+    """The field of a solver plus the prior mean `known`; of a controlled kernel one of x and u."""
     if known is not None:
         field = dataclasses.replace(field, mean=known)
     if not isinstance(field.kernel, Controlled):
@@ -249,5 +249,5 @@ def learned_field(field: Any, known: Any) -> Any:
 
 
 def known_of(field: AbstractField) -> Any:
-    """What was known before, as a function of the points that the solver had."""
+    """The prior mean of a field, as a function of the points of the solver, x or (x, u)."""
     return field.whole.mean if isinstance(field, ControlledField) else field.mean

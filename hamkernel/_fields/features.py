@@ -10,11 +10,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel._features.structured import AbstractFeatures, SumFeatures
-from hamkernel._fields.base import AbstractField, SolverInfo, root
+from hamkernel._fields.base import BATCH, AbstractField, SolverInfo, root
 from hamkernel._machine import as_given, on_each, rows_of, split
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
-
-_BATCH = 1024  # points evaluated at once: 8 MB of waves for 1000 features
 
 
 class FeatureField(AbstractField):
@@ -84,7 +82,7 @@ def feature_field(
     regularization: Float[Array, ""],
     info: SolverInfo,
 ) -> FeatureField:
-    """Σ_r w_r φ_r."""
+    """The field Σ_r w_r φ_r."""
     return FeatureField(
         kernel=K,
         features=features,
@@ -111,4 +109,4 @@ def _potential_at(features, x, weights):
 def _evaluate(field, X, spread):
     if spread is not None:
         return on_each(spread, lambda field, X: _evaluate(field, X, None), field, X, joined=True)
-    return jax.lax.map(field._learned, X, batch_size=_BATCH)
+    return jax.lax.map(field._learned, X, batch_size=BATCH)

@@ -76,8 +76,8 @@ class KernelField(AbstractField):
         bare = dataclasses.replace(self, kernel=term, offset=jnp.zeros_like(self.offset), mean=None)
         S, b = self.value_points, self.value_coefficients
         if S is not None and b is not None:  # 2 aᵀG_av b + bᵀG_vv b
-            at = dataclasses.replace(bare, coefficients=2 * A)
-            square = square + b @ at_points(at._learned_potential, S)
+            doubled = dataclasses.replace(bare, coefficients=2 * A)
+            square = square + b @ at_points(doubled._learned_potential, S)
         return dataclasses.replace(bare, norm=root(square))
 
 

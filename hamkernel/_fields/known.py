@@ -1,4 +1,4 @@
-"""What is known of a field before, where it has inputs: a function of the points (x, u)."""
+"""The prior mean of a field as a function of its points: x, or (x, u) where there are inputs."""
 
 from collections.abc import Callable
 from typing import Any
@@ -16,7 +16,7 @@ Mean = Callable[..., Float[Array, " n"]]
 
 
 class KnownPart(eqx.Module):
-    """A mean of x, or of x and u, plus G u where G is known; as a function of a point (x, u)."""
+    """A prior mean of x, or of x and u, plus G u where G is known; a function of a point (x, u)."""
 
     mean: Callable[..., Any] | None
     matrix: KnownMatrix | None
@@ -45,7 +45,7 @@ class AtRest(eqx.Module):
 
 
 def known_part(K: AbstractMatrixKernel, mean: Any, n: int, dtype: Any) -> Any:
-    """What is known at the points of K: the mean, and the input matrix if that is known.
+    """The prior mean at the points of K, plus G u if K has a known input matrix G.
 
     Args:
         K: the kernel.
@@ -54,7 +54,7 @@ def known_part(K: AbstractMatrixKernel, mean: Any, n: int, dtype: Any) -> Any:
         dtype: of the states.
 
     Returns:
-        A PyTree that maps one point to one velocity; None if nothing is known.
+        A PyTree that maps one point to one velocity; None if the prior mean is zero.
 
     Raises:
         TypeError, ValueError: the mean does not map one state to one velocity.
@@ -74,7 +74,7 @@ def known_part(K: AbstractMatrixKernel, mean: Any, n: int, dtype: Any) -> Any:
 
 
 def _takes_inputs(mean: Any, x: Float[Array, " n"]) -> bool:
-    """Whether the mean is one of x and u; of a second argument with a default it is not."""
+    """Whether the mean takes x and u; a second argument with a default does not count."""
     if getattr(mean, "takes_inputs", False):
         return True
     alone, both = (require.other_arguments(mean, *args) for args in ((x,), (x, x)))

@@ -56,9 +56,9 @@ def log_per_coordinate(value: ArrayLike, name: str, cure: str = "") -> Float[Arr
 
 
 def bounds_by_value(name: str, leaf: Any) -> tuple[ArrayLike, ArrayLike]:
-    """The bounds of a number of unknown meaning, around its value: its logarithm by three decades.
+    """Bounds around the value of a hyperparameter whose meaning is unknown, as stored.
 
-    Numbers that are stored as they are may move by ten times their size, or by ten.
+    A logarithm may move by three decades, another number by ten times its size, or by 10.
     """
     value = np.asarray(leaf)
     reach = np.log(1e3) if name.startswith("log_") else 10 * np.maximum(1.0, np.abs(value))
@@ -68,7 +68,7 @@ def bounds_by_value(name: str, leaf: Any) -> tuple[ArrayLike, ArrayLike]:
 def bounds_of_length(
     leaf: Any, X: Float[np.ndarray, "N n"], least: float, most: float
 ) -> tuple[ArrayLike, ArrayLike]:
-    """The bounds of the logarithm of a length, from `least` spacings to `most` extents of the data.
+    """Bounds of the logarithm of a length, from `least` spacings to `most` extents of the data.
 
     The spacing of N points in an extent L is taken as L / N: a fair lower bound in any dimension,
     since points on a few trajectories lie close together along them. An extent of 0 counts as 1.
@@ -257,7 +257,7 @@ class ScalarProduct(AbstractScalarKernel):
 
 
 def common_invariance(terms: Iterable[Any]) -> Invariance:
-    """What all of them have; scalar kernels or matrix-valued ones."""
+    """The symmetries that all of the kernels have, scalar or matrix-valued."""
     common = Invariance.TRANSLATION
     for kernel in terms:
         common &= kernel.invariance

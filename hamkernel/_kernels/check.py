@@ -71,24 +71,24 @@ def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     eps = _check_signature(k, X)
     X = np.asarray(X)
     N, n = X.shape
-    some = _spaced(N, min(64, max(8, _GRAM_ROWS // n)))
-    near = _spaced(len(some), _POINTS)
+    subset = _spaced(N, min(64, max(8, _GRAM_ROWS // n)))
+    near = _spaced(len(subset), _POINTS)
     spread, size = np.ptp(X.astype(float), axis=0), np.abs(X.astype(float)).max(axis=0)
     unit = np.where(spread > 0, spread, np.where(size > 0, size, 1.0))
-    here, Z = X[some], _neighbours(X[some[near]], unit, size, eps)
+    here, Z = X[subset], _neighbours(X[subset[near]], unit, size, eps)
     moved = here * (1 + 4 * eps * np.cos(np.pi * np.indices(here.shape).sum(axis=0)))
     moved = moved.astype(X.dtype)  # by some units in the last place: how far k and M round
     pairs = (here[:, None], here[None]), (moved[:, None], moved[None])
     gram, rounded, between, beyond = _evaluated(
         k, unit, *pairs, (here[near][:, None, None], Z), (Z, Z)
     )
-    _refuse_infinite(gram.k, some, f"k is {gram.k.sum()}")
+    _refuse_infinite(gram.k, subset, f"k is {gram.k.sum()}")
     with np.errstate(all="ignore"):
         own = _Pairs(*(values[near, near] for values in gram))
-        _check_limits(own, between, beyond, some[near], unit, eps)
+        _check_limits(own, between, beyond, subset[near], unit, eps)
     _refuse_infinite(
         gram.block.sum(axis=(2, 3)) + gram.gradient.sum(axis=2),
-        some,
+        subset,
         "NaN or inf in the derivatives of k",
     )
     if not gram.block.any() and not between.block.any():
@@ -97,7 +97,7 @@ def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
             "constant, a sum f(x) + f(z), piecewise, or hides its arguments from autodiff."
         )
     blocks, noise = (
-        g.block.transpose(0, 2, 1, 3).reshape(len(some) * n, -1) for g in (gram, rounded)
+        g.block.transpose(0, 2, 1, 3).reshape(len(subset) * n, -1) for g in (gram, rounded)
     )
     _check_gram("k", gram.k, rounded.k, eps)
     _check_gram("M = ∂x ∂zᵀ k", blocks, noise, eps)
@@ -218,12 +218,9 @@ def _longest(row: np.ndarray) -> int:
 
 
 def _diagnosis(own, limits, steady: bool, where: str, unit) -> str:
-    got, told = (
-        _shown(own / unit[:, None] / unit),
-        [_shown(b / unit[:, None] / unit) for b in limits],
-    )
+    got, *shown = (_shown(b / unit[:, None] / unit) for b in (own, *limits))
     scale = max(map(_size, limits), default=0.0)
-    tends = f" The neighbours M(x, x + h) tend to {told[0]} as h → 0." if limits else ""
+    tends = f" The neighbours M(x, x + h) tend to {shown[0]} as h → 0." if limits else ""
     said = f"{where} autodiff returns M(x, x) = {got}.{tends}"
     if steady or any(_lowest(b) < -0.05 * scale for b in limits):
         return (
@@ -234,7 +231,7 @@ def _diagnosis(own, limits, steady: bool, where: str, unit) -> str:
     if len(limits) == 2 and _size(limits[0] - limits[1]) > 0.2 * scale:
         return (
             f"k has no second derivative at x = z: {where} the limit of M(x, x + h) depends on the "
-            f"direction of h, {told[0]} and {told[1]}; a kink, as in the L1 distance "
+            f"direction of h, {shown[0]} and {shown[1]}; a kink, as in the L1 distance "
             f"Σ|x_a - z_a|. {_CURE}"
         )
     if not np.isfinite(own).all():
@@ -257,10 +254,10 @@ def _shown(block: np.ndarray) -> str:
     return " ".join(text.split())
 
 
-def _refuse_infinite(values: np.ndarray, some: np.ndarray, what: str) -> None:
+def _refuse_infinite(values: np.ndarray, subset: np.ndarray, what: str) -> None:
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):
-        i, j = some[bad[0]]
+        i, j = subset[bad[0]]
         raise ValueError(
             f"{what} at x = points[{i}], z = points[{j}] ({len(bad)} of {values.size} pairs): "
             "overflow, or a root, logarithm or quotient outside its domain, taken or not."

@@ -283,9 +283,10 @@ class Symmetrised(AbstractScalarKernel):
 
 
 def without_symmetry(tree: T) -> T:
-    """The tree with every mean over a group replaced by its kernel: the size of what rounds.
+    """The kernel, or any PyTree, in which each mean over a group is replaced by its scalar kernel.
 
-    (k(x, z) − k(−x, z))/2 of a long lengthscale is the small difference of large numbers.
+    Its values have the size of the terms that are added up and rounded: with a long lengthscale
+    (k(x, z) − k(−x, z))/2 is the small difference of two large numbers.
     """
 
     def is_mean(node: object) -> bool:
@@ -327,7 +328,7 @@ def symmetrised(
 
 
 def _checked(kernel: Symmetrised) -> Symmetrised:
-    """The kernel, once its group closes; maps that are functions tell no dimension to check in."""
+    """The kernel, whose group must close; of functions alone the dimension is not known yet."""
     matrices = [each for each in kernel.maps if not callable(each)]
     if matrices:
         kernel.group(len(matrices[0]))
@@ -346,7 +347,7 @@ def with_parity(kernel: AbstractScalarKernel, parity: int) -> AbstractScalarKern
 
 
 class Removed(NamedTuple):
-    """A kernel, and the means over a group that were taken off it."""
+    """A scalar kernel k, and the means over one group that were taken of it."""
 
     kernel: AbstractScalarKernel
     means: tuple[Symmetrised, ...]  # over one group; the terms of a sum have one each

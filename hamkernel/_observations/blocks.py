@@ -1,9 +1,9 @@
 """Rows of linear functionals of a field f = B∇u and of its potential u, as maps from points.
 
-A block has points z and maps what is there, f(z) or u(z), to rows: the components that were
-measured, weighted sums along groups of points, or values. Divided by the relative noise of a row
-every row has the same noise. The transpose maps coefficients of rows to coefficients at points, and
-so to a field again, whatever was observed.
+A block has points z and maps the values f(z) or u(z) there to rows: the components that were
+measured, weighted sums along groups of points, or the values of u. Each row is divided by its
+relative noise, so that all rows have noise of one variance. The transpose maps coefficients of the
+rows to coefficients at the points, so the representer of any observation is Σ K(x, z) a again.
 """
 
 import abc
@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int
 
 
 class AbstractBlock(eqx.Module):
-    """Some rows of one kind."""
+    """Rows of one kind of observation, as a linear map of the values at its points."""
 
     of_values: eqx.AbstractClassVar[bool]  # of the potential; else of the field
 
@@ -33,7 +33,7 @@ class AbstractBlock(eqx.Module):
     @property
     @abc.abstractmethod
     def values_shape(self) -> tuple[int, ...]:
-        """That of the field, or of the potential, at the points."""
+        """The shape of the values of the field, or of the potential, at all points."""
 
     @property
     @abc.abstractmethod
@@ -48,11 +48,11 @@ class AbstractBlock(eqx.Module):
     @property
     @abc.abstractmethod
     def count(self) -> int:
-        """How many of the N observations that λ is divided by these rows are."""
+        """The number of observations in this block; N is the sum over the blocks."""
 
     @abc.abstractmethod
     def labels(self) -> Int[np.ndarray, " D"]:
-        """To which of `count` observations each row belongs."""
+        """The observation that each row belongs to, as an index from 0 to `count` − 1."""
 
     @abc.abstractmethod
     def rows(self, values: Float[Array, "P *rest"]) -> Float[Array, "D *below"]:
@@ -64,7 +64,7 @@ class AbstractBlock(eqx.Module):
 
     @abc.abstractmethod
     def merge(self, other: "AbstractBlock") -> "AbstractBlock | None":
-        """One block of these rows and then the others; None if they are of another kind."""
+        """One block of these rows followed by the others; None if these are of another kind."""
 
     @abc.abstractmethod
     def with_points(self, points: Float[Array, "P d"]) -> "AbstractBlock":
@@ -72,10 +72,11 @@ class AbstractBlock(eqx.Module):
 
     @abc.abstractmethod
     def subset(self, chosen: Int[np.ndarray, " C"]) -> "Subset":
-        """The block of some observations, counted from 0 and in order.
+        """The block of the observations `chosen`, indices from 0 in increasing order.
 
         Returns:
-            It, which rows it has, and which observations those belong to.
+            The new block, the indices of its rows in this block, and the indices of the
+            observations that those rows belong to.
         """
 
 
@@ -271,7 +272,7 @@ class Values(AbstractBlock):
 
 
 def _taken(array: Array | None, index: Int[np.ndarray, " C"]) -> Any:
-    """Entries of an array, without compiling for how many they are."""
+    """array[index], taken by NumPy: JAX would compile for every number of entries."""
     return None if array is None else jnp.asarray(np.asarray(array)[index])
 
 
@@ -279,7 +280,7 @@ Subset = tuple[AbstractBlock, Int[np.ndarray, " rows"], Int[np.ndarray, " observ
 
 
 def merged(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:
-    """The same rows in fewer blocks, where neighbours are of one kind: there is less to compile."""
+    """The same rows, with neighbouring blocks of one kind merged: there is less to compile."""
     found: list[AbstractBlock] = []
     for block in blocks:
         both = found[-1].merge(block) if found else None

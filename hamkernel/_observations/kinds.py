@@ -341,8 +341,10 @@ class Functionals(AbstractObservations):
                 "(R, Q, n) and (R,): Q points and as many vectors for each of R rows. Pad shorter "
                 "rows with weights of zero."
             )
-        for name, array in zip(named, given, strict=True):
+        points, weights, targets = (
             require.finite(array, name)
+            for name, array in zip(named, (points, weights, targets), strict=True)
+        )
         zero = (require.on_host(weights) == 0).all(axis=(2, 3)).reshape(-1)
         self.weights = require.value(
             weights,

@@ -1,8 +1,8 @@
 """The normal form of all observations: y_r = L_r u + ε_r with one variance Nλ of all rows.
 
 Only in this file do inputs join their states. With inputs a point is (x, u), of d = n + m
-coordinates, and the field there has n components; the Gram, the solvers and the losses know no
-more.
+coordinates, and the field there has n components; the Gram, the solvers and the losses need not
+know that some of the coordinates are inputs.
 
 Energies are known up to one constant c, the same for all of them: E = u(z) + c. In rows divided by
 their noise the constant has the direction p = 1/noise, and rows orthogonal to p do not depend on
@@ -122,7 +122,7 @@ class Measurements:
 
     @property
     def points(self) -> Float[Array, "P d"]:
-        """All points of all blocks, (x, u) where there are inputs."""
+        """The points of all blocks, (x, u) where there are inputs."""
         return jnp.concatenate([block.points for block in self.blocks])
 
     def of(

@@ -45,7 +45,7 @@ class AbstractStructure(AbstractMatrixKernel):
     """A structure made from one scalar kernel k."""
 
     kernel: AbstractScalarKernel = eqx.field(converter=as_scalar_kernel)
-    # 1 if the fields have the parity of the functions of k, −1 if the other; a derivative flips it.
+    # 1 if the fields have the parity of the functions of k, −1 if a derivative changes it.
     field_parity: eqx.AbstractClassVar[int]
     # Of the operator: TRANSLATION where B is constant, REFLECTION where B(−x) = B(x).
     operator_invariance: eqx.AbstractClassVar[Invariance]
@@ -96,12 +96,15 @@ class AbstractStructure(AbstractMatrixKernel):
 
 
 def _operator(K: AbstractMatrixKernel) -> dict[str, Any]:
-    """What a structure has beside its scalar kernel."""
+    """The fields of a structure other than its scalar kernel, by name."""
     fields = dataclasses.fields(K)
     return {field.name: getattr(K, field.name) for field in fields if field.name != "kernel"}
 
 
-def row(k: AbstractScalarKernel, x: Float[Array, " n"], Z: Float[Array, "M n"]):
+def row(
+    k: AbstractScalarKernel, x: Float[Array, " n"], Z: Float[Array, "M n"]
+) -> Float[Array, " M"]:
+    """k(x, zⱼ) for all j."""
     return jax.vmap(k, in_axes=(None, 0))(x, Z)
 
 

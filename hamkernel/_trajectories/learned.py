@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel._observations.kinds import AbstractObservations
-from hamkernel._posterior.posterior import Posterior, condition
+from hamkernel._posterior import Posterior, condition
 from hamkernel._show import described
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel

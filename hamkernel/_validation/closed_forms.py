@@ -1,4 +1,4 @@
-"""What the validation losses need of A and y, with its derivative, for every kind of factor.
+"""Held-out residuals, free residuals and the log density of y, from any kind of factor of A.
 
 Write A = G + ridge I and a = A⁻¹y for the system with ALL points, and let S be the rows of a
 held-out fold. Eliminating the other rows from A a = y by block inversion gives the residual that
@@ -8,8 +8,9 @@ a fit WITHOUT S would have on S,
 
 so no fold is ever refitted.
 
-The derivatives are written down as well, since differentiating the factorisation costs several
-times its price. From dC = −C dA C, and with v_S = (C_SS)⁻¹ r̄_S for a cotangent r̄,
+Their derivatives are written by hand, since differentiating through the factorisation costs
+several times as much as the factorisation. From dC = −C dA C, and with v_S = (C_SS)⁻¹ r̄_S for a
+cotangent r̄,
 
     r̄·dr = Σ_S v_Sᵀ[(dC y)_S − dC_SS r_S]   so   Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − (C v) aᵀ,
 
@@ -32,7 +33,7 @@ from hamkernel._validation.folds import Partition
 
 
 def _solved(system: AbstractSystem, y: Float[Array, " D"]):
-    """The factor, a, yᵀa and whether they can be trusted: no LAPACK call beside another."""
+    """The factor, a, yᵀa and whether they can be trusted, with no two LAPACK calls side by side."""
     factor = system.factor()
     factor, a, square = jax.lax.optimization_barrier((factor, *factor.solved(y)))
     return jax.lax.optimization_barrier((factor, a, square, factor.trusted(y)))

@@ -1,4 +1,4 @@
-"""Which points cross-validation holds out together."""
+"""The folds of cross-validation: which points are held out together."""
 
 from collections.abc import Sequence
 from typing import Literal

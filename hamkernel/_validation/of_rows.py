@@ -32,7 +32,7 @@ def partition_of_rows(rows: Measurements, folds: Folds) -> Partition:
     return Partition(len(rows.targets), labels[rows.labels()])
 
 
-# Where ‖a‖² comes with them it tells `tune` how far the field will round.
+# The losses with ‖a‖² beside them are for `tune`, which bounds the rounding of a field by it.
 
 
 def partition_loss(K, rows: Measurements, regularization, partition: Partition, basis=None):
@@ -50,9 +50,9 @@ def partition_loss_and_square(
 
 @eqx.filter_jit
 def held_out_rows(K, rows: Measurements, regularization, partition: Partition, basis=None):
-    """What a fit without their fold leaves of the rows, in units of their noise, and A⁻¹y.
+    """The residual of each row under the fit without its fold, in units of its noise, and A⁻¹y.
 
-    Of a fold with all energies it is what their constant does not explain.
+    From the residuals of a fold with all energies their best constant is taken off.
     """
     energies, F = rows.energies, len(partition.folds)
     ridge = (rows.count - rows.count / F) * regularization
@@ -150,15 +150,21 @@ def gram(
 
 
 def _by_points(K, block: AbstractBlock, data, of) -> Float[Array, "d e"]:
-    """What `of(K, data)` makes of a block, a row for each of its rows.
+    """The matrix that the function `of(K, data)` returns for a block, a row for each of its rows.
 
-    Point by point: combinations of many would be larger than their rows, and are made at once.
+    It is made point by point, so that only one point is differentiated at a time; that of
+    `Combinations`, which has more points than rows, is made at once.
     """
     if isinstance(block, Combinations):
         return forward_differentiated((K, (block, data)), lambda K, both: of(K, both[1])(both[0]))
 
     def make(K, both):
         rows = of(K, both[1])
-        return lambda x: rows(at := block.with_points(x)).reshape(*at.values_shape, -1), both[0]
+
+        def at_points(x):
+            there = block.with_points(x)
+            return rows(there).reshape(*there.values_shape, -1)
+
+        return at_points, both[0]
 
     return block.rows(forward_differentiated((K, (block.points, data)), make, rowwise=True))

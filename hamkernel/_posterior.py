@@ -1,9 +1,8 @@
-"""`condition`: from data to a field and how far it may be off.
+"""`condition`: the Gaussian process of a field given data.
 
-Read as a Gaussian process, the field is a priori f ~ GP(mean, K) and the rows of the data have
-independent noise of variance σ² = Nλ, times their squared relative noise. What is left after the
-data is Gaussian again: with c(x) the covariances of the rows with what is asked at x, of f or of
-differences of H,
+A priori f ~ GP(mean, K), and the rows of the data have independent noise of variance σ² = Nλ, times
+their squared relative noise. Given the data f is Gaussian again. With c(x) the covariances of the
+rows with f(x), or with a difference of H,
 
     Cov[f(x), f(z) | y] = K(x, z) − c(x)ᵀ A⁻¹ c(z),     A = G + σ²I.
 """
@@ -70,8 +69,8 @@ def condition(
             prior,
             or `RandomFeatures(…)`, whose prior is that of its features.
         mean: what is known already, x (n,) -> (n,), as in `fit`.
-        inputs: of a `Controlled` kernel: u at each state, shape (N, m). What is asked of f is then
-            asked at (x, u): `posterior.deviation(x, u)`.
+        inputs: of a `Controlled` kernel: u at each state, shape (N, m). Predictions then need the
+            inputs as well, `posterior.deviation(x, u)`.
 
     Returns:
         The posterior. O(D³) time and O(D²) memory for D rows, with a solver of rank r O(D r²).
@@ -100,7 +99,7 @@ class Posterior(eqx.Module):
     A PyTree. Its methods take one state and work under jit, vmap and, with respect to states, grad.
 
     Attributes:
-        given: what the solver keeps of the data, minus the prior mean.
+        given: the Gaussian process given the data, less the prior mean.
         field: the posterior mean, the field that `fit` returns.
     """
 
@@ -271,18 +270,18 @@ class Posterior(eqx.Module):
         key, count = require.key(key), require.count(count, "count")
         rows = self.given.rows
         n, dtype = rows.dimension, rows.targets.dtype
-        box = require.floating(region, "region").astype(dtype)
-        if box.shape != (2, n):
+        corners = require.floating(region, "region").astype(dtype)
+        if corners.shape != (2, n):
             raise ValueError(
-                f"region has shape {box.shape}; the lowest and the highest corner of a box, "
+                f"region has shape {corners.shape}; the lowest and the highest corner of a box, "
                 f"shape (2, {n}), are needed."
             )
-        low, high = require.on_host(box)
+        low, high = require.on_host(corners)
         bad = ~((high > low) & (abs(low) < np.inf) & (abs(high) < np.inf))
         message = "region must be finite, its first row the lower corner in every coordinate."
-        box = require.value(box, bad, message)
-        box = jnp.concatenate([box, _range_of(rows.points[:, n:])], axis=1)
-        draws, known = self.given.draws(key, count, box), known_of(self.field)
+        corners = require.value(corners, bad, message)
+        corners = jnp.concatenate([corners, _range_of(rows.points[:, n:])], axis=1)
+        draws, known = self.given.draws(key, count, corners), known_of(self.field)
 
         def one(draw):
             if draw.mean is None or known is None:
@@ -292,7 +291,7 @@ class Posterior(eqx.Module):
         return jax.vmap(one)(draws)
 
 
-# One by one its operations would be hundreds of small programs, which took 4 s to compile.
+# Without jit its operations are hundreds of small programs, which took 4 s to compile.
 @eqx.filter_jit
 def _covariance(
     given: AbstractConditional, left: AbstractBlock, right: AbstractBlock | None = None
@@ -301,7 +300,7 @@ def _covariance(
 
 
 def _range_of(U: Float[Array, "N m"]) -> Float[Array, "2 m"]:
-    """A box around zero as large as the inputs."""
+    """The corners of the smallest box around zero that holds the inputs; 1 where all are 0."""
     most = jnp.max(jnp.abs(U), axis=0)
     return jnp.array([[-1.0], [1.0]], U.dtype) * jnp.where(most > 0, most, 1)[None]
 

@@ -1,1 +1,0 @@
-"""What is known after measurements: fields and how far they may be off."""
