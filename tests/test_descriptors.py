@@ -109,3 +109,34 @@ def test_an_equivariant_warp_comes_back_from_a_file(molecules, tmp_path):
     loaded = hk.load(tmp_path / "field", field.kernel)
     np.testing.assert_allclose(loaded(molecules[1]), field(molecules[1]))
     assert "equivariant=True" in repr(field.kernel)
+
+
+def test_directions_without_a_prior_do_not_enter_the_likelihood(molecules):
+    """Against the density of the other components in NumPy, in a basis of the distances."""
+    rng = np.random.default_rng(1)
+    X = molecules
+    K = hk.CurlFree(hk.Warp(hk.Matern(2.5, 0.5), inverse_distances))
+    forces = np.asarray(jax.vmap(hk.fit(K, X, rng.normal(size=X.shape), 1e-3))(jnp.asarray(X)))
+    G = np.asarray(hk.gram(K, X)).reshape(168, 168)
+    jacobians = np.asarray(jax.vmap(jax.jacobian(inverse_distances))(jnp.asarray(X)))
+    bases = [np.linalg.svd(J)[2][:6] for J in jacobians]  # of twelve directions six are distances
+    Q = np.zeros((84, 168))
+    for i, basis in enumerate(bases):
+        Q[6 * i : 6 * i + 6, 12 * i : 12 * i + 12] = basis
+    for regularization in (1e-2, 1e-4, 1e-6):
+        A = Q @ G @ Q.T + 14 * regularization * np.eye(84)
+        y = Q @ forces.reshape(-1)
+        _, log_det = np.linalg.slogdet(A)
+        expected = -0.5 * (y @ np.linalg.solve(A, y) + log_det + 84 * np.log(2 * np.pi))
+        found = hk.log_marginal_likelihood(K, X, forces, regularization)
+        np.testing.assert_allclose(found, expected, rtol=1e-8)
+        moved = forces + np.tile([1.0, 0.0, 0.0], 4)  # a net force, of which K knows nothing
+        found = hk.log_marginal_likelihood(K, X, moved, regularization)
+        np.testing.assert_allclose(found, expected, rtol=1e-8)
+    angle = hk.Symplectic(hk.Warp(hk.Gaussian(1.0), angles))  # which sees every direction
+    states, slopes = rng.normal(size=(2, 6, 2))
+    A = np.asarray(hk.gram(angle, states)).reshape(12, 12) + 0.06 * np.eye(12)
+    _, log_det = np.linalg.slogdet(A)
+    y = slopes.reshape(-1)
+    expected = -0.5 * (y @ np.linalg.solve(A, y) + log_det + 12 * np.log(2 * np.pi))
+    np.testing.assert_allclose(hk.log_marginal_likelihood(angle, states, slopes, 1e-2), expected)

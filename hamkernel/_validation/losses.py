@@ -136,7 +136,9 @@ def log_marginal_likelihood(
     """The log density of Y under f ~ GP(0, K) and independent noise of variance Nλ.
 
     −½ yᵀA⁻¹y − ½ log det A − ½ N n log 2π with A = G + NλI. The best objective when the model is
-    believed (the truth resembles a draw of the prior); cross-validation trusts it less.
+    believed (the truth resembles a draw of the prior); cross-validation trusts it less. A kernel of
+    a descriptor, `Warp(k, fn)`, may have directions along which no field of it points, such as
+    translations of a molecule: the density is that of the components of Y along all others.
 
     Args:
         K: a matrix-valued kernel.

@@ -7,6 +7,7 @@ rows of one block, and pass through here as they are.
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -105,11 +106,44 @@ def generalized_loss_and_square(K, rows: Measurements, regularization, basis=Non
 def log_likelihood(K, rows: Measurements, regularization, basis=None):
     """`log_marginal_likelihood`: with energies, of a flat prior of their constant."""
     ridge = rows.count * regularization
-    density = log_density(_of_contrasts(K, rows, ridge, basis), rows.y)
+    y, silent = without_silent_directions(K, rows)
+    y, silent, ridge = jax.lax.optimization_barrier((y, silent, ridge))  # no LAPACK side by side
+    density = log_density(_of_contrasts(K, rows, ridge, basis), y)
+    density = density + 0.5 * silent * jnp.log(2 * jnp.pi * ridge)
     density = density - jnp.sum(jnp.log(rows.scale))
     if not len(rows.energies):
         return density
     return density - 0.5 * jnp.log(jnp.sum(rows.scale[rows.energies] ** -2))
+
+
+def without_silent_directions(
+    K: AbstractMatrixKernel, rows: Measurements
+) -> tuple[Float[Array, " D"], Float[Array, ""]]:
+    """The targets without their components along which no field of K points, and their number.
+
+    A kernel of a descriptor d knows the field along the rows of the Jacobian of d alone. Forces
+    computed from a potential of distances have no component along the other directions, six for
+    each molecule, so that the likelihood would take them for measurements without any noise, and
+    drive λ to its bound. Each of them is an eigenvector of A with the eigenvalue Nλ.
+    """
+    y, none = rows.y, jnp.zeros((), rows.targets.dtype)
+    if rows.states is None:
+        return y, none
+    X, Y = rows.states
+    found = K.through_descriptor(X.shape[1])
+    if found is None:
+        return y, none
+
+    def of_point(pair):
+        x, v = pair
+        J = jax.jacfwd(found.map)(x) @ found.directions(x)  # (m, n)
+        squares, V = jnp.linalg.eigh(J.T @ J)
+        # Rounding leaves ε of the largest, and a descriptor sees distances to more than √ε.
+        seen = squares > jnp.finfo(x.dtype).eps ** (2 / 3) * squares[-1]
+        return V @ jnp.where(seen, V.T @ v, jnp.zeros_like(v)), jnp.sum(~seen)
+
+    projected, counts = jax.lax.map(of_point, jax.lax.stop_gradient((X, Y)))
+    return projected.reshape(-1), jnp.sum(counts).astype(y.dtype)
 
 
 def _of_contrasts(K, rows: Measurements, ridge, basis: AbstractBasis | None) -> AbstractSystem:
