@@ -38,8 +38,8 @@ from hamkernel import poisson, systems
 from hamkernel._discovery.formula import Formula
 from hamkernel._discovery.readout import readout
 from hamkernel._fields.base import SolverInfo
-from hamkernel._fields.controlled import ControlledField
 from hamkernel._fields.features import FeatureField
+from hamkernel._fields.joined import ControlledField, FamilyField
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import gram
 from hamkernel._gram.operator import gram_operator
@@ -59,6 +59,7 @@ from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
 from hamkernel._structures.base import Sum
 from hamkernel._structures.controlled import Controlled, InputMatrix
 from hamkernel._structures.custom_operator import Poisson, Structured
+from hamkernel._structures.family import Family
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.port_hamiltonian import PortHamiltonian
 from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
@@ -109,6 +110,7 @@ __all__ = [  # noqa: RUF022 - in reading order
     "Reversible",
     "Invariant",
     "Controlled",
+    "Family",
     "InputMatrix",
     "UnknownMasses",
     "Sum",
@@ -125,6 +127,7 @@ __all__ = [  # noqa: RUF022 - in reading order
     "KernelField",
     "FeatureField",
     "ControlledField",
+    "FamilyField",
     "LandmarkFit",
     "FeatureFit",
     "SolverInfo",

@@ -19,14 +19,14 @@ from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, FieldSum, root
-from hamkernel._fields.controlled import ControlledField, known_of, learned_field
+from hamkernel._fields.joined import AbstractJoinedField, FamilyField, known_of, learned_field
 from hamkernel._fields.known import Mean
 from hamkernel._gram.observed import components
 from hamkernel._kernels.base import Invariance, Scaled
 from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._machine import one_blas_thread
 from hamkernel._observations.blocks import AbstractBlock, Values
-from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._observations.kinds import AbstractObservations, beside
 from hamkernel._observations.measurements import inputs_of, observations
 from hamkernel._show import text
 from hamkernel._solvers.base import AbstractSolver
@@ -47,6 +47,7 @@ def condition(
     solver: AbstractSolver | None = None,
     mean: Mean | None = None,
     inputs: Num[ArrayLike, "N m"] | None = None,
+    parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Posterior:
     """Condition the Gaussian process GP(mean, K) on data: `fit` with error bars.
 
@@ -71,6 +72,8 @@ def condition(
         mean: what is known already, x (n,) -> (n,), as in `fit`.
         inputs: of a `Controlled` kernel: u at each state, shape (N, m). Predictions then need the
             inputs as well, `posterior.deviation(x, u)`.
+        parameters: of a `Family`: θ at each state, shape (N, p): `posterior.deviation(x, θ)`. The
+            deviation grows to that of the prior outside of the range of θ.
 
     Returns:
         The posterior. O(D³) time and O(D²) memory for D rows, with a solver of rank r O(D r²).
@@ -86,7 +89,7 @@ def condition(
     solver = Cholesky() if solver is None else solver
     if solver.no_factor:
         raise TypeError(solver.no_factor)
-    asked = problem(K, X, Y, regularization, mean, inputs)
+    asked = problem(K, X, Y, regularization, mean, inputs, parameters)
     require.warn_of_float32(asked.rows.targets)
     _warn_of_amplitude(asked.kernel, asked.rows.points)
     given = solver._given(asked)
@@ -132,7 +135,8 @@ class Posterior(eqx.Module):
 
         Args:
             x: one state, shape (n,).
-            u: its inputs, shape (m,), where the field has inputs; zeros for the drift.
+            u: its inputs, shape (m,), where the field has inputs, zeros for the drift; or θ of a
+                member of a family.
             x2: the other state, shape (n,); by keyword.
             u2: the inputs of the other state, where the field has inputs.
 
@@ -148,7 +152,7 @@ class Posterior(eqx.Module):
         return _covariance(self.given, here, there)
 
     def _point(self, x: Any, u: Any) -> Float[Array, " d"]:
-        if isinstance(self.field, ControlledField):
+        if isinstance(self.field, AbstractJoinedField):
             return self.field.joined(x, u)
         if u is not None:
             raise TypeError(
@@ -166,7 +170,8 @@ class Posterior(eqx.Module):
 
         Args:
             x: one state, shape (n,).
-            u: its inputs, shape (m,), where the field has inputs; zeros for the drift.
+            u: its inputs, shape (m,), where the field has inputs, zeros for the drift; or θ of a
+                member of a family.
 
         Raises:
             ValueError: x is no single state of this dimension, or u is missing. TypeError: the
@@ -175,26 +180,37 @@ class Posterior(eqx.Module):
         return jnp.stack([root(variance) for variance in jnp.diagonal(self.covariance(x, u))])
 
     def energy_deviation(
-        self, x: Num[ArrayLike, " n"], x0: Num[ArrayLike, " n"]
+        self,
+        x: Num[ArrayLike, " n"],
+        x0: Num[ArrayLike, " n"],
+        theta: Num[ArrayLike, " p"] | None = None,
     ) -> Float[Array, ""]:
         """The standard deviation of H(x) − H(x₀), or of the difference of another potential.
 
-        For a field with inputs H is that of the drift.
+        For a field with inputs H is that of the drift, and for a family that of one member.
 
         Args:
             x: one state, shape (n,).
             x0: the reference state, shape (n,).
+            theta: θ of the member of a family, shape (p,).
 
         Raises:
             AttributeError: the structure, or the mean, has no potential (with the reason).
             ValueError: a state does not fit.
         """
-        _ = self.field.potential  # raises where there is none
-        K = self.given.field.kernel
-        states = jnp.stack([self.field._state(x), self.field._state(x0)])
-        n, m = states.shape[1], inputs_of(K)
-        points = jnp.pad(states, ((0, 0), (0, m))) if m else states
-        both = Values(points, outputs=n if m else None)
+        field, K = self.field, self.given.field.kernel
+        if isinstance(field, FamilyField):
+            _ = field.at(theta).potential
+            points = jnp.stack([field.joined(x, theta), field.joined(x0, theta)])
+            both = Values(points, outputs=field.dimension)
+        else:
+            if theta is not None:
+                raise TypeError("the field is no family: leave out theta.")
+            _ = field.potential  # raises where there is none
+            states = jnp.stack([field._state(x), field._state(x0)])
+            n, m = states.shape[1], inputs_of(K)
+            points = jnp.pad(states, ((0, 0), (0, m))) if m else states
+            both = Values(points, outputs=n if m else None)
         change = jnp.array([1.0, -1.0], both.points.dtype)
         return root(change @ _covariance(self.given, both) @ change)
 
@@ -204,6 +220,7 @@ class Posterior(eqx.Module):
         Y: Num[ArrayLike, "M n"] | None = None,
         *,
         inputs: Num[ArrayLike, "M m"] | None = None,
+        parameters: Num[ArrayLike, "M p"] | None = None,
     ) -> Posterior:
         """The posterior given more data: the same as conditioning on all of it, at less cost.
 
@@ -214,12 +231,14 @@ class Posterior(eqx.Module):
             X: states, shape (M, n), or observations, and then there is no Y.
             Y: velocities, shape (M, n).
             inputs: of a `Controlled` kernel: u at each state, shape (M, m).
+            parameters: of a `Family`: θ at each state, shape (M, p).
 
         Raises:
             ValueError: the new data has another n, or does not fit itself. RuntimeError: the new
                 rows are so close to the old ones that the factor fails.
         """
-        data, old = observations(X, Y, inputs, part=True), self.given.rows
+        given = beside(inputs, parameters, self.given.field.kernel)
+        data, old = observations(X, Y, given, part=True), self.given.rows
         if data.dimension != old.dimension:
             raise ValueError(
                 f"the new data has {data.dimension} coordinates and the posterior {old.dimension}: "
@@ -280,7 +299,8 @@ class Posterior(eqx.Module):
         bad = ~((high > low) & (abs(low) < np.inf) & (abs(high) < np.inf))
         message = "region must be finite, its first row the lower corner in every coordinate."
         corners = require.value(corners, bad, message)
-        corners = jnp.concatenate([corners, _range_of(rows.points[:, n:])], axis=1)
+        around = None if isinstance(self.field, FamilyField) else 0.0
+        corners = jnp.concatenate([corners, _range_of(rows.points[:, n:], around)], axis=1)
         draws, known = self.given.draws(key, count, corners), known_of(self.field)
 
         def one(draw):
@@ -299,8 +319,13 @@ def _covariance(
     return given.covariance(left, left if right is None else right)
 
 
-def _range_of(U: Float[Array, "N m"]) -> Float[Array, "2 m"]:
-    """The corners of the smallest box around zero that holds the inputs; 1 where all are 0."""
+def _range_of(U: Float[Array, "N m"], centre: float | None) -> Float[Array, "2 m"]:
+    """The corners of the smallest box that holds the parameters, or of one around a centre.
+
+    Around zero it holds the inputs, and is 1 where all of them are 0.
+    """
+    if centre is None:
+        return jnp.stack([U.min(axis=0), U.max(axis=0)])
     most = jnp.max(jnp.abs(U), axis=0)
     return jnp.array([[-1.0], [1.0]], U.dtype) * jnp.where(most > 0, most, 1)[None]
 
@@ -309,8 +334,9 @@ def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
     """Say so where k(x, x) = 1 to the last digit, as of built-in kernels that nobody scaled."""
     if not require.is_concrete(K, X):
         return
+    x = X[0, : K.outputs(X.shape[1])]
     for k in without_symmetry(K).scalar_kernels:
-        if Invariance.TRANSLATION in k.invariance and np.asarray(k(X[0], X[0])) == 1.0:
+        if Invariance.TRANSLATION in k.invariance and np.asarray(k(x, x)) == 1.0:
             scaled = "it" if isinstance(k, Scaled) else f"that of 1.0 * {k!r}"
             require.warn(
                 f"the amplitude of {k!r} is exactly 1, as it is before tuning, and deviations are "

@@ -42,7 +42,7 @@ from jax.experimental import multihost_utils
 
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
-from hamkernel._fields.controlled import ControlledField
+from hamkernel._fields.joined import AbstractJoinedField
 from hamkernel._kernels.functions import Bound, Closure, as_pytree
 from hamkernel._kernels.symmetry import identity, reflection, time_reversal
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -177,8 +177,8 @@ def _is_field(cls: Any) -> bool:
 
 
 def _of_state(field: AbstractField) -> Callable[[Array], Array]:
-    """The field as a function of the state alone: where it has inputs, they are 1."""
-    if isinstance(field, ControlledField):
+    """The field as a function of the state alone: where it has inputs or parameters, they are 1."""
+    if isinstance(field, AbstractJoinedField):
         u = jnp.ones(field.kernel.input_count, field.offset.dtype)
         return lambda x: field(x, u)
     return field

@@ -35,7 +35,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._discovery.formula import Formula, operator_of
-from hamkernel._fields.controlled import known_of, without_inputs
+from hamkernel._fields.joined import at_inputs, known_of
 from hamkernel._gram.observed import gram_of_rows
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._kernels.symmetry import symmetry_removed
@@ -148,7 +148,7 @@ def _measured(learned: Any) -> tuple[AbstractMatrixKernel, Any, Float[Array, ""]
             f"a {type(learned).__name__}. A field alone has none: hk.condition(K, X, Y, λ)."
         )
     if isinstance(kernel, Controlled) and known is not None:
-        known = without_inputs(known, 0)  # that of the drift
+        known = at_inputs(known, 0, None)  # that of the drift
     return kernel, rows, ridge, known
 
 

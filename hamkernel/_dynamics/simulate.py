@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 from hamkernel import _require as require
 from hamkernel._dynamics.equal_steps import EqualSteps, step_counts
 from hamkernel._dynamics.symplectic import AbstractSymplecticSolver
-from hamkernel._fields.controlled import ControlledField
+from hamkernel._fields.joined import AbstractJoinedField
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.rounding import field_rounding
 from hamkernel._kernels.functions import as_pytree
@@ -208,10 +208,12 @@ def _right_hand_side(
         field = field.__wrapped__
     if inputs is None:
         if getattr(field, "takes_inputs", False):
+            has, alone = "inputs", "Without inputs simulate its drift, field.drift."
+            if hasattr(field, "at"):
+                has, alone = "parameters", "Simulate one member, field.at(θ)."
             raise ValueError(
-                f"this {type(field).__name__} has inputs: hk.simulate(field, x0, ts, inputs=u), u "
-                "a function t -> (m,) or samples (T, m) at ts. Without inputs simulate its drift, "
-                "field.drift."
+                f"this {type(field).__name__} has {has}: hk.simulate(field, x0, ts, inputs=u), u a "
+                f"function t -> (m,) or samples (T, m) at ts. {alone}"
             )
         return RightHandSide(field, None, held=False), None
     others = require.other_arguments(field, ts, ts)
@@ -309,7 +311,7 @@ def _tolerances(
     default = jnp.asarray(1e-10 if x0.dtype == jnp.float64 else 1e-5, x0.dtype)
     if rtol is None or atol is None:
         learned, point = rhs.field, x0
-        if isinstance(learned, ControlledField) and rhs.inputs is not None:
+        if isinstance(learned, AbstractJoinedField) and rhs.inputs is not None:
             learned, point = learned.whole, learned.joined(x0, rhs.inputs(start))
         if isinstance(learned, KernelField):
             Z, A = learned.points, learned.coefficients

@@ -115,8 +115,7 @@ class AbstractField(eqx.Module):
             return self._term(self.kernel, self.kernel.position(which))
         if which == 0:
             return self
-        cure = " The drift may be one: field.drift.part(…)." if self.kernel.takes_inputs else ""
-        raise KeyError(f"no part {which!r}: {type(self.kernel).__name__} is not a sum.{cure}")
+        raise KeyError(f"no part {which!r}: {type(self.kernel).__name__} is not a sum.")
 
     @abc.abstractmethod
     def _term(self: Field, kernel: Sum, position: int) -> Field:

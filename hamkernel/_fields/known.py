@@ -10,7 +10,8 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.controlled import Controlled, KnownMatrix
+from hamkernel._structures.controlled import KnownMatrix
+from hamkernel._structures.joined import AbstractJoinedKernel
 
 Mean = Callable[..., Float[Array, " n"]]
 
@@ -34,14 +35,14 @@ class KnownPart(eqx.Module):
         return known + value.astype(x.dtype)
 
 
-class AtRest(eqx.Module):
-    """f(x, 0) of a function f(x, u)."""
+class AtInputs(eqx.Module):
+    """x -> f(x, u) of a function f, for one u."""
 
     field: Callable[..., Any]
-    count: int = eqx.field(static=True)
+    u: Float[Array, " m"]
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self.field(x, jnp.zeros(self.count, x.dtype))
+        return self.field(x, self.u.astype(x.dtype))
 
 
 def known_part(K: AbstractMatrixKernel, mean: Any, n: int, dtype: Any) -> Any:
@@ -59,17 +60,18 @@ def known_part(K: AbstractMatrixKernel, mean: Any, n: int, dtype: Any) -> Any:
     Raises:
         TypeError, ValueError: the mean does not map one state to one velocity.
     """
-    if not isinstance(K, Controlled):
+    if not isinstance(K, AbstractJoinedKernel):
         if mean is None:
             return None
         require.velocity(mean, jnp.zeros(n, dtype), "mean")
         return as_pytree(mean)
-    matrix = K.inputs if isinstance(K.inputs, KnownMatrix) else None
+    matrix = K.known_matrix
     if mean is None:
         return None if matrix is None else KnownPart(None, matrix, K.input_count, of_inputs=False)
     x = jnp.zeros(n, dtype)
     of_inputs = _takes_inputs(mean, x)
-    require.velocity(AtRest(mean, K.input_count) if of_inputs else mean, x, "mean")
+    at_zero = AtInputs(mean, jnp.zeros(K.input_count, dtype)) if of_inputs else mean
+    require.velocity(at_zero, x, "mean")
     return KnownPart(as_pytree(mean), matrix, K.input_count, of_inputs)
 
 

@@ -9,7 +9,7 @@ The noise is relative: a row of relative noise s has the variance s² Nλ, where
 observations: points of velocities and equilibria, energies and functionals.
 
 A field with inputs is observed at points (x, u), and each kind but the energies, which are those of
-the drift, holds the inputs u of its points.
+the drift, holds the inputs u of its points; for a family they hold its parameters in their place.
 """
 
 from __future__ import annotations
@@ -46,14 +46,17 @@ class AbstractObservations(eqx.Module):
             yield inputs
 
     @abc.abstractmethod
-    def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+    def parts(
+        self, count: int = 0, given: str = "inputs"
+    ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
         """The blocks of rows, one for each kind, and the values that were measured.
 
         Args:
             count: m, the number of inputs of the kernel. If it is not 0 the points are (x, u).
+            given: what u is, "inputs", or the "parameters" of a family.
 
         Raises:
-            ValueError: the inputs are needed and were not given.
+            ValueError: u is needed and was not given, or energies of a family were.
         """
 
     def __add__(self, other: Any) -> AbstractObservations:
@@ -100,9 +103,11 @@ class Together(AbstractObservations):
         for term in self.terms:
             yield from term.given_inputs()
 
-    def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+    def parts(
+        self, count: int = 0, given: str = "inputs"
+    ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
         for term in self.terms:
-            yield from term.parts(count)
+            yield from term.parts(count, given)
 
 
 def _terms(data: AbstractObservations) -> tuple[AbstractObservations, ...]:
@@ -118,34 +123,64 @@ def refuse_swapped(X: Any, Y: Any, inputs: Any) -> None:
         )
 
 
-def inputs_at(X: Float[Array, "*points n"], inputs: Any) -> Float[Array, "*points m"] | None:
-    """The inputs of every state, finite and in the dtype of the states; None if none are given."""
-    if inputs is None:
+def beside(inputs: Any, parameters: Any, K: Any = None) -> Any:
+    """What is given beside the states, by the one name or the other; None if nothing is.
+
+    Raises:
+        TypeError: both are given, or K takes the other.
+    """
+    if inputs is not None and parameters is not None:
+        raise TypeError(
+            "inputs and parameters were both given: a Controlled kernel takes inputs, which act "
+            "linearly, and a Family parameters, on which its members depend in any way. An input "
+            "of a family may be one of its parameters."
+        )
+    name = getattr(K, "given", None)
+    given = "inputs" if inputs is not None else "parameters" if parameters is not None else name
+    if name is not None and given != name:
+        raise TypeError(f"{type(K).__name__} takes {name}, and {given} were given: {name}=….")
+    return parameters if inputs is None else inputs
+
+
+def inputs_at(
+    X: Float[Array, "*points n"], inputs: Any, parameters: Any = None
+) -> Float[Array, "*points m"] | None:
+    """The inputs, or parameters, of every state, finite and of its dtype; None if none are given.
+
+    Raises:
+        TypeError: both are given. ValueError: the shape does not fit, or a value is not finite.
+    """
+    name, letter = ("inputs", "U") if parameters is None else ("parameters", "Θ")
+    given = beside(inputs, parameters)
+    if given is None:
         return None
-    U = require.floating(inputs, "inputs")
+    U = require.floating(given, name)
     if U.ndim != X.ndim or U.shape[:-1] != X.shape[:-1] or U.shape[-1] == 0:
         hint = ""
         if U.shape == X.shape[:-1]:
-            hint = f" For one input write U[{':, ' * U.ndim}None]."
+            hint = f" For one of them write {letter}[{':, ' * U.ndim}None]."
         elif U.ndim == X.ndim == 2 and U.shape[1] == len(X):
-            hint = " They seem to be transposed: U.T."
+            hint = f" They seem to be transposed: {letter}.T."
+        elif U.ndim == 1:
+            hint = f" Where all have the same: np.tile({letter}, ({len(X)}, 1))."
         raise ValueError(
-            f"inputs has shape {U.shape}; m inputs for each of the states are needed, which have "
-            f"shape {X.shape}.{hint}"
+            f"{name} has shape {U.shape}; one row of {name} for each of the states is needed, "
+            f"which have shape {X.shape}.{hint}"
         )
-    return require.finite(U.astype(X.dtype), "inputs")
+    return require.finite(U.astype(X.dtype), name)
 
 
 def joined_points(
-    data: Any, X: Float[Array, "*points n"], count: int
+    data: Any, X: Float[Array, "*points n"], count: int, given: str
 ) -> tuple[Float[Array, "*points d"], int | None]:
     """The points (x, u) and n, where `count` > 0; X and None else."""
     if not count:
         return X, None
     if data.inputs is None:
         raise ValueError(
-            f"the inputs of {type(data).__name__} are missing: a Controlled kernel needs inputs=U, "
-            "one row of shape (m,) for each state."
+            f"the {given} of {type(data).__name__} are missing: a "
+            f"{'Controlled' if given == 'inputs' else 'Family'} kernel needs {given}=…, one row of "
+            "shape (m,) for each state."
         )
     return jnp.concatenate([X, data.inputs], axis=-1), X.shape[-1]
 
@@ -161,6 +196,7 @@ class Velocities(AbstractObservations):
             (n,), or one for each component, shape (N, n); 1 if None. Those of components that
             were not measured have no effect.
         inputs: u at each state, shape (N, m), for a `Controlled` kernel.
+        parameters: θ at each state, shape (N, p), for a `Family`.
 
     Raises:
         ValueError: shapes do not fit, no component was measured, X or a noise is not finite, or a
@@ -179,10 +215,11 @@ class Velocities(AbstractObservations):
         Y: Num[ArrayLike, "N n"],
         noise: ArrayLike | None = None,
         inputs: Num[ArrayLike, "N m"] | None = None,
+        parameters: Num[ArrayLike, "N p"] | None = None,
     ):
         refuse_swapped(X, Y, inputs)
         self.X, self.Y, kept = require.measured(X, Y)
-        self.inputs = inputs_at(self.X, inputs)
+        self.inputs = inputs_at(self.X, inputs, parameters)
         self.kept = None if kept is None else jnp.asarray(kept)
         N, n = self.X.shape
         self.noise = _noise(noise, [(), (n,), (N, n)], "(), (n,) or (N, n)", self.X)
@@ -191,14 +228,16 @@ class Velocities(AbstractObservations):
     def dimension(self) -> int:
         return self.X.shape[1]
 
-    def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+    def parts(
+        self, count: int = 0, given: str = "inputs"
+    ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
         y, noise = self.Y.reshape(-1), self.noise
         if noise is not None:
             noise = noise.reshape((1,) * (2 - noise.ndim) + noise.shape)
             noise = jnp.broadcast_to(noise, self.X.shape).reshape(-1)
         if self.kept is not None:
             y, noise = y[self.kept], None if noise is None else noise[self.kept]
-        points, outputs = joined_points(self, self.X, count)
+        points, outputs = joined_points(self, self.X, count, given)
         yield Components(points, self.kept, noise, outputs), y
 
 
@@ -247,8 +286,15 @@ class Energies(AbstractObservations):
     def dimension(self) -> int:
         return self.X.shape[1]
 
-    def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+    def parts(
+        self, count: int = 0, given: str = "inputs"
+    ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
         noise = None if self.noise is None else jnp.broadcast_to(self.noise, self.E.shape)
+        if given == "parameters":
+            raise ValueError(
+                "hk.Energies have one unknown constant, and each member of a family has one of its "
+                "own: learn a family from velocities, equilibria and functionals."
+            )
         if not count:
             yield Values(self.X, noise), self.E
         else:
@@ -262,6 +308,7 @@ class Equilibria(AbstractObservations):
     Args:
         X: states, shape (N, n), or one of shape (n,).
         inputs: of a `Controlled` kernel: those that hold the states, shape (N, m) or (m,).
+        parameters: of a `Family`: θ at each state, shape (N, p) or (p,).
 
     Raises:
         ValueError: a shape does not fit, or a value is not finite.
@@ -274,20 +321,25 @@ class Equilibria(AbstractObservations):
         self,
         X: Num[ArrayLike, "N n"] | Num[ArrayLike, " n"],
         inputs: Num[ArrayLike, "N m"] | Num[ArrayLike, " m"] | None = None,
+        parameters: Num[ArrayLike, "N p"] | Num[ArrayLike, " p"] | None = None,
     ):
         X = require.floating(X, "X")
-        if inputs is not None and X.ndim == np.ndim(inputs) == 1:
-            inputs = jnp.asarray(inputs)[None]
+        inputs, parameters = (
+            jnp.asarray(u)[None] if u is not None and X.ndim == np.ndim(u) == 1 else u
+            for u in (inputs, parameters)
+        )
         self.X = require.finite(require.points(X[None] if X.ndim == 1 else X, "X"), "X")
         require.single_or_double(self.X.dtype, "X has")
-        self.inputs = inputs_at(self.X, inputs)
+        self.inputs = inputs_at(self.X, inputs, parameters)
 
     @property
     def dimension(self) -> int:
         return self.X.shape[1]
 
-    def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
-        points, outputs = joined_points(self, self.X, count)
+    def parts(
+        self, count: int = 0, given: str = "inputs"
+    ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+        points, outputs = joined_points(self, self.X, count, given)
         yield Components(points, outputs=outputs), jnp.zeros(self.X.size, self.X.dtype)
 
 
@@ -308,6 +360,7 @@ class Functionals(AbstractObservations):
         weights: shape (R, Q, n): a vector for each of them, which multiplies f there.
         targets: shape (R,).
         inputs: of a `Controlled` kernel: u at each point, shape (R, Q, m), or (S, Q, m).
+        parameters: of a `Family`: θ at each point, shape (R, Q, p), or (S, Q, p).
 
     Raises:
         ValueError: shapes do not fit, a value is not finite, or a row has weights that are all
@@ -325,6 +378,7 @@ class Functionals(AbstractObservations):
         weights: Num[ArrayLike, "S Q n"] | Num[ArrayLike, "S R Q n"],
         targets: Num[ArrayLike, " S"] | Num[ArrayLike, "S R"],
         inputs: Num[ArrayLike, "S Q m"] | None = None,
+        parameters: Num[ArrayLike, "S Q p"] | None = None,
     ):
         named = {"points": points, "weights": weights, "targets": targets}
         arrays = [require.floating(array, name) for name, array in named.items()]
@@ -355,14 +409,16 @@ class Functionals(AbstractObservations):
             ),
         )
         self.points, self.targets = points, targets.reshape(-1)
-        self.inputs = inputs_at(points, inputs)
+        self.inputs = inputs_at(points, inputs, parameters)
 
     @property
     def dimension(self) -> int:
         return self.points.shape[2]
 
-    def parts(self, count: int = 0) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
-        points, _ = joined_points(self, self.points, count)
+    def parts(
+        self, count: int = 0, given: str = "inputs"
+    ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+        points, _ = joined_points(self, self.points, count, given)
         rows = Combinations(groups=points, weights=self.weights)  # pyright: ignore[reportCallIssue]
         yield rows, self.targets
 

@@ -38,7 +38,7 @@ from hamkernel._observations.kinds import (
     refuse_swapped,
 )
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.controlled import Controlled, KnownMatrix
+from hamkernel._structures.joined import AbstractJoinedKernel
 
 
 @jax.tree_util.register_dataclass
@@ -263,7 +263,7 @@ def measurements(
     Raises:
         TypeError, ValueError: as `fit` says.
     """
-    if inputs is None and not isinstance(X, AbstractObservations) and not isinstance(K, Controlled):
+    if inputs is None and not isinstance(X, AbstractObservations) and not K.takes_inputs:
         return K, measurements_of_states(*placed(velocities_at(X, Y)))
     return measurements_of(K, placed(observations(X, Y, inputs)))
 
@@ -326,7 +326,7 @@ def measurements_of(
             TypeError: K takes no inputs.
     """
     K = with_input_count(K, data, part=previous is not None)
-    blocks, targets = zip(*data.parts(inputs_of(K)), strict=True)
+    blocks, targets = zip(*data.parts(*_beside(K)), strict=True)
     dtype = np.result_type(*[block.points.dtype for block in blocks])
     blocks = tuple(_cast(block, dtype) for block in blocks)
     divided = [
@@ -344,18 +344,23 @@ def measurements_of(
 
 
 def sampled_points(
-    K: AbstractMatrixKernel, X: Float[Array, "N n"], inputs: Any
+    K: AbstractMatrixKernel, X: Float[Array, "N n"], given: Any
 ) -> tuple[AbstractMatrixKernel, Float[Array, "N d"]]:
     """The kernel with its number of inputs, and the points (x, u), where nothing is measured."""
-    data = Equilibria(X, inputs)
+    data = Equilibria(X, given)
     K = with_input_count(K, data)
-    (block, _), *_ = data.parts(inputs_of(K))
+    (block, _), *_ = data.parts(*_beside(K))
     return K, block.points
 
 
 def inputs_of(K: AbstractMatrixKernel) -> int:
     """m, the number of inputs; 0 for a kernel that takes none."""
-    return K.input_count if isinstance(K, Controlled) else 0
+    return K.input_count if isinstance(K, AbstractJoinedKernel) else 0
+
+
+def _beside(K: AbstractMatrixKernel) -> tuple[int, str]:
+    """How many numbers are given beside a state, and what they are."""
+    return (K.input_count, K.given) if isinstance(K, AbstractJoinedKernel) else (0, "inputs")
 
 
 def with_input_count(
@@ -363,45 +368,31 @@ def with_input_count(
 ) -> AbstractMatrixKernel:
     """The kernel with its number of inputs, taken from the data.
 
-    The inputs of all data must vary; those of a `part` of the data may be constant.
+    The inputs, or parameters, of all data must vary; those of a `part` of it may be constant.
     """
     given = list(data.given_inputs())
-    if not isinstance(K, Controlled):
+    if not isinstance(K, AbstractJoinedKernel):
         if given:
             raise TypeError(
                 f"{type(K).__name__} takes no inputs: say how they act, hk.Controlled(K, "
-                "inputs=hk.InputMatrix(k, acts_on=(1,)))."
+                "inputs=hk.InputMatrix(k, acts_on=(1,))), and for the parameters of a family "
+                "hk.Family(K, k)."
             )
         return K
     counts = {u.shape[-1] for u in given}
     if len(counts) > 1:
-        raise ValueError(f"the observations have {sorted(counts)} inputs: all need the same m.")
+        raise ValueError(f"the observations have {sorted(counts)} {K.given}: all need as many.")
     if not counts:
-        list(data.parts(1))  # raises where inputs are needed
+        list(data.parts(1, K.given))  # raises where they are needed
         return K
     count = counts.pop()
     if K.count is not None and K.count != count:
-        raise ValueError(f"inputs has {count} columns and the kernel {K.count} inputs.")
-    K = Controlled(K.drift, K.inputs, count)
+        raise ValueError(f"{K.given} has {count} columns and the kernel {K.count} {K.given}.")
+    K = K.with_count(count)
     K.check_dimension(data.dimension + count)
-    if not isinstance(K.inputs, KnownMatrix) and not part:
-        _check_identified([u.reshape(-1, count) for u in given])
+    if not part and require.is_concrete(given):
+        K.check_identified(np.concatenate([np.asarray(u).reshape(-1, count) for u in given]))
     return K
-
-
-def _check_identified(given: list[Float[Array, "_ m"]]) -> None:
-    """Refuse inputs a combination of which is the same at all points."""
-    if not require.is_concrete(given):
-        return
-    values = np.concatenate([np.asarray(u) for u in given])
-    rank = int(np.linalg.matrix_rank(values - values.mean(axis=0)))
-    if rank < values.shape[1]:
-        raise ValueError(
-            f"the inputs, less their means, have rank {rank} and there are {values.shape[1]}: a "
-            "combination of them is the same at all points, and cannot be told from the drift. "
-            "Vary every input on its own, leave out those that repeat others, or give the matrix "
-            "that is known, Controlled(K, inputs=G)."
-        )
 
 
 def _cast(block: AbstractBlock, dtype: Any) -> AbstractBlock:

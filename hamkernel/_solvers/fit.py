@@ -9,7 +9,7 @@ from jaxtyping import ArrayLike, Num
 
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
-from hamkernel._fields.controlled import ControlledField, learned_field
+from hamkernel._fields.joined import ControlledField, FamilyField, learned_field
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._fields.known import Mean
 from hamkernel._machine import as_given, dense_bytes, memory_bytes, one_blas_thread, rows_of
@@ -22,6 +22,7 @@ from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.problem import Problem, problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.controlled import Controlled
+from hamkernel._structures.family import AbstractFamily
 
 
 @overload
@@ -35,7 +36,20 @@ def fit(
     mean: Mean | None = None,
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
+    parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> ControlledField: ...
+@overload
+def fit(
+    K: AbstractFamily,
+    X: Num[ArrayLike, "N n"] | AbstractObservations,
+    Y: Num[ArrayLike, "N n"] | None = None,
+    regularization: ArrayLike = 1e-4,
+    *,
+    solver: AbstractSolver | None = None,
+    mean: Mean | None = None,
+    throw: bool = True,
+    parameters: Num[ArrayLike, "N p"] | None = None,
+) -> FamilyField: ...
 @overload
 def fit(
     K: AbstractMatrixKernel,
@@ -47,6 +61,7 @@ def fit(
     mean: Mean | None = None,
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
+    parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> KernelField: ...
 @overload
 def fit(
@@ -59,6 +74,7 @@ def fit(
     mean: Mean | None = None,
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
+    parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Learned: ...
 
 
@@ -73,6 +89,7 @@ def fit(
     mean: Mean | None = None,
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
+    parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> AbstractField:
     """Learn the field f in the RKHS of K that minimises (1/N) Σᵢ‖f(xᵢ) − yᵢ‖² + λ‖f‖².
 
@@ -101,6 +118,8 @@ def fit(
             all, and for your own objectives in `tune`, which turns away from NaN.
         inputs: of a `Controlled` kernel: u at each state, shape (N, m). What is learned is then a
             `ControlledField`, field(x, u).
+        parameters: of a `Family`: θ at each state, shape (N, p). What is learned is then a
+            `FamilyField`, field(x, θ), and `field.at(θ)` an ordinary field.
 
     Returns:
         The learned field. Works under jit, vmap and grad, with respect to every argument; new
@@ -117,7 +136,7 @@ def fit(
     Source: Smith & Egeland (2023), section 3, where "Nλ a_j" should read "Nλ a_i".
     """
     check_solver(solver)
-    return solved(problem(K, X, Y, regularization, mean, inputs), solver, throw)
+    return solved(problem(K, X, Y, regularization, mean, inputs, parameters), solver, throw)
 
 
 def solved(given: Problem, solver: AbstractSolver | None, throw: bool = True) -> AbstractField:

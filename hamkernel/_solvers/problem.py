@@ -13,13 +13,13 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._fields.base import at_points, potential_of
-from hamkernel._fields.controlled import without_inputs
+from hamkernel._fields.joined import at_inputs
 from hamkernel._fields.known import KnownPart, known_part
 from hamkernel._machine import RowSharding, is_on_one_device, on_one_device, rows_of
-from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._observations.kinds import AbstractObservations, beside
 from hamkernel._observations.measurements import Measurements, measurements, measurements_of
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.controlled import Controlled
+from hamkernel._structures.joined import AbstractJoinedKernel
 
 
 @jax.tree_util.register_dataclass
@@ -67,6 +67,7 @@ def problem(
     regularization: ArrayLike,
     mean: Any = None,
     inputs: Any = None,
+    parameters: Any = None,
 ) -> Problem:
     """The problem of the data, checked; X and Y are `Velocities(X, Y)`.
 
@@ -74,7 +75,7 @@ def problem(
         TypeError, ValueError: as `fit` says. AttributeError: energies without a potential.
     """
     spread = rows_of(X) if isinstance(X, jax.Array) else None
-    K, rows = measurements(matrix_kernel(K), X, Y, inputs)
+    K, rows = measurements(matrix_kernel(K), X, Y, beside(inputs, parameters, K))
     K.check_points(rows.points)
     if len(rows.energies) and K.no_potential:
         raise AttributeError(f"energies were given, and {K.no_potential}")
@@ -101,10 +102,10 @@ def without_known(K: AbstractMatrixKernel, rows: Measurements, known: Any) -> Me
 
 def _known_potential(K: AbstractMatrixKernel, known: Any):
     """The potential of what is known, as a function of the points of K."""
-    if not isinstance(known, KnownPart) or not isinstance(K, Controlled):
+    if not isinstance(known, KnownPart) or not isinstance(K, AbstractJoinedKernel):
         return potential_of(known, K)
-    drift = without_inputs(known, 0)
+    drift = at_inputs(known, 0, None)
     if drift is None:  # G u, which is no part of the drift
         return lambda s: 0 * s[0]
-    of_drift = potential_of(drift, K.drift)
+    of_drift = potential_of(drift, K.of_states)
     return lambda s: of_drift(s[: -known.count])

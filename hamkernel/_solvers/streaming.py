@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
-from hamkernel._fields.controlled import learned_field
+from hamkernel._fields.joined import learned_field
 from hamkernel._fields.known import known_part
 from hamkernel._machine import one_blas_thread, rows_of, split
-from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._observations.kinds import AbstractObservations, beside
 from hamkernel._observations.measurements import (
     Measurements,
     measurements_of,
@@ -82,6 +82,7 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
         X: Num[ArrayLike, "N n"] | AbstractObservations,
         Y: Num[ArrayLike, "N n"] | None = None,
         inputs: Num[ArrayLike, "N m"] | None = None,
+        parameters: Num[ArrayLike, "N p"] | None = None,
     ) -> Fit:
         """The fit with more data.
 
@@ -90,13 +91,14 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
                 observations take O(D r) memory, where velocities are seen tile by tile.
             Y: measured velocities, shape (N, n).
             inputs: of a `Controlled` kernel: u at each state, shape (N, m).
+            parameters: of a `Family`: θ at each state, shape (N, p).
 
         Raises:
             ValueError: a shape does not fit, the data is not finite, or there are energies, whose
                 constant all chunks would share: give differences of H as `hk.Functionals`, or fit
                 all data at once. TypeError: the dtype, or it has more digits than the fit.
         """
-        rows = self._checked_rows(observations(X, Y, inputs, part=True))
+        rows = self._checked_rows(observations(X, Y, beside(inputs, parameters), part=True))
         if rows.states is None:
             return self._added_rows(rows)
         return self._added(*(each.astype(self.dtype) for each in rows.states))
@@ -164,6 +166,7 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
         sample: Num[ArrayLike, "N n"],
         regularization: ArrayLike = 1e-4,
         inputs: Num[ArrayLike, "N m"] | None = None,
+        parameters: Num[ArrayLike, "N p"] | None = None,
     ) -> Fit:
         """A fit without data yet, to which chunks are added: a `LandmarkFit` or a `FeatureFit`.
 
@@ -176,6 +179,7 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
             regularization: the smallest λ that will be asked for, since the tolerance of `Nystrom`
                 is relative to it, and so are the digits that are kept: a smaller one loses some.
             inputs: of a `Controlled` kernel: those of the sample, shape (N, m).
+            parameters: of a `Family`: those of the sample, shape (N, p).
 
         Where `field.info.truncation` of the data added exceeds the tolerance of `Nystrom`, start
         anew with a sample that looks like the data so far.
@@ -187,7 +191,7 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
         """
         K = matrix_kernel(K)
         sample = require.finite(require.points(sample, "sample"), "sample")
-        K, sample = sampled_points(K, sample, inputs)
+        K, sample = sampled_points(K, sample, beside(inputs, parameters))
         K.check_dimension(sample.shape[1])
         require.warn_of_float32(sample)
         return self._started(K, sample, require.ridge(regularization, sample.dtype))
@@ -201,6 +205,7 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
         sample: Num[ArrayLike, "S n"] | None = None,
         progress: bool = False,
         inputs: Num[ArrayLike, "S m"] | None = None,
+        parameters: Num[ArrayLike, "S p"] | None = None,
     ) -> Any:
         """`hk.fit` to data that comes in chunks, in one pass and with memory for two chunks.
 
@@ -214,11 +219,13 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
             K: a matrix-valued kernel.
             chunks: pairs (X, Y) of states and velocities, shape (Nᵢ, n) each: a generator, or
                 slices of memory-mapped files. Every new Nᵢ compiles anew: equal ones are fast. Of a
-                `Controlled` kernel (X, Y, U), with inputs of shape (Nᵢ, m).
+                `Controlled` kernel (X, Y, U), with inputs of shape (Nᵢ, m), and of a `Family`
+                with its parameters in their place.
             regularization: λ > 0, as in `hk.fit`, with N the number of all points.
             sample: states that look like all of the data, for `start`; the first chunk if None.
             progress: show a progress bar where the standard error is a terminal.
             inputs: of a `Controlled` kernel: those of the sample, shape (S, m).
+            parameters: of a `Family`: those of the sample, shape (S, p).
 
         Raises:
             ValueError: there is no chunk, or as `hk.fit` for one of them. TypeError: as `hk.fit`.
@@ -235,16 +242,14 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
             with _naming(i):
                 if not isinstance(chunk, tuple | list) or len(chunk) not in (2, 3):
                     raise TypeError(
-                        f"a pair (X, Y) is needed, or (X, Y, U) of a field with inputs; got "
+                        f"a pair (X, Y) is needed, or (X, Y, U) with inputs or parameters; got "
                         f"{reprlib.repr(chunk)}. All of the data in one chunk is [(X, Y)]."
                     )
                 X, Y = require.data(*chunk[:2], part=True)
             U = chunk[2] if len(chunk) == 3 else None
             if model is None:
-                first = (
-                    (X, regularization, U) if sample is None else (sample, regularization, inputs)
-                )
-                model = self.start(K, *first)
+                first, given = (X, U) if sample is None else (sample, beside(inputs, parameters))
+                model = self.start(K, first, regularization, given)
             # The next chunk is read while this one is added, and no further ones pile up.
             jax.block_until_ready(model)
             with _naming(i):

@@ -153,7 +153,9 @@ class AbstractMatrixKernel(eqx.Module):
         """The transformations of both arguments that leave every block unchanged."""
 
     def __add__(self, other: Any) -> "Sum":
-        return Sum(self, other) if isinstance(other, AbstractMatrixKernel) else NotImplemented
+        if not isinstance(other, AbstractMatrixKernel) or other.takes_inputs:
+            return NotImplemented  # a kernel of more than states says itself what the sum is
+        return Sum(self, other)
 
     def __mul__(self, other: Any) -> Any:
         raise TypeError(
@@ -193,7 +195,10 @@ class Sum(AbstractMatrixKernel):
         flat += named.items()
         for _, term in flat:
             if matrix_kernel(term, "a term of a Sum", "Symplectic(k) + CurlFree(k)").takes_inputs:
-                raise TypeError("add the drifts of fields with inputs: Controlled(K1 + K2, …).")
+                raise TypeError(
+                    "add the drifts of fields with inputs, Controlled(K1 + K2, …); families add up "
+                    "themselves, Family(K1, k1) + Family(K2, k2)."
+                )
         names = [name for name, _ in flat if name is not None]
         if "regularization" in names:
             raise ValueError("a part cannot be called regularization: tune calls λ so.")

@@ -4,8 +4,7 @@ With independent priors of the drift f and of the input matrix G the kernel of t
 
     K((x, u), (x′, u′)) = K_f(x, x′) + Σᵢⱼ uᵢ u′ⱼ K_g,ij(x, x′),        shape (n, n),
 
-so points have n + m coordinates and fields n components. Everything downstream asks a kernel for
-its `outputs`.
+so points have n + m coordinates and fields n components.
 """
 
 from typing import Any, ClassVar
@@ -24,9 +23,9 @@ from hamkernel._kernels.base import (
     as_scalar_kernel,
     one_point,
 )
-from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._structures.joined import AbstractJoinedKernel
 from hamkernel._structures.port_hamiltonian import distinct_coordinates
 
 
@@ -97,7 +96,7 @@ class KnownMatrix(eqx.Module):
         return np.asarray(self.entries)
 
 
-class Controlled(AbstractMatrixKernel):
+class Controlled(AbstractJoinedKernel):
     """Fields with inputs: f(x, u) = f(x) + G(x) u, f in the RKHS of K.
 
     Give the inputs of each point to `fit`, `tune` and the losses: `hk.fit(K, X, Y, λ, inputs=U)`
@@ -129,13 +128,15 @@ class Controlled(AbstractMatrixKernel):
     inputs: InputMatrix | KnownMatrix
     count: int | None = eqx.field(static=True)
 
-    symplectic: ClassVar[bool] = False
-    takes_inputs: ClassVar[bool] = True
+    given: ClassVar[str] = "inputs"
 
     def __init__(self, drift: AbstractMatrixKernel, inputs: Any, count: int | None = None):
         self.drift = matrix_kernel(drift, "the drift of Controlled", "Controlled(Symplectic(k), …)")
-        if isinstance(self.drift, Controlled):
-            raise TypeError("the drift is controlled already: give all inputs to one Controlled.")
+        if self.drift.takes_inputs:
+            raise TypeError(
+                f"the drift of Controlled is a {type(self.drift).__name__}, which takes inputs or "
+                "parameters already: give all inputs to one Controlled."
+            )
         if isinstance(inputs, InputMatrix | KnownMatrix):
             self.inputs = inputs
         elif callable(inputs) or isinstance(inputs, str):
@@ -150,50 +151,34 @@ class Controlled(AbstractMatrixKernel):
         self.count = G.matrix.shape[1] if isinstance(G, KnownMatrix) else count
 
     @property
-    def no_potential(self) -> str | None:
-        return self.drift.no_potential
+    def of_states(self) -> AbstractMatrixKernel:
+        """The kernel of the drift."""
+        return self.drift
 
     @property
-    def has_hamiltonian(self) -> bool:
-        """Whether the drift has one."""
-        return self.drift.has_hamiltonian
+    def known_matrix(self) -> KnownMatrix | None:
+        return self.inputs if isinstance(self.inputs, KnownMatrix) else None
 
     @property
     def conserves(self) -> bool:
         """No: inputs have a power."""
         return False
 
-    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
-        return self.drift.dissipated(x, slope)
-
-    def outputs(self, inputs: int) -> int:
-        return inputs - self.input_count
-
-    @property
-    def input_count(self) -> int:
-        """m, the number of inputs; ValueError while nobody has said it."""
-        if self.count is None:
+    def check_identified(self, U: Float[np.ndarray, "N m"]) -> None:
+        """ValueError for inputs a combination of which is the same at all points."""
+        if self.known_matrix is not None:
+            return
+        rank = int(np.linalg.matrix_rank(U - U.mean(axis=0)))
+        if rank < U.shape[1]:
             raise ValueError(
-                "this Controlled kernel does not know how many inputs there are: give them, "
-                "hk.fit(K, X, Y, inputs=U), or say Controlled(K, inputs, count=1)."
+                f"the inputs, less their means, have rank {rank} and there are {U.shape[1]}: a "
+                "combination of them is the same at all points, and cannot be told from the drift. "
+                "Vary every input on its own, leave out those that repeat others, or give the "
+                "matrix that is known, Controlled(K, inputs=G)."
             )
-        return self.count
-
-    def _split(self, s: Any) -> tuple[Any, Any]:
-        """X and U of joined points, or x and u of one."""
-        n = self.outputs(s.shape[-1])
-        return s[..., :n], s[..., n:]
-
-    def __call__(self, x: Float[Array, " d"], z: Float[Array, " d"]) -> Float[Array, "n n"]:
-        """The block for two joined points (x, u)."""
-        x, z = require.same_space(one_point(x)[None], one_point(z)[None])
-        self.check_points(x)
-        basis = jnp.eye(self.outputs(x.shape[1]), dtype=x.dtype)
-        columns = jax.vmap(self.form, in_axes=(None, None, None, 0))
-        return jax.vmap(columns, in_axes=(None, 0, None, None))(x[0], basis, z[0], basis)
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
-        (x, inputs), (z, others) = self._split(x), self._split(z)
+        (x, inputs), (z, others) = self.split(x), self.split(z)
         drift = self.drift.form(x, u, z, v)
         if isinstance(self.inputs, KnownMatrix):
             return drift
@@ -203,7 +188,7 @@ class Controlled(AbstractMatrixKernel):
     def expansion(
         self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Float[Array, "M n"]
     ) -> Float[Array, " n"]:
-        (x, u), (Z, U) = self._split(x), self._split(Z)
+        (x, u), (Z, U) = self.split(x), self.split(Z)
         drift = self.drift.expansion(x, Z, A)
         if isinstance(self.inputs, KnownMatrix):
             return drift
@@ -214,15 +199,15 @@ class Controlled(AbstractMatrixKernel):
     def potential(
         self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Float[Array, "M n"]
     ) -> Float[Array, ""]:
-        return self.drift.potential(self._split(x)[0], self._split(Z)[0], A)
+        return self.drift.potential(self.split(x)[0], self.split(Z)[0], A)
 
     def potential_covariance(
         self, x: Float[Array, " d"], z: Float[Array, " d"]
     ) -> Float[Array, ""]:
-        return self.drift.potential_covariance(self._split(x)[0], self._split(z)[0])
+        return self.drift.potential_covariance(self.split(x)[0], self.split(z)[0])
 
     def centre(self, Z: Float[Array, "M d"]) -> Float[Array, " d"] | None:
-        states, inputs = self._split(Z)
+        states, inputs = self.split(Z)
         centre, G = self.drift.centre(states), self.inputs
         shifts = isinstance(G, KnownMatrix) or Invariance.TRANSLATION in G.kernel.invariance
         if centre is None or not shifts:
@@ -231,12 +216,8 @@ class Controlled(AbstractMatrixKernel):
 
     def check_dimension(self, n: int) -> None:
         """`n` counts the inputs, too."""
+        super().check_dimension(n)
         n = self.outputs(n)
-        if n < 1:
-            raise ValueError(
-                f"points (x, u) with {self.input_count} inputs have no coordinates left."
-            )
-        self.drift.check_dimension(n)
         if isinstance(self.inputs, KnownMatrix):
             if len(self.inputs.matrix) != n:
                 raise ValueError(
@@ -249,30 +230,10 @@ class Controlled(AbstractMatrixKernel):
                 f"states have {n}, counted from 0."
             )
 
-    def check_points(self, X: Float[Array, "N d"]) -> None:
-        self.check_dimension(X.shape[1])
-        self.drift.check_points(self._split(X)[0])
-
-    def shares_potential(self, other: AbstractMatrixKernel) -> bool:
-        return False
-
-    def with_parity(self, parity: int) -> "AbstractMatrixKernel":
-        raise TypeError("say the symmetry of the drift: Controlled(Odd(K), inputs=…).")
-
-    def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
-        raise TypeError("say the symmetry of the drift: Controlled(Invariant(K, maps), inputs=…).")
-
-    def transform_inputs(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
-        return self._split(X)[0]
-
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
         own = (self.inputs.kernel,) if isinstance(self.inputs, InputMatrix) else ()
         return (*self.drift.scalar_kernels, *own)
-
-    @property
-    def invariance(self) -> Invariance:
-        return Invariance.NONE
 
 
 def _entries(matrix: Any) -> tuple[tuple[float, ...], ...]:

@@ -13,16 +13,18 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo
-from hamkernel._fields.controlled import learned_field
+from hamkernel._fields.joined import learned_field
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._fields.known import known_part
 from hamkernel._gram.operator import placed_product
 from hamkernel._kernels.base import Scaled
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._observations.kinds import beside
 from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.controlled import Controlled, InputMatrix
+from hamkernel._structures.family import AbstractFamily
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import AbstractStructure
 from hamkernel._trajectories.diagnostics import NEGLIGIBLE, FitQuality, check_identifiable, diagnose
@@ -87,7 +89,7 @@ def learn(
     Args:
         K: a matrix-valued kernel. Its hyperparameters are the first guess. A structure without an
             amplitude gets one, `Symplectic(k)` becomes `Symplectic(1.0 * k)`. Runs with inputs need
-            a `Controlled` one.
+            a `Controlled` one, and runs with parameters a `Family`.
         runs: what was logged; see `Runs`, and there how inputs go on between samples.
         mean: a known part of the field, x (n,) -> (n,), or with inputs x, u -> (n,) too; K learns
             the rest.
@@ -248,10 +250,23 @@ def _check(
     if not (solver is None or isinstance(solver, Nystrom)):
         raise TypeError(f"the solver of learn is hk.Nystrom(max_points=…) or None; got {solver!r}.")
     n = runs.dimension
-    if K.takes_inputs and runs.inputs is None:
+    given = runs.inputs if runs.parameters is None else runs.parameters
+    if K.takes_inputs and given is not None:
+        beside(runs.inputs, runs.parameters, K)  # refuses the one in the place of the other
+    if isinstance(K, AbstractFamily) and given is None:
+        raise TypeError(
+            "a Family needs to know of which system each run is: hk.Runs(times, states, "
+            "parameters=[(0.5,), (0.8,), …]), for each run θ of shape (p,)."
+        )
+    if K.takes_inputs and given is None:
         raise TypeError(
             f"{type(K).__name__} needs what was applied: hk.Runs(times, states, inputs), for each "
             "run u at its times, shape (T, m)."
+        )
+    if runs.parameters is not None and not K.takes_inputs:
+        raise TypeError(
+            f"the runs have parameters and {type(K).__name__} takes none: say how systems are "
+            "alike, hk.Family(K, hk.Gaussian(1.0)), or leave parameters out of Runs."
         )
     if runs.inputs is not None and not K.takes_inputs:
         raise TypeError(
@@ -259,10 +274,10 @@ def _check(
             "hk.Controlled(K, inputs=hk.InputMatrix(1.0, acts_on=(1,))). To ignore what was applied"
             ", leave inputs out of Runs."
         )
-    if runs.inputs is None:
+    if given is None:
         K.check_dimension(n)
     else:
-        U = jnp.concatenate(runs.inputs)
+        U = jnp.asarray(np.concatenate(runs.applied()))
         K, _ = sampled_points(K, jnp.zeros((len(U), n), U.dtype), U)
     if jnp.zeros(()).dtype != jnp.float64:
         raise ValueError(
@@ -306,6 +321,11 @@ def with_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
         )
     if isinstance(K, Controlled):
         return Controlled(with_masses(K.drift, n), K.inputs, K.count)
+    if isinstance(K, AbstractFamily):
+        raise ValueError(
+            "masses=True is for one system: for a family write hk.Family(hk.UnknownMasses(K, "
+            "masses), k)."
+        )
     return K if isinstance(K, UnknownMasses) else UnknownMasses(K, jnp.ones(n // 2))
 
 

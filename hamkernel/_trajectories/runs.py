@@ -31,6 +31,8 @@ class Runs(eqx.Module):
         between: how inputs go on from a sample, as in `simulate`: "held" until the next, as a
             digital controller holds its command, or "linear", for a measured force or a smooth one.
             Where they were held and are taken for linear, they come half a sample early.
+        parameters: for each run the θ of its system, shape (p,), for `learn` with a `Family`; None
+            if all runs are of one system.
 
     A single run may be given as bare arrays (T,) and (T, n).
 
@@ -47,6 +49,7 @@ class Runs(eqx.Module):
     states: tuple[Float[Array, "T n"], ...]
     inputs: tuple[Float[Array, "T m"], ...] | None
     between: Literal["held", "linear"] = eqx.field(static=True)
+    parameters: tuple[Float[Array, " p"], ...] | None
 
     def __init__(
         self,
@@ -54,10 +57,12 @@ class Runs(eqx.Module):
         states: Any,
         inputs: Any = None,
         between: Literal["held", "linear"] = "held",
+        parameters: Any = None,
     ):
         if hasattr(times, "ndim") and times.ndim == 1:  # one run
             times, states = [times], [states]
             inputs = None if inputs is None else [inputs]
+            parameters = None if parameters is None else [parameters]
         times, states = list(times), list(states)
         _check_counts(times, states, inputs)
         self.times = tuple(_times(t, r) for r, t in enumerate(times))
@@ -73,6 +78,7 @@ class Runs(eqx.Module):
         if between not in ("held", "linear"):
             raise ValueError(f"between must be 'held' or 'linear'; got {between!r}.")
         self.between = between
+        self.parameters = None if parameters is None else _members(parameters, len(times), inputs)
         _check_coordinates(self.states)
         _warn_of_oddities(self.times, self.states)
 
@@ -136,7 +142,13 @@ class Runs(eqx.Module):
         ]
 
     def applied(self) -> list[np.ndarray]:
-        """The inputs as NumPy arrays of doubles, shape (T, 0) where there are none."""
+        """The inputs as NumPy arrays of doubles, shape (T, 0) where there are none.
+
+        With parameters they are those of the run, at all of its times.
+        """
+        if self.parameters is not None:
+            pairs = zip(self.parameters, self.times, strict=True)
+            return [np.tile(np.asarray(theta, float), (len(t), 1)) for theta, t in pairs]
         if self.inputs is None:
             return [np.zeros((len(t), 0)) for t in self.times]
         return [np.asarray(u, float) for u in self.inputs]
@@ -159,6 +171,30 @@ def _check_counts(times: Sequence[Any], states: Sequence[Any], inputs: Any) -> N
                 f"times has {len(times)} runs and {name} has {len(other)}: pass lists of equal "
                 "length, one entry a run, times (T,) and states (T, n)."
             )
+
+
+def _members(parameters: Any, count: int, inputs: Any) -> tuple[Float[Array, " p"], ...]:
+    """The parameters of each run, finite and of one shape."""
+    if inputs is not None:
+        raise TypeError(
+            "runs have inputs or parameters: those of a Controlled kernel or those of a Family. An "
+            "input of a family may be one of the parameters of hk.fit."
+        )
+    length = len(parameters) if hasattr(parameters, "__len__") else None
+    if length != count:
+        got = "no entries" if length is None else f"{length} entries"
+        raise ValueError(
+            f"parameters has {got} and there are {count} runs: one θ of shape (p,) for each run is "
+            "needed, such as [(0.5,), (0.8,)]."
+        )
+    rows = tuple(require.floating(t, f"parameters[{r}]") for r, t in enumerate(parameters))
+    shapes = {theta.shape for theta in rows}
+    if len(shapes) > 1 or rows[0].ndim != 1 or rows[0].size == 0:
+        raise ValueError(
+            f"parameters has entries of shape {', '.join(map(str, sorted(shapes)))}: one θ of shape "
+            "(p,) for each run is needed, with one p, such as [(0.5,), (0.8,)]."
+        )
+    return tuple(require.finite(theta, f"parameters[{r}]") for r, theta in enumerate(rows))
 
 
 def _times(t: Any, run: int) -> Float[Array, " T"]:

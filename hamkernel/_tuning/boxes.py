@@ -23,6 +23,7 @@ from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.joined import AbstractJoinedKernel
 
 
 @dataclasses.dataclass(frozen=True)
@@ -120,7 +121,7 @@ def _amplitude(K: AbstractMatrixKernel, X: Array, speed: float) -> float:
 def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterator[Hyperparameter]:
     """Walk the kernel; X is the data in the coordinates that `node` sees."""
     kernel = node if isinstance(node, AbstractScalarKernel | AbstractMatrixKernel) else None
-    inside = X if kernel is None else kernel.transform_inputs(X)
+    inside = (X if kernel is None else kernel.transform_inputs(X)), amplitude
     for key, child in _children(node):
         if eqx.is_inexact_array(child):
             name = keystr((*path, *key)).removeprefix(".")
@@ -143,7 +144,9 @@ def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterato
                 high=np.broadcast_to(box[1], child.shape),
             )
         elif child is not node:  # else a leaf that is no array: a degree, an activation
-            yield from _walk((*path, *key), child, inside, amplitude)
+            if isinstance(kernel, AbstractJoinedKernel):
+                inside = kernel.seen_by(child, X, amplitude)
+            yield from _walk((*path, *key), child, *inside)
 
 
 def _children(node: object) -> list[tuple[tuple, Any]]:

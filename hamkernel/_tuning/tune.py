@@ -27,7 +27,7 @@ from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._fields.known import Mean
 from hamkernel._machine import one_blas_thread
-from hamkernel._observations.kinds import AbstractObservations
+from hamkernel._observations.kinds import AbstractObservations, beside
 from hamkernel._observations.measurements import observations
 from hamkernel._show import described
 from hamkernel._solvers.base import AbstractSolver
@@ -105,6 +105,7 @@ def tune(
     mean: Mean | None = None,
     progress: bool = False,
     inputs: Num[ArrayLike, "N m"] | None = None,
+    parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Tuned:
     """Tune every hyperparameter of K, and λ with them, down the gradient of a validation loss.
 
@@ -152,6 +153,7 @@ def tune(
             loss. For your own optimiser pass it verbose=True instead.
         inputs: of a `Controlled` kernel, shape (N, m). An objective of your own is then called
             with (K, data, None, regularization), data the velocities with their inputs.
+        parameters: of a `Family`, shape (N, p); likewise.
 
     Returns:
         A `Tuned`. NaN never comes out: points where the objective is not finite cannot win.
@@ -189,10 +191,11 @@ def tune(
         optimiser = checked_optimiser(optimiser, progress)
     check_solver(solver)
     advice.warn_of_constants(K)
-    given = problem(K, X, Y, regularization, mean, inputs)
+    given = problem(K, X, Y, regularization, mean, inputs, parameters)
     K, rows = given.kernel, given.on_one_device().rows
     if rows.states is not None:
         advice.warn_of_unequal_sizes(rows.states[1])
+    inputs = beside(inputs, parameters)
     own = mean is None and inputs is None and not isinstance(X, AbstractObservations)
     data = rows.states if own else (observations(X, Y, inputs), None)
     criterion = criterion_of(objective, rows.count, folds, data)

@@ -30,6 +30,7 @@ def cross_validation_loss(
     folds: Folds = 5,
     *,
     inputs: Num[ArrayLike, "N m"] | None = None,
+    parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Float[Array, ""]:
     """The mean over folds of the mean squared error of a fit that has not seen the fold.
 
@@ -49,6 +50,7 @@ def cross_validation_loss(
             observations N is the number of all: points, energies, functionals, in their order. A
             fold with all energies is compared up to their constant.
         inputs: of a `Controlled` kernel, shape (N, m).
+        parameters: of a `Family`, shape (N, p).
 
     Returns:
         The loss, in squared units of Y, and of observations in those of the rows over their
@@ -61,7 +63,7 @@ def cross_validation_loss(
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
             matrices that do not fit in memory.
     """
-    K, rows, regularization = _checked(K, X, Y, regularization, inputs)
+    K, rows, regularization = _checked(K, X, Y, regularization, inputs, parameters)
     return partition_loss(K, rows, regularization, partition_of_rows(rows, folds))
 
 
@@ -74,6 +76,7 @@ def cross_validation_residuals(
     folds: Folds = 5,
     *,
     inputs: Num[ArrayLike, "N m"] | None = None,
+    parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Float[Array, "N n"]:
     """The residual yᵢ − f(xᵢ) of each point under the fit that has not seen its fold.
 
@@ -84,7 +87,7 @@ def cross_validation_residuals(
         Shape (N, n), in units of Y; of observations one for each row, in its units; inf where the
         matrix is not positive definite to rounding.
     """
-    K, rows, regularization = _checked(K, X, Y, regularization, inputs)
+    K, rows, regularization = _checked(K, X, Y, regularization, inputs, parameters)
     left = held_out_rows(K, rows, regularization, partition_of_rows(rows, folds))[0]
     return rows.in_units(left)
 
@@ -97,6 +100,7 @@ def generalized_cross_validation(
     regularization: ArrayLike = 1e-4,
     *,
     inputs: Num[ArrayLike, "N m"] | None = None,
+    parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Float[Array, ""]:
     """Generalised cross-validation: the training error over the squared share of free residuals.
 
@@ -110,6 +114,7 @@ def generalized_cross_validation(
         Y: measured velocities, shape (N, n).
         regularization: λ > 0.
         inputs: of a `Controlled` kernel, shape (N, m).
+        parameters: of a `Family`, shape (N, p).
 
     Returns:
         The loss, in squared units of Y; inf where the factorisation fails. Differentiable as
@@ -121,7 +126,7 @@ def generalized_cross_validation(
 
     Source: Golub, Heath & Wahba (1979), Technometrics 21.
     """
-    return generalized_loss(*_checked(K, X, Y, regularization, inputs))
+    return generalized_loss(*_checked(K, X, Y, regularization, inputs, parameters))
 
 
 @one_blas_thread
@@ -132,6 +137,7 @@ def log_marginal_likelihood(
     regularization: ArrayLike = 1e-4,
     *,
     inputs: Num[ArrayLike, "N m"] | None = None,
+    parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Float[Array, ""]:
     """The log density of Y under f ~ GP(0, K) and independent noise of variance Nλ.
 
@@ -146,6 +152,7 @@ def log_marginal_likelihood(
         Y: measured velocities, shape (N, n).
         regularization: λ > 0; the noise variance is Nλ.
         inputs: of a `Controlled` kernel, shape (N, m).
+        parameters: of a `Family`, shape (N, p).
 
     Returns:
         The log density; −inf where the factorisation fails. Differentiable as
@@ -157,13 +164,15 @@ def log_marginal_likelihood(
 
     Source: Rasmussen & Williams (2006), eq. 2.30.
     """
-    return log_likelihood(*_checked(K, X, Y, regularization, inputs))
+    return log_likelihood(*_checked(K, X, Y, regularization, inputs, parameters))
 
 
-def _checked(K, X, Y, regularization, inputs) -> tuple[Any, Measurements, Float[Array, ""]]:
+def _checked(
+    K, X, Y, regularization, inputs, parameters
+) -> tuple[Any, Measurements, Float[Array, ""]]:
     """Kernel, rows and λ."""
     # LAPACK on every device at once was seen to stall, see `_factors/dense.py`.
-    given = problem(K, X, Y, regularization, inputs=inputs).on_one_device()
+    given = problem(K, X, Y, regularization, inputs=inputs, parameters=parameters).on_one_device()
     check_memory(given.rows, LOSS_COPIES)
     return given.kernel, given.rows, given.regularization
 

@@ -1,0 +1,433 @@
+"""Learned fields of joined points (x, u): with inputs, and of a family of systems."""
+
+import abc
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from hamkernel import _require as require
+from hamkernel._features.structured import ControlledFeatures
+from hamkernel._fields.base import AbstractField, FieldSum, Scalar, SolverInfo, at_points, root
+from hamkernel._fields.features import FeatureField
+from hamkernel._fields.kernel_field import KernelField
+from hamkernel._fields.known import AtInputs, KnownPart
+from hamkernel._gram.operator import placed_product
+from hamkernel._structures.base import Sum
+from hamkernel._structures.controlled import Controlled
+from hamkernel._structures.family import AbstractFamily
+from hamkernel._structures.joined import AbstractJoinedKernel
+
+
+class AbstractJoinedField(AbstractField):
+    """f(x, u), one state (n,) and one u (m,) per call.
+
+    `residual`, `norm`, `regularization` and `info` belong to the field of joined points.
+
+    Attributes:
+        whole: the field of the points (x, u), of dimension n + m.
+    """
+
+    whole: KernelField | FeatureField
+
+    @property
+    @abc.abstractmethod
+    def _cure(self) -> str:
+        """How a field of x alone is had."""
+
+    @property
+    def kernel(self) -> AbstractJoinedKernel:
+        """The kernel K of joined points."""
+        K = self.whole.kernel
+        assert isinstance(K, AbstractJoinedKernel)
+        return K
+
+    @property
+    def points(self) -> Float[Array, "M n"]:
+        """The states zⱼ that carry the field, shape (M, n); random features have none."""
+        return self._expansion.points[..., : self.dimension]
+
+    @property
+    def coefficients(self) -> Float[Array, "M n"]:
+        """aⱼ, shape (M, n)."""
+        return self._expansion.coefficients
+
+    @property
+    def _expansion(self) -> KernelField:
+        if isinstance(self.whole, KernelField):
+            return self.whole
+        raise AttributeError("a field of random features has weights, field.whole, and no points.")
+
+    @property
+    def residual(self) -> Float[Array, "..."]:
+        """yᵢ − f(xᵢ, uᵢ) at the training data, as that of `KernelField`."""
+        return self.whole.residual
+
+    @property
+    def norm(self) -> Float[Array, ""]:
+        """‖f‖ in the RKHS of K, of f less what was known, shape ()."""
+        return self.whole.norm
+
+    @property
+    def regularization(self) -> Float[Array, ""]:
+        """The λ of the fit, shape ()."""
+        return self.whole.regularization
+
+    @property
+    def offset(self) -> Float[Array, ""]:
+        """The constant in the potential, shape ()."""
+        return self.whole.offset
+
+    @property
+    def info(self) -> SolverInfo:
+        """How the solver went."""
+        return self.whole.info
+
+    @property
+    def dimension(self) -> int:
+        whole = self.whole
+        shape = whole.coefficients if isinstance(whole, KernelField) else whole.residual
+        return shape.shape[-1]
+
+    @property
+    def takes_inputs(self) -> bool:
+        """That a velocity needs u as well: `hk.simulate` asks."""
+        return True
+
+    def __call__(
+        self, x: Num[ArrayLike, " n"], u: Num[ArrayLike, " m"] | None = None
+    ) -> Float[Array, " n"]:
+        """The velocity f(x, u).
+
+        Raises:
+            ValueError: u is missing, or x or u has another shape.
+        """
+        s = self.joined(x, u)
+        learned, known = self.whole._learned(s), self.whole.mean
+        return learned if known is None else learned + known(s).astype(learned.dtype)
+
+    def joined(self, x: Any, u: Any) -> Float[Array, " d"]:
+        """The point (x, u).
+
+        Raises:
+            ValueError: u is missing, or x or u has another shape.
+        """
+        self._check_single()
+        name = self.kernel.given
+        if u is None:
+            raise ValueError(
+                f"a {type(self).__name__} needs its {name}: field(x, u), and hk.simulate(field, "
+                f"x0, ts, inputs=u). A field of x alone is {self._cure}."
+            )
+        n, m = self.dimension, self.kernel.input_count
+        shapes = jnp.shape(x), jnp.shape(u)
+        if shapes != ((n,), (m,)):
+            swapped = " They are swapped." if shapes == ((m,), (n,)) else ""
+            raise ValueError(
+                f"x has shape {shapes[0]} and u {shapes[1]}; one state ({n},) and its {name} "
+                f"({m},) are needed, field(x, u).{swapped}"
+            )
+        x = self._state(x)
+        return jnp.concatenate([x, require.floating(u, "u").astype(x.dtype)])
+
+    def evaluate(
+        self, X: Num[ArrayLike, "N n"], U: Num[ArrayLike, "N m"] | None = None
+    ) -> Float[Array, "N n"]:
+        """The velocities at many states with their u, shapes (N, n) and (N, m).
+
+        Raises:
+            ValueError: the u are missing, or a shape does not fit.
+        """
+        self._check_single()
+        X = require.points(X, "X").astype(self.offset.dtype)
+        n, m = self.dimension, self.kernel.input_count
+        if X.shape[1] != n:
+            is_swapped = getattr(U, "shape", None) == (len(X), n)
+            swapped = " X and U are swapped." if is_swapped else ""
+            raise ValueError(f"X has {X.shape[1]} coordinates and the field {n}.{swapped}")
+        inputs = None if U is None else require.points(U, "U").astype(X.dtype)
+        if inputs is None or inputs.shape != (len(X), m):
+            raise ValueError(
+                f"field.evaluate(X, U) needs the {self.kernel.given} of every state, shape "
+                f"({len(X)}, {m}); got {None if inputs is None else inputs.shape}."
+            )
+        S, known = jnp.concatenate([X, inputs], axis=1), self.whole.mean
+        learned = self.whole._evaluated(S)
+        return learned if known is None else learned + at_points(known, S).reshape(len(S), n)
+
+    def part(self, which: int | str) -> "AbstractJoinedField":
+        """Refused: the parts are those of the field of x alone."""
+        raise KeyError(f"no part {which!r}: the parts are those of {self._cure}.part(…).")
+
+    def _term(self, kernel: Sum, position: int) -> "AbstractJoinedField":
+        return self.part(position)
+
+
+class ControlledField(AbstractJoinedField):
+    """f(x, u) = f(x) + G(x) u, one state (n,) and its inputs (m,) per call.
+
+    The potential, the Hamiltonian and the dissipation are those of the drift; `residual`, `norm`,
+    `regularization` and `info` belong to the whole. A mean of x and u may be any function of u; the
+    drift is then f(x, 0), and the input matrix ∂f/∂u there.
+
+    Attributes:
+        whole: the field of the points (x, u), of dimension n + m.
+    """
+
+    whole: KernelField | FeatureField
+
+    @property
+    def inputs(self) -> Float[Array, "M m"]:
+        """uⱼ at the points, shape (M, m)."""
+        return self._expansion.points[..., self.dimension :]
+
+    @property
+    def mean(self) -> Callable[..., Any] | None:
+        """What was known of the drift, x (n,) -> (n,)."""
+        return self.drift.mean
+
+    @property
+    def _cure(self) -> str:
+        return "field.drift"
+
+    @property
+    def drift(self) -> KernelField | FeatureField:
+        """f, a field of its own: `field.drift(x)`, `field.drift.hamiltonian(x)`."""
+        return at_inputs(self.whole, self.dimension, None)
+
+    def input_matrix(self, x: Num[ArrayLike, " n"]) -> Float[Array, "n m"]:
+        """The input matrix G(x), shape (n, m)."""
+        x = self._state(x)
+        # Forward mode drops what does not depend on u: this costs as much as G(x) alone.
+        return jax.jacfwd(lambda u: self(x, u))(jnp.zeros(self.kernel.input_count, x.dtype))
+
+    @property
+    def potential(self) -> Scalar:
+        """That of the drift.
+
+        Raises:
+            AttributeError: the structure has no potential (with the reason).
+        """
+        return self.drift.potential
+
+    def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        """That of the drift."""
+        return self.drift.unanchored_potential(x)
+
+    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+        return self.drift._evaluated(X)
+
+    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.drift._learned(x)
+
+    def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+        return self.drift._learned_potential(x)
+
+
+class FamilyField(AbstractJoinedField):
+    """f(x; θ), one state (n,) and the parameters θ (p,) of a member per call.
+
+    `field.at(θ)` is a member: an ordinary field of K, with its Hamiltonian and everything else.
+
+    Attributes:
+        whole: the field of the points (x, θ), of dimension n + p.
+    """
+
+    whole: KernelField | FeatureField
+
+    @property
+    def parameters(self) -> Float[Array, "M p"]:
+        """θⱼ at the points, shape (M, p)."""
+        return self._expansion.points[..., self.dimension :]
+
+    @property
+    def mean(self) -> Callable[..., Any] | None:
+        """What was known before, a function of the points (x, θ)."""
+        return self.whole.mean
+
+    @property
+    def _cure(self) -> str:
+        return "field.at(θ)"
+
+    def at(self, theta: Num[ArrayLike, " p"]) -> "KernelField | MemberField":
+        """The member with the parameters θ, an ordinary field of K.
+
+        Its residual is empty, since the data are those of all members, and its λ and `info` are
+        those of the fit. New values of θ do not recompile.
+
+        Args:
+            theta: θ, shape (p,).
+
+        Raises:
+            ValueError: θ has another shape, or is not finite.
+        """
+        self._check_single()
+        p, K = self.kernel.input_count, self.kernel
+        if jnp.shape(theta) != (p,):
+            hint = " Write field.at([θ]) for one." if jnp.shape(theta) == () and p == 1 else ""
+            raise ValueError(
+                f"θ has shape {jnp.shape(theta)}; the parameters of one member, shape ({p},), are "
+                f"needed.{hint}"
+            )
+        theta = require.finite(require.floating(theta, "θ"), "θ").astype(self.offset.dtype)
+        assert isinstance(K, AbstractFamily)
+        terms = tuple(
+            at_inputs(
+                dataclasses.replace(self._expansion, kernel=t, mean=None), self.dimension, theta
+            )
+            for t in K.terms
+        )
+        known = at_inputs(self.whole.mean, self.dimension, theta)
+        if len(terms) == 1:
+            return dataclasses.replace(terms[0], mean=known)
+        return MemberField(K.of_states, terms, self.offset, known)  # pyright: ignore
+
+    @property
+    def potential(self) -> Scalar:
+        """Refused: each member has its own, `field.at(θ).potential`."""
+        raise AttributeError(
+            "a family has no one potential: each member has its own, field.at(θ).potential, and "
+            "field.at(θ).hamiltonian where the structure has one."
+        )
+
+    def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        """Refused, as `potential`."""
+        return self.potential(x)
+
+    @property
+    def hamiltonian(self) -> Scalar:
+        """Refused: each member has its own, `field.at(θ).hamiltonian`."""
+        return self.potential
+
+    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+        raise AttributeError("a family is evaluated at states and parameters.")
+
+    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        raise AttributeError("a family is evaluated at a state and parameters.")
+
+    def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+        return self.potential(x)
+
+
+class MemberField(AbstractField):
+    """The member of a family with several terms, Σᵢ Σⱼ kᵢ(θ, θⱼ) Kᵢ(x, zⱼ) aⱼ.
+
+    The terms have the same points and coefficients of their own. `norm` is the root of the sum of
+    the squares of theirs.
+
+    Attributes:
+        kernel: the sum of the Kᵢ.
+        terms: the field of each.
+        offset: the constant in the potential, shape ().
+        mean: the prior mean at θ, x (n,) -> (n,), which is added; None if it is zero.
+    """
+
+    kernel: Sum
+    terms: tuple[KernelField, ...]
+    offset: Float[Array, ""]
+    mean: Callable[..., Any] | None = None
+
+    @property
+    def dimension(self) -> int:
+        return self.terms[0].dimension
+
+    @property
+    def points(self) -> Float[Array, "M n"]:
+        """zⱼ, shape (M, n)."""
+        return self.terms[0].points
+
+    @property
+    def residual(self) -> Float[Array, "..."]:
+        """Empty: the data are those of all members."""
+        return self.terms[0].residual
+
+    @property
+    def norm(self) -> Float[Array, ""]:
+        """(Σᵢ ‖fᵢ‖²)^½, shape ()."""
+        return root(sum((t.norm**2 for t in self.terms[1:]), start=self.terms[0].norm ** 2))
+
+    @property
+    def regularization(self) -> Float[Array, ""]:
+        """The λ of the fit, shape ()."""
+        return self.terms[0].regularization
+
+    @property
+    def info(self) -> SolverInfo:
+        """How the solver went."""
+        return self.terms[0].info
+
+    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return sum((t._learned(x) for t in self.terms), jnp.zeros_like(x))
+
+    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+        return sum((t._evaluated(X) for t in self.terms), jnp.zeros_like(X))
+
+    def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
+        return sum((t._learned_potential(x) for t in self.terms), jnp.zeros((), x.dtype))
+
+    def _term(self, kernel: Sum, position: int) -> Any:
+        return self.terms[position]
+
+
+def at_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
+    """A field or a mean of points (x, u) at one u, as one of x; u = 0 if None, for `Controlled`."""
+    if isinstance(part, FieldSum):
+        terms = [at_inputs(term, n, u) for term in part.terms]
+        known = tuple(term for term in terms if term is not None)
+        return FieldSum(known) if known else None
+    if isinstance(part, KnownPart):
+        if part.mean is None or not part.of_inputs:
+            return part.mean
+        if u is None:
+            # The drift has a potential where it knows one.
+            own = getattr(part.mean, "drift", None)
+            return AtInputs(part.mean, jnp.zeros(part.count)) if own is None else own
+        own = getattr(part.mean, "at", None)
+        return AtInputs(part.mean, u) if own is None else own(u)
+    if isinstance(part, KernelField):
+        K, points, values = part.kernel, part.points, part.value_points
+        assert isinstance(K, AbstractJoinedKernel)
+        member = dataclasses.replace(
+            part,
+            kernel=K.of_states,
+            points=points[..., :n],
+            value_points=None if values is None else values[..., :n],
+            mean=at_inputs(part.mean, n, u),
+        )
+        if u is None:
+            return member
+        A = K.coefficients_at(u, points[..., n:], part.coefficients)
+        bare = dataclasses.replace(member, coefficients=A, residual=jnp.zeros((0, n), A.dtype))
+        square = jnp.sum(A * placed_product(K.of_states, bare.points, bare.points, A))  # aᵀGa
+        return dataclasses.replace(bare, norm=root(square))
+    if isinstance(part, FeatureField):
+        assert isinstance(part.features, ControlledFeatures)
+        assert isinstance(part.kernel, Controlled)
+        features = part.features.drift
+        return dataclasses.replace(
+            part,
+            kernel=part.kernel.drift,
+            features=features,
+            weights=part.weights[..., : features.columns],
+            residual=part.residual[..., :n],
+            mean=at_inputs(part.mean, n, u),
+        )
+    return part
+
+
+def learned_field(field: Any, known: Any) -> Any:
+    """The field of a solver plus the prior mean `known`; of a joined kernel one of x and u."""
+    if known is not None:
+        field = dataclasses.replace(field, mean=known)
+    if not isinstance(field.kernel, AbstractJoinedKernel):
+        return field
+    made = FamilyField if isinstance(field.kernel, AbstractFamily) else ControlledField
+    return made(whole=field)  # pyright: ignore[reportCallIssue]
+
+
+def known_of(field: AbstractField) -> Any:
+    """The prior mean of a field, as a function of the points of the solver, x or (x, u)."""
+    return field.whole.mean if isinstance(field, AbstractJoinedField) else field.mean

@@ -1,0 +1,214 @@
+"""Families of systems, f(x; θ), as kernels of the joined points (x, θ).
+
+A member of the family is the field at one θ. With the kernel
+
+    K((x, θ), (z, ϑ)) = k(θ, ϑ) K(x, z)
+
+the members are fields of K, with all its structure, and k says how alike two of them are: data of
+some members tell of the others. Dependences of their own for several parts add up.
+"""
+
+import functools
+import operator
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
+from hamkernel._show import call, joined
+from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel
+from hamkernel._structures.controlled import Constant
+from hamkernel._structures.joined import AbstractJoinedKernel
+
+
+class AbstractFamily(AbstractJoinedKernel):
+    """Σᵢ kᵢ(θ, ϑ) Kᵢ(x, z), with one term or several."""
+
+    given: ClassVar[str] = "parameters"
+
+    terms: eqx.AbstractVar[tuple["Family", ...]]
+
+    @property
+    def of_states(self) -> AbstractMatrixKernel:
+        """K, the kernel of the members; of several terms their sum."""
+        first, *rest = (term.member for term in self.terms)
+        return Sum(first, *rest) if rest else first
+
+    @property
+    def conserves(self) -> bool:
+        """Whether every member conserves its H."""
+        return self.of_states.conserves
+
+    def check_identified(self, U: Float[np.ndarray, "N p"]) -> None:
+        """ValueError for a coordinate of θ that is the same at all points."""
+        fixed = np.flatnonzero((U == U[:1]).all(axis=0))
+        if fixed.size == U.shape[1]:
+            raise ValueError(
+                f"all {len(U)} points have the parameters {U[0].tolist()}: that is one system and "
+                "no family, and nothing says how the field depends on them. Give data of other "
+                "members too, or fit without parameters, with the kernel inside of Family."
+            )
+        if fixed.size:
+            i = int(fixed[0])
+            raise ValueError(
+                f"parameters[:, {i}] is {U[0, i]:g} at all points, so nothing says how the field "
+                "depends on it: leave it out, or give data of other members too."
+            )
+
+    def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
+        (x, theta), (z, other) = self.split(x), self.split(z)
+        return _sum([t.parameters(theta, other) * t.member.form(x, u, z, v) for t in self.terms])
+
+    def expansion(
+        self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Float[Array, "M n"]
+    ) -> Float[Array, " n"]:
+        (x, theta), (Z, T) = self.split(x), self.split(Z)
+        return _sum([t.member.expansion(x, Z, t.coefficients_at(theta, T, A)) for t in self.terms])
+
+    def potential(
+        self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Float[Array, "M n"]
+    ) -> Float[Array, ""]:
+        self.check_potential()
+        (x, theta), (Z, T) = self.split(x), self.split(Z)
+        return _sum([t.member.potential(x, Z, t.coefficients_at(theta, T, A)) for t in self.terms])
+
+    def potential_covariance(
+        self, x: Float[Array, " d"], z: Float[Array, " d"]
+    ) -> Float[Array, ""]:
+        self.check_potential()
+        (x, theta), (z, other) = self.split(x), self.split(z)
+        return _sum(
+            [t.parameters(theta, other) * t.member.potential_covariance(x, z) for t in self.terms]
+        )
+
+    def centre(self, Z: Float[Array, "M d"]) -> Float[Array, " d"] | None:
+        states, T = self.split(Z)
+        centre = self.of_states.centre(states)
+        if centre is None:
+            return None
+        shifts = all(Invariance.TRANSLATION in t.parameters.invariance for t in self.terms)
+        return jnp.concatenate([centre, T.mean(axis=0) if shifts else jnp.zeros_like(T[0])])
+
+    @property
+    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
+        """Those of the members, functions of states."""
+        return self.of_states.scalar_kernels
+
+    def __add__(self, other: Any) -> Any:
+        if not isinstance(other, AbstractMatrixKernel):
+            return NotImplemented
+        return FamilySum(self.terms + _terms(other))
+
+    def __radd__(self, other: Any) -> Any:
+        if isinstance(other, AbstractMatrixKernel):
+            return FamilySum(_terms(other) + self.terms)
+        return super().__radd__(other)
+
+
+class Family(AbstractFamily):
+    """A family of systems: K((x, θ), (z, ϑ)) = k(θ, ϑ) K(x, z).
+
+    θ, shape (p,), is what tells one member from another: a length, a load, the coefficients of a
+    potential, the time. Give the θ of each point: `hk.fit(hk.Family(K, k), X, Y, λ, parameters=Θ)`
+    with Θ of shape (N, p). The field is `field(x, θ)`; `field.at(θ)` is one member, an ordinary
+    field of K with its structure, to be simulated, plotted and saved as ever.
+
+    Each part may have a dependence of its own, H = T(p) + U(q; θ):
+
+        K = hk.Family(hk.Symplectic(hk.Select(k, (1,)))) + hk.Family(hk.Symplectic(hk.Select(k,
+            (0,))), hk.Gaussian(1.0))
+
+    Between members that were seen this is interpolation, and better than a model for each. Outside
+    of their range it is extrapolation in θ, no better than a model of its own for each member, and
+    the deviation of `hk.condition` grows to that of the prior there.
+
+    For a drive of known frequency take `Controlled` with u = (cos ωt, sin ωt) instead, which knows
+    that the drive enters linearly.
+
+    Args:
+        member: K, the structured kernel of each member.
+        parameters: k, a scalar kernel of θ, without an amplitude, since K has one. A lengthscale of
+            θ as long as the range of θ is a good start. None: the same for all members.
+        count: p. `fit` takes it from the data.
+
+    Raises:
+        TypeError: `member` is not matrix-valued, or takes inputs or parameters already; or
+            `parameters` is no scalar kernel.
+
+    Source: the intrinsic model of coregionalisation, k(θ, ϑ) in the place of its matrix: Bonilla,
+        Chai & Williams (2008); Álvarez, Rosasco & Lawrence (2012).
+    """
+
+    member: AbstractMatrixKernel
+    parameters: AbstractScalarKernel
+    count: int | None = eqx.field(static=True)
+
+    def __init__(self, member: AbstractMatrixKernel, parameters: Any = None, count=None):
+        self.member = matrix_kernel(member, "the members of Family", "Family(Symplectic(k), …)")
+        if self.member.takes_inputs:
+            raise TypeError(
+                f"the members of a family are fields of states alone, and {type(member).__name__} "
+                "takes inputs or parameters already: give all θ to one Family."
+            )
+        self.parameters = Constant() if parameters is None else as_scalar_kernel(parameters)
+        self.count = count
+
+    def __repr__(self) -> str:
+        shared = isinstance(self.parameters, Constant)
+        return call("Family", [repr(self.member), *([] if shared else [repr(self.parameters)])])
+
+    @property
+    def terms(self) -> tuple["Family", ...]:
+        return (self,)
+
+    def coefficients_at(
+        self, u: Float[Array, " p"], U: Float[Array, "M p"], A: Float[Array, "M n"]
+    ) -> Float[Array, "M n"]:
+        """a_j k(θ, θ_j)."""
+        return A * jax.vmap(self.parameters, in_axes=(None, 0))(u, U)[:, None]
+
+    def seen_by(
+        self, child: Any, X: Float[np.ndarray, "N d"], amplitude: float
+    ) -> tuple[Float[np.ndarray, "N _"], float]:
+        """K sees states, and k sees θ; one amplitude is enough, that of K if it has one."""
+        states, T = self.split(X)
+        if child is self.member:
+            return states, amplitude
+        scaled = any(k.has_amplitude for k in self.member.scalar_kernels)
+        return T, 1.0 if scaled else amplitude
+
+
+class FamilySum(AbstractFamily):
+    """Σᵢ kᵢ(θ, ϑ) Kᵢ(x, z): families that add up, made by `+`."""
+
+    terms: tuple["Family", ...]
+    count: int | None = eqx.field(static=True)
+
+    def __init__(self, terms: tuple["Family", ...], count: int | None = None):
+        counts = {t.count for t in terms} - {None}
+        if len(counts) > 1:
+            raise ValueError(f"the families have {sorted(counts)} parameters: all need the same θ.")
+        self.count = counts.pop() if counts and count is None else count
+        self.terms = tuple(Family(t.member, t.parameters, self.count) for t in terms)
+
+    def __repr__(self) -> str:
+        return joined("+", [repr(t) for t in self.terms])
+
+    def seen_by(
+        self, child: Any, X: Float[np.ndarray, "N d"], amplitude: float
+    ) -> tuple[Float[np.ndarray, "N d"], float]:
+        """Each term sees joined points."""
+        return X, amplitude
+
+
+def _terms(K: AbstractMatrixKernel) -> tuple["Family", ...]:
+    """The terms of a family; what does not depend on θ is shared by all members."""
+    return K.terms if isinstance(K, AbstractFamily) else (Family(K),)
+
+
+def _sum(values: list[Array]) -> Array:
+    return functools.reduce(operator.add, values)
