@@ -200,9 +200,10 @@ class Posterior(eqx.Module):
         """
         field, K = self.field, self.given.field.kernel
         if isinstance(field, FamilyField):
-            _ = field.at(theta).potential
+            n = field.dimension
             points = jnp.stack([field.joined(x, theta), field.joined(x0, theta)])
-            both = Values(points, outputs=field.dimension)
+            _ = field.at(points[0, n:]).potential
+            both = Values(points, outputs=n)
         else:
             if theta is not None:
                 raise TypeError("the field is no family: leave out theta.")

@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
@@ -123,9 +124,9 @@ class AbstractJoinedField(AbstractField):
                 f"x0, ts, inputs=u). A field of x alone is {self._cure}."
             )
         n, m = self.dimension, self.kernel.input_count
-        shapes = jnp.shape(x), jnp.shape(u)
+        shapes = np.shape(x), np.shape(u)
         if shapes != ((n,), (m,)):
-            swapped = " They are swapped." if shapes == ((m,), (n,)) else ""
+            swapped = " x and u are swapped." if shapes == ((m,), (n,)) else ""
             raise ValueError(
                 f"x has shape {shapes[0]} and u {shapes[1]}; one state ({n},) and its {name} "
                 f"({m},) are needed, field(x, u).{swapped}"
@@ -266,13 +267,14 @@ class FamilyField(AbstractJoinedField):
         """
         self._check_single()
         p, K = self.kernel.input_count, self.kernel
-        if jnp.shape(theta) != (p,):
-            hint = " Write field.at([θ]) for one." if jnp.shape(theta) == () and p == 1 else ""
+        theta = require.floating(theta, "θ")
+        if theta.shape != (p,):
+            hint = " Write field.at([θ]) for one." if theta.shape == () and p == 1 else ""
             raise ValueError(
-                f"θ has shape {jnp.shape(theta)}; the parameters of one member, shape ({p},), are "
+                f"θ has shape {theta.shape}; the parameters of one member, shape ({p},), are "
                 f"needed.{hint}"
             )
-        theta = require.finite(require.floating(theta, "θ"), "θ").astype(self.offset.dtype)
+        theta = require.finite(theta, "θ").astype(self.offset.dtype)
         assert isinstance(K, AbstractFamily)
         terms = tuple(
             at_inputs(

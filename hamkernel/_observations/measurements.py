@@ -265,13 +265,20 @@ def measurements(
     """
     if inputs is None and not isinstance(X, AbstractObservations) and not K.takes_inputs:
         return K, measurements_of_states(*placed(velocities_at(X, Y)))
-    return measurements_of(K, placed(observations(X, Y, inputs)))
+    return measurements_of(
+        K, placed(observations(X, Y, inputs, name=getattr(K, "given", "inputs")))
+    )
 
 
-def observations(X: Any, Y: Any, inputs: Any = None, part: bool = False) -> AbstractObservations:
-    """X, if it is observations, and then there is no Y; else the velocities Y at the states X."""
+def observations(
+    X: Any, Y: Any, inputs: Any = None, part: bool = False, name: str = "inputs"
+) -> AbstractObservations:
+    """X, if it is observations, and then there is no Y; else the velocities Y at the states X.
+
+    `name` is "parameters" where that is what is given in the place of inputs.
+    """
     if not isinstance(X, AbstractObservations):
-        return Velocities(*velocities_at(X, Y, inputs, part), inputs=inputs)
+        return Velocities(*velocities_at(X, Y, inputs, part), **{name: inputs})
     if Y is not None:
         raise TypeError(
             f"{type(X).__name__} is all of the data, and Y is not needed. Say the regularization "

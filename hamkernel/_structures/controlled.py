@@ -129,6 +129,7 @@ class Controlled(AbstractJoinedKernel):
     count: int | None = eqx.field(static=True)
 
     given: ClassVar[str] = "inputs"
+    inner: ClassVar[str] = "the drift: Controlled"
 
     def __init__(self, drift: AbstractMatrixKernel, inputs: Any, count: int | None = None):
         self.drift = matrix_kernel(drift, "the drift of Controlled", "Controlled(Symplectic(k), …)")

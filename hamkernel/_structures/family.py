@@ -29,6 +29,7 @@ class AbstractFamily(AbstractJoinedKernel):
     """Σᵢ kᵢ(θ, ϑ) Kᵢ(x, z), with one term or several."""
 
     given: ClassVar[str] = "parameters"
+    inner: ClassVar[str] = "the members: Family"
 
     terms: eqx.AbstractVar[tuple["Family", ...]]
 
@@ -189,7 +190,7 @@ class FamilySum(AbstractFamily):
     count: int | None = eqx.field(static=True)
 
     def __init__(self, terms: tuple["Family", ...], count: int | None = None):
-        counts = {t.count for t in terms} - {None}
+        counts = {t.count for t in terms if t.count is not None}
         if len(counts) > 1:
             raise ValueError(f"the families have {sorted(counts)} parameters: all need the same θ.")
         self.count = counts.pop() if counts and count is None else count

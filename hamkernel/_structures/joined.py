@@ -27,10 +27,12 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
     Attributes:
         count: m; None until the data says it.
         given: the name of u in `fit`: "inputs" or "parameters".
+        inner: what has a symmetry, and where to say it.
     """
 
     count: eqx.AbstractVar[int | None]
     given: eqx.AbstractClassVar[str]
+    inner: eqx.AbstractClassVar[str]
 
     symplectic: ClassVar[bool] = False  # a flow moves the states alone
     takes_inputs: ClassVar[bool] = True
@@ -125,10 +127,10 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
         return False
 
     def with_parity(self, parity: int) -> AbstractMatrixKernel:
-        raise TypeError(f"say the symmetry inside: {type(self).__name__}(Odd(K), …).")
+        raise TypeError(f"say the symmetry of {self.inner}(Odd(K), …).")
 
     def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
-        raise TypeError(f"say the symmetry inside: {type(self).__name__}(Invariant(K, maps), …).")
+        raise TypeError(f"say the symmetry of {self.inner}(Invariant(K, maps), …).")
 
     @property
     def invariance(self) -> Invariance:

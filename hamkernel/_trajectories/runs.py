@@ -191,8 +191,8 @@ def _members(parameters: Any, count: int, inputs: Any) -> tuple[Float[Array, " p
     shapes = {theta.shape for theta in rows}
     if len(shapes) > 1 or rows[0].ndim != 1 or rows[0].size == 0:
         raise ValueError(
-            f"parameters has entries of shape {', '.join(map(str, sorted(shapes)))}: one θ of shape "
-            "(p,) for each run is needed, with one p, such as [(0.5,), (0.8,)]."
+            f"parameters has entries of shape {', '.join(map(str, sorted(shapes)))}: one θ of "
+            "shape (p,) for each run is needed, with one p, such as [(0.5,), (0.8,)]."
         )
     return tuple(require.finite(theta, f"parameters[{r}]") for r, theta in enumerate(rows))
 
