@@ -150,7 +150,7 @@ def test_a_mean_may_depend_on_the_member():
     rest = hk.fit(K, X, less, LAMBDA, parameters=THETA)
     np.testing.assert_allclose(field(x, theta), rest(x, theta) + mean(x, theta), atol=1e-10)
     np.testing.assert_allclose(field.at(theta)(x), field(x, theta), atol=1e-12)
-    with pytest.raises(AttributeError, match="has no potential of this structure"):
+    with pytest.raises(AttributeError, match="has no potential of the structure"):
         field.at(theta).hamiltonian(x)
 
 
