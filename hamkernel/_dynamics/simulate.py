@@ -315,8 +315,8 @@ def _tolerances(
             learned, point = learned.whole, learned.joined(x0, rhs.inputs(start))
         if isinstance(learned, KernelField):
             Z, A = learned.points, learned.coefficients
-            share = field_rounding(learned.kernel, point, Z, A, learned(point))
-            default = jnp.maximum(default, jnp.minimum(share, _LOOSEST).astype(x0.dtype))
+            share = field_rounding(learned.kernel, point, Z, A, learned(point), _LOOSEST)
+            default = jnp.maximum(default, share)
 
     def tolerance(name: str, given: Any) -> Float[Array, ""]:
         if given is None:

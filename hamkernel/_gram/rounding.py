@@ -24,14 +24,16 @@ def field_rounding(
     Z: Float[Array, "M n"],
     A: Float[Array, "M n"],
     velocity: Float[Array, " n"],
+    most: float = jnp.inf,
 ) -> Float[Array, ""]:
     """ε ‖Σⱼ |K(x, zⱼ) aⱼ|‖ / ‖f(x)‖, the relative rounding error of f(x) = Σⱼ K(x, zⱼ) aⱼ.
 
-    Where the ridge is small the terms are large, of both signs, and each rounds to ε of itself.
+    It is cut to `most`, since it grows without bound where f(x) tends to zero. Where the ridge is
+    small the terms are large, of both signs, and each rounds to ε of itself.
     """
     K = without_symmetry(K)
     terms = jax.vmap(lambda z, a: K.expansion(x, z[None], a[None]))(Z, A)
     size = jnp.linalg.norm(jnp.sum(jnp.abs(terms), axis=0))
     least = jnp.finfo(x.dtype).tiny
     share = jnp.finfo(x.dtype).eps * size / jnp.maximum(jnp.linalg.norm(velocity), least)
-    return jax.lax.stop_gradient(share.astype(x.dtype))
+    return jax.lax.stop_gradient(jnp.minimum(share, most).astype(x.dtype))
