@@ -50,7 +50,7 @@ class EqualSteps(diffrax.AbstractSolver):
             span,
             span / equal_steps(span, self.dt),
             y0,
-            # Of a field with inputs, the time at which its own is zero.
+            # With inputs, the time of the caller at which the time of this step is zero.
             None if args is None else args + t0,
             adjoint=self.adjoint,
             max_steps=self.max_steps,

@@ -275,7 +275,7 @@ def _check_field(field: Callable[[Array], Array], x0: Float[Array, " n"]) -> Non
 
 
 class _Steps(NamedTuple):
-    """What Diffrax is told of the steps, and their number in each interval where it is known."""
+    """The steps as Diffrax takes them, and their number in each interval where it is known."""
 
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController

@@ -219,7 +219,7 @@ class AbstractGauss(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
         weights = step.h * tableau.b
         # One of each pair is in [1/2, 2], where 1 − m is exact in every precision.
         share = jnp.where(tableau.share < 0.5, 1 - tableau.share.T, tableau.share)
-        # What moves the state by less than √eps of it, and does not shrink, is rounding.
+        # Increments that move the state by less than √eps of it, and do not shrink, are rounding.
         rounding = float(jnp.finfo(step.y0.dtype).eps) ** 0.5 * jnp.abs(step.y0 / step.h).max()
         solution = optx.fixed_point(
             _stage_slopes,

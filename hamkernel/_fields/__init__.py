@@ -1,1 +1,1 @@
-"""What is learned: a vector field and its potential."""
+"""Learned vector fields and their potentials."""

@@ -284,7 +284,7 @@ def _potential_of(field, x):
 
 
 class SolverInfo(eqx.Module):
-    """How a field was found. What does not apply to the solver is None.
+    """The outcome of a solver. An attribute that does not apply to the solver is None.
 
     Attributes:
         solver: the name of the solver.

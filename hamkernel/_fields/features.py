@@ -31,7 +31,7 @@ class FeatureField(AbstractField):
         norm: ‖w‖, the norm of f in the RKHS of the approximate kernel, shape ().
         regularization: the λ of the fit, shape ().
         offset: the constant in the potential, shape ().
-        info: how the solver went.
+        info: the outcome of the solver.
         mean: the prior mean, x (n,) -> (n,), which is added; None if it is zero.
     """
 

@@ -37,7 +37,7 @@ class AbstractJoinedField(AbstractField):
     @property
     @abc.abstractmethod
     def _cure(self) -> str:
-        """How a field of x alone is had."""
+        """The expression that gives a field of x alone, for an error."""
 
     @property
     def kernel(self) -> AbstractJoinedKernel:
@@ -84,7 +84,7 @@ class AbstractJoinedField(AbstractField):
 
     @property
     def info(self) -> SolverInfo:
-        """How the solver went."""
+        """The outcome of the solver."""
         return self.whole.info
 
     @property
@@ -95,7 +95,7 @@ class AbstractJoinedField(AbstractField):
 
     @property
     def takes_inputs(self) -> bool:
-        """That a velocity needs u as well: `hk.simulate` asks."""
+        """True: a velocity needs u as well. `hk.simulate` reads this."""
         return True
 
     def __call__(
@@ -187,7 +187,7 @@ class ControlledField(AbstractJoinedField):
 
     @property
     def mean(self) -> Callable[..., Any] | None:
-        """What was known of the drift, x (n,) -> (n,)."""
+        """The prior mean of the drift, x (n,) -> (n,)."""
         return self.drift.mean
 
     @property
@@ -207,7 +207,7 @@ class ControlledField(AbstractJoinedField):
 
     @property
     def potential(self) -> Scalar:
-        """That of the drift.
+        """The potential of the drift.
 
         Raises:
             AttributeError: the structure has no potential (with the reason).
@@ -215,7 +215,7 @@ class ControlledField(AbstractJoinedField):
         return self.drift.potential
 
     def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """That of the drift."""
+        """The potential of the drift, without the constant of `anchored`."""
         return self.drift.unanchored_potential(x)
 
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
@@ -246,7 +246,7 @@ class FamilyField(AbstractJoinedField):
 
     @property
     def mean(self) -> Callable[..., Any] | None:
-        """What was known before, a function of the points (x, θ)."""
+        """The prior mean, a function of the points (x, θ)."""
         return self.whole.mean
 
     @property
@@ -358,7 +358,7 @@ class MemberField(AbstractField):
 
     @property
     def info(self) -> SolverInfo:
-        """How the solver went."""
+        """The outcome of the solver."""
         return self.terms[0].info
 
     def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:

@@ -31,7 +31,7 @@ class KernelField(AbstractField):
         norm: ‖f‖ in the RKHS of K, of f less its mean, shape ().
         regularization: the λ of the fit, shape ().
         offset: the constant in the potential, shape ().
-        info: how the solver went.
+        info: the outcome of the solver.
         value_points: sₑ, shape (E, n); None without energies.
         value_coefficients: bₑ, shape (E,); None without energies.
         mean: the prior mean, x (n,) -> (n,), which is added; None if it is zero.

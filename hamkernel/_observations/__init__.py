@@ -1,1 +1,1 @@
-"""What was measured: linear functionals of a field and its potential, and their values."""
+"""Observations: linear functionals of a field and its potential, and their measured values."""

@@ -1,6 +1,6 @@
-"""What can be measured of a field and its potential: velocities, energies, equilibria, integrals.
+"""Observations of a field and its potential: velocities, energies, equilibria, integrals.
 
-Observations of every kind are values of linear functionals of (u, f), and any of them add up:
+All of them are values of linear functionals of (u, f), and any of them add up:
 
     data = hk.Velocities(X, Y) + hk.Energies(Z, E) + hk.Equilibria(X0)
     field = hk.fit(K, data, regularization=1e-4)
@@ -124,7 +124,7 @@ def refuse_swapped(X: Any, Y: Any, inputs: Any) -> None:
 
 
 def beside(inputs: Any, parameters: Any, K: Any = None) -> Any:
-    """What is given beside the states, by the one name or the other; None if nothing is.
+    """The inputs or the parameters, whichever were given; None if neither was.
 
     Raises:
         TypeError: both are given, or K takes the other.

@@ -227,8 +227,8 @@ class Measurements:
         """P and n_i of the energies, shaped to multiply rows."""
         p = 1 / self.scale[self.energies]
         sizes = jnp.sqrt(jnp.cumsum(p**2))
-        beside = (-1, *[1] * (rows.ndim - 1))
-        return p.reshape(beside), sizes.reshape(beside)
+        shape = (-1, *[1] * (rows.ndim - 1))
+        return p.reshape(shape), sizes.reshape(shape)
 
     def coefficients(
         self, c: Float[Array, " D"]
@@ -333,7 +333,7 @@ def measurements_of(
             TypeError: K takes no inputs.
     """
     K = with_input_count(K, data, part=previous is not None)
-    blocks, targets = zip(*data.parts(*_beside(K)), strict=True)
+    blocks, targets = zip(*data.parts(*_count_and_name(K)), strict=True)
     dtype = np.result_type(*[block.points.dtype for block in blocks])
     blocks = tuple(_cast(block, dtype) for block in blocks)
     divided = [
@@ -356,7 +356,7 @@ def sampled_points(
     """The kernel with its number of inputs, and the points (x, u), where nothing is measured."""
     data = Equilibria(X, given)
     K = with_input_count(K, data)
-    (block, _), *_ = data.parts(*_beside(K))
+    (block, _), *_ = data.parts(*_count_and_name(K))
     return K, block.points
 
 
@@ -365,8 +365,8 @@ def inputs_of(K: AbstractMatrixKernel) -> int:
     return K.input_count if isinstance(K, AbstractJoinedKernel) else 0
 
 
-def _beside(K: AbstractMatrixKernel) -> tuple[int, str]:
-    """How many numbers are given beside a state, and what they are."""
+def _count_and_name(K: AbstractMatrixKernel) -> tuple[int, str]:
+    """The number of inputs or parameters of a point, and which of the two names they have."""
     return (K.input_count, K.given) if isinstance(K, AbstractJoinedKernel) else (0, "inputs")
 
 

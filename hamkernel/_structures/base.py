@@ -1,4 +1,4 @@
-"""What a matrix-valued kernel is, and sums of them."""
+"""The base of matrix-valued kernels, and their sums."""
 
 import abc
 import functools

@@ -96,7 +96,7 @@ class AbstractFamily(AbstractJoinedKernel):
 
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
-        """Those of the members, functions of states."""
+        """The scalar kernels of the members, functions of states."""
         return self.of_states.scalar_kernels
 
     def __add__(self, other: Any) -> Any:

@@ -61,7 +61,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
         return A
 
     def with_count(self, count: int) -> Self:
-        """The same for m = `count`."""
+        """This kernel with m = `count`."""
         return dataclasses.replace(self, count=count)
 
     @property
@@ -70,7 +70,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
 
     @property
     def has_hamiltonian(self) -> bool:
-        """Whether the fields of x alone have one."""
+        """Whether the fields of x alone have a Hamiltonian."""
         return self.of_states.has_hamiltonian
 
     def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:

@@ -174,7 +174,7 @@ class UnknownMasses(AbstractMatrixKernel):
 
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
-        """In the coordinates (q, p)."""
+        """The scalar kernels, functions of (q, p)."""
         return self.kernel.scalar_kernels
 
     @property

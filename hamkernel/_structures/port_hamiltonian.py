@@ -13,8 +13,8 @@ from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
 from hamkernel._structures.structure import AbstractPotentialKernel, canonical, check_even
 
-# Of the damping ratio, r over the critical friction: from 1e-5, at which an oscillation loses 6e-5
-# of its amplitude in a period and far less than can be seen, to overdamped 30 times over.
+# Bounds of the damping ratio, r over the critical friction. At 1e-5 an oscillation loses 6e-5 of
+# its amplitude in a period, far less than can be seen; at 30 it is overdamped 30 times over.
 _LEAST_DAMPING, _MOST_DAMPING = 1e-5, 30.0
 
 

@@ -47,7 +47,7 @@ class AbstractStructure(AbstractMatrixKernel):
     kernel: AbstractScalarKernel = eqx.field(converter=as_scalar_kernel)
     # 1 if the fields have the parity of the functions of k, −1 if a derivative changes it.
     field_parity: eqx.AbstractClassVar[int]
-    # Of the operator: TRANSLATION where B is constant, REFLECTION where B(−x) = B(x).
+    # The symmetry of the operator: TRANSLATION if B is constant, REFLECTION if B(−x) = B(x).
     operator_invariance: eqx.AbstractClassVar[Invariance]
 
     def __repr__(self) -> str:
@@ -71,7 +71,7 @@ class AbstractStructure(AbstractMatrixKernel):
         return eqx.tree_at(lambda K: K.kernel, self, kernel)
 
     def shares_potential(self, other: AbstractMatrixKernel) -> bool:
-        """By what the operators hold: two with arrays, which are trained, are never the same."""
+        """Whether both have one operator; operators with arrays, which are trained, never count."""
         if type(self) is not type(other):
             return False
         (own, tree), (others, other_tree) = (jax.tree.flatten(_operator(K)) for K in (self, other))

@@ -1,4 +1,4 @@
-"""What the paper did, and the numbers it published."""
+"""The experiments of the paper, and the numbers that it published."""
 
 import dataclasses
 import math
@@ -10,7 +10,7 @@ from hamkernel._structures.structure import Separable, Symplectic
 from hamkernel._structures.symmetry import Odd
 from hamkernel.systems import AbstractHamiltonianSystem, HarmonicOscillator, Pendulum
 
-# What `fit` must be given, whose ridge is N · regularization, for the ridge that is meant.
+# The regularization for which the ridge of `fit`, N · regularization, is the ridge that is meant.
 READINGS: Mapping[str, Callable[[float, int], float]] = {
     "lambda": lambda regularization, N: regularization / N,
     "N*lambda": lambda regularization, N: regularization,

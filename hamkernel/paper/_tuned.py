@@ -26,13 +26,13 @@ from hamkernel.paper._experiments import STRUCTURES, Experiment
 FOLDS = 5
 GRID = np.geomspace(0.3, 30.0, 30), np.geomspace(1e-10, 1.0, 25)  # σ, λ
 _START = 1.0, 1e-3  # σ, λ from which `tune` sets out
-# Of the test trajectories. Where the data asks for the flat limit (σ -> ∞, λ -> 0), a field rounds
-# at about 1e-9, and an adaptive step that is asked for more was measured to take 100 times as many.
+# The tolerance of the test trajectories. Where the data asks for the flat limit (σ -> ∞, λ -> 0), a
+# field rounds at about 1e-9, and with a smaller tolerance 100 times as many steps were measured.
 _TOLERANCE = 1e-6
 
 
 class Choice(NamedTuple):
-    """What one method chose for each of S seeds, and how the fields do that follow from it.
+    """The hyperparameters that one method chose for each of S seeds, and tests of their fields.
 
     Attributes:
         lengthscale: σ, shape (S,).
@@ -105,7 +105,7 @@ def compare(
 
 
 def _timed(run, X, Y) -> tuple[list, np.ndarray]:
-    """What `run` returns for each data set, and the seconds it took, compiled before."""
+    """The results of `run` for each data set, and the seconds of each run after compilation."""
     run(X[0], Y[0])
     answers, seconds = [], []
     for x, y in zip(X, Y, strict=True):

@@ -1,4 +1,4 @@
-"""What all pictures share: colours, axes, labels, and functions on a grid."""
+"""Colours, axes, labels, and functions on a grid, for all pictures."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def measured(data: Any) -> np.ndarray | None:
 
 
 def dots(ax: Axes, X: np.ndarray | None, **options: Any) -> None:
-    """What `measured` found, on top."""
+    """Draw the measured states on top of the picture; nothing if there are none."""
     if X is not None:
         ax.plot(
             *X.T, "o", color=DATA, mec="black", mew=0.6, ms=5, zorder=5, label="data", **options

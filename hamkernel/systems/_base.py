@@ -1,4 +1,4 @@
-"""What all systems share: the field that follows from H, and how parameters are stored."""
+"""The base of all systems: the field that follows from H, and the storage of parameters."""
 
 import abc
 from collections.abc import Callable, Sequence
@@ -103,7 +103,7 @@ def signed_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:
 
 
 def count_of(x: Numbers, name: str) -> int:
-    """How many entries a list of masses or circulations has; at least two."""
+    """The number of entries of a list of masses or circulations, at least two."""
     shape = require.floating(x, name).shape
     if len(shape) != 1 or shape[0] < 2:
         raise ValueError(f"{name} has shape {shape}; one number for each of two or more is needed.")
