@@ -2,7 +2,7 @@
 
     pip install -e ".[docs]" && python docs/build.py [folder]
 
-The reference comes from the docstrings by pdoc, with search; README, reading list and notebooks,
+The reference comes from the docstrings by pdoc, with search; README, texts and notebooks,
 with the outputs that they hold, by nbconvert. Formulas become MathML, which browsers render without
 a network. Warnings are errors, and a build that fails leaves the site as it was.
 """
@@ -20,6 +20,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 TEMPLATES = ROOT / "docs" / "templates"
+PAGES = sorted((ROOT / "docs").glob("*.md"))
 READING = ROOT / "docs" / "reading.md"  # what to read, and in which order
 COPIED = ["CHANGELOG.md", "CITATION.cff", "LICENSE"]
 # At the top of every page, from the root of the site.
@@ -74,14 +75,14 @@ def write_reference(site: Path) -> None:
 
 
 def write_pages(site: Path) -> None:
-    """Write a page for each notebook, one for the reading list, and the README as index.html."""
+    """Write a page for each notebook and each text beside this file; the README is index.html."""
     import nbformat
 
-    for text, name, title in (
-        ((ROOT / "README.md").read_text(), "index", "hamkernel"),
-        (READING.read_text().replace("](../", "]("), "reading", "What to read"),
-    ):
+    texts = {"index": (ROOT / "README.md").read_text()}
+    texts |= {path.stem: path.read_text().replace("](../", "](") for path in PAGES}
+    for name, text in texts.items():
         cell = nbformat.v4.new_markdown_cell(text)
+        title = text.splitlines()[0].lstrip("# ")
         page = rendered(nbformat.v4.new_notebook(cells=[cell]), title, "")
         (site / f"{name}.html").write_text(page)
     order = notebooks_in_order()
@@ -158,7 +159,8 @@ def linked(page: str) -> str:
     """The page with links to files of the repository made links to pages of the site."""
     page = re.sub(r'href="((?:notebooks/)?\w+)\.ipynb', r'href="\1.html', page)
     page = page.replace('href="hamkernel/__init__.py"', 'href="hamkernel.html"')
-    page = page.replace('href="docs/reading.md"', 'href="reading.html"')
+    pages = "|".join(path.stem for path in PAGES)
+    page = re.sub(rf'href="((?:\.\./)?)(?:docs/)?({pages})\.md', r'href="\1\2.html', page)
     page = page.replace('href="README.md', 'href="index.html')
     # nbconvert makes the ids of headings with their capitals, GitHub those of README without.
     ids = re.findall(r'<h\d id="([^"]+)"', page)

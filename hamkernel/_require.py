@@ -35,6 +35,15 @@ def eager(*values: object) -> AbstractContextManager[None]:
     return jax.ensure_compile_time_eval() if is_concrete(*values) else nullcontext()
 
 
+def untraced(name: str, instead: str, *values: object) -> None:
+    """TypeError where JAX traces one of `values`: the function decides by their numbers."""
+    if not is_concrete(*values):
+        raise TypeError(
+            f"{name} cannot run under jax.jit, jax.vmap or jax.grad: it decides in Python by the "
+            f"numbers that it is given. {instead}"
+        )
+
+
 def on_host(x: Array) -> Any:
     """`x` as a NumPy array, where it is concrete and on one device; else `x` itself."""
     if is_concrete(x) and len(x.sharding.device_set) == 1:

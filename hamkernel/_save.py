@@ -152,7 +152,8 @@ def load(
     given = kernel is not None or mean is not None
     try:
         like = skeleton(node, [], "field", _given(kernel, mean))
-        field = eqx.tree_deserialise_leaves(content, like)
+        with jax.ensure_compile_time_eval():  # a constant of what JAX traces around this call
+            field = eqx.tree_deserialise_leaves(content, like)
         if content.read():
             raise ValueError("it has arrays that belong to nothing")
         _check_evaluable(field)
@@ -168,7 +169,8 @@ def load(
             f"{source} is not a valid file of hamkernel.save{with_given}: {error}"
         ) from error
     if given:
-        _check_probe(field, probe, source)
+        with jax.ensure_compile_time_eval():
+            _check_probe(field, probe, source)
     return field
 
 

@@ -13,7 +13,7 @@ import hamkernel as hk
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-READING = (ROOT / "docs" / "reading.md").read_text()
+PAGES = {path: path.read_text() for path in sorted((ROOT / "docs").glob("*.md"))}
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
 
@@ -64,7 +64,7 @@ def test_the_readme_has_the_two_commands_that_ci_runs():
 
 def test_every_local_link_of_readme_and_notebooks_leads_to_a_file_and_a_heading():
     texts = {ROOT / "README.md": README, **{path: markdown(path) for path in NOTEBOOKS}}
-    texts[ROOT / "docs" / "reading.md"] = READING
+    texts |= PAGES
     headings = {
         path: {
             re.sub(r"\s+", "-", title.strip())
@@ -84,6 +84,13 @@ def test_every_local_link_of_readme_and_notebooks_leads_to_a_file_and_a_heading(
             assert not anchor or anchor in there, f"{source.name}: {link}"
 
 
+def test_the_times_of_the_readme_are_those_of_the_table():
+    section = README.partition("## Speed")[2].partition("##")[0]
+    times = re.findall(r"\b[\d.]+ (?:ms|µs|s)\b", section)
+    assert len(times) >= 8
+    assert [time for time in times if time not in PAGES[ROOT / "docs" / "speed.md"]] == []
+
+
 def test_ten_questions_have_answers():
     table = README.partition("## Ten questions")[2].partition("##")[0]
     rows = [line for line in table.splitlines() if line.startswith("|") and "](" in line]
@@ -95,7 +102,7 @@ def test_every_notebook_is_linked_from_the_readme():
 
 
 def test_plain_english():
-    text = README + READING + "".join(markdown(path) for path in NOTEBOOKS)
+    text = README + "".join(PAGES.values()) + "".join(markdown(path) for path in NOTEBOOKS)
     odd = ("tells", "leave away", "leaves away", "what is dense", "says nothing of", "finds out")
     odd += ("is told", "cannot tell its", "it is worth to", "as any other", "no matter of")
     assert [phrase for phrase in odd if phrase in text.lower()] == []

@@ -99,6 +99,7 @@ def readout(
     Source: Brunton, Proctor & Kutz (2016) for the dictionary; Chen & Chen (2008), Biometrika 95,
         for the criterion; Hoeting et al. (1999), Statistical Science 14, for the deviations.
     """
+    require.untraced("hk.readout", "Call it outside, on what was learned.", learned)
     kernel, rows, ridge, mean = _measured(learned)
     most = require.count(most, "most")
     if kernel.no_potential:

@@ -118,6 +118,7 @@ def learn(
         UserWarning: parts of runs were dropped, the structure does not explain the runs, the runs
             are too few to find the noise, or the iterations did not settle.
     """
+    require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
     K, given = _check(with_amplitude(matrix_kernel(K)), runs, noise, solver)
     if masses:
         K = with_masses(K, runs.dimension)

@@ -64,6 +64,8 @@ class Runs(eqx.Module):
             inputs = None if inputs is None else [inputs]
             parameters = None if parameters is None else [parameters]
         times, states = list(times), list(states)
+        inside = "Make it outside; the losses and hk.simulate work inside."
+        require.untraced("hk.Runs", inside, times, states, inputs)
         _check_counts(times, states, inputs)
         self.times = tuple(_times(t, r) for r, t in enumerate(times))
         self.states = tuple(

@@ -10,11 +10,22 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.ticker import MaxNLocator
 
-from hamkernel.plot._style import Limits, Texts, axes, grid, in_plane, legend, plane_labels, two
+from hamkernel.plot._style import (
+    Limits,
+    Texts,
+    axes,
+    drawn,
+    grid,
+    in_plane,
+    legend,
+    plane_labels,
+    two,
+)
 
 Scalar = Callable[[Float[Array, "2"]], Float[Array, ""]]
 
 
+@drawn
 def hamiltonian(
     learned: Scalar,
     true: Scalar,
@@ -88,6 +99,7 @@ def _pair() -> tuple[Axes, Axes]:
     return left, right
 
 
+@drawn
 def loss_surface(
     first: Float[ArrayLike, " A"],
     second: Float[ArrayLike, " B"],

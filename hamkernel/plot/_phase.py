@@ -15,6 +15,7 @@ from hamkernel.plot._style import (
     Texts,
     axes,
     dots,
+    drawn,
     grid,
     in_plane,
     legend,
@@ -29,6 +30,7 @@ from hamkernel.plot._style import (
 Curves = ArrayLike | Mapping[str, ArrayLike]
 
 
+@drawn
 def phase_portrait(
     field: Callable[[Float[Array, "2"]], Float[Array, "2"]],
     xlim: Limits,
@@ -80,6 +82,7 @@ def phase_portrait(
     return ax
 
 
+@drawn
 def trajectories(
     ys: Curves,
     ax: Axes | None = None,
@@ -116,6 +119,7 @@ def trajectories(
     return _finish(ax, labels, title)
 
 
+@drawn
 def plane_slice(
     fn: Callable[[Float[Array, " n"]], Array],
     point: Float[ArrayLike, " n"],

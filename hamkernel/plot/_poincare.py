@@ -10,9 +10,10 @@ from jaxtyping import ArrayLike, Float
 from matplotlib import colormaps
 from matplotlib.axes import Axes
 
-from hamkernel.plot._style import Texts, axes, legend, line_styles, named, plane_labels
+from hamkernel.plot._style import Texts, axes, drawn, legend, line_styles, named, plane_labels
 
 
+@drawn
 def crossings(
     ys: Float[ArrayLike, "T n"], coordinate: int, value: float = 0.0, direction: int = 1
 ) -> Float[np.ndarray, "M n"]:
@@ -47,6 +48,7 @@ def crossings(
     return (1 - weight) * ys[index] + weight * ys[index + 1]
 
 
+@drawn
 def poincare_section(
     points: ArrayLike | Sequence[ArrayLike] | Mapping[str, ArrayLike],
     dims: tuple[int, int],

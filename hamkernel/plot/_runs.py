@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 
 from hamkernel._trajectories.flow import simulated
 from hamkernel._trajectories.inputs import in_intervals
-from hamkernel.plot._style import COLORS, DATA, coordinate, legend, with_unit
+from hamkernel.plot._style import COLORS, DATA, coordinate, drawn, legend, with_unit
 
 if TYPE_CHECKING:
     from hamkernel._trajectories.learned import Learned
@@ -22,6 +22,7 @@ _SIGMAS = 2.0  # standard deviations on either side, which hold 95 % of a normal
 _BETWEEN = 9  # points a sample, between which a curve looks smooth
 
 
+@drawn
 def smoothing(
     runs: Runs,
     run: int = 0,
@@ -68,6 +69,7 @@ def smoothing(
     return _finished(panels, f"run {run}" if title is None else title, time_unit)
 
 
+@drawn
 def fitted(
     learned: Learned,
     run: int = 0,

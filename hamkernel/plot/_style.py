@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -12,6 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 from matplotlib.axes import Axes
+
+from hamkernel import _require as require
 
 # Okabe & Ito's palette, which stays distinct under every form of colour blindness.
 COLORS: Mapping[str, str] = {
@@ -27,6 +30,9 @@ STREAM = "#AEB6BF"  # stream lines and other background
 DATA = "#E69F00"
 
 BENEATH: Mapping[str, Any] = {"linewidth": 3.2, "zorder": 2.5}  # wide, under what may cover it
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 Limits = tuple[float, float]
 Texts = tuple[str | None, str | None]  # the units, or the names, of two coordinates
@@ -47,6 +53,18 @@ def axes(ax: Axes | None, **options: Any) -> Axes:
     import matplotlib.pyplot as plt  # starts a backend, so only where a figure must be made
 
     return plt.subplots(layout="constrained", **options)[1]
+
+
+def drawn(plot: Callable[P, R]) -> Callable[P, R]:
+    """The function `plot`, with a TypeError where JAX traces an argument."""
+
+    @functools.wraps(plot)
+    def checked(*args: P.args, **options: P.kwargs) -> R:
+        name = f"hk.plot.{plot.__name__}"
+        require.untraced(name, "Return the arrays and draw them outside.", args, options)
+        return plot(*args, **options)
+
+    return checked
 
 
 def named(series: Any) -> dict[str | None, np.ndarray]:

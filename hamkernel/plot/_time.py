@@ -9,12 +9,13 @@ from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
 
 from hamkernel import _require as require
-from hamkernel.plot._style import axes, legend, line_styles, named, two, with_unit
+from hamkernel.plot._style import axes, drawn, legend, line_styles, named, two, with_unit
 
 # Each (T,), or (S, T) for several seeds.
 Series = ArrayLike | Mapping[str, ArrayLike]
 
 
+@drawn
 def trajectory_error(
     ts: Float[ArrayLike, " T"],
     errors: Series,
@@ -52,6 +53,7 @@ def trajectory_error(
     return _finish(ax, ts, time_unit, title, show_legend)
 
 
+@drawn
 def energy_drift(
     ts: Float[ArrayLike, " T"],
     energies: Series,

@@ -16,6 +16,7 @@ from hamkernel.plot._style import (
     Texts,
     axes,
     dots,
+    drawn,
     grid,
     in_plane,
     legend,
@@ -27,6 +28,7 @@ from hamkernel.plot._style import (
 _BLUE = "#0072B2"
 
 
+@drawn
 def ensemble(
     ys: Float[ArrayLike, "S T n"],
     true: Float[ArrayLike, "T n"] | None = None,
@@ -84,6 +86,7 @@ def ensemble(
 _SHARES = ((0.9, 1.645, 0.18), (0.5, 0.674, 0.38))
 
 
+@drawn
 def band(
     ts: Float[ArrayLike, " T"],
     mean: Float[ArrayLike, " T"],
@@ -137,6 +140,7 @@ def band(
     return ax
 
 
+@drawn
 def deviation(
     fn: Callable[[Float[Array, "2"]], Array],
     xlim: Limits,

@@ -1,4 +1,4 @@
-"""Draws speed.png: the times of the table in guide_large.ipynb, beside those of the peers.
+"""Draws speed.png: the times of the table in docs/speed.md, beside those of the peers.
 
 python notebooks/figures/speed.py [folder]
 

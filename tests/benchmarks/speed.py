@@ -1,4 +1,4 @@
-"""Every number on speed in the README, against the peers, in one run.
+"""The table of `docs/speed.md`, every time that is said anywhere, against the peers in one run.
 
     python tests/benchmarks/speed.py [--figure cost.png] [--quick]
 
@@ -6,7 +6,7 @@ float64, warm, in one process, peers in turn: the minimum and the median over re
 single run. Same work and same precision; the results are checked to agree first. A peer that is not
 installed (`pip install hamkernel[benchmarks]`) is reported as missing. `--quick` omits what takes
 minutes. A target is a ratio of minima in this run, printed with "met" or "MISSED" and the ratio of
-medians. The environment matters to all of them: see `notebooks/guide_large.ipynb`.
+medians. The environment matters to all of them: see `docs/speed.md`.
 """
 
 import argparse
@@ -24,6 +24,7 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 import products
@@ -288,6 +289,26 @@ def process_section() -> None:
         line(name, time, remark)
 
 
+def field_section() -> None:
+    """What a controller pays in each of its steps, mostly the overhead of dispatch."""
+    print("\nOne call of a field, one state, odd symplectic Gaussian, n = 2")
+    system, x, calls = hk.systems.Pendulum(mass=1.0), jnp.array([0.5, 0.3]), 200
+
+    def many(fn):
+        for _ in range(calls):
+            jax.block_until_ready(fn(x))
+
+    for N in (24, 1000):
+        X = jax.random.normal(jax.random.key(0), (N, 2))
+        field = hk.fit(hk.Odd(hk.Symplectic(hk.Gaussian(3.0))), X, jax.vmap(system)(X), 1e-6)
+        exported = jax.export.export(jax.jit(field))(jax.ShapeDtypeStruct((2,), float))
+        runs = {"compiled": jax.jit(field), "exported": jax.jit(exported.call)}
+        for name, fn in runs.items():
+            time = timed(lambda fn=fn: many(fn), 7)
+            each = f"{1e6 * time.least / calls:.1f} µs a call"
+            line(f"{calls} calls, {name}, N = {N}", time, each)
+
+
 def figure_section(path: str) -> None:
     from matplotlib.figure import Figure
 
@@ -334,6 +355,7 @@ def main(figure: str | None, quick: bool) -> None:
     print(environment())
     print(f"  {'':44s} {'minimum':>13s} {'median':>13s}")
     process_section()
+    field_section()
     gram_section(repeats=9)
     product_section(4000 if quick else 20_000)
     fit_section(repeats=9)
