@@ -118,6 +118,19 @@ def count(number: Any, name: str) -> int:
     return operator.index(number)
 
 
+def coordinates(given: Any, name: str) -> tuple[int, ...]:
+    """Coordinates of the state, as a tuple of distinct integers ≥ 0."""
+    try:
+        found = tuple(operator.index(i) for i in np.atleast_1d(given))
+    except TypeError:
+        found = ()
+    if not found or min(found) < 0 or len(set(found)) < len(found):
+        raise ValueError(
+            f"{name} must be distinct coordinates, integers >= 0 such as (2, 3); got {given!r}."
+        )
+    return found
+
+
 def positive_number(number: Any, name: str) -> float:
     """`number` as a Python float, positive and finite: one that is compiled in."""
     try:

@@ -22,6 +22,10 @@ from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._show import described, exponential, in_brackets, joined, text
 
+Point = Float[Array, " n"]
+Points = Float[Array, "M n"]
+Bounds = tuple[ArrayLike, ArrayLike]  # the lower and the upper bound of a hyperparameter
+
 
 def one_point(x: ArrayLike) -> Float[Array, " n"]:
     """`x` as a float array; a batch would silently give a wrong number."""
@@ -34,9 +38,7 @@ def one_point(x: ArrayLike) -> Float[Array, " n"]:
     return x
 
 
-def divided(
-    x: Float[Array, " n"], scale: Float[Array, "..."], name: str = "lengthscale"
-) -> Float[Array, " n"]:
+def divided(x: Point, scale: Float[Array, "..."], name: str = "lengthscale") -> Point:
     """x/scale in the dtype of x, for one point; the scale is a number, or one per coordinate."""
     x = one_point(x)
     if scale.ndim and scale.shape != x.shape:
@@ -55,7 +57,7 @@ def log_per_coordinate(value: ArrayLike, name: str, cure: str = "") -> Float[Arr
     return jnp.log(array)
 
 
-def bounds_by_value(name: str, leaf: Any) -> tuple[ArrayLike, ArrayLike]:
+def bounds_by_value(name: str, leaf: Any) -> Bounds:
     """Bounds around the value of a hyperparameter whose meaning is unknown, as stored.
 
     A logarithm may move by three decades, another number by ten times its size, or by 10.
@@ -65,9 +67,7 @@ def bounds_by_value(name: str, leaf: Any) -> tuple[ArrayLike, ArrayLike]:
     return value - reach, value + reach
 
 
-def bounds_of_length(
-    leaf: Any, X: Float[np.ndarray, "N n"], least: float, most: float
-) -> tuple[ArrayLike, ArrayLike]:
+def bounds_of_length(leaf: Any, X: Float[np.ndarray, "N n"], least: float, most: float) -> Bounds:
     """Bounds of the logarithm of a length, from `least` spacings to `most` extents of the data.
 
     The spacing of N points in an extent L is taken as L / N: a fair lower bound in any dimension,
@@ -155,9 +155,7 @@ class AbstractScalarKernel(eqx.Module):
         """Whether a trained factor multiplies all of k; None in its place does not count."""
         return False
 
-    def bounds(
-        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
-    ) -> tuple[ArrayLike, ArrayLike]:
+    def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
         """The lower and upper bound of the array `name`, as stored, for `tune`.
 
         Args:
@@ -281,9 +279,7 @@ class Scaled(AbstractScalarKernel):
     def scale(self) -> Float[Array, ""]:
         return jnp.exp(self.log_scale)
 
-    def bounds(
-        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
-    ) -> tuple[ArrayLike, ArrayLike]:
+    def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
         return np.log(1e-5 * amplitude), np.log(1e5 * amplitude)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:

@@ -8,6 +8,7 @@ from jaxtyping import Array, ArrayLike, Float
 from hamkernel import _require as require
 from hamkernel._kernels.base import (
     AbstractScalarKernel,
+    Bounds,
     Invariance,
     bounds_of_length,
     divided,
@@ -49,9 +50,7 @@ class Polynomial(AbstractScalarKernel):
         product = one_point(x) @ one_point(z)
         return (product + self.offset.astype(product.dtype)) ** self.degree
 
-    def bounds(
-        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
-    ) -> tuple[ArrayLike, ArrayLike]:
+    def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
         square = np.mean(np.sum(X**2, axis=1)) or 1.0
         return np.log(1e-4 * square), np.log(1e4 * square)
 
@@ -113,9 +112,7 @@ class Periodic(AbstractScalarKernel):
         alike = self.log_lengthscale.ndim == self.log_period.ndim == 0
         return is_permutation(S) and (alike or is_diagonal(S))
 
-    def bounds(
-        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
-    ) -> tuple[ArrayLike, ArrayLike]:
+    def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
         if name == "log_lengthscale":
             # On a circle of radius 1; below 1/64 random features need too long a Fourier series.
             return np.log(max(0.6 / len(X), 1 / 64)), np.log(60.0)

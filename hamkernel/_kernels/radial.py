@@ -20,6 +20,7 @@ from jaxtyping import Array, ArrayLike, Float
 from hamkernel import _require as require
 from hamkernel._kernels.base import (
     AbstractScalarKernel,
+    Bounds,
     Invariance,
     bounds_of_length,
     divided,
@@ -68,9 +69,7 @@ class AbstractRadialKernel(AbstractScalarKernel):
         x, z = divided(x, self.lengthscale), divided(z, self.lengthscale)
         return self.profile(squared_distance(x, z, cut=self.cuts_rounding))
 
-    def bounds(
-        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
-    ) -> tuple[ArrayLike, ArrayLike]:
+    def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
         """A lengthscale far below the spacing or above the extent changes nothing but rounding."""
         if name == "log_lengthscale":
             return bounds_of_length(self.log_lengthscale, X, 0.3, 30.0)

@@ -1,6 +1,5 @@
 """Scalar kernels on transformed points: warped, and on some of the coordinates."""
 
-import operator
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -142,15 +141,7 @@ class Select(AbstractScalarKernel):
 
     def __init__(self, kernel: Any, dims: Any):
         self.kernel = as_scalar_kernel(kernel)
-        try:
-            self.dims = tuple(operator.index(d) for d in np.atleast_1d(dims))
-        except TypeError:
-            self.dims = ()
-        if not self.dims or min(self.dims) < 0 or len(set(self.dims)) < len(self.dims):
-            raise ValueError(
-                "Select needs distinct coordinates, integers >= 0, such as Select(k, (0, 1)); got "
-                f"{dims!r}."
-            )
+        self.dims = require.coordinates(dims, "dims, the second argument of Select,")
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         return self.kernel(self._selected(x), self._selected(z))

@@ -11,13 +11,16 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import (
     AbstractScalarKernel,
+    Bounds,
     Descriptor,
     Invariance,
+    Point,
+    Points,
     bounds_by_value,
     common_invariance,
     one_point,
@@ -52,13 +55,7 @@ class AbstractMatrixKernel(eqx.Module):
         return hash(jax.tree.structure(self))
 
     @abc.abstractmethod
-    def form(
-        self,
-        x: Float[Array, " n"],
-        u: Float[Array, " n"],
-        z: Float[Array, " n"],
-        v: Float[Array, " n"],
-    ) -> Float[Array, ""]:
+    def form(self, x: Point, u: Point, z: Point, v: Point) -> Float[Array, ""]:
         """uᵀ K(x, z) v for one pair of points."""
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, "n n"]:
@@ -75,20 +72,14 @@ class AbstractMatrixKernel(eqx.Module):
         return jax.vmap(columns, in_axes=(None, 0, None, None))(x, basis, z, basis)
 
     @abc.abstractmethod
-    def expansion(
-        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-    ) -> Float[Array, " n"]:
+    def expansion(self, x: Point, Z: Points, A: Points) -> Point:
         """Σⱼ K(x, zⱼ) aⱼ, without the blocks."""
 
-    def potential(
-        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-    ) -> Float[Array, ""]:
+    def potential(self, x: Point, Z: Points, A: Points) -> Float[Array, ""]:
         """The potential of `expansion`; AttributeError if there is none."""
         raise AttributeError(self.no_potential)
 
-    def potential_covariance(
-        self, x: Float[Array, " n"], z: Float[Array, " n"]
-    ) -> Float[Array, ""]:
+    def potential_covariance(self, x: Point, z: Point) -> Float[Array, ""]:
         """The kernel of the potential, of which K is B ∂x∂zᵀ(·) Bᵀ; AttributeError if none."""
         raise AttributeError(self.no_potential)
 
@@ -132,9 +123,7 @@ class AbstractMatrixKernel(eqx.Module):
     def averaged(self, maps: tuple[LinearMap, ...]) -> "AbstractMatrixKernel":
         """The kernel of the fields whose potential none of these maps changes."""
 
-    def bounds(
-        self, name: str, X: Float[np.ndarray, "N d"], amplitude: float
-    ) -> tuple[ArrayLike, ArrayLike]:
+    def bounds(self, name: str, X: Float[np.ndarray, "N d"], amplitude: float) -> Bounds:
         """The lower and upper bound of the array `name`, as stored, as those of scalar kernels."""
         return bounds_by_value(name, getattr(self, name))
 

@@ -19,6 +19,8 @@ from hamkernel import _require as require
 from hamkernel._kernels.base import (
     AbstractScalarKernel,
     Invariance,
+    Point,
+    Points,
     Scaled,
     as_scalar_kernel,
     one_point,
@@ -26,7 +28,6 @@ from hamkernel._kernels.base import (
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.joined import AbstractJoinedKernel
-from hamkernel._structures.port_hamiltonian import distinct_coordinates
 
 
 class Constant(AbstractScalarKernel):
@@ -70,7 +71,7 @@ class InputMatrix(eqx.Module):
         else:
             variance = require.positive_scalar(kernel, "the variance of a constant input matrix")
             self.kernel = Scaled(Constant(), variance)
-        self.acts_on = None if acts_on is None else distinct_coordinates(acts_on, "acts_on")
+        self.acts_on = None if acts_on is None else require.coordinates(acts_on, "acts_on")
 
     def __repr__(self) -> str:
         return described(self, positional=("kernel",))
@@ -186,9 +187,7 @@ class Controlled(AbstractJoinedKernel):
         rows = self.inputs.rows(len(x), x.dtype)
         return drift + (inputs @ others) * self.inputs.kernel(x, z) * ((u * rows) @ v)
 
-    def expansion(
-        self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Float[Array, "M n"]
-    ) -> Float[Array, " n"]:
+    def expansion(self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Points) -> Point:
         (x, u), (Z, U) = self.split(x), self.split(Z)
         drift = self.drift.expansion(x, Z, A)
         if isinstance(self.inputs, KnownMatrix):

@@ -18,7 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Invariance,
+    Point,
+    Points,
+    as_scalar_kernel,
+)
 from hamkernel._show import call, joined
 from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel
 from hamkernel._structures.controlled import Constant
@@ -64,9 +70,7 @@ class AbstractFamily(AbstractJoinedKernel):
         (x, theta), (z, other) = self.split(x), self.split(z)
         return _sum([t.parameters(theta, other) * t.member.form(x, u, z, v) for t in self.terms])
 
-    def expansion(
-        self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Float[Array, "M n"]
-    ) -> Float[Array, " n"]:
+    def expansion(self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Points) -> Point:
         (x, theta), (Z, T) = self.split(x), self.split(Z)
         return _sum([t.member.expansion(x, Z, t.coefficients_at(theta, T, A)) for t in self.terms])
 
@@ -166,9 +170,7 @@ class Family(AbstractFamily):
     def terms(self) -> tuple["Family", ...]:
         return (self,)
 
-    def coefficients_at(
-        self, u: Float[Array, " p"], U: Float[Array, "M p"], A: Float[Array, "M n"]
-    ) -> Float[Array, "M n"]:
+    def coefficients_at(self, u: Float[Array, " p"], U: Float[Array, "M p"], A: Points) -> Points:
         """a_j k(θ, θ_j)."""
         return A * jax.vmap(self.parameters, in_axes=(None, 0))(u, U)[:, None]
 

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import Invariance, one_point
+from hamkernel._kernels.base import Invariance, Points, one_point
 from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 
@@ -51,9 +51,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
         """The `KnownMatrix` G, where the field contains G u and the kernel learns the rest."""
         return None
 
-    def coefficients_at(
-        self, u: Float[Array, " m"], U: Float[Array, "M m"], A: Float[Array, "M n"]
-    ) -> Float[Array, "M n"]:
+    def coefficients_at(self, u: Float[Array, " m"], U: Float[Array, "M m"], A: Points) -> Points:
         """The coefficients with which `of_states` makes the field at u of those of joined points.
 
         For `Controlled` u is zero, and these are the same.

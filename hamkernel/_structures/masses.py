@@ -9,7 +9,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance, Point, Points
 from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
@@ -114,21 +114,15 @@ class UnknownMasses(AbstractMatrixKernel):
         u, v = self.to_velocities(u), self.to_velocities(v)
         return self.kernel.form(self.to_momenta(x), u, self.to_momenta(z), v)
 
-    def expansion(
-        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-    ) -> Float[Array, " n"]:
+    def expansion(self, x: Point, Z: Points, A: Points) -> Point:
         x, Z, A = self.to_momenta(x), self.to_momenta(Z), self.to_velocities(A)
         return self.to_velocities(self.kernel.expansion(x, Z, A))
 
-    def potential(
-        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-    ) -> Float[Array, ""]:
+    def potential(self, x: Point, Z: Points, A: Points) -> Float[Array, ""]:
         x, Z, A = self.to_momenta(x), self.to_momenta(Z), self.to_velocities(A)
         return self.kernel.potential(x, Z, A)
 
-    def potential_covariance(
-        self, x: Float[Array, " n"], z: Float[Array, " n"]
-    ) -> Float[Array, ""]:
+    def potential_covariance(self, x: Point, z: Point) -> Float[Array, ""]:
         return self.kernel.potential_covariance(self.to_momenta(x), self.to_momenta(z))
 
     def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:

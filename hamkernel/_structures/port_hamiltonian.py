@@ -1,6 +1,5 @@
 """Fields that lose energy: (J − R)∇H with friction on some of the coordinates."""
 
-import operator
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -10,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
+from hamkernel._kernels.base import AbstractScalarKernel, Bounds, Invariance, as_scalar_kernel
 from hamkernel._structures.structure import AbstractPotentialKernel, canonical, check_even
 
 # Bounds of the damping ratio, r over the critical friction. At 1e-5 an oscillation loses 6e-5 of
@@ -69,7 +68,7 @@ class PortHamiltonian(AbstractPotentialKernel):
             "and for other damping Structured(k, operator)."
         )
         array = require.positive(friction, "friction", cure)
-        self.damped = None if damped is None else distinct_coordinates(damped, "damped")
+        self.damped = None if damped is None else require.coordinates(damped, "damped")
         most = array.size if self.damped is None else len(self.damped)
         if array.ndim > 1 or (array.ndim and array.size != most):
             raise ValueError(
@@ -112,9 +111,7 @@ class PortHamiltonian(AbstractPotentialKernel):
         general = eqx.tree_at(lambda K: K.log_friction, self, stand_in)
         return general.apply(x, jnp.eye(len(x), dtype=x.dtype))
 
-    def bounds(
-        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
-    ) -> tuple[ArrayLike, ArrayLike]:
+    def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
         """Bounds for log r: an oscillation of extents (Δq, Δp) in X is critical near r = Δp/Δq."""
         n = X.shape[1]
         damped = np.asarray(self._coordinates(n))
@@ -139,16 +136,3 @@ class PortHamiltonian(AbstractPotentialKernel):
                 f"for each; states of n = {n} coordinates have {len(coordinates)}."
             )
         super().check_dimension(n)
-
-
-def distinct_coordinates(given: Any, name: str) -> tuple[int, ...]:
-    """Coordinates as a tuple of distinct integers >= 0."""
-    try:
-        found = tuple(operator.index(i) for i in np.atleast_1d(given))
-    except TypeError:
-        found = ()
-    if not found or min(found) < 0 or len(set(found)) < len(found):
-        raise ValueError(
-            f"{name} must be distinct coordinates, integers >= 0 such as (2, 3); got {given!r}."
-        )
-    return found

@@ -27,6 +27,8 @@ from hamkernel._kernels.base import (
     AbstractScalarKernel,
     Descriptor,
     Invariance,
+    Point,
+    Points,
     as_scalar_kernel,
 )
 from hamkernel._kernels.symmetry import (
@@ -101,9 +103,7 @@ def _operator(K: AbstractMatrixKernel) -> dict[str, Any]:
     return {field.name: getattr(K, field.name) for field in fields if field.name != "kernel"}
 
 
-def row(
-    k: AbstractScalarKernel, x: Float[Array, " n"], Z: Float[Array, "M n"]
-) -> Float[Array, " M"]:
+def row(k: AbstractScalarKernel, x: Point, Z: Points) -> Float[Array, " M"]:
     """k(x, zⱼ) for all j."""
     return jax.vmap(k, in_axes=(None, 0))(x, Z)
 
@@ -192,21 +192,15 @@ class AbstractPotentialKernel(AbstractStructure):
 
         return found._replace(directions=directions)
 
-    def potential(
-        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-    ) -> Float[Array, ""]:
+    def potential(self, x: Point, Z: Points, A: Points) -> Float[Array, ""]:
         directions = jax.vmap(self.apply_transpose)(Z, A)
         _, slopes = jax.jvp(lambda Z: row(self.kernel, x, Z), (Z,), (directions,))
         return slopes.sum()
 
-    def potential_covariance(
-        self, x: Float[Array, " n"], z: Float[Array, " n"]
-    ) -> Float[Array, ""]:
+    def potential_covariance(self, x: Point, z: Point) -> Float[Array, ""]:
         return self.kernel(x, z)
 
-    def expansion(
-        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-    ) -> Float[Array, " n"]:
+    def expansion(self, x: Point, Z: Points, A: Points) -> Point:
         return self.apply(x, jax.grad(self.potential)(x, Z, A))
 
     def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
@@ -329,9 +323,7 @@ class Separable(AbstractStructure):
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
         return self.kernel(x, z) * (u @ v)
 
-    def expansion(
-        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-    ) -> Float[Array, " n"]:
+    def expansion(self, x: Point, Z: Points, A: Points) -> Point:
         return row(self.kernel, x, Z) @ A
 
     def transformed_coefficients(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
@@ -366,9 +358,7 @@ class DivergenceFree(AbstractStructure):
         trace = along_both(jnp.eye(len(x), dtype=x.dtype)).sum()
         return trace * (u @ v) - mixed(self.kernel, x, v, z, u)
 
-    def expansion(
-        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-    ) -> Float[Array, " n"]:
+    def expansion(self, x: Point, Z: Points, A: Points) -> Point:
         # W_ba(x) = Σⱼ ∂_{z_b} k(x, zⱼ) a_ja, Ψ = Wᵀ − W, and f_a = Σ_b ∂_b Ψ_ab. The slopes
         # ∂_{z_b} k(x, zⱼ) of all j come from one forward derivative along e_b.
         def slopes(x, e):

@@ -5,13 +5,7 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Num
 
-from hamkernel.systems._base import (
-    AbstractHamiltonianSystem,
-    Numbers,
-    at,
-    log_parameter,
-    positive,
-)
+from hamkernel.systems._base import AbstractHamiltonianSystem, Numbers, at, log_parameter, positive
 
 
 class CartPole(AbstractHamiltonianSystem):

@@ -12,7 +12,6 @@ from jaxtyping import Array, ArrayLike, Float, Num
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._show import described
-from hamkernel._structures.port_hamiltonian import distinct_coordinates
 from hamkernel.systems._base import in_precision
 
 System = Callable[[Any], Float[Array, " n"]]
@@ -50,7 +49,7 @@ class Damped(eqx.Module):
             )
         self.system = system
         self.log_damping = jnp.log(require.positive(damping, "damping"))
-        self.damped = None if damped is None else distinct_coordinates(damped, "damped")
+        self.damped = None if damped is None else require.coordinates(damped, "damped")
         if self.log_damping.ndim > 1:
             raise ValueError(f"damping has shape {self.log_damping.shape}; () or (m,) is needed.")
 
