@@ -9,7 +9,7 @@ The description has these nodes:
 
     {"class": name, field: …}            an object of the library, by its fields
     {"array": "float64", "shape": […]}   an array, without its entries
-    {"function": name}                   one of the functions in `_FUNCTIONS`
+    {"function": name}                   one of the functions in `_MAPS`
     {"code": name, "leaves": […]}        code of the caller's, which only the caller can give
     […]  0.5  "text"  true  null         a tuple, and plain values
 
@@ -50,7 +50,7 @@ from hamkernel._structures.base import AbstractMatrixKernel
 _VERSION = 2  # of the format; 1 was an archive of NumPy's, before the first release
 _FIRST_LINE = "hamkernel field, version {}, sha256 {}"
 _PROBES = 64  # points of the field, of which the one of the largest velocity is kept
-_SAME = 1e-3  # of a velocity computed elsewhere: fields of large coefficients round at 1e-5
+_AGREES = 1e-3  # of a velocity computed elsewhere: fields of large coefficients round at 1e-5
 
 
 def save(path: str | os.PathLike[str], field: AbstractField) -> None:
@@ -100,7 +100,7 @@ def save(path: str | os.PathLike[str], field: AbstractField) -> None:
     content = io.BytesIO()
     content.write(json.dumps(header, ensure_ascii=False, allow_nan=False).encode() + b"\n")
     eqx.tree_serialise_leaves(content, field)
-    _write(pathlib.Path(path), sealed(content.getvalue()))
+    _write_at_once(pathlib.Path(path), sealed(content.getvalue()))
 
 
 def load(
@@ -209,7 +209,7 @@ def _probe(field: AbstractField) -> list[list[float]]:
 def _check_probe(field: AbstractField, probe: Any, source: str) -> None:
     state, saved = np.asarray(probe, float)
     velocity = np.asarray(_of_state(field)(jnp.asarray(state)))
-    if not np.linalg.norm(velocity - saved) <= _SAME * np.linalg.norm(saved):
+    if not np.linalg.norm(velocity - saved) <= _AGREES * np.linalg.norm(saved):
         raise ValueError(
             f"with this kernel the field in {source} has the velocity {velocity} at the state "
             f"{state}, and it had {saved} when it was saved: a function in the kernel is not the "
@@ -237,7 +237,7 @@ _ROOMS = tuple(
     f"hamkernel.{room}"
     for room in ("_kernels.", "_structures.", "_features.", "_fields.", "systems.")
 )
-_FUNCTIONS = {function.__name__: function for function in (identity, reflection, time_reversal)}
+_MAPS = {function.__name__: function for function in (identity, reflection, time_reversal)}
 
 Node = Any
 Given = Mapping[str, tuple[Node, list[Any]]]
@@ -294,7 +294,7 @@ def description(value: Any, codes: list[Any], where: str) -> Node:
         return [description(v, codes, f"{where}[{i}]") for i, v in enumerate(value)]
     if value is None or cls in (bool, int, float, str):
         return value
-    if any(value is function for function in _FUNCTIONS.values()):
+    if any(value is function for function in _MAPS.values()):
         return {"function": value.__name__}
     if not callable(value):
         raise TypeError(f"{where} is a {cls.__name__}, which cannot be stored.")
@@ -339,8 +339,8 @@ def skeleton(node: Node, codes: list[Any], where: str, given: Given) -> Any:
             return made
         case {"array": str(dtype), "shape": [*shape]}:
             return jax.ShapeDtypeStruct(tuple(shape), np.dtype(dtype))
-        case {"function": str(name)} if name in _FUNCTIONS:
-            return _FUNCTIONS[name]
+        case {"function": str(name)} if name in _MAPS:
+            return _MAPS[name]
         case {"code": str(name), "leaves": list()}:
             if not codes:
                 raise _NotGiven(f"{where} is {name[:80]!r}, code that is not in the file")
@@ -366,12 +366,12 @@ def _difference(saved: Node, given: Node, where: str) -> str | None:
         case _ if given is None or (type(saved) is type(given) and saved == given):
             return None
         case _:
-            here = f"{_shown(saved)} in the file and {_shown(given)} here"
+            here = f"{_summary(saved)} in the file and {_summary(given)} here"
             return f"{where} is {here}: not the one saved"
     return next(filter(None, (_difference(*pair) for pair in pairs)), None)
 
 
-def _shown(node: Node) -> str:
+def _summary(node: Node) -> str:
     match node:
         case {"class": str(name)} | {"function": str(name)}:
             return name
@@ -413,7 +413,7 @@ def _opened(content: bytes, source: str) -> bytes:
     return rest
 
 
-def _write(path: pathlib.Path, content: bytes) -> None:
+def _write_at_once(path: pathlib.Path, content: bytes) -> None:
     """Write all of the file or nothing: a new one takes the place of the old one at once."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder; save needs the name of a file.")

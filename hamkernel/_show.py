@@ -12,7 +12,7 @@ from jax.core import Tracer
 from jaxtyping import Array
 
 _WIDTH = 88  # of a line, beyond which each attribute has its own
-_FEW = 16  # numbers of a vector that are printed
+_PRINTED = 16  # numbers of a vector that are printed
 
 
 def described(module: Any, positional: tuple[str, ...] = ()) -> str:
@@ -83,7 +83,7 @@ def _is_short(value: Any) -> bool:
             return False
     elif not isinstance(value, np.ndarray):
         return False
-    return value.ndim <= 1 and value.size <= _FEW
+    return value.ndim <= 1 and value.size <= _PRINTED
 
 
 def text(value: Any) -> str:

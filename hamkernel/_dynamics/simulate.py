@@ -113,18 +113,19 @@ def simulate(
         )
     if dt is None:
         jumps = inputs is not None and not callable(inputs)
-        steps = _adaptive(solver, ts, _tolerances(rhs, start, x0, rtol, atol), max_steps, jumps)
+        tolerances = _tolerances(rhs, start, x0, rtol, atol)
+        steps = _adaptive_steps(solver, ts, tolerances, max_steps, jumps)
     else:
-        steps = _equal(solver, ts, dt, adjoint, max_steps)
-    solution = _solve(rhs, steps, ts, x0, start, adjoint, progress)
-    solution, failed = _finished(solution, given.astype(x0.dtype))
+        steps = _equal_steps(solver, ts, dt, adjoint, max_steps)
+    solution = _integrate(rhs, steps, ts, x0, start, adjoint, progress)
+    solution, failed = _at_caller_times(solution, given.astype(x0.dtype))
     if steps.counts is not None:  # Diffrax counted the intervals around the equal steps
         total = jnp.asarray(require.on_host(steps.counts).sum())
         stats = {**solution.stats, "num_steps": total, "num_accepted_steps": total}
         solution = eqx.tree_at(lambda s: s.stats, solution, stats)
     if not throw:
         return solution
-    message = jax.tree_util.Partial(_failure, solution, at_start, x0, dt is None)
+    message = jax.tree_util.Partial(_reason_of_failure, solution, at_start, x0, dt is None)
     ys = require.value(solution.ys, require.on_host(failed), message, RuntimeError)
     return eqx.tree_at(lambda s: s.ys, solution, ys)
 
@@ -284,7 +285,7 @@ class _Steps(NamedTuple):
     counts: Int[Array, " intervals"] | None = None
 
 
-def _adaptive(
+def _adaptive_steps(
     solver: diffrax.AbstractSolver,
     ts: Float[Array, " T"],
     tolerances: tuple[Float[Array, ""], Float[Array, ""]],
@@ -327,7 +328,7 @@ def _tolerances(
     return tolerance("rtol", rtol), tolerance("atol", atol)
 
 
-def _equal(
+def _equal_steps(
     solver: diffrax.AbstractSolver,
     ts: Float[Array, " T"],
     dt: ArrayLike,
@@ -402,7 +403,7 @@ def _check_solver(solver: Any, dt: Any, rtol: Any, atol: Any, has_inputs: bool) 
 # The solve and its outcome.
 
 
-def _solve(
+def _integrate(
     rhs: RightHandSide,
     steps: _Steps,
     ts: Float[Array, " T"],
@@ -439,7 +440,7 @@ def _solve(
 
 
 @eqx.filter_jit
-def _finished(solution: Any, ts: Float[Array, " T"]) -> tuple[Any, Bool[Array, ""]]:
+def _at_caller_times(solution: Any, ts: Float[Array, " T"]) -> tuple[Any, Bool[Array, ""]]:
     """The solution at the caller's times, and whether it failed.
 
     Times that the solve did not reach stay infinite. A state that is not finite is a failure:
@@ -454,7 +455,7 @@ def _finished(solution: Any, ts: Float[Array, " T"]) -> tuple[Any, Bool[Array, "
     return solution, result != _RESULTS.successful
 
 
-def _failure(solution: Any, field: Any, x0: Float[Array, " n"], adapts: bool) -> str:
+def _reason_of_failure(solution: Any, field: Any, x0: Float[Array, " n"], adapts: bool) -> str:
     """Why a solve failed, and what to do."""
     reason = (
         "Too many steps, a step whose equations could not be solved, or a state that "

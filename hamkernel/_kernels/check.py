@@ -79,7 +79,7 @@ def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     moved = here * (1 + 4 * eps * np.cos(np.pi * np.indices(here.shape).sum(axis=0)))
     moved = moved.astype(X.dtype)  # by some units in the last place: how far k and M round
     pairs = (here[:, None], here[None]), (moved[:, None], moved[None])
-    gram, rounded, between, beyond = _evaluated(
+    gram, rounded, between, beyond = _derivatives_of_pairs(
         k, unit, *pairs, (here[near][:, None, None], Z), (Z, Z)
     )
     _refuse_infinite(gram.k, subset, f"k is {gram.k.sum()}")
@@ -145,7 +145,7 @@ def _neighbours(X: np.ndarray, unit: np.ndarray, size: np.ndarray, eps: float) -
     return (X[:, None, None] + h).astype(X.dtype)
 
 
-def _evaluated(k: Callable, unit: np.ndarray, *pairs) -> list[_Pairs]:
+def _derivatives_of_pairs(k: Callable, unit: np.ndarray, *pairs) -> list[_Pairs]:
     """K and its derivatives on batches of pairs that broadcast to (..., n), in one compilation."""
     n = len(unit)
     wide = [np.broadcast_arrays(*pair) for pair in pairs]
@@ -218,7 +218,7 @@ def _longest(row: np.ndarray) -> int:
 
 
 def _diagnosis(own, limits, steady: bool, where: str, unit) -> str:
-    got, *shown = (_shown(b / unit[:, None] / unit) for b in (own, *limits))
+    got, *shown = (_block_text(b / unit[:, None] / unit) for b in (own, *limits))
     scale = max(map(_size, limits), default=0.0)
     tends = f" The neighbours M(x, x + h) tend to {shown[0]} as h → 0." if limits else ""
     said = f"{where} autodiff returns M(x, x) = {got}.{tends}"
@@ -248,7 +248,7 @@ def _rank_one(block: np.ndarray) -> bool:
     return len(values) > 1 and values[1] <= 0.05 * values[0]
 
 
-def _shown(block: np.ndarray) -> str:
+def _block_text(block: np.ndarray) -> str:
     block = np.where(np.abs(block) < 1e-6 * _size(block), 0.0, block) + 0.0
     text = np.array2string(block, precision=4, threshold=16, edgeitems=2, separator=", ")
     return " ".join(text.split())

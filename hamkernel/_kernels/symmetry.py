@@ -30,7 +30,7 @@ from hamkernel._show import call, text
 LinearMap = Callable[[Array], Array] | tuple[tuple[float, ...], ...]
 
 MOST = 64  # elements of a group; the largest point group of space, that of the cube, has 48
-_SAME = 1e-8  # far above the rounding of 64 products, far below the steps of a group of 64
+_SAME_MAP = 1e-8  # far above the rounding of 64 products, far below the steps of a group of 64
 
 
 def identity(x: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -139,7 +139,7 @@ def closed(
         for each, sign in zip(maps, characters, strict=True)
     ]
     for g in generators:
-        if abs(np.linalg.det(g.matrix)) < _SAME:
+        if abs(np.linalg.det(g.matrix)) < _SAME_MAP:
             raise ValueError(
                 "a map of the symmetry is not invertible, so it is no element of a group: "
                 f"S = {np.round(g.matrix, 3).tolist()}. To ignore a coordinate use Select(k, dims)."
@@ -148,7 +148,7 @@ def closed(
     for known in group:  # which grows
         for g in generators:
             new = Element(_clean(g.matrix @ known.matrix), g.character * known.character)
-            found = [e for e in group if np.abs(e.matrix - new.matrix).max() < _SAME]
+            found = [e for e in group if np.abs(e.matrix - new.matrix).max() < _SAME_MAP]
             if found and found[0].character != new.character:
                 raise ValueError(
                     "no function but zero has all these symmetries: a product of the maps is the "
@@ -179,17 +179,17 @@ def pairs(group: tuple[Element, ...], one_sided: bool) -> list[tuple[Element, El
 
 def is_orthogonal(S: Float[np.ndarray, "n n"]) -> bool:
     """Whether S keeps distances and dot products."""
-    return bool(np.abs(S @ S.T - np.eye(len(S))).max() < _SAME)
+    return bool(np.abs(S @ S.T - np.eye(len(S))).max() < _SAME_MAP)
 
 
 def is_diagonal(S: Float[np.ndarray, "n n"]) -> bool:
     """Whether S takes every coordinate to a multiple of itself."""
-    return bool(np.abs(S - np.diag(np.diagonal(S))).max() < _SAME)
+    return bool(np.abs(S - np.diag(np.diagonal(S))).max() < _SAME_MAP)
 
 
 def is_permutation(S: Float[np.ndarray, "n n"]) -> bool:
     """Whether S permutes the coordinates, up to signs."""
-    return is_orthogonal(S) and bool(np.abs(np.abs(S) - np.round(np.abs(S))).max() < _SAME)
+    return is_orthogonal(S) and bool(np.abs(np.abs(S) - np.round(np.abs(S))).max() < _SAME_MAP)
 
 
 T = TypeVar("T")
@@ -322,12 +322,12 @@ def symmetrised(
         if given.keys() <= known.keys():
             return kernel
         both = known | given
-        return _checked(Symmetrised(kernel.kernel, tuple(both), tuple(both.values())))
+        return _with_closed_group(Symmetrised(kernel.kernel, tuple(both), tuple(both.values())))
     known = Invariance.REFLECTION in kernel.invariance if reflects else None
-    return _checked(Symmetrised(kernel, maps, characters, known))
+    return _with_closed_group(Symmetrised(kernel, maps, characters, known))
 
 
-def _checked(kernel: Symmetrised) -> Symmetrised:
+def _with_closed_group(kernel: Symmetrised) -> Symmetrised:
     """The kernel, whose group must close; of functions alone the dimension is not known yet."""
     matrices = [each for each in kernel.maps if not callable(each)]
     if matrices:

@@ -18,7 +18,7 @@ from hamkernel._show import call, text
 from hamkernel._structures.structure import AbstractPotentialKernel, check_symmetries
 
 Operator = Callable[[Float[Array, " n"]], Any]
-_FEW = 16  # points at which a symmetry of B is checked: one would do, but for zeros
+_CHECKED_STATES = 16  # points at which a symmetry of B is checked: one would do, but for zeros
 _SYMMETRIC = 1e-6  # of Π at the data: rounding in float32 leaves 1e-7, a wrong sign 1
 
 
@@ -70,7 +70,7 @@ class AbstractCustomOperator(AbstractPotentialKernel):
                 f"X[{int(bad.argmax())}]: it must be defined at every state of the data."
             )
         self._check_values(matrices, X)
-        check_symmetries(self, X[:_FEW])
+        check_symmetries(self, X[:_CHECKED_STATES])
 
 
 class Structured(AbstractCustomOperator):
@@ -110,7 +110,7 @@ class Structured(AbstractCustomOperator):
 
     def __init__(self, kernel: Any, operator: Operator):
         self.kernel = as_scalar_kernel(kernel)
-        self.operator = _checked(operator, "Structured", "operator")
+        self.operator = _operator_function(operator, "Structured", "operator")
 
     def _check_values(self, matrices, X) -> None:
         del matrices, X
@@ -147,7 +147,7 @@ class Poisson(AbstractCustomOperator):
 
     def __init__(self, kernel: Any, tensor: Operator):
         self.kernel = as_scalar_kernel(kernel)
-        self.tensor = _checked(tensor, "Poisson", "tensor")
+        self.tensor = _operator_function(tensor, "Poisson", "tensor")
 
     def _check_values(self, matrices, X) -> None:
         size = np.abs(matrices).max(axis=(1, 2))
@@ -162,7 +162,7 @@ class Poisson(AbstractCustomOperator):
             )
 
 
-def _checked(fn: Any, whose: str, name: str) -> Operator:
+def _operator_function(fn: Any, whose: str, name: str) -> Operator:
     if fn is charged_particle:
         raise TypeError(_NO_TENSOR)
     if isinstance(fn, type) or not callable(fn):

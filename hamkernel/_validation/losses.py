@@ -63,7 +63,7 @@ def cross_validation_loss(
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
             matrices that do not fit in memory.
     """
-    K, rows, regularization = _checked(K, X, Y, regularization, inputs, parameters)
+    K, rows, regularization = _checked_problem(K, X, Y, regularization, inputs, parameters)
     return partition_loss(K, rows, regularization, partition_of_rows(rows, folds))
 
 
@@ -87,7 +87,7 @@ def cross_validation_residuals(
         Shape (N, n), in units of Y; of observations one for each row, in its units; inf where the
         matrix is not positive definite to rounding.
     """
-    K, rows, regularization = _checked(K, X, Y, regularization, inputs, parameters)
+    K, rows, regularization = _checked_problem(K, X, Y, regularization, inputs, parameters)
     left = held_out_rows(K, rows, regularization, partition_of_rows(rows, folds))[0]
     return rows.in_units(left)
 
@@ -126,7 +126,7 @@ def generalized_cross_validation(
 
     Source: Golub, Heath & Wahba (1979), Technometrics 21.
     """
-    return generalized_loss(*_checked(K, X, Y, regularization, inputs, parameters))
+    return generalized_loss(*_checked_problem(K, X, Y, regularization, inputs, parameters))
 
 
 @one_blas_thread
@@ -164,10 +164,10 @@ def log_marginal_likelihood(
 
     Source: Rasmussen & Williams (2006), eq. 2.30.
     """
-    return log_likelihood(*_checked(K, X, Y, regularization, inputs, parameters))
+    return log_likelihood(*_checked_problem(K, X, Y, regularization, inputs, parameters))
 
 
-def _checked(
+def _checked_problem(
     K, X, Y, regularization, inputs, parameters
 ) -> tuple[Any, Measurements, Float[Array, ""]]:
     """Kernel, rows and λ."""
