@@ -60,6 +60,7 @@ from hamkernel._structures.base import Sum
 from hamkernel._structures.controlled import Controlled, InputMatrix
 from hamkernel._structures.custom_operator import Poisson, Structured
 from hamkernel._structures.family import Family
+from hamkernel._structures.friction import Friction
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.port_hamiltonian import PortHamiltonian
 from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
@@ -102,6 +103,7 @@ __all__ = [  # noqa: RUF022 - in reading order
     "DivergenceFree",
     "Symplectic",
     "PortHamiltonian",
+    "Friction",
     "Poisson",
     "Structured",
     "poisson",

@@ -135,4 +135,11 @@ class PortHamiltonian(AbstractPotentialKernel):
                 f"friction has {self.log_friction.size} numbers: give one for all momenta, or one "
                 f"for each; states of n = {n} coordinates have {len(coordinates)}."
             )
+        unseen = sorted(set(coordinates) - frozenset().union(*self.kernel.supports(n)))
+        if unseen:
+            raise ValueError(
+                f"friction on coordinate {unseen[0]} is -r ∂H/∂x there, and the kernel of H does "
+                "not depend on that coordinate, so there would be none. Where the kinetic energy is"
+                " known as a mean, q̇ = p/m, add hk.Friction() to hk.Symplectic(k) instead."
+            )
         super().check_dimension(n)

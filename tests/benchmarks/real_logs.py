@@ -167,10 +167,7 @@ def kinematics(x, u):
 
 def kernel():
     angle = hk.Select(hk.Warp(hk.Gaussian(1.0), on_a_circle), 0)
-    speed = hk.Select(hk.Gaussian(5.0), 1)
-    drift = hk.Sum(
-        potential=hk.Symplectic(100.0 * angle), friction=hk.Odd(hk.CurlFree(100.0 * speed))
-    )
+    drift = hk.Sum(potential=hk.Symplectic(100.0 * angle), friction=hk.Friction(0.3, 3.0))
     return hk.Controlled(drift, hk.InputMatrix(50.0, acts_on=(1,)))
 
 

@@ -1,0 +1,159 @@
+"""`Friction`: a force that is odd, takes energy away, and does not vanish outside the data."""
+
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportOptionalMemberAccess=false
+# Wrong types are refused here, and any field is looked into.
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import hamkernel as hk
+
+VISCOUS, COULOMB, REST = 0.2, 0.6, 0.2
+
+
+def curve(v):
+    return VISCOUS * v + COULOMB * np.tanh(v / REST)
+
+
+def pendulum(x):
+    """A pendulum of mass one with viscous and dry friction, in NumPy."""
+    return np.stack([x[1], -6.0 * np.sin(x[0]) - curve(x[1])])
+
+
+def kinematics(x):
+    """q̇ = p, which is known."""
+    return jnp.array([x[1], 0.0])
+
+
+RNG = np.random.default_rng(0)
+X = RNG.uniform((-2.5, -3.0), (2.5, 3.0), size=(60, 2))
+Y = pendulum(X.T).T + 0.02 * RNG.normal(size=X.shape)
+FORCES = hk.Velocities(X, np.where([True, False], np.nan, Y))  # q̇ is known
+POTENTIAL = 10.0 * hk.Select(hk.Gaussian(1.5), 0)
+
+
+def test_blocks_are_those_of_the_closed_form():
+    K = hk.Friction([0.3, 0.1], 0.5, stribeck=0.7, rest_speed=0.2, stribeck_speed=0.4)
+    x, z = RNG.normal(size=(2, 4))
+
+    def force(v, d):
+        return d * v + (0.5 + 0.7 * np.exp(-((v / 0.4) ** 2))) * np.tanh(v / 0.2)
+
+    F, G = (np.array([0, 0, force(s[2], 0.3), force(s[3], 0.1)]) for s in (x, z))
+    np.testing.assert_allclose(K(x, z), np.diag(F * G), atol=1e-14)
+    assert repr(K).startswith("Friction(")
+
+
+@functools.cache
+def tuned(known):
+    """With q̇ = p known and a potential, or with any energy."""
+    energy = POTENTIAL if known else 10.0 * hk.Gaussian(2.0)
+    K = hk.Sum(energy=hk.Symplectic(energy), friction=hk.Friction(0.1, 0.1))
+    options = {"objective": "marginal_likelihood", "starts": 4}
+    if known:
+        return hk.tune(K, FORCES, mean=kinematics, **options)
+    return hk.tune(K, X, Y, **options)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_curve_is_found_with_a_known_kinetic_energy_and_without(known):
+    found = tuned(known).field.part("friction")
+    speeds = np.array([0.3, 1.0, 2.0, 3.0])
+    forces = [found(jnp.array([0.3, v]))[1] for v in speeds]
+    np.testing.assert_allclose(forces, -curve(speeds), rtol=0.1)
+    np.testing.assert_allclose(found(jnp.array([0.3, 1.0]))[0], 0.0, atol=1e-12)
+
+
+def test_it_takes_energy_away_at_every_speed_where_a_gaussian_falls_to_zero():
+    gaussian = hk.Sum(
+        energy=hk.Symplectic(POTENTIAL),
+        friction=hk.Odd(hk.CurlFree(10.0 * hk.Select(hk.Gaussian(1.0), 1))),
+    )
+    ordinary = hk.fit(gaussian, FORCES, regularization=1e-5, mean=kinematics).part("friction")
+    found = tuned(True).field.part("friction")
+    speeds = jnp.linspace(-60.0, 60.0, 241)
+    states = jnp.stack([jnp.zeros_like(speeds), speeds], axis=1)
+    force, others = found.evaluate(states)[:, 1], ordinary.evaluate(states)[:, 1]
+    assert (force * speeds <= 0).all()
+    np.testing.assert_allclose(force, -force[::-1], atol=1e-10)  # odd
+    outside = np.abs(speeds) > 20
+    assert np.abs(force[outside]).min() > COULOMB + 0.5 * VISCOUS * 20
+    assert np.abs(others[outside]).max() < 1e-6
+
+
+def test_parts_are_saved_loaded_and_symmetrised(tmp_path):
+    field = tuned(True).field
+    hk.save(tmp_path / "f", field)
+    again = hk.load(tmp_path / "f", mean=kinematics)
+    x = jnp.array([0.3, 1.7])
+    np.testing.assert_array_equal(again(x), field(x))
+    K = hk.Odd(hk.Symplectic(hk.Gaussian(1.0)) + hk.Friction())
+    np.testing.assert_allclose(K(-x, x), -K(x, x), atol=1e-14)
+
+
+@pytest.mark.slow
+def test_it_is_found_from_positions_alone_and_the_motion_stops_where_it_sticks():
+    ts = np.linspace(0.0, 8.0, 241)
+    options = {"rtol": 1e-9, "atol": 1e-10, "t_eval": ts}
+    true = [
+        solve_ivp(lambda t, x: pendulum(x), (0, 8), x0, "LSODA", **options).y.T
+        for x0 in ([2.5, 0.0], [0.5, 4.0], [-1.0, -2.0])
+    ]
+    noisy = [x + 0.005 * RNG.normal(size=x.shape) for x in true]
+    for x in noisy:
+        x[:, 1] = np.nan
+    K = hk.Sum(energy=hk.Symplectic(POTENTIAL), friction=hk.Friction(0.1, 0.1))
+    found = hk.learn(K, hk.Runs([ts] * 3, noisy), mean=kinematics)
+    speeds = np.array([0.5, 1.0, 3.0, 30.0])
+    forces = [found.field.part("friction")(jnp.array([0.3, v]))[1] for v in speeds]
+    np.testing.assert_allclose(forces[:3], -curve(speeds[:3]), rtol=0.05)
+    assert 0.5 < -forces[3] / curve(30.0) < 1.5  # ten times as fast as the log
+    path = hk.simulate(found.field, jnp.array([1.5, 0.0]), jnp.asarray(ts)).ys
+    expected = solve_ivp(lambda t, x: pendulum(x), (0, 8), [1.5, 0.0], "LSODA", **options).y.T
+    assert np.abs(path - expected).max() < 0.05
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "match"),
+    [
+        (lambda: hk.Friction(-1.0), ValueError, "viscous must be positive"),
+        (lambda: hk.Friction(damped=(1, 1)), ValueError, "distinct coordinates"),
+        (lambda: hk.Even(hk.Friction()), TypeError, "friction is odd"),
+        (
+            lambda: hk.Invariant(hk.Friction(), [-np.eye(2)]),
+            TypeError,
+            "no potential to be averaged",
+        ),
+        (lambda: hk.gram(hk.Friction(), X[:, :1]), ValueError, "say which have friction"),
+        (lambda: hk.gram(hk.Friction(damped=2), X), ValueError, "does not exist"),
+        (lambda: hk.gram(hk.Friction([0.1, 0.2]), X), ValueError, "one for each"),
+        (
+            lambda: hk.gram(hk.PortHamiltonian(POTENTIAL), X),
+            ValueError,
+            r"coordinate 1 .* add hk\.Friction",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(call, error, match):
+    with pytest.raises(error, match=match):
+        call()
+
+
+def test_it_works_under_jit_vmap_and_grad():
+    K = hk.Friction(0.3, 0.5, stribeck=0.2)
+    states = jnp.asarray(X[:5])
+
+    @jax.jit
+    def total(K):
+        return jnp.sum(jax.vmap(lambda x: K(x, x))(states))
+
+    slope = jax.grad(total)(K).log_coulomb
+    step = 1e-5
+    more, less = (total(hk.Friction(0.3, 0.5 * np.exp(h), stribeck=0.2)) for h in (step, -step))
+    np.testing.assert_allclose(slope, (more - less) / (2 * step), rtol=1e-6)
