@@ -44,12 +44,13 @@ def changed(run, change):
 
 
 def test_runs_keep_what_came():
-    runs = hk.Runs(TIMES, STATES, inputs=[x[:, :1] for x in STATES])
+    runs = hk.Runs(TIMES, STATES, inputs=[x[::-1, :1] for x in STATES])
     assert len(runs) == 3
     assert runs.dimension == 2
     np.testing.assert_array_equal(runs.times[1], TIMES[1])
-    np.testing.assert_array_equal(runs.inputs[2], STATES[2][:, :1])
-    assert repr(runs) == "Runs(3 runs, 78 samples, n=2)"
+    np.testing.assert_array_equal(runs.inputs[2], STATES[2][::-1, :1])
+    assert repr(runs) == "Runs(3 runs, 78 samples, n=2, m=1 held)"
+    assert repr(hk.Runs(TIMES, STATES)) == "Runs(3 runs, 78 samples, n=2)"
     assert len(hk.Runs(TIMES[0], STATES[0])) == 1  # one run as bare arrays
 
 
@@ -101,6 +102,47 @@ def test_gaps_and_constant_columns_are_named():
         hk.Runs(t, np.column_stack([np.sin(t), np.cos(t)]))
     with pytest.warns(UserWarning, match=r"constant in all runs: coordinate 1 \(always 3\)"):
         hk.Runs(TIMES[0], np.column_stack([np.sin(TIMES[0]), np.full(len(TIMES[0]), 3.0)]))
+
+
+# What sensors and controllers do.
+
+EVEN = np.linspace(0, 10, 400)
+SWING = np.stack([np.sin(2 * EVEN), 2 * np.cos(2 * EVEN)], axis=1)
+NOISY = SWING + 0.01 * np.random.default_rng(1).normal(size=SWING.shape)
+
+
+def test_clean_noisy_and_digital_logs_are_taken_without_a_word():
+    for x in (SWING, NOISY, np.round(SWING, 2), np.round(NOISY, 2), np.round(SWING, 1)):
+        hk.Runs(EVEN, x)  # a warning is an error here
+    hk.Runs(EVEN, np.column_stack([0.3 * EVEN, np.full(400, 0.3) + 1e-3 * EVEN]))  # no force
+    held = np.concatenate([np.repeat(SWING[:1], 50, axis=0), SWING])  # by hand, before it is let go
+    hk.Runs(np.arange(450.0), held)
+
+
+def test_clipped_dead_repeated_and_interpolated_samples_are_named():
+    clipped = np.column_stack([NOISY[:, 0], np.clip(NOISY[:, 1], -9, 1.5)])
+    with pytest.warns(UserWarning, match=r"seems clipped: coordinate 1 at 1\.5 stays"):
+        hk.Runs(EVEN, clipped)
+    dead = NOISY.copy()
+    dead[200:260, 0] = dead[200, 0]
+    with pytest.warns(UserWarning, match=r"dead: coordinate 0 of run 0 from 5\.013 to 6\.491"):
+        hk.Runs(EVEN, dead)
+    with pytest.warns(UserWarning, match=r"repeated samples: coordinate 0 \(75%\), 1 \(75%\)"):
+        hk.Runs(EVEN, np.repeat(NOISY[::4], 4, axis=0))
+    drawn = [np.interp(EVEN, EVEN[::4], column) for column in NOISY[::4].T]
+    with pytest.warns(UserWarning, match=r"interpolated samples: coordinate 0 \(75%\)"):
+        hk.Runs(EVEN, np.stack(drawn, axis=1))
+
+
+def test_feedback_without_excitation_is_named_and_with_it_is_not():
+    law = -3 * NOISY[:, :1] - NOISY[:, 1:]
+    more = np.random.default_rng(2).normal(size=law.shape)
+    with pytest.warns(UserWarning, match="the input is a function of the states but for"):
+        hk.Runs(EVEN, NOISY, law + 0.1 * more)
+    with pytest.warns(UserWarning, match="a combination of the inputs is a function of"):
+        hk.Runs(EVEN, NOISY, np.column_stack([law + more, law - more]))
+    hk.Runs(EVEN, NOISY, law + 2 * more)
+    hk.Runs(EVEN, NOISY, np.sin(5.1 * EVEN)[:, None])
 
 
 def dense(coordinate, t, s):

@@ -160,7 +160,7 @@ def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> Non
             "and K a kernel for the rest, such as hk.Symplectic(hk.Select(k, 0)) for ṗ = -U'(q). "
             "Or log it."
         )
-    d = runs.dimension + runs.applied()[0].shape[1]
+    d = runs.dimension + runs.input_count
     points = np.random.default_rng(0).standard_normal((8, d))
     with require.traceable("mean"):
         D = np.asarray(jax.vmap(jax.jacfwd(mean))(jnp.asarray(points)))  # (8, n, d)

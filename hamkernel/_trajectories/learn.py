@@ -40,7 +40,13 @@ from hamkernel._trajectories.likelihood import (
     losses,
     most_likely,
 )
-from hamkernel._trajectories.preprocessing import Preprocessed, landmarks, preprocess, sampled
+from hamkernel._trajectories.preprocessing import (
+    Preprocessed,
+    decided,
+    landmarks,
+    preprocess,
+    sampled,
+)
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.segments import (
     LinearisedSegments,
@@ -49,10 +55,10 @@ from hamkernel._trajectories.segments import (
     grown,
     halved,
     linearised_along_field,
-    linearised_along_smoothed,
     segmented,
     shoot,
     short_pieces,
+    smoothed_rows,
     trusted,
 )
 from hamkernel._trajectories.smoothing import interpolated
@@ -136,7 +142,14 @@ def learn(
     bounds, design = bounds_and_design(model, X, Y, data.scale, moves)
     S = landmarks(X, data.scale, None if solver is None else solver.max_points)
     task = Task(data, known, S, bounds, jnp.asarray(_WIDE * data.scale))
-    now, pieces, history, converged = _iterated(task, begin(task, model, design), progress)
+    first = begin(task, model, design)
+    if not runs.is_decided:
+        runs, data = decided(
+            runs, data, lambda data: initial_loss(task._replace(data=data), first.model)
+        )
+        task = task._replace(data=data)
+        first = begin(task, first.model, design)
+    now, pieces, history, converged = _iterated(task, first, progress)
     mean = None if mean is None else as_pytree(mean)
     return _learned(runs, mean, task, now, pieces, history, converged, given is not None, measured)
 
@@ -278,7 +291,7 @@ def _check(
     if given is None:
         K.check_dimension(n)
     else:
-        U = jnp.asarray(np.concatenate(runs.applied()))
+        U = jnp.concatenate([jnp.atleast_2d(each) for each in given])
         K, _ = sampled_points(K, jnp.zeros((len(U), n), U.dtype), U)
     if jnp.zeros(()).dtype != jnp.float64:
         raise ValueError(
@@ -362,18 +375,19 @@ class Current(NamedTuple):
     free: float
 
 
+def initial_loss(task: Task, model: Model) -> float:
+    """−log p of the rows along the smoothed runs, at the hyperparameters of `model`."""
+    *_, rows = smoothed_rows(task.data, task.mean)
+    return float(losses(model, model.flat[None], task.S, rows, task.start_deviation)[0])
+
+
 def begin(task: Task, model: Model, design: np.ndarray) -> Current:
     """INT: rows along the smoothed runs, with the tangent of the mean.
 
     In short segments: the errors of the smoothed path add up along a run.
     """
-    runs = task.data.runs
-    paths = [run.path for run in runs]
-    pieces = short_pieces(runs)
-    segments = segmented(runs, pieces, paths)
-    good = np.zeros(len(segments.starts), bool)
-    good[: len(pieces)] = [task.data.usable[piece.run] for piece in pieces]
-    rows = linearised_along_smoothed(task.data, pieces, segments, task.mean, good)
+    pieces, good, rows = smoothed_rows(task.data, task.mean)
+    paths = [run.path for run in task.data.runs]
     values = np.asarray(losses(model, jnp.asarray(design), task.S, rows, task.start_deviation))
     model = model.at(jnp.asarray(design[int(np.argmin(values))]))
     model, _ = most_likely(model, task.S, rows, task.start_deviation, task.bounds, _SEARCH)

@@ -6,8 +6,9 @@ many; the bias of this is of second order in what the smoothing missed. What the
 is how they scatter about that mean.
 """
 
+import functools
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import NamedTuple, get_args
 
 import equinox as eqx
 import jax
@@ -16,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._trajectories.flow import NODES, with_tangent
-from hamkernel._trajectories.inputs import at_nodes, at_samples, in_intervals
+from hamkernel._trajectories.inputs import Between, at_nodes, at_samples
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.smoothing import Coordinate, interpolated, processes, smoothed
 
@@ -91,7 +92,7 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
     With inputs it is a function of the points (x, u).
     """
     times, states = runs.on_host()
-    logged = times = [t - t[0] for t in times]
+    times = [t - t[0] for t in times]
     found, usable = _robust_processes(times, states)
     counts = [np.isfinite(x).astype(float) for x in states]
     scatter = [np.zeros_like(x) for x in states]
@@ -105,10 +106,7 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
         ]
         times, states, counts, scatter = (list(each) for each in zip(*condensed, strict=True))
     gap = _GAP * min(lengths, default=np.inf)
-    inputs = [
-        in_intervals(t, u, at, runs.between == "held")
-        for t, u, at in zip(logged, runs.applied(), times, strict=True)
-    ]
+    inputs = [runs.applied(r, t + float(runs.times[r][0])) for r, t in enumerate(times)]
     path_runs = _with_paths(found, times, states, counts, scatter, inputs, gap)
     if not all(c.seen for c in found) or mean is not None:
         path_runs = [_completed(run, mean) for run in path_runs]
@@ -116,6 +114,72 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
     good = [run.path for run, use in zip(path_runs, usable, strict=True) if use]
     scale = np.concatenate(good).std(axis=0)
     return Preprocessed(path_runs, noise, np.where(scale > 0, scale, 1.0), usable)
+
+
+def with_inputs(data: Preprocessed, runs: Runs) -> Preprocessed:
+    """The same runs with the inputs of `runs`, which may differ in how they go on."""
+    return data._replace(
+        runs=[
+            run._replace(inputs=runs.applied(r, run.times + float(runs.times[r][0])))
+            for r, run in enumerate(data.runs)
+        ]
+    )
+
+
+def decided(
+    runs: Runs, data: Preprocessed, loss: Callable[[Preprocessed], float]
+) -> tuple[Runs, Preprocessed]:
+    """The likeliest way in which inputs go on between samples, and their likeliest delay.
+
+    Args:
+        runs: runs with between="auto", delay="fit", or both.
+        data: the runs, preprocessed.
+        loss: −log p of preprocessed runs.
+    """
+    kinds = get_args(Between) if runs.between == "auto" else (runs.between,)
+    found = []
+
+    def judge(between, delay: float) -> float:
+        chosen = runs.going_on(between, delay)
+        there = with_inputs(data, chosen)
+        found.append((loss(there), chosen, there))
+        return found[-1][0]
+
+    for between in kinds:
+        if runs.delay == "fit":
+            _least(functools.partial(judge, between), _spacing(runs))
+        else:
+            judge(between, runs.delay)
+    _, chosen, there = min(found, key=lambda each: each[0])
+    return chosen, there
+
+
+def _spacing(runs: Runs) -> float:
+    """Of the inputs, or of the states where these are further apart: what may be misaligned."""
+    assert runs.input_times is not None
+    both = [*runs.times], [*runs.input_times]
+    return max(float(np.median(np.concatenate([np.diff(t) for t in each]))) for each in both)
+
+
+def _least(loss: Callable[[float], float], spacing: float) -> None:
+    """Ask for the loss near its minimum: at whole spacings downhill from none, then parabolas.
+
+    −log p is a sum of squares in the delay, nearly, so that a parabola through three points finds
+    the least one; a second and third through points that are closer settle it.
+    """
+    known = {d: loss(d) for d in (-spacing, 0.0, spacing)}
+    while (best := min(known, key=known.__getitem__)) in (min(known), max(known)):
+        if abs(best) > 20 * spacing:  # a delay of a whole swing is no delay
+            return
+        known[best + np.sign(best) * spacing] = loss(best + np.sign(best) * spacing)
+    for reach in (spacing, spacing / 4, spacing / 16):
+        best = min(known, key=known.__getitem__)
+        left, right = (known.setdefault(d, loss(d)) for d in (best - reach, best + reach))
+        bend = left - 2 * known[best] + right
+        if not bend > 0:
+            return
+        vertex = best + reach * np.clip((left - right) / (2 * bend), -1, 1)
+        known[vertex] = loss(vertex)
 
 
 def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:

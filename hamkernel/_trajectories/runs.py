@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import operator
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,9 +13,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
+from hamkernel._trajectories.inputs import Between, in_intervals
+from hamkernel._trajectories.sensors import warn_of_feedback, warn_of_gaps, warn_of_sensors
 from hamkernel._trajectories.smoothing import Smoothing, processes, smoothed, smoothing
-
-_GAP = 10.0  # times the median spacing: between such samples the path is a guess
 
 
 class Runs(eqx.Module):
@@ -26,29 +27,38 @@ class Runs(eqx.Module):
     Args:
         times: for each run the times of its samples, shape (T,), strictly increasing.
         states: for each run the states, shape (T, n). Angles must be continuous: `np.unwrap`.
-        inputs: for each run what was applied, u at the times, shape (T, m), for `learn` with a
-            `Controlled` kernel; None if nothing.
-        between: how inputs go on from a sample, as in `simulate`: "held" until the next, as a
-            digital controller holds its command, or "linear", for a measured force or a smooth one.
-            Where they were held and are taken for linear, they come half a sample early.
+        inputs: for each run what was applied, for `learn` with a `Controlled` kernel: u at the
+            times of the states, shape (T, m), or a pair (times, u) of shapes (P,) and (P, m) that
+            spans them, such as a command at 1 kHz beside a camera at 50 Hz; None if nothing.
+        between: how inputs go on from a sample: "held" until the next, as a digital controller
+            holds its command; "linear", for a measured force; "smooth", the cubic spline through
+            the samples, for one that is sampled 6 to 20 times a period; or "auto", with which
+            `learn` takes the likeliest of the three, see `learned.runs`. Inputs that were held and
+            are taken for linear come half a sample early.
         parameters: for each run the θ of its system, shape (p,), for `learn` with a `Family`; None
             if all runs are of one system.
+        delay: by how much later than logged an input acts, in the unit of the times: at time t it
+            is u(t − delay). Or "fit", with which `learn` finds it.
 
     A single run may be given as bare arrays (T,) and (T, n).
 
     Raises:
         ValueError: shapes do not fit, a run has one sample only, times do not increase, an entry is
-            infinite, an input is NaN, or `between` is unknown. TypeError: something is not an array
-            of real numbers.
+            infinite, an input is NaN, inputs do not span the states, or `between` is unknown.
+            TypeError: something is not an array of real numbers.
 
     Warns:
-        UserWarning: a jump of 2π, a long gap, a coordinate that never moves: once, with the run.
+        UserWarning: a jump of 2π, a long gap, a coordinate that never moves or stops while others
+            go on, a sensor that was clipped, samples that were repeated or interpolated, an input
+            that is a function of the states: once each, with the run.
     """
 
     times: tuple[Float[Array, " T"], ...]
     states: tuple[Float[Array, "T n"], ...]
-    inputs: tuple[Float[Array, "T m"], ...] | None
-    between: Literal["held", "linear"] = eqx.field(static=True)
+    inputs: tuple[Float[Array, "P m"], ...] | None
+    input_times: tuple[Float[Array, " P"], ...] | None
+    between: Between | Literal["auto"] = eqx.field(static=True)
+    delay: float | Literal["fit"] = eqx.field(static=True)
     parameters: tuple[Float[Array, " p"], ...] | None
 
     def __init__(
@@ -56,12 +66,13 @@ class Runs(eqx.Module):
         times: Any,
         states: Any,
         inputs: Any = None,
-        between: Literal["held", "linear"] = "held",
+        between: Between | Literal["auto"] = "held",
         parameters: Any = None,
+        delay: float | Literal["fit"] = 0.0,
     ):
         if hasattr(times, "ndim") and times.ndim == 1:  # one run
             times, states = [times], [states]
-            inputs = None if inputs is None else [inputs]
+            inputs = None if inputs is None else [inputs]  # an array, or a pair (times, u)
             parameters = None if parameters is None else [parameters]
         times, states = list(times), list(states)
         inside = "Make it outside; the losses and hk.simulate work inside."
@@ -72,24 +83,39 @@ class Runs(eqx.Module):
             _rows(x, t, r, "states")
             for r, (x, t) in enumerate(zip(states, self.times, strict=True))
         )
-        self.inputs = None
+        if between not in (*get_args(Between), "auto"):
+            raise ValueError(
+                f"between must be 'held', 'linear', 'smooth' or 'auto'; got {between!r}."
+            )
+        self.between = between
+        self.delay = "fit" if isinstance(delay, str) and delay == "fit" else _seconds(delay)
+        self.inputs = self.input_times = None
         if inputs is not None:
             pairs = zip(inputs, self.times, strict=True)
-            self.inputs = tuple(_rows(u, t, r, "inputs") for r, (u, t) in enumerate(pairs))
+            signals = [_signal(u, t, r) for r, (u, t) in enumerate(pairs)]
+            self.input_times, self.inputs = (tuple(each) for each in zip(*signals, strict=True))
             _check_inputs(self.inputs)
-        if between not in ("held", "linear"):
-            raise ValueError(f"between must be 'held' or 'linear'; got {between!r}.")
-        self.between = between
         self.parameters = None if parameters is None else _members(parameters, len(times), inputs)
         _check_coordinates(self.states)
-        _warn_of_oddities(self.times, self.states)
+        times, states = self.on_host()
+        warn_of_gaps(times, states)
+        warn_of_sensors(times, states)
+        if self.inputs is not None:
+            lines = [self.applied(r, t) for r, t in enumerate(times)]
+            warn_of_feedback(states, [np.concatenate([ends[:, 0], ends[-1:, 1]]) for ends in lines])
 
     def __len__(self) -> int:
         return len(self.times)
 
     def __repr__(self) -> str:
         samples = sum(len(t) for t in self.times)
-        return f"Runs({len(self)} runs, {samples} samples, n={self.dimension})"
+        said = [f"{len(self)} runs", f"{samples} samples", f"n={self.dimension}"]
+        if self.inputs is not None:
+            said.append(f"m={self.input_count} {self.between}")
+            if self.delay != 0.0:
+                delay = self.delay if isinstance(self.delay, str) else f"{self.delay:.4g}"
+                said.append(f"delay={delay}")
+        return f"Runs({', '.join(said)})"
 
     @property
     def dimension(self) -> int:
@@ -143,17 +169,39 @@ class Runs(eqx.Module):
             np.asarray(x, float) for x in self.states
         ]
 
-    def applied(self) -> list[np.ndarray]:
-        """The inputs as NumPy arrays of doubles, shape (T, 0) where there are none.
+    @property
+    def input_count(self) -> int:
+        """m, the number of inputs or parameters; 0 where there are none."""
+        given = self.inputs or self.parameters
+        return given[0].shape[-1] if given else 0
 
-        With parameters they are those of the run, at all of its times.
+    @property
+    def is_decided(self) -> bool:
+        """Whether `between` and `delay` are given, and not for `learn` to find."""
+        return self.inputs is None or (self.between != "auto" and self.delay != "fit")
+
+    def applied(self, run: int, at: Float[np.ndarray, " R"]) -> Float[np.ndarray, "R-1 2 m"]:
+        """The best line of the inputs in each interval of the times `at`, by its ends.
+
+        With parameters they are those of the run, always. What is not decided yet stands as linear,
+        and as no delay.
         """
         if self.parameters is not None:
-            pairs = zip(self.parameters, self.times, strict=True)
-            return [np.tile(np.asarray(theta, float), (len(t), 1)) for theta, t in pairs]
-        if self.inputs is None:
-            return [np.zeros((len(t), 0)) for t in self.times]
-        return [np.asarray(u, float) for u in self.inputs]
+            return np.tile(np.asarray(self.parameters[run], float), (len(at) - 1, 2, 1))
+        if self.inputs is None or self.input_times is None:
+            return np.zeros((len(at) - 1, 2, 0))
+        between = "linear" if self.between == "auto" else self.between
+        delay = 0.0 if isinstance(self.delay, str) else self.delay
+        t, u = (np.asarray(a[run], float) for a in (self.input_times, self.inputs))
+        return in_intervals(t, u, np.asarray(at) - delay, between)
+
+    def going_on(self, between: Between, delay: float) -> "Runs":
+        """The same runs with inputs that go on so; what was checked and warned of is not again."""
+        new = object.__new__(Runs)
+        given = {"between": between, "delay": delay}
+        for field in dataclasses.fields(self):
+            object.__setattr__(new, field.name, given.get(field.name, getattr(self, field.name)))
+        return new
 
     def _check_measured(self) -> None:
         for c in range(self.dimension):
@@ -199,10 +247,11 @@ def _members(parameters: Any, count: int, inputs: Any) -> tuple[Float[Array, " p
     return tuple(require.finite(theta, f"parameters[{r}]") for r, theta in enumerate(rows))
 
 
-def _times(t: Any, run: int) -> Float[Array, " T"]:
-    t = require.floating(t, f"times[{run}]")
+def _times(t: Any, run: int, of: str = "states") -> Float[Array, " T"]:
+    name = f"times[{run}]" if of == "states" else f"the times of {of}[{run}]"
+    t = require.floating(t, name)
     if t.ndim != 1:
-        raise ValueError(f"times[{run}] has shape {t.shape}; times of shape (T,) are needed.")
+        raise ValueError(f"{name} has shape {t.shape}; times of shape (T,) are needed.")
     if t.size < 2:
         raise ValueError(
             f"run {run} has {t.size} sample{'s' * (t.size != 1)}: at least two are needed to see "
@@ -210,14 +259,12 @@ def _times(t: Any, run: int) -> Float[Array, " T"]:
         )
     seen = np.asarray(t)
     if not np.isfinite(seen).all():
-        raise ValueError(
-            f"times[{run}] contains NaN or inf at {np.flatnonzero(~np.isfinite(seen))[0]}."
-        )
+        raise ValueError(f"{name} contains NaN or inf at {np.flatnonzero(~np.isfinite(seen))[0]}.")
     back = np.flatnonzero(np.diff(seen) <= 0)
     if back.size:
         i = int(back[0])
         raise ValueError(
-            f"times[{run}] must increase; sample {i + 1}, at {seen[i + 1]:g}, does not come after "
+            f"{name} must increase; sample {i + 1}, at {seen[i + 1]:g}, does not come after "
             f"sample {i}, at {seen[i]:g} ({back.size} such). Sort by time and drop repeats; "
             "where a log starts anew, start a new run."
         )
@@ -232,6 +279,11 @@ def _rows(x: Any, t: Array, run: int, name: str) -> Float[Array, "T n"]:
             hint = f" It seems transposed: {name}[{run}].T."
         elif x.ndim == 1 and len(x) == len(t):
             hint = f" One row a sample: {name}[{run}][:, None]."
+        elif name == "inputs" and x.ndim == 2:
+            hint = (
+                " Where inputs have times of their own, give pairs, inputs=[(times, u), …]; where "
+                "the last command is missing, repeat it."
+            )
         raise ValueError(
             f"{name}[{run}] has shape {x.shape} and times[{run}] has shape {t.shape}; one row a "
             f"sample, shape ({len(t)}, {'n' if name == 'states' else 'm'}), is needed.{hint}"
@@ -239,6 +291,39 @@ def _rows(x: Any, t: Array, run: int, name: str) -> Float[Array, "T n"]:
     if np.isinf(np.asarray(x)).any():
         raise ValueError(f"{name}[{run}] contains inf. Write NaN for what was not measured.")
     return x
+
+
+def _seconds(delay: Any) -> float:
+    if isinstance(delay, bool) or not isinstance(delay, int | float | np.number):
+        raise TypeError(f"delay must be a number, or 'fit'; got {delay!r}.")
+    if not np.isfinite(delay):
+        raise ValueError(f"delay must be finite; got {delay!r}.")
+    return float(delay)
+
+
+def _signal(u: Any, t: Array, run: int) -> tuple[Float[Array, " P"], Float[Array, "P m"]]:
+    """The times and values of the inputs of one run whose states have the times t."""
+    if not isinstance(u, tuple):
+        return t, _rows(u, t, run, "inputs")
+    if len(u) != 2:
+        raise ValueError(
+            f"inputs[{run}] is a tuple of {len(u)}: give an array (T, m), or (times, u)."
+        )
+    own = _times(u[0], run, "inputs")
+    values = _rows(u[1], own, run, "inputs")
+    spacing = float(np.median(np.diff(np.asarray(own))))
+    # A held command lasts until the next one, which comes a spacing after the last that was logged.
+    for name, missing, end in (
+        ("begin", own[0] - t[0], (own[0], t[0])),
+        ("end", t[-1] - own[-1], (own[-1], t[-1])),
+    ):
+        if missing > 1.001 * spacing:
+            raise ValueError(
+                f"the inputs of run {run} {name} at {float(end[0]):g} and its states at "
+                f"{float(end[1]):g}: what was applied must be known over the whole run. Cut the "
+                "states, or repeat the command that was held."
+            )
+    return own, values
 
 
 def _check_coordinates(states: tuple[Array, ...]) -> None:
@@ -264,52 +349,3 @@ def _check_inputs(inputs: tuple[Array, ...]) -> None:
                 ": what was applied must be known at every sample. Repeat the command that was held"
                 ", interpolate, or cut the run there."
             )
-
-
-def _warn_of_oddities(times: tuple[Array, ...], states: tuple[Array, ...]) -> None:
-    gaps, jumps, still = [], [], []
-    for run, (t, x) in enumerate(zip(times, states, strict=True)):
-        dt, x = np.diff(np.asarray(t)), np.asarray(x)
-        if len(dt) > 2 and dt.max() > _GAP * np.median(dt):
-            gaps.append(f"{dt.max():.3g} in run {run}, at a median spacing of {np.median(dt):.3g}")
-        for c in range(x.shape[1]):
-            if _is_wrapped(np.asarray(t), x[:, c]):
-                jumps.append(f"coordinate {c} of run {run}")
-    X = np.concatenate([np.asarray(x) for x in states])
-    for c in range(X.shape[1]):
-        column = X[np.isfinite(X[:, c]), c]
-        if column.size and np.ptp(column) == 0:
-            still.append(f"{c} (always {column[0]:g})")
-    if jumps:
-        require.warn(
-            f"{_some(jumps)} jumps by about 2π: a wrapped angle. A field is learned along "
-            "continuous paths; use np.unwrap(states[:, c]) before, and a kernel that is periodic, "
-            "hk.Periodic or hk.Warp, where the field is."
-        )
-    if gaps:
-        require.warn(
-            f"a gap of {_some(gaps)}. The path inside a gap is known from the field alone; cut the "
-            "run in two there if the system was moved meanwhile."
-        )
-    if still:
-        require.warn(
-            f"constant in all runs: coordinate {_some(still)}. Leave it out of the states."
-        )
-
-
-def _is_wrapped(t: Float[np.ndarray, " T"], x: Float[np.ndarray, " T"]) -> bool:
-    """Whether x turns by 2π between samples that are else less than a third as far, as it goes."""
-    t, x = t[np.isfinite(x)], x[np.isfinite(x)]
-    near = np.diff(t) <= 3 * np.median(np.diff(t)) if len(t) > 1 else slice(0)
-    step = np.abs(np.diff(x))[near]  # across a gap a momentum may go as far
-    beyond = np.abs(step - 2 * np.pi)
-    full = beyond < 2 * np.pi / 3
-    if not full.any() or full.all():
-        return bool(full.any() and beyond.max() < 0.7)
-    others = step[~full].max()
-    return bool(others < 2 * np.pi / 3 and beyond[full].max() < 0.7 + others)
-
-
-def _some(names: list[str]) -> str:
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(names[:3]) + more

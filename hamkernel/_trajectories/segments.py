@@ -330,6 +330,17 @@ def segmented(
     return segments_of(filled, power_of_two(len(pieces)), length)
 
 
+def smoothed_rows(
+    data: Preprocessed, mean
+) -> tuple[list[Piece], Bool[np.ndarray, " S"], LinearisedSegments]:
+    """Short pieces of the smoothed runs, which of them are good, and their rows."""
+    pieces = short_pieces(data.runs)
+    segments = segmented(data.runs, pieces, [run.path for run in data.runs])
+    good = np.zeros(len(segments.starts), bool)
+    good[: len(pieces)] = [data.usable[piece.run] for piece in pieces]
+    return pieces, good, linearised_along_smoothed(data, pieces, segments, mean, good)
+
+
 class Shooting(NamedTuple):
     """The path of the current field through every segment.
 

@@ -10,7 +10,6 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from hamkernel._trajectories.flow import simulated
-from hamkernel._trajectories.inputs import in_intervals
 from hamkernel.plot._style import COLORS, DATA, coordinate, drawn, legend, with_unit
 
 if TYPE_CHECKING:
@@ -110,9 +109,8 @@ def fitted(
     ts, fit = np.asarray(learned.runs.times[run]), np.asarray(learned.states[run])
     grid = np.interp(np.arange(_BETWEEN * (len(ts) - 1) + 1) / _BETWEEN, np.arange(len(ts)), ts)
     spans = np.repeat(np.diff(ts)[:, None] / _BETWEEN, _BETWEEN, axis=1)
-    applied = learned.runs.applied()[run]
-    ends = in_intervals(ts, applied, grid, learned.runs.between == "held")
-    ends = ends.reshape(*spans.shape, 2, applied.shape[1])
+    ends = learned.runs.applied(run, grid)
+    ends = ends.reshape(*spans.shape, 2, ends.shape[2])
     field = getattr(learned.field, "whole", learned.field)  # of the points (x, u) with inputs
     steps, starts = jnp.ones(_BETWEEN, int), jnp.asarray(fit[:-1])
     between = simulated(field, starts, jnp.asarray(spans), steps, jnp.asarray(ends)).x

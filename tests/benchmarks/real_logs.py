@@ -134,7 +134,8 @@ def accelerations(t, x):
     """Velocities and accelerations by a Savitzky-Golay filter over .22 s, on an even grid."""
     h = np.median(np.diff(t))
     window = 2 * round(0.11 / h) + 1
-    return [savgol_filter(x[:, 1], window, 3, deriv=order, delta=h) for order in (0, 1)]
+    v, rate = (savgol_filter(x[:, 1], window, 3, deriv=order, delta=h) for order in (0, 1))
+    return np.asarray(v), np.asarray(rate)
 
 
 def by_least_squares(t, x, u):
@@ -186,7 +187,7 @@ def by_tuning(t, x, u):
 
 
 def by_pysindy(t, x, u):
-    import pysindy
+    import pysindy  # pyright: ignore[reportMissingImports]
 
     def library(X):
         q, v, torque = X.T
@@ -216,7 +217,7 @@ METHODS = {
 
 
 def main():
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--data", type=Path, default=EXCERPT, metavar="FOLDER")
     parser.add_argument("--only", choices=METHODS, help="one method")
     given = parser.parse_args()

@@ -1,0 +1,211 @@
+"""What sensors and controllers do to a log, said before anything is learned from it."""
+
+import itertools
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from hamkernel import _require as require
+
+_GAP = 10.0  # times the median spacing: between such samples the path is a guess
+
+
+def warn_of_gaps(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> None:
+    """Say where an angle was wrapped, a gap is long, and a coordinate never moves."""
+    gaps, jumps, still = [], [], []
+    for run, (t, x) in enumerate(zip(times, states, strict=True)):
+        dt = np.diff(t)
+        if len(dt) > 2 and dt.max() > _GAP * np.median(dt):
+            gaps.append(f"{dt.max():.3g} in run {run}, at a median spacing of {np.median(dt):.3g}")
+        for c in range(x.shape[1]):
+            if _is_wrapped(t, x[:, c]):
+                jumps.append(f"coordinate {c} of run {run}")
+    X = np.concatenate(states)
+    for c in range(X.shape[1]):
+        column = X[np.isfinite(X[:, c]), c]
+        if column.size and np.ptp(column) == 0:
+            still.append(f"{c} (always {column[0]:g})")
+    if jumps:
+        require.warn(
+            f"{_some(jumps)} jumps by about 2π: a wrapped angle. A field is learned along "
+            "continuous paths; use np.unwrap(states[:, c]) before, and a kernel that is periodic, "
+            "hk.Periodic or hk.Warp, where the field is."
+        )
+    if gaps:
+        require.warn(
+            f"a gap of {_some(gaps)}. The path inside a gap is known from the field alone; cut the "
+            "run in two there if the system was moved meanwhile."
+        )
+    if still:
+        require.warn(
+            f"constant in all runs: coordinate {_some(still)}. Leave it out of the states."
+        )
+
+
+# Of the samples of a coordinate: more repeats than this are no chance. A real log of a motor whose
+# positions came late repeats a quarter of them and can be learned from.
+_MOST_REPEATS = 0.3
+_MOST_BENT = 0.6  # every other sample interpolated makes .5
+_QUANTA = 4.0  # the steps of a log, above which a repeat is no rounding of a sensor at work
+
+
+def warn_of_sensors(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> None:
+    """Say which coordinates look clipped, stuck, repeated or interpolated."""
+    X = np.concatenate(states)
+    scale = np.array([np.nanstd(x) if np.isfinite(x).any() else np.nan for x in X.T])
+    unit = np.where(scale > 0, scale, 1.0)
+    clipped, stuck, repeated, drawn = [], [], [], []
+    for c in range(X.shape[1]):
+        columns = [x[:, c] for x in states]
+        seen = [np.isfinite(x) for x in columns]
+        if not (scale[c] > 0):
+            continue
+        steps = np.abs(np.concatenate([np.diff(x[s]) for x, s in zip(columns, seen, strict=True)]))
+        moving = steps[steps > 0]
+        quantum = moving.min()
+        flat = {
+            value: sum(_plateaus(x, value, quantum) for x in columns)
+            for value in (np.nanmin(X[:, c]), np.nanmax(X[:, c]))
+        }
+        if max(flat.values()) >= 2:
+            clipped += [f"{c} at {value:.4g}" for value, count in flat.items() if count]
+            continue
+        if np.mean(steps == 0) > _MOST_REPEATS and np.median(moving) > _QUANTA * quantum:
+            repeated.append(f"{c} ({np.mean(steps == 0):.0%})")
+            continue
+        bends = [_bends(t[s], x[s]) for t, x, s in zip(times, columns, seen, strict=True)]
+        bent = np.concatenate(bends) > 1e-9 * scale[c]
+        whole = np.abs(moving / quantum - np.round(moving / quantum)).max() < 0.01  # a digital one
+        turns = any(_is_wrapped(t, x) for t, x in zip(times, columns, strict=True))
+        # A motion without forces is straight but for some collisions.
+        if bent.sum() >= 10 and bent.mean() < _MOST_BENT and not (whole or turns):
+            drawn.append(f"{c} ({1 - bent.mean():.0%})")
+        for r, x in enumerate(columns):
+            others = np.delete(states[r] / unit, c, axis=1)
+            found = _stuck(x, others)
+            if found is not None:
+                a, b = (float(times[r][i]) for i in found)
+                stuck.append(f"{c} of run {r} from {a:.4g} to {b:.4g}")
+    if clipped:
+        require.warn(
+            f"a sensor seems clipped: coordinate {_some(clipped)} stays at its outermost value and "
+            "arrives there at speed. Write NaN for these samples; the field then says where it went"
+            "."
+        )
+    if stuck:
+        require.warn(
+            f"a sensor seems dead: coordinate {_some(stuck)} keeps one value while others move by "
+            "more than a standard deviation. Write NaN for these samples."
+        )
+    if repeated:
+        require.warn(
+            f"repeated samples: coordinate {_some(repeated)} is often exactly the sample before, "
+            "and else goes on by many steps of its resolution. The log was written faster than the "
+            "sensor measures, so times are late and the noise looks smaller than it is: keep the "
+            "first of equal samples and write NaN for the others."
+        )
+    if drawn:
+        require.warn(
+            f"interpolated samples: coordinate {_some(drawn)} lies on straight lines between some "
+            "of its samples. What was interpolated is no measurement, and the noise looks smaller "
+            "than it is: give the samples at their own times, hk.Runs does not need equal ones."
+        )
+
+
+def _bends(t: Float[np.ndarray, " T"], x: Float[np.ndarray, " T"]) -> Float[np.ndarray, " P"]:
+    """By how much a sample is off the line of its neighbours, where these differ."""
+    if len(t) < 3:
+        return np.zeros(0)
+    line = x[:-2] + (x[2:] - x[:-2]) * (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
+    return np.abs(x[1:-1] - line)[x[2:] != x[:-2]]
+
+
+def _plateaus(x: Float[np.ndarray, " T"], value: float, quantum: float) -> int:
+    """How often x stays at this outermost value for three samples and enters or leaves at speed.
+
+    A smooth maximum that rounds to one value k times is a parabola that falls by less than
+    ((k + 2)/k)² of a step of the resolution one sample further on, 2.8 for k = 3.
+    """
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], x == value, [False]]).astype(int)))
+    found = 0
+    for first, stop in edges.reshape(-1, 2):
+        if stop - first < 3 or first == 0 or stop == len(x):
+            continue
+        step = min(abs(x[first - 1] - value), abs(x[stop] - value))
+        found += 1 if step > _QUANTA * quantum else 0
+    return found
+
+
+def _stuck(x: Float[np.ndarray, " T"], others: Float[np.ndarray, "T n-1"]):
+    """The longest stretch without a change in which another coordinate moves by more than one."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], x[1:] == x[:-1], [False]]).astype(int)))
+    if not edges.size or not others.size:
+        return None
+    first, stop = max(edges.reshape(-1, 2), key=lambda pair: pair[1] - pair[0])
+    part = others[first : stop + 1]
+    part = part[:, np.isfinite(part).all(axis=0)]
+    if stop - first < 5 or not part.size or np.ptp(part, axis=0).max() < 1.0:
+        return None
+    return first, stop
+
+
+# 1 − R², at which the standard error of a gain is √10 times that under independent inputs.
+_FEEDBACK = 0.1
+
+
+def warn_of_feedback(states: Sequence[np.ndarray], inputs: Sequence[np.ndarray]) -> None:
+    """Say which inputs are a smooth function of the states: a cubic of them, or a linear one."""
+    X, U = np.concatenate(states), np.concatenate(inputs)
+    X = X[:, np.isfinite(X).any(axis=0)]
+    use = np.isfinite(X).all(axis=1)
+    if use.sum() < 2 or not X.size:
+        return
+    X, U = X[use], U[use] - U[use].mean(axis=0)
+    Z = (X - X.mean(axis=0)) / np.where(X.std(axis=0) > 0, X.std(axis=0), 1.0)
+    powers = [np.ones(len(Z))]
+    for degree in range(1, 4):
+        more = itertools.combinations_with_replacement(Z.T, degree)
+        new = [np.prod(each, axis=0) for each in more]
+        if 10 * (len(powers) + len(new)) > len(Z):
+            break
+        powers += new
+    A = np.column_stack(powers)
+    if A.shape[1] == 1:
+        return
+    left = U - A @ np.linalg.lstsq(A, U, rcond=None)[0]
+    # Some combination of the inputs: the least of what is left, relative to what there was.
+    varied = U.std(axis=0) > 0
+    if not varied.any():
+        return
+    R = np.linalg.qr(U[:, varied], mode="r")
+    if np.abs(np.diag(R)).min() <= 1e-9 * np.abs(R).max():
+        return  # inputs that depend on one another are refused by `learn`
+    share = np.linalg.svd(left[:, varied] @ np.linalg.inv(R), compute_uv=False)[-1] ** 2
+    if share < _FEEDBACK:
+        which = "the input is" if U.shape[1] == 1 else "a combination of the inputs is"
+        require.warn(
+            f"{which} a function of the states but for {share:.2g} of its variance: feedback "
+            "without excitation. Gain and drift are then told apart by what is left alone, and "
+            f"their errors are {1 / np.sqrt(max(share, 1e-12)):.2g} times those under an "
+            "independent input. Add a known disturbance to the command, log other gains of the "
+            "controller, or give the input matrix, hk.Controlled(K, inputs=[[0.0], [1.0]])."
+        )
+
+
+def _is_wrapped(t: Float[np.ndarray, " T"], x: Float[np.ndarray, " T"]) -> bool:
+    """Whether x turns by 2π between samples that are else less than a third as far, as it goes."""
+    t, x = t[np.isfinite(x)], x[np.isfinite(x)]
+    near = np.diff(t) <= 3 * np.median(np.diff(t)) if len(t) > 1 else slice(0)
+    step = np.abs(np.diff(x))[near]  # across a gap a momentum may go as far
+    beyond = np.abs(step - 2 * np.pi)
+    full = beyond < 2 * np.pi / 3
+    if not full.any() or full.all():
+        return bool(full.any() and beyond.max() < 0.7)
+    others = step[~full].max()
+    return bool(others < 2 * np.pi / 3 and beyond[full].max() < 0.7 + others)
+
+
+def _some(names: list[str]) -> str:
+    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
+    return ", ".join(names[:3]) + more
