@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, log_per_coordinate
 from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.port_hamiltonian import distinct_coordinates
+from  import distinct_coordinates
 
 _DECADES = np.log(1e3)  # of a force, to both sides of one that explains the velocities
 # Of the largest speed. A swing through n samples passes its turning points in steps of 2π/n of the
