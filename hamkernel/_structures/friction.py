@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
+from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, log_per_coordinate
 from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._structures.base import AbstractMatrixKernel
-from  import distinct_coordinates
 
 _DECADES = np.log(1e3)  # of a force, to both sides of one that explains the velocities
 # Of the largest speed. A swing through n samples passes its turning points in steps of 2π/n of the
@@ -85,7 +85,7 @@ class Friction(AbstractMatrixKernel):
         if stribeck is not None:
             self.log_stribeck = log_per_coordinate(stribeck, "stribeck")
             self.log_stribeck_speed = log_per_coordinate(stribeck_speed, "stribeck_speed")
-        self.damped = None if damped is None else distinct_coordinates(damped, "damped")
+        self.damped = None if damped is None else require.coordinates(damped, "damped")
 
     @property
     def viscous(self) -> Float[Array, "..."]:
