@@ -280,6 +280,7 @@ def test_a_mesh_of_one_device_has_the_default_solver_of_one_device(kind, spec):
 
 
 SLOW = """
+from hamkernel._observations.measurements import measurements_of_states
 from hamkernel._solvers import conjugate_gradient, nystrom, random_features
 m = mesh(8)
 def slope(X, Y):
@@ -289,7 +290,9 @@ def slope(X, Y):
         fields = [hk.fit(K, X, Y, 1e-3, solver=solver) for solver in (waves, iterative)]
         return jnp.sum(values**2) + sum(jnp.sum(f.evaluate(new)**2) + f.norm for f in fields)
     return jax.grad(loss)(jnp.asarray(1.3))
-regularization, marks = jnp.asarray(1e-4), few.landmarks(K, jnp.asarray(X), jnp.asarray(1e-4))
+regularization, marks = jnp.asarray(1e-4), few.landmarks(
+    K, measurements_of_states(jnp.asarray(X), jnp.asarray(Y)), jnp.asarray(1e-4)
+)
 fits = {
     "nystrom": lambda X, Y, rows: nystrom._fit(K, X, Y, regularization, marks, rows),
     "features": lambda X, Y, rows: random_features._fit(K, waves, X, Y, regularization, rows),

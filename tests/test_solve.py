@@ -89,6 +89,76 @@ def test_fitted_values_are_within_the_tolerance_times_the_residual(tolerance):
         assert off > 1e-3
 
 
+def of_every_kind(n=24):
+    """Few velocities beside many other observations, of the swings' field and its energy."""
+    X, Y = swings(n + 3)
+    H = X[3:, 1] ** 2 / 2 - np.cos(X[3:, 0])
+    paths = X[3:, None] + np.linspace(-0.2, 0.2, 3)[:, None]
+    weights = np.ones((n, 3, 2))
+    field = np.stack([paths[..., 1], -np.sin(paths[..., 0])], axis=2)
+    masked = np.where([[True, False]], np.nan, Y[:3])
+    return {
+        "energies": hk.Velocities(X[:3], Y[:3]) + hk.Energies(X[3:], H),
+        "noise": hk.Velocities(X[:3], masked, noise=2.0) + hk.Energies(X[3:], H, noise=0.01),
+        "functionals": hk.Velocities(X[:3], Y[:3])
+        + hk.Functionals(paths, weights, np.sum(weights * field, axis=(1, 2))),
+    }
+
+
+@pytest.mark.parametrize("smoothness", [1.5, *[pytest.param(2.5, marks=pytest.mark.slow)]])
+@pytest.mark.parametrize("kind", ["energies", *slow("noise", "functionals")])
+def test_landmarks_are_rows_of_whatever_was_observed(kind, smoothness):
+    data = of_every_kind()[kind]
+    rough = hk.Symplectic(100.0 * hk.Matern(smoothness, 1.0))
+    exact, low_rank = (
+        hk.condition(rough, data, regularization=1e-5, solver=solver)
+        for solver in (hk.Cholesky(), Nystrom(tolerance=1e-8))
+    )
+    Z = swings(20, seed=9)[0]
+    assert relative(low_rank.field.evaluate(Z), np.asarray(exact.field.evaluate(Z))) < 1e-7
+    of_energy = [p.energy_deviation(Z[0], Z[1]) for p in (low_rank, exact)]
+    np.testing.assert_allclose(*of_energy, rtol=1e-7)
+    assert float(info(low_rank.field).truncation) < 1e-6
+
+
+def test_observations_are_cut_off_at_the_tolerance_and_too_few_landmarks_are_said():
+    data = of_every_kind()["energies"]
+    rough, exact = hk.Symplectic(100.0 * hk.Matern(1.5, 1.0)), {}
+    exact = hk.fit(rough, data, regularization=1e-1)
+    field = hk.fit(rough, data, regularization=1e-1, solver=Nystrom(tolerance=3.0))
+    assert 1e-3 < float(info(field).truncation) <= 3.0
+    off = np.linalg.norm(np.asarray(field.residual) - np.asarray(exact.residual))
+    assert 0 < off <= float(info(field).truncation) * np.linalg.norm(exact.residual)
+    with pytest.warns(UserWarning, match=r"8 landmarks leave .* Raise max_points"):
+        hk.fit(rough, data, regularization=1e-1, solver=Nystrom(max_points=4))
+
+
+@pytest.mark.slow
+def test_a_part_of_many_observations_has_the_landmarks_for_all():
+    X, Y = swings(300)
+    data = hk.Velocities(X[:50], Y[:50], noise=0.5) + hk.Energies(
+        X[50:], X[50:, 1] ** 2 / 2 - np.cos(X[50:, 0])
+    )
+    exact = hk.fit(K, data, regularization=RIDGE)
+    Z = swings(20, seed=9)[0]
+
+    def fit(data):
+        return hk.fit(K, data, regularization=RIDGE, solver=Nystrom(1e-4, 200, 150)).evaluate(Z)
+
+    for values in (fit(data), jax.jit(fit)(data)):
+        assert relative(values, np.asarray(exact.evaluate(Z))) < 1e-4
+
+
+@pytest.mark.slow
+def test_a_low_rank_loss_of_observations_is_the_dense_one_where_landmarks_suffice():
+    data = of_every_kind()["energies"]
+    rough = hk.Symplectic(100.0 * hk.Matern(2.5, 1.0))
+    options: Any = {"starts": 1, "max_steps": 1, "frozen": ("regularization", "lengthscale")}
+    dense = hk.tune(rough, data, regularization=1e-4, **options)
+    tuned = hk.tune(rough, data, regularization=1e-4, solver=Nystrom(1e-8), **options)
+    np.testing.assert_allclose(tuned.loss, dense.loss, rtol=1e-5)
+
+
 def test_the_truncation_and_the_norm_are_those_of_numpy():
     X, Y = swings(150)
     field = hk.fit(K, X, Y, RIDGE, solver=Nystrom())

@@ -177,6 +177,20 @@ def test_observations_in_chunks_are_the_fit_to_their_sum(solver):
         np.testing.assert_allclose(field.info.truncation, expected, rtol=1e-2)
 
 
+@pytest.mark.slow
+def test_a_stream_may_start_from_observations_whose_rows_are_the_landmarks():
+    first, _ = observed()
+    rough, X3 = hk.Symplectic(100.0 * hk.Matern(1.5, 1.0)), hk.Velocities(X[:3], Y[:3])
+    exact = hk.fit(rough, first + X3, regularization=RIDGE)
+    model = Nystrom(1e-6).start(rough, first + X3, RIDGE).add(first).add(X[:3], Y[:3])
+    assert relative(model.field().evaluate(NEW), exact.evaluate(NEW)) < 1e-4
+    of_points = Nystrom(1e-6).start(rough, X[:3], RIDGE).add(first).add(X[:3], Y[:3])
+    with pytest.warns(UserWarning, match="landmarks leave"):
+        assert relative(of_points.field().evaluate(NEW), exact.evaluate(NEW)) > 1e-2
+    with pytest.raises(ValueError, match="takes no energies"):
+        Nystrom().start(rough, hk.Energies(X[:5], Y[:5, 0]), RIDGE)
+
+
 def test_a_stream_refuses_energies_and_other_systems():
     model = given(S).start(K, X, RIDGE)
     with pytest.raises(ValueError, match=r"takes no energies.*Functionals"):

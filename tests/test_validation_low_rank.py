@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 import hamkernel as hk
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of, measurements_of_states
-from hamkernel._solvers.landmarks import given_landmarks
+from hamkernel._solvers.landmarks import given_landmarks, landmarks_of
 from hamkernel._solvers.spans import LandmarkBasis, WaveBasis
 from hamkernel._validation.of_rows import (
     features_of_rows,
@@ -38,7 +38,7 @@ K = hk.Odd(hk.Symplectic(hk.Gaussian(1.2)))
 X, Y = map(jnp.asarray, data())
 ROWS = measurements_of_states(X, Y)
 BASES = {
-    "landmarks": LandmarkBasis(X[::5]),
+    "landmarks": LandmarkBasis(landmarks_of(Components(X[::5]))),
     "waves": WaveBasis(jax.random.key(3), 7),
 }
 FOLDS = {
@@ -90,10 +90,12 @@ def test_likelihood_and_gcv_are_those_of_the_low_rank_gram(basis):
 def test_with_all_points_as_landmarks_it_is_the_dense_loss():
     # A ridge far above what the columns left out as dependent carry.
     partition = partition_of_rows(ROWS, 5)
-    basis = LandmarkBasis(X)
+    basis = LandmarkBasis(landmarks_of(Components(X)))
     found = partition_loss(K, ROWS, jnp.asarray(RIDGE), partition, basis)
     np.testing.assert_allclose(found, hk.cross_validation_loss(K, X, Y, RIDGE, 5), rtol=1e-7)
-    few = partition_loss(K, ROWS, jnp.asarray(RIDGE), partition, LandmarkBasis(X[:2]))
+    few = partition_loss(
+        K, ROWS, jnp.asarray(RIDGE), partition, LandmarkBasis(landmarks_of(Components(X[:2])))
+    )
     assert abs(few / found - 1) > 0.1
 
 
@@ -171,7 +173,7 @@ LOSSES = {
 @pytest.mark.few(1)
 @pytest.mark.parametrize("loss", LOSSES)
 def test_gradients_of_observations_are_those_of_finite_differences(loss):
-    rows, basis = of_every_kind(), LandmarkBasis(X[::8])
+    rows, basis = of_every_kind(), LandmarkBasis(landmarks_of(Components(X[::8])))
 
     def value(log_scale, log_ridge):
         K = hk.Symplectic(1.3 * hk.Gaussian(jnp.exp(log_scale)))
@@ -187,15 +189,17 @@ def test_dependent_columns_are_found():
     rng = np.random.default_rng(1)
     F = rng.normal(size=(6, 4))
     F[3], F[5] = 2 * F[0], F[1] - F[2]
-    landmarks = given_landmarks(hk.Separable(lambda x, z: x @ z), jnp.asarray(F))
-    kept = np.asarray(landmarks.kept[:, 0])
+    landmarks = given_landmarks(
+        hk.Separable(lambda x, z: x @ z), landmarks_of(Components(jnp.asarray(F)))
+    )
+    kept = np.asarray(landmarks.kept).reshape(F.shape)[:, 0]
     assert kept.sum() == np.linalg.matrix_rank(F[kept]) == np.linalg.matrix_rank(F) == 4
 
 
 def test_columns_kept_of_many_close_points_are_independent_and_span_the_others():
     # The Gram of 200 points in the plane, of numerical rank 120 or so.
     S, smooth = data(200)[0], hk.Symplectic(hk.Gaussian(1.5))
-    kept = np.asarray(given_landmarks(smooth, jnp.asarray(S)).kept).ravel()
+    kept = np.asarray(given_landmarks(smooth, landmarks_of(Components(jnp.asarray(S)))).kept)
     G = np.asarray(hk.gram(smooth, S)).reshape(S.size, S.size)
     np.linalg.cholesky(G[np.ix_(kept, kept)])  # raises where a column depends on others
     across = G[np.ix_(kept, ~kept)]
@@ -209,7 +213,7 @@ def test_where_no_landmark_can_be_used_the_losses_are_infinite():
     # A fit is refused then; without columns it would be the zero field.
     for sign in (1.0, -1.0):
         K = hk.Symplectic(lambda x, z, sign=sign: sign * jnp.exp(-((x - z) @ (x - z))))
-        given, basis = (K, ROWS, jnp.asarray(1e-3)), LandmarkBasis(X[:3])
+        given, basis = (K, ROWS, jnp.asarray(1e-3)), LandmarkBasis(landmarks_of(Components(X[:3])))
         folds = partition_loss(*given, partition_of_rows(ROWS, 3), basis)
         losses = folds, generalized_loss(*given, basis), -log_likelihood(*given, basis)
         assert all(np.isfinite(loss) if sign > 0 else loss == np.inf for loss in losses)

@@ -54,13 +54,17 @@ def rows_between(
 
 
 def trace_of_rows(K: AbstractMatrixKernel, rows: Measurements) -> Float[Array, ""]:
-    """The trace of the Gram of rows without energies."""
+    """The trace of the Gram of all rows, before the contrast of the energies."""
     return sum((_trace(K, block) for block in rows.blocks), jnp.zeros((), rows.targets.dtype))
 
 
 def _trace(K: AbstractMatrixKernel, block: AbstractBlock) -> Float[Array, ""]:
+    X = block.points
+    if block.of_values:
+        variances = jax.vmap(K.potential_covariance)(*centred(K, X, X))
+        return jnp.sum(block.rows(variances) / block.scale)
     if not isinstance(block, Combinations):
-        return jnp.sum(block.rows(diagonals(K, block.points, block.points)) / block.scale)
+        return jnp.sum(block.rows(diagonals(K, X, X)) / block.scale)
 
     def of_group(group):
         one = Combinations(groups=group[0][None], weights=group[1][None])  # pyright: ignore[reportCallIssue]

@@ -14,6 +14,7 @@ from typing import Any, ClassVar
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Float, Int
 
 
@@ -273,7 +274,9 @@ class Values(AbstractBlock):
 
 def _taken(array: Array | None, index: Int[np.ndarray, " C"]) -> Any:
     """array[index], taken by NumPy: JAX would compile for every number of entries."""
-    return None if array is None else jnp.asarray(np.asarray(array)[index])
+    if array is None or isinstance(array, Tracer):
+        return None if array is None else array[index]
+    return jnp.asarray(np.asarray(array)[index])
 
 
 Subset = tuple[AbstractBlock, Int[np.ndarray, " rows"], Int[np.ndarray, " observations"]]

@@ -237,7 +237,12 @@ class Measurements:
 
         Energies alone give one point of the field, with a = 0.
         """
-        raw = self.contrast_transpose(c)
+        return self.representer(self.contrast_transpose(c))
+
+    def representer(
+        self, raw: Float[Array, " M"]
+    ) -> tuple[Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]]:
+        """`coefficients` of the M rows before the contrast."""
         pairs = [(b, b.coefficients(raw[s])) for b, s in zip(self.blocks, self.slices, strict=True)]
         none = self.blocks[0].points[:1]
         fields = [(b.points, a) for b, a in pairs if not b.of_values]

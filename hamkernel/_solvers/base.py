@@ -7,6 +7,7 @@ import equinox as eqx
 from jaxtyping import Array, Float
 
 from hamkernel._fields.base import AbstractField
+from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.conditional import AbstractConditional
 from hamkernel._solvers.problem import Problem
 from hamkernel._solvers.spans import AbstractBasis
@@ -22,10 +23,10 @@ class AbstractSolver(eqx.Module, Generic[Learned]):
     is_low_rank: ClassVar[bool] = False  # whether `tune` is to judge by the loss in its `_basis`
 
     def _basis(
-        self, K: AbstractMatrixKernel, X: Float[Array, "N n"], regularization: Float[Array, ""]
+        self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
     ) -> AbstractBasis | None:
         """The features of a fit of low rank, as functions of the hyperparameters."""
-        del K, X, regularization
+        del K, rows, regularization
         return None
 
     @abc.abstractmethod

@@ -41,7 +41,7 @@ class _Found(NamedTuple):
     learned: tuple[Array, Array, Array]  # coefficients, residual and norm
     iterations: Int[Array, ""]
     left: Float[Array, ""]  # the relative residual of the system
-    truncation: Float[Array, ""] | None  # of the preconditioner
+    truncation: Float[Array, ""]  # of the preconditioner
 
 
 class ConjugateGradient(AbstractSolver[KernelField]):
@@ -96,7 +96,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
     def _fitted(self, problem, throw=True) -> KernelField:
         K, rows, ridge = problem.kernel, problem.rows, problem.ridge
         X, spread = rows.points, rows_of(rows.points)
-        landmarks = self.preconditioner.landmarks(K, X, problem.regularization)
+        landmarks = self.preconditioner.landmarks(K, rows, problem.regularization)
         limits = landmarks, self._tolerance(rows.targets.dtype), self.max_iterations
         if problem.states is None:
             found = _solve_rows(K, rows, ridge, *limits)
@@ -164,9 +164,9 @@ class ConjugateGradient(AbstractSolver[KernelField]):
 def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
     S = landmarks.points
     # The preconditioner changes how fast the answer is found, not the answer.
-    K_, X_, S_, ridge_ = constant((K, X, S, ridge))
-    T = whitening(K_, landmarks)
-    square = normal(Columns(K_, S_), T, X_, jnp.zeros_like(Y), spread).square
+    K_, X_, S_, ridge_, marks = constant((K, X, S, ridge, landmarks))
+    T = whitening(K_, marks)
+    square = normal(Columns(K_, marks), T, X_, jnp.zeros_like(Y), spread).square
     R = factor(square, ridge_)
 
     def preconditioned(c):
@@ -186,7 +186,9 @@ def _solve_rows(K, rows, ridge, landmarks, tolerance, max_iterations):
     """`_solve` of rows of observations, whose product is that of their field with their rows."""
     y = rows.y
     K_, rows_, ridge_ = constant((K, rows, ridge))
-    F = landmark_span(K_, landmarks).of_rows(rows_)
+    span = landmark_span(K_, landmarks)
+    all_rows = span.of_rows(rows_)
+    truncation, F = span.truncation(rows_, all_rows, ridge_), rows_.contrast(all_rows)
     R = factor(F.T @ F, ridge_)
 
     def gram(c):
@@ -195,7 +197,7 @@ def _solve_rows(K, rows, ridge, landmarks, tolerance, max_iterations):
     def preconditioned(c):
         return c - F @ jax.scipy.linalg.cho_solve((R, True), F.T @ c)
 
-    return _iterated(gram, preconditioned, y, ridge, tolerance, max_iterations, None)
+    return _iterated(gram, preconditioned, y, ridge, tolerance, max_iterations, truncation)
 
 
 def _iterated(gram, preconditioned, y, ridge, tolerance, max_iterations, truncation) -> _Found:

@@ -12,7 +12,7 @@ from hamkernel._solvers.landmark_gram import checked, singular
 
 
 class Solution(NamedTuple):
-    coefficients: Float[Array, "m n"]
+    coefficients: Float[Array, " r"]
     residual: Float[Array, "N n"]
     norm: Float[Array, ""]
     truncation: Float[Array, ""]
@@ -25,11 +25,12 @@ def landmark_field(
     dtype = landmarks.points.dtype
     failed = require.not_finite(solution.coefficients).any()
     solution = checked(solution, landmarks, solution.truncation, failed, singular(dtype), throw)
-    _warn_if_truncated(solution.truncation, landmarks.count, tolerance, cure)
+    warn_if_truncated(solution.truncation, landmarks.count, tolerance, cure)
+    Z, A, S, b = landmarks.representer(solution.coefficients)
     return KernelField(
         kernel=K,
-        points=landmarks.points,
-        coefficients=solution.coefficients,
+        points=Z,
+        coefficients=A,
         residual=solution.residual,
         norm=solution.norm,
         regularization=regularization,
@@ -41,6 +42,8 @@ def landmark_field(
             truncation=solution.truncation,
             residual_norm=solution.residual_norm,
         ),
+        value_points=S if len(S) else None,
+        value_coefficients=b if len(S) else None,
     )
 
 
@@ -54,7 +57,7 @@ START_ANEW = (
 )
 
 
-def _warn_if_truncated(truncation, count, tolerance, cure):
+def warn_if_truncated(truncation, count, tolerance, cure):
     if not require.is_concrete(truncation, count):
         return
     # Twice: a random part of the data need not show all that the rest has.

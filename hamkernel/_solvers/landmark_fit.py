@@ -6,7 +6,7 @@ from jaxtyping import Array, Float, Int
 
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
-from hamkernel._gram.observed import between, components, trace_of_rows
+from hamkernel._gram.observed import trace_of_rows
 from hamkernel._machine import rows_of, split
 from hamkernel._observations.measurements import Measurements
 from hamkernel._show import text
@@ -61,8 +61,8 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 
     @eqx.filter_jit
     def _added_rows(self, rows: Measurements) -> "LandmarkFit":
-        K, S = self.kernel, self.landmarks.points
-        design = [between(K, block, components(K, S)) for block in rows.blocks]
+        K = self.kernel
+        design = [self.landmarks.columns(K, block) for block in rows.blocks]
         new = (
             stream_sums.add_rows(self.sums, jnp.concatenate(design), rows.targets),
             self.trace + trace_of_rows(K, rows),
@@ -80,16 +80,20 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 
 @eqx.filter_jit
 def start(K, sample, regularization, landmarks, tolerance):
-    S = landmarks.points
     T = whitening(K, landmarks)
+    if sample.states is None:
+        design = [landmarks.columns(K, block) for block in sample.blocks]
+        seen = stream_sums.Normal.zero(T).plus(jnp.concatenate(design) @ T, sample.targets)
+    else:
+        seen = stream_sums.normal(Columns(K, landmarks), T, *sample.states)
     return LandmarkFit(
         kernel=K,
         landmarks=landmarks,
-        sums=stream_sums.start(Columns(K, S), T, sample, regularization),
-        trace=jnp.zeros((), S.dtype),
+        sums=stream_sums.start(seen, T, sample.count, regularization),
+        trace=jnp.zeros((), T.dtype),
         count=jnp.zeros((), int),
         regularization=regularization,
-        dimension=K.outputs(S.shape[1]),
+        dimension=sample.dimension,
         tolerance=tolerance,
     )
 
@@ -98,7 +102,7 @@ def start(K, sample, regularization, landmarks, tolerance):
 def _with_data(fit, X, Y, spread):
     K = fit.kernel
     new = (
-        stream_sums.add(fit.sums, Columns(K, fit.landmarks.points), X, Y, spread),
+        stream_sums.add(fit.sums, Columns(K, fit.landmarks), X, Y, spread),
         fit.trace + trace(K, X, spread),
         fit.count + len(X),
     )
@@ -110,7 +114,7 @@ def _solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, norm, residual_norm = stream_sums.solve(fit.sums, ridge)
     return Solution(
-        coefficients=weights.reshape(len(fit.landmarks.points), -1),
+        coefficients=weights,
         residual=jnp.zeros((0, fit.dimension), weights.dtype),
         norm=norm,
         truncation=truncated(fit.trace, stream_sums.trace(fit.sums), ridge),

@@ -14,7 +14,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from hamkernel import _require as require
-from hamkernel._gram.dense import assemble, plus_ridge
+from hamkernel._gram.dense import plus_ridge
+from hamkernel._gram.observed import components
 from hamkernel._solvers.landmarks import Landmarks, masked
 from hamkernel._structures.base import AbstractMatrixKernel
 
@@ -22,20 +23,19 @@ Learned = TypeVar("Learned")
 
 
 class Columns(eqx.Module):
-    """The columns of the Gram that belong to landmarks, at some points: (t, n) -> (t, n, r)."""
+    """The columns of the Gram that belong to landmarks, at some points: (t, d) -> (t, n, r)."""
 
     kernel: AbstractMatrixKernel
-    points: Float[Array, "m n"]
+    landmarks: Landmarks
 
-    def __call__(self, X: Float[Array, "t n"]) -> Float[Array, "t n r"]:
-        G = assemble(self.kernel, X, self.points)
-        return G.reshape(*G.shape[:2], -1)
+    def __call__(self, X: Float[Array, "t d"]) -> Float[Array, "t n r"]:
+        columns = self.landmarks.columns(self.kernel, components(self.kernel, X))
+        return columns.reshape(len(X), -1, columns.shape[1])
 
 
 def whitening(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r r"]:
     """T with T Tᵀ = G_SS⁻¹ on the kept columns, zero on the others."""
-    S, kept = landmarks.points, landmarks.kept.reshape(-1)
-    return _inverse_root(assemble(K, S, S).reshape(len(kept), -1), kept)
+    return _inverse_root(landmarks.gram(K), landmarks.kept)
 
 
 @jax.custom_jvp

@@ -1,46 +1,86 @@
-"""Landmarks: the few points whose columns of the Gram carry all of it, to a stated tolerance.
+"""Landmarks: the few rows whose columns of the Gram carry all of it, to a stated tolerance.
 
-Randomly pivoted Cholesky draws points with probability proportional to what the columns so far
+A landmark is a row of the observations, a linear functional of the field or of its potential, and
+its column of the Gram is the representer of that functional. Of velocities the n rows of a point
+come together.
+
+Randomly pivoted Cholesky draws candidates with probability proportional to what the columns so far
 leave of the Gram's diagonal, so it goes where the data still say something new, and stops when
-little is left. Points are drawn in blocks; inside a block a point is kept with the probability
+little is left. Candidates are drawn in blocks; inside a block one is kept with the probability
 that drawing one by one would have given it (Epperly, Tropp & Webber), so blocks cost nothing.
 """
 
+import abc
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from hamkernel import _require as require
 from hamkernel._gram.dense import assemble, block_traces
 from hamkernel._gram.derivatives import constant
+from hamkernel._gram.observed import between_all, components, gram_of_rows
 from hamkernel._machine import rows_of, split
+from hamkernel._observations.blocks import AbstractBlock
+from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel
 
-BLOCK = 16  # points drawn at once
-FIRST = 64  # points in the first buffer; it doubles until they suffice
+BLOCK = 16  # candidates drawn at once
+FIRST = 64  # landmarks in the first buffer; it doubles until they suffice
 
 
 class Landmarks(eqx.Module):
-    """Points S and the columns of G_SS that are independent to rounding.
+    """Rows of linear functionals, and which of their columns are independent to rounding.
 
     Attributes:
-        points: shape (m, n). The last ones may be repetitions that keep no column.
-        kept: for each column (point, component), whether it is used, shape (m, n).
-        count: the number of points in use, shape ().
+        blocks: the rows, before any contrast of energies.
+        index: which of the rows are the r columns, shape (r,); None if all are, in their order.
+        kept: for each column whether it is used, shape (r,).
+        count: the number of landmarks in use, shape ().
     """
 
-    points: Float[Array, "m n"]
-    kept: Bool[Array, "m n"]
+    blocks: tuple[AbstractBlock, ...]
+    index: Int[Array, " r"] | None
+    kept: Bool[Array, " r"]
     count: Int[Array, ""]
+
+    @property
+    def points(self) -> Float[Array, "m d"]:
+        """The points of the first block: all of them, where the landmarks are velocities."""
+        return self.blocks[0].points
+
+    @property
+    def rows(self) -> Measurements:
+        """All rows of the blocks, with no targets."""
+        size = sum(block.size for block in self.blocks)
+        return Measurements(self.blocks, jnp.zeros(size, self.points.dtype))
+
+    def columns(self, K: AbstractMatrixKernel, block: AbstractBlock) -> Float[Array, "d r"]:
+        """The covariances of the rows of a block with the landmarks."""
+        covariances = between_all(K, block, self.blocks)
+        return covariances if self.index is None else covariances[:, self.index]
+
+    def gram(self, K: AbstractMatrixKernel) -> Float[Array, "r r"]:
+        """The Gram of the landmarks."""
+        G = gram_of_rows(K, self.rows, contrasted=False)
+        return G if self.index is None else G[self.index][:, self.index]
+
+    def representer(
+        self, c: Float[Array, " r"]
+    ) -> tuple[Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]]:
+        """The function Σ c_r L_r K: its points and coefficients, and those of its values."""
+        if self.index is not None:
+            c = jnp.zeros(self.rows.targets.shape, c.dtype).at[self.index].add(c)
+        return self.rows.representer(c)
 
 
 def choose_landmarks(
     K: AbstractMatrixKernel,
-    X: Float[Array, "N n"],
+    X: Float[Array, "N d"],
     left: Float[Array, ""],
     most: int,
     candidates: int,
@@ -52,8 +92,8 @@ def choose_landmarks(
 
     Args:
         K: a matrix-valued kernel.
-        X: states.
-        left: the mean of trace(G − Ĝ) per candidate to stop at.
+        X: points.
+        left: the mean of trace(G − Ĝ) per point to stop at.
         most: how many landmarks to choose at most.
         candidates: the points to choose from: X, or a random part of it if X is longer.
         key: for the draws.
@@ -72,18 +112,62 @@ def choose_landmarks(
         X = X[_spread(jax.random.split(key)[0], len(X), candidates)]
     if rows is not None:
         X = rows.whole(X)
-    most = min(most, len(X))
-    if not require.is_concrete(K, X, left, key):
-        drawn = _begin(K, X, left, key, most)
-        return _landmarks(X, drawn, most)
+    index, kept, count = _chosen(Points(K, X), left, min(most, len(X)), key)
+    return Landmarks((components(K, X[index]),), None, kept.reshape(-1), count)
+
+
+def choose_rows(
+    K: AbstractMatrixKernel,
+    rows: Measurements,
+    left: Float[Array, ""],
+    most: int,
+    candidates: int,
+    key: Key[Array, ""],
+) -> Landmarks:
+    """`choose_landmarks` out of the rows of any observations, one row at a time.
+
+    The constant of the energies is not taken off: trace(G − Ĝ) of the contrasts is no larger.
+
+    Args:
+        K: a matrix-valued kernel.
+        rows: the observations; a row counts relative to its noise.
+        left: the mean of trace(G − Ĝ) per row to stop at.
+        most: how many landmarks to choose at most.
+        candidates: the rows to choose from: all, or the rows of a random part of the observations.
+        key: for the draws.
+
+    Returns:
+        The landmarks. O(P² + P r²) time and O(P²) memory for P candidates and r landmarks.
+    """
+    K, rows, left = constant((K, rows, left))
+    blocks = rows.blocks
+    size = sum(block.size for block in blocks)
+    if size > candidates:
+        blocks = _part(blocks, candidates / size, jax.random.split(key)[0])
+    G = _compiled_gram(K, landmarks_of(*blocks))
+    index, kept, count = _chosen(Rows(G), left, min(most, len(G)), key)
+    return _pruned(blocks, index, kept.reshape(-1), count)
+
+
+def _chosen(
+    candidates: "AbstractCandidates", left: Float[Array, ""], most: int, key: Key[Array, ""]
+) -> tuple[Int[Array, " m"], Bool[Array, "m n"], Int[Array, ""]]:
+    """The index of the chosen candidates, which of their columns are kept, and how many."""
+    if not require.is_concrete(candidates, left, key):
+        return _first(_begin(candidates, left, key, most), most)
     size = min(FIRST, most)
-    drawn = _begin(K, X, left, key, size)
+    drawn = _begin(candidates, left, key, size)
     while int(drawn.count) >= size and size < most:
         size = min(2 * size, most)
-        drawn = _draw(K, X, left, _enlarged(drawn, size + BLOCK), size)
+        drawn = _draw(candidates, left, _enlarged(drawn, size + BLOCK), size)
     # A multiple of the block, so that similar fits share their compiled code.
     blocks = max(1, -(-int(drawn.count) // BLOCK))
-    return _landmarks(X, drawn, min(size, blocks * BLOCK))
+    return _first(drawn, min(size, blocks * BLOCK))
+
+
+@eqx.filter_jit
+def _compiled_gram(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r r"]:
+    return landmarks.gram(K)
 
 
 def _spread(key, N: int, count: int) -> Int[Array, " count"]:
@@ -93,17 +177,72 @@ def _spread(key, N: int, count: int) -> Int[Array, " count"]:
     return index
 
 
-@eqx.filter_jit
-def given_landmarks(K: AbstractMatrixKernel, S: Float[Array, "m n"]) -> Landmarks:
-    """All of S, with those columns that pivoted Cholesky finds independent.
+def _part(
+    blocks: tuple[AbstractBlock, ...], share: float, key: Key[Array, ""]
+) -> tuple[AbstractBlock, ...]:
+    """A random share of the observations of each block, or an even one where JAX traces."""
+    found = []
+    for block in blocks:
+        count = max(1, int(share * block.count))
+        traced = not require.is_concrete(block, key)
+        if isinstance(getattr(block, "kept", None), Tracer):
+            found.append(block)  # which rows there are is not known
+            continue
+        even = np.arange(count) * block.count // count
+        chosen = even if traced else np.asarray(_spread(key, block.count, count))
+        found.append(block.subset(chosen)[0])
+    return tuple(found)
 
-    O((m n)² r) time for r of them. Nothing is differentiated, as in `choose_landmarks`.
+
+def _pruned(
+    blocks: tuple[AbstractBlock, ...],
+    index: Int[Array, " r"],
+    kept: Bool[Array, " r"],
+    count: Int[Array, ""],
+) -> Landmarks:
+    """Landmarks without the observations that have none of the rows, where these are known."""
+    if not require.is_concrete(blocks, index, kept):
+        return Landmarks(blocks, index, kept, count)
+    rows, used = np.asarray(index), np.asarray(kept)
+    parts, places = [], np.zeros(len(rows), int)
+    start = size = 0
+    for block in blocks:
+        own = used & (rows >= start) & (rows < start + block.size)
+        if own.any() or (block is blocks[-1] and not parts):
+            chosen = np.unique(block.labels()[rows[own] - start])
+            # Others fill up to a multiple of the block: similar fits share their compiled code.
+            wanted = min(block.count, max(1, -(-len(chosen) // BLOCK)) * BLOCK)
+            others = np.setdiff1d(np.arange(block.count), chosen)[: wanted - len(chosen)]
+            part, taken, _ = block.subset(np.sort(np.concatenate([chosen, others])))
+            places[own] = size + np.searchsorted(taken, rows[own] - start)
+            parts.append(part)
+            size += part.size
+        start += block.size
+    return Landmarks(tuple(parts), jnp.asarray(places), kept, count)
+
+
+@eqx.filter_jit
+def given_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Landmarks:
+    """The landmarks with those columns kept that pivoted Cholesky finds independent.
+
+    O(r³) time for r columns. Nothing is differentiated, as in `choose_landmarks`.
     """
-    K, S = constant((K, S))
-    m, r = len(S), len(S) * K.outputs(S.shape[1])
-    rounding = _rounding(block_traces(K, S), r)
-    kept = _independent(assemble(K, S, S).reshape(r, r), rounding).reshape(m, -1)
-    return Landmarks(points=S, kept=kept, count=kept.any(axis=1).sum())
+    K, landmarks = constant((K, landmarks))
+    G = landmarks.gram(K)
+    # In units in which every column has the norm 1: what Cholesky rounds is relative to it.
+    norms = jnp.sqrt(jnp.abs(jnp.diagonal(G)))
+    norms = jnp.where(norms > 0, norms, jnp.ones_like(norms))
+    rounding = _rounding(jnp.ones(1, G.dtype), len(G))
+    kept = _independent(G / norms[:, None] / norms, rounding[0])
+    at_points = landmarks.index is None and len(landmarks.blocks) == 1
+    in_use = kept.reshape(len(landmarks.points) if at_points else len(kept), -1).any(axis=1)
+    return Landmarks(landmarks.blocks, landmarks.index, kept, in_use.sum())
+
+
+def landmarks_of(*blocks: AbstractBlock) -> Landmarks:
+    """All rows of blocks, dependent ones too."""
+    size = sum(block.size for block in blocks)
+    return Landmarks(blocks, None, jnp.ones(size, bool), jnp.asarray(size))
 
 
 def _independent(matrix, rounding):
@@ -129,10 +268,67 @@ def _independent(matrix, rounding):
     return jax.lax.while_loop(more, column, start)[3]
 
 
-def _rounding(traces: Float[Array, " P"], columns: int) -> Float[Array, ""]:
-    """What is left of a pivot that should be zero."""
+def _rounding(traces: Float[Array, " P"], columns: int) -> Float[Array, " P"]:
+    """What is left of pivots that should be zero, given their traces before.
+
+    The error of Cholesky's method is relative to the diagonal entry, whatever the others are.
+    """
     eps = jnp.finfo(traces.dtype).eps
-    return (10 * columns * eps * jnp.abs(traces).max()).astype(traces.dtype)
+    return (10 * columns * eps * jnp.abs(traces)).astype(traces.dtype)
+
+
+class AbstractCandidates(eqx.Module):
+    """P candidates of n rows each, and their Gram."""
+
+    @property
+    @abc.abstractmethod
+    def traces(self) -> Float[Array, " P"]:
+        """The traces of the diagonal blocks of the Gram."""
+
+    @property
+    @abc.abstractmethod
+    def outputs(self) -> int:
+        """The number n of rows of a candidate."""
+
+    @abc.abstractmethod
+    def gram(self, index: Int[Array, " B"]) -> Float[Array, "Bn Pn"]:
+        """The rows of the Gram that belong to some of the candidates."""
+
+
+class Points(AbstractCandidates):
+    """All components of the field at points."""
+
+    kernel: AbstractMatrixKernel
+    points: Float[Array, "P d"]
+
+    @property
+    def traces(self) -> Float[Array, " P"]:
+        return block_traces(self.kernel, self.points)
+
+    @property
+    def outputs(self) -> int:
+        return self.kernel.outputs(self.points.shape[1])
+
+    def gram(self, index: Int[Array, " B"]) -> Float[Array, "Bn Pn"]:
+        G = assemble(self.kernel, self.points[index], self.points)
+        return G.reshape(G.shape[0] * G.shape[1], -1)
+
+
+class Rows(AbstractCandidates):
+    """Single rows, whose Gram is a matrix."""
+
+    matrix: Float[Array, "P P"]
+
+    @property
+    def traces(self) -> Float[Array, " P"]:
+        return jnp.diagonal(self.matrix)
+
+    @property
+    def outputs(self) -> int:
+        return 1
+
+    def gram(self, index: Int[Array, " B"]) -> Float[Array, "B P"]:
+        return self.matrix[index]
 
 
 class _Drawn(NamedTuple):
@@ -143,29 +339,28 @@ class _Drawn(NamedTuple):
     kept: Bool[Array, "m n"]
     factor: Float[Array, "m n P n"]  # Ĝ = FᵀF over the candidates
     left: Float[Array, " P"]  # the traces of the diagonal blocks of G − Ĝ
-    rounding: Float[Array, ""]  # what a pivot must exceed
+    rounding: Float[Array, " P"]  # what a pivot must exceed
     key: Key[Array, ""]
     rounds: Int[Array, ""]
 
 
 @eqx.filter_jit
-def _begin(K, X, left, key, size):
+def _begin(candidates: AbstractCandidates, left, key, size):
     """`_draw` from the beginning."""
-    P, n = len(X), K.outputs(X.shape[1])
-    buffer = size + BLOCK
-    traces = block_traces(K, X)
+    traces, n = candidates.traces, candidates.outputs
+    P, buffer = len(traces), size + BLOCK
     zero = jnp.zeros((), int)
     drawn = _Drawn(
         count=zero,
         index=jnp.zeros(buffer, int),
         kept=jnp.zeros((buffer, n), bool),
-        factor=jnp.zeros((buffer, n, P, n), X.dtype),
+        factor=jnp.zeros((buffer, n, P, n), traces.dtype),
         left=traces,
         rounding=_rounding(traces, buffer * n),
         key=jax.random.split(key)[1],  # the other is for the candidates
         rounds=zero,
     )
-    return _draw(K, X, left, drawn, size)
+    return _draw(candidates, left, drawn, size)
 
 
 def _enlarged(drawn: _Drawn, size: int) -> _Drawn:
@@ -178,28 +373,28 @@ def _enlarged(drawn: _Drawn, size: int) -> _Drawn:
 
 
 @eqx.filter_jit
-def _draw(K, X, left, drawn, size):
-    """Draw blocks until the mean trace is at most `left` or `size` points are chosen."""
-    goal = len(X) * jnp.maximum(left, drawn.rounding)
+def _draw(candidates: AbstractCandidates, left, drawn, size):
+    """Draw blocks until the mean trace is at most `left` or `size` candidates are chosen."""
+    goal = jnp.maximum(left, drawn.rounding).sum()
 
     def more(drawn):
         # Rounds end the loop where rounding alone would go on drawing.
         wanted = (drawn.left.sum() > goal) & (drawn.count < size) & (drawn.rounds < 4 * size)
         return wanted | (drawn.rounds == 0)
 
-    return jax.lax.while_loop(more, lambda drawn: _draw_block(K, X, drawn), drawn)
+    return jax.lax.while_loop(more, lambda drawn: _draw_block(candidates, drawn), drawn)
 
 
-def _draw_block(K, X, drawn: _Drawn) -> _Drawn:
-    P, n = len(X), drawn.kept.shape[1]
+def _draw_block(candidates: AbstractCandidates, drawn: _Drawn) -> _Drawn:
+    P, n = len(drawn.left), drawn.kept.shape[1]
     key, draw, accept = jax.random.split(drawn.key, 3)
     index = jax.random.choice(draw, P, (BLOCK,), p=drawn.left / drawn.left.sum())
     size = len(drawn.index)
     factor = drawn.factor.reshape(size * n, P * n)
     at_index = drawn.factor[:, :, index].reshape(size * n, BLOCK * n)
-    rows = assemble(K, X[index], X).reshape(BLOCK * n, P * n) - at_index.T @ factor
+    rows = candidates.gram(index) - at_index.T @ factor
     block = rows.reshape(BLOCK * n, P, n)[:, index].reshape(BLOCK * n, BLOCK * n)
-    L, kept = _accepted(accept, block, n, drawn.rounding)
+    L, kept = _accepted(accept, block, n, drawn.rounding[index])
     new = jax.scipy.linalg.solve_triangular(L, rows, lower=True)
     new = jnp.where(kept[:, None], new, jnp.zeros_like(new))
 
@@ -245,7 +440,7 @@ def _factor(block, thresholds, n, rounding):
         now = jax.lax.dynamic_slice(jnp.diagonal(block), ((c // n) * n,), (n,)).sum()
         chosen = jnp.where(c % n == 0, now > thresholds[c // n], chosen)
         pivot = block[c, c]
-        keep = chosen & (pivot > rounding)
+        keep = chosen & (pivot > rounding[c // n])
         scale = jnp.sqrt(jnp.where(keep, pivot, jnp.ones_like(pivot)))
         v = jnp.where(keep, block[:, c] / scale, jnp.zeros_like(scale))
         block = block - v[:, None] * v[None, :]
@@ -264,10 +459,8 @@ def masked(matrix: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[Array,
 
 
 @eqx.filter_jit
-def _landmarks(X, drawn, size):
+def _first(drawn, size):
+    """The first candidates drawn, at most `size`."""
     used = jnp.arange(size) < drawn.count
-    return Landmarks(
-        points=X[drawn.index[:size]],
-        kept=drawn.kept[:size] & used[:, None],
-        count=jnp.minimum(drawn.count, size),
-    )
+    kept = drawn.kept[:size] & used[:, None]
+    return drawn.index[:size], kept, jnp.minimum(drawn.count, size)

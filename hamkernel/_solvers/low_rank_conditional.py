@@ -20,8 +20,8 @@ from hamkernel._fields.base import AbstractField
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.conditional import AbstractConditional
-from hamkernel._solvers.landmark_gram import singular
-from hamkernel._solvers.spans import AbstractSpan
+from hamkernel._solvers.landmark_gram import checked, singular
+from hamkernel._solvers.spans import AbstractSpan, LandmarkSpan
 
 
 class LowRankConditional(AbstractConditional):
@@ -45,8 +45,8 @@ class LowRankConditional(AbstractConditional):
     def updated(self, new: Measurements) -> "LowRankConditional":
         rows = self.rows.joined(new)
         beside, fresh = self.rows.with_previous(new), rows.size - self.rows.size
-        own = self.span.of_rows(beside)[-fresh:], rows.y[-fresh:]
-        R, rotated = _below(self.R, self.rotated, *own)
+        new_rows = beside.contrast(self.span.of_rows(beside))[-fresh:]
+        R, rotated = _below(self.R, self.rotated, new_rows, rows.y[-fresh:])
         return _conditional(self.span, rows, self.ridge, R, rotated)
 
     def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> AbstractField:
@@ -69,15 +69,19 @@ def low_rank_conditional(
     cause = singular(field.offset.dtype)
     arrays, rest = eqx.partition(field, eqx.is_inexact_array)
     failed = require.not_finite(field.norm)
-    arrays = require.value(arrays, failed, cause, RuntimeError, throw)
+    if isinstance(span, LandmarkSpan):
+        truncation = field.info.truncation
+        arrays = checked(arrays, span.landmarks, truncation, failed, cause, throw)
+    else:
+        arrays = require.value(arrays, failed, cause, RuntimeError, throw)
     return eqx.tree_at(lambda c: c.field, conditional, eqx.combine(arrays, rest))
 
 
 @eqx.filter_jit
 def _least_squares(span, rows, ridge):
-    F, y = span.of_rows(rows), rows.y
+    F = rows.contrast(span.of_rows(rows))
     start = jnp.sqrt(ridge) * jnp.eye(F.shape[1], dtype=F.dtype)
-    return _conditional(span, rows, ridge, *_below(start, jnp.zeros_like(F[0]), F, y))
+    return _conditional(span, rows, ridge, *_below(start, jnp.zeros_like(F[0]), F, rows.y))
 
 
 def _below(R, rotated, F, y):
@@ -90,7 +94,8 @@ def _below(R, rotated, F, y):
 
 
 def _conditional(span, rows, ridge, R, rotated):
-    w = solve_triangular(R, rotated)
-    left = rows.y - span.of_rows(rows) @ w
-    field = span.field(w, rows.residual(left), ridge, rows.count)
+    w, F = solve_triangular(R, rotated), span.of_rows(rows)
+    left = rows.y - rows.contrast(F @ w)
+    truncation = span.truncation(rows, F, ridge)
+    field = span.field(w, rows.residual(left), ridge, rows.count, truncation)
     return LowRankConditional(field, rows, ridge, span, R, rotated)

@@ -23,13 +23,26 @@ from hamkernel import _require as require
 from hamkernel._fields.base import root
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
+from hamkernel._gram.observed import components
 from hamkernel._gram.operator import product
 from hamkernel._machine import as_given, rows_of, split
+from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers import landmark_fit, stream_sums
-from hamkernel._solvers.landmark_field import CHOOSE, Solution, landmark_field
+from hamkernel._solvers.landmark_field import (
+    CHOOSE,
+    Solution,
+    landmark_field,
+    warn_if_truncated,
+)
 from hamkernel._solvers.landmark_fit import LandmarkFit
 from hamkernel._solvers.landmark_gram import Columns, factor, truncated, whitening
-from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks
+from hamkernel._solvers.landmarks import (
+    Landmarks,
+    choose_landmarks,
+    choose_rows,
+    given_landmarks,
+    landmarks_of,
+)
 from hamkernel._solvers.low_rank_conditional import LowRankConditional, low_rank_conditional
 from hamkernel._solvers.spans import LandmarkBasis, landmark_span
 from hamkernel._solvers.streaming import AbstractStreamingSolver, thinned
@@ -98,29 +111,33 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
         self.points = None if points is None else require.points(points, "points")
 
     def landmarks(
-        self, K: AbstractMatrixKernel, X: Float[Array, "N n"], regularization: Float[Array, ""]
+        self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
     ) -> Landmarks:
-        """The points given, or those that reach the tolerance, or `max_points` of them."""
+        """The points given, or the rows that reach the tolerance, or as many as there may be."""
         if self.points is not None:
-            if self.points.shape[1] != X.shape[1]:
-                raise ValueError(
-                    f"the landmarks have {self.points.shape[1]} coordinates and X {X.shape[1]}."
-                )
-            return given_landmarks(K, self.points.astype(X.dtype))
+            d = rows.blocks[0].points.shape[1]
+            if self.points.shape[1] != d:
+                m = self.points.shape[1]
+                raise ValueError(f"the landmarks have {m} coordinates and X {d}.")
+            points = self.points.astype(rows.targets.dtype)
+            return given_landmarks(K, landmarks_of(components(K, points)))
         key = jax.random.key(0) if self.key is None else self.key
-        left = self.tolerance * regularization
-        return choose_landmarks(K, X, left, self.max_points, self.candidates, key)
+        left, most = self.tolerance * regularization, self.max_points
+        if rows.states is not None:
+            return choose_landmarks(K, rows.states[0], left, most, self.candidates, key)
+        left, most = left * (rows.count / len(rows.targets)), most * rows.dimension
+        return choose_rows(K, rows, left, most, self.candidates, key)
 
     def _basis(
-        self, K: AbstractMatrixKernel, X: Float[Array, "N n"], regularization: Float[Array, ""]
+        self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
     ) -> LandmarkBasis:
-        return LandmarkBasis(self.landmarks(K, X, regularization).points)
+        return LandmarkBasis(self.landmarks(K, rows, regularization))
 
     def _fitted(self, problem, throw=True) -> KernelField:
         if problem.states is None:
             return self._given(problem, throw).field
         K, (X, Y), regularization = problem.kernel, problem.states, problem.regularization
-        landmarks = self.landmarks(K, X, regularization)
+        landmarks = self.landmarks(K, problem.rows, regularization)
         spread = rows_of(X)
         X, Y = split(spread, X), split(spread, Y)
         solution = _fit(K, X, Y, regularization, landmarks, spread)
@@ -129,12 +146,15 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
 
     def _given(self, problem, throw=True) -> LowRankConditional:
         K, rows, regularization = problem.kernel, problem.rows, problem.regularization
-        span = landmark_span(K, self.landmarks(K, rows.points, regularization))
-        return low_rank_conditional(span, rows, regularization, throw)
+        landmarks = self.landmarks(K, rows, regularization)
+        given = low_rank_conditional(landmark_span(K, landmarks), rows, regularization, throw)
+        truncation = given.field.info.truncation
+        warn_if_truncated(truncation, landmarks.count, self.tolerance, CHOOSE)
+        return given
 
     def _started(self, K, sample, regularization) -> LandmarkFit:
         landmarks = self.landmarks(K, sample, regularization)
-        some = thinned(sample, self.candidates)
+        some = thinned(K, sample, self.candidates)
         return landmark_fit.start(K, some, regularization, landmarks, self.tolerance)
 
 
@@ -142,7 +162,7 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
 def _fit(K, X, Y, regularization, landmarks, spread):
     S, ridge = landmarks.points, len(X) * regularization
     T = whitening(K, landmarks)
-    total = stream_sums.normal(Columns(K, S), T, X, Y, spread)
+    total = stream_sums.normal(Columns(K, landmarks), T, X, Y, spread)
     R = factor(total.square, ridge)
 
     def step(w, residual):
@@ -157,4 +177,4 @@ def _fit(K, X, Y, regularization, landmarks, spread):
     w, residual = step(w, Y - product(K, X, S, A, spread))
     truncation = truncated(trace(K, X, spread), jnp.trace(total.square), ridge)
     # ‖f‖² = αᵀ G_SS α = ‖w‖²
-    return Solution((T @ w).reshape(len(S), -1), residual, root(w @ w), truncation)
+    return Solution(T @ w, residual, root(w @ w), truncation)

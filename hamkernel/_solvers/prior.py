@@ -28,7 +28,7 @@ from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.features import FeatureField, feature_field
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import block_traces
-from hamkernel._gram.observed import components, rows_between
+from hamkernel._gram.observed import between, components
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmark_gram import whitening
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks
@@ -53,14 +53,19 @@ class Prior(eqx.Module):
 
     def rows(self, rows: Measurements) -> Float[Array, "D count"]:
         """The rows of all draws."""
-        across = rows_between(self.kernel, rows, components(self.kernel, self.points))
+        return rows.contrast(self.raw_rows(rows))
+
+    def raw_rows(self, rows: Measurements) -> Float[Array, "M count"]:
+        """The rows of all draws before the contrast of the energies."""
+        at = components(self.kernel, self.points)
+        across = jnp.concatenate([between(self.kernel, each, at) for each in rows.blocks])
         own = across @ self.coefficients.reshape(len(self.coefficients), -1).T
         if self.features is None:
             return own
 
         def of_features(basis, w):
             field = jax.vmap(lambda x: basis.field(x, w))
-            return rows.contrast(rows.of(field, jax.vmap(lambda x: basis.potential(x, w))))
+            return rows.of(field, jax.vmap(lambda x: basis.potential(x, w)))
 
         return own + jax.vmap(of_features, out_axes=1)(self.features, self.weights)
 

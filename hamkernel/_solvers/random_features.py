@@ -67,7 +67,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
         self.key = require.key(key)
 
     def _basis(
-        self, K: AbstractMatrixKernel, X: Float[Array, "N n"], regularization: Float[Array, ""]
+        self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
     ) -> WaveBasis:
         return WaveBasis(self.key, self.count)
 
@@ -101,8 +101,8 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
         return of_kernel(K, self.key)
 
     def _started(self, K, sample, regularization) -> "FeatureFit":
-        basis = self._features(K, sample.shape[1], sample.dtype)
-        return _start(K, basis, thinned(sample, _SAMPLE), regularization)
+        basis = self._features(K, sample.points.shape[1], sample.targets.dtype)
+        return _start(K, basis, thinned(K, sample, _SAMPLE), regularization)
 
 
 _COPIES = 8  # r² numbers that a fit holds: the triangle, the tile of 3r rows below it, their QR
@@ -181,14 +181,19 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
 
 @eqx.filter_jit
 def _start(K, basis, sample, regularization):
-    identity = jnp.eye(basis.columns, dtype=sample.dtype)
+    identity = jnp.eye(basis.columns, dtype=sample.targets.dtype)
+    if sample.states is None:
+        design = FeatureSpan(K, basis, sample.dimension).of_rows(sample)
+        seen = stream_sums.Normal.zero(identity).plus(design, sample.targets)
+    else:
+        seen = stream_sums.normal(basis, identity, *sample.states)
     return FeatureFit(
         kernel=K,
         features=basis,
-        sums=stream_sums.start(basis, identity, sample, regularization),
+        sums=stream_sums.start(seen, identity, sample.count, regularization),
         count=jnp.zeros((), int),
         regularization=regularization,
-        dimension=K.outputs(sample.shape[1]),
+        dimension=sample.dimension,
     )
 
 

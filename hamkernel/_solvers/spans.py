@@ -16,10 +16,10 @@ from hamkernel._features.structured import AbstractFeatures, features
 from hamkernel._fields.base import AbstractField, SolverInfo, root
 from hamkernel._fields.features import FeatureField, feature_field
 from hamkernel._fields.kernel_field import KernelField
-from hamkernel._gram.observed import between, components
+from hamkernel._gram.observed import between, trace_of_rows
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.landmark_gram import whitening
+from hamkernel._solvers.landmark_gram import truncated, whitening
 from hamkernel._solvers.landmarks import Landmarks, given_landmarks
 from hamkernel._solvers.prior import Prior, drawn, prior_draws
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -39,7 +39,20 @@ class AbstractSpan(eqx.Module):
         """What they leave of the prior covariance of the rows of two blocks."""
 
     @abc.abstractmethod
-    def field(self, w: Float[Array, " r"], residual: Array, ridge: Array, N: int) -> AbstractField:
+    def truncation(
+        self, rows: Measurements, F: Float[Array, "M r"], ridge: Float[Array, ""]
+    ) -> Float[Array, ""] | None:
+        """trace(G − FFᵀ)/ridge of the M rows of observations; None of a kernel of its own."""
+
+    @abc.abstractmethod
+    def field(
+        self,
+        w: Float[Array, " r"],
+        residual: Array,
+        ridge: Array,
+        N: int,
+        truncation: Float[Array, ""] | None,
+    ) -> AbstractField:
         """The function with these weights."""
 
     @abc.abstractmethod
@@ -52,9 +65,9 @@ class AbstractSpan(eqx.Module):
     ) -> AbstractField:
         """The functions with these weights, and what they leave of the prior, as a batch."""
 
-    def of_rows(self, rows: Measurements) -> Float[Array, "D r"]:
-        """The rows of observations of each function."""
-        return rows.contrast(jnp.concatenate([self.of(block) for block in rows.blocks]))
+    def of_rows(self, rows: Measurements) -> Float[Array, "M r"]:
+        """The rows of observations of each function, before the contrast of the energies."""
+        return jnp.concatenate([self.of(block) for block in rows.blocks])
 
 
 class LandmarkSpan(AbstractSpan):
@@ -65,39 +78,51 @@ class LandmarkSpan(AbstractSpan):
     T: Float[Array, "r r"]
 
     def of(self, block: AbstractBlock) -> Float[Array, "d r"]:
-        return between(self.kernel, block, components(self.kernel, self.landmarks.points)) @ self.T
+        return self.landmarks.columns(self.kernel, block) @ self.T
 
     def missing(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
         return between(self.kernel, left, right) - self.of(left) @ self.of(right).T
 
-    def field(self, w, residual, ridge, N) -> KernelField:
-        S = self.landmarks.points
-        info = SolverInfo("Nystrom", landmarks=self.landmarks.count, rank=self.landmarks.kept.sum())
+    def truncation(self, rows, F, ridge) -> Float[Array, ""]:
+        return truncated(trace_of_rows(self.kernel, rows), jnp.sum(F**2), ridge)
+
+    def field(self, w, residual, ridge, N, truncation) -> KernelField:
+        landmarks = self.landmarks
+        Z, A, S, b = landmarks.representer(self.T @ w)
+        info = SolverInfo(
+            "Nystrom",
+            landmarks=landmarks.count,
+            rank=landmarks.kept.sum(),
+            truncation=truncation,
+        )
         return KernelField(
             kernel=self.kernel,
-            points=S,
-            coefficients=(self.T @ w).reshape(len(S), -1),
+            points=Z,
+            coefficients=A,
             residual=residual,
             norm=root(w @ w),
             regularization=ridge / N,
-            offset=jnp.zeros((), S.dtype),
+            offset=jnp.zeros((), A.dtype),
             info=info,
+            value_points=S if len(S) else None,
+            value_coefficients=b if len(S) else None,
         )
 
     def draws(self, weights, rows, key, region) -> KernelField:
-        count, S = len(weights), self.landmarks.points
-        everywhere = jnp.concatenate([S, rows.points])
-        prior = prior_draws(self.kernel, everywhere, region, key, count)
+        everywhere = jnp.concatenate([self.landmarks.rows.points, rows.points])
+        prior = prior_draws(self.kernel, everywhere, region, key, len(weights))
         return _on_landmarks(self, weights, prior)
 
 
 @eqx.filter_jit
 def _on_landmarks(span: LandmarkSpan, weights, prior: Prior) -> KernelField:
-    S, T = span.landmarks.points, span.T
+    landmarks = span.landmarks
     # A draw of the prior less what it is in the span.
-    here = Measurements((components(span.kernel, S),), jnp.zeros(len(T), S.dtype))
-    less = weights - prior.rows(here).T @ T
-    return prior.plus(S, (less @ T.T).reshape(len(less), len(S), -1))
+    drawn = prior.raw_rows(landmarks.rows)
+    drawn = drawn if landmarks.index is None else drawn[landmarks.index]
+    c = (weights - drawn.T @ span.T) @ span.T.T
+    Z, A, S, b = jax.vmap(landmarks.representer, out_axes=(None, 0, None, 0))(c)
+    return prior.plus(Z, A, S, b) if len(S) else prior.plus(Z, A)
 
 
 class FeatureSpan(AbstractSpan):
@@ -117,7 +142,10 @@ class FeatureSpan(AbstractSpan):
     def missing(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
         return jnp.zeros((left.size, right.size), left.points.dtype)
 
-    def field(self, w, residual, ridge, N) -> FeatureField:
+    def truncation(self, rows, F, ridge) -> None:
+        return None
+
+    def field(self, w, residual, ridge, N, truncation) -> FeatureField:
         left = jnp.linalg.norm(residual)
         info = SolverInfo("RandomFeatures", rank=jnp.asarray(len(w)), residual_norm=left)
         known = residual if residual.ndim == 2 else jnp.zeros((0, self.dimension), w.dtype)
@@ -154,13 +182,13 @@ class WaveBasis(AbstractBasis):
 
 
 class LandmarkBasis(AbstractBasis):
-    """The kernel's columns at fixed points."""
+    """The kernel's columns of fixed landmarks."""
 
-    points: Float[Array, "m n"]
+    landmarks: Landmarks
 
     def span(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> LandmarkSpan:
         del n, dtype
-        own = landmark_span(K, given_landmarks(K, self.points))
+        own = landmark_span(K, given_landmarks(K, self.landmarks))
         # Without a column a fit fails; the losses would be those of the zero field.
         T = jnp.where(own.landmarks.count == 0, jnp.nan, own.T)
         return eqx.tree_at(lambda span: span.T, own, T)

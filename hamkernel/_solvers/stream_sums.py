@@ -34,6 +34,12 @@ class Normal(NamedTuple):
     moment: Float[Array, " r"]  # Fᵀy
     energy: Float[Array, ""]  # yᵀy
 
+    @classmethod
+    def zero(cls, basis: Float[Array, "r r"]) -> "Normal":
+        """The sums over no rows in a basis."""
+        square = jnp.zeros_like(basis)
+        return cls(square, square[0], square[0, 0])
+
     def plus(self, F: Float[Array, "D r"], y: Float[Array, " D"]) -> "Normal":
         """The sums with more rows."""
         return Normal(self.square + F.T @ F, self.moment + F.T @ y, self.energy + y @ y)
@@ -53,16 +59,19 @@ class Sums(eqx.Module):
     seen: Normal
 
 
-def start(
-    design: Design, W: Float[Array, "r r"], sample: Float[Array, "N n"], ridge: Float[Array, ""]
-) -> Sums:
+def start(seen: Normal, W: Float[Array, "r r"], count: int, ridge: Float[Array, ""]) -> Sums:
     """The sums before the first row, in the basis of a sample and of λ = ridge.
 
-    NaN where the kernel is not finite, or λ below rounding.
+    Args:
+        seen: the sums over the rows of the sample, in the basis W.
+        W: what the rows of the design are multiplied with.
+        count: N, the observations in the sample.
+        ridge: λ.
+
+    Returns:
+        The sums; NaN where the kernel is not finite, or λ below rounding.
     """
-    n = jax.eval_shape(design, sample[:1]).shape[1]
-    seen = normal(design, W, sample, jnp.zeros((len(sample), n), sample.dtype))
-    R = jnp.linalg.cholesky(plus_ridge(seen.square / len(sample), ridge)).T
+    R = jnp.linalg.cholesky(plus_ridge(seen.square / count, ridge)).T
     nothing = jax.tree.map(jnp.zeros_like, seen)
     return Sums(R, solve_triangular(R, W.T, trans="T").T, nothing)
 
@@ -104,9 +113,7 @@ def normal(
         rows = design(tile[0])  # (t, n, r)
         return total.plus(rows.reshape(-1, rows.shape[-1]) @ basis, tile[1].reshape(-1)), None
 
-    zero = jnp.zeros_like(basis)
-    empty = Normal(zero, zero[0], zero[0, 0])
-    return over_tiles(step, empty, (X, Y), max(1024, TILE // len(basis)))[0]
+    return over_tiles(step, Normal.zero(basis), (X, Y), max(1024, TILE // len(basis)))[0]
 
 
 def solve(

@@ -19,12 +19,14 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 from hamkernel import _require as require
 from hamkernel._fields.joined import learned_field
 from hamkernel._fields.known import known_part
+from hamkernel._gram.observed import components
 from hamkernel._machine import one_blas_thread, rows_of, split
 from hamkernel._observations.kinds import AbstractObservations, beside
 from hamkernel._observations.measurements import (
     Measurements,
     measurements_of,
     observations,
+    placed,
     sampled_points,
 )
 from hamkernel._show import call, text
@@ -108,11 +110,7 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
         self._check(None, data.dimension)
         _, rows = measurements_of(self.kernel, data, previous=nothing)
         self._check(rows.targets.dtype, rows.dimension)
-        if len(rows.energies):
-            raise ValueError(
-                "a stream takes no energies: they are known up to a constant that all chunks would "
-                "share. Give differences of H as hk.Functionals, or fit all of the data at once."
-            )
+        _refuse_energies(rows)
         return without_known(self.kernel, rows, self._known)
 
     def _check(self, dtype: jnp.dtype | None, dimension: int) -> None:
@@ -156,14 +154,14 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
 
     @abc.abstractmethod
     def _started(
-        self, K: AbstractMatrixKernel, sample: Float[Array, "N d"], regularization: Float[Array, ""]
+        self, K: AbstractMatrixKernel, sample: Measurements, regularization: Float[Array, ""]
     ) -> Fit:
         """`start` for arguments that have been checked."""
 
     def start(
         self,
         K: AbstractMatrixKernel,
-        sample: Num[ArrayLike, "N n"],
+        sample: Num[ArrayLike, "N n"] | AbstractObservations,
         regularization: ArrayLike = 1e-4,
         inputs: Num[ArrayLike, "N m"] | None = None,
         parameters: Num[ArrayLike, "N p"] | None = None,
@@ -172,10 +170,11 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
 
         Args:
             K: a matrix-valued kernel.
-            sample: states that look like all of the data, shape (N, n). They are not added to the
-                fit. The landmarks of `Nystrom` are chosen from them now, and later data does not
-                move them: the first chunk is enough if all chunks look alike, one trajectory out of
-                many is not. Of `RandomFeatures` only the rounding of the sums depends on them.
+            sample: states that look like all of the data, shape (N, n), or observations that do,
+                where the data are not velocities. They are not added to the fit. The landmarks of
+                `Nystrom` are chosen from them now, and later data does not move them: the first
+                chunk is enough if all chunks look alike, one trajectory out of many is not. Of
+                `RandomFeatures` only the rounding of the sums depends on them.
             regularization: the smallest λ that will be asked for, since the tolerance of `Nystrom`
                 is relative to it, and so are the digits that are kept: a smaller one loses some.
             inputs: of a `Controlled` kernel: those of the sample, shape (N, m).
@@ -190,11 +189,18 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
                 `RandomFeatures`, has no known spectral density.
         """
         K = matrix_kernel(K)
-        sample = require.finite(require.points(sample, "sample"), "sample")
-        K, sample = sampled_points(K, sample, beside(inputs, parameters))
-        K.check_dimension(sample.shape[1])
-        require.warn_of_float32(sample)
-        return self._started(K, sample, require.ridge(regularization, sample.dtype))
+        if isinstance(sample, AbstractObservations):
+            K, rows = measurements_of(
+                K, placed(observations(sample, None, beside(inputs, parameters)))
+            )
+            _refuse_energies(rows)
+        else:
+            sample = require.finite(require.points(sample, "sample"), "sample")
+            K, points = sampled_points(K, sample, beside(inputs, parameters))
+            rows = rows_at(K, points)
+        K.check_dimension(rows.points.shape[1])
+        require.warn_of_float32(rows.targets)
+        return self._started(K, rows, require.ridge(regularization, rows.targets.dtype))
 
     @one_blas_thread
     def fit_chunks(
@@ -269,8 +275,25 @@ def _naming(chunk: int) -> Iterator[None]:
         raise kind(f"chunk {chunk}, counted from 0: {error}") from error
 
 
-def thinned(sample: Float[Array, "N n"], most: int) -> Float[Array, "M n"]:
-    """Every k-th point, at most `most` of them, on every device."""
-    spread = rows_of(sample)
-    some = split(spread, sample)[:: -(-len(sample) // most)]
-    return some if spread is None else spread.whole(some)
+def _refuse_energies(rows: Measurements) -> None:
+    if len(rows.energies):
+        raise ValueError(
+            "a stream takes no energies: they are known up to a constant that all chunks would "
+            "share. Give differences of H as hk.Functionals, or fit all of the data at once."
+        )
+
+
+def rows_at(K: AbstractMatrixKernel, points: Float[Array, "N d"]) -> Measurements:
+    """The rows of velocities at points, with no targets."""
+    block = components(K, points)
+    return Measurements((block,), jnp.zeros(block.size, points.dtype))
+
+
+def thinned(K: AbstractMatrixKernel, sample: Measurements, most: int) -> Measurements:
+    """Every k-th point of velocities, at most `most` of them, on every device; else all rows."""
+    if sample.states is None:
+        return sample
+    points = sample.points
+    spread = rows_of(points)
+    some = split(spread, points)[:: -(-len(points) // most)]
+    return rows_at(K, some if spread is None else spread.whole(some))

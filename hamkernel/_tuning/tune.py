@@ -217,7 +217,7 @@ def tune(
     def of_low_rank(run: Run) -> SearchCriterion:
         kernel, regularization, _ = decode(space, run.u)
         assert solver is not None
-        basis = solver._basis(kernel, points, regularization)
+        basis = solver._basis(kernel, rows, regularization)
         assert basis is not None
         return criterion.with_basis(basis)
 

@@ -27,6 +27,7 @@ from scipy.integrate import solve_ivp
 import hamkernel as hk
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of_states
+from hamkernel._solvers.landmarks import landmarks_of
 from hamkernel._solvers.spans import LandmarkBasis, WaveBasis
 from hamkernel._validation.folds import Partition
 from hamkernel._validation.of_rows import (
@@ -156,7 +157,7 @@ def bases(problem: Problem, K) -> dict[str, Any]:
     X = jnp.asarray(problem.data[0])
     n = X.shape[1]
     found: dict[str, Any] = {"dense": None}
-    found["landmarks"] = LandmarkBasis(X[:: max(1, 2 * len(X) // 8)])
+    found["landmarks"] = LandmarkBasis(landmarks_of(Components(X[:: max(1, 2 * len(X) // 8)])))
     if problem.name.startswith(("Gaussian", "Matern", "odd")):
         found["waves"] = WaveBasis(jax.random.key(0), 2 * n)
     return found

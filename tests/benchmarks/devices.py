@@ -23,6 +23,7 @@ from jax.sharding import AxisType, NamedSharding, PartitionSpec
 import hamkernel as hk
 from hamkernel._gram.operator import product
 from hamkernel._machine import RowSharding
+from hamkernel._observations.measurements import measurements_of_states
 from hamkernel._solvers import conjugate_gradient, nystrom, random_features
 
 KERNEL = hk.Symplectic(hk.Gaussian(1.5))
@@ -55,7 +56,9 @@ def programs():
     """Functions of states, velocities and where they are: a product, and what `fit` runs."""
     some = np.random.default_rng(1).uniform(-2, 2, size=(32, 2))
     ridge, waves = jnp.asarray(REGULARIZATION), hk.RandomFeatures(32, jax.random.key(0))
-    S = hk.Nystrom(points=some).landmarks(KERNEL, jnp.asarray(some), ridge)
+    S = hk.Nystrom(points=some).landmarks(
+        KERNEL, measurements_of_states(jnp.asarray(some), jnp.asarray(some)), ridge
+    )
 
     def features(X, Y, rows):
         return random_features._fit(KERNEL, waves, X, Y, ridge, rows).residual
