@@ -89,7 +89,7 @@ def condition(
     solver = Cholesky() if solver is None else solver
     if solver.no_factor:
         raise TypeError(solver.no_factor)
-    asked = problem(K, X, Y, regularization, mean, inputs, parameters)
+    asked = problem(K, X, Y, regularization, mean, inputs, parameters).on_one_device()
     require.warn_of_float32(asked.rows.targets)
     _warn_of_amplitude(asked.kernel, asked.rows.points)
     given = solver._given(asked)

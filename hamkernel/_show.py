@@ -79,7 +79,7 @@ def _is_short(value: Any) -> bool:
     if isinstance(value, jax.Array):
         if isinstance(value, Tracer) or jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
             return False
-        if not value.is_fully_addressable:
+        if not (value.is_fully_addressable or value.is_fully_replicated):
             return False
     elif not isinstance(value, np.ndarray):
         return False

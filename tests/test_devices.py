@@ -318,6 +318,30 @@ def slow():
     return on_eight(SLOW)
 
 
+CONDITIONED = """
+noisy = lambda X, Y: hk.Velocities(X, Y, noise=2.0)
+result = {}
+for kind in (AxisType.Auto, AxisType.Explicit):
+    XS, YS = spread(mesh(4, kind=kind), X[:40], Y[:40])
+    for name, solver in {"dense": None, "nystrom": few, "features": waves}.items():
+        one, many = (hk.condition(hk.Symplectic(1.5 * hk.Gaussian(1.5)), *data, 1e-3, solver=solver)
+                     for data in ((X[:40], Y[:40]), (XS, YS)))
+        result[f"{kind} {name}"] = off(many.field.evaluate(new), one.field.evaluate(new)) + off(
+            many.deviation(new[0]), one.deviation(new[0]))
+    one, many = (hk.fit(K, data, regularization=1e-3, solver=hk.ConjugateGradient(1e-12))
+                 for data in (noisy(X[:40], Y[:40]), noisy(XS, YS)))
+    result[f"{kind} gradients"] = off(many.evaluate(new), one.evaluate(new))
+print(json.dumps(result))
+"""
+
+
+@pytest.mark.slow
+def test_posteriors_and_other_observations_of_spread_data_are_those_of_one_device():
+    result = on_eight(CONDITIONED)
+    assert len(result) == 8
+    assert max(result.values()) < ORDER, result
+
+
 DENSE = """
 one = (
     hk.gram(K, X), hk.cross_validation_loss(K, X, Y, 1e-4, 5),
@@ -419,6 +443,11 @@ result = {
 }
 field, file = hk.fit(K, XS, YS, 1e-4, solver=iterative), sys.argv[3] + "/field.npz"
 hk.save(file, field)
+result["printed"] = repr(field.info)
+try:
+    hk.condition(K, XS, YS, 1e-4)
+except ValueError as error:
+    result["refused"] = str(error)
 result["saved"] = off(hk.load(file).evaluate(new), field.evaluate(new))
 print(json.dumps(result))
 """
@@ -439,3 +468,6 @@ def test_two_processes_give_the_fit_of_one(tmp_path):
         assert result["default"] == "ConjugateGradient"
         assert max(result["streams"]) < ORDER
         assert result["saved"] < ORDER
+        assert "landmarks=20" in result["printed"]
+        assert "rank=40" in result["printed"]
+        assert "the data is spread over several processes" in result["refused"]

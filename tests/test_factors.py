@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hamkernel._factors.dense import DenseFactor, DenseSystem
+from hamkernel._factors.dense import DenseSystem, dense_factor
 from hamkernel._factors.low_rank import LowRankSystem
 from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
 from hamkernel._validation.folds import Partition
@@ -23,7 +23,7 @@ def tall(D: int, r: int) -> tuple[jax.Array, jax.Array]:
 @pytest.mark.parametrize("D", [1, 31, 129, 601, 1500])  # one block, two, of unequal size, all
 def test_the_dense_inverse_and_factor_are_those_of_numpy(D):
     A = positive(D)
-    factor, C = jax.jit(lambda A: (DenseFactor(A), DenseFactor(A).inverse().C))(A)
+    factor, C = jax.jit(lambda A: (dense_factor(A), dense_factor(A).inverse().C))(A)
     np.testing.assert_allclose(C, np.linalg.inv(A), atol=1e-10)
     np.testing.assert_array_equal(C, C.T)
     np.testing.assert_allclose(factor.R, np.linalg.cholesky(A).T, atol=1e-11)
@@ -48,9 +48,9 @@ def test_every_primitive_is_that_of_numpy(kind, shape):
 
 def test_a_batch_is_one_matrix_after_the_other():
     A = np.stack([positive(40), 2 * positive(40)])
-    C = jax.vmap(lambda A: DenseFactor(A).inverse().C)(jnp.asarray(A))
+    C = jax.vmap(lambda A: dense_factor(A).inverse().C)(jnp.asarray(A))
     np.testing.assert_allclose(C, np.linalg.inv(A), atol=1e-12)
-    program = str(jax.make_jaxpr(jax.vmap(lambda A: DenseFactor(A).R))(jnp.asarray(A)))
+    program = str(jax.make_jaxpr(jax.vmap(lambda A: dense_factor(A).R))(jnp.asarray(A)))
     assert "scan" in program or "while" in program  # not one call for the batch
     assert "cholesky" in program
 
@@ -58,7 +58,7 @@ def test_a_batch_is_one_matrix_after_the_other():
 def test_a_matrix_that_is_not_positive_gives_nan():
     A = positive(75)
     A[50, 50] = -1.0
-    factor = DenseFactor(jnp.asarray(A))
+    factor = dense_factor(jnp.asarray(A))
     assert np.isnan(factor.inverse().C).all()
     assert np.isnan(factor.log_det)
     assert not factor.trusted(jnp.ones(75))
@@ -71,7 +71,7 @@ def test_derivatives_of_the_primitives_are_those_of_jax(mode):
     y = jnp.cos(jnp.arange(6.0))
 
     def ours(t):
-        factor = DenseFactor(A + t * dA)
+        factor = dense_factor(A + t * dA)
         a, square = factor.solved(y)
         return factor.log_det + square + a @ jnp.sin(y) + factor.inverse_trace
 

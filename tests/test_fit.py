@@ -420,12 +420,52 @@ if TYPE_CHECKING:
         assert_type(hk.fit(driven, X, X, solver=some, inputs=X), hk.ControlledField)
 
 
+# The norm, where rounding leaves nothing of it.
+
+
+def test_a_norm_lost_in_rounding_is_nan_and_not_zero():
+    # The velocity x has no Hamiltonian part, so that the field is small beside it.
+    rng = np.random.default_rng(0)
+    X = rng.normal(size=(60, 2))
+    exact = hk.fit(hk.Symplectic(hk.Gaussian(2.0)), X, X, 1e-4)
+    with pytest.warns(UserWarning, match="float32"):
+        rounded = [
+            hk.fit(hk.Symplectic(hk.Gaussian(2.0)), X.astype("f4"), X.astype("f4"), 10.0**-p)
+            for p in range(3, 7)
+        ]
+    for field, p in zip(rounded, range(3, 7), strict=True):
+        right = hk.fit(hk.Symplectic(hk.Gaussian(2.0)), X, X, 10.0**-p).norm
+        assert np.isnan(field.norm) or abs(field.norm / right - 1) < 0.1, (p, field.norm, right)
+    assert exact.norm > 0
+    nothing = hk.fit(hk.Symplectic(hk.Gaussian(2.0)), X, 0 * X, 1e-4)
+    assert nothing.norm == 0
+
+
 # Refusals, before any work is done.
 
 
 class Forbidden(AbstractSolver):
-    def _fitted(self, K, X, Y, regularization, throw=True):
+    def _fitted(self, problem, throw=True, progress=False):
         raise AssertionError("the solver was called with bad input")
+
+
+@pytest.mark.filterwarnings("ignore:fitting in float32")
+@pytest.mark.parametrize("act", [hk.fit, hk.condition, hk.tune])
+def test_a_mean_that_is_not_finite_at_the_data_is_named_before_any_solve(act):
+    X, Y = data(5)
+    with pytest.raises(ValueError, match=r"mean is NaN or infinite at the data of \d of the 5 obs"):
+        act(K, X, Y, 1e-3, mean=lambda x: jnp.log(x), solver=Forbidden())
+    solver = {"solver": Forbidden()} if act is not hk.tune else {}
+    with pytest.raises(ValueError, match=r"as large as \de\+200, and their squares.*Change the un"):
+        act(K, X, np.sign(Y) * 2e200, 1e-3, **solver)
+    with pytest.raises(ValueError, match=r"as large as \de\+30, .* overflow in float32"):
+        act(K, X.astype("f4"), np.sign(Y).astype("f4") * 1e30, 1e-3, **solver)
+
+
+def test_a_mean_may_be_nan_where_failure_is_not_to_raise():
+    X, Y = data(5)
+    field = hk.fit(K, X, Y, 1e-3, mean=lambda x: jnp.log(x), throw=False)
+    assert np.isnan(field.norm)
 
 
 X, Y = data(5)

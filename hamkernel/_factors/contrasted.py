@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._factors.base import AbstractBlocks, AbstractFactor, AbstractInverse, AbstractSystem
-from hamkernel._factors.dense import DenseFactor, DenseInverse, DenseSystem
+from hamkernel._factors.dense import DenseFactor, DenseInverse, DenseSystem, dense_factor
 from hamkernel._factors.groups import Group
 
 
@@ -28,7 +28,7 @@ class ContrastedSystem(AbstractSystem):
 
     def factor(self) -> "ContrastedFactor":
         p = jax.lax.stop_gradient(self.constant)
-        inner = DenseFactor(_contrast(p, _contrast(p, self.matrix).T))
+        inner = dense_factor(_contrast(p, _contrast(p, self.matrix).T))
         return ContrastedFactor(inner=inner, constant=p, size=inner.size)
 
 

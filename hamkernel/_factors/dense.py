@@ -12,7 +12,9 @@ Source: Du Croz & Higham (1992), IMA J. Numer. Anal. 12, method 2, on the stabil
 """
 
 import itertools
+from collections.abc import Callable, Iterable
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +32,11 @@ from hamkernel._factors.groups import Group
 # Rows of the blocks of U at least, and how many of them at most. More compile longer (1.7 s for 16,
 # 0.7 s for 8), and fewer are slower (D = 592 to 2000).
 _ROWS, _BLOCKS = 128, 8
+
+
+# Rows of R made at once by `factor_in_place`. Its temporaries are four blocks of rows, and every
+# block compiles a program of its own, in 0.2 s.
+ROWS_IN_PLACE = 1000
 
 
 # LAPACK. One after the other under `jax.vmap`: two batches of its calls side by side were seen to
@@ -96,7 +103,7 @@ class DenseSystem(AbstractSystem):
     matrix: Float[Array, "D D"]
 
     def factor(self) -> "DenseFactor":
-        return DenseFactor(self.matrix)
+        return dense_factor(self.matrix)
 
 
 class DenseFactor(AbstractFactor[DenseSystem]):
@@ -109,10 +116,6 @@ class DenseFactor(AbstractFactor[DenseSystem]):
 
     R: Float[Array, "D D"]
     size: Float[Array, ""]
-
-    def __init__(self, A: Float[Array, "D D"]):
-        A, self.size = jax.lax.optimization_barrier((A, jnp.linalg.norm(A)))  # A is not kept
-        self.R = cholesky(A)
 
     def whiten(self, b: Float[Array, "D *m"]) -> Float[Array, "D *m"]:
         """R⁻ᵀ b, so that ‖R⁻ᵀb‖² = bᵀA⁻¹b."""
@@ -150,11 +153,56 @@ class DenseFactor(AbstractFactor[DenseSystem]):
         return U
 
 
+def dense_factor(A: Float[Array, "D D"]) -> DenseFactor:
+    """The factor of A, inside of a compiled program."""
+    A, size = jax.lax.optimization_barrier((A, jnp.linalg.norm(A)))  # A is not kept
+    return DenseFactor(cholesky(A), size)
+
+
+def factor_in_place(A: Float[Array, "D D"], steps: Callable[[Iterable], Iterable]) -> DenseFactor:
+    """The factor of A in the memory of A, which is lost.
+
+    Rows of R are made one block after the other,
+
+        S = A_jk − Σ_{i<j} R_ijᵀ R_ik,    R_jj = chol(S_jj),    R_jk = R_jj⁻ᵀ S_jk    for k > j.
+
+    LAPACK's own takes a second matrix for the result and a third for what XLA returns.
+
+    Args:
+        A: a matrix outside of any trace.
+        steps: passes on the blocks, to show how far it is.
+    """
+    size = _norm(A)
+    starts = range(0, len(A), ROWS_IN_PLACE)
+    for start in steps(starts):
+        A = jax.block_until_ready(_rows_of_factor((start,), A))  # Ctrl-C stops between blocks
+    return DenseFactor(A, size)
+
+
+_norm = jax.jit(jnp.linalg.norm)
+
+
+@eqx.filter_jit(donate="all-except-first")
+def _rows_of_factor(at: tuple[int], A: Float[Array, "D D"]) -> Float[Array, "D D"]:
+    start, D = at[0], len(A)
+    b = min(ROWS_IN_PLACE, D - start)
+
+    def less(i, S):
+        above = jax.lax.dynamic_slice(A, (i * ROWS_IN_PLACE, start), (ROWS_IN_PLACE, D - start))
+        return S - above[:, :b].T @ above
+
+    S = jax.lax.fori_loop(0, start // ROWS_IN_PLACE, less, A[start : start + b, start:])
+    own = _lapack_cholesky(S[:, :b])
+    rest = _lapack_forward(own, S[:, b:])
+    rows = jnp.concatenate([jnp.zeros((b, start), A.dtype), own, rest], axis=1)
+    return jax.lax.dynamic_update_slice(A, rows, (start, 0))
+
+
 def solution(
     A: Float[Array, "D D"], y: Float[Array, " D"]
 ) -> tuple[DenseFactor, Float[Array, " D"]]:
     """The factor of A, and A⁻¹y, differentiated implicitly: by one more solve with the factor."""
-    factor, solve = DenseFactor(A), jax.lax.custom_linear_solve
+    factor, solve = dense_factor(A), jax.lax.custom_linear_solve
     return factor, solve(lambda x: A @ x, y, lambda _, b: factor.solve(b), symmetric=True)
 
 

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hamkernel._gram.dense import assemble, centred, diagonals
+from hamkernel._gram.dense import assemble, centred, diagonals, plus_ridge
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components
 from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -44,6 +44,45 @@ def gram_of_rows(
         found.append(jnp.concatenate([*left, between_all(K, block, rows.blocks[i:])], axis=1))
     G = jnp.concatenate(found)
     return rows.contrast(rows.contrast(G).T) if contrasted and len(rows.energies) else G
+
+
+_STRIP = 500_000  # entries made at once: of some kernels each takes 40 numbers on its way
+
+
+def regularized_gram(
+    K: AbstractMatrixKernel, rows: Measurements, ridge: Float[Array, ""]
+) -> Float[Array, "D D"]:
+    """The Gram of all rows, after the contrast of the energies, plus ridge I."""
+    if rows.states is None or rows.size**2 <= _STRIP:
+        return plus_ridge(gram_of_rows(K, rows), ridge)
+    empty = jnp.zeros((rows.size, rows.size), rows.targets.dtype)
+    return strips_of_gram((K, rows.points, ridge, 0, len(rows.points)), empty)
+
+
+def strips_of_gram(asked: tuple, A: Float[Array, "D D"]) -> Float[Array, "D D"]:
+    """A with some of its rows those of the Gram of velocities plus ridge I, strip by strip.
+
+    Args:
+        asked: the kernel, its points, the ridge, the first point whose rows are made, and the
+            number of such points, a Python integer.
+        A: whose other rows stay as they are.
+    """
+    K, X, ridge, first, count = asked
+    D, n = len(A), len(A) // len(X)
+    size = max(1, min(count, _STRIP // (n * D)))
+
+    @jax.checkpoint
+    def strip(K, X, ridge, start):
+        own = jax.lax.dynamic_slice_in_dim(X, start, size)
+        rows = assemble(K, own, X).reshape(size * n, D)
+        on_diagonal = jnp.arange(D)[None] == (start * n + jnp.arange(size * n))[:, None]
+        return rows + jnp.where(on_diagonal, ridge, jnp.zeros_like(ridge))
+
+    def write(i, A):
+        start = first + jnp.minimum(i * size, count - size)
+        return jax.lax.dynamic_update_slice_in_dim(A, strip(K, X, ridge, start), start * n, 0)
+
+    return jax.lax.fori_loop(0, -(-count // size), write, A)
 
 
 def rows_between(

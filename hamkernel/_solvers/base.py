@@ -30,10 +30,12 @@ class AbstractSolver(eqx.Module, Generic[Learned]):
         return None
 
     @abc.abstractmethod
-    def _fitted(self, problem: Problem, throw: bool = True) -> Learned:
+    def _fitted(self, problem: Problem, throw: bool = True, progress: bool = False) -> Learned:
         """The field; of NaN if the solve fails and does not `throw`."""
 
-    def _given(self, problem: Problem, throw: bool = True) -> AbstractConditional:
+    def _given(
+        self, problem: Problem, throw: bool = True, progress: bool = False
+    ) -> AbstractConditional:
         """The same with what the solver keeps, to say how far the field may be off."""
-        del problem, throw
+        del problem, throw, progress
         raise TypeError(self.no_factor)

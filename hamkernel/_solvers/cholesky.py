@@ -16,8 +16,8 @@ class Cholesky(AbstractSolver[KernelField]):
             ridge is too small for this Gram (the text says what to do).
     """
 
-    def _fitted(self, problem, throw=True) -> KernelField:
-        return dense_field(problem.on_one_device(), throw)
+    def _fitted(self, problem, throw=True, progress=False) -> KernelField:
+        return dense_field(problem.on_one_device(), throw, progress)
 
-    def _given(self, problem, throw=True) -> DenseConditional:
-        return dense_conditional(problem, throw)
+    def _given(self, problem, throw=True, progress=False) -> DenseConditional:
+        return dense_conditional(problem.on_one_device(), throw, progress)

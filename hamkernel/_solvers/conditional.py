@@ -17,11 +17,25 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
-from hamkernel._factors.dense import DenseFactor, backward, cholesky, forward, solution
+from hamkernel._factors.dense import (
+    ROWS_IN_PLACE,
+    DenseFactor,
+    backward,
+    cholesky,
+    factor_in_place,
+    forward,
+    solution,
+)
 from hamkernel._fields.base import AbstractField, SolverInfo, at_points, root
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import plus_ridge
-from hamkernel._gram.observed import between, gram_of_rows, rows_between
+from hamkernel._gram.observed import (
+    between,
+    gram_of_rows,
+    regularized_gram,
+    rows_between,
+    strips_of_gram,
+)
 from hamkernel._machine import refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
@@ -89,7 +103,9 @@ class DenseConditional(AbstractConditional):
         return _corrected(self, prior, noise)
 
 
-def dense_conditional(problem: Problem, throw: bool = True) -> DenseConditional:
+def dense_conditional(
+    problem: Problem, throw: bool = True, progress: bool = False
+) -> DenseConditional:
     """The field given the rows, by the dense Gram of them: O(D³) time and O(D²) memory.
 
     Raises:
@@ -97,44 +113,106 @@ def dense_conditional(problem: Problem, throw: bool = True) -> DenseConditional:
             rounding.
     """
     rows = problem.rows
-    check_memory(len(rows.targets), rows.targets.dtype)
-    factor, c, ridge, field, left = _conditional(problem.kernel, rows, problem.regularization)
-    return DenseConditional(_solved(field, left, rows.count, throw), rows, ridge, factor, c)
+    factor, c, field, left = _dense(problem, progress)
+    return DenseConditional(_solved(field, left, rows.count, throw), rows, problem.ridge, factor, c)
 
 
-def dense_field(problem: Problem, throw: bool = True) -> KernelField:
+def dense_field(problem: Problem, throw: bool = True, progress: bool = False) -> KernelField:
     """The field of `dense_conditional` alone."""
-    rows = problem.rows
-    check_memory(len(rows.targets), rows.targets.dtype)
-    return _solved(*_field(problem.kernel, rows, problem.regularization), rows.count, throw)
+    return _solved(*_dense(problem, progress, keep=False)[-2:], problem.rows.count, throw)
 
 
-COPIES = 3  # of A: the Gram, A, and its factor
+# Rows from which the Gram of velocities is factored in its own place, in blocks.
+IN_PLACE = 6000
 
 
-def check_memory(D: int, dtype: jnp.dtype) -> None:
+def copies(rows: Measurements) -> int:
+    """How many matrices of the size of the Gram a dense fit holds, as its peak memory shows.
+
+    In place 1.5 for all kernels; else the Gram, its factor, what is returned, and strips on the
+    way, 3.4 (`test_the_peak_memory_of_a_dense_fit_is_what_is_planned`).
+    """
+    return 2 if is_in_place(rows) else 4
+
+
+def is_in_place(rows: Measurements) -> bool:
+    """Whether the Gram is factored in its own place: not under `jax.jit`, which cannot."""
+    return rows.size >= IN_PLACE and rows.states is not None and require.is_concrete(rows)
+
+
+def check_memory(rows: Measurements) -> None:
     """Refuse what does not fit in memory."""
+    D, dtype = rows.size, rows.targets.dtype
     cure = (
         "Use solver=hk.ConjugateGradient(), which is exact and has no error bars, or "
         "solver=hk.Nystrom(), which is faster and approximate to a stated tolerance."
     )
-    refuse_beyond_memory(f"a dense fit of {D} rows", D, D, dtype, COPIES, cure)
+    refuse_beyond_memory(f"a dense fit of {D} rows", D, D, dtype, copies(rows), cure)
 
 
-def _dense(K, rows: Measurements, regularization):
-    """The factor, c, the ridge, the field, and the relative residual."""
+def _dense(problem: Problem, progress: bool, keep: bool = True):
+    """The factor, if it is to be kept, c, the field, and the relative residual."""
+    K, rows, regularization = problem.kernel, problem.rows, problem.regularization
+    check_memory(rows)
+    if not (is_in_place(rows) and require.is_concrete(K, regularization)):
+        found = (_conditional if keep else _field)(K, rows, regularization)
+        return found if keep else (None, *found)
+    factor = factor_in_place(*_assembled(K, rows, problem.ridge, progress))
+    return factor, *_of_factor(K, rows, regularization, factor)
+
+
+def _assembled(K, rows: Measurements, ridge, progress: bool):
+    """A, a slab of rows after the other, and the progress bar of its factorisation."""
+    from tqdm import tqdm  # so that importing the package does not load it
+
+    off = None if progress else True
+    points, n = rows.points, rows.dimension
+    A, slab = jnp.zeros((rows.size, rows.size), rows.targets.dtype), -(-ROWS_IN_PLACE // n)
+    for first in tqdm(range(0, len(points), slab), "Gram", disable=off):
+        start = jnp.asarray(min(first, len(points) - slab))
+        A = jax.block_until_ready(_slab((K, points, ridge, start, slab), A))
+    return A, lambda blocks: tqdm(blocks, "factor", disable=off)
+
+
+_slab = eqx.filter_jit(strips_of_gram, donate="all-except-first")
+
+
+def _dense_system(K, rows: Measurements, regularization):
+    ridge = rows.count * regularization
+    factor, c = solution(regularized_gram(K, rows, ridge), rows.y)
+    return factor, *_learned(K, rows, regularization, c)
+
+
+@eqx.filter_jit
+def _of_factor(K, rows: Measurements, regularization, factor: DenseFactor):
+    return _learned(K, rows, regularization, factor.solve(rows.y))
+
+
+def _learned(K, rows: Measurements, regularization, c):
+    """c, its field, and the relative residual ‖y − (G + σ²I)c‖/‖y‖."""
     y, ridge = rows.y, rows.count * regularization
-    factor, c = solution(plus_ridge(gram_of_rows(K, rows), ridge), y)
     values = gram_product(K, rows, c)  # without the Gram, which the factor has overwritten
     left = relative(y - values - ridge * c, y)
-    residual, norm = rows.residual(ridge * c), root(c @ values)
+    residual, norm = rows.residual(ridge * c), norm_of(c @ values, c @ (y - values - ridge * c))
     info = SolverInfo("Cholesky", relative_residual=left)
-    field = field_of_rows(K, rows, c, residual, norm, regularization, info)
-    return factor, c, ridge, field, left
+    return c, field_of_rows(K, rows, c, residual, norm, regularization, info), left
 
 
-_conditional = eqx.filter_jit(_dense)
-_field = eqx.filter_jit(lambda *problem: _dense(*problem)[-2:])
+_conditional = eqx.filter_jit(_dense_system)
+_field = eqx.filter_jit(lambda *system: _dense_system(*system)[1:])
+
+
+def norm_of(square: Float[Array, ""], error: Float[Array, ""]) -> Float[Array, ""]:
+    """√square for ‖f‖² = cᵀGc; NaN where rounding may be a tenth of it or more.
+
+    It is the small difference of large numbers where the field is small beside the velocities.
+
+    Args:
+        square: cᵀGc as it was computed.
+        error: an estimate of its error, such as cᵀr for what c leaves of the linear system.
+    """
+    lost = ~(jnp.abs(jax.lax.stop_gradient(error)) <= 0.1 * square) & (square != 0)
+    return jnp.where(lost, jnp.nan, root(square)).astype(square.dtype)
 
 
 def relative(error: Array, of: Array) -> Float[Array, ""]:
@@ -163,7 +241,9 @@ def _extended(old: DenseConditional, new: Measurements):
     first = old.representer - backward(old.factor.R, B @ last)[:, 0]
     c = jnp.concatenate([first, last[:, 0]])
     regularization = old.ridge / rows.count
-    residual, norm = rows.residual(old.ridge * c), root(c @ (y - old.ridge * c))
+    rounding = jnp.finfo(c.dtype).eps * jnp.linalg.norm(c) * jnp.linalg.norm(y)
+    residual = rows.residual(old.ridge * c)
+    norm = norm_of(c @ (y - old.ridge * c), rounding.astype(c.dtype))
     info = SolverInfo("Cholesky")
     return factor, c, field_of_rows(K, rows, c, residual, norm, regularization, info)
 

@@ -10,6 +10,7 @@ whose F = G_XS T is applied as a product with the Gram, so that it needs no memo
 trace(G − Ĝ) ≤ τρ the condition is at most 1 + τ and the iterations do not depend on N.
 """
 
+import abc
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -19,18 +20,20 @@ import lineax as lx
 from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
-from hamkernel._fields.base import SolverInfo, root
+from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
 from hamkernel._gram.derivatives import constant
 from hamkernel._gram.operator import product
-from hamkernel._machine import as_given, rows_of, split
+from hamkernel._machine import RowSharding, as_given, rows_of, split
+from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.base import AbstractSolver
-from hamkernel._solvers.conditional import field_of_rows, gram_product, relative
+from hamkernel._solvers.conditional import field_of_rows, gram_product, norm_of, relative
 from hamkernel._solvers.landmark_gram import Columns, checked, factor, truncated, whitening
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.spans import landmark_span
 from hamkernel._solvers.stream_sums import normal
+from hamkernel._structures.base import AbstractMatrixKernel
 
 # Nλ in units of ε trace(G) below which a failure is one of rounding. On 87 points of an orbit they
 # converged at 3e4 and did not at 3e2, where Cholesky left a residual of 4e-12.
@@ -93,16 +96,27 @@ class ConjugateGradient(AbstractSolver[KernelField]):
             )
         self.preconditioner = preconditioner
 
-    def _fitted(self, problem, throw=True) -> KernelField:
+    def _fitted(self, problem, throw=True, progress=False) -> KernelField:
+        if problem.states is None:
+            problem = problem.on_one_device()
         K, rows, ridge = problem.kernel, problem.rows, problem.ridge
         X, spread = rows.points, rows_of(rows.points)
         landmarks = self.preconditioner.landmarks(K, rows, problem.regularization)
-        limits = landmarks, self._tolerance(rows.targets.dtype), self.max_iterations
+        limits = self._tolerance(rows.targets.dtype), self.max_iterations
+        shown = progress and require.is_concrete(K, rows, ridge)
         if problem.states is None:
-            found = _solve_rows(K, rows, ridge, *limits)
+            given = K, rows, ridge, landmarks
+            if shown:
+                found = _shown(_prepared_rows_alone(*given), rows.y, ridge, *limits)
+            else:
+                found = _solve_rows(*given, *limits)
         else:
             X, Y = (split(spread, each) for each in problem.states)
-            found = _solve(K, X, Y, ridge, *limits, spread)
+            if shown:
+                prepared = _prepared_alone(K, X, ridge, landmarks, spread)
+                found = _shown(prepared, Y, ridge, *limits)
+            else:
+                found = _solve(K, X, Y, ridge, landmarks, *limits, spread)
         (c, left, norm), info = self._converged(K, X, ridge, landmarks, found, throw)
         left = as_given(spread, rows.residual(left.reshape(-1)))
         return field_of_rows(K, rows, c.reshape(-1), left, norm, problem.regularization, info)
@@ -121,11 +135,11 @@ class ConjugateGradient(AbstractSolver[KernelField]):
         def message() -> str:
             reached = ""
             if require.is_concrete(left, iterations, truncation):
-                cut = "" if truncation is None else f", truncation {float(truncation):.1e}"
                 reached = (
                     f" after {int(iterations)} iterations: the relative residual is "
                     f"{float(left):.1e} and the tolerance {tolerance:.1e} "
-                    f"({int(landmarks.count)} landmarks{cut})"
+                    f"({int(landmarks.count)} landmarks, truncation "
+                    f"{float(truncation):.1e})"
                 )
                 rounding = float(jnp.finfo(X.dtype).eps * trace(K, X, rows_of(X)))
                 if ridge < _DIGITS * rounding:
@@ -160,52 +174,93 @@ class ConjugateGradient(AbstractSolver[KernelField]):
         return checked(learned, landmarks, truncation, failed, message, throw), info
 
 
+class AbstractProducts(eqx.Module):
+    """Products with the Gram and with the inverse of the low-rank Gram that preconditions.
+
+    The preconditioner changes how fast the answer is found, not the answer: it is not
+    differentiated.
+    """
+
+    @abc.abstractmethod
+    def gram(self, c: Array) -> Array:
+        """G c."""
+
+    @abc.abstractmethod
+    def preconditioned(self, c: Array) -> Array:
+        """(I + Ĝ/ρ)⁻¹ c."""
+
+
+class _OfVelocities(AbstractProducts):
+    kernel: AbstractMatrixKernel
+    X: Float[Array, "N d"]
+    T: Float[Array, "r r"]
+    R: Float[Array, "r r"]
+    fixed: tuple  # the kernel, the states and the landmarks of the preconditioner
+    spread: RowSharding | None = eqx.field(static=True)
+
+    def gram(self, c):
+        return product(self.kernel, self.X, self.X, c, self.spread, self.spread)
+
+    def preconditioned(self, c):
+        K, X, S = self.fixed
+        moment = self.T.T @ product(K, S, X, c, None, self.spread).reshape(-1)
+        w = jax.scipy.linalg.cho_solve((self.R, True), moment)
+        return c - product(K, X, S, (self.T @ w).reshape(len(S), -1), self.spread)
+
+
+class _OfRows(AbstractProducts):
+    kernel: AbstractMatrixKernel
+    rows: Measurements
+    F: Float[Array, "D r"]
+    R: Float[Array, "r r"]
+
+    def gram(self, c):
+        return gram_product(self.kernel, self.rows, c)  # the rows of the field of c
+
+    def preconditioned(self, c):
+        return c - self.F @ jax.scipy.linalg.cho_solve((self.R, True), self.F.T @ c)
+
+
+def _prepared(K, X, ridge, landmarks, spread):
+    """The products for velocities, and the truncation of the preconditioner."""
+    K_, X_, ridge_, marks = constant((K, X, ridge, landmarks))
+    T, nothing = whitening(K_, marks), jnp.zeros((len(X), K.outputs(X.shape[1])), X.dtype)
+    square = normal(Columns(K_, marks), T, X_, nothing, spread).square
+    products = _OfVelocities(K, X, T, factor(square, ridge_), (K_, X_, marks.points), spread)
+    return products, truncated(trace(K_, X_, spread), jnp.trace(square), ridge_)
+
+
+def _prepared_rows(K, rows, ridge, landmarks):
+    """`_prepared` for rows of any observations."""
+    K_, rows_, ridge_, marks = constant((K, rows, ridge, landmarks))
+    span = landmark_span(K_, marks)
+    all_rows = span.of_rows(rows_)
+    F = rows_.contrast(all_rows)
+    truncation = span.truncation(rows_, all_rows, ridge_)
+    return _OfRows(K, rows, F, factor(F.T @ F, ridge_)), truncation
+
+
 @eqx.filter_jit
 def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
-    S = landmarks.points
-    # The preconditioner changes how fast the answer is found, not the answer.
-    K_, X_, S_, ridge_, marks = constant((K, X, S, ridge, landmarks))
-    T = whitening(K_, marks)
-    square = normal(Columns(K_, marks), T, X_, jnp.zeros_like(Y), spread).square
-    R = factor(square, ridge_)
-
-    def preconditioned(c):
-        moment = T.T @ product(K_, S_, X_, c, None, spread).reshape(-1)
-        w = jax.scipy.linalg.cho_solve((R, True), moment)
-        return c - product(K_, X_, S_, (T @ w).reshape(len(S), -1), spread)
-
-    def gram(c):
-        return product(K, X, X, c, spread, spread)
-
-    truncation = truncated(trace(K_, X_, spread), jnp.trace(square), ridge_)
-    return _iterated(gram, preconditioned, Y, ridge, tolerance, max_iterations, truncation)
+    prepared = _prepared(K, X, ridge, landmarks, spread)
+    return _iterated(*prepared, Y, ridge, tolerance, max_iterations)
 
 
 @eqx.filter_jit
 def _solve_rows(K, rows, ridge, landmarks, tolerance, max_iterations):
-    """`_solve` of rows of observations, whose product is that of their field with their rows."""
-    y = rows.y
-    K_, rows_, ridge_ = constant((K, rows, ridge))
-    span = landmark_span(K_, landmarks)
-    all_rows = span.of_rows(rows_)
-    truncation, F = span.truncation(rows_, all_rows, ridge_), rows_.contrast(all_rows)
-    R = factor(F.T @ F, ridge_)
-
-    def gram(c):
-        return gram_product(K, rows, c)
-
-    def preconditioned(c):
-        return c - F @ jax.scipy.linalg.cho_solve((R, True), F.T @ c)
-
-    return _iterated(gram, preconditioned, y, ridge, tolerance, max_iterations, truncation)
+    prepared = _prepared_rows(K, rows, ridge, landmarks)
+    return _iterated(*prepared, rows.y, ridge, tolerance, max_iterations)
 
 
-def _iterated(gram, preconditioned, y, ridge, tolerance, max_iterations, truncation) -> _Found:
+def _iterated(
+    products: AbstractProducts, truncation, y, ridge, tolerance, max_iterations, start=None
+) -> _Found:
     """The solution of (I + G/ridge) c = y."""
     structure = jax.ShapeDtypeStruct(y.shape, y.dtype)
     positive = lx.positive_semidefinite_tag
+    gram = products.gram
     system = lx.FunctionLinearOperator(lambda c: c + gram(c) / ridge, structure, positive)
-    preconditioner = lx.FunctionLinearOperator(preconditioned, structure, positive)
+    preconditioner = lx.FunctionLinearOperator(products.preconditioned, structure, positive)
     # lineax asks of the change of c what it asks of the residual; both are in units of y. Half of
     # the tolerance leaves room for what the recursion of the residual rounds off.
     scale = jnp.linalg.norm(jax.lax.stop_gradient(y))
@@ -216,10 +271,65 @@ def _iterated(gram, preconditioned, y, ridge, tolerance, max_iterations, truncat
         stabilise_every=None,
         max_steps=max_iterations,
     )
-    options = {"preconditioner": preconditioner}
+    options = {"preconditioner": preconditioner} | ({} if start is None else {"y0": start})
     solution = lx.linear_solve(system, y, solver, options=options, throw=False)
     c = solution.value
     values = gram(c) / ridge  # f(X)
-    norm = root(jnp.sum(c * values) / ridge)  # ‖f‖² = aᵀGa
+    # ‖f‖² = aᵀGa
+    norm = norm_of(jnp.sum(c * values) / ridge, jnp.sum(c * (y - c - values)) / ridge)
     learned = c / ridge, y - values, norm
     return _Found(learned, solution.stats["num_steps"], relative(y - c - values, y), truncation)
+
+
+# The same one iteration at a time, to show how far it is and to let Ctrl-C end it.
+
+
+class _Iterate(NamedTuple):
+    c: Array
+    residual: Array
+    direction: Array
+    square: Float[Array, ""]  # rᵀM r of the residual, M the preconditioner
+    left: Float[Array, ""]  # its norm over that of y
+
+
+def _shown(prepared, y, ridge, tolerance, max_iterations) -> _Found:
+    """`_iterated` outside of any trace, with a progress bar."""
+    from tqdm import tqdm  # so that importing the package does not load it
+
+    products, truncation = prepared
+    state, done = _begun(products, y), 0
+    with tqdm(total=max_iterations, desc="conjugate gradients", disable=None) as bar:
+        while float(state.left) > 0.5 * float(tolerance) and done < max_iterations:
+            state = _next(products, y, ridge, state)
+            done += 1
+            bar.set_postfix_str(f"residual {float(state.left):.1e}", refresh=False)
+            bar.update()
+    last = _finished(products, truncation, y, ridge, tolerance, state.c)
+    return last._replace(iterations=last.iterations + done)
+
+
+@eqx.filter_jit
+def _begun(products: AbstractProducts, y) -> _Iterate:
+    z = products.preconditioned(y)
+    return _Iterate(jnp.zeros_like(y), y, z, jnp.sum(y * z), relative(y, y))
+
+
+@eqx.filter_jit
+def _next(products: AbstractProducts, y, ridge, at: _Iterate) -> _Iterate:
+    p = at.direction
+    image = p + products.gram(p) / ridge
+    step = at.square / jnp.sum(p * image)
+    residual = at.residual - step * image
+    z = products.preconditioned(residual)
+    square = jnp.sum(residual * z)
+    c = at.c + step * p
+    return _Iterate(c, residual, z + square / at.square * p, square, relative(residual, y))
+
+
+@eqx.filter_jit
+def _finished(products: AbstractProducts, truncation, y, ridge, tolerance, start) -> _Found:
+    return _iterated(products, truncation, y, ridge, tolerance, 2, start)
+
+
+_prepared_alone = eqx.filter_jit(_prepared)
+_prepared_rows_alone = eqx.filter_jit(_prepared_rows)

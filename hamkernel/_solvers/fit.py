@@ -17,7 +17,7 @@ from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.base import AbstractSolver, Learned
 from hamkernel._solvers.cholesky import Cholesky
-from hamkernel._solvers.conditional import COPIES
+from hamkernel._solvers.conditional import copies
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.problem import Problem, problem
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -37,6 +37,7 @@ def fit(
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
+    progress: bool = False,
 ) -> ControlledField: ...
 @overload
 def fit(
@@ -49,6 +50,7 @@ def fit(
     mean: Mean | None = None,
     throw: bool = True,
     parameters: Num[ArrayLike, "N p"] | None = None,
+    progress: bool = False,
 ) -> FamilyField: ...
 @overload
 def fit(
@@ -62,6 +64,7 @@ def fit(
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
+    progress: bool = False,
 ) -> KernelField: ...
 @overload
 def fit(
@@ -75,6 +78,7 @@ def fit(
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
+    progress: bool = False,
 ) -> Learned: ...
 
 
@@ -90,6 +94,7 @@ def fit(
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
+    progress: bool = False,
 ) -> AbstractField:
     """Learn the field f in the RKHS of K that minimises (1/N) Σᵢ‖f(xᵢ) − yᵢ‖² + λ‖f‖².
 
@@ -105,11 +110,12 @@ def fit(
         regularization: λ > 0, in squared units of Y over those of the kernel. With other
             observations Nλ is the variance of a row of relative noise 1, and N counts points of
             velocities and equilibria, energies and functionals.
-        solver: if None, `Cholesky()` if its three matrices of (N n)² numbers take at most half of
-            the memory, else `ConjugateGradient()`; both are exact, and `field.info.solver` names
-            the one used. `Nystrom()` is faster, and approximate to a stated tolerance. If the rows
-            of X are sharded over a mesh of devices they stay there, and None means
-            `ConjugateGradient()`; only `Cholesky()` gathers them on one device.
+        solver: if None, `Cholesky()` if its matrices of (N n)² numbers (two of velocities from 6000
+            rows on, else four) take at most half of the memory, else `ConjugateGradient()`; both
+            are exact, and `field.info.solver` names the one used. `Nystrom()` is faster, and
+            approximate to a stated tolerance. If the rows of X are sharded over a mesh of devices
+            they stay there, and None means `ConjugateGradient()`; only `Cholesky()` gathers them on
+            one device.
         mean: the known part of the field, x (n,) -> (n,): a learned field, one of `hk.systems`, any
             function of one state. The kernel learns the rest, and the field is the sum; it has a
             Hamiltonian if both parts have one.
@@ -120,6 +126,9 @@ def fit(
             `ControlledField`, field(x, u).
         parameters: of a `Family`: θ at each state, shape (N, p). What is learned is then a
             `FamilyField`, field(x, θ), and `field.at(θ)` an ordinary field.
+        progress: show a progress bar where the standard error is a terminal: of the iterations of
+            `ConjugateGradient`, with their residual, and of the blocks of `Cholesky` from 6000 rows
+            on. Ctrl-C ends the fit between two of them; inside of one it waits for it.
 
     Returns:
         The learned field. Works under jit, vmap and grad, with respect to every argument; new
@@ -136,16 +145,19 @@ def fit(
     Source: Smith & Egeland (2023), section 3, where "Nλ a_j" should read "Nλ a_i".
     """
     check_solver(solver)
-    return solved(problem(K, X, Y, regularization, mean, inputs, parameters), solver, throw)
+    given = problem(K, X, Y, regularization, mean, inputs, parameters, throw)
+    return solved(given, solver, throw, progress)
 
 
-def solved(given: Problem, solver: AbstractSolver | None, throw: bool = True) -> AbstractField:
+def solved(
+    given: Problem, solver: AbstractSolver | None, throw: bool = True, progress: bool = False
+) -> AbstractField:
     """The field, by the default solver if there is none."""
     require.warn_of_float32(given.rows.targets)
     if solver is None:
         spread = rows_of(given.rows.points) is not None
         solver = ConjugateGradient() if spread else default_solver(given.rows)
-    field = solver._fitted(given, throw)
+    field = solver._fitted(given, throw, progress)
     if given.spread is not None and given.states is not None:
         field = dataclasses.replace(field, residual=as_given(given.spread, field.residual))
     return learned_field(field, given.known)
@@ -159,6 +171,6 @@ def check_solver(solver: Any) -> None:
 
 def default_solver(rows: Measurements) -> AbstractSolver[KernelField]:
     """Cholesky where it takes at most half of the memory of one device, which has all the data."""
-    needed = dense_bytes(rows.size, rows.size, rows.targets.dtype, COPIES)
+    needed = dense_bytes(rows.size, rows.size, rows.targets.dtype, copies(rows))
     memory = memory_bytes()
     return Cholesky() if memory is None or needed <= memory / 2 else ConjugateGradient()

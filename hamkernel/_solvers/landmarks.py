@@ -233,7 +233,7 @@ def given_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Landmarks:
     norms = jnp.sqrt(jnp.abs(jnp.diagonal(G)))
     norms = jnp.where(norms > 0, norms, jnp.ones_like(norms))
     rounding = _rounding(jnp.ones(1, G.dtype), len(G))
-    kept = _independent(G / norms[:, None] / norms, rounding[0])
+    kept = _independent(G / (norms[:, None] * norms[None]), rounding[0])
     at_points = landmarks.index is None and len(landmarks.blocks) == 1
     in_use = kept.reshape(len(landmarks.points) if at_points else len(kept), -1).any(axis=1)
     return Landmarks(landmarks.blocks, landmarks.index, kept, in_use.sum())

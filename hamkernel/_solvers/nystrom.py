@@ -133,7 +133,7 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
     ) -> LandmarkBasis:
         return LandmarkBasis(self.landmarks(K, rows, regularization))
 
-    def _fitted(self, problem, throw=True) -> KernelField:
+    def _fitted(self, problem, throw=True, progress=False) -> KernelField:
         if problem.states is None:
             return self._given(problem, throw).field
         K, (X, Y), regularization = problem.kernel, problem.states, problem.regularization
@@ -144,7 +144,8 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
         solution = solution._replace(residual=as_given(spread, solution.residual))
         return landmark_field(K, landmarks, solution, regularization, self.tolerance, CHOOSE, throw)
 
-    def _given(self, problem, throw=True) -> LowRankConditional:
+    def _given(self, problem, throw=True, progress=False) -> LowRankConditional:
+        problem = problem.on_one_device()
         K, rows, regularization = problem.kernel, problem.rows, problem.regularization
         landmarks = self.landmarks(K, rows, regularization)
         given = low_rank_conditional(landmark_span(K, landmarks), rows, regularization, throw)

@@ -9,6 +9,8 @@ import dataclasses
 from typing import Any
 
 import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
@@ -68,11 +70,14 @@ def problem(
     mean: Any = None,
     inputs: Any = None,
     parameters: Any = None,
+    throw: bool = True,
 ) -> Problem:
     """The problem of the data, checked; X and Y are `Velocities(X, Y)`.
 
     Raises:
-        TypeError, ValueError: as `fit` says. AttributeError: energies without a potential.
+        TypeError, ValueError: as `fit` says; not of a mean that is not finite at the data, nor of
+            data whose squares overflow, unless it is to `throw`. AttributeError: energies without a
+            potential.
     """
     spread = rows_of(X) if isinstance(X, jax.Array) else None
     K, rows = measurements(matrix_kernel(K), X, Y, beside(inputs, parameters, K))
@@ -81,7 +86,25 @@ def problem(
         raise AttributeError(f"energies were given, and {K.no_potential}")
     regularization = require.ridge(regularization, rows.targets.dtype)
     known = known_part(K, mean, rows.dimension, rows.targets.dtype)
-    return Problem(K, without_known(K, rows, known), regularization, known, spread)
+    left = without_known(K, rows, known, throw)
+    if throw:
+        _refuse_overflow(left, regularization)
+    return Problem(K, left, regularization, known, spread)
+
+
+def _refuse_overflow(rows: Measurements, regularization: Float[Array, ""]) -> None:
+    """ValueError where ‖y‖² or ‖f‖² ≤ ‖y‖²/(Nλ) is larger than the dtype can hold."""
+    if not require.is_concrete(rows.targets, regularization):
+        return
+    y = require.on_host(rows.targets)
+    size, limit = float(abs(y).max()), float(jnp.finfo(y.dtype).max)
+    smallest = min(1.0, rows.count * float(regularization))
+    if size > (limit * smallest / len(y)) ** 0.5:
+        raise ValueError(
+            f"the data are as large as {size:.2g}, and their squares, or these over N λ, overflow "
+            f"in {y.dtype}, whose largest number is {limit:.2g}. Change the units, so that the "
+            "data are of the order of 1."
+        )
 
 
 def new_rows(
@@ -91,13 +114,39 @@ def new_rows(
     return without_known(K, measurements_of(K, data, previous=old)[1], known)
 
 
-def without_known(K: AbstractMatrixKernel, rows: Measurements, known: Any) -> Measurements:
-    """The rows of f less what is known; AttributeError for energies if that has no potential."""
+def without_known(
+    K: AbstractMatrixKernel, rows: Measurements, known: Any, throw: bool = True
+) -> Measurements:
+    """The rows of f less what is known.
+
+    Raises:
+        AttributeError: energies, and what is known has no potential. ValueError: what is known is
+            not finite at the data, if it is to `throw`.
+    """
     if known is None:
         return rows
     potential = _known_potential(K, known) if len(rows.energies) else known
     field, potential = (jax.tree_util.Partial(at_points, each) for each in (known, potential))
-    return rows.subtract(rows.of(field, potential))
+    values = rows.of(field, potential)
+    if throw:
+        bad = require.not_finite(values)
+        values = require.value(values, bad, lambda: _not_finite(rows, bad))
+    return rows.subtract(values)
+
+
+def _not_finite(rows: Measurements, bad: Any) -> str:
+    where = ""
+    if isinstance(bad, np.ndarray) and require.is_concrete(rows):
+        of = np.unique(rows.labels()[np.flatnonzero(bad)])
+        where = f" of {len(of)} of the {rows.count} observations, the first of them number {of[0]}"
+        local, block = int(of[0]), rows.blocks[0]
+        if local < block.count == len(block.points):
+            where += f" at x = {np.asarray(block.points[local])}"
+    return (
+        f"mean is NaN or infinite at the data{where}. The kernel learns what mean leaves of the "
+        "data, so mean must be finite there: look at what it divides by, and at the logarithms and "
+        "roots in it, or leave those observations out."
+    )
 
 
 def _known_potential(K: AbstractMatrixKernel, known: Any):

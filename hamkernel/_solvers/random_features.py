@@ -71,7 +71,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
     ) -> WaveBasis:
         return WaveBasis(self.key, self.count)
 
-    def _fitted(self, problem, throw=True) -> FeatureField:
+    def _fitted(self, problem, throw=True, progress=False) -> FeatureField:
         if problem.states is None:
             return self._given(problem, throw).field
         spread = rows_of(problem.rows.points)
@@ -83,7 +83,8 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
         residual = as_given(spread, field.residual)
         return eqx.tree_at(lambda f: f.residual, field, residual)
 
-    def _given(self, problem, throw=True) -> LowRankConditional:
+    def _given(self, problem, throw=True, progress=False) -> LowRankConditional:
+        problem = problem.on_one_device()
         K, rows, regularization = problem.kernel, problem.rows, problem.regularization
         basis = self._features(K, rows.points.shape[1], rows.targets.dtype)
         span = FeatureSpan(K, basis, rows.dimension)
