@@ -13,10 +13,10 @@ above it:
     _structures   matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, symmetries; tensors in `poisson`
     _observations what is measured, as rows of linear functionals
     _gram         the Gram: dense, as an operator, and its derivatives
-    _factors      factors of G + ridge I, dense and of low rank
     _features     random Fourier features
     _fields       what is learned: f and its potential
-    _solvers      how it is solved: dense, by conjugate gradients, of low rank, from streams
+    _solvers      how it is solved: dense, by conjugate gradients, of low rank, from streams;
+                  factors of G + ridge I
     _posterior    a field with its uncertainty
     _validation   validation losses in closed form
     _tuning       hyperparameters, by gradients
@@ -50,11 +50,10 @@ from hamkernel._kernels.transforms import Select, Warp
 from hamkernel._observations.kinds import Energies, Equilibria, Functionals, Velocities
 from hamkernel._posterior import Posterior, condition
 from hamkernel._save import load, save
-from hamkernel._solvers.cholesky import Cholesky
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
+from hamkernel._solvers.dense import Cholesky
 from hamkernel._solvers.fit import fit
-from hamkernel._solvers.landmark_fit import LandmarkFit
-from hamkernel._solvers.nystrom import Nystrom
+from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
 from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
 from hamkernel._structures.base import Sum
 from hamkernel._structures.controlled import Controlled, InputMatrix

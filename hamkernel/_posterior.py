@@ -21,7 +21,7 @@ from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, FieldSum, root
 from hamkernel._fields.joined import AbstractJoinedField, FamilyField, known_of, learned_field
 from hamkernel._fields.known import Mean
-from hamkernel._gram.observed import components
+from hamkernel._gram.dense import components
 from hamkernel._kernels.base import Invariance, Scaled
 from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._machine import one_blas_thread
@@ -29,11 +29,9 @@ from hamkernel._observations.blocks import AbstractBlock, Values
 from hamkernel._observations.kinds import AbstractObservations, beside
 from hamkernel._observations.measurements import inputs_of, observations
 from hamkernel._show import text
-from hamkernel._solvers.base import AbstractSolver
-from hamkernel._solvers.cholesky import Cholesky
-from hamkernel._solvers.conditional import AbstractConditional
+from hamkernel._solvers.dense import Cholesky
 from hamkernel._solvers.fit import check_solver
-from hamkernel._solvers.problem import new_rows, problem
+from hamkernel._solvers.problem import AbstractConditional, AbstractSolver, new_rows, problem
 from hamkernel._structures.base import AbstractMatrixKernel
 
 

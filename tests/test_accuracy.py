@@ -15,7 +15,7 @@ from benchmarks.accuracy import allowed, bases, compiled, errors, orbit, problem
 import hamkernel as hk
 from hamkernel._observations.blocks import Components
 from hamkernel._solvers.landmarks import landmarks_of
-from hamkernel._solvers.spans import LandmarkBasis, WaveBasis
+from hamkernel._solvers.low_rank import LandmarkBasis, WaveBasis
 
 CASES = {
     f"{problem.name}, {kind}": (problem, basis)

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hamkernel._factors.dense import DenseSystem, dense_factor
-from hamkernel._factors.low_rank import LowRankSystem
+from hamkernel._solvers.factors import DenseSystem, dense_factor
+from hamkernel._solvers.low_rank_factor import LowRankSystem
 from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
 from hamkernel._validation.folds import Partition
 

@@ -14,12 +14,12 @@ import scipy.stats
 from kernels import canonical, gaussian_profile, matern_profile, periodic, radial, rational_profile
 
 import hamkernel as hk
+from hamkernel._features.features import features
 from hamkernel._features.spectra import spectra
-from hamkernel._features.structured import features
 from hamkernel._fields.features import FeatureField
 from hamkernel._machine import orthonormal
+from hamkernel._solvers.least_squares import ridge_regression, triangle
 from hamkernel._solvers.random_features import RandomFeatures
-from hamkernel._solvers.tall_least_squares import ridge_regression, triangle
 from hamkernel.paper import datasets, experiments
 
 STRUCTURE = 1e-9  # relative; what sums of a thousand rounded terms leave of an exact zero

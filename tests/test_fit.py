@@ -11,7 +11,7 @@ import pytest
 from kernels import BY_NAME, canonical
 
 import hamkernel as hk
-from hamkernel._solvers.base import AbstractSolver
+from hamkernel._solvers.problem import AbstractSolver
 
 SIGMA, RIDGE = 1.3, 1e-3
 # The condition of the system, trace / Nλ ~ 1e3, times rounding.
@@ -427,16 +427,15 @@ def test_a_norm_lost_in_rounding_is_nan_and_not_zero():
     # The velocity x has no Hamiltonian part, so that the field is small beside it.
     rng = np.random.default_rng(0)
     X = rng.normal(size=(60, 2))
-    exact = hk.fit(hk.Symplectic(hk.Gaussian(2.0)), X, X, 1e-4)
     with pytest.warns(UserWarning, match="float32"):
         rounded = [
             hk.fit(hk.Symplectic(hk.Gaussian(2.0)), X.astype("f4"), X.astype("f4"), 10.0**-p)
             for p in range(3, 7)
         ]
-    for field, p in zip(rounded, range(3, 7), strict=True):
-        right = hk.fit(hk.Symplectic(hk.Gaussian(2.0)), X, X, 10.0**-p).norm
-        assert np.isnan(field.norm) or abs(field.norm / right - 1) < 0.1, (p, field.norm, right)
-    assert exact.norm > 0
+    right = [hk.fit(hk.Symplectic(hk.Gaussian(2.0)), X, X, 10.0**-p).norm for p in range(3, 7)]
+    norms = np.array([float(field.norm) for field in rounded])
+    np.testing.assert_allclose(norms[np.isfinite(norms)], np.array(right)[np.isfinite(norms)], 0.1)
+    assert min(right) > 0
     nothing = hk.fit(hk.Symplectic(hk.Gaussian(2.0)), X, 0 * X, 1e-4)
     assert nothing.norm == 0
 

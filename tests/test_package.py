@@ -23,7 +23,6 @@ ROOMS = [
     {"_structures", "poisson"},
     {"_observations"},
     {"_gram"},
-    {"_factors"},
     {"_features"},
     {"_fields"},
     {"_solvers"},

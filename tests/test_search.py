@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._gram.observed import gram_of_rows
+from hamkernel._gram.dense import gram_of_rows
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of, measurements_of_states
-from hamkernel._solvers.spans import WaveBasis
+from hamkernel._solvers.low_rank import WaveBasis
 from hamkernel._tuning.boxes import full_trace, hyperparameters
 from hamkernel._tuning.descent import Descent, Run
 from hamkernel._tuning.objective import criterion_of

@@ -351,7 +351,7 @@ def test_conjugate_gradients_find_the_exact_coefficients(name):
 @pytest.mark.parametrize("kind", ["states", "rows"])
 def test_iterations_that_are_shown_end_at_the_same_field(kind, capsys, monkeypatch):
     X, Y = swings(150)
-    data = (X, Y) if kind == "states" else (hk.Velocities(X, Y, noise=0.5),)
+    data: Any = (X, Y) if kind == "states" else (hk.Velocities(X, Y, noise=0.5),)
     solver = ConjugateGradient(preconditioner=Nystrom(10.0, max_points=8))
     silent = hk.fit(K, *data, regularization=RIDGE, solver=solver)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
@@ -488,10 +488,10 @@ def test_a_dense_fit_is_chosen_where_it_takes_half_of_the_memory(monkeypatch):
 def test_a_factor_made_in_place_is_that_of_lapack(monkeypatch):
     K, (X, Y) = hk.Symplectic(1.1 * hk.Gaussian(1.5)), swings(150)
     one = hk.condition(K, X, Y, RIDGE)
-    monkeypatch.setattr("hamkernel._solvers.conditional.IN_PLACE", 200)
-    monkeypatch.setattr("hamkernel._factors.dense.ROWS_IN_PLACE", 130)
-    monkeypatch.setattr("hamkernel._solvers.conditional.ROWS_IN_PLACE", 130)
-    monkeypatch.setattr("hamkernel._gram.observed._STRIP", 7000)
+    monkeypatch.setattr("hamkernel._solvers.dense.IN_PLACE", 200)
+    monkeypatch.setattr("hamkernel._solvers.factors.ROWS_IN_PLACE", 130)
+    monkeypatch.setattr("hamkernel._solvers.dense.ROWS_IN_PLACE", 130)
+    monkeypatch.setattr("hamkernel._gram.dense._STRIP", 7000)
     blocks = hk.condition(K, X, Y, RIDGE)
     A = dense(K, X) + len(X) * RIDGE * np.eye(X.size)
     given: Any = blocks.given

@@ -12,11 +12,11 @@ import pytest
 from data import swings
 
 import hamkernel as hk
-from hamkernel._gram.observed import gram_of_rows, rows_between
+from hamkernel._gram.dense import gram_of_rows, rows_between
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of
 from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
-from hamkernel._solvers.streaming import AbstractStreamingSolver
+from hamkernel._solvers.stream import AbstractStreamingSolver
 
 K = hk.Symplectic(hk.Gaussian(1.5))
 RIDGE = 1e-4

@@ -13,7 +13,7 @@ from jax.flatten_util import ravel_pytree
 from scipy.stats import multivariate_normal
 
 import hamkernel as hk
-from hamkernel._factors.dense import DenseSystem
+from hamkernel._solvers.factors import DenseSystem
 from hamkernel._validation.closed_forms import held_out
 from hamkernel._validation.folds import Partition
 
@@ -446,7 +446,7 @@ def test_many_hyperparameters_do_not_take_the_memory_of_many_grams():
 
 
 def test_every_lapack_call_of_a_loss_and_its_gradient_waits_for_the_one_before():
-    # Side by side they were seen to stall for ever, see `_factors/dense.py`.
+    # Side by side they were seen to stall for ever, see `_solvers/factors.py`.
     partition = Partition(N, SCATTERED)
     assert len(partition.groups) == 2
 

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hamkernel._features.structured import AbstractFeatures, SumFeatures
+from hamkernel._features.features import AbstractFeatures, SumFeatures
 from hamkernel._fields.base import BATCH, AbstractField, SolverInfo, root
 from hamkernel._machine import as_given, on_each, rows_of, split
 from hamkernel._structures.base import AbstractMatrixKernel, Sum

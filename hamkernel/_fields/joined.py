@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._features.structured import ControlledFeatures
+from hamkernel._features.features import ControlledFeatures
 from hamkernel._fields.base import AbstractField, FieldSum, Scalar, SolverInfo, at_points, root
 from hamkernel._fields.features import FeatureField
 from hamkernel._fields.kernel_field import KernelField

@@ -192,7 +192,7 @@ def tiles(
     return X.reshape(count, size, n)
 
 
-# What lineax may know of the operator; it asks by type.
+# Properties of the operator for lineax, which dispatches on the type.
 
 
 @lx.is_symmetric.register

@@ -27,12 +27,12 @@ from hamkernel._gram.derivatives import constant
 from hamkernel._gram.operator import product
 from hamkernel._machine import RowSharding, as_given, rows_of, split
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.base import AbstractSolver
-from hamkernel._solvers.conditional import field_of_rows, gram_product, norm_of, relative
-from hamkernel._solvers.landmark_gram import Columns, checked, factor, truncated, whitening
+from hamkernel._solvers.dense import field_of_rows, gram_product, norm_of, relative
+from hamkernel._solvers.landmarks import whitening
+from hamkernel._solvers.least_squares import normal
+from hamkernel._solvers.low_rank import Columns, checked, factor, landmark_span, truncated
 from hamkernel._solvers.nystrom import Nystrom
-from hamkernel._solvers.spans import landmark_span
-from hamkernel._solvers.stream_sums import normal
+from hamkernel._solvers.problem import AbstractSolver
 from hamkernel._structures.base import AbstractMatrixKernel
 
 # Nλ in units of ε trace(G) below which a failure is one of rounding. On 87 points of an orbit they
@@ -128,7 +128,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
         return jnp.asarray(default if own is None else own, dtype)
 
     def _converged(self, K, X, ridge, landmarks, found: _Found, throw: bool):
-        """What was learned, if the iterations converged, and how."""
+        """Coefficients, residual and norm, if the iterations converged, and the `SolverInfo`."""
         learned, iterations, left, truncation = found
         tolerance = self._tolerance(X.dtype)
 
@@ -261,8 +261,8 @@ def _iterated(
     gram = products.gram
     system = lx.FunctionLinearOperator(lambda c: c + gram(c) / ridge, structure, positive)
     preconditioner = lx.FunctionLinearOperator(products.preconditioned, structure, positive)
-    # lineax asks of the change of c what it asks of the residual; both are in units of y. Half of
-    # the tolerance leaves room for what the recursion of the residual rounds off.
+    # lineax has one bound for the residual and for the change of c, both in units of y. Half of the
+    # tolerance leaves room for the rounding errors in the recursion of the residual.
     scale = jnp.linalg.norm(jax.lax.stop_gradient(y))
     solver = lx.CG(
         rtol=0.0,

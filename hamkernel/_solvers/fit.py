@@ -14,12 +14,9 @@ from hamkernel._fields.kernel_field import KernelField
 from hamkernel._fields.known import Mean
 from hamkernel._machine import as_given, dense_bytes, memory_bytes, one_blas_thread, rows_of
 from hamkernel._observations.kinds import AbstractObservations
-from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.base import AbstractSolver, Learned
-from hamkernel._solvers.cholesky import Cholesky
-from hamkernel._solvers.conditional import copies
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
-from hamkernel._solvers.problem import Problem, problem
+from hamkernel._solvers.dense import Cholesky, copies
+from hamkernel._solvers.problem import AbstractSolver, Learned, Problem, problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.controlled import Controlled
 from hamkernel._structures.family import AbstractFamily
@@ -156,7 +153,7 @@ def solved(
     require.warn_of_float32(given.rows.targets)
     if solver is None:
         spread = rows_of(given.rows.points) is not None
-        solver = ConjugateGradient() if spread else default_solver(given.rows)
+        solver = ConjugateGradient() if spread else default_solver(given)
     field = solver._fitted(given, throw, progress)
     if given.spread is not None and given.states is not None:
         field = dataclasses.replace(field, residual=as_given(given.spread, field.residual))
@@ -169,8 +166,9 @@ def check_solver(solver: Any) -> None:
         raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
 
 
-def default_solver(rows: Measurements) -> AbstractSolver[KernelField]:
+def default_solver(given: Problem) -> AbstractSolver[KernelField]:
     """Cholesky where it takes at most half of the memory of one device, which has all the data."""
-    needed = dense_bytes(rows.size, rows.size, rows.targets.dtype, copies(rows))
+    rows = given.rows
+    needed = dense_bytes(rows.size, rows.size, rows.targets.dtype, copies(given))
     memory = memory_bytes()
     return Cholesky() if memory is None or needed <= memory / 2 else ConjugateGradient()

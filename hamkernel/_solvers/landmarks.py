@@ -4,10 +4,11 @@ A landmark is a row of the observations, a linear functional of the field or of 
 its column of the Gram is the representer of that functional. Of velocities the n rows of a point
 come together.
 
-Randomly pivoted Cholesky draws candidates with probability proportional to what the columns so far
-leave of the Gram's diagonal, so it goes where the data still say something new, and stops when
-little is left. Candidates are drawn in blocks; inside a block one is kept with the probability
-that drawing one by one would have given it (Epperly, Tropp & Webber), so blocks cost nothing.
+Randomly pivoted Cholesky draws candidates with probability proportional to the diagonal of the
+residual G − Ĝ of the columns so far, so it goes where the data still say something new, and stops
+when its trace is small. Candidates are drawn in blocks; inside a block one is kept with the
+probability that drawing one by one would have given it (Epperly, Tropp & Webber), so blocks cost
+nothing.
 """
 
 import abc
@@ -21,9 +22,8 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from hamkernel import _require as require
-from hamkernel._gram.dense import assemble, block_traces
+from hamkernel._gram.dense import assemble, between_all, block_traces, components, gram_of_rows
 from hamkernel._gram.derivatives import constant
-from hamkernel._gram.observed import between_all, components, gram_of_rows
 from hamkernel._machine import rows_of, split
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
@@ -229,7 +229,7 @@ def given_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Landmarks:
     """
     K, landmarks = constant((K, landmarks))
     G = landmarks.gram(K)
-    # In units in which every column has the norm 1: what Cholesky rounds is relative to it.
+    # In units in which the diagonal is 1: the rounding errors of Cholesky are relative to it.
     norms = jnp.sqrt(jnp.abs(jnp.diagonal(G)))
     norms = jnp.where(norms > 0, norms, jnp.ones_like(norms))
     rounding = _rounding(jnp.ones(1, G.dtype), len(G))
@@ -246,7 +246,7 @@ def landmarks_of(*blocks: AbstractBlock) -> Landmarks:
 
 
 def _independent(matrix, rounding):
-    """Columns of a Gram: the one with the most left, until what is left is rounding.
+    """Independent columns of a Gram, by pivoted Cholesky until the largest pivot is rounding.
 
     In the order in which they come, columns whose pivots all exceed rounding may still depend on
     each other: only with pivoting does a small eigenvalue show in a small pivot.
@@ -269,7 +269,7 @@ def _independent(matrix, rounding):
 
 
 def _rounding(traces: Float[Array, " P"], columns: int) -> Float[Array, " P"]:
-    """What is left of pivots that should be zero, given their traces before.
+    """The rounding error of pivots that should be zero, given their traces before elimination.
 
     The error of Cholesky's method is relative to the diagonal entry, whatever the others are.
     """
@@ -464,3 +464,25 @@ def _first(drawn, size):
     used = jnp.arange(size) < drawn.count
     kept = drawn.kept[:size] & used[:, None]
     return drawn.index[:size], kept, jnp.minimum(drawn.count, size)
+
+
+def whitening(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r r"]:
+    """T with T Tᵀ = G_SS⁻¹ on the kept columns, zero on the others."""
+    return _inverse_root(landmarks.gram(K), landmarks.kept)
+
+
+@jax.custom_jvp
+def _inverse_root(G: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[Array, "r r"]:
+    L = jnp.linalg.cholesky(masked(G, kept))
+    T = jax.scipy.linalg.solve_triangular(L, jnp.eye(len(G), dtype=G.dtype), lower=True).T
+    both = kept[:, None] & kept[None, :]
+    return jnp.where(both, T, jnp.zeros_like(T))
+
+
+@_inverse_root.defjvp
+def _(primals, tangents):
+    # Only T Tᵀ = G⁻¹ matters, which this dT changes as that of the Cholesky factor would; that one
+    # rounds by the condition of G.
+    (G, kept), (dG, _) = primals, tangents
+    T = _inverse_root(G, kept)
+    return T, -0.5 * T @ (T.T @ dG @ T)

@@ -5,48 +5,226 @@ With S the landmarks, L the Cholesky factor of their Gram and F = G_XS L⁻ᵀ, 
 by tile and only the sums FᵀF and Fᵀy stay.
 
 The matrix FᵀF + NλI has the condition of G + NλI, not its square: these are no normal equations in
-α, which would lose twice the digits. What the sums round off is given back by one step of
+α, which would lose twice the digits. The digits that the sums round off come back by one step of
 refinement with the residual of the data (Björck's corrected seminormal equations).
 
-A stream is seen once and leaves no residual; `stream_sums.py` says how its sums keep digits.
+A stream is seen once and leaves no residual; `least_squares.py` says how its sums keep digits.
 """
 
 import numbers
-from typing import ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
+from jaxtyping import Array, ArrayLike, Float, Int, Key, Num, UInt32
 
 from hamkernel import _require as require
-from hamkernel._fields.base import root
+from hamkernel._fields.base import SolverInfo, root
 from hamkernel._fields.kernel_field import KernelField
-from hamkernel._gram.dense import trace
-from hamkernel._gram.observed import components
+from hamkernel._gram.dense import components, trace, trace_of_rows
 from hamkernel._gram.operator import product
 from hamkernel._machine import as_given, rows_of, split
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers import landmark_fit, stream_sums
-from hamkernel._solvers.landmark_field import (
-    CHOOSE,
-    Solution,
-    landmark_field,
-    warn_if_truncated,
-)
-from hamkernel._solvers.landmark_fit import LandmarkFit
-from hamkernel._solvers.landmark_gram import Columns, factor, truncated, whitening
+from hamkernel._show import text
 from hamkernel._solvers.landmarks import (
     Landmarks,
     choose_landmarks,
     choose_rows,
     given_landmarks,
     landmarks_of,
+    whitening,
 )
-from hamkernel._solvers.low_rank_conditional import LowRankConditional, low_rank_conditional
-from hamkernel._solvers.spans import LandmarkBasis, landmark_span
-from hamkernel._solvers.streaming import AbstractStreamingSolver, thinned
+from hamkernel._solvers.least_squares import (
+    Normal,
+    Sums,
+    add_rows,
+    add_velocities,
+    first_sums,
+    normal,
+    solve_sums,
+    trace_of_sums,
+)
+from hamkernel._solvers.low_rank import (
+    Columns,
+    LandmarkBasis,
+    LowRankConditional,
+    checked,
+    factor,
+    landmark_span,
+    low_rank_conditional,
+    singular,
+    truncated,
+)
+from hamkernel._solvers.stream import AbstractStreamingFit, AbstractStreamingSolver, thinned
 from hamkernel._structures.base import AbstractMatrixKernel
+
+
+class Solution(NamedTuple):
+    coefficients: Float[Array, " r"]
+    residual: Float[Array, "N n"]
+    norm: Float[Array, ""]
+    truncation: Float[Array, ""]
+    residual_norm: Float[Array, ""] | None = None
+
+
+def landmark_field(
+    K, landmarks, solution, regularization, tolerance, cure, throw=True
+) -> KernelField:
+    dtype = landmarks.points.dtype
+    failed = require.not_finite(solution.coefficients).any()
+    solution = checked(solution, landmarks, solution.truncation, failed, singular(dtype), throw)
+    warn_if_truncated(solution.truncation, landmarks.count, tolerance, cure)
+    Z, A, S, b = landmarks.representer(solution.coefficients)
+    return KernelField(
+        kernel=K,
+        points=Z,
+        coefficients=A,
+        residual=solution.residual,
+        norm=solution.norm,
+        regularization=regularization,
+        offset=jnp.zeros((), dtype),
+        info=SolverInfo(
+            "Nystrom",
+            landmarks=landmarks.count,
+            rank=landmarks.kept.sum(),
+            truncation=solution.truncation,
+            residual_norm=solution.residual_norm,
+        ),
+        value_points=S if len(S) else None,
+        value_coefficients=b if len(S) else None,
+    )
+
+
+CHOOSE = (
+    "Raise max_points, the tolerance or the regularization; let landmarks be chosen from more "
+    "candidates;"
+)
+START_ANEW = (
+    "Start anew with landmarks from a sample that looks like the data so far, and a max_points "
+    "that suffices; or ask for a larger regularization;"
+)
+
+
+def warn_if_truncated(truncation, count, tolerance, cure):
+    if not require.is_concrete(truncation, count):
+        return
+    # Twice: a random part of the data need not show all that the rest has.
+    if truncation > 2 * tolerance:
+        if truncation.dtype == jnp.float32:
+            cure = (
+                "In float32 rounding may have ended the choice of landmarks early: "
+                f"jax.config.update('jax_enable_x64', True). {cure}"
+            )
+        require.warn(
+            f"{int(count)} landmarks leave trace(G - Ĝ)/(N λ) = {float(truncation):.2g}, more than "
+            f"the tolerance {tolerance:.2g}. The field is the best one on these landmarks, but may "
+            f"be far from the exact fit. {cure} for a rough kernel or many dimensions take "
+            "hk.ConjugateGradient(), which is exact."
+        )
+
+
+class LandmarkFit(AbstractStreamingFit[KernelField]):
+    """A fit on landmarks to the data added so far, made by `Nystrom.start`.
+
+    It has a fixed size, 3r² numbers for r columns. `add` returns a new one, and `field` solves
+    for any λ:
+
+        model = hk.Nystrom().start(K, X, 1e-4).add(X, Y)
+        field = model.field()
+        better = model.add(X_new, Y_new).field()
+
+    `field.info.truncation` is that of all the data added: it shows whether the landmarks are still
+    enough.
+
+    Attributes:
+        kernel: K.
+        landmarks: the points that carry the field.
+        sums: the sums over the rows added, of which the least squares are solved.
+        trace: the trace of their Gram, shape ().
+        count: N, the number of points added, shape ().
+        regularization: the λ of `start`, shape ().
+        dimension: n, the number of coordinates of a state.
+        tolerance: of the solver, for its warning.
+    """
+
+    kernel: AbstractMatrixKernel
+    landmarks: Landmarks
+    sums: Sums
+    trace: Float[Array, ""]
+    count: Int[Array, ""]
+    regularization: Float[Array, ""]
+    dimension: int = eqx.field(static=True)
+    tolerance: float = eqx.field(static=True)
+
+    def _size(self) -> str:
+        return f"landmarks={text(self.landmarks.count)}"
+
+    def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "LandmarkFit":
+        spread = rows_of(X)
+        return _with_data(self, split(spread, X), split(spread, Y), spread)
+
+    @eqx.filter_jit
+    def _added_rows(self, rows: Measurements) -> "LandmarkFit":
+        K = self.kernel
+        design = [self.landmarks.columns(K, block) for block in rows.blocks]
+        new = (
+            add_rows(self.sums, jnp.concatenate(design), rows.targets),
+            self.trace + trace_of_rows(K, rows),
+            self.count + rows.count,
+        )
+        return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), self, new)
+
+    def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
+        solution = _solution(self, count, regularization)
+        landmarks, tolerance = self.landmarks, self.tolerance
+        return landmark_field(
+            self.kernel, landmarks, solution, regularization, tolerance, START_ANEW
+        )
+
+
+@eqx.filter_jit
+def start_fit(K, sample, regularization, landmarks, tolerance):
+    T = whitening(K, landmarks)
+    if sample.states is None:
+        design = [landmarks.columns(K, block) for block in sample.blocks]
+        seen = Normal.zero(T).plus(jnp.concatenate(design) @ T, sample.targets)
+    else:
+        seen = normal(Columns(K, landmarks), T, *sample.states)
+    return LandmarkFit(
+        kernel=K,
+        landmarks=landmarks,
+        sums=first_sums(seen, T, sample.count, regularization),
+        trace=jnp.zeros((), T.dtype),
+        count=jnp.zeros((), int),
+        regularization=regularization,
+        dimension=sample.dimension,
+        tolerance=tolerance,
+    )
+
+
+@eqx.filter_jit
+def _with_data(fit, X, Y, spread):
+    K = fit.kernel
+    new = (
+        add_velocities(fit.sums, Columns(K, fit.landmarks), X, Y, spread),
+        fit.trace + trace(K, X, spread),
+        fit.count + len(X),
+    )
+    return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), fit, new)
+
+
+@eqx.filter_jit
+def _solution(fit, count, regularization):
+    ridge = count.astype(regularization.dtype) * regularization
+    weights, norm, residual_norm = solve_sums(fit.sums, ridge)
+    return Solution(
+        coefficients=weights,
+        residual=jnp.zeros((0, fit.dimension), weights.dtype),
+        norm=norm,
+        truncation=truncated(fit.trace, trace_of_sums(fit.sums), ridge),
+        residual_norm=residual_norm,
+    )
 
 
 class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
@@ -135,7 +313,8 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
 
     def _fitted(self, problem, throw=True, progress=False) -> KernelField:
         if problem.states is None:
-            return self._given(problem, throw).field
+            field: Any = self._given(problem, throw).field
+            return field
         K, (X, Y), regularization = problem.kernel, problem.states, problem.regularization
         landmarks = self.landmarks(K, problem.rows, regularization)
         spread = rows_of(X)
@@ -156,14 +335,14 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
     def _started(self, K, sample, regularization) -> LandmarkFit:
         landmarks = self.landmarks(K, sample, regularization)
         some = thinned(K, sample, self.candidates)
-        return landmark_fit.start(K, some, regularization, landmarks, self.tolerance)
+        return start_fit(K, some, regularization, landmarks, self.tolerance)
 
 
 @eqx.filter_jit
 def _fit(K, X, Y, regularization, landmarks, spread):
     S, ridge = landmarks.points, len(X) * regularization
     T = whitening(K, landmarks)
-    total = stream_sums.normal(Columns(K, landmarks), T, X, Y, spread)
+    total = normal(Columns(K, landmarks), T, X, Y, spread)
     R = factor(total.square, ridge)
 
     def step(w, residual):

@@ -1,23 +1,29 @@
-"""What is solved: rows of observations for a kernel, a ridge, and what was known before.
+"""The problem that a solver is given, and the interface of solvers.
 
-`fit`, `condition`, `tune` and every loss begin here, and nothing after it asks what was measured.
+A `Problem` holds the rows of observations, a kernel, a ridge, and the known part of the field.
+`fit`, `condition`, `tune` and every loss begin here, and nothing after it asks which kinds of
+observations there were. A solver returns a field, or an `AbstractConditional`, the Gaussian field
+given the rows.
 """
 
 from __future__ import annotations
 
+import abc
 import dataclasses
-from typing import Any
+from typing import Any, ClassVar, Generic, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Key
 
 from hamkernel import _require as require
-from hamkernel._fields.base import at_points, potential_of
+from hamkernel._fields.base import AbstractField, at_points, potential_of
 from hamkernel._fields.joined import at_inputs
 from hamkernel._fields.known import KnownPart, known_part
 from hamkernel._machine import RowSharding, is_on_one_device, on_one_device, rows_of
+from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.kinds import AbstractObservations, beside
 from hamkernel._observations.measurements import Measurements, measurements, measurements_of
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
@@ -27,11 +33,11 @@ from hamkernel._structures.joined import AbstractJoinedKernel
 @jax.tree_util.register_dataclass
 @dataclasses.dataclass(frozen=True)
 class Problem:
-    """y = L f + ε for f ~ GP(known, kernel), y less the rows of what is known.
+    """y = L f + ε for f ~ GP(known, kernel); the rows of the known part are subtracted from y.
 
     Attributes:
         kernel: K.
-        rows: the observations less what is known of them, on automatic axes of a mesh of devices.
+        rows: the observations less the known part, on automatic axes of a mesh of devices.
         regularization: λ, shape ().
         known: the mean at the points of the rows; None if it is zero.
         spread: how the rows of the states that were given are spread over devices; None if they
@@ -55,7 +61,7 @@ class Problem:
         return self.rows.states
 
     def on_one_device(self) -> Problem:
-        """The same with the rows on one device."""
+        """This problem with its rows on one device; ValueError if they are on several processes."""
         if all(is_on_one_device(array) for array in jax.tree.leaves(self.rows)):
             return self
         move = jax.tree.map(lambda array: on_one_device("the data", array), self.rows)
@@ -110,18 +116,18 @@ def _refuse_overflow(rows: Measurements, regularization: Float[Array, ""]) -> No
 def new_rows(
     K: AbstractMatrixKernel, data: AbstractObservations, old: Measurements, known: Any
 ) -> Measurements:
-    """The rows of data that is added to other rows, less what is known of them."""
+    """The rows of new data that is added to other rows, less those of the known part."""
     return without_known(K, measurements_of(K, data, previous=old)[1], known)
 
 
 def without_known(
     K: AbstractMatrixKernel, rows: Measurements, known: Any, throw: bool = True
 ) -> Measurements:
-    """The rows of f less what is known.
+    """The rows of observations less those of the known part of the field.
 
     Raises:
-        AttributeError: energies, and what is known has no potential. ValueError: what is known is
-            not finite at the data, if it is to `throw`.
+        AttributeError: energies, and the known part has no potential. ValueError: the known part
+            is not finite at the data, if it is to `throw`.
     """
     if known is None:
         return rows
@@ -150,7 +156,7 @@ def _not_finite(rows: Measurements, bad: Any) -> str:
 
 
 def _known_potential(K: AbstractMatrixKernel, known: Any):
-    """The potential of what is known, as a function of the points of K."""
+    """The potential of the known part, as a function of the points of K."""
     if not isinstance(known, KnownPart) or not isinstance(K, AbstractJoinedKernel):
         return potential_of(known, K)
     drift = at_inputs(known, 0, None)
@@ -158,3 +164,60 @@ def _known_potential(K: AbstractMatrixKernel, known: Any):
         return lambda s: 0 * s[0]
     of_drift = potential_of(drift, K.of_states)
     return lambda s: of_drift(s[: -known.count])
+
+
+Own = TypeVar("Own", bound="AbstractConditional")
+
+
+class AbstractConditional(eqx.Module):
+    """A Gaussian field f ~ GP(0, K) given rows of observations.
+
+    Attributes:
+        field: the conditional mean.
+        rows: the observations.
+        ridge: σ² = Nλ, the variance of the noise of a row, shape ().
+    """
+
+    field: eqx.AbstractVar[AbstractField]
+    rows: eqx.AbstractVar[Measurements]
+    ridge: eqx.AbstractVar[Float[Array, ""]]
+
+    @abc.abstractmethod
+    def covariance(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
+        """The covariance of the rows of two blocks, given the data."""
+
+    @abc.abstractmethod
+    def updated(self: Own, new: Measurements) -> Own:
+        """The Gaussian field given the old rows and new ones, with the same σ²."""
+
+    @abc.abstractmethod
+    def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> AbstractField:
+        """Fields drawn given the data, every leaf with a leading axis of `count`."""
+
+
+Learned = TypeVar("Learned", bound=AbstractField, covariant=True)
+
+
+class AbstractSolver(eqx.Module, Generic[Learned]):
+    """A method by which `fit` finds the field."""
+
+    no_factor: ClassVar[str | None] = None  # why there is no `_given`
+    is_low_rank: ClassVar[bool] = False  # whether `tune` is to judge by the loss in its `_basis`
+
+    def _basis(
+        self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
+    ) -> Any:
+        """The features of a fit of low rank, as functions of the hyperparameters."""
+        del K, rows, regularization
+        return None
+
+    @abc.abstractmethod
+    def _fitted(self, problem: Problem, throw: bool = True, progress: bool = False) -> Learned:
+        """The field; of NaN if the solve fails and does not `throw`."""
+
+    def _given(
+        self, problem: Problem, throw: bool = True, progress: bool = False
+    ) -> AbstractConditional:
+        """The Gaussian field given the rows; TypeError if the solver keeps no factor."""
+        del problem, throw, progress
+        raise TypeError(self.no_factor)

@@ -1,31 +1,35 @@
 """Least squares in random Fourier features, in memory that does not grow with the points."""
 
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, UInt32
 
 from hamkernel import _require as require
-from hamkernel._features.structured import AbstractFeatures, features
+from hamkernel._features.features import AbstractFeatures, features
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.features import FeatureField, feature_field
 from hamkernel._machine import as_given, refuse_beyond_memory, rows_of, split
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers import stream_sums
-from hamkernel._solvers.landmark_gram import singular
-from hamkernel._solvers.low_rank_conditional import (
+from hamkernel._solvers.least_squares import (
+    Normal,
+    Sums,
+    add_rows,
+    add_velocities,
+    first_sums,
+    normal,
+    ridge_regression,
+    solve_sums,
+)
+from hamkernel._solvers.low_rank import (
+    FeatureSpan,
     LowRankConditional,
+    WaveBasis,
     low_rank_conditional,
+    singular,
 )
-from hamkernel._solvers.spans import FeatureSpan, WaveBasis
-from hamkernel._solvers.stream_sums import Sums
-from hamkernel._solvers.streaming import (
-    AbstractStreamingFit,
-    AbstractStreamingSolver,
-    thinned,
-)
-from hamkernel._solvers.tall_least_squares import ridge_regression
+from hamkernel._solvers.stream import AbstractStreamingFit, AbstractStreamingSolver, thinned
 from hamkernel._structures.base import AbstractMatrixKernel
 
 _SAMPLE = 4096  # points of a sample that are looked at
@@ -73,7 +77,8 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
 
     def _fitted(self, problem, throw=True, progress=False) -> FeatureField:
         if problem.states is None:
-            return self._given(problem, throw).field
+            field: Any = self._given(problem, throw).field
+            return field
         spread = rows_of(problem.rows.points)
         X, Y = (split(spread, each) for each in problem.states)
         field = _fit(problem.kernel, self, X, Y, problem.regularization, spread)
@@ -148,7 +153,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     Attributes:
         kernel: K.
         features: the features of K.
-        sums: what the least squares need of the points added.
+        sums: the sums over the rows added, of which the least squares are solved.
         count: N, the number of points added, shape ().
         regularization: the λ of `start`, shape ().
         dimension: n, the number of coordinates of a state.
@@ -173,7 +178,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     @eqx.filter_jit
     def _added_rows(self, rows: Measurements) -> "FeatureFit":
         design = FeatureSpan(self.kernel, self.features, self.dimension).of_rows(rows)
-        new = stream_sums.add_rows(self.sums, design, rows.targets), self.count + rows.count
+        new = add_rows(self.sums, design, rows.targets), self.count + rows.count
         return eqx.tree_at(lambda f: (f.sums, f.count), self, new)
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
@@ -185,25 +190,25 @@ def _start(K, basis, sample, regularization):
     identity = jnp.eye(basis.columns, dtype=sample.targets.dtype)
     if sample.states is None:
         design = FeatureSpan(K, basis, sample.dimension).of_rows(sample)
-        seen = stream_sums.Normal.zero(identity).plus(design, sample.targets)
+        seen = Normal.zero(identity).plus(design, sample.targets)
     else:
-        seen = stream_sums.normal(basis, identity, *sample.states)
+        seen = normal(basis, identity, *sample.states)
     return FeatureFit(
         kernel=K,
         features=basis,
-        sums=stream_sums.start(seen, identity, sample.count, regularization),
+        sums=first_sums(seen, identity, sample.count, regularization),
         count=jnp.zeros((), int),
         regularization=regularization,
         dimension=sample.dimension,
     )
 
 
-_add = eqx.filter_jit(stream_sums.add)
+_add = eqx.filter_jit(add_velocities)
 
 
 @eqx.filter_jit
 def _solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
-    weights, _, residual_norm = stream_sums.solve(fit.sums, ridge)
+    weights, _, residual_norm = solve_sums(fit.sums, ridge)
     unseen = jnp.zeros((0, fit.dimension), weights.dtype)
     return _field(fit.kernel, fit.features, weights, unseen, regularization, residual_norm)

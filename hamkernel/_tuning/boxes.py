@@ -15,8 +15,7 @@ import numpy as np
 from jax.tree_util import GetAttrKey, SequenceKey, keystr, tree_flatten_with_path
 from jaxtyping import Array, Float
 
-from hamkernel._gram.dense import trace
-from hamkernel._gram.observed import gram_of_rows
+from hamkernel._gram.dense import gram_of_rows, trace
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, bounds_by_value
 from hamkernel._kernels.functions import Bound
 from hamkernel._kernels.symmetry import without_symmetry

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.spans import AbstractBasis
+from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._validation.folds import Folds, Partition
 from hamkernel._validation.losses import (

@@ -30,9 +30,8 @@ from hamkernel._machine import one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations, beside
 from hamkernel._observations.measurements import observations
 from hamkernel._show import described
-from hamkernel._solvers.base import AbstractSolver
 from hamkernel._solvers.fit import check_solver, solved
-from hamkernel._solvers.problem import Problem, problem
+from hamkernel._solvers.problem import AbstractSolver, Problem, problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._tuning import advice
 from hamkernel._tuning.boxes import typical_speed

@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from hamkernel._factors.base import AbstractSystem
+from hamkernel._solvers.factors import AbstractSystem
 from hamkernel._validation.folds import Partition
 
 

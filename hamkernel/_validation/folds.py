@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Int
 
 from hamkernel import _require as require
-from hamkernel._factors.groups import Group
+from hamkernel._solvers.factors import Group
 
 Folds = int | Literal["loo"] | Int[ArrayLike, " N"] | Sequence[int]
 

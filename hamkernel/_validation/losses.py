@@ -171,7 +171,7 @@ def _checked_problem(
     K, X, Y, regularization, inputs, parameters
 ) -> tuple[Any, Measurements, Float[Array, ""]]:
     """Kernel, rows and λ."""
-    # LAPACK on every device at once was seen to stall, see `_factors/dense.py`.
+    # LAPACK on every device at once was seen to stall, see `_solvers/factors.py`.
     given = problem(K, X, Y, regularization, inputs=inputs, parameters=parameters).on_one_device()
     check_memory(given.rows, LOSS_COPIES)
     return given.kernel, given.rows, given.regularization

@@ -12,16 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hamkernel._factors.base import AbstractSystem
-from hamkernel._factors.contrasted import ContrastedSystem
-from hamkernel._factors.dense import DenseSystem
-from hamkernel._factors.low_rank import LowRankSystem
-from hamkernel._gram.dense import plus_ridge
+from hamkernel._gram.dense import between_all, gram_of_rows, plus_ridge
 from hamkernel._gram.derivatives import forward_differentiated
-from hamkernel._gram.observed import between_all, gram_of_rows
 from hamkernel._observations.blocks import AbstractBlock, Combinations
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.spans import AbstractBasis
+from hamkernel._solvers.factors import AbstractSystem, ContrastedSystem, DenseSystem
+from hamkernel._solvers.low_rank import AbstractBasis
+from hamkernel._solvers.low_rank_factor import LowRankSystem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
 from hamkernel._validation.folds import Folds, Partition

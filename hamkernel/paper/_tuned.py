@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hamkernel._factors.dense import solution
 from hamkernel._gram.dense import assemble, plus_ridge
 from hamkernel._kernels.radial import Gaussian
+from hamkernel._solvers.factors import solution
 from hamkernel._tuning.tune import tune
 from hamkernel._validation.folds import Partition
 from hamkernel.paper._evaluate import evaluate

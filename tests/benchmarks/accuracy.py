@@ -28,7 +28,7 @@ import hamkernel as hk
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of_states
 from hamkernel._solvers.landmarks import landmarks_of
-from hamkernel._solvers.spans import LandmarkBasis, WaveBasis
+from hamkernel._solvers.low_rank import LandmarkBasis, WaveBasis
 from hamkernel._validation.folds import Partition
 from hamkernel._validation.of_rows import (
     generalized_loss,

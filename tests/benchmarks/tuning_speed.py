@@ -33,8 +33,8 @@ from dynamics import TWO_BODIES, near_circular
 from timing import Timed, environment, in_turn, timed
 
 import hamkernel as hk
-from hamkernel._factors.dense import solution
 from hamkernel._gram.dense import assemble, plus_ridge
+from hamkernel._solvers.factors import solution
 from hamkernel._validation.folds import Partition
 from hamkernel.paper._tuned import grid_losses
 

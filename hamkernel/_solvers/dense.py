@@ -1,15 +1,14 @@
-"""The field given observations, and what a solver keeps of them to say how far it may be off.
+"""The exact fit by a dense factor of the Gram, and the Gaussian field that it keeps.
 
-Of two linear functionals with covariances c with the rows of the data, the covariance given the
-data is that before less what the data tell, c₁ᵀ A⁻¹ c₂ with A = G + σ²I. A prediction is a linear
-functional as a measurement is, so both are blocks of rows, and every variance is one function.
+With the covariances c of two linear functionals with the rows of the data, their covariance given
+the data is their prior covariance less c₁ᵀ A⁻¹ c₂, A = G + σ²I. A prediction is a linear functional
+as a measurement is, so both are blocks of rows, and every variance is one function.
 
 New rows extend a factor: with A = RᵀR the factor of all is [[R, B], [0, S]], B = R⁻ᵀK₁₂ and
 SᵀS = K₂₂ + σ²I − BᵀB. The variance σ² of a row stays as it was.
 """
 
-import abc
-from typing import TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -17,7 +16,20 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
-from hamkernel._factors.dense import (
+from hamkernel._fields.base import SolverInfo, at_points, root
+from hamkernel._fields.kernel_field import KernelField
+from hamkernel._gram.dense import (
+    between,
+    gram_of_rows,
+    plus_ridge,
+    regularized_gram,
+    rows_between,
+    strips_of_gram,
+)
+from hamkernel._machine import refuse_beyond_memory
+from hamkernel._observations.blocks import AbstractBlock
+from hamkernel._observations.measurements import Measurements
+from hamkernel._solvers.factors import (
     ROWS_IN_PLACE,
     DenseFactor,
     backward,
@@ -26,54 +38,13 @@ from hamkernel._factors.dense import (
     forward,
     solution,
 )
-from hamkernel._fields.base import AbstractField, SolverInfo, at_points, root
-from hamkernel._fields.kernel_field import KernelField
-from hamkernel._gram.dense import plus_ridge
-from hamkernel._gram.observed import (
-    between,
-    gram_of_rows,
-    regularized_gram,
-    rows_between,
-    strips_of_gram,
-)
-from hamkernel._machine import refuse_beyond_memory
-from hamkernel._observations.blocks import AbstractBlock
-from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.prior import Prior, prior_draws
-from hamkernel._solvers.problem import Problem
+from hamkernel._solvers.problem import AbstractConditional, AbstractSolver, Problem
+from hamkernel._solvers.sampling import Prior, prior_draws
 from hamkernel._structures.base import AbstractMatrixKernel
-
-Own = TypeVar("Own", bound="AbstractConditional")
-
-
-class AbstractConditional(eqx.Module):
-    """A Gaussian field f ~ GP(0, K) given rows of observations.
-
-    Attributes:
-        field: the conditional mean.
-        rows: the observations.
-        ridge: σ² = Nλ, the variance of the noise of a row, shape ().
-    """
-
-    field: eqx.AbstractVar[AbstractField]
-    rows: eqx.AbstractVar[Measurements]
-    ridge: eqx.AbstractVar[Float[Array, ""]]
-
-    @abc.abstractmethod
-    def covariance(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
-        """The covariance of the rows of two blocks, given the data."""
-
-    @abc.abstractmethod
-    def updated(self: Own, new: Measurements) -> Own:
-        """The same given new rows too, with the same σ²."""
-
-    @abc.abstractmethod
-    def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> AbstractField:
-        """Fields drawn given the data, every leaf with a leading axis of `count`."""
 
 
 class DenseConditional(AbstractConditional):
-    """By the Cholesky factor of A; `representer` is c = A⁻¹y."""
+    """The Gaussian field by the Cholesky factor of A; `representer` is c = A⁻¹y."""
 
     field: KernelField
     rows: Measurements
@@ -94,7 +65,7 @@ class DenseConditional(AbstractConditional):
         factor, c, field = _extended(self, new)
         rows = self.rows.joined(new)
         return DenseConditional(
-            _solved(field, 0 * field.norm, rows.count), rows, self.ridge, factor, c
+            _solved(field, jnp.sum(0 * c), rows.count), rows, self.ridge, factor, c
         )
 
     def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> KernelField:
@@ -119,46 +90,49 @@ def dense_conditional(
 
 def dense_field(problem: Problem, throw: bool = True, progress: bool = False) -> KernelField:
     """The field of `dense_conditional` alone."""
-    return _solved(*_dense(problem, progress, keep=False)[-2:], problem.rows.count, throw)
+    _, _, field, left = _dense(problem, progress, keep=False)
+    return _solved(field, left, problem.rows.count, throw)
 
 
 # Rows from which the Gram of velocities is factored in its own place, in blocks.
 IN_PLACE = 6000
 
 
-def copies(rows: Measurements) -> int:
-    """How many matrices of the size of the Gram a dense fit holds, as its peak memory shows.
+def copies(problem: Problem) -> int:
+    """The number of matrices of the size of the Gram that a dense fit holds at its peak.
 
     In place 1.5 for all kernels; else the Gram, its factor, what is returned, and strips on the
     way, 3.4 (`test_the_peak_memory_of_a_dense_fit_is_what_is_planned`).
     """
-    return 2 if is_in_place(rows) else 4
+    return 2 if _is_in_place(problem) else 4
 
 
-def is_in_place(rows: Measurements) -> bool:
-    """Whether the Gram is factored in its own place: not under `jax.jit`, which cannot."""
-    return rows.size >= IN_PLACE and rows.states is not None and require.is_concrete(rows)
+def _is_in_place(problem: Problem) -> bool:
+    """Whether the Gram is factored in its own memory, which is not possible under `jax.jit`."""
+    has_states = problem.rows.size >= IN_PLACE and problem.states is not None
+    return has_states and require.is_concrete(problem)
 
 
-def check_memory(rows: Measurements) -> None:
-    """Refuse what does not fit in memory."""
-    D, dtype = rows.size, rows.targets.dtype
+def _check_memory(problem: Problem) -> None:
+    """Refuse a dense fit whose matrices do not fit in memory."""
+    D, dtype = problem.rows.size, problem.rows.targets.dtype
     cure = (
         "Use solver=hk.ConjugateGradient(), which is exact and has no error bars, or "
         "solver=hk.Nystrom(), which is faster and approximate to a stated tolerance."
     )
-    refuse_beyond_memory(f"a dense fit of {D} rows", D, D, dtype, copies(rows), cure)
+    refuse_beyond_memory(f"a dense fit of {D} rows", D, D, dtype, copies(problem), cure)
 
 
-def _dense(problem: Problem, progress: bool, keep: bool = True):
+def _dense(problem: Problem, progress: bool, keep: bool = True) -> Any:
     """The factor, if it is to be kept, c, the field, and the relative residual."""
     K, rows, regularization = problem.kernel, problem.rows, problem.regularization
-    check_memory(rows)
-    if not (is_in_place(rows) and require.is_concrete(K, regularization)):
+    _check_memory(problem)
+    if not _is_in_place(problem):
         found = (_conditional if keep else _field)(K, rows, regularization)
         return found if keep else (None, *found)
     factor = factor_in_place(*_assembled(K, rows, problem.ridge, progress))
-    return factor, *_of_factor(K, rows, regularization, factor)
+    found: Any = _of_factor(K, rows, regularization, factor)
+    return factor, *found
 
 
 def _assembled(K, rows: Measurements, ridge, progress: bool):
@@ -199,7 +173,11 @@ def _learned(K, rows: Measurements, regularization, c):
 
 
 _conditional = eqx.filter_jit(_dense_system)
-_field = eqx.filter_jit(lambda *system: _dense_system(*system)[1:])
+
+
+@eqx.filter_jit
+def _field(K, rows: Measurements, regularization):
+    return _dense_system(K, rows, regularization)[1:]
 
 
 def norm_of(square: Float[Array, ""], error: Float[Array, ""]) -> Float[Array, ""]:
@@ -209,7 +187,7 @@ def norm_of(square: Float[Array, ""], error: Float[Array, ""]) -> Float[Array, "
 
     Args:
         square: cᵀGc as it was computed.
-        error: an estimate of its error, such as cᵀr for what c leaves of the linear system.
+        error: an estimate of its error, such as cᵀr with the residual r of the linear system.
     """
     lost = ~(jnp.abs(jax.lax.stop_gradient(error)) <= 0.1 * square) & (square != 0)
     return jnp.where(lost, jnp.nan, root(square)).astype(square.dtype)
@@ -325,3 +303,21 @@ def _solved(field: KernelField, left: Array, N: int, throw: bool = True) -> Kern
         return require.value(field, failed, message, RuntimeError)
     values = require.value(learned(field), failed, message, RuntimeError, throw)
     return eqx.tree_at(learned, field, values, is_leaf=lambda leaf: leaf is None)
+
+
+class Cholesky(AbstractSolver[KernelField]):
+    """The dense Gram and its Cholesky factor: exact, O((N n)³) time and O((N n)²) memory.
+
+    `field.info.relative_residual` is the error that rounding leaves in the linear system; a fit in
+    which it is more than one per cent of the velocities is refused.
+
+    Raises:
+        ValueError, from `fit`: the matrices do not fit in memory. RuntimeError, from `fit`: the
+            ridge is too small for this Gram (the text says what to do).
+    """
+
+    def _fitted(self, problem, throw=True, progress=False) -> KernelField:
+        return dense_field(problem.on_one_device(), throw, progress)
+
+    def _given(self, problem, throw=True, progress=False) -> DenseConditional:
+        return dense_conditional(problem.on_one_device(), throw, progress)

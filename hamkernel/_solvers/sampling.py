@@ -1,7 +1,7 @@
 """Whole fields drawn from the prior, with which draws from a posterior begin.
 
 By Matheron's rule a draw f₀ of the prior and a draw ε of the noise would have given the rows
-L f₀ + ε, and what the data say instead is corrected for as in a fit:
+L f₀ + ε, and a fit to the difference from the data corrects it:
 
     f = f₀ + Σ K(·, x_j) a_j,     a = A⁻¹ (y − L f₀ − ε),
 
@@ -23,15 +23,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from hamkernel._features.structured import AbstractFeatures, features
+from hamkernel._features.features import AbstractFeatures, features
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.features import FeatureField, feature_field
 from hamkernel._fields.kernel_field import KernelField
-from hamkernel._gram.dense import block_traces
-from hamkernel._gram.observed import between, components
+from hamkernel._gram.dense import between, block_traces, components
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.landmark_gram import whitening
-from hamkernel._solvers.landmarks import Landmarks, choose_landmarks
+from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, whitening
 from hamkernel._structures.base import AbstractMatrixKernel
 
 # Landmarks are drawn until they leave this share of tr K(x, x) over the region, or so many are

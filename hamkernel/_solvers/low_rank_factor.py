@@ -13,7 +13,7 @@ twice: products of matrices only, and Q orthonormal to rounding where the condit
 The derivatives use CΦ = ΦM⁻¹ and C²Φ = ΦM⁻².
 
 Of rows that see an unknown constant, in the direction p with ‖p‖ = 1, C is that of
-`contrasted.py`. With Φ − ppᵀΦ in the place of Φ it is (I − ppᵀ − QQᵀ)/δ: the constant is one more
+`factors.py`. With Φ − ppᵀΦ in the place of Φ it is (I − ppᵀ − QQᵀ)/δ: the constant is one more
 orthonormal column beside Q, whose weight is free.
 
 Source: Yamamoto, Nakatsukasa, Yanagisawa & Fukaya (2015), ETNA 44, on the second pass.
@@ -23,16 +23,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hamkernel._factors.base import (
+from hamkernel._gram.dense import plus_ridge
+from hamkernel._solvers.factors import (
     AbstractBlocks,
     AbstractFactor,
     AbstractInverse,
     AbstractSystem,
     CholeskyBlocks,
+    Group,
+    backward,
+    cholesky,
+    forward,
 )
-from hamkernel._factors.dense import backward, cholesky, forward
-from hamkernel._factors.groups import Group
-from hamkernel._gram.dense import plus_ridge
 
 
 class LowRankSystem(AbstractSystem):

@@ -1,19 +1,33 @@
-"""Linear least squares whose rows are made in tiles and never stored.
+"""Linear least squares whose rows Φ are made in tiles and never stored.
 
-minimise ‖Φw − y‖² + δ‖w‖² for a tall Φ (m, r) that is never stored. The state is the triangular
-factor of [Φ y] alone, below √δ [I 0] from the start: orthogonal transformations of the rows change
-no norm, so the factor of the rows seen so far, with new rows below it, has the factor of all of
-them (Golub & Van Loan, section 6.5.3; Demmel et al. (2012), "tall and skinny QR"). The normal
-equations ΦᵀΦ would have the same size and half of the digits.
+minimise ‖Φw − y‖² + δ‖w‖² for a tall Φ (m, r). Two ways keep the digits that the normal equations
+ΦᵀΦ would lose.
+
+**A triangle.** The state is the triangular factor of [Φ y] alone, below √δ [I 0] from the start:
+orthogonal transformations of the rows change no norm, so the factor of the rows seen so far, with
+new rows below it, has the factor of all of them (Golub & Van Loan, section 6.5.3; Demmel et al.
+(2012), "tall and skinny QR").
+
+**Sums in the basis of a sample.** The normal equations lose the digits of the condition of
+ΦᵀΦ + NλI, which is of order 1/λ, because small directions drown in the rounding of the large ones.
+So the sums are over the rows ΦR⁻¹ instead, where RᵀR = ΦᵀΦ/N + λI on a sample of the data: in this
+basis the system is near N times the identity and no direction is small. The rounding of ΦR⁻¹ is
+left, of order ε/√λ, as with a QR of all rows, which costs several times as much and waits for
+threads on a busy machine. This is the second pass of a Cholesky QR (Fukaya et al. (2020), "shifted
+Cholesky QR"), whose first pass needs to see a sample only. Rows that the sample does not resemble
+are treated no worse than by the normal equations.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.scipy.linalg import solve_triangular
+from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
+from hamkernel._gram.dense import plus_ridge
 from hamkernel._gram.derivatives import constant
 from hamkernel._machine import RowSharding, on_each
 
@@ -33,7 +47,7 @@ def triangle(
     """The upper triangular factor of √ridge [I 0] above [Φ y]: R, and Qᵀy beside it.
 
     From the start with the ridge: a QR of Φ alone, where it has fewer rows than columns, divides by
-    what rounding leaves of the dependent ones, again and again until that underflows to NaN.
+    the rounding errors of the dependent ones, again and again until these underflow to NaN.
     """
     if spread is not None:
 
@@ -165,5 +179,119 @@ def over_tiles(step, carry, data: tuple[Array, Array], rows: int):
 
 
 def _rows(columns: int) -> int:
-    """Of a tile. A factorisation below R costs (rows + r) r²: 3r lose a quarter to repeating R."""
+    """The rows of a tile. A factorisation below R costs (rows + r) r²; 3r rows lose a quarter."""
     return max(1024, 3 * columns)
+
+
+# Numbers in the tile of rows that is held at once; see `_gram/operator.py`.
+TILE = 2**20
+
+
+class Normal(NamedTuple):
+    """The sums over rows F with targets y; those of parts of the rows add up."""
+
+    square: Float[Array, "r r"]  # FᵀF
+    moment: Float[Array, " r"]  # Fᵀy
+    energy: Float[Array, ""]  # yᵀy
+
+    @classmethod
+    def zero(cls, basis: Float[Array, "r r"]) -> "Normal":
+        """The sums over no rows in a basis."""
+        square = jnp.zeros_like(basis)
+        return cls(square, square[0], square[0, 0])
+
+    def plus(self, F: Float[Array, "D r"], y: Float[Array, " D"]) -> "Normal":
+        """The sums with more rows."""
+        return Normal(self.square + F.T @ F, self.moment + F.T @ y, self.energy + y @ y)
+
+
+class Sums(eqx.Module):
+    """The sums over all rows seen so far, r² numbers. Rows are those of a design, times `basis`.
+
+    Attributes:
+        triangle: R, upper triangular, shape (r, r).
+        basis: R⁻¹, or WR⁻¹ if Φ is a design times W, shape (r, r).
+        seen: the sums over ΦR⁻¹ and y.
+    """
+
+    triangle: Float[Array, "r r"]
+    basis: Float[Array, "r r"]
+    seen: Normal
+
+
+def first_sums(seen: Normal, W: Float[Array, "r r"], count: int, ridge: Float[Array, ""]) -> Sums:
+    """The sums before the first row, in the basis of a sample and of λ = ridge.
+
+    Args:
+        seen: the sums over the rows of the sample, in the basis W.
+        W: the matrix that the rows of the design are multiplied with.
+        count: N, the observations in the sample.
+        ridge: λ.
+
+    Returns:
+        The sums; NaN where the kernel is not finite, or λ below rounding.
+    """
+    R = jnp.linalg.cholesky(plus_ridge(seen.square / count, ridge)).T
+    nothing = jax.tree.map(jnp.zeros_like, seen)
+    return Sums(R, solve_triangular(R, W.T, trans="T").T, nothing)
+
+
+def add_velocities(
+    sums: Sums,
+    design: Design,
+    X: Float[Array, "N n"],
+    Y: Float[Array, "N n"],
+    spread: RowSharding | None = None,
+) -> Sums:
+    """The sums after the rows design(X) with targets Y."""
+    new = normal(design, sums.basis, X, Y, spread)
+    return Sums(sums.triangle, sums.basis, jax.tree.map(jnp.add, sums.seen, new))
+
+
+def add_rows(sums: Sums, rows: Float[Array, "D r"], y: Float[Array, " D"]) -> Sums:
+    """The sums after rows of the design that were made already, with targets y."""
+    return Sums(sums.triangle, sums.basis, sums.seen.plus(rows @ sums.basis, y))
+
+
+def normal(
+    design: Design,
+    basis: Float[Array, "r r"],
+    X: Float[Array, "N n"],
+    Y: Float[Array, "N n"],
+    spread: RowSharding | None = None,
+) -> Normal:
+    """The sums over the rows F = design(X) basis, tile by tile, on the devices where they are."""
+    if spread is not None:
+
+        def part(whole, X, Y):
+            design, basis = whole
+            return spread.sum(normal(design, basis, X, Y))
+
+        return on_each(spread, part, (design, basis), X, Y, joined=False)
+
+    def step(total, tile):
+        rows = design(tile[0])  # (t, n, r)
+        return total.plus(rows.reshape(-1, rows.shape[-1]) @ basis, tile[1].reshape(-1)), None
+
+    return over_tiles(step, Normal.zero(basis), (X, Y), max(1024, TILE // len(basis)))[0]
+
+
+def solve_sums(
+    sums: Sums, ridge: Float[Array, ""]
+) -> tuple[Float[Array, " r"], Float[Array, ""], Float[Array, ""]]:
+    """For the minimiser w: its weights in the design, ‖w‖, and ‖Φw − y‖; NaN if it fails.
+
+    The last one has the digits of a difference of squares: it is good to 1e-8 ‖y‖ in float64.
+    """
+    R, seen = sums.triangle, sums.seen
+    inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype))
+    L = jnp.linalg.cholesky(seen.square + ridge * inverse.T @ inverse)
+    v = cho_solve((L, True), seen.moment)
+    norm = jnp.linalg.norm(inverse @ v)
+    left = seen.energy - seen.moment @ v - ridge * norm**2
+    return sums.basis @ v, norm, jnp.sqrt(jnp.maximum(left, jnp.zeros_like(left)))
+
+
+def trace_of_sums(sums: Sums) -> Float[Array, ""]:
+    """The trace of ΦᵀΦ."""
+    return jnp.sum((sums.seen.square @ sums.triangle) * sums.triangle)

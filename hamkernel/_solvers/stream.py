@@ -1,6 +1,6 @@
 """Fits to data that comes in chunks: one pass, and memory that ignores the number of points.
 
-A low-rank solver that can do so compresses what it has seen to r² numbers for r columns. More data
+A low-rank solver compresses the rows that it has seen to r² numbers for r columns. More data
 changes them, and any λ is solved for from them.
 """
 
@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 from hamkernel import _require as require
 from hamkernel._fields.joined import learned_field
 from hamkernel._fields.known import known_part
-from hamkernel._gram.observed import components
+from hamkernel._gram.dense import components
 from hamkernel._machine import one_blas_thread, rows_of, split
 from hamkernel._observations.kinds import AbstractObservations, beside
 from hamkernel._observations.measurements import (
@@ -30,8 +30,7 @@ from hamkernel._observations.measurements import (
     sampled_points,
 )
 from hamkernel._show import call, text
-from hamkernel._solvers.base import AbstractSolver, Learned
-from hamkernel._solvers.problem import without_known
+from hamkernel._solvers.problem import AbstractSolver, Learned, without_known
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 Fit = TypeVar("Fit", bound="AbstractStreamingFit")
@@ -60,12 +59,12 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
 
     @property
     def dtype(self) -> jnp.dtype:
-        """That of the fit, and of its fields."""
+        """The dtype of the fit, and of its fields."""
         return self.regularization.dtype
 
     @abc.abstractmethod
     def _size(self) -> str:
-        """What carries the field, as it is printed."""
+        """The number of landmarks or features, as it is printed."""
 
     @abc.abstractmethod
     def _added(self: Fit, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> Fit:

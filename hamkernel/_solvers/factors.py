@@ -1,0 +1,484 @@
+"""Factors of A = G + ridge I, of which every loss and posterior is made, and the dense ones.
+
+A *system* says what A is; its cotangent has the same type. Its *factor* solves with it, and the
+*inverse* C = A⁻¹, which need not be a matrix, has what validation losses and their derivatives
+need.
+
+**Dense.** A = RᵀR by LAPACK, U = R⁻¹ from blocks of columns,
+
+    U_<j,j = −(U_<j,<j R_<j,j) U_jj,        C = A⁻¹ = U Uᵀ,
+
+and quadratic forms as ‖R⁻ᵀy‖². C is then positive by construction. A faster inversion by blocks of
+C itself was wrong by a factor of 1e14 at condition 1e13; `tests/benchmarks/accuracy.py` compares
+this one with 100 digits from condition 1e2 to 1e14.
+
+**With an unknown constant** in the direction p, ‖p‖ = 1, that is estimated as well, C = A⁻¹ becomes
+
+    C = A⁻¹ − A⁻¹p (pᵀA⁻¹p)⁻¹ pᵀA⁻¹ = Tᵀ (T A Tᵀ)⁻¹ T,
+
+the rows of T an orthonormal basis of the complement of p. dC = −C dA C still holds, and so do the
+residuals of held-out rows, (C_SS)⁻¹ (C y)_S, and their derivatives: each fit without a fold finds
+the constant anew. T is the reflection of p to the first axis, without its first row.
+
+Source: Du Croz & Higham (1992), IMA J. Numer. Anal. 12, method 2, on the stability of inversions;
+Dubrule (1983), Mathematical Geology 15, for held-out points with an unknown trend.
+"""
+
+import abc
+import itertools
+from collections.abc import Callable, Iterable
+from typing import Generic, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.custom_batching import sequential_vmap
+from jaxtyping import Array, Bool, Float, Int
+
+
+class Group:
+    """F folds of similar size, padded to S points each so that they can be worked on together.
+
+    Attributes:
+        members: the points of each fold, shape (F, S), padded with N, which is no point.
+    """
+
+    def __init__(self, N: int, folds: list[Int[np.ndarray, " _"]]):
+        self.N = N
+        self.members = np.full((len(folds), max(map(len, folds))), N)
+        for row, fold in zip(self.members, folds, strict=True):
+            row[: len(fold)] = fold
+
+    def gather(self, array: Float[Array, "Nn *r"]) -> Float[Array, "F Sn *r"]:
+        """The rows of each fold; zeros in the padding."""
+        by_point, points = array.reshape(self.N, -1, *array.shape[1:]), self.members.reshape(-1)
+        if not np.array_equal(points, np.arange(self.N)):
+            by_point = jnp.take(by_point, points, axis=0, mode="fill", fill_value=0)
+        return by_point.reshape(len(self.members), -1, *array.shape[1:])
+
+    def scattered(
+        self, values: Float[Array, "F Sn *r"], into: Float[Array, "Nn *r"]
+    ) -> Float[Array, "Nn *r"]:
+        """`into` with the rows of these folds replaced; the padding is dropped."""
+        by_point = values.reshape(*self.members.shape, -1)
+        rows = into.reshape(self.N, -1).at[self.members].set(by_point, mode="drop")
+        return rows.reshape(into.shape)
+
+    def diagonal_blocks(self, C: Float[Array, "Nn Nn"]) -> Float[Array, "F Sn Sn"]:
+        """The block of C that belongs to each fold, and the identity in the padding."""
+        n = len(C) // self.N
+        rows = (n * self.members[:, :, None] + np.arange(n)).reshape(len(self.members), -1)
+        blocks = C.at[rows[:, :, None], rows[:, None, :]].get(mode="fill", fill_value=0)
+        in_padding = jnp.asarray(rows >= len(C), C.dtype)
+        diagonal = np.arange(rows.shape[1])
+        return blocks.at[:, diagonal, diagonal].add(in_padding)
+
+
+System = TypeVar("System", bound="AbstractSystem")
+
+# A result is refused where ε cond(A) is larger, cond(A) above 9e13. At 1e13 the worst value and
+# gradient of `tests/benchmarks/accuracy.py` were 2e-3 and 6e-3 off, at 1e14 2e-2 and 0.13, and at
+# 1e16 by factors.
+_TRUSTED = 2e-2
+
+
+class AbstractBlocks(eqx.Module):
+    """The blocks C_SS of some folds S, factored."""
+
+    @abc.abstractmethod
+    def solve(self, b: Float[Array, "F s"]) -> Float[Array, "F s"]:
+        """(C_SS)⁻¹ b_S for each fold."""
+
+
+class AbstractInverse(eqx.Module, Generic[System]):
+    """C = A⁻¹, with the cotangents of A that the losses need."""
+
+    @abc.abstractmethod
+    def blocks(self, group: Group) -> AbstractBlocks:
+        """The diagonal blocks of the folds of a group."""
+
+    @abc.abstractmethod
+    def pulled(
+        self,
+        u: Float[Array, " D"],
+        w: Float[Array, " D"],
+        inverse: Float[Array, ""] | None = None,
+        square: Float[Array, ""] | None = None,
+    ) -> System:
+        """The cotangent of the system for Ā = u wᵀ + inverse · C + square · C²."""
+
+    @abc.abstractmethod
+    def pulled_folds(
+        self,
+        a: Float[Array, " D"],
+        groups: list[Group],
+        V: list[Float[Array, "F s"]],
+        R: list[Float[Array, "F s"]],
+        bars: tuple[Float[Array, " D"], Float[Array, " D"]],
+    ) -> tuple[System, Float[Array, " D"]]:
+        """The cotangent for Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − w aᵀ, and w = C (v + ā).
+
+        Args:
+            a: A⁻¹y.
+            groups: of the folds S.
+            V: v_S = (C_SS)⁻¹ r̄_S.
+            R: r_S = (C_SS)⁻¹ a_S.
+            bars: r̄ and ā.
+        """
+
+
+class AbstractFactor(eqx.Module, Generic[System]):
+    """A, factored; NaN where it is not positive definite to rounding."""
+
+    size: eqx.AbstractVar[Float[Array, ""]]
+
+    @abc.abstractmethod
+    def solve(self, b: Float[Array, "D *m"]) -> Float[Array, "D *m"]:
+        """A⁻¹ b."""
+
+    @abc.abstractmethod
+    def solved(self, y: Float[Array, " D"]) -> tuple[Float[Array, " D"], Float[Array, ""]]:
+        """The coefficients a = A⁻¹y, and yᵀA⁻¹y as a sum of squares."""
+
+    @property
+    @abc.abstractmethod
+    def log_det(self) -> Float[Array, ""]:
+        """Log det A."""
+
+    @property
+    @abc.abstractmethod
+    def inverse_trace(self) -> Float[Array, ""]:
+        """The trace of A⁻¹."""
+
+    @abc.abstractmethod
+    def inverse(self) -> AbstractInverse[System]:
+        """C = A⁻¹."""
+
+    def trusted(self, y: Float[Array, " D"]) -> Bool[Array, ""]:
+        """Whether ε cond(A) leaves digits, with ‖A⁻¹‖ from two steps of the power method.
+
+        They do not start from y, which may be an eigenvector.
+        """
+        b = jnp.cos(jnp.arange(len(y), dtype=y.dtype) ** 2)
+        c = self.solve(b / jnp.linalg.norm(b))
+        c = self.solve(c / jnp.linalg.norm(c))
+        condition = jax.lax.stop_gradient(self.size * jnp.linalg.norm(c))
+        return condition * jnp.finfo(y.dtype).eps <= _TRUSTED
+
+
+class AbstractSystem(eqx.Module):
+    """A = G + ridge I, before it is factored."""
+
+    @abc.abstractmethod
+    def factor(self) -> AbstractFactor:
+        """Its factor."""
+
+
+class CholeskyBlocks(AbstractBlocks):
+    """Blocks by their own lower Cholesky factors."""
+
+    lower: Float[Array, "F s s"]
+
+    def __init__(self, blocks: Float[Array, "F s s"]):
+        self.lower = jax.lax.linalg.cholesky(blocks, symmetrize_input=False)
+
+    def solve(self, b: Float[Array, "F s"]) -> Float[Array, "F s"]:
+        return jax.scipy.linalg.cho_solve((self.lower, True), b[..., None])[..., 0]
+
+
+# Rows of the blocks of U at least, and how many of them at most. More compile longer (1.7 s for 16,
+# 0.7 s for 8), and fewer are slower (D = 592 to 2000).
+_ROWS, _BLOCKS = 128, 8
+
+
+# Rows of R made at once by `factor_in_place`. Its temporaries are four blocks of rows, and every
+# block compiles a program of its own, in 0.2 s.
+ROWS_IN_PLACE = 1000
+
+
+# LAPACK. One after the other under `jax.vmap`: two batches of its calls side by side were seen to
+# stall for ever on two cores, since jaxlib 0.10.2 waits for threads that wait for it.
+
+
+@sequential_vmap
+def _lapack_cholesky(A):
+    # Transposed twice, the matrix is never copied from the order of rows to that of columns.
+    return jax.lax.linalg.cholesky(A.T, symmetrize_input=False).T
+
+
+@sequential_vmap
+def _lapack_backward(R, b):
+    # Rᵀ in the order of columns, which LAPACK asks for, is R as it lies in memory: without a copy a
+    # solve with 2000 rows takes a third of the time.
+    return jax.lax.linalg.triangular_solve(R.T, b, left_side=True, lower=True, transpose_a=True)
+
+
+@sequential_vmap
+def _lapack_forward(R, b):
+    return jax.lax.linalg.triangular_solve(R.T, b, left_side=True, lower=True)
+
+
+def backward(R: Float[Array, "D D"], b: Float[Array, "D m"]) -> Float[Array, "D m"]:
+    """R⁻¹ b for an upper triangular R."""
+    return jax.lax.custom_linear_solve(
+        lambda x: R @ x,
+        b,
+        lambda _, b: _lapack_backward(R, b),
+        lambda _, b: _lapack_forward(R, b),
+    )
+
+
+def forward(R: Float[Array, "D D"], b: Float[Array, "D m"]) -> Float[Array, "D m"]:
+    """R⁻ᵀ b for an upper triangular R."""
+    return jax.lax.custom_linear_solve(
+        lambda x: R.T @ x,
+        b,
+        lambda _, b: _lapack_forward(R, b),
+        lambda _, b: _lapack_backward(R, b),
+    )
+
+
+@jax.custom_jvp
+def cholesky(A: Float[Array, "D D"]) -> Float[Array, "D D"]:
+    """R upper triangular with A = RᵀR; NaN where A is not positive definite."""
+    return _lapack_cholesky(A)
+
+
+@cholesky.defjvp
+def _(primals, tangents):
+    # dR = upper(R⁻ᵀ dA R⁻¹) R, with half of the diagonal: Murray (2016), arXiv 1602.07527.
+    (A,), (dA,) = primals, tangents
+    R = cholesky(A)
+    S = forward(R, forward(R, dA).T)
+    half = 1 - 0.5 * jnp.eye(len(A), dtype=A.dtype)
+    return R, (jnp.triu(S) * half) @ R
+
+
+class DenseSystem(AbstractSystem):
+    """A as a matrix."""
+
+    matrix: Float[Array, "D D"]
+
+    def factor(self) -> "DenseFactor":
+        return dense_factor(self.matrix)
+
+
+class DenseFactor(AbstractFactor[DenseSystem]):
+    """A = RᵀR with R upper triangular.
+
+    Attributes:
+        R: the factor; NaN where A is not positive definite to rounding.
+        size: ‖A‖ in the Frobenius norm.
+    """
+
+    R: Float[Array, "D D"]
+    size: Float[Array, ""]
+
+    def whiten(self, b: Float[Array, "D *m"]) -> Float[Array, "D *m"]:
+        """R⁻ᵀ b, so that ‖R⁻ᵀb‖² = bᵀA⁻¹b."""
+        return forward(self.R, b.reshape(len(b), -1)).reshape(b.shape)
+
+    def solve(self, b: Float[Array, "D *m"]) -> Float[Array, "D *m"]:
+        return backward(self.R, forward(self.R, b.reshape(len(b), -1))).reshape(b.shape)
+
+    def solved(self, y: Float[Array, " D"]) -> tuple[Float[Array, " D"], Float[Array, ""]]:
+        z = self.whiten(y)
+        return backward(self.R, z[:, None])[:, 0], z @ z
+
+    @property
+    def log_det(self) -> Float[Array, ""]:
+        return 2 * jnp.sum(jnp.log(jnp.diagonal(self.R)))
+
+    @property
+    def inverse_trace(self) -> Float[Array, ""]:
+        return jnp.sum(self.inverse_root() ** 2)
+
+    def inverse(self) -> "DenseInverse":
+        return DenseInverse(_outer_square(self.inverse_root()))
+
+    def inverse_root(self) -> Float[Array, "D D"]:
+        """U = R⁻¹, upper triangular, with A⁻¹ = U Uᵀ."""
+        R = self.R
+        U = jnp.zeros_like(R)
+        for j in _blocks(len(R)):
+            before = slice(0, j.start)
+            own = backward(R[j, j], jnp.eye(j.stop - j.start, dtype=R.dtype))
+            # Each call of LAPACK waits for the one before.
+            R, own = jax.lax.optimization_barrier((R, own))
+            U = U.at[j, j].set(own)
+            U = U.at[before, j].set(-(U[before, before] @ R[before, j]) @ own)
+        return U
+
+
+def dense_factor(A: Float[Array, "D D"]) -> DenseFactor:
+    """The factor of A, inside of a compiled program."""
+    A, size = jax.lax.optimization_barrier((A, jnp.linalg.norm(A)))  # A is not kept
+    return DenseFactor(cholesky(A), size)
+
+
+def factor_in_place(A: Float[Array, "D D"], steps: Callable[[Iterable], Iterable]) -> DenseFactor:
+    """The factor of A in the memory of A, which is lost.
+
+    Rows of R are made one block after the other,
+
+        S = A_jk − Σ_{i<j} R_ijᵀ R_ik,    R_jj = chol(S_jj),    R_jk = R_jj⁻ᵀ S_jk    for k > j.
+
+    LAPACK's own takes a second matrix for the result and a third for what XLA returns.
+
+    Args:
+        A: a matrix outside of any trace.
+        steps: passes on the blocks, to show how far it is.
+    """
+    size = _norm(A)
+    starts = range(0, len(A), ROWS_IN_PLACE)
+    for start in steps(starts):
+        A = jax.block_until_ready(_rows_of_factor((start,), A))  # Ctrl-C stops between blocks
+    return DenseFactor(A, size)
+
+
+_norm = jax.jit(jnp.linalg.norm)
+
+
+@eqx.filter_jit(donate="all-except-first")
+def _rows_of_factor(at: tuple[int], A: Float[Array, "D D"]) -> Float[Array, "D D"]:
+    start, D = at[0], len(A)
+    b = min(ROWS_IN_PLACE, D - start)
+
+    def less(i, S):
+        above = jax.lax.dynamic_slice(A, (i * ROWS_IN_PLACE, start), (ROWS_IN_PLACE, D - start))
+        return S - above[:, :b].T @ above
+
+    S = jax.lax.fori_loop(0, start // ROWS_IN_PLACE, less, A[start : start + b, start:])
+    own = _lapack_cholesky(S[:, :b])
+    rest = _lapack_forward(own, S[:, b:])
+    rows = jnp.concatenate([jnp.zeros((b, start), A.dtype), own, rest], axis=1)
+    return jax.lax.dynamic_update_slice(A, rows, (start, 0))
+
+
+def solution(
+    A: Float[Array, "D D"], y: Float[Array, " D"]
+) -> tuple[DenseFactor, Float[Array, " D"]]:
+    """The factor of A, and A⁻¹y, differentiated implicitly: by one more solve with the factor."""
+    factor, solve = dense_factor(A), jax.lax.custom_linear_solve
+    return factor, solve(lambda x: A @ x, y, lambda _, b: factor.solve(b), symmetric=True)
+
+
+class DenseInverse(AbstractInverse[DenseSystem]):
+    """C as a matrix."""
+
+    C: Float[Array, "D D"]
+
+    def blocks(self, group: Group) -> CholeskyBlocks:
+        return CholeskyBlocks(group.diagonal_blocks(self.C))
+
+    def pulled(self, u, w, inverse=None, square=None) -> DenseSystem:
+        A_bar = u[:, None] * w[None, :]
+        if inverse is not None:
+            A_bar = A_bar + inverse * self.C
+        if square is not None:
+            A_bar = A_bar + square * (self.C @ self.C)
+        return DenseSystem(A_bar)
+
+    def pulled_folds(self, a, groups, V, R, bars) -> tuple[DenseSystem, Float[Array, " D"]]:
+        P, Q = [], []  # C_:S v_S and C_:S r_S, a column for each fold
+        for group, v, r in zip(groups, V, R, strict=True):
+            rows = group.gather(self.C)  # whose sums are three times faster than those of columns
+            P.append(jnp.einsum("fid,fi->df", rows, v))
+            Q.append(jnp.einsum("fid,fi->df", rows, r))
+        w = jnp.concatenate(P, axis=1).sum(axis=1) + self.C @ bars[1]
+        left, right = jnp.column_stack([*P, -w]), jnp.column_stack([*Q, a])
+        # Else XLA computes these sums again for every entry of the product: 10 times slower.
+        left, right, w = jax.lax.optimization_barrier((left, right, w))
+        return DenseSystem(left @ right.T), w
+
+
+def _outer_square(U: Float[Array, "D D"]) -> Float[Array, "D D"]:
+    """U Uᵀ of an upper triangular U, at a third of the price of the product."""
+    C = U  # in its place: no column after j needs those before
+    for j in _blocks(len(U)):
+        columns = C[: j.stop, j.start :] @ C[j, j.start :].T
+        C = C.at[: j.stop, j].set(columns).at[j, : j.start].set(columns[: j.start].T)
+    return C
+
+
+def _blocks(D: int) -> list[slice]:
+    starts = np.linspace(0, D, min(-(-D // _ROWS), _BLOCKS) + 1).astype(int).tolist()
+    return [slice(start, stop) for start, stop in itertools.pairwise(starts)]
+
+
+class ContrastedSystem(AbstractSystem):
+    """A before the contrast, and p, with no negative entry, which is not differentiated."""
+
+    matrix: Float[Array, "M M"]
+    constant: Float[Array, " M"]
+
+    def factor(self) -> "ContrastedFactor":
+        p = jax.lax.stop_gradient(self.constant)
+        inner = dense_factor(_contrast(p, _contrast(p, self.matrix).T))
+        return ContrastedFactor(inner=inner, constant=p, size=inner.size)
+
+
+class ContrastedFactor(AbstractFactor[ContrastedSystem]):
+    """C = Tᵀ(T A Tᵀ)⁻¹T in the place of A⁻¹."""
+
+    inner: DenseFactor
+    constant: Float[Array, " M"]
+    size: Float[Array, ""]
+
+    def solve(self, b: Float[Array, "M *m"]) -> Float[Array, "M *m"]:
+        return _spread(self.constant, self.inner.solve(_contrast(self.constant, b)))
+
+    def solved(self, y: Float[Array, " M"]) -> tuple[Float[Array, " M"], Float[Array, ""]]:
+        a, square = self.inner.solved(_contrast(self.constant, y))
+        return _spread(self.constant, a), square
+
+    @property
+    def log_det(self) -> Float[Array, ""]:
+        return self.inner.log_det
+
+    @property
+    def inverse_trace(self) -> Float[Array, ""]:
+        return self.inner.inverse_trace
+
+    def inverse(self) -> "ContrastedInverse":
+        p = self.constant
+        return ContrastedInverse(DenseInverse(_spread(p, _spread(p, self.inner.inverse().C).T)))
+
+    def trusted(self, y: Float[Array, " M"]) -> Bool[Array, ""]:
+        return self.inner.trusted(_contrast(self.constant, y))
+
+
+class ContrastedInverse(AbstractInverse[ContrastedSystem]):
+    """C as a matrix."""
+
+    dense: DenseInverse
+
+    def blocks(self, group: Group) -> AbstractBlocks:
+        return self.dense.blocks(group)
+
+    def pulled(self, u, w, inverse=None, square=None) -> ContrastedSystem:
+        return _cotangent(self.dense.pulled(u, w, inverse, square))
+
+    def pulled_folds(self, a, groups, V, R, bars) -> tuple[ContrastedSystem, Float[Array, " M"]]:
+        dense, w = self.dense.pulled_folds(a, groups, V, R, bars)
+        return _cotangent(dense), w
+
+
+def _cotangent(dense: DenseSystem) -> ContrastedSystem:
+    return ContrastedSystem(dense.matrix, jnp.zeros_like(dense.matrix[0]))
+
+
+def _contrast(p: Float[Array, " M"], b: Float[Array, "M *m"]) -> Float[Array, "D *m"]:
+    """T b."""
+    return _reflected(p, b)[1:]
+
+
+def _spread(p: Float[Array, " M"], c: Float[Array, "D *m"]) -> Float[Array, "M *m"]:
+    """Tᵀ c."""
+    return _reflected(p, jnp.concatenate([jnp.zeros_like(c[:1]), c]))
+
+
+def _reflected(p: Float[Array, " M"], b: Float[Array, "M *m"]) -> Float[Array, "M *m"]:
+    v = p.at[0].add(1.0)  # the reflection is I − vvᵀ/(1 + p₀)
+    return b - jnp.tensordot(v / (1 + p[0]), v @ b, axes=0)
