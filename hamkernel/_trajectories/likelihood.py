@@ -28,10 +28,10 @@ from hamkernel._gram.derivatives import forward_differentiated
 from hamkernel._machine import orthonormal
 from hamkernel._observations.kinds import Functionals, Together
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._trajectories.descent import HUGE, minimise
 from hamkernel._trajectories.flow import means
 from hamkernel._trajectories.segments import LinearisedSegments, accumulated, back_substituted
-from hamkernel._tuning.boxes import gram_trace, hyperparameters
+from hamkernel._tuning.minimiser import most_likely_in_box
+from hamkernel._tuning.space import gram_trace, hyperparameters
 
 # Above the rounding of K(S, S): it bounds how finely the landmarks resolve, and biases nothing.
 _ROUNDINGS = 100.0
@@ -178,7 +178,7 @@ def _loss(model: Model, h, S, rows, start_deviation):
     value = negative_log_likelihood(
         project_out_starts(there.kernel, there.log_noise, S, rows, start_deviation)
     )
-    return jnp.where(jnp.isfinite(value), value, HUGE)
+    return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
 
 @eqx.filter_jit
@@ -199,9 +199,9 @@ def _best(model: Model, S, rows: LinearisedSegments, start_deviation, low, high,
     # Of log σ a sample of N knows 1/√(2N); a lengthscale or an amplitude is known to some tenths.
     count = jnp.maximum(rows.counts.sum(axis=(0, 1)), 1)
     kernel = jnp.full(start.size - count.size, 0.2, start.dtype)
-    sizes = jnp.concatenate([kernel, 1 / jnp.sqrt(2 * count)])
-    found, value = minimise(loss, start, low, high, sizes, steps)
-    return jnp.where(free & (value < HUGE), found, start), value
+    deviations = jnp.concatenate([kernel, 1 / jnp.sqrt(2 * count)])
+    found, value = most_likely_in_box(loss, start, low, high, deviations, steps)
+    return jnp.where(free & (value < jnp.inf), found, start), value
 
 
 def most_likely(

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hamkernel._show import described
-from hamkernel._trajectories.descent import minimise
+from hamkernel._tuning.minimiser import most_likely_in_box
 
 
 class Padded(NamedTuple):
@@ -286,7 +286,7 @@ def _found(steps, y, seen, low, high) -> Float[Array, "3"]:
     sizes = jnp.stack(
         [jnp.full_like(count, 0.2), jnp.full_like(count, 0.1), 1 / jnp.sqrt(2 * count)]
     )
-    return minimise(loss, design[jnp.argmin(values)], low, high, sizes, steps=40)[0]
+    return most_likely_in_box(loss, design[jnp.argmin(values)], low, high, sizes, steps=40)[0]
 
 
 @eqx.filter_jit

@@ -1,4 +1,7 @@
-"""What `tune` minimises: a validation loss of the dense or of the low-rank fit, or the caller's."""
+"""What `tune` minimises: a validation loss of the dense or of the low-rank fit, or the caller's.
+
+A search goes through parts of the observations, `parts_of`, each with a `SearchObjective`.
+"""
 
 import dataclasses
 from collections.abc import Callable
@@ -8,13 +11,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._tuning.space import SearchSpace
 from hamkernel._validation.folds import Folds, Partition
 from hamkernel._validation.losses import (
     cross_validation_loss,
@@ -46,12 +50,12 @@ class SearchCriterion(eqx.Module):
     fn: Any  # a function, or the `Partial` of one of ours
     partition: Partition | None = eqx.field(static=True)  # of the observations; see `on`
     logarithmic: bool = eqx.field(static=True)
-    own: bool = eqx.field(static=True)  # the caller's, which may need all the data
+    custom: bool = eqx.field(static=True)  # the caller's, which may need all the data
 
     def loss(
         self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
-        """The objective, as `tune` reports it, and ‖a‖² of the fit where there is a wall for it."""
+        """The objective, as `tune` reports it, and ‖a‖² of the fit where a penalty needs it."""
         extra = () if self.partition is None else (self.partition,)
         with require.traceable("the objective"):
             value = self.fn(K, rows, regularization, *extra)
@@ -63,36 +67,6 @@ class SearchCriterion(eqx.Module):
             )
         return value, square
 
-    def searched(self, loss, square, rows: Measurements, wall) -> Float[Array, ""]:
-        """What the search minimises: the loss in its units, and the wall.
-
-        The wall keeps away from fields that rounding makes rough where the loss is still right.
-        f(x) = Σ K(x, xⱼ) aⱼ rounds by up to ε tr(G) ‖a‖, of which an adaptive step, or the
-        iteration of an implicit one, sees 1e-2. It is to stay a share √ε of the velocities:
-        ‖a‖ tr(G) √ε ≤ ‖y‖. Beyond the wall the square of the logarithm of what is too much is
-        added: of 18 fields, for polynomial and trigonometric H with noise of 0, 1 and 10 %, all can
-        then be integrated (`tests/benchmarks/tuned_fields.py`). The likelihood has no need of one:
-        its Nλ is the variance of y − f = Nλ a. Of an objective of the caller's nothing is known.
-
-        Args:
-            loss: the value of `loss`, shape ().
-            square: ‖a‖², shape ().
-            rows: what the loss is of.
-            wall: tr(G)² over ‖y‖², of velocities at all points of the rows; None where the caller
-                has said what λ may be.
-        """
-        value = loss
-        if self.logarithmic:
-            tiny = jnp.finfo(loss.dtype).tiny
-            value = jnp.log(jnp.maximum(loss, tiny))
-            if wall is not None:
-                eps = jnp.log(jnp.finfo(loss.dtype).eps).astype(loss.dtype)
-                beyond = (jnp.log(jnp.maximum(square, tiny)) + jnp.log(wall) + eps) / 2
-                value = value + jnp.maximum(beyond, 0) ** 2
-        elif not self.own:
-            value = value * (2 / rows.size)
-        return jnp.where(jnp.isfinite(value), value, jnp.inf)
-
     def with_basis(self, basis: AbstractBasis) -> "SearchCriterion":
         """The same criterion of the low-rank fit in this basis."""
         # A Partial of a Partial would be another function, to be compiled, for each call of `tune`.
@@ -100,11 +74,99 @@ class SearchCriterion(eqx.Module):
         return dataclasses.replace(self, fn=fn)
 
     def on(self, rows: Measurements, chosen: np.ndarray) -> "SearchCriterion":
-        """The same criterion for the rows of some observations."""
+        """The same criterion for the rows of a subset of the observations."""
         if self.partition is None:
             return self
         partition = partition_of_rows(rows, self.partition.labels[chosen])
         return dataclasses.replace(self, partition=partition)
+
+
+class SearchObjective(eqx.Module):
+    """The function u -> (value, loss): what is minimised, and the objective as it is reported.
+
+    Attributes:
+        space: of u.
+        criterion: of these rows.
+        rows: all observations, or a subset of them.
+        thinning: the number of all observations over that of these; the ridge Nλ is that of all.
+        rms: the size of velocities, see `velocity_rms`.
+        unit: of the caller's objective, whose size may be any.
+    """
+
+    space: SearchSpace
+    criterion: SearchCriterion
+    rows: Measurements
+    thinning: Float[Array, ""]
+    rms: Float[Array, ""]
+    unit: Float[Array, ""]
+
+    def __call__(self, u: Float[Array, " P"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        return self.at(*self.space.decode(u.astype(self.rms.dtype)))
+
+    def at(
+        self, K: AbstractMatrixKernel, regularization: Float[Array, ""], size: Float[Array, ""]
+    ) -> tuple[Float[Array, ""], Float[Array, ""]]:
+        """The value and the loss of a kernel and λ, where tr(G)/N is `size`."""
+        loss, square = self.criterion.loss(K, self.rows, self.thinning * regularization)
+        value = loss
+        if self.criterion.logarithmic:
+            value = jnp.log(jnp.maximum(loss, jnp.finfo(loss.dtype).tiny))
+            if self.space.chooses_ridge and square is not None:
+                value = value + self.rounding_penalty(square, size)
+        elif self.criterion.custom:
+            value = value / self.unit.astype(value.dtype)
+        else:
+            value = value * (2 / self.rows.size)
+        return jnp.where(jnp.isfinite(value), value, jnp.inf), loss
+
+    def rounding_penalty(
+        self, square: Float[Array, ""], size: Float[Array, ""]
+    ) -> Float[Array, ""]:
+        """What keeps away from fields that rounding makes rough where the loss is still right.
+
+        f(x) = Σ K(x, xⱼ) aⱼ rounds by up to ε tr(G) ‖a‖, of which an adaptive step, or the
+        iteration of an implicit one, sees 1e-2. It is to stay a share √ε of the velocities:
+        ‖a‖ tr(G) √ε ≤ ‖y‖. Beyond that the square of the logarithm of what is too much is added:
+        of 18 fields, for polynomial and trigonometric H with noise of 0, 1 and 10 %, all can then
+        be integrated (`tests/benchmarks/tuned_fields.py`). The likelihood has no need of it: its Nλ
+        is the variance of y − f = Nλ a. Of an objective of the caller's nothing is known.
+
+        Args:
+            square: ‖a‖², shape ().
+            size: tr(G)/N, shape ().
+        """
+        X, dtype = self.rows.points, square.dtype
+        trace = self.thinning * len(X) * size  # of noise a is as large at every point
+        velocities = self.rms**2 * (len(X) * self.space.kernel.outputs(X.shape[1]))
+        tiny, eps = jnp.finfo(dtype).tiny, jnp.log(jnp.finfo(dtype).eps).astype(dtype)
+        scale = trace**2 / jnp.maximum(velocities, tiny)
+        beyond = (jnp.log(jnp.maximum(square, tiny)) + jnp.log(scale) + eps) / 2
+        return jnp.maximum(beyond, 0) ** 2
+
+
+# The first part has so many points, or so many rows of its Gram; with half as many the best run
+# often leads to a poor optimum of all the data. The second part has so many rows, and is there
+# where all points have at least twice as many. See `tests/benchmarks/tuning_speed.py`.
+FIRST_POINTS, FIRST_ROWS, SECOND_ROWS = 64, 256, 1024
+
+
+def parts_of(
+    rows: Measurements, criterion: SearchCriterion, dense: bool
+) -> list[Int[np.ndarray, " _"]]:
+    """The observations of each part; all of them at last, where the loss is dense."""
+    N, n = rows.count, len(rows.targets) / rows.count
+    if criterion.custom:  # it may need all the data
+        return [np.arange(N)]
+    counts = [min(FIRST_POINTS, max(int(FIRST_ROWS / n), 2)), int(SECOND_ROWS / n)]
+    if 2 * counts[1] > N:
+        del counts[1]
+    if counts[0] >= N:
+        return [np.arange(N)]
+    labels = np.zeros(N) if criterion.partition is None else criterion.partition.labels
+    order = np.argsort(labels, kind="stable")
+    # Spread evenly over the folds, and over the observations of each.
+    few = [np.sort(order[np.linspace(0, N - 1, count).round().astype(int)]) for count in counts]
+    return [*few, np.arange(N)] if dense else few
 
 
 def criterion_of(
@@ -120,14 +182,14 @@ def criterion_of(
     if objective == "cross_validation" or objective is cross_validation_loss:
         partition = Partition(N, folds)
         return SearchCriterion(
-            partial(partition_loss_and_square), partition, logarithmic=True, own=False
+            partial(partition_loss_and_square), partition, logarithmic=True, custom=False
         )
     if objective == "generalized_cross_validation" or objective is generalized_cross_validation:
         fn = partial(generalized_loss_and_square, least_free=LEAST_FREE)
-        return SearchCriterion(fn, None, logarithmic=True, own=False)
+        return SearchCriterion(fn, None, logarithmic=True, custom=False)
     if objective == "marginal_likelihood":
         fn = partial(_negative_log_likelihood)
-        return SearchCriterion(fn, None, logarithmic=False, own=False)
+        return SearchCriterion(fn, None, logarithmic=False, custom=False)
     if objective is log_marginal_likelihood:
         raise TypeError(
             "log_marginal_likelihood is to be large and an objective is to be small: pass "
@@ -145,11 +207,11 @@ def criterion_of(
             "an objective is called with (K, X, Y, regularization), by position, and returns one "
             f"number; this one takes ({other})."
         )
-    fn = partial(_own_of_data, as_pytree(objective), data)
-    return SearchCriterion(fn, None, logarithmic=False, own=True)
+    fn = partial(_custom_of_data, as_pytree(objective), data)
+    return SearchCriterion(fn, None, logarithmic=False, custom=True)
 
 
-def _own_of_data(fn, data, K, rows, regularization):
+def _custom_of_data(fn, data, K, rows, regularization):
     return fn(K, *data, regularization)
 
 

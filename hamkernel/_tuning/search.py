@@ -6,20 +6,24 @@ up to all points. The price of a loss grows with the cube of the points, so that
 most of the time although it looks at one or two points and takes few steps.
 """
 
+import functools
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jaxtyping import Float
 
 from hamkernel import _require as require
 from hamkernel._observations.measurements import Measurements
-from hamkernel._tuning.descent import Descent, Run
-from hamkernel._tuning.objective import SearchCriterion
-from hamkernel._tuning.other_optimisers import minimised
-from hamkernel._tuning.part import Part, parts_of
+from hamkernel._tuning.minimiser import BoxBFGS, MinimiserRun, begun, minimised
+from hamkernel._tuning.objective import FIRST_ROWS, SearchCriterion, SearchObjective, parts_of
 from hamkernel._tuning.space import SearchSpace
-from hamkernel._tuning.starts import design, shares_apart, spread_out
 
 _TOLERANCE = 1e-4  # of the logarithm of a loss: what a run may still gain at its end
 # The same where it goes on with more points. On seven problems of 120 points this took 391 losses
@@ -34,9 +38,10 @@ _SAME = 0.01
 # follows what happens to be held out: with 1, 2, 3 and 6 steps the median loss of 141 runs of a
 # pendulum, six seeds, was .0126, .0118, .0114 and .0112, and the median field error .0025, .0025,
 # .0026 and .0026.
-_LAST_TRIALS = 2
+_LAST_STEPS = 2
 _LONG = 60.0  # seconds of which the caller is told beforehand
 _CALLS_OF_A_RUN, _CALLS_OF_THE_LAST = 25, 5  # of the loss, as the estimates count
+_DESIGN_POINTS = 64  # for each direction of the box, and four at most
 
 
 class Search:
@@ -46,10 +51,10 @@ class Search:
         space: where.
         criterion: of all observations.
         rows: their rows, on one device.
-        speed: see `Part`.
+        rms: the size of velocities, see `velocity_rms`.
         starts: the number of runs.
         max_steps: of one run, on each part.
-        optimiser: one of optimistix, or None for BFGS.
+        optimiser: one of optimistix, or None for `BoxBFGS`.
         progress: whether to print how it goes.
     """
 
@@ -58,19 +63,22 @@ class Search:
         space: SearchSpace,
         criterion: SearchCriterion,
         rows: Measurements,
-        speed: float,
+        rms: float,
         starts: int,
         max_steps: int,
         optimiser: optx.AbstractMinimiser | None,
         progress: bool,
     ):
-        self.space, self.criterion, self.rows, self.speed = space, criterion, rows, speed
+        self.space, self.criterion, self.rows, self.rms = space, criterion, rows, rms
         self.starts, self.max_steps = starts, max_steps
         self.optimiser, self.progress = optimiser, progress
-        self._given = np.asarray(space.encode_start(), float)
+        given = np.asarray(space.encode_start(), float)[None]
+        self._points = given if starts == 1 else np.append(given, design(space.directions), axis=0)
 
-    def runs(self, low_rank: Callable[[Run], SearchCriterion] | None = None) -> list[Run]:
-        """A run for each start, where the search ends.
+    def runs(
+        self, low_rank: Callable[[MinimiserRun], SearchCriterion] | None = None
+    ) -> MinimiserRun:
+        """The runs where the search ends, one for each start, stacked.
 
         Args:
             low_rank: the criterion of the last part, given the best run before; None if dense.
@@ -79,79 +87,97 @@ class Search:
         part = self._part(self.criterion, parts[0])
         only = len(parts) == 1 and low_rank is None
         runs = self._first(part, _TOLERANCE if only else _COARSE)
-        ends = [*_different(runs), Run(self._given)]
+        if only:
+            return runs
+        ends = _joined(_take(runs, _different(runs)), self._given(part))
         last = parts[-1] if len(parts) > 2 else None
         for more in parts[1:]:
-            trials = np.inf
+            steps = self.max_steps
             if more is last:  # the caller's point has lost on the part before
-                trials, ends = _LAST_TRIALS, ends[:1]
+                steps, ends = _LAST_STEPS, _take(ends, [0])
             growth = (len(more) / part.count) ** 3
             self._warn_of_waiting(part.seconds * growth * _CALLS_OF_THE_LAST, _SMALLER)
             part = self._part(self.criterion, more)
-            runs, ends = self._finished(part, ends, trials)
-        if low_rank is not None and best(runs).value < np.inf:
+            runs, ends = self._finished(part, ends, steps)
+        if low_rank is not None and runs.best.value.min() < np.inf:
             part = self._part(low_rank(best(runs)), np.arange(self.rows.count))
-            runs, _ = self._finished(part, ends)
+            runs, _ = self._finished(part, ends, self.max_steps)
         return runs
 
-    def _part(self, criterion: SearchCriterion, chosen: np.ndarray) -> Part:
-        return Part(self.space, criterion, self.rows, self.speed, chosen)
+    def _part(self, criterion: SearchCriterion, chosen: np.ndarray) -> "Part":
+        return Part(self.space, criterion, self.rows, self.rms, chosen, len(self._points))
 
-    def _first(self, part: Part, tolerance: float) -> list[Run]:
+    def _given(self, part: "Part") -> MinimiserRun:
+        return part.begun(self._minimiser(_TOLERANCE), self._points[:1])
+
+    def _first(self, part: "Part", tolerance: float) -> MinimiserRun:
         """A run from the caller's point, and from the best points of a design."""
-        runs = [Run(self._given)]
+        minimiser, points = self._minimiser(tolerance), self._points
+        begun = part.begun(minimiser, points)
+        # The first call compiles, and says nothing of how long the next will take.
+        runs = self._looked_at(part, _take(begun, [0]), minimiser)
         if self.starts > 1:
-            points = design(self.space.directions)
-            values = np.array([value for value, *_ in part(points)])
-            runs += [Run(u) for u in spread_out(points, values, self.starts - 1)]
+            others = self._looked_at(part, _take(begun, np.arange(1, len(points))), minimiser)
             seconds = part.seconds * self.starts * _CALLS_OF_A_RUN
             self._warn_of_waiting(seconds, f"Pass fewer starts than {self.starts}.")
-        self._descend(part, runs, tolerance)
-        return runs
+            chosen = spread_out(points[1:], others.best.value, self.starts - 1)
+            runs = _joined(runs, _take(others, chosen))
+        if self.criterion.custom:
+            values = runs.best.value
+            sizes = np.abs(values[(values != 0) & (np.abs(values) < np.inf)])
+            part.measure_in(sizes[0] if len(sizes) else 1.0)
+            runs = self._looked_at(part, part.begun(minimiser, runs.best.u), minimiser)
+        return self._descended(part, runs, minimiser, self.max_steps)
 
     def _finished(
-        self, part: Part, ends: list[Run], max_trials: float = np.inf
-    ) -> tuple[list[Run], list[Run]]:
+        self, part: "Part", ends: MinimiserRun, steps: int
+    ) -> tuple[MinimiserRun, MinimiserRun]:
         """The ends in the order of their losses on these points, the best two finished there.
 
-        The last of the ends is the caller's point. The second list has those of them to look at on
-        more points: the best, and the caller's.
+        The last of the ends is the caller's point. The second result has those of them to look at
+        on more points: the best, and the caller's.
         """
-        points = part(np.stack([end.u for end in ends]))
-        for end, (value, loss, slope) in zip(ends, points, strict=True):
-            end.value, end.loss, end.slope = value, loss, slope
-        ends = sorted(ends, key=lambda end: end.value)
-        converged = ends[0].converged
-        if max_trials < np.inf:  # a correction, which says nothing of it
-            self._descend(part, ends[:1], _TOLERANCE, max_trials)
-            ends[0].converged = converged
+        minimiser = self._minimiser(_TOLERANCE)
+        runs = part.begun(minimiser, ends.best.u).going_on_from(ends)
+        runs = _sorted(self._looked_at(part, runs, minimiser))
+        if steps < self.max_steps:  # a correction, which says nothing of convergence
+            corrected = self._descended(part, runs, minimiser, steps)
+            runs = corrected._replace(converged=ends.converged)
         else:
-            self._descend(part, ends[:_FINISHED], _TOLERANCE)
-            ends = sorted(ends, key=lambda end: end.value)
-        return ends[: self.starts], [ends[0], Run(self._given)]
+            finished = self._descended(part, _take(runs, slice(_FINISHED)), minimiser, steps)
+            runs = _sorted(_joined(finished, _take(runs, slice(_FINISHED, None))))
+        runs = _take(runs, slice(self.starts))
+        return runs, _joined(_take(runs, [0]), self._given(part))
 
-    def _descend(
-        self, part: Part, runs: list[Run], tolerance: float, max_trials: float = np.inf
-    ) -> None:
-        """Go on with the runs, side by side, until each has converged or used up its steps."""
-        if self.optimiser is not None:
-            for run in runs:
-                minimised(part.objective, run, self.optimiser, self.max_steps)
-            return
-        relative = self.criterion.own  # it has a unit of its own
-        descents = [Descent(run, tolerance, self.max_steps, relative, max_trials) for run in runs]
-        while going := [descent for descent in descents if descent.going]:
-            points = part(np.stack([descent.trial for descent in going]))
-            for descent, point in zip(going, points, strict=True):
-                descent.tell(*point)
+    def _minimiser(self, tolerance: float) -> optx.AbstractMinimiser:
+        return BoxBFGS(atol=jnp.asarray(tolerance)) if self.optimiser is None else self.optimiser
+
+    def _looked_at(
+        self, part: "Part", runs: MinimiserRun, minimiser: optx.AbstractMinimiser
+    ) -> MinimiserRun:
+        """The runs with the values where they are."""
+        if isinstance(minimiser, optx.AbstractQuasiNewton):  # its first step does no more
+            return part.minimised(minimiser, runs, 1)
+        bfgs = BoxBFGS(atol=jnp.asarray(_TOLERANCE))
+        return runs._replace(best=part.minimised(bfgs, part.begun(bfgs, runs.u), 1).best)
+
+    def _descended(
+        self, part: "Part", runs: MinimiserRun, minimiser: optx.AbstractMinimiser, steps: int
+    ) -> MinimiserRun:
+        """The runs where each has converged or used up its steps."""
+        most = runs.steps.max() + steps
+        while (going := runs.going & (runs.steps < most)).any():
+            # A call takes a second at most, or one step, so that Ctrl-C is heard.
+            few = 1 if self.progress else max(1, int(1 / (part.seconds * going.sum())))
+            runs = part.minimised(minimiser, runs, min(few, int(most - runs.steps[going].max())))
             if self.progress:
-                self._say(part, runs, len(going))
+                self._say(part, runs, going.sum())
+        return runs
 
-    def _say(self, part: Part, runs: list[Run], going: int) -> None:
+    def _say(self, part: "Part", runs: MinimiserRun, going: int) -> None:
         sys.stdout.write(
-            f"tune: {part.count} of {self.rows.count} points, "
-            f"step {max(run.steps for run in runs)}, {going} of {len(runs)} runs, "
-            f"best loss {best(runs).loss:.6g}\n"
+            f"tune: {part.count} of {self.rows.count} points, step {runs.steps.max()}, "
+            f"{going} of {len(runs.u)} runs, best loss {best(runs).best.loss:.6g}\n"
         )
         sys.stdout.flush()
 
@@ -167,16 +193,154 @@ _SMALLER = (
 )
 
 
-def best(runs: list[Run]) -> Run:
+def best(runs: MinimiserRun) -> MinimiserRun:
     """The run that found the least value."""
-    return min(runs, key=lambda run: run.value)
+    return _take(runs, int(np.argmin(runs.best.value)))
 
 
-def _different(runs: list[Run]) -> list[Run]:
+def _different(runs: MinimiserRun) -> list[int]:
     """The runs that ended where no better one did, from the best on."""
-    ends: list[Run] = []
-    for run in sorted(runs, key=lambda run: run.value):
-        apart = [shares_apart(run.u, end.u) for end in ends]
-        if run.value < np.inf and min(apart, default=1.0) > _SAME:
-            ends.append(run)
+    ends: list[int] = []
+    for i in np.argsort(runs.best.value, kind="stable"):
+        apart = [shares_apart(runs.best.u[i], runs.best.u[j]) for j in ends]
+        if runs.best.value[i] < np.inf and min(apart, default=1.0) > _SAME:
+            ends.append(int(i))
     return ends
+
+
+def _sorted(runs: MinimiserRun) -> MinimiserRun:
+    return _take(runs, np.argsort(runs.best.value, kind="stable"))
+
+
+def _take(runs: MinimiserRun, which: Any) -> MinimiserRun:
+    arrays, static = eqx.partition(runs, eqx.is_array)
+    return eqx.combine(jax.tree.map(lambda a: a[which], arrays), static)
+
+
+def _joined(one: MinimiserRun, other: MinimiserRun) -> MinimiserRun:
+    arrays, static = eqx.partition(one, eqx.is_array)
+    others = eqx.filter(other, eqx.is_array)
+    return eqx.combine(jax.tree.map(lambda a, b: np.append(a, b, axis=0), arrays, others), static)
+
+
+class Part:
+    """The objective on a subset of the observations: one compiled program for all its runs.
+
+    Attributes:
+        count: the number of these observations.
+        seconds: what one step took, the least seen.
+        objective: the function of u.
+    """
+
+    def __init__(
+        self,
+        space: SearchSpace,
+        criterion: SearchCriterion,
+        rows: Measurements,
+        rms: float,
+        chosen: np.ndarray,
+        most: int,
+    ):
+        """Take those `chosen` of all observations that the criterion and the rows belong to.
+
+        There are never more runs than `most`, to which their arrays are padded.
+        """
+        self.seconds: float = np.inf
+        self._most = most + 1
+        N = rows.count
+        if len(chosen) < N:
+            rows, chosen = rows.subset(chosen)
+        self.count = rows.count
+        numbers = (jnp.asarray(each, rows.targets.dtype) for each in (N / self.count, rms, 1.0))
+        self.objective = SearchObjective(space, criterion.on(rows, chosen), rows, *numbers)
+
+    def measure_in(self, unit: float) -> None:
+        """Divide the caller's objective by its size: tolerances are those of numbers of size 1."""
+        unit = jnp.asarray(unit, self.objective.unit.dtype)
+        self.objective = eqx.tree_at(lambda objective: objective.unit, self.objective, unit)
+
+    def begun(
+        self, minimiser: optx.AbstractMinimiser, us: Float[np.ndarray, "count P"]
+    ) -> MinimiserRun:
+        """Runs from points that they have not looked at yet."""
+        padded = np.resize(us, (self._most, us.shape[1])).astype(jnp.result_type(float))
+        runs = _begun(self.objective, minimiser, padded)
+        return _take(jax.tree.map(_as_numpy, runs), slice(len(us)))
+
+    def minimised(
+        self, minimiser: optx.AbstractMinimiser, runs: MinimiserRun, steps: int
+    ) -> MinimiserRun:
+        """The runs at most so many steps further."""
+        count, before = len(runs.u), runs.steps.sum()
+        # On a CPU one after the other took two thirds of the time; elsewhere a lane costs nothing.
+        side_by_side = (
+            jax.default_backend() != "cpu" and len(self.objective.rows.targets) <= FIRST_ROWS
+        )
+        padded = _take(runs, np.resize(np.arange(count), self._most))
+        padded = padded._replace(going=padded.going & (np.arange(self._most) < count))
+        began = time.perf_counter()
+        moved = _minimised(self.objective, minimiser, padded, padded.steps + steps, side_by_side)
+        moved = _take(jax.tree.map(_as_numpy, moved), slice(count))
+        taken = int(moved.steps.sum() - before)
+        self.seconds = min(self.seconds, (time.perf_counter() - began) / max(taken, 1))
+        return moved
+
+
+def _as_numpy(leaf: Any) -> Any:
+    return np.asarray(leaf) if eqx.is_array(leaf) else leaf
+
+
+@eqx.filter_jit
+def _begun(objective, minimiser, us) -> MinimiserRun:
+    return eqx.filter_vmap(functools.partial(begun, minimiser, objective))(us)
+
+
+@eqx.filter_jit
+def _minimised(objective, minimiser, runs: MinimiserRun, most, side_by_side) -> MinimiserRun:
+    """The runs, each where it ends or has taken its most steps."""
+    arrays, static = eqx.partition(runs, eqx.is_array)
+
+    def one(arrays, most):
+        run = minimised(minimiser, objective, eqx.combine(arrays, static), most)
+        return eqx.filter(run, eqx.is_array)
+
+    across = jax.vmap(one) if side_by_side else lambda *each: jax.lax.map(lambda e: one(*e), each)
+    return eqx.combine(across(arrays, most), static)
+
+
+# Where the runs start: the best points of a space-filling design of the box.
+
+
+def design(directions: Sequence[int]) -> Float[np.ndarray, "count P"]:
+    """A space-filling design in the box: the additive sequence of Roberts (2018), R_d.
+
+    Coordinates with the same direction move together, each through its own side. Were the
+    lengthscales of n coordinates to move apart, almost every point would have some that is far
+    too short or too long, and hardly a start would lead to a good optimum.
+    """
+    d = max(directions) + 1
+    count = _DESIGN_POINTS * min(d, 4)
+    root = 2.0
+    for _ in range(64):  # the positive solution of root^(d + 1) = root + 1
+        root = (1 + root) ** (1 / (d + 1))
+    share = (0.5 + np.outer(np.arange(1, count + 1), root ** -np.arange(1.0, d + 1))) % 1.0
+    return np.arcsin(2 * share - 1)[:, list(directions)]
+
+
+def spread_out(
+    points: Float[np.ndarray, "count P"], values: Float[np.ndarray, " count"], starts: int
+) -> list[int]:
+    """Which points of a design are the best and no neighbours of a better one already taken."""
+    reach = 0.25 * points.shape[1] ** 0.5  # of a box of side 1
+    order = np.argsort(values, kind="stable")
+    taken: list[int] = []
+    for i in order:
+        if all(shares_apart(points[i], points[j]) >= reach for j in taken):
+            taken.append(int(i))
+    left = [int(i) for i in order if i not in taken]  # of which the best, where the box is full
+    return (taken + left)[:starts]
+
+
+def shares_apart(u: Float[np.ndarray, " P"], v: Float[np.ndarray, " P"]) -> float:
+    """The distance of two points in a box of side 1."""
+    return float(np.linalg.norm(np.sin(u) - np.sin(v)) / 2)

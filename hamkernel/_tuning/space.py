@@ -1,17 +1,31 @@
-"""The box of hyperparameters, as all real vectors u."""
+"""The hyperparameters of a kernel, the bounds that it takes from the data, and the search space.
 
-from collections.abc import Mapping
+Every kernel gives the bounds of its own arrays, `bounds`, and the data in the coordinates that the
+kernels inside it see, `transform_inputs`: a `Select` or a `Warp` transforms them first.
+"""
+
+import dataclasses
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from jax.tree_util import GetAttrKey, SequenceKey, keystr, tree_flatten_with_path
 from jaxtyping import Array, ArrayLike, Float
 
+from hamkernel._gram.dense import gram_of_rows, trace
 from hamkernel._gram.derivatives import forward_differentiated
-from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._tuning.boxes import full_trace, hyperparameters
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance, bounds_by_value
+from hamkernel._kernels.functions import Bound
+from hamkernel._kernels.symmetry import without_symmetry
+from hamkernel._observations.blocks import Components
+from hamkernel._observations.measurements import Measurements
+from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.joined import AbstractJoinedKernel
+from hamkernel._tuning.minimiser import from_box, inside_box
 
 RIDGE = "regularization"
 ROUNDINGS = 100.0  # how far the ridge stays above the rounding of the Gram, ε tr(G): two digits
@@ -19,11 +33,145 @@ LOW_RANK_ROUNDINGS = 2e4  # above the rounding at which `choose_landmarks` drops
 _EDGE = 0.01  # the share of the box that counts as resting on a bound
 
 
+@dataclasses.dataclass(frozen=True)
+class Hyperparameter:
+    """One trainable leaf of a kernel and the box to look for it in.
+
+    `low` and `high` have the shape of the leaf and are in its stored coordinates, which are
+    logarithms where `logarithmic` holds.
+    """
+
+    name: str
+    logarithmic: bool
+    low: np.ndarray
+    high: np.ndarray
+
+    @property
+    def entries(self) -> list[str]:
+        """The name of each number, with its place if there are several: `kernel.lengthscale[1]`."""
+        if self.low.ndim == 0:
+            return [self.name]
+        return [
+            f"{self.name}[{', '.join(map(str, index))}]" for index in np.ndindex(self.low.shape)
+        ]
+
+
+def hyperparameters(
+    K: AbstractMatrixKernel,
+    X: Float[Array, "N n"],
+    rms: float,
+    states: Float[Array, "M n"],
+) -> list[Hyperparameter]:
+    """The trainable leaves of K, in the order of its leaves, with their boxes from the data.
+
+    The size of K(x, x) is that at `states`, a subset of X or all, and `rms` that of velocities, the
+    root of the mean square of their components.
+    """
+    inputs = np.asarray(X)
+    # What is a fair amplitude depends on the lengthscales: it is that in the middle of their boxes.
+    arrays, rest = eqx.partition(K, eqx.is_inexact_array)
+    leaves, structure = jax.tree.flatten(arrays)
+    middle = [
+        jnp.asarray((p.low + p.high) / 2, leaf.dtype)
+        for p, leaf in zip(_walk((), K, inputs, 1.0), leaves, strict=True)
+    ]
+    K_middle = eqx.combine(jax.tree.unflatten(structure, middle), rest)
+    return list(_walk((), K, inputs, _amplitude(K_middle, states, rms)))
+
+
+def constants(K: AbstractMatrixKernel) -> dict[str, float]:
+    """The Python floats among the attributes of a kernel, which are no leaves to train."""
+    found: dict[str, float] = {}
+    for path, node in tree_flatten_with_path(K, is_leaf=lambda node: isinstance(node, Bound))[0]:
+        if isinstance(node, float) and not eqx.is_array(node):  # that of NumPy is both
+            found[keystr(path).removeprefix(".")] = node
+        elif isinstance(node, Bound):
+            found |= node.floats
+    return found
+
+
+gram_trace = eqx.filter_jit(trace)
+
+
+def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
+    """The trace of the Gram before the terms of an odd or even kernel cancel: what rounds."""
+    terms = without_symmetry(K)
+    trace = gram_trace(terms, X)
+    if Invariance.REFLECTION in terms.invariance:
+        return trace  # that of the Gram is no larger
+    return jnp.maximum(trace, gram_trace(K, X))
+
+
+def velocity_rms(K: AbstractMatrixKernel, rows: Measurements) -> float:
+    """The root of the mean square of a component of a velocity, as far as the rows tell.
+
+    It is to the mean diagonal of the Gram of the points as the mean square of the rows is to that
+    of theirs: an amplitude then fits both.
+    """
+    if isinstance(rows.blocks[0], Components) and len(rows.blocks) == 1:
+        return float(np.sqrt(np.mean(np.asarray(rows.measured()) ** 2)))
+    ratio = np.sum(np.asarray(rows.y) ** 2) / np.trace(np.asarray(_gram_of_rows(K, rows)))
+    components = len(rows.points) * rows.dimension
+    return float(np.sqrt(ratio * float(gram_trace(K, rows.points)) / components))
+
+
+_gram_of_rows = eqx.filter_jit(gram_of_rows)
+
+
+def _amplitude(K: AbstractMatrixKernel, X: Array, rms: float) -> float:
+    """The factor that gives K(x, x) the size of velocities squared: over its mean diagonal."""
+    trace = float(gram_trace(K, X))
+    ratio = rms**2 * len(X) * K.outputs(X.shape[1]) / trace if trace > 0 else 0.0
+    return ratio if np.isfinite(ratio) and ratio > 0 else 1.0
+
+
+def _walk(path: tuple, node: object, X: np.ndarray, amplitude: float) -> Iterator[Hyperparameter]:
+    """Walk the kernel; X is the data in the coordinates that `node` sees."""
+    kernel = node if isinstance(node, AbstractScalarKernel | AbstractMatrixKernel) else None
+    inside = (X if kernel is None else kernel.transform_inputs(X)), amplitude
+    for key, child in _children(node):
+        if eqx.is_inexact_array(child):
+            name = keystr((*path, *key)).removeprefix(".")
+            if jnp.iscomplexobj(child):
+                raise TypeError(
+                    f"the hyperparameter {name} is complex; tune moves real numbers. Store its "
+                    "real and imaginary parts as two arrays."
+                )
+            head, dot, last = name.rpartition(".")
+            box = (
+                bounds_by_value(last, child)
+                if kernel is None
+                else kernel.bounds(last, X, amplitude)
+            )
+            yield Hyperparameter(
+                # `terms[0].kernel.lengthscale` for the leaf `.terms[0].kernel.log_lengthscale`
+                name=head + dot + last.removeprefix("log_"),
+                logarithmic=last.startswith("log_"),
+                low=np.broadcast_to(box[0], child.shape),
+                high=np.broadcast_to(box[1], child.shape),
+            )
+        elif child is not node:  # else a leaf that is no array: a degree, an activation
+            if isinstance(kernel, AbstractJoinedKernel):
+                inside = kernel.seen_by(child, X, amplitude)
+            yield from _walk((*path, *key), child, *inside)
+
+
+def _children(node: object) -> list[tuple[tuple, Any]]:
+    """The nodes below this one with their keys; the terms of a sum by their names."""
+    if isinstance(node, Sum):
+        keys = [
+            (GetAttrKey(name),) if name else (GetAttrKey("terms"), SequenceKey(i))
+            for i, name in enumerate(node.names)
+        ]
+        return list(zip(keys, node.terms, strict=True))
+    return tree_flatten_with_path(node, is_leaf=lambda sub: sub is not node)[0]
+
+
 class SearchSpace(eqx.Module):
     """The map u (P,) -> (kernel, λ) with h = low + (high − low)(1 + sin u)/2 for each entry.
 
     The entries are those of the kernel's leaves, then log λ; `free` says which of them u moves.
-    The box of λ follows the kernel, see `ridge_box`.
+    The box of λ follows the kernel, see `ridge_bounds`.
     """
 
     kernel: AbstractMatrixKernel
@@ -43,7 +191,7 @@ class SearchSpace(eqx.Module):
         self,
         K: AbstractMatrixKernel,
         X: Float[Array, "N n"],
-        speed: float,
+        rms: float,
         regularization: Float[Array, ""],
         frozen: tuple[str, ...],
         bounds: Mapping[str, tuple[ArrayLike, ArrayLike]],
@@ -52,12 +200,12 @@ class SearchSpace(eqx.Module):
     ):
         """Make the space for data at X; the size of the Gram is taken on `states`, or X.
 
-        `speed` is that of velocities, see `boxes.typical_speed`.
+        `rms` is the size of velocities, see `velocity_rms`.
         """
         dtype = X.dtype
         self.roundings = roundings
         self.states = X if states is None else states
-        params = hyperparameters(K, X, speed, self.states)
+        params = hyperparameters(K, X, rms, self.states)
         sizes = [param.low.size for param in params]
         self.names = (*np.repeat([p.name for p in params], sizes).tolist(), RIDGE)
         self.entries = (*(entry for p in params for entry in p.entries), RIDGE)
@@ -108,23 +256,22 @@ class SearchSpace(eqx.Module):
     ) -> tuple[AbstractMatrixKernel, Float[Array, ""], Float[Array, ""]]:
         """The kernel and λ at u, and tr(G)/N there."""
         n_leaves = len(self.start) - 1
-        moved = jnp.zeros_like(self.start).at[jnp.asarray(self.free)].set((1 + jnp.sin(u)) / 2)
+        every = jnp.zeros_like(self.start).at[jnp.asarray(self.free)].set(u)
         is_free = np.isin(np.arange(len(self.start)), self.free)
-        h = jnp.where(is_free, self.low + (self.high - self.low) * moved, self.start)
+        h = jnp.where(is_free, inside_box(every, self.low, self.high), self.start)
         params, static = eqx.partition(self.kernel, eqx.is_inexact_array)
         flat, unravel = ravel_pytree(params)
         kernel = eqx.combine(unravel(h[:n_leaves].astype(flat.dtype)), static)
         size = self.size_of_gram(kernel)
         if not is_free[-1]:
             return kernel, self.regularization, size
-        low, high = self.ridge_box(size)
-        return kernel, jnp.exp(low + (high - low) * moved[-1]), size
+        return kernel, jnp.exp(inside_box(every[-1], *self.ridge_bounds(size))), size
 
     def size_of_gram(self, kernel: AbstractMatrixKernel) -> Float[Array, ""]:
         """tr(G)/N, before the terms of an odd or even kernel cancel."""
         return forward_differentiated((kernel, self.states), full_trace) / len(self.states)
 
-    def ridge_box(self, size: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    def ridge_bounds(self, size: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
         """The bounds of log λ: from the rounding of the Gram to where the field is almost zero.
 
         Args:
@@ -139,15 +286,11 @@ class SearchSpace(eqx.Module):
     @eqx.filter_jit
     def encode_start(self) -> Float[Array, " P"]:
         """The u of the caller's values, moved a little inside the box where they are not."""
-        ridge_low, ridge_high = self.ridge_box(self.size_of_gram(self.kernel))
+        ridge_low, ridge_high = self.ridge_bounds(self.size_of_gram(self.kernel))
         low, high = self.low.at[-1].set(ridge_low), self.high.at[-1].set(ridge_high)
-        width = jnp.where(high > low, high - low, jnp.ones_like(low))
-        # Not on the edge itself, where the derivative of the sine is zero, nor where it would
-        # count as resting there before it has moved.
-        share = jnp.clip((self.start - low) / width, 2 * _EDGE, 1 - 2 * _EDGE)
-        # Where the kernel is not positive at the start there is no box of λ.
-        share = jnp.where(jnp.isfinite(share), share, 0.5)
-        return jnp.arcsin(2 * share - 1)[jnp.asarray(self.free)]
+        # Where the kernel is not positive at the start there are no bounds of λ, and λ starts in
+        # the middle. Twice the edge: nearer it would count as resting there before it has moved.
+        return from_box(self.start, low, high, 2 * _EDGE)[jnp.asarray(self.free)]
 
     @property
     def directions(self) -> tuple[int, ...]:
@@ -163,10 +306,10 @@ class SearchSpace(eqx.Module):
         at_edge = np.abs(np.sin(u)) > 1 - 2 * _EDGE
         return tuple(self.entries[i] for i in np.array(self.free)[at_edge])
 
-    def box(self, size: Float[Array, ""]) -> dict[str, tuple[float, float]]:
+    def bounds(self, size: Float[Array, ""]) -> dict[str, tuple[float, float]]:
         """The lowest and highest value for each name, in its units; λ where the Gram has `size`."""
         low, high = np.array(self.low, float), np.array(self.high, float)
-        low[-1], high[-1] = self.ridge_box(size)
+        low[-1], high[-1] = self.ridge_bounds(size)
         box: dict[str, tuple[float, float]] = {}
         for i in self.free:
             pair = np.array([low[i], high[i]])

@@ -5,9 +5,9 @@
 Five systems, four kernels, noise seeds, and poor starting points (lengthscale 0.3, 3, 30 with
 λ = 0.1): 240 problems by default. The grid has 60 × 60 points over the box that `tune` searches,
 lengthscale by λ, where λ runs upwards from the rounding of the Gram at each lengthscale. Prints the
-ratio of the tuned loss, with the wall, to the grid's best. `--times 4` has four times the points on
-each trajectory, so that the runs are on a subset; the grid then takes most of the time, minutes
-with n = 4. `--noiseless` takes data without noise.
+ratio of the tuned loss, with the penalty on rounding, to the grid's best. `--times 4` has four
+times the points on each trajectory, so that the runs are on a subset; the grid then takes most of
+the time, minutes with n = 4. `--noiseless` takes data without noise.
 """
 
 import argparse
@@ -22,8 +22,7 @@ import numpy as np
 
 import hamkernel as hk
 from hamkernel._observations.measurements import measurements_of_states
-from hamkernel._tuning.objective import criterion_of
-from hamkernel._tuning.part import Part, SearchObjective
+from hamkernel._tuning.objective import SearchObjective, criterion_of
 from hamkernel._tuning.space import SearchSpace
 
 GRID = 60
@@ -81,7 +80,7 @@ def data(system: str, seed: int, times: int, noiseless: bool) -> tuple[jax.Array
 
 @eqx.filter_jit
 def searched_on_grid(objective: SearchObjective) -> jax.Array:
-    """What is minimised, at GRID × GRID points of the box: the logarithm of the loss, walled."""
+    """What is minimised, at GRID × GRID points of the box: the logarithm of the loss, penalised."""
     shares = jnp.linspace(0.0, 1.0, GRID)
     u = jnp.arcsin(2 * jnp.stack(jnp.meshgrid(shares, shares), -1).reshape(-1, 2) - 1)
     return jax.lax.map(lambda u: objective(u)[0], u)
@@ -89,19 +88,17 @@ def searched_on_grid(objective: SearchObjective) -> jax.Array:
 
 def objective_of(K, X, Y) -> SearchObjective:
     """That of the search, on all points."""
-    rows, speed = measurements_of_states(X, Y), float(jnp.sqrt(jnp.mean(Y**2)))
-    space = SearchSpace(K, X, speed, jnp.asarray(START_RIDGE), (), {})
-    criterion = criterion_of("cross_validation", len(X), FOLDS)
-    return Part(space, criterion, rows, speed, np.arange(len(X))).objective
+    rows, rms = measurements_of_states(X, Y), float(jnp.sqrt(jnp.mean(Y**2)))
+    space = SearchSpace(K, X, rms, jnp.asarray(START_RIDGE), (), {})
+    criterion = criterion_of("cross_validation", len(X), FOLDS).on(rows, np.arange(len(X)))
+    return SearchObjective(space, criterion, rows, *map(jnp.asarray, (1.0, rms, 1.0)))
 
 
 @eqx.filter_jit
 def searched(objective: SearchObjective, tuned) -> jax.Array:
     """The same for what was tuned."""
-    criterion, rows = objective.criterion, objective.rows
-    loss, square = criterion.loss(tuned.kernel, rows, tuned.regularization)
-    wall = objective.wall(objective.space.size_of_gram(tuned.kernel))
-    return criterion.searched(loss, square, rows, wall)
+    size = objective.space.size_of_gram(tuned.kernel)
+    return objective.at(tuned.kernel, tuned.regularization, size)[0]
 
 
 def main() -> None:

@@ -1,0 +1,280 @@
+"""Minimisers of optimistix, stepped by hand so that many runs share one compiled program.
+
+A minimiser is followed through its `init`, `step` and `terminate`, the public interface of
+optimistix, from points of a box that is searched as h = low + (high − low)(1 + sin u)/2 over all
+real u, as MINUIT does: an unconstrained minimiser then respects the bounds and can rest on one,
+where a sigmoid would creep towards it. The side of the box is π long in u.
+
+`BoxBFGS` is the default. It is the BFGS of optimistix with a line search, a limit of the step and a
+tolerance of its own, by the classes that optimistix has for them: halving the steps of
+`optimistix.BFGS` takes twice the losses, and its tolerance, of differences of u and of the loss
+together, cannot say "less than 0.01 % is still to be gained".
+
+Source: Nocedal & Wright (2006), Numerical Optimization, algorithms 3.1 and 6.1.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optimistix as optx
+from jaxtyping import Array, Bool, Float, Int
+
+# A step is taken if it lowers the value by this share of what the slope promises. Small: as the
+# curvature becomes known a step of full length is good, and none is to be refused.
+_SUFFICIENT = 1e-4
+# Of the box, which is π wide, that a first step crosses, where no curvature is known.
+_FIRST = 0.1 * jnp.pi
+# A step is at most so long: half of the box, where a quadratic model is no longer one.
+_LONGEST = 0.5 * jnp.pi
+_SHORTEST = 1e-8  # a step that moves no more than half the digits of u finds only rounding
+_HUGE = 1e30  # stands for a value that is not finite: a line search backs away from it
+
+
+def inside_box(u: Array, low: Array, high: Array) -> Array:
+    """The point h = low + (high − low)(1 + sin u)/2 of the box, all of the same shape."""
+    return low + (high - low) * (1 + jnp.sin(u)) / 2
+
+
+def from_box(h: Array, low: Array, high: Array, margin: float) -> Array:
+    """The u of a point h, which is moved into the box by the share `margin` of its sides.
+
+    On the edge itself the derivative of the sine is zero, and no slope would lead away from it. The
+    middle stands for what is not finite.
+    """
+    width = jnp.where(high > low, high - low, jnp.ones_like(low))
+    share = jnp.clip((h - low) / width, margin, 1 - margin)
+    return jnp.arcsin(2 * jnp.where(jnp.isfinite(share), share, 0.5) - 1)
+
+
+class LimitedNewton(optx.AbstractDescent):
+    """The direction −H g, H the inverse Hessian and g the slope, no longer than half of the box.
+
+    Where H is still the identity nothing is known of it: the direction is then down the slope, a
+    tenth of the box long.
+    """
+
+    def init(self, y, f_info_struct):
+        del f_info_struct
+        return jnp.zeros_like(y)
+
+    def query(self, y, f_info, state):
+        H, slope = f_info.hessian_inv.pytree, f_info.grad
+        direction = -(H @ slope)
+        length = jnp.linalg.norm(direction)
+        unknown = jnp.all(H == jnp.eye(len(y), dtype=H.dtype))
+        most = jnp.where(unknown, _FIRST, jnp.minimum(length, _LONGEST))
+        return direction * (most / jnp.where(length > 0, length, jnp.ones_like(length)))
+
+    def step(self, step_size, state):
+        return step_size * state, optx.RESULTS.successful
+
+
+class ParabolicSearch(optx.AbstractSearch):
+    """A step that is refused is followed by one to the minimum of the parabola through both values.
+
+    It is a tenth to a half as long. A step is accepted by the condition of Armijo.
+    """
+
+    def init(self, y, f_info_struct):
+        del f_info_struct
+        return jnp.ones((), y.dtype)
+
+    def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
+        promised = f_info.grad @ (y_eval - y)
+        change = f_eval_info.f - f_info.f
+        accept = first_step | (change <= _SUFFICIENT * promised)
+        share = jnp.clip(-promised / (2 * (change - promised)), 0.1, 0.5)
+        size = jnp.where(accept, jnp.ones_like(state), state * share)
+        return size, accept, optx.RESULTS.successful, size
+
+
+class BoxBFGS(optx.AbstractBFGS):
+    """BFGS for a box in u that has converged where the next step promises less than `atol`.
+
+    Half of what the slope promises for a step is what the quadratic model does.
+    """
+
+    atol: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    rtol: float = 0.0
+    norm: Callable = optx.max_norm
+    use_inverse: bool = True
+    descent: LimitedNewton = LimitedNewton()
+    search: ParabolicSearch = ParabolicSearch()
+    verbose: Callable[..., None] = lambda **_: None
+
+    def terminate(self, fn, y, args, options, state, tags):
+        promised = -(state.f_info.grad @ state.descent_state) / 2
+        step = jnp.linalg.norm(state.y_eval - y)
+        converged = promised < self.atol
+        stuck = step <= _SHORTEST * (1 + jnp.linalg.norm(y))
+        result = optx.RESULTS.where(
+            stuck & ~converged, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+        )
+        return converged | stuck, result
+
+
+class Point(NamedTuple):
+    """A point that has been looked at: what is minimised there, and the loss that is reported."""
+
+    seen: Bool[Any, ""]
+    u: Float[Any, " P"]
+    value: Float[Any, ""]
+    loss: Float[Any, ""]
+
+
+class MinimiserRun(NamedTuple):
+    """A run in progress.
+
+    Attributes:
+        u: where the minimiser is.
+        state: what it knows.
+        best: the best point that it has looked at.
+        steps: how many it took.
+        going: whether it goes on.
+        converged: whether it met its tolerance.
+    """
+
+    u: Float[Any, " P"]
+    state: Any
+    best: Point
+    steps: Int[Any, ""]
+    going: Bool[Any, ""]
+    converged: Bool[Any, ""]
+
+    def going_on_from(self, runs: "MinimiserRun") -> "MinimiserRun":
+        """These runs, at the best points of others, with the curvature that those have learned.
+
+        The functions are alike. The first step of a quasi-Newton method only looks at the point.
+        """
+        if not hasattr(runs.state, "hessian_update_state"):
+            return self._replace(steps=runs.steps)
+        new = self.state.first_step, self.state.y_eval
+        known = eqx.tree_at(lambda state: (state.first_step, state.y_eval), runs.state, new)
+        return self._replace(state=known, steps=runs.steps)
+
+    def with_curvature(self, inverse: Float[Array, "P P"]) -> "MinimiserRun":
+        """This run of `BoxBFGS` with an inverse Hessian that is known beforehand."""
+        state = eqx.tree_at(lambda state: state.f_info.hessian_inv.pytree, self.state, inverse)
+        return self._replace(state=state)
+
+
+Minimised = Callable[[Float[Array, " P"]], tuple[Float[Array, ""], Float[Array, ""]]]
+
+
+def begun(minimiser: optx.AbstractMinimiser, fn: Minimised, u: Float[Array, " P"]) -> MinimiserRun:
+    """A run at u that has not looked at it yet."""
+    number = jax.ShapeDtypeStruct((), u.dtype)
+    flag = jax.ShapeDtypeStruct((), jnp.bool_)
+    point = Point(flag, u, number, number)
+    nothing = Point(jnp.array(False), u, *jnp.full(2, jnp.inf, u.dtype))
+    state = minimiser.init(_with_slope_backward(fn), u, None, {}, number, point, frozenset())
+    no = jnp.array(False)
+    return MinimiserRun(u, state, nothing, jnp.array(0), jnp.array(True), no)
+
+
+def stepped(minimiser: optx.AbstractMinimiser, fn: Minimised, run: MinimiserRun) -> MinimiserRun:
+    """A run one step further, where `fn` is minimised, u -> (value, loss)."""
+    with_args, arguments = _with_slope_backward(fn), (None, {})
+    u, state, aux = minimiser.step(with_args, run.u, *arguments, run.state, frozenset())
+    stopped, result = minimiser.terminate(with_args, u, *arguments, state, frozenset())
+    best = _better(run.best, aux)
+    # Of an accepted step optimistix returns the point before, and keeps this one in its state.
+    best = _better(best, getattr(state, "aux", aux))
+    successful = result == optx.RESULTS.successful
+    return MinimiserRun(
+        u,
+        state,
+        best,
+        run.steps + 1,
+        ~stopped & successful & jnp.isfinite(u).all(),
+        stopped & successful & (best.value < jnp.inf),
+    )
+
+
+def minimised(
+    minimiser: optx.AbstractMinimiser, fn: Minimised, run: MinimiserRun, steps: int
+) -> MinimiserRun:
+    """The run where it ends, after so many steps at most."""
+    arrays, static = eqx.partition(run, eqx.is_array)
+
+    def going(arrays):
+        return arrays.going & (arrays.steps < steps)
+
+    def step(arrays):
+        return eqx.filter(stepped(minimiser, fn, eqx.combine(arrays, static)), eqx.is_array)
+
+    return eqx.combine(jax.lax.while_loop(going, step, arrays), static)
+
+
+# Of its standard deviation: no hyperparameter need be nearer to its best value. −log p is quadratic
+# there, and ½ .1² is what may still be gained.
+_NEAR = 0.1
+_MARGIN = 0.01  # of the box, by which a start on its edge is moved inside
+
+
+def most_likely_in_box(
+    fn: Callable[[Float[Array, " P"]], Float[Array, ""]],
+    start: Float[Array, " P"],
+    low: Float[Array, " P"],
+    high: Float[Array, " P"],
+    deviations: Float[Array, " P"],
+    steps: int,
+) -> tuple[Float[Array, " P"], Float[Array, ""]]:
+    """The h in the box low ≤ h ≤ high where −log p = fn(h) is least, from `start`, and fn there.
+
+    `deviations` are the standard deviations of h that the likelihood leaves, as far as they are
+    known: their squares are the inverse Hessian that BFGS begins with.
+    """
+    bfgs = BoxBFGS(atol=jnp.asarray(_NEAR**2 / 2, start.dtype))
+    u = from_box(start, low, high, _MARGIN)
+    width = jnp.where(high > low, high - low, jnp.ones_like(low))
+    inverse = jnp.diag((2 * deviations / (width * jnp.cos(u))) ** 2)
+
+    def loss(u):
+        value = fn(inside_box(u, low, high))
+        return jnp.where(jnp.isfinite(value), value, jnp.inf), value
+
+    run = minimised(bfgs, loss, begun(bfgs, loss, u).with_curvature(inverse), steps)
+    return inside_box(run.best.u, low, high), run.best.value
+
+
+def _better(one: Point, other: Point) -> Point:
+    better = other.seen & (other.value < one.value)
+    return jax.tree.map(lambda a, b: jnp.where(better, b, a), one, other)
+
+
+def _with_slope_backward(fn: Minimised) -> Callable[[Array, Any], tuple[Array, Point]]:
+    """`fn` for optimistix, (u, args) -> (value, the point it looks at).
+
+    optimistix linearises forward, and then transposes, while derivatives of losses are written
+    backward: here the slope is made with the value. What is not finite counts as huge, without a
+    slope.
+    """
+
+    def looked_at(u):
+        value, loss = fn(u)
+        # `seen` is False in the zeros that optimistix begins with.
+        seen = jnp.isfinite(u).all()
+        point = Point(seen, u, value.astype(u.dtype), loss.astype(u.dtype))
+        return jnp.where(jnp.isfinite(point.value), point.value, _HUGE), point
+
+    differentiable = jax.custom_jvp(looked_at)
+
+    @differentiable.defjvp
+    def _(primals, tangents):
+        (value, point), slope = jax.value_and_grad(looked_at, has_aux=True)(*primals)
+        slope = jnp.where(jnp.isfinite(slope), slope, jnp.zeros_like(slope))
+        zeros = jax.tree.map(
+            lambda a: (
+                jnp.zeros_like(a)
+                if jnp.issubdtype(a.dtype, jnp.inexact)
+                else jnp.zeros(a.shape, jax.dtypes.float0)
+            ),
+            point,
+        )
+        return (value, point), (slope @ tangents[0], zeros)
+
+    return lambda u, _: differentiable(u)
