@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 
 import hamkernel as hk
 from hamkernel._save import load, save
-from hamkernel._tuning.boxes import hyperparameters
+from hamkernel._tuning.space import hyperparameters
 
 RNG = np.random.default_rng(0)
 N, LAMBDA = 9, 1e-2

@@ -245,7 +245,7 @@ class Part:
 
         There are never more runs than `most`, to which their arrays are padded.
         """
-        self.seconds: float = np.inf
+        self.seconds = np.inf
         self._most = most + 1
         N = rows.count
         if len(chosen) < N:
@@ -256,8 +256,8 @@ class Part:
 
     def measure_in(self, unit: float) -> None:
         """Divide the caller's objective by its size: tolerances are those of numbers of size 1."""
-        unit = jnp.asarray(unit, self.objective.unit.dtype)
-        self.objective = eqx.tree_at(lambda objective: objective.unit, self.objective, unit)
+        number = jnp.asarray(unit, self.objective.unit.dtype)
+        self.objective = eqx.tree_at(lambda objective: objective.unit, self.objective, number)
 
     def begun(
         self, minimiser: optx.AbstractMinimiser, us: Float[np.ndarray, "count P"]
