@@ -264,10 +264,11 @@ def test_runs_of_other_lengths_do_not_compile_anew(learned, caplog):
 
 
 def test_five_samples_a_swing_are_enough():
-    """Smoothing finds no noise at all in either coordinate: it must not be where learning ends."""
+    """Smoothing finds next to no noise, .05 in truth: it must not be where learning ends."""
     times, states, true = logs(length=15.0)
     runs = hk.Runs(times, states)
-    assert (preprocess(runs, None).noise < 0.001).all()
+    # Its likelihood is flat there, and is followed until no more than .005 is to be gained.
+    assert (preprocess(runs, None).noise < 0.05 / 4).all()
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         found = hk.learn(K, runs)
