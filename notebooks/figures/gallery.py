@@ -20,6 +20,7 @@ CHOSEN = {
     "double_pendulum": 1,
     "guide_choose": 0,
     "logs": 2,
+    "molecule": 0,
     "guide_data": 0,
     "paper": 0,
 }
