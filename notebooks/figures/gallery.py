@@ -23,6 +23,8 @@ CHOSEN = {
     "molecule": 0,
     "guide_data": 0,
     "paper": 0,
+    "formula": 0,
+    "families": 0,
 }
 
 
