@@ -185,7 +185,7 @@ class _AtStart(eqx.Module):
     """x -> f(x, u) with the inputs u of the first time."""
 
     rhs: RightHandSide
-    start: Float[Array, ""]
+    start: Any  # (), the time of the inputs
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return self.rhs(jnp.zeros_like(self.start), x, self.start)

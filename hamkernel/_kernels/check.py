@@ -184,7 +184,7 @@ def _check_limits(own: _Pairs, between: _Pairs, beyond: _Pairs, index, unit, eps
     total = np.abs(own.k[:, None, None]) + np.abs(beyond.k)
     moved = own.k[:, None, None] + beyond.k - 2 * between.k
     moved = np.abs(moved) / np.where(total > 0, total, 1.0)  # (P, 2, J)
-    finite = np.isfinite(between.block).all(axis=(-2, -1))
+    finite: Any = np.isfinite(between.block).all(axis=(-2, -1))
     size = _size(between.block)
     # k must have moved by more than rounding, and M by little: Matérn-3/2 moves by 3 √moved.
     near = finite & (moved > 8 * eps) & (moved <= eps**0.5 / 8)
@@ -198,7 +198,7 @@ def _check_limits(own: _Pairs, between: _Pairs, beyond: _Pairs, index, unit, eps
     misses = [_size(tends - here) for tends in (between.block, 2 * between.block - before)]
     differs = np.minimum(*misses) / np.where(scale > 0, scale, 1.0)
     differs = np.where(np.isfinite(own.block).all(axis=(-2, -1))[:, None, None], differs, np.inf)
-    grows = (size[..., 1:] > 1.2 * size[..., :-1]) & finite[..., 1:] & finite[..., :-1]
+    grows: Any = (size[..., 1:] > 1.2 * size[..., :-1]) & finite[..., 1:] & finite[..., :-1]
     grows &= (moved <= 0.1 * np.where(finite, moved, 0).max(axis=2, keepdims=True))[..., :-1]
     for p, i in enumerate(index):
         steady = max(_longest(row) for row in grows[p]) >= _HALVINGS

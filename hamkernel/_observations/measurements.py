@@ -109,8 +109,9 @@ class Measurements:
     def states(self) -> tuple[Float[Array, "N d"], Float[Array, "N n"]] | None:
         """Points and velocities, if all rows are velocities of one noise; else None."""
         block = self.blocks[0]
-        plain = len(self.blocks) == 1 and isinstance(block, Components)
-        if not plain or block.kept is not None or block.noise is not None:
+        if len(self.blocks) > 1 or not isinstance(block, Components):
+            return None
+        if block.kept is not None or block.noise is not None:
             return None
         return block.points, self.targets.reshape(block.values_shape)
 
