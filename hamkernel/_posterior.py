@@ -18,9 +18,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 
 from hamkernel import _require as require
-from hamkernel._fields.base import AbstractField, FieldSum, root
+from hamkernel._fields.base import AbstractField, FieldSum, Mean, root
 from hamkernel._fields.joined import AbstractJoinedField, FamilyField, known_of, learned_field
-from hamkernel._fields.known import Mean
 from hamkernel._gram.dense import components
 from hamkernel._kernels.base import Invariance, Scaled
 from hamkernel._kernels.symmetry import without_symmetry

@@ -7,8 +7,7 @@ import pytest
 
 from hamkernel._solvers.factors import DenseSystem, dense_factor
 from hamkernel._solvers.low_rank_factor import LowRankSystem
-from hamkernel._validation.closed_forms import free_residuals, held_out, log_density
-from hamkernel._validation.folds import Partition
+from hamkernel._validation.closed_forms import Partition, free_residuals, held_out, log_density
 
 
 def positive(D: int) -> np.ndarray:

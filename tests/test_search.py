@@ -18,7 +18,7 @@ from hamkernel._tuning.minimiser import BoxBFGS, begun, minimised, most_likely_i
 from hamkernel._tuning.objective import SearchObjective, criterion_of, parts_of
 from hamkernel._tuning.search import design, shares_apart, spread_out
 from hamkernel._tuning.space import SearchSpace, full_trace, hyperparameters
-from hamkernel._validation.of_rows import generalized_loss
+from hamkernel._validation.losses import generalized_loss
 
 N = 20
 RNG = np.random.default_rng(0)

@@ -12,10 +12,18 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._features.features import ControlledFeatures
-from hamkernel._fields.base import AbstractField, FieldSum, Scalar, SolverInfo, at_points, root
+from hamkernel._fields.base import (
+    AbstractField,
+    AtInputs,
+    FieldSum,
+    KnownPart,
+    Scalar,
+    SolverInfo,
+    at_points,
+    root,
+)
 from hamkernel._fields.features import FeatureField
 from hamkernel._fields.kernel_field import KernelField
-from hamkernel._fields.known import AtInputs, KnownPart
 from hamkernel._gram.operator import placed_product
 from hamkernel._structures.base import Sum
 from hamkernel._structures.controlled import Controlled

@@ -8,10 +8,9 @@ from typing import Any, overload
 from jaxtyping import ArrayLike, Num
 
 from hamkernel import _require as require
-from hamkernel._fields.base import AbstractField
+from hamkernel._fields.base import AbstractField, Mean
 from hamkernel._fields.joined import ControlledField, FamilyField, learned_field
 from hamkernel._fields.kernel_field import KernelField
-from hamkernel._fields.known import Mean
 from hamkernel._machine import as_given, dense_bytes, memory_bytes, one_blas_thread, rows_of
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient

@@ -19,9 +19,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
 from hamkernel import _require as require
-from hamkernel._fields.base import AbstractField, at_points, potential_of
+from hamkernel._fields.base import AbstractField, KnownPart, at_points, known_part, potential_of
 from hamkernel._fields.joined import at_inputs
-from hamkernel._fields.known import KnownPart, known_part
 from hamkernel._machine import RowSharding, is_on_one_device, on_one_device, rows_of
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.kinds import AbstractObservations, beside

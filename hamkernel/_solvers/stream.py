@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
+from hamkernel._fields.base import known_part
 from hamkernel._fields.joined import learned_field
-from hamkernel._fields.known import known_part
 from hamkernel._gram.dense import components
 from hamkernel._machine import one_blas_thread, rows_of, split
 from hamkernel._observations.kinds import AbstractObservations, beside

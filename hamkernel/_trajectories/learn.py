@@ -12,10 +12,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from hamkernel import _require as require
-from hamkernel._fields.base import SolverInfo
+from hamkernel._fields.base import SolverInfo, known_part
 from hamkernel._fields.joined import learned_field
 from hamkernel._fields.kernel_field import KernelField
-from hamkernel._fields.known import known_part
 from hamkernel._gram.operator import placed_product
 from hamkernel._kernels.base import Scaled
 from hamkernel._kernels.functions import as_pytree

@@ -19,15 +19,13 @@ from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._tuning.space import SearchSpace
-from hamkernel._validation.folds import Folds, Partition
+from hamkernel._validation.closed_forms import Folds, Partition
 from hamkernel._validation.losses import (
     cross_validation_loss,
     generalized_cross_validation,
-    log_marginal_likelihood,
-)
-from hamkernel._validation.of_rows import (
     generalized_loss_and_square,
     log_likelihood,
+    log_marginal_likelihood,
     partition_loss_and_square,
     partition_of_rows,
 )

@@ -22,8 +22,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
-from hamkernel._fields.base import AbstractField
-from hamkernel._fields.known import Mean
+from hamkernel._fields.base import AbstractField, Mean
 from hamkernel._machine import one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations, beside
 from hamkernel._observations.measurements import observations
@@ -48,7 +47,7 @@ from hamkernel._tuning.space import (
     constants,
     velocity_rms,
 )
-from hamkernel._validation.folds import Folds
+from hamkernel._validation.closed_forms import Folds
 from hamkernel._validation.losses import check_memory
 
 

@@ -1,23 +1,38 @@
-"""Validation losses in closed form, each at the price of one factorisation."""
+"""Validation losses in closed form, each at the price of one factorisation.
+
+The public functions check their arguments and make the rows of the observations; the functions of
+rows, below, are the same losses for the dense fit and, in a `basis`, for the fit of low rank. Their
+residuals count in units of the relative noise of a row. Velocities X, Y that were all measured are
+the rows of one block, and pass through as they are.
+"""
 
 from __future__ import annotations
 
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
+from hamkernel._gram.dense import between_all, gram_of_rows, plus_ridge
+from hamkernel._gram.derivatives import forward_differentiated
 from hamkernel._machine import one_blas_thread, refuse_beyond_memory
+from hamkernel._observations.blocks import AbstractBlock, Combinations
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.measurements import Measurements
+from hamkernel._solvers.factors import AbstractSystem, ContrastedSystem, DenseSystem
+from hamkernel._solvers.low_rank import AbstractBasis
+from hamkernel._solvers.low_rank_factor import LowRankSystem
 from hamkernel._solvers.problem import problem
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._validation.folds import Folds
-from hamkernel._validation.of_rows import (
-    generalized_loss,
-    held_out_rows,
-    log_likelihood,
-    partition_loss,
-    partition_of_rows,
+from hamkernel._validation.closed_forms import (
+    Folds,
+    Partition,
+    free_residuals,
+    held_out,
+    log_density,
 )
 
 
@@ -188,3 +203,183 @@ def check_memory(rows: Measurements, copies: int) -> None:
         "is of low rank too, or a part of the data."
     )
     refuse_beyond_memory(f"the loss of {M} rows", M, M, rows.targets.dtype, copies, cure)
+
+
+# The losses of rows.
+
+
+def partition_of_rows(rows: Measurements, folds: Folds) -> Partition:
+    """The folds of the rows from those of the observations that they belong to."""
+    labels = Partition(rows.count, folds).labels
+    return Partition(len(rows.targets), labels[rows.labels()])
+
+
+# The losses with ‖a‖² beside them are for `tune`, which bounds the rounding of a field by it.
+
+
+def partition_loss(K, rows: Measurements, regularization, partition: Partition, basis=None):
+    """`cross_validation_loss`: the mean over folds of the mean over their rows."""
+    return partition_loss_and_square(K, rows, regularization, partition, basis)[0]
+
+
+@eqx.filter_jit
+def partition_loss_and_square(
+    K, rows: Measurements, regularization, partition: Partition, basis=None
+):
+    left, a = held_out_rows(K, rows, regularization, partition, basis)
+    return jnp.asarray(partition.weights, left.dtype) @ left**2, a @ a
+
+
+@eqx.filter_jit
+def held_out_rows(K, rows: Measurements, regularization, partition: Partition, basis=None):
+    """The residual of each row under the fit without its fold, in units of its noise, and A⁻¹y.
+
+    From the residuals of a fold with all energies their best constant is taken off.
+    """
+    energies, F = rows.energies, len(partition.folds)
+    ridge = (rows.count - rows.count / F) * regularization
+    y, p = rows.targets, rows.constant
+    contrasted = any(len(energies) and np.isin(energies, fold).all() for fold in partition.folds)
+    if contrasted:  # no other fold sees the constant: rows that do not see it are held out
+        y, p = rows.y, None
+        partition = Partition(rows.size, np.delete(partition.labels, energies[0]))
+    features = None if basis is None else features_of_rows(K, rows, basis, contrasted)
+    found: Any
+    if features is None:
+        found = _dense_held_out(gram(K, rows, contrasted), ridge, y, p, rows, partition)
+    elif features.shape[1] > len(y) - max(map(len, partition.folds)):
+        # A fold interpolates the rest, and its coefficients are the difference of those of all:
+        # the gradient lost the square of the condition, 5 times itself at 1e10. Such data are few.
+        found = _dense_held_out(features @ features.T, ridge, y, p, rows, partition)
+    else:
+        found = held_out(LowRankSystem(features, ridge, p), y, partition)
+    return tuple(map(rows.contrast_transpose, found)) if contrasted else found
+
+
+def _dense_held_out(G, ridge, y, p, rows: Measurements, partition: Partition):
+    A = plus_ridge(G, ridge)
+    if p is None:
+        return held_out(DenseSystem(A), y, partition)
+    # In the units of the energies the direction of their constant does not depend on the noise, so
+    # that nothing is missing from the derivative.
+    units = jnp.where(p == 0, jnp.ones_like(p), rows.scale)
+    equal = jnp.where(p == 0, p, len(rows.energies) ** -0.5)
+    system = ContrastedSystem(units[:, None] * A * units[None], equal)
+    found: Any = held_out(system, units * y, partition)
+    return found[0] / units, units * found[1]
+
+
+def generalized_loss(K, rows: Measurements, regularization, basis=None, least_free=0.0):
+    """`generalized_cross_validation` of the rows."""
+    return generalized_loss_and_square(K, rows, regularization, basis, least_free)[0]
+
+
+@eqx.filter_jit
+def generalized_loss_and_square(K, rows: Measurements, regularization, basis=None, least_free=0.0):
+    # Infinite where less than the share `least_free` of the residuals is free, tr(I − S)/D.
+    ridge = rows.count * regularization
+    squares, trace = free_residuals(_of_contrasts(K, rows, ridge, basis), rows.y)
+    enough = ridge * trace >= least_free * rows.size  # tr(I − S) = ridge tr A⁻¹
+    return jnp.where(enough, squares * rows.size / trace**2, jnp.inf), squares
+
+
+@eqx.filter_jit
+def log_likelihood(K, rows: Measurements, regularization, basis=None):
+    """`log_marginal_likelihood`: with energies, of a flat prior of their constant."""
+    ridge = rows.count * regularization
+    y, silent = without_silent_directions(K, rows)
+    y, silent, ridge = jax.lax.optimization_barrier((y, silent, ridge))  # no LAPACK side by side
+    density = log_density(_of_contrasts(K, rows, ridge, basis), y)
+    density = density + 0.5 * silent * jnp.log(2 * jnp.pi * ridge)
+    density = density - jnp.sum(jnp.log(rows.scale))
+    if not len(rows.energies):
+        return density
+    return density - 0.5 * jnp.log(jnp.sum(rows.scale[rows.energies] ** -2))
+
+
+def without_silent_directions(
+    K: AbstractMatrixKernel, rows: Measurements
+) -> tuple[Float[Array, " D"], Float[Array, ""]]:
+    """The targets without their components along which no field of K points, and their number.
+
+    A kernel of a descriptor d knows the field along the rows of the Jacobian of d alone. Forces
+    computed from a potential of distances have no component along the other directions, six for
+    each molecule, so that the likelihood would take them for measurements without any noise, and
+    drive λ to its bound. Each of them is an eigenvector of A with the eigenvalue Nλ.
+    """
+    y, none = rows.y, jnp.zeros((), rows.targets.dtype)
+    if rows.states is None:
+        return y, none
+    X, Y = rows.states
+    found = K.through_descriptor(X.shape[1])
+    if found is None:
+        return y, none
+
+    def of_point(pair):
+        x, v = pair
+        J = jax.jacfwd(found.map)(x) @ found.directions(x)  # (m, n)
+        squares, V = jnp.linalg.eigh(J.T @ J)
+        # Rounding leaves ε of the largest, and a descriptor sees distances to more than √ε.
+        seen = squares > jnp.finfo(x.dtype).eps ** (2 / 3) * squares[-1]
+        return V @ jnp.where(seen, V.T @ v, jnp.zeros_like(v)), jnp.sum(~seen)
+
+    projected, counts = jax.lax.map(of_point, jax.lax.stop_gradient((X, Y)))
+    return projected.reshape(-1), jnp.sum(counts).astype(y.dtype)
+
+
+def _of_contrasts(K, rows: Measurements, ridge, basis: AbstractBasis | None) -> AbstractSystem:
+    """A of the rows that do not see the constant, whose y is `rows.y`."""
+    if basis is not None:
+        return LowRankSystem(features_of_rows(K, rows, basis, contrasted=True), ridge)
+    return DenseSystem(plus_ridge(gram(K, rows, contrasted=True), ridge))
+
+
+# The Gram and the features of the rows, cheap to differentiate with respect to K.
+
+
+def features_of_rows(
+    K, rows: Measurements, basis: AbstractBasis, contrasted: bool = False
+) -> Float[Array, "M r"]:
+    """Φ, before the contrast or after it."""
+    like = rows.blocks[0].points
+
+    def of(K, basis):
+        return basis.span(K, like.shape[1], like.dtype).of
+
+    features = jnp.concatenate([_by_points(K, block, basis, of) for block in rows.blocks])
+    return rows.contrast(features) if contrasted else features
+
+
+def gram(
+    K: AbstractMatrixKernel, rows: Measurements, contrasted: bool = False
+) -> Float[Array, "M M"]:
+    """G, before the contrast or after it."""
+
+    def of(K, others):
+        return lambda block: between_all(K, block, others)
+
+    def by_points(K, block, others):
+        return _by_points(K, block, others, of)
+
+    return gram_of_rows(K, rows, contrasted, by_points)
+
+
+def _by_points(K, block: AbstractBlock, data, of) -> Float[Array, "d e"]:
+    """The matrix that the function `of(K, data)` returns for a block, a row for each of its rows.
+
+    It is made point by point, so that only one point is differentiated at a time; that of
+    `Combinations`, which has more points than rows, is made at once.
+    """
+    if isinstance(block, Combinations):
+        return forward_differentiated((K, (block, data)), lambda K, both: of(K, both[1])(both[0]))
+
+    def make(K, both):
+        rows = of(K, both[1])
+
+        def at_points(x):
+            there = block.with_points(x)
+            return rows(there).reshape(*there.values_shape, -1)
+
+        return at_points, both[0]
+
+    return block.rows(forward_differentiated((K, (block.points, data)), make, rowwise=True))

@@ -19,7 +19,7 @@ from hamkernel._gram.dense import assemble, plus_ridge
 from hamkernel._kernels.radial import Gaussian
 from hamkernel._solvers.factors import solution
 from hamkernel._tuning.tune import tune
-from hamkernel._validation.folds import Partition
+from hamkernel._validation.closed_forms import Partition
 from hamkernel.paper._evaluate import evaluate
 from hamkernel.paper._experiments import STRUCTURES, Experiment
 

@@ -29,8 +29,8 @@ from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of_states
 from hamkernel._solvers.landmarks import landmarks_of
 from hamkernel._solvers.low_rank import LandmarkBasis, WaveBasis
-from hamkernel._validation.folds import Partition
-from hamkernel._validation.of_rows import (
+from hamkernel._validation.closed_forms import Partition
+from hamkernel._validation.losses import (
     generalized_loss,
     log_likelihood,
     partition_loss,

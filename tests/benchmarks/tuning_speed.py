@@ -35,7 +35,7 @@ from timing import Timed, environment, in_turn, timed
 import hamkernel as hk
 from hamkernel._gram.dense import assemble, plus_ridge
 from hamkernel._solvers.factors import solution
-from hamkernel._validation.folds import Partition
+from hamkernel._validation.closed_forms import Partition
 from hamkernel.paper._tuned import grid_losses
 
 FOLDS = 5
