@@ -35,6 +35,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from hamkernel import poisson, systems
+from hamkernel._discovery.compare import compare
 from hamkernel._discovery.formula import Formula
 from hamkernel._discovery.readout import readout
 from hamkernel._fields.base import SolverInfo
@@ -152,6 +153,7 @@ __all__ = [  # noqa: RUF022 - in reading order
     "learn",
     "Learned",
     # What the data say beyond the field.
+    "compare",
     "readout",
     "Formula",
     # Simulation.

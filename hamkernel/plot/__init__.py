@@ -5,6 +5,7 @@ several curves as a mapping from names to arrays. A name in `COLORS` has the sam
 picture; the colours stay distinct for colour-blind readers and in grey.
 """
 
+from hamkernel.plot._comparison import comparison
 from hamkernel.plot._contours import hamiltonian, loss_surface
 from hamkernel.plot._phase import phase_portrait, plane_slice, trajectories
 from hamkernel.plot._poincare import crossings, poincare_section
@@ -16,6 +17,7 @@ from hamkernel.plot._uncertainty import band, deviation, ensemble
 __all__ = [
     "COLORS",
     "band",
+    "comparison",
     "crossings",
     "deviation",
     "energy_drift",
