@@ -1,6 +1,7 @@
 """`hk.compare`: what candidates claim, the score, the answers and their guards."""
 
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+# pyright: reportOptionalIterable=false
 # Wrong types are refused here.
 
 import dataclasses

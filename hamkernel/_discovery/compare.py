@@ -30,7 +30,7 @@ from hamkernel._structures.port_hamiltonian import PortHamiltonian
 from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
 from hamkernel._structures.symmetry import Odd, Reversible
 from hamkernel._trajectories.learned import Learned
-from hamkernel._tuning.boxes import typical_speed
+from  import typical_speed
 from hamkernel._tuning.tune import tune
 
 # A factor of e⁵ = 148 in the evidence. Of the confident answers none was wrong in the prototype at

@@ -9,6 +9,7 @@ hyperparameters come from `tune(..., objective="marginal_likelihood")`.
 """
 
 # pyright: reportArgumentType=false, reportOptionalOperand=false, reportAttributeAccessIssue=false
+# pyright: reportCallIssue=false
 
 import argparse
 import time
