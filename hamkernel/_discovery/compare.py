@@ -30,7 +30,7 @@ from hamkernel._structures.port_hamiltonian import PortHamiltonian
 from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
 from hamkernel._structures.symmetry import Odd, Reversible
 from hamkernel._trajectories.learned import Learned
-from  import typical_speed
+from hamkernel._tuning.space import velocity_rms
 from hamkernel._tuning.tune import tune
 
 # A factor of e⁵ = 148 in the evidence. Of the confident answers none was wrong in the prototype at
@@ -166,7 +166,7 @@ def compare(
     rows = problem(Separable(Gaussian(1.0)), data, None, 1.0).rows
     points, n, D = np.asarray(rows.points), rows.dimension, rows.size
     scale = points.std(axis=0)
-    speed = typical_speed(Separable(Gaussian(jnp.asarray(np.where(scale > 0, scale, 1.0)))), rows)
+    speed = velocity_rms(Separable(Gaussian(jnp.asarray(np.where(scale > 0, scale, 1.0)))), rows)
     ladder = _ladder(scale, speed) if candidates is None else _checked(candidates, n, points)
     found = []
     for name, K in ladder.items():
