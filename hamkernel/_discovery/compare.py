@@ -150,7 +150,7 @@ def compare(
         candidates: kernels by name, in place of the ladder of all structures and symmetries with
             Gaussian kernels. What they claim is found from their structure.
         starts: the number of starts of each search, see `tune`.
-        progress: print a line for each candidate.
+        progress: show a progress bar where the standard error is a terminal.
 
     Returns:
         The table and the answers. Its time is that of tuning 13 to 17 candidates.
@@ -162,6 +162,8 @@ def compare(
 
     Source: Schwarz (1978), Annals of Statistics 6, for the score.
     """
+    from tqdm import tqdm  # so that importing the package does not load it
+
     data, ridge = _data(X, Y)
     rows = problem(Separable(Gaussian(1.0)), data, None, 1.0).rows
     points, n, D = np.asarray(rows.points), rows.dimension, rows.size
@@ -169,7 +171,7 @@ def compare(
     speed = velocity_rms(Separable(Gaussian(jnp.asarray(np.where(scale > 0, scale, 1.0)))), rows)
     ladder = _ladder(scale, speed) if candidates is None else _checked(candidates, n, points)
     found = []
-    for name, K in ladder.items():
+    for name, K in tqdm(ladder.items(), "candidates", disable=None if progress else True):
         result = tune(
             K,
             data,
@@ -182,8 +184,6 @@ def compare(
         score = likelihood - P / 2 * math.log(D)
         tuned = (result.kernel, result.regularization, result.hyperparameters)
         found.append(Candidate(name, claims(K, scale), score, 0.0, likelihood, P, *tuned))
-        if progress:
-            print(f"{name}: score {score:.1f}", flush=True)
     best = max(row.score for row in found)
     table = [row._replace(difference=row.score - best) for row in found]
     return _answered(tuple(sorted(table, key=lambda row: -row.score)), points, D)
