@@ -197,7 +197,7 @@ def test_a_network_inside_a_kernel_is_trained():
 
 
 @pytest.mark.slow
-@pytest.mark.filterwarnings("ignore:fitting in float32")
+@pytest.mark.filterwarnings("ignore:fitting in float32", "ignore:every term of this kernel")
 def test_a_kernel_with_leaves_of_two_precisions_is_trained():
     X, Y = (each.astype(np.float32) for each in scattered())
     K = hk.Symplectic(hk.Gaussian(jnp.float32(1.0)) * jnp.asarray(2.0))

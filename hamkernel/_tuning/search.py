@@ -182,7 +182,7 @@ class Search:
         sys.stdout.flush()
 
     def _warn_of_waiting(self, seconds: float, cure: str) -> None:
-        if seconds > _LONG:
+        if _LONG < seconds < np.inf:
             require.warn(f"this search will take about {seconds / 60:.0f} minutes. {cure}")
 
 
@@ -228,7 +228,7 @@ class Part:
 
     Attributes:
         count: the number of these observations.
-        seconds: what one step took, the least seen.
+        seconds: what one step took, the least seen after the first call, which compiles.
         objective: the function of u.
     """
 
@@ -245,7 +245,7 @@ class Part:
 
         There are never more runs than `most`, to which their arrays are padded.
         """
-        self.seconds = np.inf
+        self.seconds, self._compiled = np.inf, False
         self._most = most + 1
         N = rows.count
         if len(chosen) < N:
@@ -281,8 +281,10 @@ class Part:
         began = time.perf_counter()
         moved = _minimised(self.objective, minimiser, padded, padded.steps + steps, side_by_side)
         moved = _take(jax.tree.map(_as_numpy, moved), slice(count))
-        taken = int(moved.steps.sum() - before)
-        self.seconds = min(self.seconds, (time.perf_counter() - began) / max(taken, 1))
+        if self._compiled:
+            taken = int(moved.steps.sum() - before)
+            self.seconds = min(self.seconds, (time.perf_counter() - began) / max(taken, 1))
+        self._compiled = True
         return moved
 
 
