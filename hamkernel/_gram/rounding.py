@@ -9,10 +9,11 @@ from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
-def gram_rounding(trace: Float[Array, ""]) -> Float[Array, ""]:
+def gram_rounding(trace: Float[Array, "..."]) -> Float[Array, "..."]:
     """ε tr(G), the size of the rounding errors in products with the Gram G and in its factors.
 
-    A ridge or a pivot that is smaller than this number is lost in the rounding.
+    A ridge or a pivot that is smaller than this number is lost in the rounding. `trace` may be that
+    of G, of its diagonal blocks, or of G/N, for a bound of λ.
     """
     return jnp.finfo(trace.dtype).eps * trace
 

@@ -25,6 +25,7 @@ from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import trace
 from hamkernel._gram.derivatives import constant
 from hamkernel._gram.operator import product
+from hamkernel._gram.rounding import gram_rounding
 from hamkernel._machine import RowSharding, as_given, rows_of, split
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.dense import field_of_rows, gram_product, norm_of, relative
@@ -141,7 +142,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                     f"({int(landmarks.count)} landmarks, truncation "
                     f"{float(truncation):.1e})"
                 )
-                rounding = float(jnp.finfo(X.dtype).eps * trace(K, X, rows_of(X)))
+                rounding = float(gram_rounding(trace(K, X, rows_of(X))))
                 if ridge < _DIGITS * rounding:
                     return (
                         f"conjugate gradients did not converge{reached}: the ridge N λ = "

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from hamkernel import _require as require
 from hamkernel._gram.dense import assemble, between_all, block_traces, components, gram_of_rows
 from hamkernel._gram.derivatives import constant
+from hamkernel._gram.rounding import gram_rounding
 from hamkernel._machine import rows_of, split
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
@@ -273,8 +274,7 @@ def _rounding(traces: Float[Array, " P"], columns: int) -> Float[Array, " P"]:
 
     The error of Cholesky's method is relative to the diagonal entry, whatever the others are.
     """
-    eps = jnp.finfo(traces.dtype).eps
-    return (10 * columns * eps * jnp.abs(traces)).astype(traces.dtype)
+    return (10 * columns * gram_rounding(jnp.abs(traces))).astype(traces.dtype)
 
 
 class AbstractCandidates(eqx.Module):

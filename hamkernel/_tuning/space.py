@@ -18,6 +18,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel._gram.dense import gram_of_rows, trace
 from hamkernel._gram.derivatives import forward_differentiated
+from hamkernel._gram.rounding import gram_rounding
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, bounds_by_value
 from hamkernel._kernels.functions import Bound
 from hamkernel._kernels.symmetry import without_symmetry
@@ -277,7 +278,7 @@ class SearchSpace(eqx.Module):
         Args:
             size: `size_of_gram` of the kernel.
         """
-        low, high = self.roundings * jnp.finfo(self.low.dtype).eps * size, 10 * size
+        low, high = self.roundings * gram_rounding(size), 10 * size
         if self.given_ridge is not None:
             low = jnp.maximum(low, self.given_ridge[0])
             high = jnp.maximum(self.given_ridge[1], low)
