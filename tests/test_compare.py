@@ -108,6 +108,9 @@ def test_answers_compare_the_best_yes_with_the_best_no():
     assert found["friction"] == "no"  # its best value is within a deviation of zero
     found = answers((ENERGY, 0, 0), (FRICTION, -2, 1.0), (set(), -20, 0))
     assert found["friction"] == "undecided"
+    # An H that is even in p has no candidate with friction: it is judged beside its own like.
+    found = answers((ENERGY, 0, 0), (FRICTION, 8, 11), (set(), -20, 0), (BACK, 20, 0))
+    assert found["friction"] == "yes"
     found = answers((ENERGY, 0, 0), (set(), 4.9, 0))
     assert found["energy"] == "undecided"
     found = answers((ENERGY, 0, 0), (FRICTION, 8, 11), (set(), 20, 0))

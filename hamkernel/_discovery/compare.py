@@ -7,7 +7,8 @@ trained numbers and D rows its score is
 
 the evidence with the price of its hyperparameters (Schwarz 1978). A question is answered by the
 best candidate for which the answer is yes against the best for which it is no; so the ladder has
-the products of its steps, or the lack of one would speak against another.
+the products of its steps, or the lack of one would speak against another. Friction is judged
+against the candidate that lacks nothing else.
 """
 
 import dataclasses
@@ -321,6 +322,8 @@ def _answered(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D:
             max((row for row in among if (key in row.claims) == claimed), default=None, key=_score)
             for claimed in (True, False)
         )
+        if key == "friction" and yes is not None:
+            no = _without_friction(yes, among) or no
         if yes is None or no is None:
             return say(key, "not tested", "no candidate for the other answer")
         change = yes.score - no.score
@@ -353,6 +356,16 @@ def _answered(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D:
     else:
         say("reversible", "not tested", "no data near those of backward motion")
     return Comparison(table, _sorted(answers), reasons, differences, D)
+
+
+def _without_friction(damped: Candidate, among: list[Candidate]) -> Candidate | None:
+    """The candidate that lacks nothing but the friction; None if there is none.
+
+    There are none that have friction and an H that is even in p, since their motion is not
+    reversible: one without friction may be better for that reason alone.
+    """
+    same = [row for row in among if row.claims - {"reversible"} == damped.claims - {"friction"}]
+    return min(same, key=lambda row: len(row.claims), default=None)
 
 
 def _score(row: Candidate) -> float:
