@@ -63,6 +63,8 @@ def warn_of_sensors(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -
             continue
         steps = np.abs(np.concatenate([np.diff(x[s]) for x, s in zip(columns, seen, strict=True)]))
         moving = steps[steps > 0]
+        if not moving.size:
+            continue
         quantum = moving.min()
         flat = {
             value: sum(_plateaus(x, value, quantum) for x in columns)
