@@ -54,7 +54,7 @@ def test_blocks_are_those_of_the_closed_form():
 def tuned(known):
     """With q̇ = p known and a potential, or with any energy."""
     energy = POTENTIAL if known else 10.0 * hk.Gaussian(2.0)
-    K = hk.Sum(energy=hk.Symplectic(energy), friction=hk.Friction(0.1, 0.1))
+    K = hk.Sum(energy=hk.Symplectic(energy), friction=hk.Friction(0.1, 0.1, rest_speed=REST))
     options = {"objective": "marginal_likelihood", "starts": 4}
     if known:
         return hk.tune(K, FORCES, mean=kinematics, **options)
@@ -108,7 +108,7 @@ def test_it_is_found_from_positions_alone_and_the_motion_stops_where_it_sticks()
     noisy = [x + 0.005 * RNG.normal(size=x.shape) for x in true]
     for x in noisy:
         x[:, 1] = np.nan
-    K = hk.Sum(energy=hk.Symplectic(POTENTIAL), friction=hk.Friction(0.1, 0.1))
+    K = hk.Sum(energy=hk.Symplectic(POTENTIAL), friction=hk.Friction(0.1, 0.1, rest_speed=REST))
     found = hk.learn(K, hk.Runs([ts] * 3, noisy), mean=kinematics)
     speeds = np.array([0.5, 1.0, 3.0, 30.0])
     forces = [found.field.part("friction")(jnp.array([0.3, v]))[1] for v in speeds]
