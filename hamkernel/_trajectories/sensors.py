@@ -46,7 +46,7 @@ def warn_of_gaps(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> N
 # Of the samples of a coordinate: more repeats than this are no chance. A real log of a motor whose
 # positions came late repeats a quarter of them and can be learned from.
 _MOST_REPEATS = 0.3
-_MOST_BENT = 0.6  # every other sample interpolated makes .5
+_MOST_STRAIGHT = 0.4  # every other sample interpolated makes .5
 _QUANTA = 4.0  # the steps of a log, above which a repeat is no rounding of a sensor at work
 
 
@@ -76,13 +76,15 @@ def warn_of_sensors(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -
         if np.mean(steps == 0) > _MOST_REPEATS and np.median(moving) > _QUANTA * quantum:
             repeated.append(f"{c} ({np.mean(steps == 0):.0%})")
             continue
-        bends = [_bends(t[s], x[s]) for t, x, s in zip(times, columns, seen, strict=True)]
-        bent = np.concatenate(bends) > 1e-9 * scale[c]
+        bent = np.concatenate(
+            [_bends(t[i], x[i]) for t, x, i in zip(times, columns, seen, strict=True)]
+        )
+        share = 1 - np.mean(bent > 1e-9 * scale[c]) if bent.size else 0.0
         whole = np.abs(moving / quantum - np.round(moving / quantum)).max() < 0.01  # a digital one
         turns = any(_is_wrapped(t, x) for t, x in zip(times, columns, strict=True))
         # A motion without forces is straight but for some collisions.
-        if bent.sum() >= 10 and bent.mean() < _MOST_BENT and not (whole or turns):
-            drawn.append(f"{c} ({1 - bent.mean():.0%})")
+        if (1 - share) * bent.size >= 10 and share > _MOST_STRAIGHT and not (whole or turns):
+            drawn.append(f"{c} ({share:.0%})")
         for r, x in enumerate(columns):
             others = np.delete(states[r] / unit, c, axis=1)
             found = _stuck(x, others)
