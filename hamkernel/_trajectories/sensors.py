@@ -76,14 +76,9 @@ def warn_of_sensors(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -
         if np.mean(steps == 0) > _MOST_REPEATS and np.median(moving) > _QUANTA * quantum:
             repeated.append(f"{c} ({np.mean(steps == 0):.0%})")
             continue
-        bent = np.concatenate(
-            [_bends(t[i], x[i]) for t, x, i in zip(times, columns, seen, strict=True)]
-        )
-        share = 1 - np.mean(bent > 1e-9 * scale[c]) if bent.size else 0.0
+        share = _straight(times, columns)
         whole = np.abs(moving / quantum - np.round(moving / quantum)).max() < 0.01  # a digital one
-        turns = any(_is_wrapped(t, x) for t, x in zip(times, columns, strict=True))
-        # A motion without forces is straight but for some collisions.
-        if (1 - share) * bent.size >= 10 and share > _MOST_STRAIGHT and not (whole or turns):
+        if share > _MOST_STRAIGHT and not whole:
             drawn.append(f"{c} ({share:.0%})")
         for r, x in enumerate(columns):
             others = np.delete(states[r] / unit, c, axis=1)
@@ -117,12 +112,22 @@ def warn_of_sensors(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -
         )
 
 
-def _bends(t: Float[np.ndarray, " T"], x: Float[np.ndarray, " T"]) -> Float[np.ndarray, " P"]:
-    """By how much a sample is off the line of its neighbours, where these differ."""
-    if len(t) < 3:
-        return np.zeros(0)
-    line = x[:-2] + (x[2:] - x[:-2]) * (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
-    return np.abs(x[1:-1] - line)[x[2:] != x[:-2]]
+def _straight(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> float:
+    """The share of samples on the line of their neighbours, of those where these differ.
+
+    Zero where fewer than ten are off it, as in a motion without forces but for some collisions, and
+    where the angle was wrapped.
+    """
+    off = [np.zeros(0)]
+    for t, x in zip(times, columns, strict=True):
+        if _is_wrapped(t, x):
+            return 0.0
+        t, x = t[np.isfinite(x)], x[np.isfinite(x)]
+        if len(t) > 2:
+            line = x[:-2] + (x[2:] - x[:-2]) * (t[1:-1] - t[:-2]) / (t[2:] - t[:-2])
+            off.append(np.abs(x[1:-1] - line)[x[2:] != x[:-2]])
+    bent = np.concatenate(off) > 1e-9 * np.nanmax(np.abs(np.concatenate(columns)))
+    return float(1 - bent.mean()) if bent.sum() >= 10 else 0.0
 
 
 def _plateaus(x: Float[np.ndarray, " T"], value: float, quantum: float) -> int:
