@@ -19,7 +19,8 @@ from scipy.interpolate import CubicSpline
 import hamkernel as hk
 from hamkernel._trajectories.flow import NODES, jacobians, means, simulated
 from hamkernel._trajectories.inputs import at_nodes, at_samples, in_intervals, values
-from hamkernel._trajectories.likelihood import as_observations
+from hamkernel._trajectories.kalman import as_observations
+from hamkernel._trajectories.likelihood import Model
 from hamkernel._trajectories.preprocessing import _least
 from hamkernel._trajectories.segments import Segments, given_path, linearised, segments_of
 
@@ -195,7 +196,8 @@ def test_along_a_true_path_rows_are_exact_with_inputs():
     ]
     found = rows(ends)
     np.testing.assert_allclose(found.target[0], expected, atol=1e-8)
-    observations = as_observations(found, np.zeros(2), mean)
+    model = Model(K, jnp.zeros(2), jnp.full(2, -jnp.inf))
+    observations = as_observations(found, model, mean, jnp.full(2, 100.0))
     assert observations is not None
     ((block, targets),) = observations.parts(1)
     np.testing.assert_allclose(

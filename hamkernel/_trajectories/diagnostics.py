@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
+from hamkernel._trajectories.kalman import SIGNIFICANT
 from hamkernel._trajectories.runs import Runs
 
 # χ² per degree of freedom has the standard deviation √(2/ν); five of them, and a tenth for the
@@ -20,6 +21,8 @@ _ALL_NOISE = 0.5
 
 # Of the states: what a field that is not yet exact leaves, and averages of samples without noise.
 NEGLIGIBLE = 1e-3
+_SWING = 5.0  # samples in a swing: with fewer noise and motion cannot be told apart
+_USABLE = 1.5  # a misfit up to which a field that still moves a little explains its run
 _FEW = 10  # degrees of freedom, from which σ is known to a fifth
 
 
@@ -28,19 +31,31 @@ class FitQuality(NamedTuple):
 
     Attributes:
         kept: the share of each run that it was learned from, shape (R,).
+        dropped: what it was not learned from: run, first sample, and the one behind the last.
         misfit: of each run and coordinate, in units of the noise, shape (R, n).
         chi_squared: per degree of freedom.
         free: the degrees of freedom.
+        white: the probability that white innovations are as correlated.
+        correlation: of innovations at lag one, by coordinate, shape (n,).
+        process: q as it was found, shape (n,); None where it was given.
         count: of iterations.
         settled: whether they ended by themselves.
+        swing: how many samples there are in a swing.
+        driven: whether there are inputs.
     """
 
     kept: Float[np.ndarray, " R"]
+    dropped: tuple[tuple[int, int, int], ...]
     misfit: Float[np.ndarray, "R n"]
     chi_squared: float
     free: float
+    white: float
+    correlation: Float[np.ndarray, " n"]
+    process: Float[np.ndarray, " n"] | None
     count: int
     settled: bool
+    swing: float
+    driven: bool
 
 
 def diagnose(
@@ -54,18 +69,26 @@ def diagnose(
         scale: the standard deviations of the coordinates.
         given: whether the noise was given.
     """
-    warn_of_dropped(fit.kept)
+    warn_of_dropped(fit)
     if not fit.kept.any():
         return False
-    explained = explains(fit.chi_squared, fit.free)
-    if given and not explained:
-        warn_of_misfit(fit.chi_squared, fit.misfit)
-        return fit.settled
+    disturbed = fit.process is not None and bool(fit.process.any())
+    explained = disturbed or explains(fit.chi_squared, fit.free)
     left = np.sqrt(fit.chi_squared) * np.nanmax(noise / scale)
-    converged = fit.settled and (explained or bool(left < NEGLIGIBLE))
-    said = not given and (warn_of_few(fit.free) or warn_of_noise(noise, scale))
+    # Of states without noise only what the field cannot have is left, and that is not white.
+    exact = bool(left < NEGLIGIBLE) and not given and not disturbed
+    white = exact or fit.white >= SIGNIFICANT
+    if given and not explains(fit.chi_squared, fit.free):
+        warn_of_misfit(fit)
+    elif disturbed:
+        warn_of_process(fit)
+    said = not given and (warn_of_few(fit.free) or warn_of_noise(noise, scale, fit.swing))
+    converged = fit.settled and (explained or exact) and white
     if not (converged or said):
-        warn_of_unsettled(fit.count, fit.chi_squared, explained)
+        if not fit.settled or not (explained or exact or given):
+            warn_of_unsettled(fit, explained)
+        if not white:
+            warn_of_correlation(fit)
     return converged
 
 
@@ -74,32 +97,75 @@ def explains(chi_squared: float, free: float) -> bool:
     return bool(chi_squared <= 1 + _CURVATURE + _SIGMAS * np.sqrt(2 / max(free, 1.0)))
 
 
-def warn_of_misfit(chi_squared: float, misfit: Float[np.ndarray, "R n"]) -> None:
+_LACKS = (
+    "a part of the motion that the kernel cannot have, such as friction (add hk.CurlFree, or take "
+    "hk.PortHamiltonian)"
+)
+
+
+def warn_of_misfit(fit: FitQuality) -> None:
     """Say that the structure does not explain the runs at the noise that was given, and where."""
-    causes = (
-        "Likely causes, in order: a part of the motion that the kernel cannot have, such as "
-        "friction (add hk.CurlFree, or take hk.PortHamiltonian); (q, q̇) given where (q, p) is "
-        "needed (p = m q̇, in one scale; masses=True finds their ratios); a wrong unit; a jump or "
-        "push in a run."
+    run, c = np.unravel_index(np.nanargmax(fit.misfit), fit.misfit.shape)
+    where = (
+        f"The residuals are largest in coordinate {c} of run {run}, {fit.misfit[run, c]:.2g} "
+        "standard deviations."
     )
-    run, c = np.unravel_index(np.nanargmax(misfit), misfit.shape)
+    if fit.process is not None and fit.process.any():  # the path follows the samples
+        where = f"Process noise that would explain them is {_numbers(fit.process)}; it is used."
     require.warn(
-        f"the structure does not explain the runs: χ² is {chi_squared:.3g} per degree of freedom "
-        f"at the noise given, and should be 1. The residuals are largest in coordinate {c} of run "
-        f"{run}, {misfit[run, c]:.2g} standard deviations. {causes}"
+        f"the structure does not explain the runs: χ² is {fit.chi_squared:.3g} per degree of "
+        f"freedom at the noise given, and should be 1. {where} Likely causes, in order: {_LACKS}; "
+        "(q, q̇) given where (q, p) is needed (p = m q̇, in one scale; masses=True finds their "
+        "ratios); a wrong unit; a jump or push in a run."
     )
 
 
-def warn_of_noise(noise: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"]) -> bool:
+def warn_of_process(fit: FitQuality) -> None:
+    """Say that the structure is not the whole truth, and what was put in its place."""
+    assert fit.process is not None
+    timing = " inputs that act at other times than logged;" if fit.driven else ""
+    require.warn(
+        "the structure alone does not explain the runs: with process noise, ẋ = f + w of intensity "
+        f"{_numbers(fit.process)} in units of the states over √time, they are likelier, and it is "
+        f"used. What w stands for is in .disturbance. Likely causes, in order: {_LACKS};{timing} "
+        "stiction, or a flexible part. process_noise=0 learns without."
+    )
+
+
+def warn_of_correlation(fit: FitQuality) -> None:
+    """Say that the innovations are not white, and what to try."""
+    c = int(np.nanargmax(np.abs(fit.correlation)))
+    timing = (
+        "inputs that act at other times than logged, or go on otherwise in between (between=); "
+        if fit.driven
+        else ""
+    )
+    more = "; process_noise=None" if fit.process is None else ""
+    require.warn(
+        f"the innovations are not white (p = {fit.white:.2g} by Ljung and Box; the correlation of "
+        f"neighbours is {fit.correlation[c]:.2f} in coordinate {c}): what the field and the noise "
+        "leave is known in part from the samples before, and bands are too narrow. Likely causes, "
+        f"in order: {timing}{_LACKS}; sensors that are filtered or resampled{more}."
+    )
+
+
+def _numbers(values: Float[np.ndarray, " n"]) -> str:
+    return "(" + ", ".join(f"{v:.2g}" for v in values) + ")"
+
+
+def warn_of_noise(
+    noise: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"], swing: float
+) -> bool:
     """Say where nearly all of the motion was taken for noise, and whether it was."""
     share = np.nan_to_num(noise / scale)
     c = int(np.argmax(share))
     if share[c] < _ALL_NOISE:
         return False
+    few = f"{swing:.1f} samples a swing, where five or more are needed; " if swing < _SWING else ""
     require.warn(
         f"the field explains little of the runs: the noise found in coordinate {c} is "
         f"{noise[c]:.3g}, and its states vary by {scale[c]:.3g} (standard deviations). Causes: "
-        "fewer than about five samples a swing, one lengthscale for coordinates of different sizes "
+        f"{few}one lengthscale for coordinates of different sizes "
         f"(hk.Gaussian(np.ones({len(noise)})) has one for each), a jump in a run, a structure that "
         "the motion does not have, or sensors that are indeed so noisy. If you know the noise, "
         "pass noise=…; see hk.plot.fitted."
@@ -118,31 +184,45 @@ def warn_of_few(free: float) -> bool:
     return True
 
 
-def warn_of_unsettled(count: int, chi_squared: float, explained: bool) -> None:
+def warn_of_unsettled(fit: FitQuality, explained: bool) -> None:
     """Say that the iterations did not end where the field explains the runs."""
-    why = f"residuals are {np.sqrt(chi_squared):.2g} times the noise found"
+    low, high = np.nanmin(fit.misfit), np.nanmax(fit.misfit)
+    misfits = f"the misfits, by run and coordinate, are {low:.2f} to {high:.2f}"
+    if explained and high < _USABLE:
+        require.warn(
+            f"learning did not settle in {fit.count} iterations: noise or objective still move. "
+            f"The result is usable: {misfits}, where 1 is right. iterations={2 * fit.count} goes "
+            "on."
+        )
+        return
+    why = (
+        f"{misfits}, where 1 is right"
+        if explained
+        else f"the residuals are {np.sqrt(fit.chi_squared):.2g} times the noise found"
+    )
+    few = f" More samples a swing help, there are {fit.swing:.1f}." if fit.swing < _SWING else ""
     require.warn(
-        f"learning did not converge in {count} iterations: "
-        f"{'noise or objective still move' if explained else why}; see .history and "
-        "hk.plot.fitted. More samples a swing help, shorter runs, or a kernel closer to the truth."
+        f"learning did not converge in {fit.count} iterations: {why}. Do not trust the field where "
+        f"hk.plot.fitted shows that it leaves the samples; see .history. A kernel closer to the "
+        f"truth helps, or shorter runs; iterations={2 * fit.count} goes on.{few}"
     )
 
 
-def warn_of_dropped(kept: np.ndarray) -> None:
-    """Name the runs that the field is not learned from."""
-    lost = [f"{r} ({1 - share:.0%})" for r, share in enumerate(kept) if share < 1]
-    if not kept.any():
+def warn_of_dropped(fit: FitQuality) -> None:
+    """Name the samples that the field is not learned from."""
+    if not fit.kept.any():
         require.warn(
             "nothing was learned: no field of this kernel that was found follows any run. Causes: "
             "too few samples a swing, a mean that is wrong, or a structure that the motion does "
             "not have. Look at hk.plot.smoothing(runs)."
         )
-    elif lost:
-        more = f" and {len(lost) - 5} more" if len(lost) > 5 else ""
+    elif fit.dropped:
+        named = [f"{a} to {b - 1} of run {r}" for r, a, b in fit.dropped[:5]]
+        more = f" and {len(fit.dropped) - 5} more parts" if len(fit.dropped) > 5 else ""
         require.warn(
-            f"dropped from run {', '.join(lost[:5])}{more}: the field does not follow the samples "
-            "there (a χ² above 25 times the median, or a tangent above 1e4). Look at these runs: a "
-            "jump, another system, or chaos with samples too far apart."
+            f"dropped: samples {', '.join(named)}{more}. The field does not follow them (a χ² "
+            "above 25 times the median, or a tangent above 1e4). Look there: a jump, another "
+            "system, or chaos with samples too far apart."
         )
 
 

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo, known_part
@@ -26,19 +26,27 @@ from hamkernel._structures.controlled import Controlled, InputMatrix
 from hamkernel._structures.family import AbstractFamily
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import AbstractStructure
-from hamkernel._trajectories.diagnostics import NEGLIGIBLE, FitQuality, check_identifiable, diagnose
-from hamkernel._trajectories.flow import Expansion, steps_for, with_tangent
-from hamkernel._trajectories.learned import Iteration, Learned, empty, misfits
-from hamkernel._trajectories.likelihood import (
-    Bounds,
-    Model,
-    as_observations,
-    bounds_and_design,
-    closed_form,
-    landmark_whitening,
-    losses,
-    most_likely,
+from hamkernel._trajectories.diagnostics import FitQuality, check_identifiable, diagnose
+from hamkernel._trajectories.flow import Expansion
+from hamkernel._trajectories.iteration import (
+    End,
+    Task,
+    begin,
+    evidence,
+    initial_loss,
+    iterate,
 )
+from hamkernel._trajectories.kalman import (
+    SIGNIFICANT,
+    as_observations,
+    innovations,
+    neighbours,
+    smoothed_path,
+    whiten,
+    whiteness,
+)
+from hamkernel._trajectories.learned import Learned, empty, misfits
+from hamkernel._trajectories.likelihood import KernelRows, Model, bounds_and_design, losses
 from hamkernel._trajectories.preprocessing import (
     Preprocessed,
     decided,
@@ -47,29 +55,10 @@ from hamkernel._trajectories.preprocessing import (
     sampled,
 )
 from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.segments import (
-    LinearisedSegments,
-    Piece,
-    Shooting,
-    grown,
-    halved,
-    linearised_along_field,
-    segmented,
-    shoot,
-    short_pieces,
-    smoothed_rows,
-    trusted,
-)
 from hamkernel._trajectories.smoothing import interpolated
 
-_ROUNDS = 4  # Levenberg steps before a segment is diagnose: without them up to 40 % were lost
-_SEARCH = 25  # steps of BFGS, which go on in the next iteration
-_SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a step, until one makes the objective smaller
 _WIDE = 100.0  # standard deviations of the states: the prior of a start
-_SHORT_ROUNDS = 2  # iterations with short segments, in which a rough field stays near the samples
 _MOST = 8  # iterations; 4 or 5 are the rule
-_SETTLED = 0.01  # of log σ, and of the objective by degree of freedom
-_UNCHANGED = 1e-4  # of the field: without noise its digits end before the objective settles
 
 
 def learn(
@@ -79,7 +68,9 @@ def learn(
     noise: ArrayLike | None = None,
     solver: Nystrom | None = None,
     *,
+    process_noise: ArrayLike | None = None,
     masses: bool = False,
+    iterations: int = _MOST,
     progress: bool = False,
 ) -> Learned:
     """Learn a field from noisy states at times, without velocities.
@@ -103,9 +94,15 @@ def learn(
             runs is detected. If None, it is estimated.
         solver: `hk.Nystrom(max_points=…)` sets how many landmarks carry the field; if None, 48 for
             n = 2 and 80 for n = 4, which cover the paths evenly. Inputs count as coordinates.
+        process_noise: the intensity q of white noise w in ẋ = f(x, u) + w, in units of the states
+            over √time, a number or one for each coordinate, shape (n,): what stiction, timing or a
+            flexible part move besides the field. 0 where the structure is the whole truth. If None,
+            it is looked for where something says that the structure is not, and kept where the
+            marginal likelihood pays for it.
         masses: whether states are (q, q̇) with unknown masses instead of (q, p). Their ratios are
             then learned, `learned.kernel.masses`; see `UnknownMasses`, whose kernel K becomes.
             With inputs they are those of the drift, `learned.kernel.drift.masses`.
+        iterations: at most as many; 4 or 5 are the rule.
         progress: show a progress bar (tqdm).
 
     Returns:
@@ -124,7 +121,8 @@ def learn(
             are too few to find the noise, or the iterations did not settle.
     """
     require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
-    K, given = _check(with_amplitude(matrix_kernel(K)), runs, noise, solver)
+    K, given, process = _check(with_amplitude(matrix_kernel(K)), runs, noise, process_noise, solver)
+    most = require.count(iterations, "iterations")
     if masses:
         K = with_masses(K, runs.dimension)
     known = known_part(K, mean, runs.dimension, jnp.float64)
@@ -136,66 +134,112 @@ def learn(
         Y = Y - np.asarray(jax.vmap(known)(jnp.asarray(X)))
     # Smoothing may find no noise at all; a share of 1e-7 is what the digits of a log leave.
     level = np.maximum(np.where(measured, data.noise, data.scale), 1e-6 * data.scale)
-    model = Model(K, jnp.log(jnp.asarray(level if given is None else given)))
+    log_noise = jnp.log(jnp.asarray(level if given is None else given))
     moves = measured & (given is None)
-    bounds, design = bounds_and_design(model, X, Y, data.scale, moves)
     S = landmarks(X, data.scale, None if solver is None else solver.max_points)
-    task = Task(data, known, S, bounds, jnp.asarray(_WIDE * data.scale))
-    first = begin(task, model, design)
+
+    def asked(q: np.ndarray, spacing: float = 0.0, impulse: np.ndarray | None = None):
+        with np.errstate(divide="ignore"):
+            model = Model(K, log_noise, jnp.log(jnp.asarray(q)))
+        bounds, design = bounds_and_design(model, X, Y, data.scale, moves, spacing, impulse)
+        return Task(data, known, S, bounds, jnp.asarray(_WIDE * data.scale)), model, design
+
+    def ended(q: np.ndarray, spacing: float = 0.0, impulse: np.ndarray | None = None) -> End:
+        disturbed = bool(q.any()) or impulse is not None
+        return iterate(*asked(q, spacing, impulse), disturbed, most, progress)
+
+    none, alone = np.zeros(runs.dimension), None
     if not runs.is_decided:
-        runs, data = decided(
-            runs, data, lambda data: initial_loss(task._replace(data=data), first.model)
-        )
-        task = task._replace(data=data)
-        first = begin(task, first.model, design)
-    now, pieces, history, converged = _iterated(task, first, progress)
+        task, model, design = asked(none)
+        first = begin(task, model, design).model
+        runs, data = decided(runs, data, lambda data: initial_loss(task._replace(data=data), first))
+    if process is not None:
+        spacing = landmark_spacing(X, S, data.scale) if process.any() else 0.0
+        end = ended(process, spacing)
+    else:
+        end = alone = ended(none)
+        impulse, spacing = impulses(K, S, Y, data), landmark_spacing(X, S, data.scale)
+        if asks_for_process(alone, impulse):
+            end = likelier(alone, ended(none, spacing, impulse))
     mean = None if mean is None else as_pytree(mean)
-    return _learned(runs, mean, task, now, pieces, history, converged, given is not None, measured)
+    return _learned(runs, mean, end, alone, given is not None, measured)
 
 
-def _iterated(
-    task: Task, now: Current, progress: bool
-) -> tuple[Current, list[Piece], list[Iteration], bool]:
-    """Gauss-Newton steps until noise and objective settle."""
-    from tqdm import tqdm  # so that importing the package does not load it
+def impulses(K: AbstractMatrixKernel, S, Y, data: Preprocessed) -> Float[np.ndarray, " n"]:
+    """The logarithm of the process noise that would move each coordinate as the field does.
 
-    history: list[Iteration] = []
-    pieces: list[Piece] = []
-    bar = tqdm(range(_MOST), "learning", disable=None if progress else True)
-    for i in bar:
-        if i < _SHORT_ROUNDS:
-            wanted = short_pieces(task.data.runs)
-        elif i == _SHORT_ROUNDS:
-            wanted = grown(task.data.runs, pieces, now.good)
-        else:
-            wanted = halved(task.data.runs, pieces, now.good)
-        before, same, pieces = now, wanted == pieces, wanted
-        now, step = iterated(task, now, pieces)
-        history.append(step)
-        noise = ", ".join(f"{sigma:.3g}" for sigma in np.asarray(step.noise))
-        bar.set_postfix_str(f"noise {noise}, kept {float(step.kept):.0%}")
-        moved = float(jnp.abs(now.model.log_noise - before.model.log_noise).max())
-        small = float(step.gain) < _SETTLED * max(now.free, 1.0)
-        settled = moved < _SETTLED and (small or changed(task, before, now) < _UNCHANGED)
-        if settled and same and i > _SHORT_ROUNDS:
-            bar.close()
-            return now, pieces, history, True
-    bar.close()
-    return now, pieces, history, False
+    That is its velocity times the root of the time in which it does so. −inf where K moves nothing.
+    """
+    prior = np.asarray(KernelRows(S).rows(K, S)).reshape(len(S), len(data.scale), -1)
+    velocity = np.sqrt(np.mean(Y**2, axis=0))
+    whole = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
+    time = np.median(data.scale / np.maximum(whole, np.finfo(float).tiny))
+    with np.errstate(divide="ignore"):
+        return np.where((prior != 0).any((0, 2)), np.log(velocity * np.sqrt(time)), -np.inf)
+
+
+def landmark_spacing(X, S, scale: Float[np.ndarray, " n"]) -> float:
+    """How far a point of X may be from all landmarks, in standard deviations.
+
+    A field of shorter lengthscale has ripples between the landmarks.
+    """
+    spread = X.std(axis=0)
+    spread[: len(scale)] = scale
+    unit = np.where(spread > 0, spread, 1.0)
+    A, B = X / unit, np.asarray(S) / unit
+    squares = (A**2).sum(1)[:, None] + (B**2).sum(1)[None] - 2 * A @ B.T
+    return float(np.sqrt(np.maximum(squares.min(axis=1), 0.0).max()))
+
+
+def price(end: End, impulse: Float[np.ndarray, " n"]) -> float:
+    """What process noise must gain in log p: Schwarz's ½ log N for each of its numbers."""
+    return float(0.5 * np.isfinite(impulse).sum() * np.log(np.asarray(end.now.rows.counts).sum()))
+
+
+def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
+    """Whether anything says that the structure is not the whole truth.
+
+    Iterations that did not settle, parts that were dropped, innovations that are not white, or rows
+    that are likelier with process noise.
+    """
+    now, task = end.now, end.task
+    if not (end.settled and now.good.all()):
+        return True
+    z = innovations(_whitened(now.model, task.S, now.rows, task.start_deviation), now.rows)
+    if whiteness(z, np.asarray(now.rows.counts)) < SIGNIFICANT:
+        return True
+    shares = np.log([1e-3, 1e-2, 1e-1])
+    design = [now.model.log_process, *(impulse + share for share in shares)]
+    flat = np.tile(np.asarray(now.model.flat), (len(design), 1))
+    flat[:, -len(impulse) :] = design
+    values = losses(now.model, jnp.asarray(flat), task.S, now.rows, task.start_deviation, whiten)
+    values = np.asarray(values)
+    return bool(values[0] - values.min() > price(end, impulse))
+
+
+def likelier(without: End, process: End) -> End:
+    """That of both whose rows are the likelier, process noise at its price."""
+    more = price(process, np.asarray(process.now.model.log_process))
+    return process if evidence(process) + more < evidence(without) else without
+
+
+_whitened = eqx.filter_jit(whiten)
 
 
 def _learned(
-    runs: Runs,
-    mean: Any,
-    task: Task,
-    now: Current,
-    pieces: list[Piece],
-    history: list[Iteration],
-    converged: bool,
-    given: bool,
-    measured: np.ndarray,
+    runs: Runs, mean: Any, end: End, alone: End | None, given: bool, measured: np.ndarray
 ) -> Learned:
-    """The result, and the warnings that it asks for."""
+    """The result, and the warnings that it asks for.
+
+    Args:
+        runs: what was given.
+        mean: what was given.
+        end: where the iterations ended.
+        alone: where they ended without process noise, if that was to be found.
+        given: whether the noise was given.
+        measured: which coordinates were.
+    """
+    task, now, history = end.task, end.now, end.history
     field, data = now.field, task.data
     times, _ = runs.on_host()
     velocity = jax.jit(jax.vmap(field))
@@ -206,31 +250,97 @@ def _learned(
         for t, run, path in zip(times, data.runs, now.paths, strict=True)
     ]
     kept = np.zeros(len(data.runs))
-    for (r, start, stop), good in zip(pieces, now.good, strict=True):
+    for (r, start, stop), good in zip(end.pieces, now.good, strict=True):
         kept[r] += good * (stop - start) / len(data.runs[r].times)
     noise = np.where(measured, np.exp(np.asarray(now.model.log_noise)), np.nan)
+    process = np.exp(np.asarray(now.model.log_process))
     misfit = misfits(runs, states, noise)
-    chi_squared = now.squares / max(now.free, 1.0)
-    fit = FitQuality(kept, misfit, chi_squared, now.free, len(history), converged)
+    given_rows = now.model, task.S, now.rows, task.start_deviation
+    z, counts = innovations(_whitened(*given_rows), now.rows), np.asarray(now.rows.counts)
+    squares, free = now.squares, now.free
+    if alone is not None:
+        squares, free = alone.now.squares, alone.now.free
+    elif process.any():  # the path follows the samples: only what was expected can be judged
+        squares, free = float((z**2).sum()), float((counts > 0).sum())
+    chi_squared = squares / max(free, 1.0)
+    white = whiteness(z, counts)
+    speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
+    spacing = np.median(np.concatenate([np.diff(t) for t in times]))
+    swing = 2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)) / spacing
+    dropped = dropped_samples(end, times)
+    fit = FitQuality(
+        kept=kept,
+        dropped=dropped,
+        misfit=misfit,
+        chi_squared=chi_squared,
+        free=free,
+        white=white,
+        correlation=neighbours(z, counts),
+        process=None if alone is None else process,
+        count=len(history),
+        settled=end.settled,
+        swing=float(swing),
+        driven=runs.inputs is not None,
+    )
     converged = diagnose(fit, noise, data.scale, given)
-    observations = as_observations(now.rows, now.model.log_noise, task.mean)
+    observations = as_observations(now.rows, now.model, task.mean, task.start_deviation)
     count = 1 if observations is None else sum(len(y) for _, y in observations.parts())
     regularization = jnp.asarray(1 / count)
+    w = np.zeros_like(np.asarray(now.rows.drive))
+    if process.any():
+        found = smoothed_path(now.model, field.coefficients, *given_rows[1:])
+        w = np.asarray(found.disturbance)
+    disturbance = [
+        of_run[np.clip(np.searchsorted(run.times, t - t[0], "right") - 1, 0, len(of_run) - 1)]
+        for of_run, run, t in zip(_by_run(w, end, 0.0), data.runs, times, strict=True)
+    ]
     return Learned(
         field=_field(field, regularization),
         kernel=field.kernel,
         regularization=regularization,
         noise=jnp.asarray(noise),
+        process_noise=jnp.asarray(process),
         states=tuple(jnp.asarray(x) for x in states),
         kept=jnp.asarray(kept),
+        dropped=dropped,
         misfit=jnp.asarray(misfit),
         chi_squared=jnp.asarray(chi_squared),
+        innovations=tuple(
+            jnp.asarray(x) for x in _by_run(np.where(counts > 0, z, np.nan), end, np.nan)
+        ),
+        whiteness=jnp.asarray(white),
+        disturbance=tuple(jnp.asarray(x) for x in disturbance),
         history=tuple(history),
         converged=converged,
         runs=runs,
         observations=observations,
         mean=mean,
     )
+
+
+def dropped_samples(end: End, times: list[np.ndarray]) -> tuple[tuple[int, int, int], ...]:
+    """The run, the first sample and the one behind the last of what was not learned from."""
+    out: list[tuple[int, int, int]] = []
+    for (r, start, stop), good in sorted(zip(end.pieces, end.now.good, strict=True)):
+        if good:
+            continue
+        t, at = times[r] - times[r][0], end.task.data.runs[r].times
+        first = int(np.searchsorted(t, at[start])) if start else 0
+        last = int(np.searchsorted(t, at[stop])) if stop < len(at) else len(t)
+        if out and out[-1][0] == r and out[-1][2] == first:
+            first = out.pop()[1]
+        out.append((r, first, last))
+    return tuple(out)
+
+
+def _by_run(values: np.ndarray, end: End, empty: float) -> list[Float[np.ndarray, "T n"]]:
+    """Values by segment put together to runs."""
+    out = [np.full(run.path.shape, empty) for run in end.task.data.runs]
+    for s, ((r, start, stop), good) in enumerate(zip(end.pieces, end.now.good, strict=True)):
+        if good:
+            part = values[s, : stop - start]
+            out[r][start : start + len(part)] = part
+    return out
 
 
 def _field(found: Expansion, regularization: Float[Array, ""]) -> Any:
@@ -252,9 +362,9 @@ def _field(found: Expansion, regularization: Float[Array, ""]) -> Any:
 
 
 def _check(
-    K: AbstractMatrixKernel, runs: Any, noise: Any, solver: Any
-) -> tuple[AbstractMatrixKernel, np.ndarray | None]:
-    """The kernel, which knows how many inputs there are, and the noise that was given, (n,)."""
+    K: AbstractMatrixKernel, runs: Any, noise: Any, process_noise: Any, solver: Any
+) -> tuple[AbstractMatrixKernel, np.ndarray | None, np.ndarray | None]:
+    """The kernel, which knows how many inputs there are, and both noises that were given, (n,)."""
     if not isinstance(runs, Runs):
         raise TypeError(
             f"learn takes hk.Runs(times, states), lists of arrays, one entry a run; got a "
@@ -297,14 +407,30 @@ def _check(
             "learn needs doubles, since paths and their tangents are compared over many steps: "
             "jax.config.update('jax_enable_x64', True) first."
         )
-    if noise is None:
-        return K, None
-    given = np.asarray(
-        require.positive(noise, "noise", "Leave it out to have it found from the runs.")
-    )
-    if given.shape not in ((), (n,)):
-        raise ValueError(f"noise has shape {given.shape}; a number or shape ({n},) is needed.")
-    return K, np.broadcast_to(given, (n,))
+    given = process = None
+    if noise is not None:
+        given = _of_coordinates(
+            require.positive(noise, "noise", "Leave it out to have it found from the runs."),
+            n,
+            "noise",
+        )
+    if process_noise is not None:
+        process = _of_coordinates(
+            require.floating(process_noise, "process_noise"), n, "process_noise"
+        )
+        if not (np.isfinite(process).all() and (process >= 0).all()):
+            raise ValueError(
+                f"process_noise must be 0 or more, got {process_noise}: 0 where the structure is "
+                "the whole truth, None to have it found."
+            )
+    return K, given, process
+
+
+def _of_coordinates(value: Any, n: int, name: str) -> Float[np.ndarray, " n"]:
+    value = np.asarray(value, float)
+    if value.shape not in ((), (n,)):
+        raise ValueError(f"{name} has shape {value.shape}; a number or shape ({n},) is needed.")
+    return np.broadcast_to(value, (n,))
 
 
 def with_amplitude(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
@@ -340,159 +466,3 @@ def with_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
             "masses), k)."
         )
     return K if isinstance(K, UnknownMasses) else UnknownMasses(K, jnp.ones(n // 2))
-
-
-class Task(NamedTuple):
-    """What does not change: the runs, the mean, landmarks, the box and the prior of starts."""
-
-    data: Preprocessed
-    mean: Any
-    S: Float[Array, "m d"]
-    bounds: Bounds
-    start_deviation: Float[Array, " n"]
-
-
-class Current(NamedTuple):
-    """Where learning stands.
-
-    Attributes:
-        model: kernel and noise.
-        field: the field.
-        rows: what it was learned from.
-        paths: of each run at its samples.
-        good: which pieces were kept.
-        squares: the sum of their squared normalised residuals.
-        free: the degrees of freedom that are left.
-    """
-
-    model: Model
-    field: Expansion
-    rows: LinearisedSegments
-    paths: list[np.ndarray]
-    good: Bool[np.ndarray, " S"]
-    squares: float
-    free: float
-
-
-def initial_loss(task: Task, model: Model) -> float:
-    """−log p of the rows along the smoothed runs, at the hyperparameters of `model`."""
-    *_, rows = smoothed_rows(task.data, task.mean)
-    return float(losses(model, model.flat[None], task.S, rows, task.start_deviation)[0])
-
-
-def begin(task: Task, model: Model, design: np.ndarray) -> Current:
-    """INT: rows along the smoothed runs, with the tangent of the mean.
-
-    In short segments: the errors of the smoothed path add up along a run.
-    """
-    pieces, good, rows = smoothed_rows(task.data, task.mean)
-    paths = [run.path for run in task.data.runs]
-    values = np.asarray(losses(model, jnp.asarray(design), task.S, rows, task.start_deviation))
-    model = model.at(jnp.asarray(design[int(np.argmin(values))]))
-    model, _ = most_likely(model, task.S, rows, task.start_deviation, task.bounds, _SEARCH)
-    found = closed_form(model.kernel, model.log_noise, task.S, rows, task.start_deviation)
-    field = Expansion(model.kernel, task.S, found.coefficients, task.mean)
-    return Current(model, field, rows, paths, good[: len(pieces)], np.inf, float(found.free))
-
-
-def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, Iteration]:
-    """GN: one linearisation along the current field, one closed form, one line search."""
-    runs = task.data.runs
-    segments = segmented(runs, pieces, now.paths)
-    count = steps_for(np.asarray(segments.spans), _stiffness(now.field, task.data, now.paths))
-    steps = jnp.asarray(count)
-    before = shoot(
-        now.field,
-        segments,
-        now.model.log_noise,
-        task.start_deviation,
-        steps,
-        segments.starts,
-        _ROUNDS,
-    )
-    least = NEGLIGIBLE * task.data.scale
-    good = trusted(before, segments, np.exp(np.asarray(now.model.log_noise)), least)
-    rows = linearised_along_field(now.field, before.path, segments, jnp.asarray(good))
-    model, loss = most_likely(now.model, task.S, rows, task.start_deviation, task.bounds, _SEARCH)
-    found = closed_form(model.kernel, model.log_noise, task.S, rows, task.start_deviation)
-    # The current field in the new basis, by what it says of the same rows.
-    known = rows._replace(target=rows.along, prior_offset=jnp.zeros_like(rows.prior_offset))
-    old = closed_form(model.kernel, model.log_noise, task.S, known, task.start_deviation).weights
-    T = _landmark_whitening(model.kernel, task.S)
-
-    def trial(share: float) -> _Trial:
-        weights = (1 - share) * old + share * found.weights
-        field = Expansion(model.kernel, task.S, (T @ weights).reshape(len(task.S), -1), task.mean)
-        starts = before.starts + share * found.moves
-        there = shoot(
-            field, segments, model.log_noise, task.start_deviation, steps, starts, _ROUNDS
-        )
-        squares = float(np.asarray(there.squares)[good].sum())
-        return _Trial(squares + float(weights @ weights), squares, field, there)
-
-    at_old = trial(0.0)
-    taken, best = 0.0, at_old
-    for share in _SHARES if good.any() else ():
-        there = trial(share)
-        if there.objective < best.objective:
-            taken, best = share, there
-            break
-    good = good[: len(pieces)]
-    paths = _updated(now.paths, pieces, good, best.shooting)
-    samples = sum(len(run.times) for run in runs)
-    kept = sum(piece.stop - piece.start for piece, ok in zip(pieces, good, strict=True) if ok)
-    gain = at_old.objective - best.objective
-    numbers = (best.objective, gain if taken else 0.0, taken, kept / samples, loss)
-    objective, gain, taken, kept, loss = (jnp.asarray(value) for value in numbers)
-    longest = max(piece.stop - piece.start for piece in pieces)
-    noise = jnp.exp(model.log_noise)
-    step = Iteration(longest, objective, gain, taken, noise, kept, loss)
-    free = float(found.free)
-    return Current(model, best.field, rows, paths, good, best.squares, free), step
-
-
-class _Trial(NamedTuple):
-    objective: float
-    squares: float
-    field: Expansion
-    shooting: Shooting
-
-
-def _updated(paths, pieces: list[Piece], good, there: Shooting) -> list[np.ndarray]:
-    """The paths, those of the pieces that were kept along the field."""
-    new, x = [path.copy() for path in paths], np.asarray(there.path.x)
-    for s, (r, start, stop) in enumerate(pieces):
-        if good[s] and np.isfinite(x[s]).all():
-            new[r][start:stop] = x[s, : stop - start]
-    return new
-
-
-_landmark_whitening = eqx.filter_jit(landmark_whitening)
-
-
-@eqx.filter_jit
-def _norms(field, X: Float[Array, "N d"], scale: Float[Array, " n"]) -> Float[Array, " N"]:
-    def norm(s):
-        D = with_tangent(field, s, len(scale))[1]
-        return jnp.linalg.norm(D * scale[None] / scale[:, None])
-
-    return jax.vmap(norm)(X)
-
-
-def _stiffness(field: Expansion, data: Preprocessed, paths: list[np.ndarray]) -> float:
-    """‖∂f/∂x‖ in standard deviations along the paths, but for the largest twentieth."""
-    X = np.concatenate([run.joined(path) for run, path in zip(data.runs, paths, strict=True)])
-    X = X[np.linspace(0, len(X) - 1, 256).round().astype(int)]
-    norms = np.asarray(_norms(field, jnp.asarray(X), jnp.asarray(data.scale)))
-    return float(np.nanquantile(np.where(np.isfinite(norms), norms, 0.0), 0.95))
-
-
-def changed(task: Task, before: Current, now: Current) -> float:
-    """By how much the field has changed at the landmarks, relative to its size there."""
-    old, new = (
-        np.asarray(_values(each.field, task.S)) / task.data.scale[None] for each in (before, now)
-    )
-    return float(np.linalg.norm(new - old) / max(np.linalg.norm(new), np.finfo(float).tiny))
-
-
-_values = eqx.filter_jit(lambda field, S: jax.vmap(field)(S))

@@ -28,6 +28,7 @@ class Iteration(eqx.Module):
         gain: by how much it went down at these hyperparameters, shape ().
         step: the share of the step that was taken, 0 where none made it smaller, shape ().
         noise: σ of each coordinate, shape (n,).
+        process_noise: q of each coordinate, shape (n,).
         kept: the share of the samples in segments that were kept, shape ().
         loss: −log p of the rows, but for a constant, shape ().
     """
@@ -37,6 +38,7 @@ class Iteration(eqx.Module):
     gain: Float[Array, ""]
     step: Float[Array, ""]
     noise: Float[Array, " n"]
+    process_noise: Float[Array, " n"]
     kept: Float[Array, ""]
     loss: Float[Array, ""]
 
@@ -54,15 +56,29 @@ class Learned(eqx.Module):
             noise; the amplitude of the field is in `kernel`.
         noise: the standard deviation of the sensor noise of each coordinate, shape (n,); NaN where
             nothing was measured.
+        process_noise: the intensity q of w in ẋ = f + w, of each coordinate, in units of the states
+            over √time, shape (n,); 0 where the structure is the whole truth.
         states: the fitted path of each run at its times, missing coordinates filled in, (T, n).
         kept: for each run the share of its samples that the field is learned from, shape (R,).
+        dropped: what it is not learned from, as (run, first sample, the one behind the last).
         misfit: for each run and coordinate the root mean square of (measured − fitted)/σ, shape
             (R, n); about one where the structure explains the run, NaN where nothing was measured.
         chi_squared: the sum of squares of all of them over the degrees of freedom that the fit
             leaves, shape (). It carries no information if σ was estimated from the same residuals.
+            Where process noise was found it is that of the field without; where it was given, that
+            of the innovations.
+        innovations: what each sample says beyond all before it, in standard deviations, for each
+            run, (T, n); NaN where nothing was measured or it was dropped. If model and noise are
+            right they are independent and N(0, 1). Of fast logs, whose samples are averaged, one a
+            mean.
+        whiteness: the probability that independent innovations are as correlated as these, by the
+            test of Ljung and Box over ten lags, shape (); where it is below .05 the structure, or
+            the timing of inputs, leaves something that moves on from sample to sample.
+        disturbance: the mean of w from each sample to the next as far as the samples know it, for
+            each run, (T, n); 0 without process noise.
         history: one entry an iteration.
         converged: whether noise and objective settled, where the field explains the runs at the
-            noise found.
+            noise found, with innovations that are white.
         runs: what was given.
         observations: what the runs say of the field near the fitted paths, starts projected out:
             linear functionals of it, with independent noise of variance one. `hk.fit(kernel,
@@ -75,10 +91,15 @@ class Learned(eqx.Module):
     kernel: AbstractMatrixKernel
     regularization: Float[Array, ""]
     noise: Float[Array, " n"]
+    process_noise: Float[Array, " n"]
     states: tuple[Float[Array, "T n"], ...]
     kept: Float[Array, " R"]
+    dropped: tuple[tuple[int, int, int], ...] = eqx.field(static=True)
     misfit: Float[Array, "R n"]
     chi_squared: Float[Array, ""]
+    innovations: tuple[Float[Array, "T n"], ...]
+    whiteness: Float[Array, ""]
+    disturbance: tuple[Float[Array, "T n"], ...]
     history: tuple[Iteration, ...]
     converged: bool = eqx.field(static=True)
     runs: Runs

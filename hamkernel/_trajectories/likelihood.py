@@ -13,7 +13,8 @@ for P = QU, but for a constant.
 """
 
 import functools
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -26,10 +27,13 @@ from jaxtyping import Array, Bool, Float
 from hamkernel._gram.dense import assemble
 from hamkernel._gram.derivatives import forward_differentiated
 from hamkernel._machine import orthonormal
-from hamkernel._observations.kinds import Functionals, Together
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._trajectories.flow import means
-from hamkernel._trajectories.segments import LinearisedSegments, accumulated, back_substituted
+from hamkernel._trajectories.segments import (
+    LinearisedSegments,
+    accumulated,
+    back_substituted,
+    tangents,
+)
 from hamkernel._tuning.minimiser import most_likely_in_box
 from hamkernel._tuning.space import gram_trace, hyperparameters
 
@@ -60,34 +64,81 @@ def landmark_whitening(K: AbstractMatrixKernel, S: Float[Array, "m d"]) -> Float
     return solve_triangular(jnp.linalg.cholesky(G + jnp.diag(rounding)), eye, lower=True).T
 
 
-class ProjectedRows(NamedTuple):
-    """The rows with the starts projected out, M̃ and r̃, and what gives the starts back."""
+class Model(NamedTuple):
+    """A kernel, the noise and that of the process, as one vector h of hyperparameters.
+
+    Attributes:
+        kernel: the kernel.
+        log_noise: log σ of each coordinate.
+        log_process: log q of each, −inf where the field is the whole truth.
+    """
+
+    kernel: AbstractMatrixKernel
+    log_noise: Float[Array, " n"]
+    log_process: Float[Array, " n"]
+
+    @property
+    def flat(self) -> Float[Array, " P"]:
+        leaves, _ = ravel_pytree(eqx.filter(self.kernel, eqx.is_inexact_array))
+        leaves = leaves.astype(self.log_noise.dtype)
+        return jnp.concatenate([leaves, self.log_noise, self.log_process])
+
+    def at(self, h: Float[Array, " P"]) -> "Model":
+        params, static = eqx.partition(self.kernel, eqx.is_inexact_array)
+        flat, unravel = ravel_pytree(params)
+        leaves, noise, process = jnp.split(h, [flat.size, flat.size + len(self.log_noise)])
+        return Model(eqx.combine(unravel(leaves.astype(flat.dtype)), static), noise, process)
+
+
+class WhitenedRows(NamedTuple):
+    """Rows with independent noise of variance one, M̃ and r̃, in which no start is left.
+
+    Attributes:
+        M: what w adds to them, shape (D, q).
+        r: their values, shape (D,).
+        constant: the part of −log p in which M̃ has none.
+        T: from w to coefficients, shape (q, q).
+        start: QᵀM, Qᵀr and U of each segment, which give the starts back, where they were projected
+            out.
+    """
 
     M: Float[Array, "D q"]
     r: Float[Array, " D"]
-    constant: Float[Array, ""]  # what M̃ has no part in: log det U − log det W and the scatter
+    constant: Float[Array, ""]
     T: Float[Array, "q q"]
-    start: tuple[Array, Array, Array]  # QᵀM, Qᵀr and U of each segment
+    start: tuple[Array, Array, Array] | None = None
+
+
+Whitening = Callable[[Model, Array, LinearisedSegments, Array], WhitenedRows]
+
+
+def columns(
+    K: AbstractMatrixKernel, S: Float[Array, "m d"], rows: LinearisedSegments
+) -> tuple[Float[Array, "S L n q"], Float[Array, "q q"]]:
+    """Σ_k Γ_k K(x̂(τ_k), S) of each interval, and T."""
+    (*nodes, d), n = rows.nodes.shape, rows.residual.shape[-1]
+    raw = forward_differentiated((K, rows.nodes.reshape(-1, d)), KernelRows(S), rowwise=True)
+    local = jnp.einsum("slkab,slkbq->slaq", rows.weights, raw.reshape(*nodes, n, -1))
+    return local, landmark_whitening(K, S)
 
 
 def project_out_starts(
-    K: AbstractMatrixKernel,
-    log_noise: Float[Array, " n"],
+    model: Model,
     S: Float[Array, "m d"],
     rows: LinearisedSegments,
     start_deviation: Float[Array, " n"],
-) -> ProjectedRows:
+) -> WhitenedRows:
     """The rows at these hyperparameters; the starts have the prior N(·, diag(start_deviation²))."""
-    (*nodes, d), n = rows.nodes.shape, rows.target.shape[-1]
-    size, q = len(rows.counts), len(S) * n
-    raw = forward_differentiated((K, rows.nodes.reshape(-1, d)), KernelRows(S), rowwise=True)
-    T = landmark_whitening(K, S)
-    M = accumulated(rows.across, rows.weights, raw.reshape(*nodes, n, q)) @ T
+    log_noise, n, size = model.log_noise, rows.residual.shape[-1], len(rows.counts)
+    local, T = columns(model.kernel, S, rows)
+    M = accumulated(rows.across, local) @ T
+    q = M.shape[-1]
     W = jnp.sqrt(rows.counts) * jnp.exp(-log_noise)[None, None]  # (S, L + 1, n)
     none = jnp.zeros((size, n, q), M.dtype)
     M = jnp.concatenate([(W[..., None] * M).reshape(size, -1, q), none], axis=1)
     prior = jnp.broadcast_to(jnp.diag(1 / start_deviation), (size, n, n))
-    P = jnp.concatenate([(W[..., None] * rows.tangent).reshape(size, -1, n), prior], axis=1)
+    Phi = tangents(rows.across)
+    P = jnp.concatenate([(W[..., None] * Phi).reshape(size, -1, n), prior], axis=1)
     r = jnp.concatenate(
         [(W * rows.target).reshape(size, -1), rows.prior_offset / start_deviation[None]], axis=1
     )
@@ -99,18 +150,19 @@ def project_out_starts(
     # All samples that a row is the mean of: what they scatter about it knows σ, and not the field.
     samples, scatter = (a.sum(axis=(0, 1)) for a in (rows.counts, rows.scatter))
     constant = constant + samples @ log_noise + 0.5 * scatter @ jnp.exp(-2 * log_noise)
-    return ProjectedRows(M.reshape(-1, q), r.reshape(-1), constant, T, (QM, Qr, U))
+    return WhitenedRows(M.reshape(-1, q), r.reshape(-1), constant, T, (QM, Qr, U))
 
 
-def negative_log_likelihood(rows: ProjectedRows) -> Float[Array, ""]:
+def negative_log_likelihood(rows: WhitenedRows) -> Float[Array, ""]:
     """Of the rows, but for a constant; not finite where the factorisation fails."""
-    R, w = _weights(rows)
+    R, w = weights_of(rows)
     misfit = rows.r - rows.M @ w
     log_det = 2 * jnp.sum(jnp.log(jnp.diagonal(R)))
     return 0.5 * (misfit @ misfit + w @ w + log_det) + rows.constant
 
 
-def _weights(rows: ProjectedRows) -> tuple[Float[Array, "q q"], Float[Array, " q"]]:
+def weights_of(rows: WhitenedRows) -> tuple[Float[Array, "q q"], Float[Array, " q"]]:
+    """A root of I + M̃ᵀM̃, and w."""
     q = rows.M.shape[1]
     R = jnp.linalg.cholesky(rows.M.T @ rows.M + jnp.eye(q, dtype=rows.M.dtype))
     return R, cho_solve((R, True), rows.M.T @ rows.r)
@@ -133,36 +185,21 @@ class ClosedForm(NamedTuple):
 
 
 @eqx.filter_jit
-def closed_form(K, log_noise, S, rows: LinearisedSegments, start_deviation) -> ClosedForm:
+def closed_form(
+    model: Model, S, rows: LinearisedSegments, start_deviation, whitening: Whitening
+) -> ClosedForm:
     """The field and the starts that the rows ask for."""
-    made = project_out_starts(K, log_noise, S, rows, start_deviation)
-    R, w = _weights(made)
-    QM, Qr, U = made.start
-    right = Qr - jnp.einsum("snq,q->sn", QM, w)
-    moves = back_substituted(U, right)
+    made = whitening(model, S, rows, start_deviation)
+    R, w = weights_of(made)
     inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype), lower=True)
     used = len(w) - jnp.sum(inverse**2)  # tr M̃ (I + M̃ᵀM̃)⁻¹ M̃ᵀ
-    started = rows.counts.any(axis=(1, 2)).sum() * U.shape[1]
+    moves = jnp.zeros_like(rows.prior_offset)
+    if made.start is not None:
+        QM, Qr, U = made.start
+        moves = back_substituted(U, Qr - jnp.einsum("snq,q->sn", QM, w))
+    started = rows.counts.any(axis=(1, 2)).sum() * moves.shape[1]
     free = ((rows.counts > 0).sum() - started).astype(used.dtype) - used
     return ClosedForm(w, (made.T @ w).reshape(len(S), -1), moves, free)
-
-
-class Model(NamedTuple):
-    """A kernel and the noise, as one vector h of hyperparameters."""
-
-    kernel: AbstractMatrixKernel
-    log_noise: Float[Array, " n"]
-
-    @property
-    def flat(self) -> Float[Array, " P"]:
-        leaves, _ = ravel_pytree(eqx.filter(self.kernel, eqx.is_inexact_array))
-        return jnp.concatenate([leaves.astype(self.log_noise.dtype), self.log_noise])
-
-    def at(self, h: Float[Array, " P"]) -> "Model":
-        params, static = eqx.partition(self.kernel, eqx.is_inexact_array)
-        flat, unravel = ravel_pytree(params)
-        kernel = eqx.combine(unravel(h[: flat.size].astype(flat.dtype)), static)
-        return Model(kernel, h[flat.size :])
 
 
 class Bounds(NamedTuple):
@@ -173,45 +210,57 @@ class Bounds(NamedTuple):
     free: Bool[np.ndarray, " P"]
 
 
-def _loss(model: Model, h, S, rows, start_deviation):
-    there = model.at(h)
-    value = negative_log_likelihood(
-        project_out_starts(there.kernel, there.log_noise, S, rows, start_deviation)
-    )
+def _loss(model: Model, h, S, rows, start_deviation, whitening: Whitening):
+    value = negative_log_likelihood(whitening(model.at(h), S, rows, start_deviation))
     return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
 
 @eqx.filter_jit
 def losses(
-    model: Model, design: Float[Array, "count P"], S, rows: LinearisedSegments, start_deviation
+    model: Model,
+    design: Float[Array, "count P"],
+    S,
+    rows: LinearisedSegments,
+    start_deviation,
+    whitening: Whitening,
 ):
     """−log p(rows) at some points h."""
-    return jax.lax.map(lambda h: _loss(model, h, S, rows, start_deviation), design)
+    return jax.lax.map(lambda h: _loss(model, h, S, rows, start_deviation, whitening), design)
 
 
 @eqx.filter_jit
-def _best(model: Model, S, rows: LinearisedSegments, start_deviation, low, high, free, steps):
+def _best(
+    model: Model, S, rows: LinearisedSegments, start_deviation, low, high, free, steps, whitening
+):
     start = model.flat
 
     def loss(h):
-        return _loss(model, jnp.where(free, h, start), S, rows, start_deviation)
+        return _loss(model, jnp.where(free, h, start), S, rows, start_deviation, whitening)
 
     # Of log σ a sample of N knows 1/√(2N); a lengthscale or an amplitude is known to some tenths.
     count = jnp.maximum(rows.counts.sum(axis=(0, 1)), 1)
-    kernel = jnp.full(start.size - count.size, 0.2, start.dtype)
-    deviations = jnp.concatenate([kernel, 1 / jnp.sqrt(2 * count)])
+    kernel = jnp.full(start.size - 2 * count.size, 0.2, start.dtype)
+    noise = 1 / jnp.sqrt(2 * count)
+    deviations = jnp.concatenate([kernel, noise, noise])
     found, value = most_likely_in_box(loss, start, low, high, deviations, steps)
     return jnp.where(free & (value < jnp.inf), found, start), value
 
 
 def most_likely(
-    model: Model, S, rows: LinearisedSegments, start_deviation, bounds: Bounds, steps: int
+    model: Model,
+    S,
+    rows: LinearisedSegments,
+    start_deviation,
+    bounds: Bounds,
+    steps: int,
+    whitening: Whitening,
 ) -> tuple[Model, float]:
     """The model whose rows are the most likely, by BFGS from this one, and −log p there."""
     if not bounds.free.any():
-        return model, float(losses(model, model.flat[None], S, rows, start_deviation)[0])
+        flat = model.flat[None]
+        return model, float(losses(model, flat, S, rows, start_deviation, whitening)[0])
     sides = jnp.asarray(bounds.low), jnp.asarray(bounds.high), jnp.asarray(bounds.free)
-    h, value = _best(model, S, rows, start_deviation, *sides, steps)
+    h, value = _best(model, S, rows, start_deviation, *sides, steps, whitening)
     return model.at(h), float(value)
 
 
@@ -219,9 +268,20 @@ def most_likely(
 # swing smoothing cannot know it: it found none at all in 3 of 5 logs with noise of 8 %.
 _NOISES = (0.01, 0.1)
 
+# Process noise to begin with, of the accelerations, and how far it may go: what is three times the
+# motion moves everything, and a millionth of it nothing.
+_DISTURBANCES = (1e-4, 1e-2, 0.1)
+_LEAST_DISTURBANCE, _MOST_DISTURBANCE = 1e-6, 3.0
+
 
 def bounds_and_design(
-    model: Model, X: np.ndarray, Y: np.ndarray, scale: np.ndarray, moves: np.ndarray
+    model: Model,
+    X: np.ndarray,
+    Y: np.ndarray,
+    scale: np.ndarray,
+    moves: np.ndarray,
+    spacing: float = 0.0,
+    impulse: np.ndarray | None = None,
 ) -> tuple[Bounds, np.ndarray]:
     """The box of all hyperparameters, those of the caller inside, and a design of first points.
 
@@ -231,10 +291,13 @@ def bounds_and_design(
         Y: their velocities.
         scale: the standard deviations of the coordinates.
         moves: the coordinates whose noise is looked for.
+        spacing: the least lengthscale, in standard deviations of the coordinates.
+        impulse: the noise of the process that would be all of the motion, shape (n,); −inf where
+            it is not looked for. None where it is nowhere.
     """
     speed = float(np.sqrt(np.mean(Y**2)))
     leaves = hyperparameters(model.kernel, jnp.asarray(X), speed, jnp.asarray(X))
-    start = np.asarray(model.flat)
+    start = np.asarray(model.flat)[: -len(scale)]  # without the noise of the process
     size = len(start) - len(scale)
     most = np.maximum(scale, np.exp(start[size:]))  # where next to nothing moves
     low = np.concatenate([*(p.low.ravel() for p in leaves), np.log(1e-7 * scale)])
@@ -245,6 +308,14 @@ def bounds_and_design(
     none = np.zeros(len(scale), bool)
     lengths = np.append([name.endswith("lengthscale") for name in names], none).astype(bool)
     scales = np.append([name.split(".")[-1] == "scale" for name in names], none).astype(bool)
+    if spacing > 0:
+        spread = X.std(axis=0)
+        spread[: len(scale)] = scale
+        each = (spread if p.low.size == len(spread) else scale.min() for p in leaves)
+        least = [np.full(p.low.size, s) for p, s in zip(leaves, each, strict=True)]
+        least = np.log(spacing * np.maximum(np.concatenate([*least, scale]), np.finfo(float).tiny))
+        low[lengths] = np.clip(least, low, high - 0.1)[lengths]
+        start = np.clip(start, low, high)
     extents = np.concatenate([*(_extents(p.low, X[:, : len(scale)]) for p in leaves), none])
     design = [start]
     for shift in (None, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0):
@@ -259,7 +330,25 @@ def bounds_and_design(
     for share in _NOISES if moves.any() else ():
         noisy.append(design.copy())
         noisy[-1][:, size:] = np.where(moves, np.log(share * scale), start[size:])
-    return Bounds(low, high, free), np.clip(np.concatenate(noisy), low, high)
+    if impulse is None:
+        noisy, process = np.concatenate(noisy), np.asarray(model.log_process)[None]
+        impulse = np.full(len(scale), -np.inf)
+    else:
+        levels = [impulse + np.log(share) for share in _DISTURBANCES]
+        kept = np.where(np.isfinite(impulse), levels, np.asarray(model.log_process))
+        noisy, process = np.repeat(design, len(kept), axis=0), np.tile(kept, (len(design), 1))
+    design = np.clip(noisy, low, high)
+    process = np.broadcast_to(process, (len(design), len(scale)))
+    looked = np.isfinite(impulse)
+    # Of what is not free neither the box nor a step matters.
+    sides = [
+        np.where(looked, impulse + np.log(share), 0.0)
+        for share in (_LEAST_DISTURBANCE, _MOST_DISTURBANCE)
+    ]
+    bounds = Bounds(
+        *(np.concatenate(each) for each in ((low, sides[0]), (high, sides[1]), (free, looked)))
+    )
+    return bounds, np.concatenate([design, process], axis=1)
 
 
 def _extents(leaf: np.ndarray, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, " size"]:
@@ -274,65 +363,10 @@ def _amplified(model: Model, h, scales, X, Y):
     """The point h, its amplitudes such that a velocity of the prior is twice one that was seen."""
     if not scales.any():
         return h
-    trace = float(gram_trace(model.at(jnp.asarray(h)).kernel, jnp.asarray(X))) / len(X)
+    full = jnp.concatenate([jnp.asarray(h), model.log_process])
+    trace = float(gram_trace(model.at(full).kernel, jnp.asarray(X))) / len(X)
     target = 4 * np.mean(np.sum(Y**2, axis=1))
     out = h.copy()
     if np.isfinite(trace) and trace > 0 and target > 0:
         out[scales] += np.log(target / trace)
     return out
-
-
-def as_observations(
-    rows: LinearisedSegments, log_noise: Float[Array, " n"], mean: Any
-) -> Together | None:
-    """CᵀW B f = CᵀW (x − x̂ + ô + B m) + ε with ε ~ N(0, I), one block for each segment.
-
-    C are the last columns of the complete QR of W Φ, so that the start is projected out. None where
-    no segment has more samples than its start takes.
-    """
-    sigma = np.exp(np.asarray(log_noise))
-    at_nodes = _at_nodes(mean, rows.nodes, len(sigma))
-    every = jax.tree.map(np.asarray, (rows, at_nodes))  # one segment of a JAX array compiles
-    segments = (jax.tree.map(lambda a, s=s: a[s], every) for s in range(len(rows.counts)))
-    found = [_of_segment(segment, at_nodes, sigma) for segment, at_nodes in segments]
-    parts = tuple(part for part in found if part is not None)
-    return Together(parts) if parts else None
-
-
-@eqx.filter_jit
-def _at_nodes(mean, nodes: Float[Array, "S L 3 d"], n: int) -> Float[Array, "S L 3 n"]:
-    return means(mean, nodes, nodes[..., :n])
-
-
-def _of_segment(
-    rows: Any, mean: Float[np.ndarray, "L 3 n"], sigma: Float[np.ndarray, " n"]
-) -> Functionals | None:
-    """The block of one segment, `rows` without their first axis; None if it says nothing."""
-    n = len(sigma)
-    if not rows.counts.any():
-        return None
-    last = int(np.flatnonzero(rows.counts.any(axis=1))[-1])  # padding follows
-    B = _sums(rows.across[:last], rows.weights[:last])
-    counts = rows.counts[: last + 1]
-    seen = counts.reshape(-1) > 0
-    W = (np.sqrt(counts) / sigma[None]).reshape(-1)[seen]
-    P = W[:, None] * rows.tangent[: last + 1].reshape(-1, n)[seen]
-    if len(P) <= n:
-        return None
-    C = np.linalg.qr(P, mode="complete")[0][:, n:]
-    B = C.T @ (W[:, None] * B[seen])
-    target = C.T @ (W * rows.target[: last + 1].reshape(-1)[seen]) + B @ mean[:last].reshape(-1)
-    x, u = np.split(rows.nodes[:last].reshape(1, 3 * last, -1), [n], axis=2)
-    return Functionals(x, B.reshape(1, len(B), 3 * last, n), target[None], u if u.size else None)
-
-
-def _sums(
-    across: Float[np.ndarray, "L n n"], weights: Float[np.ndarray, "L 3 n n"]
-) -> Float[np.ndarray, "D Q"]:
-    """B of one segment as a matrix: all samples by all nodes."""
-    L, k, n, _ = weights.shape
-    out = np.zeros((L + 1, n, L, k, n))
-    for i in range(L):
-        out[i + 1] = np.einsum("ab,blkc->alkc", across[i], out[i])
-        out[i + 1, :, i] += np.moveaxis(weights[i], 0, 1)
-    return out.reshape((L + 1) * n, L * k * n)

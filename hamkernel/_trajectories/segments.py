@@ -5,7 +5,8 @@ With x̂ the path, Φ its tangent, m the mean and τ_k Gauss nodes with weights 
     x(tᵢ) ≈ x̂(tᵢ) + Φᵢ δz + Σ_{τ_k < tᵢ} w_k Φᵢ Φ_k⁻¹ (f(x̂(τ_k)) − d x̂/dt(τ_k)),
 
 so with g = f − m, and ô the same sum of d x̂/dt − m, xᵢ − x̂ᵢ + ôᵢ = Φᵢ δz + (B g)ᵢ. The sums run
-from interval to interval, sᵢ₊₁ = Ψᵢ sᵢ + Σ_k Γ_ik (…)_k, and no matrix B is stored.
+from interval to interval, sᵢ₊₁ = Ψᵢ sᵢ + Σ_k Γ_ik (…)_k, and no matrix B is stored. To ô each one
+adds its `drive`, and what the path moves besides, where it solves no equation, is `missed`.
 
 The path is that of the current field, or any other, such as a smoothed one: then Φ is the tangent
 of the mean alone, the identity where there is none.
@@ -70,9 +71,10 @@ class LinearisedSegments(NamedTuple):
         nodes: where g is asked for, shape (S, L, 3, d), d = n + m with inputs: points (x, u).
         across: Ψ, shape (S, L, n, n).
         weights: Γ, shape (S, L, 3, n, n).
-        tangent: Φ at the samples, shape (S, L + 1, n, n).
-        target: x − x̂ + ô, shape (S, L + 1, n).
-        along: ô, what the rows would be if x̂ were right, the same shape.
+        spans: the lengths of the intervals, shape (S, L).
+        drive: Σ_k Γ_k (d x̂/dt − m)_k, shape (S, L, n).
+        missed: by how much x̂ moves otherwise than d x̂/dt says, 0 for a solution, the same shape.
+        residual: x − x̂, shape (S, L + 1, n).
         counts: those of the segments, zero on what was dropped.
         scatter: those of the segments, zero on what was dropped.
         prior_offset: where the prior of the start has its middle, relative to x̂, shape (S, n).
@@ -81,21 +83,25 @@ class LinearisedSegments(NamedTuple):
     nodes: Float[Array, "S L 3 d"]
     across: Float[Array, "S L n n"]
     weights: Float[Array, "S L 3 n n"]
-    tangent: Float[Array, "S L+1 n n"]
-    target: Float[Array, "S L+1 n"]
-    along: Float[Array, "S L+1 n"]
+    spans: Float[Array, "S L"]
+    drive: Float[Array, "S L n"]
+    missed: Float[Array, "S L n"]
+    residual: Float[Array, "S L+1 n"]
     counts: Float[Array, "S L+1 n"]
     scatter: Float[Array, "S L+1 n"]
     prior_offset: Float[Array, "S n"]
 
+    @property
+    def target(self) -> Float[Array, "S L+1 n"]:
+        """The sum x − x̂ + ô."""
+        moved = (self.drive + self.missed)[..., None]
+        return self.residual + accumulated(self.across, moved)[..., 0]
+
 
 def accumulated(
-    across: Float[Array, "S L n n"],
-    weights: Float[Array, "S L 3 n n"],
-    values: Float[Array, "S L 3 n q"],
+    across: Float[Array, "S L n n"], local: Float[Array, "S L n q"]
 ) -> Float[Array, "S L+1 n q"]:
-    """Bv for each column of values at the nodes."""
-    local = jnp.einsum("slkab,slkbq->slaq", weights, values)
+    """The sums sᵢ₊₁ = Ψᵢ sᵢ + localᵢ from s₀ = 0: Bv for localᵢ = Σ_k Γ_ik v_k."""
 
     def step(s, at):
         transition, own = at
@@ -152,17 +158,18 @@ def linearised(
     shares = segments.spans[:, :, None] * jnp.asarray(WEIGHTS, x.dtype)[None, None]
     weights = shares[..., None, None] * to_end  # Γ_k = h w_k Ψ Φ_k⁻¹
     slopes, mean = _where(good, slopes), _where(good, mean)
-    offset = accumulated(across, weights, (slopes - mean)[..., None])[..., 0]
+    drive = jnp.einsum("slkab,slkb->sla", weights, slopes - mean)
+    missed = jnp.zeros_like(drive)
     if not is_solution:
         missed = jnp.diff(x, axis=1) - (shares[..., None] * slopes).sum(axis=2)
-        offset = offset + accumulated(across, eye[:, :, None], missed[:, :, None, :, None])[..., 0]
     return LinearisedSegments(
         nodes=nodes,
         across=across,
         weights=weights,
-        tangent=tangents(across),
-        target=segments.measured - x + offset,
-        along=offset,
+        spans=segments.spans,
+        drive=drive,
+        missed=missed,
+        residual=segments.measured - x,
         counts=_where(good, segments.counts),
         scatter=_where(good, segments.scatter),
         prior_offset=_where(good, segments.starts - x[:, 0]),

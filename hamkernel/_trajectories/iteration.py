@@ -1,0 +1,389 @@
+"""Gauss-Newton steps: a linearisation, a closed form and a line search, again and again.
+
+Without process noise a step is one of multiple shooting: the path solves the equation in each
+segment, and the starts are projected out. With it the path is moved by the process too, and the
+rows are whitened by a Kalman filter.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hamkernel._trajectories.diagnostics import NEGLIGIBLE
+from hamkernel._trajectories.flow import Expansion, steps_for, with_tangent
+from hamkernel._trajectories.kalman import (
+    linearised_by_interval,
+    process_covariance,
+    smoothed_path,
+    whiten,
+)
+from hamkernel._trajectories.learned import Iteration
+from hamkernel._trajectories.likelihood import (
+    Bounds,
+    ClosedForm,
+    Model,
+    Whitening,
+    closed_form,
+    landmark_whitening,
+    losses,
+    most_likely,
+    project_out_starts,
+)
+from hamkernel._trajectories.preprocessing import Preprocessed
+from hamkernel._trajectories.segments import (
+    LONG,
+    LinearisedSegments,
+    Piece,
+    Segments,
+    equal_pieces,
+    grown,
+    halved,
+    linearised_along_field,
+    linearised_along_smoothed,
+    segmented,
+    shoot,
+    short_pieces,
+    smoothed_rows,
+    trusted,
+)
+
+_ROUNDS = 4  # Levenberg steps before a segment is judged: without them up to 40 % were lost
+_SEARCH = 25  # steps of BFGS, which go on in the next iteration
+_SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a step, until one makes the objective smaller
+_SHORT_ROUNDS = 2  # iterations with short segments, in which a rough field stays near the samples
+_SETTLED = 0.01  # of log σ, and of the objective by degree of freedom
+_UNCHANGED = 1e-4  # of the field: without noise its digits end before the objective settles
+_INTEGRATED = 1e-6  # of the states, what the steps of `flow` may leave in an interval
+
+
+class Task(NamedTuple):
+    """What does not change: the runs, the mean, landmarks, the box and the prior of starts."""
+
+    data: Preprocessed
+    mean: Any
+    S: Float[Array, "m d"]
+    bounds: Bounds
+    start_deviation: Float[Array, " n"]
+
+
+class Current(NamedTuple):
+    """Where learning stands.
+
+    Attributes:
+        model: kernel and noise.
+        field: the field.
+        rows: what it was learned from.
+        paths: of each run at its samples.
+        good: which pieces were kept.
+        squares: the sum of their squared normalised residuals.
+        free: the degrees of freedom that are left.
+    """
+
+    model: Model
+    field: Expansion
+    rows: LinearisedSegments
+    paths: list[np.ndarray]
+    good: Bool[np.ndarray, " S"]
+    squares: float
+    free: float
+
+
+class End(NamedTuple):
+    """Where the iterations ended.
+
+    Attributes:
+        task: what was asked.
+        now: the last step.
+        pieces: of the last step.
+        history: all steps.
+        settled: whether noise and objective did.
+    """
+
+    task: Task
+    now: Current
+    pieces: list[Piece]
+    history: list[Iteration]
+    settled: bool
+
+
+def iterate(
+    task: Task, model: Model, design: np.ndarray, process: bool, most: int, progress: bool
+) -> End:
+    """Gauss-Newton steps until noise and objective settle, `most` of them at most."""
+    from tqdm import tqdm  # so that importing the package does not load it
+
+    runs, step = task.data.runs, iterated_with_process if process else iterated
+    now = (begin_with_process if process else begin)(task, model, design)
+    history: list[Iteration] = []
+    pieces: list[Piece] = []
+    settled = False
+    bar = tqdm(range(most), "learning", disable=None if progress else True)
+    for i in bar:
+        if process:
+            wanted = equal_pieces(runs, LONG)
+        elif i < _SHORT_ROUNDS:
+            wanted = short_pieces(runs)
+        elif i == _SHORT_ROUNDS:
+            wanted = grown(runs, pieces, now.good)
+        else:
+            wanted = halved(runs, pieces, now.good)
+        before, same, pieces = now, wanted == pieces, wanted
+        now, done = step(task, now, pieces)
+        history.append(done)
+        noise = ", ".join(f"{sigma:.3g}" for sigma in np.asarray(done.noise))
+        bar.set_postfix_str(f"noise {noise}, kept {float(done.kept):.0%}")
+        moved = float(jnp.abs(now.model.log_noise - before.model.log_noise).max())
+        small = float(done.gain) < _SETTLED * max(now.free, 1.0)
+        settled = moved < _SETTLED and (small or changed(task, before, now) < _UNCHANGED)
+        settled = settled and same and i > _SHORT_ROUNDS
+        if settled:
+            break
+    bar.close()
+    return End(task, now, pieces, history, settled)
+
+
+def initial_loss(task: Task, model: Model) -> float:
+    """−log p of the rows along the smoothed runs, at the hyperparameters of `model`."""
+    *_, rows = smoothed_rows(task.data, task.mean)
+    given = task.S, rows, task.start_deviation, project_out_starts
+    return float(losses(model, model.flat[None], *given)[0])
+
+
+def begin(task: Task, model: Model, design: np.ndarray) -> Current:
+    """INT: rows along the smoothed runs, with the tangent of the mean.
+
+    In short segments: the errors of the smoothed path add up along a run.
+    """
+    pieces, good, rows = smoothed_rows(task.data, task.mean)
+    paths = [run.path for run in task.data.runs]
+    model, found, field = _first(task, model, design, rows, project_out_starts)
+    return Current(model, field, rows, paths, good[: len(pieces)], np.inf, float(found.free))
+
+
+def _first(
+    task: Task, model: Model, design: np.ndarray, rows: LinearisedSegments, whitening: Whitening
+) -> tuple[Model, ClosedForm, Expansion]:
+    """The likeliest model, from the best point of a design, and its field."""
+    given = task.S, rows, task.start_deviation
+    values = np.asarray(losses(model, jnp.asarray(design), *given, whitening))
+    model = model.at(jnp.asarray(design[int(np.argmin(values))]))
+    model, _ = most_likely(model, *given, task.bounds, _SEARCH, whitening)
+    found = closed_form(model, *given, whitening)
+    return model, found, Expansion(model.kernel, task.S, found.coefficients, task.mean)
+
+
+def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, Iteration]:
+    """GN: one linearisation along the current field, one closed form, one line search."""
+    runs = task.data.runs
+    segments = segmented(runs, pieces, now.paths)
+    count = steps_for(np.asarray(segments.spans), _stiffness(now.field, task.data, now.paths))
+    steps = jnp.asarray(count)
+    before = shoot(
+        now.field,
+        segments,
+        now.model.log_noise,
+        task.start_deviation,
+        steps,
+        segments.starts,
+        _ROUNDS,
+    )
+    least = NEGLIGIBLE * task.data.scale
+    good = trusted(before, segments, np.exp(np.asarray(now.model.log_noise)), least)
+    rows = linearised_along_field(now.field, before.path, segments, jnp.asarray(good))
+    model, loss, found, between = _solved(task, now.model, rows, project_out_starts)
+
+    def trial(share: float) -> _Trial:
+        weights, field = between(share)
+        starts = before.starts + share * found.moves
+        there = shoot(
+            field, segments, model.log_noise, task.start_deviation, steps, starts, _ROUNDS
+        )
+        squares = float(np.asarray(there.squares)[good].sum())
+        x = np.asarray(there.path.x)
+        return _Trial(squares + float(weights @ weights), squares, field, x)
+
+    gain, taken, best = _searched(trial, bool(good.any()))
+    good = good[: len(pieces)]
+    paths = _updated(now.paths, pieces, good, best.x)
+    step = _described(task, pieces, good, best, gain, taken, model, loss)
+    return Current(model, best.field, rows, paths, good, best.squares, float(found.free)), step
+
+
+class _Trial(NamedTuple):
+    objective: float
+    squares: float
+    field: Expansion
+    x: np.ndarray
+
+
+def _solved(
+    task: Task, model: Model, rows: LinearisedSegments, whitening: Whitening
+) -> tuple[Model, float, ClosedForm, Callable[[float], tuple[Array, Expansion]]]:
+    """The likeliest model, its closed form, and the fields on the way to it: share -> (w, f)."""
+    given = task.S, rows, task.start_deviation
+    model, loss = most_likely(model, *given, task.bounds, _SEARCH, whitening)
+    found = closed_form(model, *given, whitening)
+    # The current field in the new basis, by what it says of the same rows.
+    names = "residual", "missed", "prior_offset"
+    known = rows._replace(**{name: jnp.zeros_like(getattr(rows, name)) for name in names})
+    old = closed_form(model, task.S, known, task.start_deviation, whitening).weights
+    T = _landmark_whitening(model.kernel, task.S)
+
+    def between(share: float) -> tuple[Float[Array, " q"], Expansion]:
+        weights = (1 - share) * old + share * found.weights
+        coefficients = (T @ weights).reshape(len(task.S), -1)
+        return weights, Expansion(model.kernel, task.S, coefficients, task.mean)
+
+    return model, loss, found, between
+
+
+def _searched(trial: Callable[[float], _Trial], any_good: bool) -> tuple[float, float, _Trial]:
+    """The gain, the share and the trial of the first share that makes the objective smaller."""
+    at_old = trial(0.0)
+    for share in _SHARES if any_good else ():
+        there = trial(share)
+        if there.objective < at_old.objective:
+            return at_old.objective - there.objective, share, there
+    return 0.0, 0.0, at_old
+
+
+def _described(task, pieces, good, best: _Trial, gain, taken, model: Model, loss) -> Iteration:
+    samples = sum(len(run.times) for run in task.data.runs)
+    kept = sum(piece.stop - piece.start for piece, ok in zip(pieces, good, strict=True) if ok)
+    numbers = (best.objective, gain, taken, kept / samples, loss)
+    objective, gain, taken, kept, loss = (jnp.asarray(value) for value in numbers)
+    longest = max(piece.stop - piece.start for piece in pieces)
+    noise, process = jnp.exp(model.log_noise), jnp.exp(model.log_process)
+    return Iteration(longest, objective, gain, taken, noise, process, kept, loss)
+
+
+def begin_with_process(task: Task, model: Model, design: np.ndarray) -> Current:
+    """INT with process noise: rows along the smoothed runs, each whole or in long parts."""
+    runs = task.data.runs
+    pieces = equal_pieces(runs, LONG)
+    segments = segmented(runs, pieces, [run.path for run in runs])
+    good = np.zeros(len(segments.starts), bool)
+    good[: len(pieces)] = [task.data.usable[piece.run] for piece in pieces]
+    rows = linearised_along_smoothed(task.data, pieces, segments, task.mean, good)
+    model, found, field = _first(task, model, design, rows, whiten)
+    moves = smoothed_path(model, found.coefficients, task.S, rows, task.start_deviation).moves
+    good = good[: len(pieces)]
+    paths = [run.path for run in runs]
+    x = _on_segments(paths, pieces, segments)
+    paths = _updated(paths, pieces, good, x + np.asarray(moves))
+    return Current(model, field, rows, paths, good, np.inf, float(found.free))
+
+
+def iterated_with_process(
+    task: Task, now: Current, pieces: list[Piece]
+) -> tuple[Current, Iteration]:
+    """GN with process noise: every interval linearised by itself, along a path that w moves too.
+
+    The objective is ‖W (y − x)‖² + Σ dᵢᵀ (Cov ηᵢ)⁻¹ dᵢ + ‖f‖², d what the field misses of the path.
+    """
+    segments, x, steps, rows = _by_interval(task, now, pieces)
+    good = rows.counts.any((1, 2))
+    model, loss, found, between = _solved(task, now.model, rows, whiten)
+    moves = smoothed_path(model, found.coefficients, task.S, rows, task.start_deviation).moves
+    # A defect that the integrator may leave is none.
+    covariance = process_covariance(model, rows, jnp.asarray(_INTEGRATED * task.data.scale))
+
+    def trial(share: float) -> _Trial:
+        weights, field = between(share)
+        there = x + share * moves
+        defect = linearised_by_interval(field, there, segments, steps, good).missed
+        squares = _squares(there, defect, covariance, segments, rows.counts, model.log_noise)
+        squares = float(squares) if np.isfinite(squares) else np.inf
+        return _Trial(squares + float(weights @ weights), squares, field, np.asarray(there))
+
+    any_good = bool(good.any())
+    gain, taken, best = _searched(trial, any_good)
+    good = np.asarray(good)[: len(pieces)]
+    paths = _updated(now.paths, pieces, good, best.x)
+    step = _described(task, pieces, good, best, gain, taken, model, loss)
+    return Current(model, best.field, rows, paths, good, best.squares, float(found.free)), step
+
+
+def _by_interval(
+    task: Task, now: Current, pieces: list[Piece]
+) -> tuple[Segments, Float[Array, "S L+1 n"], Array, LinearisedSegments]:
+    """The pieces, the path on them, Runge-Kutta steps, and the rows along it."""
+    segments = segmented(task.data.runs, pieces, now.paths)
+    spans = np.asarray(segments.spans).reshape(-1, 1)
+    steps = jnp.asarray(steps_for(spans, _stiffness(now.field, task.data, now.paths)))
+    x = jnp.asarray(_on_segments(now.paths, pieces, segments))
+    good = np.zeros(len(x), bool)
+    good[: len(pieces)] = [task.data.usable[piece.run] for piece in pieces]
+    rows = linearised_by_interval(now.field, x, segments, steps, jnp.asarray(good))
+    return segments, x, steps, rows
+
+
+def evidence(end: End) -> float:
+    """−log p of the runs, each in as few parts as may be, linearised about the path of the end."""
+    task, model = end.task, end.now.model
+    rows = _by_interval(task, end.now, equal_pieces(task.data.runs, LONG))[3]
+    given = task.S, rows, task.start_deviation
+    return float(losses(model, model.flat[None], *given, whiten)[0])
+
+
+@eqx.filter_jit
+def _squares(x, defect, covariance, segments: Segments, counts, log_noise) -> Float[Array, ""]:
+    residual = jnp.where(counts > 0, segments.measured - x, 0.0)
+    moved = jnp.linalg.solve(covariance, defect[..., None])[..., 0]
+    return jnp.sum(counts * residual**2 * jnp.exp(-2 * log_noise)[None, None]) + jnp.sum(
+        defect * moved
+    )
+
+
+def _on_segments(paths, pieces: list[Piece], segments: Segments) -> Float[np.ndarray, "S L+1 n"]:
+    """The paths at the samples of each segment; behind the last one they stay."""
+    x = np.repeat(np.asarray(segments.starts)[:, None], segments.measured.shape[1], axis=1)
+    for s, (r, start, stop) in enumerate(pieces):
+        x[s] = paths[r][stop - 1]
+        x[s, : stop - start] = paths[r][start:stop]
+    return x
+
+
+def _updated(paths, pieces: list[Piece], good, x: np.ndarray) -> list[np.ndarray]:
+    """The paths, those of the pieces that were kept along the field."""
+    new = [path.copy() for path in paths]
+    for s, (r, start, stop) in enumerate(pieces):
+        if good[s] and np.isfinite(x[s]).all():
+            new[r][start:stop] = x[s, : stop - start]
+    return new
+
+
+_landmark_whitening = eqx.filter_jit(landmark_whitening)
+
+
+@eqx.filter_jit
+def _norms(field, X: Float[Array, "N d"], scale: Float[Array, " n"]) -> Float[Array, " N"]:
+    def norm(s):
+        D = with_tangent(field, s, len(scale))[1]
+        return jnp.linalg.norm(D * scale[None] / scale[:, None])
+
+    return jax.vmap(norm)(X)
+
+
+def _stiffness(field: Expansion, data: Preprocessed, paths: list[np.ndarray]) -> float:
+    """‖∂f/∂x‖ in standard deviations along the paths, but for the largest twentieth."""
+    X = np.concatenate([run.joined(path) for run, path in zip(data.runs, paths, strict=True)])
+    X = X[np.linspace(0, len(X) - 1, 256).round().astype(int)]
+    norms = np.asarray(_norms(field, jnp.asarray(X), jnp.asarray(data.scale)))
+    return float(np.nanquantile(np.where(np.isfinite(norms), norms, 0.0), 0.95))
+
+
+def changed(task: Task, before: Current, now: Current) -> float:
+    """By how much the field has changed at the landmarks, relative to its size there."""
+    old, new = (
+        np.asarray(_values(each.field, task.S)) / task.data.scale[None] for each in (before, now)
+    )
+    return float(np.linalg.norm(new - old) / max(np.linalg.norm(new), np.finfo(float).tiny))
+
+
+_values = eqx.filter_jit(lambda field, S: jax.vmap(field)(S))

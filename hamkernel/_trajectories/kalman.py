@@ -1,0 +1,315 @@
+"""Rows whitened by a Kalman filter: samples of a motion that the field alone does not explain.
+
+With ẋ = f(x, u) + w, w white of intensity diag(q²), each interval is linearised by itself about a
+path x̂. The distance d from the path moves by
+
+    dᵢ₊₁ = Ψᵢ dᵢ + Σ_k Γ_ik g(x̂(τ_k)) − ôᵢ + ηᵢ,    Cov ηᵢ = Σ_k Γ_ik diag(q²) Γ_ikᵀ / (h w_k),
+
+in which ôᵢ is the `drive` of the interval and what the path `missed`, and a sample is
+yᵢ − x̂ᵢ = dᵢ + εᵢ. For g = K(·, S) T w the filter of (Ψ, Cov η, Cov ε) turns what the samples say of
+w, column by column, into rows with independent noise of variance one. It carries E, the columns of
+what is expected of d for each entry of w, and minus what is expected besides. A measured component
+c with the innovation variance s gives the row (E_c, y_c − x̂_c + E_c)/√s; then E ← E − k E_c with
+the gain k, and across the interval E ← Ψ E + (Γ K T, ô). Roots L of Cov d are carried: Potter's
+update for a sample, an orthonormal factor of ((Ψ L)ᵀ, √Cov ηᵀ) for an interval.
+
+What the samples say of d and η afterwards is a gradient: for J = ½ Σ e²/s and a push u of the state
+between two samples, E[η | y] = −Cov η ∂J/∂u, and E[d | y] = m − L Lᵀ ∂J/∂m where m is expected from
+the samples before.
+
+Source: Potter (1963), in Bierman (1977), "Factorization methods for discrete sequential
+estimation"; Bryson & Frazier (1963) for the smoother.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import gammaincc
+from jaxtyping import Array, Float
+
+from hamkernel._machine import orthonormal
+from hamkernel._observations.kinds import Functionals, Together
+from hamkernel._trajectories.flow import WEIGHTS, Expansion, means, simulated
+from hamkernel._trajectories.likelihood import Model, WhitenedRows, columns
+from hamkernel._trajectories.segments import LinearisedSegments, Path, Segments, linearised
+
+_LAGS = 10  # of the test of whiteness, where the samples have as many
+_PAIRS = 20  # at a lag, from which a correlation is normal
+SIGNIFICANT = 0.05  # of its false alarms
+
+
+class Filtered(NamedTuple):
+    """What the filter makes of S segments.
+
+    Attributes:
+        rows: E_c/√s, the samples in the last column, shape (S, L + 1, n, q); 0 where none is.
+        log_variance: log s, 0 where there is no sample, shape (S, L + 1, n).
+        expected: E before each sample, shape (S, L + 1, n, q).
+        roots: L before each sample, shape (S, L + 1, n, n).
+    """
+
+    rows: Float[Array, "S L+1 n q"]
+    log_variance: Float[Array, "S L+1 n"]
+    expected: Float[Array, "S L+1 n q"]
+    roots: Float[Array, "S L+1 n n"]
+
+
+def process_roots(
+    log_process: Float[Array, " n"], rows: LinearisedSegments
+) -> Float[Array, "S L n 3n"]:
+    """√Cov η, a column for each node and component of w."""
+    h = rows.spans[:, :, None] * jnp.asarray(WEIGHTS, rows.spans.dtype)[None, None]
+    scale = jnp.where(h > 0, 1 / jnp.sqrt(jnp.where(h > 0, h, 1.0)), 0.0)
+    q = jnp.exp(log_process)[None, None, None, None]
+    roots = rows.weights * scale[..., None, None] * q
+    return jnp.moveaxis(roots, 2, 3).reshape(*rows.drive.shape, -1)
+
+
+def filtered(
+    model: Model,
+    rows: LinearisedSegments,
+    local: Float[Array, "S L n q"],
+    start: Float[Array, "S n q"],
+    start_deviation: Float[Array, " n"],
+) -> Filtered:
+    """The rows of the columns that move by `local` in each interval, from `start`."""
+    noise, n = jnp.exp(2 * model.log_noise), rows.residual.shape[-1]
+
+    def measured(L, E, y, count):
+        out = []
+        for c in range(n):
+            seen, phi = count[c] > 0, L[c]
+            r = noise[c] / jnp.where(seen, count[c], 1.0)
+            s = phi @ phi + r
+            k = jnp.where(seen, L @ phi / s, 0.0)
+            e = E[c].at[-1].add(y[c])
+            out.append((jnp.where(seen, e / jnp.sqrt(s), 0.0), jnp.where(seen, jnp.log(s), 0.0)))
+            L = L - jnp.outer(k / (1 + jnp.sqrt(r / s)), phi)
+            E = E - jnp.outer(k, e)
+        return L, E, [jnp.stack(each) for each in zip(*out, strict=True)]
+
+    def step(carry, at):
+        (L, E), (across, root, own, y, count) = carry, at
+        after, E_after, out = measured(L, E, y, count)
+        U = orthonormal(jnp.concatenate([(across @ after).T, root.T])[None])[1][0]
+        return (U.T, across @ E_after + own), (*out, E, L)
+
+    def segment(across, roots, local, y, count, E):
+        # The last sample has no interval behind it: one that stays.
+        still = [jnp.eye(n, dtype=y.dtype), jnp.zeros_like(roots[0]), jnp.zeros_like(local[0])]
+        each = [
+            jnp.concatenate([a, b[None]])
+            for a, b in zip((across, roots, local), still, strict=True)
+        ]
+        return jax.lax.scan(step, (jnp.diag(start_deviation), E), (*each, y, count))[1]
+
+    roots = process_roots(model.log_process, rows)
+    given = rows.across, roots, local, rows.residual, rows.counts, start
+    rows_, log_variance, expected, L = jax.vmap(segment)(*given)
+    return Filtered(rows_, log_variance, expected, L)
+
+
+def whiten(
+    model: Model, S: Float[Array, "m d"], rows: LinearisedSegments, start_deviation
+) -> WhitenedRows:
+    """The rows with process noise and the starts integrated out, in the order of time."""
+    local, T = columns(model.kernel, S, rows)
+    local = jnp.concatenate([local @ T, (rows.drive + rows.missed)[..., None]], axis=-1)
+    start = jnp.zeros((*local.shape[:1], *local.shape[2:]), local.dtype)
+    start = start.at[..., -1].set(-rows.prior_offset)
+    found = filtered(model, rows, local, start, start_deviation)
+    flat = found.rows.reshape(-1, local.shape[-1])
+    # What the samples of a mean scatter about it knows σ, and neither the field nor w.
+    more, scatter = jnp.maximum(rows.counts - 1, 0.0).sum((0, 1)), rows.scatter.sum((0, 1))
+    constant = 0.5 * found.log_variance.sum() + more @ model.log_noise
+    constant = constant + 0.5 * scatter @ jnp.exp(-2 * model.log_noise)
+    return WhitenedRows(flat[:, :-1], flat[:, -1], constant, T)
+
+
+class SmoothedPath(NamedTuple):
+    """The path given the samples and a field, and what moved it besides.
+
+    Attributes:
+        moves: the path less x̂, shape (S, L + 1, n).
+        disturbance: the mean of w in each interval, shape (S, L, n).
+    """
+
+    moves: Float[Array, "S L+1 n"]
+    disturbance: Float[Array, "S L n"]
+
+
+@eqx.filter_jit
+def smoothed_path(
+    model: Model,
+    found: Float[Array, "m n"],
+    S: Float[Array, "m d"],
+    rows: LinearisedSegments,
+    start_deviation,
+) -> SmoothedPath:
+    """The path for the field with these coefficients."""
+    (*nodes, d), n = rows.nodes.shape, rows.residual.shape[-1]
+    field = Expansion(model.kernel, S, found, None)
+    g = jax.vmap(field)(rows.nodes.reshape(-1, d)).reshape(*nodes, n)
+    push = jnp.einsum("slkab,slkb->sla", rows.weights, g) - rows.drive - rows.missed
+
+    def half_chi_squared(push, start):
+        out = filtered(model, rows, -push[..., None], -start[..., None], start_deviation)
+        return 0.5 * jnp.sum(out.rows**2), out
+
+    slopes, out = jax.grad(half_chi_squared, (0, 1), has_aux=True)(push, rows.prior_offset)
+    adjoint = jnp.concatenate([slopes[1][:, None], slopes[0]], axis=1)
+    back = jnp.einsum("slba,slb->sla", out.roots, adjoint)
+    moves = -out.expected[..., 0] - jnp.einsum("slab,slb->sla", out.roots, back)
+    # Of w at a node −diag(q²) Γ_kᵀ ∂J/∂u / (h w_k), of which the weighted mean is taken.
+    h = jnp.where(rows.spans > 0, rows.spans, 1.0)[..., None]
+    w = jnp.einsum("slkab,sla->slb", rows.weights, slopes[0])
+    return SmoothedPath(moves, -jnp.exp(2 * model.log_process)[None, None] * w / h)
+
+
+@eqx.filter_jit
+def linearised_by_interval(
+    field: Expansion, x: Float[Array, "S L+1 n"], segments: Segments, steps, good
+) -> LinearisedSegments:
+    """The rows along a path that the field need not follow; `missed` is by how much it does not.
+
+    What is not finite is dropped.
+    """
+    (S, L), n, m = segments.spans.shape, x.shape[-1], segments.inputs.shape[-1]
+    there = simulated(
+        field,
+        x[:, :-1].reshape(-1, n),
+        segments.spans.reshape(-1, 1),
+        steps,
+        segments.inputs.reshape(S * L, 1, 2, m),
+    )
+    nodes, to_end, across = (a.reshape(S, L, *a.shape[2:]) for a in there[1:])
+    defect = x[:, 1:] - there.x[:, 1].reshape(S, L, n)
+    finite = jnp.isfinite(defect).all((1, 2)) & jnp.isfinite(across).all((1, 2, 3))
+    good = good & finite
+    nodes = jnp.where(good[:, None, None, None], nodes, 0.0)
+    slopes = jax.vmap(jax.vmap(jax.vmap(field)))(nodes)
+    rows = linearised(
+        Path(x, nodes, to_end, across),
+        slopes,
+        means(field.mean, nodes, slopes),
+        segments,
+        good,
+        is_solution=True,
+    )
+    return rows._replace(missed=jnp.where(good[:, None, None], defect, 0.0))
+
+
+@eqx.filter_jit
+def process_covariance(
+    model: Model, rows: LinearisedSegments, least: Float[Array, " n"]
+) -> Float[Array, "S L n n"]:
+    """Cov η of each interval, and the squares of `least` besides."""
+    roots = process_roots(model.log_process, rows)
+    return jnp.einsum("slab,slcb->slac", roots, roots) + jnp.diag(least**2)[None, None]
+
+
+def innovations(made: WhitenedRows, rows: LinearisedSegments) -> Float[np.ndarray, "S L+1 n"]:
+    """What each row says beyond those before it, in standard deviations; 0 where there is none.
+
+    L⁻¹r with L Lᵀ = I + M Mᵀ, row after row: under the model they are independent and N(0, 1),
+    which residuals of a fit are not, since every sample has a part in it. Of each segment together
+    I + V Vᵀ is factorised, V = M R⁻¹ with RᵀR the precision that those before leave.
+    """
+    M, r, shape = np.asarray(made.M), np.asarray(made.r), rows.residual.shape
+    precision, right = np.eye(M.shape[1]), np.zeros(M.shape[1])
+    out = np.zeros((shape[0], shape[1] * shape[2]))
+    for s, (A, y) in enumerate(zip(np.split(M, shape[0]), np.split(r, shape[0]), strict=True)):
+        there = (A != 0).any(axis=1) | (y != 0)
+        if not there.any():
+            continue
+        A, y = A[there], y[there]
+        R = np.linalg.cholesky(precision)
+        V = np.linalg.solve(R, A.T).T
+        error = y - V @ np.linalg.solve(R, right)
+        out[s, there] = np.linalg.solve(np.linalg.cholesky(np.eye(len(y)) + V @ V.T), error)
+        precision, right = precision + A.T @ A, right + A.T @ y
+    return out.reshape(shape)
+
+
+def ljung_box(series: list[Float[np.ndarray, " T"]]) -> tuple[float, int]:
+    """Ljung and Box's statistic of series of mean zero, N (N + 2) Σ_k r_k²/N_k, and its lags.
+
+    N_k are the pairs at lag k, none of them of two series: N − k for a single one.
+    """
+    N, total = sum(len(z) for z in series), sum(z @ z for z in series)
+    statistic, lags = 0.0, 0
+    for k in range(1, _LAGS + 1):
+        pairs = [(z[k:], z[:-k]) for z in series if len(z) > k]
+        count = sum(len(a) for a, _ in pairs)
+        if count >= _PAIRS and total > 0:
+            correlation = sum(a @ b for a, b in pairs) / total
+            statistic, lags = statistic + N * (N + 2) * correlation**2 / count, lags + 1
+    return float(statistic), lags
+
+
+def whiteness(z: Float[np.ndarray, "S L+1 n"], counts: Float[np.ndarray, "S L+1 n"]) -> float:
+    """The probability that white innovations are as correlated as these, 1 of too few."""
+    statistics, lags = zip(*(ljung_box(series) for series in _series(z, counts)), strict=True)
+    return float(gammaincc(sum(lags) / 2, sum(statistics) / 2)) if sum(lags) else 1.0
+
+
+def neighbours(z: Float[np.ndarray, "S L+1 n"], counts) -> Float[np.ndarray, " n"]:
+    """The correlation of each coordinate's innovations at lag one."""
+    out = []
+    for series in _series(z, counts):
+        total = sum(one @ one for one in series)
+        out.append(sum(one[1:] @ one[:-1] for one in series) / total if total > 0 else 0.0)
+    return np.array(out)
+
+
+def _series(z, counts) -> list[list[Float[np.ndarray, " T"]]]:
+    """The innovations of each coordinate by segment.
+
+    The first n measured entries of a segment know its start, and say nothing here.
+    """
+    S, n = len(z), z.shape[2]
+    seen = counts > 0
+    used = seen & (np.cumsum(seen.reshape(S, -1), axis=1).reshape(z.shape) > n)
+    return [[z[s, used[s, :, c], c] for s in range(S)] for c in range(n)]
+
+
+def as_observations(
+    rows: LinearisedSegments, model: Model, mean: object, start_deviation: Float[Array, " n"]
+) -> Together | None:
+    """What the samples say of f = g + m, with independent noise of variance one, block by segment.
+
+    The whitened rows of g at the nodes, and r̃ + the same rows of m for targets. None where no
+    segment has more samples than its start takes.
+    """
+    n = rows.residual.shape[-1]
+    least = rows.counts.astype(bool).sum((1, 2)) > n
+    there = eqx.filter_jit(means)(mean, rows.nodes, rows.nodes[..., :n])
+    # On the host: one segment of a JAX array compiles.
+    every = jax.tree.map(np.asarray, (rows, there))
+    found = []
+    for s in np.flatnonzero(np.asarray(least)):
+        one = jax.tree.map(lambda a, s=s: a[s : s + 1], every)
+        B, r = (np.asarray(a) for a in _at_nodes(model, one[0], start_deviation))
+        seen = B.any(axis=1)  # a first sample says nothing of g
+        last = int(np.flatnonzero(one[0].counts[0].any(axis=1))[-1])
+        B = B[seen].reshape(seen.sum(), -1, n)[:, : 3 * last]
+        target = r[seen] + np.einsum("dqn,qn->d", B, one[1][0, :last].reshape(-1, n))
+        points = one[0].nodes[0, :last].reshape(1, 3 * last, -1)
+        x, u = np.split(points, [n], axis=2)
+        found.append(Functionals(x, B[None], target[None], u if u.size else None))
+    return Together(tuple(found)) if found else None
+
+
+@eqx.filter_jit
+def _at_nodes(model: Model, rows: LinearisedSegments, start_deviation):
+    """The rows of one segment by all values of g at its nodes, and what they are to be."""
+    _, L, _, n, _ = rows.weights.shape
+    placed = jnp.einsum("lkab,lj->lajkb", rows.weights[0], jnp.eye(L, dtype=rows.weights.dtype))
+    own = (rows.drive + rows.missed)[0][..., None]
+    local = jnp.concatenate([placed.reshape(L, n, -1), own], axis=-1)[None]
+    start = jnp.zeros((1, n, local.shape[-1]), local.dtype).at[..., -1].set(-rows.prior_offset)
+    flat = filtered(model, rows, local, start, start_deviation).rows.reshape((L + 1) * n, -1)
+    return flat[:, :-1], flat[:, -1]
