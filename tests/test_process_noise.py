@@ -1,0 +1,247 @@
+"""Process noise in `learn`: the Kalman filter against dense covariances, the test of whiteness."""
+
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false
+
+import functools
+import itertools
+import warnings
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.linalg
+import scipy.stats
+from test_learn import damped, field_error, logs
+
+import hamkernel as hk
+from hamkernel._trajectories.flow import WEIGHTS
+from hamkernel._trajectories.kalman import (
+    as_observations,
+    innovations,
+    ljung_box,
+    neighbours,
+    smoothed_path,
+    whiten,
+    whiteness,
+)
+from hamkernel._trajectories.likelihood import Model, losses, weights_of
+from hamkernel._trajectories.segments import LinearisedSegments
+
+# The filter.
+
+T, N, SPREAD = 6, 2, np.array([2.0, 3.0])
+KERNEL = hk.Symplectic(1.7 * hk.Gaussian(1.2))
+
+
+@functools.cache
+def segment(seed=0):
+    """A linearised segment of no system, in which two entries were not measured."""
+    rng = np.random.default_rng(seed)
+    L = T - 1
+    counts = np.ones((1, T, N))
+    counts[0, 1, 0] = counts[0, 3, 1] = 0.0
+    across = np.eye(N) + 0.3 * rng.standard_normal((1, L, N, N))
+    rows = LinearisedSegments(
+        nodes=rng.standard_normal((1, L, 3, N)),
+        across=across,
+        weights=0.1 * (np.eye(N) + 0.3 * rng.standard_normal((1, L, 3, N, N))),
+        spans=rng.uniform(0.2, 0.5, (1, L)),
+        drive=0.1 * rng.standard_normal((1, L, N)),
+        missed=0.1 * rng.standard_normal((1, L, N)),
+        residual=rng.standard_normal((1, T, N)),
+        counts=counts,
+        scatter=np.zeros((1, T, N)),
+        prior_offset=rng.standard_normal((1, N)),
+    )
+    return jax.tree.map(jnp.asarray, rows)
+
+
+def model(sigma=0.3, q=(0.4, 0.2), kernel=KERNEL):
+    return Model(kernel, jnp.full(N, np.log(sigma)), jnp.log(jnp.asarray(q)))
+
+
+def dense(rows, model):
+    """Of all states in one vector: the mean, the map B of g at the nodes, Cov d, and y."""
+    across, weights, h = (np.asarray(a[0]) for a in (rows.across, rows.weights, rows.spans))
+    drive, q = np.asarray(rows.drive + rows.missed)[0], np.exp(np.asarray(model.log_process))
+    L = T - 1
+    A = np.eye(T * N)  # (I − shifted Ψ) d = (start, pushes)
+    B, Q = np.zeros((T * N, L * 3 * N)), np.zeros((T * N, T * N))
+    Q[:N, :N] = np.diag(SPREAD**2)
+    push = np.asarray(rows.prior_offset)[0]
+    for i in range(L):
+        here, after = slice(i * N, (i + 1) * N), slice((i + 1) * N, (i + 2) * N)
+        A[after, here] = -across[i]
+        for k in range(3):
+            place = slice((3 * i + k) * N, (3 * i + k + 1) * N)
+            B[after, place] = weights[i, k]
+            Q[after, after] += weights[i, k] @ np.diag(q**2) @ weights[i, k].T / h[i] / WEIGHTS[k]
+        push = np.concatenate([push, -drive[i]])
+    inverse = np.linalg.inv(A)
+    return inverse @ push, inverse @ B, inverse @ Q @ inverse.T, inverse, Q
+
+
+def measured(rows, model):
+    """What was measured: the residual, its map of g, its covariance, and Cov(d, y)."""
+    mean, B, P, _, _ = dense(rows, model)
+    seen = np.asarray(rows.counts).reshape(-1) > 0
+    noise = np.tile(np.exp(2 * np.asarray(model.log_noise)), T)
+    r = np.asarray(rows.residual).reshape(-1) - mean
+    return r[seen], B[seen], (P + np.diag(noise))[np.ix_(seen, seen)], P[:, seen]
+
+
+LANDMARKS = jnp.asarray(np.random.default_rng(5).uniform(-2, 2, (5, N)))
+
+
+def gram(kernel, X, Z):
+    G = np.asarray(hk.gram(kernel, X, Z))
+    return G.reshape(X.size, Z.size)
+
+
+def test_the_likelihood_is_that_of_the_dense_covariance():
+    rows = segment()
+    nodes = jnp.asarray(rows.nodes).reshape(-1, N)
+    for each in (model(), model(0.1, (1.0, 0.3), hk.Symplectic(0.8 * hk.Gaussian(2.0)))):
+        r, B, C, _ = measured(rows, each)
+        across = gram(each.kernel, nodes, LANDMARKS)
+        G = across @ np.linalg.solve(gram(each.kernel, LANDMARKS, LANDMARKS), across.T)
+        expected = -scipy.stats.multivariate_normal(np.zeros(len(r)), C + B @ G @ B.T).logpdf(r)
+        given = LANDMARKS, rows, jnp.asarray(SPREAD), whiten
+        found = float(losses(each, each.flat[None], *given)[0])
+        np.testing.assert_allclose(found, expected - 0.5 * len(r) * np.log(2 * np.pi), rtol=1e-10)
+        # The control: without process noise it is another one.
+        none = each._replace(log_process=jnp.full(N, -jnp.inf))
+        assert abs(float(losses(none, none.flat[None], *given)[0]) - found) > 0.1
+
+
+def test_the_smoothed_path_and_the_disturbance_are_conditional_means():
+    rows, each = segment(), model()
+    a = jnp.asarray(np.random.default_rng(6).standard_normal((5, N)))
+    found = smoothed_path(each, a, LANDMARKS, rows, jnp.asarray(SPREAD))
+    nodes = jnp.asarray(rows.nodes).reshape(-1, N)
+    g = gram(each.kernel, nodes, LANDMARKS) @ np.asarray(a).reshape(-1)
+    r, B, C, cross = measured(rows, each)
+    mean, everywhere, _, inverse, Q = dense(rows, each)
+    ahead = np.linalg.solve(C, r - B @ g)
+    d = mean + everywhere @ g + cross @ ahead
+    np.testing.assert_allclose(found.moves[0], d.reshape(T, N), rtol=1e-9, atol=1e-10)
+    # η given the samples moves the path by what the mean of w over the interval would, where Γ is
+    # the same at all nodes.
+    same = rows._replace(
+        weights=jnp.broadcast_to(rows.spans[..., None, None, None], (1, T - 1, 3, 1, 1))
+        * jnp.asarray(WEIGHTS)[None, None, :, None, None]
+        * jnp.eye(N)[None, None, None]
+    )
+    found = smoothed_path(each, a, LANDMARKS, same, jnp.asarray(SPREAD))
+    r, B, C, cross = measured(same, each)
+    _, _, _, inverse, Q = dense(same, each)
+    seen = np.asarray(rows.counts).reshape(-1) > 0
+    eta = (Q @ inverse.T)[:, seen] @ np.linalg.solve(C, r - B @ g)
+    expected = eta.reshape(T, N)[1:] / np.asarray(same.spans[0])[:, None]
+    np.testing.assert_allclose(found.disturbance[0], expected, rtol=1e-9, atol=1e-10)
+
+
+def test_observations_say_what_the_dense_covariance_says():
+    rows, each = segment(), model()
+    found = as_observations(rows, each, None, jnp.asarray(SPREAD))
+    ((block, targets),) = found.parts()
+    r, B, C, _ = measured(rows, each)
+    W, y = np.asarray(block.weights[0]).reshape(len(targets), -1), np.asarray(targets)
+    np.testing.assert_allclose(W.T @ W, B.T @ np.linalg.solve(C, B), rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(W.T @ y, B.T @ np.linalg.solve(C, r), rtol=1e-9, atol=1e-10)
+
+
+# Innovations.
+
+
+def test_innovations_are_those_of_the_dense_cholesky_factor():
+    rows = segment()
+    made = jax.jit(whiten)(model(), LANDMARKS, rows, jnp.asarray(SPREAD))
+    M, r = np.asarray(made.M), np.asarray(made.r)
+    seen = np.asarray(rows.counts).reshape(-1) > 0
+    L = np.linalg.cholesky(np.eye(seen.sum()) + M[seen] @ M[seen].T)
+    expected = scipy.linalg.solve_triangular(L, r[seen], lower=True)
+    z = innovations(made, rows)
+    np.testing.assert_allclose(z.reshape(-1)[seen], expected, rtol=1e-10)
+    assert not z.reshape(-1)[~seen].any()
+    R, w = weights_of(made)  # −2 log p but for log det is their sum of squares
+    misfit = r - M @ np.asarray(w)
+    np.testing.assert_allclose(z.reshape(-1) @ z.reshape(-1), misfit @ misfit + w @ w, rtol=1e-10)
+    assert R.shape == (10, 10)
+
+
+def white_or_not(rng, correlation=0.0, runs=3, length=60):
+    z = rng.standard_normal((runs, length, 2))
+    for i, c in itertools.product(range(1, length), range(2)):
+        z[:, i, c] = correlation * z[:, i - 1, c] + np.sqrt(1 - correlation**2) * z[:, i, c]
+    return z
+
+
+def test_whiteness_is_the_test_of_ljung_and_box():
+    z = white_or_not(np.random.default_rng(1), 0.2, runs=1, length=80)[0, :, 0]
+    N, r = len(z), [z[k:] @ z[:-k] / (z @ z) for k in range(1, 11)]
+    Q = N * (N + 2) * sum(each**2 / (N - k) for k, each in enumerate(r, 1))
+    found, lags = ljung_box([z])
+    np.testing.assert_allclose(found, Q, rtol=1e-12)
+    assert lags == 10
+    # One measured coordinate, and a first sample that knows the start.
+    both, counts = np.stack([np.append(9.0, z), np.zeros(81)], axis=1)[None], np.ones((1, 81, 2))
+    counts[..., 1] = 0.0
+    counts[0, 0] = 1.0
+    np.testing.assert_allclose(whiteness(both, counts), scipy.stats.chi2.sf(Q, 10), rtol=1e-8)
+    np.testing.assert_allclose(neighbours(both, counts)[0], r[0], rtol=1e-12)
+
+
+def test_one_in_twenty_of_white_innovations_is_a_false_alarm():
+    rng, counts = np.random.default_rng(2), np.ones((3, 60, 2))
+    p = np.array([whiteness(white_or_not(rng), counts) for _ in range(400)])
+    assert 0.025 < np.mean(p < 0.05) < 0.08  # ±2.5 standard errors of 400
+    alarms = [whiteness(white_or_not(rng, 0.3), counts) < 0.05 for _ in range(20)]
+    assert sum(alarms) > 17
+
+
+# What is learned.
+
+
+def test_process_noise_that_cannot_be_meant_is_refused():
+    t = np.linspace(0.0, 1.0, 5)
+    times, states, K = (
+        [t],
+        [np.stack([np.cos(t), -np.sin(t)], axis=1)],
+        hk.Symplectic(hk.Gaussian(1.0)),
+    )
+    with pytest.raises(ValueError, match=r"process_noise must be 0 or more.*None to have it found"):
+        hk.learn(K, hk.Runs(times, states), process_noise=-1.0)
+    with pytest.raises(ValueError, match=r"process_noise has shape \(3,\)"):
+        hk.learn(K, hk.Runs(times, states), process_noise=np.ones(3))
+    with pytest.raises(ValueError, match="iterations"):
+        hk.learn(K, hk.Runs(times, states), iterations=0)
+
+
+@pytest.mark.slow
+def test_little_process_noise_is_none():
+    times, states, true = logs()
+    K, runs = hk.Symplectic(hk.Gaussian(1.0)), hk.Runs(times, states)
+    none, little = (hk.learn(K, runs, process_noise=q) for q in (0.0, 1e-3))
+    X = jnp.asarray(true[0])
+    f, g = (np.asarray(jax.vmap(each.field)(X)) for each in (none, little))
+    np.testing.assert_allclose(f, g, atol=1e-3 * np.abs(f).max())
+    np.testing.assert_allclose(none.noise, little.noise, rtol=1e-3)
+    assert np.asarray(none.process_noise).tolist() == [0.0, 0.0]
+    assert not np.concatenate(none.disturbance).any()
+
+
+@pytest.mark.slow
+def test_friction_that_the_structure_lacks_is_process_noise_and_said():
+    times, states, true = logs(damped, noise=0.01)
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        found = hk.learn(hk.Symplectic(hk.Gaussian(1.0)), hk.Runs(times, states))
+    assert (np.asarray(found.process_noise) > 0).all()
+    assert any("the structure alone does not explain the runs" in str(w.message) for w in seen)
+    assert field_error(found.field, true, damped) < 0.02
+    # w stands for what is lacking: −.05 p.
+    p = np.concatenate(true)[:, 1]
+    w = np.concatenate(found.disturbance)[:, 1]
+    assert np.corrcoef(p, w)[0, 1] < -0.5
