@@ -145,6 +145,7 @@ def test_the_smoothed_path_and_the_disturbance_are_conditional_means():
 def test_observations_say_what_the_dense_covariance_says():
     rows, each = segment(), model()
     found = as_observations(rows, each, None, jnp.asarray(SPREAD))
+    assert found is not None
     ((block, targets),) = found.parts()
     r, B, C, _ = measured(rows, each)
     W, y = np.asarray(block.weights[0]).reshape(len(targets), -1), np.asarray(targets)

@@ -5,9 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float, Key
 
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._posterior import Posterior, condition
@@ -132,6 +133,34 @@ class Learned(eqx.Module):
             solver=solver,
             mean=self.mean,
         )
+
+    def sample_disturbance(
+        self, key: Key[Array, ""], ts: Float[ArrayLike, " T"]
+    ) -> Float[Array, "T n"]:
+        """Draw w at the times ts, held until the next: normal, of deviation q/√h over a step h.
+
+        With it free runs have honest bands, those of the field and of what the structure lacks:
+
+            fields = learned.posterior.sample(key, 64, region)
+            w = jax.vmap(lambda k: learned.sample_disturbance(k, ts))(jax.random.split(key, 64))
+            runs = jax.vmap(
+                lambda f, w: hk.simulate(lambda x, w: f(x) + w, x0, ts, inputs=w).ys
+            )(fields, w)
+
+        With inputs u join them: `lambda x, s: f(x, s[:m]) + s[m:]` and
+        `inputs=jnp.concatenate([u, w], axis=1)`.
+
+        Args:
+            key: the random key.
+            ts: times, shape (T,), increasing.
+
+        Returns:
+            w, shape (T, n); zero without process noise.
+        """
+        h = jnp.diff(jnp.asarray(ts, self.noise.dtype))
+        h = jnp.append(h, h[-1:])[:, None]
+        draws = jax.random.normal(key, (len(h), len(self.noise)), self.noise.dtype)
+        return self.process_noise[None] * draws / jnp.sqrt(h)
 
     @property
     def residuals(self) -> tuple[Float[Array, "T n"], ...]:
