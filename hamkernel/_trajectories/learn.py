@@ -249,51 +249,16 @@ def _learned(
         else interpolated(t - t[0], run.times, path, np.asarray(velocity(run.joined(path))))
         for t, run, path in zip(times, data.runs, now.paths, strict=True)
     ]
-    kept = np.zeros(len(data.runs))
-    for (r, start, stop), good in zip(end.pieces, now.good, strict=True):
-        kept[r] += good * (stop - start) / len(data.runs[r].times)
     noise = np.where(measured, np.exp(np.asarray(now.model.log_noise)), np.nan)
     process = np.exp(np.asarray(now.model.log_process))
     misfit = misfits(runs, states, noise)
-    given_rows = now.model, task.S, now.rows, task.start_deviation
-    z, counts = innovations(_whitened(*given_rows), now.rows), np.asarray(now.rows.counts)
-    squares, free = now.squares, now.free
-    if alone is not None:
-        squares, free = alone.now.squares, alone.now.free
-    elif process.any():  # the path follows the samples: only what was expected can be judged
-        squares, free = float((z**2).sum()), float((counts > 0).sum())
-    chi_squared = squares / max(free, 1.0)
-    white = whiteness(z, counts)
-    speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
-    spacing = np.median(np.concatenate([np.diff(t) for t in times]))
-    swing = 2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)) / spacing
-    dropped = dropped_samples(end, times)
-    fit = FitQuality(
-        kept=kept,
-        dropped=dropped,
-        misfit=misfit,
-        chi_squared=chi_squared,
-        free=free,
-        white=white,
-        correlation=neighbours(z, counts),
-        process=None if alone is None else process,
-        count=len(history),
-        settled=end.settled,
-        swing=float(swing),
-        driven=runs.inputs is not None,
-    )
+    rows = task.S, now.rows, task.start_deviation
+    z, counts = innovations(_whitened(now.model, *rows), now.rows), np.asarray(now.rows.counts)
+    fit = _quality(runs, end, alone, misfit, z, process)
     converged = diagnose(fit, noise, data.scale, given)
     observations = as_observations(now.rows, now.model, task.mean, task.start_deviation)
     count = 1 if observations is None else sum(len(y) for _, y in observations.parts())
     regularization = jnp.asarray(1 / count)
-    w = np.zeros_like(np.asarray(now.rows.drive))
-    if process.any():
-        found = smoothed_path(now.model, field.coefficients, *given_rows[1:])
-        w = np.asarray(found.disturbance)
-    disturbance = [
-        of_run[np.clip(np.searchsorted(run.times, t - t[0], "right") - 1, 0, len(of_run) - 1)]
-        for of_run, run, t in zip(_by_run(w, end, 0.0), data.runs, times, strict=True)
-    ]
     return Learned(
         field=_field(field, regularization),
         kernel=field.kernel,
@@ -301,21 +266,73 @@ def _learned(
         noise=jnp.asarray(noise),
         process_noise=jnp.asarray(process),
         states=tuple(jnp.asarray(x) for x in states),
-        kept=jnp.asarray(kept),
-        dropped=dropped,
+        kept=jnp.asarray(fit.kept),
+        dropped=fit.dropped,
         misfit=jnp.asarray(misfit),
-        chi_squared=jnp.asarray(chi_squared),
+        chi_squared=jnp.asarray(fit.chi_squared),
         innovations=tuple(
             jnp.asarray(x) for x in _by_run(np.where(counts > 0, z, np.nan), end, np.nan)
         ),
-        whiteness=jnp.asarray(white),
-        disturbance=tuple(jnp.asarray(x) for x in disturbance),
+        whiteness=jnp.asarray(fit.white),
+        disturbance=_disturbances(end, times),
         history=tuple(history),
         converged=converged,
         runs=runs,
         observations=observations,
         mean=mean,
     )
+
+
+def _quality(
+    runs: Runs,
+    end: End,
+    alone: End | None,
+    misfit: Float[np.ndarray, "R n"],
+    z: Float[np.ndarray, "S L+1 n"],
+    process: Float[np.ndarray, " n"],
+) -> FitQuality:
+    """How well the field follows the runs; `z` are the innovations by segment."""
+    now, data, times = end.now, end.task.data, runs.on_host()[0]
+    counts = np.asarray(now.rows.counts)
+    kept = np.zeros(len(data.runs))
+    for (r, start, stop), good in zip(end.pieces, now.good, strict=True):
+        kept[r] += good * (stop - start) / len(data.runs[r].times)
+    squares, free = now.squares, now.free
+    if alone is not None:
+        squares, free = alone.now.squares, alone.now.free
+    elif process.any():  # the path follows the samples: only what was expected can be judged
+        squares, free = float((z**2).sum()), float((counts > 0).sum())
+    speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
+    spacing = np.median(np.concatenate([np.diff(t) for t in times]))
+    swing = 2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)) / spacing
+    return FitQuality(
+        kept=kept,
+        dropped=dropped_samples(end, times),
+        misfit=misfit,
+        chi_squared=squares / max(free, 1.0),
+        free=free,
+        white=whiteness(z, counts),
+        correlation=neighbours(z, counts),
+        process=None if alone is None else process,
+        count=len(end.history),
+        settled=end.settled,
+        swing=float(swing),
+        driven=runs.inputs is not None,
+    )
+
+
+def _disturbances(end: End, times: list[np.ndarray]) -> tuple[Float[Array, "T n"], ...]:
+    """The smoothed w of each run, from each of its times to the next."""
+    task, now = end.task, end.now
+    w = np.zeros(now.rows.drive.shape)
+    if bool(jnp.isfinite(now.model.log_process).any()):
+        given = task.S, now.rows, task.start_deviation
+        w = np.asarray(smoothed_path(now.model, now.field.coefficients, *given).disturbance)
+    out = []
+    for of_run, run, t in zip(_by_run(w, end, 0.0), task.data.runs, times, strict=True):
+        i = np.searchsorted(run.times, t - t[0], "right") - 1
+        out.append(jnp.asarray(of_run[np.clip(i, 0, len(of_run) - 1)]))
+    return tuple(out)
 
 
 def dropped_samples(end: End, times: list[np.ndarray]) -> tuple[tuple[int, int, int], ...]:
@@ -407,6 +424,13 @@ def _check(
             "learn needs doubles, since paths and their tangents are compared over many steps: "
             "jax.config.update('jax_enable_x64', True) first."
         )
+    return K, *_noises(noise, process_noise, n)
+
+
+def _noises(
+    noise: Any, process_noise: Any, n: int
+) -> tuple[Float[np.ndarray, " n"] | None, Float[np.ndarray, " n"] | None]:
+    """Both noises, of each coordinate, where they were given."""
     given = process = None
     if noise is not None:
         given = _of_coordinates(
@@ -423,7 +447,7 @@ def _check(
                 f"process_noise must be 0 or more, got {process_noise}: 0 where the structure is "
                 "the whole truth, None to have it found."
             )
-    return K, given, process
+    return given, process
 
 
 def _of_coordinates(value: Any, n: int, name: str) -> Float[np.ndarray, " n"]:
