@@ -309,11 +309,7 @@ def bounds_and_design(
     lengths = np.append([name.endswith("lengthscale") for name in names], none).astype(bool)
     scales = np.append([name.split(".")[-1] == "scale" for name in names], none).astype(bool)
     if spacing > 0:
-        spread = X.std(axis=0)
-        spread[: len(scale)] = scale
-        each = (spread if p.low.size == len(spread) else scale.min() for p in leaves)
-        least = [np.full(p.low.size, s) for p, s in zip(leaves, each, strict=True)]
-        least = np.log(spacing * np.maximum(np.concatenate([*least, scale]), np.finfo(float).tiny))
+        least = np.append(_least_lengths(leaves, X, scale, spacing), scale)
         low[lengths] = np.clip(least, low, high - 0.1)[lengths]
         start = np.clip(start, low, high)
     extents = np.concatenate([*(_extents(p.low, X[:, : len(scale)]) for p in leaves), none])
@@ -341,14 +337,22 @@ def bounds_and_design(
     process = np.broadcast_to(process, (len(design), len(scale)))
     looked = np.isfinite(impulse)
     # Of what is not free neither the box nor a step matters.
-    sides = [
+    least, most = (
         np.where(looked, impulse + np.log(share), 0.0)
         for share in (_LEAST_DISTURBANCE, _MOST_DISTURBANCE)
-    ]
-    bounds = Bounds(
-        *(np.concatenate(each) for each in ((low, sides[0]), (high, sides[1]), (free, looked)))
     )
-    return bounds, np.concatenate([design, process], axis=1)
+    pairs = (low, least), (high, most), (free, looked)
+    return Bounds(*map(np.concatenate, pairs)), np.concatenate([design, process], axis=1)
+
+
+def _least_lengths(leaves, X, scale, spacing: float) -> Float[np.ndarray, " P"]:
+    """The logarithm of `spacing` in units of the coordinates, or of the smallest of them."""
+    spread = X.std(axis=0)
+    spread[: len(scale)] = scale
+    each = [
+        spread if p.low.size == len(spread) else np.full(p.low.size, scale.min()) for p in leaves
+    ]
+    return np.log(spacing * np.maximum(np.concatenate(each), np.finfo(float).tiny))
 
 
 def _extents(leaf: np.ndarray, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, " size"]:
