@@ -99,6 +99,7 @@ REFUSED = {
     "`hk.learn`": lambda s: hk.learn(hk.Symplectic(hk.Gaussian(s)), runs),
     "`hk.tune`": lambda s: hk.tune(K, X, s * Y),
     "`hk.readout`": lambda s: hk.readout(hk.condition(K, X, s * Y, 1e-4), {"q": lambda x: x[0]}),
+    "`hk.compare`": lambda s: hk.compare(X, s * Y),
     "`hk.check_kernel`": lambda s: hk.check_kernel(hk.Gaussian(s), X),
     "`hk.save`": lambda s: hk.save("no file", hk.fit(K, X, s * Y, 1e-4)),
     "`hk.plot`": lambda s: hk.plot.trajectories({"a": s * Y}),
@@ -141,8 +142,10 @@ def test_works_under_jit_vmap_and_grad(name):
     jax.eval_shape(jax.vmap(jax.grad(number)), jnp.ones(2))
 
 
+# Under jit `posterior.sample` chooses its landmarks without looking at how many are needed, so that
+# its draws are others of the same distribution.
 @pytest.mark.slow
-@pytest.mark.parametrize("name", WORKS)
+@pytest.mark.parametrize("name", [name for name in WORKS if "sample`, its count" not in name])
 def test_the_numbers_under_jit_and_grad_are_those_without(name):
     def number(s):
         return jnp.sum(WORKS[name](s))

@@ -165,6 +165,7 @@ def compare(
     """
     from tqdm import tqdm  # so that importing the package does not load it
 
+    require.untraced("hk.compare", "Call it outside.", X, Y, candidates)
     data, ridge = _data(X, Y)
     rows = problem(Separable(Gaussian(1.0)), data, None, 1.0).rows
     points, n, D = np.asarray(rows.points), rows.dimension, rows.size

@@ -5,11 +5,12 @@ from __future__ import annotations
 from matplotlib.axes import Axes
 
 from hamkernel._discovery.compare import QUESTIONS, THRESHOLD, Comparison
-from hamkernel.plot._style import COLORS, STREAM, axes
+from hamkernel.plot._style import COLORS, STREAM, axes, drawn
 
 _SHOWN = 60.0  # beyond, a bar ends at the edge: e⁶⁰ to one needs no comparing
 
 
+@drawn
 def comparison(compared: Comparison, ax: Axes | None = None) -> Axes:
     """How far the score of each candidate is below the best, the best on top, and the answers.
 
