@@ -159,8 +159,9 @@ def closed(
             if len(group) > MOST:
                 raise ValueError(
                     f"the maps generate more than {MOST} others, so they do not close to a finite "
-                    "group of use here. Rotations must be by 2π over a whole number; a continuous "
-                    "symmetry cannot be averaged over so. Give the (n, n) matrices all digits."
+                    "group of use here. A rotation must be by 2π over a whole number, given with "
+                    "all digits; a shear or a stretch never closes, and a continuous symmetry "
+                    "cannot be averaged over so."
                 )
     return tuple(group)
 
