@@ -839,7 +839,21 @@ def test_conjugate_gradients_solve_what_was_tuned_on_noisy_data(simple):
         hk.tune(SIMPLE, X, Y, 1e-17, solver=hk.ConjugateGradient(), bounds=small)
 
 
-# Planted truths.
+# Without noise, and planted truths.
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("folds", [5, 10])
+def test_seven_revolutions_of_a_planet_are_predicted_from_one(folds):
+    # The data is a closed curve in a space of four dimensions: nothing is known beside it.
+    kepler = hk.systems.Kepler(reduced_mass=1.0, gravitational_parameter=1.0)
+    start = jnp.array([0.95, 0.0, 0.0, (1.05 / 0.95) ** 0.5])  # eccentricity .05, semi-major axis 1
+    ts = np.linspace(0.0, 14 * np.pi, 421)
+    truth: Any = hk.simulate(kepler, start, ts, rtol=1e-11, atol=1e-11).ys
+    X, Y = truth[:60], jax.vmap(kepler)(truth[:60])
+    tuned = hk.tune(hk.Odd(hk.Symplectic(hk.Gaussian(2.0))), X, Y, 1e-6, folds, starts=6)
+    path: Any = hk.simulate(tuned.field, start, ts).ys
+    assert jnp.linalg.norm((path - truth)[:, :2], axis=1).max() < 0.005
 
 
 def prior_draw(K, X, noise: float, seed: int) -> np.ndarray:
