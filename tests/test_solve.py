@@ -151,10 +151,10 @@ def test_a_part_of_many_observations_has_the_landmarks_for_all():
     Z = swings(20, seed=9)[0]
 
     def fit(data):
-        return hk.fit(K, data, regularization=RIDGE, solver=Nystrom(1e-4, 200, 150)).evaluate(Z)
+        return hk.fit(K, data, regularization=RIDGE, solver=Nystrom(0.1, 200, 150)).evaluate(Z)
 
     for values in (fit(data), jax.jit(fit)(data)):
-        assert relative(values, np.asarray(exact.evaluate(Z))) < 1e-4
+        assert relative(values, np.asarray(exact.evaluate(Z))) < 1e-2
 
 
 @pytest.mark.slow
