@@ -142,6 +142,7 @@ def test_too_few_rows_for_landmarks_are_said():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:.* landmarks leave")  # a part has not all that the rest has
 def test_a_part_of_many_observations_has_the_landmarks_for_all():
     X, Y = swings(300)
     data = hk.Velocities(X[:50], Y[:50], noise=0.5) + hk.Energies(
