@@ -215,22 +215,25 @@ def innovations(made: WhitenedRows, rows: LinearisedSegments) -> Float[np.ndarra
     """What each row says beyond those before it, in standard deviations; 0 where there is none.
 
     L⁻¹r with L Lᵀ = I + M Mᵀ, row after row: under the model they are independent and N(0, 1),
-    which residuals of a fit are not, since every sample has a part in it. Of each segment together
-    I + V Vᵀ is factorised, V = M R⁻¹ with RᵀR the precision that those before leave.
+    which residuals of a fit are not, since every sample has a part in it. R w = v with noise of one
+    is what those before say of w, and for a segment L is the factor of I + V Vᵀ, V = M R⁻¹. Both
+    come from orthonormal factors: without sensor noise squares of M have no digits for the rest.
     """
     M, r, shape = np.asarray(made.M), np.asarray(made.r), rows.residual.shape
-    precision, right = np.eye(M.shape[1]), np.zeros(M.shape[1])
+    R, v = np.eye(M.shape[1]), np.zeros(M.shape[1])
     out = np.zeros((shape[0], shape[1] * shape[2]))
     for s, (A, y) in enumerate(zip(np.split(M, shape[0]), np.split(r, shape[0]), strict=True)):
         there = (A != 0).any(axis=1) | (y != 0)
-        if not there.any():
-            continue
         A, y = A[there], y[there]
-        R = np.linalg.cholesky(precision)
-        V = np.linalg.solve(R, A.T).T
-        error = y - V @ np.linalg.solve(R, right)
-        out[s, there] = np.linalg.solve(np.linalg.cholesky(np.eye(len(y)) + V @ V.T), error)
-        precision, right = precision + A.T @ A, right + A.T @ y
+        if not (len(y) and np.isfinite(A).all() and np.isfinite(y).all()):
+            continue
+        V = np.linalg.solve(R.T, A.T).T
+        L = np.linalg.qr(np.concatenate([np.eye(len(y)), V.T]), mode="r").T
+        L = L * np.sign(np.diagonal(L))[None]
+        out[s, there] = np.linalg.solve(L, y - V @ v)
+        both = np.column_stack([np.concatenate([R, A]), np.append(v, y)])
+        both = np.linalg.qr(both, mode="r")[: len(v)]
+        R, v = both[:, :-1], both[:, -1]
     return out.reshape(shape)
 
 
