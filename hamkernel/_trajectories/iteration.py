@@ -28,11 +28,13 @@ from hamkernel._trajectories.likelihood import (
     ClosedForm,
     Model,
     Whitening,
+    begun,
     closed_form,
     landmark_whitening,
-    losses,
     most_likely,
     project_out_starts,
+    searched,
+    solved,
 )
 from hamkernel._trajectories.preprocessing import Preprocessed
 from hamkernel._trajectories.segments import (
@@ -62,11 +64,21 @@ _INTEGRATED = 1e-6  # of the states, what the steps of `flow` may leave in an in
 
 
 class Task(NamedTuple):
-    """What does not change: the runs, the mean, landmarks, the box and the prior of starts."""
+    """What does not change.
+
+    Attributes:
+        data: the runs.
+        mean: what is known.
+        S: as many landmarks as there may be.
+        first: with how many of them learning begins.
+        bounds: the box of hyperparameters.
+        start_deviation: of the prior of starts.
+    """
 
     data: Preprocessed
     mean: Any
-    S: Float[Array, "m d"]
+    S: Float[np.ndarray, "m d"]
+    first: int
     bounds: Bounds
     start_deviation: Float[Array, " n"]
 
@@ -77,6 +89,7 @@ class Current(NamedTuple):
     Attributes:
         model: kernel and noise.
         field: the field.
+        S: its landmarks, and more if there may be more.
         rows: what it was learned from.
         paths: of each run at its samples.
         good: which pieces were kept.
@@ -86,6 +99,7 @@ class Current(NamedTuple):
 
     model: Model
     field: Expansion
+    S: Float[np.ndarray, "m d"]
     rows: LinearisedSegments
     paths: list[np.ndarray]
     good: Bool[np.ndarray, " S"]
@@ -112,18 +126,16 @@ class End(NamedTuple):
 
 
 def iterate(
-    task: Task, model: Model, design: np.ndarray, process: bool, most: int, progress: bool
+    task: Task, model: Model, design: np.ndarray, process: bool, most: int, bar: Any
 ) -> End:
     """Gauss-Newton steps until noise and objective settle, `most` of them at most."""
-    from tqdm import tqdm  # so that importing the package does not load it
-
     runs, step = task.data.runs, iterated_with_process if process else iterated
     now = (begin_with_process if process else begin)(task, model, design)
     history: list[Iteration] = []
     pieces: list[Piece] = []
     settled = False
-    bar = tqdm(range(most), "learning", disable=None if progress else True)
-    for i in bar:
+    bar.update()
+    for i in range(most):
         if process:
             wanted = equal_pieces(runs, LONG)
         elif i < _SHORT_ROUNDS:
@@ -136,21 +148,21 @@ def iterate(
         now, done = step(task, now, pieces)
         history.append(done)
         noise = ", ".join(f"{sigma:.3g}" for sigma in np.asarray(done.noise))
-        bar.set_postfix_str(f"noise {noise}, kept {float(done.kept):.0%}")
+        bar.set_postfix_str(f"noise {noise}, kept {float(done.kept):.0%}", refresh=False)
+        bar.update()
         moved = float(jnp.abs(now.model.log_noise - before.model.log_noise).max())
         small = float(done.gain) < _SETTLED * max(now.free, 1.0)
         settled = moved < _SETTLED and (small or changed(task, before, now) < _UNCHANGED)
         settled = settled and same and i > _SHORT_ROUNDS
         if settled:
             break
-    bar.close()
     return End(task, now, pieces, history, settled)
 
 
 def initial_loss(task: Task, model: Model) -> float:
     """−log p of the rows along the smoothed runs, at the hyperparameters of `model`."""
     *_, rows = smoothed_rows(task.data, task.mean)
-    given = task.S, rows, task.start_deviation, project_out_starts
+    given = jnp.asarray(task.S[: task.first]), rows, task.start_deviation, project_out_starts
     return float(losses(model, model.flat[None], *given)[0])
 
 
@@ -161,20 +173,22 @@ def begin(task: Task, model: Model, design: np.ndarray) -> Current:
     """
     pieces, good, rows = smoothed_rows(task.data, task.mean)
     paths = [run.path for run in task.data.runs]
-    model, found, field = _first(task, model, design, rows, project_out_starts)
-    return Current(model, field, rows, paths, good[: len(pieces)], np.inf, float(found.free))
+    model, found, field, S = _first(task, model, design, rows, project_out_starts)
+    good = good[: len(pieces)]
+    return Current(model, field, S, rows, paths, good, np.inf, float(found.free))
 
 
 def _first(
     task: Task, model: Model, design: np.ndarray, rows: LinearisedSegments, whitening: Whitening
-) -> tuple[Model, ClosedForm, Expansion]:
-    """The likeliest model, from the best point of a design, and its field."""
-    given = task.S, rows, task.start_deviation
-    values = np.asarray(losses(model, jnp.asarray(design), *given, whitening))
-    model = model.at(jnp.asarray(design[int(np.argmin(values))]))
-    model, _ = most_likely(model, *given, task.bounds, _SEARCH, whitening)
-    found = closed_form(model, *given, whitening)
-    return model, found, Expansion(model.kernel, task.S, found.coefficients, task.mean)
+) -> tuple[Model, ClosedForm, Expansion, np.ndarray]:
+    """The likeliest model, from the best point of a design, its field, and landmarks for more."""
+    given = rows, task.start_deviation
+    model, count = begun(model, design, task.S, task.first, *given, whitening)
+    S = task.S[:count]
+    model, _ = most_likely(model, S, *given, task.bounds, _SEARCH, whitening)
+    S = task.S if searched(S, rows)[1] is not rows else S
+    model, found = solved(model, S, task.first, *given, whitening, task.bounds)
+    return model, found, Expansion(model.kernel, found.points, found.coefficients, task.mean), S
 
 
 def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, Iteration]:
@@ -193,9 +207,12 @@ def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, It
         _ROUNDS,
     )
     least = NEGLIGIBLE * task.data.scale
-    good = trusted(before, segments, np.exp(np.asarray(now.model.log_noise)), least)
+    was_asked = bool(np.isfinite(now.squares))
+    good = trusted(before, segments, np.exp(np.asarray(now.model.log_noise)), least, was_asked)
+    if not was_asked:  # the pieces are those of the smoothed paths
+        good[: len(pieces)] &= now.good
     rows = linearised_along_field(now.field, before.path, segments, jnp.asarray(good))
-    model, loss, found, between = _solved(task, now.model, rows, project_out_starts)
+    model, found, S, between = _solved(task, now, rows, project_out_starts)
 
     def trial(share: float) -> _Trial:
         weights, field = between(share)
@@ -210,8 +227,9 @@ def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, It
     gain, taken, best = _searched(trial, bool(good.any()))
     good = good[: len(pieces)]
     paths = _updated(now.paths, pieces, good, best.x)
-    step = _described(task, pieces, good, best, gain, taken, model, loss)
-    return Current(model, best.field, rows, paths, good, best.squares, float(found.free)), step
+    step = _described(task, pieces, good, best, gain, taken, model, found.loss)
+    free = float(found.free)
+    return Current(model, best.field, S, rows, paths, good, best.squares, free), step
 
 
 class _Trial(NamedTuple):
@@ -222,24 +240,28 @@ class _Trial(NamedTuple):
 
 
 def _solved(
-    task: Task, model: Model, rows: LinearisedSegments, whitening: Whitening
-) -> tuple[Model, float, ClosedForm, Callable[[float], tuple[Array, Expansion]]]:
-    """The likeliest model, its closed form, and the fields on the way to it: share -> (w, f)."""
-    given = task.S, rows, task.start_deviation
-    model, loss = most_likely(model, *given, task.bounds, _SEARCH, whitening)
-    found = closed_form(model, *given, whitening)
+    task: Task, now: Current, rows: LinearisedSegments, whitening: Whitening
+) -> tuple[Model, ClosedForm, np.ndarray, Callable[[float], tuple[Array, Expansion]]]:
+    """The likeliest model, its closed form, landmarks for more, and the way to it: share -> (w, f).
+
+    Rows that ask for no more landmarks once are not asked again.
+    """
+    given, used = (rows, task.start_deviation), len(now.field.points)
+    model, _ = most_likely(now.model, now.S[:used], *given, task.bounds, _SEARCH, whitening)
+    model, found = solved(model, now.S, used, *given, whitening, task.bounds)
     # The current field in the new basis, by what it says of the same rows.
     names = "residual", "missed", "prior_offset"
     known = rows._replace(**{name: jnp.zeros_like(getattr(rows, name)) for name in names})
-    old = closed_form(model, task.S, known, task.start_deviation, whitening).weights
-    T = _landmark_whitening(model.kernel, task.S)
+    S = found.points
+    old = closed_form(model, S, known, task.start_deviation, whitening).weights
+    T = _landmark_whitening(model.kernel, S)
 
     def between(share: float) -> tuple[Float[Array, " q"], Expansion]:
         weights = (1 - share) * old + share * found.weights
-        coefficients = (T @ weights).reshape(len(task.S), -1)
-        return weights, Expansion(model.kernel, task.S, coefficients, task.mean)
+        coefficients = (T @ weights).reshape(len(S), -1)
+        return weights, Expansion(model.kernel, S, coefficients, task.mean)
 
-    return model, loss, found, between
+    return model, found, np.asarray(S) if len(S) == used else now.S, between
 
 
 def _searched(trial: Callable[[float], _Trial], any_good: bool) -> tuple[float, float, _Trial]:
@@ -270,13 +292,18 @@ def begin_with_process(task: Task, model: Model, design: np.ndarray) -> Current:
     good = np.zeros(len(segments.starts), bool)
     good[: len(pieces)] = [task.data.usable[piece.run] for piece in pieces]
     rows = linearised_along_smoothed(task.data, pieces, segments, task.mean, good)
-    model, found, field = _first(task, model, design, rows, whiten)
-    moves = smoothed_path(model, found.coefficients, task.S, rows, task.start_deviation).moves
+    model, found, field, S = _first(task, model, design, rows, whiten)
+    moves = _moves(model, found, rows, task)
     good = good[: len(pieces)]
     paths = [run.path for run in runs]
     x = _on_segments(paths, pieces, segments)
     paths = _updated(paths, pieces, good, x + np.asarray(moves))
-    return Current(model, field, rows, paths, good, np.inf, float(found.free))
+    return Current(model, field, S, rows, paths, good, np.inf, float(found.free))
+
+
+def _moves(model: Model, found: ClosedForm, rows: LinearisedSegments, task: Task):
+    given = found.coefficients, found.points, rows, task.start_deviation
+    return smoothed_path(model, *given).moves
 
 
 def iterated_with_process(
@@ -288,8 +315,8 @@ def iterated_with_process(
     """
     segments, x, steps, rows = _by_interval(task, now, pieces)
     good = rows.counts.any((1, 2))
-    model, loss, found, between = _solved(task, now.model, rows, whiten)
-    moves = smoothed_path(model, found.coefficients, task.S, rows, task.start_deviation).moves
+    model, found, S, between = _solved(task, now, rows, whiten)
+    moves = _moves(model, found, rows, task)
     # A defect that the integrator may leave is none.
     covariance = process_covariance(model, rows, jnp.asarray(_INTEGRATED * task.data.scale))
 
@@ -305,8 +332,9 @@ def iterated_with_process(
     gain, taken, best = _searched(trial, any_good)
     good = np.asarray(good)[: len(pieces)]
     paths = _updated(now.paths, pieces, good, best.x)
-    step = _described(task, pieces, good, best, gain, taken, model, loss)
-    return Current(model, best.field, rows, paths, good, best.squares, float(found.free)), step
+    step = _described(task, pieces, good, best, gain, taken, model, found.loss)
+    free = float(found.free)
+    return Current(model, best.field, S, rows, paths, good, best.squares, free), step
 
 
 def _by_interval(
@@ -327,8 +355,8 @@ def evidence(end: End) -> float:
     """−log p of the runs, each in as few parts as may be, linearised about the path of the end."""
     task, model = end.task, end.now.model
     rows = _by_interval(task, end.now, equal_pieces(task.data.runs, LONG))[3]
-    given = task.S, rows, task.start_deviation
-    return float(losses(model, model.flat[None], *given, whiten)[0])
+    given = end.now.field.points, rows, task.start_deviation
+    return float(closed_form(model, *given, whiten).loss)
 
 
 @eqx.filter_jit
@@ -381,7 +409,8 @@ def _stiffness(field: Expansion, data: Preprocessed, paths: list[np.ndarray]) ->
 def changed(task: Task, before: Current, now: Current) -> float:
     """By how much the field has changed at the landmarks, relative to its size there."""
     old, new = (
-        np.asarray(_values(each.field, task.S)) / task.data.scale[None] for each in (before, now)
+        np.asarray(_values(each.field, now.field.points)) / task.data.scale[None]
+        for each in (before, now)
     )
     return float(np.linalg.norm(new - old) / max(np.linalg.norm(new), np.finfo(float).tiny))
 

@@ -113,11 +113,15 @@ def filtered(
 
 
 def whiten(
-    model: Model, S: Float[Array, "m d"], rows: LinearisedSegments, start_deviation
+    model: Model,
+    S: Float[Array, "m d"],
+    T: Float[Array, "q q"],
+    rows: LinearisedSegments,
+    start_deviation,
 ) -> WhitenedRows:
     """The rows with process noise and the starts integrated out, in the order of time."""
-    local, T = columns(model.kernel, S, rows)
-    local = jnp.concatenate([local @ T, (rows.drive + rows.missed)[..., None]], axis=-1)
+    local = columns(model.kernel, S, T, rows)
+    local = jnp.concatenate([local, (rows.drive + rows.missed)[..., None]], axis=-1)
     start = jnp.zeros((*local.shape[:1], *local.shape[2:]), local.dtype)
     start = start.at[..., -1].set(-rows.prior_offset)
     found = filtered(model, rows, local, start, start_deviation)
@@ -126,7 +130,7 @@ def whiten(
     more, scatter = jnp.maximum(rows.counts - 1, 0.0).sum((0, 1)), rows.scatter.sum((0, 1))
     constant = 0.5 * found.log_variance.sum() + more @ model.log_noise
     constant = constant + 0.5 * scatter @ jnp.exp(-2 * model.log_noise)
-    return WhitenedRows(flat[:, :-1], flat[:, -1], constant, T)
+    return WhitenedRows(flat[:, :-1], flat[:, -1], constant)
 
 
 class SmoothedPath(NamedTuple):

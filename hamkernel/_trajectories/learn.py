@@ -46,7 +46,15 @@ from hamkernel._trajectories.kalman import (
     whiteness,
 )
 from hamkernel._trajectories.learned import Learned, empty, misfits
-from hamkernel._trajectories.likelihood import KernelRows, Model, bounds_and_design, losses
+from hamkernel._trajectories.likelihood import (
+    KernelRows,
+    Model,
+    WhitenedRows,
+    bounds_and_design,
+    landmark_whitening,
+    losses,
+    searched,
+)
 from hamkernel._trajectories.preprocessing import (
     Preprocessed,
     decided,
@@ -55,10 +63,12 @@ from hamkernel._trajectories.preprocessing import (
     sampled,
 )
 from hamkernel._trajectories.runs import Runs
+from hamkernel._trajectories.segments import LinearisedSegments
 from hamkernel._trajectories.smoothing import interpolated
 
 _WIDE = 100.0  # standard deviations of the states: the prior of a start
 _MOST = 8  # iterations; 4 or 5 are the rule
+_QUIET = 10.0  # seconds before progress is shown to those who did not ask for it
 
 
 def learn(
@@ -71,7 +81,7 @@ def learn(
     process_noise: ArrayLike | None = None,
     masses: bool = False,
     iterations: int = _MOST,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> Learned:
     """Learn a field from noisy states at times, without velocities.
 
@@ -92,8 +102,10 @@ def learn(
         noise: the standard deviation of the sensor noise, in units of the states, a number or one
             for each coordinate, shape (n,), if it is known; then a field that does not explain the
             runs is detected. If None, it is estimated.
-        solver: `hk.Nystrom(max_points=…)` sets how many landmarks carry the field; if None, 48 for
-            n = 2 and 80 for n = 4, which cover the paths evenly. Inputs count as coordinates.
+        solver: `hk.Nystrom(max_points=…)` sets how many landmarks carry the field, points that
+            cover the paths. If None, 48 for n = 2 and 80 for n = 4, inputs counted as coordinates,
+            and twice as many while the marginal likelihood grows by more than its error, as long
+            as a solve takes some seconds; then name a number to have more.
         process_noise: the intensity q of white noise w in ẋ = f(x, u) + w, in units of the states
             over √time, a number or one for each coordinate, shape (n,): what stiction, timing or a
             flexible part move besides the field. 0 where the structure is the whole truth. If None,
@@ -103,7 +115,7 @@ def learn(
             then learned, `learned.kernel.masses`; see `UnknownMasses`, whose kernel K becomes.
             With inputs they are those of the drift, `learned.kernel.drift.masses`.
         iterations: at most as many; 4 or 5 are the rule.
-        progress: show a progress bar (tqdm).
+        progress: whether to show a progress bar (tqdm); if None, from ten seconds on.
 
     Returns:
         A `Learned`: the field, its kernel, the noise, the fitted states, and how well they fit.
@@ -127,7 +139,12 @@ def learn(
         K = with_masses(K, runs.dimension)
     known = known_part(K, mean, runs.dimension, jnp.float64)
     check_identifiable(runs, known)
+    from tqdm import tqdm  # so that importing the package does not load it
+
+    wait = 0.0 if progress else _QUIET
+    bar = tqdm(desc="learning", total=2 + most, disable=progress is False, delay=wait)
     data = preprocess(runs, known)
+    bar.update()
     measured = np.isfinite(data.noise)
     X, Y = sampled(data)
     if known is not None:
@@ -136,31 +153,36 @@ def learn(
     level = np.maximum(np.where(measured, data.noise, data.scale), 1e-6 * data.scale)
     log_noise = jnp.log(jnp.asarray(level if given is None else given))
     moves = measured & (given is None)
-    S = landmarks(X, data.scale, None if solver is None else solver.max_points)
+    S, first = landmarks(data, None if solver is None else solver.max_points)
 
     def asked(q: np.ndarray, spacing: float = 0.0, impulse: np.ndarray | None = None):
         with np.errstate(divide="ignore"):
             model = Model(K, log_noise, jnp.log(jnp.asarray(q)))
         bounds, design = bounds_and_design(model, X, Y, data.scale, moves, spacing, impulse)
-        return Task(data, known, S, bounds, jnp.asarray(_WIDE * data.scale)), model, design
+        prior = jnp.asarray(_WIDE * data.scale)
+        return Task(data, known, S, first, bounds, prior), model, design
 
     def ended(q: np.ndarray, spacing: float = 0.0, impulse: np.ndarray | None = None) -> End:
         disturbed = bool(q.any()) or impulse is not None
-        return iterate(*asked(q, spacing, impulse), disturbed, most, progress)
+        return iterate(*asked(q, spacing, impulse), disturbed, most, bar)
 
     none, alone = np.zeros(runs.dimension), None
     if not runs.is_decided:
         task, model, design = asked(none)
-        first = begin(task, model, design).model
-        runs, data = decided(runs, data, lambda data: initial_loss(task._replace(data=data), first))
+        model = begin(task, model, design).model
+        runs, data = decided(runs, data, lambda data: initial_loss(task._replace(data=data), model))
     if process is not None:
-        spacing = landmark_spacing(X, S, data.scale) if process.any() else 0.0
+        spacing = landmark_spacing(X, S[:first], data.scale) if process.any() else 0.0
         end = ended(process, spacing)
     else:
         end = alone = ended(none)
-        impulse, spacing = impulses(K, S, Y, data), landmark_spacing(X, S, data.scale)
+        impulse, spacing = (
+            impulses(K, jnp.asarray(S[:first]), Y, data),
+            landmark_spacing(X, S[:first], data.scale),
+        )
         if asks_for_process(alone, impulse):
             end = likelier(alone, ended(none, spacing, impulse))
+    bar.close()
     mean = None if mean is None else as_pytree(mean)
     return _learned(runs, mean, end, alone, given is not None, measured)
 
@@ -205,15 +227,16 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     now, task = end.now, end.task
     if not (end.settled and now.good.all()):
         return True
-    z = innovations(_whitened(now.model, task.S, now.rows, task.start_deviation), now.rows)
+    given = now.field.points, now.rows, task.start_deviation
+    z = innovations(_whitened(now.model, *given), now.rows)
     if whiteness(z, np.asarray(now.rows.counts)) < SIGNIFICANT:
         return True
     shares = np.log([1e-3, 1e-2, 1e-1])
     design = [now.model.log_process, *(impulse + share for share in shares)]
     flat = np.tile(np.asarray(now.model.flat), (len(design), 1))
     flat[:, -len(impulse) :] = design
-    values = losses(now.model, jnp.asarray(flat), task.S, now.rows, task.start_deviation, whiten)
-    values = np.asarray(values)
+    part = searched(*given[:2])
+    values = np.asarray(losses(now.model, jnp.asarray(flat), *part, task.start_deviation, whiten))
     return bool(values[0] - values.min() > price(end, impulse))
 
 
@@ -223,7 +246,9 @@ def likelier(without: End, process: End) -> End:
     return process if evidence(process) + more < evidence(without) else without
 
 
-_whitened = eqx.filter_jit(whiten)
+@eqx.filter_jit
+def _whitened(model: Model, S, rows: LinearisedSegments, start_deviation) -> WhitenedRows:
+    return whiten(model, S, landmark_whitening(model.kernel, S), rows, start_deviation)
 
 
 def _learned(
@@ -252,7 +277,7 @@ def _learned(
     noise = np.where(measured, np.exp(np.asarray(now.model.log_noise)), np.nan)
     process = np.exp(np.asarray(now.model.log_process))
     misfit = misfits(runs, states, noise)
-    rows = task.S, now.rows, task.start_deviation
+    rows = now.field.points, now.rows, task.start_deviation
     z, counts = innovations(_whitened(now.model, *rows), now.rows), np.asarray(now.rows.counts)
     fit = _quality(runs, end, alone, misfit, z, process)
     converged = diagnose(fit, noise, data.scale, given)
@@ -326,7 +351,7 @@ def _disturbances(end: End, times: list[np.ndarray]) -> tuple[Float[Array, "T n"
     task, now = end.task, end.now
     w = np.zeros(now.rows.drive.shape)
     if bool(jnp.isfinite(now.model.log_process).any()):
-        given = task.S, now.rows, task.start_deviation
+        given = now.field.points, now.rows, task.start_deviation
         w = np.asarray(smoothed_path(now.model, now.field.coefficients, *given).disturbance)
     out = []
     for of_run, run, t in zip(_by_run(w, end, 0.0), task.data.runs, times, strict=True):

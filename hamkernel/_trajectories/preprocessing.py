@@ -21,9 +21,12 @@ from hamkernel._trajectories.inputs import Between, at_nodes, at_samples
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.smoothing import Coordinate, interpolated, processes, smoothed
 
-# Landmarks for n coordinates, 128 for more. 45 for n = 2 and 80 for n = 4 were as good as all.
+# Landmarks for d coordinates to begin with, 128 for more. 45 for two and 80 for four were as good
+# as all on ten runs of 10 s; where the data asks for more there are more.
 _FEWEST = {1: 24, 2: 48, 3: 64, 4: 80}
-_POINTS = 1024  # from which boxes and landmarks are taken
+# Rows times columns²: 2 s for each solve; 2e10 took 9 s (20 runs of 50 samples, n = 8).
+_WORK = 5e9
+_POINTS = 1024  # from which boxes are taken, and landmarks if there are not more intervals
 
 # Of the lengthscale in time, between samples that are kept. A pendulum of frequency ω has a
 # lengthscale near 2.7/ω, so these are 23 samples a swing; three Gauss nodes in such an interval are
@@ -294,7 +297,9 @@ def _solved_for(mean, X, U, slopes, missing):
     return jax.lax.map(lambda each: one(*each), (X, U, slopes))
 
 
-def sampled(data: Preprocessed) -> tuple[Float[np.ndarray, "N d"], Float[np.ndarray, "N n"]]:
+def sampled(
+    data: Preprocessed, count: int = _POINTS
+) -> tuple[Float[np.ndarray, "N d"], Float[np.ndarray, "N n"]]:
     """Points, (x, u) with inputs, and velocities of the smoothed runs at some of their nodes.
 
     Always as many, if need be some of them twice, so that other lengths do not compile anew.
@@ -304,23 +309,34 @@ def sampled(data: Preprocessed) -> tuple[Float[np.ndarray, "N d"], Float[np.ndar
     points = [np.concatenate([run.nodes, at_nodes(run.inputs)], axis=-1) for run in runs]
     X = np.concatenate([each.reshape(-1, each.shape[-1]) for each in points])
     Y = np.concatenate([run.slopes.reshape(-1, n) for run in runs])
-    chosen = np.linspace(0, len(X) - 1, _POINTS).round().astype(int)
+    chosen = np.linspace(0, len(X) - 1, count).round().astype(int)
     return X[chosen], Y[chosen]
 
 
-def landmarks(X: Float[np.ndarray, "N d"], scale, count: int | None) -> Float[Array, "m d"]:
-    """Points of X that cover it: each the one farthest from those before, in standard deviations.
+def landmarks(data: Preprocessed, count: int | None) -> tuple[Float[np.ndarray, "m d"], int]:
+    """Points of the paths in an order in which the first cover them, and how many to begin with.
 
-    They do not depend on hyperparameters, which are not known yet.
+    Each is the one farthest from those before, in standard deviations. They do not depend on
+    hyperparameters, which are not known yet. There are at most as many as intervals: of a field on
+    an interval its samples see the mean.
+
+    Args:
+        data: the runs.
+        count: how many there are; if None, as many as are of use.
     """
-    count = _FEWEST.get(X.shape[1], 128) if count is None else count
-    spread = X[:, len(scale) :].std(axis=0)  # of the inputs
-    points = X / np.concatenate([scale, np.where(spread > 0, spread, 1.0)])[None]
+    n, used = len(data.scale), zip(data.runs, data.usable, strict=True)
+    intervals = max(sum(len(run.times) - 1 for run, use in used if use), 1)
+    affordable = int((_WORK / (n * intervals)) ** 0.5) // n
+    X, _ = sampled(data, max(_POINTS, min(intervals, 2 * affordable)))
+    first = _FEWEST.get(X.shape[1], 128)
+    most = max(first, min(intervals, affordable)) if count is None else count
+    spread = X[:, n:].std(axis=0)  # of the inputs
+    points = X / np.concatenate([data.scale, np.where(spread > 0, spread, 1.0)])[None]
     chosen = [int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
     distance = np.full(len(points), np.inf)
-    while len(chosen) < min(count, len(points)):
+    while len(chosen) < min(most, len(points)):
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
         if not distance.max() > 0:
             break
         chosen.append(int(np.argmax(distance)))
-    return jnp.asarray(X[chosen])
+    return X[chosen], min(len(chosen), first if count is None else count)

@@ -176,9 +176,43 @@ def linearised(
     )
 
 
+def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
+    """The rows, or windows of them, evenly from all segments, that have at most so many samples.
+
+    What a window says of the field is what its part of the segment says if the start of that part
+    is not known.
+    """
+    seen = np.asarray(rows.counts).any(axis=2)
+    if seen.size <= samples or not seen[:, 1:].any():
+        return rows
+    ends = np.where(seen.any(axis=1), seen.shape[1] - np.argmax(seen[:, ::-1], axis=1), 0)
+    # One length for runs that will be followed in longer segments: one program does for all.
+    length = SHORT if seen.shape[1] >= SHORT else int(ends.max())
+    firsts = [
+        (s, max(min(i, end - length), 0))
+        for s, end in enumerate(ends)
+        for i in range(0, end - 1, max(length - 1, 1))
+    ]
+    most = max(samples // length, 1)
+    if len(firsts) > most:
+        chosen = np.linspace(0, len(firsts) - 1, most).round().astype(int)
+        firsts = [firsts[i] for i in chosen]
+    s, first = np.array(firsts).T
+    return _windows(rows, jnp.asarray(s), jnp.asarray(first[:, None] + np.arange(length)[None]))
+
+
+@jax.jit
+def _windows(rows: LinearisedSegments, s, at) -> LinearisedSegments:
+    inner, s = at[:, :-1], s[:, None]
+    cut = {name: getattr(rows, name)[s, at] for name in ("residual", "counts", "scatter")}
+    for name in ("nodes", "across", "weights", "spans", "drive", "missed"):
+        cut[name] = getattr(rows, name)[s, inner]
+    offset = jnp.where(at[:, :1] == 0, rows.prior_offset[s[:, 0]], 0.0)
+    return LinearisedSegments(**cut, prior_offset=offset)
+
+
 def _where(good, a):
-    mask = good.reshape(-1, *([1] * (a.ndim - 1)))
-    return jnp.where(mask, a, jnp.zeros_like(a))
+    return jnp.where(_like(good, a), a, jnp.zeros_like(a))
 
 
 def given_path(
@@ -270,6 +304,7 @@ SHORT = 12  # samples at most in a segment while the field is rough; 10 gave the
 _LEAST = 3  # samples of a piece: one more than its start takes
 LONG = 256  # at most: the tangent of a longer path says little more, and arrays stay small
 _GROWTH = 1e4  # of the tangent, beyond which a path says nothing of its start
+_DONE = 1e-3  # of χ², and absolutely: a start that is .03 of its deviation from the best
 _FAR = 25.0  # times the median χ² per sample
 
 
@@ -328,7 +363,9 @@ def segmented(
 ) -> Segments:
     """The pieces as arrays of a few shapes; they start on `paths`."""
     longest = max(piece.stop - piece.start for piece in pieces)
-    length = SHORT if longest <= SHORT else power_of_two(longest)
+    length = power_of_two(longest)
+    if longest <= SHORT:
+        length = min(length, SHORT)
     filled = []
     for r, start, stop in pieces:
         run, part = runs[r], slice(start, stop)
@@ -375,7 +412,8 @@ def shoot(
     """The starts after some Levenberg steps from `starts`, of each segment on its own.
 
     δz minimises ‖r − Pδz‖² + μ‖U δz‖², where P = QU scales the coordinates; μ goes down by ten
-    after a step that was better, and up after one that was worse.
+    after a step that was better, and up after one that was worse. The steps end when none promises
+    a decrease of χ², ‖Qᵀr‖², that would be noticed.
     """
     W = jnp.sqrt(segments.counts) * jnp.exp(-log_noise)[None, None]
     S, n = starts.shape
@@ -389,34 +427,48 @@ def shoot(
         squares = jnp.where(jnp.isfinite(squares), squares, jnp.inf)
         return path, r, squares
 
-    def move(path, r, squares):
+    def move(path, r):
         P = (W[..., None] * tangents(path.across)).reshape(S, -1, n)
         P = jnp.concatenate([P, prior], axis=1)
         P = jnp.where(jnp.isfinite(P), P, jnp.zeros_like(P))
         Q, U = orthonormal(P)
-        return back_substituted(U, jnp.einsum("sdn,sd->sn", Q, jnp.where(jnp.isfinite(r), r, 0.0)))
+        right = jnp.einsum("sdn,sd->sn", Q, jnp.where(jnp.isfinite(r), r, 0.0))
+        return back_substituted(U, right), jnp.sum(right**2, axis=1)
 
-    def step(carry, _):
-        best, least, way, mu = carry
+    def step(carry):
+        count, best, path, least, way, mu, promised = carry
         z = best + way / (1 + mu)[:, None]
-        path, r, squares = at(z)
+        there, r, squares = at(z)
         better = squares < least
-        new = jnp.where(better[:, None], move(path, r, squares), way)
-        new = jnp.where(jnp.isfinite(new), new, jnp.zeros_like(new))
-        best = jnp.where(better[:, None], z, best)
-        mu = jnp.where(better, mu / 10, mu * 10 + 1)
-        return (best, jnp.minimum(squares, least), new, mu), None
+        new, decrease = move(there, r)
+        path = jax.tree.map(lambda a, b: jnp.where(_like(better, a), a, b), there, path)
+        return (
+            count + 1,
+            jnp.where(better[:, None], z, best),
+            path,
+            jnp.minimum(squares, least),
+            jnp.where(better[:, None], jnp.where(jnp.isfinite(new), new, 0.0), way),
+            jnp.where(better, mu / 10, mu * 10 + 1),
+            jnp.where(better, decrease, promised),
+        )
+
+    def goes_on(carry):
+        count, *_, least, _, _, promised = carry
+        return (count == 0) | ((count <= rounds) & jnp.any(promised > _DONE * (1 + least)))
 
     # The first step goes nowhere: it finds the way from the given starts.
+    shapes = jax.eval_shape(at, starts)[0]
+    lost = jnp.full(S, jnp.inf, starts.dtype)
     begin = (
-        starts,
-        jnp.full(S, jnp.inf, starts.dtype),
-        jnp.zeros_like(starts),
-        jnp.zeros_like(starts[:, 0]),
+        *(0, starts, jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes), lost),
+        *(jnp.zeros_like(starts), jnp.zeros_like(starts[:, 0]), jnp.zeros_like(starts[:, 0])),
     )
-    (best, _, _, _), _ = jax.lax.scan(step, begin, length=rounds + 1)
-    path, _, squares = at(best)
+    _, best, path, squares, *_ = jax.lax.while_loop(goes_on, step, begin)
     return Shooting(best, path, squares)
+
+
+def _like(mask: Bool[Array, " S"], a: Array) -> Bool[Array, "S ..."]:
+    return mask.reshape(-1, *([1] * (a.ndim - 1)))
 
 
 def trusted(
@@ -424,6 +476,7 @@ def trusted(
     segments: Segments,
     noise: Float[np.ndarray, " n"],
     least: Float[np.ndarray, " n"],
+    was_asked: bool = True,
 ) -> Bool[np.ndarray, " S"]:
     """Which segments the field follows well enough to learn from them.
 
@@ -436,6 +489,9 @@ def trusted(
         noise: the noise as far as it is known.
         least: what a field that is not yet exact may leave where there is no noise at all, a share
             of the states.
+        was_asked: whether a field was learned from rows along its own path before. If not, it may
+            miss a segment because the smoothed path did: of five samples a swing, or of the fastest
+            of short runs.
     """
     counts = np.asarray(segments.counts)
     samples = (counts > 0).sum(axis=1)  # (S, n)
@@ -453,7 +509,7 @@ def trusted(
     )
     sigma = np.maximum(np.minimum(noise, np.sqrt(typical)), least)
     good = whole & samples.any(axis=1) & (growth.max(axis=(1, 2, 3)) < _GROWTH)
-    if good.any():
+    if good.any() and was_asked:
         each = (squares / sigma[None] ** 2).sum(axis=1) / np.maximum(samples.sum(axis=1), 1)
         # Where half of them are better than that, it is no reason to drop the others.
         good &= each < _FAR * max(np.median(each[good]), 1.0)

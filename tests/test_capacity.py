@@ -1,0 +1,200 @@
+"""What carries many rows and many landmarks in `learn`, against dense algebra in more digits."""
+
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+
+import math
+import warnings
+from fractions import Fraction
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hamkernel as hk
+from hamkernel._trajectories.likelihood import (
+    Bounds,
+    Model,
+    closed_form,
+    landmark_whitening,
+    losses,
+    project_out_starts,
+    regression_loss,
+    searched,
+    solved,
+)
+from hamkernel._trajectories.segments import (
+    SHORT,
+    LinearisedSegments,
+    Segments,
+    given_path,
+    linearised,
+    windows,
+)
+
+NONE, WIDE = jnp.full(2, -jnp.inf), jnp.full(2, 1e4)  # no process noise; the prior of starts
+MODEL = Model(hk.Symplectic(1.7 * hk.Gaussian(1.2)), jnp.log(jnp.full(2, 0.3)), NONE)
+
+
+def rows_of(spans, path, nodes, slopes, measured) -> LinearisedSegments:
+    size, T, n = path.shape
+    none = jnp.zeros((size, T - 1, n, n))
+    ones, zeros = jnp.ones_like(path), jnp.zeros_like(path)
+    inputs = jnp.zeros((size, T - 1, 2, 0))
+    segments = Segments(spans, measured, ones, zeros, path[:, 0], inputs)
+    along = given_path(path, nodes, spans, none)
+    good = jnp.ones(size, bool)
+    return linearised(along, slopes, jnp.zeros_like(slopes), segments, good, is_solution=False)
+
+
+def arrays(size, T, seed=0):
+    rng = np.random.default_rng(seed)
+    shapes = (size, T - 1), (size, T, 2), (size, T - 1, 3, 2), (size, T - 1, 3, 2), (size, T, 2)
+    spans, *rest = (jnp.asarray(rng.standard_normal(shape)) for shape in shapes)
+    return 0.2 + 0.1 * jnp.abs(spans), *rest
+
+
+def test_the_closed_form_in_strips_is_ridge_regression_on_all_rows():
+    rows = rows_of(*arrays(4, 12))
+    S = rows.nodes[:, 0, 0]  # eight columns: four strips
+    found = closed_form(MODEL, S, rows, WIDE, project_out_starts)
+    T = landmark_whitening(MODEL.kernel, S)
+    made = project_out_starts(MODEL, S, T, rows, WIDE)
+    M, r = np.asarray(made.M), np.asarray(made.r)
+    A = M.T @ M + np.eye(8)
+    w = np.linalg.solve(A, M.T @ r)
+    np.testing.assert_allclose(found.weights, w, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(found.used, np.trace(np.linalg.solve(A, M.T @ M)), rtol=1e-9)
+    np.testing.assert_allclose(found.squares, np.sum((r - M @ w) ** 2), rtol=1e-9)
+    loss = 0.5 * (np.sum((r - M @ w) ** 2) + w @ w + np.linalg.slogdet(A)[1])
+    np.testing.assert_allclose(found.loss, loss + made.constant, rtol=1e-10)
+
+
+def exact_regression_loss(M, r):
+    """½ (rᵀ (I + MMᵀ)⁻¹ r + log det (I + MMᵀ)) by elimination in rational numbers."""
+    M = np.vectorize(Fraction)(M)
+    A = np.column_stack([M @ M.T + np.eye(len(M), dtype=int), np.vectorize(Fraction)(r)])
+    determinant, quadratic = Fraction(1), Fraction(0)
+    for i in range(len(A)):
+        pivot, value = A[i, i], A[i, -1]
+        determinant *= pivot
+        quadratic += value * value / pivot
+        for j in range(i + 1, len(A)):
+            A[j] = A[j] - A[i] * (A[j, i] / pivot)
+    log_det = math.log(determinant.numerator) - math.log(determinant.denominator)
+    return (log_det + float(quadratic)) / 2
+
+
+@pytest.mark.parametrize("noise", [1.0, 1e-4, 1e-8, 1e-11])
+def test_the_loss_keeps_its_digits_without_noise(noise):
+    rng = np.random.default_rng(0)
+    mixed = np.linalg.qr(rng.standard_normal((5, 5)))[0]
+    M = rng.standard_normal((12, 5)) @ (np.logspace(0, -8, 5)[:, None] * mixed) / noise
+    r = M @ rng.standard_normal(5) + rng.standard_normal(12)
+    expected = exact_regression_loss(M, r)
+    found = regression_loss(jnp.asarray(M), jnp.asarray(r))
+    # A residual is rounded as r is, which is 1/noise times as large.
+    np.testing.assert_allclose(found, expected, rtol=1e-8, atol=1e-15 / noise)
+    # By a factorisation of I + MᵀM, as a control, the digits are lost.
+    if noise < 1e-9:
+        normal = np.linalg.slogdet(np.eye(5) + M.T @ M)[1] / 2
+        exact = np.log(np.hypot(1, np.linalg.svd(M, compute_uv=False))).sum()
+        assert abs(normal - exact) > 1e-6 * abs(exact)
+
+
+def test_the_gradient_of_the_loss_is_that_of_its_values():
+    rng = np.random.default_rng(0)
+    M, r = jnp.asarray(rng.standard_normal((9, 4))), jnp.asarray(rng.standard_normal(9))
+    found = jax.grad(regression_loss, argnums=(0, 1))(M, r)
+    ways = jnp.asarray(rng.standard_normal((9, 4))), jnp.asarray(rng.standard_normal(9))
+    up, down = (regression_loss(M + h * ways[0], r + h * ways[1]) for h in (1e-5, -1e-5))
+    slope = jnp.vdot(found[0], ways[0]) + jnp.vdot(found[1], ways[1])
+    np.testing.assert_allclose(slope, (up - down) / 2e-5, rtol=1e-7)
+
+
+def test_a_window_says_what_its_part_of_the_path_says():
+    given = arrays(1, 40)
+    rows = rows_of(*given)
+    found = windows(rows, 2 * SHORT)
+    assert found.counts.shape == (2, SHORT, 2)
+    first, last = slice(0, SHORT), slice(40 - SHORT, 40)
+    parts = [
+        rows_of(*(a[:, part.start : part.stop - (a.shape[1] == 39)] for a in given))
+        for part in (first, last)
+    ]
+    direct = jax.tree.map(lambda *a: jnp.concatenate(a), *parts)
+    S, flat = given[2][0, :6, 0], MODEL.flat[None]
+    values = [
+        float(losses(MODEL, flat, S, each, WIDE, project_out_starts)[0]) for each in (found, direct)
+    ]
+    np.testing.assert_allclose(*values, rtol=1e-8)
+
+
+def test_few_rows_are_all_searched_and_many_are_not():
+    few, S = rows_of(*arrays(4, 12)), jnp.zeros((48, 2))
+    same, part = searched(S, few)
+    assert part is few
+    assert len(same) == 48
+    many = jax.tree.map(lambda a: jnp.concatenate([a] * 512), few)
+    same, part = searched(S, many)
+    assert len(same) == 48
+    assert 2 * 48 * 3 * 2 * part.counts[..., 0].size < 1_000_000
+    some, part = searched(jnp.zeros((1000, 2)), many)
+    assert (len(some), len(part.counts)) == (24 * 11, 24)
+
+
+def test_landmarks_are_doubled_while_the_rows_become_likelier():
+    """On rows of a rough field; those of a smooth one are content with the first."""
+    rng = np.random.default_rng(0)
+    S = rng.uniform(-1, 1, (64, 2))
+    spans, path, nodes, _, _ = arrays(16, 12)
+    nodes = jnp.asarray(rng.uniform(-1, 1, nodes.shape))
+    counts = []
+    for length in (0.2, 3.0):
+        truth = hk.Symplectic(1.0 * hk.Gaussian(length))
+        centres = jnp.asarray(rng.uniform(-1, 1, (200, 2)))
+        K = hk.gram(truth, nodes.reshape(-1, 2), centres).reshape(*nodes.shape, -1)
+        f = K @ jnp.asarray(rng.standard_normal(400)) / 10
+        steps = jnp.einsum("slka,k,sl->sla", f, jnp.array([5, 8, 5]) / 18, spans)
+        x = jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0), (0, 0)))
+        noisy = x + 0.01 * jnp.asarray(rng.standard_normal(x.shape))
+        rows = rows_of(spans, path, nodes, jnp.zeros_like(nodes), noisy)
+        model = Model(truth, jnp.log(jnp.full(2, 0.01)), NONE)
+        none = np.zeros(len(model.flat))
+        bounds = Bounds(none, none, none > 0)
+        found = solved(model, S, 16, rows, WIDE, project_out_starts, bounds)[1]
+        counts.append(len(found.points))
+    assert counts == [64, 16]
+
+
+@pytest.mark.slow
+def test_short_runs_without_noise_are_learned_from_whole_and_no_noise_is_found():
+    """Forty runs of five samples of a double pendulum; eighty landmarks found noise of .0003."""
+    system, rng, ts = hk.systems.DoublePendulum(), np.random.default_rng(0), 0.03 * np.arange(5)
+    starts = jnp.asarray(rng.standard_normal((40, 4)) * np.array([1.0, 1.0, 3.0, 2.0]))
+    options = {"rtol": 1e-9, "atol": 1e-9}
+    states = jax.vmap(lambda x: hk.simulate(system, x, jnp.asarray(ts), **options).ys)(starts)
+    K = hk.Symplectic(hk.Gaussian(np.ones(4)))
+    found = hk.learn(K, hk.Runs([ts] * 40, list(states)), process_noise=0)
+    scale = np.asarray(states).std(axis=(0, 1))
+    assert (np.asarray(found.noise) < 1e-4 * scale).all()
+    assert np.asarray(found.kept).all()
+    assert len(found.field.points) > 80
+    f, g = (jax.vmap(each)(states.reshape(-1, 4)) for each in (system, found.field))
+    assert np.linalg.norm(f - g) < 0.01 * np.linalg.norm(f)
+
+
+def test_progress_is_told_to_those_who_wait(capsys, monkeypatch):
+    """After ten seconds, here at once; never to those who say so."""
+    monkeypatch.setattr("hamkernel._trajectories.learn._QUIET", 0.0)
+    ts = np.linspace(0, 3, 8)
+    runs = hk.Runs([ts] * 2, [np.column_stack([np.cos(ts + a), -np.sin(ts + a)]) for a in (0, 1)])
+    options = {"process_noise": 0, "iterations": 1, "noise": 1e-3}
+    said = []
+    for progress in (None, False):
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            hk.learn(MODEL.kernel, runs, progress=progress, **options)
+        said.append(capsys.readouterr().err)
+    assert "learning" in said[0]
+    assert not said[1]
