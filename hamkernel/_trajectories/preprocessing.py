@@ -109,7 +109,7 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
         ]
         times, states, counts, scatter = (list(each) for each in zip(*condensed, strict=True))
     gap = _GAP * min(lengths, default=np.inf)
-    inputs = [runs.applied(r, t + float(runs.times[r][0])) for r, t in enumerate(times)]
+    inputs = [runs.applied(r, t + float(np.asarray(runs.times[r])[0])) for r, t in enumerate(times)]
     path_runs = _with_paths(found, times, states, counts, scatter, inputs, gap)
     if not all(c.seen for c in found) or mean is not None:
         path_runs = [_completed(run, mean) for run in path_runs]
@@ -123,7 +123,7 @@ def with_inputs(data: Preprocessed, runs: Runs) -> Preprocessed:
     """The same runs with the inputs of `runs`, which may differ in how they go on."""
     return data._replace(
         runs=[
-            run._replace(inputs=runs.applied(r, run.times + float(runs.times[r][0])))
+            run._replace(inputs=runs.applied(r, run.times + float(np.asarray(runs.times[r])[0])))
             for r, run in enumerate(data.runs)
         ]
     )
