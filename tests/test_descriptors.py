@@ -1,6 +1,7 @@
 """Kernels that see points through a descriptor: the Gram by Jacobians, and equivariant warps."""
 
 import itertools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -57,7 +58,9 @@ def test_the_gram_of_a_warp_is_that_of_its_second_derivatives(inner, key):
 def test_an_equivariant_warp_has_the_mean_over_both_arguments(molecules):
     """Against the mean over all pairs of permutations, written out."""
     inner = hk.Matern(2.5, 0.5)
-    K = hk.Invariant(hk.CurlFree(hk.Warp(inner, inverse_distances, equivariant=True)), GENERATORS)
+    K: Any = hk.Invariant(
+        hk.CurlFree(hk.Warp(inner, inverse_distances, equivariant=True)), GENERATORS
+    )
 
     def mean(x, z):
         pairs = itertools.product(GROUP, GROUP)

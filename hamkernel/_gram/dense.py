@@ -97,7 +97,8 @@ def _by_jacobians(
         return jax.grad(lambda e: jax.jvp(lambda d: found.kernel(d, e), (d,), (v,))[1])(e)
 
     def rows(point):
-        slopes = jax.vmap(jax.vmap(slope, (None, None, 0)), (None, 1, None))(*point, E)
+        d, J = point
+        slopes = jax.vmap(jax.vmap(slope, (None, None, 0)), (None, 1, None))(d, J, E)
         return jnp.einsum("ajm,jmb->ajb", slopes, L)  # (n, M, n)
 
     return jax.lax.map(rows, (D, J))

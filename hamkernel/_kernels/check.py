@@ -194,10 +194,11 @@ def _check_limits(own: _Pairs, between: _Pairs, beyond: _Pairs, index, unit, eps
     # The limit may lie beyond the resolution: Matérn-3/2 tends to it linearly, so that the step
     # before and this one extrapolate to it.
     before = np.concatenate([between.block[:, :, :1], between.block[:, :, :-1]], axis=2)
-    here = own.block[:, None, None]
+    here: Any = own.block[:, None, None]
     misses = [_size(tends - here) for tends in (between.block, 2 * between.block - before)]
     differs = np.minimum(*misses) / np.where(scale > 0, scale, 1.0)
-    differs = np.where(np.isfinite(own.block).all(axis=(-2, -1))[:, None, None], differs, np.inf)
+    whole: Any = np.isfinite(own.block).all(axis=(-2, -1))
+    differs = np.where(whole[:, None, None], differs, np.inf)
     grows: Any = (size[..., 1:] > 1.2 * size[..., :-1]) & finite[..., 1:] & finite[..., :-1]
     grows &= (moved <= 0.1 * np.where(finite, moved, 0).max(axis=2, keepdims=True))[..., :-1]
     for p, i in enumerate(index):

@@ -55,8 +55,8 @@ def spline_slopes(
     upper = np.concatenate([[begin[1]], h[:-1], [0.0]])
     inner = 3 * (h[1:, None] * secants[:-1] + h[:-1, None] * secants[1:])
     right = np.concatenate([begin[2][None], inner, last[2][None]])
-    bands = (jnp.asarray(band) for band in (lower, diagonal, upper))
-    return np.asarray(jax.lax.linalg.tridiagonal_solve(*bands, jnp.asarray(right)))
+    lower, diagonal, upper, right = map(jnp.asarray, (lower, diagonal, upper, right))
+    return np.asarray(jax.lax.linalg.tridiagonal_solve(lower, diagonal, upper, right))
 
 
 def values(

@@ -31,6 +31,7 @@ from hamkernel._trajectories.likelihood import (
     begun,
     closed_form,
     landmark_whitening,
+    losses,
     most_likely,
     project_out_starts,
     searched,
@@ -186,7 +187,7 @@ def _first(
     model, count = begun(model, design, task.S, task.first, *given, whitening)
     S = task.S[:count]
     model, _ = most_likely(model, S, *given, task.bounds, _SEARCH, whitening)
-    S = task.S if searched(S, rows)[1] is not rows else S
+    S = task.S if searched(jnp.asarray(S), rows)[1] is not rows else S
     model, found = solved(model, S, task.first, *given, whitening, task.bounds)
     return model, found, Expansion(model.kernel, found.points, found.coefficients, task.mean), S
 

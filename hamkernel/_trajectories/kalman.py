@@ -21,7 +21,7 @@ Source: Potter (1963), in Bierman (1977), "Factorization methods for discrete se
 estimation"; Bryson & Frazier (1963) for the smoother.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -232,12 +232,13 @@ def innovations(made: WhitenedRows, rows: LinearisedSegments) -> Float[np.ndarra
         if not (len(y) and np.isfinite(A).all() and np.isfinite(y).all()):
             continue
         V = np.linalg.solve(R.T, A.T).T
-        L = np.linalg.qr(np.concatenate([np.eye(len(y)), V.T]), mode="r").T
+        factor: Any = np.linalg.qr(np.concatenate([np.eye(len(y)), V.T]), mode="r")
+        L = factor.T
         L = L * np.sign(np.diagonal(L))[None]
         out[s, there] = np.linalg.solve(L, y - V @ v)
         both = np.column_stack([np.concatenate([R, A]), np.append(v, y)])
-        both = np.linalg.qr(both, mode="r")[: len(v)]
-        R, v = both[:, :-1], both[:, -1]
+        factor = np.linalg.qr(both, mode="r")[: len(v)]
+        R, v = factor[:, :-1], factor[:, -1]
     return out.reshape(shape)
 
 

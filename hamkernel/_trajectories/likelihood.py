@@ -283,7 +283,7 @@ def solved(
         found, count = more, 2 * count
     free, size = np.array(bounds.free), len(model.flat) - 2 * len(model.log_noise)
     free[:size] = False  # what is left are both kinds of noise
-    many = searched(S[:count], rows)[1] is not rows
+    many = searched(jnp.asarray(S[:count]), rows)[1] is not rows
     if many and free.any() and found.free > found.used and found.squares > 0:
         shift = jnp.where(jnp.asarray(free), jnp.log(found.squares / found.free) / 2, 0.0)
         there = jnp.clip(model.flat + shift, jnp.asarray(bounds.low), jnp.asarray(bounds.high))

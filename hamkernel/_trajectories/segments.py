@@ -182,7 +182,7 @@ def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
     What a window says of the field is what its part of the segment says if the start of that part
     is not known.
     """
-    seen = np.asarray(rows.counts).any(axis=2)
+    seen: Any = np.asarray(rows.counts).any(axis=2)
     if seen.size <= samples or not seen[:, 1:].any():
         return rows
     ends = np.where(seen.any(axis=1), seen.shape[1] - np.argmax(seen[:, ::-1], axis=1), 0)

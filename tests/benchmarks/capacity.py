@@ -164,7 +164,8 @@ def many(options):
 def long(options):
     """A torque of three tones, held for .01 s each, on a pendulum with friction."""
     rng, ts = np.random.default_rng(options.seed), 0.01 * np.arange(65_000)
-    u = sum(np.sin(w * ts + rng.uniform(0, 6)) for w in (0.7, 1.9, 3.1))[:, None]
+    tones = [np.sin(w * ts + rng.uniform(0, 6)) for w in (0.7, 1.9, 3.1)]
+    u = np.sum(tones, axis=0)[:, None]
 
     def step(x, u):
         def slope(x):

@@ -22,6 +22,7 @@ and the innovations called white; CPU seconds.
 import argparse
 import time
 import warnings
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -117,10 +118,10 @@ def grey_box(t, log, inputs):
     """Least squares on rollouts of half a second, starts smoothed by cubics over 9 samples."""
     from scipy.signal import savgol_filter
 
-    q = savgol_filter(log[:, 0], 9, 3)
-    v = savgol_filter(log[:, 0], 9, 3, deriv=1, delta=DT)
+    q: Any = savgol_filter(log[:, 0], 9, 3)
+    v: Any = savgol_filter(log[:, 0], 9, 3, deriv=1, delta=DT)
     x, starts = np.stack([q, v], axis=1), np.arange(0, T - 26, 25)
-    u = jnp.asarray(np.stack([inputs[s : s + 25] for s in starts]))
+    u = jnp.stack([jnp.asarray(inputs[s : s + 25]) for s in starts])
     seen = np.stack([log[s + 1 : s + 26, 0] for s in starts])
 
     @jax.jit
@@ -144,7 +145,7 @@ def grey_box(t, log, inputs):
     found = least_squares(
         lambda p: np.asarray(residuals(p)),
         np.array([3.0, 0.1, 0.1, 1.0]),
-        lambda p: np.asarray(jacobian(p)),
+        lambda p: np.asarray(jacobian(p)),  # pyright: ignore[reportArgumentType]
         loss="soft_l1",
         f_scale=0.01,
     )

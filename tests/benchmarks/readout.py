@@ -87,7 +87,7 @@ def scores(formula):
 
 def sindy(noise, seed, of_runs):
     """Whether some of five thresholds finds exactly q̇ = p and ṗ = −sin q."""
-    import pysindy as ps
+    import pysindy as ps  # type: ignore
 
     slopes = [
         lambda q, p, f=f, i=i: np.asarray(
@@ -130,7 +130,7 @@ def main():
     parser.add_argument("--seeds", type=int, default=5)
     seeds = parser.parse_args().seeds
     try:
-        import pysindy  # noqa: F401
+        import pysindy  # type: ignore  # noqa: F401
     except ImportError:
         sindy_is_there = False
     else:
