@@ -185,6 +185,7 @@ def test_short_runs_without_noise_are_learned_from_whole_and_no_noise_is_found()
     assert np.linalg.norm(f - g) < 0.01 * np.linalg.norm(f)
 
 
+@pytest.mark.slow
 def test_progress_is_told_to_those_who_wait(capsys, monkeypatch):
     """After ten seconds, here at once; never to those who say so."""
     monkeypatch.setattr("hamkernel._trajectories.learn._QUIET", 0.0)

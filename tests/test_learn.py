@@ -343,6 +343,8 @@ def damped(x):
     return PENDULUM(x) - 0.05 * jnp.array([0.0, 1.0]) * x
 
 
+@pytest.mark.slow
+@pytest.mark.ci
 def test_friction_that_the_structure_lacks_is_noticed():
     times, states, _ = logs(damped, noise=0.01)
     with warnings.catch_warnings(record=True) as seen:

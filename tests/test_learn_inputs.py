@@ -121,7 +121,7 @@ def test_inputs_have_times_of_their_own_and_act_late():
     ts, x = np.linspace(0, 1, 9), np.column_stack([np.sin(np.arange(9.0)), np.cos(np.arange(9.0))])
     own = np.linspace(-0.01, 1.01, 1000)
     late = hk.Runs(ts, x, (own, np.sin(7 * own)[:, None]), between="linear", delay=0.05)
-    assert repr(late) == "Runs(1 runs, 9 samples, n=2, m=1 linear, delay=0.05)"
+    assert repr(late) == "Runs(1 run, 9 samples, n=2, m=1 linear, delay=0.05)"
     nodes = ts[1:-1, None] + np.diff(ts[1:])[:, None] * NODES
     found = at_nodes(late.applied(0, ts))[1:, :, 0]
     np.testing.assert_allclose(found, np.sin(7 * (nodes - 0.05)), atol=0.06)  # a line in each

@@ -11,8 +11,8 @@ pytest.importorskip("ipykernel")
 
 FOLDER = Path(__file__).parent.parent / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
-# Run with the other tests; every other notebook takes long enough to be marked slow.
-QUICK = {"quickstart"}
+# Each runs in a process of its own, compiled as for a user, and so is slow; CI runs this one.
+IN_CI = {"quickstart"}
 PACKAGES = {"planets": ["jplephem", "skyfield_data"]}
 # Without pictures: what they show is numbers and error messages.
 NUMBERS = {"guide_deploy", "guide_sharp_bits"}
@@ -67,7 +67,7 @@ def test_ends_in_asserts_on_its_claims(path):
 
 
 def marked(path):
-    marks = [] if path.stem in QUICK else [pytest.mark.slow]
+    marks = [pytest.mark.slow, *([pytest.mark.ci] if path.stem in IN_CI else [])]
     return pytest.param(path, marks=marks, id=path.stem)
 
 

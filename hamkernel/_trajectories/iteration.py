@@ -46,14 +46,12 @@ from hamkernel._trajectories.segments import (
     equal_pieces,
     grown,
     halved,
-    linearised_along_field,
     linearised_along_smoothed,
     segmented,
-    shoot,
     short_pieces,
     smoothed_rows,
-    trusted,
 )
+from hamkernel._trajectories.shooting import linearised_along_field, shoot, trusted
 
 _ROUNDS = 4  # Levenberg steps before a segment is judged: without them up to 40 % were lost
 _SEARCH = 25  # steps of BFGS, which go on in the next iteration

@@ -26,34 +26,26 @@ from hamkernel._structures.controlled import Controlled, InputMatrix
 from hamkernel._structures.family import AbstractFamily
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import AbstractStructure
+from hamkernel._trajectories.design import bounds_and_design
 from hamkernel._trajectories.diagnostics import FitQuality, check_identifiable, diagnose
 from hamkernel._trajectories.flow import Expansion
 from hamkernel._trajectories.iteration import (
     End,
     Task,
     begin,
-    evidence,
     initial_loss,
     iterate,
 )
 from hamkernel._trajectories.kalman import (
-    SIGNIFICANT,
     as_observations,
     innovations,
     neighbours,
     smoothed_path,
-    whiten,
     whiteness,
 )
 from hamkernel._trajectories.learned import Learned, empty, misfits
 from hamkernel._trajectories.likelihood import (
-    KernelRows,
     Model,
-    WhitenedRows,
-    bounds_and_design,
-    landmark_whitening,
-    losses,
-    searched,
 )
 from hamkernel._trajectories.preprocessing import (
     Preprocessed,
@@ -62,8 +54,14 @@ from hamkernel._trajectories.preprocessing import (
     preprocess,
     sampled,
 )
+from hamkernel._trajectories.process_noise import (
+    asks_for_process,
+    impulses,
+    landmark_spacing,
+    likelier,
+    whitened_rows,
+)
 from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.segments import LinearisedSegments
 from hamkernel._trajectories.smoothing import interpolated
 
 _WIDE = 100.0  # standard deviations of the states: the prior of a start
@@ -149,9 +147,7 @@ def learn(
     X, Y = sampled(data)
     if known is not None:
         Y = Y - np.asarray(jax.vmap(known)(jnp.asarray(X)))
-    # Smoothing may find no noise at all; a share of 1e-7 is what the digits of a log leave.
-    level = np.maximum(np.where(measured, data.noise, data.scale), 1e-6 * data.scale)
-    log_noise = jnp.log(jnp.asarray(level if given is None else given))
+    log_noise = jnp.log(jnp.asarray(_first_noise(data) if given is None else given))
     moves = measured & (given is None)
     S, first = landmarks(data, None if solver is None else solver.max_points)
 
@@ -176,79 +172,21 @@ def learn(
         end = ended(process, spacing)
     else:
         end = alone = ended(none)
-        impulse, spacing = (
-            impulses(K, jnp.asarray(S[:first]), Y, data),
-            landmark_spacing(X, S[:first], data.scale),
-        )
+        impulse = impulses(K, jnp.asarray(S[:first]), Y, data)
+        spacing = landmark_spacing(X, S[:first], data.scale)
         if asks_for_process(alone, impulse):
             end = likelier(alone, ended(none, spacing, impulse))
     bar.close()
-    mean = None if mean is None else as_pytree(mean)
     return _learned(runs, mean, end, alone, given is not None, measured)
 
 
-def impulses(K: AbstractMatrixKernel, S, Y, data: Preprocessed) -> Float[np.ndarray, " n"]:
-    """The logarithm of the process noise that would move each coordinate as the field does.
+def _first_noise(data: Preprocessed) -> Float[np.ndarray, " n"]:
+    """The noise that smoothing found, of each coordinate.
 
-    That is its velocity times the root of the time in which it does so. −inf where K moves nothing.
+    It may have found none at all; a share of 1e-7 is what the digits of a log leave.
     """
-    prior = np.asarray(KernelRows(S).rows(K, S)).reshape(len(S), len(data.scale), -1)
-    velocity = np.sqrt(np.mean(Y**2, axis=0))
-    whole = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
-    time = np.median(data.scale / np.maximum(whole, np.finfo(float).tiny))
-    with np.errstate(divide="ignore"):
-        return np.where((prior != 0).any((0, 2)), np.log(velocity * np.sqrt(time)), -np.inf)
-
-
-def landmark_spacing(X, S, scale: Float[np.ndarray, " n"]) -> float:
-    """How far a point of X may be from all landmarks, in standard deviations.
-
-    A field of shorter lengthscale has ripples between the landmarks.
-    """
-    spread = X.std(axis=0)
-    spread[: len(scale)] = scale
-    unit = np.where(spread > 0, spread, 1.0)
-    A, B = X / unit, np.asarray(S) / unit
-    squares = (A**2).sum(1)[:, None] + (B**2).sum(1)[None] - 2 * A @ B.T
-    return float(np.sqrt(np.maximum(squares.min(axis=1), 0.0).max()))
-
-
-def price(end: End, impulse: Float[np.ndarray, " n"]) -> float:
-    """What process noise must gain in log p: Schwarz's ½ log N for each of its numbers."""
-    return float(0.5 * np.isfinite(impulse).sum() * np.log(np.asarray(end.now.rows.counts).sum()))
-
-
-def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
-    """Whether anything says that the structure is not the whole truth.
-
-    Iterations that did not settle, parts that were dropped, innovations that are not white, or rows
-    that are likelier with process noise.
-    """
-    now, task = end.now, end.task
-    if not (end.settled and now.good.all()):
-        return True
-    given = now.field.points, now.rows, task.start_deviation
-    z = innovations(_whitened(now.model, *given), now.rows)
-    if whiteness(z, np.asarray(now.rows.counts)) < SIGNIFICANT:
-        return True
-    shares = np.log([1e-3, 1e-2, 1e-1])
-    design = [now.model.log_process, *(impulse + share for share in shares)]
-    flat = np.tile(np.asarray(now.model.flat), (len(design), 1))
-    flat[:, -len(impulse) :] = design
-    part = searched(*given[:2])
-    values = np.asarray(losses(now.model, jnp.asarray(flat), *part, task.start_deviation, whiten))
-    return bool(values[0] - values.min() > price(end, impulse))
-
-
-def likelier(without: End, process: End) -> End:
-    """That of both whose rows are the likelier, process noise at its price."""
-    more = price(process, np.asarray(process.now.model.log_process))
-    return process if evidence(process) + more < evidence(without) else without
-
-
-@eqx.filter_jit
-def _whitened(model: Model, S, rows: LinearisedSegments, start_deviation) -> WhitenedRows:
-    return whiten(model, S, landmark_whitening(model.kernel, S), rows, start_deviation)
+    found = np.where(np.isfinite(data.noise), data.noise, data.scale)
+    return np.maximum(found, 1e-6 * data.scale)
 
 
 def _learned(
@@ -264,6 +202,7 @@ def _learned(
         given: whether the noise was given.
         measured: which coordinates were.
     """
+    mean = None if mean is None else as_pytree(mean)
     task, now, history = end.task, end.now, end.history
     field, data = now.field, task.data
     times, _ = runs.on_host()
@@ -278,7 +217,7 @@ def _learned(
     process = np.exp(np.asarray(now.model.log_process))
     misfit = misfits(runs, states, noise)
     rows = now.field.points, now.rows, task.start_deviation
-    z, counts = innovations(_whitened(now.model, *rows), now.rows), np.asarray(now.rows.counts)
+    z, counts = innovations(whitened_rows(now.model, *rows), now.rows), np.asarray(now.rows.counts)
     fit = _quality(runs, end, alone, misfit, z, process)
     converged = diagnose(fit, noise, data.scale, given)
     observations = as_observations(now.rows, now.model, task.mean, task.start_deviation)

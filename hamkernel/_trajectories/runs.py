@@ -109,7 +109,11 @@ class Runs(eqx.Module):
 
     def __repr__(self) -> str:
         samples = sum(len(t) for t in self.times)
-        said = [f"{len(self)} runs", f"{samples} samples", f"n={self.dimension}"]
+        said = [
+            f"{len(self)} run{'s' * (len(self) != 1)}",
+            f"{samples} samples",
+            f"n={self.dimension}",
+        ]
         if self.inputs is not None:
             said.append(f"m={self.input_count} {self.between}")
             if self.delay != 0.0:

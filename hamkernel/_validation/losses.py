@@ -318,6 +318,7 @@ def without_silent_directions(
     def of_point(pair):
         x, v = pair
         J = jax.jacfwd(found.map)(x) @ found.directions(x)  # (m, n)
+        J = jax.lax.stop_gradient(J)  # the projection of a map of full rank is constant
         squares, V = jnp.linalg.eigh(J.T @ J)
         # Rounding leaves ε of the largest, and a descriptor sees distances to more than √ε.
         seen = squares > jnp.finfo(x.dtype).eps ** (2 / 3) * squares[-1]
