@@ -7,7 +7,7 @@ downstream asks a kernel for its `outputs`.
 
 import abc
 import dataclasses
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -58,7 +58,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
         """
         return A
 
-    def with_count(self, count: int) -> Self:
+    def with_count(self, count: int) -> "AbstractJoinedKernel":
         """This kernel with m = `count`."""
         return dataclasses.replace(self, count=count)
 

@@ -105,7 +105,7 @@ def in_intervals(
     return np.stack([m0 - 3 * m1, m0 + 3 * m1], axis=1)
 
 
-def at_samples(ends: Float[np.ndarray, "R-1 2 m"]) -> Float[np.ndarray, "R m"]:
+def at_samples(ends: Float[np.ndarray, "intervals 2 m"]) -> Float[np.ndarray, "R m"]:
     """U at the ends of the intervals, where it jumps the mean of both sides."""
     before, after = (
         np.concatenate([ends[:1, 0], ends[:, 1]]),

@@ -146,7 +146,7 @@ def _plateaus(x: Float[np.ndarray, " T"], value: float, quantum: float) -> int:
     return found
 
 
-def _stuck(x: Float[np.ndarray, " T"], others: Float[np.ndarray, "T n-1"]):
+def _stuck(x: Float[np.ndarray, " T"], others: Float[np.ndarray, "T others"]):
     """The longest stretch without a change in which another coordinate moves by more than one."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], x[1:] == x[:-1], [False]]).astype(int)))
     if not edges.size or not others.size:

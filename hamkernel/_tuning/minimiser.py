@@ -195,7 +195,7 @@ def stepped(minimiser: optx.AbstractMinimiser, fn: Minimised, run: MinimiserRun)
 
 
 def minimised(
-    minimiser: optx.AbstractMinimiser, fn: Minimised, run: MinimiserRun, steps: int
+    minimiser: optx.AbstractMinimiser, fn: Minimised, run: MinimiserRun, steps: Any
 ) -> MinimiserRun:
     """The run where it ends, after so many steps at most."""
     arrays, static = eqx.partition(run, eqx.is_array)
@@ -221,7 +221,7 @@ def most_likely_in_box(
     low: Float[Array, " P"],
     high: Float[Array, " P"],
     deviations: Float[Array, " P"],
-    steps: int,
+    steps: Any,
 ) -> tuple[Float[Array, " P"], Float[Array, ""]]:
     """The h in the box low ≤ h ≤ high where −log p = fn(h) is least, from `start`, and fn there.
 
