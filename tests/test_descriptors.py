@@ -143,3 +143,12 @@ def test_directions_without_a_prior_do_not_enter_the_likelihood(molecules):
     y = slopes.reshape(-1)
     expected = -0.5 * (y @ np.linalg.solve(A, y) + log_det + 12 * np.log(2 * np.pi))
     np.testing.assert_allclose(hk.log_marginal_likelihood(angle, states, slopes, 1e-2), expected)
+
+
+def test_the_likelihood_through_a_warp_has_its_derivative_in_the_targets():
+    """Against −A⁻¹y in NumPy."""
+    states, slopes = np.random.default_rng(2).normal(size=(2, 6, 2))
+    K = hk.Symplectic(hk.Warp(hk.Gaussian(1.0), angles))
+    A = np.asarray(hk.gram(K, states)).reshape(12, 12) + 0.06 * np.eye(12)
+    found = jax.grad(lambda Y: hk.log_marginal_likelihood(K, states, Y, 1e-2))(jnp.asarray(slopes))
+    np.testing.assert_allclose(found.reshape(-1), -np.linalg.solve(A, slopes.reshape(-1)))

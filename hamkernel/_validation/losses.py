@@ -324,7 +324,7 @@ def without_silent_directions(
         seen = squares > jnp.finfo(x.dtype).eps ** (2 / 3) * squares[-1]
         return V @ jnp.where(seen, V.T @ v, jnp.zeros_like(v)), jnp.sum(~seen)
 
-    projected, counts = jax.lax.map(of_point, jax.lax.stop_gradient((X, Y)))
+    projected, counts = jax.lax.map(of_point, (X, Y))
     return projected.reshape(-1), jnp.sum(counts).astype(y.dtype)
 
 
