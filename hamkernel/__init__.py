@@ -39,14 +39,12 @@ from hamkernel._discovery.compare import compare
 from hamkernel._discovery.formula import Formula
 from hamkernel._discovery.readout import readout
 from hamkernel._fields.base import SolverInfo
-from hamkernel._fields.features import FeatureField
+from hamkernel._fields.expansions import FeatureField, KernelField
 from hamkernel._fields.joined import ControlledField, FamilyField
-from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.dense import gram
 from hamkernel._gram.operator import gram_operator
+from hamkernel._kernels.built_in import Gaussian, Matern, Periodic, Polynomial, RationalQuadratic
 from hamkernel._kernels.check import check_kernel
-from hamkernel._kernels.dot_products import Periodic, Polynomial
-from hamkernel._kernels.radial import Gaussian, Matern, RationalQuadratic
 from hamkernel._kernels.transforms import Select, Warp
 from hamkernel._observations.kinds import Energies, Equilibria, Functionals, Velocities
 from hamkernel._posterior import Posterior, condition
@@ -56,15 +54,12 @@ from hamkernel._solvers.dense import Cholesky
 from hamkernel._solvers.fit import fit
 from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
 from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
-from hamkernel._structures.base import Sum
-from hamkernel._structures.controlled import Controlled, InputMatrix
+from hamkernel._structures.base import Even, Invariant, Odd, Reversible, Sum
 from hamkernel._structures.custom_operator import Poisson, Structured
 from hamkernel._structures.family import Family
-from hamkernel._structures.friction import Friction
-from hamkernel._structures.masses import UnknownMasses
-from hamkernel._structures.port_hamiltonian import PortHamiltonian
+from hamkernel._structures.joined import Controlled, InputMatrix
+from hamkernel._structures.mechanics import Friction, PortHamiltonian, UnknownMasses
 from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
-from hamkernel._structures.symmetry import Even, Invariant, Odd, Reversible
 from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.runs import Runs

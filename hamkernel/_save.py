@@ -235,7 +235,7 @@ def _library_version() -> str:
 
 _ROOMS = tuple(
     f"hamkernel.{room}"
-    for room in ("_kernels.", "_structures.", "_features.", "_fields.", "systems.")
+    for room in ("_kernels.", "_structures.", "_features", "_fields.", "systems.")
 )
 _MAPS = {function.__name__: function for function in (identity, reflection, time_reversal)}
 

@@ -14,9 +14,8 @@ import scipy.stats
 from kernels import canonical, gaussian_profile, matern_profile, periodic, radial, rational_profile
 
 import hamkernel as hk
-from hamkernel._features.features import features
-from hamkernel._features.spectra import spectra
-from hamkernel._fields.features import FeatureField
+from hamkernel._features import features
+from hamkernel._fields.expansions import FeatureField
 from hamkernel._machine import orthonormal
 from hamkernel._solvers.least_squares import ridge_regression, triangle
 from hamkernel._solvers.random_features import RandomFeatures
@@ -107,7 +106,7 @@ def estimate(terms, d):
 @pytest.mark.parametrize("name", KERNELS)
 def test_the_mean_of_the_waves_is_the_kernel(name, key):
     make, formula = KERNELS[name]
-    terms = spectra(make(), 4, 20_000, key, jnp.float64)
+    terms = make().spectra(4, 20_000, key, jnp.float64)
     zero = np.zeros(4)
     for d in np.asarray(points(5)):
         mean, error, total = estimate(terms, d)
@@ -117,7 +116,7 @@ def test_the_mean_of_the_waves_is_the_kernel(name, key):
 
 def test_the_mean_of_the_waves_of_another_kernel_is_not(key):
     d = np.asarray(points(1)[0])
-    mean, error, _ = estimate(spectra(hk.Gaussian(1.5), 4, 20_000, key, jnp.float64), d)
+    mean, error, _ = estimate(hk.Gaussian(1.5).spectra(4, 20_000, key, jnp.float64), d)
     formula = KERNELS["gaussian"][1]
     assert abs(mean - formula(d, np.zeros(4))) > 2 * DEVIATIONS * error
 
@@ -140,7 +139,7 @@ MARGINALS = {  # of one coordinate of ω
 @pytest.mark.parametrize("n", [1, 3])
 def test_frequencies_have_the_spectral_density(name, n, key):
     make, marginal = MARGINALS[name]
-    (s,) = spectra(make(), n, 4000, key, jnp.float64)
+    (s,) = make().spectra(n, 4000, key, jnp.float64)
     # Every n-th: those within a block are orthogonal, and so not independent.
     draws = np.asarray(s.frequencies)[::n]
     for a in range(n):
@@ -168,7 +167,7 @@ def test_directions_are_those_of_qr_without_its_program(key):
 
 @pytest.mark.slow
 def test_harmonics_of_a_periodic_kernel_have_its_fourier_coefficients(key):
-    (s,) = spectra(hk.Periodic(2 * np.pi, 0.8), 1, 100_000, key, jnp.float64)
+    (s,) = hk.Periodic(2 * np.pi, 0.8).spectra(1, 100_000, key, jnp.float64)
     harmonics = np.asarray(s.frequencies)[:, 0]
     np.testing.assert_allclose(harmonics, np.round(harmonics), atol=ROUNDING)
     for j in range(-4, 5):
@@ -178,7 +177,7 @@ def test_harmonics_of_a_periodic_kernel_have_its_fourier_coefficients(key):
 
 
 def test_the_same_key_draws_the_same_and_another_does_not(key):
-    draw = functools.partial(spectra, hk.Matern(2.5), 2, 10, dtype=jnp.float64)
+    draw = functools.partial(hk.Matern(2.5).spectra, 2, 10, dtype=jnp.float64)
     (a,), (b,), (c,) = draw(key), draw(key), draw(jax.random.key(0))
     np.testing.assert_array_equal(a.frequencies, b.frequencies)
     assert not np.allclose(a.frequencies, c.frequencies)
@@ -490,7 +489,7 @@ def test_slopes_of_the_measure_are_those_of_the_kernel_in_the_mean(make, formula
     d = np.array([0.7, -0.4])
 
     def kernel(t):
-        (s,) = spectra(make(t), 2, 200_000, key, jnp.float64)
+        (s,) = make(t).spectra(2, 200_000, key, jnp.float64)
         return s.weights @ jnp.cos(s.frequencies @ d)
 
     h, zero = 1e-6, np.zeros(2)

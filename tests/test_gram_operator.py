@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._gram.operator import COLUMNS, ROWS, gram_operator
+from hamkernel._gram.operator import TILE, gram_operator
 
 # Sums of a thousand terms of order one.
 ROUNDING = 1e-12
 # Three tiles of rows and two of columns, and neither is full.
-N, M, n = 2 * ROWS + 23, COLUMNS + 203, 2
+N, M, n = 2 * TILE + 23, TILE + 203, 2
 # Points far from the edge of a tile give the same in one tile.
 FEW = 12
 
@@ -143,11 +143,11 @@ def test_jit_and_vmap_give_the_same_product():
 def test_the_gradient_is_that_of_finite_differences_across_tiles(argument):
     start = {
         "lengthscale": jnp.asarray(1.3),
-        "X": jnp.asarray(normal((ROWS + 3, n))),
-        "Z": jnp.asarray(normal((COLUMNS + 7, n), 1)),
-        "A": jnp.asarray(normal((COLUMNS + 7, n), 2)),
+        "X": jnp.asarray(normal((TILE + 3, n))),
+        "Z": jnp.asarray(normal((TILE + 7, n), 1)),
+        "A": jnp.asarray(normal((TILE + 7, n), 2)),
     }
-    weights = jnp.asarray(normal((ROWS + 3, n), 3))
+    weights = jnp.asarray(normal((TILE + 3, n), 3))
 
     def loss(value):
         given = {**start, argument: value}
@@ -201,7 +201,7 @@ def test_value_and_gradient_need_memory_linear_in_the_points():
     for function in (value, jax.grad(value)):
         # Sixteen times the points. The tile is the same.
         assert temporaries(function, large) < 16 * temporaries(function, small)
-        assert temporaries(function, large) < 64 * large.nbytes + 64 * 8 * ROWS * COLUMNS
+        assert temporaries(function, large) < 64 * large.nbytes + 64 * 8 * TILE * TILE
     assert temporaries(dense, small) > small.size**2 * 8  # the measure would notice a Gram
 
 
@@ -216,9 +216,9 @@ def test_points_far_from_the_origin_lose_nothing():
 def test_a_field_at_many_states_is_the_same_as_one_by_one():
     X, Y = normal((FEW, n)), normal((FEW, n), 1)
     field = hk.fit(KERNELS["odd_symplectic"], X, Y, 1e-2)
-    new = normal((ROWS + 1, n), 2)
-    one_by_one = np.stack([field(x) for x in jnp.asarray(new[:: ROWS // 2])])
-    np.testing.assert_allclose(field.evaluate(new)[:: ROWS // 2], one_by_one, atol=1e-10)
+    new = normal((TILE + 1, n), 2)
+    one_by_one = np.stack([field(x) for x in jnp.asarray(new[:: TILE // 2])])
+    np.testing.assert_allclose(field.evaluate(new)[:: TILE // 2], one_by_one, atol=1e-10)
     with pytest.raises(ValueError, match="3 coordinates and the field 2"):
         field.evaluate(normal((4, 3)))
 

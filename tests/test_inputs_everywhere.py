@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._features.features import features
+from hamkernel._features import features
 
 GAIN = hk.InputMatrix(0.8 * hk.Gaussian(0.9), acts_on=(1,))
 K = hk.Controlled(hk.Symplectic(2.0 * hk.Gaussian(1.3)), GAIN)

@@ -77,7 +77,7 @@ def test_what_is_heavy_loads_when_it_is_used(use, module):
 
 
 def stem(path):
-    """The first name below the package: `_show` for _show.py, `paper` for paper/_evaluate.py."""
+    """The first name below the package: `_show` for _show.py, `paper` for paper/_experiments.py."""
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 

@@ -16,7 +16,6 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._dynamics.equal_steps import equal_steps
 from hamkernel._dynamics.simulate import simulate
 from hamkernel._dynamics.symplectic import (
     GaussLegendre4,
@@ -24,8 +23,9 @@ from hamkernel._dynamics.symplectic import (
     ImplicitMidpoint,
     StormerVerlet,
     Yoshida4,
+    equal_steps,
 )
-from hamkernel._kernels.radial import Gaussian
+from hamkernel._kernels.built_in import Gaussian
 from hamkernel._structures.structure import Symplectic
 
 SYMPLECTIC = [

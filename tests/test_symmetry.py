@@ -12,7 +12,7 @@ import pytest
 from kernels import BY_NAME, canonical, difference_mixed
 
 import hamkernel as hk
-from hamkernel._features.features import features as features_of
+from hamkernel._features import features as features_of
 from hamkernel._kernels.symmetry import symmetry_removed
 from hamkernel._save import load, save
 

@@ -21,15 +21,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._kernels.radial import Gaussian
+from hamkernel._kernels.built_in import Gaussian
 from hamkernel._kernels.transforms import Select
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.measurements import observations
 from hamkernel._solvers.problem import problem
-from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.port_hamiltonian import PortHamiltonian
+from hamkernel._structures.base import AbstractMatrixKernel, Odd, Reversible, matrix_kernel
+from hamkernel._structures.mechanics import PortHamiltonian
 from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
-from hamkernel._structures.symmetry import Odd, Reversible
 from hamkernel._trajectories.learned import Learned
 from hamkernel._tuning.space import velocity_rms
 from hamkernel._tuning.tune import tune

@@ -13,11 +13,10 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
-from hamkernel._dynamics.equal_steps import EqualSteps, step_counts
-from hamkernel._dynamics.symplectic import AbstractSymplecticSolver
+from hamkernel._dynamics.symplectic import AbstractSymplecticSolver, EqualSteps, step_counts
+from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import AbstractJoinedField
-from hamkernel._fields.kernel_field import KernelField
-from hamkernel._gram.rounding import field_rounding
+from hamkernel._gram.dense import field_rounding
 from hamkernel._kernels.functions import as_pytree
 
 Between = Literal["held", "linear"]

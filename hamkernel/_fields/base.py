@@ -13,8 +13,7 @@ from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
-from hamkernel._structures.controlled import KnownMatrix
-from hamkernel._structures.joined import AbstractJoinedKernel
+from hamkernel._structures.joined import AbstractJoinedKernel, KnownMatrix
 
 Field = TypeVar("Field", bound="AbstractField")
 Mean = Callable[..., Float[Array, " n"]]

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._features.features import ControlledFeatures
+from hamkernel._features import ControlledFeatures
 from hamkernel._fields.base import (
     AbstractField,
     AtInputs,
@@ -22,13 +22,11 @@ from hamkernel._fields.base import (
     at_points,
     root,
 )
-from hamkernel._fields.features import FeatureField
-from hamkernel._fields.kernel_field import KernelField
+from hamkernel._fields.expansions import FeatureField, KernelField
 from hamkernel._gram.operator import placed_product
 from hamkernel._structures.base import Sum
-from hamkernel._structures.controlled import Controlled
 from hamkernel._structures.family import AbstractFamily
-from hamkernel._structures.joined import AbstractJoinedKernel
+from hamkernel._structures.joined import AbstractJoinedKernel, Controlled
 
 
 class AbstractJoinedField(AbstractField):

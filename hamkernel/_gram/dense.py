@@ -1,4 +1,4 @@
-"""The dense Gram of a kernel: of points, and of the rows of observations.
+"""The dense Gram of a kernel: of points and of rows of observations, its derivatives and rounding.
 
 The rows of observations are linear functionals of a field and its potential. Between values of u
 and derivatives there is one forward derivative less than between derivatives,
@@ -7,6 +7,10 @@ and derivatives there is one forward derivative less than between derivatives,
 
 the second of which is the potential of the representer K(·, z)v, and the third is `K.form`. A block
 of observations maps such covariances at its points to rows.
+
+Derivatives with respect to the hyperparameters of a kernel, of which there are few, are taken
+FORWARD: each costs about one assembly. Backward through the pairs of points was measured at 6 to 60
+assemblies, and takes several times as long to compile.
 """
 
 from __future__ import annotations
@@ -16,10 +20,12 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import Descriptor, Invariance
+from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._machine import RowSharding, automatic, on_each, refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components
 from hamkernel._observations.measurements import Measurements
@@ -119,11 +125,6 @@ def block_traces(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array
     return diagonals(K, X, X).sum(axis=1)
 
 
-# Whose blocks are made at once: of a network in a kernel they take kilobytes each. A Gaussian's
-# then stay in the cache: 16 ms for a million points, four times as many at once 90 ms.
-_POINTS = 1024
-
-
 def trace(
     K: AbstractMatrixKernel, X: Float[Array, "N n"], spread: RowSharding | None = None
 ) -> Float[Array, ""]:
@@ -137,7 +138,9 @@ def trace(
     def of_point(x):
         return block_traces(K, x[None])[0]
 
-    return jax.lax.map(of_point, X, batch_size=_POINTS).sum()
+    # Of a network in a kernel each block takes kilobytes. Those of a Gaussian stay in the cache:
+    # 16 ms for a million points, four times as many at once 90 ms.
+    return jax.lax.map(of_point, X, batch_size=1024).sum()
 
 
 def centred(K: AbstractMatrixKernel, x: Array, Z: Float[Array, "M n"]) -> tuple[Array, Array]:
@@ -155,11 +158,6 @@ def centred(K: AbstractMatrixKernel, x: Array, Z: Float[Array, "M n"]) -> tuple[
 def plus_ridge(G: Float[Array, "D D"], ridge: Float[Array, ""]) -> Float[Array, "D D"]:
     """G + ridge I."""
     return G + ridge * jnp.eye(len(G), dtype=G.dtype)
-
-
-# Groups of combinations whose points are made at once, for each of which there are Q n rows as long
-# as all points of the other side.
-_ENTRIES = 1_000_000
 
 
 def between_all(
@@ -184,8 +182,6 @@ def gram_of_rows(
     return rows.contrast(rows.contrast(G).T) if contrasted and len(rows.energies) else G
 
 
-# Entries of a Gram up to which it is made at once: in strips 2000 rows took a fifth longer.
-_WHOLE = 4_000_000
 _STRIP = 500_000  # entries made at once: of some kernels each takes 40 numbers on its way
 
 
@@ -193,7 +189,7 @@ def regularized_gram(
     K: AbstractMatrixKernel, rows: Measurements, ridge: Float[Array, ""]
 ) -> Float[Array, "D D"]:
     """The Gram of all rows, after the contrast of the energies, plus ridge I."""
-    if rows.states is None or rows.size**2 <= _WHOLE:
+    if rows.states is None or rows.size <= 2000:  # in strips 2000 rows took a fifth longer
         return plus_ridge(gram_of_rows(K, rows), ridge)
     empty = jnp.zeros((rows.size, rows.size), rows.targets.dtype)
     return strips_of_gram((K, rows.points, ridge, 0, len(rows.points)), empty)
@@ -272,8 +268,9 @@ def between(
         one = Combinations(groups=points[None], weights=weights[None])  # pyright: ignore[reportCallIssue]
         return _mapped(K, one, right)
 
-    # One group after the other: the covariances of all points need not fit in memory.
-    at_once = max(1, _ENTRIES // (left.groups[0].size * right.points.size))
+    # Some groups after the others, since the covariances of all points need not fit in memory: of
+    # a group there are Q n rows as long as all points of the other side, of all some 8 MB.
+    at_once = max(1, 1_000_000 // (left.groups[0].size * right.points.size))
     out = jax.lax.map(of_group, (left.groups, left.weights), batch_size=at_once)
     return out.reshape(left.count, -1)
 
@@ -303,3 +300,123 @@ def _at_points(K: AbstractMatrixKernel, left: AbstractBlock, right: AbstractBloc
     for axis in (2, 1, 0):  # b, zⱼ, xᵢ
         entry = jax.vmap(entry, in_axes=[0 if i == axis else None for i in range(3)])
     return entry(X, Z, basis)  # (P, P′, n)
+
+
+@eqx.filter_custom_vjp
+def forward_differentiated(kernel_and_data, make, rowwise: bool = False):
+    """make(K, data), an array, cheap to differentiate with respect to K.
+
+    If `rowwise` then make(K, data) is a function and points instead. The function makes of points
+    a row for each, and the array is its value there. Derivatives take the memory of a strip of it.
+    """
+    return _array(make, rowwise, *kernel_and_data)
+
+
+@forward_differentiated.def_fwd
+def _(perturbed, kernel_and_data, make, rowwise=False):
+    return forward_differentiated(kernel_and_data, make, rowwise), None
+
+
+@forward_differentiated.def_bwd
+def _(saved, bar, perturbed, kernel_and_data, make, rowwise=False):
+    K, data = kernel_and_data
+
+    def paired(K, data, bar):
+        if not rowwise:
+            return jnp.vdot(bar, make(K, data))
+        rows, X = make(K, data)
+        return _paired_by_rows(rows, X, bar)
+
+    params, static = eqx.partition(K, eqx.is_inexact_array)
+    flat, unravel = ravel_pytree(params)
+
+    def slope(direction):
+        # What does not depend on the direction depends on it now: XLA would else compute it ahead
+        # of the loop and keep it, several arrays of the size of the Gram.
+        here, direction = jax.lax.optimization_barrier((flat, direction))
+        at = lambda h: paired(eqx.combine(unravel(h), static), data, bar)  # noqa: E731
+        return jax.jvp(at, (here,), (direction,))[1]
+
+    # Side by side the directions share what does not depend on them, at the price of memory: of up
+    # to 200 000 entries of the array and its changes.
+    arrays, rest = eqx.partition(data, eqx.is_inexact_array)
+    largest = max(each.size for each in [bar, *jax.tree.leaves(arrays)])
+    together = min(flat.size, 200_000 // largest)
+    directions = jnp.eye(flat.size, dtype=flat.dtype)
+    slopes = jax.lax.map(slope, directions, batch_size=together if together > 1 else None)
+    K_bar = unravel(slopes.astype(flat.dtype))
+    if not any(jax.tree.leaves(perturbed[1])):
+        return K_bar, jax.tree.map(lambda _: None, arrays)
+    _, pull = jax.vjp(lambda arrays: _array(make, rowwise, K, eqx.combine(arrays, rest)), arrays)
+    return K_bar, pull(bar)[0]
+
+
+def _array(make, rowwise: bool, K, data) -> Array:
+    if not rowwise:
+        return make(K, data)
+    rows, X = make(K, data)
+    return rows(X)
+
+
+def _paired_by_rows(rows, X: Float[Array, "N n"], bar: Float[Array, "N ..."]) -> Float[Array, ""]:
+    """⟨bar, rows(X)⟩, in strips.
+
+    The products of all strips are added entry by entry, and summed once: entries that XLA sums as
+    it makes them are made by one thread, one at a time, in four times as long. Strips are cut out
+    one at a time: `over_tiles` would rearrange, and so copy, `bar`.
+    """
+    N = len(X)
+    if bar.size <= 10_000:  # as fast at once, and sooner compiled
+        return jnp.vdot(bar, rows(X))
+    # Strips of 200 000 entries, whose derivatives hold up to 13 arrays of this size; but four of
+    # them at least, for a loop of few is unrolled.
+    points = max(1, min(N // 4, 200_000 * N // bar.size))
+
+    def strip(start, count):
+        x, own = (jax.lax.dynamic_slice_in_dim(each, start, count) for each in (X, bar))
+        return own * rows(x)
+
+    def add(total, start):
+        return total + strip(start, points), None
+
+    starts = jnp.arange(0, N - points + 1, points)
+    total, _ = jax.lax.scan(add, jnp.zeros((points, *bar.shape[1:]), bar.dtype), starts)
+    left = N % points
+    return total.sum() + (strip(N - left, left).sum() if left else 0.0)
+
+
+def constant(tree):
+    """`tree` with no derivative through its arrays; it may have leaves of other kinds, as K may."""
+    arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
+    return eqx.combine(jax.tree.map(jax.lax.stop_gradient, arrays), rest)
+
+
+def gram_rounding(trace: Float[Array, "..."]) -> Float[Array, "..."]:
+    """ε tr(G), the size of the rounding errors in products with the Gram G and in its factors.
+
+    A ridge or a pivot that is smaller than this number is lost in the rounding. `trace` may be that
+    of G, of its diagonal blocks, or of G/N, for a bound of λ.
+    """
+    return jnp.finfo(trace.dtype).eps * trace
+
+
+@eqx.filter_jit
+def field_rounding(
+    K: AbstractMatrixKernel,
+    x: Float[Array, " n"],
+    Z: Float[Array, "M n"],
+    A: Float[Array, "M n"],
+    velocity: Float[Array, " n"],
+    most: float = jnp.inf,
+) -> Float[Array, ""]:
+    """ε ‖Σⱼ |K(x, zⱼ) aⱼ|‖ / ‖f(x)‖, the relative rounding error of f(x) = Σⱼ K(x, zⱼ) aⱼ.
+
+    It is cut to `most`, since it grows without bound where f(x) tends to zero. Where the ridge is
+    small the terms are large, of both signs, and each rounds to ε of itself.
+    """
+    K = without_symmetry(K)
+    terms = jax.vmap(lambda z, a: K.expansion(x, z[None], a[None]))(Z, A)
+    size = jnp.linalg.norm(jnp.sum(jnp.abs(terms), axis=0))
+    least = jnp.finfo(x.dtype).tiny
+    share = jnp.finfo(x.dtype).eps * size / jnp.maximum(jnp.linalg.norm(velocity), least)
+    return jax.lax.stop_gradient(jnp.minimum(share, most).astype(x.dtype))

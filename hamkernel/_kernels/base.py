@@ -8,6 +8,8 @@ differentiation makes every structured kernel from it, so a kernel should be wri
 
 import abc
 import enum
+import functools
+import itertools
 import math
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
@@ -16,7 +18,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Key
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
@@ -102,6 +104,34 @@ class Descriptor(NamedTuple):
     directions: Callable[[Float[Array, " n"]], Float[Array, "n n"]] = lambda x: jnp.eye(len(x))
 
 
+class Spectrum(eqx.Module):
+    """Draws from a spectral measure: k(x, z) ≈ Σ_r c_r cos(ω_r·(x − z)), or its even or odd part.
+
+    Bochner: k(x, z) = κ(x − z) is the mean of cos(ω·(x − z)) over its spectral measure, so that
+    with F frequencies drawn from it the sum is right to F^(−1/2).
+
+    Frequencies are smooth functions of the hyperparameters and of base samples that depend on the
+    key alone, so fits are differentiable and losses comparable between steps. α of a rational
+    quadratic kernel and the lengthscale of a periodic one change the law of the base samples: there
+    the derivative is that of the measure, right in the mean over keys but not the exact slope for
+    one key.
+
+    Attributes:
+        frequencies: ω_r in radians per unit of the states, shape (F, n).
+        weights: c_r > 0, shape (F,); their sum is k(x, x) of the shift-invariant kernel.
+        parity: +1 for the even part, −1 for the odd part, 0 for all.
+
+    Source: Rahimi & Recht (2007).
+    """
+
+    frequencies: Float[Array, "F n"]
+    weights: Float[Array, " F"]
+    parity: int = eqx.field(static=True, default=0)
+
+
+Spectra = tuple[Spectrum, ...]  # one for each term
+
+
 class AbstractScalarKernel(eqx.Module):
     """A positive definite function k(x, z) -> () of two points of shape (n,).
 
@@ -149,6 +179,23 @@ class AbstractScalarKernel(eqx.Module):
     def through_descriptor(self, n: int) -> Descriptor | None:
         """The descriptor through which k sees points of n coordinates, if it has one."""
         return None
+
+    def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
+        """`count` random frequencies for each term of the kernel on n coordinates.
+
+        Terms are what remains when products of sums are expanded.
+
+        Raises:
+            TypeError: no spectral density of the kernel is known, or it is not shift-invariant.
+        """
+        fn = getattr(self, "fn", None)
+        name = getattr(getattr(fn, "func", fn), "__name__", "")
+        raise TypeError(
+            f"RandomFeatures cannot draw frequencies for {type(self).__name__}"
+            f"{name and f' ({name})'}: that takes a shift-invariant kernel with a known spectral "
+            "density. Use Gaussian, Matern, RationalQuadratic or Periodic, their sums, products, "
+            "multiples and Select, or another solver, hk.Cholesky() or hk.Nystrom()."
+        )
 
     @property
     def has_amplitude(self) -> bool:
@@ -220,6 +267,9 @@ class ScalarSum(AbstractScalarKernel):
     def summands(self, reflection: bool) -> tuple[AbstractScalarKernel, ...]:
         return self.terms
 
+    def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
+        return tuple(itertools.chain.from_iterable(_of_terms(self, n, count, key, dtype)))
+
     @property
     def has_amplitude(self) -> bool:
         return all(k.has_amplitude for k in self.terms)
@@ -249,9 +299,32 @@ class ScalarProduct(AbstractScalarKernel):
     def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
         return all(k.is_unchanged_by(S) for k in self.terms)
 
+    def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
+        """The measure of a product is the convolution: frequencies add."""
+        factors = _of_terms(self, n, count, key, dtype)
+        if any(s.parity for factor in factors for s in factor):
+            raise TypeError(
+                "RandomFeatures cannot take a product with an even or odd kernel inside. Give the "
+                "parity to the whole, for example hk.Odd(hk.Symplectic(k1 * k2))."
+            )
+
+        def convolved(a: Spectrum, b: Spectrum) -> Spectrum:
+            weights = len(a.weights) * a.weights * b.weights
+            return Spectrum(a.frequencies + b.frequencies, weights)
+
+        return tuple(functools.reduce(convolved, term) for term in itertools.product(*factors))
+
     @property
     def has_amplitude(self) -> bool:
         return any(k.has_amplitude for k in self.terms)
+
+
+def _of_terms(
+    kernel: ScalarSum | ScalarProduct, n: int, count: int, key: Key[Array, ""], dtype: Any
+) -> list[Spectra]:
+    """The spectra of each term, of independent draws."""
+    keys = jax.random.split(key, len(kernel.terms))
+    return [t.spectra(n, count, key, dtype) for t, key in zip(kernel.terms, keys, strict=True)]
 
 
 def common_invariance(terms: Iterable[Any]) -> Invariance:
@@ -304,6 +377,10 @@ class Scaled(AbstractScalarKernel):
         if found is None:
             return None
         return found._replace(kernel=eqx.tree_at(lambda k: k.kernel, self, found.kernel))
+
+    def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
+        inner, scale = self.kernel.spectra(n, count, key, dtype), self.scale.astype(dtype)
+        return tuple(Spectrum(s.frequencies, scale * s.weights, s.parity) for s in inner)
 
     @property
     def has_amplitude(self) -> bool:

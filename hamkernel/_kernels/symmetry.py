@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import (
@@ -21,6 +21,7 @@ from hamkernel._kernels.base import (
     Descriptor,
     Invariance,
     ScalarProduct,
+    Spectrum,
     one_point,
 )
 from hamkernel._kernels.transforms import Warp
@@ -261,6 +262,16 @@ class Symmetrised(AbstractScalarKernel):
         if set(self.maps) != {identity, reflection}:
             return None
         return int(self.characters[self.maps.index(reflection)])
+
+    def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
+        inner = self.kernel.spectra(n, count, key, dtype)
+        if self.parity is None or any(s.parity == -self.parity for s in inner):
+            raise TypeError(
+                "RandomFeatures takes one group for all of a structure, around all of its terms: "
+                "hk.Odd(K), hk.Reversible(K), hk.Symplectic(hk.Invariant(k1 + k2, maps)). For "
+                "others use hk.Cholesky() or hk.Nystrom()."
+            )
+        return tuple(Spectrum(s.frequencies, s.weights, self.parity) for s in inner)
 
     @property
     def has_amplitude(self) -> bool:

@@ -7,13 +7,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import (
     AbstractScalarKernel,
     Descriptor,
     Invariance,
+    Spectrum,
     as_scalar_kernel,
     one_point,
 )
@@ -175,6 +176,16 @@ class Select(AbstractScalarKernel):
 
     def summands(self, reflection: bool) -> tuple[AbstractScalarKernel, ...]:
         return (self.kernel,) if reflection else ()  # which the selected coordinates do, too
+
+    def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
+        if max(self.dims) >= n:
+            raise ValueError(f"Select has coordinates {self.dims} and the points have {n}, from 0.")
+        inner, columns = self.kernel.spectra(len(self.dims), count, key, dtype), list(self.dims)
+
+        def placed(frequencies):
+            return jnp.zeros((len(frequencies), n), dtype).at[:, columns].set(frequencies)
+
+        return tuple(Spectrum(placed(s.frequencies), s.weights, s.parity) for s in inner)
 
     @property
     def has_amplitude(self) -> bool:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo, at_points, root
-from hamkernel._fields.kernel_field import KernelField
+from hamkernel._fields.expansions import KernelField
 from hamkernel._gram.dense import (
     between,
     gram_of_rows,

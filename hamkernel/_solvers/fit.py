@@ -9,16 +9,16 @@ from jaxtyping import ArrayLike, Num
 
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, Mean
+from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import ControlledField, FamilyField, learned_field
-from hamkernel._fields.kernel_field import KernelField
 from hamkernel._machine import as_given, dense_bytes, memory_bytes, one_blas_thread, rows_of
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.dense import Cholesky, copies
 from hamkernel._solvers.problem import AbstractSolver, Learned, Problem, problem
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.controlled import Controlled
 from hamkernel._structures.family import AbstractFamily
+from hamkernel._structures.joined import Controlled
 
 
 @overload

@@ -22,9 +22,15 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from hamkernel import _require as require
-from hamkernel._gram.dense import assemble, between_all, block_traces, components, gram_of_rows
-from hamkernel._gram.derivatives import constant
-from hamkernel._gram.rounding import gram_rounding
+from hamkernel._gram.dense import (
+    assemble,
+    between_all,
+    block_traces,
+    components,
+    constant,
+    gram_of_rows,
+    gram_rounding,
+)
 from hamkernel._machine import rows_of, split
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements

@@ -27,8 +27,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
-from hamkernel._gram.dense import plus_ridge
-from hamkernel._gram.derivatives import constant
+from hamkernel._gram.dense import constant, plus_ridge
 from hamkernel._machine import RowSharding, on_each
 
 # A design gives the rows of some points at once: (t, n) -> (t, n, r), row (i, a) of a field's

@@ -24,10 +24,9 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Bool, Float, Key
 
 from hamkernel import _require as require
-from hamkernel._features.features import AbstractFeatures, features
+from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import AbstractField, SolverInfo, root
-from hamkernel._fields.features import FeatureField, feature_field
-from hamkernel._fields.kernel_field import KernelField
+from hamkernel._fields.expansions import FeatureField, KernelField, feature_field
 from hamkernel._gram.dense import between, components, plus_ridge, trace_of_rows
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements

@@ -21,7 +21,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Key, Num, UInt32
 
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo, root
-from hamkernel._fields.kernel_field import KernelField
+from hamkernel._fields.expansions import KernelField
 from hamkernel._gram.dense import components, trace, trace_of_rows
 from hamkernel._gram.operator import product
 from hamkernel._machine import as_given, rows_of, split

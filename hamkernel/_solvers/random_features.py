@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key, UInt32
 
 from hamkernel import _require as require
-from hamkernel._features.features import AbstractFeatures, features
+from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import SolverInfo
-from hamkernel._fields.features import FeatureField, feature_field
+from hamkernel._fields.expansions import FeatureField, feature_field
 from hamkernel._machine import as_given, refuse_beyond_memory, rows_of, split
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.least_squares import (

@@ -23,10 +23,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-from hamkernel._features.features import AbstractFeatures, features
+from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import SolverInfo
-from hamkernel._fields.features import FeatureField, feature_field
-from hamkernel._fields.kernel_field import KernelField
+from hamkernel._fields.expansions import FeatureField, KernelField, feature_field
 from hamkernel._gram.dense import between, block_traces, components
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, whitening

@@ -25,9 +25,9 @@ from hamkernel._kernels.base import (
     Points,
     as_scalar_kernel,
 )
+from hamkernel._kernels.built_in import Constant
 from hamkernel._show import call, joined
 from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel
-from hamkernel._structures.controlled import Constant
 from hamkernel._structures.joined import AbstractJoinedKernel
 
 

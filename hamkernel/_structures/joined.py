@@ -3,6 +3,11 @@
 That is what was applied, the inputs of `Controlled`, or which member of a family it was, the
 parameters of `Family`. Points have n + m coordinates and fields n components, and everything
 downstream asks a kernel for its `outputs`.
+
+Fields with inputs are f(x, u) = f(x) + G(x) u. With independent priors of the drift f and of the
+input matrix G the kernel of two joined points is
+
+    K((x, u), (x′, u′)) = K_f(x, x′) + Σᵢⱼ uᵢ u′ⱼ K_g,ij(x, x′),        shape (n, n).
 """
 
 import abc
@@ -16,9 +21,19 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import Invariance, Points, one_point
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Invariance,
+    Point,
+    Points,
+    Scaled,
+    as_scalar_kernel,
+    one_point,
+)
+from hamkernel._kernels.built_in import Constant
 from hamkernel._kernels.symmetry import LinearMap
-from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._show import described
+from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel
 
 
 class AbstractJoinedKernel(AbstractMatrixKernel):
@@ -121,9 +136,6 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
         self.check_dimension(X.shape[1])
         self.of_states.check_points(self.split(X)[0])
 
-    def shares_potential(self, other: AbstractMatrixKernel) -> bool:
-        return False
-
     def with_parity(self, parity: int) -> AbstractMatrixKernel:
         raise TypeError(f"say the symmetry of {self.inner}(Odd(K), …).")
 
@@ -138,3 +150,205 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
         if isinstance(other, AbstractMatrixKernel):
             return Sum(other, self)  # which says why there is none
         return super().__radd__(other)
+
+
+class InputMatrix(eqx.Module):
+    """The prior of an unknown input matrix G(x), shape (n, m).
+
+    Its entries are independent functions in the RKHS of one scalar kernel, in the rows `acts_on`;
+    the other rows are zero: a torque changes momenta and not positions.
+
+    Args:
+        kernel: a scalar kernel, for a G that depends on the state; or a positive number, the prior
+            variance of the entries of an unknown constant G.
+        acts_on: the coordinates that inputs change, counted from 0; all of them if None.
+
+    Raises:
+        TypeError: `kernel` is neither. ValueError: the variance is not positive, or `acts_on` are
+            no coordinates.
+
+    Example: `hk.Controlled(K, inputs=hk.InputMatrix(hk.Gaussian(2.0), acts_on=(1,)))`.
+    """
+
+    kernel: AbstractScalarKernel
+    acts_on: tuple[int, ...] | None = eqx.field(static=True)
+
+    def __init__(self, kernel: Any, acts_on: Any = None):
+        if callable(kernel):
+            self.kernel = as_scalar_kernel(kernel)
+        else:
+            variance = require.positive_scalar(kernel, "the variance of a constant input matrix")
+            self.kernel = Scaled(Constant(), variance)
+        self.acts_on = None if acts_on is None else require.coordinates(acts_on, "acts_on")
+
+    def __repr__(self) -> str:
+        return described(self, positional=("kernel",))
+
+    def rows(self, n: int, dtype: Any) -> Float[Array, " n"]:
+        """1 for the rows of G that are not zero."""
+        if self.acts_on is None:
+            return jnp.ones(n, dtype)
+        return jnp.zeros(n, dtype).at[np.asarray(self.acts_on)].set(1.0)
+
+
+class KnownMatrix(eqx.Module):
+    """A known constant input matrix G, kept as numbers: nothing of it is trained."""
+
+    entries: tuple[tuple[float, ...], ...] = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        return repr([list(row) for row in self.entries])
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """G, shape (n, m)."""
+        return np.asarray(self.entries)
+
+
+class Controlled(AbstractJoinedKernel):
+    """Fields with inputs: f(x, u) = f(x) + G(x) u, f in the RKHS of K.
+
+    Give the inputs of each point to `fit`, `tune` and the losses: `hk.fit(K, X, Y, λ, inputs=U)`
+    with U of shape (N, m). The field is `field(x, u)`; `field.drift(x)` is f, with its Hamiltonian
+    and everything else that a field of K has, and `field.input_matrix(x)` is G.
+
+    Time is an input like any other: with U the values of t, or of cos ωt and sin ωt, the field is
+    f(x) + G(x) u(t), and `hk.simulate(field, x0, ts, inputs=lambda t: jnp.array([t]))` follows it.
+
+    An input that is constant over all data cannot be distinguished from the drift, and is refused
+    unless G is known: vary it.
+
+    Args:
+        drift: K, the structured kernel of f.
+        inputs: an `InputMatrix`, for an unknown G; or G itself, an array (n, m), where it is known.
+        count: m, the number of inputs. `fit` takes it from the data.
+
+    Raises:
+        TypeError: `drift` is not matrix-valued, or `inputs` is neither. ValueError: a known G is no
+            finite matrix.
+
+    Example: `hk.Controlled(hk.PortHamiltonian(k), inputs=hk.InputMatrix(1.0, acts_on=(1,)))`.
+
+    Source: Beckers et al. (2022) for the process; the kernel of a function that is affine in u is
+        that of Castañeda et al. (2021).
+    """
+
+    drift: AbstractMatrixKernel
+    inputs: InputMatrix | KnownMatrix
+    count: int | None = eqx.field(static=True)
+
+    given: ClassVar[str] = "inputs"
+    inner: ClassVar[str] = "the drift: Controlled"
+
+    def __init__(self, drift: AbstractMatrixKernel, inputs: Any, count: int | None = None):
+        self.drift = matrix_kernel(drift, "the drift of Controlled", "Controlled(Symplectic(k), …)")
+        if self.drift.takes_inputs:
+            raise TypeError(
+                f"the drift of Controlled is a {type(self.drift).__name__}, which takes inputs or "
+                "parameters already: give all inputs to one Controlled."
+            )
+        if isinstance(inputs, InputMatrix | KnownMatrix):
+            self.inputs = inputs
+        elif callable(inputs) or isinstance(inputs, str):
+            raise TypeError(
+                "inputs must be hk.InputMatrix(k, acts_on=(1,)), for an unknown input matrix, or a "
+                f"known one as an array (n, m); got {inputs!r}. Where G(x) is a known function, fit"
+                " with mean=lambda x, u: G(x) @ u, and an array of zeros here."
+            )
+        else:
+            self.inputs = KnownMatrix(_entries(inputs))
+        G = self.inputs
+        self.count = G.matrix.shape[1] if isinstance(G, KnownMatrix) else count
+
+    @property
+    def of_states(self) -> AbstractMatrixKernel:
+        """The kernel of the drift."""
+        return self.drift
+
+    @property
+    def known_matrix(self) -> KnownMatrix | None:
+        return self.inputs if isinstance(self.inputs, KnownMatrix) else None
+
+    @property
+    def conserves(self) -> bool:
+        """No: inputs have a power."""
+        return False
+
+    def check_identified(self, U: Float[np.ndarray, "N m"]) -> None:
+        """ValueError for inputs a combination of which is the same at all points."""
+        if self.known_matrix is not None:
+            return
+        rank = int(np.linalg.matrix_rank(U - U.mean(axis=0)))
+        if rank < U.shape[1]:
+            raise ValueError(
+                f"the inputs, less their means, have rank {rank} and there are {U.shape[1]}: a "
+                "combination of them is the same at all points, and cannot be told from the drift. "
+                "Vary every input on its own, leave out those that repeat others, or give the "
+                "matrix that is known, Controlled(K, inputs=G)."
+            )
+
+    def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
+        (x, inputs), (z, others) = self.split(x), self.split(z)
+        drift = self.drift.form(x, u, z, v)
+        if isinstance(self.inputs, KnownMatrix):
+            return drift
+        rows = self.inputs.rows(len(x), x.dtype)
+        return drift + (inputs @ others) * self.inputs.kernel(x, z) * ((u * rows) @ v)
+
+    def expansion(self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Points) -> Point:
+        (x, u), (Z, U) = self.split(x), self.split(Z)
+        drift = self.drift.expansion(x, Z, A)
+        if isinstance(self.inputs, KnownMatrix):
+            return drift
+        row = jax.vmap(self.inputs.kernel, in_axes=(None, 0))(x, Z)
+        G = A.T @ (row[:, None] * U)  # (n, m)
+        return drift + self.inputs.rows(len(x), x.dtype) * (G @ u)
+
+    def potential(
+        self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Float[Array, "M n"]
+    ) -> Float[Array, ""]:
+        return self.drift.potential(self.split(x)[0], self.split(Z)[0], A)
+
+    def potential_covariance(
+        self, x: Float[Array, " d"], z: Float[Array, " d"]
+    ) -> Float[Array, ""]:
+        return self.drift.potential_covariance(self.split(x)[0], self.split(z)[0])
+
+    def centre(self, Z: Float[Array, "M d"]) -> Float[Array, " d"] | None:
+        states, inputs = self.split(Z)
+        centre, G = self.drift.centre(states), self.inputs
+        shifts = isinstance(G, KnownMatrix) or Invariance.TRANSLATION in G.kernel.invariance
+        if centre is None or not shifts:
+            return None
+        return jnp.concatenate([centre, jnp.zeros_like(inputs[0])])
+
+    def check_dimension(self, n: int) -> None:
+        """`n` counts the inputs, too."""
+        super().check_dimension(n)
+        n = self.outputs(n)
+        if isinstance(self.inputs, KnownMatrix):
+            if len(self.inputs.matrix) != n:
+                raise ValueError(
+                    f"the known input matrix has shape {self.inputs.matrix.shape} and states have "
+                    f"{n} coordinates: (n, m) is needed."
+                )
+        elif self.inputs.acts_on is not None and max(self.inputs.acts_on) >= n:
+            raise ValueError(
+                f"acts_on = {self.inputs.acts_on} names a coordinate that does not exist: the "
+                f"states have {n}, counted from 0."
+            )
+
+    @property
+    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
+        own = (self.inputs.kernel,) if isinstance(self.inputs, InputMatrix) else ()
+        return (*self.drift.scalar_kernels, *own)
+
+
+def _entries(matrix: Any) -> tuple[tuple[float, ...], ...]:
+    array = np.asarray(require.floating(matrix, "the known input matrix"), float)
+    if array.ndim != 2 or not np.isfinite(array).all():
+        raise ValueError(
+            f"the known input matrix has shape {array.shape}; a finite array (n, m), one column "
+            "for each input, is needed, such as [[0.0], [1.0]]."
+        )
+    return tuple(tuple(row) for row in array.tolist())

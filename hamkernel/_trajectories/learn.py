@@ -13,8 +13,8 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo, known_part
+from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import learned_field
-from hamkernel._fields.kernel_field import KernelField
 from hamkernel._gram.operator import placed_product
 from hamkernel._kernels.base import Scaled
 from hamkernel._kernels.functions import as_pytree
@@ -22,9 +22,9 @@ from hamkernel._observations.kinds import beside
 from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.controlled import Controlled, InputMatrix
 from hamkernel._structures.family import AbstractFamily
-from hamkernel._structures.masses import UnknownMasses
+from hamkernel._structures.joined import Controlled, InputMatrix
+from hamkernel._structures.mechanics import UnknownMasses
 from hamkernel._structures.structure import AbstractStructure
 from hamkernel._trajectories.design import bounds_and_design
 from hamkernel._trajectories.diagnostics import FitQuality, check_identifiable, diagnose

@@ -29,8 +29,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
-from hamkernel._gram.dense import assemble
-from hamkernel._gram.derivatives import forward_differentiated
+from hamkernel._gram.dense import assemble, forward_differentiated
 from hamkernel._machine import orthonormal
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._trajectories.segments import (

@@ -16,8 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
-from hamkernel._gram.dense import between_all, gram_of_rows, plus_ridge
-from hamkernel._gram.derivatives import forward_differentiated
+from hamkernel._gram.dense import between_all, forward_differentiated, gram_of_rows, plus_ridge
 from hamkernel._machine import one_blas_thread, refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock, Combinations
 from hamkernel._observations.kinds import AbstractObservations

@@ -14,10 +14,17 @@ The paper leaves three things open, so they are run side by side or stated with 
 Everything here needs float64: `jax.config.update("jax_enable_x64", True)` before arrays are made.
 """
 
-from hamkernel.paper._evaluate import Outcome, datasets, evaluate
-from hamkernel.paper._experiments import READINGS, Experiment, Model, Published, experiments
-from hamkernel.paper._report import report, tuning_report
-from hamkernel.paper._reproduce import reproduce, retune, summarise
+from hamkernel.paper._experiments import (
+    READINGS,
+    Experiment,
+    Model,
+    Outcome,
+    Published,
+    datasets,
+    evaluate,
+    experiments,
+)
+from hamkernel.paper._reproduce import report, reproduce, retune, summarise, tuning_report
 from hamkernel.paper._tuned import Choice, Comparison, compare
 
 __all__ = [

@@ -1,14 +1,24 @@
-"""The experiments of the paper, and the numbers that it published."""
+"""The experiments of the paper with its published numbers, and the test of a kernel in them."""
 
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
+from typing import Any, cast
 
-from hamkernel._kernels.radial import Gaussian
-from hamkernel._structures.base import AbstractMatrixKernel
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Key
+
+from hamkernel._dynamics.simulate import simulate
+from hamkernel._fields.expansions import KernelField
+from hamkernel._kernels.built_in import Gaussian
+from hamkernel._solvers.fit import fit
+from hamkernel._structures.base import AbstractMatrixKernel, Odd
 from hamkernel._structures.structure import Separable, Symplectic
-from hamkernel._structures.symmetry import Odd
-from hamkernel.systems import AbstractHamiltonianSystem, HarmonicOscillator, Pendulum
+from hamkernel.systems import AbstractHamiltonianSystem, HarmonicOscillator, Pendulum, sample
 
 # The regularization for which the ridge of `fit`, N · regularization, is the ridge that is meant.
 READINGS: Mapping[str, Callable[[float, int], float]] = {
@@ -143,3 +153,198 @@ def _models(
         "symplectic": Model("symplectic", *odd_symplectic),
         "odd_symplectic": Model("odd_symplectic", *odd_symplectic),
     }
+
+
+_TIMES = 100  # steps of the test trajectory
+_PORTRAIT = 2.25  # horizons of the test that the orbits in the portraits run: two turns
+_POINTS = 10_000  # where the odd error is sampled, as in the paper
+_POINTS_KEY = 2023  # the same points for every kernel and seed
+_BATCH = 20  # seeds in one call of the compiled program, whatever their number
+_SIZE = 24  # fields get points without weight up to a multiple of this, see `_padded`
+
+
+class Outcome(eqx.Module):
+    """The tests of one kernel on S seeds.
+
+    Attributes:
+        ts: times of the test trajectory [s], shape (T,).
+        true: the test trajectory of the true system, shape (T, n).
+        true_orbits: from the initial states of the data, over the longer time of the phase
+            portraits, shape (B, P, n).
+        learned: the test trajectory of each learned field, shape (S, T, n).
+        error: its distance from the true one, shape (S, T).
+        quantities: numbers by name, each of shape (S,).
+        field: the one learned from the first seed; its `points` are the states measured.
+        orbits: `true_orbits` with this field.
+    """
+
+    ts: Float[Array, " T"]
+    true: Float[Array, "T n"]
+    true_orbits: Float[Array, "B P n"]
+    learned: Float[Array, "S T n"]
+    error: Float[Array, "S T"]
+    quantities: dict[str, Float[Array, " S"]]
+    field: KernelField
+    orbits: Float[Array, "B P n"]
+
+
+def datasets(
+    experiment: Experiment, keys: Key[Array, " S"]
+) -> tuple[Float[Array, "S N n"], Float[Array, "S N n"]]:
+    """Return states and velocities for each noise key, trajectory after trajectory.
+
+    Args:
+        experiment: what is sampled.
+        keys: one key per seed.
+    """
+    ts = experiment.step * jnp.arange(experiment.count, dtype=float)
+    x0 = jnp.asarray(experiment.initial_states)
+    return _datasets(experiment.system, x0, ts, jnp.asarray(experiment.noise), keys)
+
+
+@eqx.filter_jit
+def _datasets(system, x0, ts, noise, keys):
+    X, Y = jax.vmap(lambda key: sample(system, x0, ts, noise, noise, key=key))(keys)
+    S, _, _, n = X.shape  # (S, B, T, n)
+    return X.reshape(S, -1, n), Y.reshape(S, -1, n)  # (S, N, n)
+
+
+def evaluate(
+    experiment: Experiment,
+    kernel: AbstractMatrixKernel,
+    X: Float[Array, "S N n"],
+    Y: Float[Array, "S N n"],
+    regularization: ArrayLike,
+    *,
+    tolerance: float = 1e-10,
+) -> Outcome:
+    """Fit `kernel` to every data set and test the learned fields.
+
+    The quantities are the mean and maximum of the trajectory error over the test horizon; mean and
+    variance of the odd error ‖f(x) + f(−x)‖ over the sampled points; and along the test
+    trajectory, mean and variance of the learned Hamiltonian on the learned trajectory (where the
+    kernel has one; with the constant that the representer gives it) and of the true Hamiltonian
+    on the true trajectory.
+
+    Args:
+        experiment: the system and its test.
+        kernel: the matrix-valued kernel; where `regularization` has the shape (S,), one for each
+            data set, as leaves with a leading axis S.
+        X: states, shape (S, N, n), of `datasets`.
+        Y: velocities, shape (S, N, n).
+        regularization: of `fit`, shape () for all data sets or (S,).
+        tolerance: of the integrator, relative and absolute.
+
+    Raises:
+        RuntimeError: a fit or an integration failed.
+    """
+    (low_q, high_q), (low_p, high_p) = experiment.box
+    corner, opposite = jnp.asarray([max(low_q, 0.0), low_p]), jnp.asarray([high_q, high_p])
+    uniform = jax.random.uniform(jax.random.key(_POINTS_KEY), (_POINTS, 2))
+    step = experiment.horizon / _TIMES
+    ts = step * jnp.arange(round(_PORTRAIT * _TIMES) + 1, dtype=X.dtype)
+    starts = jnp.asarray([experiment.test_state, *experiment.initial_states])
+    accuracy = jnp.asarray(tolerance, X.dtype)
+    true, energy = _truth(experiment.system, starts, ts, accuracy)
+    points = corner[None] + uniform * (opposite - corner)[None]
+    ridge = jnp.asarray(regularization, X.dtype)
+    if not ridge.ndim:  # the same hyperparameters for all data sets
+        kernel, ridge = jax.tree.map(lambda a: jnp.stack([a] * len(X)), (kernel, ridge))
+    fields = _in_batches(_fit, (kernel, X, Y, ridge))
+    learned, error, quantities = _in_batches(
+        lambda batch: _tests(batch, ts, true, points, accuracy), _padded(fields)
+    )
+    test = slice(_TIMES + 1)
+    return Outcome(
+        ts=ts[test],
+        true=true[0, test],
+        true_orbits=true[1:],
+        learned=learned[:, 0, test],
+        error=error,
+        quantities=quantities | {name: jnp.full(len(X), value) for name, value in energy.items()},
+        field=jax.tree.map(lambda leaf: leaf[0], fields),
+        orbits=learned[0, 1:],
+    )
+
+
+@eqx.filter_jit
+def _fit(kernels_and_data) -> KernelField:
+    return jax.vmap(fit)(*kernels_and_data)
+
+
+def _padded(fields: KernelField) -> KernelField:
+    """The same fields with points that carry no weight, so that all experiments are one program."""
+    extra = -fields.points.shape[1] % _SIZE
+
+    def longer(a: Float[Array, "S N n"]) -> Float[Array, "S M n"]:
+        return jnp.pad(a, ((0, 0), (0, extra), (0, 0)))
+
+    parts = longer(fields.points), longer(fields.coefficients), longer(fields.residual)
+    return eqx.tree_at(lambda f: (f.points, f.coefficients, f.residual), fields, parts)
+
+
+def _in_batches(fn: Callable, seeds):
+    """fn(seeds), a PyTree with the leading axis S of that argument, `_BATCH` of them at a time."""
+    S = len(jax.tree.leaves(seeds)[0])
+    batch = min(_BATCH, S)
+    parts = []
+    for start in range(0, S, batch):
+        # The last batch is filled up with the last seed, so that no other size is compiled.
+        rows = np.minimum(np.arange(start, start + batch), S - 1)
+        parts.append(fn(jax.tree.map(lambda a, rows=rows: a[rows], seeds)))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:S], *parts)
+
+
+@eqx.filter_jit
+def _truth(
+    system, starts: Float[Array, "B n"], ts: Float[Array, " P"], tolerance: Float[Array, ""]
+) -> tuple[Float[Array, "B P n"], dict[str, Float[Array, ""]]]:
+    true = _trajectories(system, starts, ts, tolerance)
+    energy = jax.vmap(system.hamiltonian)(true[0, : _TIMES + 1])
+    return true, _moments("true_hamiltonian", energy)
+
+
+@eqx.filter_jit
+def _trajectories(
+    field: Callable[[Array], Array],
+    starts: Float[Array, "B n"],
+    ts: Float[Array, " P"],
+    tolerance: Float[Array, ""],
+) -> Float[Array, "B P n"]:
+    # Nothing is differentiated here, and a plain loop compiles faster than one with checkpoints.
+    options: Any = dict(rtol=tolerance, atol=tolerance, adjoint=diffrax.ForwardMode())
+    return jax.vmap(lambda x0: cast(Array, simulate(field, x0, ts, **options).ys))(starts)
+
+
+@eqx.filter_jit
+def _tests(fields: KernelField, ts, true, points, tolerance):
+    """Trajectories (S, B, P, n), error (S, T) and quantities of S fields.
+
+    `true` (B, P, n) begins with the trajectory of the test; the others are orbits.
+    """
+    test = slice(_TIMES + 1)
+
+    def one(field):
+        learned = _trajectories(field, true[:, 0], ts, tolerance)
+        error = jnp.linalg.norm(learned[0, test] - true[0, test], axis=1)
+        quantities = {
+            "trajectory_error_mean": error.mean(),
+            "trajectory_error_max": error.max(),
+        }
+        if field.kernel.symplectic:
+            energy = jax.vmap(field.unanchored_potential)(learned[0, test])
+            quantities |= _moments("learned_hamiltonian", energy)
+        return learned, error, quantities
+
+    def odd_error(field):
+        values = jax.vmap(field)(jnp.concatenate([points, -points]))
+        total = values[: len(points)] + values[len(points) :]  # f(x) + f(−x)
+        return _moments("odd_error", jnp.linalg.norm(total, axis=1))
+
+    learned, error, quantities = jax.vmap(one)(fields)
+    # One seed after the other: all at once, the many points would not fit into the caches.
+    return learned, error, quantities | jax.lax.map(odd_error, fields)
+
+
+def _moments(name: str, values: Float[Array, " P"]) -> dict[str, Float[Array, ""]]:
+    return {f"{name}_mean": values.mean(), f"{name}_variance": values.var()}

@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from hamkernel import plot
-from hamkernel.paper._evaluate import Outcome
-from hamkernel.paper._experiments import Experiment, experiments
+from hamkernel.paper._experiments import Experiment, Outcome, experiments
 from hamkernel.paper._tuned import GRID, Comparison
 
 Models = Mapping[str, Outcome]

@@ -16,12 +16,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel._gram.dense import assemble, plus_ridge
-from hamkernel._kernels.radial import Gaussian
+from hamkernel._kernels.built_in import Gaussian
 from hamkernel._solvers.factors import solution
 from hamkernel._tuning.tune import tune
 from hamkernel._validation.closed_forms import Partition
-from hamkernel.paper._evaluate import evaluate
-from hamkernel.paper._experiments import STRUCTURES, Experiment
+from hamkernel.paper._experiments import STRUCTURES, Experiment, evaluate
 
 FOLDS = 5
 GRID = np.geomspace(0.3, 30.0, 30), np.geomspace(1e-10, 1.0, 25)  # σ, λ

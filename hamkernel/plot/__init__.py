@@ -5,14 +5,16 @@ several curves as a mapping from names to arrays. A name in `COLORS` has the sam
 picture; the colours stay distinct for colour-blind readers and in grey.
 """
 
-from hamkernel.plot._comparison import comparison
-from hamkernel.plot._contours import hamiltonian, loss_surface
-from hamkernel.plot._phase import phase_portrait, plane_slice, trajectories
-from hamkernel.plot._poincare import crossings, poincare_section
-from hamkernel.plot._runs import fitted, smoothing
+from hamkernel.plot._learned import band, comparison, deviation, ensemble, hamiltonian, loss_surface
+from hamkernel.plot._phase import (
+    crossings,
+    phase_portrait,
+    plane_slice,
+    poincare_section,
+    trajectories,
+)
 from hamkernel.plot._style import COLORS
-from hamkernel.plot._time import energy_drift, trajectory_error
-from hamkernel.plot._uncertainty import band, deviation, ensemble
+from hamkernel.plot._time import energy_drift, fitted, smoothing, trajectory_error
 
 __all__ = [
     "COLORS",

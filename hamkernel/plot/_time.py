@@ -1,15 +1,33 @@
-"""Pictures over time."""
+"""Curves over time: errors and energies, and logged runs with their smoothed and fitted states."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
 
 from hamkernel import _require as require
-from hamkernel.plot._style import axes, drawn, legend, line_styles, named, two, with_unit
+from hamkernel._trajectories.flow import simulated
+from hamkernel.plot._style import (
+    COLORS,
+    DATA,
+    axes,
+    coordinate,
+    drawn,
+    legend,
+    line_styles,
+    named,
+    two,
+    with_unit,
+)
+
+if TYPE_CHECKING:
+    from hamkernel._trajectories.learned import Learned
+    from hamkernel._trajectories.runs import Runs
 
 # Each (T,), or (S, T) for several seeds.
 Series = ArrayLike | Mapping[str, ArrayLike]
@@ -169,3 +187,186 @@ def _finish(
     if show_legend:
         legend(ax)
     return ax
+
+
+_BLUE = "#0072B2"
+_SIGMAS = 2.0  # standard deviations on either side, which hold 95 % of a normal variable
+_BETWEEN = 9  # points a sample, between which a curve looks smooth
+
+
+@drawn
+def smoothing(
+    runs: Runs,
+    run: int = 0,
+    ax: Sequence[Axes] | None = None,
+    *,
+    units: Sequence[str | None] | None = None,
+    names: Sequence[str | None] | None = None,
+    time_unit: str | None = None,
+    title: str | None = None,
+) -> tuple[Axes, ...]:
+    """Draw one logged run: the samples, and the smoothed states within two standard deviations.
+
+    One panel per coordinate, stacked. The band is that of the state, not of a new sample, which
+    has noise on top. The panel of a coordinate that was never measured stays empty.
+
+    Args:
+        runs: what was logged.
+        run: which of them, counted from 0, or from the end if negative.
+        ax: n axes, one for each coordinate; new ones if None.
+        units: of the coordinates.
+        names: of the coordinates, if they are not q and p.
+        time_unit: of the times.
+        title: above the first panel; the number of the run if None.
+
+    Returns:
+        The n axes.
+
+    Raises:
+        ValueError: there is no such run, or an argument does not have one entry per coordinate.
+    """
+    run, n = _position(run, len(runs)), runs.dimension
+    labels = _labels(n, units, names)
+    panels = _column(n, 1, ax)[:, 0]
+    curves = runs.smoothing(_BETWEEN - 1)
+    ts, mean = np.asarray(curves.times[run]), np.asarray(curves.states[run])
+    reach = _SIGMAS * np.asarray(curves.deviation[run])
+    for c, panel in enumerate(panels):
+        low, high = mean[:, c] - reach[:, c], mean[:, c] + reach[:, c]
+        name = rf"$\pm{_SIGMAS:g}\sigma$"
+        panel.fill_between(ts, low, high, color=_BLUE, alpha=0.25, linewidth=0, label=name)
+        panel.plot(ts, mean[:, c], color=_BLUE, linewidth=1.4, label="smoothed")
+        _samples(panel, runs, run, c)
+        _over_time(panel, ts, labels[c])
+    return _finished(panels, f"run {run}" if title is None else title, time_unit)
+
+
+@drawn
+def fitted(
+    learned: Learned,
+    run: int = 0,
+    ax: Sequence[Sequence[Axes]] | None = None,
+    *,
+    units: Sequence[str | None] | None = None,
+    names: Sequence[str | None] | None = None,
+    time_unit: str | None = None,
+    title: str | None = None,
+) -> tuple[tuple[Axes, Axes], ...]:
+    """Draw one run as measured and as the learned field explains it, with the residuals.
+
+    One row of panels per coordinate: on the left the samples and the fitted states, between which
+    the field moves, across gaps too; on the right
+    (measured − fitted)/σ, of which about one in twenty lies outside the grey band of ±2. A wave in
+    the residuals means that the structure misses part of the motion; a single outlier means that
+    the sample is wrong. A coordinate that was never measured has no residuals.
+
+    Args:
+        learned: what `hk.learn` found.
+        run: which run, counted from 0, or from the end if negative.
+        ax: n pairs of axes; new ones if None.
+        units: of the coordinates.
+        names: of the coordinates, if they are not q and p.
+        time_unit: of the times.
+        title: above the first panel; if None, the number of the run and the share of it from which
+            the field was learned.
+
+    Returns:
+        The axes, a pair for each coordinate.
+
+    Raises:
+        ValueError: there is no such run, or an argument does not have one entry per coordinate.
+    """
+    run, n = _position(run, len(learned.runs)), learned.runs.dimension
+    labels = _labels(n, units, names)
+    panels = _column(n, 2, ax)
+    ts, fit = np.asarray(learned.runs.times[run]), np.asarray(learned.states[run])
+    grid = np.interp(np.arange(_BETWEEN * (len(ts) - 1) + 1) / _BETWEEN, np.arange(len(ts)), ts)
+    spans = np.repeat(np.diff(ts)[:, None] / _BETWEEN, _BETWEEN, axis=1)
+    ends = learned.runs.applied(run, grid)
+    ends = ends.reshape(*spans.shape, 2, ends.shape[2])
+    field = getattr(learned.field, "whole", learned.field)  # of the points (x, u) with inputs
+    steps, starts = jnp.ones(_BETWEEN, int), jnp.asarray(fit[:-1])
+    between = simulated(field, starts, jnp.asarray(spans), steps, jnp.asarray(ends)).x
+    path = np.concatenate([np.asarray(between[:, :-1]).reshape(-1, n), fit[-1:]])
+    residuals, misfit = np.asarray(learned.residuals[run]), np.asarray(learned.misfit[run])
+    for c, (left, right) in enumerate(panels):
+        left.plot(grid, path[:, c], color=_BLUE, linewidth=1.4, label="fitted")
+        _samples(left, learned.runs, run, c)
+        _over_time(left, ts, labels[c])
+        right.axhspan(-_SIGMAS, _SIGMAS, color="0.9", linewidth=0)
+        right.axhline(0.0, color="0.6", linewidth=0.8)
+        right.plot(ts, residuals[:, c], "o", color=COLORS["true"], ms=3, clip_on=False)
+        _over_time(right, ts, r"residual / $\sigma$")
+        said = f"root mean square {misfit[c]:.2f}" if np.isfinite(misfit[c]) else "never measured"
+        right.set_title(said, fontsize="small")
+        if np.isfinite(misfit[c]):
+            far = max(1.6 * _SIGMAS, 1.1 * np.nanmax(np.abs(residuals[:, c])))
+            right.set_ylim(-far, far)
+    if title is None:
+        title = f"run {run}, {float(learned.kept[run]):.0%} kept"
+    _finished(panels[:, 0], title, time_unit)
+    panels[-1, 1].set_xlabel(with_unit("time $t$", time_unit))
+    return tuple((left, right) for left, right in panels)
+
+
+def _position(run: int, count: int) -> int:
+    if not -count <= run < count:
+        raise ValueError(f"there is no run {run}: there are {count}, counted from 0.")
+    return range(count)[run]
+
+
+def _labels(
+    n: int, units: Sequence[str | None] | None, names: Sequence[str | None] | None
+) -> list[str]:
+    """The label of each coordinate."""
+    for name, values in (("units", units), ("names", names)):
+        if values is not None and (isinstance(values, str) or len(values) != n):
+            raise ValueError(f"{name} must have {n} entries, one a coordinate, got {values!r}.")
+    symbols = [None] * n if names is None else names
+    return [
+        with_unit(name or coordinate(c, n), unit)
+        for c, (name, unit) in enumerate(zip(symbols, units or [None] * n, strict=True))
+    ]
+
+
+def _column(n: int, width: int, ax: object) -> np.ndarray:
+    """Panels, shape (n, width), those that were given or new ones."""
+    if ax is None:
+        import matplotlib.pyplot as plt  # starts a backend, so only where a figure must be made
+
+        ratios = [3, 2][:width] if width > 1 else None
+        size = (5.6 if width == 1 else 8.8, 0.8 + 1.9 * n)
+        options = {"figsize": size, "layout": "constrained", "squeeze": False}
+        return plt.subplots(n, width, sharex=True, width_ratios=ratios, **options)[1]
+    panels = np.asarray(ax, object)
+    if panels.size != n * width:
+        each = "axes, one" if width == 1 else "pairs of axes, one"
+        raise ValueError(f"ax has {panels.size} axes; {n} {each} for each coordinate, are needed.")
+    return panels.reshape(n, width)
+
+
+def _samples(panel: Axes, runs: Runs, run: int, c: int) -> None:
+    ts, x = np.asarray(runs.times[run]), np.asarray(runs.states[run])[:, c]
+    style = {
+        "mec": "black",
+        "mew": 0.4,
+        "ms": 4,
+        "linestyle": "none",
+        "zorder": 4,
+        "clip_on": False,
+    }
+    panel.plot(ts, x, "o", color=DATA, label="measured", **style)
+
+
+def _over_time(panel: Axes, ts: np.ndarray, label: str) -> None:
+    panel.set_ylabel(label)
+    panel.set_xlim(ts[0], ts[-1])
+    panel.grid(True, color="0.9", linewidth=0.6)
+    panel.set_axisbelow(True)
+
+
+def _finished(panels: np.ndarray, title: str, time_unit: str | None) -> tuple[Axes, ...]:
+    panels[0].set_title(title)
+    panels[-1].set_xlabel(with_unit("time $t$", time_unit))
+    legend(panels[0])
+    return tuple(panels)

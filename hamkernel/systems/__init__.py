@@ -14,9 +14,15 @@ A system states only H, and the field follows from it: J∇H, or Π(x)∇H for `
 as in `Driven(Damped(Pendulum(), 0.1), [[0.0], [1.0]])`; call a driven system as `system(x, u)`.
 """
 
-from hamkernel.systems._actuated import Acrobot, CartPole
-from hamkernel.systems._base import AbstractHamiltonianSystem
-from hamkernel.systems._mechanisms import DoublePendulum, Kepler, NBody, PointVortices
+from hamkernel.systems._base import AbstractHamiltonianSystem, Damped, Driven, sample
+from hamkernel.systems._mechanisms import (
+    Acrobot,
+    CartPole,
+    DoublePendulum,
+    Kepler,
+    NBody,
+    PointVortices,
+)
 from hamkernel.systems._oscillators import (
     Duffing,
     HarmonicOscillator,
@@ -30,8 +36,6 @@ from hamkernel.systems._poisson import (
     LotkaVolterra,
     RigidBody,
 )
-from hamkernel.systems._sample import sample
-from hamkernel.systems._wrapped import Damped, Driven
 
 __all__ = [
     "AbstractHamiltonianSystem",

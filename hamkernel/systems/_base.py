@@ -1,16 +1,19 @@
-"""The base of all systems: the field that follows from H, and the storage of parameters."""
+"""The base of all systems, damping and inputs added to any of them, and their noisy data."""
+
+from __future__ import annotations
 
 import abc
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar, TypeVar, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Num
+from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 
 from hamkernel import _require as require
+from hamkernel._kernels.functions import as_pytree
 from hamkernel._show import described
 
 Numbers = ArrayLike | Sequence[ArrayLike]
@@ -114,3 +117,286 @@ def squared_distances(positions: Float[Array, "bodies 2"]) -> tuple[np.ndarray, 
     """Indices i < j of all pairs, and |r_i − r_j|² of each; a body never meets itself."""
     i, j = np.triu_indices(positions.shape[0], k=1)
     return i, j, jnp.sum((positions[i] - positions[j]) ** 2, axis=1)
+
+
+System = Callable[[Any], Float[Array, " n"]]
+
+
+class Damped(eqx.Module):
+    """A system with friction: ẋ = f(x) − R∇H, R diagonal and constant.
+
+    With damping of the momenta ṗ = … − r ∂H/∂p = … − r q̇, viscous friction. dH/dt = −∇HᵀR∇H.
+
+    Args:
+        system: one of this module, or any field with a `hamiltonian`.
+        damping: r > 0, one number, or one for each damped coordinate.
+        damped: the coordinates with friction, from 0; the momenta, the second half, if None.
+
+    Raises:
+        ValueError: the damping is not positive or has the wrong shape; `damped` are not
+            coordinates, or, when called, not those of the state. TypeError: the system has no
+            Hamiltonian.
+
+    Example: `hk.systems.Damped(hk.systems.Pendulum(), 0.1)`.
+    """
+
+    system: Any
+    log_damping: Float[Array, "..."]
+    damped: tuple[int, ...] | None = eqx.field(static=True)
+
+    def __init__(
+        self, system: Any, damping: ArrayLike = 0.1, damped: int | Sequence[int] | None = None
+    ):
+        if not callable(system) or not hasattr(system, "hamiltonian"):
+            raise TypeError(
+                f"Damped needs a system with a hamiltonian, such as hk.systems.Pendulum(); got "
+                f"{system!r}. Of a driven one damp the inside: Driven(Damped(system), G)."
+            )
+        self.system = system
+        self.log_damping = jnp.log(require.positive(damping, "damping"))
+        self.damped = None if damped is None else require.coordinates(damped, "damped")
+        if self.log_damping.ndim > 1:
+            raise ValueError(f"damping has shape {self.log_damping.shape}; () or (m,) is needed.")
+
+    @property
+    def damping(self) -> Float[Array, "..."]:
+        """The friction r."""
+        return jnp.exp(self.log_damping)
+
+    def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        """Return the energy H(x), which decreases, shape ()."""
+        return self.system.hamiltonian(x)
+
+    def dissipation(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        """Return the power lost, ∇HᵀR∇H ≥ 0, shape ()."""
+        x = require.floating(x, "x")
+        slope = jax.grad(in_precision(self, x.dtype).hamiltonian)(x)
+        return self._resistance(x) @ slope**2
+
+    def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+        """Return the velocity of one state, shape (n,)."""
+        x = require.floating(x, "x")
+        return _damped_velocity(self, x)
+
+    def _resistance(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        n = len(x)
+        which = tuple(range(n // 2, n)) if self.damped is None else self.damped
+        if max(which) >= n or (self.log_damping.ndim and self.log_damping.size != len(which)):
+            raise ValueError(
+                f"damping of shape {self.log_damping.shape} on the coordinates {which}: the states "
+                f"have {n} coordinates, and one number or one for each damped one is needed."
+            )
+        return jnp.zeros_like(x).at[np.asarray(which)].set(self.damping.astype(x.dtype))
+
+    def __repr__(self) -> str:
+        return described(self, positional=("system",))
+
+
+@eqx.filter_jit
+def _damped_velocity(system: Damped, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    system = in_precision(system, x.dtype)
+    return system.system(x) - system._resistance(x) * jax.grad(system.system.hamiltonian)(x)
+
+
+class Driven(eqx.Module):
+    """A system with inputs: ẋ = f(x) + G(x) u, called as `system(x, u)`.
+
+    `hk.simulate(system, x0, ts, inputs=u)` integrates it.
+
+    Args:
+        system: any field x (n,) -> (n,), such as one of this module.
+        inputs: G, an array (n, m), or a function x -> (n, m); if None that of the system's motors,
+            which `CartPole` and `Acrobot` know.
+
+    Raises:
+        TypeError: `system` is not a function, or knows of no motors. ValueError: G is not a matrix,
+            or, when called, x or u does not fit it.
+
+    Example: a torque on a pendulum with friction,
+        `hk.systems.Driven(hk.systems.Damped(hk.systems.Pendulum()), [[0.0], [1.0]])`.
+    """
+
+    system: System
+    inputs: Any
+
+    def __init__(self, system: System, inputs: ArrayLike | Callable[[Array], Any] | None = None):
+        if not callable(system):
+            raise TypeError(f"Driven needs a system x -> (n,) first; got {system!r}.")
+        if inputs is None:
+            inputs = getattr(system, "actuation", None)
+        if inputs is None:
+            raise TypeError(
+                f"{system!r} does not say where its motors act: give the input matrix, such as "
+                "Driven(system, [[0.0], [1.0]])."
+            )
+        self.system = as_pytree(system)
+        if callable(inputs):
+            self.inputs = as_pytree(inputs)
+        else:
+            self.inputs = require.floating(inputs, "inputs")
+            if self.inputs.ndim != 2:
+                raise ValueError(
+                    f"inputs has shape {self.inputs.shape}; a matrix G of shape (n, m) is needed, "
+                    "such as [[0.0], [1.0]] for one force on the momentum."
+                )
+
+    @property
+    def drift(self) -> System:
+        """The system without inputs."""
+        return self.system
+
+    @property
+    def takes_inputs(self) -> bool:
+        """Whether a velocity needs u as well; `hk.simulate` reads this."""
+        return True
+
+    def input_matrix(self, x: Num[ArrayLike, " n"]) -> Float[Array, "n m"]:
+        """Return G(x), shape (n, m)."""
+        x = require.floating(x, "x")
+        G: Any = self.inputs
+        G = G(x) if callable(G) else G
+        if jnp.ndim(G) != 2 or len(G) != len(x):
+            raise ValueError(
+                f"the input matrix has shape {jnp.shape(G)} and the state {x.shape}: (n, m) and "
+                "(n,) are needed. Are x and u swapped? system(x, u)."
+            )
+        return jnp.asarray(G).astype(x.dtype)
+
+    def __call__(
+        self, x: Num[ArrayLike, " n"], u: Num[ArrayLike, " m"] | None = None
+    ) -> Float[Array, " n"]:
+        """Return the velocity f(x) + G(x) u, shape (n,)."""
+        if u is None:
+            raise ValueError(
+                "a driven system needs its inputs: system(x, u), and hk.simulate(system, x0, ts, "
+                "inputs=u). Without inputs it is system.drift."
+            )
+        x, G = require.floating(x, "x"), self.input_matrix(x)
+        u = require.floating(u, "u")
+        if u.shape != G.shape[1:]:
+            raise ValueError(
+                f"u has shape {u.shape}; the inputs have shape {G.shape[1:]}. Is it system(x, u)?"
+            )
+        drift = cast(Array, self.system(x))
+        return drift + G @ u.astype(x.dtype)
+
+    def __repr__(self) -> str:
+        return described(self, positional=("system",))
+
+
+def sample(
+    system: Callable[[Array], Array],
+    x0: Num[ArrayLike, "*batch n"],
+    ts: Num[ArrayLike, " T"],
+    state_noise: Num[ArrayLike, "..."] = 0.0,
+    velocity_noise: Num[ArrayLike, "..."] = 0.0,
+    *,
+    key: Key[Array, ""] | UInt32[Array, "..."] | None = None,
+) -> tuple[Float[Array, "*batch T n"], Float[Array, "*batch T n"]]:
+    """Return noisy states and velocities along trajectories of `system`.
+
+        X = x(t) + state_noise · ξ,   Y = f(x(t)) + velocity_noise · η,   ξ, η ~ N(0, I)
+
+    The velocities belong to the true states x(t), not to the noisy ones. Trajectories are
+    integrated by an adaptive Runge-Kutta method of order 8, in steps whose estimated error is
+    below 1e-10 in float64 and about 1e-6 in float32, relative and absolute: choose units in which
+    states are not tiny. Differentiable in reverse mode with respect to `system`, `x0` and the noise
+    levels.
+
+    Args:
+        system: any traceable field, (n,) -> (n,); one of this module, a learned one, a function.
+        x0: states at time ts[0], shape (B, n), or (n,) for a single trajectory. Its dtype is that
+            of the integration and the results; the arrays of `system` are cast to it.
+        ts: times, shape (T,), strictly increasing.
+        state_noise: standard deviation of the noise on X, shape () or (n,), in units of the state.
+        velocity_noise: standard deviation of the noise on Y, shape () or (n,), per unit of time.
+        key: the source of the noise, needed unless both levels are zero. Many seeds:
+            `jax.vmap(lambda key: sample(..., key=key))(keys)` integrates once.
+
+    Returns:
+        X and Y, each of shape (B, T, n), or (T, n) if x0 is a single state. `hk.fit` takes
+        them as `X.reshape(-1, n)` and `Y.reshape(-1, n)`.
+
+    Raises:
+        ValueError: a shape is wrong; x0 or ts is not finite; ts does not increase; a noise level
+            is negative or not finite; there is noise but no key, or more than one.
+        TypeError: `system` does not map one JAX array to another; x0 has less precision than
+            float32; the key is not a JAX key.
+        RuntimeError: a trajectory diverged or needed too many steps.
+
+    Source: Smith & Egeland (2023), section Experiments, where both levels are one number.
+    """
+    x0 = require.floating(x0, "x0")
+    require.single_or_double(x0.dtype, "x0 has")
+    states = require.finite(require.points(x0[None] if x0.ndim == 1 else x0, "x0"), "x0")
+    ts = require.elapsed(require.times(ts, least=1), states.dtype)
+    system = in_precision(system, states.dtype)
+    require.velocity(system, states[0], "system")
+    levels = [
+        _noise_level(level, name, states, key)
+        for level, name in [(state_noise, "state_noise"), (velocity_noise, "velocity_noise")]
+    ]
+    key = None if key is None else require.key(key)
+    X, Y = _trajectories(system, states, ts)
+    failed = (require.not_finite(X) | require.not_finite(Y)).any(axis=(1, 2))  # (B,)
+    X = require.value(X, failed, lambda: _failure(failed), RuntimeError)
+    if key is not None:
+        noises = (jax.random.normal(k, X.shape, X.dtype) for k in jax.random.split(key))
+        X, Y = (
+            clean + jnp.broadcast_to(level, X.shape) * noise
+            for clean, level, noise in zip((X, Y), levels, noises, strict=True)
+        )
+    return (X[0], Y[0]) if x0.ndim == 1 else (X, Y)
+
+
+def _noise_level(level: ArrayLike, name: str, states: Float[Array, "B n"], key: Any) -> Array:
+    """A standard deviation in the dtype of the states, shape () or (n,)."""
+    if key is None and not (require.is_concrete(level) and np.all(np.asarray(level) == 0)):
+        raise ValueError(f"{name} needs randomness: pass `key=jax.random.key(...)`.")
+    array = shaped(require.floating(level, name), name, (), states.shape[1:])
+    seen = require.on_host(array)
+    array = require.value(
+        array,
+        ~((seen >= 0) & (seen < np.inf)),
+        lambda: f"{name} is a standard deviation, finite and not negative; got {array}.",
+    )
+    return array.astype(states.dtype)
+
+
+def _failure(failed: Array) -> str:
+    if require.is_concrete(failed):
+        which = f"The trajectory of x0 in row {', '.join(map(str, np.flatnonzero(failed)))}"
+    else:
+        which = "A trajectory"
+    return (
+        f"{which} could not be integrated to the end of ts: the field blows up or is NaN on the "
+        "way (a collision, an escape to infinity), or the time span needs too many steps. "
+        "Start elsewhere, shorten ts, or check the field at x0."
+    )
+
+
+# Far more than a smooth trajectory needs beside one step for each of ts: a few dozen per swing of
+# a pendulum.
+_MAX_STEPS = 2**16
+
+
+@eqx.filter_jit
+def _trajectories(
+    field: Callable[[Array], Array], states: Float[Array, "B n"], ts: Float[Array, " T"]
+) -> tuple[Float[Array, "B T n"], Float[Array, "B T n"]]:
+    """True states and velocities at times ts from the first on; not finite where that failed."""
+
+    def velocity(x):
+        return field(x).astype(x.dtype)
+
+    from hamkernel._dynamics.simulate import simulate  # which loads diffrax
+
+    def trajectory(x0):
+        if ts.size == 1:
+            return x0[None]
+        tolerance = max(1e-10, 10 * float(jnp.finfo(x0.dtype).eps))
+        bounds = {"rtol": tolerance, "atol": tolerance, "max_steps": _MAX_STEPS + ts.size}
+        return cast(Array, simulate(velocity, x0, ts, **bounds, throw=False).ys)
+
+    X = jax.vmap(trajectory)(states)
+    return X, jax.vmap(jax.vmap(velocity))(X)

@@ -15,11 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from hamkernel._features.spectra import Spectrum, spectra
-from hamkernel._kernels.base import AbstractScalarKernel
+from hamkernel._kernels.base import AbstractScalarKernel, Spectrum
 from hamkernel._kernels.symmetry import symmetry_removed
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
-from hamkernel._structures.controlled import Controlled, KnownMatrix
+from hamkernel._structures.joined import Controlled, KnownMatrix
 from hamkernel._structures.structure import AbstractPotentialKernel, DivergenceFree, Separable
 
 
@@ -78,11 +77,11 @@ def waves_of(
 ) -> Waves | GroupWaves:
     """Waves with the spectrum of a scalar kernel, and with its symmetry."""
     found = symmetry_removed(k)
-    if found is None or found.parity is not None:  # which `Spectrum` knows
-        return Waves(spectra(k, n, count, key, dtype))
+    if found is None or found.parity is not None:  # which a `Spectrum` knows
+        return Waves(k.spectra(n, count, key, dtype))
     group = found.group(n)
     return GroupWaves(
-        Waves(spectra(found.kernel, n, count, key, dtype)),
+        Waves(found.kernel.spectra(n, count, key, dtype)),
         jnp.asarray(np.stack([g.matrix for g in group]), dtype),
         jnp.asarray([g.character for g in group], dtype),
     )

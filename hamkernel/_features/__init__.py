@@ -1,1 +1,0 @@
-"""Random Fourier features of structured kernels."""

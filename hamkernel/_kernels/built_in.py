@@ -1,0 +1,406 @@
+"""The built-in kernels: of the scaled distance, k = φ(s) with s = ‖(x − z)/ℓ‖², and of products.
+
+A structured kernel meets every point with itself, so the second derivatives of k at x = z must
+be exact. They are when φ is differentiated with respect to s, the SQUARED distance, in which a
+smooth kernel is smooth: ∂x ∂zᵀ k = −2φ′(s) I/ℓ² − 4φ″(s) ddᵀ with d = (x − z)/ℓ². A kernel
+written with the distance √s gives NaN there, or, after the usual repairs, a wrong block.
+"""
+
+import abc
+import functools
+import math
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Key
+
+from hamkernel import _require as require
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Bounds,
+    Invariance,
+    Spectrum,
+    bounds_of_length,
+    divided,
+    log_per_coordinate,
+    one_point,
+)
+from hamkernel._kernels.symmetry import is_diagonal, is_orthogonal, is_permutation
+from hamkernel._machine import orthonormal
+
+_LENGTH = "It is a length in the units of the states."
+
+
+def squared_distance(x: Float[Array, " n"], z: Float[Array, " n"], cut: bool) -> Float[Array, ""]:
+    """‖x − z‖² as x·x + z·z − 2 x·z, which under two vmaps is one matrix product.
+
+    The factor −2 stands outside, so that the derivative of exp(−s/2) needs no pass over all pairs
+    for it.
+
+    With `cut`, what lies below the rounding of the product form is zero: on the Gram's diagonal its
+    noise of one unit in the last place would be a distance of 1e-8, which Matérn-3/2 can feel.
+    Only the value is cut; derivatives are those of the exact expression.
+    """
+    halves = x @ x / 2 + z @ z / 2
+    s = -2 * (x @ z - halves)
+    if not cut:
+        return s
+    noise = 16 * jnp.finfo(s.dtype).eps * halves
+    return s - jax.lax.stop_gradient(jnp.where(s < noise, s, jnp.zeros_like(s)))
+
+
+def orthogonal_normal(
+    key: Key[Array, ""], count: int, n: int, dtype: Any
+) -> Float[Array, "count n"]:
+    """Standard normal vectors, independent but for directions orthogonal in blocks of n.
+
+    Means over a block then have less variance (Yu et al. (2016), "Orthogonal random features"): a
+    quarter less error on the pendulum of the paper.
+    """
+    directions, lengths = jax.random.split(key)
+    blocks = -(-count // n)
+    # With a positive diagonal of U the directions are uniform.
+    Q, _ = orthonormal(jax.random.normal(directions, (blocks, n, n), dtype))
+    rows = Q.reshape(blocks * n, n)[:count]
+    return rows * jnp.linalg.norm(jax.random.normal(lengths, (count, n), dtype), axis=1)[:, None]
+
+
+class AbstractRadialKernel(AbstractScalarKernel):
+    """k(x, z) = φ(‖(x − z)/ℓ‖²), ℓ a number or one lengthscale per coordinate."""
+
+    log_lengthscale: eqx.AbstractVar[Float[Array, "..."]]
+    # Whether the rounding of s at zero is felt by φ and must be cut off, which takes a quarter of
+    # the time of a product with the Gram.
+    cuts_rounding: eqx.AbstractClassVar[bool]
+
+    @abc.abstractmethod
+    def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
+        """φ(s), smooth at s = 0 as often as the kernel may be differentiated."""
+
+    @abc.abstractmethod
+    def widths(self, key: Key[Array, ""], count: int, dtype: Any) -> Float[Array, "count 1"] | None:
+        """Random √w whose w makes φ(s) the mean of exp(−w s/2), a mixture of Gaussians; None: 1."""
+
+    def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
+        """Normal vectors over ℓ, of random width."""
+        normal, mixture = jax.random.split(key)
+        widths = self.widths(mixture, count, dtype)
+        base = orthogonal_normal(key if widths is None else normal, count, n, dtype)
+        base = base if widths is None else base * widths
+        frequencies = jax.vmap(divided, in_axes=(0, None))(base, self.lengthscale)
+        return (Spectrum(frequencies, jnp.full(count, 1 / count, dtype)),)
+
+    @property
+    def lengthscale(self) -> Float[Array, "..."]:
+        return jnp.exp(self.log_lengthscale)
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        x, z = divided(x, self.lengthscale), divided(z, self.lengthscale)
+        return self.profile(squared_distance(x, z, cut=self.cuts_rounding))
+
+    def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
+        """A lengthscale far below the spacing or above the extent changes nothing but rounding."""
+        if name == "log_lengthscale":
+            return bounds_of_length(self.log_lengthscale, X, 0.3, 30.0)
+        return super().bounds(name, X, amplitude)
+
+    @property
+    def invariance(self) -> Invariance:
+        return Invariance.TRANSLATION
+
+    def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
+        """A lengthscale for each coordinate allows changes of sign, one for all every rotation."""
+        return is_orthogonal(S) and (self.log_lengthscale.ndim == 0 or is_diagonal(S))
+
+
+class Gaussian(AbstractRadialKernel):
+    """The Gaussian kernel, k(x, z) = exp(−‖(x − z)/ℓ‖²/2).
+
+    Args:
+        lengthscale: ℓ > 0, the paper's σ, in the units of the states; a number, or an array
+            (n,) with one for each coordinate.
+
+    Raises:
+        ValueError: a lengthscale is not positive and finite.
+
+    Source: Smith & Egeland (2023), section 4.
+    """
+
+    log_lengthscale: Float[Array, "..."]
+    cuts_rounding: ClassVar[bool] = False
+
+    def __init__(self, lengthscale: ArrayLike = 1.0):
+        self.log_lengthscale = log_per_coordinate(lengthscale, "lengthscale", _LENGTH)
+
+    def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
+        return jnp.exp(-0.5 * s)
+
+    def widths(self, key: Key[Array, ""], count: int, dtype: Any) -> None:
+        return None
+
+
+class Matern(AbstractRadialKernel):
+    """The Matérn kernel of half-integer smoothness ν = p + 1/2, p ≥ 1.
+
+    k(x, z) = p!/(2p)! e^(−r) Σᵢ (p + i)!/(i! (p − i)!) (2r)^(p − i), with r² = 2ν ‖(x − z)/ℓ‖².
+
+    Args:
+        nu: 1.5, 2.5, 3.5, …; fixed, not trained. A field of this kernel is differentiable
+            ⌈ν⌉ − 2 times, so 2.5 is the roughest whose flow has a continuous Jacobian.
+        lengthscale: ℓ > 0 in the units of the states; a number, or an array (n,).
+
+    Raises:
+        ValueError: `nu` is 1/2, whose second derivative at x = z does not exist, or no
+            half-integer; a lengthscale is not positive and finite.
+
+    Where more than 1000 points are multiplied, as in `field.evaluate` and `gram_operator`, second
+    derivatives at points that coincide are NaN once one of the two is in reverse mode, as in
+    `jax.hessian`; `jax.jacfwd(jax.jacfwd(f))` is right.
+
+    Source: Rasmussen & Williams (2006), eq. 4.16.
+    """
+
+    log_lengthscale: Float[Array, "..."]
+    nu: float = eqx.field(static=True)
+    cuts_rounding: ClassVar[bool] = True  # φ is a function of √s
+
+    def __init__(self, nu: float = 2.5, lengthscale: ArrayLike = 1.0):
+        nu = float(nu)
+        if nu == 0.5:
+            raise ValueError(
+                "Matern(nu=0.5) is not differentiable at x = z, so its structured kernels do not "
+                "exist: their blocks are the second derivatives of k. Use nu=1.5 or larger."
+            )
+        if not (nu > 0.5 and nu % 1 == 0.5):  # refuses NaN and inf as well
+            raise ValueError(f"Matern needs nu = 1.5, 2.5, 3.5, ...; got {nu}.")
+        self.log_lengthscale = log_per_coordinate(lengthscale, "lengthscale", _LENGTH)
+        self.nu = nu
+
+    def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
+        return _matern(round(self.nu - 0.5), 2 * self.nu * s)
+
+    def widths(self, key: Key[Array, ""], count: int, dtype: Any) -> Float[Array, "count 1"]:
+        """√(2ν/χ²): the frequencies are Student's t with 2ν degrees of freedom."""
+        half_square = jax.random.gamma(key, self.nu, (count, 1), dtype)  # χ²_{2ν}/2
+        return jnp.sqrt(self.nu / half_square)
+
+
+# With ψ_p(t) the Matérn function of order p + 1/2 at r = √t, the identity
+# d/dr [r^ν K_ν(r)] = −r^ν K_{ν−1}(r) (DLMF 10.29.4) gives  ψ_p′(t) = −ψ_{p−1}(t) / (4p − 2):
+# the derivative of a Matérn function is a smoother multiple of the next rougher one, so a
+# custom_jvp that calls itself is exact to every order and never divides by the distance. Only
+# the last, ψ_0 = e^(−r), has a derivative that grows like 1/r. It multiplies components of
+# x − z that vanish faster, so the value 0 at r = 0 gives the limit of the whole expression.
+@functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _matern(p: int, t: Float[Array, ""]) -> Float[Array, ""]:
+    far = -1.2 * math.log(float(jnp.finfo(t.dtype).tiny))  # e^(−r) is zero, the polynomial finite
+    r = jnp.sqrt(jnp.clip(t, 0.0, far**2))
+    polynomial = jnp.zeros_like(t)
+    for i in range(p + 1):  # Horner's scheme in 2r, the highest power first
+        ways = math.comb(p, i) * math.perm(p + i, i) * math.factorial(p)
+        polynomial = polynomial * (2 * r) + ways / math.factorial(2 * p)
+    return polynomial * jnp.exp(-r)
+
+
+@_matern.defjvp
+def _matern_jvp(p, primals, tangents):
+    (t,), (dt,) = primals, tangents
+    slope = _matern(p - 1, t) / -(4 * p - 2) if p > 0 else _rough_slope(t)
+    return _matern(p, t), slope * dt
+
+
+def _rough_slope(t: Float[Array, ""]) -> Float[Array, ""]:
+    """d/dt e^(−√t) = −e^(−√t)/(2√t), and 0 in place of −∞ at t = 0."""
+    apart = t > 0
+    r = jnp.sqrt(jnp.where(apart, t, jnp.ones_like(t)))
+    return jnp.where(apart, -jnp.exp(-r) / (2 * r), jnp.zeros_like(t))
+
+
+class RationalQuadratic(AbstractRadialKernel):
+    """The rational quadratic kernel, k(x, z) = (1 + ‖(x − z)/ℓ‖²/(2α))^(−α).
+
+    A mixture of Gaussians of many lengthscales; α → ∞ gives the Gaussian.
+
+    Args:
+        alpha: α > 0, dimensionless.
+        lengthscale: ℓ > 0 in the units of the states; a number, or an array (n,).
+
+    Raises:
+        ValueError: a hyperparameter is not positive and finite.
+
+    Source: Rasmussen & Williams (2006), eq. 4.19.
+    """
+
+    log_alpha: Float[Array, ""]
+    log_lengthscale: Float[Array, "..."]
+    cuts_rounding: ClassVar[bool] = True  # or a small α makes it log of a negative
+
+    def __init__(self, alpha: ArrayLike = 1.0, lengthscale: ArrayLike = 1.0):
+        self.log_alpha = jnp.log(require.positive_scalar(alpha, "alpha"))
+        self.log_lengthscale = log_per_coordinate(lengthscale, "lengthscale", _LENGTH)
+
+    @property
+    def alpha(self) -> Float[Array, ""]:
+        return jnp.exp(self.log_alpha)
+
+    def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
+        alpha = self.alpha.astype(s.dtype)
+        return jnp.exp(-alpha * jnp.log1p(s / (2 * alpha)))
+
+    def widths(self, key: Key[Array, ""], count: int, dtype: Any) -> Float[Array, "count 1"]:
+        """√(g/α) with g ~ Gamma(α), over which φ(s) is the mean of exp(−(g/α) s/2)."""
+        alpha = self.alpha.astype(dtype)
+        # The logarithm, since for small α the sample underflows, and √ has no derivative at 0.
+        log_g = jax.random.loggamma(key, alpha, (count, 1), dtype)
+        return jnp.exp((log_g - jnp.log(alpha)) / 2)
+
+
+class Polynomial(AbstractScalarKernel):
+    """The polynomial kernel, k(x, z) = (x·z + c)^d.
+
+    Its potentials are the polynomials of degree ≤ d, so a Hamiltonian of degree d is learned
+    exactly. Not shift-invariant: state the data in coordinates whose origin means something.
+
+    Args:
+        degree: d ≥ 1, an integer; fixed, not trained.
+        offset: c > 0, in squared units of the states.
+
+    Raises:
+        ValueError: `degree` or `offset` is not positive, or `offset` not finite. TypeError:
+            `degree` is not whole.
+
+    Source: Rasmussen & Williams (2006), section 4.2.2.
+    """
+
+    log_offset: Float[Array, ""]
+    degree: int = eqx.field(static=True)
+
+    def __init__(self, degree: int = 4, offset: ArrayLike = 1.0):
+        self.log_offset = jnp.log(require.positive_scalar(offset, "offset"))
+        self.degree = require.count(degree, "degree")
+
+    @property
+    def offset(self) -> Float[Array, ""]:
+        return jnp.exp(self.log_offset)
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        product = one_point(x) @ one_point(z)
+        return (product + self.offset.astype(product.dtype)) ** self.degree
+
+    def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
+        square = np.mean(np.sum(X**2, axis=1)) or 1.0
+        return np.log(1e-4 * square), np.log(1e4 * square)
+
+    @property
+    def invariance(self) -> Invariance:
+        return Invariance.REFLECTION
+
+    def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
+        return is_orthogonal(S)
+
+
+class Periodic(AbstractScalarKernel):
+    """The periodic kernel, k(x, z) = exp(−2 Σₐ sin²(π(xₐ − zₐ)/Tₐ)/ℓₐ²).
+
+    It is the Gaussian kernel on the circle: sin² of half an angle is a quarter of the squared
+    chord between (cos, sin) pairs, so the sum is a dot product of features.
+
+    Args:
+        period: T > 0 in the units of the states; a number, or an array (n,). It is trained like
+            every hyperparameter: where it is known, such as 2π, say `tune(..., frozen="period")`.
+        lengthscale: ℓ > 0, dimensionless; a number, or an array (n,).
+
+    Raises:
+        ValueError: a hyperparameter is not positive and finite.
+
+    Source: Rasmussen & Williams (2006), eq. 4.31, there of period 2π; first in MacKay (1998).
+    """
+
+    log_period: Float[Array, "..."]
+    log_lengthscale: Float[Array, "..."]
+
+    def __init__(self, period: ArrayLike = 1.0, lengthscale: ArrayLike = 1.0):
+        self.log_period = log_per_coordinate(period, "period")
+        self.log_lengthscale = log_per_coordinate(lengthscale, "lengthscale")
+
+    @property
+    def period(self) -> Float[Array, "..."]:
+        return jnp.exp(self.log_period)
+
+    @property
+    def lengthscale(self) -> Float[Array, "..."]:
+        return jnp.exp(self.log_lengthscale)
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        x, z = one_point(x), one_point(z)
+        weight = divided(divided(jnp.ones_like(x), self.lengthscale), self.lengthscale)
+        # Σ 2 sin²(θ/2)/ℓ² = Σ (1 − cos θ)/ℓ², and cos(a − b) is a product of features.
+        return jnp.exp(self._features(x) @ (jnp.tile(weight, 2) * self._features(z)) - weight.sum())
+
+    def _features(self, x: Float[Array, " n"]) -> Float[Array, " 2*n"]:
+        angle = divided(2 * jnp.pi * x, self.period, "period")
+        return jnp.concatenate([jnp.cos(angle), jnp.sin(angle)])
+
+    @property
+    def invariance(self) -> Invariance:
+        return Invariance.TRANSLATION
+
+    def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
+        alike = self.log_lengthscale.ndim == self.log_period.ndim == 0
+        return is_permutation(S) and (alike or is_diagonal(S))
+
+    def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
+        if name == "log_lengthscale":
+            # On a circle of radius 1; below 1/64 random features need too long a Fourier series.
+            return np.log(max(0.6 / len(X), 1 / 64)), np.log(60.0)
+        return bounds_of_length(self.log_period, X, 2.0, 10.0)
+
+    def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
+        """Harmonics 2πj/T with the probabilities of the Fourier series of the kernel.
+
+        exp((cos θ − 1)/ℓ²) = Σ_j p_j cos jθ with p_j = exp(−1/ℓ²) I_j(1/ℓ²), here by a discrete
+        Fourier transform of M = 1024 samples, whose aliasing is below rounding for ℓ ≥ 1/64. An
+        integer j has no derivative in ℓ; the weights p_j(ℓ)/p_j have the value 1 and the derivative
+        of the measure.
+        """
+        lengthscale, M = self.lengthscale.astype(dtype), 1024
+        lengthscale = require.value(
+            lengthscale,
+            require.on_host(lengthscale) < 1 / 64,
+            "RandomFeatures of a Periodic kernel needs a lengthscale (dimensionless) of at least "
+            "1/64.",
+        )
+        concentration = divided(divided(jnp.ones(n, dtype), lengthscale), lengthscale)  # (n,)
+        circle = jnp.cos(2 * jnp.pi * jnp.arange(M, dtype=dtype) / M) - 1
+        samples = jnp.exp(concentration[:, None] * circle[None])
+        probability = jnp.fft.fftshift(jnp.fft.fft(samples).real, axes=1) / M  # j ≥ −M/2
+        fixed = jax.lax.stop_gradient(probability)
+        cumulative = jnp.cumsum(fixed, axis=1)
+        # Never zero: it would draw a harmonic whose probability underflows, and then 0/0.
+        uniform = jax.random.uniform(key, (n, count), dtype, minval=jnp.finfo(dtype).tiny)
+        index = jax.vmap(jnp.searchsorted)(cumulative, uniform * cumulative[:, -1:])  # (n, F)
+        ratio = jnp.take_along_axis(probability, index, 1) / jnp.take_along_axis(fixed, index, 1)
+        harmonic = (index - M // 2).astype(dtype).T  # (F, n)
+        frequencies = jax.vmap(lambda j: divided(2 * jnp.pi * j, self.period, "period"))(harmonic)
+        return (Spectrum(frequencies, jnp.prod(ratio, axis=0) / count),)
+
+
+class Constant(AbstractScalarKernel):
+    """k(x, z) = 1: functions that are one number."""
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        return jnp.ones((), one_point(x).dtype)
+
+    @property
+    def invariance(self) -> Invariance:
+        return Invariance.TRANSLATION
+
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        return (frozenset(),)
+
+    def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
+        """The one frequency 0, exactly."""
+        return (Spectrum(jnp.zeros((1, n), dtype), jnp.ones(1, dtype), parity=1),)

@@ -1,0 +1,500 @@
+"""Mechanical systems: friction, of two kinds, and states (q, q̇) in the place of (q, p).
+
+`PortHamiltonian` has friction in its operator, J − R. `Friction` is a kernel of one curve, a force
+that is known everywhere but for a few numbers.
+"""
+
+from collections.abc import Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, ArrayLike, Float
+
+from hamkernel import _require as require
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Bounds,
+    Invariance,
+    Point,
+    Points,
+    as_scalar_kernel,
+    log_per_coordinate,
+)
+from hamkernel._kernels.symmetry import LinearMap
+from hamkernel._show import described
+from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._structures.structure import AbstractPotentialKernel, canonical, check_even
+
+
+def damped_coordinates(damped: tuple[int, ...] | None, n: int) -> tuple[int, ...]:
+    """The coordinates with friction of a state of n: those that were given, else the momenta.
+
+    Raises:
+        ValueError: one of those that were given does not exist.
+    """
+    if damped is not None and max(damped) >= n:
+        raise ValueError(
+            f"damped = {damped} names a coordinate that does not exist: the states have {n}, "
+            f"counted from 0, and the momenta are {tuple(range(n // 2, n))}."
+        )
+    return tuple(range(n // 2, n)) if damped is None else damped
+
+
+class PortHamiltonian(AbstractPotentialKernel):
+    """K(x, z) = (J − R) [∂x ∂zᵀ k(x, z)] (J − R)ᵀ: fields f = (J − R)∇H with friction R ≥ 0.
+
+    R is diagonal, constant and positive on the damped coordinates, zero on the others. With the
+    momenta damped q̇ = ∂H/∂p and ṗ = −∂H/∂q − r ∂H/∂p = −∂H/∂q − r q̇: viscous friction. Along the
+    flow dH/dt = −∇HᵀR∇H, `field.dissipation(x)`.
+
+    The friction is a hyperparameter, found by every objective of `tune` and kept with
+    `frozen="friction"`. Friction on p is unique if ∂²H/∂p² is invertible. In a (nearly) linear
+    system only the sum of the frictions on q and p can be identified. A friction at the lower end
+    of its box, see `tuned.at_bounds`, means that none was found.
+
+    Args:
+        kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
+        friction: r > 0, a number for all damped coordinates or one for each, in units of the
+            momentum over those of the position, for damped momenta (mass per time).
+        damped: the coordinates with friction, counted from 0; the momenta if None.
+
+    Raises:
+        TypeError: `kernel` is not a scalar kernel. ValueError: the friction is not positive, or not
+            one number or one per damped coordinate; `damped` are no coordinates. With data: n is
+            odd, or there is no such coordinate.
+
+    Example: `hk.tune(hk.PortHamiltonian(1.0 * hk.Gaussian(1.0), friction=0.1), X, Y,
+        objective="marginal_likelihood").kernel.friction`.
+
+    Source: van der Schaft & Jeltsema (2014), Port-Hamiltonian Systems Theory; as a Gaussian
+        process Beckers et al. (2022).
+    """
+
+    kernel: AbstractScalarKernel
+    log_friction: Float[Array, "..."]
+    damped: tuple[int, ...] | None = eqx.field(static=True)
+
+    operator_invariance: ClassVar[Invariance] = Invariance.TRANSLATION
+    symplectic: ClassVar[bool] = False
+    has_hamiltonian: ClassVar[bool] = True
+    conserves: ClassVar[bool] = False
+
+    def __init__(
+        self, kernel: Any, friction: ArrayLike = 0.1, damped: int | Sequence[int] | None = None
+    ):
+        self.kernel = as_scalar_kernel(kernel)
+        cure = (
+            "Energy that grows is no friction; for a system without friction use Symplectic(k), "
+            "and for other damping Structured(k, operator)."
+        )
+        array = require.positive(friction, "friction", cure)
+        self.damped = None if damped is None else require.coordinates(damped, "damped")
+        most = array.size if self.damped is None else len(self.damped)
+        if array.ndim > 1 or (array.ndim and array.size != most):
+            raise ValueError(
+                f"friction has shape {array.shape}; one number, or one for each of the "
+                f"{most} damped coordinates, is needed."
+            )
+        self.log_friction = jnp.log(array)
+
+    @property
+    def friction(self) -> Float[Array, "..."]:
+        """The friction r, one number or one for each damped coordinate."""
+        return jnp.exp(self.log_friction)
+
+    def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+        return canonical(v) - self._rubbed(v)
+
+    def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
+        return -canonical(v) - self._rubbed(v)
+
+    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
+        """∇HᵀR∇H, a sum of squares."""
+        return jnp.sum(self.resistance(len(x)).astype(x.dtype) * slope**2)
+
+    def resistance(self, n: int) -> Float[Array, " n"]:
+        """The diagonal of R."""
+        zero = jnp.zeros(n, self.log_friction.dtype)
+        return zero.at[np.asarray(damped_coordinates(self.damped, n))].set(self.friction)
+
+    def _rubbed(self, v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+        r = self.resistance(len(v)).astype(v.dtype)
+        return r.reshape(-1, *(1,) * (v.ndim - 1)) * v
+
+    def operator_at(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+        # Frictions that are trained apart must be told apart: the square roots of 2, 3, 4, …
+        apart = jnp.sqrt(jnp.arange(2.0, 2 + self.log_friction.size)).astype(x.dtype)
+        stand_in = jnp.log(apart.reshape(self.log_friction.shape))
+        general = eqx.tree_at(lambda K: K.log_friction, self, stand_in)
+        return general.apply(x, jnp.eye(len(x), dtype=x.dtype))
+
+    def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
+        """Bounds for log r: an oscillation of extents (Δq, Δp) in X is critical near r = Δp/Δq."""
+        n = X.shape[1]
+        damped = np.asarray(damped_coordinates(self.damped, n))
+        extent = np.ptp(X, axis=0)
+        extent = np.where(extent > 0, extent, 1.0)
+        critical = np.log(extent[damped] / extent[(damped + n // 2) % n])
+        if self.log_friction.ndim == 0:
+            critical = critical.mean()
+        # Of the damping ratio, r over the critical friction: at 1e-5 an oscillation loses 6e-5 of
+        # its amplitude in a period, far less than can be seen; at 30 it is overdamped 30 times.
+        return critical + np.log(1e-5), critical + np.log(30.0)
+
+    def check_dimension(self, n: int) -> None:
+        check_even(n, "a PortHamiltonian kernel")
+        coordinates = damped_coordinates(self.damped, n)
+        if self.log_friction.ndim and self.log_friction.size != len(coordinates):
+            raise ValueError(
+                f"friction has {self.log_friction.size} numbers: give one for all momenta, or one "
+                f"for each; states of n = {n} coordinates have {len(coordinates)}."
+            )
+        unseen = sorted(set(coordinates) - frozenset().union(*self.kernel.supports(n)))
+        if unseen:
+            raise ValueError(
+                f"friction on coordinate {unseen[0]} is -r ∂H/∂x there, and the kernel of H does "
+                "not depend on that coordinate, so there would be none. Where the kinetic energy is"
+                " known as a mean, q̇ = p/m, add hk.Friction() to hk.Symplectic(k) instead."
+            )
+        super().check_dimension(n)
+
+
+class Friction(AbstractMatrixKernel):
+    """K_ii(x, z) = F(xᵢ) F(zᵢ): forces −a F(v) on the momenta, a ~ N(0, 1), for a sum of kernels.
+
+    F(v) = d v + c tanh(v/ε) + s exp(−(v/w)²) tanh(v/ε): viscous, dry (Coulomb) and Stribeck
+    friction, with d, c, s and w > 0 as hyperparameters. F is odd and has the sign of v, so the
+    force takes energy away at every speed, measured or not, where a > 0; the closed form finds a,
+    and it is negative only for a motion that friction drives. A Gaussian kernel of the momentum
+    falls to zero outside the data instead, and with it the friction.
+
+    It stands beside the kernel of the energy, `Sum(energy=Symplectic(k), friction=Friction())`, and
+    needs no energy that depends on the momenta: with q̇ = p/m known and
+    `Symplectic(Select(k, 0))` for the rest it is found from positions alone, where the R ∂H/∂p of
+    `PortHamiltonian` is zero. What the curve cannot say, a smooth remainder that vanishes outside
+    the data is for: one more term `Odd(CurlFree(Select(k, 1)))`. The energy of the sum is that of
+    its part, `field.part("energy").hamiltonian`.
+
+    Args:
+        viscous: the first guess of d, in units of the momentum's rate over the momentum.
+        coulomb: that of c, a force.
+        stribeck: that of s, the force by which sticking exceeds sliding; None for none.
+        rest_speed: ε > 0, the momentum below which dry friction fades to zero: no guess but a
+            number that makes the force smooth, and is not trained. A hundredth of the largest
+            momentum is sharp; less costs a simulation more steps. Trained, it takes up what the
+            log has beside friction: on a real pendulum it rose from a hundredth to a fifth of the
+            largest speed, and the error of rollouts under another controller from .13 to .5 rad.
+        stribeck_speed: that of w, the momentum above which it slides.
+        damped: the coordinates with friction, counted from 0; the momenta if None.
+
+    Each guess is a number for all damped coordinates, or an array with one for each.
+
+    Raises:
+        ValueError: a guess is not positive and finite, or `damped` are no coordinates. With data: n
+            is odd and `damped` is None, or there is no such coordinate. TypeError: a guess is no
+            number.
+
+    Example: `hk.Sum(energy=hk.Symplectic(hk.Select(k, 0)), friction=hk.Friction(0.1, 1.0))`.
+
+    Source: Armstrong-Hélouvry, Dupont & Canudas de Wit (1994), Automatica 30, 1083.
+    """
+
+    log_viscous: Float[Array, "..."]
+    log_coulomb: Float[Array, "..."]
+    log_stribeck: Float[Array, "..."] | None
+    log_stribeck_speed: Float[Array, "..."] | None
+    rest_speed: float = eqx.field(static=True)
+    damped: tuple[int, ...] | None = eqx.field(static=True)
+
+    symplectic: ClassVar[bool] = False
+    no_potential: ClassVar[str | None] = (
+        "friction has no potential: the energy is that of another part of the sum, "
+        "field.part(…).hamiltonian."
+    )
+
+    def __init__(
+        self,
+        viscous: ArrayLike = 0.1,
+        coulomb: ArrayLike = 0.1,
+        stribeck: ArrayLike | None = None,
+        rest_speed: float = 0.1,
+        stribeck_speed: ArrayLike = 0.5,
+        damped: int | Sequence[int] | None = None,
+    ):
+        self.log_viscous = log_per_coordinate(viscous, "viscous")
+        self.log_coulomb = log_per_coordinate(coulomb, "coulomb")
+        self.rest_speed = require.positive_number(rest_speed, "rest_speed")
+        self.log_stribeck = self.log_stribeck_speed = None
+        if stribeck is not None:
+            self.log_stribeck = log_per_coordinate(stribeck, "stribeck")
+            self.log_stribeck_speed = log_per_coordinate(stribeck_speed, "stribeck_speed")
+        self.damped = None if damped is None else require.coordinates(damped, "damped")
+
+    @property
+    def viscous(self) -> Float[Array, "..."]:
+        return jnp.exp(self.log_viscous)
+
+    @property
+    def coulomb(self) -> Float[Array, "..."]:
+        return jnp.exp(self.log_coulomb)
+
+    @property
+    def stribeck(self) -> Float[Array, "..."] | None:
+        return None if self.log_stribeck is None else jnp.exp(self.log_stribeck)
+
+    @property
+    def stribeck_speed(self) -> Float[Array, "..."] | None:
+        return None if self.log_stribeck_speed is None else jnp.exp(self.log_stribeck_speed)
+
+    def curve(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """F of the damped coordinates of a state, zero elsewhere."""
+        damped = np.asarray(damped_coordinates(self.damped, len(x)))
+        v = x[damped]
+        stick = jnp.tanh(v / self.rest_speed)
+        force = self.viscous.astype(x.dtype) * v + self.coulomb.astype(x.dtype) * stick
+        if self.stribeck is not None and self.stribeck_speed is not None:
+            fades = jnp.exp(-((v / self.stribeck_speed.astype(x.dtype)) ** 2))
+            force = force + self.stribeck.astype(x.dtype) * fades * stick
+        return jnp.zeros_like(x).at[damped].set(force)
+
+    def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
+        return (self.curve(x) * u) @ (self.curve(z) * v)
+
+    def expansion(
+        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
+    ) -> Float[Array, " n"]:
+        return self.curve(x) * jnp.sum(jax.vmap(self.curve)(Z) * A, axis=0)
+
+    def bounds(
+        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
+    ) -> tuple[ArrayLike, ArrayLike]:
+        """Bounds of forces around √amplitude, and of speeds up to the largest in X."""
+        damped = list(damped_coordinates(self.damped, X.shape[1]))
+        fastest = np.abs(X[:, damped]).max(axis=0)
+        fastest = np.where(fastest > 0, fastest, 1.0)
+        if getattr(self, name).ndim == 0:
+            fastest = fastest.max()
+        if name == "log_stribeck_speed":
+            # A swing through n samples passes its turning points in steps of 2π/n of the largest
+            # speed, so with fewer than 300 samples a swing a log does not resolve what is finer.
+            return np.log(0.02 * fastest), np.log(fastest)
+        force = 0.5 * np.log(amplitude)
+        if name == "log_viscous":
+            force = force - np.log(fastest)
+        # Three decades to both sides of a force that explains the velocities.
+        return force - np.log(1e3), force + np.log(1e3)
+
+    def check_dimension(self, n: int) -> None:
+        if self.damped is None and n % 2:
+            raise ValueError(
+                f"Friction acts on the momenta of states x = (q, p), and there are n = {n} "
+                "coordinates: say which have friction, Friction(…, damped=(2,))."
+            )
+        coordinates = damped_coordinates(self.damped, n)
+        for guess in jax.tree.leaves(self):
+            if guess.ndim and guess.size != len(coordinates):
+                raise ValueError(
+                    f"a guess of Friction has {guess.size} numbers and {len(coordinates)} "
+                    "coordinates are damped: give one for all, or one for each."
+                )
+
+    def with_parity(self, parity: int) -> "Friction":
+        if parity > 0:
+            raise TypeError("friction is odd, F(-v) = -F(v): add it to Even(K), Even(K) + Friction")
+        return self
+
+    def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
+        raise TypeError(
+            "friction has no potential to be averaged, and no motion with friction runs backwards: "
+            "say the symmetry of the energy alone, Sum(energy=Invariant(K, maps), "
+            "friction=Friction())."
+        )
+
+    @property
+    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
+        return ()
+
+    @property
+    def invariance(self) -> Invariance:
+        return Invariance.REFLECTION
+
+
+class UnknownMasses(AbstractMatrixKernel):
+    """K′(y, z) = S⁻¹ K(Sy, Sz) S⁻ᵀ: states y = (q, q̇) of a structure for x = Sy = (q, p).
+
+    S = diag(I, M) with a constant mass matrix M, so p = M q̇, and a field f of K for (q, p) is
+    S⁻¹f(Sy) for (q, q̇). M is a hyperparameter: diagonal, or a full matrix that stays symmetric and
+    positive, M = L D Lᵀ with a unit lower triangle L. Its first entry is 1, since scaling H and M
+    together changes no motion; `field.hamiltonian(y)` is H in that unit.
+
+    What can be identified: with q̈ = −M⁻¹∇U(q), every M that makes M ∂q̈/∂q symmetric at all q
+    explains the motion. The ratio of two masses is seen only where the motion of one depends on the
+    other. A full matrix needs nonlinear forces: for linear oscillations every M under which their
+    modes are orthogonal explains the motion.
+
+    As the drift of `Controlled` it leaves the inputs in (q, q̇): G holds accelerations, M⁻¹ times
+    the forces, so a force on one coordinate moves several where M is full.
+
+    Args:
+        kernel: K, a matrix-valued kernel, such as `Symplectic(k)`.
+        masses: the first guess, m ≥ 2 degrees of freedom: shape (m,) for a diagonal M, (m, m) for a
+            full one, symmetric and positive definite. Its unit does not matter.
+
+    Raises:
+        TypeError: K is not matrix-valued, or it is `Controlled`. ValueError: a mass is not positive
+            and finite, a matrix is not symmetric and positive definite, or there is one degree of
+            freedom only.
+
+    Example: `hk.tune(hk.UnknownMasses(hk.Symplectic(k), [1.0, 1.0]), X, Y)`, or
+    `hk.learn(hk.UnknownMasses(hk.Symplectic(k), np.eye(2)), runs)`.
+    """
+
+    kernel: AbstractMatrixKernel
+    log_masses: Float[Array, " m-1"]  # the diagonal of D, over its first entry
+    coupling: Float[Array, " c"] | None  # the m(m − 1)/2 entries of L below its diagonal, by row
+
+    symplectic: ClassVar[bool] = False  # dq ∧ dp is kept, dq ∧ dq̇ is not
+
+    def __init__(self, kernel: AbstractMatrixKernel, masses: ArrayLike):
+        self.kernel = matrix_kernel(kernel, "the kernel of UnknownMasses", "Symplectic(k)")
+        if self.kernel.takes_inputs:
+            raise TypeError(
+                "the masses are those of the drift: Controlled(UnknownMasses(K, masses), …)."
+            )
+        guess = require.floating(masses, "masses")
+        if guess.shape not in ((len(guess),) * k for k in (1, 2)) or len(guess) < 2:
+            raise ValueError(
+                f"masses has shape {guess.shape}; two or more, shape (m,), or a matrix (m, m) are "
+                "needed. With one degree of freedom there is nothing to find: every mass explains "
+                "the same motion, and is only a unit of the energy. Leave UnknownMasses out."
+            )
+        self.coupling = None
+        if guess.ndim == 2:
+            guess, self.coupling = _factors(guess)
+        else:
+            guess = require.positive(guess, "masses", "One for each degree of freedom.")
+        self.log_masses = jnp.log(guess[1:] / guess[0])
+
+    def __repr__(self) -> str:
+        return described(self, positional=("kernel",))
+
+    @property
+    def masses(self) -> Float[Array, " m"] | Float[Array, "m m"]:
+        """The masses over the first one, shape (m,), or M over its first entry, (m, m)."""
+        D = self._diagonal
+        if self.coupling is None:
+            return D
+        L = self._triangle(D.dtype)
+        return jnp.einsum("ab,b,cb->ac", L, D, L)
+
+    @property
+    def _diagonal(self) -> Float[Array, " m"]:
+        """D, whose first entry is 1."""
+        return jnp.exp(jnp.pad(self.log_masses, (1, 0)))
+
+    def _triangle(self, dtype: Any) -> Float[Array, "m m"]:
+        """L."""
+        m = len(self.log_masses) + 1
+        below = jnp.asarray(self.coupling, dtype)
+        return jnp.eye(m, dtype=dtype).at[jnp.tril_indices(m, -1)].set(below)
+
+    def to_momenta(self, y: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """S y, for one state or many."""
+        q, v = jnp.split(y, 2, axis=-1)
+        M = self.masses.astype(y.dtype)
+        p = v * M.reshape((1,) * (v.ndim - 1) + M.shape) if M.ndim == 1 else v @ M
+        return jnp.concatenate([q, p], axis=-1)
+
+    def to_velocities(self, x: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """S⁻¹ x, and S⁻ᵀ x, which is the same; for one state or many."""
+        q, p = jnp.split(x, 2, axis=-1)
+        M = self.masses.astype(x.dtype)
+        if M.ndim == 1:
+            return jnp.concatenate([q, p / M.reshape((1,) * (p.ndim - 1) + M.shape)], axis=-1)
+        L, one = self._triangle(M.dtype), jnp.eye(len(M), dtype=M.dtype)
+        inverse = solve_triangular(L, one, lower=True, unit_diagonal=True)
+        scaled = inverse / self._diagonal.astype(M.dtype)[:, None]
+        return jnp.concatenate([q, p @ (inverse.T @ scaled)], axis=-1)  # M⁻¹ = L⁻ᵀ D⁻¹ L⁻¹
+
+    def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
+        u, v = self.to_velocities(u), self.to_velocities(v)
+        return self.kernel.form(self.to_momenta(x), u, self.to_momenta(z), v)
+
+    def expansion(self, x: Point, Z: Points, A: Points) -> Point:
+        x, Z, A = self.to_momenta(x), self.to_momenta(Z), self.to_velocities(A)
+        return self.to_velocities(self.kernel.expansion(x, Z, A))
+
+    def potential(self, x: Point, Z: Points, A: Points) -> Float[Array, ""]:
+        x, Z, A = self.to_momenta(x), self.to_momenta(Z), self.to_velocities(A)
+        return self.kernel.potential(x, Z, A)
+
+    def potential_covariance(self, x: Point, z: Point) -> Float[Array, ""]:
+        return self.kernel.potential_covariance(self.to_momenta(x), self.to_momenta(z))
+
+    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
+        # ∂H/∂x = S⁻ᵀ ∂H/∂y
+        return self.kernel.dissipated(self.to_momenta(x), self.to_velocities(slope))
+
+    @property
+    def no_potential(self) -> str | None:
+        return self.kernel.no_potential
+
+    @property
+    def has_hamiltonian(self) -> bool:
+        return self.kernel.has_hamiltonian
+
+    @property
+    def conserves(self) -> bool:
+        return self.kernel.conserves
+
+    def check_dimension(self, n: int) -> None:
+        count = len(self.log_masses) + 1
+        if n != 2 * count:
+            raise ValueError(
+                f"states have {n} coordinates and there are {count} masses: states (q, q̇) of "
+                f"{2 * count} coordinates are needed, or one mass for each degree of freedom."
+            )
+        self.kernel.check_dimension(n)
+
+    def check_points(self, X: Float[Array, "N n"]) -> None:
+        self.check_dimension(X.shape[1])
+        self.kernel.check_points(self.to_momenta(X))
+
+    def with_parity(self, parity: int) -> "UnknownMasses":
+        return eqx.tree_at(lambda K: K.kernel, self, self.kernel.with_parity(parity))
+
+    def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
+        raise TypeError("say the symmetry inside: UnknownMasses(Invariant(K, maps), masses).")
+
+    def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
+        return np.asarray(self.to_momenta(jnp.asarray(X)))
+
+    @property
+    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
+        """The scalar kernels, functions of (q, p)."""
+        return self.kernel.scalar_kernels
+
+    @property
+    def invariance(self) -> Invariance:
+        return self.kernel.invariance  # S is linear
+
+
+def _factors(M: Array) -> tuple[Float[Array, " m"], Float[Array, " c"]]:
+    """D and L below its diagonal, of M = L D Lᵀ."""
+    guess = np.asarray(M)
+    if not np.isfinite(guess).all() or np.abs(guess - guess.T).max() > 1e-6 * np.abs(guess).max():
+        raise ValueError("masses, as a matrix, must be symmetric and finite.")
+    try:
+        C = np.linalg.cholesky(guess)
+    except np.linalg.LinAlgError:
+        lowest = np.linalg.eigvalsh(guess)[0]
+        raise ValueError(
+            f"masses, as a matrix, must be positive definite, as kinetic energy is; its lowest "
+            f"eigenvalue is {lowest:.3g}."
+        ) from None
+    L = C / np.diag(C)[None]
+    return jnp.asarray(np.diag(C) ** 2), jnp.asarray(L[np.tril_indices(len(L), -1)])
