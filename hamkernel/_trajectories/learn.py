@@ -18,6 +18,7 @@ from hamkernel._fields.joined import learned_field
 from hamkernel._gram.operator import placed_product
 from hamkernel._kernels.base import Scaled
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._machine import one_blas_thread
 from hamkernel._observations.kinds import beside
 from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
@@ -69,6 +70,7 @@ _MOST = 8  # iterations; 4 or 5 are the rule
 _QUIET = 10.0  # seconds before progress is shown to those who did not ask for it
 
 
+@one_blas_thread
 def learn(
     K: AbstractMatrixKernel,
     runs: Runs,
