@@ -7,6 +7,7 @@
 import dataclasses
 import math
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
@@ -14,7 +15,8 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._discovery.compare import Candidate, Comparison, _answered, _is_seen, _ladder, claims
+from hamkernel._discovery.compare import Candidate, Comparison, _answered, _is_seen, claims
+from hamkernel._discovery.ladder import ladder
 
 RNG = np.random.default_rng(0)
 X = RNG.uniform(-1, 1, size=(24, 2)) * [2.5, 2.0]
@@ -24,8 +26,40 @@ K = hk.Gaussian(2.0)
 TWO = {"any": hk.Separable(1.0 * K), "energy": hk.Symplectic(1.0 * K)}
 
 
+def kernels(n):
+    """Each step of the ladder, as searched and as shown."""
+    rng = np.random.default_rng(n)
+    for step in ladder(n).values():
+        rung = step.rung(rng.uniform(0.5, 2.0, n), 1.3)
+        numbers = eqx.filter(rung, eqx.is_inexact_array)
+        moved = jax.tree.map(lambda h: h + rng.normal(size=h.shape), numbers)
+        rung = eqx.combine(moved, rung)
+        yield rung, step.kernel(rung)
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_a_rung_of_the_ladder_is_the_kernel_that_is_shown_for_it(n):
+    x, z = RNG.normal(size=(2, n))
+    for rung, K in kernels(n):
+        np.testing.assert_allclose(rung(x, z), K(x, z), rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(rung(x, x), K(x, x), rtol=1e-12, atol=1e-12)
+
+
+def test_rungs_of_one_shape_share_one_compiled_search():
+    shapes = {jax.tree.structure(rung) for rung, _ in kernels(2)}
+    arrays = {tuple((a.shape, a.dtype) for a in jax.tree.leaves(rung)) for rung, _ in kernels(2)}
+    assert len(shapes) == 1
+    assert len(arrays) == 3  # one part; T and U; the four images of a reversible H
+    assert not any(a.weak_type for rung, _ in kernels(2) for a in jax.tree.leaves(rung))
+
+
 def test_the_ladder_has_the_products_of_its_steps():
-    found = {frozenset(claims(k, np.ones(2))) for k in _ladder(np.ones(2), 1.0).values()}
+    def claimed(n):
+        scale = np.ones(n)
+        found = {k: step.kernel(step.rung(scale, 1.0)) for k, step in ladder(n).items()}
+        return {frozenset(claims(K, scale)) for K in found.values()}
+
+    found = claimed(2)
     free = [{"mirror"} & set(c) for c in found if "energy" not in c]
     assert len(free) == 2
     for has in ({"T + U"}, {"mirror"}, {"friction"}, {"T + U", "mirror"}, {"T + U", "friction"}):
@@ -37,11 +71,9 @@ def test_the_ladder_has_the_products_of_its_steps():
         assert frozenset({"energy", "reversible"} | has) in found
     assert frozenset({"energy", "friction", "mirror", "T + U"}) in found
     # Three coordinates have no (q, p); in two, divergence-free fields are those of an energy.
-    assert set().union(*(claims(k, np.ones(3)) for k in _ladder(np.ones(3), 1.0).values())) == {
-        "mirror"
-    }
-    assert "divergence-free" in _ladder(np.ones(3), 1.0)
-    assert "divergence-free" not in _ladder(np.ones(2), 1.0)
+    assert set().union(*claimed(3)) == {"mirror"}
+    assert "divergence-free" in ladder(3)
+    assert "divergence-free" not in ladder(2)
 
 
 @pytest.mark.parametrize(
@@ -168,7 +200,7 @@ def test_a_comparison_is_a_plain_record():
 @pytest.mark.slow
 @pytest.mark.ci
 def test_a_pendulum_has_an_energy_and_a_mirror_and_friction_is_found():
-    # Slow for its fifteen candidates: some 60 s of compilation.
+    # Slow for the compilation of its searches.
     found = hk.compare(X, Y)
     assert found.answers["energy"] == "yes"
     assert found.answers["friction"] != "yes"
@@ -177,8 +209,13 @@ def test_a_pendulum_has_an_energy_and_a_mirror_and_friction_is_found():
     found = hk.compare(X, damped)
     assert found.answers["friction"] == "yes"
     assert found.answers["reversible"] == "no"
-    best = found.best.kernel
-    assert float(best.friction) == pytest.approx(0.2, abs=0.05)
+    best = found.best
+    assert float(best.kernel.friction) == pytest.approx(0.2, abs=0.05)
+    assert float(best.hyperparameters["friction"]) == float(best.kernel.friction)
+    for row in found.table:  # that of the kernel which is shown
+        assert row.parameters == sum(np.size(value) for value in row.hyperparameters.values())
+        likelihood = hk.log_marginal_likelihood(row.kernel, X, damped, row.regularization)
+        assert row.log_likelihood == pytest.approx(float(likelihood), rel=1e-6)
 
 
 @pytest.mark.slow

@@ -78,6 +78,15 @@ def hyperparameters(
     return list(_walk((), K, inputs, _amplitude(K_middle, states, rms)))
 
 
+def named_values(K: AbstractMatrixKernel, X: Float[np.ndarray, "N n"]) -> dict[str, Array]:
+    """The values of the trainable leaves of K in their units, by the names of their bounds."""
+    leaves = jax.tree.leaves(eqx.filter(K, eqx.is_inexact_array))
+    return {
+        param.name: jnp.exp(leaf) if param.logarithmic else leaf
+        for param, leaf in zip(_walk((), K, X, 1.0), leaves, strict=True)
+    }
+
+
 def constants(K: AbstractMatrixKernel) -> dict[str, float]:
     """The Python floats among the attributes of a kernel, which are no leaves to train."""
     found: dict[str, float] = {}

@@ -198,7 +198,7 @@ def tune(
     _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
     _check_optimiser(optimiser)
     check_solver(solver)
-    _warn_of_constants(K)
+    warn_of_constants(K)
     given = problem(K, X, Y, regularization, mean, inputs, parameters)
     K, rows = given.kernel, given.on_one_device().rows
     if rows.states is not None:
@@ -211,7 +211,7 @@ def tune(
     low_rank = solver is not None and solver.is_low_rank and not criterion.custom
     parts = parts_of(rows, criterion, dense=True)
     if not low_rank and not criterion.custom:
-        check_memory(rows, _LOSS_COPIES)
+        check_memory(rows, SEARCH_COPIES)
     few = rows if len(parts) == 1 else rows.subset(parts[0])[0]
     rms = velocity_rms(K, few)
     roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
@@ -230,11 +230,11 @@ def tune(
         return criterion.with_basis(basis)
 
     runs = search.runs(of_low_rank if low_rank else None)
-    _check_found(best(runs))
+    check_found(best(runs))
     return _tuned(space, runs, starts, given, solver)
 
 
-def _check_found(found: MinimiserRun) -> None:
+def check_found(found: MinimiserRun) -> None:
     if not found.best.value < np.inf:
         raise RuntimeError(
             "the objective is not finite at any start. Likely causes, in order: a kernel that "
@@ -322,7 +322,7 @@ def _warn_of_unequal_sizes(Y: Array) -> None:
         )
 
 
-def _warn_of_constants(K: AbstractMatrixKernel) -> None:
+def warn_of_constants(K: AbstractMatrixKernel) -> None:
     """Python floats, which are no hyperparameters."""
     kept = constants(K)
     if kept:
@@ -369,7 +369,7 @@ def _has_amplitude(space: SearchSpace) -> bool:
     return bool(terms) and all(k.has_amplitude for k in terms)
 
 
-_LOSS_COPIES = 5  # matrices of the size of the Gram that a loss in a loop holds: 4.4 measured
+SEARCH_COPIES = 5  # matrices of the size of the Gram that a loss in a loop holds: 4.4 measured
 _UNEQUAL = 100.0  # in size, and so 10 000 in the loss
 # Held out one at a time, few runs are a noisy judge: on the pendulum of the paper, with three, the
 # field error was 0.164 where the likelihood's was 0.048. See `tests/benchmarks/judges.py`.

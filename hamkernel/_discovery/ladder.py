@@ -1,0 +1,222 @@
+"""The ladder of structures and symmetries that `compare` climbs.
+
+A first comparison took 96 s, 90 of them to compile 15 searches. A `Rung` is any step of the ladder,
+with the choice between structures and symmetries in its arrays, so that one compiled search serves
+all steps with as many parts and images: three in place of 15.
+"""
+
+from typing import ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from hamkernel._kernels.base import AbstractScalarKernel, Bounds, Invariance, bounds_of_length
+from hamkernel._kernels.built_in import Gaussian
+from hamkernel._kernels.symmetry import LinearMap
+from hamkernel._kernels.transforms import Select
+from hamkernel._structures.base import AbstractMatrixKernel, Odd, Reversible
+from hamkernel._structures.mechanics import PortHamiltonian
+from hamkernel._structures.structure import (
+    CurlFree,
+    DivergenceFree,
+    Separable,
+    Symplectic,
+    canonical,
+)
+
+_NONE = -200.0  # the logarithm of a friction that is none: e⁻²⁰⁰ is lost in every sum
+_STRUCTURES = (Separable, DivergenceFree, CurlFree, Symplectic)
+
+
+class Rung(AbstractMatrixKernel):
+    """Σᵢ Σ_g w_ig K_ig(x, z), K_ig of a structure from the Gaussian kernel of x and gz.
+
+    Each part i sees some of the coordinates, and each g changes signs. With
+    k = aᵢ exp(−‖(x − gz)/ℓ‖²/2) and M = ∂x ∂zᵀ k, the structure is
+
+        s k I + d (tr(M) I − Mᵀ) + B M Bᵀ,    B = c I + h (J − R).
+
+    Attributes:
+        log_variances: those of a component of the field, for each part. A potential that changes
+            over ℓ is ℓ² times as large, for the geometric mean of the ℓ that its part sees.
+        log_lengthscales: ℓ, one for each coordinate.
+        log_friction: the diagonal of R on the momenta.
+        masks: 1 where the part sees the coordinate.
+        weights: w_ig up to the sum of their sizes, which is 1 for each part.
+        structure: (s, d, c, h), one of which is 1.
+    """
+
+    log_variances: Float[Array, " parts"]
+    log_lengthscales: Float[Array, " n"]
+    log_friction: Float[Array, ""]
+    masks: Int[Array, "parts n"]
+    weights: Int[Array, "parts images"]
+    structure: Int[Array, " 4"]
+
+    symplectic: ClassVar[bool] = False
+    no_potential: ClassVar[str | None] = "a Rung is only searched: ask the kernel of its Step."
+
+    def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
+        return u @ self.blocks(x[None], z[None])[0, :, 0] @ v
+
+    def blocks(self, X: Float[Array, "N n"], Z: Float[Array, "M n"]) -> Float[Array, "N n M n"]:
+        n, dtype = X.shape[1], X.dtype
+        numbers = (self.masks, self.weights, self.structure)
+        masks, weights, (s, d, c, h) = (each.astype(dtype) for each in numbers)
+        weights = weights / jnp.abs(weights).sum(axis=1, keepdims=True)
+        one = jnp.eye(n, dtype=dtype)
+        B = c * one + h * self._hamiltonian_operator(n).astype(dtype)
+
+        def term(D, w, S):
+            """The w k, (N, M), and the w M, (N, n, M, n), of one part and image."""
+            apart = X[:, None] - (S[None] * Z)[None]  # (N, M, n)
+            k = w * jnp.exp(-0.5 * (apart**2 @ D))
+            apart = D[None, None] * apart
+            products = apart.swapaxes(1, 2)[..., None] * (S[None, None] * apart)[:, None]
+            return k, k[:, None, :, None] * (jnp.diag(D * S)[None, :, None] - products)
+
+        D = masks * jnp.exp(-2 * self.log_lengthscales).astype(dtype)[None]
+        weights = weights * self.amplitudes().astype(dtype)[:, None]
+        signs = jnp.asarray(_signs(n, weights.shape[1]), dtype)
+        terms = jax.vmap(jax.vmap(term, (None, 0, 0)), (0, 0, None))
+        k, M = terms(D, weights, signs)
+        k, M = k.sum(axis=(0, 1)), M.sum(axis=(0, 1))  # (N, M), (N, n, M, n)
+        plain = s * k
+        if n > 2:
+            plain = plain + d * jnp.einsum("iaja->ij", M)
+        G = plain[:, None, :, None] * one[None, :, None] + jnp.einsum("ac,icjd,bd->iajb", B, M, B)
+        return G if n == 2 else G - d * M.transpose(0, 3, 2, 1)
+
+    def _hamiltonian_operator(self, n: int) -> Float[Array, "n n"]:
+        """J − R; zero where there is no such thing."""
+        m, odd = divmod(n, 2)
+        if odd:
+            return jnp.zeros((n, n), self.log_friction.dtype)
+        one = jnp.eye(n, dtype=self.log_friction.dtype)
+        return canonical(one) - jnp.exp(self.log_friction) * one.at[:m].set(0)
+
+    def amplitudes(self) -> Float[Array, " parts"]:
+        """The aᵢ."""
+        masks = self.masks.astype(self.log_lengthscales.dtype)
+        squares = 2 * (masks @ self.log_lengthscales) / masks.sum(axis=1)
+        of_fields = self.structure[0] > 0
+        return jnp.exp(self.log_variances + jnp.where(of_fields, jnp.zeros_like(squares), squares))
+
+    def expansion(self, x: Array, Z: Array, A: Array) -> Float[Array, " n"]:
+        return jnp.einsum("jab,jb->a", jax.vmap(lambda z: self(x, z))(Z), A)
+
+    def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
+        value = np.asarray(getattr(self, name))
+        if name == "log_lengthscales":
+            return bounds_of_length(value, X, 0.3, 30.0)
+        if name == "log_variances":
+            return np.log(1e-5 * amplitude), np.log(1e5 * amplitude)
+        if value == _NONE:
+            return value, value
+        return PortHamiltonian(Gaussian(1.0)).bounds(name, X, amplitude)
+
+    def shares_potential(self, other: AbstractMatrixKernel) -> bool:
+        return False
+
+    def with_parity(self, parity: int) -> AbstractMatrixKernel:
+        raise TypeError(self.no_potential)
+
+    def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
+        raise TypeError(self.no_potential)
+
+    @property
+    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
+        return ()
+
+    @property
+    def invariance(self) -> Invariance:
+        return Invariance.NONE
+
+
+def _signs(n: int, images: int) -> Float[np.ndarray, "images n"]:
+    """Those of x, −x, and, of four images, of backward motion."""
+    reversal = np.repeat([1.0, -1.0], [n // 2, n - n // 2])
+    return np.stack([np.ones(n), -np.ones(n), reversal, -reversal])[:images]
+
+
+class Step(NamedTuple):
+    """One step of the ladder.
+
+    Attributes:
+        structure: its class; with friction `Symplectic` stands for `PortHamiltonian`.
+        apart: whether H = T(p) + U(q).
+        friction: whether there is friction on the momenta.
+        mirror: whether f(−x) = −f(x).
+        reversible: whether H(q, −p) = H(q, p).
+    """
+
+    structure: type[AbstractMatrixKernel]
+    apart: bool = False
+    friction: bool = False
+    mirror: bool = False
+    reversible: bool = False
+
+    def rung(self, scale: Float[np.ndarray, " n"], speed: float) -> Rung:
+        """The kernel to search with, at first for fields of this size that change over 2 `scale`.
+
+        Args:
+            scale: the standard deviation of each coordinate; 0 counts as 1.
+            speed: the root mean square of a component of the field.
+        """
+        n = len(scale)
+        momenta = np.repeat([0, 1], [n // 2, n - n // 2])
+        even = int(self.mirror) * (-1 if self.structure is Separable else 1)
+        if self.apart:  # T(p) and U(q); seen from T backward motion is the mirror image
+            masks, weights = (
+                [momenta, 1 - momenta],
+                [[1, self.mirror or self.reversible], [1, even]],
+            )
+        else:
+            masks, weights = (
+                [momenta * 0 + 1],
+                [[1, even, 1, even] if self.reversible else [1, even]],
+            )
+        length = np.log(2 * np.where(scale > 0, scale, 1.0))
+        return Rung(
+            log_variances=jnp.asarray(np.full(len(masks), 2 * np.log(speed))),
+            log_lengthscales=jnp.asarray(length),
+            log_friction=jnp.asarray(np.float64(np.log(0.1) if self.friction else _NONE)),
+            masks=jnp.asarray(np.array(masks)),
+            weights=jnp.asarray(np.array(weights, int)),
+            structure=jnp.asarray([int(self.structure is each) for each in _STRUCTURES]),
+        )
+
+    def kernel(self, rung: Rung) -> AbstractMatrixKernel:
+        """The structured kernel with the numbers of the rung."""
+        n, length = len(rung.log_lengthscales), jnp.exp(rung.log_lengthscales)
+        terms = []
+        for mask, amplitude in zip(np.asarray(rung.masks), rung.amplitudes(), strict=True):
+            dims = tuple(np.flatnonzero(mask).tolist())
+            k = Gaussian(length[np.array(dims)])
+            terms.append(amplitude * (k if len(dims) == n else Select(k, dims)))
+        k = sum(terms[1:], start=terms[0])
+        friction = jnp.exp(rung.log_friction)
+        K = PortHamiltonian(k, friction) if self.friction else self.structure(k)  # type: ignore[call-arg]
+        K = Odd(K) if self.mirror else K
+        return Reversible(K) if self.reversible else K
+
+
+def ladder(n: int) -> dict[str, Step]:
+    """Structures by name, the weakest first, with the products of their steps."""
+    found = {"any field": Step(Separable), "gradient": Step(CurlFree)}
+    if n > 2:
+        found["divergence-free"] = Step(DivergenceFree)
+    if n % 2 == 0:
+        found |= {
+            "energy": Step(Symplectic),
+            "energy, friction": Step(Symplectic, friction=True),
+            "T + U": Step(Symplectic, apart=True),
+            "T + U, friction": Step(Symplectic, apart=True, friction=True),
+        }
+    found |= {f"{name}, mirror": step._replace(mirror=True) for name, step in found.items()}
+    if n % 2 == 0:  # T + U with a mirror has an even T, and is reversible
+        for name in ("energy", "energy, mirror", "T + U"):
+            found[f"{name}, reversible"] = found[name]._replace(reversible=True)
+    return found
