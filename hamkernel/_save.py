@@ -1,5 +1,7 @@
 """`save` and `load`: a learned field in one file, which is read without running anything in it.
 
+A fit to which chunks are added is kept the same way.
+
 A file is a line with the version of the format and the SHA-256 of the rest, a line of JSON that
 describes the field, and its arrays as Equinox writes the leaves of a PyTree, one after another in
 NumPy's `.npy` format. The digest finds a cut or changed file before anything is parsed. It does
@@ -45,6 +47,7 @@ from hamkernel._fields.base import AbstractField
 from hamkernel._fields.joined import AbstractJoinedField
 from hamkernel._kernels.functions import Bound, Closure, as_pytree
 from hamkernel._kernels.symmetry import identity, reflection, time_reversal
+from hamkernel._solvers.stream import AbstractStreamingFit
 from hamkernel._structures.base import AbstractMatrixKernel
 
 _VERSION = 2  # of the format; 1 was an archive of NumPy's, before the first release
@@ -53,18 +56,21 @@ _PROBES = 64  # points of the field, of which the one of the largest velocity is
 _AGREES = 1e-3  # of a velocity computed elsewhere: fields of large coefficients round at 1e-5
 
 
-def save(path: str | os.PathLike[str], field: AbstractField) -> None:
+def save(path: str | os.PathLike[str], field: AbstractField | AbstractStreamingFit) -> None:
     """Write a learned field to one file: kernel, hyperparameters, data, coefficients, version.
+
+    Or a fit to which chunks are added: after `load` it goes on with the next one.
 
     The file at `path` is replaced in one step, so that no reader ever sees half of it. Code of
     your own (kernels, maps of a `Warp`, a mean) is not written, only its arrays are: see `load`.
 
-    If the rows of the field are spread over several processes, all of them must make the call;
-    each writes the whole field, to a path of its own or to one that they share.
+    If the rows of the field are spread over several processes, all of them must make the call, and
+    the first process writes the file before any of them goes on.
 
     Args:
         path: the file. The name is taken as it is.
-        field: what `fit` returned, or `tune(...).field`.
+        field: what `fit` returned, `tune(...).field`, or the `LandmarkFit` or `FeatureFit` of a
+            solver's `start`.
 
     Raises:
         TypeError: `field` is no field of this library, or holds something that cannot be stored.
@@ -72,18 +78,19 @@ def save(path: str | os.PathLike[str], field: AbstractField) -> None:
             finite.
         OSError: the file cannot be written; an older one at `path` is left as it was.
     """
-    if not isinstance(field, AbstractField):
-        names = [name for name, cls in _classes().items() if _is_field(cls)]
+    if not _is_saved(type(field)):
+        names = [name for name, cls in _classes().items() if _is_saved(cls)]
         raise TypeError(
-            f"save writes learned fields ({', '.join(names)}), got {type(field).__name__}. For "
-            "the result of tune pass tuned.field."
+            f"save writes learned fields and streams ({', '.join(names)}), got "
+            f"{type(field).__name__}. For the result of tune pass tuned.field."
         )
     if not require.is_concrete(field):
         raise ValueError("save writes numbers and cannot run under jax.jit, grad or vmap.")
+    spread = not all(map(_is_here, jax.tree.leaves(field)))
     field = jax.tree.map(_whole, field)
     described = description(field, [], "field")
     try:
-        _check_evaluable(field)
+        evaluable = _evaluable(field)
     except Exception as error:  # a kernel of the caller's may raise anything
         raise ValueError(
             "save writes one field that can be evaluated, and this one cannot (of a batch made by "
@@ -94,20 +101,27 @@ def save(path: str | os.PathLike[str], field: AbstractField) -> None:
         "x64": any(
             leaf.dtype.itemsize == 8 for leaf in jax.tree.leaves(field) if eqx.is_array(leaf)
         ),
-        "probe": _probe(field),
+        "probe": _probe(evaluable),
         "field": described,
     }
     content = io.BytesIO()
     content.write(json.dumps(header, ensure_ascii=False, allow_nan=False).encode() + b"\n")
     eqx.tree_serialise_leaves(content, field)
-    _write_at_once(pathlib.Path(path), sealed(content.getvalue()))
+    if not spread:
+        _write_at_once(pathlib.Path(path), sealed(content.getvalue()))
+        return
+    try:
+        if jax.process_index() == 0:
+            _write_at_once(pathlib.Path(path), sealed(content.getvalue()))
+    finally:  # else the others would wait for ever for one that could not write
+        multihost_utils.sync_global_devices("hamkernel.save")
 
 
 def load(
     path: str | os.PathLike[str],
     kernel: AbstractMatrixKernel | None = None,
     mean: Callable[..., Any] | None = None,
-) -> AbstractField:
+) -> Any:
     """Read a field that `save` wrote: the same arrays bit by bit, so the same values of f.
 
     Nothing in the file is executed. Built-in kernels restore by themselves. For a kernel of your
@@ -121,7 +135,7 @@ def load(
             `hk.systems` are in the file.
 
     Returns:
-        The field, of the class that was saved.
+        The field, or the fit to which chunks are added, of the class that was saved.
 
     Raises:
         ValueError: the file is no such file, cut off, changed, of another version, or in float64
@@ -140,7 +154,7 @@ def load(
     try:
         header = json.loads(content.readline())
         node, probe, needs_x64 = header["field"], header["probe"], header["x64"]
-        if not _is_field(_classes().get(node["class"])):
+        if not _is_saved(_classes().get(node["class"])):
             raise ValueError("it holds no learned field")
     except (ValueError, LookupError, TypeError, RecursionError) as error:
         raise ValueError(f"{source} is not a valid file of hamkernel.save: {error}.") from error
@@ -156,7 +170,7 @@ def load(
             field = eqx.tree_deserialise_leaves(content, like)
         if content.read():
             raise ValueError("it has arrays that belong to nothing")
-        _check_evaluable(field)
+        evaluable = _evaluable(field)
     except _NotGiven as error:
         name = "mean" if ".mean" in str(error) else "kernel"
         raise ValueError(
@@ -170,12 +184,13 @@ def load(
         ) from error
     if given:
         with jax.ensure_compile_time_eval():
-            _check_probe(field, probe, source)
+            _check_probe(evaluable, probe, source)
     return field
 
 
-def _is_field(cls: Any) -> bool:
-    return isinstance(cls, type) and issubclass(cls, AbstractField) and not inspect.isabstract(cls)
+def _is_saved(cls: Any) -> bool:
+    kinds = AbstractField, AbstractStreamingFit
+    return isinstance(cls, type) and issubclass(cls, kinds) and not inspect.isabstract(cls)
 
 
 def _of_state(field: AbstractField) -> Callable[[Array], Array]:
@@ -186,11 +201,16 @@ def _of_state(field: AbstractField) -> Callable[[Array], Array]:
     return field
 
 
-def _check_evaluable(field: AbstractField) -> None:
-    """Raise unless the parts fit each other: as many lengthscales as coordinates, and the like."""
+def _evaluable(saved: Any) -> AbstractField:
+    """The field; that of a fit to chunks is the sum of its columns, which needs no data.
+
+    Raises unless the parts fit each other: as many lengthscales as coordinates, and the like.
+    """
+    field = saved.sum_of_columns() if isinstance(saved, AbstractStreamingFit) else saved
     state = jax.ShapeDtypeStruct((field.dimension,), field.offset.dtype)
     if field.offset.shape or jax.eval_shape(_of_state(field), state).shape != state.shape:
         raise ValueError("its arrays have an axis more than those of one field.")
+    return field
 
 
 def _probe(field: AbstractField) -> list[list[float]]:
@@ -217,11 +237,15 @@ def _check_probe(field: AbstractField, probe: Any, source: str) -> None:
         )
 
 
-def _whole(leaf):
+def _is_here(leaf: Any) -> bool:
+    """Whether this process has the whole array."""
+    is_array = isinstance(leaf, jax.Array)
+    return not is_array or leaf.is_fully_addressable or leaf.is_fully_replicated
+
+
+def _whole(leaf: Any) -> Any:
     """The whole array, on this process, of one whose rows are spread over several processes."""
-    if not isinstance(leaf, jax.Array) or leaf.is_fully_addressable or leaf.is_fully_replicated:
-        return leaf
-    return multihost_utils.process_allgather(leaf, tiled=True)
+    return leaf if _is_here(leaf) else multihost_utils.process_allgather(leaf, tiled=True)
 
 
 def _library_version() -> str:
@@ -235,7 +259,15 @@ def _library_version() -> str:
 
 _ROOMS = tuple(
     f"hamkernel.{room}"
-    for room in ("_kernels.", "_structures.", "_features", "_fields.", "systems.")
+    for room in (
+        "_kernels.",
+        "_structures.",
+        "_observations.blocks",
+        "_features",
+        "_fields.",
+        "_solvers.",
+        "systems.",
+    )
 )
 _MAPS = {function.__name__: function for function in (identity, reflection, time_reversal)}
 
@@ -326,7 +358,7 @@ def skeleton(node: Node, codes: list[Any], where: str, given: Given) -> Any:
                 raise ValueError(f"{where} is of the unknown class {name[:80]!r}")
             if nodes.keys() != {field.name for field in dataclasses.fields(cls)}:
                 raise ValueError(f"{where} does not have the fields of {name}")
-            replaced = given if issubclass(cls, AbstractField) else {}
+            replaced = given if _is_saved(cls) else {}
             made = object.__new__(cls)  # past __init__, which takes no logarithms
             for key, child in nodes.items():
                 path, inside = f"{where}.{key}", (codes, given)

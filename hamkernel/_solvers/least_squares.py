@@ -19,7 +19,6 @@ are treated no worse than by the normal equations.
 """
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -186,7 +185,7 @@ def _rows(columns: int) -> int:
 TILE = 2**20
 
 
-class Normal(NamedTuple):
+class Normal(eqx.Module):
     """The sums over rows F with targets y; those of parts of the rows add up."""
 
     square: Float[Array, "r r"]  # FᵀF
@@ -194,14 +193,9 @@ class Normal(NamedTuple):
     energy: Float[Array, ""]  # yᵀy
 
     @classmethod
-    def zero(cls, basis: Float[Array, "r r"]) -> "Normal":
-        """The sums over no rows in a basis."""
-        square = jnp.zeros_like(basis)
-        return cls(square, square[0], square[0, 0])
-
-    def plus(self, F: Float[Array, "D r"], y: Float[Array, " D"]) -> "Normal":
-        """The sums with more rows."""
-        return Normal(self.square + F.T @ F, self.moment + F.T @ y, self.energy + y @ y)
+    def of(cls, rows: Float[Array, "D r"], y: Float[Array, " D"]) -> "Normal":
+        """The sums over rows that were made already."""
+        return cls(rows.T @ rows, rows.T @ y, y @ y)
 
 
 class Sums(eqx.Module):
@@ -235,23 +229,6 @@ def first_sums(seen: Normal, W: Float[Array, "r r"], count: int, ridge: Float[Ar
     return Sums(R, solve_triangular(R, W.T, trans="T").T, nothing)
 
 
-def add_velocities(
-    sums: Sums,
-    design: Design,
-    X: Float[Array, "N n"],
-    Y: Float[Array, "N n"],
-    spread: RowSharding | None = None,
-) -> Sums:
-    """The sums after the rows design(X) with targets Y."""
-    new = normal(design, sums.basis, X, Y, spread)
-    return Sums(sums.triangle, sums.basis, jax.tree.map(jnp.add, sums.seen, new))
-
-
-def add_rows(sums: Sums, rows: Float[Array, "D r"], y: Float[Array, " D"]) -> Sums:
-    """The sums after rows of the design that were made already, with targets y."""
-    return Sums(sums.triangle, sums.basis, sums.seen.plus(rows @ sums.basis, y))
-
-
 def normal(
     design: Design,
     basis: Float[Array, "r r"],
@@ -270,9 +247,12 @@ def normal(
 
     def step(total, tile):
         rows = design(tile[0])  # (t, n, r)
-        return total.plus(rows.reshape(-1, rows.shape[-1]) @ basis, tile[1].reshape(-1)), None
+        new = Normal.of(rows.reshape(-1, rows.shape[-1]) @ basis, tile[1].reshape(-1))
+        return jax.tree.map(jnp.add, total, new), None
 
-    return over_tiles(step, Normal.zero(basis), (X, Y), max(1024, TILE // len(basis)))[0]
+    square = jnp.zeros_like(basis)
+    nothing = Normal(square, square[0], square[0, 0])
+    return over_tiles(step, nothing, (X, Y), max(1024, TILE // len(basis)))[0]
 
 
 def solve_sums(

@@ -24,7 +24,7 @@ from hamkernel._fields.base import SolverInfo, root
 from hamkernel._fields.expansions import KernelField
 from hamkernel._gram.dense import components, trace, trace_of_rows
 from hamkernel._gram.operator import product
-from hamkernel._machine import as_given, rows_of, split
+from hamkernel._machine import RowSharding, as_given, rows_of, split
 from hamkernel._observations.measurements import Measurements
 from hamkernel._show import text
 from hamkernel._solvers.landmarks import (
@@ -38,8 +38,6 @@ from hamkernel._solvers.landmarks import (
 from hamkernel._solvers.least_squares import (
     Normal,
     Sums,
-    add_rows,
-    add_velocities,
     first_sums,
     normal,
     solve_sums,
@@ -127,7 +125,7 @@ def warn_if_truncated(truncation, count, tolerance, cure):
 class LandmarkFit(AbstractStreamingFit[KernelField]):
     """A fit on landmarks to the data added so far, made by `Nystrom.start`.
 
-    It has a fixed size, 3r² numbers for r columns. `add` returns a new one, and `field` solves
+    It has a fixed size, 4r² numbers for r columns. `add` returns a new one, and `field` solves
     for any λ:
 
         model = hk.Nystrom().start(K, X, 1e-4).add(X, Y)
@@ -142,6 +140,7 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         landmarks: the points that carry the field.
         sums: the sums over the rows added, of which the least squares are solved.
         trace: the trace of their Gram, shape ().
+        lost: what rounding took from the sums and the trace.
         count: N, the number of points added, shape ().
         regularization: the λ of `start`, shape ().
         dimension: n, the number of coordinates of a state.
@@ -152,6 +151,7 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
     landmarks: Landmarks
     sums: Sums
     trace: Float[Array, ""]
+    lost: tuple[Normal, Float[Array, ""]]
     count: Int[Array, ""]
     regularization: Float[Array, ""]
     dimension: int = eqx.field(static=True)
@@ -160,20 +160,23 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
     def _size(self) -> str:
         return f"landmarks={text(self.landmarks.count)}"
 
-    def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "LandmarkFit":
-        spread = rows_of(X)
-        return _with_data(self, split(spread, X), split(spread, Y), spread)
+    def _columns(self) -> tuple[str, Any]:
+        return "landmarks", self.landmarks
 
-    @eqx.filter_jit
-    def _added_rows(self, rows: Measurements) -> "LandmarkFit":
-        K = self.kernel
-        design = [self.landmarks.columns(K, block) for block in rows.blocks]
-        new = (
-            add_rows(self.sums, jnp.concatenate(design), rows.targets),
-            self.trace + trace_of_rows(K, rows),
-            self.count + rows.count,
-        )
-        return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), self, new)
+    @property
+    def _totals(self) -> tuple[Any, ...]:
+        return self.sums.seen, self.trace
+
+    def _of_velocities(
+        self, X: Float[Array, "N n"], Y: Float[Array, "N n"], spread: RowSharding | None
+    ) -> tuple[Any, ...]:
+        seen = normal(Columns(self.kernel, self.landmarks), self.sums.basis, X, Y, spread)
+        return seen, trace(self.kernel, X, spread)
+
+    def _of_rows(self, rows: Measurements) -> tuple[Any, ...]:
+        design = _design(self.kernel, self.landmarks, rows)
+        seen = Normal.of(design @ self.sums.basis, rows.targets)
+        return seen, trace_of_rows(self.kernel, rows)
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
         solution = _solution(self, count, regularization)
@@ -187,15 +190,16 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 def start_fit(K, sample, regularization, landmarks, tolerance):
     T = whitening(K, landmarks)
     if sample.states is None:
-        design = [landmarks.columns(K, block) for block in sample.blocks]
-        seen = Normal.zero(T).plus(jnp.concatenate(design) @ T, sample.targets)
+        seen = Normal.of(_design(K, landmarks, sample) @ T, sample.targets)
     else:
         seen = normal(Columns(K, landmarks), T, *sample.states)
+    sums, nothing = first_sums(seen, T, sample.count, regularization), jnp.zeros((), T.dtype)
     return LandmarkFit(
         kernel=K,
         landmarks=landmarks,
-        sums=first_sums(seen, T, sample.count, regularization),
-        trace=jnp.zeros((), T.dtype),
+        sums=sums,
+        trace=nothing,
+        lost=(sums.seen, nothing),
         count=jnp.zeros((), int),
         regularization=regularization,
         dimension=sample.dimension,
@@ -203,15 +207,8 @@ def start_fit(K, sample, regularization, landmarks, tolerance):
     )
 
 
-@eqx.filter_jit
-def _with_data(fit, X, Y, spread):
-    K = fit.kernel
-    new = (
-        add_velocities(fit.sums, Columns(K, fit.landmarks), X, Y, spread),
-        fit.trace + trace(K, X, spread),
-        fit.count + len(X),
-    )
-    return eqx.tree_at(lambda f: (f.sums, f.trace, f.count), fit, new)
+def _design(K, landmarks, rows):
+    return jnp.concatenate([landmarks.columns(K, block) for block in rows.blocks])
 
 
 @eqx.filter_jit

@@ -10,13 +10,11 @@ from hamkernel import _require as require
 from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import FeatureField, feature_field
-from hamkernel._machine import as_given, refuse_beyond_memory, rows_of, split
+from hamkernel._machine import RowSharding, as_given, refuse_beyond_memory, rows_of, split
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.least_squares import (
     Normal,
     Sums,
-    add_rows,
-    add_velocities,
     first_sums,
     normal,
     ridge_regression,
@@ -143,7 +141,7 @@ def _checked(field: FeatureField, throw: bool = True) -> FeatureField:
 class FeatureFit(AbstractStreamingFit[FeatureField]):
     """A fit in random features to the data added so far, made by `RandomFeatures.start`.
 
-    It has a fixed size, 3r² numbers for r columns. `add` returns a new one, and `field` solves
+    It has a fixed size, 4r² numbers for r columns. `add` returns a new one, and `field` solves
     for any λ:
 
         model = hk.RandomFeatures(500, key).start(K, X, 1e-4).add(X, Y)
@@ -154,6 +152,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
         kernel: K.
         features: the features of K.
         sums: the sums over the rows added, of which the least squares are solved.
+        lost: what rounding took from the sums.
         count: N, the number of points added, shape ().
         regularization: the λ of `start`, shape ().
         dimension: n, the number of coordinates of a state.
@@ -162,6 +161,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     kernel: AbstractMatrixKernel
     features: AbstractFeatures
     sums: Sums
+    lost: tuple[Normal]
     count: Int[Array, ""]
     regularization: Float[Array, ""]
     dimension: int = eqx.field(static=True)
@@ -169,17 +169,21 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     def _size(self) -> str:
         return f"features={len(self.sums.basis)}"
 
-    def _added(self, X: Float[Array, "N n"], Y: Float[Array, "N n"]) -> "FeatureFit":
-        spread = rows_of(X)
-        X, Y = split(spread, X), split(spread, Y)
-        sums = _add(self.sums, self.features, X, Y, spread)
-        return eqx.tree_at(lambda f: (f.sums, f.count), self, (sums, self.count + len(X)))
+    def _columns(self) -> tuple[str, Any]:
+        return "features", self.features
 
-    @eqx.filter_jit
-    def _added_rows(self, rows: Measurements) -> "FeatureFit":
+    @property
+    def _totals(self) -> tuple[Any, ...]:
+        return (self.sums.seen,)
+
+    def _of_velocities(
+        self, X: Float[Array, "N n"], Y: Float[Array, "N n"], spread: RowSharding | None
+    ) -> tuple[Any, ...]:
+        return (normal(self.features, self.sums.basis, X, Y, spread),)
+
+    def _of_rows(self, rows: Measurements) -> tuple[Any, ...]:
         design = FeatureSpan(self.kernel, self.features, self.dimension).of_rows(rows)
-        new = add_rows(self.sums, design, rows.targets), self.count + rows.count
-        return eqx.tree_at(lambda f: (f.sums, f.count), self, new)
+        return (Normal.of(design @ self.sums.basis, rows.targets),)
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
         return _checked(_solution(self, count, regularization))
@@ -190,20 +194,19 @@ def _start(K, basis, sample, regularization):
     identity = jnp.eye(basis.columns, dtype=sample.targets.dtype)
     if sample.states is None:
         design = FeatureSpan(K, basis, sample.dimension).of_rows(sample)
-        seen = Normal.zero(identity).plus(design, sample.targets)
+        seen = Normal.of(design, sample.targets)
     else:
         seen = normal(basis, identity, *sample.states)
+    sums = first_sums(seen, identity, sample.count, regularization)
     return FeatureFit(
         kernel=K,
         features=basis,
-        sums=first_sums(seen, identity, sample.count, regularization),
+        sums=sums,
+        lost=(sums.seen,),
         count=jnp.zeros((), int),
         regularization=regularization,
         dimension=sample.dimension,
     )
-
-
-_add = eqx.filter_jit(add_velocities)
 
 
 @eqx.filter_jit
