@@ -285,15 +285,11 @@ def point(x: ArrayLike, n: int, name: str = "x") -> Float[Array, " n"]:
     return array
 
 
-_NOT_MEASURED = " Where NaN means that a component was not measured, pass hk.Velocities(X, Y)."
-_TRACED = (
-    " Where NaN means that a component was not measured, make hk.Velocities(X, Y) outside of "
-    "jax.jit: inside, it is not known which they are."
-)
-
-
 def data(
-    X: ArrayLike, Y: ArrayLike, part: bool = False, cure: str = _NOT_MEASURED
+    X: ArrayLike,
+    Y: ArrayLike,
+    part: bool = False,
+    cure: str = " Where NaN means that a component was not measured, pass hk.Velocities(X, Y).",
 ) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
     """States and velocities: two finite float arrays of one shape (N, n) and one dtype.
 
@@ -326,7 +322,11 @@ def measured(X: ArrayLike, Y: ArrayLike) -> tuple[Array, Array, np.ndarray | Non
     X, Y = points(X, "X"), points(Y, "Y")
     seen = on_host(Y)
     if not is_concrete(Y):
-        return *data(X, Y, part=True, cure=_TRACED), None
+        cure = (
+            " Where NaN means that a component was not measured, make hk.Velocities(X, Y) outside "
+            "of jax.jit: inside, it is not known which they are."
+        )
+        return *data(X, Y, part=True, cure=cure), None
     if not (seen != seen).any():
         return *data(X, Y, part=True), None
     if not Y.is_fully_addressable:

@@ -11,9 +11,6 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-_WIDTH = 88  # of a line, beyond which each attribute has its own
-_PRINTED = 16  # numbers of a vector that are printed
-
 
 def described(module: Any, positional: tuple[str, ...] = ()) -> str:
     """`Gaussian(lengthscale=3.28)`: the attributes as they are read, few numbers as values.
@@ -54,7 +51,7 @@ def in_brackets(sum_of_terms: str) -> str:
 
 
 def _fits(line: str) -> bool:
-    return len(line) <= _WIDTH and "\n" not in line
+    return len(line) <= 88 and "\n" not in line
 
 
 def _indented(lines: str) -> str:
@@ -83,7 +80,7 @@ def _is_short(value: Any) -> bool:
             return False
     elif not isinstance(value, np.ndarray):
         return False
-    return value.ndim <= 1 and value.size <= _PRINTED
+    return value.ndim <= 1 and value.size <= 16
 
 
 def text(value: Any) -> str:

@@ -160,14 +160,11 @@ def _with_deviation(value: float, deviation: float) -> str:
     return f"{value:.{-power}f}({digits})"
 
 
-_FUNCTIONS = "sin|cos|tan|sinh|cosh|tanh|exp|log|sqrt|arctan"
-
-
 def _latex(name: str) -> str:
     """A name written as Python, in LaTeX."""
     if "\\" in name:
         return name
     name = re.sub(r"\*\*\s*\(([^()]*)\)|\*\*\s*(-?[\w.]+)", lambda m: f"^{{{m[1] or m[2]}}}", name)
-    name = re.sub(rf"\b({_FUNCTIONS})\b", r"\\\1", name)
+    name = re.sub(r"\b(sin|cos|tan|sinh|cosh|tanh|exp|log|sqrt|arctan)\b", r"\\\1", name)
     name = re.sub(r"(?<![\\\w])([A-Za-z])_?(\d+)\b", r"\1_{\2}", name)
     return re.sub(r"\s*\*\s*", r"\\,", name)

@@ -49,10 +49,7 @@ from hamkernel._structures.mechanics import UnknownMasses
 from hamkernel._structures.structure import CurlFree
 from hamkernel._trajectories.learned import Learned
 
-_SUBSETS = 1_000_000  # 4 s of CPU time and 150 MB
-_AT_ONCE = 20_000  # subsets in one stack of QR factorisations
 _SAME = 1e-6  # of a function and its image under a symmetry, between rounding and a wrong sign
-_POOR = 2.0  # the misfit of a formula that leaves three quarters of its residuals unexplained
 
 
 def readout(
@@ -111,7 +108,7 @@ def readout(
     _check_columns(names, columns, typical, y, float(jnp.finfo(rows.targets.dtype).eps))
     found = _selected(columns, y, min(most, len(names)))
     misfit = math.sqrt(found.variance / float(ridge))
-    if misfit > _POOR:
+    if misfit > 2.0:  # three quarters of the residuals are then not noise
         require.warn(
             f"the formula leaves {misfit:.3g} times the noise of the fit: a term is missing from "
             "the dictionary or more than `most` are needed; or the regularization, whose Nλ is "
@@ -331,10 +328,10 @@ def _selected(columns: np.ndarray, y: np.ndarray, most: int) -> _Selection:
     R, D = columns.shape
     most = min(most, R - 1)
     count = sum(math.comb(D, k) for k in range(1, most + 1))
-    if count > _SUBSETS:
+    if count > 1_000_000:  # which take 4 s of CPU time and 150 MB
         raise ValueError(
             f"{D} terms have {count} subsets of up to {most}, and all are compared: give fewer "
-            f"terms or a smaller `most`, for at most {_SUBSETS} subsets."
+            f"terms or a smaller `most`, for at most 1000000 subsets."
         )
     sizes = np.linalg.norm(columns, axis=0)
     T = np.asarray(np.linalg.qr(np.column_stack([columns / sizes, y]), mode="r"))
@@ -344,7 +341,8 @@ def _selected(columns: np.ndarray, y: np.ndarray, most: int) -> _Selection:
     for k in range(1, most + 1):
         prior = k * math.log(R) + 2 * math.log(math.comb(D, k))
         subsets = itertools.combinations(range(D), k)
-        while len(some := np.array(list(itertools.islice(subsets, _AT_ONCE)), int)):
+        # 20 000 of them in one stack of QR factorisations.
+        while len(some := np.array(list(itertools.islice(subsets, 20_000)), int)):
             theta, inverse, squares = _least_squares(T, some)
             squares = np.maximum(squares, floor)
             scores.append(R * np.log(squares) + prior)

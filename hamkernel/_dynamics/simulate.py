@@ -23,9 +23,6 @@ Between = Literal["held", "linear"]
 
 # Bounds the loop where the number of steps is not known beforehand: some seconds of a cheap field.
 _MAX_STEPS = 2**20
-# The loosest default tolerance. At an equilibrium f is zero and has no digits at all; with 1e-6
-# states are right to a few digits.
-_LOOSEST = 1e-6
 _RESULTS: Any = diffrax.RESULTS
 
 
@@ -315,7 +312,8 @@ def _tolerances(
             learned, point = learned.whole, learned.joined(x0, rhs.inputs(start))
         if isinstance(learned, KernelField):
             Z, A = learned.points, learned.coefficients
-            share = field_rounding(learned.kernel, point, Z, A, learned(point), _LOOSEST)
+            # At an equilibrium f is zero and has no digits at all; with 1e-6 states have a few.
+            share = field_rounding(learned.kernel, point, Z, A, learned(point), 1e-6)
             default = jnp.maximum(default, share)
 
     def tolerance(name: str, given: Any) -> Float[Array, ""]:

@@ -334,12 +334,10 @@ def potential_of(field: Callable[..., Any], kernel: AbstractMatrixKernel) -> Sca
     )
 
 
-BATCH = 1024  # states at which a field is evaluated at once: 8 MB of waves for 1000 features
-
-
 def at_points(fn: Callable[..., Any], X: Float[Array, "N n"]) -> Float[Array, "N *out"]:
     """fn(x) at many states, in bounded memory, in their dtype."""
-    return jax.lax.map(lambda x: jnp.asarray(fn(x)).astype(X.dtype), X, batch_size=BATCH)
+    # 1024 states at once: of 1000 random features 8 MB of waves.
+    return jax.lax.map(lambda x: jnp.asarray(fn(x)).astype(X.dtype), X, batch_size=1024)
 
 
 def root(square: Float[Array, ""]) -> Float[Array, ""]:

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel._features import AbstractFeatures, SumFeatures
-from hamkernel._fields.base import BATCH, AbstractField, SolverInfo, at_points, root
+from hamkernel._fields.base import AbstractField, SolverInfo, at_points, root
 from hamkernel._gram.dense import centred
 from hamkernel._gram.operator import placed_product
 from hamkernel._machine import as_given, on_each, rows_of, split
@@ -227,4 +227,4 @@ def _potential_at(features, x, weights):
 def _evaluate(field, X, spread):
     if spread is not None:
         return on_each(spread, lambda field, X: _evaluate(field, X, None), field, X, joined=True)
-    return jax.lax.map(field._learned, X, batch_size=BATCH)
+    return at_points(field._learned, X)

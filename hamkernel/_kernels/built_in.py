@@ -31,8 +31,6 @@ from hamkernel._kernels.base import (
 from hamkernel._kernels.symmetry import is_diagonal, is_orthogonal, is_permutation
 from hamkernel._machine import orthonormal
 
-_LENGTH = "It is a length in the units of the states."
-
 
 def squared_distance(x: Float[Array, " n"], z: Float[Array, " n"], cut: bool) -> Float[Array, ""]:
     """‖x − z‖² as x·x + z·z − 2 x·z, which under two vmaps is one matrix product.
@@ -66,6 +64,12 @@ def orthogonal_normal(
     Q, _ = orthonormal(jax.random.normal(directions, (blocks, n, n), dtype))
     rows = Q.reshape(blocks * n, n)[:count]
     return rows * jnp.linalg.norm(jax.random.normal(lengths, (count, n), dtype), axis=1)[:, None]
+
+
+def log_length(lengthscale: ArrayLike) -> Float[Array, "..."]:
+    """The logarithm of a lengthscale of the states."""
+    cure = "It is a length in the units of the states."
+    return log_per_coordinate(lengthscale, "lengthscale", cure)
 
 
 class AbstractRadialKernel(AbstractScalarKernel):
@@ -133,7 +137,7 @@ class Gaussian(AbstractRadialKernel):
     cuts_rounding: ClassVar[bool] = False
 
     def __init__(self, lengthscale: ArrayLike = 1.0):
-        self.log_lengthscale = log_per_coordinate(lengthscale, "lengthscale", _LENGTH)
+        self.log_lengthscale = log_length(lengthscale)
 
     def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
         return jnp.exp(-0.5 * s)
@@ -176,7 +180,7 @@ class Matern(AbstractRadialKernel):
             )
         if not (nu > 0.5 and nu % 1 == 0.5):  # refuses NaN and inf as well
             raise ValueError(f"Matern needs nu = 1.5, 2.5, 3.5, ...; got {nu}.")
-        self.log_lengthscale = log_per_coordinate(lengthscale, "lengthscale", _LENGTH)
+        self.log_lengthscale = log_length(lengthscale)
         self.nu = nu
 
     def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
@@ -240,7 +244,7 @@ class RationalQuadratic(AbstractRadialKernel):
 
     def __init__(self, alpha: ArrayLike = 1.0, lengthscale: ArrayLike = 1.0):
         self.log_alpha = jnp.log(require.positive_scalar(alpha, "alpha"))
-        self.log_lengthscale = log_per_coordinate(lengthscale, "lengthscale", _LENGTH)
+        self.log_lengthscale = log_length(lengthscale)
 
     @property
     def alpha(self) -> Float[Array, ""]:

@@ -22,14 +22,6 @@ from hamkernel import _require as require
 from hamkernel._kernels.base import UserKernel, as_scalar_kernel
 from hamkernel._machine import one_blas_thread
 
-_POINTS, _GRAM_ROWS = 8, 256  # points that meet neighbours; rows of the Gram of blocks
-# Between M(x, x) and all of its near neighbours, relative to the larger of both: a sound kernel
-# differs by 3 √(√ε/8) = .02 in float32, a block that is twice too large by .5.
-_DIFFERS = 0.3
-# Halvings of h, a factor of 1000, over which only a kernel of the distance keeps growing: a sound
-# one with a second, smaller scale passes that in two or three.
-_HALVINGS = 10
-
 _CURE = (
     "Write the kernel as a profile of the squared distance s = ‖x - z‖² with exact derivatives at "
     "s = 0 instead of through the distance, or use a kernel of this library (hk.Matern, …)."
@@ -71,8 +63,8 @@ def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     eps = _check_signature(k, X)
     X = np.asarray(X)
     N, n = X.shape
-    subset = _spaced(N, min(64, max(8, _GRAM_ROWS // n)))
-    near = _spaced(len(subset), _POINTS)
+    subset = _spaced(N, min(64, max(8, 256 // n)))  # the Gram of blocks has some 256 rows
+    near = _spaced(len(subset), 8)  # those that meet neighbours
     spread, size = np.ptp(X.astype(float), axis=0), np.abs(X.astype(float)).max(axis=0)
     unit = np.where(spread > 0, spread, np.where(size > 0, size, 1.0))
     here, Z = X[subset], _neighbours(X[subset[near]], unit, size, eps)
@@ -202,9 +194,13 @@ def _check_limits(own: _Pairs, between: _Pairs, beyond: _Pairs, index, unit, eps
     grows: Any = (size[..., 1:] > 1.2 * size[..., :-1]) & finite[..., 1:] & finite[..., :-1]
     grows &= (moved <= 0.1 * np.where(finite, moved, 0).max(axis=2, keepdims=True))[..., :-1]
     for p, i in enumerate(index):
-        steady = max(_longest(row) for row in grows[p]) >= _HALVINGS
+        # Over 10 halvings of h, a factor of 1000, only a kernel of the distance keeps growing: a
+        # sound one with a second, smaller scale passes that in two or three. And from M(x, x) all
+        # near neighbours of a sound one differ by 3 √(√ε/8) = .02 in float32, of a block that is
+        # twice too large by .5.
+        steady = max(_longest(row) for row in grows[p]) >= 10
         rows = zip(near[p], differs[p], strict=True)
-        wrong = any(row.any() and off[row].min() > _DIFFERS for row, off in rows)
+        wrong = any(row.any() and off[row].min() > 0.3 for row, off in rows)
         if not (steady or wrong or not np.isfinite(own.block[p]).all()):
             continue
         last = [np.flatnonzero(row)[-1] for row in near[p] if row.any()]

@@ -30,7 +30,6 @@ from hamkernel._show import call, text
 # A function, or the rows of a matrix.
 LinearMap = Callable[[Array], Array] | tuple[tuple[float, ...], ...]
 
-MOST = 64  # elements of a group; the largest point group of space, that of the cube, has 48
 _SAME_MAP = 1e-8  # far above the rounding of 64 products, far below the steps of a group of 64
 
 
@@ -157,9 +156,9 @@ def closed(
                 )
             if not found:
                 group.append(new)
-            if len(group) > MOST:
+            if len(group) > 64:  # the largest point group of space, that of the cube, has 48
                 raise ValueError(
-                    f"the maps generate more than {MOST} others, so they do not close to a finite "
+                    "the maps generate more than 64 others, so they do not close to a finite "
                     "group of use here. A rotation must be by 2π over a whole number, given with "
                     "all digits; a shear or a stretch never closes, and a continuous symmetry "
                     "cannot be averaged over so."

@@ -34,10 +34,6 @@ from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.problem import AbstractSolver
 from hamkernel._structures.base import AbstractMatrixKernel
 
-# Nλ in units of ε trace(G) below which a failure is one of rounding. On 87 points of an orbit they
-# converged at 3e4 and did not at 3e2, where Cholesky left a residual of 4e-12.
-_DIGITS = 1e4
-
 
 class _Found(NamedTuple):
     learned: tuple[Array, Array, Array]  # coefficients, residual and norm
@@ -141,7 +137,9 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                     f"{float(truncation):.1e})"
                 )
                 rounding = float(gram_rounding(trace(K, X, rows_of(X))))
-                if ridge < _DIGITS * rounding:
+                # On 87 points of an orbit they converged at 3e4 of it and did not at 3e2, where
+                # Cholesky left a residual of 4e-12.
+                if ridge < 1e4 * rounding:
                     return (
                         f"conjugate gradients did not converge{reached}: the ridge N λ = "
                         f"{float(ridge):.2g} is {float(ridge) / rounding:.2g} times the rounding "

@@ -272,11 +272,6 @@ def gram_product(
     return rows.contrast(rows.of(field._evaluated, potential))
 
 
-# ‖y − (G + σ²I)c‖/‖y‖ up to which a factorisation counts as a solution. The fitted values were
-# measured to be wrong by 1 to 10 times this number, from full accuracy down to none.
-_SOLVED = 1e-2
-
-
 def _solved(field: KernelField, left: Array, N: int, throw: bool = True) -> KernelField:
     """The field, if the factorisation succeeded."""
     regularization = field.regularization
@@ -298,7 +293,9 @@ def _solved(field: KernelField, left: Array, N: int, throw: bool = True) -> Kern
     def learned(f):
         return f.coefficients, f.residual, f.norm, f.value_coefficients
 
-    failed = ~(require.on_host(left) <= _SOLVED)
+    # Fitted values were measured to be wrong by 1 to 10 times ‖y − (G + σ²I)c‖/‖y‖, from full
+    # accuracy down to none.
+    failed = ~(require.on_host(left) <= 1e-2)
     if throw and require.is_concrete(failed):  # the field as it is, in less time
         return require.value(field, failed, message, RuntimeError)
     values = require.value(learned(field), failed, message, RuntimeError, throw)

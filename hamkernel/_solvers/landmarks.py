@@ -37,7 +37,6 @@ from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel
 
 BLOCK = 16  # candidates drawn at once
-FIRST = 64  # landmarks in the first buffer; it doubles until they suffice
 
 
 class Landmarks(eqx.Module):
@@ -162,7 +161,7 @@ def _chosen(
     """The index of the chosen candidates, which of their columns are kept, and how many."""
     if not require.is_concrete(candidates, left, key):
         return _first(_begin(candidates, left, key, most), most)
-    size = min(FIRST, most)
+    size = min(64, most)  # of the buffer, which doubles until it suffices
     drawn = _begin(candidates, left, key, size)
     while int(drawn.count) >= size and size < most:
         size = min(2 * size, most)

@@ -31,13 +31,6 @@ from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, whitening
 from hamkernel._structures.base import AbstractMatrixKernel
 
-# Landmarks are drawn until they leave this share of tr K(x, x) over the region, or so many are
-# chosen: 100 in the plane for a region of a few lengthscales; the features do the rest.
-_LEFT, _MOST = 1e-6, 192
-_CANDIDATES = 2048  # points of the region that they are chosen from, beside those of the data
-_FREQUENCIES = 256  # of each draw
-_AT_ONCE = 4  # draws; 400 together took 1.5 GB and half as long again
-
 
 class Prior(eqx.Module):
     """Draws f₀: coefficients at points that all share, and weights of features or None."""
@@ -118,10 +111,12 @@ def prior_draws(
     """
     of_region, of_landmarks, of_draws = jax.random.split(key, 3)
     low, high = region
-    share = jax.random.uniform(of_region, (_CANDIDATES, len(low)), X.dtype)
+    share = jax.random.uniform(of_region, (2048, len(low)), X.dtype)
     X = jnp.concatenate([X, low[None] + (high - low)[None] * share])
-    left = _LEFT * jnp.mean(block_traces(K, X))
-    landmarks = choose_landmarks(K, X, left, _MOST, len(X), of_landmarks)
+    # Until they leave 1e-6 of tr K(x, x) over the region, or 192 are chosen: 100 in the plane for a
+    # region of a few lengthscales; the features do the rest.
+    left = 1e-6 * jnp.mean(block_traces(K, X))
+    landmarks = choose_landmarks(K, X, left, 192, len(X), of_landmarks)
     return _drawn(K, landmarks, of_draws, count)
 
 
@@ -134,7 +129,7 @@ def _drawn(K, landmarks: Landmarks, key, count: int) -> Prior:
     w = jax.random.normal(on_landmarks, (count, m * n), S.dtype)
 
     def basis(key):
-        return features(K, d, _FREQUENCIES, key, S.dtype)
+        return features(K, d, 256, key, S.dtype)
 
     try:
         columns = eqx.filter_eval_shape(basis, key).columns
@@ -147,5 +142,6 @@ def _drawn(K, landmarks: Landmarks, key, count: int) -> Prior:
         basis, weights = draw
         return jax.vmap(lambda x: basis.field(x, weights))(S).reshape(-1)
 
-    g = jax.lax.map(at_landmarks, (waves, weights), batch_size=_AT_ONCE)  # (count, m n)
+    # Four draws at once: 400 together took 1.5 GB and half as long again.
+    g = jax.lax.map(at_landmarks, (waves, weights), batch_size=4)  # (count, m n)
     return Prior(K, S, ((w - g @ T) @ T.T).reshape(count, m, n), waves, weights)

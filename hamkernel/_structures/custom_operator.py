@@ -18,8 +18,6 @@ from hamkernel._show import call, text
 from hamkernel._structures.structure import AbstractPotentialKernel, check_symmetries
 
 Operator = Callable[[Float[Array, " n"]], Any]
-_CHECKED_STATES = 16  # points at which a symmetry of B is checked: one would do, but for zeros
-_SYMMETRIC = 1e-6  # of Π at the data: rounding in float32 leaves 1e-7, a wrong sign 1
 
 
 class AbstractCustomOperator(AbstractPotentialKernel):
@@ -70,7 +68,7 @@ class AbstractCustomOperator(AbstractPotentialKernel):
                 f"X[{int(bad.argmax())}]: it must be defined at every state of the data."
             )
         self._check_values(matrices, X)
-        check_symmetries(self, X[:_CHECKED_STATES])
+        check_symmetries(self, X[:16])  # one would do, but for zeros
 
 
 class Structured(AbstractCustomOperator):
@@ -152,8 +150,9 @@ class Poisson(AbstractCustomOperator):
     def _check_values(self, matrices, X) -> None:
         size = np.abs(matrices).max(axis=(1, 2))
         symmetric = np.abs(matrices + np.swapaxes(matrices, 1, 2)).max(axis=(1, 2)) / 2
-        worst = int(np.argmax(symmetric - _SYMMETRIC * size))
-        if symmetric[worst] > _SYMMETRIC * size[worst]:
+        # Rounding in float32 leaves 1e-7 of Π, a wrong sign 1.
+        worst = int(np.argmax(symmetric - 1e-6 * size))
+        if symmetric[worst] > 1e-6 * size[worst]:
             raise ValueError(
                 f"the tensor of Poisson is not antisymmetric: at X[{worst}] = "
                 f"{np.round(np.asarray(X[worst]), 4).tolist()} its symmetric part is as large as "

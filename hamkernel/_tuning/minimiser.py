@@ -22,16 +22,6 @@ import jax.numpy as jnp
 import optimistix as optx
 from jaxtyping import Array, Bool, Float, Int
 
-# A step is taken if it lowers the value by this share of what the slope promises. Small: as the
-# curvature becomes known a step of full length is good, and none is to be refused.
-_SUFFICIENT = 1e-4
-# Of the box, which is π wide, that a first step crosses, where no curvature is known.
-_FIRST = 0.1 * jnp.pi
-# A step is at most so long: half of the box, where a quadratic model is no longer one.
-_LONGEST = 0.5 * jnp.pi
-_SHORTEST = 1e-8  # a step that moves no more than half the digits of u finds only rounding
-_HUGE = 1e30  # stands for a value that is not finite: a line search backs away from it
-
 
 def inside_box(u: Array, low: Array, high: Array) -> Array:
     """The point h = low + (high − low)(1 + sin u)/2 of the box, all of the same shape."""
@@ -52,8 +42,9 @@ def from_box(h: Array, low: Array, high: Array, margin: float) -> Array:
 class LimitedNewton(optx.AbstractDescent):
     """The direction −H g, H the inverse Hessian and g the slope, no longer than half of the box.
 
-    Where H is still the identity nothing is known of it: the direction is then down the slope, a
-    tenth of the box long.
+    Beyond half of the box, which is π wide, a quadratic model is no longer one. Where H is still
+    the identity nothing is known of it: the direction is then down the slope, a tenth of the box
+    long.
     """
 
     def init(self, y, f_info_struct):
@@ -65,7 +56,7 @@ class LimitedNewton(optx.AbstractDescent):
         direction = -(H @ slope)
         length = jnp.linalg.norm(direction)
         unknown = jnp.all(H == jnp.eye(len(y), dtype=H.dtype))
-        most = jnp.where(unknown, _FIRST, jnp.minimum(length, _LONGEST))
+        most = jnp.where(unknown, 0.1 * jnp.pi, jnp.minimum(length, 0.5 * jnp.pi))
         return direction * (most / jnp.where(length > 0, length, jnp.ones_like(length)))
 
     def step(self, step_size, state):
@@ -75,7 +66,9 @@ class LimitedNewton(optx.AbstractDescent):
 class ParabolicSearch(optx.AbstractSearch):
     """A step that is refused is followed by one to the minimum of the parabola through both values.
 
-    It is a tenth to a half as long. A step is accepted by the condition of Armijo.
+    It is a tenth to a half as long. A step is accepted by the condition of Armijo, if it lowers the
+    value by 1e-4 of what the slope promises. Small: as the curvature becomes known a step of full
+    length is good, and none is to be refused.
     """
 
     def init(self, y, f_info_struct):
@@ -85,7 +78,7 @@ class ParabolicSearch(optx.AbstractSearch):
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
         promised = f_info.grad @ (y_eval - y)
         change = f_eval_info.f - f_info.f
-        accept = first_step | (change <= _SUFFICIENT * promised)
+        accept = first_step | (change <= 1e-4 * promised)
         share = jnp.clip(-promised / (2 * (change - promised)), 0.1, 0.5)
         size = jnp.where(accept, jnp.ones_like(state), state * share)
         return size, accept, optx.RESULTS.successful, size
@@ -109,7 +102,8 @@ class BoxBFGS(optx.AbstractBFGS):
         promised = -(state.f_info.grad @ state.descent_state) / 2
         step = jnp.linalg.norm(state.y_eval - y)
         converged = promised < self.atol
-        stuck = step <= _SHORTEST * (1 + jnp.linalg.norm(y))
+        # A step that moves no more than half the digits of u finds only rounding.
+        stuck = step <= 1e-8 * (1 + jnp.linalg.norm(y))
         result = optx.RESULTS.where(
             stuck & ~converged, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
         )
@@ -209,12 +203,6 @@ def minimised(
     return eqx.combine(jax.lax.while_loop(going, step, arrays), static)
 
 
-# Of its standard deviation: no hyperparameter need be nearer to its best value. −log p is quadratic
-# there, and ½ .1² is what may still be gained.
-_NEAR = 0.1
-_MARGIN = 0.01  # of the box, by which a start on its edge is moved inside
-
-
 def most_likely_in_box(
     fn: Callable[[Float[Array, " P"]], Float[Array, ""]],
     start: Float[Array, " P"],
@@ -228,8 +216,10 @@ def most_likely_in_box(
     `deviations` are the standard deviations of h that the likelihood leaves, as far as they are
     known: their squares are the inverse Hessian that BFGS begins with.
     """
-    bfgs = BoxBFGS(atol=jnp.asarray(_NEAR**2 / 2, start.dtype))
-    u = from_box(start, low, high, _MARGIN)
+    # No hyperparameter need be nearer to its best value than a tenth of its standard deviation:
+    # −log p is quadratic there, and ½ .1² is what may still be gained.
+    bfgs = BoxBFGS(atol=jnp.asarray(0.005, start.dtype))
+    u = from_box(start, low, high, 0.01)
     width = jnp.where(high > low, high - low, jnp.ones_like(low))
     inverse = jnp.diag((2 * deviations / (width * jnp.cos(u))) ** 2)
 
@@ -259,7 +249,8 @@ def _with_slope_backward(fn: Minimised) -> Callable[[Array, Any], tuple[Array, P
         # `seen` is False in the zeros that optimistix begins with.
         seen = jnp.isfinite(u).all()
         point = Point(seen, u, value.astype(u.dtype), loss.astype(u.dtype))
-        return jnp.where(jnp.isfinite(point.value), point.value, _HUGE), point
+        # A line search backs away from a huge number as it would not from infinity.
+        return jnp.where(jnp.isfinite(point.value), point.value, 1e30), point
 
     differentiable = jax.custom_jvp(looked_at)
 

@@ -142,10 +142,9 @@ class SearchObjective(eqx.Module):
         return jnp.maximum(beyond, 0) ** 2
 
 
-# The first part has so many points, or so many rows of its Gram; with half as many the best run
-# often leads to a poor optimum of all the data. The second part has so many rows, and is there
-# where all points have at least twice as many. See `tests/benchmarks/tuning_speed.py`.
-FIRST_POINTS, FIRST_ROWS, SECOND_ROWS = 64, 256, 1024
+# Rows of the Gram of the first part, or 64 points where these are fewer; with half as many the best
+# run often leads to a poor optimum of all the data (`tests/benchmarks/tuning_speed.py`).
+FIRST_ROWS = 256
 
 
 def parts_of(
@@ -155,7 +154,8 @@ def parts_of(
     N, n = rows.count, len(rows.targets) / rows.count
     if criterion.custom:  # it may need all the data
         return [np.arange(N)]
-    counts = [min(FIRST_POINTS, max(int(FIRST_ROWS / n), 2)), int(SECOND_ROWS / n)]
+    # The second part has 1024 rows, and is there where all points have at least twice as many.
+    counts = [min(64, max(int(FIRST_ROWS / n), 2)), int(1024 / n)]
     if 2 * counts[1] > N:
         del counts[1]
     if counts[0] >= N:

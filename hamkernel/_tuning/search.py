@@ -26,22 +26,10 @@ from hamkernel._tuning.objective import FIRST_ROWS, SearchCriterion, SearchObjec
 from hamkernel._tuning.space import SearchSpace
 
 _TOLERANCE = 1e-4  # of the logarithm of a loss: what a run may still gain at its end
-# The same where it goes on with more points. On seven problems of 120 points this took 391 losses
-# of the subset and 23 of all points; 1e-2 took 328 and 29, 1e-4 476 and 22, with the same fields.
-_COARSE = 1e-3
 # Ends that are finished: with one, the better optimum of two that are within a few per cent on the
 # subset was missed (96 points of `tuning_speed.py`, a loss 3 % larger).
 _FINISHED = 2
-# Of the box: ends that are closer are one. Without it 25 losses of all points for 23.
-_SAME = 0.01
-# With a second part the last one only corrects the best that it found. On so many points the loss
-# follows what happens to be held out: with 1, 2, 3 and 6 steps the median loss of 141 runs of a
-# pendulum, six seeds, was .0126, .0118, .0114 and .0112, and the median field error .0025, .0025,
-# .0026 and .0026.
-_LAST_STEPS = 2
 _LONG = 60.0  # seconds of which the caller is told beforehand
-_CALLS_OF_A_RUN, _CALLS_OF_THE_LAST = 25, 5  # of the loss, as the estimates count
-_DESIGN_POINTS = 64  # for each direction of the box, and four at most
 
 
 class Search:
@@ -86,17 +74,29 @@ class Search:
         parts = parts_of(self.rows, self.criterion, dense=low_rank is None)
         part = self._part(self.criterion, parts[0])
         only = len(parts) == 1 and low_rank is None
-        runs = self._first(part, _TOLERANCE if only else _COARSE)
+        # 1e-3 where it goes on with more points: on seven problems of 120 points this took 391
+        # losses of the subset and 23 of all points; 1e-2 took 328 and 29, 1e-4 476 and 22, with the
+        # same fields.
+        runs = self._first(part, _TOLERANCE if only else 1e-3)
         if only:
             return runs
         ends = _joined(_take(runs, _different(runs)), self._given(part))
         last = parts[-1] if len(parts) > 2 else None
         for more in parts[1:]:
             steps = self.max_steps
-            if more is last:  # the caller's point has lost on the part before
-                steps, ends = _LAST_STEPS, _take(ends, [0])
-            growth = (len(more) / part.count) ** 3
-            self._warn_of_waiting(part.seconds * growth * _CALLS_OF_THE_LAST, _SMALLER)
+            if more is last:
+                # It only corrects the best that the second part found, where the caller's point
+                # has lost. On so many points the loss follows what happens to be held out: with 1,
+                # 2, 3 and 6 steps the median loss of 141 runs of a pendulum, six seeds, was .0126,
+                # .0118, .0114 and .0112, and the median field error .0025, .0025, .0026 and .0026.
+                steps, ends = 2, _take(ends, [0])
+            growth = (len(more) / part.count) ** 3  # and some five losses
+            self._warn_of_waiting(
+                5 * growth * part.seconds,
+                "The price of the loss grows with the cube of N n: pass a part of the data and fit "
+                "all of it with what is found, or a solver whose loss is of low rank, "
+                "solver=hk.Nystrom() or solver=hk.RandomFeatures(count, key).",
+            )
             part = self._part(self.criterion, more)
             runs, ends = self._finished(part, ends, steps)
         if low_rank is not None and runs.best.value.min() < np.inf:
@@ -118,7 +118,7 @@ class Search:
         runs = self._looked_at(part, _take(begun, [0]), minimiser)
         if self.starts > 1:
             others = self._looked_at(part, _take(begun, np.arange(1, len(points))), minimiser)
-            seconds = part.seconds * self.starts * _CALLS_OF_A_RUN
+            seconds = 25 * self.starts * part.seconds  # a run takes some 25 losses
             self._warn_of_waiting(seconds, f"Pass fewer starts than {self.starts}.")
             chosen = spread_out(points[1:], others.best.value, self.starts - 1)
             runs = _joined(runs, _take(others, chosen))
@@ -186,13 +186,6 @@ class Search:
             require.warn(f"this search will take about {seconds / 60:.0f} minutes. {cure}")
 
 
-_SMALLER = (
-    "The price of the loss grows with the cube of N n: pass a part of the data and fit all of it "
-    "with what is found, or a solver whose loss is of low rank, solver=hk.Nystrom() or "
-    "solver=hk.RandomFeatures(count, key)."
-)
-
-
 def best(runs: MinimiserRun) -> MinimiserRun:
     """The run that found the least value."""
     return _take(runs, int(np.argmin(runs.best.value)))
@@ -203,7 +196,8 @@ def _different(runs: MinimiserRun) -> list[int]:
     ends: list[int] = []
     for i in np.argsort(runs.best.value, kind="stable"):
         apart = [shares_apart(runs.best.u[i], runs.best.u[j]) for j in ends]
-        if runs.best.value[i] < np.inf and min(apart, default=1.0) > _SAME:
+        # Without the hundredth of the box 25 losses of all points were taken for 23.
+        if runs.best.value[i] < np.inf and min(apart, default=1.0) > 0.01:
             ends.append(int(i))
     return ends
 
@@ -321,7 +315,7 @@ def design(directions: Sequence[int]) -> Float[np.ndarray, "count P"]:
     too short or too long, and hardly a start would lead to a good optimum.
     """
     d = max(directions) + 1
-    count = _DESIGN_POINTS * min(d, 4)
+    count = 64 * min(d, 4)
     root = 2.0
     for _ in range(64):  # the positive solution of root^(d + 1) = root + 1
         root = (1 + root) ** (1 / (d + 1))

@@ -187,11 +187,8 @@ def _checked_problem(
     """Kernel, rows and λ."""
     # LAPACK on every device at once was seen to stall, see `_solvers/factors.py`.
     given = problem(K, X, Y, regularization, inputs=inputs, parameters=parameters).on_one_device()
-    check_memory(given.rows, LOSS_COPIES)
+    check_memory(given.rows, 3)  # matrices of the size of the Gram, with the gradient
     return given.kernel, given.rows, given.regularization
-
-
-LOSS_COPIES = 3  # matrices of the size of the Gram that a loss holds, with its gradient
 
 
 def check_memory(rows: Measurements, copies: int) -> None:

@@ -156,11 +156,6 @@ def _models(
 
 
 _TIMES = 100  # steps of the test trajectory
-_PORTRAIT = 2.25  # horizons of the test that the orbits in the portraits run: two turns
-_POINTS = 10_000  # where the odd error is sampled, as in the paper
-_POINTS_KEY = 2023  # the same points for every kernel and seed
-_BATCH = 20  # seeds in one call of the compiled program, whatever their number
-_SIZE = 24  # fields get points without weight up to a multiple of this, see `_padded`
 
 
 class Outcome(eqx.Module):
@@ -240,9 +235,11 @@ def evaluate(
     """
     (low_q, high_q), (low_p, high_p) = experiment.box
     corner, opposite = jnp.asarray([max(low_q, 0.0), low_p]), jnp.asarray([high_q, high_p])
-    uniform = jax.random.uniform(jax.random.key(_POINTS_KEY), (_POINTS, 2))
+    # As many points as in the paper, the same for every kernel and seed.
+    uniform = jax.random.uniform(jax.random.key(2023), (10_000, 2))
     step = experiment.horizon / _TIMES
-    ts = step * jnp.arange(round(_PORTRAIT * _TIMES) + 1, dtype=X.dtype)
+    # The orbits in the portraits run for 2.25 horizons of the test: two turns.
+    ts = step * jnp.arange(round(2.25 * _TIMES) + 1, dtype=X.dtype)
     starts = jnp.asarray([experiment.test_state, *experiment.initial_states])
     accuracy = jnp.asarray(tolerance, X.dtype)
     true, energy = _truth(experiment.system, starts, ts, accuracy)
@@ -274,7 +271,7 @@ def _fit(kernels_and_data) -> KernelField:
 
 def _padded(fields: KernelField) -> KernelField:
     """The same fields with points that carry no weight, so that all experiments are one program."""
-    extra = -fields.points.shape[1] % _SIZE
+    extra = -fields.points.shape[1] % 24
 
     def longer(a: Float[Array, "S N n"]) -> Float[Array, "S M n"]:
         return jnp.pad(a, ((0, 0), (0, extra), (0, 0)))
@@ -284,9 +281,9 @@ def _padded(fields: KernelField) -> KernelField:
 
 
 def _in_batches(fn: Callable, seeds):
-    """fn(seeds), a PyTree with the leading axis S of that argument, `_BATCH` of them at a time."""
+    """fn(seeds), a PyTree with the leading axis S of that argument, 20 of them at a time."""
     S = len(jax.tree.leaves(seeds)[0])
-    batch = min(_BATCH, S)
+    batch = min(20, S)
     parts = []
     for start in range(0, S, batch):
         # The last batch is filled up with the last seed, so that no other size is compiled.

@@ -13,7 +13,6 @@ from hamkernel.paper._tuned import GRID, Comparison
 
 Models = Mapping[str, Outcome]
 
-_TUNED = "pendulum_m1"  # the experiment whose tuning is drawn
 _DPI = 150  # 1200 pixels over 8 inches: sharp at the 800 of a README
 
 
@@ -52,8 +51,9 @@ def tuning_figure(
         comparisons: by experiment and model.
         out: an existing folder.
     """
-    path = out / f"{_TUNED}_tuning.png"
-    figure = tuning(experiments()[_TUNED], comparisons[_TUNED]["odd_symplectic"])
+    name = "pendulum_m1"
+    path = out / f"{name}_tuning.png"
+    figure = tuning(experiments()[name], comparisons[name]["odd_symplectic"])
     figure.savefig(path, dpi=_DPI)
     return path
 

@@ -272,8 +272,6 @@ Outcomes = dict[str, dict[str, dict[str, Outcome]]]
 Comparisons = dict[str, dict[str, Comparison]]
 Data = Mapping[str, tuple[Float[Array, "S N n"], Float[Array, "S N n"]]]
 
-TUNED_SEEDS = 20  # of the seeds: enough for a median
-
 
 def reproduce(
     out: str | pathlib.Path = "results",
@@ -341,7 +339,7 @@ def retune(
     path = pathlib.Path(out) / "results.json"
     if not path.exists():
         raise FileNotFoundError(f"no {path}: run hamkernel.paper.reproduce({str(out)!r}) first.")
-    seeds = min(seeds, TUNED_SEEDS)
+    seeds = min(seeds, 20)  # enough for a median
     comparisons = _comparisons(_data(seeds), progress)
     results = json.loads(path.read_text())
     for name, models in comparisons.items():

@@ -24,10 +24,6 @@ from hamkernel.paper._experiments import STRUCTURES, Experiment, evaluate
 
 FOLDS = 5
 GRID = np.geomspace(0.3, 30.0, 30), np.geomspace(1e-10, 1.0, 25)  # σ, λ
-_START = 1.0, 1e-3  # σ, λ from which `tune` sets out
-# The tolerance of the test trajectories. Where the data asks for the flat limit (σ -> ∞, λ -> 0), a
-# field rounds at about 1e-9, and with a smaller tolerance 100 times as many steps were measured.
-_TOLERANCE = 1e-6
 
 
 class Choice(NamedTuple):
@@ -90,7 +86,9 @@ def compare(
             X,
             Y,
             regularization,
-            tolerance=_TOLERANCE,
+            # Where the data asks for the flat limit (σ -> ∞, λ -> 0), a field rounds at about 1e-9,
+            # and with a smaller tolerance 100 times as many steps were measured.
+            tolerance=1e-6,
         )
         return Choice(lengthscale, regularization, loss, seconds, outcome.quantities)
 
@@ -133,7 +131,7 @@ def _lowest(surface: np.ndarray) -> _Found:
 
 
 def _by_gradient(make, x, y) -> _Found:
-    tuned = tune(make(Gaussian(_START[0])), x, y, _START[1], FOLDS)
+    tuned = tune(make(Gaussian(1.0)), x, y, 1e-3, FOLDS)
     # The only hyperparameter of these kernels, which is stored as a logarithm.
     (leaf,) = jax.tree.leaves(eqx.filter(tuned.kernel, eqx.is_inexact_array))
     return _Found(float(np.exp(leaf)), float(tuned.regularization), float(tuned.loss))

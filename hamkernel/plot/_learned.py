@@ -14,6 +14,7 @@ from matplotlib.ticker import MaxNLocator
 
 from hamkernel._discovery.compare import QUESTIONS, THRESHOLD, Comparison
 from hamkernel.plot._style import (
+    BLUE,
     COLORS,
     STREAM,
     Limits,
@@ -194,9 +195,6 @@ def _in_one_format(values: list[float]) -> list[str]:
     return texts
 
 
-_BLUE = "#0072B2"
-
-
 @drawn
 def ensemble(
     ys: Float[ArrayLike, "S T n"],
@@ -204,7 +202,7 @@ def ensemble(
     ax: Axes | None = None,
     *,
     dims: tuple[int, int] = (0, 1),
-    color: str = _BLUE,
+    color: str = BLUE,
     title: str | None = None,
     units: Texts | None = None,
     names: Texts | None = None,
@@ -251,10 +249,6 @@ def ensemble(
     return ax
 
 
-# Standard deviations on either side that hold a share of a normal variable, and how it is shaded.
-_SHARES = ((0.9, 1.645, 0.18), (0.5, 0.674, 0.38))
-
-
 @drawn
 def band(
     ts: Float[ArrayLike, " T"],
@@ -263,7 +257,7 @@ def band(
     true: Float[ArrayLike, " T"] | None = None,
     ax: Axes | None = None,
     *,
-    color: str = _BLUE,
+    color: str = BLUE,
     xlabel: str = "time $t$",
     ylabel: str = "",
     unit: str | None = None,
@@ -294,7 +288,8 @@ def band(
     if (deviation < 0).any():
         raise ValueError("deviation is negative somewhere: standard deviations are needed.")
     ax = axes(ax, figsize=(5.6, 3.6))
-    for share, width, shade in _SHARES:
+    # A share of a normal variable, the standard deviations that hold it, and its shade.
+    for share, width, shade in ((0.9, 1.645, 0.18), (0.5, 0.674, 0.38)):
         reach = width * deviation
         name = f"{share:.0%}"
         ax.fill_between(
@@ -362,9 +357,6 @@ def _length(fn: Callable[[Array], Array], x: Float[Array, "2"]) -> Float[Array, 
     return jnp.linalg.norm(jnp.atleast_1d(fn(x)))
 
 
-_SHOWN = 60.0  # beyond, a bar ends at the edge: e⁶⁰ to one needs no comparing
-
-
 @drawn
 def comparison(compared: Comparison, ax: Axes | None = None) -> Axes:
     """How far the score of each candidate is below the best, the best on top, and the answers.
@@ -381,16 +373,17 @@ def comparison(compared: Comparison, ax: Axes | None = None) -> Axes:
     """
     count = len(compared.table)
     ax = axes(ax, figsize=(7.0, 0.8 + 0.27 * count))
+    most = 60.0  # e⁶⁰ to one needs no comparing
     for place, row in enumerate(compared.table):
         behind = -row.difference
         near = behind <= THRESHOLD
         color = COLORS["symplectic"] if near else STREAM
-        ax.barh(place, min(behind, _SHOWN), color=color, height=0.7)
-        ax.text(min(behind, _SHOWN) + 0.6, place, f"{behind:.1f}", va="center", fontsize="small")
+        ax.barh(place, min(behind, most), color=color, height=0.7)
+        ax.text(min(behind, most) + 0.6, place, f"{behind:.1f}", va="center", fontsize="small")
     ax.axvline(THRESHOLD, color=COLORS["true"], linestyle="--", linewidth=1)
     ax.set_yticks(range(count), [row.name for row in compared.table])
     ax.invert_yaxis()
-    ax.set_xlim(0.0, 1.12 * _SHOWN)
+    ax.set_xlim(0.0, 1.12 * most)
     ax.set_xlabel("score below the best (log evidence)")
     pairs = QUESTIONS.items()
     answers = [f"{question.rstrip('?')}: {compared.answers[key]}" for key, question in pairs]

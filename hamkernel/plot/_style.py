@@ -23,9 +23,7 @@ COLORS: Mapping[str, str] = {
     "symplectic": "#009E73",
     "odd_symplectic": "#0072B2",
 }
-_OTHERS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-_DASHES: Mapping[str, Any] = {"separable": (0, (5, 1.5)), "symplectic": (0, (1, 1))}
-
+BLUE = "#0072B2"
 STREAM = "#AEB6BF"  # stream lines and other background
 DATA = "#E69F00"
 
@@ -77,12 +75,14 @@ def line_styles(series: Mapping[str | None, Any]) -> Iterator[dict[str, Any]]:
     """Colour, dashes, width, order and legend entry of each curve."""
     keys = [(name or "").lower().replace(" ", "_") for name in series]
     taken = {COLORS[key] for key in keys if key in COLORS}
-    others = itertools.cycle([color for color in _OTHERS if color not in taken])
+    palette = (BLUE, "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
+    others = itertools.cycle([color for color in palette if color not in taken])
+    dashes: dict[str, Any] = {"separable": (0, (5, 1.5)), "symplectic": (0, (1, 1))}
     for name, key in zip(series, keys, strict=True):
         color = COLORS[key] if key in COLORS else next(others)
         yield {
             "color": color,
-            "linestyle": _DASHES.get(key, "-"),
+            "linestyle": dashes.get(key, "-"),
             "label": name and name.replace("_", " "),
             "linewidth": 1.6,
             "zorder": 3,

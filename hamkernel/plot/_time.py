@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from hamkernel import _require as require
 from hamkernel._trajectories.flow import simulated
 from hamkernel.plot._style import (
+    BLUE,
     COLORS,
     DATA,
     axes,
@@ -189,7 +190,6 @@ def _finish(
     return ax
 
 
-_BLUE = "#0072B2"
 _SIGMAS = 2.0  # standard deviations on either side, which hold 95 % of a normal variable
 _BETWEEN = 9  # points a sample, between which a curve looks smooth
 
@@ -234,8 +234,8 @@ def smoothing(
     for c, panel in enumerate(panels):
         low, high = mean[:, c] - reach[:, c], mean[:, c] + reach[:, c]
         name = rf"$\pm{_SIGMAS:g}\sigma$"
-        panel.fill_between(ts, low, high, color=_BLUE, alpha=0.25, linewidth=0, label=name)
-        panel.plot(ts, mean[:, c], color=_BLUE, linewidth=1.4, label="smoothed")
+        panel.fill_between(ts, low, high, color=BLUE, alpha=0.25, linewidth=0, label=name)
+        panel.plot(ts, mean[:, c], color=BLUE, linewidth=1.4, label="smoothed")
         _samples(panel, runs, run, c)
         _over_time(panel, ts, labels[c])
     return _finished(panels, f"run {run}" if title is None else title, time_unit)
@@ -290,7 +290,7 @@ def fitted(
     path = np.concatenate([np.asarray(between[:, :-1]).reshape(-1, n), fit[-1:]])
     residuals, misfit = np.asarray(learned.residuals[run]), np.asarray(learned.misfit[run])
     for c, (left, right) in enumerate(panels):
-        left.plot(grid, path[:, c], color=_BLUE, linewidth=1.4, label="fitted")
+        left.plot(grid, path[:, c], color=BLUE, linewidth=1.4, label="fitted")
         _samples(left, learned.runs, run, c)
         _over_time(left, ts, labels[c])
         right.axhspan(-_SIGMAS, _SIGMAS, color="0.9", linewidth=0)
