@@ -166,22 +166,14 @@ __all__ = [  # noqa: RUF022 - in reading order
 
 __version__ = "0.1.0"
 
-# Loaded when first asked for, so that `import hamkernel` loads neither diffrax nor matplotlib.
-_LAZY = {
-    "simulate": "_dynamics.simulate",
-    "ImplicitMidpoint": "_dynamics.symplectic",
-    "GaussLegendre4": "_dynamics.symplectic",
-    "GaussLegendre6": "_dynamics.symplectic",
-    "StormerVerlet": "_dynamics.symplectic",
-    "Yoshida4": "_dynamics.symplectic",
-}
-
 
 def __getattr__(name: str) -> Any:
-    if name in _LAZY:
-        return getattr(importlib.import_module(f"hamkernel.{_LAZY[name]}"), name)
+    # Loaded when first asked for, so that `import hamkernel` loads neither diffrax nor matplotlib.
     if name in ("plot", "paper"):
         return importlib.import_module(f"hamkernel.{name}")
+    if name in __all__:  # what is not loaded yet: `simulate` and the integrators
+        file = "simulate" if name == "simulate" else "symplectic"
+        return getattr(importlib.import_module(f"hamkernel._dynamics.{file}"), name)
     raise AttributeError(f"module 'hamkernel' has no attribute {name!r}")
 
 

@@ -25,7 +25,7 @@ from hamkernel._kernels.base import Invariance, Scaled
 from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._machine import one_blas_thread
 from hamkernel._observations.blocks import AbstractBlock, Values
-from hamkernel._observations.kinds import AbstractObservations, beside
+from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import inputs_of, observations
 from hamkernel._show import text
 from hamkernel._solvers.dense import Cholesky
@@ -235,7 +235,7 @@ class Posterior(eqx.Module):
             ValueError: the new data has another n, or does not fit itself. RuntimeError: the new
                 rows are so close to the old ones that the factor fails.
         """
-        given = beside(inputs, parameters, self.given.field.kernel)
+        given = inputs_or_parameters(inputs, parameters, self.given.field.kernel)
         data, old = observations(X, Y, given, part=True), self.given.rows
         if data.dimension != old.dimension:
             raise ValueError(

@@ -133,6 +133,30 @@ def _values_at_points(K, X, S, b):
 _of_values, _values = eqx.filter_jit(_value_field), eqx.filter_jit(_value_potential)
 
 
+def kernel_field(
+    K: AbstractMatrixKernel,
+    representer: tuple[Array, Array, Array, Array],
+    residual: Float[Array, "..."],
+    norm: Float[Array, ""],
+    regularization: Float[Array, ""],
+    info: SolverInfo,
+) -> KernelField:
+    """The field Σ K(x, z) a + Σ b k(·, s) of a representer (z, a, s, b), without an anchor."""
+    Z, A, S, b = representer
+    return KernelField(
+        kernel=K,
+        points=Z,
+        coefficients=A,
+        residual=residual,
+        norm=norm,
+        regularization=regularization,
+        offset=jnp.zeros((), A.dtype),
+        info=info,
+        value_points=S if len(S) else None,
+        value_coefficients=b if len(S) else None,
+    )
+
+
 class FeatureField(AbstractField):
     """f(x) = Σ_r w_r φ_r(x), φ_r random features with the structure of the kernel.
 

@@ -123,7 +123,7 @@ def refuse_swapped(X: Any, Y: Any, inputs: Any) -> None:
         )
 
 
-def beside(inputs: Any, parameters: Any, K: Any = None) -> Any:
+def inputs_or_parameters(inputs: Any, parameters: Any, K: Any = None) -> Any:
     """The inputs or the parameters, whichever were given; None if neither was.
 
     Raises:
@@ -151,7 +151,7 @@ def inputs_at(
         TypeError: both are given. ValueError: the shape does not fit, or a value is not finite.
     """
     name, letter = ("inputs", "U") if parameters is None else ("parameters", "Θ")
-    given = beside(inputs, parameters)
+    given = inputs_or_parameters(inputs, parameters)
     if given is None:
         return None
     U = require.floating(given, name)

@@ -11,6 +11,7 @@ trace(G − Ĝ) ≤ τρ the condition is at most 1 + τ and the iterations do n
 """
 
 import abc
+from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
@@ -98,20 +99,16 @@ class ConjugateGradient(AbstractSolver[KernelField]):
         X, spread = rows.points, rows_of(rows.points)
         landmarks = self.preconditioner.landmarks(K, rows, problem.regularization)
         limits = self._tolerance(rows.targets.dtype), self.max_iterations
-        shown = progress and require.is_concrete(K, rows, ridge)
+        prepare: Callable[..., tuple[AbstractProducts, Array]]
         if problem.states is None:
-            given = K, rows, ridge, landmarks
-            if shown:
-                found = _shown(_prepared_rows_alone(*given), rows.y, ridge, *limits)
-            else:
-                found = _solve_rows(*given, *limits)
+            prepare, given, y = _prepared_rows, (K, rows, ridge, landmarks), rows.y
         else:
-            X, Y = (split(spread, each) for each in problem.states)
-            if shown:
-                prepared = _prepared_alone(K, X, ridge, landmarks, spread)
-                found = _shown(prepared, Y, ridge, *limits)
-            else:
-                found = _solve(K, X, Y, ridge, landmarks, *limits, spread)
+            X, y = (split(spread, each) for each in problem.states)
+            prepare, given = _prepared, (K, X, ridge, landmarks, spread)
+        if progress and require.is_concrete(K, rows, ridge):
+            found = _shown(_prepared_alone(prepare, given), y, ridge, *limits)
+        else:
+            found = _solve(prepare, given, y, ridge, *limits)
         (c, left, norm), info = self._converged(K, X, ridge, landmarks, found, throw)
         left = as_given(spread, rows.residual(left.reshape(-1)))
         return field_of_rows(K, rows, c.reshape(-1), left, norm, problem.regularization, info)
@@ -238,15 +235,13 @@ def _prepared_rows(K, rows, ridge, landmarks):
 
 
 @eqx.filter_jit
-def _solve(K, X, Y, ridge, landmarks, tolerance, max_iterations, spread):
-    prepared = _prepared(K, X, ridge, landmarks, spread)
-    return _iterated(*prepared, Y, ridge, tolerance, max_iterations)
+def _prepared_alone(prepare, given):
+    return prepare(*given)
 
 
 @eqx.filter_jit
-def _solve_rows(K, rows, ridge, landmarks, tolerance, max_iterations):
-    prepared = _prepared_rows(K, rows, ridge, landmarks)
-    return _iterated(*prepared, rows.y, ridge, tolerance, max_iterations)
+def _solve(prepare, given, y, ridge, tolerance, max_iterations):
+    return _iterated(*prepare(*given), y, ridge, tolerance, max_iterations)
 
 
 def _iterated(
@@ -326,7 +321,3 @@ def _next(products: AbstractProducts, y, ridge, at: _Iterate) -> _Iterate:
 @eqx.filter_jit
 def _finished(products: AbstractProducts, truncation, y, ridge, tolerance, start) -> _Found:
     return _iterated(products, truncation, y, ridge, tolerance, 2, start)
-
-
-_prepared_alone = eqx.filter_jit(_prepared)
-_prepared_rows_alone = eqx.filter_jit(_prepared_rows)

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo, at_points, root
-from hamkernel._fields.expansions import KernelField
+from hamkernel._fields.expansions import KernelField, kernel_field
 from hamkernel._gram.dense import (
     between,
     gram_of_rows,
@@ -247,19 +247,7 @@ def field_of_rows(
     info: SolverInfo,
 ) -> KernelField:
     """The field Σ c_r L_r K, at the points of the rows."""
-    Z, A, S, b = rows.coefficients(c)
-    return KernelField(
-        kernel=K,
-        points=Z,
-        coefficients=A,
-        residual=residual,
-        norm=norm,
-        regularization=regularization,
-        offset=jnp.zeros((), c.dtype),
-        info=info,
-        value_points=S if len(S) else None,
-        value_coefficients=b if len(S) else None,
-    )
+    return kernel_field(K, rows.coefficients(c), residual, norm, regularization, info)
 
 
 def gram_product(

@@ -26,7 +26,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Key
 from hamkernel import _require as require
 from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import AbstractField, SolverInfo, root
-from hamkernel._fields.expansions import FeatureField, KernelField, feature_field
+from hamkernel._fields.expansions import FeatureField, KernelField, feature_field, kernel_field
 from hamkernel._gram.dense import between, components, plus_ridge, trace_of_rows
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
@@ -163,25 +163,14 @@ class LandmarkSpan(AbstractSpan):
 
     def field(self, w, residual, ridge, N, truncation) -> KernelField:
         landmarks = self.landmarks
-        Z, A, S, b = landmarks.representer(self.T @ w)
         info = SolverInfo(
             "Nystrom",
             landmarks=landmarks.count,
             rank=landmarks.kept.sum(),
             truncation=truncation,
         )
-        return KernelField(
-            kernel=self.kernel,
-            points=Z,
-            coefficients=A,
-            residual=residual,
-            norm=root(w @ w),
-            regularization=ridge / N,
-            offset=jnp.zeros((), A.dtype),
-            info=info,
-            value_points=S if len(S) else None,
-            value_coefficients=b if len(S) else None,
-        )
+        representer = landmarks.representer(self.T @ w)
+        return kernel_field(self.kernel, representer, residual, root(w @ w), ridge / N, info)
 
     def draws(self, weights, rows, key, region) -> KernelField:
         everywhere = jnp.concatenate([self.landmarks.rows.points, rows.points])

@@ -23,7 +23,7 @@ from hamkernel._fields.base import AbstractField, KnownPart, at_points, known_pa
 from hamkernel._fields.joined import at_inputs
 from hamkernel._machine import RowSharding, is_on_one_device, on_one_device, rows_of
 from hamkernel._observations.blocks import AbstractBlock
-from hamkernel._observations.kinds import AbstractObservations, beside
+from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import Measurements, measurements, measurements_of
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.joined import AbstractJoinedKernel
@@ -85,7 +85,7 @@ def problem(
             potential.
     """
     spread = rows_of(X) if isinstance(X, jax.Array) else None
-    K, rows = measurements(matrix_kernel(K), X, Y, beside(inputs, parameters, K))
+    K, rows = measurements(matrix_kernel(K), X, Y, inputs_or_parameters(inputs, parameters, K))
     K.check_points(rows.points)
     if len(rows.energies) and K.no_potential:
         raise AttributeError(f"energies were given, and {K.no_potential}")

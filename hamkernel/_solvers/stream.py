@@ -28,7 +28,7 @@ from hamkernel._fields.base import known_part
 from hamkernel._fields.joined import learned_field
 from hamkernel._gram.dense import components
 from hamkernel._machine import RowSharding, one_blas_thread, rows_of, split
-from hamkernel._observations.kinds import AbstractObservations, beside
+from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import (
     Measurements,
     measurements_of,
@@ -158,7 +158,9 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
                 all data at once. TypeError: the dtype, or it has more digits than the fit. The fit
                 is then as it was before.
         """
-        rows = self._checked_rows(observations(X, Y, beside(inputs, parameters), part=True))
+        rows = self._checked_rows(
+            observations(X, Y, inputs_or_parameters(inputs, parameters), part=True)
+        )
         if rows.states is None:
             return _with_rows(self, rows)
         X, Y = (each.astype(self.dtype) for each in rows.states)
@@ -332,12 +334,12 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
         K = matrix_kernel(K)
         if isinstance(sample, AbstractObservations):
             K, rows = measurements_of(
-                K, placed(observations(sample, None, beside(inputs, parameters)))
+                K, placed(observations(sample, None, inputs_or_parameters(inputs, parameters)))
             )
             _refuse_energies(rows)
         else:
             sample = require.finite(require.points(sample, "sample"), "sample")
-            K, points = sampled_points(K, sample, beside(inputs, parameters))
+            K, points = sampled_points(K, sample, inputs_or_parameters(inputs, parameters))
             rows = rows_at(K, points)
         K.check_dimension(rows.points.shape[1])
         require.warn_of_float32(rows.targets)
@@ -401,7 +403,9 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
                 X, Y = require.data(*chunk[:2], part=True)
             U = chunk[2] if len(chunk) == 3 else None
             if model is None:
-                first, given = (X, U) if sample is None else (sample, beside(inputs, parameters))
+                first, given = (
+                    (X, U) if sample is None else (sample, inputs_or_parameters(inputs, parameters))
+                )
                 model = self.start(K, first, regularization, given)
             # The next chunk is read while this one is added, and no further ones pile up.
             jax.block_until_ready(model)

@@ -73,7 +73,7 @@ class AbstractMatrixKernel(eqx.Module):
         x, z = require.same_space(one_point(x)[None], one_point(z)[None])
         x, z = x[0], z[0]
         self.check_dimension(len(x))
-        basis = jnp.eye(len(x), dtype=x.dtype)
+        basis = jnp.eye(self.outputs(len(x)), dtype=x.dtype)
         columns = jax.vmap(self.form, in_axes=(None, None, None, 0))
         return jax.vmap(columns, in_axes=(None, 0, None, None))(x, basis, z, basis)
 
@@ -168,6 +168,11 @@ class AbstractMatrixKernel(eqx.Module):
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
+def total(values: list[Array]) -> Array:
+    """The sum of the terms of a kernel, which has one at least."""
+    return functools.reduce(operator.add, values)
+
+
 class Sum(AbstractMatrixKernel):
     """K₁(x, z) + K₂(x, z) + …: fields that are sums of fields with different structures.
 
@@ -213,18 +218,18 @@ class Sum(AbstractMatrixKernel):
         return call("Sum", [f"{name}={K!r}" if name else repr(K) for name, K in pairs])
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
-        return functools.reduce(operator.add, [K.form(x, u, z, v) for K in self.terms])
+        return total([K.form(x, u, z, v) for K in self.terms])
 
     def expansion(self, x: Array, Z: Array, A: Array) -> Float[Array, " n"]:
-        return functools.reduce(operator.add, [K.expansion(x, Z, A) for K in self.terms])
+        return total([K.expansion(x, Z, A) for K in self.terms])
 
     def potential(self, x: Array, Z: Array, A: Array) -> Float[Array, ""]:
         self.check_potential()
-        return functools.reduce(operator.add, [K.potential(x, Z, A) for K in self.terms])
+        return total([K.potential(x, Z, A) for K in self.terms])
 
     def potential_covariance(self, x: Array, z: Array) -> Float[Array, ""]:
         self.check_potential()
-        return functools.reduce(operator.add, [K.potential_covariance(x, z) for K in self.terms])
+        return total([K.potential_covariance(x, z) for K in self.terms])
 
     @property
     def no_potential(self) -> str | None:

@@ -8,8 +8,6 @@ the members are fields of K, with all its structure, and k says how alike two of
 some members tell of the others. Dependences of their own for several parts add up.
 """
 
-import functools
-import operator
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -27,7 +25,7 @@ from hamkernel._kernels.base import (
 )
 from hamkernel._kernels.built_in import Constant
 from hamkernel._show import call, joined
-from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel
+from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel, total
 from hamkernel._structures.joined import AbstractJoinedKernel
 
 
@@ -68,25 +66,25 @@ class AbstractFamily(AbstractJoinedKernel):
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
         (x, theta), (z, other) = self.split(x), self.split(z)
-        return _sum([t.parameters(theta, other) * t.member.form(x, u, z, v) for t in self.terms])
+        return total([t.parameters(theta, other) * t.member.form(x, u, z, v) for t in self.terms])
 
     def expansion(self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Points) -> Point:
         (x, theta), (Z, T) = self.split(x), self.split(Z)
-        return _sum([t.member.expansion(x, Z, t.coefficients_at(theta, T, A)) for t in self.terms])
+        return total([t.member.expansion(x, Z, t.coefficients_at(theta, T, A)) for t in self.terms])
 
     def potential(
         self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Float[Array, "M n"]
     ) -> Float[Array, ""]:
         self.check_potential()
         (x, theta), (Z, T) = self.split(x), self.split(Z)
-        return _sum([t.member.potential(x, Z, t.coefficients_at(theta, T, A)) for t in self.terms])
+        return total([t.member.potential(x, Z, t.coefficients_at(theta, T, A)) for t in self.terms])
 
     def potential_covariance(
         self, x: Float[Array, " d"], z: Float[Array, " d"]
     ) -> Float[Array, ""]:
         self.check_potential()
         (x, theta), (z, other) = self.split(x), self.split(z)
-        return _sum(
+        return total(
             [t.parameters(theta, other) * t.member.potential_covariance(x, z) for t in self.terms]
         )
 
@@ -211,7 +209,3 @@ class FamilySum(AbstractFamily):
 def _terms(K: AbstractMatrixKernel) -> tuple["Family", ...]:
     """The terms of a family; what does not depend on θ is shared by all members."""
     return K.terms if isinstance(K, AbstractFamily) else (Family(K),)
-
-
-def _sum(values: list[Array]) -> Array:
-    return functools.reduce(operator.add, values)

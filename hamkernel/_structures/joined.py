@@ -28,7 +28,6 @@ from hamkernel._kernels.base import (
     Points,
     Scaled,
     as_scalar_kernel,
-    one_point,
 )
 from hamkernel._kernels.built_in import Constant
 from hamkernel._kernels.symmetry import LinearMap
@@ -115,14 +114,6 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
         They set the bounds of the hyperparameters of the part, which are states by default.
         """
         return self.split(X)[0], amplitude
-
-    def __call__(self, x: Float[Array, " d"], z: Float[Array, " d"]) -> Float[Array, "n n"]:
-        """The block for two joined points (x, u)."""
-        x, z = require.same_space(one_point(x)[None], one_point(z)[None])
-        self.check_points(x)
-        basis = jnp.eye(self.outputs(x.shape[1]), dtype=x.dtype)
-        columns = jax.vmap(self.form, in_axes=(None, None, None, 0))
-        return jax.vmap(columns, in_axes=(None, 0, None, None))(x[0], basis, z[0], basis)
 
     def check_dimension(self, n: int) -> None:
         """`n` counts the coordinates of u, too."""

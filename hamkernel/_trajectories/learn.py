@@ -19,7 +19,7 @@ from hamkernel._gram.operator import placed_product
 from hamkernel._kernels.base import Scaled
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._machine import one_blas_thread
-from hamkernel._observations.kinds import beside
+from hamkernel._observations.kinds import inputs_or_parameters
 from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
@@ -358,7 +358,9 @@ def _check(
     n = runs.dimension
     given = runs.inputs if runs.parameters is None else runs.parameters
     if K.takes_inputs and given is not None:
-        beside(runs.inputs, runs.parameters, K)  # refuses the one in the place of the other
+        inputs_or_parameters(
+            runs.inputs, runs.parameters, K
+        )  # refuses the one in the place of the other
     if isinstance(K, AbstractFamily) and given is None:
         raise TypeError(
             "a Family needs to know of which system each run is: hk.Runs(times, states, "

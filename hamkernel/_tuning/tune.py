@@ -24,7 +24,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, Mean
 from hamkernel._machine import one_blas_thread
-from hamkernel._observations.kinds import AbstractObservations, beside
+from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import observations
 from hamkernel._show import described
 from hamkernel._solvers.fit import check_solver, solved
@@ -203,7 +203,7 @@ def tune(
     K, rows = given.kernel, given.on_one_device().rows
     if rows.states is not None:
         _warn_of_unequal_sizes(rows.states[1])
-    inputs = beside(inputs, parameters)
+    inputs = inputs_or_parameters(inputs, parameters)
     plain = mean is None and inputs is None and not isinstance(X, AbstractObservations)
     data: Any = rows.states if plain else (observations(X, Y, inputs), None)
     criterion = criterion_of(objective, rows.count, folds, data)
