@@ -241,7 +241,8 @@ def _prepared_alone(prepare, given):
 
 @eqx.filter_jit
 def _solve(prepare, given, y, ridge, tolerance, max_iterations):
-    return _iterated(*prepare(*given), y, ridge, tolerance, max_iterations)
+    products, truncation = prepare(*given)
+    return _iterated(products, truncation, y, ridge, tolerance, max_iterations)
 
 
 def _iterated(
