@@ -45,6 +45,7 @@ def condition(
     mean: Mean | None = None,
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
+    progress: bool = False,
 ) -> Posterior:
     """Condition the Gaussian process GP(mean, K) on data: `fit` with error bars.
 
@@ -71,6 +72,7 @@ def condition(
             inputs as well, `posterior.deviation(x, u)`.
         parameters: of a `Family`: θ at each state, shape (N, p): `posterior.deviation(x, θ)`. The
             deviation grows to that of the prior outside of the range of θ.
+        progress: show a progress bar of the blocks of `Cholesky`, as in `fit`.
 
     Returns:
         The posterior. O(D³) time and O(D²) memory for D rows, with a solver of rank r O(D r²).
@@ -89,7 +91,7 @@ def condition(
     asked = problem(K, X, Y, regularization, mean, inputs, parameters).on_one_device()
     require.warn_of_float32(asked.rows.targets)
     _warn_of_amplitude(asked.kernel, asked.rows.points)
-    given = solver._given(asked)
+    given = solver._given(asked, progress=progress)
     return Posterior(given, learned_field(given.field, asked.known))
 
 

@@ -83,7 +83,10 @@ def save(path: str | os.PathLike[str], field: AbstractField | AbstractStreamingF
             f"{type(field).__name__}. For the result of tune pass tuned.field."
         )
     if not require.is_concrete(field):
-        raise ValueError("save writes numbers and cannot run under jax.jit, grad or vmap.")
+        raise ValueError(
+            "save writes numbers, and there are none yet under jax.jit, grad or vmap: return the "
+            "field from there, and save it outside."
+        )
     spread = not all(map(_is_here, jax.tree.leaves(field)))
     field = jax.tree.map(_whole, field)
     described = description(field, [], "field")

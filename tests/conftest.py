@@ -7,9 +7,13 @@ import zlib
 # Before NumPy loads. The threads of BLAS in two workers on two cores wait for each other: half of
 # the time of test_validation_low_rank.py.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Most programs run once, and compiling them as for a user takes a third of the suite's time more.
-# `.ci/run` does that for its slow tests and those of rounding, with an empty XLA_FLAGS.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
+# Most programs run once, and compiling them as for a user takes 2.5 times the suite's CPU time:
+# LLVM's optimiser is a third of it, and a pipeline of MLIR for each fusion half of the rest
+# (test_observations.py: 86 s with that pipeline, 43 without).
+# `.ci/run` compiles as for a user for its slow tests and those of rounding, with empty XLA_FLAGS.
+os.environ.setdefault(
+    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+)
 
 import jax
 import pytest

@@ -348,7 +348,6 @@ def test_conjugate_gradients_find_the_exact_coefficients(name):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["states", "rows"])
 def test_iterations_that_are_shown_end_at_the_same_field(kind, capsys, monkeypatch):
     X, Y = swings(150)
@@ -362,6 +361,17 @@ def test_iterations_that_are_shown_end_at_the_same_field(kind, capsys, monkeypat
     said = capsys.readouterr().err
     assert "conjugate gradients" in said
     assert "residual" in said
+
+
+@pytest.mark.parametrize("ask", [hk.fit, hk.condition])
+def test_blocks_of_a_factorisation_are_shown(ask, capsys, monkeypatch):
+    monkeypatch.setattr("hamkernel._solvers.dense.IN_PLACE", 100)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    model = hk.Odd(hk.Symplectic(2.0 * hk.Gaussian(1.0)))
+    ask(model, *swings(150), regularization=RIDGE, progress=True)
+    assert "factor" in capsys.readouterr().err
+    ask(model, *swings(150), regularization=RIDGE)
+    assert "factor" not in capsys.readouterr().err
 
 
 def test_a_new_tolerance_of_conjugate_gradients_compiles_nothing():

@@ -148,7 +148,10 @@ def _derivatives_of_pairs(k: Callable, unit: np.ndarray, *pairs) -> list[_Pairs]
         lambda X, Z: jax.lax.map(
             lambda p: (k(*p), jax.grad(k)(*p), _mixed(k)(*p)), (X, Z), batch_size=8192 // n**2 or 1
         ),
-        compiler_options={"xla_backend_optimization_level": 0},
+        compiler_options={
+            "xla_backend_optimization_level": 0,
+            "xla_cpu_use_fusion_emitters": True,
+        },
     )(X, Z)
     values, slopes, blocks = (np.asarray(v, float) for v in values)
     ends = np.cumsum([0, *(x[..., 0].size for x, _ in wide)])
