@@ -70,7 +70,7 @@ def rows_of(array: Array) -> RowSharding | None:
 
 
 def split(rows: RowSharding | None, array: Array) -> Array:
-    """`array` spread as `rows` says, on automatic axes, which leave the rest to the compiler."""
+    """The array spread over the devices of `rows`, on axes that leave the rest to the compiler."""
     if rows is None:
         return automatic(array)
     return jax.device_put(array, NamedSharding(rows.mesh, rows.spec))
@@ -120,7 +120,7 @@ def on_one_device(name: str, array: Array) -> Array:
 
 
 def as_given(rows: RowSharding | None, array: Array) -> Array:
-    """`array`, of one row for each given row, on the mesh that was given."""
+    """The array, of one row for each row of the data, on the mesh on which the data came."""
     if rows is None or isinstance(array, Tracer) or rows.given.mesh == rows.mesh:
         return array
     return jax.device_put(array, rows.given)

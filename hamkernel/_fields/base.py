@@ -341,7 +341,7 @@ def at_points(fn: Callable[..., Any], X: Float[Array, "N n"]) -> Float[Array, "N
 
 
 def root(square: Float[Array, ""]) -> Float[Array, ""]:
-    """√square; zero, with a zero derivative, where rounding or data of zeros leave it ≤ 0."""
+    """√square, and zero with a zero derivative where rounding, or data of zeros, leave it ≤ 0."""
     nothing = square <= 0
     return jnp.where(nothing, 0.0, jnp.sqrt(jnp.where(nothing, jnp.ones_like(square), square)))
 

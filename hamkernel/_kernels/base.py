@@ -281,7 +281,7 @@ class ScalarProduct(AbstractScalarKernel):
     terms: tuple[AbstractScalarKernel, ...]
 
     def __repr__(self) -> str:
-        return joined("*", [_factor(k) for k in self.terms])
+        return joined("*", [_as_factor(k) for k in self.terms])
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         return math.prod((k(x, z) for k in self.terms[1:]), start=self.terms[0](x, z))
@@ -346,7 +346,7 @@ class Scaled(AbstractScalarKernel):
         self.log_scale = jnp.log(require.positive_scalar(scale, "the scale of a kernel"))
 
     def __repr__(self) -> str:
-        return f"{exponential(self.log_scale)} * {_factor(self.kernel)}"
+        return f"{exponential(self.log_scale)} * {_as_factor(self.kernel)}"
 
     @property
     def scale(self) -> Float[Array, ""]:
@@ -387,7 +387,7 @@ class Scaled(AbstractScalarKernel):
         return self.log_scale is not None or self.kernel.has_amplitude
 
 
-def _factor(kernel: AbstractScalarKernel) -> str:
+def _as_factor(kernel: AbstractScalarKernel) -> str:
     return in_brackets(repr(kernel)) if isinstance(kernel, ScalarSum) else repr(kernel)
 
 

@@ -79,11 +79,11 @@ def linear_maps(maps: Any) -> tuple[LinearMap, ...]:
             "maps must be a list of linear maps of the state, (n, n) arrays or functions "
             f"x -> S @ x; got {maps!r}."
         )
-    rows: Any = tuple(each if callable(each) else _rows(each) for each in given)
+    rows: Any = tuple(each if callable(each) else _nested(each) for each in given)
     return rows
 
 
-def _rows(matrix: Any) -> tuple[tuple[float, ...], ...]:
+def _nested(matrix: Any) -> tuple[tuple[float, ...], ...]:
     require.floating(matrix, "a map")
     array = np.asarray(matrix, float)  # all digits, also where JAX would keep those of float32
     if array.ndim != 2 or array.shape[0] != array.shape[1] or not np.isfinite(array).all():
@@ -246,7 +246,7 @@ class Symmetrised(AbstractScalarKernel):
         images = [self.kernel.image(matrix_of(each, n)) for each in self.maps]
         if any(image is None for image in images):
             return None
-        inner = Symmetrised(self.kernel.kernel, tuple(map(_rows, images)), self.characters)
+        inner = Symmetrised(self.kernel.kernel, tuple(map(_nested, images)), self.characters)
         return Descriptor(self.kernel.warped, inner)
 
     def is_one_sided(self, n: int) -> bool:

@@ -173,7 +173,7 @@ def inputs_at(
 def joined_points(
     data: Any, X: Float[Array, "*points n"], count: int, given: str
 ) -> tuple[Float[Array, "*points d"], int | None]:
-    """The points (x, u) and n, where `count` > 0; X and None else."""
+    """The points (x, u) and the dimension n of x; X and None for a kernel of states alone."""
     if not count:
         return X, None
     if data.inputs is None:

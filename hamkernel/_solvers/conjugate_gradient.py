@@ -225,7 +225,7 @@ def _prepared(K, X, ridge, landmarks, spread):
 
 
 def _prepared_rows(K, rows, ridge, landmarks):
-    """`_prepared` for rows of any observations."""
+    """The products for rows of any observations, and the truncation of the preconditioner."""
     K_, rows_, ridge_, marks = constant((K, rows, ridge, landmarks))
     span = landmark_span(K_, marks)
     all_rows = span.of_rows(rows_)

@@ -65,7 +65,7 @@ class DenseConditional(AbstractConditional):
         factor, c, field = _extended(self, new)
         rows = self.rows.joined(new)
         return DenseConditional(
-            _solved(field, jnp.sum(0 * c), rows.count), rows, self.ridge, factor, c
+            _unless_lost(field, jnp.sum(0 * c), rows.count), rows, self.ridge, factor, c
         )
 
     def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> KernelField:
@@ -85,13 +85,15 @@ def dense_conditional(
     """
     rows = problem.rows
     factor, c, field, left = _dense(problem, progress)
-    return DenseConditional(_solved(field, left, rows.count, throw), rows, problem.ridge, factor, c)
+    return DenseConditional(
+        _unless_lost(field, left, rows.count, throw), rows, problem.ridge, factor, c
+    )
 
 
 def dense_field(problem: Problem, throw: bool = True, progress: bool = False) -> KernelField:
     """The field of `dense_conditional` alone."""
     _, _, field, left = _dense(problem, progress, keep=False)
-    return _solved(field, left, problem.rows.count, throw)
+    return _unless_lost(field, left, problem.rows.count, throw)
 
 
 # Rows from which the Gram of velocities is factored in its own place, in blocks.
@@ -128,7 +130,7 @@ def _dense(problem: Problem, progress: bool, keep: bool = True) -> Any:
     K, rows, regularization = problem.kernel, problem.rows, problem.regularization
     _check_memory(problem)
     if not _is_in_place(problem):
-        found = (_conditional if keep else _field)(K, rows, regularization)
+        found = (_compiled_conditional if keep else _field)(K, rows, regularization)
         return found if keep else (None, *found)
     factor = factor_in_place(*_assembled(K, rows, problem.ridge, progress))
     found: Any = _of_factor(K, rows, regularization, factor)
@@ -163,7 +165,7 @@ def _of_factor(K, rows: Measurements, regularization, factor: DenseFactor):
 
 
 def _learned(K, rows: Measurements, regularization, c):
-    """c, its field, and the relative residual ‖y − (G + σ²I)c‖/‖y‖."""
+    """The coefficients c, their field, and the relative residual ‖y − (G + σ²I)c‖/‖y‖."""
     y, ridge = rows.y, rows.count * regularization
     values = gram_product(K, rows, c)  # without the Gram, which the factor has overwritten
     left = relative(y - values - ridge * c, y)
@@ -172,7 +174,7 @@ def _learned(K, rows: Measurements, regularization, c):
     return c, field_of_rows(K, rows, c, residual, norm, regularization, info), left
 
 
-_conditional = eqx.filter_jit(_dense_system)
+_compiled_conditional = eqx.filter_jit(_dense_system)
 
 
 @eqx.filter_jit
@@ -260,7 +262,7 @@ def gram_product(
     return rows.contrast(rows.of(field._evaluated, potential))
 
 
-def _solved(field: KernelField, left: Array, N: int, throw: bool = True) -> KernelField:
+def _unless_lost(field: KernelField, left: Array, N: int, throw: bool = True) -> KernelField:
     """The field, if the factorisation succeeded."""
     regularization = field.regularization
 

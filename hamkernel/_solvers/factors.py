@@ -424,11 +424,11 @@ class ContrastedFactor(AbstractFactor[ContrastedSystem]):
     size: Float[Array, ""]
 
     def solve(self, b: Float[Array, "M *m"]) -> Float[Array, "M *m"]:
-        return _spread(self.constant, self.inner.solve(_contrast(self.constant, b)))
+        return _uncontrast(self.constant, self.inner.solve(_contrast(self.constant, b)))
 
     def solved(self, y: Float[Array, " M"]) -> tuple[Float[Array, " M"], Float[Array, ""]]:
         a, square = self.inner.solved(_contrast(self.constant, y))
-        return _spread(self.constant, a), square
+        return _uncontrast(self.constant, a), square
 
     @property
     def log_det(self) -> Float[Array, ""]:
@@ -440,7 +440,9 @@ class ContrastedFactor(AbstractFactor[ContrastedSystem]):
 
     def inverse(self) -> "ContrastedInverse":
         p = self.constant
-        return ContrastedInverse(DenseInverse(_spread(p, _spread(p, self.inner.inverse().C).T)))
+        return ContrastedInverse(
+            DenseInverse(_uncontrast(p, _uncontrast(p, self.inner.inverse().C).T))
+        )
 
     def trusted(self, y: Float[Array, " M"]) -> Bool[Array, ""]:
         return self.inner.trusted(_contrast(self.constant, y))
@@ -471,7 +473,7 @@ def _contrast(p: Float[Array, " M"], b: Float[Array, "M *m"]) -> Float[Array, "D
     return _reflected(p, b)[1:]
 
 
-def _spread(p: Float[Array, " M"], c: Float[Array, "D *m"]) -> Float[Array, "M *m"]:
+def _uncontrast(p: Float[Array, " M"], c: Float[Array, "D *m"]) -> Float[Array, "M *m"]:
     """Tᵀ c."""
     return _reflected(p, jnp.concatenate([jnp.zeros_like(c[:1]), c]))
 

@@ -115,10 +115,10 @@ def choose_landmarks(
     rows = rows_of(X)
     X = split(rows, X)
     if len(X) > candidates:
-        X = X[_spread(jax.random.split(key)[0], len(X), candidates)]
+        X = X[_stratified(jax.random.split(key)[0], len(X), candidates)]
     if rows is not None:
         X = rows.whole(X)
-    index, kept, count = _chosen(Points(K, X), left, min(most, len(X)), key)
+    index, kept, count = _chosen(PointCandidates(K, X), left, min(most, len(X)), key)
     return Landmarks((components(K, X[index]),), None, kept.reshape(-1), count)
 
 
@@ -150,8 +150,8 @@ def choose_rows(
     size = sum(block.size for block in blocks)
     if size > candidates:
         blocks = _part(blocks, candidates / size, jax.random.split(key)[0])
-    G = _compiled_gram(K, landmarks_of(*blocks))
-    index, kept, count = _chosen(Rows(G), left, min(most, len(G)), key)
+    G = _gram_of_landmarks(K, landmarks_of(*blocks))
+    index, kept, count = _chosen(RowCandidates(G), left, min(most, len(G)), key)
     return _pruned(blocks, index, kept.reshape(-1), count)
 
 
@@ -172,11 +172,11 @@ def _chosen(
 
 
 @eqx.filter_jit
-def _compiled_gram(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r r"]:
+def _gram_of_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r r"]:
     return landmarks.gram(K)
 
 
-def _spread(key, N: int, count: int) -> Int[Array, " count"]:
+def _stratified(key, N: int, count: int) -> Int[Array, " count"]:
     """A random index out of each of `count` equal parts of N, in O(count) memory."""
     ends = np.arange(count + 1) * N // count
     index: Int[Array, " count"] = jax.random.randint(key, (count,), ends[:-1], ends[1:])
@@ -195,7 +195,7 @@ def _part(
             found.append(block)  # which rows there are is not known
             continue
         even = np.arange(count) * block.count // count
-        chosen = even if traced else np.asarray(_spread(key, block.count, count))
+        chosen = even if traced else np.asarray(_stratified(key, block.count, count))
         found.append(block.subset(chosen)[0])
     return tuple(found)
 
@@ -246,7 +246,7 @@ def given_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Landmarks:
 
 
 def landmarks_of(*blocks: AbstractBlock) -> Landmarks:
-    """All rows of blocks, dependent ones too."""
+    """The landmarks that are all rows of some blocks, those that depend on others too."""
     size = sum(block.size for block in blocks)
     return Landmarks(blocks, None, jnp.ones(size, bool), jnp.asarray(size))
 
@@ -300,7 +300,7 @@ class AbstractCandidates(eqx.Module):
         """The rows of the Gram that belong to some of the candidates."""
 
 
-class Points(AbstractCandidates):
+class PointCandidates(AbstractCandidates):
     """All components of the field at points."""
 
     kernel: AbstractMatrixKernel
@@ -319,7 +319,7 @@ class Points(AbstractCandidates):
         return G.reshape(G.shape[0] * G.shape[1], -1)
 
 
-class Rows(AbstractCandidates):
+class RowCandidates(AbstractCandidates):
     """Single rows, whose Gram is a matrix."""
 
     matrix: Float[Array, "P P"]
@@ -434,10 +434,10 @@ def _accepted(key, block, n, rounding):
     """
     before = jnp.diagonal(block).reshape(-1, n).sum(axis=1)
     thresholds = jnp.maximum(jax.random.uniform(key, before.shape, block.dtype) * before, rounding)
-    return _factor(block, thresholds, n, rounding)
+    return _masked_cholesky(block, thresholds, n, rounding)
 
 
-def _factor(block, thresholds, n, rounding):
+def _masked_cholesky(block, thresholds, n, rounding):
     """Cholesky of the points whose trace exceeds its threshold when their turn comes."""
 
     def column(c, carry):

@@ -32,10 +32,10 @@ from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmarks import Landmarks, given_landmarks, whitening
 from hamkernel._solvers.problem import AbstractConditional
-from hamkernel._solvers.sampling import Prior, drawn, prior_draws
+from hamkernel._solvers.sampling import Prior, feature_draw, prior_draws
 from hamkernel._structures.base import AbstractMatrixKernel
 
-Learned = TypeVar("Learned")
+Arrays = TypeVar("Arrays")
 
 
 class Columns(eqx.Module):
@@ -67,13 +67,13 @@ def truncated(
 
 
 def checked(
-    learned: Learned,
+    learned: Arrays,
     landmarks: Landmarks,
     truncation: Float[Array, ""] | None,
     failed: Bool[ArrayLike, ""],
     message: str | Callable[[], str],
     throw: bool,
-) -> Learned:
+) -> Arrays:
     """The arrays `learned` with landmarks; a RuntimeError with `message` where the solve `failed`.
 
     Without landmarks all of the Gram must be missing, unless it is zero, and so is the field.
@@ -217,7 +217,7 @@ class FeatureSpan(AbstractSpan):
 
     def draws(self, weights, rows, key, region) -> FeatureField:
         def one(w):
-            return drawn(self.kernel, self.features, w, self.dimension)
+            return feature_draw(self.kernel, self.features, w, self.dimension)
 
         return jax.vmap(one)(weights)
 

@@ -83,13 +83,13 @@ class Prior(eqx.Module):
                 info=info,
                 value_points=S,
                 value_coefficients=b,
-                mean=None if basis is None else drawn(K, basis, w, Z.shape[1]),
+                mean=None if basis is None else feature_draw(K, basis, w, Z.shape[1]),
             )
 
         return jax.vmap(one)(A, b, self.coefficients, self.features, self.weights)
 
 
-def drawn(
+def feature_draw(
     K: AbstractMatrixKernel, basis: AbstractFeatures, w: Float[Array, " r"], n: int
 ) -> FeatureField:
     """The field of one draw of features, at points of n coordinates."""

@@ -110,7 +110,7 @@ class BoxBFGS(optx.AbstractBFGS):
         return converged | stuck, result
 
 
-class Point(NamedTuple):
+class Evaluation(NamedTuple):
     """A point that has been looked at: what is minimised there, and the loss that is reported."""
 
     seen: Bool[Any, ""]
@@ -133,7 +133,7 @@ class MinimiserRun(NamedTuple):
 
     u: Float[Any, " P"]
     state: Any
-    best: Point
+    best: Evaluation
     steps: Int[Any, ""]
     going: Bool[Any, ""]
     converged: Bool[Any, ""]
@@ -162,8 +162,8 @@ def begun(minimiser: optx.AbstractMinimiser, fn: Minimised, u: Float[Array, " P"
     """A run at u that has not looked at it yet."""
     number = jax.ShapeDtypeStruct((), u.dtype)
     flag = jax.ShapeDtypeStruct((), jnp.bool_)
-    point = Point(flag, u, number, number)
-    nothing = Point(jnp.array(False), u, *jnp.full(2, jnp.inf, u.dtype))
+    point = Evaluation(flag, u, number, number)
+    nothing = Evaluation(jnp.array(False), u, *jnp.full(2, jnp.inf, u.dtype))
     state = minimiser.init(_with_slope_backward(fn), u, None, {}, number, point, frozenset())
     no = jnp.array(False)
     return MinimiserRun(u, state, nothing, jnp.array(0), jnp.array(True), no)
@@ -231,12 +231,12 @@ def most_likely_in_box(
     return inside_box(run.best.u, low, high), run.best.value
 
 
-def _better(one: Point, other: Point) -> Point:
+def _better(one: Evaluation, other: Evaluation) -> Evaluation:
     better = other.seen & (other.value < one.value)
     return jax.tree.map(lambda a, b: jnp.where(better, b, a), one, other)
 
 
-def _with_slope_backward(fn: Minimised) -> Callable[[Array, Any], tuple[Array, Point]]:
+def _with_slope_backward(fn: Minimised) -> Callable[[Array, Any], tuple[Array, Evaluation]]:
     """`fn` for optimistix, (u, args) -> (value, the point it looks at).
 
     optimistix linearises forward, and then transposes, while derivatives of losses are written
@@ -248,7 +248,7 @@ def _with_slope_backward(fn: Minimised) -> Callable[[Array, Any], tuple[Array, P
         value, loss = fn(u)
         # `seen` is False in the zeros that optimistix begins with.
         seen = jnp.isfinite(u).all()
-        point = Point(seen, u, value.astype(u.dtype), loss.astype(u.dtype))
+        point = Evaluation(seen, u, value.astype(u.dtype), loss.astype(u.dtype))
         # A line search backs away from a huge number as it would not from infinity.
         return jnp.where(jnp.isfinite(point.value), point.value, 1e30), point
 

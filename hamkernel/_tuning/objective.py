@@ -150,7 +150,7 @@ FIRST_ROWS = 256
 def parts_of(
     rows: Measurements, criterion: SearchCriterion, dense: bool
 ) -> list[Int[np.ndarray, " _"]]:
-    """The observations of each part; all of them at last, where the loss is dense."""
+    """The observations of each part of a search: few, more, and all where the loss is dense."""
     N, n = rows.count, len(rows.targets) / rows.count
     if criterion.custom:  # it may need all the data
         return [np.arange(N)]
@@ -170,7 +170,7 @@ def parts_of(
 def criterion_of(
     objective: Criterion | Objective, N: int, folds: Folds, data: tuple[Any, Any] = (None, None)
 ) -> SearchCriterion:
-    """What the objective of `tune` means for N observations.
+    """The criterion that the objective of `tune` stands for, of N observations.
 
     A public loss is what its name is: it takes the folds and is searched by its logarithm. A
     function of the caller's is called with what the caller gave, states and velocities, or

@@ -80,7 +80,7 @@ class Search:
         runs = self._first(part, _TOLERANCE if only else 1e-3)
         if only:
             return runs
-        ends = _joined(_take(runs, _different(runs)), self._given(part))
+        ends = _concatenated(_take(runs, _different(runs)), self._given(part))
         last = parts[-1] if len(parts) > 2 else None
         for more in parts[1:]:
             steps = self.max_steps
@@ -121,7 +121,7 @@ class Search:
             seconds = 25 * self.starts * part.seconds  # a run takes some 25 losses
             self._warn_of_waiting(seconds, f"Pass fewer starts than {self.starts}.")
             chosen = spread_out(points[1:], others.best.value, self.starts - 1)
-            runs = _joined(runs, _take(others, chosen))
+            runs = _concatenated(runs, _take(others, chosen))
         if self.criterion.custom:
             values = runs.best.value
             sizes = np.abs(values[(values != 0) & (np.abs(values) < np.inf)])
@@ -145,9 +145,9 @@ class Search:
             runs = corrected._replace(converged=ends.converged)
         else:
             finished = self._descended(part, _take(runs, slice(_FINISHED)), minimiser, steps)
-            runs = _sorted(_joined(finished, _take(runs, slice(_FINISHED, None))))
+            runs = _sorted(_concatenated(finished, _take(runs, slice(_FINISHED, None))))
         runs = _take(runs, slice(self.starts))
-        return runs, _joined(_take(runs, [0]), self._given(part))
+        return runs, _concatenated(_take(runs, [0]), self._given(part))
 
     def _minimiser(self, tolerance: float) -> optx.AbstractMinimiser:
         return BoxBFGS(atol=jnp.asarray(tolerance)) if self.optimiser is None else self.optimiser
@@ -211,7 +211,7 @@ def _take(runs: MinimiserRun, which: Any) -> MinimiserRun:
     return eqx.combine(jax.tree.map(lambda a: a[which], arrays), static)
 
 
-def _joined(one: MinimiserRun, other: MinimiserRun) -> MinimiserRun:
+def _concatenated(one: MinimiserRun, other: MinimiserRun) -> MinimiserRun:
     arrays, static = eqx.partition(one, eqx.is_array)
     others = eqx.filter(other, eqx.is_array)
     return eqx.combine(jax.tree.map(lambda a, b: np.append(a, b, axis=0), arrays, others), static)
@@ -326,7 +326,7 @@ def design(directions: Sequence[int]) -> Float[np.ndarray, "count P"]:
 def spread_out(
     points: Float[np.ndarray, "count P"], values: Float[np.ndarray, " count"], starts: int
 ) -> list[int]:
-    """Which points of a design are the best and no neighbours of a better one already taken."""
+    """The indices of the best points of a design, of which no two are neighbours."""
     reach = 0.25 * points.shape[1] ** 0.5  # of a box of side 1
     order = np.argsort(values, kind="stable")
     taken: list[int] = []

@@ -251,7 +251,7 @@ def _tuned(
     given: Problem,
     solver: AbstractSolver | None,
 ) -> Tuned:
-    """The fit at the best point, and what is to be said of the search."""
+    """The result of the best run: its kernel, the fit with it, and the record of the search."""
     found = best(runs)
     dtype = space.low.dtype
     kernel, regularization, size = decode(space, jnp.asarray(found.best.u, dtype))
@@ -310,10 +310,10 @@ def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -
 
 
 def _warn_of_unequal_sizes(Y: Array) -> None:
-    """Velocities of one coordinate that are lost beside those of another."""
+    """Warn where the velocities of one coordinate are lost beside those of another."""
     sizes = np.asarray(Y).std(axis=0)
     sizes = sizes[sizes > 0]
-    if sizes.size and sizes.max() > _UNEQUAL * sizes.min():
+    if sizes.size and sizes.max() > 100 * sizes.min():  # and so 10 000 times in the loss
         require.warn(
             f"the velocities of one coordinate are {sizes.max() / sizes.min():.3g} times as large "
             "as those of another, and a loss sums the squares of both: the small one may be lost "
@@ -323,7 +323,7 @@ def _warn_of_unequal_sizes(Y: Array) -> None:
 
 
 def warn_of_constants(K: AbstractMatrixKernel) -> None:
-    """Python floats, which are no hyperparameters."""
+    """Warn of Python floats in the kernel, which are no hyperparameters."""
     kept = constants(K)
     if kept:
         shown = ", ".join(f"{name} = {value:.4g}" for name, value in kept.items())
@@ -334,20 +334,22 @@ def warn_of_constants(K: AbstractMatrixKernel) -> None:
 
 
 def _warn_of_few_folds(criterion: SearchCriterion, folds: object) -> None:
-    """Labels of so few groups that what is held out is a matter of chance."""
+    """Warn of labels of so few groups that what is held out is a matter of chance."""
     if criterion.partition is None or criterion.custom or np.ndim(folds) == 0:  # type: ignore
         return
     count = len(criterion.partition.folds)
-    if count < _FEW_FOLDS:
+    # Held out one at a time, few runs are a noisy judge: on the pendulum of the paper, with three,
+    # the field error was .164 where the likelihood's was .048 (`tests/benchmarks/judges.py`).
+    if count < 5:
         require.warn(
             f"the labels in folds make {count} folds, and cross-validation by fewer than "
-            f"{_FEW_FOLDS} runs is a noisy judge. Compare with objective='marginal_likelihood' and "
+            "5 runs is a noisy judge. Compare with objective='marginal_likelihood' and "
             "an amplitude, `1.0 * k`, or with folds='loo': the docstring of hk.tune has numbers."
         )
 
 
 def _warn_of_free_scale(space: SearchSpace, criterion: SearchCriterion) -> None:
-    """Amplitudes on every term, of which only the ratios to λ count."""
+    """Warn of amplitudes on every term, of which only the ratios to λ count."""
     free = {space.names[i] for i in space.free}
     if not criterion.logarithmic or RIDGE not in free or space.given_ridge is not None:
         return
@@ -370,7 +372,3 @@ def _has_amplitude(space: SearchSpace) -> bool:
 
 
 SEARCH_COPIES = 5  # matrices of the size of the Gram that a loss in a loop holds: 4.4 measured
-_UNEQUAL = 100.0  # in size, and so 10 000 in the loss
-# Held out one at a time, few runs are a noisy judge: on the pendulum of the paper, with three, the
-# field error was 0.164 where the likelihood's was 0.048. See `tests/benchmarks/judges.py`.
-_FEW_FOLDS = 5

@@ -102,8 +102,11 @@ def _labels(N: int, folds: Folds) -> Int[np.ndarray, " N"]:
     return array
 
 
-def _solved(system: AbstractSystem, y: Float[Array, " D"]):
-    """The factor, a, yᵀa and whether they can be trusted, with no two LAPACK calls side by side."""
+def _factored(system: AbstractSystem, y: Float[Array, " D"]):
+    """The factor of A, a = A⁻¹y, yᵀa, and whether these can be trusted.
+
+    Barriers keep calls of LAPACK from running side by side.
+    """
     factor = system.factor()
     factor, a, square = jax.lax.optimization_barrier((factor, *factor.solved(y)))
     return jax.lax.optimization_barrier((factor, a, square, factor.trusted(y)))
@@ -118,7 +121,7 @@ def held_out(
 
 
 def _held_out_forward(system, y, partition):
-    factor, a, _, trusted = _solved(system, y)
+    factor, a, _, trusted = _factored(system, y)
     C = factor.inverse()
     r, blocks = jnp.zeros_like(a), []
     for group in partition.groups:
@@ -153,7 +156,7 @@ def free_residuals(
 
 
 def _free_residuals_forward(system, y):
-    factor, a, _, trusted = _solved(system, y)
+    factor, a, _, trusted = _factored(system, y)
     squares, trace = a @ a, factor.inverse_trace
     ok = trusted & jnp.isfinite(squares) & jnp.isfinite(trace)
     value = jnp.where(ok, squares, jnp.inf), jnp.where(ok, trace, jnp.ones_like(trace))
@@ -177,7 +180,7 @@ def log_density(system: AbstractSystem, y: Float[Array, " D"]) -> Float[Array, "
 
 
 def _log_density_forward(system, y):
-    factor, a, square, trusted = _solved(system, y)
+    factor, a, square, trusted = _factored(system, y)
     value = -0.5 * (square + factor.log_det + len(y) * jnp.log(2 * jnp.pi).astype(y.dtype))
     ok = trusted & jnp.isfinite(value)
     return jnp.where(ok, value, -jnp.inf), (factor, a, ok)

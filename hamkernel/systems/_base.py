@@ -377,9 +377,6 @@ def _failure(failed: Array) -> str:
 
 # Far more than a smooth trajectory needs beside one step for each of ts: a few dozen per swing of
 # a pendulum.
-_MAX_STEPS = 2**16
-
-
 @eqx.filter_jit
 def _trajectories(
     field: Callable[[Array], Array], states: Float[Array, "B n"], ts: Float[Array, " T"]
@@ -395,7 +392,7 @@ def _trajectories(
         if ts.size == 1:
             return x0[None]
         tolerance = max(1e-10, 10 * float(jnp.finfo(x0.dtype).eps))
-        bounds = {"rtol": tolerance, "atol": tolerance, "max_steps": _MAX_STEPS + ts.size}
+        bounds = {"rtol": tolerance, "atol": tolerance, "max_steps": 2**16 + ts.size}
         return cast(Array, simulate(velocity, x0, ts, **bounds, throw=False).ys)
 
     X = jax.vmap(trajectory)(states)
