@@ -38,8 +38,8 @@ from hamkernel._solvers.factors import (
     forward,
     solution,
 )
+from hamkernel._solvers.low_rank import Prior, prior_draws
 from hamkernel._solvers.problem import AbstractConditional, AbstractSolver, Problem
-from hamkernel._solvers.sampling import Prior, prior_draws
 from hamkernel._structures.base import AbstractMatrixKernel
 
 

@@ -102,7 +102,7 @@ gram_trace = eqx.filter_jit(trace)
 
 
 def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
-    """The trace of the Gram before the terms of odd and even kernels cancel: it sets the rounding."""
+    """The trace of the Gram before terms of odd and even kernels cancel: it sets the rounding."""
     terms = without_symmetry(K)
     trace = gram_trace(terms, X)
     if Invariance.REFLECTION in terms.invariance:
