@@ -365,12 +365,12 @@ def test_iterations_that_are_shown_end_at_the_same_field(kind, capsys, monkeypat
 
 @pytest.mark.parametrize("ask", [hk.fit, hk.condition])
 def test_blocks_of_a_factorisation_are_shown(ask, capsys, monkeypatch):
-    monkeypatch.setattr("hamkernel._solvers.dense.IN_PLACE", 100)
+    monkeypatch.setattr("hamkernel._solvers.dense.IN_PLACE", 1000)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     model = hk.Odd(hk.Symplectic(2.0 * hk.Gaussian(1.0)))
-    ask(model, *swings(150), regularization=RIDGE, progress=True)
+    ask(model, *swings(600), regularization=RIDGE, progress=True)
     assert "factor" in capsys.readouterr().err
-    ask(model, *swings(150), regularization=RIDGE)
+    ask(model, *swings(600), regularization=RIDGE)
     assert "factor" not in capsys.readouterr().err
 
 
