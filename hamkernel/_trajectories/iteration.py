@@ -248,12 +248,12 @@ def _solved(
     given, used = (rows, task.start_deviation), len(now.field.points)
     model, _ = most_likely(now.model, now.S[:used], *given, task.bounds, _SEARCH, whitening)
     model, found = solved(model, now.S, used, *given, whitening, task.bounds)
-    # The current field in the new basis, by what it says of the same rows.
-    names = "residual", "missed", "prior_offset"
-    known = rows._replace(**{name: jnp.zeros_like(getattr(rows, name)) for name in names})
+    # The current field in the new basis: the one with its values at the landmarks.
     S = found.points
-    old = closed_form(model, S, known, task.start_deviation, whitening).weights
     T = _landmark_whitening(model.kernel, S)
+    old = T.T @ _values(
+        Expansion(now.field.kernel, now.field.points, now.field.coefficients, None), S
+    ).reshape(-1)
 
     def between(share: float) -> tuple[Float[Array, " q"], Expansion]:
         weights = (1 - share) * old + share * found.weights

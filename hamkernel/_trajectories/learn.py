@@ -66,7 +66,9 @@ from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.smoothing import interpolated
 
 _WIDE = 100.0  # standard deviations of the states: the prior of a start
-_MOST = 8  # iterations; 4 or 5 are the rule
+_MOST, _USUAL = 8, 5  # iterations; 4 or 5 are the rule
+_LONG = 60.0  # seconds of a computation that is announced
+_SPEED = 1e10  # operations a second of a QR factorisation by one core: 1.6 s for 19 billion
 _QUIET = 10.0  # seconds before progress is shown to those who did not ask for it
 
 
@@ -152,6 +154,7 @@ def learn(
     log_noise = jnp.log(jnp.asarray(_first_noise(data) if given is None else given))
     moves = measured & (given is None)
     S, first = landmarks(data, None if solver is None else solver.max_points)
+    warn_of_cost(sum(len(run.times) for run in data.runs) * runs.dimension, first, runs.dimension)
 
     def asked(q: np.ndarray, spacing: float = 0.0, impulse: np.ndarray | None = None):
         with np.errstate(divide="ignore"):
@@ -182,10 +185,24 @@ def learn(
     return _learned(runs, mean, end, alone, given is not None, measured)
 
 
+def warn_of_cost(rows: int, count: int, n: int) -> None:
+    """Say what learning will cost, if that is much: 2 rows · columns² operations an iteration."""
+    seconds = 2 * rows * (count * n) ** 2 / _SPEED
+    if _USUAL * seconds < _LONG:
+        return
+    fewer = max(int(count * (_LONG / (_USUAL * seconds)) ** 0.5), 1)
+    require.warn(
+        f"learning will take about {seconds:.0f} s an iteration, and 4 to {_MOST} iterations: "
+        f"{rows} measured numbers on {count} landmarks, {count * n} columns. It works; "
+        f"solver=hk.Nystrom(max_points={fewer}) takes a minute and finds a smoother field, and "
+        "fewer samples or known parts (mean=) take less too."
+    )
+
+
 def _first_noise(data: Preprocessed) -> Float[np.ndarray, " n"]:
     """The noise that smoothing found, of each coordinate.
 
-    It may have found none at all; a share of 1e-7 is what the digits of a log leave.
+    It may have found none at all; then a share of 1e-6 of the states begins.
     """
     found = np.where(np.isfinite(data.noise), data.noise, data.scale)
     return np.maximum(found, 1e-6 * data.scale)

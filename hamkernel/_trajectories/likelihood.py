@@ -198,6 +198,28 @@ def _regression_backward(saved, bar):
 regression_loss.defvjp(_regression, _regression_backward)
 
 
+class Condensed(NamedTuple):
+    """All that rows say of w, in O(q²) memory.
+
+    Attributes:
+        T: the whitening of the landmarks, shape (q, q).
+        triangle: of the QR factorisation of (M̃, r̃), shape (q + 1, q + 1).
+        start: QᵀM, Qᵀr and U of each segment, as `WhitenedRows` has them.
+        constant: the part of −log p in which M̃ has none.
+        scatter: the sum of squares of samples about the rows that are their means, in units of σ².
+        samples: how many samples there are, less n for each start.
+        rows: the number of rows, less n for each start.
+    """
+
+    T: Float[Array, "q q"]
+    triangle: Float[Array, "k k"]
+    start: tuple[Array, Array, Array] | None
+    constant: Float[Array, ""]
+    scatter: Float[Array, ""]
+    samples: Float[Array, ""]
+    rows: Float[Array, ""]
+
+
 class ClosedForm(NamedTuple):
     """The closed form.
 
@@ -223,10 +245,10 @@ class ClosedForm(NamedTuple):
 
 
 @eqx.filter_jit
-def closed_form(
+def condensed(
     model: Model, S, rows: LinearisedSegments, start_deviation, whitening: Whitening
-) -> ClosedForm:
-    """The field and the starts that the rows ask for, in O(q²) memory and that of a strip."""
+) -> Condensed:
+    """The rows in the triangle of their QR factorisation, a strip at a time."""
     T = landmark_whitening(model.kernel, S)
     (size, samples, n), q = rows.counts.shape, len(T)
     # Strips of twice as many rows as columns: less, and most of the work would be the triangle's.
@@ -239,20 +261,45 @@ def closed_form(
         return triangle(F, made.M, made.r), (made.start, made.constant)
 
     parts = jax.tree.map(lambda a: a.reshape(count, -1, *a.shape[1:]), rows)
-    F, (start, constant) = jax.lax.scan(strip, no_rows(q, T.dtype), parts)
+    F, (start, constant) = jax.lax.scan(strip, jnp.zeros((q + 1, q + 1), T.dtype), parts)
+    if start is not None:
+        start = jax.tree.map(lambda a: a.reshape(size, *a.shape[2:]), start)
+    started = (rows.counts.any(axis=(1, 2)).sum() * n).astype(T.dtype)
+    scatter = (rows.scatter.sum((0, 1)) @ jnp.exp(-2 * model.log_noise)).astype(T.dtype)
+    count, samples = (rows.counts > 0).sum().astype(T.dtype), rows.counts.sum().astype(T.dtype)
+    sizes = samples - started, count - started
+    return Condensed(T, F, start, constant.sum(), scatter, *sizes)
+
+
+@eqx.filter_jit
+def conditional(known: Condensed, S, shift=0.0) -> ClosedForm:
+    """The field and the starts for rows whose noise is exp(shift) times what it was.
+
+    All rows scale together but for the prior of the starts, which is so wide that it says nothing.
+    """
+    q, scale = len(known.T), jnp.exp(-shift)
+    there = scale * known.triangle
+    F = triangle(no_rows(q, there.dtype), there[:, :q], there[:, q])
     R = F[:q, :q]
     w = solve_triangular(R, F[:q, q])
     inverse = solve_triangular(R, jnp.eye(q, dtype=R.dtype))
     used = q - jnp.sum(inverse**2)  # tr M̃ (I + M̃ᵀM̃)⁻¹ M̃ᵀ
-    moves = jnp.zeros_like(rows.prior_offset)
-    if start is not None:
-        QM, Qr, U = (a.reshape(size, *a.shape[2:]) for a in start)
+    moves = jnp.zeros((0, S.shape[1]), w.dtype)
+    if known.start is not None:
+        QM, Qr, U = known.start
         moves = back_substituted(U, Qr - jnp.einsum("snq,q->sn", QM, w))
-    started = rows.counts.any(axis=(1, 2)).sum() * n
-    free = ((rows.counts > 0).sum() - started).astype(used.dtype) - used
-    loss = 0.5 * F[q, q] ** 2 + jnp.log(jnp.abs(jnp.diagonal(R))).sum() + constant.sum()
+    loss = 0.5 * F[q, q] ** 2 + jnp.log(jnp.abs(jnp.diagonal(R))).sum() + known.constant
+    loss = loss + shift * known.samples + 0.5 * (scale**2 - 1) * known.scatter
     squares = F[q, q] ** 2 - w @ w
-    return ClosedForm(w, S, (T @ w).reshape(len(S), -1), moves, free, used, squares, loss)
+    coefficients = (known.T @ w).reshape(len(S), -1)
+    return ClosedForm(w, S, coefficients, moves, known.rows - used, used, squares, loss)
+
+
+def closed_form(
+    model: Model, S, rows: LinearisedSegments, start_deviation, whitening: Whitening
+) -> ClosedForm:
+    """The field and the starts that the rows ask for."""
+    return conditional(condensed(model, S, rows, start_deviation, whitening), S)
 
 
 def solved(
@@ -270,24 +317,45 @@ def solved(
     unknown. Noise that was found on some of the rows is scaled to what all of them leave.
     """
 
-    def on(model, count: int) -> ClosedForm:
-        return closed_form(model, jnp.asarray(S[:count]), rows, start_deviation, whitening)
+    def on(count: int) -> tuple[Condensed, ClosedForm]:
+        points = jnp.asarray(S[:count])
+        known = condensed(model, points, rows, start_deviation, whitening)
+        return known, conditional(known, points)
 
-    found = on(model, count)
+    known, found = on(count)
     while count < len(S):
-        more = on(model, 2 * count)
-        if not more.loss < found.loss - (more.weights.size / 2) ** 0.5:
+        more = on(2 * count)
+        if not more[1].loss < found.loss - (more[1].weights.size / 2) ** 0.5:
             break
-        found, count = more, 2 * count
+        (known, found), count = more, 2 * count
     free, size = np.array(bounds.free), len(model.flat) - 2 * len(model.log_noise)
     free[:size] = False  # what is left are both kinds of noise
+    fixed = np.isfinite(np.asarray(model.log_process)) & ~free[-len(model.log_process) :]
     many = searched(jnp.asarray(S[:count]), rows)[1] is not rows
-    if many and free.any() and found.free > found.used and found.squares > 0:
-        shift = jnp.where(jnp.asarray(free), jnp.log(found.squares / found.free) / 2, 0.0)
-        there = jnp.clip(model.flat + shift, jnp.asarray(bounds.low), jnp.asarray(bounds.high))
+    if many and free.any() and not fixed.any() and found.free > found.used and found.squares > 0:
+        shift = jnp.log(found.squares / found.free) / 2
+        there = jnp.where(jnp.asarray(free), model.flat + shift, model.flat)
+        there = jnp.clip(there, jnp.asarray(bounds.low), jnp.asarray(bounds.high))
         model = model.at(jnp.where(jnp.asarray(free), there, model.flat))
-        found = on(model, count)
+        found = conditional(known, found.points, shift)
     return model, found
+
+
+def limited_by_landmarks(
+    model: Model, S, rows: LinearisedSegments, start_deviation, whitening: Whitening
+) -> bool:
+    """Whether windows of the rows are likelier with a landmark in each of their intervals.
+
+    By more than √(q/2), by which q parameters leave −log p unknown.
+    """
+    width = (_ENTRIES / 3) ** 0.5
+    part = windows(rows, int(width / rows.residual.shape[-1]))
+    own = exact(part)[0]
+    few, many = (
+        float(losses(model, model.flat[None], points, part, start_deviation, whitening)[0])
+        for points in (S, own)
+    )
+    return few - many > (rows.residual.shape[-1] * len(own) / 2) ** 0.5
 
 
 # Entries of K at nodes while hyperparameters are looked for: a search with n = 8 takes 4 to 10 s.

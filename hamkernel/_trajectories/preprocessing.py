@@ -24,8 +24,8 @@ from hamkernel._trajectories.smoothing import Coordinate, interpolated, processe
 # Landmarks for d coordinates to begin with, 128 for more. 45 for two and 80 for four were as good
 # as all on ten runs of 10 s; where the data asks for more there are more.
 _FEWEST = {1: 24, 2: 48, 3: 64, 4: 80}
-# Rows times columns²: 2 s for each solve; 2e10 took 9 s (20 runs of 50 samples, n = 8).
-_WORK = 5e9
+# Rows times columns²: 4 to 5 s for each solve (20 runs of 50 samples, n = 8, 256 landmarks).
+_WORK = 3.5e10
 _POINTS = 1024  # from which boxes are taken, and landmarks if there are not more intervals
 
 # Of the lengthscale in time, between samples that are kept. A pendulum of frequency ω has a

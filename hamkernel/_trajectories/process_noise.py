@@ -16,7 +16,9 @@ from hamkernel._trajectories.likelihood import (
     Model,
     WhitenedRows,
     landmark_whitening,
+    limited_by_landmarks,
     losses,
+    project_out_starts,
     searched,
 )
 from hamkernel._trajectories.preprocessing import Preprocessed, sampled
@@ -58,12 +60,15 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     """Whether anything says that the structure is not the whole truth.
 
     Iterations that did not settle, parts that were dropped, innovations that are not white, or rows
-    that are likelier with process noise.
+    that are likelier with process noise. Not where more landmarks would explain them: what a field
+    on too few cannot say looks like process noise.
     """
     now, task = end.now, end.task
+    given = now.field.points, now.rows, task.start_deviation
+    if limited_by_landmarks(now.model, *given, project_out_starts):
+        return False
     if not (end.settled and now.good.all()):
         return True
-    given = now.field.points, now.rows, task.start_deviation
     z = innovations(whitened_rows(now.model, *given), now.rows)
     if whiteness(z, np.asarray(now.rows.counts)) < SIGNIFICANT:
         return True

@@ -356,20 +356,34 @@ def halved(
     return out
 
 
+# Entries of a log, above which it is padded to multiples of an eighth of a power of two: compiling
+# anew, some 15 s, is then less than what padding costs in all iterations.
+_LARGE = 4096
+
+
+def padded_count(count: int, large: bool) -> int:
+    """The least power of two that is not below `count`; of a large log an eighth finer."""
+    most = power_of_two(count)
+    step = max(most // 8, 1) if large else most
+    return -(-count // step) * step
+
+
 def segmented(
     runs: list[PreprocessedRun], pieces: list[Piece], paths: list[np.ndarray]
 ) -> Segments:
     """The pieces as arrays of a few shapes; they start on `paths`."""
     longest = max(piece.stop - piece.start for piece in pieces)
-    length = power_of_two(longest)
-    if longest <= SHORT:
-        length = min(length, SHORT)
+    # Padding costs as much as samples: in each direction half of a large log may be padding.
+    large = len(pieces) * longest * len(runs[0].path[0]) > _LARGE
+    size, length = (padded_count(count, large) for count in (len(pieces), longest))
+    if longest <= SHORT:  # as the windows of longer pieces have, so that one program does for both
+        length = min(power_of_two(longest), SHORT)
     filled = []
     for r, start, stop in pieces:
         run, part = runs[r], slice(start, stop)
         own = run.times, run.states, run.counts, run.scatter
         filled.append((*(a[part] for a in own), paths[r][start], run.inputs[start : stop - 1]))
-    return segments_of(filled, power_of_two(len(pieces)), length)
+    return segments_of(filled, size, length)
 
 
 def smoothed_rows(
