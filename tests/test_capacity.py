@@ -5,6 +5,7 @@
 import math
 import warnings
 from fractions import Fraction
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -12,11 +13,15 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
+from hamkernel._trajectories.learn import warn_of_cost
 from hamkernel._trajectories.likelihood import (
     Bounds,
     Model,
     closed_form,
+    condensed,
+    conditional,
     landmark_whitening,
+    limited_by_landmarks,
     losses,
     project_out_starts,
     regression_loss,
@@ -29,6 +34,7 @@ from hamkernel._trajectories.segments import (
     Segments,
     given_path,
     linearised,
+    padded_count,
     windows,
 )
 
@@ -68,6 +74,37 @@ def test_the_closed_form_in_strips_is_ridge_regression_on_all_rows():
     np.testing.assert_allclose(found.squares, np.sum((r - M @ w) ** 2), rtol=1e-9)
     loss = 0.5 * (np.sum((r - M @ w) ** 2) + w @ w + np.linalg.slogdet(A)[1])
     np.testing.assert_allclose(found.loss, loss + made.constant, rtol=1e-10)
+
+
+def test_noise_is_scaled_in_the_triangle_as_in_the_rows():
+    rows = rows_of(*arrays(4, 12))
+    rng = np.random.default_rng(3)
+    counts = jnp.asarray(rng.integers(0, 4, rows.counts.shape).astype(float))
+    scatter = jnp.where(counts > 1, jnp.asarray(rng.uniform(0, 1, counts.shape)), 0.0)
+    rows = rows._replace(counts=counts, scatter=scatter)
+    S, given = rows.nodes[:, 0, 0], (rows, WIDE, project_out_starts)
+    found = conditional(condensed(MODEL, S, *given), S, jnp.asarray(0.7))
+    expected = closed_form(MODEL._replace(log_noise=MODEL.log_noise + 0.7), S, *given)
+    for name in ("weights", "coefficients", "moves", "free", "used", "squares"):
+        a, b = getattr(found, name), getattr(expected, name)
+        np.testing.assert_allclose(a, b, rtol=1e-6, atol=1e-6, err_msg=name)
+    np.testing.assert_allclose(found.loss, expected.loss, rtol=1e-6)
+
+
+def test_a_large_log_is_padded_by_less_than_a_small_one():
+    assert [padded_count(50, large) for large in (False, True)] == [64, 56]
+    assert [padded_count(count, True) for count in (3, 8, 20, 120, 129)] == [3, 8, 20, 128, 160]
+
+
+def test_a_long_computation_says_what_it_costs():
+    run = SimpleNamespace(times=np.zeros(1000))
+    few, many = (SimpleNamespace(scale=np.ones(n), runs=[run]) for n in (2, 16))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        warn_of_cost(few, 128)
+    said = r"about 13 s an iteration.*16000 measured numbers on 128 landmarks, 2048 columns"
+    with pytest.warns(UserWarning, match=said):
+        warn_of_cost(many, 128)
 
 
 def exact_regression_loss(M, r):
@@ -149,7 +186,7 @@ def test_landmarks_are_doubled_while_the_rows_become_likelier():
     S = rng.uniform(-1, 1, (64, 2))
     spans, path, nodes, _, _ = arrays(16, 12)
     nodes = jnp.asarray(rng.uniform(-1, 1, nodes.shape))
-    counts = []
+    counts, limited = [], []
     for length in (0.2, 3.0):
         truth = hk.Symplectic(1.0 * hk.Gaussian(length))
         centres = jnp.asarray(rng.uniform(-1, 1, (200, 2)))
@@ -164,7 +201,10 @@ def test_landmarks_are_doubled_while_the_rows_become_likelier():
         bounds = Bounds(none, none, none > 0)
         found = solved(model, S, 16, rows, WIDE, project_out_starts, bounds)[1]
         counts.append(len(found.points))
+        given = model, jnp.asarray(S[:16]), rows, WIDE, project_out_starts
+        limited.append(limited_by_landmarks(*given))
     assert counts == [64, 16]
+    assert limited == [True, False]
 
 
 @pytest.mark.slow

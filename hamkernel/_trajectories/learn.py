@@ -143,8 +143,8 @@ def learn(
     check_identifiable(runs, known)
     from tqdm import tqdm  # so that importing the package does not load it
 
-    wait = 0.0 if progress else _QUIET
-    bar = tqdm(desc="learning", total=2 + most, disable=progress is False, delay=wait)
+    quiet, wait = progress is False, 0.0 if progress else _QUIET
+    bar = tqdm(desc="learning", total=2 + most, disable=quiet, delay=wait)
     data = preprocess(runs, known)
     bar.update()
     measured = np.isfinite(data.noise)
@@ -154,7 +154,7 @@ def learn(
     log_noise = jnp.log(jnp.asarray(_first_noise(data) if given is None else given))
     moves = measured & (given is None)
     S, first = landmarks(data, None if solver is None else solver.max_points)
-    warn_of_cost(sum(len(run.times) for run in data.runs) * runs.dimension, first, runs.dimension)
+    warn_of_cost(data, first)
 
     def asked(q: np.ndarray, spacing: float = 0.0, impulse: np.ndarray | None = None):
         with np.errstate(divide="ignore"):
@@ -167,26 +167,27 @@ def learn(
         disturbed = bool(q.any()) or impulse is not None
         return iterate(*asked(q, spacing, impulse), disturbed, most, bar)
 
-    none, alone = np.zeros(runs.dimension), None
+    none = np.zeros(runs.dimension)
     if not runs.is_decided:
         task, model, design = asked(none)
         model = begin(task, model, design).model
         runs, data = decided(runs, data, lambda data: initial_loss(task._replace(data=data), model))
+    spacing = landmark_spacing(X, S[:first], data.scale)
     if process is not None:
-        spacing = landmark_spacing(X, S[:first], data.scale) if process.any() else 0.0
-        end = ended(process, spacing)
+        end, alone = ended(process, spacing if process.any() else 0.0), None
     else:
         end = alone = ended(none)
         impulse = impulses(K, jnp.asarray(S[:first]), Y, data)
-        spacing = landmark_spacing(X, S[:first], data.scale)
         if asks_for_process(alone, impulse):
             end = likelier(alone, ended(none, spacing, impulse))
     bar.close()
     return _learned(runs, mean, end, alone, given is not None, measured)
 
 
-def warn_of_cost(rows: int, count: int, n: int) -> None:
+def warn_of_cost(data: Preprocessed, count: int) -> None:
     """Say what learning will cost, if that is much: 2 rows · columns² operations an iteration."""
+    n = len(data.scale)
+    rows = n * sum(len(run.times) for run in data.runs)
     seconds = 2 * rows * (count * n) ** 2 / _SPEED
     if _USUAL * seconds < _LONG:
         return
