@@ -94,6 +94,16 @@ def test_a_map_that_is_not_equivariant_is_refused(molecules):
         hk.gram(K, molecules)
 
 
+def test_atoms_in_one_place_are_named_before_any_solve(molecules):
+    K = hk.CurlFree(hk.Warp(hk.Matern(2.5, 2.0), inverse_distances, equivariant=True))
+    X = molecules.copy()
+    X[7, 3:6] = X[7, :3]
+    for one in (K, hk.Invariant(K, GENERATORS)):
+        for use in (hk.fit, hk.log_marginal_likelihood):
+            with pytest.raises(ValueError, match=r"infinite at X\[7\]: two atoms in one place"):
+                use(one, X, np.ones_like(X), 1e-3)
+
+
 def test_losses_through_a_descriptor_have_their_derivatives(molecules):
     forces = np.random.default_rng(1).normal(size=molecules.shape)
 

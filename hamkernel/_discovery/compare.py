@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._discovery.ladder import ladder
+from hamkernel._discovery.ladder import Rung, ladder
 from hamkernel._kernels.built_in import Gaussian
 from hamkernel._machine import one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations
@@ -46,6 +46,7 @@ _NOTHING = 0.5
 # the positive quadrant, where nothing is known of −x, Lotka-Volterra was called odd 9 times of 10.
 _SEEN = 0.1
 _STEPS = 64  # of a search at most, as in `tune`
+_LOOKS = 32  # where a search may start: its first point is a good one for data of this size
 _ROUNDING = 1e-4  # of blocks of a symmetric kernel, in single precision too
 
 QUESTIONS = {
@@ -184,7 +185,7 @@ def compare(
     found = []
     for name, K in tqdm(searched.items(), "candidates", disable=None if progress else True):
         K, regularization, likelihood = _most_likely(K, rows, ridge, starts)
-        K = steps[name].kernel(K) if name in steps else K
+        K = steps[name].kernel(K) if isinstance(K, Rung) else K
         values = named_values(K, points) | {RIDGE: regularization}
         P = sum(np.size(value) for value in values.values())
         score = likelihood - P / 2 * math.log(D)
@@ -203,7 +204,7 @@ def _most_likely(
     rms = velocity_rms(K, rows)
     space = SearchSpace(K, rows.points, rms, ridge, (), {})
     criterion = criterion_of("marginal_likelihood", rows.count, 2)
-    run = best(Search(space, criterion, rows, rms, starts, _STEPS, None, False).runs())
+    run = best(Search(space, criterion, rows, rms, starts, _STEPS, None, False, _LOOKS).runs())
     check_found(run)
     K, regularization, _ = decode(space, jnp.asarray(run.best.u, rows.targets.dtype))
     return K, regularization, -float(run.best.loss)

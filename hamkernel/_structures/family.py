@@ -127,7 +127,10 @@ class Family(AbstractFamily):
 
     Between members that were seen this is interpolation, and better than a model for each. Outside
     of their range it is extrapolation in θ, no better than a model of its own for each member, and
-    the deviation of `hk.condition` grows to that of the prior there.
+    the deviation of `hk.condition` grows there, over a lengthscale of k, to that of the prior. It
+    is too small where the field changes faster with θ than among the members that were seen, as
+    1/θ² does towards zero, since built-in kernels k(θ, ϑ) know of θ − ϑ alone: choose a θ in which
+    the field changes evenly.
 
     For a drive of known frequency take `Controlled` with u = (cos ωt, sin ωt) instead, which knows
     that the drive enters linearly.

@@ -20,7 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import (
@@ -38,6 +38,7 @@ from hamkernel._kernels.symmetry import (
     symmetrised,
     symmetry_removed,
     with_parity,
+    without_symmetry,
 )
 from hamkernel._show import call, described
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -68,6 +69,19 @@ class AbstractStructure(AbstractMatrixKernel):
         kernel = with_parity(self.kernel, self.field_parity * parity)
         return eqx.tree_at(lambda K: K.kernel, self, kernel)
 
+    def check_points(self, X: Float[Array, "N d"]) -> None:
+        super().check_points(X)
+        k = without_symmetry(self.kernel)
+        if k.through_descriptor(X.shape[1]) is None or not require.is_concrete(X, k):
+            return
+        smooth = np.asarray(_smooth_descriptors(k, X))
+        if not smooth.all():
+            raise ValueError(
+                f"the map of Warp, or its derivative, is NaN or infinite at X[{smooth.argmin()}]: "
+                "two atoms in one place have no inverse distance, and roots and logarithms no "
+                "derivative at 0. Leave such states out, or write a map that is smooth there."
+            )
+
     def averaged(self, maps: tuple[LinearMap, ...]) -> "AbstractStructure":
         kernel = symmetrised(self.kernel, maps, (1.0,) * len(maps))
         return eqx.tree_at(lambda K: K.kernel, self, kernel)
@@ -95,6 +109,19 @@ class AbstractStructure(AbstractMatrixKernel):
     @property
     def invariance(self) -> Invariance:
         return self.kernel.invariance & self.operator_invariance
+
+
+@eqx.filter_jit
+def _smooth_descriptors(k: AbstractScalarKernel, X: Float[Array, "N n"]) -> Bool[Array, " N"]:
+    """Whether the descriptor of k and its Jacobian are finite at each point."""
+
+    def at(x):
+        found = k.through_descriptor(len(x))
+        assert found is not None
+        J = jax.jacfwd(found.map)(x)
+        return jnp.isfinite(found.map(x)).all() & jnp.isfinite(J).all()
+
+    return jax.lax.map(at, X)
 
 
 def _operator(K: AbstractMatrixKernel) -> dict[str, Any]:

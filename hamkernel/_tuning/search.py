@@ -44,6 +44,8 @@ class Search:
         max_steps: of one run, on each part.
         optimiser: one of optimistix, or None for `BoxBFGS`.
         progress: whether to print how it goes.
+        looks: the number of points at which a search of several starts looks first; by default 64
+            for each direction of the box, and 256 at most.
     """
 
     def __init__(
@@ -56,12 +58,15 @@ class Search:
         max_steps: int,
         optimiser: optx.AbstractMinimiser | None,
         progress: bool,
+        looks: int | None = None,
     ):
         self.space, self.criterion, self.rows, self.rms = space, criterion, rows, rms
         self.starts, self.max_steps = starts, max_steps
         self.optimiser, self.progress = optimiser, progress
         given = np.asarray(space.encode_start(), float)[None]
-        self._points = given if starts == 1 else np.append(given, design(space.directions), axis=0)
+        self._points = (
+            given if starts == 1 else np.append(given, design(space.directions)[:looks], axis=0)
+        )
 
     def runs(
         self, low_rank: Callable[[MinimiserRun], SearchCriterion] | None = None

@@ -75,6 +75,7 @@ def errors(forces, energies, data) -> tuple[float, float]:
 
 
 def with_hamkernel(name: str, data: dict[str, Any], bands: bool) -> dict[str, Any]:
+    import equinox as eqx
     import jax
 
     jax.config.update("jax_enable_x64", True)
@@ -99,18 +100,24 @@ def with_hamkernel(name: str, data: dict[str, Any], bands: bool) -> dict[str, An
         warp = hk.Warp(inner, inverse_distances, equivariant=True)
         return hk.Invariant(hk.CurlFree(warp if amplitude is None else amplitude * warp), maps)
 
+    @eqx.filter_jit
+    def at(field, X):
+        return jax.vmap(field)(X), -jax.vmap(field.potential)(X)
+
     def predicted(field, part):
-        X = jnp.asarray(part["coords"])
-        return jax.lax.map(field, X, batch_size=50), -jax.lax.map(field.potential, X, batch_size=50)
+        """Forces and energies, in batches of one shape: compiled once, for all ℓ."""
+        X = part["coords"]
+        parts = [at(field, X[i : i + VALIDATION]) for i in range(0, len(X), VALIDATION)]
+        return tuple(np.concatenate(each) for each in zip(*parts, strict=True))
 
     X, F = data["train"]["coords"], data["train"]["forces"]
     N, ridge = len(X), RIDGE / 6  # our kernel is the mean over the six permutations
     found = []
     for scale in SCALES:
         field = hk.fit(structure(scale), X, F, ridge / N)
-        found.append((errors(*predicted(field, data["validation"]), data["validation"]), scale))
-    scale = min(found)[1]
-    field = hk.fit(structure(scale), X, F, ridge / N)
+        error = errors(*predicted(field, data["validation"]), data["validation"])
+        found.append((error, scale, field))
+    _, scale, field = min(found, key=lambda each: each[0])
     force, energy = errors(*predicted(field, data["test"]), data["test"])
     result = {"force": force, "energy": energy, "scale": scale}
     if bands:

@@ -7,7 +7,11 @@ states (two runs of 61), with noise of 1, 5 and 10 % of each coordinate. Printed
 sets with exactly the true terms, the median error of their coefficients (those of all data sets),
 the share of true coefficients within two deviations, and the median misfit. PySINDy learns the
 equations and not H: it is given the gradients B∇φ of the same functions as its library (q̇ and ṗ
-with separate coefficients), and its threshold is the best of a scan over five, on the truth.
+with separate coefficients), and its threshold is the best of a scan over five, on the truth. From
+states it takes smoothed differences, or the weak form, integrals over 200 windows of a run.
+
+Five seeds, 122 states, exact at noise of 1, 5 and 10 %: readout 1.0, 1.0, 1.0; PySINDy 2.1 with
+smoothed differences 1.0, 0.6, 0.6, in its weak form 1.0, 0.8, 0.4.
 """
 
 import argparse
@@ -85,17 +89,20 @@ def scores(formula):
     return exact, error, within, float(formula.misfit)
 
 
-def sindy(noise, seed, of_runs):
+def sindy(noise, seed, of_runs, weak=False):
     """Whether some of five thresholds finds exactly q̇ = p and ṗ = −sin q."""
     import pysindy as ps  # type: ignore
 
-    slopes = [
-        lambda q, p, f=f, i=i: np.asarray(
-            jax.vmap(jax.grad(lambda x: f(x)))(jnp.stack([q, p], axis=-1))[:, i]
-        )
-        for f in TERMS.values()
-        for i in (0, 1)
-    ]
+    def slope(f, i):  # PySINDy counts arguments, defaults too
+        gradients = jax.jit(jax.vmap(jax.grad(f)))
+
+        def of_states(q, p):
+            x = np.stack([np.ravel(q), np.ravel(p)], axis=-1)
+            return np.asarray(gradients(x))[:, i].reshape(np.shape(q))
+
+        return of_states
+
+    slopes = [slope(f, i) for f in TERMS.values() for i in (0, 1)]
     probe = np.random.default_rng(0).normal(size=(9, 2))
     values = [s(*probe.T) for s in slopes]
     library = []
@@ -104,13 +111,16 @@ def sindy(noise, seed, of_runs):
         if value.std() > 0 and not any(same):
             library.append(i)
     functions = [slopes[i] for i in library]
-    names = [lambda q, p, i=i: f"g{i}" for i in library]
+    names = [(lambda name: lambda q, p: name)(f"g{i}") for i in library]
     truth = {0: {"g" + str(2 * 0 + 1)}, 1: {"g" + str(2 * 1)}}
+    columns = ps.CustomLibrary(functions, function_names=names)
+    if weak:
+        columns = ps.WeakPDELibrary(columns, spatiotemporal_grid=TIMES, is_uniform=True, K=200)
     for threshold in (0.02, 0.05, 0.1, 0.2, 0.4):
         model = ps.SINDy(
             optimizer=ps.STLSQ(threshold=threshold),
-            feature_library=ps.CustomLibrary(functions, function_names=names),
-            differentiation_method=ps.SmoothedFiniteDifference(),
+            feature_library=columns,
+            differentiation_method=None if weak else ps.SmoothedFiniteDifference(),
         )
         if of_runs:
             model.fit(list(states(noise, seed)), t=TIMES[1] - TIMES[0])
@@ -150,6 +160,9 @@ def main():
             if sindy_is_there:
                 tried = [sindy(noise, seed, kind == "122 states") for seed in range(seeds)]
                 other = f"{np.mean(tried):.1f}"
+                if kind == "122 states":
+                    tried = [sindy(noise, seed, True, weak=True) for seed in range(seeds)]
+                    other += f", weak form {np.mean(tried):.1f}"
             print(
                 f"{kind:14s}  {noise:5.0%}  {exact:5.2f}  {errors:6.2%}  {within:6.2f}  "
                 f"{misfit:6.2f}  {seconds:5.1f}  {other}",
