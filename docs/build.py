@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 TEMPLATES = ROOT / "docs" / "templates"
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 READING = ROOT / "docs" / "reading.md"  # what to read, and in which order
-COPIED = ["CHANGELOG.md", "CITATION.cff", "LICENSE"]
+COPIED = ["CHANGELOG.md", "CITATION.cff", "LICENSE", "docs/distributed.py"]
 # At the top of every page, from the root of the site.
 LINKS = {
     "hamkernel": "index.html",
@@ -50,6 +50,7 @@ def build(site: Path) -> None:
             new / "notebooks" / "figures",
             ignore=shutil.ignore_patterns("*.py", "__pycache__"),
         )
+        (new / "docs").mkdir()
         for name in COPIED:
             shutil.copy(ROOT / name, new / name)
         if site.exists():

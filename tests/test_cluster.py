@@ -4,9 +4,11 @@ import copy
 import operator
 import os
 import pickle
+import socket
 import subprocess
 import sys
 from functools import reduce
+from pathlib import Path
 from typing import Any
 
 import equinox as eqx
@@ -290,3 +292,117 @@ def test_a_process_that_is_killed_goes_on_from_its_file_to_the_same_numbers(tmp_
     assert again.returncode == whole.returncode == 0, again.stderr
     assert again.stdout == whole.stdout
     assert whole.stdout.startswith("2000 ")
+
+
+# Engines of others: two worker processes of Dask, and a million points in twenty files.
+
+DASK = """
+import operator, os, signal, sys
+from pathlib import Path
+
+import jax
+jax.config.update("jax_enable_x64", True)
+import dask.bag
+import numpy as np
+from dask.distributed import Client, LocalCluster
+
+import hamkernel as hk
+
+folder = Path(sys.argv[1])
+
+
+def added(model, path, killed_at=None):
+    part = np.load(path)
+    model = model.add(part["X"], part["Y"])
+    jax.block_until_ready(model)
+    if path.name == killed_at:  # once: the second time the file is there
+        try:
+            (path.parent / "killed").touch(exist_ok=False)
+        except FileExistsError:
+            return model
+        os.kill(os.getpid(), signal.SIGKILL)
+    return model
+
+
+def killing(model, path):
+    return added(model, path, "07.npz")
+
+
+if __name__ == "__main__":
+    os.environ["JAX_ENABLE_X64"] = "1"
+    rng = np.random.default_rng(0)
+    for i in range(20):
+        X = rng.uniform(-2, 2, size=(50_000, 2))
+        Y = np.stack([X[:, 1], -np.sin(X[:, 0])], axis=1) + 0.01 * rng.normal(size=X.shape)
+        np.savez(folder / f"{i:02}.npz", X=X, Y=Y)
+    paths = sorted(folder.glob("*.npz"))
+    sample, K = rng.uniform(-2, 2, size=(2000, 2)), hk.Symplectic(hk.Gaussian(1.5))
+    start = hk.Nystrom().start(K, sample, 1e-8)
+    with LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        with Client(cluster):
+            files = dask.bag.from_sequence(paths, npartitions=4)
+            parts = [
+                files.fold(added, operator.add, initial=start).compute(),
+                # Not the first file of its partition: some of it was added, and is lost.
+                files.fold(killing, operator.add, initial=start).compute(),
+            ]
+    whole = start
+    for path in paths:
+        whole = added(whole, path)
+    values = [np.asarray(m.field().evaluate(sample)) for m in (whole, *parts)]
+    off = [np.linalg.norm(v - values[0]) / np.linalg.norm(values[0]) for v in values]
+    killed = (folder / "killed").exists()
+    print([int(m.count) for m in parts], off, killed)
+    assert all(int(m.count) == 1_000_000 for m in parts)
+    assert max(off) < 1e-12
+    assert killed
+"""
+
+
+@pytest.mark.slow
+def test_two_workers_of_dask_are_one_pass_and_one_that_dies_is_run_again(tmp_path):
+    pytest.importorskip("distributed")
+    (tmp_path / "program.py").write_text(DASK)
+    command = [sys.executable, str(tmp_path / "program.py"), str(tmp_path)]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout[-2000:] + done.stderr[-3000:]
+
+
+# The program of the guide.
+
+
+@pytest.mark.slow
+def test_the_program_for_jax_distributed_fits_in_two_processes(tmp_path):
+    parts = np.array_split(np.arange(600), 4)
+    for i, part in enumerate(parts[:3]):  # one process has more than the other
+        np.savez(tmp_path / f"{i}.npz", X=X[part], Y=Y[part])
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    program = Path(__file__).parents[1] / "docs" / "distributed.py"
+    environment = os.environ | {"JAX_CPU_COLLECTIVES_IMPLEMENTATION": "gloo"}
+    environment.pop("XLA_FLAGS", None)
+    options = "--coordinator", address, "--processes", "2", "--process"
+    processes = [
+        subprocess.Popen(
+            [sys.executable, program, tmp_path, tmp_path / "field", *options, str(i)],
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            env=environment,
+        )
+        for i in range(2)
+    ]
+    try:
+        said = [process.communicate(timeout=600) for process in processes]
+    finally:
+        for process in processes:
+            process.kill()
+    assert all(process.returncode == 0 for process in processes), said
+    assert "process 0: 150 of 300 points of 2 files" in said[0][0]
+    assert "process 1: 150 of 150 points of 1 files" in said[1][0]
+    assert "300 points: SolverInfo(" in said[0][0]
+    used = np.concatenate([parts[0], parts[1]])
+    exact = hk.fit(K, X[used], Y[used], 1e-6)
+    field = hk.load(tmp_path / "field")
+    assert relative(field.evaluate(NEW), exact.evaluate(NEW)) < 1e-5

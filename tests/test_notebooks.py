@@ -13,9 +13,9 @@ FOLDER = Path(__file__).parent.parent / "notebooks"
 NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 # Each runs in a process of its own, compiled as for a user, and so is slow; CI runs this one.
 IN_CI = {"quickstart"}
-PACKAGES = {"planets": ["jplephem", "skyfield_data"]}
+PACKAGES = {"planets": ["jplephem", "skyfield_data"], "guide_cluster": ["dask", "distributed"]}
 # Without pictures: what they show is numbers and error messages.
-NUMBERS = {"guide_deploy", "guide_sharp_bits"}
+NUMBERS = {"guide_cluster", "guide_deploy", "guide_sharp_bits"}
 # No claim about speed: only so that a kernel that hangs ends the test.
 TIMEOUT = 1200
 
