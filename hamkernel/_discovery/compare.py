@@ -46,7 +46,8 @@ _NOTHING = 0.5
 # the positive quadrant, where nothing is known of −x, Lotka-Volterra was called odd 9 times of 10.
 _SEEN = 0.1
 _STEPS = 64  # of a search at most, as in `tune`
-_LOOKS = 32  # where a search may start: its first point is a good one for data of this size
+# Where a search may start, in place of 256 as in `tune`: the first point suits data of this size.
+_LOOKS = 32
 _ROUNDING = 1e-4  # of blocks of a symmetric kernel, in single precision too
 
 QUESTIONS = {

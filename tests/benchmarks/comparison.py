@@ -6,7 +6,10 @@
 A confident answer is yes or no. The share of confident answers is that of the questions that have
 an answer; "not tested" counts as not confident, unless there is nothing to test it on. Velocities
 have noise of 2 % of their size in each coordinate, runs are of 2 % of the size of their states, at
-20 samples each. Medians and shares over seeds; seconds of CPU a data set.
+20 samples each. Shares over seeds; seconds of CPU a data set.
+
+Three seeds of all ten, velocities: 24 points: confident .92, wrong 0 of 119; 60 points: .91, 0 of
+118; the best candidate claims nothing false in any.
 """
 
 # pyright: reportArgumentType=false, reportOptionalOperand=false, reportAttributeAccessIssue=false
