@@ -9,6 +9,7 @@ change little. Workers run half of the files, and then all: the peak memory of a
 """
 
 import argparse
+import contextlib
 import operator
 import os
 import tempfile
@@ -31,7 +32,8 @@ def pinned(core):
     if hasattr(os, "sched_setaffinity"):
         cores = sorted(os.sched_getaffinity(os.getppid()))
         for thread in os.listdir("/proc/self/task"):
-            os.sched_setaffinity(int(thread), [cores[core % len(cores)]])
+            with contextlib.suppress(ProcessLookupError):  # one that has just ended
+                os.sched_setaffinity(int(thread), [cores[core % len(cores)]])
 
 
 def peak():
