@@ -78,7 +78,6 @@ class AbstractSymplecticSolver(diffrax.AbstractSolver):
 
     def order(self, terms: Any) -> int:
         """Return the order p: the error at a fixed time is O(hᵖ)."""
-        del terms
         return self.nominal_order
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
@@ -121,13 +120,11 @@ class FixedPointToRounding(optx.AbstractFixedPointSolver):
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
         """Return (increment, smallest increment so far, iterations since then)."""
-        del fn, args, options, f_struct, aux_struct, tags
         infinite = jnp.full_like(self.norm(y), jnp.inf)
         return infinite, infinite, jnp.array(0)
 
     def step(self, fn, y, args, options, state, tags):
         """Apply f once."""
-        del options, tags
         _, smallest, since = state
         new, aux = fn(y, args)
         increment = self.norm(new - y)
@@ -136,7 +133,6 @@ class FixedPointToRounding(optx.AbstractFixedPointSolver):
 
     def terminate(self, fn, y, args, options, state, tags) -> tuple[Bool[Array, ""], optx.RESULTS]:
         """Return whether the increments are rounding errors, or not finite."""
-        del fn, args, tags
         increment, _, since = state
         size = self.norm(y)
         eps = float(jnp.finfo(size.dtype).eps)
@@ -153,7 +149,6 @@ class FixedPointToRounding(optx.AbstractFixedPointSolver):
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Return the last iterate as it is."""
-        del fn, args, options, state, tags, result
         return y, aux, {}
 
 
@@ -213,7 +208,6 @@ class AbstractGauss(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> tuple[Float[Array, " n"], None, dict[str, Array], Float[Array, "s n"], diffrax.RESULTS]:
         """Solve the stage equations to rounding and make one step."""
-        del made_jump  # The slopes of the last step are but a guess.
         step = Step(terms, t0, t1, y0, args)
         tableau = jax.tree.map(lambda x: jnp.asarray(x, step.y0.dtype), self.tableau)
         weights = step.h * tableau.b
@@ -439,7 +433,6 @@ class EqualSteps(diffrax.AbstractSolver):
         self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any, solver_state: Any, made_jump: Any
     ) -> tuple[Any, None, dict[str, Any], None, diffrax.RESULTS]:
         """Make the equal steps."""
-        del solver_state, made_jump
         span = t1 - t0
         solution = diffrax.diffeqsolve(
             terms,

@@ -276,6 +276,27 @@ class AbstractSpan(eqx.Module):
         return jnp.concatenate([self.of(block) for block in rows.blocks])
 
 
+def landmark_field(
+    K: AbstractMatrixKernel,
+    landmarks: Landmarks,
+    regularization: Float[Array, ""],
+    c: Float[Array, " r"],
+    residual: Float[Array, "..."],
+    norm: Float[Array, ""],
+    truncation: Float[Array, ""] | None,
+    residual_norm: Float[Array, ""] | None = None,
+) -> KernelField:
+    """The field Σ c_r L_r K of the functionals L_r that are the landmarks."""
+    info = SolverInfo(
+        "Nystrom",
+        landmarks=landmarks.count,
+        rank=landmarks.kept.sum(),
+        truncation=truncation,
+        residual_norm=residual_norm,
+    )
+    return kernel_field(K, landmarks.representer(c), residual, norm, regularization, info)
+
+
 class LandmarkSpan(AbstractSpan):
     """The columns K(·, s) of landmarks, times T, which makes them orthonormal."""
 
@@ -293,15 +314,8 @@ class LandmarkSpan(AbstractSpan):
         return truncated(trace_of_rows(self.kernel, rows), jnp.sum(F**2), ridge)
 
     def field(self, w, residual, ridge, N, truncation) -> KernelField:
-        landmarks = self.landmarks
-        info = SolverInfo(
-            "Nystrom",
-            landmarks=landmarks.count,
-            rank=landmarks.kept.sum(),
-            truncation=truncation,
-        )
-        representer = landmarks.representer(self.T @ w)
-        return kernel_field(self.kernel, representer, residual, root(w @ w), ridge / N, info)
+        c, norm = self.T @ w, root(w @ w)
+        return landmark_field(self.kernel, self.landmarks, ridge / N, c, residual, norm, truncation)
 
     def draws(self, weights, rows, key, region) -> KernelField:
         everywhere = jnp.concatenate([self.landmarks.rows.points, rows.points])
@@ -382,7 +396,6 @@ class LandmarkBasis(AbstractBasis):
     landmarks: Landmarks
 
     def span(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> LandmarkSpan:
-        del n, dtype
         own = landmark_span(K, given_landmarks(K, self.landmarks))
         # Without a column a fit fails; the losses would be those of the zero field.
         T = jnp.where(own.landmarks.count == 0, jnp.nan, own.T)

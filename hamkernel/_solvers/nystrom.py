@@ -20,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int, Key, Num, UInt32
 
 from hamkernel import _require as require
-from hamkernel._fields.base import SolverInfo, root
+from hamkernel._fields.base import root
 from hamkernel._fields.expansions import KernelField
 from hamkernel._gram.dense import components, trace, trace_of_rows
 from hamkernel._gram.operator import product
@@ -49,6 +49,7 @@ from hamkernel._solvers.low_rank import (
     LowRankConditional,
     checked,
     factor,
+    landmark_field,
     landmark_span,
     low_rank_conditional,
     singular,
@@ -66,32 +67,15 @@ class Solution(NamedTuple):
     residual_norm: Float[Array, ""] | None = None
 
 
-def landmark_field(
+def _checked_field(
     K, landmarks, solution, regularization, tolerance, cure, throw=True
 ) -> KernelField:
+    """The field of a solution, if it is one; UserWarning where it is truncated."""
     dtype = landmarks.points.dtype
     failed = require.not_finite(solution.coefficients).any()
     solution = checked(solution, landmarks, solution.truncation, failed, singular(dtype), throw)
     warn_if_truncated(solution.truncation, landmarks.count, tolerance, cure)
-    Z, A, S, b = landmarks.representer(solution.coefficients)
-    return KernelField(
-        kernel=K,
-        points=Z,
-        coefficients=A,
-        residual=solution.residual,
-        norm=solution.norm,
-        regularization=regularization,
-        offset=jnp.zeros((), dtype),
-        info=SolverInfo(
-            "Nystrom",
-            landmarks=landmarks.count,
-            rank=landmarks.kept.sum(),
-            truncation=solution.truncation,
-            residual_norm=solution.residual_norm,
-        ),
-        value_points=S if len(S) else None,
-        value_coefficients=b if len(S) else None,
-    )
+    return landmark_field(K, landmarks, regularization, *solution)
 
 
 CHOOSE = (
@@ -181,7 +165,7 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
         solution = _solution(self, count, regularization)
         landmarks, tolerance = self.landmarks, self.tolerance
-        return landmark_field(
+        return _checked_field(
             self.kernel, landmarks, solution, regularization, tolerance, START_ANEW
         )
 
@@ -318,7 +302,7 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
         X, Y = split(spread, X), split(spread, Y)
         solution = _fit(K, X, Y, regularization, landmarks, spread)
         solution = solution._replace(residual=as_given(spread, solution.residual))
-        return landmark_field(K, landmarks, solution, regularization, self.tolerance, CHOOSE, throw)
+        return _checked_field(K, landmarks, solution, regularization, self.tolerance, CHOOSE, throw)
 
     def _given(self, problem, throw=True, progress=False) -> LowRankConditional:
         problem = problem.on_one_device()

@@ -218,5 +218,4 @@ class AbstractSolver(eqx.Module, Generic[Learned]):
         self, problem: Problem, throw: bool = True, progress: bool = False
     ) -> AbstractConditional:
         """The Gaussian field given the rows; TypeError if the solver keeps no factor."""
-        del problem, throw, progress
         raise TypeError(self.no_factor)

@@ -48,7 +48,6 @@ class LimitedNewton(optx.AbstractDescent):
     """
 
     def init(self, y, f_info_struct):
-        del f_info_struct
         return jnp.zeros_like(y)
 
     def query(self, y, f_info, state):
@@ -72,7 +71,6 @@ class ParabolicSearch(optx.AbstractSearch):
     """
 
     def init(self, y, f_info_struct):
-        del f_info_struct
         return jnp.ones((), y.dtype)
 
     def step(self, first_step, y, y_eval, f_info, f_eval_info, state):
