@@ -134,7 +134,6 @@ MARGINALS = {  # of one coordinate of ω
 }
 
 
-@pytest.mark.few(2)
 @pytest.mark.parametrize("name", MARGINALS)
 @pytest.mark.parametrize("n", [1, 3])
 def test_frequencies_have_the_spectral_density(name, n, key):

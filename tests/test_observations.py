@@ -209,6 +209,15 @@ def test_order_and_splitting_change_nothing():
     )
 
 
+def test_the_squares_of_the_norms_of_parts_add_up_with_energies_too():
+    rng = np.random.default_rng(3)
+    X, Z = rng.normal(size=(2, 6, 2))
+    data = hk.Velocities(X, rng.normal(size=(6, 2))) + hk.Energies(Z, rng.normal(size=6))
+    field = hk.fit(K + hk.Symplectic(hk.Gaussian(0.7)), data, regularization=1e-2)
+    squares = [field.part(i).norm ** 2 for i in range(2)]
+    np.testing.assert_allclose(sum(squares), field.norm**2, rtol=SOLVE)
+
+
 def test_functionals_that_share_points_or_are_padded_are_the_same_rows():
     rng = np.random.default_rng(0)
     points, weights, targets = (rng.normal(size=s) for s in ((3, 4, 2), (3, 5, 4, 2), (3, 5)))

@@ -221,6 +221,15 @@ def test_draws_have_the_mean_and_the_covariance_of_the_posterior(solver, mean, k
     assert abs(changes.std() / deviation - 1) < 5 / (2 * SAMPLES) ** 0.5
 
 
+def test_draws_of_low_rank_leave_nothing_of_the_prior_at_the_landmarks(key):
+    """There the rest of the prior is zero, and draws are as near to the mean as the data say."""
+    posterior, points = hk.condition(K, X, Y, RIDGE, solver=hk.Nystrom(points=X)), jnp.asarray(X)
+    velocities = jax.vmap(lambda field: jax.vmap(field)(points))(posterior.sample(key, 3, REGION))
+    mean, deviation = (jax.vmap(f)(points) for f in (posterior.field, posterior.deviation))
+    off = (velocities - mean[None]) / deviation[None]
+    assert 0.3 < abs(off).max() < 5  # in standard deviations; those of the prior are 10 of them
+
+
 @pytest.mark.slow
 def test_draws_without_a_spectrum_are_right_in_the_region(key):
     kernel = hk.Symplectic(hk.Warp(3.0 * hk.Gaussian(1.5), jnp.tanh))
