@@ -19,7 +19,7 @@ _SIGMAS, _CURVATURE = 5.0, 0.1
 # Noise of half the motion or more: where learning failed, it was found 0.9 to 1.1 times the motion.
 _ALL_NOISE = 0.5
 
-# Of the states: what a field that is not yet exact leaves, and averages of samples without noise.
+# Residuals below this share of the states are no noise: a field that is not yet exact leaves them.
 NEGLIGIBLE = 1e-3
 _SWING = 5.0  # samples in a swing: with fewer noise and motion cannot be told apart
 _USABLE = 1.5  # a misfit up to which a field that still moves a little explains its run
@@ -42,6 +42,7 @@ class FitQuality(NamedTuple):
         settled: whether they ended by themselves.
         swing: how many samples there are in a swing.
         driven: whether there are inputs.
+        capped: the number of landmarks where more would take too long, else 0.
     """
 
     kept: Float[np.ndarray, " R"]
@@ -56,6 +57,7 @@ class FitQuality(NamedTuple):
     settled: bool
     swing: float
     driven: bool
+    capped: int = 0
 
 
 def diagnose(
@@ -141,6 +143,9 @@ def warn_of_correlation(fit: FitQuality) -> None:
         else ""
     )
     more = "; process_noise=None" if fit.process is None else ""
+    if fit.capped:
+        few = f"the {fit.capped} landmarks are too few, and solver=hk.Nystrom(max_points="
+        timing = f"{few}{2 * fit.capped}) takes four times as long; {timing}"
     require.warn(
         f"the innovations are not white (p = {fit.white:.2g} by Ljung and Box; the correlation of "
         f"neighbours is {fit.correlation[c]:.2f} in coordinate {c}): what the field and the noise "

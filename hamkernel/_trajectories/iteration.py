@@ -70,6 +70,7 @@ class Task(NamedTuple):
         mean: what is known.
         S: as many landmarks as there may be.
         first: with how many of them learning begins.
+        capped: whether more would be of use, and take too long.
         bounds: the box of hyperparameters.
         start_deviation: of the prior of starts.
     """
@@ -78,6 +79,7 @@ class Task(NamedTuple):
     mean: Any
     S: Float[np.ndarray, "m d"]
     first: int
+    capped: bool
     bounds: Bounds
     start_deviation: Float[Array, " n"]
 
@@ -133,6 +135,7 @@ def iterate(
     history: list[Iteration] = []
     pieces: list[Piece] = []
     settled = False
+    bar.total = bar.n + 1 + most
     bar.update()
     for i in range(most):
         if process:
@@ -186,7 +189,8 @@ def _first(
     S = task.S[:count]
     model, _ = most_likely(model, S, *given, task.bounds, _SEARCH, whitening)
     S = task.S if searched(jnp.asarray(S), rows)[1] is not rows else S
-    model, found = solved(model, S, task.first, *given, whitening, task.bounds)
+    # Along the smoothed runs more of them are asked for only where `begun` did.
+    model, found = solved(model, task.S[:count], task.first, *given, whitening, task.bounds)
     return model, found, Expansion(model.kernel, found.points, found.coefficients, task.mean), S
 
 

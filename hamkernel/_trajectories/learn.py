@@ -153,7 +153,7 @@ def learn(
         Y = Y - np.asarray(jax.vmap(known)(jnp.asarray(X)))
     log_noise = jnp.log(jnp.asarray(_first_noise(data) if given is None else given))
     moves = measured & (given is None)
-    S, first = landmarks(data, None if solver is None else solver.max_points)
+    S, first, capped = landmarks(data, None if solver is None else solver.max_points)
     warn_of_cost(data, first)
 
     def asked(q: np.ndarray, spacing: float = 0.0, impulse: np.ndarray | None = None):
@@ -161,7 +161,7 @@ def learn(
             model = Model(K, log_noise, jnp.log(jnp.asarray(q)))
         bounds, design = bounds_and_design(model, X, Y, data.scale, moves, spacing, impulse)
         prior = jnp.asarray(_WIDE * data.scale)
-        return Task(data, known, S, first, bounds, prior), model, design
+        return Task(data, known, S, first, capped, bounds, prior), model, design
 
     def ended(q: np.ndarray, spacing: float = 0.0, impulse: np.ndarray | None = None) -> End:
         disturbed = bool(q.any()) or impulse is not None
@@ -302,6 +302,7 @@ def _quality(
         settled=end.settled,
         swing=float(swing),
         driven=runs.inputs is not None,
+        capped=len(now.field.points) if end.task.capped else 0,
     )
 
 

@@ -1,9 +1,9 @@
 """The runs before anything is learned of the field: condensed, smoothed, completed.
 
-Samples that are much closer than the motion needs are averaged: what they say together of the
-motion is the smoothed path in their middle plus the mean of their residuals, with the noise of so
-many; the bias of this is of second order in what the smoothing missed. What they say of the noise
-is how they scatter about that mean.
+Samples that are much closer in time than the motion needs are averaged in blocks. A block becomes
+one sample in its middle: the smoothed path there plus the mean of the block's residuals, whose
+noise is σ/√count. The bias of that sample is of second order in the error of the smoothed path. How
+the block scatters about its mean is kept, since it knows σ.
 """
 
 import functools
@@ -24,8 +24,9 @@ from hamkernel._trajectories.smoothing import Coordinate, interpolated, processe
 # Landmarks for d coordinates to begin with, 128 for more. 45 for two and 80 for four were as good
 # as all on ten runs of 10 s; where the data asks for more there are more.
 _FEWEST = {1: 24, 2: 48, 3: 64, 4: 80}
-# Rows times columns²: 4 to 5 s for each solve (20 runs of 50 samples, n = 8, 256 landmarks).
-_WORK = 3.5e10
+# Rows times columns²: 2 s for each solve. With 3.5e10, 20 runs of 50 samples with n = 8 had 256
+# landmarks, for 128, and took 210 s for 115, and 1.9 GB for 1.4.
+_WORK = 1e10
 _POINTS = 1024  # from which boxes are taken, and landmarks if there are not more intervals
 
 # Of the lengthscale in time, between samples that are kept. A pendulum of frequency ω has a
@@ -313,8 +314,10 @@ def sampled(
     return X[chosen], Y[chosen]
 
 
-def landmarks(data: Preprocessed, count: int | None) -> tuple[Float[np.ndarray, "m d"], int]:
-    """Points of the paths in an order in which the first cover them, and how many to begin with.
+def landmarks(data: Preprocessed, count: int | None) -> tuple[Float[np.ndarray, "m d"], int, bool]:
+    """Points of the paths, of which the first cover them, how many to begin with, and the cap.
+
+    The last is whether more than the first would be of use and take too long.
 
     Each is the one farthest from those before, in standard deviations. They do not depend on
     hyperparameters, which are not known yet. There are at most as many as intervals: of a field on
@@ -329,6 +332,8 @@ def landmarks(data: Preprocessed, count: int | None) -> tuple[Float[np.ndarray, 
     affordable = int((_WORK / (n * intervals)) ** 0.5) // n
     X, _ = sampled(data, max(_POINTS, min(intervals, 2 * affordable)))
     first = _FEWEST.get(X.shape[1], 128)
+    # They are doubled: a last step to a few more would cost a compilation and a solve.
+    affordable = first * 2 ** int(np.log2(max(affordable / first, 1)))
     most = max(first, min(intervals, affordable)) if count is None else count
     spread = X[:, n:].std(axis=0)  # of the inputs
     points = X / np.concatenate([data.scale, np.where(spread > 0, spread, 1.0)])[None]
@@ -339,4 +344,5 @@ def landmarks(data: Preprocessed, count: int | None) -> tuple[Float[np.ndarray, 
         if not distance.max() > 0:
             break
         chosen.append(int(np.argmax(distance)))
-    return X[chosen], min(len(chosen), first if count is None else count)
+    capped = count is None and most == first < intervals
+    return X[chosen], min(len(chosen), first if count is None else count), capped

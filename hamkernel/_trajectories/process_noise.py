@@ -65,7 +65,7 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     """
     now, task = end.now, end.task
     given = now.field.points, now.rows, task.start_deviation
-    if limited_by_landmarks(now.model, *given, project_out_starts):
+    if task.capped or limited_by_landmarks(now.model, *given, project_out_starts):
         return False
     if not (end.settled and now.good.all()):
         return True

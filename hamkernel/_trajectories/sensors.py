@@ -203,7 +203,7 @@ def warn_of_feedback(states: Sequence[np.ndarray], inputs: Sequence[np.ndarray])
 
 
 def _is_wrapped(t: Float[np.ndarray, " T"], x: Float[np.ndarray, " T"]) -> bool:
-    """Whether x turns by 2π between samples that are else less than a third as far, as it goes."""
+    """Whether x has steps of about 2π, while all its other steps are less than a third of that."""
     t, x = t[np.isfinite(x)], x[np.isfinite(x)]
     near = np.diff(t) <= 3 * np.median(np.diff(t)) if len(t) > 1 else slice(0)
     step = np.abs(np.diff(x))[near]  # across a gap a momentum may go as far
