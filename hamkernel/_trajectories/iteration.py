@@ -189,8 +189,7 @@ def _first(
     S = task.S[:count]
     model, _ = most_likely(model, S, *given, task.bounds, _SEARCH, whitening)
     S = task.S if searched(jnp.asarray(S), rows)[1] is not rows else S
-    # Along the smoothed runs more of them are asked for only where `begun` did.
-    model, found = solved(model, task.S[:count], task.first, *given, whitening, task.bounds)
+    model, found = solved(model, S, task.first, *given, whitening, task.bounds)
     return model, found, Expansion(model.kernel, found.points, found.coefficients, task.mean), S
 
 
