@@ -113,7 +113,8 @@ def with_hamkernel(name: str, data: dict[str, Any], bands: bool) -> dict[str, An
         """Forces and energies, in batches of one shape: compiled once, for all ℓ."""
         X = part["coords"]
         parts = [evaluated(field, X[i : i + VALIDATION]) for i in range(0, len(X), VALIDATION)]
-        return tuple(np.concatenate(each) for each in zip(*parts, strict=True))
+        forces, energies = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return forces, energies
 
     X, F = data["train"]["coords"], data["train"]["forces"]
     N, ridge = len(X), RIDGE / 6  # our kernel is the mean over the six permutations
