@@ -272,7 +272,7 @@ def condensed(
 
 
 @eqx.filter_jit
-def conditional(known: Condensed, S, shift=0.0) -> ClosedForm:
+def conditional(known: Condensed, S, shift: Array | float = 0.0) -> ClosedForm:
     """The field and the starts for rows whose noise is exp(shift) times what it was.
 
     All rows scale together but for the prior of the starts, which is so wide that it says nothing.

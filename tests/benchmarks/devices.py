@@ -64,7 +64,11 @@ def programs():
         return random_features._fit(KERNEL, waves, X, Y, ridge, rows).residual
 
     def gradients(X, Y, rows):
-        return conjugate_gradient._solve(KERNEL, X, Y, len(X) * ridge, S, 1e-8, 100, rows)
+        N_ridge = len(X) * ridge
+        given = KERNEL, X, N_ridge, S, rows
+        return conjugate_gradient._solve(
+            conjugate_gradient._prepared, given, Y, N_ridge, jnp.asarray(1e-8), 100
+        )
 
     return {
         "product": lambda X, Y, rows: product(KERNEL, X, X, Y, rows, rows),
