@@ -109,7 +109,9 @@ class AbstractMatrixKernel(eqx.Module):
         """The mean of Z, as far as K does not change when it is taken off both arguments."""
         return Z.mean(axis=0) if Invariance.TRANSLATION in self.invariance else None
 
-    def blocks(self, X: Points, Z: Points) -> Float[Array, "N n M n"] | None:
+    def blocks(
+        self, X: Float[Array, "N n"], Z: Float[Array, "M n"]
+    ) -> Float[Array, "N n M n"] | None:
         """The Gram of points that are paired, where it has a closed form of its own."""
         return None
 

@@ -187,15 +187,26 @@ def _least(loss: Callable[[float], float], spacing: float) -> None:
 
 
 def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:
-    """The processes, without runs that are five times as far from them as half of the others."""
+    """The processes, without runs that are five times as far from them as half of the others.
+
+    In units of the states. A thousandth of those is no reason: of exact runs the smoother leaves
+    that, most of it in the fastest one.
+    """
     found = processes(times, states)
     if len(times) < 3:
         return found, np.ones(len(times), bool)
     paths = smoothed(found, times, states)
+    every = np.concatenate(states)
+    seen = np.isfinite(every).any(axis=0)
+    spread = np.where(seen, np.nanstd(np.where(seen, every, 0.0), axis=0), 1.0)
+    unit = np.where(spread > 0, spread, 1.0)
     far = np.array(
-        [np.sqrt(np.nanmean((x - paths.value[r, : len(x)]) ** 2)) for r, x in enumerate(states)]
+        [
+            np.sqrt(np.nanmean(((x - paths.value[r, : len(x)]) / unit) ** 2))
+            for r, x in enumerate(states)
+        ]
     )
-    usable = ~(far > 5 * np.nanmedian(far))
+    usable = ~(far > max(5 * np.nanmedian(far), 1e-3))
     if usable.all():
         return found, usable
     chosen = np.flatnonzero(usable)
