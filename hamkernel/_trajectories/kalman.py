@@ -237,12 +237,13 @@ def innovations(made: WhitenedRows, rows: LinearisedSegments) -> Float[np.ndarra
         if not (len(y) and np.isfinite(A).all() and np.isfinite(y).all()):
             continue
         R, v = known[:q, :q], known[:q, q]
-        V = solve_triangular(R, A.T, trans="T").T
+        V = solve_triangular(R, A.T, trans=1).T
         root: Any = np.linalg.qr(np.concatenate([np.eye(len(y)), V.T]), mode="r")
         L = root.T * np.sign(np.diagonal(root))[None]
         out[s, there] = solve_triangular(L, y - V @ v, lower=True)
         # A triangle above a segment's rows, in 2 d q² operations; a plain QR took 18 s of q = 2048.
-        known, *_ = lapack.dtpqrt(0, min(_BLOCK, q + 1), known, np.column_stack([A, y]))
+        both = np.column_stack([A, y])
+        known, *_ = lapack.dtpqrt(0, min(_BLOCK, q + 1), known, both)  # type: ignore[attr-defined]
         known[q, q] = 0.0
     return out.reshape(shape)
 
