@@ -377,9 +377,8 @@ def _check(
     n = runs.dimension
     given = runs.inputs if runs.parameters is None else runs.parameters
     if K.takes_inputs and given is not None:
-        inputs_or_parameters(
-            runs.inputs, runs.parameters, K
-        )  # refuses the one in the place of the other
+        # This refuses the one in the place of the other.
+        inputs_or_parameters(runs.inputs, runs.parameters, K)
     if isinstance(K, AbstractFamily) and given is None:
         raise TypeError(
             "a Family needs to know of which system each run is: hk.Runs(times, states, "
