@@ -13,25 +13,21 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
+from hamkernel._trajectories.flow import Segments
 from hamkernel._trajectories.learn import warn_of_cost
 from hamkernel._trajectories.likelihood import (
-    Bounds,
     Model,
     closed_form,
     condensed,
     conditional,
     landmark_whitening,
-    limited_by_landmarks,
-    losses,
     project_out_starts,
     regression_loss,
-    searched,
-    solved,
 )
+from hamkernel._trajectories.search import Bounds, limited_by_landmarks, losses, searched, solved
 from hamkernel._trajectories.segments import (
     SHORT,
     LinearisedSegments,
-    Segments,
     given_path,
     linearised,
     padded_count,

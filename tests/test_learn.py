@@ -21,24 +21,25 @@ from scipy.integrate import solve_ivp
 import hamkernel as hk
 from hamkernel._machine import orthonormal
 from hamkernel._trajectories.diagnostics import warn_of_few, warn_of_noise
-from hamkernel._trajectories.flow import NODES, WEIGHTS, jacobians, means, simulated
+from hamkernel._trajectories.flow import (
+    NODES,
+    WEIGHTS,
+    Segments,
+    back_substituted,
+    jacobians,
+    means,
+    simulated,
+)
 from hamkernel._trajectories.kalman import as_observations
 from hamkernel._trajectories.likelihood import (
     Model,
-    _loss,
     closed_form,
     landmark_whitening,
-    losses,
     project_out_starts,
 )
 from hamkernel._trajectories.preprocessing import preprocess
-from hamkernel._trajectories.segments import (
-    Segments,
-    back_substituted,
-    given_path,
-    linearised,
-    short_pieces,
-)
+from hamkernel._trajectories.search import _loss, losses
+from hamkernel._trajectories.segments import given_path, linearised, short_pieces
 
 K = hk.Symplectic(hk.Gaussian(1.0))
 NO_PROCESS = jnp.full(2, -jnp.inf)

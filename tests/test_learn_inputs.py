@@ -17,12 +17,12 @@ from scipy.integrate import solve_ivp
 from scipy.interpolate import CubicSpline
 
 import hamkernel as hk
-from hamkernel._trajectories.flow import NODES, jacobians, means, simulated
-from hamkernel._trajectories.inputs import at_nodes, at_samples, in_intervals, values
+from hamkernel._trajectories.flow import NODES, Segments, jacobians, means, simulated
 from hamkernel._trajectories.kalman import as_observations
 from hamkernel._trajectories.likelihood import Model
 from hamkernel._trajectories.preprocessing import _least
-from hamkernel._trajectories.segments import Segments, given_path, linearised, segments_of
+from hamkernel._trajectories.runs import at_nodes, at_samples, in_intervals, values
+from hamkernel._trajectories.segments import given_path, linearised, segments_of
 
 FRICTION, GAIN = 0.2, 1.5
 PENDULUM = hk.systems.Damped(hk.systems.Pendulum(1.0, 1.0, 6.0), FRICTION)

@@ -15,22 +15,11 @@ import scipy.stats
 from test_learn import damped, field_error, logs
 
 import hamkernel as hk
+from hamkernel._trajectories.diagnostics import ljung_box, neighbours, whiteness
 from hamkernel._trajectories.flow import WEIGHTS
-from hamkernel._trajectories.kalman import (
-    as_observations,
-    innovations,
-    ljung_box,
-    neighbours,
-    smoothed_path,
-    whiten,
-    whiteness,
-)
-from hamkernel._trajectories.likelihood import (
-    Model,
-    WhitenedRows,
-    landmark_whitening,
-    losses,
-)
+from hamkernel._trajectories.kalman import as_observations, innovations, smoothed_path, whiten
+from hamkernel._trajectories.likelihood import Model, WhitenedRows, landmark_whitening
+from hamkernel._trajectories.search import losses
 from hamkernel._trajectories.segments import LinearisedSegments
 
 # The filter.

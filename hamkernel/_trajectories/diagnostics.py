@@ -6,11 +6,16 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.scipy.special import gammaincc
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._trajectories.kalman import SIGNIFICANT
 from hamkernel._trajectories.runs import Runs
+
+_LAGS = 10  # of the test of whiteness, where the samples have as many
+_PAIRS = 20  # at a lag, from which a correlation is normal
+SIGNIFICANT = 0.05  # of its false alarms
+
 
 # χ² per degree of freedom has the standard deviation √(2/ν); five of them, and a tenth for the
 # curvature that a linearisation misses.
@@ -255,3 +260,45 @@ def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> Non
             f"coordinate {blind[0]} was measured in no run, and the velocities of the mean do not "
             "depend on it: give a mean that says how it moves the others, such as q̇ = p/m."
         )
+
+
+def ljung_box(series: list[Float[np.ndarray, " T"]]) -> tuple[float, int]:
+    """Ljung and Box's statistic of series of mean zero, N (N + 2) Σ_k r_k²/N_k, and its lags.
+
+    N_k are the pairs at lag k, none of them of two series: N − k for a single one.
+    """
+    N, total = sum(len(z) for z in series), sum(z @ z for z in series)
+    statistic, lags = 0.0, 0
+    for k in range(1, _LAGS + 1):
+        pairs = [(z[k:], z[:-k]) for z in series if len(z) > k]
+        count = sum(len(a) for a, _ in pairs)
+        if count >= _PAIRS and total > 0:
+            correlation = sum(a @ b for a, b in pairs) / total
+            statistic, lags = statistic + N * (N + 2) * correlation**2 / count, lags + 1
+    return float(statistic), lags
+
+
+def whiteness(z: Float[np.ndarray, "S L+1 n"], counts: Float[np.ndarray, "S L+1 n"]) -> float:
+    """The probability that white innovations are as correlated as these, 1 of too few."""
+    statistics, lags = zip(*(ljung_box(series) for series in _series(z, counts)), strict=True)
+    return float(gammaincc(sum(lags) / 2, sum(statistics) / 2)) if sum(lags) else 1.0
+
+
+def neighbours(z: Float[np.ndarray, "S L+1 n"], counts) -> Float[np.ndarray, " n"]:
+    """The correlation of each coordinate's innovations at lag one."""
+    out = []
+    for series in _series(z, counts):
+        total = sum(one @ one for one in series)
+        out.append(sum(one[1:] @ one[:-1] for one in series) / total if total > 0 else 0.0)
+    return np.array(out)
+
+
+def _series(z, counts) -> list[list[Float[np.ndarray, " T"]]]:
+    """The innovations of each coordinate by segment.
+
+    The first n measured entries of a segment know its start, and say nothing here.
+    """
+    S, n = len(z), z.shape[2]
+    seen = counts > 0
+    used = seen & (np.cumsum(seen.reshape(S, -1), axis=1).reshape(z.shape) > n)
+    return [[z[s, used[s, :, c], c] for s in range(S)] for c in range(n)]

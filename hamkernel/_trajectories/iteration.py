@@ -14,44 +14,55 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hamkernel._trajectories.diagnostics import NEGLIGIBLE
-from hamkernel._trajectories.flow import Expansion, steps_for, with_tangent
+from hamkernel._trajectories.diagnostics import NEGLIGIBLE, SIGNIFICANT, whiteness
+from hamkernel._trajectories.flow import (
+    Expansion,
+    Segments,
+    shoot,
+    steps_for,
+    trusted,
+    with_tangent,
+)
 from hamkernel._trajectories.kalman import (
+    innovations,
     linearised_by_interval,
     process_covariance,
     smoothed_path,
     whiten,
+    whitened_rows,
 )
 from hamkernel._trajectories.learned import Iteration
 from hamkernel._trajectories.likelihood import (
-    Bounds,
     ClosedForm,
     Model,
     Whitening,
-    begun,
     closed_form,
     landmark_whitening,
+    project_out_starts,
+)
+from hamkernel._trajectories.preprocessing import Preprocessed
+from hamkernel._trajectories.search import (
+    Bounds,
+    begun,
+    limited_by_landmarks,
     losses,
     most_likely,
-    project_out_starts,
     searched,
     solved,
 )
-from hamkernel._trajectories.preprocessing import Preprocessed
 from hamkernel._trajectories.segments import (
     LONG,
     LinearisedSegments,
     Piece,
-    Segments,
     equal_pieces,
     grown,
     halved,
+    linearised_along_field,
     linearised_along_smoothed,
     segmented,
     short_pieces,
     smoothed_rows,
 )
-from hamkernel._trajectories.shooting import linearised_along_field, shoot, trusted
 
 _ROUNDS = 4  # Levenberg steps before a segment is judged: without them up to 40 % were lost
 _SEARCH = 25  # steps of BFGS, which go on in the next iteration
@@ -418,3 +429,39 @@ def changed(task: Task, before: Current, now: Current) -> float:
 
 
 _values = eqx.filter_jit(lambda field, S: jax.vmap(field)(S))
+
+
+def price(end: End, impulse: Float[np.ndarray, " n"]) -> float:
+    """What process noise must gain in log p: Schwarz's ½ log N for each of its numbers."""
+    return float(0.5 * np.isfinite(impulse).sum() * np.log(np.asarray(end.now.rows.counts).sum()))
+
+
+def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
+    """Whether anything says that the structure is not the whole truth.
+
+    Iterations that did not settle, parts that were dropped, innovations that are not white, or rows
+    that are likelier with process noise. Not where more landmarks would explain them: what a field
+    on too few cannot say looks like process noise.
+    """
+    now, task = end.now, end.task
+    given = now.field.points, now.rows, task.start_deviation
+    if task.capped or limited_by_landmarks(now.model, *given, project_out_starts):
+        return False
+    if not (end.settled and now.good.all()):
+        return True
+    z = innovations(whitened_rows(now.model, *given), now.rows)
+    if whiteness(z, np.asarray(now.rows.counts)) < SIGNIFICANT:
+        return True
+    shares = np.log([1e-3, 1e-2, 1e-1])
+    design = [now.model.log_process, *(impulse + share for share in shares)]
+    flat = np.tile(np.asarray(now.model.flat), (len(design), 1))
+    flat[:, -len(impulse) :] = design
+    part = searched(*given[:2])
+    values = np.asarray(losses(now.model, jnp.asarray(flat), *part, task.start_deviation, whiten))
+    return bool(values[0] - values.min() > price(end, impulse))
+
+
+def likelier(without: End, process: End) -> End:
+    """That of both whose rows are the likelier, process noise at its price."""
+    more = price(process, np.asarray(process.now.model.log_process))
+    return process if evidence(process) + more < evidence(without) else without

@@ -27,19 +27,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import gammaincc
 from jaxtyping import Array, Float
 
 from hamkernel._machine import orthonormal
 from hamkernel._observations.kinds import Functionals, Together
-from hamkernel._trajectories.flow import WEIGHTS, Expansion, means, simulated
-from hamkernel._trajectories.likelihood import Model, WhitenedRows, columns
-from hamkernel._trajectories.segments import LinearisedSegments, Path, Segments, linearised
+from hamkernel._trajectories.flow import WEIGHTS, Expansion, Path, Segments, means, simulated
+from hamkernel._trajectories.likelihood import Model, WhitenedRows, columns, landmark_whitening
+from hamkernel._trajectories.segments import LinearisedSegments, linearised
 
-_LAGS = 10  # of the test of whiteness, where the samples have as many
-_PAIRS = 20  # at a lag, from which a correlation is normal
 _BLOCK = 32  # columns that LAPACK turns at once; 16 to 64 take as long
-SIGNIFICANT = 0.05  # of its false alarms
 
 
 class Filtered(NamedTuple):
@@ -248,48 +244,6 @@ def innovations(made: WhitenedRows, rows: LinearisedSegments) -> Float[np.ndarra
     return out.reshape(shape)
 
 
-def ljung_box(series: list[Float[np.ndarray, " T"]]) -> tuple[float, int]:
-    """Ljung and Box's statistic of series of mean zero, N (N + 2) Σ_k r_k²/N_k, and its lags.
-
-    N_k are the pairs at lag k, none of them of two series: N − k for a single one.
-    """
-    N, total = sum(len(z) for z in series), sum(z @ z for z in series)
-    statistic, lags = 0.0, 0
-    for k in range(1, _LAGS + 1):
-        pairs = [(z[k:], z[:-k]) for z in series if len(z) > k]
-        count = sum(len(a) for a, _ in pairs)
-        if count >= _PAIRS and total > 0:
-            correlation = sum(a @ b for a, b in pairs) / total
-            statistic, lags = statistic + N * (N + 2) * correlation**2 / count, lags + 1
-    return float(statistic), lags
-
-
-def whiteness(z: Float[np.ndarray, "S L+1 n"], counts: Float[np.ndarray, "S L+1 n"]) -> float:
-    """The probability that white innovations are as correlated as these, 1 of too few."""
-    statistics, lags = zip(*(ljung_box(series) for series in _series(z, counts)), strict=True)
-    return float(gammaincc(sum(lags) / 2, sum(statistics) / 2)) if sum(lags) else 1.0
-
-
-def neighbours(z: Float[np.ndarray, "S L+1 n"], counts) -> Float[np.ndarray, " n"]:
-    """The correlation of each coordinate's innovations at lag one."""
-    out = []
-    for series in _series(z, counts):
-        total = sum(one @ one for one in series)
-        out.append(sum(one[1:] @ one[:-1] for one in series) / total if total > 0 else 0.0)
-    return np.array(out)
-
-
-def _series(z, counts) -> list[list[Float[np.ndarray, " T"]]]:
-    """The innovations of each coordinate by segment.
-
-    The first n measured entries of a segment know its start, and say nothing here.
-    """
-    S, n = len(z), z.shape[2]
-    seen = counts > 0
-    used = seen & (np.cumsum(seen.reshape(S, -1), axis=1).reshape(z.shape) > n)
-    return [[z[s, used[s, :, c], c] for s in range(S)] for c in range(n)]
-
-
 def as_observations(
     rows: LinearisedSegments, model: Model, mean: object, start_deviation: Float[Array, " n"]
 ) -> Together | None:
@@ -327,3 +281,9 @@ def _at_nodes(model: Model, rows: LinearisedSegments, start_deviation):
     start = jnp.zeros((1, n, local.shape[-1]), local.dtype).at[..., -1].set(-rows.prior_offset)
     flat = filtered(model, rows, local, start, start_deviation).rows.reshape((L + 1) * n, -1)
     return flat[:, :-1], flat[:, -1]
+
+
+@eqx.filter_jit
+def whitened_rows(model: Model, S, rows: LinearisedSegments, start_deviation) -> WhitenedRows:
+    """The rows whitened with process noise, and M and r of the landmarks S."""
+    return whiten(model, S, landmark_whitening(model.kernel, S), rows, start_deviation)

@@ -27,27 +27,31 @@ from hamkernel._structures.family import AbstractFamily
 from hamkernel._structures.joined import Controlled, InputMatrix
 from hamkernel._structures.mechanics import UnknownMasses
 from hamkernel._structures.structure import AbstractStructure
-from hamkernel._trajectories.design import bounds_and_design
-from hamkernel._trajectories.diagnostics import FitQuality, check_identifiable, diagnose
+from hamkernel._trajectories.diagnostics import (
+    FitQuality,
+    check_identifiable,
+    diagnose,
+    neighbours,
+    whiteness,
+)
 from hamkernel._trajectories.flow import Expansion
 from hamkernel._trajectories.iteration import (
     End,
     Task,
+    asks_for_process,
     begin,
     initial_loss,
     iterate,
+    likelier,
 )
 from hamkernel._trajectories.kalman import (
     as_observations,
     innovations,
-    neighbours,
     smoothed_path,
-    whiteness,
+    whitened_rows,
 )
 from hamkernel._trajectories.learned import Learned, empty, misfits
-from hamkernel._trajectories.likelihood import (
-    Model,
-)
+from hamkernel._trajectories.likelihood import Model
 from hamkernel._trajectories.preprocessing import (
     Preprocessed,
     decided,
@@ -55,14 +59,8 @@ from hamkernel._trajectories.preprocessing import (
     preprocess,
     sampled,
 )
-from hamkernel._trajectories.process_noise import (
-    asks_for_process,
-    impulses,
-    landmark_spacing,
-    likelier,
-    whitened_rows,
-)
 from hamkernel._trajectories.runs import Runs
+from hamkernel._trajectories.search import bounds_and_design, impulses, landmark_spacing
 from hamkernel._trajectories.smoothing import interpolated
 
 _WIDE = 100.0  # standard deviations of the states: the prior of a start

@@ -12,9 +12,6 @@ generalised least squares with the starts integrated out; no complete QR is need
 for P = QU, but for a constant. All of it is in the triangle of the QR factorisation of (I, 0) above
 (M̃, r̃), which keeps the digits that I + M̃ᵀM̃ loses where there is next to no noise, and which takes
 rows a strip at a time.
-
-A gradient in the hyperparameters makes K anew for each of them. Where rows are many it is taken on
-some windows of them, which are as likely as any others, and on the first of the landmarks.
 """
 
 import functools
@@ -24,22 +21,15 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from hamkernel._gram.dense import assemble, forward_differentiated
 from hamkernel._machine import orthonormal
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._trajectories.segments import (
-    LinearisedSegments,
-    accumulated,
-    back_substituted,
-    tangents,
-    windows,
-)
-from hamkernel._tuning.minimiser import most_likely_in_box
+from hamkernel._trajectories.flow import back_substituted, tangents
+from hamkernel._trajectories.segments import LinearisedSegments, accumulated
 
 # Above the rounding of K(S, S): it bounds how finely the landmarks resolve, and biases nothing.
 _ROUNDINGS = 100.0
@@ -300,188 +290,3 @@ def closed_form(
 ) -> ClosedForm:
     """The field and the starts that the rows ask for."""
     return conditional(condensed(model, S, rows, start_deviation, whitening), S)
-
-
-def solved(
-    model: Model,
-    S: Float[np.ndarray, "m d"],
-    count: int,
-    rows: LinearisedSegments,
-    start_deviation,
-    whitening: Whitening,
-    bounds: "Bounds",
-) -> tuple[Model, ClosedForm]:
-    """The closed form of all rows on the first `count` landmarks or more, and the model with it.
-
-    Landmarks are doubled while −log p falls by more than √(q/2), by which q parameters leave it
-    unknown. Noise that was found on some of the rows is scaled to what all of them leave.
-    """
-
-    def on(count: int) -> tuple[Condensed, ClosedForm]:
-        points = jnp.asarray(S[:count])
-        known = condensed(model, points, rows, start_deviation, whitening)
-        return known, conditional(known, points)
-
-    known, found = on(count)
-    while count < len(S):
-        more = on(2 * count)
-        if not more[1].loss < found.loss - (more[1].weights.size / 2) ** 0.5:
-            break
-        (known, found), count = more, 2 * count
-    free, size = np.array(bounds.free), len(model.flat) - 2 * len(model.log_noise)
-    free[:size] = False  # what is left are both kinds of noise
-    fixed = np.isfinite(np.asarray(model.log_process)) & ~free[-len(model.log_process) :]
-    many = searched(jnp.asarray(S[:count]), rows)[1] is not rows
-    if many and free.any() and not fixed.any() and found.free > found.used and found.squares > 0:
-        shift = jnp.log(found.squares / found.free) / 2
-        there = jnp.where(jnp.asarray(free), model.flat + shift, model.flat)
-        there = jnp.clip(there, jnp.asarray(bounds.low), jnp.asarray(bounds.high))
-        model = model.at(jnp.where(jnp.asarray(free), there, model.flat))
-        found = conditional(known, found.points, shift)
-    return model, found
-
-
-def limited_by_landmarks(
-    model: Model, S, rows: LinearisedSegments, start_deviation, whitening: Whitening
-) -> bool:
-    """Whether windows of the rows are likelier with a landmark in each of their intervals.
-
-    By more than √(q/2), by which q parameters leave −log p unknown.
-    """
-    width = (_ENTRIES / 3) ** 0.5
-    part = windows(rows, int(width / rows.residual.shape[-1]))
-    own = exact(part)[0]
-    few, many = (
-        float(losses(model, model.flat[None], points, part, start_deviation, whitening)[0])
-        for points in (S, own)
-    )
-    return few - many > (rows.residual.shape[-1] * len(own) / 2) ** 0.5
-
-
-# Entries of K at nodes while hyperparameters are looked for: a search with n = 8 takes 4 to 10 s.
-# All rows of 20 runs of 50 samples on 128 landmarks have 25 million, and 46 s went by before it.
-_ENTRIES = 1_000_000
-
-
-def searched(
-    S: Float[Array, "m d"], rows: LinearisedSegments
-) -> tuple[Float[Array, "k d"], LinearisedSegments]:
-    """The landmarks and rows on which hyperparameters are looked for: all, if they are few.
-
-    Of many rows some windows. If the landmarks are too many for them, one in the middle of each
-    interval of the windows, which for a field that is smooth over an interval is as good as all.
-    """
-    n = rows.residual.shape[-1]
-    if 3 * n * rows.residual.size * len(S) <= _ENTRIES:
-        return S, rows
-    width = (_ENTRIES / 3) ** 0.5  # columns, and rows, if there are as many of both
-    if n * len(S) <= width:
-        return S, windows(rows, int(width**2 / (n**2 * len(S))))
-    return exact(windows(rows, int(width / n)))
-
-
-def exact(rows: LinearisedSegments) -> tuple[Float[Array, "k d"], LinearisedSegments]:
-    """The rows with a landmark in the middle of each of their intervals.
-
-    Those of padding are the same point again and again, which adds nothing to the span; without
-    them rows of every length would be compiled for.
-    """
-    return rows.nodes[:, :, 1].reshape(-1, rows.nodes.shape[-1]), rows
-
-
-class Bounds(NamedTuple):
-    """Where hyperparameters are looked for, and which of them move."""
-
-    low: Float[np.ndarray, " P"]
-    high: Float[np.ndarray, " P"]
-    free: Bool[np.ndarray, " P"]
-
-
-def _loss(model: Model, h, S, rows, start_deviation, whitening: Whitening):
-    there = model.at(h)
-    T = landmark_whitening(there.kernel, S)
-    made = whitening(there, S, T, rows, start_deviation)
-    value = regression_loss(made.M, made.r) + made.constant
-    return jnp.where(jnp.isfinite(value), value, jnp.inf)
-
-
-@eqx.filter_jit
-def losses(
-    model: Model,
-    design: Float[Array, "count P"],
-    S,
-    rows: LinearisedSegments,
-    start_deviation,
-    whitening: Whitening,
-):
-    """−log p(rows) at some points h."""
-    return jax.lax.map(lambda h: _loss(model, h, S, rows, start_deviation, whitening), design)
-
-
-@eqx.filter_jit
-def _best(
-    model: Model, S, rows: LinearisedSegments, start_deviation, low, high, free, steps, whitening
-):
-    start = model.flat
-
-    def loss(h):
-        return _loss(model, jnp.where(free, h, start), S, rows, start_deviation, whitening)
-
-    # Of log σ a sample of N knows 1/√(2N); a lengthscale or an amplitude is known to some tenths.
-    count = jnp.maximum(rows.counts.sum(axis=(0, 1)), 1)
-    kernel = jnp.full(start.size - 2 * count.size, 0.2, start.dtype)
-    noise = 1 / jnp.sqrt(2 * count)
-    deviations = jnp.concatenate([kernel, noise, noise])
-    found, value = most_likely_in_box(loss, start, low, high, deviations, steps)
-    return jnp.where(free & (value < jnp.inf), found, start), value
-
-
-def most_likely(
-    model: Model,
-    S,
-    rows: LinearisedSegments,
-    start_deviation,
-    bounds: Bounds,
-    steps: int,
-    whitening: Whitening,
-) -> tuple[Model, float]:
-    """The model whose rows are the most likely, by BFGS from this one, and −log p there.
-
-    Of many rows some windows, see `searched`, and −log p of those.
-    """
-    S, rows = searched(jnp.asarray(S), rows)
-    if not bounds.free.any():
-        flat = model.flat[None]
-        return model, float(losses(model, flat, S, rows, start_deviation, whitening)[0])
-    sides = jnp.asarray(bounds.low), jnp.asarray(bounds.high), jnp.asarray(bounds.free)
-    h, value = _best(model, S, rows, start_deviation, *sides, steps, whitening)
-    return model.at(h), float(value)
-
-
-def begun(
-    model: Model,
-    design: Float[np.ndarray, "count P"],
-    S: Float[np.ndarray, "m d"],
-    first: int,
-    rows: LinearisedSegments,
-    start_deviation,
-    whitening: Whitening,
-) -> tuple[Model, int]:
-    """The most likely model of a design, and with how many landmarks to look for a better one.
-
-    With the first of them, or with all where −log p then falls by more than √(q/2), by which q
-    parameters leave it unknown. All of the design is compared: with too few landmarks the best is a
-    smooth field with much noise, at which more of them do not help.
-    """
-    n, width = rows.residual.shape[-1], (_ENTRIES / 3) ** 0.5
-    points, part = jnp.asarray(design), windows(rows, int(width / n))
-    own = exact(part)[0]
-    sets = {first: jnp.asarray(S[:first]) if n * first <= width else own}
-    if len(own) > first < len(S):
-        sets[len(S)] = own
-    best, count, start = np.inf, first, design[0]
-    for size, some in sets.items():
-        values = np.asarray(losses(model, points, some, part, start_deviation, whitening))
-        if values.min() < best - (n * len(some) / 2) ** 0.5:
-            best, count, start = values.min(), size, design[int(np.argmin(values))]
-    return model.at(jnp.asarray(start)), count

@@ -17,8 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._trajectories.flow import NODES, with_tangent
-from hamkernel._trajectories.inputs import Between, at_nodes, at_samples
-from hamkernel._trajectories.runs import Runs
+from hamkernel._trajectories.runs import Between, Runs, at_nodes, at_samples
 from hamkernel._trajectories.smoothing import Coordinate, interpolated, processes, smoothed
 
 # Landmarks for d coordinates to begin with, 128 for more. 45 for two and 80 for four were as good

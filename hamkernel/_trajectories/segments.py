@@ -24,12 +24,15 @@ from jaxtyping import Array, Bool, Float
 from hamkernel._trajectories.flow import (
     NODES,
     WEIGHTS,
+    Expansion,
     Path,
+    Segments,
+    broadcast_mask,
     jacobians,
     means,
 )
-from hamkernel._trajectories.inputs import at_nodes
 from hamkernel._trajectories.preprocessing import Preprocessed, PreprocessedRun
+from hamkernel._trajectories.runs import at_nodes
 from hamkernel._trajectories.smoothing import power_of_two
 
 
@@ -39,26 +42,6 @@ class Piece(NamedTuple):
     run: int
     start: int
     stop: int
-
-
-class Segments(NamedTuple):
-    """Measured samples on S segments of at most L intervals; padding has no weight and no length.
-
-    Attributes:
-        spans: the lengths of the intervals, shape (S, L).
-        measured: the states, zero where nothing was seen, shape (S, L + 1, n).
-        counts: how many samples an entry stands for, 0 where nothing was seen, the same shape.
-        scatter: the sum of squares of those samples about the entry, the same shape.
-        starts: where the segments may begin, shape (S, n).
-        inputs: at both ends of each interval, shape (S, L, 2, m); m is 0 where there are none.
-    """
-
-    spans: Float[Array, "S L"]
-    measured: Float[Array, "S L+1 n"]
-    counts: Float[Array, "S L+1 n"]
-    scatter: Float[Array, "S L+1 n"]
-    starts: Float[Array, "S n"]
-    inputs: Float[Array, "S L 2 m"]
 
 
 class LinearisedSegments(NamedTuple):
@@ -108,20 +91,6 @@ def accumulated(
     start = jnp.zeros_like(local[:, 0])
     _, sums = jax.lax.scan(step, start, (jnp.moveaxis(across, 1, 0), jnp.moveaxis(local, 1, 0)))
     return jnp.concatenate([start[:, None], jnp.moveaxis(sums, 0, 1)], axis=1)
-
-
-@jax.jit
-def tangents(across: Float[Array, "S L n n"]) -> Float[Array, "S L+1 n n"]:
-    """Φ at the samples, from the tangents across the intervals."""
-    S, _, n, _ = across.shape
-    first = jnp.broadcast_to(jnp.eye(n, dtype=across.dtype), (S, n, n))
-
-    def step(V, transition):
-        V = jnp.einsum("sab,sbc->sac", transition, V)
-        return V, V
-
-    _, rest = jax.lax.scan(step, first, jnp.moveaxis(across, 1, 0))
-    return jnp.concatenate([first[:, None], jnp.moveaxis(rest, 0, 1)], axis=1)
 
 
 @eqx.filter_jit
@@ -208,10 +177,6 @@ def _windows(rows: LinearisedSegments, s, at) -> LinearisedSegments:
     return LinearisedSegments(**cut, prior_offset=offset)
 
 
-def broadcast_mask(mask: Bool[Array, " S"], a: Array) -> Bool[Array, "S ..."]:
-    return mask.reshape(-1, *([1] * (a.ndim - 1)))
-
-
 def _where(good, a):
     return jnp.where(broadcast_mask(good, a), a, jnp.zeros_like(a))
 
@@ -288,17 +253,6 @@ def _linearised_along_smoothed(mean, along, good, segments: Segments) -> Lineari
     path = given_path(x, points, segments.spans, jacobians(mean, points, x.shape[-1]))
     there = means(mean, points, slopes)
     return linearised(path, slopes, there, segments, good, is_solution=False)
-
-
-def back_substituted(U: Float[Array, "S n n"], b: Float[Array, "S n"]) -> Float[Array, "S n"]:
-    n = b.shape[1]
-    out: list[Array] = [b[:, 0]] * n
-    for i in reversed(range(n)):
-        left = b[:, i]
-        for j in range(i + 1, n):
-            left = left - U[:, i, j] * out[j]
-        out[i] = left / U[:, i, i]
-    return jnp.stack(out, axis=1)
 
 
 SHORT = 12  # samples at most in a segment while the field is rough; 10 gave the same errors
@@ -395,3 +349,15 @@ def smoothed_rows(
     good = np.zeros(len(segments.starts), bool)
     good[: len(pieces)] = [data.usable[piece.run] for piece in pieces]
     return pieces, good, linearised_along_smoothed(data, pieces, segments, mean, good)
+
+
+@eqx.filter_jit
+def linearised_along_field(
+    field: Expansion, path: Path, segments: Segments, good
+) -> LinearisedSegments:
+    """The rows along the path of the current field."""
+    nodes = jnp.where(good[:, None, None, None], path.nodes, jnp.zeros_like(path.nodes))
+    slopes = jax.vmap(jax.vmap(jax.vmap(field)))(nodes)
+    return linearised(
+        path, slopes, means(field.mean, nodes, slopes), segments, good, is_solution=True
+    )

@@ -1,0 +1,353 @@
+"""Hyperparameters: their bounds, a design of first points, and the search for the likeliest.
+
+A gradient in the hyperparameters makes K anew for each of them. Where rows are many it is taken on
+some windows of them, which are as likely as any others, and on the first of the landmarks.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._trajectories.likelihood import (
+    ClosedForm,
+    Condensed,
+    KernelRows,
+    Model,
+    Whitening,
+    condensed,
+    conditional,
+    landmark_whitening,
+    regression_loss,
+)
+from hamkernel._trajectories.preprocessing import Preprocessed, sampled
+from hamkernel._trajectories.segments import LinearisedSegments, windows
+from hamkernel._tuning.minimiser import most_likely_in_box
+from hamkernel._tuning.space import gram_trace, hyperparameters
+
+
+class Bounds(NamedTuple):
+    """Where hyperparameters are looked for, and which of them move."""
+
+    low: Float[np.ndarray, " P"]
+    high: Float[np.ndarray, " P"]
+    free: Bool[np.ndarray, " P"]
+
+
+# Entries of K at nodes while hyperparameters are looked for: a search with n = 8 takes 4 to 10 s.
+# All rows of 20 runs of 50 samples on 128 landmarks have 25 million, and 46 s went by before it.
+_ENTRIES = 1_000_000
+
+
+def _loss(model: Model, h, S, rows, start_deviation, whitening: Whitening):
+    there = model.at(h)
+    T = landmark_whitening(there.kernel, S)
+    made = whitening(there, S, T, rows, start_deviation)
+    value = regression_loss(made.M, made.r) + made.constant
+    return jnp.where(jnp.isfinite(value), value, jnp.inf)
+
+
+@eqx.filter_jit
+def losses(
+    model: Model,
+    design: Float[Array, "count P"],
+    S,
+    rows: LinearisedSegments,
+    start_deviation,
+    whitening: Whitening,
+):
+    """−log p(rows) at some points h."""
+    return jax.lax.map(lambda h: _loss(model, h, S, rows, start_deviation, whitening), design)
+
+
+def searched(
+    S: Float[Array, "m d"], rows: LinearisedSegments
+) -> tuple[Float[Array, "k d"], LinearisedSegments]:
+    """The landmarks and rows on which hyperparameters are looked for: all, if they are few.
+
+    Of many rows some windows. If the landmarks are too many for them, one in the middle of each
+    interval of the windows, which for a field that is smooth over an interval is as good as all.
+    """
+    n = rows.residual.shape[-1]
+    if 3 * n * rows.residual.size * len(S) <= _ENTRIES:
+        return S, rows
+    width = (_ENTRIES / 3) ** 0.5  # columns, and rows, if there are as many of both
+    if n * len(S) <= width:
+        return S, windows(rows, int(width**2 / (n**2 * len(S))))
+    return exact(windows(rows, int(width / n)))
+
+
+def exact(rows: LinearisedSegments) -> tuple[Float[Array, "k d"], LinearisedSegments]:
+    """The rows with a landmark in the middle of each of their intervals.
+
+    Those of padding are the same point again and again, which adds nothing to the span; without
+    them rows of every length would be compiled for.
+    """
+    return rows.nodes[:, :, 1].reshape(-1, rows.nodes.shape[-1]), rows
+
+
+@eqx.filter_jit
+def _best(
+    model: Model, S, rows: LinearisedSegments, start_deviation, low, high, free, steps, whitening
+):
+    start = model.flat
+
+    def loss(h):
+        return _loss(model, jnp.where(free, h, start), S, rows, start_deviation, whitening)
+
+    # Of log σ a sample of N knows 1/√(2N); a lengthscale or an amplitude is known to some tenths.
+    count = jnp.maximum(rows.counts.sum(axis=(0, 1)), 1)
+    kernel = jnp.full(start.size - 2 * count.size, 0.2, start.dtype)
+    noise = 1 / jnp.sqrt(2 * count)
+    deviations = jnp.concatenate([kernel, noise, noise])
+    found, value = most_likely_in_box(loss, start, low, high, deviations, steps)
+    return jnp.where(free & (value < jnp.inf), found, start), value
+
+
+def most_likely(
+    model: Model,
+    S,
+    rows: LinearisedSegments,
+    start_deviation,
+    bounds: Bounds,
+    steps: int,
+    whitening: Whitening,
+) -> tuple[Model, float]:
+    """The model whose rows are the most likely, by BFGS from this one, and −log p there.
+
+    Of many rows some windows, see `searched`, and −log p of those.
+    """
+    S, rows = searched(jnp.asarray(S), rows)
+    if not bounds.free.any():
+        flat = model.flat[None]
+        return model, float(losses(model, flat, S, rows, start_deviation, whitening)[0])
+    sides = jnp.asarray(bounds.low), jnp.asarray(bounds.high), jnp.asarray(bounds.free)
+    h, value = _best(model, S, rows, start_deviation, *sides, steps, whitening)
+    return model.at(h), float(value)
+
+
+def begun(
+    model: Model,
+    design: Float[np.ndarray, "count P"],
+    S: Float[np.ndarray, "m d"],
+    first: int,
+    rows: LinearisedSegments,
+    start_deviation,
+    whitening: Whitening,
+) -> tuple[Model, int]:
+    """The most likely model of a design, and with how many landmarks to look for a better one.
+
+    With the first of them, or with all where −log p then falls by more than √(q/2), by which q
+    parameters leave it unknown. All of the design is compared: with too few landmarks the best is a
+    smooth field with much noise, at which more of them do not help.
+    """
+    n, width = rows.residual.shape[-1], (_ENTRIES / 3) ** 0.5
+    points, part = jnp.asarray(design), windows(rows, int(width / n))
+    own = exact(part)[0]
+    sets = {first: jnp.asarray(S[:first]) if n * first <= width else own}
+    if len(own) > first < len(S):
+        sets[len(S)] = own
+    best, count, start = np.inf, first, design[0]
+    for size, some in sets.items():
+        values = np.asarray(losses(model, points, some, part, start_deviation, whitening))
+        if values.min() < best - (n * len(some) / 2) ** 0.5:
+            best, count, start = values.min(), size, design[int(np.argmin(values))]
+    return model.at(jnp.asarray(start)), count
+
+
+def solved(
+    model: Model,
+    S: Float[np.ndarray, "m d"],
+    count: int,
+    rows: LinearisedSegments,
+    start_deviation,
+    whitening: Whitening,
+    bounds: "Bounds",
+) -> tuple[Model, ClosedForm]:
+    """The closed form of all rows on the first `count` landmarks or more, and the model with it.
+
+    Landmarks are doubled while −log p falls by more than √(q/2), by which q parameters leave it
+    unknown. Noise that was found on some of the rows is scaled to what all of them leave.
+    """
+
+    def on(count: int) -> tuple[Condensed, ClosedForm]:
+        points = jnp.asarray(S[:count])
+        known = condensed(model, points, rows, start_deviation, whitening)
+        return known, conditional(known, points)
+
+    known, found = on(count)
+    while count < len(S):
+        more = on(2 * count)
+        if not more[1].loss < found.loss - (more[1].weights.size / 2) ** 0.5:
+            break
+        (known, found), count = more, 2 * count
+    free, size = np.array(bounds.free), len(model.flat) - 2 * len(model.log_noise)
+    free[:size] = False  # what is left are both kinds of noise
+    fixed = np.isfinite(np.asarray(model.log_process)) & ~free[-len(model.log_process) :]
+    many = searched(jnp.asarray(S[:count]), rows)[1] is not rows
+    if many and free.any() and not fixed.any() and found.free > found.used and found.squares > 0:
+        shift = jnp.log(found.squares / found.free) / 2
+        there = jnp.where(jnp.asarray(free), model.flat + shift, model.flat)
+        there = jnp.clip(there, jnp.asarray(bounds.low), jnp.asarray(bounds.high))
+        model = model.at(jnp.where(jnp.asarray(free), there, model.flat))
+        found = conditional(known, found.points, shift)
+    return model, found
+
+
+def limited_by_landmarks(
+    model: Model, S, rows: LinearisedSegments, start_deviation, whitening: Whitening
+) -> bool:
+    """Whether windows of the rows are likelier with a landmark in each of their intervals.
+
+    By more than √(q/2), by which q parameters leave −log p unknown.
+    """
+    width = (_ENTRIES / 3) ** 0.5
+    part = windows(rows, int(width / rows.residual.shape[-1]))
+    own = exact(part)[0]
+    few, many = (
+        float(losses(model, model.flat[None], points, part, start_deviation, whitening)[0])
+        for points in (S, own)
+    )
+    return few - many > (rows.residual.shape[-1] * len(own) / 2) ** 0.5
+
+
+# Noise to begin with, of the standard deviations, besides that of smoothing. With five samples a
+# swing smoothing cannot know it: it found none at all in 3 of 5 logs with noise of 8 %.
+_NOISES = (0.01, 0.1)
+
+# Process noise to begin with, of the accelerations, and how far it may go: what is three times the
+# motion moves everything, and a millionth of it nothing.
+_DISTURBANCES = (1e-4, 1e-2, 0.1)
+_LEAST_DISTURBANCE, _MOST_DISTURBANCE = 1e-6, 3.0
+
+
+def bounds_and_design(
+    model: Model,
+    X: np.ndarray,
+    Y: np.ndarray,
+    scale: np.ndarray,
+    moves: np.ndarray,
+    spacing: float = 0.0,
+    impulse: np.ndarray | None = None,
+) -> tuple[Bounds, np.ndarray]:
+    """The box of all hyperparameters, those of the caller inside, and a design of first points.
+
+    Args:
+        model: the caller's kernel and the noise of the smoothed runs.
+        X: states, with inputs the points (x, u).
+        Y: their velocities.
+        scale: the standard deviations of the coordinates.
+        moves: the coordinates whose noise is looked for.
+        spacing: the least lengthscale, in standard deviations of the coordinates.
+        impulse: the noise of the process that would be all of the motion, shape (n,); −inf where
+            it is not looked for. None where it is nowhere.
+    """
+    speed = float(np.sqrt(np.mean(Y**2)))
+    leaves = hyperparameters(model.kernel, jnp.asarray(X), speed, jnp.asarray(X))
+    start = np.asarray(model.flat)[: -len(scale)]  # without the noise of the process
+    size = len(start) - len(scale)
+    most = np.maximum(scale, np.exp(start[size:]))  # where next to nothing moves
+    low = np.concatenate([*(p.low.ravel() for p in leaves), np.log(1e-7 * scale)])
+    high = np.concatenate([*(p.high.ravel() for p in leaves), np.log(2 * most)])
+    low, high = np.minimum(low, start), np.maximum(high, start)
+    free = np.concatenate([np.ones(size, bool), moves])
+    names = [p.name for p in leaves for _ in range(p.low.size)]
+    none = np.zeros(len(scale), bool)
+    lengths = np.append([name.endswith("lengthscale") for name in names], none).astype(bool)
+    scales = np.append([name.split(".")[-1] == "scale" for name in names], none).astype(bool)
+    if spacing > 0:
+        least = np.append(_least_lengths(leaves, X, scale, spacing), scale)
+        low[lengths] = np.clip(least, low, high - 0.1)[lengths]
+        start = np.clip(start, low, high)
+    extents = np.concatenate([*(_extents(p.low, X[:, : len(scale)]) for p in leaves), none])
+    design = [start]
+    for shift in (None, -1.2, -0.6, 0.0, 0.6, 1.2, 2.0):
+        point = start.copy()
+        if shift is not None:
+            if not lengths.any():
+                continue
+            point[lengths] = np.clip(extents - 0.7 + shift, low, high)[lengths]
+        design.append(_amplified(model, point, scales, X, Y))
+    design = np.array(design)
+    noisy = [design]
+    for share in _NOISES if moves.any() else ():
+        noisy.append(design.copy())
+        noisy[-1][:, size:] = np.where(moves, np.log(share * scale), start[size:])
+    if impulse is None:
+        noisy, process = np.concatenate(noisy), np.asarray(model.log_process)[None]
+        impulse = np.full(len(scale), -np.inf)
+    else:
+        levels = [impulse + np.log(share) for share in _DISTURBANCES]
+        kept = np.where(np.isfinite(impulse), levels, np.asarray(model.log_process))
+        noisy, process = np.repeat(design, len(kept), axis=0), np.tile(kept, (len(design), 1))
+    design = np.clip(noisy, low, high)
+    process = np.broadcast_to(process, (len(design), len(scale)))
+    looked = np.isfinite(impulse)
+    # Of what is not free neither the box nor a step matters.
+    least, most = (
+        np.where(looked, impulse + np.log(share), 0.0)
+        for share in (_LEAST_DISTURBANCE, _MOST_DISTURBANCE)
+    )
+    pairs = (low, least), (high, most), (free, looked)
+    return Bounds(*map(np.concatenate, pairs)), np.concatenate([design, process], axis=1)
+
+
+def _least_lengths(leaves, X, scale, spacing: float) -> Float[np.ndarray, " P"]:
+    """The logarithm of `spacing` in units of the coordinates, or of the smallest of them."""
+    spread = X.std(axis=0)
+    spread[: len(scale)] = scale
+    each = [
+        spread if p.low.size == len(spread) else np.full(p.low.size, scale.min()) for p in leaves
+    ]
+    return np.log(spacing * np.maximum(np.concatenate(each), np.finfo(float).tiny))
+
+
+def _extents(leaf: np.ndarray, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, " size"]:
+    """The logarithm of the extent of X, for each coordinate where the leaf has as many entries."""
+    ranges = np.maximum(np.ptp(X, axis=0), np.finfo(float).tiny)
+    if leaf.shape == ranges.shape:
+        return np.log(ranges * np.sqrt(len(ranges)))
+    return np.full(leaf.size, np.log(np.hypot.reduce(ranges)))
+
+
+def _amplified(model: Model, h, scales, X, Y):
+    """The point h, its amplitudes such that a velocity of the prior is twice one that was seen."""
+    if not scales.any():
+        return h
+    full = jnp.concatenate([jnp.asarray(h), model.log_process])
+    trace = float(gram_trace(model.at(full).kernel, jnp.asarray(X))) / len(X)
+    target = 4 * np.mean(np.sum(Y**2, axis=1))
+    out = h.copy()
+    if np.isfinite(trace) and trace > 0 and target > 0:
+        out[scales] += np.log(target / trace)
+    return out
+
+
+def impulses(K: AbstractMatrixKernel, S, Y, data: Preprocessed) -> Float[np.ndarray, " n"]:
+    """The logarithm of the process noise that would move each coordinate as the field does.
+
+    That is its velocity times the root of the time in which it does so. −inf where K moves nothing.
+    """
+    prior = np.asarray(KernelRows(S).rows(K, S)).reshape(len(S), len(data.scale), -1)
+    velocity = np.sqrt(np.mean(Y**2, axis=0))
+    whole = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
+    time = np.median(data.scale / np.maximum(whole, np.finfo(float).tiny))
+    with np.errstate(divide="ignore"):
+        return np.where((prior != 0).any((0, 2)), np.log(velocity * np.sqrt(time)), -np.inf)
+
+
+def landmark_spacing(X, S, scale: Float[np.ndarray, " n"]) -> float:
+    """How far a point of X may be from all landmarks, in standard deviations.
+
+    A field of shorter lengthscale has ripples between the landmarks.
+    """
+    spread = X.std(axis=0)
+    spread[: len(scale)] = scale
+    unit = np.where(spread > 0, spread, 1.0)
+    A, B = X / unit, np.asarray(S) / unit
+    squares = (A**2).sum(1)[:, None] + (B**2).sum(1)[None] - 2 * A @ B.T
+    return float(np.sqrt(np.maximum(squares.min(axis=1), 0.0).max()))
