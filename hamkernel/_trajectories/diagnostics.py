@@ -12,22 +12,12 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._trajectories.runs import Runs
 
-_LAGS = 10  # of the test of whiteness, where the samples have as many
-_PAIRS = 20  # at a lag, from which a correlation is normal
 SIGNIFICANT = 0.05  # of its false alarms
 
-
-# χ² per degree of freedom has the standard deviation √(2/ν); five of them, and a tenth for the
-# curvature that a linearisation misses.
-_SIGMAS, _CURVATURE = 5.0, 0.1
-
-# Noise of half the motion or more: where learning failed, it was found 0.9 to 1.1 times the motion.
-_ALL_NOISE = 0.5
 
 # Residuals below this share of the states are no noise: a field that is not yet exact leaves them.
 NEGLIGIBLE = 1e-3
 _SWING = 5.0  # samples in a swing: with fewer noise and motion cannot be told apart
-_USABLE = 1.5  # a misfit up to which a field that still moves a little explains its run
 _FEW = 10  # degrees of freedom, from which σ is known to a fifth
 
 
@@ -101,7 +91,9 @@ def diagnose(
 
 def explains(chi_squared: float, free: float) -> bool:
     """Whether χ² per degree of freedom is what noise of the given size leaves."""
-    return bool(chi_squared <= 1 + _CURVATURE + _SIGMAS * np.sqrt(2 / max(free, 1.0)))
+    # Its standard deviation is √(2/ν): five of them, and a tenth for the curvature that a
+    # linearisation misses.
+    return bool(chi_squared <= 1.1 + 5 * np.sqrt(2 / max(free, 1.0)))
 
 
 _LACKS = (
@@ -169,7 +161,7 @@ def warn_of_noise(
     """Say where nearly all of the motion was taken for noise, and whether it was."""
     share = np.nan_to_num(noise / scale)
     c = int(np.argmax(share))
-    if share[c] < _ALL_NOISE:
+    if share[c] < 0.5:  # where learning failed, noise was found .9 to 1.1 times the motion
         return False
     few = f"{swing:.1f} samples a swing, where five or more are needed; " if swing < _SWING else ""
     require.warn(
@@ -198,7 +190,7 @@ def warn_of_unsettled(fit: FitQuality, explained: bool) -> None:
     """Say that the iterations did not end where the field explains the runs."""
     low, high = np.nanmin(fit.misfit), np.nanmax(fit.misfit)
     misfits = f"the misfits, by run and coordinate, are {low:.2f} to {high:.2f}"
-    if explained and high < _USABLE:
+    if explained and high < 1.5:  # a field that still moves a little, and explains its run
         require.warn(
             f"learning did not settle in {fit.count} iterations: noise or objective still move. "
             f"The result is usable: {misfits}, where 1 is right. iterations={2 * fit.count} goes "
@@ -269,10 +261,10 @@ def ljung_box(series: list[Float[np.ndarray, " T"]]) -> tuple[float, int]:
     """
     N, total = sum(len(z) for z in series), sum(z @ z for z in series)
     statistic, lags = 0.0, 0
-    for k in range(1, _LAGS + 1):
+    for k in range(1, 11):
         pairs = [(z[k:], z[:-k]) for z in series if len(z) > k]
         count = sum(len(a) for a, _ in pairs)
-        if count >= _PAIRS and total > 0:
+        if count >= 20 and total > 0:  # from which on a correlation is nearly normal
             correlation = sum(a @ b for a, b in pairs) / total
             statistic, lags = statistic + N * (N + 2) * correlation**2 / count, lags + 1
     return float(statistic), lags

@@ -23,10 +23,6 @@ _LEGENDRE, _WEIGHTS = np.polynomial.legendre.leggauss(3)
 NODES, WEIGHTS = (1 + _LEGENDRE) / 2, _WEIGHTS / 2
 _PIECES = np.diff(np.concatenate([[0.0], NODES, [1.0]]))
 
-# A Runge-Kutta step of order four with ‖Df‖ dt = 0.15 is wrong by 0.15⁵/120 = 6e-7 of the change.
-_REACH = 0.15
-_MOST = 64  # steps between two nodes
-
 
 class Expansion(eqx.Module):
     """f(x) = mean(x) + Σⱼ K(x, sⱼ) aⱼ; with inputs x and sⱼ are points (x, u)."""
@@ -73,8 +69,9 @@ class Path(NamedTuple):
 
 def steps_for(spans: Float[np.ndarray, "S L"], stiffness: float) -> Int[np.ndarray, " L"]:
     """Runge-Kutta steps between two nodes, for intervals of these lengths and this ‖Df‖."""
-    needed = np.ceil(spans.max(axis=0) * _PIECES.max() * stiffness / _REACH)
-    return np.clip(np.nan_to_num(needed, nan=1.0), 1, _MOST).astype(int)
+    # A step of order four with ‖Df‖ dt = 0.15 is wrong by 0.15⁵/120 = 6e-7 of the change.
+    needed = np.ceil(spans.max(axis=0) * _PIECES.max() * stiffness / 0.15)
+    return np.clip(np.nan_to_num(needed, nan=1.0), 1, 64).astype(int)
 
 
 @eqx.filter_jit
@@ -198,11 +195,6 @@ def back_substituted(U: Float[Array, "S n n"], b: Float[Array, "S n"]) -> Float[
     return jnp.stack(out, axis=1)
 
 
-_GROWTH = 1e4  # of the tangent, beyond which a path says nothing of its start
-_DONE = 1e-3  # of χ², and absolutely: a start that is .03 of its deviation from the best
-_FAR = 25.0  # times the median χ² per sample
-
-
 class Shooting(NamedTuple):
     """The path of the current field through every segment.
 
@@ -272,7 +264,8 @@ def shoot(
 
     def goes_on(carry):
         count, *_, least, _, _, promised = carry
-        return (count == 0) | ((count <= rounds) & jnp.any(promised > _DONE * (1 + least)))
+        # A thousandth of χ², or absolutely: a start that is .03 of its deviation from the best.
+        return (count == 0) | ((count <= rounds) & jnp.any(promised > 1e-3 * (1 + least)))
 
     # The first step goes nowhere: it finds the way from the given starts.
     shapes = jax.eval_shape(at, starts)[0]
@@ -320,9 +313,10 @@ def trusted(
         ]
     )
     sigma = np.maximum(np.minimum(noise, np.sqrt(typical)), least)
-    good = whole & samples.any(axis=1) & (growth.max(axis=(1, 2, 3)) < _GROWTH)
+    # Beyond a growth of 1e4 a path says nothing of its start.
+    good = whole & samples.any(axis=1) & (growth.max(axis=(1, 2, 3)) < 1e4)
     if good.any() and was_asked:
         each = (squares / sigma[None] ** 2).sum(axis=1) / np.maximum(samples.sum(axis=1), 1)
         # Where half of them are better than that, it is no reason to drop the others.
-        good &= each < _FAR * max(np.median(each[good]), 1.0)
+        good &= each < 25 * max(np.median(each[good]), 1.0)
     return good

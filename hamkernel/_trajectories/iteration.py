@@ -66,11 +66,7 @@ from hamkernel._trajectories.segments import (
 
 _ROUNDS = 4  # Levenberg steps before a segment is judged: without them up to 40 % were lost
 _SEARCH = 25  # steps of BFGS, which go on in the next iteration
-_SHARES = (1.0, 0.5, 0.25, 0.125, 0.0625)  # of a step, until one makes the objective smaller
 _SHORT_ROUNDS = 2  # iterations with short segments, in which a rough field stays near the samples
-_SETTLED = 0.01  # of log σ, and of the objective by degree of freedom
-_UNCHANGED = 1e-4  # of the field: without noise its digits end before the objective settles
-_INTEGRATED = 1e-6  # of the states, what the steps of `flow` may leave in an interval
 
 
 class Task(NamedTuple):
@@ -164,8 +160,10 @@ def iterate(
         bar.set_postfix_str(f"noise {noise}, kept {float(done.kept):.0%}", refresh=False)
         bar.update()
         moved = float(jnp.abs(now.model.log_noise - before.model.log_noise).max())
-        small = float(done.gain) < _SETTLED * max(now.free, 1.0)
-        settled = moved < _SETTLED and (small or changed(task, before, now) < _UNCHANGED)
+        # A hundredth of log σ, and of the objective by degree of freedom; or a field that stays:
+        # without noise its digits end before the objective settles.
+        small = float(done.gain) < 0.01 * max(now.free, 1.0)
+        settled = moved < 0.01 and (small or changed(task, before, now) < 1e-4)
         settled = settled and same and i > _SHORT_ROUNDS
         if settled:
             break
@@ -280,7 +278,7 @@ def _solved(
 def _searched(trial: Callable[[float], _Trial], any_good: bool) -> tuple[float, float, _Trial]:
     """The gain, the share and the trial of the first share that makes the objective smaller."""
     at_old = trial(0.0)
-    for share in _SHARES if any_good else ():
+    for share in 0.5 ** np.arange(5) if any_good else ():
         there = trial(share)
         if there.objective < at_old.objective:
             return at_old.objective - there.objective, share, there
@@ -330,8 +328,8 @@ def iterated_with_process(
     good = rows.counts.any((1, 2))
     model, found, S, between = _solved(task, now, rows, whiten)
     moves = _moves(model, found, rows, task)
-    # A defect that the integrator may leave is none.
-    covariance = process_covariance(model, rows, jnp.asarray(_INTEGRATED * task.data.scale))
+    # A defect that the integrator may leave is none: see `steps_for`.
+    covariance = process_covariance(model, rows, jnp.asarray(1e-6 * task.data.scale))
 
     def trial(share: float) -> _Trial:
         weights, field = between(share)

@@ -35,8 +35,6 @@ from hamkernel._trajectories.flow import WEIGHTS, Expansion, Path, Segments, mea
 from hamkernel._trajectories.likelihood import Model, WhitenedRows, columns, landmark_whitening
 from hamkernel._trajectories.segments import LinearisedSegments, linearised
 
-_BLOCK = 32  # columns that LAPACK turns at once; 16 to 64 take as long
-
 
 class Filtered(NamedTuple):
     """What the filter makes of S segments.
@@ -239,7 +237,8 @@ def innovations(made: WhitenedRows, rows: LinearisedSegments) -> Float[np.ndarra
         out[s, there] = solve_triangular(L, y - V @ v, lower=True)
         # A triangle above a segment's rows, in 2 d q² operations; a plain QR took 18 s of q = 2048.
         both = np.column_stack([A, y])
-        known, *_ = lapack.dtpqrt(0, min(_BLOCK, q + 1), known, both)  # type: ignore[attr-defined]
+        # It turns 32 columns at once; 16 to 64 take as long.
+        known, *_ = lapack.dtpqrt(0, min(32, q + 1), known, both)  # type: ignore[attr-defined]
         known[q, q] = 0.0
     return out.reshape(shape)
 

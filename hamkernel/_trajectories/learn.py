@@ -63,12 +63,6 @@ from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.search import bounds_and_design, impulses, landmark_spacing
 from hamkernel._trajectories.smoothing import interpolated
 
-_WIDE = 100.0  # standard deviations of the states: the prior of a start
-_MOST, _USUAL = 8, 5  # iterations; 4 or 5 are the rule
-_LONG = 60.0  # seconds of a computation that is announced
-_SPEED = 1e10  # operations a second of a QR factorisation by one core: 1.6 s for 19 billion
-_QUIET = 10.0  # seconds before progress is shown to those who did not ask for it
-
 
 @one_blas_thread
 def learn(
@@ -80,7 +74,7 @@ def learn(
     *,
     process_noise: ArrayLike | None = None,
     masses: bool = False,
-    iterations: int = _MOST,
+    iterations: int = 8,
     progress: bool | None = None,
 ) -> Learned:
     """Learn a field from noisy states at times, without velocities.
@@ -141,7 +135,7 @@ def learn(
     check_identifiable(runs, known)
     from tqdm import tqdm  # so that importing the package does not load it
 
-    quiet, wait = progress is False, 0.0 if progress else _QUIET
+    quiet, wait = progress is False, 0.0 if progress else 10.0  # seconds
     bar = tqdm(desc="learning", total=2 + most, disable=quiet, delay=wait)
     data = preprocess(runs, known)
     bar.update()
@@ -158,7 +152,7 @@ def learn(
         with np.errstate(divide="ignore"):
             model = Model(K, log_noise, jnp.log(jnp.asarray(q)))
         bounds, design = bounds_and_design(model, X, Y, data.scale, moves, spacing, impulse)
-        prior = jnp.asarray(_WIDE * data.scale)
+        prior = jnp.asarray(100 * data.scale)  # of a start, which says next to nothing
         return Task(data, known, S, first, capped, bounds, prior), model, design
 
     def ended(q: np.ndarray, spacing: float = 0.0, impulse: np.ndarray | None = None) -> End:
@@ -186,12 +180,13 @@ def warn_of_cost(data: Preprocessed, count: int) -> None:
     """Say what learning will cost, if that is much: 2 rows · columns² operations an iteration."""
     n = len(data.scale)
     rows = n * sum(len(run.times) for run in data.runs)
-    seconds = 2 * rows * (count * n) ** 2 / _SPEED
-    if _USUAL * seconds < _LONG:
+    seconds = 2 * rows * (count * n) ** 2 / 1e10  # by one core, which took 1.6 s for 19 billion
+    minutes = 5 * seconds / 60  # 4 or 5 iterations are the rule
+    if minutes < 1:
         return
-    fewer = max(int(count * (_LONG / (_USUAL * seconds)) ** 0.5), 1)
+    fewer = max(int(count / minutes**0.5), 1)
     require.warn(
-        f"learning will take about {seconds:.0f} s an iteration, and 4 to {_MOST} iterations: "
+        f"learning will take about {seconds:.0f} s an iteration, and 4 to 8 iterations: "
         f"{rows} measured numbers on {count} landmarks, {count * n} columns. It works; "
         f"solver=hk.Nystrom(max_points={fewer}) takes a minute and finds a smoother field, and "
         "fewer samples or known parts (mean=) take less too."

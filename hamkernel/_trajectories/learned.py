@@ -17,8 +17,6 @@ from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._trajectories.runs import Runs
 
-_EXACT = 3000  # rows of a posterior without approximation: some seconds
-
 
 class Iteration(eqx.Module):
     """One iteration.
@@ -125,7 +123,7 @@ class Learned(eqx.Module):
             raise ValueError("no run had enough samples to say anything of the field.")
         rows = sum(len(targets) for _, targets in self.observations.parts())
         whole = getattr(self.field, "whole", self.field)  # of the points (x, u) with inputs
-        solver = None if rows <= _EXACT else Nystrom(points=whole.points)
+        solver = None if rows <= 3000 else Nystrom(points=whole.points)
         return condition(
             self.kernel,
             self.observations,

@@ -31,9 +31,6 @@ from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._trajectories.flow import back_substituted, tangents
 from hamkernel._trajectories.segments import LinearisedSegments, accumulated
 
-# Above the rounding of K(S, S): it bounds how finely the landmarks resolve, and biases nothing.
-_ROUNDINGS = 100.0
-
 
 class KernelRows(eqx.Module):
     """K(x, S) for many points x, as rows."""
@@ -53,7 +50,8 @@ def landmark_whitening(K: AbstractMatrixKernel, S: Float[Array, "m d"]) -> Float
     G = G.reshape(-1, G.shape[-1])
     # Of each component by itself, which have different units; some are zero, as q̇ of a U(q).
     d = jnp.diagonal(G)
-    rounding = _ROUNDINGS * jnp.finfo(G.dtype).eps * len(G) * jnp.where(d > 0, d, d.mean())
+    # A hundred times it bounds how finely the landmarks resolve, and biases nothing.
+    rounding = 100 * jnp.finfo(G.dtype).eps * len(G) * jnp.where(d > 0, d, d.mean())
     eye = jnp.eye(len(G), dtype=G.dtype)
     return solve_triangular(jnp.linalg.cholesky(G + jnp.diag(rounding)), eye, lower=True).T
 

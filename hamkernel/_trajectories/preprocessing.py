@@ -20,23 +20,7 @@ from hamkernel._trajectories.flow import NODES, with_tangent
 from hamkernel._trajectories.runs import Between, Runs, at_nodes, at_samples
 from hamkernel._trajectories.smoothing import Coordinate, interpolated, processes, smoothed
 
-# Landmarks for d coordinates to begin with, 128 for more. 45 for two and 80 for four were as good
-# as all on ten runs of 10 s; where the data asks for more there are more.
-_FEWEST = {1: 24, 2: 48, 3: 64, 4: 80}
-# Rows times columns²: 2 s for each solve. With 3.5e10, 20 runs of 50 samples with n = 8 had 256
-# landmarks, for 128, and took 210 s for 115, and 1.9 GB for 1.4.
-_WORK = 1e10
 _POINTS = 1024  # from which boxes are taken, and landmarks if there are not more intervals
-
-# Of the lengthscale in time, between samples that are kept. A pendulum of frequency ω has a
-# lengthscale near 2.7/ω, so these are 23 samples a swing; three Gauss nodes in such an interval are
-# exact to 1e-8, and samples at 5 Hz of a pendulum of period 2.6 are left as they are.
-_DENSE = 0.1
-
-# A gap is longer than this share of that lengthscale, and than three intervals of its run: at 0.75,
-# two radians of a swing, three Gauss nodes are exact to 1e-4, and a smoothed path across 1.3 was
-# seen to lead to a field with ripples, which fitted the samples.
-_GAP, _INTERVALS = 0.75, 3.0
 
 
 class PreprocessedRun(NamedTuple):
@@ -100,7 +84,10 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
     counts = [np.isfinite(x).astype(float) for x in states]
     scatter = [np.zeros_like(x) for x in states]
     lengths = [c.lengthscale for c in found if np.isfinite(c.process.log_amplitude)]
-    block = _DENSE * min(lengths, default=np.inf)
+    # A pendulum of frequency ω has a lengthscale near 2.7/ω, so a tenth of it is 23 samples a
+    # swing; three Gauss nodes in such an interval are exact to 1e-8, and samples at 5 Hz of a
+    # pendulum of period 2.6 are left as they are.
+    block = 0.1 * min(lengths, default=np.inf)
     if any(2 * np.median(np.diff(t)) < block for t in times):
         paths = smoothed(found, times, states)
         condensed = [
@@ -108,7 +95,9 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
             for r, (t, x) in enumerate(zip(times, states, strict=True))
         ]
         times, states, counts, scatter = (list(each) for each in zip(*condensed, strict=True))
-    gap = _GAP * min(lengths, default=np.inf)
+    # At .75 of it, two radians of a swing, three Gauss nodes are exact to 1e-4, and a smoothed path
+    # across 1.3 was seen to lead to a field with ripples, which fitted the samples.
+    gap = 0.75 * min(lengths, default=np.inf)
     inputs = [runs.applied(r, t + float(np.asarray(runs.times[r])[0])) for r, t in enumerate(times)]
     path_runs = _with_paths(found, times, states, counts, scatter, inputs, gap)
     if not all(c.seen for c in found) or mean is not None:
@@ -250,7 +239,7 @@ def _with_paths(found, times, states, counts, scatter, inputs, gap: float) -> li
         value, slope = (a[r, :size] for a in (paths.value, paths.slope))
         nodes, slopes = (a[:-1].reshape(len(t) - 1, 4, -1)[:, 1:] for a in (value, slope))
         spans = np.diff(t)
-        gaps = 1 + np.flatnonzero((spans > gap) & (spans > _INTERVALS * np.median(spans)))
+        gaps = 1 + np.flatnonzero((spans > gap) & (spans > 3 * np.median(spans)))
         out.append(PreprocessedRun(t, x, count, about, value[::4], nodes, slopes, gaps, ends))
     return out
 
@@ -339,9 +328,12 @@ def landmarks(data: Preprocessed, count: int | None) -> tuple[Float[np.ndarray, 
     """
     n, used = len(data.scale), zip(data.runs, data.usable, strict=True)
     intervals = max(sum(len(run.times) - 1 for run, use in used if use), 1)
-    affordable = int((_WORK / (n * intervals)) ** 0.5) // n
+    # Rows times columns² are 2 s for each solve. With 3.5e10, 20 runs of 50 samples with n = 8 had
+    # 256 landmarks, for 128, and took 210 s for 115, and 1.9 GB for 1.4.
+    affordable = int((1e10 / (n * intervals)) ** 0.5) // n
     X, _ = sampled(data, max(_POINTS, min(intervals, 2 * affordable)))
-    first = _FEWEST.get(X.shape[1], 128)
+    # 45 for two coordinates and 80 for four were as good as all on ten runs of 10 s.
+    first = {1: 24, 2: 48, 3: 64, 4: 80}.get(X.shape[1], 128)
     # They are doubled: a last step to a few more would cost a compilation and a solve.
     affordable = first * 2 ** int(np.log2(max(affordable / first, 1)))
     most = max(first, min(intervals, affordable)) if count is None else count

@@ -215,16 +215,6 @@ def limited_by_landmarks(
     return few - many > (rows.residual.shape[-1] * len(own) / 2) ** 0.5
 
 
-# Noise to begin with, of the standard deviations, besides that of smoothing. With five samples a
-# swing smoothing cannot know it: it found none at all in 3 of 5 logs with noise of 8 %.
-_NOISES = (0.01, 0.1)
-
-# Process noise to begin with, of the accelerations, and how far it may go: what is three times the
-# motion moves everything, and a millionth of it nothing.
-_DISTURBANCES = (1e-4, 1e-2, 0.1)
-_LEAST_DISTURBANCE, _MOST_DISTURBANCE = 1e-6, 3.0
-
-
 def bounds_and_design(
     model: Model,
     X: np.ndarray,
@@ -274,24 +264,24 @@ def bounds_and_design(
         design.append(_amplified(model, point, scales, X, Y))
     design = np.array(design)
     noisy = [design]
-    for share in _NOISES if moves.any() else ():
+    # With five samples a swing smoothing cannot know the noise: it found none at all in 3 of 5 logs
+    # with noise of 8 %. Shares of the standard deviations stand beside what it found.
+    for share in (0.01, 0.1) if moves.any() else ():
         noisy.append(design.copy())
         noisy[-1][:, size:] = np.where(moves, np.log(share * scale), start[size:])
     if impulse is None:
         noisy, process = np.concatenate(noisy), np.asarray(model.log_process)[None]
         impulse = np.full(len(scale), -np.inf)
     else:
-        levels = [impulse + np.log(share) for share in _DISTURBANCES]
+        levels = [impulse + np.log(share) for share in (1e-4, 1e-2, 0.1)]
         kept = np.where(np.isfinite(impulse), levels, np.asarray(model.log_process))
         noisy, process = np.repeat(design, len(kept), axis=0), np.tile(kept, (len(design), 1))
     design = np.clip(noisy, low, high)
     process = np.broadcast_to(process, (len(design), len(scale)))
     looked = np.isfinite(impulse)
-    # Of what is not free neither the box nor a step matters.
-    least, most = (
-        np.where(looked, impulse + np.log(share), 0.0)
-        for share in (_LEAST_DISTURBANCE, _MOST_DISTURBANCE)
-    )
+    # Process noise of three times the motion moves everything, and of a millionth of it nothing. Of
+    # what is not free neither the box nor a step matters.
+    least, most = (np.where(looked, impulse + np.log(share), 0.0) for share in (1e-6, 3.0))
     pairs = (low, least), (high, most), (free, looked)
     return Bounds(*map(np.concatenate, pairs)), np.concatenate([design, process], axis=1)
 

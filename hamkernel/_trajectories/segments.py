@@ -256,7 +256,6 @@ def _linearised_along_smoothed(mean, along, good, segments: Segments) -> Lineari
 
 
 SHORT = 12  # samples at most in a segment while the field is rough; 10 gave the same errors
-_LEAST = 3  # samples of a piece: one more than its start takes
 LONG = 256  # at most: the tangent of a longer path says little more, and arrays stay small
 
 
@@ -271,7 +270,7 @@ def short_pieces(runs: list[PreprocessedRun]) -> list[Piece]:
     for r, run in enumerate(runs):
         start, T = 0, len(run.times)
         for gap in run.gaps:
-            if gap - start >= _LEAST and T - gap >= _LEAST:
+            if min(gap - start, T - gap) >= 3:
                 pieces += _equal(r, start, int(gap), SHORT)
                 start = int(gap)
         pieces += _equal(r, start, T, SHORT)
@@ -310,11 +309,6 @@ def halved(
     return out
 
 
-# Entries of a log, above which it is padded to multiples of an eighth of a power of two: compiling
-# anew, some 15 s, is then less than what padding costs in all iterations.
-_LARGE = 4096
-
-
 def padded_count(count: int, large: bool) -> int:
     """The least power of two that is not below `count`; of a large log an eighth finer."""
     most = power_of_two(count)
@@ -327,8 +321,9 @@ def segmented(
 ) -> Segments:
     """The pieces as arrays of a few shapes; they start on `paths`."""
     longest = max(piece.stop - piece.start for piece in pieces)
-    # Padding costs as much as samples: in each direction half of a large log may be padding.
-    large = len(pieces) * longest * len(runs[0].path[0]) > _LARGE
+    # Padding costs as much as samples: in each direction half of a large log may be padding, and
+    # above some thousand entries that costs more than to compile anew, some 15 s.
+    large = len(pieces) * longest * len(runs[0].path[0]) > 4096
     size, length = (padded_count(count, large) for count in (len(pieces), longest))
     if longest <= SHORT:  # as the windows of longer pieces have, so that one program does for both
         length = min(power_of_two(longest), SHORT)

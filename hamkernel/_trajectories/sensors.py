@@ -8,15 +8,13 @@ from jaxtyping import Float
 
 from hamkernel import _require as require
 
-_GAP = 10.0  # times the median spacing: between such samples the path is a guess
-
 
 def warn_of_gaps(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> None:
     """Say where an angle was wrapped, a gap is long, and a coordinate never moves."""
     gaps, jumps, still = [], [], []
     for run, (t, x) in enumerate(zip(times, states, strict=True)):
         dt = np.diff(t)
-        if len(dt) > 2 and dt.max() > _GAP * np.median(dt):
+        if len(dt) > 2 and dt.max() > 10 * np.median(dt):
             gaps.append(f"{dt.max():.3g} in run {run}, at a median spacing of {np.median(dt):.3g}")
         for c in range(x.shape[1]):
             if _is_wrapped(t, x[:, c]):
@@ -43,10 +41,6 @@ def warn_of_gaps(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> N
         )
 
 
-# Of the samples of a coordinate: more repeats than this are no chance. A real log of a motor whose
-# positions came late repeats a quarter of them and can be learned from.
-_MOST_REPEATS = 0.3
-_MOST_STRAIGHT = 0.4  # every other sample interpolated makes .5
 _QUANTA = 4.0  # the steps of a log, above which a repeat is no rounding of a sensor at work
 
 
@@ -73,12 +67,14 @@ def warn_of_sensors(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -
         if max(flat.values()) >= 2:
             clipped += [f"{c} at {value:.4g}" for value, count in flat.items() if count]
             continue
-        if np.mean(steps == 0) > _MOST_REPEATS and np.median(moving) > _QUANTA * quantum:
+        # A real log of a motor whose positions came late repeats a quarter of them and can be
+        # learned from.
+        if np.mean(steps == 0) > 0.3 and np.median(moving) > _QUANTA * quantum:
             repeated.append(f"{c} ({np.mean(steps == 0):.0%})")
             continue
         share = _straight(times, columns)
         whole = np.abs(moving / quantum - np.round(moving / quantum)).max() < 0.01  # a digital one
-        if share > _MOST_STRAIGHT and not whole:
+        if share > 0.4 and not whole:  # every other sample interpolated makes .5
             drawn.append(f"{c} ({share:.0%})")
         for r, x in enumerate(columns):
             others = np.delete(states[r] / unit, c, axis=1)
@@ -159,10 +155,6 @@ def _stuck(x: Float[np.ndarray, " T"], others: Float[np.ndarray, "T others"]):
     return first, stop
 
 
-# 1 − R², at which the standard error of a gain is √10 times that under independent inputs.
-_FEEDBACK = 0.1
-
-
 def warn_of_feedback(states: Sequence[np.ndarray], inputs: Sequence[np.ndarray]) -> None:
     """Say which inputs are a smooth function of the states: a cubic of them, or a linear one."""
     X, U = np.concatenate(states), np.concatenate(inputs)
@@ -191,7 +183,7 @@ def warn_of_feedback(states: Sequence[np.ndarray], inputs: Sequence[np.ndarray])
     if np.abs(np.diag(R)).min() <= 1e-9 * np.abs(R).max():
         return  # inputs that depend on one another are refused by `learn`
     share = np.linalg.svd(left[:, varied] @ np.linalg.inv(R), compute_uv=False)[-1] ** 2
-    if share < _FEEDBACK:
+    if share < 0.1:  # where the error of a gain is √10 times that under independent inputs
         which = "the input is" if U.shape[1] == 1 else "a combination of the inputs is"
         require.warn(
             f"{which} a function of the states but for {share:.2g} of its variance: feedback "

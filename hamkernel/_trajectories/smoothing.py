@@ -83,8 +83,8 @@ def cut(
 _STATIONARY = np.array(
     [[1, 0, -0.2, 0], [0, 0.2, 0, -0.2], [-0.2, 0, 0.2, 0], [0, -0.2, 0, 1]], float
 )
-_NILPOTENT = np.eye(4) + np.array([[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [-1, -4, -6, -4]])
-_POWERS = np.stack([np.linalg.matrix_power(_NILPOTENT, j) / f for j, f in enumerate((1, 1, 2, 6))])
+_nilpotent = np.eye(4) + np.array([[0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1], [-1, -4, -6, -4]])
+_powers = np.stack([np.linalg.matrix_power(_nilpotent, j) / f for j, f in enumerate((1, 1, 2, 6))])
 
 
 class Process(NamedTuple):
@@ -113,7 +113,7 @@ class Smoothed(NamedTuple):
 
 def _transition(u: Float[Array, ""]) -> Float[Array, "4 4"]:
     powers = jnp.cumprod(jnp.concatenate([jnp.ones(1, u.dtype), jnp.broadcast_to(u, (3,))]))
-    return jnp.exp(-u) * jnp.tensordot(powers, jnp.asarray(_POWERS, u.dtype), 1)
+    return jnp.exp(-u) * jnp.tensordot(powers, jnp.asarray(_powers, u.dtype), 1)
 
 
 def _stationary(process: Process) -> Float[Array, "4 4"]:
@@ -191,11 +191,6 @@ def smooth(
     return Smoothed(mean[:, 0], rate * mean[:, 1], deviation[:, 0], rate * deviation[:, 1])
 
 
-# For the hyperparameters long runs are cut into pieces, which are filtered side by side, and of
-# many pieces some are taken: 100 000 samples then cost as much as 16 000.
-_PIECE, _PIECES = 256, 64
-
-
 class Coordinate(NamedTuple):
     """A process of one coordinate in the units of the states.
 
@@ -229,9 +224,11 @@ def _mean(x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, " n"]:
 def processes(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> list[Coordinate]:
     """The hyperparameters of each coordinate, by the marginal likelihood of all runs."""
     states = centred(states)[0]
-    pieces_t, pieces_x = cut(times, states, _PIECE)
-    if len(pieces_t) > _PIECES:
-        chosen = np.linspace(0, len(pieces_t) - 1, _PIECES).round().astype(int)
+    # Pieces are filtered side by side, and of many some are taken: 100 000 samples then cost as
+    # much as 16 000.
+    pieces_t, pieces_x = cut(times, states, 256)
+    if len(pieces_t) > 64:
+        chosen = np.linspace(0, len(pieces_t) - 1, 64).round().astype(int)
         pieces_t, pieces_x = [pieces_t[i] for i in chosen], [pieces_x[i] for i in chosen]
     pieces = padded(pieces_t, pieces_x)
     steps = np.diff(pieces.times, axis=1, prepend=0.0)
