@@ -67,8 +67,7 @@ def warn_of_sensors(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -
         if max(flat.values()) >= 2:
             clipped += [f"{c} at {value:.4g}" for value, count in flat.items() if count]
             continue
-        # A real log of a motor whose positions came late repeats a quarter of them and can be
-        # learned from.
+        # A real log of a motor repeats a quarter of the positions, and can be learned from.
         if np.mean(steps == 0) > 0.3 and np.median(moving) > _QUANTA * quantum:
             repeated.append(f"{c} ({np.mean(steps == 0):.0%})")
             continue
