@@ -50,7 +50,7 @@ class RowSharding:
         return jax.device_put(array, NamedSharding(self.mesh, PartitionSpec()))
 
     def sum(self, tree: Any) -> Any:
-        """The sum over the devices, inside of `on_each`."""
+        """The sum over the devices, for functions that run on each of them."""
         return jax.lax.psum(tree, self.axes)
 
 
@@ -127,22 +127,35 @@ def as_given(rows: RowSharding | None, array: Array) -> Array:
 
 
 def on_each(
-    rows: RowSharding, function: Callable[..., Any], whole: Any, *parts: Array, joined: bool
+    rows: RowSharding | None,
+    function: Callable[..., Any],
+    whole: Any,
+    *parts: Array,
+    joined: bool,
+    reduce: Callable[[RowSharding, Any], Any] = RowSharding.sum,
 ) -> Any:
-    """`function(whole, *parts)` on each device, with its own rows of the parts.
+    """`function(whole, *parts)`, evaluated by each device for its own rows of the parts.
 
     Args:
-        rows: how the parts are spread.
-        function: its result has rows of its own, or is made the same on all devices by `rows.sum`.
+        rows: how the parts are spread; None if they are not, and the function is called once.
+        function: (whole, *parts) -> a PyTree of arrays.
         whole: a PyTree, the same on all devices.
         parts: arrays with rows.
-        joined: whether the results are rows to be put one after the other.
+        joined: whether the results are rows to be put one after the other. Else they are reduced.
+        reduce: the results of all devices -> one result, the same on all of them; their sum.
     """
+    if rows is None:
+        return function(whole, *parts)
     arrays, static = eqx.partition(whole, eqx.is_array)
+
+    def of_device(arrays, *parts):
+        result = function(eqx.combine(arrays, static), *parts)
+        return result if joined else reduce(rows, result)
+
     # Untracked: a user's kernel may contain anything, and tracking asks every loop to say whether
     # its start differs between devices. Derivatives are right either way.
     mapped = jax.shard_map(
-        lambda arrays, *parts: function(eqx.combine(arrays, static), *parts),
+        of_device,
         mesh=rows.mesh,
         in_specs=(PartitionSpec(), *(rows.spec for _ in parts)),
         out_specs=rows.spec if joined else PartitionSpec(),
@@ -165,17 +178,10 @@ def sum_of_columns(
     Raises:
         ValueError: X and Z are spread differently.
     """
-    if X_rows is None and Z_rows is None:
-        return product(K, X, Z, A)
     if Z_rows is None:
-        assert X_rows is not None
         return on_each(X_rows, lambda w, x: product(w[0], x, *w[1:]), (K, Z, A), X, joined=True)
     if X_rows is None:
-
-        def part(whole, z, a):
-            return Z_rows.sum(product(*whole, z, a))
-
-        return on_each(Z_rows, part, (K, X), Z, A, joined=False)
+        return on_each(Z_rows, lambda w, z, a: product(*w, z, a), (K, X), Z, A, joined=False)
     if (X_rows.mesh, X_rows.axes) != (Z_rows.mesh, Z_rows.axes):
         raise ValueError(
             f"X and Z are spread over devices differently: {X_rows.given} and {Z_rows.given}. "

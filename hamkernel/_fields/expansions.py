@@ -57,20 +57,20 @@ class KernelField(AbstractField):
 
     def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         field = _expansion(self.kernel, x, self.points, self.coefficients)
-        S, b = self.value_points, self.value_coefficients
-        return field if S is None or b is None else field + _of_values(self.kernel, x, S, b)
+        return self._plus_values(field, _value_field, x)
 
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         fields = placed_product(self.kernel, X, self.points, self.coefficients)
-        S, b = self.value_points, self.value_coefficients
-        if S is None or b is None:
-            return fields
-        return fields + _values_at_points(self.kernel, X, S, b)
+        return self._plus_values(fields, _value_fields, X)
 
     def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         potential = _potential(self.kernel, x, self.points, self.coefficients)
+        return self._plus_values(potential, _value_potential, x)
+
+    def _plus_values(self, of_field: Array, of_values: Callable[..., Array], x: Array) -> Array:
+        """`of_field`, plus the contribution `of_values(K, x, s, b)` of the energies if any."""
         S, b = self.value_points, self.value_coefficients
-        return potential if S is None or b is None else potential + _values(self.kernel, x, S, b)
+        return of_field if S is None or b is None else of_field + of_values(self.kernel, x, S, b)
 
     def _term(self, kernel: Sum, position: int) -> "KernelField":
         term, Z, A = kernel.terms[position], self.points, self.coefficients
@@ -101,6 +101,7 @@ def _potential(
     return K.potential(x, Z, A)
 
 
+@eqx.filter_jit
 def _value_potential(
     K: AbstractMatrixKernel, x: Float[Array, " n"], S: Float[Array, "E n"], b: Float[Array, " E"]
 ) -> Float[Array, ""]:
@@ -109,6 +110,7 @@ def _value_potential(
     return b @ jax.vmap(K.potential_covariance, in_axes=(None, 0))(x, S)
 
 
+@eqx.filter_jit
 def _value_field(
     K: AbstractMatrixKernel, x: Float[Array, " n"], S: Float[Array, "E n"], b: Float[Array, " E"]
 ) -> Float[Array, " n"]:
@@ -126,11 +128,8 @@ def _value_field(
 
 
 @eqx.filter_jit
-def _values_at_points(K, X, S, b):
+def _value_fields(K, X, S, b):
     return at_points(lambda x: _value_field(K, x, S, b), X)
-
-
-_of_values, _values = eqx.filter_jit(_value_field), eqx.filter_jit(_value_potential)
 
 
 def kernel_field(
@@ -249,6 +248,4 @@ def _potential_at(features, x, weights):
 
 @eqx.filter_jit
 def _evaluate(field, X, spread):
-    if spread is not None:
-        return on_each(spread, lambda field, X: _evaluate(field, X, None), field, X, joined=True)
-    return at_points(field._learned, X)
+    return on_each(spread, lambda field, X: at_points(field._learned, X), field, X, joined=True)

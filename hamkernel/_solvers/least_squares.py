@@ -47,27 +47,29 @@ def triangle(
     From the start with the ridge: a QR of Φ alone, where it has fewer rows than columns, divides by
     the rounding errors of the dependent ones, again and again until these underflow to NaN.
     """
-    if spread is not None:
 
-        def part(whole, X, Y):
-            design, ridge = whole
-            return _joined(spread, triangle(design, columns, X, Y, ridge / spread.count))
+    def own_triangle(whole, X, Y):
+        design, ridge = whole
 
-        return on_each(spread, part, (design, ridge), X, Y, joined=False)
+        def step(factor, tile):
+            rows = design(tile[0])  # (t, n, r)
+            below = jnp.concatenate([rows, tile[1][..., None]], axis=2).reshape(-1, columns + 1)
+            return jnp.linalg.qr(jnp.concatenate([factor, below]), mode="r"), None
 
-    def step(factor, tile):
-        rows = design(tile[0])  # (t, n, r)
-        below = jnp.concatenate([rows, tile[1][..., None]], axis=2).reshape(-1, columns + 1)
-        return jnp.linalg.qr(jnp.concatenate([factor, below]), mode="r"), None
+        on_diagonal = jnp.append(jnp.full(columns, jnp.sqrt(ridge)), jnp.zeros((), Y.dtype))
+        return over_tiles(step, jnp.diag(on_diagonal), (X, Y), _rows(columns))[0]
 
-    on_diagonal = jnp.append(jnp.full(columns, jnp.sqrt(ridge)), jnp.zeros((), Y.dtype))
-    return over_tiles(step, jnp.diag(on_diagonal), (X, Y), _rows(columns))[0]
+    ridge = ridge if spread is None else ridge / spread.count
+    return on_each(
+        spread, own_triangle, (design, ridge), X, Y, joined=False, reduce=_merged_triangle
+    )
 
 
-def _joined(spread: RowSharding, own: Float[Array, "k k"]) -> Float[Array, "k k"]:
-    """The factor of the rows of all devices, of which each has its `own`.
+def _merged_triangle(spread: RowSharding, own: Float[Array, "k k"]) -> Float[Array, "k k"]:
+    """The triangular factor of the rows of all devices, from the factor `own` of each device.
 
-    One factor after the other, so that no device holds more than two, and all get the same.
+    The factors are merged one after the other: no device holds more than two of them, and all
+    devices get the same result.
     """
 
     def join(device, factor):
@@ -126,41 +128,39 @@ def residual(
     spread: RowSharding | None = None,
 ) -> Float[Array, "N n"]:
     """Y − Φw, tile by tile, where the rows are."""
-    if spread is not None:
 
-        def part(whole, X, Y):
-            return residual(whole[0], X, Y, whole[1])
+    def own_residual(whole, X, Y):
+        design, w = whole
 
-        return on_each(spread, part, (design, w), X, Y, joined=True)
+        def step(_, tile):
+            return None, tile[1] - design(tile[0]) @ w
 
-    def step(_, tile):
-        return None, tile[1] - design(tile[0]) @ w
+        return over_tiles(step, None, (X, Y), _rows(len(w)))[1]
 
-    return over_tiles(step, None, (X, Y), _rows(len(w)))[1]
+    return on_each(spread, own_residual, (design, w), X, Y, joined=True)
 
 
 def _correlations(design, X, Y, w, spread: RowSharding | None) -> Float[Array, " r"]:
     """Φᵀ(Y − Φw)."""
-    if spread is not None:
 
-        def part(whole, X, Y):
-            return spread.sum(_correlations(whole[0], X, Y, whole[1], None))
+    def own_correlations(whole, X, Y):
+        design, w = whole
 
-        return on_each(spread, part, (design, w), X, Y, joined=False)
+        def step(total, tile):
+            rows = design(tile[0])
+            return total + jnp.einsum("inr,in->r", rows, tile[1] - rows @ w), None
 
-    def step(total, tile):
-        rows = design(tile[0])
-        return total + jnp.einsum("inr,in->r", rows, tile[1] - rows @ w), None
+        return over_tiles(step, jnp.zeros_like(w), (X, Y), _rows(len(w)))[0]
 
-    return over_tiles(step, jnp.zeros_like(w), (X, Y), _rows(len(w)))[0]
+    return on_each(spread, own_correlations, (design, w), X, Y, joined=False)
 
 
 def over_tiles(step, carry, data: tuple[Array, Array], rows: int):
-    """`jax.lax.scan` of `step` over tiles of so many rows of a design, the last one after it.
+    """`jax.lax.scan` of `step` over tiles of `rows` rows of a design; the last tile may be smaller.
 
-    A loop, when differentiated backward, forgets the rule by which a Matérn kernel is smooth at
-    x = z, and second derivatives are NaN: where one tile will do there is none. Derivatives
-    recompute the rows of a tile: they are not kept.
+    A loop that is differentiated backward forgets the rule by which a Matérn kernel is smooth at
+    x = z, and second derivatives are NaN: a single tile is therefore evaluated without a loop.
+    Derivatives recompute the rows of a tile, which are not stored.
     """
     N, n = data[1].shape
     size = rows // n + 1
@@ -177,12 +177,12 @@ def over_tiles(step, carry, data: tuple[Array, Array], rows: int):
 
 
 def _rows(columns: int) -> int:
-    """The rows of a tile. A factorisation below R costs (rows + r) r²; 3r rows lose a quarter."""
+    """The rows of a tile.
+
+    Appending `rows` rows to a factor of r columns costs (rows + r) r²; with 3r rows a quarter of
+    that is spent on the factor.
+    """
     return max(1024, 3 * columns)
-
-
-# Numbers in the tile of rows that is held at once; see `_gram/operator.py`.
-TILE = 2**20
 
 
 class Normal(eqx.Module):
@@ -237,22 +237,21 @@ def normal(
     spread: RowSharding | None = None,
 ) -> Normal:
     """The sums over the rows F = design(X) basis, tile by tile, on the devices where they are."""
-    if spread is not None:
 
-        def part(whole, X, Y):
-            design, basis = whole
-            return spread.sum(normal(design, basis, X, Y))
+    def own_sums(whole, X, Y):
+        design, basis = whole
 
-        return on_each(spread, part, (design, basis), X, Y, joined=False)
+        def step(total, tile):
+            rows = design(tile[0])  # (t, n, r)
+            new = Normal.of(rows.reshape(-1, rows.shape[-1]) @ basis, tile[1].reshape(-1))
+            return jax.tree.map(jnp.add, total, new), None
 
-    def step(total, tile):
-        rows = design(tile[0])  # (t, n, r)
-        new = Normal.of(rows.reshape(-1, rows.shape[-1]) @ basis, tile[1].reshape(-1))
-        return jax.tree.map(jnp.add, total, new), None
+        square = jnp.zeros_like(basis)
+        nothing = Normal(square, square[0], square[0, 0])
+        # A tile of 2²⁰ numbers, 8 MB, stays in the cache; see `_gram/operator.py`.
+        return over_tiles(step, nothing, (X, Y), max(1024, 2**20 // len(basis)))[0]
 
-    square = jnp.zeros_like(basis)
-    nothing = Normal(square, square[0], square[0, 0])
-    return over_tiles(step, nothing, (X, Y), max(1024, TILE // len(basis)))[0]
+    return on_each(spread, own_sums, (design, basis), X, Y, joined=False)
 
 
 def solve_sums(
