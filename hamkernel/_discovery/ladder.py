@@ -27,7 +27,6 @@ from hamkernel._structures.structure import (
 )
 
 _NONE = -200.0  # the logarithm of a friction that is none: e⁻²⁰⁰ is lost in every sum
-_STRUCTURES = (Separable, DivergenceFree, CurlFree, Symplectic)
 
 
 class Rung(AbstractMatrixKernel):
@@ -179,13 +178,14 @@ class Step(NamedTuple):
                 [[1, even, 1, even] if self.reversible else [1, even]],
             )
         length = np.log(2 * np.where(scale > 0, scale, 1.0))
+        known = Separable, DivergenceFree, CurlFree, Symplectic
         return Rung(
             log_variances=jnp.asarray(np.full(len(masks), 2 * np.log(speed))),
             log_lengthscales=jnp.asarray(length),
             log_friction=jnp.asarray(np.float64(np.log(0.1) if self.friction else _NONE)),
             masks=jnp.asarray(np.array(masks)),
             weights=jnp.asarray(np.array(weights, int)),
-            structure=jnp.asarray([int(self.structure is each) for each in _STRUCTURES]),
+            structure=jnp.asarray([int(self.structure is each) for each in known]),
         )
 
     def kernel(self, rung: Rung) -> AbstractMatrixKernel:

@@ -1,16 +1,16 @@
 """The dense Gram of a kernel: of points and of rows of observations, its derivatives and rounding.
 
-The rows of observations are linear functionals of a field and its potential. Between values of u
-and derivatives there is one forward derivative less than between derivatives,
+The rows of observations are linear functionals of a field and its potential. Their covariances are
+made of three, of which those with a value of u take fewer derivatives,
 
     Cov(u(x), u(z)) = k(x, z),  Cov(u(x), vᵀf(z)) = ∂z k(x, z)·B(z)ᵀv,  Cov(uᵀf(x), vᵀf(z)) = uᵀKv,
 
-the second of which is the potential of the representer K(·, z)v, and the third is `K.form`. A block
-of observations maps such covariances at its points to rows.
+The second is the potential of the representer K(·, z)v, and the third is `K.form`. A block of
+observations maps the covariances at its points to rows.
 
-Derivatives with respect to the hyperparameters of a kernel, of which there are few, are taken
-FORWARD: each costs about one assembly. Backward through the pairs of points was measured at 6 to 60
-assemblies, and takes several times as long to compile.
+Derivatives with respect to the hyperparameters of a kernel, of which there are few, are taken in
+forward mode: each costs about one assembly. Reverse mode through the pairs of points was measured
+at 6 to 60 assemblies, and takes several times as long to compile.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ def assemble(
         return closed
     X, Z = centred(K, X, Z)
     basis = jnp.eye(K.outputs(X.shape[1]), dtype=X.dtype)
-    # Entry by entry in the order of memory. Computing blocks of K and then moving them to their
-    # place was measured to take two to four times as long, most of it for a copy of the Gram.
+    # Entries are computed in the order of memory. Blocks of K that are moved to their place
+    # afterwards took two to four times as long, most of it for a copy of the Gram.
     form = K.form
     for axis in (3, 2, 1, 0):  # b, zⱼ, a, xᵢ
         form = jax.vmap(form, in_axes=[0 if i == axis else None for i in range(4)])
@@ -131,7 +131,7 @@ def block_traces(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array
 def trace(
     K: AbstractMatrixKernel, X: Float[Array, "N n"], spread: RowSharding | None = None
 ) -> Float[Array, ""]:
-    """The trace of the Gram, in O(N n) memory for every kernel, where the rows are."""
+    """The trace of the Gram of X, in O(N n) memory; each device adds up its own rows."""
     if Invariance.TRANSLATION in K.invariance:  # all blocks on the diagonal are K(0, 0)
         return len(X) * block_traces(K, jnp.zeros((1, X.shape[1]), X.dtype))[0]
 
@@ -183,7 +183,8 @@ def gram_of_rows(
     return rows.contrast(rows.contrast(G).T) if contrasted and len(rows.energies) else G
 
 
-_STRIP = 500_000  # entries made at once: of some kernels each takes 40 numbers on its way
+# The largest number of entries of a strip: some kernels hold 40 intermediate numbers for each.
+_STRIP = 500_000
 
 
 def regularized_gram(
@@ -197,12 +198,14 @@ def regularized_gram(
 
 
 def strips_of_gram(asked: tuple, A: Float[Array, "D D"]) -> Float[Array, "D D"]:
-    """A with some of its rows those of the Gram of velocities plus ridge I, strip by strip.
+    """A, in which the rows of some points are replaced by those of the Gram plus ridge I.
+
+    The rows are computed in strips, so that the intermediate arrays stay small.
 
     Args:
         asked: the kernel, its points, the ridge, the first point whose rows are made, and the
             number of such points, a Python integer.
-        A: whose other rows stay as they are.
+        A: the matrix, whose other rows are kept.
     """
     K, X, ridge, first, count = asked
     D, n = len(A), len(A) // len(X)
@@ -269,21 +272,21 @@ def between(
         one = Combinations(groups=points[None], weights=weights[None])  # pyright: ignore[reportCallIssue]
         return _mapped(K, one, right)
 
-    # Some groups after the others, since the covariances of all points need not fit in memory: of
-    # a group there are Q n rows as long as all points of the other side, of all some 8 MB.
+    # The covariances at the points of all groups may not fit in memory. So many groups are taken
+    # at once that theirs, Q n rows for each group, have some million entries, 8 MB.
     at_once = max(1, 1_000_000 // (left.groups[0].size * right.points.size))
     out = jax.lax.map(of_group, (left.groups, left.weights), batch_size=at_once)
     return out.reshape(left.count, -1)
 
 
 def _mapped(K: AbstractMatrixKernel, left: AbstractBlock, right: AbstractBlock) -> Array:
-    """Rows of the left of covariances, and of the right of these."""
+    """The covariances of the rows of two blocks, from those of the field at their points."""
     of_left = left.rows(_at_points(K, left, right))  # (D, P′, *n′)
     return jax.vmap(right.rows)(of_left)
 
 
 def _at_points(K: AbstractMatrixKernel, left: AbstractBlock, right: AbstractBlock) -> Array:
-    """The covariances of f or u at the points of the left with f or u at those of the right."""
+    """The covariances of f or u at the points of one block with f or u at those of the other."""
     X, Z = left.points, right.points
     if not left.of_values and not right.of_values:
         return assemble(K, X, Z)  # (P, n, P′, n)
@@ -305,10 +308,11 @@ def _at_points(K: AbstractMatrixKernel, left: AbstractBlock, right: AbstractBloc
 
 @eqx.filter_custom_vjp
 def forward_differentiated(kernel_and_data, make, rowwise: bool = False):
-    """make(K, data), an array, cheap to differentiate with respect to K.
+    """The array make(K, data), whose derivatives with respect to K are taken in forward mode.
 
-    If `rowwise` then make(K, data) is a function and points instead. The function makes of points
-    a row for each, and the array is its value there. Derivatives take the memory of a strip of it.
+    With `rowwise` the value of make(K, data) is a pair (rows, X) of a function and points, and the
+    array is rows(X), with one row for each point. Its derivatives take the memory of a strip of
+    rows.
     """
     return _array(make, rowwise, *kernel_and_data)
 
@@ -332,14 +336,14 @@ def _(saved, bar, perturbed, kernel_and_data, make, rowwise=False):
     flat, unravel = ravel_pytree(params)
 
     def slope(direction):
-        # What does not depend on the direction depends on it now: XLA would else compute it ahead
-        # of the loop and keep it, several arrays of the size of the Gram.
+        # The barrier makes every intermediate depend on the direction. XLA would compute those
+        # that do not before the loop and keep them, several arrays of the size of the Gram.
         here, direction = jax.lax.optimization_barrier((flat, direction))
         at = lambda h: paired(eqx.combine(unravel(h), static), data, bar)  # noqa: E731
         return jax.jvp(at, (here,), (direction,))[1]
 
-    # Side by side the directions share what does not depend on them, at the price of memory: of up
-    # to 200 000 entries of the array and its changes.
+    # Directions that are taken together share the intermediates that do not depend on them. So
+    # many are taken together that the array and its derivatives have up to 200 000 entries.
     arrays, rest = eqx.partition(data, eqx.is_inexact_array)
     largest = max(each.size for each in [bar, *jax.tree.leaves(arrays)])
     together = min(flat.size, 200_000 // largest)
@@ -362,15 +366,15 @@ def _array(make, rowwise: bool, K, data) -> Array:
 def _paired_by_rows(rows, X: Float[Array, "N n"], bar: Float[Array, "N ..."]) -> Float[Array, ""]:
     """⟨bar, rows(X)⟩, in strips.
 
-    The products of all strips are added entry by entry, and summed once: entries that XLA sums as
-    it makes them are made by one thread, one at a time, in four times as long. Strips are cut out
-    one at a time: `over_tiles` would rearrange, and so copy, `bar`.
+    The products of the strips are added entry by entry, and summed once at the end: a sum that XLA
+    fuses with the computation of its terms runs in one thread and takes four times as long. Each
+    strip is sliced out of `bar`, since `over_tiles` would reshape, and so copy, the whole array.
     """
     N = len(X)
     if bar.size <= 10_000:  # as fast at once, and sooner compiled
         return jnp.vdot(bar, rows(X))
-    # Strips of 200 000 entries, whose derivatives hold up to 13 arrays of this size; but four of
-    # them at least, for a loop of few is unrolled.
+    # Strips of 200 000 entries, whose derivatives hold up to 13 arrays of this size. There are at
+    # least four strips, since a shorter loop is unrolled.
     points = max(1, min(N // 4, 200_000 * N // bar.size))
 
     def strip(start, count):
@@ -387,7 +391,7 @@ def _paired_by_rows(rows, X: Float[Array, "N n"], bar: Float[Array, "N ..."]) ->
 
 
 def constant(tree):
-    """`tree` with no derivative through its arrays; it may have leaves of other kinds, as K may."""
+    """The PyTree with `stop_gradient` applied to its arrays; leaves of other kinds are kept."""
     arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
     return eqx.combine(jax.tree.map(jax.lax.stop_gradient, arrays), rest)
 
@@ -412,8 +416,8 @@ def field_rounding(
 ) -> Float[Array, ""]:
     """ε ‖Σⱼ |K(x, zⱼ) aⱼ|‖ / ‖f(x)‖, the relative rounding error of f(x) = Σⱼ K(x, zⱼ) aⱼ.
 
-    It is cut to `most`, since it grows without bound where f(x) tends to zero. Where the ridge is
-    small the terms are large, of both signs, and each rounds to ε of itself.
+    The error is cut off at `most`, since it grows without bound where f(x) tends to zero. Where the
+    ridge is small the terms are large and of both signs, and each rounds to ε of itself.
     """
     K = without_symmetry(K)
     terms = jax.vmap(lambda z, a: K.expansion(x, z[None], a[None]))(Z, A)

@@ -140,14 +140,14 @@ def placed_product(
     Z: Float[Array, "M n"],
     A: Float[Array, "M n"],
 ) -> Float[Array, "N n"]:
-    """`product` for arrays that know where they are."""
+    """`product` for arrays whose own sharding says over which devices their rows are spread."""
     X_rows, Z_rows = rows_of(X), rows_of(Z)
     X, Z = split(X_rows, X), split(Z_rows, Z)
     return _compiled(K, X, Z, A, X_rows, Z_rows)
 
 
 def _compiled(K, X, Z, A, X_rows, Z_rows):
-    """`product` of X and Z that are split already."""
+    """`product` for X and Z that have been split over the devices."""
     return as_given(X_rows, _product(K, X, Z, split(Z_rows, A), X_rows, Z_rows))
 
 
@@ -161,7 +161,7 @@ def _tiled(K, X, Z, A):
     rows = tiles(X, X[:1], TILE)
     columns = (tiles(Z, Z[:1], TILE), tiles(A, jnp.zeros_like(A[:1]), TILE))
 
-    # Recomputed in the backward pass: otherwise it would keep every pair.
+    # Tiles are recomputed in the backward pass, which would otherwise keep every pair.
     @jax.checkpoint
     def tile(x, z, a):
         return jax.vmap(K.expansion, in_axes=(0, None, None))(x, z, a)
@@ -172,8 +172,8 @@ def _tiled(K, X, Z, A):
 
         return jax.lax.scan(add, jnp.zeros((len(x), A.shape[1]), x.dtype), columns)[0]
 
-    # A loop, when differentiated backward, forgets the rule by which a Matérn kernel is smooth
-    # at x = z, and second derivatives are NaN: where one tile will do there is none.
+    # A loop that is differentiated backward forgets the rule by which a Matérn kernel is smooth at
+    # x = z, and second derivatives are NaN: a single tile is evaluated without a loop.
     if len(rows) == len(columns[0]) == 1:
         return tile(rows[0], columns[0][0], columns[1][0])
     return jax.lax.map(row, rows).reshape(-1, A.shape[1])[: len(X)]

@@ -1,8 +1,8 @@
 """Regularised least squares in the span of landmarks: O(N r²) time, O(N n + r²) memory.
 
 With S the landmarks, L the Cholesky factor of their Gram and F = G_XS L⁻ᵀ, the Gram is nearly
-Ĝ = F Fᵀ, and the field Σⱼ K(x, sⱼ) αⱼ with α = L⁻ᵀw minimises ‖y − F w‖² + Nλ‖w‖². F is seen tile
-by tile and only the sums FᵀF and Fᵀy stay.
+Ĝ = F Fᵀ, and the field Σⱼ K(x, sⱼ) αⱼ with α = L⁻ᵀw minimises ‖y − F w‖² + Nλ‖w‖². F is made tile
+by tile, and only the sums FᵀF and Fᵀy are kept.
 
 The matrix FᵀF + NλI has the condition of G + NλI, not its square: these are no normal equations in
 α, which would lose twice the digits. The digits that the sums round off come back by one step of
@@ -70,7 +70,7 @@ class Solution(NamedTuple):
 def _checked_field(
     K, landmarks, solution, regularization, tolerance, cure, throw=True
 ) -> KernelField:
-    """The field of a solution, if it is one; UserWarning where it is truncated."""
+    """The field of a solution; UserWarning where the landmarks do not reach the tolerance."""
     dtype = landmarks.points.dtype
     failed = require.not_finite(solution.coefficients).any()
     solution = checked(solution, landmarks, solution.truncation, failed, singular(dtype), throw)
@@ -82,16 +82,12 @@ CHOOSE = (
     "Raise max_points, the tolerance or the regularization; let landmarks be chosen from more "
     "candidates;"
 )
-START_ANEW = (
-    "Start anew with landmarks from a sample that looks like the data so far, and a max_points "
-    "that suffices; or ask for a larger regularization;"
-)
 
 
 def warn_if_truncated(truncation, count, tolerance, cure):
     if not require.is_concrete(truncation, count):
         return
-    # Twice: a random part of the data need not show all that the rest has.
+    # Landmarks that were chosen from a random part of the data may leave more of the whole.
     if truncation > 2 * tolerance:
         if truncation.dtype == jnp.float32:
             cure = (
@@ -124,7 +120,7 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         landmarks: the points that carry the field.
         sums: the sums over the rows added, of which the least squares are solved.
         trace: the trace of their Gram, shape ().
-        lost: what rounding took from the sums and the trace.
+        lost: the rounding errors of the sums and the trace.
         count: N, the number of points added, shape ().
         regularization: the λ of `start`, shape ().
         dimension: n, the number of coordinates of a state.
@@ -164,9 +160,12 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
         solution = _solution(self, count, regularization)
-        landmarks, tolerance = self.landmarks, self.tolerance
+        cure = (
+            "Start anew with landmarks from a sample that looks like the data so far, and a "
+            "max_points that suffices; or ask for a larger regularization;"
+        )
         return _checked_field(
-            self.kernel, landmarks, solution, regularization, tolerance, START_ANEW
+            self.kernel, self.landmarks, solution, regularization, self.tolerance, cure
         )
 
 

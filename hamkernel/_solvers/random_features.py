@@ -30,8 +30,6 @@ from hamkernel._solvers.low_rank import (
 from hamkernel._solvers.stream import AbstractStreamingFit, AbstractStreamingSolver, thinned
 from hamkernel._structures.base import AbstractMatrixKernel
 
-_SAMPLE = 4096  # points of a sample that are looked at
-
 
 class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
     """Ridge regression in random Fourier features: O(N n r²) time, O(r²) memory beside the data.
@@ -101,15 +99,14 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
 
         r = eqx.filter_eval_shape(of_kernel, K, self.key).columns
         what, cure = f"a fit with count = {self.count}", "Take fewer features."
-        refuse_beyond_memory(what, r, r, dtype, _COPIES, cure)
+        # Eight: the triangle, the tile of 3r rows below it, and their QR factorisation.
+        refuse_beyond_memory(what, r, r, dtype, 8, cure)
         return of_kernel(K, self.key)
 
     def _started(self, K, sample, regularization) -> "FeatureFit":
         basis = self._features(K, sample.points.shape[1], sample.targets.dtype)
-        return _start(K, basis, thinned(K, sample, _SAMPLE), regularization)
-
-
-_COPIES = 8  # r² numbers that a fit holds: the triangle, the tile of 3r rows below it, their QR
+        # The points that set the basis of the sums, as many as `Nystrom` has candidates by default.
+        return _start(K, basis, thinned(K, sample, 4096), regularization)
 
 
 @eqx.filter_jit
@@ -152,7 +149,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
         kernel: K.
         features: the features of K.
         sums: the sums over the rows added, of which the least squares are solved.
-        lost: what rounding took from the sums.
+        lost: the rounding errors of the sums.
         count: N, the number of points added, shape ().
         regularization: the λ of `start`, shape ().
         dimension: n, the number of coordinates of a state.

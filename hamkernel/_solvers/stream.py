@@ -4,10 +4,10 @@ A low-rank solver compresses the rows that it has seen to r² numbers for r colu
 rows, in a basis that `start` chose. More data adds to them, those of two parts of the data add up
 to those of both, and any λ is solved for from them.
 
-The sums are of order 1 to rounding, but coefficients of landmarks that nearly depend on each other
-amplify that: 600 points on 160 landmarks at λ = 1e-13, added in another order, gave a field 6e-7
-away. So each sum carries what rounding took from it (Knuth's error-free addition), and the order of
-the parts, which an engine on many machines does not fix, does not show.
+The sums are exact to rounding, but the coefficients of landmarks that nearly depend on each other
+amplify rounding errors: 600 points on 160 landmarks at λ = 1e-13, added in another order, gave a
+field 6e-7 away. So each sum carries its rounding error (Knuth's error-free addition), and the
+result does not depend on the order of the parts, which an engine on many machines does not fix.
 """
 
 import abc
@@ -101,17 +101,17 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
     @property
     @abc.abstractmethod
     def _totals(self) -> tuple[Any, ...]:
-        """The sums over the data, a part of this PyTree; the rest but the count is of `start`."""
+        """The sums over the data: all that `add` changes in this PyTree, but for the count."""
 
     @abc.abstractmethod
     def _columns(self) -> tuple[str, Any]:
         """Landmarks or features, by name."""
 
     def _from_start(self) -> dict[str, Any]:
-        """What fits that add up have in common, by name.
+        """The parts, by name, in which two fits must agree bit by bit if they are to be added.
 
-        Bit by bit: the basis depends on the kernel and on the sample, and so it differs where
-        functions in kernels do, which nobody can compare.
+        Functions in kernels cannot be compared. The basis depends on the kernel and on the sample,
+        so it differs where such functions do.
         """
         name, columns = self._columns()
         return {
@@ -216,7 +216,7 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
         return known_part(self.kernel, None, self.dimension, self.dtype)
 
     def sum_of_columns(self) -> Any:
-        """The field whose weights are all 1, whatever was added: what a file knows a kernel by."""
+        """The field whose weights are all 1, by which a file recognises its kernel."""
         nothing = jax.tree.map(jnp.zeros_like, self._totals)
         fit = eqx.tree_at(lambda f: f._totals, self, nothing)
         fit = eqx.tree_at(lambda f: f.sums.seen.moment, fit, replace_fn=jnp.ones_like)
@@ -286,7 +286,7 @@ def _plus(fit: Fit, more: Any, more_lost: Any, count: Int[ArrayLike, ""]) -> Fit
 
 
 def _two_sum(a: Array, b: Array) -> tuple[Array, Array]:
-    """The sum, and what rounding took from it (Knuth)."""
+    """The sum, rounded, and its rounding error (Knuth)."""
     s = a + b
     c = s - a
     return s, (a - (s - c)) + (b - c)
@@ -388,12 +388,12 @@ class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
                 f"chunks must be an iterable of pairs (X, Y), got {chunks!r}. Call a generator "
                 "function: fit_chunks(K, read(), ...)."
             )
-        model = None
+        model, no_more = None, object()  # no `None`, which may be a chunk of the wrong type
         remaining = iter(tqdm(chunks, "chunks", disable=None if progress else True))
         for i in itertools.count():
             with _naming(i):
-                chunk = next(remaining, _NO_MORE)
-                if chunk is _NO_MORE:
+                chunk = next(remaining, no_more)
+                if chunk is no_more:
                     break
                 if not isinstance(chunk, tuple | list) or len(chunk) not in (2, 3):
                     raise TypeError(
@@ -427,9 +427,6 @@ def _naming(chunk: int) -> Iterator[None]:
     except BaseException as error:  # whatever reading it raises, and Ctrl-C
         error.add_note(f"in chunk {chunk}, counted from 0")
         raise
-
-
-_NO_MORE = object()  # chunks; None may be a wrong one
 
 
 def _refuse_energies(rows: Measurements) -> None:

@@ -33,8 +33,8 @@ from hamkernel._validation.losses import (
 Objective = Callable[[AbstractMatrixKernel, Array, Array, Array], Float[Array, ""]]
 Criterion = Literal["cross_validation", "generalized_cross_validation", "marginal_likelihood"]
 
-# Share of the residuals that a fit must leave free, tr(I − S)/D, to be judged by generalised
-# cross-validation: it is 0/0 where a fit interpolates, and can be very small there.
+# The least tr(I − S)/D of a fit that generalised cross-validation may judge. Where a fit
+# interpolates, both this share of free residuals and the loss are 0/0, and the loss can be small.
 LEAST_FREE = 0.2
 
 
@@ -120,14 +120,15 @@ class SearchObjective(eqx.Module):
     def rounding_penalty(
         self, square: Float[Array, ""], size: Float[Array, ""]
     ) -> Float[Array, ""]:
-        """What keeps away from fields that rounding makes rough where the loss is still right.
+        """The penalty on fields whose rounding errors are too large to be integrated.
 
         f(x) = Σ K(x, xⱼ) aⱼ rounds by up to ε tr(G) ‖a‖, of which an adaptive step, or the
-        iteration of an implicit one, sees 1e-2. It is to stay a share √ε of the velocities:
-        ‖a‖ tr(G) √ε ≤ ‖y‖. Beyond that the square of the logarithm of what is too much is added:
-        of 18 fields, for polynomial and trigonometric H with noise of 0, 1 and 10 %, all can then
-        be integrated (`tests/benchmarks/tuned_fields.py`). The likelihood has no need of it: its Nλ
-        is the variance of y − f = Nλ a. Of an objective of the caller's nothing is known.
+        iteration of an implicit one, sees 1e-2. This error should not exceed a share √ε of the
+        velocities: ‖a‖ tr(G) √ε ≤ ‖y‖. The penalty is the squared logarithm of the ratio of the
+        two sides where it is larger than 1: of 18 fields, for polynomial and trigonometric H with
+        noise of 0, 1 and 10 %, all can then be integrated (`tests/benchmarks/tuned_fields.py`).
+        The likelihood needs no penalty: its Nλ is the variance of y − f = Nλ a. An objective of the
+        caller's gets none, since its meaning is not known.
 
         Args:
             square: ‖a‖², shape ().
@@ -142,11 +143,6 @@ class SearchObjective(eqx.Module):
         return jnp.maximum(beyond, 0) ** 2
 
 
-# Rows of the Gram of the first part, or 64 points where these are fewer; with half as many the best
-# run often leads to a poor optimum of all the data (`tests/benchmarks/tuning_speed.py`).
-FIRST_ROWS = 256
-
-
 def parts_of(
     rows: Measurements, criterion: SearchCriterion, dense: bool
 ) -> list[Int[np.ndarray, " _"]]:
@@ -154,8 +150,10 @@ def parts_of(
     N, n = rows.count, len(rows.targets) / rows.count
     if criterion.custom:  # it may need all the data
         return [np.arange(N)]
-    # The second part has 1024 rows, and is there where all points have at least twice as many.
-    counts = [min(64, max(int(FIRST_ROWS / n), 2)), int(1024 / n)]
+    # The first part has 256 rows, or 64 points where these are fewer: with half as many the best
+    # run often leads to a poor optimum of all the data (`tests/benchmarks/tuning_speed.py`). The
+    # second part has 1024 rows, and is used where all points have at least twice as many.
+    counts = [min(64, max(int(256 / n), 2)), int(1024 / n)]
     if 2 * counts[1] > N:
         del counts[1]
     if counts[0] >= N:

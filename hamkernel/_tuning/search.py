@@ -22,7 +22,7 @@ from jaxtyping import Float
 from hamkernel import _require as require
 from hamkernel._observations.measurements import Measurements
 from hamkernel._tuning.minimiser import BoxBFGS, MinimiserRun, begun, minimised
-from hamkernel._tuning.objective import FIRST_ROWS, SearchCriterion, SearchObjective, parts_of
+from hamkernel._tuning.objective import SearchCriterion, SearchObjective, parts_of
 from hamkernel._tuning.space import SearchSpace
 
 _TOLERANCE = 1e-4  # of the logarithm of a loss: what a run may still gain at its end
@@ -272,9 +272,7 @@ class Part:
         """The runs at most so many steps further."""
         count, before = len(runs.u), runs.steps.sum()
         # On a CPU one after the other took two thirds of the time; elsewhere a lane costs nothing.
-        side_by_side = (
-            jax.default_backend() != "cpu" and len(self.objective.rows.targets) <= FIRST_ROWS
-        )
+        side_by_side = jax.default_backend() != "cpu" and len(self.objective.rows.targets) <= 256
         padded = _take(runs, np.resize(np.arange(count), self._most))
         padded = padded._replace(going=padded.going & (np.arange(self._most) < count))
         began = time.perf_counter()

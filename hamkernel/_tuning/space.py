@@ -27,8 +27,6 @@ from hamkernel._structures.joined import AbstractJoinedKernel
 from hamkernel._tuning.minimiser import from_box, inside_box
 
 RIDGE = "regularization"
-ROUNDINGS = 100.0  # how far the ridge stays above the rounding of the Gram, ε tr(G): two digits
-LOW_RANK_ROUNDINGS = 2e4  # above the rounding at which `choose_landmarks` drops a column
 _EDGE = 0.01  # the share of the box that counts as resting on a bound
 
 
@@ -203,12 +201,13 @@ class SearchSpace(eqx.Module):
         regularization: Float[Array, ""],
         frozen: tuple[str, ...],
         bounds: Mapping[str, tuple[ArrayLike, ArrayLike]],
-        roundings: float = ROUNDINGS,
+        roundings: float = 100.0,
         states: Float[Array, "M n"] | None = None,
     ):
         """Make the space for data at X; the size of the Gram is taken on `states`, or X.
 
-        `rms` is the size of velocities, see `velocity_rms`.
+        `rms` is the size of velocities, see `velocity_rms`. The least λ is `roundings` times the
+        rounding of the Gram, ε tr(G)/N: with 100 two digits are left.
         """
         dtype = X.dtype
         self.roundings = roundings

@@ -40,9 +40,7 @@ from hamkernel._tuning.objective import (
 )
 from hamkernel._tuning.search import Search, best
 from hamkernel._tuning.space import (
-    LOW_RANK_ROUNDINGS,
     RIDGE,
-    ROUNDINGS,
     SearchSpace,
     constants,
     velocity_rms,
@@ -214,7 +212,8 @@ def tune(
         check_memory(rows, SEARCH_COPIES)
     few = rows if len(parts) == 1 else rows.subset(parts[0])[0]
     rms = velocity_rms(K, few)
-    roundings = LOW_RANK_ROUNDINGS if low_rank else ROUNDINGS
+    # For a low-rank fit λ stays above the rounding at which `choose_landmarks` drops a column.
+    roundings = 2e4 if low_rank else 100.0
     kept, points = tuple(frozen), rows.points
     space = SearchSpace(
         K, points, rms, given.regularization, kept, bounds or {}, roundings, few.points
