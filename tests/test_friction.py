@@ -97,23 +97,50 @@ def test_parts_are_saved_loaded_and_symmetrised(tmp_path):
     np.testing.assert_allclose(K(-x, x), -K(x, x), atol=1e-14)
 
 
-@pytest.mark.slow
-def test_it_is_found_from_positions_alone_and_the_motion_stops_where_it_sticks():
-    ts = np.linspace(0.0, 8.0, 241)
+def positions(starts, samples, rng):
+    """Times and noisy positions of 8 s from these starts, in lists."""
+    ts = np.linspace(0.0, 8.0, samples)
     options = {"rtol": 1e-9, "atol": 1e-10, "t_eval": ts}
-    true = [
-        solve_ivp(lambda t, x: pendulum(x), (0, 8), x0, "LSODA", **options).y.T
-        for x0 in ([2.5, 0.0], [0.5, 4.0], [-1.0, -2.0])
+    runs = [
+        solve_ivp(lambda t, x: pendulum(x), (0, 8), x0, "LSODA", **options).y.T for x0 in starts
     ]
-    noisy = [x + 0.005 * RNG.normal(size=x.shape) for x in true]
+    noisy = [x + 0.005 * rng.normal(size=x.shape) for x in runs]
     for x in noisy:
         x[:, 1] = np.nan
-    K = hk.Sum(energy=hk.Symplectic(POTENTIAL), friction=hk.Friction(0.1, 0.1, rest_speed=REST))
-    found = hk.learn(K, hk.Runs([ts] * 3, noisy), mean=kinematics)
+    return [ts] * len(starts), noisy
+
+
+def energy_and_friction(guess):
+    friction = hk.Friction(guess, guess, rest_speed=REST)
+    return hk.Sum(energy=hk.Symplectic(POTENTIAL), friction=friction)
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # one iteration does not settle
+def test_it_is_found_whatever_the_guess():
+    # From a guess of .003 alone the search ended at 1.2 times the force at ten times the speed.
+    log = hk.Runs(*positions(([2.5, 0.0], [0.5, 4.0]), 48, np.random.default_rng(1)))
+    K = energy_and_friction(0.003)
+    found = hk.learn(K, log, mean=kinematics, iterations=1, process_noise=0, progress=False)
+    speeds = np.array([0.5, 1.0, 3.0, 30.0])
+    forces = [found.field.part("friction")(jnp.array([0.3, v]))[1] for v in speeds]
+    np.testing.assert_allclose(forces[:3], -curve(speeds[:3]), rtol=0.05)
+    np.testing.assert_allclose(forces[3], -curve(30.0), rtol=0.1)
+
+
+@pytest.mark.slow
+def test_it_is_found_from_positions_alone_and_the_motion_stops_where_it_sticks():
+    # Three runs of one of six such logs lost two: the search had ended without viscous friction.
+    starts = [2.5, 0.0], [0.5, 4.0], [-1.0, -2.0]
+    log = hk.Runs(*positions(starts, 241, RNG))
+    found = hk.learn(energy_and_friction(0.1), log, mean=kinematics)
+    assert found.converged
+    assert found.dropped == ()
     speeds = np.array([0.5, 1.0, 3.0, 30.0])
     forces = [found.field.part("friction")(jnp.array([0.3, v]))[1] for v in speeds]
     np.testing.assert_allclose(forces[:3], -curve(speeds[:3]), rtol=0.05)
     assert 0.5 < -forces[3] / curve(30.0) < 1.5  # ten times as fast as the log
+    ts = np.asarray(log.times[0])
+    options = {"rtol": 1e-9, "atol": 1e-10, "t_eval": ts}
     path = hk.simulate(found.field, jnp.array([1.5, 0.0]), jnp.asarray(ts)).ys
     expected = solve_ivp(lambda t, x: pendulum(x), (0, 8), [1.5, 0.0], "LSODA", **options).y.T
     assert np.abs(path - expected).max() < 0.05
