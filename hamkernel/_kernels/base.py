@@ -62,7 +62,7 @@ def log_per_coordinate(value: ArrayLike, name: str, cure: str = "") -> Float[Arr
 def bounds_by_value(name: str, leaf: Any) -> Bounds:
     """Bounds around the value of a hyperparameter whose meaning is unknown, as stored.
 
-    A logarithm may move by three decades, another number by ten times its size, or by 10.
+    A logarithm may move by three decades, any other number by ten times its size and at least 10.
     """
     value = np.asarray(leaf)
     reach = np.log(1e3) if name.startswith("log_") else 10 * np.maximum(1.0, np.abs(value))
@@ -170,9 +170,9 @@ class AbstractScalarKernel(eqx.Module):
         return np.array_equal(S, -identity) and Invariance.REFLECTION in self.invariance
 
     def summands(self, reflection: bool) -> "tuple[AbstractScalarKernel, ...]":
-        """The kernels inside that may be averaged over linear maps in place of this one.
+        """The inner kernels that may be averaged over linear maps in place of this kernel.
 
-        That is so where k is linear in them; `reflection` says that x -> −x is the only map.
+        They are those in which k is linear; `reflection` says that x -> −x is the only map.
         """
         return ()
 
@@ -199,7 +199,7 @@ class AbstractScalarKernel(eqx.Module):
 
     @property
     def has_amplitude(self) -> bool:
-        """Whether a trained factor multiplies all of k; None in its place does not count."""
+        """Whether a trained factor multiplies all of k; a factor that is None is not trained."""
         return False
 
     def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
@@ -213,7 +213,7 @@ class AbstractScalarKernel(eqx.Module):
         return bounds_by_value(name, getattr(self, name))
 
     def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
-        """The data in the coordinates of the kernels inside."""
+        """The data in the coordinates that the inner kernels see."""
         return X
 
     def __add__(self, other: Any) -> "ScalarSum":
@@ -322,7 +322,7 @@ class ScalarProduct(AbstractScalarKernel):
 def _of_terms(
     kernel: ScalarSum | ScalarProduct, n: int, count: int, key: Key[Array, ""], dtype: Any
 ) -> list[Spectra]:
-    """The spectra of each term, of independent draws."""
+    """The spectra of the terms, drawn independently."""
     keys = jax.random.split(key, len(kernel.terms))
     return [t.spectra(n, count, key, dtype) for t, key in zip(kernel.terms, keys, strict=True)]
 
@@ -422,7 +422,10 @@ class UserKernel(AbstractScalarKernel):
 
 
 def of_one_pair(fn: Callable[..., Any]) -> Callable[..., Any]:
-    """`fn`, or the method for one pair of a tinygp kernel, which makes a Gram when called."""
+    """The function of one pair of points: `fn`, or the method `evaluate` of a tinygp kernel.
+
+    A call of a tinygp kernel returns a Gram.
+    """
     families = {cls.__module__.partition(".")[0] for cls in type(fn).__mro__}
     return getattr(fn, "evaluate", fn) if "tinygp" in families else fn
 

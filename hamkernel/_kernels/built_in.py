@@ -38,9 +38,9 @@ def squared_distance(x: Float[Array, " n"], z: Float[Array, " n"], cut: bool) ->
     The factor −2 stands outside, so that the derivative of exp(−s/2) needs no pass over all pairs
     for it.
 
-    With `cut`, what lies below the rounding of the product form is zero: on the Gram's diagonal its
-    noise of one unit in the last place would be a distance of 1e-8, which Matérn-3/2 can feel.
-    Only the value is cut; derivatives are those of the exact expression.
+    With `cut`, a value below the rounding error of the product form is set to zero: on the diagonal
+    of the Gram one unit in the last place would be a distance of 1e-8, to which Matérn-3/2 is
+    sensitive. Only the value is cut; the derivatives are those of the exact expression.
     """
     halves = x @ x / 2 + z @ z / 2
     s = -2 * (x @ z - halves)
@@ -53,10 +53,10 @@ def squared_distance(x: Float[Array, " n"], z: Float[Array, " n"], cut: bool) ->
 def orthogonal_normal(
     key: Key[Array, ""], count: int, n: int, dtype: Any
 ) -> Float[Array, "count n"]:
-    """Standard normal vectors, independent but for directions orthogonal in blocks of n.
+    """Standard normal vectors in blocks of n with orthogonal directions, otherwise independent.
 
-    Means over a block then have less variance (Yu et al. (2016), "Orthogonal random features"): a
-    quarter less error on the pendulum of the paper.
+    The mean over a block then has less variance (Yu et al. (2016), "Orthogonal random features"):
+    the error on the pendulum of the paper is smaller by a quarter.
     """
     directions, lengths = jax.random.split(key)
     blocks = -(-count // n)
@@ -76,8 +76,8 @@ class AbstractRadialKernel(AbstractScalarKernel):
     """k(x, z) = φ(‖(x − z)/ℓ‖²), ℓ a number or one lengthscale per coordinate."""
 
     log_lengthscale: eqx.AbstractVar[Float[Array, "..."]]
-    # Whether the rounding of s at zero is felt by φ and must be cut off, which takes a quarter of
-    # the time of a product with the Gram.
+    # Whether φ is sensitive to the rounding of s at zero, so that the rounding must be cut off. The
+    # cut takes a quarter of the time of a product with the Gram.
     cuts_rounding: eqx.AbstractClassVar[bool]
 
     @abc.abstractmethod
@@ -86,10 +86,13 @@ class AbstractRadialKernel(AbstractScalarKernel):
 
     @abc.abstractmethod
     def widths(self, key: Key[Array, ""], count: int, dtype: Any) -> Float[Array, "count 1"] | None:
-        """Random √w whose w makes φ(s) the mean of exp(−w s/2), a mixture of Gaussians; None: 1."""
+        """Random √w for which φ(s) is the mean of exp(−w s/2); None where w is 1.
+
+        Such a φ is a mixture of Gaussians.
+        """
 
     def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
-        """Normal vectors over ℓ, of random width."""
+        """Normal vectors divided by ℓ, each multiplied by a random width √w."""
         normal, mixture = jax.random.split(key)
         widths = self.widths(mixture, count, dtype)
         base = orthogonal_normal(key if widths is None else normal, count, n, dtype)
@@ -257,7 +260,8 @@ class RationalQuadratic(AbstractRadialKernel):
     def widths(self, key: Key[Array, ""], count: int, dtype: Any) -> Float[Array, "count 1"]:
         """√(g/α) with g ~ Gamma(α), over which φ(s) is the mean of exp(−(g/α) s/2)."""
         alpha = self.alpha.astype(dtype)
-        # The logarithm, since for small α the sample underflows, and √ has no derivative at 0.
+        # The logarithm is drawn: for small α the sample itself underflows, and √ has no derivative
+        # at 0.
         log_g = jax.random.loggamma(key, alpha, (count, 1), dtype)
         return jnp.exp((log_g - jnp.log(alpha)) / 2)
 
@@ -383,7 +387,8 @@ class Periodic(AbstractScalarKernel):
         probability = jnp.fft.fftshift(jnp.fft.fft(samples).real, axes=1) / M  # j ≥ −M/2
         fixed = jax.lax.stop_gradient(probability)
         cumulative = jnp.cumsum(fixed, axis=1)
-        # Never zero: it would draw a harmonic whose probability underflows, and then 0/0.
+        # The least value is not zero, which would draw a harmonic whose probability underflows and
+        # lead to 0/0.
         uniform = jax.random.uniform(key, (n, count), dtype, minval=jnp.finfo(dtype).tiny)
         index = jax.vmap(jnp.searchsorted)(cumulative, uniform * cumulative[:, -1:])  # (n, F)
         ratio = jnp.take_along_axis(probability, index, 1) / jnp.take_along_axis(fixed, index, 1)

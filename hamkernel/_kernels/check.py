@@ -64,12 +64,12 @@ def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     X = np.asarray(X)
     N, n = X.shape
     subset = _spaced(N, min(64, max(8, 256 // n)))  # the Gram of blocks has some 256 rows
-    near = _spaced(len(subset), 8)  # those that meet neighbours
+    near = _spaced(len(subset), 8)  # the points that are compared with their neighbours
     spread, size = np.ptp(X.astype(float), axis=0), np.abs(X.astype(float)).max(axis=0)
     unit = np.where(spread > 0, spread, np.where(size > 0, size, 1.0))
     here, Z = X[subset], _neighbours(X[subset[near]], unit, size, eps)
     moved = here * (1 + 4 * eps * np.cos(np.pi * np.indices(here.shape).sum(axis=0)))
-    moved = moved.astype(X.dtype)  # by some units in the last place: how far k and M round
+    moved = moved.astype(X.dtype)  # some units in the last place show how far k and M round
     pairs = (here[:, None], here[None]), (moved[:, None], moved[None])
     gram, rounded, between, beyond = _derivatives_of_pairs(
         k, unit, *pairs, (here[near][:, None, None], Z), (Z, Z)
@@ -142,8 +142,9 @@ def _derivatives_of_pairs(k: Callable, unit: np.ndarray, *pairs) -> list[_Pairs]
     n = len(unit)
     wide = [np.broadcast_arrays(*pair) for pair in pairs]
     X, Z = (np.concatenate([pair[side].reshape(-1, n) for pair in wide]) for side in (0, 1))
-    # In small batches, for the memory and for github.com/jax-ml/jax/issues/39103. Unoptimised:
-    # where x/ℓ − z/ℓ becomes a fused multiply-add its rounding stands in for the distance.
+    # Small batches save memory and avoid github.com/jax-ml/jax/issues/39103. The program is not
+    # optimised: where x/ℓ − z/ℓ becomes a fused multiply-add, its rounding error takes the place of
+    # the distance.
     values = jax.jit(
         lambda X, Z: jax.lax.map(
             lambda p: (k(*p), jax.grad(k)(*p), _mixed(k)(*p)), (X, Z), batch_size=8192 // n**2 or 1
@@ -175,19 +176,20 @@ def _lowest(matrix: np.ndarray) -> float:
 
 
 def _check_limits(own: _Pairs, between: _Pairs, beyond: _Pairs, index, unit, eps) -> None:
-    """Name what is wrong with the first M(x, x) that is not the limit of M(x, x + h)."""
+    """Raise a ValueError for the first M(x, x) that is not the limit of M(x, x + h)."""
     total = np.abs(own.k[:, None, None]) + np.abs(beyond.k)
     moved = own.k[:, None, None] + beyond.k - 2 * between.k
     moved = np.abs(moved) / np.where(total > 0, total, 1.0)  # (P, 2, J)
     finite: Any = np.isfinite(between.block).all(axis=(-2, -1))
     size = _size(between.block)
-    # k must have moved by more than rounding, and M by little: Matérn-3/2 moves by 3 √moved.
+    # Near are neighbours at which k has changed by more than rounding and M by little; that of
+    # Matérn-3/2 changes by 3 √moved.
     near = finite & (moved > 8 * eps) & (moved <= eps**0.5 / 8)
     larger = np.maximum.accumulate(np.where(finite & (moved <= 0.01), size, 0.0), axis=2)
     scale = np.maximum(np.maximum(size, larger), _size(own.block)[:, None, None])
     scale = np.maximum(scale, 0.1 * scale.max(axis=(0, 1)))  # blocks may vanish at some points
-    # The limit may lie beyond the resolution: Matérn-3/2 tends to it linearly, so that the step
-    # before and this one extrapolate to it.
+    # The limit may lie beyond the smallest step. Matérn-3/2 tends to it linearly, so two successive
+    # steps are extrapolated too.
     before = np.concatenate([between.block[:, :, :1], between.block[:, :, :-1]], axis=2)
     here: Any = own.block[:, None, None]
     misses = [_size(tends - here) for tends in (between.block, 2 * between.block - before)]
@@ -197,10 +199,10 @@ def _check_limits(own: _Pairs, between: _Pairs, beyond: _Pairs, index, unit, eps
     grows: Any = (size[..., 1:] > 1.2 * size[..., :-1]) & finite[..., 1:] & finite[..., :-1]
     grows &= (moved <= 0.1 * np.where(finite, moved, 0).max(axis=2, keepdims=True))[..., :-1]
     for p, i in enumerate(index):
-        # Over 10 halvings of h, a factor of 1000, only a kernel of the distance keeps growing: a
-        # sound one with a second, smaller scale passes that in two or three. And from M(x, x) all
-        # near neighbours of a sound one differ by 3 √(√ε/8) = .02 in float32, of a block that is
-        # twice too large by .5.
+        # Only the blocks of a kernel of the distance keep growing over 10 halvings of h, a factor
+        # of 1000; those of a sound kernel with a second, smaller scale grow over two or three. And
+        # the blocks of a sound kernel at near neighbours differ from M(x, x) by 3 √(√ε/8) = .02 in
+        # float32, while an M(x, x) that is twice too large differs from them by .5.
         steady = max(_longest(row) for row in grows[p]) >= 10
         rows = zip(near[p], differs[p], strict=True)
         wrong = any(row.any() and off[row].min() > 0.3 for row, off in rows)
@@ -212,7 +214,7 @@ def _check_limits(own: _Pairs, between: _Pairs, beyond: _Pairs, index, unit, eps
 
 
 def _longest(row: np.ndarray) -> int:
-    """The longest run of True."""
+    """The length of the longest run of True."""
     breaks = np.flatnonzero(~np.concatenate([[False], row, [False]]))
     return int(np.diff(breaks).max()) - 1
 
@@ -265,7 +267,7 @@ def _refuse_infinite(values: np.ndarray, subset: np.ndarray, what: str) -> None:
 
 
 def _check_gram(name: str, G: np.ndarray, noisy: np.ndarray, eps: float) -> None:
-    """Symmetric, and no eigenvalue below what rounding allows."""
+    """ValueError where G is not symmetric, or has an eigenvalue below what rounding allows."""
     scale = np.abs(G).max()
     if not scale:
         return

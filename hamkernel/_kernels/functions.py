@@ -26,7 +26,7 @@ def as_pytree(fn: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _no_leaf(leaf: Any) -> Any:
-    """A function, such as the activation of a network, as structure instead of a leaf."""
+    """The leaf, or a PyTree without leaves in place of a function such as an activation."""
     is_function = callable(leaf) and not eqx.is_array_like(leaf)
     return jax.tree_util.Partial(leaf) if is_function else leaf
 

@@ -145,7 +145,7 @@ def closed(
                 f"S = {np.round(g.matrix, 3).tolist()}. To ignore a coordinate use Select(k, dims)."
             )
     group = [Element(np.eye(n), 1.0)]
-    for known in group:  # which grows
+    for known in group:  # the list grows inside of the loop
         for g in generators:
             new = Element(_clean(g.matrix @ known.matrix), g.character * known.character)
             found = [e for e in group if np.abs(e.matrix - new.matrix).max() < _SAME_MAP]
@@ -339,7 +339,10 @@ def symmetrised(
 
 
 def _with_closed_group(kernel: Symmetrised) -> Symmetrised:
-    """The kernel, whose group must close; of functions alone the dimension is not known yet."""
+    """The kernel, once its group is known to close.
+
+    The dimension follows from a matrix; with functions alone the check waits for the first point.
+    """
     matrices = [each for each in kernel.maps if not callable(each)]
     if matrices:
         kernel.group(len(matrices[0]))
@@ -358,7 +361,7 @@ def with_parity(kernel: AbstractScalarKernel, parity: int) -> AbstractScalarKern
 
 
 class Removed(NamedTuple):
-    """A scalar kernel k, and the means over one group that were taken of it."""
+    """A scalar kernel k without its symmetry, and the means over a group from which it came."""
 
     kernel: AbstractScalarKernel
     means: tuple[Symmetrised, ...]  # over one group; the terms of a sum have one each
@@ -375,9 +378,9 @@ class Removed(NamedTuple):
 
 
 def symmetry_removed(kernel: AbstractScalarKernel) -> Removed | None:
-    """The k and the group of which `kernel` is `symmetrised`, or None.
+    """The k and the group with `kernel` = `symmetrised(k, …)`, or None.
 
-    Where all of it is one-sided, it is the mean over h of χ(h) k(x, hz).
+    Where every mean is one-sided, `kernel` is the mean over h of χ(h) k(x, hz).
     """
     if isinstance(kernel, Symmetrised):
         return Removed(kernel.kernel, (kernel,))

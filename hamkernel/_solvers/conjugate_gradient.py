@@ -116,7 +116,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
     def _tolerance(self, dtype: jnp.dtype) -> Float[Array, ""]:
         own = self.tolerance
         default = 1e-8 if dtype == jnp.float64 else 1e-5
-        # As a Python float it would compile anew.
+        # An array, since every new Python float would compile anew.
         return jnp.asarray(default if own is None else own, dtype)
 
     def _converged(self, K, X, ridge, landmarks, found: _Found, throw: bool):
@@ -134,8 +134,8 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                     f"{float(truncation):.1e})"
                 )
                 rounding = float(gram_rounding(trace(K, X, rows_of(X))))
-                # On 87 points of an orbit they converged at 3e4 of it and did not at 3e2, where
-                # Cholesky left a residual of 4e-12.
+                # On 87 points of an orbit the iterations converged with a ridge of 3e4 times the
+                # rounding and not with 3e2, where Cholesky left a residual of 4e-12.
                 if ridge < 1e4 * rounding:
                     return (
                         f"conjugate gradients did not converge{reached}: the ridge N λ = "
@@ -274,7 +274,7 @@ def _iterated(
     return _Found(learned, solution.stats["num_steps"], relative(y - c - values, y), truncation)
 
 
-# The same one iteration at a time, to show how far it is and to let Ctrl-C end it.
+# The same iterations one at a time, which a progress bar can show and Ctrl-C can end.
 
 
 class _Iterate(NamedTuple):

@@ -96,15 +96,15 @@ def dense_field(problem: Problem, throw: bool = True, progress: bool = False) ->
     return _unless_lost(field, left, problem.rows.count, throw)
 
 
-# Rows from which the Gram of velocities is factored in its own place, in blocks.
+# The number of rows from which the Gram of velocities, 288 MB, is factored in its own memory.
 IN_PLACE = 6000
 
 
 def copies(problem: Problem) -> int:
     """The number of matrices of the size of the Gram that a dense fit holds at its peak.
 
-    In place 1.5 for all kernels; else the Gram, its factor, what is returned, and strips on the
-    way, 3.4 (`test_the_peak_memory_of_a_dense_fit_is_what_is_planned`).
+    A fit in place held 1.5 for all kernels. Other fits hold the Gram, its factor, what is returned,
+    and strips on the way: 3.4 (`test_the_peak_memory_of_a_dense_fit_is_what_is_planned`).
     """
     return 2 if _is_in_place(problem) else 4
 
@@ -138,7 +138,7 @@ def _dense(problem: Problem, progress: bool, keep: bool = True) -> Any:
 
 
 def _assembled(K, rows: Measurements, ridge, progress: bool):
-    """A, a slab of rows after the other, and the progress bar of its factorisation."""
+    """A, made in slabs of rows, and the progress bar of its factorisation."""
     from tqdm import tqdm  # so that importing the package does not load it
 
     off = None if progress else True
@@ -185,7 +185,7 @@ def _field(K, rows: Measurements, regularization):
 def norm_of(square: Float[Array, ""], error: Float[Array, ""]) -> Float[Array, ""]:
     """√square for ‖f‖² = cᵀGc; NaN where rounding may be a tenth of it or more.
 
-    It is the small difference of large numbers where the field is small beside the velocities.
+    cᵀGc is a small difference of large numbers where the field is small beside the velocities.
 
     Args:
         square: cᵀGc as it was computed.
@@ -212,7 +212,7 @@ def _extended(old: DenseConditional, new: Measurements):
     B = old.factor.whiten(across)
     own = plus_ridge(gram_of_rows(K, beside)[-fresh:, -fresh:], old.ridge) - B.T @ B
     D, S = len(R), cholesky(own)
-    # Placed in zeros: four times as fast as blocks joined.
+    # Blocks that are written into zeros take a quarter of the time of joined blocks.
     R = jnp.zeros((D + fresh,) * 2, R.dtype).at[:D, :D].set(R).at[:D, D:].set(B).at[D:, D:].set(S)
     factor = eqx.tree_at(lambda f: f.R, old.factor, R)
     y = rows.y
@@ -286,7 +286,7 @@ def _unless_lost(field: KernelField, left: Array, N: int, throw: bool = True) ->
     # Fitted values were measured to be wrong by 1 to 10 times ‖y − (G + σ²I)c‖/‖y‖, from full
     # accuracy down to none.
     failed = ~(require.on_host(left) <= 1e-2)
-    if throw and require.is_concrete(failed):  # the field as it is, in less time
+    if throw and require.is_concrete(failed):  # the field need not be taken apart
         return require.value(field, failed, message, RuntimeError)
     values = require.value(learned(field), failed, message, RuntimeError, throw)
     return eqx.tree_at(learned, field, values, is_leaf=lambda leaf: leaf is None)

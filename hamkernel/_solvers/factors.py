@@ -153,7 +153,7 @@ class AbstractFactor(eqx.Module, Generic[System]):
     def trusted(self, y: Float[Array, " D"]) -> Bool[Array, ""]:
         """Whether ε cond(A) leaves digits, with ‖A⁻¹‖ from two steps of the power method.
 
-        They do not start from y, which may be an eigenvector.
+        The steps do not start from y, which may be an eigenvector.
         """
         b = jnp.cos(jnp.arange(len(y), dtype=y.dtype) ** 2)
         c = self.solve(b / jnp.linalg.norm(b))
@@ -190,8 +190,8 @@ class CholeskyBlocks(AbstractBlocks):
 ROWS_IN_PLACE = 1000
 
 
-# LAPACK. One after the other under `jax.vmap`: two batches of its calls side by side were seen to
-# stall for ever on two cores, since jaxlib 0.10.2 waits for threads that wait for it.
+# Calls of LAPACK. Under `jax.vmap` they run one after the other: two batches of calls side by side
+# were seen to stall for ever on two cores, since jaxlib 0.10.2 waits for threads that wait for it.
 
 
 @sequential_vmap
@@ -297,7 +297,7 @@ class DenseFactor(AbstractFactor[DenseSystem]):
         for j in _blocks(len(R)):
             before = slice(0, j.start)
             own = backward(R[j, j], jnp.eye(j.stop - j.start, dtype=R.dtype))
-            # Each call of LAPACK waits for the one before.
+            # The barrier makes each call of LAPACK wait for the one before.
             R, own = jax.lax.optimization_barrier((R, own))
             U = U.at[j, j].set(own)
             U = U.at[before, j].set(-(U[before, before] @ R[before, j]) @ own)
@@ -317,11 +317,11 @@ def factor_in_place(A: Float[Array, "D D"], steps: Callable[[Iterable], Iterable
 
         S = A_jk − Σ_{i<j} R_ijᵀ R_ik,    R_jj = chol(S_jj),    R_jk = R_jj⁻ᵀ S_jk    for k > j.
 
-    LAPACK's own takes a second matrix for the result and a third for what XLA returns.
+    The routine of LAPACK takes a second matrix for its result and a third for what XLA returns.
 
     Args:
         A: a matrix outside of any trace.
-        steps: passes on the blocks, to show how far it is.
+        steps: blocks -> the same blocks, such as a progress bar around them.
     """
     size = _norm(A)
     starts = range(0, len(A), ROWS_IN_PLACE)
@@ -376,12 +376,13 @@ class DenseInverse(AbstractInverse[DenseSystem]):
     def pulled_folds(self, a, groups, V, R, bars) -> tuple[DenseSystem, Float[Array, " D"]]:
         P, Q = [], []  # C_:S v_S and C_:S r_S, a column for each fold
         for group, v, r in zip(groups, V, R, strict=True):
-            rows = group.gather(self.C)  # whose sums are three times faster than those of columns
+            rows = group.gather(self.C)  # sums of rows are three times as fast as of columns
             P.append(jnp.einsum("fid,fi->df", rows, v))
             Q.append(jnp.einsum("fid,fi->df", rows, r))
         w = jnp.concatenate(P, axis=1).sum(axis=1) + self.C @ bars[1]
         left, right = jnp.column_stack([*P, -w]), jnp.column_stack([*Q, a])
-        # Else XLA computes these sums again for every entry of the product: 10 times slower.
+        # Without the barrier XLA computes these sums again for every entry of the product, which
+        # takes 10 times as long.
         left, right, w = jax.lax.optimization_barrier((left, right, w))
         return DenseSystem(left @ right.T), w
 
@@ -398,14 +399,18 @@ def _outer_square(U: Float[Array, "D D"]) -> Float[Array, "D D"]:
 def _blocks(D: int) -> list[slice]:
     """Blocks of 128 rows, and at most 8 of them, as large as each other.
 
-    More compile longer (1.7 s for 16, 0.7 s for 8), and fewer are slower (D = 592 to 2000).
+    More blocks take longer to compile (1.7 s for 16, 0.7 s for 8), and fewer are slower to run
+    (D = 592 to 2000).
     """
     starts = np.linspace(0, D, min(-(-D // 128), 8) + 1).astype(int).tolist()
     return [slice(start, stop) for start, stop in itertools.pairwise(starts)]
 
 
 class ContrastedSystem(AbstractSystem):
-    """A before the contrast, and p, with no negative entry, which is not differentiated."""
+    """A of the rows before the contrast, and the direction p of the unknown constant.
+
+    No entry of p is negative, and p is not differentiated.
+    """
 
     matrix: Float[Array, "M M"]
     constant: Float[Array, " M"]

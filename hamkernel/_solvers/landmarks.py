@@ -1,14 +1,14 @@
 """Landmarks: the few rows whose columns of the Gram carry all of it, to a stated tolerance.
 
 A landmark is a row of the observations, a linear functional of the field or of its potential, and
-its column of the Gram is the representer of that functional. Of velocities the n rows of a point
-come together.
+its column of the Gram is the representer of that functional. The n rows of a velocity are chosen
+together.
 
 Randomly pivoted Cholesky draws candidates with probability proportional to the diagonal of the
-residual G − Ĝ of the columns so far, so it goes where the data still say something new, and stops
-when its trace is small. Candidates are drawn in blocks; inside a block one is kept with the
-probability that drawing one by one would have given it (Epperly, Tropp & Webber), so blocks cost
-nothing.
+residual G − Ĝ, where Ĝ is the Gram of the columns drawn so far: it prefers points at which the
+data say something new, and stops when the trace of the residual is small. Candidates are drawn in
+blocks; inside a block a candidate is kept with the probability that drawing one by one would have
+given it (Epperly, Tropp & Webber), so blocks change nothing but the speed.
 """
 
 import abc
@@ -36,7 +36,9 @@ from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel
 
-BLOCK = 16  # candidates drawn at once
+# Candidates drawn at once. The number of landmarks is rounded up to a multiple of it, so that
+# similar fits share their compiled programs.
+BLOCK = 16
 
 
 class Landmarks(eqx.Module):
@@ -166,7 +168,6 @@ def _chosen(
     while int(drawn.count) >= size and size < most:
         size = min(2 * size, most)
         drawn = _draw(candidates, left, _enlarged(drawn, size + BLOCK), size)
-    # A multiple of the block, so that similar fits share their compiled code.
     blocks = max(1, -(-int(drawn.count) // BLOCK))
     return _first(drawn, min(size, blocks * BLOCK))
 
@@ -186,7 +187,7 @@ def _stratified(key, N: int, count: int) -> Int[Array, " count"]:
 def _part(
     blocks: tuple[AbstractBlock, ...], share: float, key: Key[Array, ""]
 ) -> tuple[AbstractBlock, ...]:
-    """A random share of the observations of each block, or an even one where JAX traces."""
+    """A random share of the observations of each block; evenly spaced ones under tracing."""
     found = []
     for block in blocks:
         count = max(1, int(share * block.count))
@@ -206,7 +207,7 @@ def _pruned(
     kept: Bool[Array, " r"],
     count: Int[Array, ""],
 ) -> Landmarks:
-    """Landmarks without the observations that have none of the rows, where these are known."""
+    """The landmarks without observations of which no row is used; all of them under tracing."""
     if not require.is_concrete(blocks, index, kept):
         return Landmarks(blocks, index, kept, count)
     rows, used = np.asarray(index), np.asarray(kept)
@@ -216,7 +217,7 @@ def _pruned(
         own = used & (rows >= start) & (rows < start + block.size)
         if own.any() or (block is blocks[-1] and not parts):
             chosen = np.unique(block.labels()[rows[own] - start])
-            # Others fill up to a multiple of the block: similar fits share their compiled code.
+            # Other observations fill up a multiple of the block.
             wanted = min(block.count, max(1, -(-len(chosen) // BLOCK)) * BLOCK)
             others = np.setdiff1d(np.arange(block.count), chosen)[: wanted - len(chosen)]
             part, taken, _ = block.subset(np.sort(np.concatenate([chosen, others])))
@@ -246,7 +247,7 @@ def given_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Landmarks:
 
 
 def landmarks_of(*blocks: AbstractBlock) -> Landmarks:
-    """The landmarks that are all rows of some blocks, those that depend on others too."""
+    """The landmarks that consist of all rows of some blocks, dependent rows included."""
     size = sum(block.size for block in blocks)
     return Landmarks(blocks, None, jnp.ones(size, bool), jnp.asarray(size))
 
@@ -254,8 +255,8 @@ def landmarks_of(*blocks: AbstractBlock) -> Landmarks:
 def _independent(matrix, rounding):
     """Independent columns of a Gram, by pivoted Cholesky until the largest pivot is rounding.
 
-    In the order in which they come, columns whose pivots all exceed rounding may still depend on
-    each other: only with pivoting does a small eigenvalue show in a small pivot.
+    Without pivoting, columns whose pivots all exceed rounding may still depend on each other: only
+    with pivoting does a small eigenvalue show in a small pivot.
     """
 
     def more(carry):
@@ -277,7 +278,7 @@ def _independent(matrix, rounding):
 def _rounding(traces: Float[Array, " P"], columns: int) -> Float[Array, " P"]:
     """The rounding error of pivots that should be zero, given their traces before elimination.
 
-    The error of Cholesky's method is relative to the diagonal entry, whatever the others are.
+    The error of Cholesky's method is relative to the diagonal entry of the same row.
     """
     return (10 * columns * gram_rounding(jnp.abs(traces))).astype(traces.dtype)
 
@@ -351,7 +352,7 @@ class _Drawn(NamedTuple):
 
 @eqx.filter_jit
 def _begin(candidates: AbstractCandidates, left, key, size):
-    """`_draw` from the beginning."""
+    """The state after the first call of `_draw`."""
     traces, n = candidates.traces, candidates.outputs
     P, buffer = len(traces), size + BLOCK
     zero = jnp.zeros((), int)
@@ -383,7 +384,7 @@ def _draw(candidates: AbstractCandidates, left, drawn, size):
     goal = jnp.maximum(left, drawn.rounding).sum()
 
     def more(drawn):
-        # Rounds end the loop where rounding alone would go on drawing.
+        # The number of rounds is bounded, since rounding errors alone could go on for ever.
         wanted = (drawn.left.sum() > goal) & (drawn.count < size) & (drawn.rounds < 4 * size)
         return wanted | (drawn.rounds == 0)
 
@@ -403,7 +404,7 @@ def _draw_block(candidates: AbstractCandidates, drawn: _Drawn) -> _Drawn:
     new = jax.scipy.linalg.solve_triangular(L, rows, lower=True)
     new = jnp.where(kept[:, None], new, jnp.zeros_like(new))
 
-    # Those refused go to the end of the block, where the next block overwrites them.
+    # Refused candidates go to the end of the block, where the next block overwrites them.
     kept = kept.reshape(BLOCK, n)
     chosen = kept.any(axis=1)
     order = jnp.argsort(~chosen, stable=True)
@@ -430,7 +431,7 @@ def _draw_block(candidates: AbstractCandidates, drawn: _Drawn) -> _Drawn:
 def _accepted(key, block, n, rounding):
     """Cholesky of the accepted columns of `block`, with the identity in the place of the others.
 
-    Point j is kept with the probability that its trace now has over its trace before the block.
+    Point j is kept with a probability that is the ratio of its trace now to that before the block.
     """
     before = jnp.diagonal(block).reshape(-1, n).sum(axis=1)
     thresholds = jnp.maximum(jax.random.uniform(key, before.shape, block.dtype) * before, rounding)
@@ -486,8 +487,8 @@ def _inverse_root(G: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[Arra
 
 @_inverse_root.defjvp
 def _(primals, tangents):
-    # Only T Tᵀ = G⁻¹ matters, which this dT changes as that of the Cholesky factor would; that one
-    # rounds by the condition of G.
+    # Only T Tᵀ = G⁻¹ matters, and its derivative is the same with this dT as with that of the
+    # Cholesky factor, whose rounding error grows with the condition of G.
     (G, kept), (dG, _) = primals, tangents
     T = _inverse_root(G, kept)
     return T, -0.5 * T @ (T.T @ dG @ T)

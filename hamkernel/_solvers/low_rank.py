@@ -6,9 +6,9 @@ the landmarks, or the random key, stay.
 
 The prior in a span is f(x) = Φ(x) w, w ~ N(0, I). With F the rows of the data and
 RᵀR = FᵀF + σ²I, the weights are N(R⁻¹R⁻ᵀFᵀy, σ² R⁻¹R⁻ᵀ), so that a covariance given the data is
-σ² Φ₁ R⁻¹R⁻ᵀ Φ₂ᵀ. The part K − ΦΦᵀ of the prior that landmarks do not span is not told by the data
-and stays as it was before, so that far from them nothing is claimed to be known. R comes from a QR
-of F below σI, not from FᵀF; new rows go on with it.
+σ² Φ₁ R⁻¹R⁻ᵀ Φ₂ᵀ. The data say nothing of the part K − ΦΦᵀ of the prior, which landmarks do not
+span: it is added to the covariance, so that nothing is claimed to be known far from the landmarks.
+R comes from a QR of F below σI, not from FᵀF, and new rows update it by another QR.
 
 **Draws of the prior**, with which draws from a posterior begin. By Matheron's rule a draw f₀ of the
 prior and a draw ε of the noise would have given the rows L f₀ + ε, and a fit to the difference from
@@ -18,11 +18,12 @@ the data corrects it:
 
 so every draw is one function with one Hamiltonian, whose orbits keep their own energy.
 
-f₀ lives on landmarks s of a region: α = T w with w ~ N(0, I) and G_SS⁻¹ = T Tᵀ. It has the
-covariance of the part of f that the landmarks tell. Of random Fourier features alone the error of
-Cov(H) was .33 for 512 of them, of 100 landmarks it was 6e-8. Outside of the region landmarks tell
-little. The rest, g(x) − K(x, S) G_SS⁻¹ g(S), is drawn in features g where the kernel has a spectrum
-in frequencies of its own for every draw, so that the covariance over draws has no error of theirs.
+f₀ has coefficients α = T w at landmarks s of a region, with w ~ N(0, I) and G_SS⁻¹ = T Tᵀ, and so
+the covariance of the part of f that its values at the landmarks determine. The error of Cov(H) was
+6e-8 with 100 landmarks, and .33 with 512 random Fourier features alone. Outside of the region the
+landmarks determine little. The rest of the draw, g(x) − K(x, S) G_SS⁻¹ g(S), takes random features
+g, where the kernel has a spectrum. Every draw has frequencies of its own, so that the features add
+no error to the covariance over draws.
 
 Source: Quiñonero-Candela & Rasmussen (2005), section 5, the deterministic training conditional;
 Wilson, Borovitskiy, Terenin, Mostowsky & Deisenroth (2020), arXiv 2002.09309.
@@ -132,8 +133,8 @@ def prior_draws(
     low, high = region
     share = jax.random.uniform(of_region, (2048, len(low)), X.dtype)
     X = jnp.concatenate([X, low[None] + (high - low)[None] * share])
-    # Until they leave 1e-6 of tr K(x, x) over the region, or 192 are chosen: 100 in the plane for a
-    # region of a few lengthscales; the features do the rest.
+    # Landmarks are chosen until 1e-6 of tr K(x, x) is left over the region, or there are 192. In
+    # the plane 100 suffice for a region of a few lengthscales.
     left = 1e-6 * jnp.mean(block_traces(K, X))
     landmarks = choose_landmarks(K, X, left, 192, len(X), of_landmarks)
     return _drawn(K, landmarks, of_draws, count)
@@ -161,7 +162,7 @@ def _drawn(K, landmarks: Landmarks, key, count: int) -> Prior:
         basis, weights = draw
         return jax.vmap(lambda x: basis.field(x, weights))(S).reshape(-1)
 
-    # Four draws at once: 400 together took 1.5 GB and half as long again.
+    # Four draws are evaluated at once: 400 together took 1.5 GB and half as long again.
     g = jax.lax.map(at_landmarks, (waves, weights), batch_size=4)  # (count, m n)
     return Prior(K, S, ((w - g @ T) @ T.T).reshape(count, m, n), waves, weights)
 
@@ -190,8 +191,8 @@ def truncated(
 ) -> Float[Array, ""]:
     """trace(G − Ĝ)/ridge from trace G and trace Ĝ; NaN if Ĝ is larger than G.
 
-    Of a positive definite kernel it is not, but for rounding, of 1e-16 where it was measured; of
-    kernels that are not it was by 4 per cent and more.
+    trace Ĝ exceeds trace G by rounding alone, 1e-16, if the kernel is positive definite, and by 4
+    per cent and more for kernels that were not.
     """
     left = jnp.where(covered - trace > 1e-3 * jnp.abs(trace), jnp.nan, trace - covered)
     return jnp.maximum(left, jnp.zeros_like(left)) / ridge
@@ -205,9 +206,9 @@ def checked(
     message: str | Callable[[], str],
     throw: bool,
 ) -> Arrays:
-    """The arrays `learned` with landmarks; a RuntimeError with `message` where the solve `failed`.
+    """The arrays `learned`; a RuntimeError with `message` where the solve `failed`.
 
-    Without landmarks all of the Gram must be missing, unless it is zero, and so is the field.
+    A fit without landmarks has failed too, unless the Gram, and with it the field, is zero.
     """
     if truncation is None:
         return require.value(learned, failed, message, RuntimeError, throw)
@@ -238,7 +239,7 @@ class AbstractSpan(eqx.Module):
 
     @abc.abstractmethod
     def of(self, block: AbstractBlock) -> Float[Array, "d r"]:
-        """The rows of a block of each function."""
+        """The rows of a block for each of the functions."""
 
     @abc.abstractmethod
     def missing(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
@@ -248,7 +249,7 @@ class AbstractSpan(eqx.Module):
     def truncation(
         self, rows: Measurements, F: Float[Array, "M r"], ridge: Float[Array, ""]
     ) -> Float[Array, ""] | None:
-        """trace(G − FFᵀ)/ridge of the M rows of observations; None of a kernel of its own."""
+        """trace(G − FFᵀ)/ridge for the M rows; None where Σ φφᵀ is a kernel of its own."""
 
     @abc.abstractmethod
     def field(
@@ -259,7 +260,7 @@ class AbstractSpan(eqx.Module):
         N: int,
         truncation: Float[Array, ""] | None,
     ) -> AbstractField:
-        """The function with these weights."""
+        """The field Σ_r w_r φ_r."""
 
     @abc.abstractmethod
     def draws(

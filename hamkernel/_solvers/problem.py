@@ -56,7 +56,7 @@ class Problem:
 
     @property
     def states(self) -> tuple[Float[Array, "N d"], Float[Array, "N n"]] | None:
-        """Points and velocities, where these are all the rows: they can be seen tile by tile."""
+        """Points and velocities if there are no other rows, which a solver can read in tiles."""
         return self.rows.states
 
     def on_one_device(self) -> Problem:
@@ -80,9 +80,9 @@ def problem(
     """The problem of the data, checked; X and Y are `Velocities(X, Y)`.
 
     Raises:
-        TypeError, ValueError: as `fit` says; not of a mean that is not finite at the data, nor of
-            data whose squares overflow, unless it is to `throw`. AttributeError: energies without a
-            potential.
+        TypeError, ValueError: as `fit` says. A mean that is not finite at the data, and data whose
+            squares overflow, are refused only with `throw`. AttributeError: there are energies and
+            K has no potential.
     """
     spread = rows_of(X) if isinstance(X, jax.Array) else None
     K, rows = measurements(matrix_kernel(K), X, Y, inputs_or_parameters(inputs, parameters, K))
@@ -200,19 +200,19 @@ Learned = TypeVar("Learned", bound=AbstractField, covariant=True)
 class AbstractSolver(eqx.Module, Generic[Learned]):
     """A method by which `fit` finds the field."""
 
-    no_factor: ClassVar[str | None] = None  # why there is no `_given`
-    is_low_rank: ClassVar[bool] = False  # whether `tune` is to judge by the loss in its `_basis`
+    no_factor: ClassVar[str | None] = None  # the reason why `_given` is not available, if so
+    is_low_rank: ClassVar[bool] = False  # whether `tune` minimises the loss of its `_basis`
 
     def _basis(
         self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
     ) -> Any:
-        """The features of a fit of low rank, as functions of the hyperparameters."""
+        """The rule that gives each kernel the functions of its low-rank fit; None if dense."""
         del K, rows, regularization
         return None
 
     @abc.abstractmethod
     def _fitted(self, problem: Problem, throw: bool = True, progress: bool = False) -> Learned:
-        """The field; of NaN if the solve fails and does not `throw`."""
+        """The field. If the solve fails and `throw` is False, its numbers are NaN."""
 
     def _given(
         self, problem: Problem, throw: bool = True, progress: bool = False
