@@ -273,7 +273,7 @@ class Values(AbstractBlock):
 
 
 def _taken(array: Array | None, index: Int[np.ndarray, " C"]) -> Any:
-    """array[index], taken by NumPy: JAX would compile for every number of entries."""
+    """array[index], evaluated by NumPy, since JAX compiles anew for every number of entries."""
     if array is None or isinstance(array, Tracer):
         return None if array is None else array[index]
     return jnp.asarray(np.asarray(array)[index])
@@ -283,7 +283,7 @@ Subset = tuple[AbstractBlock, Int[np.ndarray, " rows"], Int[np.ndarray, " observ
 
 
 def merged(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:
-    """The same rows, with neighbouring blocks of one kind merged: there is less to compile."""
+    """The same rows, with neighbouring blocks of one kind merged, which compile faster."""
     found: list[AbstractBlock] = []
     for block in blocks:
         both = found[-1].merge(block) if found else None

@@ -1,6 +1,6 @@
 """The normal form of all observations: y_r = L_r u + ε_r with one variance Nλ of all rows.
 
-Only in this file do inputs join their states. With inputs a point is (x, u), of d = n + m
+Inputs are joined to their states here alone. With inputs a point is (x, u), of d = n + m
 coordinates, and the field there has n components; the Gram, the solvers and the losses need not
 know that some of the coordinates are inputs.
 
@@ -11,7 +11,7 @@ it. Such rows are the contrasts of each energy with the weighted mean of those b
     q_i = (n_{i−1} e_i − (p_i/n_{i−1}) Σ_{j<i} p_j e_j)/n_i,   n_i² = Σ_{j≤i} p_j².
 
 The contrasts are orthonormal, so their noise is independent again: this is generalised least
-squares with the constant estimated, exactly, in one row less. They are Helmert's contrasts, with
+squares with the constant estimated, exactly, with one row fewer. They are Helmert's contrasts with
 weights, and a cumulative sum computes them.
 """
 
@@ -225,7 +225,7 @@ class Measurements:
         return rows.at[where].set(own - p * jnp.concatenate([after, none]))
 
     def _constant(self, rows: Float[Array, "M *rest"]) -> tuple[Array, Array]:
-        """P and n_i of the energies, shaped to multiply rows."""
+        """The p_i and n_i of the energies, shaped to multiply rows."""
         p = 1 / self.scale[self.energies]
         sizes = jnp.sqrt(jnp.cumsum(p**2))
         shape = (-1, *[1] * (rows.ndim - 1))

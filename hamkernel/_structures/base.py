@@ -1,8 +1,8 @@
 """The base of matrix-valued kernels, their sums, and their symmetries: odd, even, reversible, any.
 
-Of a symmetry the SCALAR kernel inside a structure is averaged over the group, so that the potential
-has the symmetry, and with it the field: where B(Sx) = ± S B(x) Sᵀ, a potential with u(Sx) = u(x)
-gives f(Sx) = ± S f(x).
+A symmetry is imposed on the SCALAR kernel inside a structure, which is averaged over the group. The
+potential then has the symmetry, and so has the field: where B(Sx) = ± S B(x) Sᵀ, a potential with
+u(Sx) = u(x) gives f(Sx) = ± S f(x).
 """
 
 import abc
@@ -106,13 +106,13 @@ class AbstractMatrixKernel(eqx.Module):
         self.check_dimension(X.shape[1])
 
     def centre(self, Z: Float[Array, "M d"]) -> Float[Array, " d"] | None:
-        """The mean of Z, as far as K does not change when it is taken off both arguments."""
+        """The mean of Z if K(x − c, z − c) = K(x, z) for all c, else None."""
         return Z.mean(axis=0) if Invariance.TRANSLATION in self.invariance else None
 
     def blocks(
         self, X: Float[Array, "N n"], Z: Float[Array, "M n"]
     ) -> Float[Array, "N n M n"] | None:
-        """The Gram of points that are paired, where it has a closed form of its own."""
+        """The Gram, where K has a closed form for many points at once; else None."""
         return None
 
     def through_descriptor(self, n: int) -> Descriptor | None:
@@ -120,11 +120,11 @@ class AbstractMatrixKernel(eqx.Module):
         return None
 
     def outputs(self, inputs: int) -> int:
-        """The number of components of a field at points of so many coordinates."""
+        """The number of components of a field at points with `inputs` coordinates."""
         return inputs
 
     def shares_potential(self, other: "AbstractMatrixKernel") -> bool:
-        """Whether the fields of both are made from a potential by one and the same operator."""
+        """Whether the fields of both kernels are made from a potential by the same operator."""
         return False
 
     @abc.abstractmethod
@@ -133,14 +133,14 @@ class AbstractMatrixKernel(eqx.Module):
 
     @abc.abstractmethod
     def averaged(self, maps: tuple[LinearMap, ...]) -> "AbstractMatrixKernel":
-        """The kernel of the fields whose potential none of these maps changes."""
+        """The kernel of the fields whose potential is invariant under these maps."""
 
     def bounds(self, name: str, X: Float[np.ndarray, "N d"], amplitude: float) -> Bounds:
-        """The lower and upper bound of the array `name`, as stored, as those of scalar kernels."""
+        """The lower and upper bound of the array `name`, as `AbstractScalarKernel.bounds`."""
         return bounds_by_value(name, getattr(self, name))
 
     def transform_inputs(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
-        """The data in the coordinates of the kernels inside."""
+        """The data in the coordinates that the inner kernels see."""
         return X
 
     @property
@@ -155,7 +155,7 @@ class AbstractMatrixKernel(eqx.Module):
 
     def __add__(self, other: Any) -> "Sum":
         if not isinstance(other, AbstractMatrixKernel) or other.takes_inputs:
-            return NotImplemented  # a kernel of more than states says itself what the sum is
+            return NotImplemented  # a kernel of joined points defines the sum
         return Sum(self, other)
 
     def __mul__(self, other: Any) -> Any:
@@ -171,7 +171,7 @@ class AbstractMatrixKernel(eqx.Module):
 
 
 def total(values: list[Array]) -> Array:
-    """The sum of the terms of a kernel, which has one at least."""
+    """The sum of the values of the terms of a kernel, of which there is at least one."""
     return functools.reduce(operator.add, values)
 
 
@@ -245,7 +245,7 @@ class Sum(AbstractMatrixKernel):
         )
 
     def _structures(self) -> Iterator[AbstractMatrixKernel]:
-        """All terms, those of named sums among them too."""
+        """All terms, with those of inner named sums."""
         for K in self.terms:
             yield from K._structures() if isinstance(K, Sum) else (K,)
 

@@ -21,7 +21,7 @@ Operator = Callable[[Float[Array, " n"]], Any]
 
 
 class AbstractCustomOperator(AbstractPotentialKernel):
-    """B(x) is a function of the caller's, the attribute that `role` names."""
+    """A structure whose B(x) is a function of the caller's, the attribute named by `role`."""
 
     role: AbstractClassVar[str]
 
@@ -67,7 +67,7 @@ class AbstractCustomOperator(AbstractPotentialKernel):
                 f"X[{int(bad.argmax())}]: it must be defined at every state of the data."
             )
         self._check_values(matrices, X)
-        check_symmetries(self, X[:16])  # one would do, but for zeros
+        check_symmetries(self, X[:16])  # at a single point B may happen to be zero
 
 
 class Structured(AbstractCustomOperator):

@@ -4,8 +4,8 @@ A member of the family is the field at one θ. With the kernel
 
     K((x, θ), (z, ϑ)) = k(θ, ϑ) K(x, z)
 
-the members are fields of K, with all its structure, and k says how alike two of them are: data of
-some members tell of the others. Dependences of their own for several parts add up.
+the members are fields of K, with all its structure, and k is the correlation of two members: data
+of some members inform the fit of the others. Families with different k can be added.
 """
 
 from typing import Any, ClassVar
@@ -205,10 +205,10 @@ class FamilySum(AbstractFamily):
     def seen_by(
         self, child: Any, X: Float[np.ndarray, "N d"], amplitude: float
     ) -> tuple[Float[np.ndarray, "N d"], float]:
-        """Each term sees joined points."""
+        """The terms see joined points."""
         return X, amplitude
 
 
 def _terms(K: AbstractMatrixKernel) -> tuple["Family", ...]:
-    """The terms of a family; what does not depend on θ is shared by all members."""
+    """The terms of a family; any other kernel is a family whose members are all the same."""
     return K.terms if isinstance(K, AbstractFamily) else (Family(K),)

@@ -1,8 +1,7 @@
-"""Kernels of joined points (x, u): a state x, and what is given beside it.
+"""Kernels of joined points (x, u): a state x, and the inputs or parameters u that belong to it.
 
-That is what was applied, the inputs of `Controlled`, or which member of a family it was, the
-parameters of `Family`. Points have n + m coordinates and fields n components, and everything
-downstream asks a kernel for its `outputs`.
+u holds the inputs of `Controlled`, or the parameters of the member of a `Family`. Points have n + m
+coordinates and fields n components, and all other modules ask a kernel for its `outputs`.
 
 Fields with inputs are f(x, u) = f(x) + G(x) u. With independent priors of the drift f and of the
 input matrix G the kernel of two joined points is
@@ -41,7 +40,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
     Attributes:
         count: m; None until the data says it.
         given: the name of u in `fit`: "inputs" or "parameters".
-        inner: what has a symmetry, and where to say it.
+        inner: the part that may have a symmetry, as error messages call it.
     """
 
     count: eqx.AbstractVar[int | None]
@@ -66,9 +65,9 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
         return None
 
     def coefficients_at(self, u: Float[Array, " m"], U: Float[Array, "M m"], A: Points) -> Points:
-        """The coefficients with which `of_states` makes the field at u of those of joined points.
+        """The coefficients b with Σⱼ K((x, u), (zⱼ, uⱼ)) aⱼ = Σⱼ K_states(x, zⱼ) bⱼ.
 
-        For `Controlled` u is zero, and these are the same.
+        For `Controlled` they are those at u = 0, and so b = a.
         """
         return A
 
@@ -93,7 +92,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
 
     @property
     def input_count(self) -> int:
-        """m; ValueError while nobody has said it."""
+        """m; ValueError as long as it is not known."""
         if self.count is None:
             raise ValueError(
                 f"this {type(self).__name__} kernel does not know how many {self.given} there are: "
@@ -111,7 +110,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
     ) -> tuple[Float[np.ndarray, "N _"], float]:
         """The data in the coordinates of a part of this kernel, and a plausible factor of it.
 
-        They set the bounds of the hyperparameters of the part, which are states by default.
+        Both set the bounds of the hyperparameters of the part. By default a part sees the states.
         """
         return self.split(X)[0], amplitude
 
@@ -139,7 +138,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
 
     def __radd__(self, other: Any) -> Any:
         if isinstance(other, AbstractMatrixKernel):
-            return Sum(other, self)  # which says why there is none
+            return Sum(other, self)  # raises with the reason why there is no such sum
         return super().__radd__(other)
 
 
@@ -183,7 +182,7 @@ class InputMatrix(eqx.Module):
 
 
 class KnownMatrix(eqx.Module):
-    """A known constant input matrix G, kept as numbers: nothing of it is trained."""
+    """A known constant input matrix G, kept as Python numbers, which are not trained."""
 
     entries: tuple[tuple[float, ...], ...] = eqx.field(static=True)
 

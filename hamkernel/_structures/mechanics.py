@@ -126,7 +126,7 @@ class PortHamiltonian(AbstractPotentialKernel):
         return r.reshape(-1, *(1,) * (v.ndim - 1)) * v
 
     def operator_at(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-        # Frictions that are trained apart must be told apart: the square roots of 2, 3, 4, …
+        # Frictions that are trained separately get different values: the square roots of 2, 3, 4, …
         apart = jnp.sqrt(jnp.arange(2.0, 2 + self.log_friction.size)).astype(x.dtype)
         stand_in = jnp.log(apart.reshape(self.log_friction.shape))
         general = eqx.tree_at(lambda K: K.log_friction, self, stand_in)
@@ -141,8 +141,8 @@ class PortHamiltonian(AbstractPotentialKernel):
         critical = np.log(extent[damped] / extent[(damped + n // 2) % n])
         if self.log_friction.ndim == 0:
             critical = critical.mean()
-        # Of the damping ratio, r over the critical friction: at 1e-5 an oscillation loses 6e-5 of
-        # its amplitude in a period, far less than can be seen; at 30 it is overdamped 30 times.
+        # Bounds of the damping ratio, r over the critical friction: at 1e-5 an oscillation loses
+        # 6e-5 of its amplitude in a period, far less than data show; at 30 it creeps.
         return critical + np.log(1e-5), critical + np.log(30.0)
 
     def check_dimension(self, n: int) -> None:

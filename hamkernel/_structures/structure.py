@@ -138,8 +138,8 @@ def row(k: AbstractScalarKernel, x: Point, Z: Points) -> Float[Array, " M"]:
 def mixed(k: AbstractScalarKernel, x, u, z, v) -> Float[Array, ""]:
     """uᵀ [∂x ∂zᵀ k(x, z)] v, forward in both arguments.
 
-    For k(x, z) = φ(s) this is φ″(s) ds(u) ds(v) + φ′(s) dds(u, v): in a Gram an entry costs a few
-    multiplications, since what belongs to one point or to the pair alone is made once.
+    For k(x, z) = φ(s) this is φ″(s) ds(u) ds(v) + φ′(s) dds(u, v). An entry of a Gram costs a few
+    multiplications, since the factors of a point, and those of a pair of points, are computed once.
     """
 
     def slope(x):
@@ -149,7 +149,8 @@ def mixed(k: AbstractScalarKernel, x, u, z, v) -> Float[Array, ""]:
 
 
 def _operators(K: Any, X: Float[Array, "N n"]) -> Float[np.ndarray, "N n n"]:
-    # Compiled, 0.05 ms in place of 2; but of a traced K whose B is known that would be traced too.
+    # Compiled code takes 0.05 ms in place of 2. Under tracing it would be traced too, although B is
+    # known.
     evaluate = _compiled_operators_at if require.is_concrete(K, X) else _operators_at
     return np.asarray(evaluate(K, X))
 
@@ -192,7 +193,7 @@ def check_symmetries(K: Any, X: Float[Array | np.ndarray, "N n"]) -> None:
 class AbstractPotentialKernel(AbstractStructure):
     """K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ: fields f = B ∇u of a potential u.
 
-    A final class adds B, and says what B is invariant to; everything else is here.
+    A final class adds B and the symmetry of B; everything else is defined here.
     """
 
     field_parity: ClassVar[int] = -1
@@ -236,13 +237,13 @@ class AbstractPotentialKernel(AbstractStructure):
         return -slope @ self.apply(x, slope)
 
     def operator_at(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-        """B(x) for all values of what is trained in it: where a symmetry of B must hold."""
+        """B(x) with stand-ins for its trained numbers, for which its symmetries must hold."""
         return self.apply(x, jnp.eye(len(x), dtype=x.dtype))
 
     def transformed_coefficients(
         self, S: Float[np.ndarray, "n n"]
     ) -> Float[np.ndarray, "n n"] | None:
-        # S B(z)ᵀ = ± B(Sz)ᵀ S⁻ᵀ, where B(Sz) = ± S B(z) Sᵀ: of a B(x) the sign is not known here.
+        # S B(z)ᵀ = ± B(Sz)ᵀ S⁻ᵀ, where B(Sz) = ± S B(z) Sᵀ. The sign is known for a constant B.
         if Invariance.TRANSLATION not in self.operator_invariance:
             return S if np.array_equal(S, np.eye(len(S))) else None
         with jax.ensure_compile_time_eval():
@@ -432,8 +433,8 @@ def group_expanded(
 
         Σⱼ ∂x ∂zᵀ k(x, hzⱼ) B(zⱼ)ᵀ aⱼ = ± Σⱼ (∂x ∂₂ᵀ k)(x, hzⱼ) B(hzⱼ)ᵀ h⁻ᵀ aⱼ.
 
-    In a sum over many pairs this is cheaper than all terms at once, which fill the registers.
-    K, Z and A come back as they are where K has no group, or one that is not one-sided.
+    In a sum over many pairs this is cheaper than adding all terms for each pair, which fills the
+    registers. K, Z and A are returned unchanged where K has no group, or not a one-sided one.
     """
     if not isinstance(K, AbstractStructure):
         return K, Z, A
