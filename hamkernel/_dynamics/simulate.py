@@ -21,7 +21,7 @@ from hamkernel._kernels.functions import as_pytree
 
 Between = Literal["held", "linear"]
 
-# Bounds the loop where the number of steps is not known beforehand: some seconds of a cheap field.
+# The bound of a loop whose number of steps is not known beforehand: some seconds of a cheap field.
 _MAX_STEPS = 2**20
 _RESULTS: Any = diffrax.RESULTS
 
@@ -162,7 +162,8 @@ class RightHandSide(eqx.Module):
 
     field: Any  # x -> velocity; or x, u -> velocity
     inputs: Callable[[Array], Any] | None
-    # Whether u is that of t = 0 over a whole step, whose last stage would else see the next one.
+    # Whether u is held at its value at t = 0 over a whole step; the last stage would otherwise see
+    # the next sample.
     held: bool = eqx.field(static=True)
 
     @property
@@ -199,8 +200,8 @@ def _right_hand_side(
     constant_steps: bool,
 ) -> tuple[RightHandSide, Float[Array, ""] | None]:
     """The field with its inputs, and the time of the inputs at ts[0] = 0, for `args`."""
-    # A function inside of `jax.jit` says what it is, and the loop is compiled anyway. Not behind
-    # every `__wrapped__`: what functools.wraps names is another field.
+    # The function inside of `jax.jit` may have attributes such as `is_separable`, and the loop is
+    # compiled anyway. Other functions with `__wrapped__`, by functools.wraps, are another field.
     while isinstance(field, (jax.stages.Wrapped, _FilterJit)):
         field = field.__wrapped__
     if inputs is None:
@@ -220,7 +221,7 @@ def _right_hand_side(
             "its inputs u: a field of a Controlled kernel, hk.systems.Driven(system, G), or a "
             "function of yours. To simulate it without inputs, leave them out."
         )
-    # Functions get the caller's time, samples have times of their own: those since the start.
+    # Functions are called with the caller's time; the times of samples count from the start.
     start = first.astype(ts.dtype) if callable(inputs) else jnp.zeros((), ts.dtype)
     held = constant_steps and between == "held" and not callable(inputs)
     return RightHandSide(field, _inputs(inputs, ts, between), held), start
@@ -365,7 +366,7 @@ def _bound(counts: Int[Array, " intervals"], max_steps: int | None) -> int:
 
 
 def _check_solver(solver: Any, dt: Any, rtol: Any, atol: Any, has_inputs: bool) -> None:
-    """Refuse what is no solver, and what it cannot do."""
+    """ValueError or TypeError for an object that is no solver, and for options it cannot use."""
     name = solver.__name__ if isinstance(solver, type) else type(solver).__name__
     symplectic = isinstance(solver, AbstractSymplecticSolver)
     if isinstance(solver, type) or not isinstance(solver, diffrax.AbstractSolver):

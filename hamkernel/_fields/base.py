@@ -38,8 +38,8 @@ class AbstractField(eqx.Module):
     def __repr__(self) -> str:
         return described(self)
 
-    # jax.jit(field) looks up the function it compiles by hash and equality. Arrays have no hash and
-    # traced ones no equality, so here a field is equal to itself only.
+    # jax.jit(field) looks up the compiled function by hash and equality. Arrays have no hash and
+    # traced arrays no equality, so a field equals only itself.
     def __hash__(self) -> int:
         return id(self)
 
@@ -71,7 +71,7 @@ class AbstractField(eqx.Module):
         """The velocity without that of the mean."""
 
     def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """The potential with the constants that the representer and the mean give it."""
+        """The potential with whatever constant the representer and the mean have."""
         self.kernel.check_potential()
         x = self._state(x)
         learned = self._learned_potential(x)
@@ -336,7 +336,7 @@ def potential_of(field: Callable[..., Any], kernel: AbstractMatrixKernel) -> Sca
 
 def at_points(fn: Callable[..., Any], X: Float[Array, "N n"]) -> Float[Array, "N *out"]:
     """fn(x) at many states, in bounded memory, in their dtype."""
-    # 1024 states at once: of 1000 random features 8 MB of waves.
+    # 1024 states at once: with 1000 random features their waves take 8 MB.
     return jax.lax.map(lambda x: jnp.asarray(fn(x)).astype(X.dtype), X, batch_size=1024)
 
 
@@ -347,7 +347,7 @@ def root(square: Float[Array, ""]) -> Float[Array, ""]:
 
 
 def _potential_of(field, x):
-    # With the field as an argument, so that a potential is a PyTree and its arrays no constants.
+    # The field is an argument, so that a potential is a PyTree whose arrays are no constants.
     return field.unanchored_potential(x) + field.offset
 
 

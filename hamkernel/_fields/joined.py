@@ -208,7 +208,7 @@ class ControlledField(AbstractJoinedField):
     def input_matrix(self, x: Num[ArrayLike, " n"]) -> Float[Array, "n m"]:
         """The input matrix G(x), shape (n, m)."""
         x = self._state(x)
-        # Forward mode drops what does not depend on u: this costs as much as G(x) alone.
+        # Forward mode drops all terms that do not depend on u: this costs as much as G(x) alone.
         return jax.jacfwd(lambda u: self(x, u))(jnp.zeros(self.kernel.input_count, x.dtype))
 
     @property
@@ -323,8 +323,8 @@ class FamilyField(AbstractJoinedField):
 class MemberField(AbstractField):
     """The member of a family with several terms, Σᵢ Σⱼ kᵢ(θ, θⱼ) Kᵢ(x, zⱼ) aⱼ.
 
-    The terms have the same points and coefficients of their own. `norm` is the root of the sum of
-    the squares of theirs.
+    The terms share their points, and each has coefficients of its own. The square of `norm` is the
+    sum of the squares of their norms.
 
     Attributes:
         kernel: the sum of the Kᵢ.
@@ -381,7 +381,10 @@ class MemberField(AbstractField):
 
 
 def at_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
-    """A field or a mean of points (x, u) at one u, as one of x; u = 0 if None, for `Controlled`."""
+    """A field or a mean of points (x, u) at one u, as a function of x.
+
+    Without u it is the drift of a `Controlled` kernel, at u = 0.
+    """
     if isinstance(part, FieldSum):
         terms = [at_inputs(term, n, u) for term in part.terms]
         known = tuple(term for term in terms if term is not None)
@@ -427,7 +430,7 @@ def at_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
 
 
 def learned_field(field: Any, known: Any) -> Any:
-    """The field of a solver plus the prior mean `known`; of a joined kernel one of x and u."""
+    """The field of a solver plus the prior mean `known`, of x and u if its kernel is joined."""
     if known is not None:
         field = dataclasses.replace(field, mean=known)
     if not isinstance(field.kernel, AbstractJoinedKernel):

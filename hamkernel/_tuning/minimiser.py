@@ -5,10 +5,10 @@ optimistix, from points of a box that is searched as h = low + (high − low)(1 
 real u, as MINUIT does: an unconstrained minimiser then respects the bounds and can rest on one,
 where a sigmoid would creep towards it. The side of the box is π long in u.
 
-`BoxBFGS` is the default. It is the BFGS of optimistix with a line search, a limit of the step and a
-tolerance of its own, by the classes that optimistix has for them: halving the steps of
-`optimistix.BFGS` takes twice the losses, and its tolerance, of differences of u and of the loss
-together, cannot say "less than 0.01 % is still to be gained".
+`BoxBFGS` is the default. It is the BFGS of optimistix with its own line search, limit of the step
+and tolerance, made from the classes that optimistix has for them. The line search of
+`optimistix.BFGS`, which halves the step, takes twice as many losses, and its tolerance, on
+differences of u and of the loss together, cannot say "less than 0.01 % is still to be gained".
 
 Source: Nocedal & Wright (2006), Numerical Optimization, algorithms 3.1 and 6.1.
 """
@@ -31,8 +31,8 @@ def inside_box(u: Array, low: Array, high: Array) -> Array:
 def from_box(h: Array, low: Array, high: Array, margin: float) -> Array:
     """The u of a point h, which is moved into the box by the share `margin` of its sides.
 
-    On the edge itself the derivative of the sine is zero, and no slope would lead away from it. The
-    middle stands for what is not finite.
+    On the edge itself the derivative of the sine is zero, and no slope would lead away from it. A
+    coordinate that is not finite becomes the middle of its side.
     """
     width = jnp.where(high > low, high - low, jnp.ones_like(low))
     share = jnp.clip((h - low) / width, margin, 1 - margin)
@@ -42,8 +42,8 @@ def from_box(h: Array, low: Array, high: Array, margin: float) -> Array:
 class LimitedNewton(optx.AbstractDescent):
     """The direction −H g, H the inverse Hessian and g the slope, no longer than half of the box.
 
-    Beyond half of the box, which is π wide, a quadratic model is no longer one. Where H is still
-    the identity nothing is known of it: the direction is then down the slope, a tenth of the box
+    The quadratic model does not hold beyond half of the box, which is π wide. Where H is still the
+    identity, and the curvature unknown, the direction is the steepest descent, a tenth of the box
     long.
     """
 
@@ -63,11 +63,12 @@ class LimitedNewton(optx.AbstractDescent):
 
 
 class ParabolicSearch(optx.AbstractSearch):
-    """A step that is refused is followed by one to the minimum of the parabola through both values.
+    """A line search by parabolas, with the condition of Armijo.
 
-    It is a tenth to a half as long. A step is accepted by the condition of Armijo, if it lowers the
-    value by 1e-4 of what the slope promises. Small: as the curvature becomes known a step of full
-    length is good, and none is to be refused.
+    A step is accepted if it lowers the value by 1e-4 of the decrease that the slope promises; the
+    share is small, since with a known curvature full steps are good and none should be refused. A
+    refused step is followed by a step to the minimum of the parabola through both values, a tenth
+    to a half as long.
     """
 
     def init(self, y, f_info_struct):
@@ -85,7 +86,7 @@ class ParabolicSearch(optx.AbstractSearch):
 class BoxBFGS(optx.AbstractBFGS):
     """BFGS for a box in u that has converged where the next step promises less than `atol`.
 
-    Half of what the slope promises for a step is what the quadratic model does.
+    The quadratic model promises half of the decrease that the slope alone does.
     """
 
     atol: Float[Array, ""] = eqx.field(converter=jnp.asarray)
@@ -100,7 +101,7 @@ class BoxBFGS(optx.AbstractBFGS):
         promised = -(state.f_info.grad @ state.descent_state) / 2
         step = jnp.linalg.norm(state.y_eval - y)
         converged = promised < self.atol
-        # A step that moves no more than half the digits of u finds only rounding.
+        # A step that changes less than half of the digits of u sees rounding errors alone.
         stuck = step <= 1e-8 * (1 + jnp.linalg.norm(y))
         result = optx.RESULTS.where(
             stuck & ~converged, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
@@ -109,7 +110,7 @@ class BoxBFGS(optx.AbstractBFGS):
 
 
 class Evaluation(NamedTuple):
-    """A point that has been looked at: what is minimised there, and the loss that is reported."""
+    """A point at which the function was evaluated: its value, and the loss that is reported."""
 
     seen: Bool[Any, ""]
     u: Float[Any, " P"]
@@ -121,12 +122,12 @@ class MinimiserRun(NamedTuple):
     """A run in progress.
 
     Attributes:
-        u: where the minimiser is.
-        state: what it knows.
-        best: the best point that it has looked at.
-        steps: how many it took.
-        going: whether it goes on.
-        converged: whether it met its tolerance.
+        u: the current point of the minimiser.
+        state: the state of the minimiser.
+        best: the best point so far.
+        steps: the number of steps so far.
+        going: whether the run has not ended.
+        converged: whether the run met its tolerance.
     """
 
     u: Float[Any, " P"]
@@ -137,9 +138,9 @@ class MinimiserRun(NamedTuple):
     converged: Bool[Any, ""]
 
     def going_on_from(self, runs: "MinimiserRun") -> "MinimiserRun":
-        """These runs, at the best points of others, with the curvature that those have learned.
+        """These runs with the curvature that others have learned on a similar function.
 
-        The functions are alike. The first step of a quasi-Newton method only looks at the point.
+        The first step of a quasi-Newton method only evaluates the function at its point.
         """
         if not hasattr(runs.state, "hessian_update_state"):
             return self._replace(steps=runs.steps)
@@ -157,7 +158,7 @@ Minimised = Callable[[Float[Array, " P"]], tuple[Float[Array, ""], Float[Array, 
 
 
 def begun(minimiser: optx.AbstractMinimiser, fn: Minimised, u: Float[Array, " P"]) -> MinimiserRun:
-    """A run at u that has not looked at it yet."""
+    """A run at u, where the function has not been evaluated yet."""
     number = jax.ShapeDtypeStruct((), u.dtype)
     flag = jax.ShapeDtypeStruct((), jnp.bool_)
     point = Evaluation(flag, u, number, number)
@@ -168,12 +169,12 @@ def begun(minimiser: optx.AbstractMinimiser, fn: Minimised, u: Float[Array, " P"
 
 
 def stepped(minimiser: optx.AbstractMinimiser, fn: Minimised, run: MinimiserRun) -> MinimiserRun:
-    """A run one step further, where `fn` is minimised, u -> (value, loss)."""
+    """The run after one more step of the minimisation of `fn`, u -> (value, loss)."""
     with_args, arguments = _with_slope_backward(fn), (None, {})
     u, state, aux = minimiser.step(with_args, run.u, *arguments, run.state, frozenset())
     stopped, result = minimiser.terminate(with_args, u, *arguments, state, frozenset())
     best = _better(run.best, aux)
-    # Of an accepted step optimistix returns the point before, and keeps this one in its state.
+    # After an accepted step optimistix returns the previous point; the new one is in its state.
     best = _better(best, getattr(state, "aux", aux))
     successful = result == optx.RESULTS.successful
     return MinimiserRun(
@@ -189,7 +190,7 @@ def stepped(minimiser: optx.AbstractMinimiser, fn: Minimised, run: MinimiserRun)
 def minimised(
     minimiser: optx.AbstractMinimiser, fn: Minimised, run: MinimiserRun, steps: Any
 ) -> MinimiserRun:
-    """The run where it ends, after so many steps at most."""
+    """The run at its end, or once it has taken `steps` steps."""
     arrays, static = eqx.partition(run, eqx.is_array)
 
     def going(arrays):
@@ -214,8 +215,8 @@ def most_likely_in_box(
     `deviations` are the standard deviations of h that the likelihood leaves, as far as they are
     known: their squares are the inverse Hessian that BFGS begins with.
     """
-    # No hyperparameter need be nearer to its best value than a tenth of its standard deviation:
-    # −log p is quadratic there, and ½ .1² is what may still be gained.
+    # No hyperparameter need be nearer to its best value than a tenth of its standard deviation,
+    # where the quadratic −log p is ½ .1² above its minimum.
     bfgs = BoxBFGS(atol=jnp.asarray(0.005, start.dtype))
     u = from_box(start, low, high, 0.01)
     width = jnp.where(high > low, high - low, jnp.ones_like(low))
@@ -235,11 +236,11 @@ def _better(one: Evaluation, other: Evaluation) -> Evaluation:
 
 
 def _with_slope_backward(fn: Minimised) -> Callable[[Array, Any], tuple[Array, Evaluation]]:
-    """`fn` for optimistix, (u, args) -> (value, the point it looks at).
+    """`fn` for optimistix, (u, args) -> (value, the `Evaluation` at u).
 
-    optimistix linearises forward, and then transposes, while derivatives of losses are written
-    backward: here the slope is made with the value. What is not finite counts as huge, without a
-    slope.
+    optimistix linearises in forward mode and transposes, while the derivatives of losses are
+    written in reverse mode: here the slope is computed together with the value. A value that is not
+    finite counts as huge, with a slope of zero.
     """
 
     def looked_at(u):
@@ -247,7 +248,7 @@ def _with_slope_backward(fn: Minimised) -> Callable[[Array, Any], tuple[Array, E
         # `seen` is False in the zeros that optimistix begins with.
         seen = jnp.isfinite(u).all()
         point = Evaluation(seen, u, value.astype(u.dtype), loss.astype(u.dtype))
-        # A line search backs away from a huge number as it would not from infinity.
+        # A line search can interpolate a huge number, and not infinity.
         return jnp.where(jnp.isfinite(point.value), point.value, 1e30), point
 
     differentiable = jax.custom_jvp(looked_at)

@@ -66,13 +66,13 @@ class SearchCriterion(eqx.Module):
         return value, square
 
     def with_basis(self, basis: AbstractBasis) -> "SearchCriterion":
-        """The same criterion of the low-rank fit in this basis."""
+        """This criterion for the low-rank fit in a basis."""
         # A Partial of a Partial would be another function, to be compiled, for each call of `tune`.
         fn = jax.tree_util.Partial(self.fn.func, **self.fn.keywords, basis=basis)
         return dataclasses.replace(self, fn=fn)
 
     def on(self, rows: Measurements, chosen: np.ndarray) -> "SearchCriterion":
-        """The same criterion for the rows of a subset of the observations."""
+        """This criterion for the rows of a subset of the observations."""
         if self.partition is None:
             return self
         partition = partition_of_rows(rows, self.partition.labels[chosen])

@@ -1,9 +1,9 @@
 """The search of `tune`: many runs on few points, and few on many.
 
-The runs are made on a subset of the points. Their ends, those that differ, are compared on more
-points, and the best two are finished there, with the curvature that they have learned; and so on,
-up to all points. The price of a loss grows with the cube of the points, so that the last part takes
-most of the time although it looks at one or two points and takes few steps.
+The runs are made on a subset of the points. Those of their ends that differ are compared on more
+points, and the best two are continued there, with the curvature that they have learned; and so on,
+up to all points. The price of a loss grows with the cube of the number of points, so the last part
+takes most of the time although it makes few steps from one or two ends.
 """
 
 import functools
@@ -25,11 +25,8 @@ from hamkernel._tuning.minimiser import BoxBFGS, MinimiserRun, begun, minimised
 from hamkernel._tuning.objective import SearchCriterion, SearchObjective, parts_of
 from hamkernel._tuning.space import SearchSpace
 
-_TOLERANCE = 1e-4  # of the logarithm of a loss: what a run may still gain at its end
-# Ends that are finished: with one, the better optimum of two that are within a few per cent on the
-# subset was missed (96 points of `tuning_speed.py`, a loss 3 % larger).
-_FINISHED = 2
-_LONG = 60.0  # seconds of which the caller is told beforehand
+_TOLERANCE = 1e-4  # the decrease of the logarithm of a loss that a finished run may have missed
+_LONG = 60.0  # seconds; the caller is warned of a longer search
 
 
 class Search:
@@ -137,10 +134,10 @@ class Search:
     def _finished(
         self, part: "Part", ends: MinimiserRun, steps: int
     ) -> tuple[MinimiserRun, MinimiserRun]:
-        """The ends in the order of their losses on these points, the best two finished there.
+        """The ends in the order of their losses on these points, with the best two finished there.
 
-        The last of the ends is the caller's point. The second result has those of them to look at
-        on more points: the best, and the caller's.
+        The last of the ends is the caller's point. The second result holds the runs to be compared
+        on more points: the best one and the caller's point.
         """
         minimiser = self._minimiser(_TOLERANCE)
         runs = part.begun(minimiser, ends.best.u).going_on_from(ends)
@@ -149,8 +146,10 @@ class Search:
             corrected = self._descended(part, runs, minimiser, steps)
             runs = corrected._replace(converged=ends.converged)
         else:
-            finished = self._descended(part, _take(runs, slice(_FINISHED)), minimiser, steps)
-            runs = _sorted(_concatenated(finished, _take(runs, slice(_FINISHED, None))))
+            # Two ends are finished: with one, the better of two optima that are within a few per
+            # cent on the subset was missed (96 points of `tuning_speed.py`, a loss 3 % larger).
+            finished = self._descended(part, _take(runs, slice(2)), minimiser, steps)
+            runs = _sorted(_concatenated(finished, _take(runs, slice(2, None))))
         runs = _take(runs, slice(self.starts))
         return runs, _concatenated(_take(runs, [0]), self._given(part))
 
@@ -160,7 +159,7 @@ class Search:
     def _looked_at(
         self, part: "Part", runs: MinimiserRun, minimiser: optx.AbstractMinimiser
     ) -> MinimiserRun:
-        """The runs with the values where they are."""
+        """The runs with the values at their points."""
         if isinstance(minimiser, optx.AbstractQuasiNewton):  # its first step does no more
             return part.minimised(minimiser, runs, 1)
         bfgs = BoxBFGS(atol=jnp.asarray(_TOLERANCE))
@@ -169,7 +168,7 @@ class Search:
     def _descended(
         self, part: "Part", runs: MinimiserRun, minimiser: optx.AbstractMinimiser, steps: int
     ) -> MinimiserRun:
-        """The runs where each has converged or used up its steps."""
+        """The runs once each has converged or used up its steps."""
         most = runs.steps.max() + steps
         while (going := runs.going & (runs.steps < most)).any():
             # A call takes a second at most, or one step, so that Ctrl-C is heard.
@@ -197,11 +196,11 @@ def best(runs: MinimiserRun) -> MinimiserRun:
 
 
 def _different(runs: MinimiserRun) -> list[int]:
-    """The runs that ended where no better one did, from the best on."""
+    """The runs, from the best on, that did not end where a better one did."""
     ends: list[int] = []
     for i in np.argsort(runs.best.value, kind="stable"):
         apart = [shares_apart(runs.best.u[i], runs.best.u[j]) for j in ends]
-        # Without the hundredth of the box 25 losses of all points were taken for 23.
+        # Ends within a hundredth of the box count as one, which saved 2 of 25 losses of all points.
         if runs.best.value[i] < np.inf and min(apart, default=1.0) > 0.01:
             ends.append(int(i))
     return ends
@@ -261,7 +260,7 @@ class Part:
     def begun(
         self, minimiser: optx.AbstractMinimiser, us: Float[np.ndarray, "count P"]
     ) -> MinimiserRun:
-        """Runs from points that they have not looked at yet."""
+        """Runs from points at which the function has not been evaluated yet."""
         padded = np.resize(us, (self._most, us.shape[1])).astype(jnp.result_type(float))
         runs = _begun(self.objective, minimiser, padded)
         return _take(jax.tree.map(_as_numpy, runs), slice(len(us)))
@@ -269,9 +268,10 @@ class Part:
     def minimised(
         self, minimiser: optx.AbstractMinimiser, runs: MinimiserRun, steps: int
     ) -> MinimiserRun:
-        """The runs at most so many steps further."""
+        """The runs after up to `steps` more steps."""
         count, before = len(runs.u), runs.steps.sum()
-        # On a CPU one after the other took two thirds of the time; elsewhere a lane costs nothing.
+        # On a CPU runs one after the other took two thirds of the time; on a GPU a few hundred rows
+        # do not fill the device, and runs side by side are free.
         side_by_side = jax.default_backend() != "cpu" and len(self.objective.rows.targets) <= 256
         padded = _take(runs, np.resize(np.arange(count), self._most))
         padded = padded._replace(going=padded.going & (np.arange(self._most) < count))
@@ -296,7 +296,7 @@ def _begun(objective, minimiser, us) -> MinimiserRun:
 
 @eqx.filter_jit
 def _minimised(objective, minimiser, runs: MinimiserRun, most, side_by_side) -> MinimiserRun:
-    """The runs, each where it ends or has taken its most steps."""
+    """The runs, each at its end or at its largest number of steps."""
     arrays, static = eqx.partition(runs, eqx.is_array)
 
     def one(arrays, most):
@@ -313,8 +313,8 @@ def _minimised(objective, minimiser, runs: MinimiserRun, most, side_by_side) -> 
 def design(directions: Sequence[int]) -> Float[np.ndarray, "count P"]:
     """A space-filling design in the box: the additive sequence of Roberts (2018), R_d.
 
-    Coordinates with the same direction move together, each through its own side. Were the
-    lengthscales of n coordinates to move apart, almost every point would have some that is far
+    Coordinates with the same direction move together, each through its own side. If the
+    lengthscales of n coordinates moved independently, almost every point would have one that is far
     too short or too long, and hardly a start would lead to a good optimum.
     """
     d = max(directions) + 1
@@ -336,7 +336,7 @@ def spread_out(
     for i in order:
         if all(shares_apart(points[i], points[j]) >= reach for j in taken):
             taken.append(int(i))
-    left = [int(i) for i in order if i not in taken]  # of which the best, where the box is full
+    left = [int(i) for i in order if i not in taken]  # neighbours, where the box is full
     return (taken + left)[:starts]
 
 

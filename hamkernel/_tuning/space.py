@@ -65,7 +65,7 @@ def hyperparameters(
     root of the mean square of their components.
     """
     inputs = np.asarray(X)
-    # What is a fair amplitude depends on the lengthscales: it is that in the middle of their boxes.
+    # A fair amplitude depends on the lengthscales, which are taken in the middle of their boxes.
     arrays, rest = eqx.partition(K, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(arrays)
     middle = [
@@ -109,10 +109,10 @@ def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, 
 
 
 def velocity_rms(K: AbstractMatrixKernel, rows: Measurements) -> float:
-    """The root of the mean square of a component of a velocity, as far as the rows tell.
+    """The root of the mean square of a component of a velocity, estimated from the rows.
 
-    It is to the mean diagonal of the Gram of the points as the mean square of the rows is to that
-    of theirs: an amplitude then fits both.
+    Of rows that are no velocities the mean square is scaled by the ratio of the mean diagonals of
+    the two Grams, that of velocities at the points over that of the rows.
     """
     if isinstance(rows.blocks[0], Components) and len(rows.blocks) == 1:
         return float(np.sqrt(np.mean(np.asarray(rows.measured()) ** 2)))
@@ -245,7 +245,7 @@ class SearchSpace(eqx.Module):
 
     @property
     def chooses_ridge(self) -> bool:
-        """Whether the least λ is ours to choose, and not what the caller has said."""
+        """Whether λ is searched in bounds that the caller has not given."""
         return self.given_ridge is None and self._moves_ridge
 
     @property
@@ -296,7 +296,7 @@ class SearchSpace(eqx.Module):
         ridge_low, ridge_high = self.ridge_bounds(self.size_of_gram(self.kernel))
         low, high = self.low.at[-1].set(ridge_low), self.high.at[-1].set(ridge_high)
         # Where the kernel is not positive at the start there are no bounds of λ, and λ starts in
-        # the middle. Twice the edge: nearer it would count as resting there before it has moved.
+        # the middle. The margin is twice the edge, on which a start would count as at a bound.
         return from_box(self.start, low, high, 2 * _EDGE)[jnp.asarray(self.free)]
 
     @property
@@ -359,7 +359,7 @@ class SearchSpace(eqx.Module):
 def _checked_box(
     name: str, given: tuple[ArrayLike, ArrayLike], size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Both sides of a box, for each entry of that name."""
+    """The lower and the upper bounds, one for each entry of that name."""
     sides = [np.asarray(side, float) for side in given] if hasattr(given, "__len__") else []
     if len(sides) != 2 or any(side.shape not in ((), (size,)) for side in sides):
         raise ValueError(

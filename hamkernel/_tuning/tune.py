@@ -1,11 +1,10 @@
 """Hyperparameters by following the gradient of a validation loss, inside a box, from many starts.
 
 The ridge. λ is searched relative to the Gram. The residuals of a fit lose about ε tr(G)/(Nλ) of
-their digits, ε the rounding of the dtype, so Nλ ≥ 100 ε tr(G) is demanded at every point, with
-the G that was there before the terms of an odd or even kernel cancelled: what lies below is
-rounding noise and can look like a very good loss. This matters. A quadratic
-Hamiltonian is the flat limit of the Gaussian kernel, so the loss of an oscillator improves all
-the way along ℓ -> ∞, λ -> 0 until nothing is left of it but noise.
+their digits, ε the rounding of the dtype, so Nλ ≥ 100 ε tr(G) is required at every point, with the
+G before the terms of an odd or even kernel cancel. A loss below this bound is rounding noise, and
+may look very good. This matters: a quadratic Hamiltonian is the flat limit of the Gaussian kernel,
+so the loss of an oscillator improves along ℓ -> ∞, λ -> 0 until only noise is left of it.
 """
 
 from __future__ import annotations
@@ -39,18 +38,13 @@ from hamkernel._tuning.objective import (
     parts_of,
 )
 from hamkernel._tuning.search import Search, best
-from hamkernel._tuning.space import (
-    RIDGE,
-    SearchSpace,
-    constants,
-    velocity_rms,
-)
+from hamkernel._tuning.space import RIDGE, SearchSpace, constants, velocity_rms
 from hamkernel._validation.closed_forms import Folds
 from hamkernel._validation.losses import check_memory
 
 
 class Tuned(eqx.Module):
-    """What `tune` found.
+    """The result of `tune`.
 
     Attributes:
         kernel: the kernel with its tuned hyperparameters.
@@ -305,7 +299,7 @@ def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -
     require.count(max_steps, "max_steps")
 
 
-# What `tune` warns of before it searches: data and kernels whose best values mean little.
+# The warnings of `tune` before the search: data and kernels whose best values mean little.
 
 
 def _warn_of_unequal_sizes(Y: Array) -> None:
@@ -333,12 +327,12 @@ def warn_of_constants(K: AbstractMatrixKernel) -> None:
 
 
 def _warn_of_few_folds(criterion: SearchCriterion, folds: object) -> None:
-    """Warn of labels of so few groups that what is held out is a matter of chance."""
+    """Warn of so few labels that the loss depends on the choice of the groups."""
     if criterion.partition is None or criterion.custom or np.ndim(folds) == 0:  # type: ignore
         return
     count = len(criterion.partition.folds)
-    # Held out one at a time, few runs are a noisy judge: on the pendulum of the paper, with three,
-    # the field error was .164 where the likelihood's was .048 (`tests/benchmarks/judges.py`).
+    # The loss over few runs is noisy: on the pendulum of the paper, with three runs, the field
+    # error was .164 where that of the likelihood was .048 (`tests/benchmarks/judges.py`).
     if count < 5:
         require.warn(
             f"the labels in folds make {count} folds, and cross-validation by fewer than "
@@ -348,7 +342,7 @@ def _warn_of_few_folds(criterion: SearchCriterion, folds: object) -> None:
 
 
 def _warn_of_free_scale(space: SearchSpace, criterion: SearchCriterion) -> None:
-    """Warn of amplitudes on every term, of which only the ratios to λ count."""
+    """Warn of amplitudes on all terms where the loss depends on their ratios to λ alone."""
     free = {space.names[i] for i in space.free}
     if not criterion.logarithmic or RIDGE not in free or space.given_ridge is not None:
         return
@@ -370,4 +364,4 @@ def _has_amplitude(space: SearchSpace) -> bool:
     return bool(terms) and all(k.has_amplitude for k in terms)
 
 
-SEARCH_COPIES = 5  # matrices of the size of the Gram that a loss in a loop holds: 4.4 measured
+SEARCH_COPIES = 5  # matrices of the size of the Gram that the loop over a loss holds: 4.4 measured

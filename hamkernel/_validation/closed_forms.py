@@ -38,7 +38,7 @@ Folds = int | Literal["loo"] | Int[ArrayLike, " N"] | Sequence[int]
 
 
 class Partition:
-    """N points in F folds: what `folds` means, as a static argument of compiled functions.
+    """N points in F folds, as a static argument of compiled functions.
 
     Attributes:
         folds: the points of each of the F folds.
@@ -57,7 +57,7 @@ class Partition:
             )
         self.folds = np.split(np.argsort(index, kind="stable"), np.cumsum(sizes)[:-1])
         self.weights = 1.0 / (len(names) * sizes[index])
-        # Within a factor of two of the largest of them: the padding never doubles the points.
+        # The sizes in a group are within a factor of two, so padding at most doubles the points.
         octave = np.floor(np.log2(sizes.max() / sizes)).astype(int)
         self.groups = [
             Group(N, [self.folds[i] for i in np.flatnonzero(octave == each)])

@@ -210,7 +210,7 @@ def partition_of_rows(rows: Measurements, folds: Folds) -> Partition:
     return Partition(len(rows.targets), labels[rows.labels()])
 
 
-# The losses with ‖a‖² beside them are for `tune`, which bounds the rounding of a field by it.
+# Some losses return ‖a‖² too, by which `tune` bounds the rounding errors of a field.
 
 
 def partition_loss(K, rows: Measurements, regularization, partition: Partition, basis=None):
@@ -230,13 +230,13 @@ def partition_loss_and_square(
 def held_out_rows(K, rows: Measurements, regularization, partition: Partition, basis=None):
     """The residual of each row under the fit without its fold, in units of its noise, and A⁻¹y.
 
-    From the residuals of a fold with all energies their best constant is taken off.
+    The residuals of a fold that holds all energies are those up to the best constant.
     """
     energies, F = rows.energies, len(partition.folds)
     ridge = (rows.count - rows.count / F) * regularization
     y, p = rows.targets, rows.constant
     contrasted = any(len(energies) and np.isin(energies, fold).all() for fold in partition.folds)
-    if contrasted:  # no other fold sees the constant: rows that do not see it are held out
+    if contrasted:  # no other fold determines the constant, so contrasts are held out
         y, p = rows.y, None
         partition = Partition(rows.size, np.delete(partition.labels, energies[0]))
     features = None if basis is None else features_of_rows(K, rows, basis, contrasted)
@@ -244,8 +244,9 @@ def held_out_rows(K, rows: Measurements, regularization, partition: Partition, b
     if features is None:
         found = _dense_held_out(gram(K, rows, contrasted), ridge, y, p, rows, partition)
     elif features.shape[1] > len(y) - max(map(len, partition.folds)):
-        # A fold interpolates the rest, and its coefficients are the difference of those of all:
-        # the gradient lost the square of the condition, 5 times itself at 1e10. Such data are few.
+        # The fit without a fold interpolates, and the low-rank gradient lost the square of the
+        # condition: at 1e10 its error was 5 times itself. The data are then few enough for a dense
+        # factor.
         found = _dense_held_out(features @ features.T, ridge, y, p, rows, partition)
     else:
         found = held_out(LowRankSystem(features, ridge, p), y, partition)
@@ -256,8 +257,8 @@ def _dense_held_out(G, ridge, y, p, rows: Measurements, partition: Partition):
     A = plus_ridge(G, ridge)
     if p is None:
         return held_out(DenseSystem(A), y, partition)
-    # In the units of the energies the direction of their constant does not depend on the noise, so
-    # that nothing is missing from the derivative.
+    # In the units of the energies the direction of their constant does not depend on the noise, and
+    # the derivative is complete.
     units = jnp.where(p == 0, jnp.ones_like(p), rows.scale)
     equal = jnp.where(p == 0, p, len(rows.energies) ** -0.5)
     system = ContrastedSystem(units[:, None] * A * units[None], equal)
@@ -272,7 +273,7 @@ def generalized_loss(K, rows: Measurements, regularization, basis=None, least_fr
 
 @eqx.filter_jit
 def generalized_loss_and_square(K, rows: Measurements, regularization, basis=None, least_free=0.0):
-    # Infinite where less than the share `least_free` of the residuals is free, tr(I − S)/D.
+    # The loss is infinite where the share of free residuals, tr(I − S)/D, is below `least_free`.
     ridge = rows.count * regularization
     squares, trace = free_residuals(_of_contrasts(K, rows, ridge, basis), rows.y)
     enough = ridge * trace >= least_free * rows.size  # tr(I − S) = ridge tr A⁻¹
@@ -281,7 +282,7 @@ def generalized_loss_and_square(K, rows: Measurements, regularization, basis=Non
 
 @eqx.filter_jit
 def log_likelihood(K, rows: Measurements, regularization, basis=None):
-    """`log_marginal_likelihood`: with energies, of a flat prior of their constant."""
+    """`log_marginal_likelihood` of the rows, with a flat prior for the constant of energies."""
     ridge = rows.count * regularization
     y, silent = without_silent_directions(K, rows)
     y, silent, ridge = jax.lax.optimization_barrier((y, silent, ridge))  # no LAPACK side by side
@@ -325,7 +326,7 @@ def without_silent_directions(
 
 
 def _of_contrasts(K, rows: Measurements, ridge, basis: AbstractBasis | None) -> AbstractSystem:
-    """A of the rows that do not see the constant, whose y is `rows.y`."""
+    """A of the contrasts, which do not depend on the constant of the energies."""
     if basis is not None:
         return LowRankSystem(features_of_rows(K, rows, basis, contrasted=True), ridge)
     return DenseSystem(plus_ridge(gram(K, rows, contrasted=True), ridge))
@@ -364,8 +365,8 @@ def gram(
 def _by_points(K, block: AbstractBlock, data, of) -> Float[Array, "d e"]:
     """The matrix that the function `of(K, data)` returns for a block, a row for each of its rows.
 
-    It is made point by point, so that only one point is differentiated at a time; that of
-    `Combinations`, which has more points than rows, is made at once.
+    The matrix is made point by point, so that only one point is differentiated at a time. That of
+    `Combinations`, which have more points than rows, is made at once.
     """
     if isinstance(block, Combinations):
         return forward_differentiated((K, (block, data)), lambda K, both: of(K, both[1])(both[0]))
