@@ -16,16 +16,18 @@ Everything here needs float64: `jax.config.update("jax_enable_x64", True)` befor
 
 from hamkernel.paper._experiments import (
     READINGS,
+    Choice,
+    Comparison,
     Experiment,
     Model,
     Outcome,
     Published,
+    compare,
     datasets,
     evaluate,
     experiments,
 )
 from hamkernel.paper._reproduce import report, reproduce, retune, summarise, tuning_report
-from hamkernel.paper._tuned import Choice, Comparison, compare
 
 __all__ = [
     "READINGS",

@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 from tqdm import tqdm
 
 from hamkernel import plot
-from hamkernel.paper._experiments import Experiment, Outcome, experiments
-from hamkernel.paper._tuned import GRID, Comparison
+from hamkernel.paper._experiments import GRID, Comparison, Experiment, Outcome, experiments
 
 Models = Mapping[str, Outcome]
 

@@ -12,14 +12,18 @@ from jaxtyping import Array, ArrayLike, Float
 from tqdm import tqdm
 
 from hamkernel.paper._experiments import (
+    FOLDS,
+    GRID,
     READINGS,
+    Choice,
+    Comparison,
     Experiment,
     Outcome,
+    compare,
     datasets,
     evaluate,
     experiments,
 )
-from hamkernel.paper._tuned import FOLDS, GRID, Choice, Comparison, compare
 
 # experiment -> reading -> model -> quantity -> "median", "p10", "p90"; see `summarise`
 Results = dict[str, dict[str, dict[str, dict[str, Any]]]]

@@ -1,4 +1,4 @@
-"""What was learned: contours of energies and losses, error bars, and the comparison of physics."""
+"""Contours of learned energies and of losses, error bars, and the comparison of structures."""
 
 from __future__ import annotations
 
@@ -233,7 +233,7 @@ def ensemble(
         raise ValueError(f"true has shape {np.shape(true)}; (T, {ys.shape[2]}) is needed.")
     labels = plane_labels(dims, ys.shape[2], units, names)
     ax = axes(ax, figsize=(4.8, 4.4))
-    # Where all of them coincide they are as dark as one line; a single one stays visible.
+    # Orbits that coincide are as dark as one line, and a single orbit stays visible.
     alpha = float(np.clip(8 / len(ys), 0.06, 0.6))
     for i, orbit in enumerate(ys):
         name = label if i == 0 else None
@@ -359,13 +359,13 @@ def _length(fn: Callable[[Array], Array], x: Float[Array, "2"]) -> Float[Array, 
 
 @drawn
 def comparison(compared: Comparison, ax: Axes | None = None) -> Axes:
-    """How far the score of each candidate is below the best, the best on top, and the answers.
+    """Draw how far the score of each candidate is below the best, and the answers as the title.
 
-    Candidates within the threshold, the dashed line, are not told apart by the data. Bars longer
-    than 60 end at the edge and carry their number.
+    The best is on top. The data do not decide between candidates within the threshold, the dashed
+    line. Bars longer than 60 end at the edge and carry their number.
 
     Args:
-        compared: what `hk.compare` returned.
+        compared: the result of `hk.compare`.
         ax: the axes to draw on; those of a new figure if None.
 
     Returns:

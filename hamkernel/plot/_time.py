@@ -211,8 +211,8 @@ def smoothing(
     has noise on top. The panel of a coordinate that was never measured stays empty.
 
     Args:
-        runs: what was logged.
-        run: which of them, counted from 0, or from the end if negative.
+        runs: the logged runs.
+        run: the position of the run, counted from 0, or from the end if negative.
         ax: n axes, one for each coordinate; new ones if None.
         units: of the coordinates.
         names: of the coordinates, if they are not q and p.
@@ -254,14 +254,14 @@ def fitted(
 ) -> tuple[tuple[Axes, Axes], ...]:
     """Draw one run as measured and as the learned field explains it, with the residuals.
 
-    One row of panels per coordinate: on the left the samples and the fitted states, between which
-    the field moves, across gaps too; on the right
-    (measured − fitted)/σ, of which about one in twenty lies outside the grey band of ±2. A wave in
-    the residuals means that the structure misses part of the motion; a single outlier means that
-    the sample is wrong. A coordinate that was never measured has no residuals.
+    One row of panels per coordinate: on the left the samples and the fitted states, joined by the
+    flow of the field, across gaps too; on the right (measured − fitted)/σ, of which about one in
+    twenty lies outside the grey band of ±2. A wave in the residuals means that the structure misses
+    part of the motion; a single outlier means that the sample is wrong. A coordinate that was never
+    measured has no residuals.
 
     Args:
-        learned: what `hk.learn` found.
+        learned: the result of `hk.learn`.
         run: which run, counted from 0, or from the end if negative.
         ax: n pairs of axes; new ones if None.
         units: of the coordinates.

@@ -375,13 +375,11 @@ def _failure(failed: Array) -> str:
     )
 
 
-# Far more than a smooth trajectory needs beside one step for each of ts: a few dozen per swing of
-# a pendulum.
 @eqx.filter_jit
 def _trajectories(
     field: Callable[[Array], Array], states: Float[Array, "B n"], ts: Float[Array, " T"]
 ) -> tuple[Float[Array, "B T n"], Float[Array, "B T n"]]:
-    """True states and velocities at times ts from the first on; not finite where that failed."""
+    """True states and velocities at the times ts; not finite where the integration failed."""
 
     def velocity(x):
         return field(x).astype(x.dtype)
@@ -392,6 +390,8 @@ def _trajectories(
         if ts.size == 1:
             return x0[None]
         tolerance = max(1e-10, 10 * float(jnp.finfo(x0.dtype).eps))
+        # One step for each of ts, and far more than a smooth trajectory needs besides: a few dozen
+        # per swing of a pendulum.
         bounds = {"rtol": tolerance, "atol": tolerance, "max_steps": 2**16 + ts.size}
         return cast(Array, simulate(velocity, x0, ts, **bounds, throw=False).ys)
 

@@ -114,7 +114,7 @@ class LotkaVolterra(AbstractPoissonSystem):
     log_death: Float[Array, ""]
     log_reproduction: Float[Array, ""]
     growth = positive("growth", "The growth of the prey.")
-    predation = positive("predation", "What each predator takes of the prey.")
+    predation = positive("predation", "The rate at which each predator eats prey.")
     death = positive("death", "The death rate of the predators.")
     reproduction = positive("reproduction", "The growth of the predators by each prey.")
 

@@ -36,7 +36,7 @@ import hamkernel as hk
 from hamkernel._gram.dense import assemble, plus_ridge
 from hamkernel._solvers.factors import solution
 from hamkernel._validation.closed_forms import Partition
-from hamkernel.paper._tuned import grid_losses
+from hamkernel.paper._experiments import grid_losses
 
 FOLDS = 5
 SIGMAS, RIDGES = np.geomspace(0.3, 30, 30), np.geomspace(1e-8, 1, 25)
