@@ -155,14 +155,9 @@ def _pendulum(mass: float) -> Experiment:
     )
 
 
-def _models(
-    separable: tuple[float, float], odd_symplectic: tuple[float, float]
-) -> dict[str, Model]:
-    return {
-        "separable": Model("separable", *separable),
-        "symplectic": Model("symplectic", *odd_symplectic),
-        "odd_symplectic": Model("odd_symplectic", *odd_symplectic),
-    }
+def _models(**found: tuple[float, float]) -> dict[str, Model]:
+    found["symplectic"] = found["odd_symplectic"]
+    return {structure: Model(structure, *found[structure]) for structure in STRUCTURES}
 
 
 _TIMES = 100  # steps of the test trajectory
@@ -416,17 +411,11 @@ def compare(
 
     def chosen(found: list[_Found], seconds: np.ndarray) -> Choice:
         kernels = [make(Gaussian(each.lengthscale)) for each in found]
+        kernels = jax.tree.map(lambda *leaves: jnp.stack(leaves), *kernels)
         lengthscale, regularization, loss = np.array(found).T
-        outcome = evaluate(
-            experiment,
-            jax.tree.map(lambda *leaves: jnp.stack(leaves), *kernels),
-            X,
-            Y,
-            regularization,
-            # Where the data asks for the flat limit (σ -> ∞, λ -> 0), a field rounds at about 1e-9,
-            # and with a smaller tolerance 100 times as many steps were measured.
-            tolerance=1e-6,
-        )
+        # Where the data asks for the flat limit (σ -> ∞, λ -> 0), a field rounds at about 1e-9,
+        # and with a smaller tolerance 100 times as many steps were measured.
+        outcome = evaluate(experiment, kernels, X, Y, regularization, tolerance=1e-6)
         return Choice(lengthscale, regularization, loss, seconds, outcome.quantities)
 
     surfaces, grid_seconds = _timed(lambda x, y: _surface(make, x, y), X, Y)
@@ -485,16 +474,7 @@ def grid_losses(
 ) -> Float[Array, "A B"]:
     """Return the cross-validation loss over a grid of (σ, λ), by a refit for every fold.
 
-    Args:
-        make: scalar kernel -> matrix-valued kernel.
-        lengthscales: values of σ, shape (A,).
-        ridges: values of λ, shape (B,).
-        X: states, shape (N, n).
-        Y: velocities, shape (N, n).
-        partition: the folds; each refit has the ridge (N − N/F) λ of `cross_validation_loss`.
-
-    Returns:
-        Shape (A, B); NaN where a fit fails.
+    Each refit has the ridge (N − N/F) λ of `cross_validation_loss`; NaN where one fails.
     """
     N, n = X.shape
     points = partition.folds
