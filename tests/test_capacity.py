@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
+from hamkernel import _machine
 from hamkernel._trajectories.flow import Segments
 from hamkernel._trajectories.learn import warn_of_cost
 from hamkernel._trajectories.likelihood import (
@@ -201,6 +202,29 @@ def test_landmarks_are_doubled_while_the_rows_become_likelier():
         limited.append(limited_by_landmarks(*given))
     assert counts == [64, 16]
     assert limited == [True, False]
+
+
+@pytest.mark.parametrize("size", [10, _machine._SMALL])
+def test_how_a_program_is_compiled_changes_neither_values_nor_derivatives(size):
+    """Small ones without optimisation, and inside of others as those say."""
+
+    def waves(x, power: int):
+        return jnp.cumsum(jnp.sin(3 * x) ** power)
+
+    x = jnp.linspace(0, 2, size)
+    compiled = _machine.compiled_by_size(waves)
+    np.testing.assert_allclose(compiled(x, 2), np.cumsum(np.sin(3 * x) ** 2), rtol=1e-12)
+    for transform in (jax.jit, jax.jacfwd, jax.vmap):
+        points = x[:8].reshape(4, 2)
+        found, expected = (transform(lambda x, f=f: f(x, 2))(points) for f in (compiled, waves))
+        np.testing.assert_allclose(found, expected, rtol=1e-12)
+
+
+def test_options_that_a_compiler_does_not_know_are_left_out(monkeypatch):
+    monkeypatch.setattr(_machine, "_FASTEST", {"xla_no_such_option": True})
+    assert not _machine._options_are_known.__wrapped__()
+    monkeypatch.setattr(_machine, "_options_are_known", lambda: False)
+    assert float(_machine.compiled_by_size(lambda x: 2 * x)(jnp.ones(()))) == 2.0
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hamkernel._gram.dense import centred
-from hamkernel._machine import orthonormal
+from hamkernel._machine import compiled_by_size, orthonormal
 from hamkernel._structures.base import AbstractMatrixKernel
 
 # Gauss-Legendre nodes and weights on [0, 1]: exact for polynomials of degree 5.
@@ -74,7 +74,7 @@ def steps_for(spans: Float[np.ndarray, "S L"], stiffness: float) -> Int[np.ndarr
     return np.clip(np.nan_to_num(needed, nan=1.0), 1, 64).astype(int)
 
 
-@eqx.filter_jit
+@compiled_by_size
 def simulated(
     field: Any,
     starts: Float[Array, "S n"],
@@ -209,7 +209,7 @@ class Shooting(NamedTuple):
     squares: Float[Array, " S"]
 
 
-@eqx.filter_jit
+@compiled_by_size
 def shoot(
     field: Any,
     segments: Segments,

@@ -8,12 +8,12 @@ rows are whitened by a Kalman filter.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hamkernel._machine import compiled_by_size
 from hamkernel._trajectories.diagnostics import NEGLIGIBLE, SIGNIFICANT, whiteness
 from hamkernel._trajectories.flow import (
     Expansion,
@@ -269,7 +269,7 @@ def _solved(
     # The current field in the new basis: the one with its values at the landmarks.
     S = found.points
     T = _landmark_whitening(model.kernel, S)
-    old = T.T @ _values(
+    old = T.T @ values(
         Expansion(now.field.kernel, now.field.points, now.field.coefficients, None), S
     ).reshape(-1)
 
@@ -376,7 +376,7 @@ def evidence(end: End) -> float:
     return float(closed_form(model, *given, whiten).loss)
 
 
-@eqx.filter_jit
+@compiled_by_size
 def _squares(x, defect, covariance, segments: Segments, counts, log_noise) -> Float[Array, ""]:
     residual = jnp.where(counts > 0, segments.measured - x, 0.0)
     moved = jnp.linalg.solve(covariance, defect[..., None])[..., 0]
@@ -403,10 +403,10 @@ def _updated(paths, pieces: list[Piece], good, x: np.ndarray) -> list[np.ndarray
     return new
 
 
-_landmark_whitening = eqx.filter_jit(landmark_whitening)
+_landmark_whitening = compiled_by_size(landmark_whitening)
 
 
-@eqx.filter_jit
+@compiled_by_size
 def _norms(field, X: Float[Array, "N d"], scale: Float[Array, " n"]) -> Float[Array, " N"]:
     def norm(s):
         D = with_tangent(field, s, len(scale))[1]
@@ -426,13 +426,16 @@ def _stiffness(field: Expansion, data: Preprocessed, paths: list[np.ndarray]) ->
 def changed(task: Task, before: Current, now: Current) -> float:
     """By how much the field has changed at the landmarks, relative to its size there."""
     old, new = (
-        np.asarray(_values(each.field, now.field.points)) / task.data.scale[None]
+        np.asarray(values(each.field, now.field.points)) / task.data.scale[None]
         for each in (before, now)
     )
     return float(np.linalg.norm(new - old) / max(np.linalg.norm(new), np.finfo(float).tiny))
 
 
-_values = eqx.filter_jit(lambda field, S: jax.vmap(field)(S))
+@compiled_by_size
+def values(field: Expansion, X: Float[Array, "N d"]) -> Float[Array, "N n"]:
+    """The field at many points."""
+    return jax.vmap(field)(X)
 
 
 def price(end: End, impulse: Float[np.ndarray, " n"]) -> float:

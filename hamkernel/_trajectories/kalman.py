@@ -23,13 +23,12 @@ estimation"; Bryson & Frazier (1963) for the smoother.
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hamkernel._machine import orthonormal
+from hamkernel._machine import compiled_by_size, orthonormal
 from hamkernel._observations.kinds import Functionals, Together
 from hamkernel._trajectories.flow import WEIGHTS, Expansion, Path, Segments, means, simulated
 from hamkernel._trajectories.likelihood import Model, WhitenedRows, columns, landmark_whitening
@@ -140,7 +139,7 @@ class SmoothedPath(NamedTuple):
     disturbance: Float[Array, "S L n"]
 
 
-@eqx.filter_jit
+@compiled_by_size
 def smoothed_path(
     model: Model,
     found: Float[Array, "m n"],
@@ -168,7 +167,7 @@ def smoothed_path(
     return SmoothedPath(moves, -jnp.exp(2 * model.log_process)[None, None] * w / h)
 
 
-@eqx.filter_jit
+@compiled_by_size
 def linearised_by_interval(
     field: Expansion, x: Float[Array, "S L+1 n"], segments: Segments, steps, good
 ) -> LinearisedSegments:
@@ -201,7 +200,7 @@ def linearised_by_interval(
     return rows._replace(missed=jnp.where(good[:, None, None], defect, 0.0))
 
 
-@eqx.filter_jit
+@compiled_by_size
 def process_covariance(
     model: Model, rows: LinearisedSegments, least: Float[Array, " n"]
 ) -> Float[Array, "S L n n"]:
@@ -253,7 +252,7 @@ def as_observations(
     """
     n = rows.residual.shape[-1]
     least = rows.counts.astype(bool).sum((1, 2)) > n
-    there = eqx.filter_jit(means)(mean, rows.nodes, rows.nodes[..., :n])
+    there = compiled_by_size(means)(mean, rows.nodes, rows.nodes[..., :n])
     # On the host: one segment of a JAX array compiles.
     every = jax.tree.map(np.asarray, (rows, there))
     found = []
@@ -270,7 +269,7 @@ def as_observations(
     return Together(tuple(found)) if found else None
 
 
-@eqx.filter_jit
+@compiled_by_size
 def _at_nodes(model: Model, rows: LinearisedSegments, start_deviation):
     """The rows of one segment by all values of g at its nodes, and what they are to be."""
     _, L, _, n, _ = rows.weights.shape
@@ -282,7 +281,7 @@ def _at_nodes(model: Model, rows: LinearisedSegments, start_deviation):
     return flat[:, :-1], flat[:, -1]
 
 
-@eqx.filter_jit
+@compiled_by_size
 def whitened_rows(model: Model, S, rows: LinearisedSegments, start_deviation) -> WhitenedRows:
     """The rows whitened with process noise, and M and r of the landmarks S."""
     return whiten(model, S, landmark_whitening(model.kernel, S), rows, start_deviation)

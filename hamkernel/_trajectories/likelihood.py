@@ -26,7 +26,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from hamkernel._gram.dense import assemble, forward_differentiated
-from hamkernel._machine import orthonormal
+from hamkernel._machine import compiled_by_size, orthonormal
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._trajectories.flow import back_substituted, tangents
 from hamkernel._trajectories.segments import LinearisedSegments, accumulated
@@ -232,7 +232,7 @@ class ClosedForm(NamedTuple):
     loss: Float[Array, ""]
 
 
-@eqx.filter_jit
+@compiled_by_size
 def condensed(
     model: Model, S, rows: LinearisedSegments, start_deviation, whitening: Whitening
 ) -> Condensed:
@@ -259,7 +259,7 @@ def condensed(
     return Condensed(T, F, start, constant.sum(), scatter, *sizes)
 
 
-@eqx.filter_jit
+@compiled_by_size
 def conditional(known: Condensed, S, shift: Array | float = 0.0) -> ClosedForm:
     """The field and the starts for rows whose noise is exp(shift) times what it was.
 

@@ -10,12 +10,12 @@ import functools
 from collections.abc import Callable
 from typing import NamedTuple, get_args
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hamkernel._machine import compiled_by_size
 from hamkernel._trajectories.flow import NODES, with_tangent
 from hamkernel._trajectories.runs import Between, Runs, at_nodes, at_samples
 from hamkernel._trajectories.smoothing import Coordinate, interpolated, processes, smoothed
@@ -274,7 +274,7 @@ def _completed(run: PreprocessedRun, mean: Callable[[Array], Array] | None) -> P
     return run._replace(path=path, nodes=there.reshape(shape), slopes=found_slopes.reshape(shape))
 
 
-@eqx.filter_jit
+@compiled_by_size
 def _solved_for(mean, X, U, slopes, missing):
     """X with its missing coordinates such that the mean has the slopes of the others."""
     on = jnp.asarray(missing)

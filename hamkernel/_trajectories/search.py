@@ -6,12 +6,12 @@ some windows of them, which are as likely as any others, and on the first of the
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hamkernel._machine import compiled_by_size
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._trajectories.likelihood import (
     ClosedForm,
@@ -51,7 +51,7 @@ def _loss(model: Model, h, S, rows, start_deviation, whitening: Whitening):
     return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
 
-@eqx.filter_jit
+@compiled_by_size
 def losses(
     model: Model,
     design: Float[Array, "count P"],
@@ -90,7 +90,7 @@ def exact(rows: LinearisedSegments) -> tuple[Float[Array, "k d"], LinearisedSegm
     return rows.nodes[:, :, 1].reshape(-1, rows.nodes.shape[-1]), rows
 
 
-@eqx.filter_jit
+@compiled_by_size
 def _best(
     model: Model, S, rows: LinearisedSegments, start_deviation, low, high, free, steps, whitening
 ):

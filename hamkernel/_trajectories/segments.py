@@ -15,12 +15,12 @@ of the mean alone, the identity where there is none.
 import itertools
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hamkernel._machine import compiled_by_size
 from hamkernel._trajectories.flow import (
     NODES,
     WEIGHTS,
@@ -93,7 +93,7 @@ def accumulated(
     return jnp.concatenate([start[:, None], jnp.moveaxis(sums, 0, 1)], axis=1)
 
 
-@eqx.filter_jit
+@compiled_by_size
 def linearised(
     path: Path,
     slopes: Float[Array, "S L 3 n"],
@@ -247,7 +247,7 @@ def linearised_along_smoothed(
     return _linearised_along_smoothed(mean, along, jnp.asarray(good), segments)
 
 
-@eqx.filter_jit
+@compiled_by_size
 def _linearised_along_smoothed(mean, along, good, segments: Segments) -> LinearisedSegments:
     x, points, slopes = along
     path = given_path(x, points, segments.spans, jacobians(mean, points, x.shape[-1]))
@@ -346,7 +346,7 @@ def smoothed_rows(
     return pieces, good, linearised_along_smoothed(data, pieces, segments, mean, good)
 
 
-@eqx.filter_jit
+@compiled_by_size
 def linearised_along_field(
     field: Expansion, path: Path, segments: Segments, good
 ) -> LinearisedSegments:

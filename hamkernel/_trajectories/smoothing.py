@@ -26,6 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from hamkernel._machine import compiled_by_size
 from hamkernel._show import described
 from hamkernel._tuning.minimiser import most_likely_in_box
 
@@ -258,7 +259,7 @@ def _process(steps, y, seen, longest: float, spacing: float) -> Coordinate:
     )
 
 
-@eqx.filter_jit
+@compiled_by_size
 def _found(steps, y, seen, low, high) -> Float[Array, "3"]:
     """(log amplitude, log rate, log noise) by BFGS from the best point of a grid."""
     low, high = jnp.asarray(low, y.dtype), jnp.asarray(high, y.dtype)
@@ -286,7 +287,7 @@ def _found(steps, y, seen, low, high) -> Float[Array, "3"]:
     return most_likely_in_box(loss, design[jnp.argmin(values)], low, high, sizes, steps=40)[0]
 
 
-@eqx.filter_jit
+@compiled_by_size
 def _smoothed(process: Process, steps, y, seen: Bool[Array, "R T"]) -> Smoothed:
     return jax.vmap(lambda dt, value, there: smooth(process, dt, value, there))(steps, y, seen)
 
