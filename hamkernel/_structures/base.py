@@ -40,6 +40,8 @@ class AbstractMatrixKernel(eqx.Module):
 
     matrix_valued: ClassVar[bool] = True
     takes_inputs: ClassVar[bool] = False  # whether its points are (x, u)
+    # Whether derivatives of its Gram are cheaper in reverse mode, as those of a closed form can be.
+    differentiated_backward: ClassVar[bool] = False
     symplectic: eqx.AbstractVar[bool]  # whether flows keep dq ∧ dp, as those of J∇H do
     no_potential: eqx.AbstractVar[str | None]  # why its fields have none; None if they have one
 
