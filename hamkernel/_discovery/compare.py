@@ -180,8 +180,9 @@ def compare(
         values = named_values(K, points) | {RIDGE: regularization}
         P = sum(np.size(value) for value in values.values())
         score = likelihood - P / 2 * math.log(D)
+        claimed = steps[name].claims if name in steps else claims(K, scale)
         tuned = (K, regularization, values)
-        found.append(Candidate(name, claims(K, scale), score, 0.0, likelihood, P, *tuned))
+        found.append(Candidate(name, claimed, score, 0.0, likelihood, P, *tuned))
     top = max(row.score for row in found)
     table = [row._replace(difference=row.score - top) for row in found]
     return _answered(tuple(sorted(table, key=lambda row: -row.score)), points, D)

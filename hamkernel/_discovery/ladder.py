@@ -177,6 +177,18 @@ class Step(NamedTuple):
     mirror: bool = False
     reversible: bool = False
 
+    @property
+    def claims(self) -> frozenset[str]:
+        """The questions that every field of it answers with yes, as `compare.claims` finds."""
+        found = {"mirror"} if self.mirror else set()
+        if self.structure is Symplectic:
+            found.add("energy")
+            # T(p) + U(q) with a mirror has an even T.
+            back = self.reversible or (self.apart and self.mirror)
+            found |= {"friction"} if self.friction else {"reversible"} if back else set()
+            found |= {"T + U"} if self.apart else set()
+        return frozenset(found)
+
     def rung(self, scale: Float[np.ndarray, " n"], speed: float) -> Rung:
         """The kernel to search with, at first for fields of this size that change over 2 `scale`.
 
