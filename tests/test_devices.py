@@ -297,7 +297,8 @@ fits = {
     "nystrom": lambda X, Y, rows: nystrom._fit(K, X, Y, regularization, marks, rows),
     "features": lambda X, Y, rows: random_features._fit(K, waves, X, Y, regularization, rows),
     "gradients": lambda X, Y, rows: conjugate_gradient._solve(
-        conjugate_gradient._prepared, (K, X, regularization, marks, rows), Y, regularization, 1e-8, 9
+        conjugate_gradient._prepared, (K, X, regularization, marks, rows),
+        Y, regularization, 1e-8, 9,
     ),
 }
 print(json.dumps({
