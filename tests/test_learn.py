@@ -238,6 +238,23 @@ def test_averaged_samples_keep_what_they_say_of_the_noise():
     np.testing.assert_allclose(pooled, noise, rtol=0.05)
 
 
+def test_averaged_samples_are_as_exact_as_their_number_says():
+    t, squares = 0.02 * np.arange(256), []
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        rates, phases = rng.uniform(1, 6, 6), rng.uniform(0, 2 * np.pi, 6)
+
+        def truth(t):
+            return 0.25 * np.sin(np.multiply.outer(t, rates) + phases).sum(-1)  # noqa: B023
+
+        x = truth(t)[:, None] + 0.001 * rng.standard_normal((256, 1))
+        run = preprocess(hk.Runs(t, x), None).runs[0]
+        assert len(run.times) < 200
+        squares.append(run.counts[:, 0] * ((run.states[:, 0] - truth(run.times)) / 0.001) ** 2)
+    # 1.0 with blocks of half the time that smoothing averages over, 1.2 without that bound.
+    assert 0.85 < np.concatenate(squares).mean() < 1.1
+
+
 # What is learned. One shape, so that it is compiled once.
 
 

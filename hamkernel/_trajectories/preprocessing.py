@@ -20,6 +20,9 @@ from hamkernel._trajectories.flow import NODES, with_tangent
 from hamkernel._trajectories.runs import Between, Runs, at_nodes, at_samples
 from hamkernel._trajectories.smoothing import Coordinate, interpolated, processes, smoothed
 
+# Rows times columns², 2 s for each solve. With 3.5e10, 20 runs of 50 samples with n = 8 had 256
+# landmarks, for 128, and took 210 s for 115, and 1.9 GB for 1.4.
+_WORK = 1e10
 _POINTS = 1024  # from which boxes are taken, and landmarks if there are not more intervals
 
 
@@ -90,6 +93,9 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
     block = 0.1 * min(lengths, default=np.inf)
     if any(2 * np.median(np.diff(t)) < block for t in times):
         paths = smoothed(found, times, states)
+        shortest = _shortest_block(sum(t[-1] for t in times), runs.dimension, runs.input_count)
+        averaged = 0.5 * averaging_time(found, times, paths.deviation)
+        block = min(block, max(averaged, shortest))
         condensed = [
             _condensed(t, x, paths.value[r, : len(t)], paths.slope[r, : len(t)], block)
             for r, (t, x) in enumerate(zip(times, states, strict=True))
@@ -106,6 +112,35 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
     good = [run.path for run, use in zip(path_runs, usable, strict=True) if use]
     scale = np.concatenate(good).std(axis=0)
     return Preprocessed(path_runs, noise, np.where(scale > 0, scale, 1.0), usable)
+
+
+def averaging_time(found: list[Coordinate], times, deviation: Float[np.ndarray, "R T n"]) -> float:
+    """The time of as many samples as smoothing averages, σ²/Var x(t), in the coordinate of fewest.
+
+    In a longer block the path bends with the noise, and the block's sample is not as exact as
+    σ/√count says. On nine logs at 50 Hz of a driven pendulum the squares of the errors were 1.88,
+    1.20, 1.07 and 1.00 times that for blocks of 1.6, 1.1, 0.8 and 0.5 of this time, and with the
+    longest 10 of 20 clean logs were said to have process noise, or did not converge, for one.
+
+    Args:
+        found: the processes of the coordinates.
+        times: those of each run.
+        deviation: √Var x(t) of each coordinate at the times of each run.
+    """
+    spacing = np.median(np.concatenate([np.diff(t) for t in times]))
+    there = np.concatenate([deviation[r, : len(t)] for r, t in enumerate(times)])
+    counts = [
+        (c.noise / max(float(np.median(there[:, i])), np.finfo(float).tiny)) ** 2
+        for i, c in enumerate(found)
+        if c.seen
+    ]
+    return float(spacing * min(counts, default=np.inf))
+
+
+def _shortest_block(duration: float, n: int, inputs: int) -> float:
+    """The shortest block whose rows can be afforded: without noise smoothing averages nothing."""
+    columns = n * first_landmarks(n + inputs)
+    return duration * n * columns**2 / _WORK
 
 
 def with_inputs(data: Preprocessed, runs: Runs) -> Preprocessed:
@@ -313,6 +348,12 @@ def sampled(
     return X[chosen], Y[chosen]
 
 
+def first_landmarks(d: int) -> int:
+    """With how many landmarks learning begins, for points of d coordinates."""
+    # 45 for two coordinates and 80 for four were as good as all on ten runs of 10 s.
+    return {1: 24, 2: 48, 3: 64, 4: 80}.get(d, 128)
+
+
 def landmarks(data: Preprocessed, count: int | None) -> tuple[Float[np.ndarray, "m d"], int, bool]:
     """Points of the paths, of which the first cover them, how many to begin with, and the cap.
 
@@ -328,12 +369,9 @@ def landmarks(data: Preprocessed, count: int | None) -> tuple[Float[np.ndarray, 
     """
     n, used = len(data.scale), zip(data.runs, data.usable, strict=True)
     intervals = max(sum(len(run.times) - 1 for run, use in used if use), 1)
-    # Rows times columns² are 2 s for each solve. With 3.5e10, 20 runs of 50 samples with n = 8 had
-    # 256 landmarks, for 128, and took 210 s for 115, and 1.9 GB for 1.4.
-    affordable = int((1e10 / (n * intervals)) ** 0.5) // n
+    affordable = int((_WORK / (n * intervals)) ** 0.5) // n
     X, _ = sampled(data, max(_POINTS, min(intervals, 2 * affordable)))
-    # 45 for two coordinates and 80 for four were as good as all on ten runs of 10 s.
-    first = {1: 24, 2: 48, 3: 64, 4: 80}.get(X.shape[1], 128)
+    first = first_landmarks(X.shape[1])
     # They are doubled: a last step to a few more would cost a compilation and a solve.
     affordable = first * 2 ** int(np.log2(max(affordable / first, 1)))
     most = max(first, min(intervals, affordable)) if count is None else count
