@@ -15,7 +15,13 @@ import scipy.stats
 from test_learn import damped, field_error, logs
 
 import hamkernel as hk
-from hamkernel._trajectories.diagnostics import ljung_box, neighbours, whiteness
+from hamkernel._trajectories.diagnostics import (
+    are_white,
+    ljung_box,
+    neighbours,
+    spectral_peak,
+    whiteness,
+)
 from hamkernel._trajectories.flow import WEIGHTS
 from hamkernel._trajectories.kalman import as_observations, innovations, smoothed_path, whiten
 from hamkernel._trajectories.likelihood import Model, WhitenedRows, landmark_whitening
@@ -205,8 +211,20 @@ def test_one_in_twenty_of_white_innovations_is_a_false_alarm():
     rng, counts = np.random.default_rng(2), np.ones((3, 60, 2))
     p = np.array([whiteness(white_or_not(rng), counts) for _ in range(400)])
     assert 0.025 < np.mean(p < 0.05) < 0.08  # ±2.5 standard errors of 400
-    alarms = [whiteness(white_or_not(rng, 0.3), counts) < 0.05 for _ in range(20)]
-    assert sum(alarms) > 17
+    for correlation in (0.3, -0.3):
+        found = [white_or_not(rng, correlation) for _ in range(20)]
+        alarms = [not are_white(whiteness(z, counts), spectral_peak(z, counts)) for z in found]
+        assert sum(alarms) > 17
+
+
+def test_what_costs_bands_five_points_is_no_longer_white():
+    assert 2 * scipy.stats.norm.cdf(2 / 1.44**0.5) - 1 > 0.90  # for 95 %
+    rng, counts = np.random.default_rng(3), np.ones((200, 500, 2))
+    for correlation, least, most in ((0.02, 1.0, 1.1), (0.3, 1.6, 1.9)):
+        z = white_or_not(rng, correlation, runs=200, length=500)
+        # Of an autoregressive series (1 + r)/(1 − r) = 1.04 and 1.86 at ω = 0, less the windows.
+        assert least < spectral_peak(z, counts) < most
+        assert whiteness(z, counts) < 0.05  # both are significant
 
 
 # What is learned.

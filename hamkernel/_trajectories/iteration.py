@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled_by_size
-from hamkernel._trajectories.diagnostics import NEGLIGIBLE, SIGNIFICANT, whiteness
+from hamkernel._trajectories.diagnostics import NEGLIGIBLE, are_white, spectral_peak, whiteness
 from hamkernel._trajectories.flow import (
     Expansion,
     Segments,
@@ -457,7 +457,8 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     if not (end.settled and now.good.all()):
         return True
     z = innovations(whitened_rows(now.model, *given), now.rows)
-    if whiteness(z, np.asarray(now.rows.counts)) < SIGNIFICANT:
+    counts = np.asarray(now.rows.counts)
+    if not are_white(whiteness(z, counts), spectral_peak(z, counts)):
         return True
     shares = np.log([1e-3, 1e-2, 1e-1])
     design = [now.model.log_process, *(impulse + share for share in shares)]

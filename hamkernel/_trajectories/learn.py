@@ -32,6 +32,7 @@ from hamkernel._trajectories.diagnostics import (
     check_identifiable,
     diagnose,
     neighbours,
+    spectral_peak,
     whiteness,
 )
 from hamkernel._trajectories.flow import Expansion
@@ -291,7 +292,9 @@ def _quality(
         misfit=misfit,
         chi_squared=squares / max(free, 1.0),
         free=free,
+        remaining=now.free,
         white=whiteness(z, counts),
+        peak=spectral_peak(z, counts),
         correlation=neighbours(z, counts),
         process=None if alone is None else process,
         count=len(end.history),

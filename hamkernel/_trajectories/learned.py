@@ -72,7 +72,8 @@ class Learned(eqx.Module):
             mean.
         whiteness: the probability that independent innovations are as correlated as these, by the
             test of Ljung and Box over ten lags, shape (); where it is below .05 the structure, or
-            the timing of inputs, leaves something that moves on from sample to sample.
+            the timing of inputs, leaves something that moves on from sample to sample. It counts
+            against `converged` where it makes bands more than 1.2 times too narrow.
         disturbance: the mean of w from each sample to the next as far as the samples know it, for
             each run, (T, n); 0 without process noise.
         history: one entry an iteration.
