@@ -447,15 +447,18 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     """Whether anything says that the structure is not the whole truth.
 
     Iterations that did not settle, parts that were dropped, innovations that are not white, or rows
-    that are likelier with process noise. Not where more landmarks would explain them: what a field
-    on too few cannot say looks like process noise.
+    that are likelier with process noise. Of innovations and rows it is not said where more
+    landmarks would explain them: what a field on too few cannot say looks like process noise. Where
+    parts are lost the lengthscale has often collapsed, and landmarks are always too few for that.
     """
     now, task = end.now, end.task
     given = now.field.points, now.rows, task.start_deviation
-    if task.capped or limited_by_landmarks(now.model, *given, project_out_starts):
+    if task.capped:
         return False
     if not (end.settled and now.good.all()):
         return True
+    if limited_by_landmarks(now.model, *given, project_out_starts):
+        return False
     z = innovations(whitened_rows(now.model, *given), now.rows)
     counts = np.asarray(now.rows.counts)
     if not are_white(whiteness(z, counts), spectral_peak(z, counts)):
