@@ -11,7 +11,9 @@ A pendulum v̇ = −6 sin q + G u of gain G = 2, logged at 50 Hz:
   inertia, that the structure does not have; both together have an inertia of one, so that the field
   and the gain of slow motion are those of all other cases;
 - `delayed`: inputs that act half a sample after they were logged;
-- `encoder`: q alone by 12 bits a turn, no other noise.
+- `encoder`: q alone by 12 bits a turn, no other noise;
+- `friction`: the log of `stiction`, and a kernel with `hk.Friction`, which can say it;
+- `timed`: the log of `delayed`, and `delay="fit"`.
 
 Printed by case, the medians over seeds: the error of U′ along the log relative to its rms (the
 smooth part of the field), that of the gain, the share of U′ inside two standard deviations, the
@@ -19,6 +21,11 @@ rms of the angle in free runs of 1 s of another log where it stays inside the an
 and the same for least squares on rollouts with the equation
 q̈ = −a sin q − d v − c tanh(v/.05) + G u, which has the true form; how much process noise was found,
 how often the innovations were called white; the delay found; CPU seconds.
+
+Medians of seeds 0 to 2, errors of U′ and of the gain, and free runs beside the grey box: stiction
+12 %, 16 %, .14 for .0042 rad; with friction in the kernel .17 %, .04 %, .0011 for .0042; flexible
+.24 %, .52 %, .0017 for .0060; delayed 1.5 %, .27 %, .023 for .021; encoder .009 %, .006 %, .00005
+for .0024. White w alone does not stand for stiction: say that there is friction.
 """
 
 import argparse
@@ -40,6 +47,10 @@ PENDULUM = hk.systems.Pendulum(1.0, 1.0, A)
 U_PART = hk.Controlled(
     hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0)), hk.InputMatrix(1.0, acts_on=(1,))
 )
+WITH_FRICTION = hk.Controlled(
+    hk.Sum(potential=U_PART.drift, friction=hk.Friction(0.1, 0.3, rest_speed=0.05)), U_PART.inputs
+)
+LOGS = {"friction": "stiction", "timed": "delayed"}  # those of other cases
 
 
 def velocity_known(s, u):
@@ -48,6 +59,7 @@ def velocity_known(s, u):
 
 def driven(case, seed):
     """Times, true states (T, 2), inputs (T, 1), and the log, NaN for v."""
+    case = LOGS.get(case, case)
     rng = np.random.default_rng(seed)
     t, fine = DT * np.arange(T), 40
     frequencies, phases = rng.uniform(1.0, 6.0, 6), rng.uniform(0, 2 * np.pi, 6)
@@ -180,10 +192,12 @@ def without_warnings(*args, **options):
 def on_driven(case, seed):
     t, states, inputs, log = driven(case, seed)
     begun = time.process_time()
-    found = without_warnings(U_PART, hk.Runs(t, log, inputs), mean=velocity_known)
+    kernel = WITH_FRICTION if case == "friction" else U_PART
+    runs = hk.Runs(t, log, inputs, delay="fit" if case == "timed" else 0.0)
+    found = without_warnings(kernel, runs, mean=velocity_known)
     spent = time.process_time() - begun
     test = driven(case, seed + 1000)
-    X = jnp.asarray(states[::5])
+    X = jnp.asarray(states[::5] * [1.0, 0.0])  # where there is no friction
     drift = np.asarray(jax.vmap(found.field.drift)(X))[:, 1]
     truth = -A * np.sin(states[::5, 0])
     scale = np.sqrt(np.mean(truth**2))
@@ -250,7 +264,7 @@ DRIVEN = (
     "error of U', of the gain, inside 2 sd, free run, grey box's, its gain, q, white, noise, "
     "delay, CPU s"
 )
-CASES = ("none", "stiction", "flexible", "delayed", "encoder")
+CASES = ("none", "stiction", "flexible", "delayed", "encoder", "friction", "timed")
 
 
 def main():
