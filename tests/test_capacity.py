@@ -204,7 +204,7 @@ def test_landmarks_are_doubled_while_the_rows_become_likelier():
     assert limited == [True, False]
 
 
-@pytest.mark.parametrize("size", [10, _machine._SMALL])
+@pytest.mark.parametrize("size", [10, _machine._SMALL + 1])
 def test_how_a_program_is_compiled_changes_neither_values_nor_derivatives(size):
     """Small ones without optimisation, and inside of others as those say."""
 

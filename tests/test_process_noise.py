@@ -15,13 +15,7 @@ import scipy.stats
 from test_learn import damped, field_error, logs
 
 import hamkernel as hk
-from hamkernel._trajectories.diagnostics import (
-    are_white,
-    ljung_box,
-    neighbours,
-    spectral_peak,
-    whiteness,
-)
+from hamkernel._trajectories.diagnostics import autocorrelations, ljung_box, whiteness
 from hamkernel._trajectories.flow import WEIGHTS
 from hamkernel._trajectories.kalman import as_observations, innovations, smoothed_path, whiten
 from hamkernel._trajectories.likelihood import Model, WhitenedRows, landmark_whitening
@@ -196,35 +190,33 @@ def test_whiteness_is_the_test_of_ljung_and_box():
     z = white_or_not(np.random.default_rng(1), 0.2, runs=1, length=80)[0, :, 0]
     N, r = len(z), [z[k:] @ z[:-k] / (z @ z) for k in range(1, 11)]
     Q = N * (N + 2) * sum(each**2 / (N - k) for k, each in enumerate(r, 1))
-    found, lags = ljung_box([z])
-    np.testing.assert_allclose(found, Q, rtol=1e-12)
-    assert lags == 10
+    assert ljung_box(N, *autocorrelations([z])) == pytest.approx(Q, rel=1e-12)
     # One measured coordinate, and a first sample that knows the start.
     both, counts = np.stack([np.append(9.0, z), np.zeros(81)], axis=1)[None], np.ones((1, 81, 2))
     counts[..., 1] = 0.0
     counts[0, 0] = 1.0
-    np.testing.assert_allclose(whiteness(both, counts), scipy.stats.chi2.sf(Q, 10), rtol=1e-8)
-    np.testing.assert_allclose(neighbours(both, counts)[0], r[0], rtol=1e-12)
+    white = whiteness(both, counts)
+    assert white.probability == pytest.approx(scipy.stats.chi2.sf(Q, 10), rel=1e-8)
+    assert white.neighbours.tolist() == pytest.approx([r[0], 0.0], rel=1e-12)
 
 
 def test_one_in_twenty_of_white_innovations_is_a_false_alarm():
     rng, counts = np.random.default_rng(2), np.ones((3, 60, 2))
-    p = np.array([whiteness(white_or_not(rng), counts) for _ in range(400)])
+    p = np.array([whiteness(white_or_not(rng), counts).probability for _ in range(400)])
     assert 0.025 < np.mean(p < 0.05) < 0.08  # ±2.5 standard errors of 400
     for correlation in (0.3, -0.3):
-        found = [white_or_not(rng, correlation) for _ in range(20)]
-        alarms = [not are_white(whiteness(z, counts), spectral_peak(z, counts)) for z in found]
-        assert sum(alarms) > 17
+        found = [whiteness(white_or_not(rng, correlation), counts) for _ in range(20)]
+        assert sum(not white.is_enough for white in found) > 17
 
 
 def test_what_costs_bands_five_points_is_no_longer_white():
     assert 2 * scipy.stats.norm.cdf(2 / 1.44**0.5) - 1 > 0.90  # for 95 %
     rng, counts = np.random.default_rng(3), np.ones((200, 500, 2))
     for correlation, least, most in ((0.02, 1.0, 1.1), (0.3, 1.6, 1.9)):
-        z = white_or_not(rng, correlation, runs=200, length=500)
+        white = whiteness(white_or_not(rng, correlation, runs=200, length=500), counts)
         # Of an autoregressive series (1 + r)/(1 − r) = 1.04 and 1.86 at ω = 0, less the windows.
-        assert least < spectral_peak(z, counts) < most
-        assert whiteness(z, counts) < 0.05  # both are significant
+        assert least < white.peak < most
+        assert white.probability < 0.05  # both are significant
 
 
 # What is learned.

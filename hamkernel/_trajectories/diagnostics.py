@@ -18,6 +18,32 @@ _SWING = 5.0  # samples in a swing: with fewer noise and motion cannot be told a
 _FEW = 10  # degrees of freedom, from which σ is known to a fifth
 
 
+class Whiteness(NamedTuple):
+    """How far innovations are from white ones.
+
+    Attributes:
+        probability: that white innovations are as correlated, by Ljung and Box; 1 of too few.
+        peak: the largest value of their spectra 1 + 2 Σ_k (1 − k/11) r_k cos(kω), k = 1 to 10; 1
+            where they are white.
+        neighbours: their correlation at lag one, by coordinate, shape (n,).
+    """
+
+    probability: float
+    peak: float
+    neighbours: Float[np.ndarray, " n"]
+
+    @property
+    def is_enough(self) -> bool:
+        """Whether they are as good as white.
+
+        False alarms are 5 % of logs. The noise of a part of the motion that is in one frequency is
+        as much larger as the spectrum there; up to 1.44, a deviation of 1.2, at least 90 % lies
+        inside of two of the deviations that are said, for 95 %. Of 2e5 innovations a correlation of
+        .01 would be significant.
+        """
+        return self.probability >= 0.05 or self.peak < 1.44
+
+
 class FitQuality(NamedTuple):
     """How well the field follows the runs.
 
@@ -28,9 +54,7 @@ class FitQuality(NamedTuple):
         chi_squared: per degree of freedom, without process noise where that was to be found.
         free: its degrees of freedom.
         remaining: the degrees of freedom that the fit leaves, process noise included.
-        white: the probability that white innovations are as correlated.
-        peak: of the spectra of innovations, 1 where they are white.
-        correlation: of innovations at lag one, by coordinate, shape (n,).
+        white: how white the innovations are.
         process: q as it was found, shape (n,); None where it was given.
         count: of iterations.
         settled: whether they ended by themselves.
@@ -45,9 +69,7 @@ class FitQuality(NamedTuple):
     chi_squared: float
     free: float
     remaining: float
-    white: float
-    peak: float
-    correlation: Float[np.ndarray, " n"]
+    white: Whiteness
     process: Float[np.ndarray, " n"] | None
     count: int
     settled: bool
@@ -75,7 +97,7 @@ def diagnose(
     left = np.sqrt(fit.chi_squared) * np.nanmax(noise / scale)
     # Of states without noise only what the field cannot have is left, and that is not white.
     exact = bool(left < NEGLIGIBLE) and not given and not disturbed
-    white = exact or are_white(fit.white, fit.peak)
+    white = exact or fit.white.is_enough
     if given and not explains(fit.chi_squared, fit.free):
         warn_of_misfit(fit)
     elif disturbed:
@@ -134,7 +156,7 @@ def warn_of_process(fit: FitQuality) -> None:
 
 def warn_of_correlation(fit: FitQuality) -> None:
     """Say that the innovations are not white, and what to try."""
-    c = int(np.nanargmax(np.abs(fit.correlation)))
+    white, c = fit.white, int(np.argmax(np.abs(fit.white.neighbours)))
     timing = (
         "inputs that act at other times than logged, or go on otherwise in between (between=); "
         if fit.driven
@@ -145,10 +167,11 @@ def warn_of_correlation(fit: FitQuality) -> None:
         few = f"the {fit.capped} landmarks are too few, and solver=hk.Nystrom(max_points="
         timing = f"{few}{2 * fit.capped}) takes four times as long; {timing}"
     require.warn(
-        f"the innovations are not white (p = {fit.white:.2g} by Ljung and Box; the correlation of "
-        f"neighbours is {fit.correlation[c]:.2f} in coordinate {c}): what the field and the noise "
-        "leave is known in part from the samples before, and bands are too narrow. Likely causes, "
-        f"in order: {timing}{_LACKS}; sensors that are filtered or resampled{more}."
+        f"the innovations are not white (p = {white.probability:.2g} by Ljung and Box; the "
+        f"correlation of neighbours is {white.neighbours[c]:.2f} in coordinate {c}): what the "
+        "field and the noise leave is known in part from the samples before, and bands are too "
+        f"narrow. Likely causes, in order: {timing}{_LACKS}; sensors that are filtered or "
+        f"resampled{more}."
     )
 
 
@@ -255,73 +278,48 @@ def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> Non
         )
 
 
-def autocorrelations(
-    series: list[Float[np.ndarray, " T"]],
-) -> tuple[Float[np.ndarray, " lags"], Float[np.ndarray, " lags"]]:
-    """Those of series of mean zero at lags 1 to 10, and how many pairs there are at each.
-
-    No pair is one of two series. Lags of less than 20 pairs, from which on a correlation is nearly
-    normal, are left out.
-    """
-    pairs = [[(z[k:], z[:-k]) for z in series if len(z) > k] for k in range(1, 11)]
-    counts = np.array([sum(len(a) for a, _ in each) for each in pairs], float)
-    sums = np.array([sum(float(a @ b) for a, b in each) for each in pairs])
-    total = sum(z @ z for z in series)
-    used = (counts >= 20) & (total > 0)
-    return sums[used] / total if used.any() else sums[used], counts[used]
-
-
-def ljung_box(series: list[Float[np.ndarray, " T"]]) -> tuple[float, int]:
-    """Ljung and Box's statistic of series of mean zero, N (N + 2) Σ_k r_k²/N_k, and its lags.
-
-    N_k are the pairs at lag k, none of them of two series: N − k for a single one.
-    """
-    N, (r, counts) = sum(len(z) for z in series), autocorrelations(series)
-    return float(N * (N + 2) * (r**2 / counts).sum()), len(r)
-
-
-def whiteness(z: Float[np.ndarray, "S L+1 n"], counts: Float[np.ndarray, "S L+1 n"]) -> float:
-    """The probability that white innovations are as correlated as these, 1 of too few."""
-    statistics, lags = zip(*(ljung_box(series) for series in _series(z, counts)), strict=True)
-    return float(gammaincc(sum(lags) / 2, sum(statistics) / 2)) if sum(lags) else 1.0
-
-
-def spectral_peak(z: Float[np.ndarray, "S L+1 n"], counts: Float[np.ndarray, "S L+1 n"]) -> float:
-    """The largest value of the spectra 1 + 2 Σ_k (1 − k/11) r_k cos(kω), 1 of white innovations."""
-    k, peaks = np.arange(1, 11), [1.0]
-    waves = np.cos(np.linspace(0, np.pi, 45)[:, None] * k[None]) * (1 - k / 11)[None]
-    for series in _series(z, counts):
-        r = autocorrelations(series)[0]
-        peaks.append(float((1 + 2 * waves[:, : len(r)] @ r).max()))
-    return max(peaks)
-
-
-def are_white(white: float, peak: float) -> bool:
-    """Whether innovations of this `whiteness` and `spectral_peak` are as good as white.
-
-    False alarms are 5 % of logs. The noise of a part of the motion that is in one frequency is as
-    much larger as the spectrum there; up to 1.44, a deviation of 1.2, at least 90 % lies inside of
-    two of the deviations that are said, for 95 %. Of 2e5 innovations a correlation of .01 would be
-    significant.
-    """
-    return white >= 0.05 or peak < 1.44
-
-
-def neighbours(z: Float[np.ndarray, "S L+1 n"], counts) -> Float[np.ndarray, " n"]:
-    """The correlation of each coordinate's innovations at lag one."""
-    out = []
-    for series in _series(z, counts):
-        total = sum(one @ one for one in series)
-        out.append(sum(one[1:] @ one[:-1] for one in series) / total if total > 0 else 0.0)
-    return np.array(out)
-
-
-def _series(z, counts) -> list[list[Float[np.ndarray, " T"]]]:
-    """The innovations of each coordinate by segment.
+def whiteness(z: Float[np.ndarray, "S L+1 n"], counts: Float[np.ndarray, "S L+1 n"]) -> Whiteness:
+    """How white the innovations z are, by segment, sample and coordinate.
 
     The first n measured entries of a segment know its start, and say nothing here.
     """
     S, n = len(z), z.shape[2]
     seen = counts > 0
     used = seen & (np.cumsum(seen.reshape(S, -1), axis=1).reshape(z.shape) > n)
-    return [[z[s, used[s, :, c], c] for s in range(S)] for c in range(n)]
+    statistic, lags, peak, neighbours = 0.0, 0, 1.0, np.zeros(n)
+    k = np.arange(1, 11)
+    waves = np.cos(np.linspace(0, np.pi, 45)[:, None] * k[None]) * (1 - k / 11)[None]
+    for c in range(n):
+        r, pairs = autocorrelations([z[s, used[s, :, c], c] for s in range(S)])
+        neighbours[c] = r[0]
+        # From 20 pairs on a correlation is nearly normal.
+        r, pairs = r[pairs >= 20], pairs[pairs >= 20]
+        statistic += ljung_box(int(used[:, :, c].sum()), r, pairs)
+        lags += len(r)
+        peak = max(peak, float((1 + 2 * waves[:, : len(r)] @ r).max()))
+    probability = float(gammaincc(lags / 2, statistic / 2)) if lags else 1.0
+    return Whiteness(probability, peak, neighbours)
+
+
+def autocorrelations(
+    series: list[Float[np.ndarray, " T"]],
+) -> tuple[Float[np.ndarray, " 10"], Float[np.ndarray, " 10"]]:
+    """Those of series of mean zero at lags 1 to 10, and how many pairs there are at each.
+
+    No pair is one of two series. Where nothing varies there are no pairs.
+    """
+    total = sum(float(z @ z) for z in series)
+    if total == 0:
+        return np.zeros(10), np.zeros(10)
+    pairs = [[(z[k:], z[:-k]) for z in series if len(z) > k] for k in range(1, 11)]
+    counts = np.array([sum(len(a) for a, _ in each) for each in pairs], float)
+    sums = np.array([sum(float(a @ b) for a, b in each) for each in pairs])
+    return sums / total, counts
+
+
+def ljung_box(N: int, r: Float[np.ndarray, " K"], counts: Float[np.ndarray, " K"]) -> float:
+    """Ljung and Box's statistic of N values, N (N + 2) Σ_k r_k²/N_k.
+
+    N_k are the pairs at lag k, none of them of two series: N − k for a single one.
+    """
+    return float(N * (N + 2) * (r**2 / counts).sum())

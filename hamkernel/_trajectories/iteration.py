@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled_by_size
-from hamkernel._trajectories.diagnostics import NEGLIGIBLE, are_white, spectral_peak, whiteness
+from hamkernel._trajectories.diagnostics import NEGLIGIBLE, whiteness
 from hamkernel._trajectories.flow import (
     Expansion,
     Segments,
@@ -269,7 +269,7 @@ def _solved(
     # The current field in the new basis: the one with its values at the landmarks.
     S = found.points
     T = _landmark_whitening(model.kernel, S)
-    old = T.T @ values(
+    old = T.T @ field_values(
         Expansion(now.field.kernel, now.field.points, now.field.coefficients, None), S
     ).reshape(-1)
 
@@ -426,14 +426,14 @@ def _stiffness(field: Expansion, data: Preprocessed, paths: list[np.ndarray]) ->
 def changed(task: Task, before: Current, now: Current) -> float:
     """By how much the field has changed at the landmarks, relative to its size there."""
     old, new = (
-        np.asarray(values(each.field, now.field.points)) / task.data.scale[None]
+        np.asarray(field_values(each.field, now.field.points)) / task.data.scale[None]
         for each in (before, now)
     )
     return float(np.linalg.norm(new - old) / max(np.linalg.norm(new), np.finfo(float).tiny))
 
 
 @compiled_by_size
-def values(field: Expansion, X: Float[Array, "N d"]) -> Float[Array, "N n"]:
+def field_values(field: Expansion, X: Float[Array, "N d"]) -> Float[Array, "N n"]:
     """The field at many points."""
     return jax.vmap(field)(X)
 
@@ -460,8 +460,7 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     if limited_by_landmarks(now.model, *given, project_out_starts):
         return False
     z = innovations(whitened_rows(now.model, *given), now.rows)
-    counts = np.asarray(now.rows.counts)
-    if not are_white(whiteness(z, counts), spectral_peak(z, counts)):
+    if not whiteness(z, np.asarray(now.rows.counts)).is_enough:
         return True
     shares = np.log([1e-3, 1e-2, 1e-1])
     design = [now.model.log_process, *(impulse + share for share in shares)]

@@ -252,7 +252,7 @@ def as_observations(
     """
     n = rows.residual.shape[-1]
     least = rows.counts.astype(bool).sum((1, 2)) > n
-    there = compiled_by_size(means)(mean, rows.nodes, rows.nodes[..., :n])
+    there = _means(mean, rows.nodes, rows.nodes[..., :n])
     # On the host: one segment of a JAX array compiles.
     every = jax.tree.map(np.asarray, (rows, there))
     found = []
@@ -267,6 +267,9 @@ def as_observations(
         x, u = np.split(points, [n], axis=2)
         found.append(Functionals(x, B[None], target[None], u if u.size else None))
     return Together(tuple(found)) if found else None
+
+
+_means = compiled_by_size(means)
 
 
 @compiled_by_size

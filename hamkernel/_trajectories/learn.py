@@ -31,8 +31,6 @@ from hamkernel._trajectories.diagnostics import (
     FitQuality,
     check_identifiable,
     diagnose,
-    neighbours,
-    spectral_peak,
     whiteness,
 )
 from hamkernel._trajectories.flow import Expansion
@@ -41,10 +39,10 @@ from hamkernel._trajectories.iteration import (
     Task,
     asks_for_process,
     begin,
+    field_values,
     initial_loss,
     iterate,
     likelier,
-    values,
 )
 from hamkernel._trajectories.kalman import (
     as_observations,
@@ -221,15 +219,7 @@ def _learned(
     task, now, history = end.task, end.now, end.history
     field, data = now.field, task.data
     times, _ = runs.on_host()
-    pairs = list(zip(data.runs, now.paths, strict=True))
-    ends = np.cumsum([len(path) for path in now.paths])
-    X = np.concatenate([run.joined(path) for run, path in pairs])
-    X = np.pad(X, ((0, power_of_two(len(X)) - len(X)), (0, 0)), "edge")  # one program for many logs
-    slopes = np.split(np.asarray(values(field, jnp.asarray(X))), ends)[:-1]
-    states = [
-        path if len(path) == len(t) else interpolated(t - t[0], run.times, path, slope)
-        for t, (run, path), slope in zip(times, pairs, slopes, strict=True)
-    ]
+    states = _at_all_times(end, times)
     noise = np.where(measured, np.exp(np.asarray(now.model.log_noise)), np.nan)
     process = np.exp(np.asarray(now.model.log_process))
     misfit = misfits(runs, states, noise)
@@ -254,7 +244,7 @@ def _learned(
         innovations=tuple(
             jnp.asarray(x) for x in _by_run(np.where(counts > 0, z, np.nan), end, np.nan)
         ),
-        whiteness=jnp.asarray(fit.white),
+        whiteness=jnp.asarray(fit.white.probability),
         disturbance=_disturbances(end, times),
         history=tuple(history),
         converged=converged,
@@ -262,6 +252,20 @@ def _learned(
         observations=observations,
         mean=mean,
     )
+
+
+def _at_all_times(end: End, times: list[np.ndarray]) -> list[Float[np.ndarray, "T n"]]:
+    """The paths at all times of their runs, by cubics where samples were averaged."""
+    now, data = end.now, end.task.data
+    out = []
+    for t, run, path in zip(times, data.runs, now.paths, strict=True):
+        if len(path) != len(t):
+            X, N = run.joined(path), len(path)
+            X = np.pad(X, ((0, power_of_two(N) - N), (0, 0)), "edge")  # one program for many logs
+            slope = np.asarray(field_values(now.field, jnp.asarray(X)))[:N]
+            path = interpolated(t - t[0], run.times, path, slope)
+        out.append(path)
+    return out
 
 
 def _quality(
@@ -294,8 +298,6 @@ def _quality(
         free=free,
         remaining=now.free,
         white=whiteness(z, counts),
-        peak=spectral_peak(z, counts),
-        correlation=neighbours(z, counts),
         process=None if alone is None else process,
         count=len(end.history),
         settled=end.settled,
