@@ -1,4 +1,4 @@
-"""Whether what was learned explains the runs, and what to say where it does not."""
+"""Whether the learned field explains the runs, and the warnings where it does not."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._trajectories.runs import Runs
 
-# Residuals below this share of the states are no noise: a field that is not yet exact leaves them.
+# Residuals below this share of the states are not noise: a field that is not yet exact leaves them.
 NEGLIGIBLE = 1e-3
 _SWING = 5.0  # samples in a swing: with fewer noise and motion cannot be told apart
 _FEW = 10  # degrees of freedom, from which σ is known to a fifth
@@ -48,19 +48,19 @@ class FitQuality(NamedTuple):
     """How well the field follows the runs.
 
     Attributes:
-        kept: the share of each run that it was learned from, shape (R,).
-        dropped: what it was not learned from: run, first sample, and the one behind the last.
+        kept: the share of each run that the field was learned from, shape (R,).
+        dropped: the parts it was not learned from: run, first sample, and the one after the last.
         misfit: of each run and coordinate, in units of the noise, shape (R, n).
-        chi_squared: per degree of freedom, without process noise where that was to be found.
+        chi_squared: χ² per degree of freedom, of the fit without process noise if q was estimated.
         free: its degrees of freedom.
         remaining: the degrees of freedom that the fit leaves, process noise included.
         white: how white the innovations are.
-        process: q as it was found, shape (n,); None where it was given.
+        process: q if it was estimated, shape (n,); None where it was given.
         count: of iterations.
         settled: whether they ended by themselves.
         swing: how many samples there are in a swing.
         driven: whether there are inputs.
-        capped: the number of landmarks where more would take too long, else 0.
+        capped: the number of landmarks if more would help but take too long, else 0.
     """
 
     kept: Float[np.ndarray, " R"]
@@ -81,7 +81,7 @@ class FitQuality(NamedTuple):
 def diagnose(
     fit: FitQuality, noise: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"], given: bool
 ) -> bool:
-    """Warn of what is wrong, and say whether learning converged.
+    """Warn of what is wrong, and return whether learning converged.
 
     Args:
         fit: how well the field follows the runs.
@@ -126,7 +126,7 @@ _LACKS = (
 
 
 def warn_of_misfit(fit: FitQuality) -> None:
-    """Say that the structure does not explain the runs at the noise that was given, and where."""
+    """Warn that the structure does not explain the runs at the given noise, and where."""
     run, c = np.unravel_index(np.nanargmax(fit.misfit), fit.misfit.shape)
     where = (
         f"The residuals are largest in coordinate {c} of run {run}, {fit.misfit[run, c]:.2g} "
@@ -143,7 +143,7 @@ def warn_of_misfit(fit: FitQuality) -> None:
 
 
 def warn_of_process(fit: FitQuality) -> None:
-    """Say that the structure is not the whole truth, and what was put in its place."""
+    """Warn that the structure is not the whole truth, and that process noise was added."""
     assert fit.process is not None
     timing = " inputs that act at other times than logged;" if fit.driven else ""
     require.warn(
@@ -155,7 +155,7 @@ def warn_of_process(fit: FitQuality) -> None:
 
 
 def warn_of_correlation(fit: FitQuality) -> None:
-    """Say that the innovations are not white, and what to try."""
+    """Warn that the innovations are not white, and say what to try."""
     white, c = fit.white, int(np.argmax(np.abs(fit.white.neighbours)))
     timing = (
         "inputs that act at other times than logged, or go on otherwise in between (between=); "
@@ -182,7 +182,7 @@ def _numbers(values: Float[np.ndarray, " n"]) -> str:
 def warn_of_noise(
     noise: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"], swing: float
 ) -> bool:
-    """Say where nearly all of the motion was taken for noise, and whether it was."""
+    """Warn where nearly all of the motion was taken for noise; return whether it was."""
     share = np.nan_to_num(noise / scale)
     c = int(np.argmax(share))
     if share[c] < 0.5:  # where learning failed, noise was found .9 to 1.1 times the motion
@@ -200,7 +200,7 @@ def warn_of_noise(
 
 
 def warn_of_few(free: float) -> bool:
-    """Say that the noise is a guess, and whether it is: σ is known to 1/√(2ν)."""
+    """Warn that the noise is a guess; return whether it is: σ is known to 1/√(2ν)."""
     if free >= _FEW:
         return False
     require.warn(
@@ -211,7 +211,7 @@ def warn_of_few(free: float) -> bool:
 
 
 def warn_of_unsettled(fit: FitQuality, explained: bool) -> None:
-    """Say that the iterations did not end where the field explains the runs."""
+    """Warn that the iterations ended before the field explains the runs."""
     low, high = np.nanmin(fit.misfit), np.nanmax(fit.misfit)
     misfits = f"the misfits, by run and coordinate, are {low:.2f} to {high:.2f}"
     if explained and high < 1.5:  # a field that still moves a little, and explains its run
@@ -253,7 +253,7 @@ def warn_of_dropped(fit: FitQuality) -> None:
 
 
 def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> None:
-    """A coordinate that no run measured must be known through a mean, of the points (x, u)."""
+    """Raise unless a mean of the points (x, u) determines each coordinate that no run measured."""
     never = ~np.any([np.isfinite(np.asarray(x)).any(axis=0) for x in runs.states], axis=0)
     if not never.any():
         return

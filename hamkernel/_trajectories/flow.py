@@ -1,6 +1,6 @@
 """The flow of a field, its tangent, and multiple shooting along segments of the samples.
 
-Every interval between two samples has three Gauss nodes, at which the field is asked for later.
+Every interval between two samples has three Gauss nodes, at which the field is evaluated later.
 Multiple shooting simulates each segment with the current field and improves its start: Levenberg
 steps on the starts alone come before a segment is judged.
 """
@@ -40,7 +40,7 @@ class Expansion(eqx.Module):
 def with_tangent(
     field: Callable[[Array], Array], s: Float[Array, " d"], n: int
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """F and ∂f/∂x at a point s = (x, u) with n coordinates of x."""
+    """The values f and ∂f/∂x at a point s = (x, u) with n coordinates of x."""
     u = s[n:]
 
     def twice(x):
@@ -84,8 +84,8 @@ def simulated(
 ) -> Path:
     """The path of each segment from its start, and its tangents.
 
-    Not finite from where the field is not. In shares of an interval of length h the point (x, u)
-    moves by (h f, u₁ − u₀), from the input u₀ at its beginning to u₁ at its end.
+    The path is not finite from where the field is not. In shares of an interval of length h the
+    point (x, u) moves by (h f, u₁ − u₀), from the input u₀ at its beginning to u₁ at its end.
     """
     n = starts.shape[1]
 
@@ -201,7 +201,7 @@ class Shooting(NamedTuple):
     Attributes:
         starts: where it starts, shape (S, n).
         path: the path.
-        squares: χ² of each segment, inf where the path is lost.
+        squares: χ² of each segment, inf where the path is not finite.
     """
 
     starts: Float[Array, "S n"]
@@ -222,8 +222,8 @@ def shoot(
     """The starts after some Levenberg steps from `starts`, of each segment on its own.
 
     δz minimises ‖r − Pδz‖² + μ‖U δz‖², where P = QU scales the coordinates; μ goes down by ten
-    after a step that was better, and up after one that was worse. The steps end when none promises
-    a decrease of χ², ‖Qᵀr‖², that would be noticed.
+    after a step that lowers χ², and up after one that does not. The steps end when none promises a
+    noticeable decrease of χ², which is ‖Qᵀr‖².
     """
     W = jnp.sqrt(segments.counts) * jnp.exp(-log_noise)[None, None]
     S, n = starts.shape
@@ -285,15 +285,15 @@ def trusted(
 ) -> Bool[np.ndarray, " S"]:
     """Which segments the field follows well enough to learn from them.
 
-    Residuals are compared with the noise, or with those of half of the segments where they are
-    less: a jump in one of them may have been taken for noise in all.
+    Residuals are compared with the noise, or with the median over segments where that is smaller: a
+    jump in one segment may have been taken for noise in all.
 
     Args:
         found: the paths.
         segments: the samples.
-        noise: the noise as far as it is known.
-        least: what a field that is not yet exact may leave where there is no noise at all, a share
-            of the states.
+        noise: the current estimate of the noise.
+        least: the residual that a field which is not yet exact may leave where there is no noise,
+            a share of the states.
         was_asked: whether a field was learned from rows along its own path before. If not, it may
             miss a segment because the smoothed path did: of five samples a swing, or of the fastest
             of short runs.

@@ -70,14 +70,14 @@ _SHORT_ROUNDS = 2  # iterations with short segments, in which a rough field stay
 
 
 class Task(NamedTuple):
-    """What does not change.
+    """The task: what no iteration changes.
 
     Attributes:
         data: the runs.
         mean: what is known.
-        S: as many landmarks as there may be.
-        first: with how many of them learning begins.
-        capped: whether more would be of use, and take too long.
+        S: the landmarks, as many as may be used.
+        first: how many of them learning begins with.
+        capped: whether more landmarks would help but take too long.
         bounds: the box of hyperparameters.
         start_deviation: of the prior of starts.
     """
@@ -92,14 +92,14 @@ class Task(NamedTuple):
 
 
 class Current(NamedTuple):
-    """Where learning stands.
+    """The state of the iterations.
 
     Attributes:
         model: kernel and noise.
         field: the field.
-        S: its landmarks, and more if there may be more.
+        S: its landmarks, and those that may be added.
         rows: what it was learned from.
-        paths: of each run at its samples.
+        paths: the path of each run at its samples.
         good: which pieces were kept.
         squares: the sum of their squared normalised residuals.
         free: the degrees of freedom that are left.
@@ -122,8 +122,8 @@ class End(NamedTuple):
         task: what was asked.
         now: the last step.
         pieces: of the last step.
-        history: all steps.
-        settled: whether noise and objective did.
+        history: one entry a step.
+        settled: whether noise and objective settled.
     """
 
     task: Task
@@ -136,7 +136,7 @@ class End(NamedTuple):
 def iterate(
     task: Task, model: Model, design: np.ndarray, process: bool, most: int, bar: Any
 ) -> End:
-    """Gauss-Newton steps until noise and objective settle, `most` of them at most."""
+    """Gauss-Newton steps until noise and objective settle, at most `most` of them."""
     runs, step = task.data.runs, iterated_with_process if process else iterated
     now = (begin_with_process if process else begin)(task, model, design)
     history: list[Iteration] = []
@@ -178,9 +178,9 @@ def initial_loss(task: Task, model: Model) -> float:
 
 
 def begin(task: Task, model: Model, design: np.ndarray) -> Current:
-    """INT: rows along the smoothed runs, with the tangent of the mean.
+    """The first model, from rows along the smoothed runs with the tangent of the mean.
 
-    In short segments: the errors of the smoothed path add up along a run.
+    Segments are short, since the errors of the smoothed path add up along a run.
     """
     pieces, good, rows = smoothed_rows(task.data, task.mean)
     paths = [run.path for run in task.data.runs]
@@ -203,7 +203,7 @@ def _first(
 
 
 def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, Iteration]:
-    """GN: one linearisation along the current field, one closed form, one line search."""
+    """One Gauss-Newton step: linearisation along the current field, closed form, line search."""
     runs = task.data.runs
     segments = segmented(runs, pieces, now.paths)
     count = steps_for(np.asarray(segments.spans), _stiffness(now.field, task.data, now.paths))
@@ -302,7 +302,7 @@ def _described(task, pieces, good, best: _Trial, gain, taken, model: Model, loss
 
 
 def begin_with_process(task: Task, model: Model, design: np.ndarray) -> Current:
-    """INT with process noise: rows along the smoothed runs, each whole or in long parts."""
+    """The first model with process noise, from the smoothed runs, whole or in long parts."""
     runs = task.data.runs
     pieces = equal_pieces(runs, LONG)
     segments = segmented(runs, pieces, [run.path for run in runs])
@@ -326,9 +326,9 @@ def _moves(model: Model, found: ClosedForm, rows: LinearisedSegments, task: Task
 def iterated_with_process(
     task: Task, now: Current, pieces: list[Piece]
 ) -> tuple[Current, Iteration]:
-    """GN with process noise: every interval linearised by itself, along a path that w moves too.
+    """One Gauss-Newton step with process noise: each interval is linearised by itself.
 
-    The objective is ‖W (y − x)‖² + Σ dᵢᵀ (Cov ηᵢ)⁻¹ dᵢ + ‖f‖², d what the field misses of the path.
+    The objective is ‖W (y − x)‖² + Σ dᵢᵀ (Cov ηᵢ)⁻¹ dᵢ + ‖f‖², d the defect of each interval.
     """
     segments, x, steps, rows = _by_interval(task, now, pieces)
     good = rows.counts.any((1, 2))
@@ -386,7 +386,7 @@ def _squares(x, defect, covariance, segments: Segments, counts, log_noise) -> Fl
 
 
 def _on_segments(paths, pieces: list[Piece], segments: Segments) -> Float[np.ndarray, "S L+1 n"]:
-    """The paths at the samples of each segment; behind the last one they stay."""
+    """The paths at the samples of each segment; after the last one they are constant."""
     x = np.repeat(np.asarray(segments.starts)[:, None], segments.measured.shape[1], axis=1)
     for s, (r, start, stop) in enumerate(pieces):
         x[s] = paths[r][stop - 1]
@@ -395,7 +395,7 @@ def _on_segments(paths, pieces: list[Piece], segments: Segments) -> Float[np.nda
 
 
 def _updated(paths, pieces: list[Piece], good, x: np.ndarray) -> list[np.ndarray]:
-    """The paths, those of the pieces that were kept along the field."""
+    """The paths, with those of the pieces that were kept replaced by x."""
     new = [path.copy() for path in paths]
     for s, (r, start, stop) in enumerate(pieces):
         if good[s] and np.isfinite(x[s]).all():
@@ -416,7 +416,7 @@ def _norms(field, X: Float[Array, "N d"], scale: Float[Array, " n"]) -> Float[Ar
 
 
 def _stiffness(field: Expansion, data: Preprocessed, paths: list[np.ndarray]) -> float:
-    """‖∂f/∂x‖ in standard deviations along the paths, but for the largest twentieth."""
+    """The .95 quantile of ‖∂f/∂x‖ along the paths, in standard deviations of the coordinates."""
     X = np.concatenate([run.joined(path) for run, path in zip(data.runs, paths, strict=True)])
     X = X[np.linspace(0, len(X) - 1, 256).round().astype(int)]
     norms = np.asarray(_norms(field, jnp.asarray(X), jnp.asarray(data.scale)))
@@ -424,7 +424,7 @@ def _stiffness(field: Expansion, data: Preprocessed, paths: list[np.ndarray]) ->
 
 
 def changed(task: Task, before: Current, now: Current) -> float:
-    """By how much the field has changed at the landmarks, relative to its size there."""
+    """The change of the field at the landmarks, relative to its size there."""
     old, new = (
         np.asarray(field_values(each.field, now.field.points)) / task.data.scale[None]
         for each in (before, now)
@@ -439,12 +439,12 @@ def field_values(field: Expansion, X: Float[Array, "N d"]) -> Float[Array, "N n"
 
 
 def price(end: End, impulse: Float[np.ndarray, " n"]) -> float:
-    """What process noise must gain in log p: Schwarz's ½ log N for each of its numbers."""
+    """The gain in log p that pays for process noise: Schwarz's ½ log N for each intensity."""
     return float(0.5 * np.isfinite(impulse).sum() * np.log(np.asarray(end.now.rows.counts).sum()))
 
 
 def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
-    """Whether anything says that the structure is not the whole truth.
+    """Whether anything suggests that the structure is not the whole truth.
 
     Iterations that did not settle, parts that were dropped, innovations that are not white, or rows
     that are likelier with process noise. Of innovations and rows it is not said where more
@@ -472,6 +472,6 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
 
 
 def likelier(without: End, process: End) -> End:
-    """That of both whose rows are the likelier, process noise at its price."""
+    """The likelier of both ends, process noise at its price."""
     more = price(process, np.asarray(process.now.model.log_process))
     return process if evidence(process) + more < evidence(without) else without

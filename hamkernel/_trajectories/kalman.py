@@ -36,7 +36,7 @@ from hamkernel._trajectories.segments import LinearisedSegments, linearised
 
 
 class Filtered(NamedTuple):
-    """What the filter makes of S segments.
+    """The output of the filter on S segments.
 
     Attributes:
         rows: E_c/√s, the samples in the last column, shape (S, L + 1, n, q); 0 where none is.
@@ -69,7 +69,7 @@ def filtered(
     start: Float[Array, "S n q"],
     start_deviation: Float[Array, " n"],
 ) -> Filtered:
-    """The rows of the columns that move by `local` in each interval, from `start`."""
+    """The whitened rows of columns E that grow by `local` in each interval, from `start`."""
     noise, n = jnp.exp(2 * model.log_noise), rows.residual.shape[-1]
 
     def measured(L, E, y, count):
@@ -113,7 +113,7 @@ def whiten(
     rows: LinearisedSegments,
     start_deviation,
 ) -> WhitenedRows:
-    """The rows with process noise and the starts integrated out, in the order of time."""
+    """The rows with process noise and starts integrated out, in the order of time."""
     local = columns(model.kernel, S, T, rows)
     local = jnp.concatenate([local, (rows.drive + rows.missed)[..., None]], axis=-1)
     start = jnp.zeros((*local.shape[:1], *local.shape[2:]), local.dtype)
@@ -128,7 +128,7 @@ def whiten(
 
 
 class SmoothedPath(NamedTuple):
-    """The path given the samples and a field, and what moved it besides.
+    """The path given the samples and a field, and the disturbance w that moved it besides.
 
     Attributes:
         moves: the path less x̂, shape (S, L + 1, n).
@@ -171,9 +171,9 @@ def smoothed_path(
 def linearised_by_interval(
     field: Expansion, x: Float[Array, "S L+1 n"], segments: Segments, steps, good
 ) -> LinearisedSegments:
-    """The rows along a path that the field need not follow; `missed` is by how much it does not.
+    """The rows along a path that the field need not follow; `missed` is each one's defect.
 
-    What is not finite is dropped.
+    Segments that are not finite are dropped.
     """
     (S, L), n, m = segments.spans.shape, x.shape[-1], segments.inputs.shape[-1]
     there = simulated(
@@ -204,13 +204,13 @@ def linearised_by_interval(
 def process_covariance(
     model: Model, rows: LinearisedSegments, least: Float[Array, " n"]
 ) -> Float[Array, "S L n n"]:
-    """Cov η of each interval, and the squares of `least` besides."""
+    """Cov η of each interval, plus the squares of `least` on its diagonal."""
     roots = process_roots(model.log_process, rows)
     return jnp.einsum("slab,slcb->slac", roots, roots) + jnp.diag(least**2)[None, None]
 
 
 def innovations(made: WhitenedRows, rows: LinearisedSegments) -> Float[np.ndarray, "S L+1 n"]:
-    """What each row says beyond those before it, in standard deviations; 0 where there is none.
+    """Each row less its prediction from those before it, in standard deviations; 0 without one.
 
     L⁻¹r with L Lᵀ = I + M Mᵀ, row after row: under the model they are independent and N(0, 1),
     which residuals of a fit are not, since every sample has a part in it. R w = v with noise of one
@@ -245,7 +245,7 @@ def innovations(made: WhitenedRows, rows: LinearisedSegments) -> Float[np.ndarra
 def as_observations(
     rows: LinearisedSegments, model: Model, mean: object, start_deviation: Float[Array, " n"]
 ) -> Together | None:
-    """What the samples say of f = g + m, with independent noise of variance one, block by segment.
+    """The samples as observations of f = g + m with independent unit noise, segment by segment.
 
     The whitened rows of g at the nodes, and r̃ + the same rows of m for targets. None where no
     segment has more samples than its start takes.
@@ -274,7 +274,7 @@ _means = compiled_by_size(means)
 
 @compiled_by_size
 def _at_nodes(model: Model, rows: LinearisedSegments, start_deviation):
-    """The rows of one segment by all values of g at its nodes, and what they are to be."""
+    """The rows of one segment as functionals of g at its nodes, and their targets."""
     _, L, _, n, _ = rows.weights.shape
     placed = jnp.einsum("lkab,lj->lajkb", rows.weights[0], jnp.eye(L, dtype=rows.weights.dtype))
     own = (rows.drive + rows.missed)[0][..., None]

@@ -205,7 +205,7 @@ def _first_noise(data: Preprocessed) -> Float[np.ndarray, " n"]:
 def _learned(
     runs: Runs, mean: Any, end: End, alone: End | None, given: bool, measured: np.ndarray
 ) -> Learned:
-    """The result, and the warnings that it asks for.
+    """The result; warns where it must.
 
     Args:
         runs: what was given.

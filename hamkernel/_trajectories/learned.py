@@ -66,14 +66,14 @@ class Learned(eqx.Module):
             leaves, shape (). It carries no information if σ was estimated from the same residuals.
             Where process noise was found it is that of the field without; where it was given, that
             of the innovations.
-        innovations: what each sample says beyond all before it, in standard deviations, for each
-            run, (T, n); NaN where nothing was measured or it was dropped. If model and noise are
-            right they are independent and N(0, 1). Of fast logs, whose samples are averaged, one a
-            mean.
+        innovations: each sample less its prediction from all samples before it, in standard
+            deviations, for each run, (T, n); NaN where nothing was measured or it was dropped. If
+            model and noise are right they are independent and N(0, 1). Fast logs, whose samples
+            are averaged, have one for each mean.
         whiteness: the probability that independent innovations are as correlated as these, by the
-            test of Ljung and Box over ten lags, shape (); where it is below .05 the structure, or
-            the timing of inputs, leaves something that moves on from sample to sample. It counts
-            against `converged` where it makes bands more than 1.2 times too narrow.
+            test of Ljung and Box over ten lags, shape (). Below .05 the structure, or the timing
+            of inputs, leaves residuals that persist from sample to sample; this counts against
+            `converged` where it makes bands more than 1.2 times too narrow.
         disturbance: the mean of w from each sample to the next as far as the samples know it, for
             each run, (T, n); 0 without process noise.
         history: one entry an iteration.
@@ -182,5 +182,5 @@ def misfits(runs: Runs, states: list[np.ndarray], noise: np.ndarray) -> np.ndarr
 
 
 def empty(n: int) -> Float[Array, "0 n"]:
-    """The residual of velocities, of which there were none."""
+    """Residuals of velocities, of which there are none."""
     return jnp.zeros((0, n))

@@ -1,4 +1,4 @@
-"""The field that the rows ask for, in closed form, and their marginal likelihood.
+"""The field given the rows, in closed form, and their marginal likelihood.
 
 In the span of landmarks S, g(x) = K(x, S) T w with T = L⁻ᵀ, L Lᵀ = K(S, S) and w ~ N(0, I). Rows
 divided by their noise, M = W B K(·, S) T and P = W Φ, are M w + P δz + ε with ε ~ N(0, I). The
@@ -48,21 +48,21 @@ def landmark_whitening(K: AbstractMatrixKernel, S: Float[Array, "m d"]) -> Float
     """T = L⁻ᵀ with L Lᵀ = K(S, S), q = m n."""
     G = forward_differentiated((K, S), KernelRows(S), rowwise=True)
     G = G.reshape(-1, G.shape[-1])
-    # Of each component by itself, which have different units; some are zero, as q̇ of a U(q).
+    # For each component by itself, since units differ; some are zero, such as q̇ for a U(q).
     d = jnp.diagonal(G)
-    # A hundred times it bounds how finely the landmarks resolve, and biases nothing.
+    # A hundred times the rounding bounds how finely landmarks resolve, and biases nothing.
     rounding = 100 * jnp.finfo(G.dtype).eps * len(G) * jnp.where(d > 0, d, d.mean())
     eye = jnp.eye(len(G), dtype=G.dtype)
     return solve_triangular(jnp.linalg.cholesky(G + jnp.diag(rounding)), eye, lower=True).T
 
 
 class Model(NamedTuple):
-    """A kernel, the noise and that of the process, as one vector h of hyperparameters.
+    """A kernel, sensor noise and process noise, as one vector h of hyperparameters.
 
     Attributes:
         kernel: the kernel.
         log_noise: log σ of each coordinate.
-        log_process: log q of each, −inf where the field is the whole truth.
+        log_process: log q of each coordinate, −inf where the field is the whole truth.
     """
 
     kernel: AbstractMatrixKernel
@@ -88,7 +88,7 @@ class WhitenedRows(NamedTuple):
     Attributes:
         M: what w adds to them, shape (D, q).
         r: their values, shape (D,).
-        constant: the part of −log p in which M̃ has none.
+        constant: the part of −log p that does not depend on M̃.
         start: QᵀM, Qᵀr and U of each segment, which give the starts back, where they were projected
             out.
     """
@@ -139,7 +139,7 @@ def project_out_starts(
     M = M - jnp.einsum("sdn,snq->sdq", Q, QM)
     r = r - jnp.einsum("sdn,sn->sd", Q, Qr)
     constant = jnp.log(jnp.diagonal(U, axis1=1, axis2=2)).sum()
-    # All samples that a row is the mean of: what they scatter about it knows σ, and not the field.
+    # The scatter of the samples about their mean depends on σ, and not on the field.
     samples, scatter = (a.sum(axis=(0, 1)) for a in (rows.counts, rows.scatter))
     constant = constant + samples @ log_noise + 0.5 * scatter @ jnp.exp(-2 * log_noise)
     return WhitenedRows(M.reshape(-1, q), r.reshape(-1), constant, (QM, Qr, U))
@@ -161,8 +161,8 @@ def no_rows(q: int, dtype) -> Float[Array, "k k"]:
 def regression_loss(M: Float[Array, "D q"], r: Float[Array, " D"]) -> Float[Array, ""]:
     """½(‖r − Mw‖² + ‖w‖² + log det(I + MᵀM)) at its least w.
 
-    Its derivatives are M(I + MᵀM)⁻¹ − (r − Mw)wᵀ in M and r − Mw in r. The first is taken as
-    (MR⁻¹)R⁻ᵀ, and MR⁻¹ is bounded by one however little noise there is.
+    Its derivatives are M(I + MᵀM)⁻¹ − (r − Mw)wᵀ in M and r − Mw in r. The first term is computed
+    as (MR⁻¹)R⁻ᵀ, since MR⁻¹ is bounded by one however small the noise is.
     """
     return _regression(M, r)[0]
 
@@ -187,13 +187,13 @@ regression_loss.defvjp(_regression, _regression_backward)
 
 
 class Condensed(NamedTuple):
-    """All that rows say of w, in O(q²) memory.
+    """What the rows say about w, in O(q²) memory.
 
     Attributes:
         T: the whitening of the landmarks, shape (q, q).
         triangle: of the QR factorisation of (M̃, r̃), shape (q + 1, q + 1).
         start: QᵀM, Qᵀr and U of each segment, as `WhitenedRows` has them.
-        constant: the part of −log p in which M̃ has none.
+        constant: the part of −log p that does not depend on M̃.
         scatter: the sum of squares of samples about the rows that are their means, in units of σ².
         samples: how many samples there are, less n for each start.
         rows: the number of rows, less n for each start.
@@ -215,8 +215,8 @@ class ClosedForm(NamedTuple):
         weights: w, shape (q,); ‖f‖² = ‖w‖².
         points: the landmarks, shape (m, d).
         coefficients: T w, shape (m, n).
-        moves: δz, by how much the start of each segment moves, shape (S, n).
-        free: the number of rows less that of the parameters they have determined, shape ().
+        moves: δz, the correction of the start of each segment, shape (S, n).
+        free: the number of rows less the number of parameters that they determine, shape ().
         used: that number of parameters.
         squares: ‖r̃ − M̃w‖².
         loss: −log p(rows), but for a constant.
@@ -239,7 +239,7 @@ def condensed(
     """The rows in the triangle of their QR factorisation, a strip at a time."""
     T = landmark_whitening(model.kernel, S)
     (size, samples, n), q = rows.counts.shape, len(T)
-    # Strips of twice as many rows as columns: less, and most of the work would be the triangle's.
+    # Strips have twice as many rows as columns: with fewer, most of the work is the triangle's.
     count = 1
     while size % (2 * count) == 0 and size // (2 * count) * samples * n >= 2 * q:
         count *= 2
@@ -263,7 +263,7 @@ def condensed(
 def conditional(known: Condensed, S, shift: Array | float = 0.0) -> ClosedForm:
     """The field and the starts for rows whose noise is exp(shift) times what it was.
 
-    All rows scale together but for the prior of the starts, which is so wide that it says nothing.
+    The prior of the starts does not scale with the rows; it is too wide for that to matter.
     """
     q, scale = len(known.T), jnp.exp(-shift)
     there = scale * known.triangle
@@ -286,5 +286,5 @@ def conditional(known: Condensed, S, shift: Array | float = 0.0) -> ClosedForm:
 def closed_form(
     model: Model, S, rows: LinearisedSegments, start_deviation, whitening: Whitening
 ) -> ClosedForm:
-    """The field and the starts that the rows ask for."""
+    """The field and the starts given the rows."""
     return conditional(condensed(model, S, rows, start_deviation, whitening), S)

@@ -1,9 +1,9 @@
-"""The runs before anything is learned of the field: condensed, smoothed, completed.
+"""The runs before the field is learned: condensed, smoothed, completed.
 
 Samples that are much closer in time than the motion needs are averaged in blocks. A block becomes
 one sample in its middle: the smoothed path there plus the mean of the block's residuals, whose
-noise is σ/√count. The bias of that sample is of second order in the error of the smoothed path. How
-the block scatters about its mean is kept, since it knows σ.
+noise is σ/√count. The bias of that sample is of second order in the error of the smoothed path. The
+scatter of the block about its mean is kept, since it determines σ.
 """
 
 import functools
@@ -115,7 +115,7 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
 
 
 def averaging_time(found: list[Coordinate], times, deviation: Float[np.ndarray, "R T n"]) -> float:
-    """The time of as many samples as smoothing averages, σ²/Var x(t), in the coordinate of fewest.
+    """The time of the σ²/Var x(t) samples that smoothing averages, the least of all coordinates.
 
     In a longer block the path bends with the noise, and the block's sample is not as exact as
     σ/√count says. On nine logs at 50 Hz of a driven pendulum the squares of the errors were 1.88,
@@ -144,7 +144,7 @@ def _shortest_block(duration: float, n: int, inputs: int) -> float:
 
 
 def with_inputs(data: Preprocessed, runs: Runs) -> Preprocessed:
-    """The same runs with the inputs of `runs`, which may differ in how they go on."""
+    """The same runs with the inputs of `runs`, which may go on differently between samples."""
     return data._replace(
         runs=[
             run._replace(inputs=runs.applied(r, run.times + float(np.asarray(runs.times[r])[0])))
@@ -182,17 +182,17 @@ def decided(
 
 
 def _spacing(runs: Runs) -> float:
-    """Of the inputs, or of the states where these are further apart: what may be misaligned."""
+    """The median spacing of the inputs, or of the states where these are further apart."""
     assert runs.input_times is not None
     both = [*runs.times], [*runs.input_times]
     return max(float(np.median(np.concatenate([np.diff(t) for t in each]))) for each in both)
 
 
 def _least(loss: Callable[[float], float], spacing: float) -> None:
-    """Ask for the loss near its minimum: at whole spacings downhill from none, then parabolas.
+    """Evaluate the loss near its minimum: downhill in whole spacings from 0, then by parabolas.
 
-    −log p is a sum of squares in the delay, nearly, so that a parabola through three points finds
-    the least one; a second and third through points that are closer settle it.
+    −log p is nearly quadratic in the delay, so that a parabola through three points finds its
+    minimum; a second and a third one through closer points settle it.
     """
     known = {d: loss(d) for d in (-spacing, 0.0, spacing)}
     while (best := min(known, key=known.__getitem__)) in (min(known), max(known)):
@@ -210,10 +210,10 @@ def _least(loss: Callable[[float], float], spacing: float) -> None:
 
 
 def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:
-    """The processes, without runs that are five times as far from them as half of the others.
+    """The processes, without runs that are five times as far from them as the median run.
 
-    In units of the states. A thousandth of those is no reason: of exact runs the smoother leaves
-    that, most of it in the fastest one.
+    In standard deviations of the states; up to a thousandth of those no run is left out, since of
+    exact runs the smoother leaves that, most of it in the fastest one.
     """
     found = processes(times, states)
     if len(times) < 3:
@@ -280,7 +280,7 @@ def _with_paths(found, times, states, counts, scatter, inputs, gap: float) -> li
 
 
 def _completed(run: PreprocessedRun, mean: Callable[[Array], Array] | None) -> PreprocessedRun:
-    """The run with coordinates that it never measured found from how they move the others.
+    """The run with its unmeasured coordinates found from how they move the others.
 
     Given q̇ and a mean with q̇ = p/m, that is p = m q̇; in general Newton's method for the
     coordinates that explain the slopes.
@@ -311,7 +311,7 @@ def _completed(run: PreprocessedRun, mean: Callable[[Array], Array] | None) -> P
 
 @compiled_by_size
 def _solved_for(mean, X, U, slopes, missing):
-    """X with its missing coordinates such that the mean has the slopes of the others."""
+    """X with its missing coordinates such that the mean equals the slopes of the others."""
     on = jnp.asarray(missing)
 
     def one(x, u, slope):
@@ -319,8 +319,8 @@ def _solved_for(mean, X, U, slopes, missing):
             f, D = with_tangent(mean, jnp.concatenate([x, u]), len(x))
             D = jnp.where(on[None, :] & ~on[:, None], D, 0.0)
             wrong = jnp.where(on, 0.0, slope - f)
-            # In units in which every coordinate moves the others by as much; one that moves none
-            # of them stays where it is.
+            # In units in which every coordinate moves the others equally; one that moves none of
+            # them stays where it is.
             unit = jnp.linalg.norm(D, axis=0)
             unit = jnp.where(unit > 0, unit, jnp.ones_like(unit))
             D = D / unit[None]

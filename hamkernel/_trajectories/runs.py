@@ -1,15 +1,16 @@
-"""`Runs`: what was logged, with what is wrong with it said at once, and inputs between samples.
+"""`Runs`: what was logged, checked at once, and the inputs between its samples.
 
-What was applied between samples is a line in each interval, its ends of shape (…, 2, m). Held
-inputs are lines that do not rise. Where samples were averaged an interval spans many of the log,
-and where inputs are smooth they bend in it: its line is the best one in the mean square, so that
-the impulse ∫u dt and its first moment are kept exactly.
+In each interval the input is a line, given by its two ends, shape (…, 2, m); a held input is a
+constant one. Where samples were averaged an interval spans many samples of the log, and smooth
+inputs bend within it: the line is then the best one in the mean square, which keeps the impulse
+∫u dt and its first moment exactly.
 
 "smooth" is the cubic spline through the samples. Of a sinusoid sampled with the phase step φ it
 misses 5φ⁴/384, 1.6 % at six samples a period and .1 % at twelve, where lines miss φ²/8 (14 and
 3 %) and held inputs φ. The band-limited interpolation Σ u_j sinc(t/h − j) misses nothing of a
-sinusoid without end; it needs even times, and what lies before the first sample and behind the last
-is felt as 1/k after k samples, and in a spline as (√3 − 2)ᵏ = .27ᵏ.
+sinusoid without end; it needs even times, and the error that the unknown inputs before the first
+sample and after the last one cause falls as 1/k over k samples, that of a spline as
+|√3 − 2|ᵏ = .27ᵏ.
 """
 
 from __future__ import annotations
@@ -80,11 +81,11 @@ def values(
     at: Float[np.ndarray, " P"],
     between: Between,
 ) -> Float[np.ndarray, "P m"]:
-    """The inputs at other times; before the first sample and behind the last they stay."""
+    """The inputs at other times; before the first sample and after the last they are constant."""
     at = np.clip(at, t[0], t[-1])
     if between == "smooth":
         return interpolated(at, t, u, spline_slopes(t, u))
-    # Held inputs change at a sample, and what is said of the last one ends there.
+    # Held inputs change at a sample, and a value that is held ends at the next one.
     i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 1 - (between == "linear"))
     if between == "held":
         return u[i]
@@ -121,7 +122,7 @@ def in_intervals(
 
 
 def at_samples(ends: Float[np.ndarray, "intervals 2 m"]) -> Float[np.ndarray, "R m"]:
-    """U at the ends of the intervals, where it jumps the mean of both sides."""
+    """U at the ends of the intervals; where it jumps, the mean of both sides."""
     before, after = (
         np.concatenate([ends[:1, 0], ends[:, 1]]),
         np.concatenate([ends[:, 0], ends[-1:, 1]]),
@@ -241,13 +242,13 @@ class Runs(eqx.Module):
 
     @property
     def dimension(self) -> int:
-        """n, the number of coordinates of a state."""
+        """The number n of coordinates of a state."""
         return self.states[0].shape[1]
 
     def velocities(
         self,
     ) -> tuple[Float[Array, "N n"], Float[Array, "N n"], Int[Array, " N"]]:
-        """Smoothed states X, their velocities Y, and the run of each, for `hk.fit` and `hk.tune`.
+        """Smoothed states X, their velocities Y and run labels, for `hk.fit` and `hk.tune`.
 
         Every coordinate is a Gaussian process in time (Matérn-7/2), whose lengthscale, amplitude
         and noise come from the marginal likelihood of all runs. Linear in the number of samples.
@@ -270,12 +271,12 @@ class Runs(eqx.Module):
         return X, Y, jnp.asarray(np.repeat(np.arange(len(times)), lengths))
 
     def smoothing(self, between: int = 0) -> Smoothing:
-        """The smoothed states and how far they may be off: what `hk.plot.smoothing` draws.
+        """The smoothed states with their standard deviations: what `hk.plot.smoothing` draws.
 
         The processes in time are those of `velocities`.
 
         Args:
-            between: how many times between each two samples are smoothed besides.
+            between: at how many times between each two samples the states are smoothed, too.
 
         Raises:
             ValueError: `between` is negative. TypeError: it is no integer.
@@ -293,20 +294,20 @@ class Runs(eqx.Module):
 
     @property
     def input_count(self) -> int:
-        """m, the number of inputs or parameters; 0 where there are none."""
+        """The number m of inputs or parameters; 0 where there are none."""
         given = self.inputs or self.parameters
         return given[0].shape[-1] if given else 0
 
     @property
     def is_decided(self) -> bool:
-        """Whether `between` and `delay` are given, and not for `learn` to find."""
+        """Whether `between` and `delay` are both given rather than left to `learn`."""
         return self.inputs is None or (self.between != "auto" and self.delay != "fit")
 
     def applied(self, run: int, at: Float[np.ndarray, " R"]) -> Float[np.ndarray, "R-1 2 m"]:
         """The best line of the inputs in each interval of the times `at`, by its ends.
 
-        With parameters they are those of the run, always. What is not decided yet stands as linear,
-        and as no delay.
+        The parameters of a run are its inputs at all times. While `between` or `delay` is not
+        decided yet, inputs are linear, or without delay.
         """
         if self.parameters is not None:
             return np.tile(np.asarray(self.parameters[run], float), (len(at) - 1, 2, 1))
@@ -318,7 +319,7 @@ class Runs(eqx.Module):
         return in_intervals(t, u, np.asarray(at) - delay, between)
 
     def going_on(self, between: Between, delay: float) -> "Runs":
-        """The same runs with inputs that go on so; what was checked and warned of is not again."""
+        """The same runs with inputs that go on in this way; nothing is checked again."""
         new = object.__new__(Runs)
         given = {"between": between, "delay": delay}
         for field in dataclasses.fields(self):

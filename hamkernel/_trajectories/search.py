@@ -1,7 +1,7 @@
-"""Hyperparameters: their bounds, a design of first points, and the search for the likeliest.
+"""The search for the likeliest hyperparameters: bounds, a design of first points, BFGS.
 
-A gradient in the hyperparameters makes K anew for each of them. Where rows are many it is taken on
-some windows of them, which are as likely as any others, and on the first of the landmarks.
+Each gradient in the hyperparameters evaluates K anew. Of many rows the search therefore uses a
+sample of windows, and the first of the landmarks.
 """
 
 from typing import NamedTuple
@@ -31,15 +31,15 @@ from hamkernel._tuning.space import gram_trace, hyperparameters
 
 
 class Bounds(NamedTuple):
-    """Where hyperparameters are looked for, and which of them move."""
+    """The box of the hyperparameters, and which of them are free."""
 
     low: Float[np.ndarray, " P"]
     high: Float[np.ndarray, " P"]
     free: Bool[np.ndarray, " P"]
 
 
-# Entries of K at nodes while hyperparameters are looked for: a search with n = 8 takes 4 to 10 s.
-# All rows of 20 runs of 50 samples on 128 landmarks have 25 million, and 46 s went by before it.
+# Entries of K at nodes in the search of hyperparameters: with n = 8 it takes 4 to 10 s.
+# All rows of 20 runs of 50 samples on 128 landmarks have 25 million, and took 46 s.
 _ENTRIES = 1_000_000
 
 
@@ -67,7 +67,7 @@ def losses(
 def searched(
     S: Float[Array, "m d"], rows: LinearisedSegments
 ) -> tuple[Float[Array, "k d"], LinearisedSegments]:
-    """The landmarks and rows on which hyperparameters are looked for: all, if they are few.
+    """The landmarks and rows on which hyperparameters are searched: all, if they are few.
 
     Of many rows some windows. If the landmarks are too many for them, one in the middle of each
     interval of the windows, which for a field that is smooth over an interval is as good as all.
@@ -99,7 +99,7 @@ def _best(
     def loss(h):
         return _loss(model, jnp.where(free, h, start), S, rows, start_deviation, whitening)
 
-    # Of log σ a sample of N knows 1/√(2N); a lengthscale or an amplitude is known to some tenths.
+    # N samples determine log σ to 1/√(2N); a lengthscale or an amplitude is known to some tenths.
     count = jnp.maximum(rows.counts.sum(axis=(0, 1)), 1)
     kernel = jnp.full(start.size - 2 * count.size, 0.2, start.dtype)
     noise = 1 / jnp.sqrt(2 * count)
@@ -117,7 +117,7 @@ def most_likely(
     steps: int,
     whitening: Whitening,
 ) -> tuple[Model, float]:
-    """The model whose rows are the most likely, by BFGS from this one, and −log p there.
+    """The model under which the rows are likeliest, by BFGS from this one, and −log p there.
 
     Of many rows some windows, see `searched`, and −log p of those.
     """
@@ -231,14 +231,14 @@ def bounds_and_design(
         X: states, with inputs the points (x, u).
         Y: their velocities.
         scale: the standard deviations of the coordinates.
-        moves: the coordinates whose noise is looked for.
+        moves: the coordinates whose noise is estimated.
         spacing: the least lengthscale, in standard deviations of the coordinates.
-        impulse: the noise of the process that would be all of the motion, shape (n,); −inf where
-            it is not looked for. None where it is nowhere.
+        impulse: log of the process noise that would explain all of the motion, shape (n,); −inf
+            in coordinates without process noise, None if no coordinate has any.
     """
     speed = float(np.sqrt(np.mean(Y**2)))
     leaves = hyperparameters(model.kernel, jnp.asarray(X), speed, jnp.asarray(X))
-    start = np.asarray(model.flat)[: -len(scale)]  # without the noise of the process
+    start = np.asarray(model.flat)[: -len(scale)]  # without process noise
     size = len(start) - len(scale)
     most = np.maximum(scale, np.exp(start[size:]))  # where next to nothing moves
     low = np.concatenate([*(p.low.ravel() for p in leaves), np.log(1e-7 * scale)])
@@ -287,11 +287,11 @@ def bounds_and_design(
 
 
 def _with_friction(design: list[np.ndarray], forces, middle) -> list[np.ndarray]:
-    """The design, and its points with forces of a friction of a third of all that move the states.
+    """The design, and its points with friction of a third of all forces.
 
-    They are amplitudes too: from the caller's alone the search ended without the viscous one, 63
-    nats above the best, in one of six logs of three runs, of which two were then lost. The middle
-    of its box is the force that is all of the motion.
+    Coefficients of friction are amplitudes too: from the caller's alone the search ended without
+    viscous friction in one of six logs of three runs, 63 nats above the best, and two of the runs
+    were lost. The middle of the box is a friction as large as all forces together.
     """
     if not forces.any():
         return design
@@ -317,7 +317,7 @@ def _extents(leaf: np.ndarray, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray,
 
 
 def _amplified(model: Model, h, scales, X, Y):
-    """The point h, its amplitudes such that a velocity of the prior is twice one that was seen."""
+    """The point h with amplitudes at which velocities of the prior are twice those observed."""
     if not scales.any():
         return h
     full = jnp.concatenate([jnp.asarray(h), model.log_process])
@@ -330,9 +330,9 @@ def _amplified(model: Model, h, scales, X, Y):
 
 
 def impulses(K: AbstractMatrixKernel, S, Y, data: Preprocessed) -> Float[np.ndarray, " n"]:
-    """The logarithm of the process noise that would move each coordinate as the field does.
+    """The logarithm of the process noise that would move each coordinate as much as the field does.
 
-    That is its velocity times the root of the time in which it does so. −inf where K moves nothing.
+    It is the velocity times the root of the time over which it lasts; −inf where K moves nothing.
     """
     prior = np.asarray(KernelRows(S).rows(K, S)).reshape(len(S), len(data.scale), -1)
     velocity = np.sqrt(np.mean(Y**2, axis=0))
@@ -343,7 +343,7 @@ def impulses(K: AbstractMatrixKernel, S, Y, data: Preprocessed) -> Float[np.ndar
 
 
 def landmark_spacing(X, S, scale: Float[np.ndarray, " n"]) -> float:
-    """How far a point of X may be from all landmarks, in standard deviations.
+    """The largest distance of a point of X from its nearest landmark, in standard deviations.
 
     A field of shorter lengthscale has ripples between the landmarks.
     """

@@ -1,12 +1,13 @@
-"""Measured states as linear functionals of the field, along a path that is nearly right.
+"""Measured states as linear functionals of the field, linearised about a path.
 
 With x̂ the path, Φ its tangent, m the mean and τ_k Gauss nodes with weights w_k, a sample is
 
     x(tᵢ) ≈ x̂(tᵢ) + Φᵢ δz + Σ_{τ_k < tᵢ} w_k Φᵢ Φ_k⁻¹ (f(x̂(τ_k)) − d x̂/dt(τ_k)),
 
 so with g = f − m, and ô the same sum of d x̂/dt − m, xᵢ − x̂ᵢ + ôᵢ = Φᵢ δz + (B g)ᵢ. The sums run
-from interval to interval, sᵢ₊₁ = Ψᵢ sᵢ + Σ_k Γ_ik (…)_k, and no matrix B is stored. To ô each one
-adds its `drive`, and what the path moves besides, where it solves no equation, is `missed`.
+from interval to interval, sᵢ₊₁ = Ψᵢ sᵢ + Σ_k Γ_ik (…)_k, and no matrix B is stored. Each
+interval adds its `drive` to ô; where the path solves no equation, `missed` is the rest of its
+increment.
 
 The path is that of the current field, or any other, such as a smoothed one: then Φ is the tangent
 of the mean alone, the identity where there is none.
@@ -48,16 +49,17 @@ class LinearisedSegments(NamedTuple):
     """What the samples say of g = f − m, before the starts are projected out.
 
     Attributes:
-        nodes: where g is asked for, shape (S, L, 3, d), d = n + m with inputs: points (x, u).
+        nodes: where g is evaluated, with inputs the points (x, u), d = n + m, shape (S, L, 3, d).
         across: Ψ, shape (S, L, n, n).
         weights: Γ, shape (S, L, 3, n, n).
         spans: the lengths of the intervals, shape (S, L).
         drive: Σ_k Γ_k (d x̂/dt − m)_k, shape (S, L, n).
-        missed: by how much x̂ moves otherwise than d x̂/dt says, 0 for a solution, the same shape.
+        missed: the increment of x̂ less that of the Gauss rule for d x̂/dt, 0 for a solution, the
+            same shape.
         residual: x − x̂, shape (S, L + 1, n).
         counts: those of the segments, zero on what was dropped.
         scatter: those of the segments, zero on what was dropped.
-        prior_offset: where the prior of the start has its middle, relative to x̂, shape (S, n).
+        prior_offset: the mean of the prior of the start, relative to x̂, shape (S, n).
     """
 
     nodes: Float[Array, "S L 3 d"]
@@ -102,7 +104,7 @@ def linearised(
     good: Bool[Array, " S"],
     is_solution: bool,
 ) -> LinearisedSegments:
-    """The rows along a path of which the slopes and the mean at the nodes are known.
+    """The rows along a path, given its slopes and the mean at the nodes.
 
     Args:
         path: a path, with tangents of the field along it or of the mean.
@@ -143,10 +145,9 @@ def linearised(
 
 
 def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
-    """The rows, or windows of them, evenly from all segments, that have at most so many samples.
+    """The rows, or windows of them, evenly from all segments, with at most `samples` samples.
 
-    What a window says of the field is what its part of the segment says if the start of that part
-    is not known.
+    The start of a window is unknown, as that of a segment is.
     """
     seen: Any = np.asarray(rows.counts).any(axis=2)
     if seen.size <= samples or not seen[:, 1:].any():
@@ -256,7 +257,7 @@ def _linearised_along_smoothed(mean, along, good, segments: Segments) -> Lineari
 
 
 SHORT = 12  # samples at most in a segment while the field is rough; 10 gave the same errors
-LONG = 256  # at most: the tangent of a longer path says little more, and arrays stay small
+LONG = 256  # at most: longer segments add little information, and arrays stay small
 
 
 def equal_pieces(runs: list[PreprocessedRun], most: int) -> list[Piece]:
@@ -287,7 +288,7 @@ def _equal(run: int, start: int, stop: int, most: int) -> list[Piece]:
 def grown(
     runs: list[PreprocessedRun], pieces: list[Piece], good: Bool[np.ndarray, " S"]
 ) -> list[Piece]:
-    """Runs of which all pieces are good in one piece, up to `LONG` samples; others as they are."""
+    """Runs whose pieces are all good in one piece, up to `LONG` samples; the others as they are."""
     lost = {piece.run for piece, is_good in zip(pieces, good, strict=True) if not is_good}
     whole = [piece for piece in equal_pieces(runs, LONG) if piece.run not in lost]
     return whole + [piece for piece in pieces if piece.run in lost]

@@ -10,7 +10,7 @@ from hamkernel import _require as require
 
 
 def warn_of_gaps(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> None:
-    """Say where an angle was wrapped, a gap is long, and a coordinate never moves."""
+    """Warn where an angle was wrapped, a gap is long, or a coordinate never moves."""
     gaps, jumps, still = [], [], []
     for run, (t, x) in enumerate(zip(times, states, strict=True)):
         dt = np.diff(t)
@@ -45,7 +45,7 @@ _QUANTA = 4.0  # the steps of a log, above which a repeat is no rounding of a se
 
 
 def warn_of_sensors(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> None:
-    """Say which coordinates look clipped, stuck, repeated or interpolated."""
+    """Warn of coordinates that look clipped, stuck, repeated or interpolated."""
     X = np.concatenate(states)
     scale = np.array([np.nanstd(x) if np.isfinite(x).any() else np.nan for x in X.T])
     unit = np.where(scale > 0, scale, 1.0)
@@ -108,10 +108,10 @@ def warn_of_sensors(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -
 
 
 def _straight(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> float:
-    """The share of samples on the line of their neighbours, of those where these differ.
+    """The share of samples on the line of their neighbours, among those whose neighbours differ.
 
-    Zero where fewer than ten are off it, as in a motion without forces but for some collisions, and
-    where the angle was wrapped.
+    Zero where fewer than ten samples lie off their line, as in free motion with a few collisions,
+    and where the angle was wrapped.
     """
     off = [np.zeros(0)]
     for t, x in zip(times, columns, strict=True):
@@ -142,7 +142,7 @@ def _plateaus(x: Float[np.ndarray, " T"], value: float, quantum: float) -> int:
 
 
 def _stuck(x: Float[np.ndarray, " T"], others: Float[np.ndarray, "T others"]):
-    """The longest stretch without a change in which another coordinate moves by more than one."""
+    """The longest stretch of equal values in which another coordinate moves by more than one."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], x[1:] == x[:-1], [False]]).astype(int)))
     if not edges.size or not others.size:
         return None
@@ -155,7 +155,7 @@ def _stuck(x: Float[np.ndarray, " T"], others: Float[np.ndarray, "T others"]):
 
 
 def warn_of_feedback(states: Sequence[np.ndarray], inputs: Sequence[np.ndarray]) -> None:
-    """Say which inputs are a smooth function of the states: a cubic of them, or a linear one."""
+    """Warn of inputs that are a smooth function of the states: a cubic polynomial at most."""
     X, U = np.concatenate(states), np.concatenate(inputs)
     X = X[:, np.isfinite(X).any(axis=0)]
     use = np.isfinite(X).all(axis=1)
@@ -194,7 +194,7 @@ def warn_of_feedback(states: Sequence[np.ndarray], inputs: Sequence[np.ndarray])
 
 
 def _is_wrapped(t: Float[np.ndarray, " T"], x: Float[np.ndarray, " T"]) -> bool:
-    """Whether x has steps of about 2π, while all its other steps are less than a third of that."""
+    """Whether x has steps of about 2π, and no other steps of more than a third of that."""
     t, x = t[np.isfinite(x)], x[np.isfinite(x)]
     near = np.diff(t) <= 3 * np.median(np.diff(t)) if len(t) > 1 else slice(0)
     step = np.abs(np.diff(x))[near]  # across a gap a momentum may go as far

@@ -32,13 +32,13 @@ from hamkernel._tuning.minimiser import most_likely_in_box
 
 
 class Padded(NamedTuple):
-    """Runs side by side. Behind the end of a run its last time is repeated and nothing was seen.
+    """Runs side by side. After the end of a run its last time is repeated, with nothing measured.
 
     Attributes:
         times: since the first sample of the run, shape (R, T).
         states: zero where nothing was measured, shape (R, T, n).
         seen: what was measured.
-        lengths: the samples of each run; 0 for a run that is padding.
+        lengths: how many samples each run has; 0 for a run that is padding.
     """
 
     times: Float[np.ndarray, "R T"]
@@ -123,7 +123,7 @@ def _stationary(process: Process) -> Float[Array, "4 4"]:
 
 
 def _filtered(process: Process, steps, y, seen):
-    """One pass forward; what the backward pass needs of each time, and the log likelihood.
+    """The forward pass: what the backward pass needs at each time, and the log likelihood.
 
     `steps` are the times since the sample before, and 0 for the first.
     """
@@ -246,8 +246,8 @@ def _process(steps, y, seen, longest: float, spacing: float) -> Coordinate:
     if not scale > 0:  # never measured, or constant
         nothing = Process(*(jnp.asarray(v) for v in (-np.inf, -np.log(longest), -np.inf)))
         return Coordinate(nothing, bool(seen.any()))
-    # A swing of a hundred spans of the data looks like a line; one faster than half of a sample,
-    # like noise. The noise is at least what the digits of the states leave.
+    # A swing a hundred times as long as the data looks like a line; one faster than half a sample,
+    # like noise. The noise is at least the rounding of the states.
     low = np.log([0.3, 0.03 / longest, 1e-7])
     high = np.log([1e3, 3.0 / spacing, 2.0])
     found = _found(jnp.asarray(steps), jnp.asarray(y / scale), jnp.asarray(seen), low, high)
@@ -327,10 +327,10 @@ def smoothed(
 
 
 class Smoothing(eqx.Module):
-    """Runs smoothed one coordinate at a time, for a look at them; no field is asked.
+    """Runs smoothed one coordinate at a time, to be looked at; no field is involved.
 
     Attributes:
-        times: of each run, shape (P,): its samples and what was asked for between them.
+        times: of each run, shape (P,): those of its samples, and those asked for in between.
         states: the smoothed states there, shape (P, n); NaN where never measured.
         deviation: the standard deviation of each coordinate, the sensor noise left out, (P, n).
         noise: the standard deviation of the sensor noise of each coordinate, shape (n,).
@@ -346,7 +346,7 @@ class Smoothing(eqx.Module):
 
 
 def smoothing(times: Sequence[np.ndarray], states: Sequence[np.ndarray], between: int) -> Smoothing:
-    """The runs at their samples and at so many times between each two."""
+    """The smoothed runs at their samples and at `between` times between each two."""
     found = processes(times, states)
     grids, wide = [], []
     for t, x in zip(times, states, strict=True):
