@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 import scipy.linalg
 from scipy.integrate import solve_ivp
-from scipy.interpolate import CubicSpline
 
 import hamkernel as hk
 from hamkernel._trajectories.flow import NODES, Segments, jacobians, means, simulated
@@ -42,7 +41,13 @@ def held(t, u, at):
 
 
 def spline(t, u, at):
-    return CubicSpline(t, u)(at)
+    """The interpolant of least ∫(u‴)² dt: quadratics and |t − tⱼ|⁵, orthogonal to quadratics."""
+    V = np.vander(t, 3)
+    system = np.block([[np.abs(t[:, None] - t) ** 5, V], [V.T, np.zeros((3, 3))]])
+    values = np.concatenate([u, np.zeros((3, *u.shape[1:]))])
+    return np.hstack([np.abs(at[:, None] - t) ** 5, np.vander(at, 3)]) @ np.linalg.solve(
+        system, values
+    )
 
 
 WAYS = {"held": held, "linear": lambda t, u, at: np.interp(at, t, u), "smooth": spline}
@@ -75,12 +80,14 @@ def test_inputs_between_the_samples_of_a_log_are_as_they_were_said():
     assert in_intervals(t, u[:, :0], t, "held").shape == (3, 2, 0)
 
 
-@pytest.mark.parametrize("count", [2, 3, 4, 5, 17])
-def test_smooth_inputs_are_the_cubic_spline_of_scipy(count):
+@pytest.mark.parametrize("count", [2, 3, 4, 5, 12])
+def test_smooth_inputs_are_the_interpolant_of_least_third_derivative(count):
     rng = np.random.default_rng(count)
-    t, u = np.sort(rng.uniform(0, 1, count)), rng.normal(size=(count, 2))
+    t, u = np.linspace(0, 1, count), rng.normal(size=(count, 2))
+    t[1:-1] += rng.uniform(-0.3, 0.3, count - 2) / count
     at = np.linspace(t[0], t[-1], 50)
-    np.testing.assert_allclose(values(t, u, at, "smooth"), CubicSpline(t, u)(at), atol=1e-9)
+    expected = spline(t, u, at) if count > 2 else u[0] + at[:, None] * (u[1] - u[0])
+    np.testing.assert_allclose(values(t, u, at, "smooth"), expected, atol=1e-8)
     outside = values(t, u, np.array([-1.0, 2.0]), "smooth")
     np.testing.assert_allclose(outside, u[[0, -1]], atol=1e-12)  # they stay
 
@@ -114,7 +121,7 @@ def test_a_driven_oscillator_follows_smooth_inputs_ten_times_as_well(per_period)
         found, true = responses(per_period, between)
         error[between] = np.sqrt(np.mean((found - true) ** 2) / np.mean(true**2))
     assert error["smooth"] < 0.1 * error["linear"] < 0.1 * error["held"]
-    assert error["smooth"] < 0.01  # 1.6 % of the input are missed at most, at six a period
+    assert error["smooth"] < 0.01
 
 
 def test_inputs_have_times_of_their_own_and_act_late():

@@ -5,12 +5,11 @@ constant one. Where samples were averaged an interval spans many samples of the 
 inputs bend within it: the line is then the best one in the mean square, which keeps the impulse
 ∫u dt and its first moment exactly.
 
-"smooth" is the cubic spline through the samples. Of a sinusoid sampled with the phase step φ it
-misses 5φ⁴/384, 1.6 % at six samples a period and .1 % at twelve, where lines miss φ²/8 (14 and
-3 %) and held inputs φ. The band-limited interpolation Σ u_j sinc(t/h − j) misses nothing of a
+"smooth" is the natural quintic spline through the samples. Of a sinusoid it misses 2e-3 at four
+samples a period, 1.3e-4 at six and 1.5e-6 at twelve, where the cubic one misses .08, .016 and .001,
+lines .31, .14 and .03. The band-limited interpolation Σ u_j sinc(t/h − j) misses nothing of a
 sinusoid without end; it needs even times, and the error that the unknown inputs before the first
-sample and after the last one cause falls as 1/k over k samples, that of a spline as
-|√3 − 2|ᵏ = .27ᵏ.
+sample and after the last one cause falls as 1/k over k samples, that of this spline as .43ᵏ.
 """
 
 from __future__ import annotations
@@ -21,17 +20,15 @@ from collections.abc import Sequence
 from typing import Any, Literal, get_args
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
-from hamkernel._trajectories.flow import NODES, WEIGHTS
+from hamkernel._trajectories.flow import NODES
 from hamkernel._trajectories.sensors import warn_of_feedback, warn_of_gaps, warn_of_sensors
 from hamkernel._trajectories.smoothing import (
     Smoothing,
-    interpolated,
     processes,
     smoothed,
     smoothing,
@@ -40,39 +37,20 @@ from hamkernel._trajectories.smoothing import (
 Between = Literal["held", "linear", "smooth"]
 
 
-def spline_slopes(
-    t: Float[np.ndarray, " T"], u: Float[np.ndarray, "T m"]
-) -> Float[np.ndarray, "T m"]:
-    """The slopes s at the samples of the cubic spline through them, a line or parabola for T < 4.
+def spline(
+    t: Float[np.ndarray, " T"], u: Float[np.ndarray, "T m"], at: Float[np.ndarray, " P"]
+) -> Float[np.ndarray, "P m"]:
+    """The natural quintic spline through the samples, of all functions that of least ∫(u‴)² dt.
 
-    Continuous second derivatives ask, with the spacings h and the secants δ, for
-    hᵢ sᵢ₋₁ + 2 (hᵢ₋₁ + hᵢ) sᵢ + hᵢ₋₁ sᵢ₊₁ = 3 (hᵢ δᵢ₋₁ + hᵢ₋₁ δᵢ); the first and the last two
-    intervals share one cubic (not-a-knot).
-
-    Source: de Boor (1978), A Practical Guide to Splines, chapter IV.
+    Of two samples it is a line. Times are counted in spacings: its fourth derivatives have a place
+    in the same matrix as its values.
     """
-    h = np.diff(t)
-    secants = np.diff(u, axis=0) / h[:, None]
-    if len(t) == 2 or not u.size:
-        return np.repeat(secants[:1], len(t), axis=0)
-    if len(t) == 3:
-        middle = (h[1] * secants[0] + h[0] * secants[1]) / (h[0] + h[1])
-        return np.stack([2 * secants[0] - middle, middle, 2 * secants[1] - middle])
+    from scipy.interpolate import make_interp_spline  # so that importing does not load it
 
-    def end(first, second, secant, other):
-        """The diagonal, its neighbour and the right side at an end, from it inwards."""
-        both = first + second
-        return second, both, ((first + 2 * both) * second * secant + first**2 * other) / both
-
-    begin = end(h[0], h[1], secants[0], secants[1])
-    last = end(h[-1], h[-2], secants[-1], secants[-2])
-    lower = np.concatenate([[0.0], h[1:], [last[1]]])
-    diagonal = np.concatenate([[begin[0]], 2 * (h[:-1] + h[1:]), [last[0]]])
-    upper = np.concatenate([[begin[1]], h[:-1], [0.0]])
-    inner = 3 * (h[1:, None] * secants[:-1] + h[:-1, None] * secants[1:])
-    right = np.concatenate([begin[2][None], inner, last[2][None]])
-    lower, diagonal, upper, right = map(jnp.asarray, (lower, diagonal, upper, right))
-    return np.asarray(jax.lax.linalg.tridiagonal_solve(lower, diagonal, upper, right))
+    unit, free = np.median(np.diff(t)), [(d, np.zeros(u.shape[1])) for d in (3, 4)]
+    degree, ends = (5, (free, free)) if len(t) > 2 else (1, None)
+    through = make_interp_spline((t - t[0]) / unit, u, degree, bc_type=ends)
+    return through((at - t[0]) / unit)
 
 
 def values(
@@ -84,7 +62,7 @@ def values(
     """The inputs at other times; before the first sample and after the last they are constant."""
     at = np.clip(at, t[0], t[-1])
     if between == "smooth":
-        return interpolated(at, t, u, spline_slopes(t, u))
+        return spline(t, u, at)
     # Held inputs change at a sample, and a value that is held ends at the next one.
     i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 1 - (between == "linear"))
     if between == "held":
@@ -102,16 +80,17 @@ def in_intervals(
     """The best line in each interval of the times `at`.
 
     Of u(σ) with σ from −1 to 1 it is m₀ + 3 m₁ σ, the moments m₀ = ½∫u dσ and m₁ = ½∫uσ dσ. Both
-    are sums over the pieces between all times; three Gauss nodes are exact for a cubic times σ.
+    are sums over the pieces between all times; four Gauss nodes are exact for a quintic times σ.
     """
     grid = np.union1d(t, at)
     grid = grid[(grid >= at[0]) & (grid <= at[-1])]
     lengths = np.diff(grid)
-    nodes = grid[:-1, None] + lengths[:, None] * NODES[None]
+    x, w = np.polynomial.legendre.leggauss(4)
+    nodes = grid[:-1, None] + lengths[:, None] * (1 + x[None]) / 2
     k = np.searchsorted(at, grid[:-1], side="right") - 1
     span = np.diff(at)[k]
     sigma = 2 * (nodes - at[k][:, None]) / span[:, None] - 1
-    weights = (lengths / span)[:, None] * WEIGHTS[None]
+    weights = (lengths / span)[:, None] * w[None] / 2
     there = values(t, u, nodes.ravel(), between).reshape(*nodes.shape, u.shape[1])
     first = np.searchsorted(grid, at[:-1])
     m0, m1 = (
@@ -150,8 +129,8 @@ class Runs(eqx.Module):
             times of the states, shape (T, m), or a pair (times, u) of shapes (P,) and (P, m) that
             spans them, such as a command at 1 kHz beside a camera at 50 Hz; None if nothing.
         between: how inputs go on from a sample: "held" until the next, as a digital controller
-            holds its command; "linear", for a measured force; "smooth", the cubic spline through
-            the samples, for one that is sampled 6 to 20 times a period; or "auto", with which
+            holds its command; "linear", for a measured force; "smooth", the quintic spline through
+            the samples, for one that is sampled 4 to 20 times a period; or "auto", with which
             `learn` takes the likeliest of the three, see `learned.runs`. Inputs that were held and
             are taken for linear come half a sample early.
         parameters: for each run the θ of its system, shape (p,), for `learn` with a `Family`; None
