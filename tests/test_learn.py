@@ -348,13 +348,17 @@ def test_the_units_of_the_momenta_do_not_matter():
     kernel, D = hk.Symplectic(hk.Gaussian(np.ones(2))), np.array([1.0, 1e6])
     found = hk.learn(kernel, hk.Runs(times, states))
     scaled = hk.learn(kernel, hk.Runs(times, [x * D[None] for x in states]))
-    np.testing.assert_allclose(scaled.noise / D, found.noise, rtol=1e-5)
-    X = true[0]
+    # The guess of the kernel has other units, so the search begins elsewhere, and ends within a
+    # tenth of the standard deviation of each hyperparameter, which of σ is σ/√(2N).
+    samples = sum(len(t) for t in times)
+    np.testing.assert_allclose(scaled.noise / D, found.noise, rtol=0.1 / np.sqrt(2 * samples))
+    X = np.concatenate(true)
     field, expected = (
         np.asarray(jax.vmap(each.field)(jnp.asarray(X * unit))) / unit
         for each, unit in ((scaled, D[None]), (found, np.ones((1, 2))))
     )
-    np.testing.assert_allclose(field, expected, atol=1e-5)
+    error = np.abs(expected - np.asarray(jax.vmap(PENDULUM)(jnp.asarray(X)))).max()
+    np.testing.assert_allclose(field, expected, atol=0.1 * error)
 
 
 def damped(x):

@@ -42,6 +42,7 @@ from hamkernel._trajectories.likelihood import (
 )
 from hamkernel._trajectories.preprocessing import Preprocessed
 from hamkernel._trajectories.search import (
+    LEAST_NOISE,
     Bounds,
     begun,
     limited_by_landmarks,
@@ -457,6 +458,8 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
         return False
     if not (end.settled and now.good.all()):
         return True
+    if _is_exact(end):
+        return False
     if limited_by_landmarks(now.model, *given, project_out_starts):
         return False
     z = innovations(whitened_rows(now.model, *given), now.rows)
@@ -469,6 +472,13 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     part = searched(*given[:2])
     values = np.asarray(losses(now.model, jnp.asarray(flat), *part, task.start_deviation, whiten))
     return bool(values[0] - values.min() > price(end, impulse))
+
+
+def _is_exact(end: End) -> bool:
+    """Whether the field explains the samples as far as paths are integrated: no noise is left."""
+    noise, least = np.asarray(end.now.model.log_noise), np.log(LEAST_NOISE * end.task.data.scale)
+    moves = end.task.bounds.free[-2 * noise.size : -noise.size]
+    return bool(moves.any() and (noise < least + 0.1)[moves].all())
 
 
 def likelier(without: End, process: End) -> End:

@@ -41,6 +41,10 @@ class Bounds(NamedTuple):
 # Entries of K at nodes in the search of hyperparameters: with n = 8 it takes 4 to 10 s.
 # All rows of 20 runs of 50 samples on 128 landmarks have 25 million, and took 46 s.
 _ENTRIES = 1_000_000
+# Noise in standard deviations of the states. Steps of Runge and Kutta leave as much (`steps_for`),
+# and below it the kernel would bend to their errors: of exact runs σ then fell to 1e-7, rose again
+# from iteration to iteration, and was joined by process noise of 1e-6.
+LEAST_NOISE = 1e-6
 
 
 def _loss(model: Model, h, S, rows, start_deviation, whitening: Whitening):
@@ -241,7 +245,7 @@ def bounds_and_design(
     start = np.asarray(model.flat)[: -len(scale)]  # without process noise
     size = len(start) - len(scale)
     most = np.maximum(scale, np.exp(start[size:]))  # where next to nothing moves
-    low = np.concatenate([*(p.low.ravel() for p in leaves), np.log(1e-7 * scale)])
+    low = np.concatenate([*(p.low.ravel() for p in leaves), np.log(LEAST_NOISE * scale)])
     high = np.concatenate([*(p.high.ravel() for p in leaves), np.log(2 * most)])
     low, high = np.minimum(low, start), np.maximum(high, start)
     free = np.concatenate([np.ones(size, bool), moves])
