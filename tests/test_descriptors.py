@@ -95,13 +95,24 @@ def test_a_map_that_is_not_equivariant_is_refused(molecules):
 
 
 def test_atoms_in_one_place_are_named_before_any_solve(molecules):
-    K = hk.CurlFree(hk.Warp(hk.Matern(2.5, 2.0), inverse_distances, equivariant=True))
+    warp = hk.Warp(hk.Matern(2.5, 2.0), inverse_distances, equivariant=True)
+    twice = hk.Warp(hk.Warp(hk.Gaussian(1.0), jnp.square), inverse_distances)
+    kernels = warp, 2.0 * (warp + hk.Gaussian(1.0)) * hk.Gaussian(1.0), twice
     X = molecules.copy()
     X[7, 3:6] = X[7, :3]
-    for one in (K, hk.Invariant(K, GENERATORS)):
+    for one in (*map(hk.CurlFree, kernels), hk.Invariant(hk.CurlFree(warp), GENERATORS)):
         for use in (hk.fit, hk.log_marginal_likelihood):
             with pytest.raises(ValueError, match=r"infinite at X\[7\]: two atoms in one place"):
                 use(one, X, np.ones_like(X), 1e-3)
+    field = hk.fit(hk.CurlFree(warp), molecules, np.ones_like(X), 1e-3)
+    assert np.isnan(field(X[7])).all()
+    assert np.isnan(field.potential(X[7]))
+    with pytest.raises(RuntimeError, match="NaN or infinite at x0 already"):
+        hk.simulate(field, X[7], jnp.linspace(0.0, 1.0, 3))
+    roots = hk.CurlFree(hk.Select(hk.Warp(hk.Gaussian(1.0), jnp.sqrt), (2,)))
+    X[3, 2] = X[:, 2].min() - 1.0
+    with pytest.raises(ValueError, match=r"infinite at X\[3\]: two atoms in one place"):
+        hk.fit(roots, X - X[3], np.ones_like(X), 1e-3)
 
 
 def test_losses_through_a_descriptor_have_their_derivatives(molecules):

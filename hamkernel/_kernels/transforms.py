@@ -29,7 +29,8 @@ class Warp(AbstractScalarKernel):
         kernel: a scalar kernel on the warped coordinates, shape (m,).
         fn: a smooth map (n,) -> (m,), written with jax.numpy; the array leaves of an Equinox
             module are trained. Define it once: JAX treats a new lambda as a new function and
-            compiles again.
+            compiles again. Data at which it or its derivative is not finite are refused, and a
+            field is NaN at such states: inverse distances know nothing of two atoms in one place.
         equivariant: whether the maps of a symmetry only permute the entries of `fn`, as a
             permutation of like atoms permutes the distances between atoms. `Invariant` then takes
             its mean in the warped coordinates, over |G| terms in place of |G|².

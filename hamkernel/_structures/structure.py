@@ -14,6 +14,7 @@ the case k(x, z) = g(x − z); the mixed derivative is the one that is positive 
 
 import abc
 import dataclasses
+from collections.abc import Iterator
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -40,6 +41,7 @@ from hamkernel._kernels.symmetry import (
     with_parity,
     without_symmetry,
 )
+from hamkernel._kernels.transforms import Warp
 from hamkernel._show import call, described
 from hamkernel._structures.base import AbstractMatrixKernel
 
@@ -72,15 +74,17 @@ class AbstractStructure(AbstractMatrixKernel):
     def check_points(self, X: Float[Array, "N d"]) -> None:
         super().check_points(X)
         k = without_symmetry(self.kernel)
-        if k.through_descriptor(X.shape[1]) is None or not require.is_concrete(X, k):
+        if not require.is_concrete(X, k):
             return
-        smooth = np.asarray(_smooth_descriptors(k, X))
-        if not smooth.all():
-            raise ValueError(
-                f"the map of Warp, or its derivative, is NaN or infinite at X[{smooth.argmin()}]: "
-                "two atoms in one place have no inverse distance, and roots and logarithms no "
-                "derivative at 0. Leave such states out, or write a map that is smooth there."
-            )
+        for warp, seen in _warps(k, np.asarray(X)):
+            smooth = np.asarray(_is_smooth(warp, jnp.asarray(seen)))
+            if not smooth.all():
+                raise ValueError(
+                    f"the map of Warp, or its derivative, is NaN or infinite at "
+                    f"X[{smooth.argmin()}]: two atoms in one place have no inverse distance, and "
+                    "roots and logarithms no derivative at 0. Leave such states out, or write a "
+                    "map that is smooth there."
+                )
 
     def averaged(self, maps: tuple[LinearMap, ...]) -> "AbstractStructure":
         kernel = symmetrised(self.kernel, maps, (1.0,) * len(maps))
@@ -111,15 +115,31 @@ class AbstractStructure(AbstractMatrixKernel):
         return self.kernel.invariance & self.operator_invariance
 
 
+def _warps(
+    k: AbstractScalarKernel, X: Float[np.ndarray, "N n"]
+) -> Iterator[tuple[Warp, Float[np.ndarray, "N m"]]]:
+    """Each `Warp` within k, k itself among them, with the points that it sees."""
+    if isinstance(k, Warp):
+        yield k, X
+
+    def is_inside(node: object) -> bool:
+        return node is not k and isinstance(node, AbstractScalarKernel)
+
+    for inner in filter(is_inside, jax.tree.leaves(k, is_leaf=is_inside)):
+        if any(map(_is_warp, jax.tree.leaves(inner, is_leaf=_is_warp))):
+            yield from _warps(inner, k.transform_inputs(X))
+
+
+def _is_warp(node: object) -> bool:
+    return isinstance(node, Warp)
+
+
 @eqx.filter_jit
-def _smooth_descriptors(k: AbstractScalarKernel, X: Float[Array, "N n"]) -> Bool[Array, " N"]:
-    """Whether the descriptor of k and its Jacobian are finite at each point."""
+def _is_smooth(warp: Warp, X: Float[Array, "N n"]) -> Bool[Array, " N"]:
+    """Whether the map and its Jacobian are finite at each point."""
 
     def at(x):
-        found = k.through_descriptor(len(x))
-        assert found is not None
-        J = jax.jacfwd(found.map)(x)
-        return jnp.isfinite(found.map(x)).all() & jnp.isfinite(J).all()
+        return jnp.isfinite(warp.warped(x)).all() & jnp.isfinite(jax.jacfwd(warp.warped)(x)).all()
 
     return jax.lax.map(at, X)
 

@@ -112,7 +112,7 @@ def of_pendulum(K, sampled):
     return measured
 
 
-def on_orbits(K):
+def on_orbits(K, alike=alike):
     """One short run of each, judged where such runs go: |q| and |p| that an orbit reaches."""
 
     def measured(seed):
@@ -173,6 +173,11 @@ def driven(seed):
     ]
 
 
+def each_apart(K):
+    """T(p; θ) + U(q; θ), with a lengthscale of θ for each."""
+    return sum(hk.Family(hk.Odd(hk.Symplectic(k)), hk.Gaussian(1.0)) for k in apart(2))
+
+
 def linear(K):
     """T(p), shared by all members, and U(q; θ), affine in θ."""
     T, U = apart(4)
@@ -191,6 +196,7 @@ CASES = {
     "few": ("4 points of each pendulum", of_pendulum(PLAIN, lambda r, m: states(r, 4, m))),
     "runs": ("one short run of each pendulum", on_orbits(PLAIN)),
     "even": ("the same, T + U even", on_orbits(EVEN)),
+    "apart": ("the same, T and U with a dependence each", on_orbits(EVEN, each_apart)),
     "masses": ("12 points of two masses", of_two_masses(hk.Symplectic(gaussian(4)), alike)),
     "linear": (
         "the same, T(p) + U(q; θ), affine in θ",
