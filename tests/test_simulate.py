@@ -390,9 +390,7 @@ def test_failed_solves_raise_unless_told_not_to():
     with pytest.raises(RuntimeError, match="maximum number of solver steps"):
         simulate(Pendulum(), START, ts, max_steps=3)
     with pytest.raises(RuntimeError, match="Too many steps"):
-        jax.jit(
-            lambda ts: states(PENDULUM, START, ts, diffrax.Euler(), dt=0.01, max_steps=100)
-        )(ts)
+        jax.jit(lambda ts: states(PENDULUM, START, ts, diffrax.Euler(), dt=0.01, max_steps=100))(ts)
     stiff = Pendulum(jnp.array(1e6))
     with pytest.raises(RuntimeError, match=r"maximum number|diverge"):
         simulate(stiff, START, TIMES, ImplicitMidpoint(), dt=0.05)
