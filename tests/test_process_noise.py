@@ -41,6 +41,7 @@ def segment(seed=0):
         across=across,
         weights=0.1 * (np.eye(N) + 0.3 * rng.standard_normal((1, L, 3, N, N))),
         spans=rng.uniform(0.2, 0.5, (1, L)),
+        pushed=np.where(np.arange(L) == 2, 5.0, 1.0)[None],
         drive=0.1 * rng.standard_normal((1, L, N)),
         missed=0.1 * rng.standard_normal((1, L, N)),
         residual=rng.standard_normal((1, T, N)),
@@ -57,7 +58,8 @@ def model(sigma=0.3, q=(0.4, 0.2), kernel=KERNEL):
 
 def dense(rows, model):
     """Of all states in one vector: the mean, the map B of g at the nodes, Cov d, and y."""
-    across, weights, h = (np.asarray(a[0]) for a in (rows.across, rows.weights, rows.spans))
+    given = rows.across, rows.weights, rows.spans, rows.pushed
+    across, weights, h, larger = (np.asarray(a[0]) for a in given)
     drive, q = np.asarray(rows.drive + rows.missed)[0], np.exp(np.asarray(model.log_process))
     L = T - 1
     A = np.eye(T * N)  # (I − shifted Ψ) d = (start, pushes)
@@ -70,7 +72,8 @@ def dense(rows, model):
         for k in range(3):
             place = slice((3 * i + k) * N, (3 * i + k + 1) * N)
             B[after, place] = weights[i, k]
-            Q[after, after] += weights[i, k] @ np.diag(q**2) @ weights[i, k].T / h[i] / WEIGHTS[k]
+            w = np.diag((larger[i] * q) ** 2) / h[i] / WEIGHTS[k]
+            Q[after, after] += weights[i, k] @ w @ weights[i, k].T
         push = np.concatenate([push, -drive[i]])
     inverse = np.linalg.inv(A)
     return inverse @ push, inverse @ B, inverse @ Q @ inverse.T, inverse, Q
@@ -235,6 +238,42 @@ def test_process_noise_that_cannot_be_meant_is_refused():
         hk.learn(K, hk.Runs(times, states), process_noise=np.ones(3))
     with pytest.raises(ValueError, match="iterations"):
         hk.learn(K, hk.Runs(times, states), iterations=0)
+
+
+def pushed_log(push, seed=0):
+    """A damped pendulum by small steps, moved by little noise and by a hand from 4 to 4.2 s."""
+    rng, dt, fine = np.random.default_rng(seed), 0.05, 50
+    x, states, t = np.array([2.0, 0.0]), [], np.arange(0.0, 12.0, dt)
+    for start in t:
+        states.append(x.copy())
+        for j in range(fine):
+            h, at = dt / fine, start + j * dt / fine
+            w = 0.05 * rng.standard_normal() / np.sqrt(h) + push * (4.0 <= at < 4.2)
+            x = x + h * np.array([x[1], 0.0])
+            x = x + h * np.array([0.0, -6 * np.sin(x[0]) - 0.1 * x[1] + w])
+    states = np.array(states)
+    return t, states, states + 0.005 * rng.standard_normal(states.shape)
+
+
+def test_a_push_leaves_the_field_as_it_is_and_is_named():
+    K = hk.Sum(potential=hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0)), friction=hk.Friction())
+    errors, X = [], jnp.stack([jnp.linspace(-2, 2, 41), jnp.full(41, 1.0)], axis=1)
+    truth = -6 * np.sin(X[:, 0]) - 0.1
+    for push in (0.0, 20.0):
+        t, _, log = pushed_log(push)
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            learned = hk.learn(
+                K, hk.Runs(t, log), mean=lambda x: jnp.array([x[1], 0.0]), process_noise=[0.0, 0.1]
+            )
+        errors.append(np.sqrt(np.mean((jax.vmap(learned.field)(X)[:, 1] - truth) ** 2)))
+        named = [str(w.message) for w in said if "pushed" in str(w.message)]
+        assert len(named) == (push > 0), named
+        if push:
+            assert "pushed: samples 80 to 83 of run 0." in named[0]
+            w = np.asarray(learned.disturbance[0])[:, 1]
+            np.testing.assert_allclose(w[80:84], push, rtol=0.1)
+    assert errors[1] < 1.5 * errors[0]
 
 
 @pytest.mark.slow

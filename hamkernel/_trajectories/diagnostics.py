@@ -61,6 +61,7 @@ class FitQuality(NamedTuple):
         swing: how many samples there are in a swing.
         driven: whether there are inputs.
         capped: the number of landmarks if more would help but take too long, else 0.
+        pushed: the parts in which something pushed the system, as those that were dropped.
     """
 
     kept: Float[np.ndarray, " R"]
@@ -76,6 +77,7 @@ class FitQuality(NamedTuple):
     swing: float
     driven: bool
     capped: int = 0
+    pushed: tuple[tuple[int, int, int], ...] = ()
 
 
 def diagnose(
@@ -92,6 +94,7 @@ def diagnose(
     warn_of_dropped(fit)
     if not fit.kept.any():
         return False
+    warn_of_pushes(fit)
     disturbed = fit.process is not None and bool(fit.process.any())
     explained = disturbed or explains(fit.chi_squared, fit.free)
     left = np.sqrt(fit.chi_squared) * np.nanmax(noise / scale)
@@ -243,13 +246,28 @@ def warn_of_dropped(fit: FitQuality) -> None:
             "not have. Look at hk.plot.smoothing(runs)."
         )
     elif fit.dropped:
-        named = [f"{a} to {b - 1} of run {r}" for r, a, b in fit.dropped[:5]]
-        more = f" and {len(fit.dropped) - 5} more parts" if len(fit.dropped) > 5 else ""
         require.warn(
-            f"dropped: samples {', '.join(named)}{more}. The field does not follow them (a χ² "
+            f"dropped: samples {_parts(fit.dropped)}. The field does not follow them (a χ² "
             "above 25 times the median, or a tangent above 1e4). Look there: a jump, another "
             "system, or chaos with samples too far apart."
         )
+
+
+def warn_of_pushes(fit: FitQuality) -> None:
+    """Name the samples where w is not that of all others."""
+    if fit.pushed:
+        require.warn(
+            f"pushed: samples {_parts(fit.pushed)}. Something that is not in the log moved the "
+            "system there, by more than three deviations of the process noise of all other samples,"
+            " and the field is hardly learned from them; .disturbance has how much. Look there: a "
+            "hand, a stop, a cable, or inputs that were not applied."
+        )
+
+
+def _parts(parts: tuple[tuple[int, int, int], ...]) -> str:
+    named = [f"{a} to {b - 1} of run {r}" for r, a, b in parts[:5]]
+    more = f" and {len(parts) - 5} more parts" if len(parts) > 5 else ""
+    return ", ".join(named) + more
 
 
 def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> None:

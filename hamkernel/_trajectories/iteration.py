@@ -24,6 +24,7 @@ from hamkernel._trajectories.flow import (
     with_tangent,
 )
 from hamkernel._trajectories.kalman import (
+    SmoothedPath,
     innovations,
     linearised_by_interval,
     process_covariance,
@@ -104,6 +105,7 @@ class Current(NamedTuple):
         good: which pieces were kept.
         squares: the sum of their squared normalised residuals.
         free: the degrees of freedom that are left.
+        pushed: by how much larger the deviation of w is in the intervals of the segments.
     """
 
     model: Model
@@ -114,6 +116,7 @@ class Current(NamedTuple):
     good: Bool[np.ndarray, " S"]
     squares: float
     free: float
+    pushed: Array | float = 1.0
 
 
 class End(NamedTuple):
@@ -311,17 +314,19 @@ def begin_with_process(task: Task, model: Model, design: np.ndarray) -> Current:
     good[: len(pieces)] = [task.data.usable[piece.run] for piece in pieces]
     rows = linearised_along_smoothed(task.data, pieces, segments, task.mean, good)
     model, found, field, S = _first(task, model, design, rows, whiten)
-    moves = _moves(model, found, rows, task)
+    moves, _, pushed = _smoothed(model, found, rows, task)
     good = good[: len(pieces)]
     paths = [run.path for run in runs]
     x = _on_segments(paths, pieces, segments)
     paths = _updated(paths, pieces, good, x + np.asarray(moves))
-    return Current(model, field, S, rows, paths, good, np.inf, float(found.free))
+    return Current(model, field, S, rows, paths, good, np.inf, float(found.free), pushed)
 
 
-def _moves(model: Model, found: ClosedForm, rows: LinearisedSegments, task: Task):
+def _smoothed(
+    model: Model, found: ClosedForm, rows: LinearisedSegments, task: Task
+) -> SmoothedPath:
     given = found.coefficients, found.points, rows, task.start_deviation
-    return smoothed_path(model, *given).moves
+    return smoothed_path(model, *given)
 
 
 def iterated_with_process(
@@ -334,7 +339,7 @@ def iterated_with_process(
     segments, x, steps, rows = _by_interval(task, now, pieces)
     good = rows.counts.any((1, 2))
     model, found, S, between = _solved(task, now, rows, whiten)
-    moves = _moves(model, found, rows, task)
+    moves, _, pushed = _smoothed(model, found, rows, task)
     # A defect that the integrator may leave is none: see `steps_for`.
     covariance = process_covariance(model, rows, jnp.asarray(1e-6 * task.data.scale))
 
@@ -352,7 +357,7 @@ def iterated_with_process(
     paths = _updated(now.paths, pieces, good, best.x)
     step = _described(task, pieces, good, best, gain, taken, model, found.loss)
     free = float(found.free)
-    return Current(model, best.field, S, rows, paths, good, best.squares, free), step
+    return Current(model, best.field, S, rows, paths, good, best.squares, free, pushed), step
 
 
 def _by_interval(
@@ -366,7 +371,7 @@ def _by_interval(
     good = np.zeros(len(x), bool)
     good[: len(pieces)] = [task.data.usable[piece.run] for piece in pieces]
     rows = linearised_by_interval(now.field, x, segments, steps, jnp.asarray(good))
-    return segments, x, steps, rows
+    return segments, x, steps, rows._replace(pushed=now.pushed * rows.pushed)
 
 
 def evidence(end: End) -> float:
@@ -439,9 +444,10 @@ def field_values(field: Expansion, X: Float[Array, "N d"]) -> Float[Array, "N n"
     return jax.vmap(field)(X)
 
 
-def price(end: End, impulse: Float[np.ndarray, " n"]) -> float:
-    """The gain in log p that pays for process noise: Schwarz's ½ log N for each intensity."""
-    return float(0.5 * np.isfinite(impulse).sum() * np.log(np.asarray(end.now.rows.counts).sum()))
+def price(end: End, impulse: Float[np.ndarray, " n"], pushes: int = 0) -> float:
+    """The gain in log p that pays for process noise: Schwarz's ½ log N for each deviation of w."""
+    count = np.isfinite(impulse).sum() + pushes
+    return float(0.5 * count * np.log(np.asarray(end.now.rows.counts).sum()))
 
 
 def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
@@ -483,5 +489,6 @@ def _is_exact(end: End) -> bool:
 
 def likelier(without: End, process: End) -> End:
     """The likelier of both ends, process noise at its price."""
-    more = price(process, np.asarray(process.now.model.log_process))
+    pushes = int((process.now.rows.pushed > 1).sum())
+    more = price(process, np.asarray(process.now.model.log_process), pushes)
     return process if evidence(process) + more < evidence(without) else without

@@ -58,7 +58,7 @@ def process_roots(
     h = rows.spans[:, :, None] * jnp.asarray(WEIGHTS, rows.spans.dtype)[None, None]
     scale = jnp.where(h > 0, 1 / jnp.sqrt(jnp.where(h > 0, h, 1.0)), 0.0)
     q = jnp.exp(log_process)[None, None, None, None]
-    roots = rows.weights * scale[..., None, None] * q
+    roots = rows.weights * (rows.pushed[..., None] * scale)[..., None, None] * q
     return jnp.moveaxis(roots, 2, 3).reshape(*rows.drive.shape, -1)
 
 
@@ -127,16 +127,27 @@ def whiten(
     return WhitenedRows(flat[:, :-1], flat[:, -1], constant)
 
 
+# Deviations of w, which a normal one has in one of 370 intervals at most. A hand at a real pendulum
+# moved it by 9 of them while they were estimated with it, and by 30 without: the errors of rollouts
+# were .099, .066 and .250 rad on three logs, and are .052, .024 and .159; with 5 for 3, .055, .024
+# and .168.
+_PUSH = 3.0
+
+
 class SmoothedPath(NamedTuple):
     """The path given the samples and a field, and the disturbance w that moved it besides.
 
     Attributes:
         moves: the path less x̂, shape (S, L + 1, n).
         disturbance: the mean of w in each interval, shape (S, L, n).
+        pushed: that mean in units of its deviation q/√h, of the coordinate where it is largest, in
+            intervals where it is more than `_PUSH`; 1 in all others. It is their deviation of w
+            in the next step, shape (S, L).
     """
 
     moves: Float[Array, "S L+1 n"]
     disturbance: Float[Array, "S L n"]
+    pushed: Float[Array, "S L"]
 
 
 @compiled_by_size
@@ -164,7 +175,11 @@ def smoothed_path(
     # Of w at a node −diag(q²) Γ_kᵀ ∂J/∂u / (h w_k), of which the weighted mean is taken.
     h = jnp.where(rows.spans > 0, rows.spans, 1.0)[..., None]
     w = jnp.einsum("slkab,sla->slb", rows.weights, slopes[0])
-    return SmoothedPath(moves, -jnp.exp(2 * model.log_process)[None, None] * w / h)
+    variance = jnp.exp(2 * model.log_process)[None, None] * rows.pushed[..., None] ** 2
+    w = -variance * w / h
+    unit = jnp.where(model.log_process > -jnp.inf, jnp.exp(model.log_process), jnp.inf)
+    size = jnp.abs(w / unit[None, None]).max(axis=-1) * jnp.sqrt(rows.spans)
+    return SmoothedPath(moves, w, jnp.where(size > _PUSH, size, 1.0))
 
 
 @compiled_by_size

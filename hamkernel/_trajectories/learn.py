@@ -61,6 +61,7 @@ from hamkernel._trajectories.preprocessing import (
 )
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.search import bounds_and_design, impulses, landmark_spacing
+from hamkernel._trajectories.segments import Piece
 from hamkernel._trajectories.smoothing import interpolated, power_of_two
 
 
@@ -104,7 +105,8 @@ def learn(
             over √time, a number or one for each coordinate, shape (n,): what stiction, timing or a
             flexible part move besides the field. 0 where the structure is the whole truth. If None,
             it is looked for where something says that the structure is not, and kept where the
-            marginal likelihood pays for it.
+            marginal likelihood pays for it. Where w is more than three deviations of the rest, as
+            where a hand pushed the system, it has a deviation of its own there.
         masses: whether states are (q, q̇) with unknown masses instead of (q, p). Their ratios are
             then learned, `learned.kernel.masses`; see `UnknownMasses`, whose kernel K becomes.
             With inputs they are those of the drift, `learned.kernel.drift.masses`.
@@ -123,8 +125,8 @@ def learn(
             enabled.
 
     Warns:
-        UserWarning: parts of runs were dropped, the structure does not explain the runs, the runs
-            are too few to find the noise, or the iterations did not settle.
+        UserWarning: parts of runs were dropped or pushed, the structure does not explain the runs,
+            the runs are too few to find the noise, or the iterations did not settle.
     """
     require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
     K, given, process = _check(with_amplitude(matrix_kernel(K)), runs, noise, process_noise, solver)
@@ -279,8 +281,8 @@ def _quality(
     """How well the field follows the runs; `z` are the innovations by segment."""
     now, data, times = end.now, end.task.data, runs.on_host()[0]
     counts = np.asarray(now.rows.counts)
-    kept = np.zeros(len(data.runs))
-    for (r, start, stop), good in zip(end.pieces, now.good, strict=True):
+    kept, pieces = np.zeros(len(data.runs)), list(zip(end.pieces, now.good, strict=True))
+    for (r, start, stop), good in pieces:
         kept[r] += good * (stop - start) / len(data.runs[r].times)
     squares, free = now.squares, now.free
     if alone is not None:
@@ -292,7 +294,8 @@ def _quality(
     swing = 2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)) / spacing
     return FitQuality(
         kept=kept,
-        dropped=dropped_samples(end, times),
+        dropped=_samples([piece for piece, good in pieces if not good], end, times),
+        pushed=_samples(_pushed(end), end, times),
         misfit=misfit,
         chi_squared=squares / max(free, 1.0),
         free=free,
@@ -321,12 +324,22 @@ def _disturbances(end: End, times: list[np.ndarray]) -> tuple[Float[Array, "T n"
     return tuple(out)
 
 
-def dropped_samples(end: End, times: list[np.ndarray]) -> tuple[tuple[int, int, int], ...]:
-    """The run, the first sample and the one behind the last of what was not learned from."""
+def _pushed(end: End) -> list[Piece]:
+    """The intervals in which something pushed the system, from one sample to the next."""
+    sizes = np.asarray(end.now.rows.pushed)
+    return [
+        Piece(r, start + int(i), start + int(i) + 1)
+        for s, (r, start, stop) in enumerate(end.pieces)
+        for i in np.flatnonzero(sizes[s, : stop - start - 1] > 1)
+    ]
+
+
+def _samples(
+    pieces: list[Piece], end: End, times: list[np.ndarray]
+) -> tuple[tuple[int, int, int], ...]:
+    """The run, the first sample and the one behind the last of pieces, joined where they touch."""
     out: list[tuple[int, int, int]] = []
-    for (r, start, stop), good in sorted(zip(end.pieces, end.now.good, strict=True)):
-        if good:
-            continue
+    for r, start, stop in sorted(pieces):
         t, at = times[r] - times[r][0], end.task.data.runs[r].times
         first = int(np.searchsorted(t, at[start])) if start else 0
         last = int(np.searchsorted(t, at[stop])) if stop < len(at) else len(t)

@@ -53,6 +53,7 @@ class LinearisedSegments(NamedTuple):
         across: Ψ, shape (S, L, n, n).
         weights: Γ, shape (S, L, 3, n, n).
         spans: the lengths of the intervals, shape (S, L).
+        pushed: by how much larger the deviation of w is in an interval, shape (S, L).
         drive: Σ_k Γ_k (d x̂/dt − m)_k, shape (S, L, n).
         missed: the increment of x̂ less that of the Gauss rule for d x̂/dt, 0 for a solution, the
             same shape.
@@ -66,6 +67,7 @@ class LinearisedSegments(NamedTuple):
     across: Float[Array, "S L n n"]
     weights: Float[Array, "S L 3 n n"]
     spans: Float[Array, "S L"]
+    pushed: Float[Array, "S L"]
     drive: Float[Array, "S L n"]
     missed: Float[Array, "S L n"]
     residual: Float[Array, "S L+1 n"]
@@ -135,6 +137,7 @@ def linearised(
         across=across,
         weights=weights,
         spans=segments.spans,
+        pushed=jnp.ones_like(segments.spans),
         drive=drive,
         missed=missed,
         residual=segments.measured - x,
@@ -172,7 +175,7 @@ def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
 def _windows(rows: LinearisedSegments, s, at) -> LinearisedSegments:
     inner, s = at[:, :-1], s[:, None]
     cut = {name: getattr(rows, name)[s, at] for name in ("residual", "counts", "scatter")}
-    for name in ("nodes", "across", "weights", "spans", "drive", "missed"):
+    for name in ("nodes", "across", "weights", "spans", "pushed", "drive", "missed"):
         cut[name] = getattr(rows, name)[s, inner]
     offset = jnp.where(at[:, :1] == 0, rows.prior_offset[s[:, 0]], 0.0)
     return LinearisedSegments(**cut, prior_offset=offset)

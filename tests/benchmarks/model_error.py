@@ -23,7 +23,7 @@ q̈ = −a sin q − d v − c tanh(v/.05) + G u, which has the true form; how m
 how often the innovations were called white; the delay found; CPU seconds.
 
 Medians of seeds 0 to 2, errors of U′ and of the gain, and free runs beside the grey box: stiction
-12 %, 16 %, .14 for .0042 rad; with friction in the kernel .17 %, .04 %, .0011 for .0042; flexible
+5.4 %, 6.4 %, .14 for .0042 rad; with friction in the kernel .17 %, .04 %, .0011 for .0042; flexible
 .24 %, .52 %, .0017 for .0060; delayed 1.5 %, .27 %, .023 for .021; encoder .009 %, .006 %, .00005
 for .0024. White w alone does not stand for stiction: say that there is friction.
 """
