@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import hamkernel as hk
 from hamkernel._discovery.compare import Candidate, Comparison, _answered, _is_seen, claims
@@ -217,6 +218,23 @@ def test_a_pendulum_has_an_energy_and_a_mirror_and_friction_is_found():
         assert row.parameters == sum(np.size(value) for value in row.hyperparameters.values())
         likelihood = hk.log_marginal_likelihood(row.kernel, X, damped, row.regularization)
         assert row.log_likelihood == pytest.approx(float(likelihood), rel=1e-6)
+
+
+@pytest.mark.slow
+def test_runs_with_friction_have_an_energy():
+    """With two starts half of the searches ended where all noise is taken for the field."""
+    rng, ts = np.random.default_rng(0), np.linspace(0.0, 6.0, 20)
+
+    def velocity(t, x):
+        return [x[1], -np.sin(x[0]) - 0.1 * x[1]]
+
+    firsts = [rng.uniform([-2.5, -2.0], [2.5, 2.0]) for _ in range(3)]
+    states = [solve_ivp(velocity, (0, 6), x, t_eval=ts, rtol=1e-8).y.T for x in firsts]
+    size = np.concatenate(states).std(axis=0)
+    states = [x + 0.02 * size * rng.normal(size=x.shape) for x in states]
+    k = hk.Gaussian(jnp.asarray(2 * size))
+    found = hk.compare(hk.learn(hk.Separable(k), hk.Runs([ts] * 3, states)))
+    assert found.answers == dict.fromkeys(found.answers, "yes") | {"reversible": "no"}
 
 
 @pytest.mark.slow

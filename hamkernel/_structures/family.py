@@ -122,8 +122,12 @@ class Family(AbstractFamily):
 
     Each part may have a dependence of its own, H = T(p) + U(q; θ):
 
-        K = hk.Family(hk.Symplectic(hk.Select(k, (1,)))) + hk.Family(hk.Symplectic(hk.Select(k,
-            (0,))), hk.Gaussian(1.0))
+        T, U = hk.Symplectic(hk.Select(k, (1,))), hk.Symplectic(hk.Select(k, (0,)))
+        K = hk.Family(T) + hk.Family(U, hk.Gaussian(1.0))
+
+    Give each part a k of its own where both change: T and U may follow θ over different lengths.
+    With one short run of each of eight pendulums, H even, the error of one that was not measured is
+    .0051 with one k for T + U and .0039 with two (`tests/benchmarks/families.py`).
 
     Between members that were seen this is interpolation, and better than a model for each. Outside
     of their range it is extrapolation in θ, no better than a model of its own for each member, and

@@ -6,6 +6,9 @@ Errors are root mean square over fresh states, as a share of the field, medians 
 family is asked for members it has not seen, halfway between two that it has; the model of each for
 the member it was fitted to; the model of all, which ignores θ, for the same unseen members. All
 hyperparameters come from `tune(..., objective="marginal_likelihood")`.
+
+Medians of five seeds, family / of each / of all: points .0138/.0262/.24, and .34 outside; even
+.0051/.0068/.25; apart .0039/.0068/.25; linear .0042/.14/.81.
 """
 
 # pyright: reportArgumentType=false, reportOptionalOperand=false, reportAttributeAccessIssue=false
