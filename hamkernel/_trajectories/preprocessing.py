@@ -20,8 +20,9 @@ from hamkernel._trajectories.flow import NODES, with_tangent
 from hamkernel._trajectories.runs import Between, Runs, at_nodes, at_samples
 from hamkernel._trajectories.smoothing import Coordinate, interpolated, processes, smoothed
 
-# Rows times columns², 2 s for each solve. With 3.5e10, 20 runs of 50 samples with n = 8 had 256
-# landmarks, for 128, and took 210 s for 115, and 1.9 GB for 1.4.
+# Rows times columns², 1 to 2 s for each solve. 20 runs of 50 samples with n = 8 have 128 landmarks
+# with it. With 256 a solve takes 6.5 s, and the field's error would be .0105 for .0145; with 512
+# and 768 it is .0105 too (`tests/benchmarks/capacity.py chain`).
 _WORK = 1e10
 _POINTS = 1024  # from which boxes are taken, and landmarks if there are not more intervals
 
