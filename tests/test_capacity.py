@@ -14,8 +14,8 @@ import pytest
 
 import hamkernel as hk
 from hamkernel import _machine
+from hamkernel._trajectories.diagnostics import warn_of_cost
 from hamkernel._trajectories.flow import Segments
-from hamkernel._trajectories.learn import warn_of_cost
 from hamkernel._trajectories.likelihood import (
     Model,
     closed_form,

@@ -15,7 +15,12 @@ import scipy.stats
 from test_learn import damped, field_error, logs
 
 import hamkernel as hk
-from hamkernel._trajectories.diagnostics import autocorrelations, ljung_box, whiteness
+from hamkernel._trajectories.diagnostics import (
+    autocorrelations,
+    ljung_box,
+    warn_of_rest_speed,
+    whiteness,
+)
 from hamkernel._trajectories.flow import WEIGHTS
 from hamkernel._trajectories.kalman import as_observations, innovations, smoothed_path, whiten
 from hamkernel._trajectories.likelihood import Model, WhitenedRows, landmark_whitening
@@ -222,6 +227,32 @@ def test_what_costs_bands_five_points_is_no_longer_white():
         assert white.probability < 0.05  # both are significant
 
 
+def test_bands_are_widened_as_much_as_correlated_noise_widens_least_squares():
+    rng, counts, t = np.random.default_rng(4), np.ones((40, 200, 2)), np.arange(200)
+    z = white_or_not(rng, 0.5, runs=40, length=200)
+    widening = whiteness(z, counts).widening
+    for frequency, least, most in ((0.0, 0.7, 1.2), (np.pi / 2, 3.0, 8.0)):
+        # The amplitude of a wave by least squares: 80 estimates, whose variance in white noise is
+        # one over its sum of squares.
+        wave = np.cos(frequency * t)
+        estimates = np.einsum("sti,t->si", z, wave) / (wave @ wave) ** 0.5
+        # By more than needed where the noise has less power, never by much less.
+        assert least < widening / np.var(estimates) < most
+    assert whiteness(white_or_not(rng, 0.0, runs=40, length=200), counts).widening == 1.0
+
+
+@pytest.mark.parametrize(("rest_speed", "said"), [(0.1, True), (0.01, False)])
+def test_dry_friction_that_fades_over_the_momenta_of_the_runs_is_said(rest_speed, said):
+    drift = hk.Sum(energy=hk.Symplectic(hk.Gaussian()), dry=hk.Friction(rest_speed=rest_speed))
+    X = np.array([[0.0, 0.25, 1.0], [1.0, -0.24, 0.0]])  # q, p and an input
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        warn_of_rest_speed(hk.Controlled(drift, hk.InputMatrix(1.0)), X, 2)
+    assert [str(w.message).endswith("hk.Friction(rest_speed=0.0025).") for w in seen] == [
+        True
+    ] * said
+
+
 # What is learned.
 
 
@@ -296,9 +327,18 @@ def test_friction_that_the_structure_lacks_is_process_noise_and_said():
         warnings.simplefilter("always")
         found = hk.learn(hk.Symplectic(hk.Gaussian(1.0)), hk.Runs(times, states))
     assert (np.asarray(found.process_noise) > 0).all()
-    assert any("the structure alone does not explain the runs" in str(w.message) for w in seen)
+    said = " ".join(str(w.message) for w in seen)
+    assert "the structure alone does not explain the runs" in said
+    assert "friction, with which log p would be" in said
     assert field_error(found.field, true, damped) < 0.02
-    # w stands for what is lacking: −.05 p.
+    X = jnp.asarray(np.concatenate(true)[::5])
+    error = np.abs(np.asarray(jax.vmap(found.field)(X) - jax.vmap(damped)(X)))
+    deviation = np.asarray(jax.vmap(found.posterior.deviation)(X))
+    assert (
+        np.mean(error < 2 * deviation) > 0.9 > np.mean(error < 2 * deviation / found.widening**0.5)
+    )
+    # w stands for what is lacking, −.05 p, and here for the noise of the sensors too: log p is
+    # larger by 70 without any. Of 180 samples without a correlation 3 in 1000 have −.2.
     p = np.concatenate(true)[:, 1]
     w = np.concatenate(found.disturbance)[:, 1]
-    assert np.corrcoef(p, w)[0, 1] < -0.5
+    assert np.corrcoef(p, w)[0, 1] < -0.2

@@ -450,6 +450,11 @@ def price(end: End, impulse: Float[np.ndarray, " n"], pushes: int = 0) -> float:
     return float(0.5 * count * np.log(np.asarray(end.now.rows.counts).sum()))
 
 
+def whitening_of(model: Model) -> Whitening:
+    """How rows of this model are whitened."""
+    return whiten if bool(jnp.isfinite(model.log_process).any()) else project_out_starts
+
+
 def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     """Whether anything suggests that the structure is not the whole truth.
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +15,6 @@ from hamkernel._fields.base import SolverInfo, known_part
 from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import learned_field
 from hamkernel._gram.operator import placed_product
-from hamkernel._kernels.base import Scaled
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._machine import one_blas_thread
 from hamkernel._observations.kinds import inputs_or_parameters
@@ -24,13 +22,14 @@ from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.family import AbstractFamily
-from hamkernel._structures.joined import Controlled, InputMatrix
+from hamkernel._structures.joined import Controlled
 from hamkernel._structures.mechanics import UnknownMasses
-from hamkernel._structures.structure import AbstractStructure
 from hamkernel._trajectories.diagnostics import (
     FitQuality,
     check_identifiable,
     diagnose,
+    frictions,
+    warn_in_advance,
     whiteness,
 )
 from hamkernel._trajectories.flow import Expansion
@@ -43,6 +42,7 @@ from hamkernel._trajectories.iteration import (
     initial_loss,
     iterate,
     likelier,
+    whitening_of,
 )
 from hamkernel._trajectories.kalman import (
     as_observations,
@@ -51,7 +51,7 @@ from hamkernel._trajectories.kalman import (
     whitened_rows,
 )
 from hamkernel._trajectories.learned import Learned, empty, misfits
-from hamkernel._trajectories.likelihood import Model
+from hamkernel._trajectories.likelihood import Model, with_amplitude
 from hamkernel._trajectories.preprocessing import (
     Preprocessed,
     decided,
@@ -60,7 +60,13 @@ from hamkernel._trajectories.preprocessing import (
     sampled,
 )
 from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.search import bounds_and_design, impulses, landmark_spacing
+from hamkernel._trajectories.search import (
+    bounds_and_design,
+    gain_of_friction,
+    impulses,
+    landmark_spacing,
+    limited_by_landmarks,
+)
 from hamkernel._trajectories.segments import Piece
 from hamkernel._trajectories.smoothing import interpolated, power_of_two
 
@@ -146,14 +152,14 @@ def learn(
     if known is not None:
         Y = Y - np.asarray(jax.vmap(known)(jnp.asarray(X)))
     log_noise = jnp.log(jnp.asarray(_first_noise(data) if given is None else given))
-    moves = measured & (given is None)
     S, first, capped = landmarks(data, None if solver is None else solver.max_points)
-    warn_of_cost(data, first)
+    warn_in_advance(K, data, X, first)
 
     def asked(q: np.ndarray, spacing: float = 0.0, impulse: np.ndarray | None = None):
         with np.errstate(divide="ignore"):
             model = Model(K, log_noise, jnp.log(jnp.asarray(q)))
-        bounds, design = bounds_and_design(model, X, Y, data.scale, moves, spacing, impulse)
+        free = measured & (given is None)
+        bounds, design = bounds_and_design(model, X, Y, data.scale, free, spacing, impulse)
         prior = jnp.asarray(100 * data.scale)  # of a start, which says next to nothing
         return Task(data, known, S, first, capped, bounds, prior), model, design
 
@@ -176,23 +182,6 @@ def learn(
             end = likelier(alone, ended(none, spacing, impulse))
     bar.close()
     return _learned(runs, mean, end, alone, given is not None, measured)
-
-
-def warn_of_cost(data: Preprocessed, count: int) -> None:
-    """Say what learning will cost, if that is much: 2 rows · columns² operations an iteration."""
-    n = len(data.scale)
-    rows = n * sum(len(run.times) for run in data.runs)
-    seconds = 2 * rows * (count * n) ** 2 / 1e10  # by one core, which took 1.6 s for 19 billion
-    minutes = 5 * seconds / 60  # 4 or 5 iterations are the rule
-    if minutes < 1:
-        return
-    fewer = max(int(count / minutes**0.5), 1)
-    require.warn(
-        f"learning will take about {seconds:.0f} s an iteration, and 4 to 8 iterations: "
-        f"{rows} measured numbers on {count} landmarks, {count * n} columns. It works; "
-        f"solver=hk.Nystrom(max_points={fewer}) takes a minute and finds a smoother field, and "
-        "fewer samples or known parts (mean=) take less too."
-    )
 
 
 def _first_noise(data: Preprocessed) -> Float[np.ndarray, " n"]:
@@ -227,7 +216,7 @@ def _learned(
     misfit = misfits(runs, states, noise)
     rows = now.field.points, now.rows, task.start_deviation
     z, counts = innovations(whitened_rows(now.model, *rows), now.rows), np.asarray(now.rows.counts)
-    fit = _quality(runs, end, alone, misfit, z, process)
+    fit = _quality(runs, end, alone, misfit, z, process, states)
     converged = diagnose(fit, noise, data.scale, given)
     observations = as_observations(now.rows, now.model, task.mean, task.start_deviation)
     count = 1 if observations is None else sum(len(y) for _, y in observations.parts())
@@ -247,6 +236,7 @@ def _learned(
             jnp.asarray(x) for x in _by_run(np.where(counts > 0, z, np.nan), end, np.nan)
         ),
         whiteness=jnp.asarray(fit.white.probability),
+        widening=jnp.asarray(fit.white.widening),
         disturbance=_disturbances(end, times),
         history=tuple(history),
         converged=converged,
@@ -277,9 +267,10 @@ def _quality(
     misfit: Float[np.ndarray, "R n"],
     z: Float[np.ndarray, "S L+1 n"],
     process: Float[np.ndarray, " n"],
+    states: list[Float[np.ndarray, "T n"]],
 ) -> FitQuality:
     """How well the field follows the runs; `z` are the innovations by segment."""
-    now, data, times = end.now, end.task.data, runs.on_host()[0]
+    now, task, data, times = end.now, end.task, end.task.data, runs.on_host()[0]
     counts = np.asarray(now.rows.counts)
     kept, pieces = np.zeros(len(data.runs)), list(zip(end.pieces, now.good, strict=True))
     for (r, start, stop), good in pieces:
@@ -292,6 +283,10 @@ def _quality(
     speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
     spacing = np.median(np.concatenate([np.diff(t) for t in times]))
     swing = 2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)) / spacing
+    white, n = whiteness(z, counts), runs.dimension
+    is_white = white.is_enough  # then no causes are looked for
+    given = now.model, now.field.points, now.rows, task.start_deviation, whitening_of(now.model)
+    least = 0.0 if n % 2 else 0.01 * max(float(np.abs(x[:, n // 2 :]).max()) for x in states)
     return FitQuality(
         kept=kept,
         dropped=_samples([piece for piece, good in pieces if not good], end, times),
@@ -300,14 +295,30 @@ def _quality(
         chi_squared=squares / max(free, 1.0),
         free=free,
         remaining=now.free,
-        white=whiteness(z, counts),
+        white=white,
         process=None if alone is None else process,
         count=len(end.history),
         settled=end.settled,
         swing=float(swing),
         driven=runs.inputs is not None,
-        capped=len(now.field.points) if end.task.capped else 0,
+        few=0 if is_white or not (task.capped or limited_by_landmarks(*given)) else len(given[1]),
+        between="" if is_white else likelier_between(runs, end if alone is None else alone),
+        gained=0.0 if is_white or not least > 0 else gain_of_friction(*given, data, least),
+        rest_speed=least,
+        has_friction=bool(frictions(now.field.kernel)),
     )
+
+
+def likelier_between(runs: Runs, end: End) -> str:
+    """How inputs go on in the likeliest way along the smoothed runs; "" if as was said."""
+    if runs.inputs is None or isinstance(runs.delay, str):
+        return ""
+    task, model = end.task, end.now.model
+    any_way = runs.going_on("auto", runs.delay)
+    chosen, _ = decided(
+        any_way, task.data, lambda data: initial_loss(task._replace(data=data), model)
+    )
+    return chosen.between if chosen.between != runs.between else ""
 
 
 def _disturbances(end: End, times: list[np.ndarray]) -> tuple[Float[Array, "T n"], ...]:
@@ -455,23 +466,6 @@ def _of_coordinates(value: Any, n: int, name: str) -> Float[np.ndarray, " n"]:
     if value.shape not in ((), (n,)):
         raise ValueError(f"{name} has shape {value.shape}; a number or shape ({n},) is needed.")
     return np.broadcast_to(value, (n,))
-
-
-def with_amplitude(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
-    """K, every structure and input matrix in it scaled; a likelihood needs amplitudes.
-
-    `Symplectic(Gaussian(2.0))` becomes `Symplectic(1.0 * Gaussian(2.0))`.
-    """
-
-    def is_structure(node: object) -> bool:
-        return isinstance(node, AbstractStructure | InputMatrix)
-
-    def scaled(node):
-        if not is_structure(node) or node.kernel.has_amplitude:
-            return node
-        return eqx.tree_at(lambda node: node.kernel, node, Scaled(node.kernel, 1.0))
-
-    return jax.tree.map(scaled, K, is_leaf=is_structure)
 
 
 def with_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:

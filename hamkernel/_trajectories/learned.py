@@ -74,6 +74,8 @@ class Learned(eqx.Module):
             test of Ljung and Box over ten lags, shape (). Below .05 the structure, or the timing
             of inputs, leaves residuals that persist from sample to sample; this counts against
             `converged` where it makes bands more than 1.2 times too narrow.
+        widening: the factor on the variance of the noise in `posterior` where innovations are
+            correlated, the peak of their spectrum over ten lags, shape (); 1 where they are white.
         disturbance: the mean of w from each sample to the next as far as the samples know it, for
             each run, (T, n); 0 without process noise.
         history: one entry an iteration.
@@ -99,6 +101,7 @@ class Learned(eqx.Module):
     chi_squared: Float[Array, ""]
     innovations: tuple[Float[Array, "T n"], ...]
     whiteness: Float[Array, ""]
+    widening: Float[Array, ""]
     disturbance: tuple[Float[Array, "T n"], ...]
     history: tuple[Iteration, ...]
     converged: bool = eqx.field(static=True)
@@ -114,8 +117,9 @@ class Learned(eqx.Module):
         """The Gaussian process of the field given the runs: bands, samples, updates.
 
         As `hk.condition` on the observations, exact up to 3000 rows and on the landmarks of the
-        field above; starts are integrated out, hyperparameters plugged in. It is made anew with
-        every call: keep it.
+        field above; starts are integrated out, hyperparameters plugged in. Where innovations are
+        correlated the noise is larger by `widening`, and its mean somewhat smoother than `field`.
+        It is made anew with every call: keep it.
 
         Raises:
             ValueError: the runs had too few samples to learn from.
@@ -128,7 +132,7 @@ class Learned(eqx.Module):
         return condition(
             self.kernel,
             self.observations,
-            regularization=self.regularization,
+            regularization=self.regularization * self.widening,
             solver=solver,
             mean=self.mean,
         )

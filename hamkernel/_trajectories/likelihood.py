@@ -26,8 +26,11 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from hamkernel._gram.dense import assemble, forward_differentiated
+from hamkernel._kernels.base import Scaled
 from hamkernel._machine import compiled_by_size, orthonormal
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.joined import InputMatrix
+from hamkernel._structures.structure import AbstractStructure
 from hamkernel._trajectories.flow import back_substituted, tangents
 from hamkernel._trajectories.segments import LinearisedSegments, accumulated
 
@@ -54,6 +57,23 @@ def landmark_whitening(K: AbstractMatrixKernel, S: Float[Array, "m d"]) -> Float
     rounding = 100 * jnp.finfo(G.dtype).eps * len(G) * jnp.where(d > 0, d, d.mean())
     eye = jnp.eye(len(G), dtype=G.dtype)
     return solve_triangular(jnp.linalg.cholesky(G + jnp.diag(rounding)), eye, lower=True).T
+
+
+def with_amplitude(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
+    """K, every structure and input matrix in it scaled; a likelihood needs amplitudes.
+
+    `Symplectic(Gaussian(2.0))` becomes `Symplectic(1.0 * Gaussian(2.0))`.
+    """
+
+    def is_structure(node: object) -> bool:
+        return isinstance(node, AbstractStructure | InputMatrix)
+
+    def scaled(node):
+        if not is_structure(node) or node.kernel.has_amplitude:
+            return node
+        return eqx.tree_at(lambda node: node.kernel, node, Scaled(node.kernel, 1.0))
+
+    return jax.tree.map(scaled, K, is_leaf=is_structure)
 
 
 class Model(NamedTuple):

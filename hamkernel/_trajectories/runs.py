@@ -297,7 +297,7 @@ class Runs(eqx.Module):
         t, u = (np.asarray(a[run], float) for a in (self.input_times, self.inputs))
         return in_intervals(t, u, np.asarray(at) - delay, between)
 
-    def going_on(self, between: Between, delay: float) -> "Runs":
+    def going_on(self, between: Between | Literal["auto"], delay: float) -> "Runs":
         """The same runs with inputs that go on in this way; nothing is checked again."""
         new = object.__new__(Runs)
         given = {"between": between, "delay": delay}

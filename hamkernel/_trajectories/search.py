@@ -13,6 +13,10 @@ from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled_by_size
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.family import AbstractFamily
+from hamkernel._structures.joined import Controlled
+from hamkernel._structures.mechanics import Friction
+from hamkernel._trajectories.diagnostics import frictions
 from hamkernel._trajectories.likelihood import (
     ClosedForm,
     Condensed,
@@ -217,6 +221,38 @@ def limited_by_landmarks(
         for points in (S, own)
     )
     return few - many > (rows.residual.shape[-1] * len(own) / 2) ** 0.5
+
+
+def gain_of_friction(
+    model: Model,
+    S,
+    rows: LinearisedSegments,
+    start_deviation,
+    whitening: Whitening,
+    data: Preprocessed,
+    rest_speed: float,
+) -> float:
+    """The gain of log p from viscous and dry friction of the momenta beside the drift.
+
+    All else stays. Forces as large as all of the motion are as good as free in the closed form. 0
+    where the kernel has friction, or is that of a family.
+    """
+    K = model.kernel
+    if frictions(K) or isinstance(K, AbstractFamily):
+        return 0.0
+    X, Y = sampled(data)
+    n = Y.shape[1]
+    force, fastest = np.sqrt(np.mean(Y[:, n // 2 :] ** 2)), np.abs(X[:, n // 2 : n]).max()
+    viscous = Friction(force / fastest, 1e-6 * force, rest_speed=rest_speed)
+    dry = Friction(1e-6 * force / fastest, force, rest_speed=rest_speed)
+    more = (K.drift if isinstance(K, Controlled) else K) + viscous + dry
+    more = Controlled(more, K.inputs, K.count) if isinstance(K, Controlled) else more
+    S, rows = searched(jnp.asarray(S), rows)
+    without, there = (
+        float(losses(each, each.flat[None], S, rows, start_deviation, whitening)[0])
+        for each in (model, model._replace(kernel=more))
+    )
+    return without - there
 
 
 def bounds_and_design(
