@@ -8,7 +8,8 @@ the member it was fitted to; the model of all, which ignores θ, for the same un
 hyperparameters come from `tune(..., objective="marginal_likelihood")`.
 
 Medians of five seeds, family / of each / of all: points .0138/.0262/.24, and .34 outside; even
-.0051/.0068/.25; apart .0039/.0068/.25; linear .0042/.14/.81.
+.0051/.0068/.25; apart .0039/.0068/.25; linear .0042/.14/.81; symmetric .0061/.0067/.25, and .29
+outside; driven .0057, and .0039 with inputs.
 """
 
 # pyright: reportArgumentType=false, reportOptionalOperand=false, reportAttributeAccessIssue=false
