@@ -74,7 +74,8 @@ class AbstractStructure(AbstractMatrixKernel):
     def check_points(self, X: Float[Array, "N d"]) -> None:
         super().check_points(X)
         k = without_symmetry(self.kernel)
-        if not require.is_concrete(X, k):
+        # Of rows that are spread over processes none can see all.
+        if not (require.is_concrete(X, k) and jnp.asarray(X).is_fully_addressable):
             return
         for warp, seen in _warps(k, np.asarray(X)):
             smooth = np.asarray(_is_smooth(warp, jnp.asarray(seen)))
