@@ -57,10 +57,6 @@ class Pendulum(eqx.Module):
         return x[..., 1] ** 2 / 2 - self.gravity * jnp.cos(x[..., 0])
 
 
-# One gravity that is an array: tests with one solver and as many times share one program.
-PENDULUM = Pendulum(jnp.array(1.0))
-
-
 def states(*args, **options):
     ys = simulate(*args, **options).ys
     assert ys is not None
@@ -75,9 +71,9 @@ def reference(times, start=START, **tolerances):
 
 
 def test_default_solver_agrees_with_scipy():
-    times = np.linspace(0, 20, len(TIMES))
-    solution = simulate(PENDULUM, START, times)
-    assert jnp.asarray(solution.ys).shape == (len(TIMES), 2)
+    times = np.linspace(0, 20, 101)
+    solution = simulate(Pendulum(), START, times)
+    assert jnp.asarray(solution.ys).shape == (101, 2)
     np.testing.assert_array_equal(solution.ts, times)
     # 20 time units of local errors of 1e-10.
     np.testing.assert_allclose(jnp.asarray(solution.ys), reference(times), atol=1e-8)
@@ -175,17 +171,24 @@ def test_batch_by_vmap_is_the_loop(options):
     np.testing.assert_allclose(jax.jit(jax.vmap(run))(starts), loop, atol=1e-13)
 
 
-def test_jit_with_traced_times_and_step_changes_nothing_and_compiles_once():
+def test_jit_with_traced_times_and_step_changes_nothing():
+    def run(x, ts, dt):
+        return states(Pendulum(), x, ts, GaussLegendre4(), dt)
+
+    plain = run(START, TIMES, 0.05)
+    np.testing.assert_allclose(
+        jax.jit(run)(START, jnp.asarray(TIMES), jnp.array(0.05)), plain, atol=1e-14
+    )
+
+
+def test_a_new_start_field_or_step_does_not_compile_again():
     @eqx.filter_jit
     @eqx.debug.assert_max_traces(max_traces=1)
     def run(field, x, ts, dt):
         return states(field, x, ts, ImplicitMidpoint(), dt)
 
-    plain = states(PENDULUM, START, TIMES, ImplicitMidpoint(), 0.05)
-    traced = run(PENDULUM, START, jnp.asarray(TIMES), jnp.array(0.05))
-    np.testing.assert_allclose(traced, plain, atol=1e-14)
-    other = run(Pendulum(jnp.array(2.0)), START * 2, jnp.asarray(TIMES) * 2, jnp.array(0.1))
-    assert jnp.abs(other - traced).max() > 0.1
+    for g, dt in [(1.0, 0.1), (2.0, 0.05)]:
+        run(Pendulum(jnp.array(g)), START * g, jnp.asarray(TIMES) * g, jnp.array(dt))
 
 
 def test_a_new_tolerance_does_not_compile_again():
@@ -196,18 +199,18 @@ def test_a_new_tolerance_does_not_compile_again():
             compiled.append(event)
 
     jax.monitoring.register_event_duration_secs_listener(listen)
-    jax.clear_caches()  # other tests compile this program too
-    coarse = states(PENDULUM, START, TIMES, rtol=1e-3, atol=1e-3)
+    field = Pendulum(jnp.array(1.0))
+    coarse = states(field, START, TIMES, rtol=1e-3, atol=1e-3)
     assert compiled
     compiled.clear()
-    fine = states(PENDULUM, START, TIMES, rtol=1e-9, atol=1e-9)
+    fine = states(field, START, TIMES, rtol=1e-9, atol=1e-9)
     assert not compiled
     assert 1e-8 < np.abs(fine - coarse).max() < 1e-1
 
 
 def test_a_tolerance_must_be_positive():
     with pytest.raises(ValueError, match="rtol must be positive"):
-        states(PENDULUM, START, TIMES, rtol=0.0)
+        states(Pendulum(jnp.array(1.0)), START, TIMES, rtol=0.0)
 
 
 @pytest.mark.few(1)
@@ -217,25 +220,24 @@ def test_a_tolerance_must_be_positive():
     ids=["adaptive", "ImplicitMidpoint", "StormerVerlet"],
 )
 def test_gradient_of_a_rollout_is_the_central_difference(options):
+    @jax.jit
     def loss(gravity, x0):
         ys = states(Pendulum(gravity), x0, np.linspace(0, 3, 7), **options)
         return jnp.sum(ys[:, 0] ** 2)
 
-    # The losses of the differences come from the program of the gradient: one compilation.
-    both = jax.jit(jax.value_and_grad(loss, (0, 1)))
     gravity, step = jnp.array(1.2), 1e-5
-    _, (by_gravity, by_start) = both(gravity, START)
-    above, below = (both(gravity + h, START)[0] for h in (step, -step))
-    # step² and eps/step
-    np.testing.assert_allclose(by_gravity, (above - below) / (2 * step), rtol=1e-6)
-    above, below = (both(gravity, START + jnp.array([h, 0.0]))[0] for h in (step, -step))
-    np.testing.assert_allclose(by_start[0], (above - below) / (2 * step), rtol=1e-6)
+    by_gravity, by_start = jax.jit(jax.grad(loss, (0, 1)))(gravity, START)
+    difference = (loss(gravity + step, START) - loss(gravity - step, START)) / (2 * step)
+    np.testing.assert_allclose(by_gravity, difference, rtol=1e-6)  # step² and eps/step
+    e = jnp.array([step, 0.0])
+    difference = (loss(gravity, START + e) - loss(gravity, START - e)) / (2 * step)
+    np.testing.assert_allclose(by_start[0], difference, rtol=1e-6)
 
 
 def test_flow_map_by_forward_mode_is_symplectic():
     def end(x):
         adjoint = diffrax.ForwardMode()
-        return states(PENDULUM, x, TIMES, ImplicitMidpoint(), 0.1, adjoint=adjoint)[-1]
+        return states(Pendulum(), x, TIMES, GaussLegendre4(), 0.1, adjoint=adjoint)[-1]
 
     # For n = 2 symplectic means of determinant one.
     np.testing.assert_allclose(np.linalg.det(jax.jit(jax.jacfwd(end))(START)), 1.0, atol=1e-12)
@@ -380,9 +382,7 @@ def test_an_error_inside_the_field_is_not_hidden():
 
 def test_bad_times_are_refused_under_jit_too():
     with pytest.raises(Exception, match="strictly increasing"):
-        jax.jit(lambda ts: states(PENDULUM, START, ts, diffrax.Euler(), 0.1))(
-            jnp.array([0.0, 2.0, 1.0])
-        )
+        jax.jit(lambda ts: states(Pendulum(), START, ts))(jnp.array([0.0, 2.0, 1.0]))
 
 
 def test_failed_solves_raise_unless_told_not_to():
@@ -390,26 +390,26 @@ def test_failed_solves_raise_unless_told_not_to():
     with pytest.raises(RuntimeError, match="maximum number of solver steps"):
         simulate(Pendulum(), START, ts, max_steps=3)
     with pytest.raises(RuntimeError, match="Too many steps"):
-        jax.jit(lambda ts: states(PENDULUM, START, ts, diffrax.Euler(), dt=0.01, max_steps=100))(ts)
-    stiff = Pendulum(jnp.array(1e6))
+        jax.jit(lambda ts: states(Pendulum(), START, ts, Yoshida4(), dt=0.01, max_steps=100))(ts)
     with pytest.raises(RuntimeError, match=r"maximum number|diverge"):
-        simulate(stiff, START, TIMES, ImplicitMidpoint(), dt=0.05)
+        simulate(Pendulum(jnp.array(1e4)), START, ts, ImplicitMidpoint(), dt=0.5)
     with pytest.raises(RuntimeError, match=r"overflowed.*smaller dt"):
         simulate(lambda x: x**3, START, ts, diffrax.Euler(), dt=0.1)
     quiet = simulate(Pendulum(), START, ts, max_steps=3, throw=False)
     assert quiet.result == diffrax.RESULTS.max_steps_reached
-    stuck = simulate(stiff, START, TIMES, ImplicitMidpoint(), dt=0.05, throw=False)
+    stiff = Pendulum(jnp.array(1e4))
+    stuck = simulate(stiff, START, ts, ImplicitMidpoint(), dt=0.5, throw=False)
     assert stuck.result != diffrax.RESULTS.successful
     # The state of a step that failed is no state.
-    assert not jnp.isfinite(jnp.asarray(stuck.ys)[-1]).any()
+    assert not jnp.isfinite(jnp.asarray(stuck.ys)[1:]).any()
 
 
 @pytest.mark.few(1)
 @pytest.mark.parametrize("options", [{}, {"solver": Yoshida4(), "dt": 0.1}])
 def test_progress_shows_a_bar_and_changes_nothing(options, capsys):
-    quiet = simulate(PENDULUM, START, TIMES, **options)
+    quiet = simulate(Pendulum(), START, TIMES, **options)
     assert "%" not in capsys.readouterr().err
-    loud = simulate(PENDULUM, START, TIMES, progress=True, **options)
+    loud = simulate(Pendulum(), START, TIMES, progress=True, **options)
     jax.effects_barrier()
     assert "100.00%" in capsys.readouterr().err
     np.testing.assert_array_equal(loud.ys, quiet.ys)
@@ -449,7 +449,7 @@ def test_a_state_that_overflows_in_constant_steps_is_no_success():
 
 def test_the_reason_of_a_failure_is_the_one_that_is_said():
     with pytest.raises(RuntimeError, match="NaN or infinite at x0 already"):
-        simulate(Pendulum(jnp.array(jnp.nan)), START, TIMES)
+        simulate(lambda x: x * jnp.nan, START, TIMES)
     with pytest.raises(TypeError, match="return floats"):
         simulate(lambda x: jnp.array([1, 2]), START, TIMES)
     with pytest.raises(TypeError, match="float32 or float64"):
@@ -457,8 +457,10 @@ def test_the_reason_of_a_failure_is_the_one_that_is_said():
 
 
 def test_each_tolerance_is_its_own():
+    pendulum, x0, ts = hk.systems.Pendulum(), jnp.array([1.0, 0.0]), jnp.linspace(0.0, 1.0, 5)
+
     def steps(**tolerances):
-        return int(hk.simulate(PENDULUM, START, TIMES, **tolerances).stats["num_steps"])
+        return int(hk.simulate(pendulum, x0, ts, **tolerances).stats["num_steps"])
 
     assert steps(atol=1e-2) < steps(atol=1e-12)
     assert steps(rtol=1e-2, atol=1e-9) < steps(rtol=1e-12, atol=1e-9)

@@ -51,10 +51,10 @@ class Whiteness(NamedTuple):
         """The factor on the variance of noise in the posterior, the peak of the spectrum.
 
         A field that varies along the runs with one frequency meets the noise at that frequency. On
-        the log of a drive with friction, cogging and late inputs, deviations of the gain became
-        3.0, 2.5 and 3.0 times as large by it for three kernels, and 3.1, 2.5 and 3.0 times with an
-        Ornstein-Uhlenbeck disturbance, which whitens the innovations, moves the gain by less than
-        its deviation, and needs a state more.
+        the log of a drive with friction, cogging and late inputs the root of the peak is 3.0, 2.4
+        and 2.5 for three models. With an Ornstein-Uhlenbeck disturbance, which whitens the
+        innovations and needs a state more, the deviation of the gain is 2.8, 2.6 and 3.0 times as
+        large, and the gain as wrong (`tests/benchmarks/disturbances.py`).
         """
         return 1.0 if self.is_enough else self.peak
 
@@ -103,6 +103,22 @@ class FitQuality(NamedTuple):
     rest_speed: float = 0.0
     has_friction: bool = False
 
+    @property
+    def is_disturbed(self) -> bool:
+        """Whether process noise was found."""
+        return self.process is not None and bool(self.process.any())
+
+
+def is_exact(
+    fit: FitQuality, noise: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"], given: bool
+) -> bool:
+    """Whether the states are without noise: only what the field cannot have is left, never white.
+
+    The arguments are those of `diagnose`.
+    """
+    left = np.sqrt(fit.chi_squared) * np.nanmax(noise / scale)
+    return bool(left < NEGLIGIBLE) and not given and not fit.is_disturbed
+
 
 def diagnose(
     fit: FitQuality, noise: Float[np.ndarray, " n"], scale: Float[np.ndarray, " n"], given: bool
@@ -119,15 +135,12 @@ def diagnose(
     if not fit.kept.any():
         return False
     warn_of_pushes(fit)
-    disturbed = fit.process is not None and bool(fit.process.any())
-    explained = disturbed or explains(fit.chi_squared, fit.free)
-    left = np.sqrt(fit.chi_squared) * np.nanmax(noise / scale)
-    # Of states without noise only what the field cannot have is left, and that is not white.
-    exact = bool(left < NEGLIGIBLE) and not given and not disturbed
+    explained = fit.is_disturbed or explains(fit.chi_squared, fit.free)
+    exact = is_exact(fit, noise, scale, given)
     white = exact or fit.white.is_enough
     if given and not explains(fit.chi_squared, fit.free):
         warn_of_misfit(fit)
-    elif disturbed:
+    elif fit.is_disturbed:
         warn_of_process(fit)
     said = not given and (warn_of_few(fit.remaining) or warn_of_noise(noise, scale, fit.swing))
     converged = fit.settled and (explained or exact) and white
@@ -135,7 +148,7 @@ def diagnose(
         if not fit.settled or not (explained or exact or given):
             warn_of_unsettled(fit, explained)
         if not white:
-            warn_of_correlation(fit, disturbed)
+            warn_of_correlation(fit)
     return converged
 
 
@@ -204,8 +217,8 @@ def warn_of_cost(data: Preprocessed, count: int) -> None:
 def warn_of_rest_speed(K: AbstractMatrixKernel, X: Float[np.ndarray, "N d"], n: int) -> None:
     """Warn of a `Friction` whose dry force fades over much of the momenta in X.
 
-    On a drive of at most .24 m/s a rest speed of .1 in place of .002 left the field 22 % off for
-    5 %, and a free run of 12 s 23 mm for 1.6.
+    On a drive of at most .25 m/s a rest speed of .1 in place of .0025 left the drift 27 % off for
+    5.8 %, and a free run of 12 s 24 mm for 1.7 (`tests/benchmarks/machines.py`).
     """
     for part in frictions(K):
         fastest = float(np.abs(X[:, list(damped_coordinates(part.damped, n))]).max())
@@ -224,7 +237,7 @@ def warn_of_misfit(fit: FitQuality) -> None:
         f"The residuals are largest in coordinate {c} of run {run}, {fit.misfit[run, c]:.2g} "
         "standard deviations."
     )
-    if fit.process is not None and fit.process.any():  # the path follows the samples
+    if fit.process is not None and fit.is_disturbed:  # the path follows the samples
         where = f"Process noise that would explain them is {_numbers(fit.process)}; it is used."
     require.warn(
         f"the structure does not explain the runs: χ² is {fit.chi_squared:.3g} per degree of "
@@ -246,7 +259,7 @@ def warn_of_process(fit: FitQuality) -> None:
     )
 
 
-def warn_of_correlation(fit: FitQuality, disturbed: bool) -> None:
+def warn_of_correlation(fit: FitQuality) -> None:
     """Warn that the innovations are not white, and say what to try.
 
     What a disturbance may stand for is said once, by `warn_of_process`.
@@ -259,7 +272,7 @@ def warn_of_correlation(fit: FitQuality, disturbed: bool) -> None:
     )
     if fit.between:
         timing = f"inputs that go on otherwise, between='{fit.between}' is likelier; {timing}"
-    lacks = "" if disturbed else f"{_lacked(fit)}; "
+    lacks = "" if fit.is_disturbed else f"{_lacked(fit)}; "
     more = "; process_noise=None" if fit.process is None else ""
     if fit.few:
         few = f"the {fit.few} landmarks are too few, and solver=hk.Nystrom(max_points="

@@ -452,7 +452,7 @@ def price(end: End, impulse: Float[np.ndarray, " n"], pushes: int = 0) -> float:
 
 def whitening_of(model: Model) -> Whitening:
     """How rows of this model are whitened."""
-    return whiten if bool(jnp.isfinite(model.log_process).any()) else project_out_starts
+    return whiten if model.is_disturbed else project_out_starts
 
 
 def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:

@@ -29,6 +29,7 @@ from hamkernel._trajectories.diagnostics import (
     check_identifiable,
     diagnose,
     frictions,
+    is_exact,
     warn_in_advance,
     whiteness,
 )
@@ -217,6 +218,9 @@ def _learned(
     rows = now.field.points, now.rows, task.start_deviation
     z, counts = innovations(whitened_rows(now.model, *rows), now.rows), np.asarray(now.rows.counts)
     fit = _quality(runs, end, alone, misfit, z, process, states)
+    exact = is_exact(fit, noise, data.scale, given)
+    if fit.kept.any() and not (exact or fit.white.is_enough):
+        fit = _with_causes(fit, runs, end, alone)
     converged = diagnose(fit, noise, data.scale, given)
     observations = as_observations(now.rows, now.model, task.mean, task.start_deviation)
     count = 1 if observations is None else sum(len(y) for _, y in observations.parts())
@@ -270,7 +274,7 @@ def _quality(
     states: list[Float[np.ndarray, "T n"]],
 ) -> FitQuality:
     """How well the field follows the runs; `z` are the innovations by segment."""
-    now, task, data, times = end.now, end.task, end.task.data, runs.on_host()[0]
+    now, data, times = end.now, end.task.data, runs.on_host()[0]
     counts = np.asarray(now.rows.counts)
     kept, pieces = np.zeros(len(data.runs)), list(zip(end.pieces, now.good, strict=True))
     for (r, start, stop), good in pieces:
@@ -283,9 +287,7 @@ def _quality(
     speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
     spacing = np.median(np.concatenate([np.diff(t) for t in times]))
     swing = 2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)) / spacing
-    white, n = whiteness(z, counts), runs.dimension
-    is_white = white.is_enough  # then no causes are looked for
-    given = now.model, now.field.points, now.rows, task.start_deviation, whitening_of(now.model)
+    n = runs.dimension
     least = 0.0 if n % 2 else 0.01 * max(float(np.abs(x[:, n // 2 :]).max()) for x in states)
     return FitQuality(
         kept=kept,
@@ -295,17 +297,25 @@ def _quality(
         chi_squared=squares / max(free, 1.0),
         free=free,
         remaining=now.free,
-        white=white,
+        white=whiteness(z, counts),
         process=None if alone is None else process,
         count=len(end.history),
         settled=end.settled,
         swing=float(swing),
         driven=runs.inputs is not None,
-        few=0 if is_white or not (task.capped or limited_by_landmarks(*given)) else len(given[1]),
-        between="" if is_white else likelier_between(runs, end if alone is None else alone),
-        gained=0.0 if is_white or not least > 0 else gain_of_friction(*given, data, least),
         rest_speed=least,
         has_friction=bool(frictions(now.field.kernel)),
+    )
+
+
+def _with_causes(fit: FitQuality, runs: Runs, end: End, alone: End | None) -> FitQuality:
+    """The same with what would make the rows likelier: the causes that warnings name."""
+    now, task, least = end.now, end.task, fit.rest_speed
+    given = now.model, now.field.points, now.rows, task.start_deviation, whitening_of(now.model)
+    return fit._replace(
+        few=len(now.field.points) if task.capped or limited_by_landmarks(*given) else 0,
+        between=likelier_between(runs, end if alone is None else alone),
+        gained=gain_of_friction(*given, task.data, least) if least > 0 else 0.0,
     )
 
 
@@ -325,7 +335,7 @@ def _disturbances(end: End, times: list[np.ndarray]) -> tuple[Float[Array, "T n"
     """The smoothed w of each run, from each of its times to the next."""
     task, now = end.task, end.now
     w = np.zeros(now.rows.drive.shape)
-    if bool(jnp.isfinite(now.model.log_process).any()):
+    if now.model.is_disturbed:
         given = now.field.points, now.rows, task.start_deviation
         w = np.asarray(smoothed_path(now.model, now.field.coefficients, *given).disturbance)
     out = []

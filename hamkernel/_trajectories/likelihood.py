@@ -90,6 +90,11 @@ class Model(NamedTuple):
     log_process: Float[Array, " n"]
 
     @property
+    def is_disturbed(self) -> bool:
+        """Whether there is process noise."""
+        return bool(jnp.isfinite(self.log_process).any())
+
+    @property
     def flat(self) -> Float[Array, " P"]:
         leaves, _ = ravel_pytree(eqx.filter(self.kernel, eqx.is_inexact_array))
         leaves = leaves.astype(self.log_noise.dtype)
