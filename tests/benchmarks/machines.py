@@ -14,6 +14,11 @@ Printed: errors of the gain and of the drift along the log relative to its rms, 
 drift inside two standard deviations, by how much bands are widened, the rms of the position in a
 free run of a log that was not learned from (drive: 12 s, in mm; oscillator: the first 50 samples,
 in mV), whether it converged, CPU seconds.
+
+Seed 0, errors of gain and drift, share inside, free run. Drive: potential alone 63 %, 101 %, .02,
+333 mm; with friction 12 %, 27 %, .33, 24 mm; with sharp friction 2.2 %, 5.8 %, .59, 1.7 mm; none
+converged. Oscillator: held 15 %, 10 %, .54, 48 mV; linear 4.8 %, .81 %, .67, 3.1 mV; smooth and
+auto, which takes it, .05 %, .012 %, .95, .47 mV, the only ones that converged.
 """
 
 import argparse
