@@ -6,23 +6,27 @@
     posterior = hk.condition(K, X, Y, 1e-4)                  # with error bars
     orbit = hk.simulate(field, x0, ts).ys
 
-Data flows from kernels to fields through these folders; each imports only from itself and those
-above it:
+Data flows from kernels to fields through these folders and files; each imports only from itself and
+those above it:
 
     _kernels      scalar kernels k(x, z), and any callable as one
     _structures   matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, symmetries; tensors in `poisson`
     _observations what is measured, as rows of linear functionals
-    _gram         the Gram: dense, as an operator, and its derivatives
+    _gram         the Gram as a matrix, its parts, and its derivatives
+    _gram_operator
+                  products with the Gram, tile by tile
     _features     random Fourier features
     _fields       what is learned: f and its potential
     _solvers      how it is solved: dense, by conjugate gradients, of low rank, from streams;
                   factors of G + ridge I
     _posterior    a field with its uncertainty
-    _validation   validation losses in closed form
+    _closed_forms held-out residuals and the likelihood, from any factor of G + ridge I
+    _validation   validation losses, each by one factorisation
     _tuning       hyperparameters, by gradients
     _trajectories from logged runs to a field
-    _dynamics     simulation
     _discovery    a formula read off the data, and which physics they obey
+    _symplectic, _simulate
+                  symplectic integrators, and trajectories of any field
     _save         fields in files
     systems, plot, paper
                   example systems, pictures, the paper's experiments
@@ -41,8 +45,8 @@ from hamkernel._discovery.readout import readout
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import FeatureField, KernelField
 from hamkernel._fields.joined import ControlledField, FamilyField
-from hamkernel._gram.dense import gram
-from hamkernel._gram.operator import gram_operator
+from hamkernel._gram import gram
+from hamkernel._gram_operator import gram_operator
 from hamkernel._kernels.built_in import Gaussian, Matern, Periodic, Polynomial, RationalQuadratic
 from hamkernel._kernels.check import check_kernel
 from hamkernel._kernels.transforms import Select, Warp
@@ -64,7 +68,7 @@ from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.runs import Runs
 from hamkernel._tuning.tune import Tuned, tune
-from hamkernel._validation.losses import (
+from hamkernel._validation import (
     cross_validation_loss,
     cross_validation_residuals,
     generalized_cross_validation,
@@ -73,8 +77,8 @@ from hamkernel._validation.losses import (
 
 if TYPE_CHECKING:
     from hamkernel import paper, plot
-    from hamkernel._dynamics.simulate import simulate
-    from hamkernel._dynamics.symplectic import (
+    from hamkernel._simulate import simulate
+    from hamkernel._symplectic import (
         GaussLegendre4,
         GaussLegendre6,
         ImplicitMidpoint,
@@ -172,8 +176,8 @@ def __getattr__(name: str) -> Any:
     if name in ("plot", "paper"):
         return importlib.import_module(f"hamkernel.{name}")
     if name in __all__:  # what is not loaded yet: `simulate` and the integrators
-        file = "simulate" if name == "simulate" else "symplectic"
-        return getattr(importlib.import_module(f"hamkernel._dynamics.{file}"), name)
+        file = "_simulate" if name == "simulate" else "_symplectic"
+        return getattr(importlib.import_module(f"hamkernel.{file}"), name)
     raise AttributeError(f"module 'hamkernel' has no attribute {name!r}")
 
 

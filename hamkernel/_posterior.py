@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, FieldSum, Mean, root
 from hamkernel._fields.joined import AbstractJoinedField, FamilyField, known_of, learned_field
-from hamkernel._gram.dense import components
+from hamkernel._gram import components
 from hamkernel._kernels.base import Invariance, Scaled
 from hamkernel._kernels.symmetry import without_symmetry
 from hamkernel._machine import one_blas_thread

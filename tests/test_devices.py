@@ -192,7 +192,7 @@ fitted = hk.fit(K, XE, YE, 1e-4, solver=few)
 given = fitted.residual, fitted.evaluate(XE), hk.gram_operator(K, XE).mv(YE)
 dense = {kind: hk.fit(K, *data, 1e-4, solver=hk.Cholesky()).coefficients
          for kind, data in {"one": (X, Y), "spread": (XS, YS), "explicit": (XE, YE)}.items()}
-from hamkernel._gram.operator import product as multiply
+from hamkernel._gram_operator import product as multiply
 there = lambda X, A, rows: multiply(K, X, X, A, rows, rows)
 lost = lambda X, A, rows: multiply(K, X, X, A)
 print(json.dumps({

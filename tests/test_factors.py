@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from hamkernel._closed_forms import Partition, free_residuals, held_out, log_density
 from hamkernel._solvers.factors import DenseSystem, dense_factor
 from hamkernel._solvers.low_rank_factor import LowRankSystem
-from hamkernel._validation.closed_forms import Partition, free_residuals, held_out, log_density
 
 
 def positive(D: int) -> np.ndarray:

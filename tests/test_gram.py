@@ -9,7 +9,7 @@ import pytest
 from kernels import BY_NAME, CASES, canonical
 
 import hamkernel as hk
-from hamkernel._gram.dense import block_traces, trace
+from hamkernel._gram import block_traces, trace
 
 SYMMETRY = 1e-12  # relative: entries are computed twice, in two orders
 NEGATIVE = -1e-10  # smallest eigenvalue relative to the trace: rounding of the eigenvalues

@@ -11,7 +11,7 @@ from jax.test_util import check_grads
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._dynamics.symplectic import (
+from hamkernel._symplectic import (
     FixedPointToRounding,
     GaussLegendre4,
     GaussLegendre6,

@@ -360,7 +360,7 @@ def test_values_and_gradients_together_are_those_of_gpytorch():
     x = torch.as_tensor(X[:5]).double()
     theirs = kernel(x, x).to_dense().detach().numpy().reshape(5, 3, 5, 3)
     curl_free = hk.CurlFree(hk.Gaussian(1.5))
-    from hamkernel._gram.dense import between
+    from hamkernel._gram import between
     from hamkernel._observations.blocks import Components
 
     values, slopes = Values(jnp.asarray(X[:5])), Components(jnp.asarray(X[:5]))

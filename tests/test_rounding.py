@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._gram.dense import field_rounding
+from hamkernel._gram import field_rounding
 
 HENON_HEILES = hk.systems.HenonHeiles()
 START = jnp.array([0.1, 0.2, 0.3, 0.1])

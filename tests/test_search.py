@@ -10,7 +10,7 @@ import optimistix as optx
 import pytest
 
 import hamkernel as hk
-from hamkernel._gram.dense import gram_of_rows
+from hamkernel._gram import gram_of_rows
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of, measurements_of_states
 from hamkernel._solvers.low_rank import WaveBasis
@@ -18,7 +18,7 @@ from hamkernel._tuning.minimiser import BoxBFGS, begun, minimised, most_likely_i
 from hamkernel._tuning.objective import SearchObjective, criterion_of, parts_of
 from hamkernel._tuning.search import design, shares_apart, spread_out
 from hamkernel._tuning.space import SearchSpace, full_trace, hyperparameters
-from hamkernel._validation.losses import generalized_loss
+from hamkernel._validation import generalized_loss
 
 N = 20
 RNG = np.random.default_rng(0)

@@ -16,8 +16,10 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._dynamics.simulate import simulate
-from hamkernel._dynamics.symplectic import (
+from hamkernel._kernels.built_in import Gaussian
+from hamkernel._simulate import simulate
+from hamkernel._structures.structure import Symplectic
+from hamkernel._symplectic import (
     GaussLegendre4,
     GaussLegendre6,
     ImplicitMidpoint,
@@ -25,8 +27,6 @@ from hamkernel._dynamics.symplectic import (
     Yoshida4,
     equal_steps,
 )
-from hamkernel._kernels.built_in import Gaussian
-from hamkernel._structures.structure import Symplectic
 
 SYMPLECTIC = [
     ImplicitMidpoint(),

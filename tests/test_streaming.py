@@ -12,7 +12,7 @@ import pytest
 from data import swings
 
 import hamkernel as hk
-from hamkernel._gram.dense import gram_of_rows, rows_between
+from hamkernel._gram import gram_of_rows, rows_between
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of
 from hamkernel._solvers.nystrom import LandmarkFit, Nystrom

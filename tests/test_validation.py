@@ -13,8 +13,8 @@ from jax.flatten_util import ravel_pytree
 from scipy.stats import multivariate_normal
 
 import hamkernel as hk
+from hamkernel._closed_forms import Partition, held_out
 from hamkernel._solvers.factors import DenseSystem
-from hamkernel._validation.closed_forms import Partition, held_out
 
 EXACT = 1e-10  # condition of the systems, up to 1e4, times rounding
 DIFFERENCES = 1e-5  # of central differences: their own error is below 1e-7

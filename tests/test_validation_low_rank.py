@@ -13,7 +13,7 @@ from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of, measurements_of_states
 from hamkernel._solvers.landmarks import given_landmarks, landmarks_of
 from hamkernel._solvers.low_rank import LandmarkBasis, WaveBasis
-from hamkernel._validation.losses import (
+from hamkernel._validation import (
     features_of_rows,
     generalized_loss,
     held_out_rows,

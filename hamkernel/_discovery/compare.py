@@ -34,7 +34,7 @@ from hamkernel._tuning.objective import criterion_of
 from hamkernel._tuning.search import Search, best
 from hamkernel._tuning.space import RIDGE, SearchSpace, named_values, velocity_rms
 from hamkernel._tuning.tune import SEARCH_COPIES, check_found, decode, warn_of_constants
-from hamkernel._validation.losses import check_memory
+from hamkernel._validation import check_memory
 
 # A factor of e⁵ = 148 in the evidence. Of the confident answers none was wrong in the prototype at
 # 5, up to .05 at 3; see `tests/benchmarks/comparison.py`.

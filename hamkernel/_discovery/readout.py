@@ -37,7 +37,7 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._discovery.formula import Formula, operator_of
 from hamkernel._fields.joined import at_inputs, known_of
-from hamkernel._gram.dense import gram_of_rows
+from hamkernel._gram import gram_of_rows
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._kernels.symmetry import symmetry_removed
 from hamkernel._observations.measurements import inputs_of

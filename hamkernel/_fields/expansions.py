@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 
 from hamkernel._features import AbstractFeatures, SumFeatures
 from hamkernel._fields.base import AbstractField, SolverInfo, at_points, root
-from hamkernel._gram.dense import centred
-from hamkernel._gram.operator import placed_product
+from hamkernel._gram import centred
+from hamkernel._gram_operator import placed_product
 from hamkernel._machine import as_given, on_each, rows_of, split
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 

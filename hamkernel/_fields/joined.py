@@ -23,7 +23,7 @@ from hamkernel._fields.base import (
     root,
 )
 from hamkernel._fields.expansions import FeatureField, KernelField
-from hamkernel._gram.operator import placed_product
+from hamkernel._gram_operator import placed_product
 from hamkernel._structures.base import Sum
 from hamkernel._structures.family import AbstractFamily
 from hamkernel._structures.joined import AbstractJoinedKernel, Controlled

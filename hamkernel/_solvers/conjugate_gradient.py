@@ -23,8 +23,8 @@ from jaxtyping import Array, Float, Int
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import KernelField
-from hamkernel._gram.dense import constant, gram_rounding, trace
-from hamkernel._gram.operator import product
+from hamkernel._gram import constant, gram_rounding, trace
+from hamkernel._gram_operator import product
 from hamkernel._machine import RowSharding, as_given, rows_of, split
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.dense import field_of_rows, gram_product, norm_of, relative

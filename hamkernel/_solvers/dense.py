@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Key
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo, at_points, root
 from hamkernel._fields.expansions import KernelField, kernel_field
-from hamkernel._gram.dense import (
+from hamkernel._gram import (
     between,
     gram_of_rows,
     plus_ridge,

@@ -22,7 +22,7 @@ from jax.core import Tracer
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from hamkernel import _require as require
-from hamkernel._gram.dense import (
+from hamkernel._gram import (
     assemble,
     between_all,
     block_traces,

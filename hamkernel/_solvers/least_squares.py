@@ -26,7 +26,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
-from hamkernel._gram.dense import constant, plus_ridge
+from hamkernel._gram import constant, plus_ridge
 from hamkernel._machine import RowSharding, on_each
 
 # A design gives the rows of some points at once: (t, n) -> (t, n, r), row (i, a) of a field's
@@ -248,7 +248,7 @@ def normal(
 
         square = jnp.zeros_like(basis)
         nothing = Normal(square, square[0], square[0, 0])
-        # A tile of 2²⁰ numbers, 8 MB, stays in the cache; see `_gram/operator.py`.
+        # A tile of 2²⁰ numbers, 8 MB, stays in the cache; see `_gram_operator.py`.
         return over_tiles(step, nothing, (X, Y), max(1024, 2**20 // len(basis)))[0]
 
     return on_each(spread, own_sums, (design, basis), X, Y, joined=False)

@@ -44,7 +44,7 @@ from hamkernel import _require as require
 from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import AbstractField, SolverInfo, root
 from hamkernel._fields.expansions import FeatureField, KernelField, feature_field, kernel_field
-from hamkernel._gram.dense import between, block_traces, components, plus_ridge, trace_of_rows
+from hamkernel._gram import between, block_traces, components, plus_ridge, trace_of_rows
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks, whitening

@@ -23,7 +23,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hamkernel._gram.dense import plus_ridge
+from hamkernel._gram import plus_ridge
 from hamkernel._solvers.factors import (
     AbstractBlocks,
     AbstractFactor,

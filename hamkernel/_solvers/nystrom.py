@@ -22,8 +22,8 @@ from jaxtyping import Array, ArrayLike, Float, Int, Key, Num, UInt32
 from hamkernel import _require as require
 from hamkernel._fields.base import root
 from hamkernel._fields.expansions import KernelField
-from hamkernel._gram.dense import components, trace, trace_of_rows
-from hamkernel._gram.operator import product
+from hamkernel._gram import components, trace, trace_of_rows
+from hamkernel._gram_operator import product
 from hamkernel._machine import RowSharding, as_given, rows_of, split
 from hamkernel._observations.measurements import Measurements
 from hamkernel._show import text

@@ -26,7 +26,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 from hamkernel import _require as require
 from hamkernel._fields.base import known_part
 from hamkernel._fields.joined import learned_field
-from hamkernel._gram.dense import components
+from hamkernel._gram import components
 from hamkernel._machine import RowSharding, one_blas_thread, rows_of, split
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import (

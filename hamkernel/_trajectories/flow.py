@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hamkernel._gram.dense import centred
+from hamkernel._gram import centred
 from hamkernel._machine import compiled_by_size, orthonormal
 from hamkernel._structures.base import AbstractMatrixKernel
 

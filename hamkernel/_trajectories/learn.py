@@ -14,7 +14,7 @@ from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo, known_part
 from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import learned_field
-from hamkernel._gram.operator import placed_product
+from hamkernel._gram_operator import placed_product
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._machine import one_blas_thread
 from hamkernel._observations.kinds import inputs_or_parameters

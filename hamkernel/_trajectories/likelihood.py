@@ -25,7 +25,7 @@ from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
-from hamkernel._gram.dense import assemble, forward_differentiated
+from hamkernel._gram import assemble, forward_differentiated
 from hamkernel._kernels.base import Scaled
 from hamkernel._machine import compiled_by_size, orthonormal
 from hamkernel._structures.base import AbstractMatrixKernel

@@ -14,13 +14,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
+from hamkernel._closed_forms import Folds, Partition
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._tuning.space import SearchSpace
-from hamkernel._validation.closed_forms import Folds, Partition
-from hamkernel._validation.losses import (
+from hamkernel._validation import (
     cross_validation_loss,
     generalized_cross_validation,
     generalized_loss_and_square,

@@ -16,7 +16,7 @@ from jax.flatten_util import ravel_pytree
 from jax.tree_util import GetAttrKey, SequenceKey, keystr, tree_flatten_with_path
 from jaxtyping import Array, ArrayLike, Float
 
-from hamkernel._gram.dense import forward_differentiated, gram_of_rows, gram_rounding, trace
+from hamkernel._gram import forward_differentiated, gram_of_rows, gram_rounding, trace
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, bounds_by_value
 from hamkernel._kernels.functions import Bound
 from hamkernel._kernels.symmetry import without_symmetry

@@ -21,6 +21,7 @@ import optimistix as optx
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
+from hamkernel._closed_forms import Folds
 from hamkernel._fields.base import AbstractField, Mean
 from hamkernel._machine import one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
@@ -39,8 +40,7 @@ from hamkernel._tuning.objective import (
 )
 from hamkernel._tuning.search import Search, best
 from hamkernel._tuning.space import RIDGE, SearchSpace, constants, velocity_rms
-from hamkernel._validation.closed_forms import Folds
-from hamkernel._validation.losses import check_memory
+from hamkernel._validation import check_memory
 
 
 class Tuned(eqx.Module):

@@ -18,16 +18,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
-from hamkernel._dynamics.simulate import simulate
+from hamkernel._closed_forms import Partition
 from hamkernel._fields.expansions import KernelField
-from hamkernel._gram.dense import assemble, plus_ridge
+from hamkernel._gram import assemble, plus_ridge
 from hamkernel._kernels.built_in import Gaussian
+from hamkernel._simulate import simulate
 from hamkernel._solvers.factors import solution
 from hamkernel._solvers.fit import fit
 from hamkernel._structures.base import AbstractMatrixKernel, Odd
 from hamkernel._structures.structure import Separable, Symplectic
 from hamkernel._tuning.tune import tune
-from hamkernel._validation.closed_forms import Partition
 from hamkernel.systems import AbstractHamiltonianSystem, HarmonicOscillator, Pendulum, sample
 
 # The regularization for which the ridge of `fit`, N · regularization, is the ridge that is meant.

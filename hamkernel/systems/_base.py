@@ -384,7 +384,7 @@ def _trajectories(
     def velocity(x):
         return field(x).astype(x.dtype)
 
-    from hamkernel._dynamics.simulate import simulate  # which loads diffrax
+    from hamkernel._simulate import simulate  # which loads diffrax
 
     def trajectory(x0):
         if ts.size == 1:

@@ -25,12 +25,12 @@ from flint import arb, arb_mat, ctx
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
+from hamkernel._closed_forms import Partition
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of_states
 from hamkernel._solvers.landmarks import landmarks_of
 from hamkernel._solvers.low_rank import LandmarkBasis, WaveBasis
-from hamkernel._validation.closed_forms import Partition
-from hamkernel._validation.losses import (
+from hamkernel._validation import (
     generalized_loss,
     log_likelihood,
     partition_loss,

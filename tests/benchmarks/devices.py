@@ -21,7 +21,7 @@ import numpy as np
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import hamkernel as hk
-from hamkernel._gram.operator import product
+from hamkernel._gram_operator import product
 from hamkernel._machine import RowSharding
 from hamkernel._observations.measurements import measurements_of_states
 from hamkernel._solvers import conjugate_gradient, nystrom, random_features

@@ -33,9 +33,9 @@ from dynamics import TWO_BODIES, near_circular
 from timing import Timed, environment, in_turn, timed
 
 import hamkernel as hk
-from hamkernel._gram.dense import assemble, plus_ridge
+from hamkernel._closed_forms import Partition
+from hamkernel._gram import assemble, plus_ridge
 from hamkernel._solvers.factors import solution
-from hamkernel._validation.closed_forms import Partition
 from hamkernel.paper._experiments import grid_losses
 
 FOLDS = 5

@@ -16,7 +16,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
-from hamkernel._gram.dense import between_all, forward_differentiated, gram_of_rows, plus_ridge
+from hamkernel._closed_forms import (
+    Folds,
+    Partition,
+    free_residuals,
+    held_out,
+    log_density,
+)
+from hamkernel._gram import between_all, forward_differentiated, gram_of_rows, plus_ridge
 from hamkernel._machine import one_blas_thread, refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock, Combinations
 from hamkernel._observations.kinds import AbstractObservations
@@ -26,13 +33,6 @@ from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._solvers.low_rank_factor import LowRankSystem
 from hamkernel._solvers.problem import problem
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._validation.closed_forms import (
-    Folds,
-    Partition,
-    free_residuals,
-    held_out,
-    log_density,
-)
 
 
 @one_blas_thread

@@ -13,11 +13,11 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
-from hamkernel._dynamics.symplectic import AbstractSymplecticSolver, EqualSteps, step_counts
 from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import AbstractJoinedField
-from hamkernel._gram.dense import field_rounding
+from hamkernel._gram import field_rounding
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._symplectic import AbstractSymplecticSolver, EqualSteps, step_counts
 
 Between = Literal["held", "linear"]
 

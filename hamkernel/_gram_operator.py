@@ -17,7 +17,7 @@ import lineax as lx
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._gram.dense import centred, diagonals, gram
+from hamkernel._gram import centred, diagonals, gram
 from hamkernel._machine import RowSharding, as_given, rows_of, split, sum_of_columns
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel

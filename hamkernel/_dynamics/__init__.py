@@ -1,1 +1,0 @@
-"""Simulation: trajectories of any vector field."""

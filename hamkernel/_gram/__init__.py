@@ -1,1 +1,0 @@
-"""The Gram of a kernel: dense, as an operator, and its derivatives."""

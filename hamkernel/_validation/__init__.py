@@ -1,1 +1,0 @@
-"""Validation losses in closed form."""
