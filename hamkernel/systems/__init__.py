@@ -15,26 +15,24 @@ as in `Driven(Damped(Pendulum(), 0.1), [[0.0], [1.0]])`; call a driven system as
 """
 
 from hamkernel.systems._base import AbstractHamiltonianSystem, Damped, Driven, sample
+from hamkernel.systems._bodies import (
+    AbstractPoissonSystem,
+    ChargedParticle,
+    Kepler,
+    LotkaVolterra,
+    NBody,
+    PointVortices,
+    RigidBody,
+)
 from hamkernel.systems._mechanisms import (
     Acrobot,
     CartPole,
     DoublePendulum,
-    Kepler,
-    NBody,
-    PointVortices,
-)
-from hamkernel.systems._oscillators import (
     Duffing,
     HarmonicOscillator,
     HenonHeiles,
     Pendulum,
     SpringChain,
-)
-from hamkernel.systems._poisson import (
-    AbstractPoissonSystem,
-    ChargedParticle,
-    LotkaVolterra,
-    RigidBody,
 )
 
 __all__ = [

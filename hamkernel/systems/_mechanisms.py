@@ -1,7 +1,8 @@
-"""Systems of several bodies: linked, driven by one motor, gravitating, or carried by a flow."""
+"""Masses on springs, pendulums and linkages: Hamiltonian systems with J∇H."""
 
 from typing import ClassVar
 
+import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Num
 
@@ -10,14 +11,192 @@ from hamkernel.systems._base import (
     AbstractHamiltonianSystem,
     Numbers,
     at,
-    count_of,
-    in_precision,
     log_parameter,
     positive,
-    shaped,
     signed_parameter,
-    squared_distances,
 )
+
+
+class HarmonicOscillator(AbstractHamiltonianSystem):
+    """A mass on a spring: H = p²/(2m) + kq²/2, n = 2.
+
+    q is the displacement [m], p = mq̇ the momentum [kg m/s]. The period is 2π√(m/k).
+
+    Args:
+        mass: m > 0 [kg].
+        stiffness: k > 0 [N/m].
+
+    Raises:
+        ValueError: a parameter is not a positive scalar.
+
+    Source: Smith & Egeland (2023), section Experiments, whose values are the defaults.
+    """
+
+    is_separable: ClassVar[bool] = True
+
+    log_mass: Float[Array, ""]
+    log_stiffness: Float[Array, ""]
+    mass = positive("mass", "The mass m.")
+    stiffness = positive("stiffness", "The spring constant k.")
+
+    def __init__(self, mass: ArrayLike = 0.5, stiffness: ArrayLike = 1.0):
+        self.log_mass = log_parameter(mass, "mass")
+        self.log_stiffness = log_parameter(stiffness, "stiffness")
+
+    def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
+        """Return H(x), shape (); ValueError unless x has shape (2,)."""
+        self, (q, p) = at(self, x, 2)
+        return p**2 / (2 * self.mass) + self.stiffness * q**2 / 2
+
+
+class Pendulum(AbstractHamiltonianSystem):
+    """A point mass on a massless rod: H = p²/(2ml²) + mgl(1 − cos q), n = 2.
+
+    q is the angle from hanging [rad], p = ml²q̇ its angular momentum [kg m²/s]. Small swings have
+    the period 2π√(l/g).
+
+    Args:
+        mass: m > 0 [kg].
+        length: l > 0 [m].
+        gravity: g > 0 [m/s²].
+
+    Raises:
+        ValueError: a parameter is not a positive scalar.
+
+    Source: Smith & Egeland (2023), section Experiments, whose text gives the defaults.
+    """
+
+    is_separable: ClassVar[bool] = True
+
+    log_mass: Float[Array, ""]
+    log_length: Float[Array, ""]
+    log_gravity: Float[Array, ""]
+    mass = positive("mass", "The mass m.")
+    length = positive("length", "The length l of the rod.")
+    gravity = positive("gravity", "The acceleration of gravity g.")
+
+    def __init__(self, mass: ArrayLike = 0.5, length: ArrayLike = 1.0, gravity: ArrayLike = 9.81):
+        self.log_mass = log_parameter(mass, "mass")
+        self.log_length = log_parameter(length, "length")
+        self.log_gravity = log_parameter(gravity, "gravity")
+
+    def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
+        """Return H(x), shape (); ValueError unless x has shape (2,)."""
+        self, (q, p) = at(self, x, 2)
+        kinetic = p**2 / (2 * self.mass * self.length**2)
+        return kinetic + self.mass * self.gravity * self.length * (1 - jnp.cos(q))
+
+
+class Duffing(AbstractHamiltonianSystem):
+    """An undamped, unforced Duffing oscillator: H = p²/(2m) + αq²/2 + βq⁴/4, n = 2.
+
+    q is the displacement [m], p = mq̇ [kg m/s]. The defaults have two wells, at q = ±√(−α/β), and
+    a saddle between them; with β < 0 the motion may escape to infinity in finite time.
+
+    Args:
+        mass: m > 0 [kg].
+        linear_stiffness: α of either sign [N/m].
+        cubic_stiffness: β of either sign [N/m³].
+
+    Raises:
+        ValueError: the mass is not a positive scalar, or a stiffness not a finite one.
+
+    Source: Guckenheimer & Holmes, Nonlinear Oscillations, Dynamical Systems, and Bifurcations of
+        Vector Fields (Springer, 1983), section 2.2, without damping and forcing.
+    """
+
+    is_separable: ClassVar[bool] = True
+
+    log_mass: Float[Array, ""]
+    linear_stiffness: Float[Array, ""]
+    cubic_stiffness: Float[Array, ""]
+    mass = positive("mass", "The mass m.")
+
+    def __init__(
+        self,
+        mass: ArrayLike = 1.0,
+        linear_stiffness: ArrayLike = -1.0,
+        cubic_stiffness: ArrayLike = 1.0,
+    ):
+        self.log_mass = log_parameter(mass, "mass")
+        self.linear_stiffness = signed_parameter(linear_stiffness, "linear_stiffness")
+        self.cubic_stiffness = signed_parameter(cubic_stiffness, "cubic_stiffness")
+
+    def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
+        """Return H(x), shape (); ValueError unless x has shape (2,)."""
+        self, (q, p) = at(self, x, 2)
+        potential = self.linear_stiffness * q**2 / 2 + self.cubic_stiffness * q**4 / 4
+        return p**2 / (2 * self.mass) + potential
+
+
+class HenonHeiles(AbstractHamiltonianSystem):
+    """A star in a galaxy's plane: H = |p|²/2 + |q|²/2 + λ(q₁²q₂ − q₂³/3), n = 4.
+
+    Dimensionless. Motion that starts near the origin stays bounded for H < 1/(6λ²), and turns
+    from mostly regular to mostly chaotic as H nears that value.
+
+    Args:
+        coupling: λ of either sign; 1 in the paper, 0 for two free oscillators.
+
+    Raises:
+        ValueError: the coupling is not a finite scalar.
+
+    Source: Hénon & Heiles, The applicability of the third integral of motion: some numerical
+        experiments, Astronomical Journal 69 (1964) 73-79.
+    """
+
+    is_separable: ClassVar[bool] = True
+
+    coupling: Float[Array, ""]
+
+    def __init__(self, coupling: ArrayLike = 1.0):
+        self.coupling = signed_parameter(coupling, "coupling")
+
+    def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
+        """Return H(x), shape (); ValueError unless x has shape (4,)."""
+        self, x = at(self, x, 4)
+        return x @ x / 2 + self.coupling * (x[0] ** 2 * x[1] - x[1] ** 3 / 3)
+
+
+class SpringChain(AbstractHamiltonianSystem):
+    """Masses in a row, joined by springs to each other and to two fixed walls, n = 2·count.
+
+    H = Σᵢ pᵢ²/(2mᵢ) + ½ Σ_{i=0}^{count} kᵢ(qᵢ₊₁ − qᵢ)²,  q₀ = q_{count+1} = 0
+
+    q are the displacements from rest [m], p their momenta [kg m/s]. With equal masses and springs
+    the normal frequencies are 2√(k/m) sin(jπ/(2(count+1))), j = 1…count.
+
+    Args:
+        count: number of masses, one or more.
+        mass: m > 0 [kg], one for all or shape (count,).
+        stiffness: k > 0 [N/m], one for all or shape (count + 1,), from wall to wall.
+
+    Raises:
+        TypeError: count is not an integer.
+        ValueError: count is below one, or a parameter has the wrong shape or is not positive.
+
+    Source: Goldstein, Poole & Safko, Classical Mechanics (3rd ed., 2002), section 13.1.
+    """
+
+    is_separable: ClassVar[bool] = True
+
+    count: int = eqx.field(static=True)
+    log_mass: Float[Array, "*count"]
+    log_stiffness: Float[Array, "*springs"]
+    mass = positive("mass", "The masses m, shape () or (count,).")
+    stiffness = positive("stiffness", "The spring constants k, shape () or (count + 1,).")
+
+    def __init__(self, count: int = 10, mass: Numbers = 1.0, stiffness: Numbers = 1.0):
+        self.count = require.count(count, "count")
+        self.log_mass = log_parameter(mass, "mass", (), (self.count,))
+        self.log_stiffness = log_parameter(stiffness, "stiffness", (), (self.count + 1,))
+
+    def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        """Return H(x), shape (); ValueError unless x has shape (2·count,)."""
+        self, x = at(self, x, 2 * self.count)
+        q, p = jnp.split(x, 2)
+        stretch = jnp.diff(jnp.pad(q, 1))  # (count + 1,)
+        return jnp.sum(p**2 / (2 * self.mass)) + jnp.sum(self.stiffness * stretch**2) / 2
 
 
 class DoublePendulum(AbstractHamiltonianSystem):
@@ -39,7 +218,7 @@ class DoublePendulum(AbstractHamiltonianSystem):
         ValueError: a parameter has the wrong shape or is not positive.
 
     Source: the Legendre transform of the Lagrangian in Landau & Lifshitz, Mechanics (3rd ed.,
-        1976), section 5, problem 1. Differs in the zero of energy, which is the state of rest.
+        1976), section 5, problem 1. The zero of energy differs: here it is the energy at rest.
     """
 
     log_masses: Float[Array, "2"]
@@ -63,179 +242,12 @@ class DoublePendulum(AbstractHamiltonianSystem):
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
         self, (q1, q2, p1, p2) = at(self, x, 4)
         (m1, m2), (l1, l2), g = self.masses, self.lengths, self.gravity
-        # Momenta per length: the kinetic energy is then free of the lengths.
+        # Momenta divided by the lengths; in them the kinetic energy does not contain the lengths.
         u1, u2 = p1 / l1, p2 / l2
         numerator = m2 * u1**2 + (m1 + m2) * u2**2 - 2 * m2 * u1 * u2 * jnp.cos(q1 - q2)
         kinetic = numerator / (2 * m2 * (m1 + m2 * jnp.sin(q1 - q2) ** 2))
         upper = (m1 + m2) * g * l1 * (1 - jnp.cos(q1))
         return kinetic + upper + m2 * g * l2 * (1 - jnp.cos(q2))
-
-
-class Kepler(AbstractHamiltonianSystem):
-    """The relative motion of two bodies in their plane: H = |p|²/(2μ) − GMμ/|q|, n = 4.
-
-    q is the vector from one body to the other [m], p = μq̇ [kg m/s], μ = m₁m₂/(m₁+m₂) the reduced
-    mass and M = m₁+m₂. An ellipse of semi-major axis a takes 2π√(a³/GM). At q = 0 the energy is
-    −inf and the field NaN. `NBody` moves both bodies.
-
-    Args:
-        reduced_mass: μ > 0 [kg].
-        gravitational_parameter: GM > 0 [m³/s²].
-
-    Raises:
-        ValueError: a parameter is not a positive scalar.
-
-    Source: Goldstein, Poole & Safko, Classical Mechanics (3rd ed., 2002), chapter 3.
-    """
-
-    is_separable: ClassVar[bool] = True
-
-    log_reduced_mass: Float[Array, ""]
-    log_gravitational_parameter: Float[Array, ""]
-    reduced_mass = positive("reduced_mass", "The reduced mass μ.")
-    gravitational_parameter = positive("gravitational_parameter", "The gravitational parameter GM.")
-
-    def __init__(self, reduced_mass: ArrayLike = 1.0, gravitational_parameter: ArrayLike = 1.0):
-        self.log_reduced_mass = log_parameter(reduced_mass, "reduced_mass")
-        self.log_gravitational_parameter = log_parameter(
-            gravitational_parameter, "gravitational_parameter"
-        )
-
-    def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
-        """Return H(x), shape (); ValueError unless x has shape (4,)."""
-        self, x = at(self, x, 4)
-        q, p = jnp.split(x, 2)
-        potential = -self.gravitational_parameter * self.reduced_mass / jnp.sqrt(q @ q)
-        return p @ p / (2 * self.reduced_mass) + potential
-
-
-class NBody(AbstractHamiltonianSystem):
-    """Bodies in a plane that attract each other, n = 4·bodies.
-
-    H = Σᵢ |pᵢ|²/(2mᵢ) − G Σ_{i<j} mᵢmⱼ/|qᵢ − qⱼ|
-
-    The state holds all positions, then all momenta, body by body: q = (x₁, y₁, x₂, y₂, …) [m],
-    p = (m₁ẋ₁, m₁ẏ₁, …) [kg m/s]. With two masses it is the two-body problem in 8 dimensions.
-    Where two bodies meet the energy is −inf and the field NaN.
-
-    Args:
-        masses: mᵢ > 0, shape (bodies,), two or more [kg].
-        gravitational_constant: G > 0 [m³/(kg s²)].
-
-    Raises:
-        ValueError: a parameter has the wrong shape or is not positive.
-
-    Source: Hairer, Lubich & Wanner, Geometric Numerical Integration (2nd ed., 2006), section I.2.
-    """
-
-    is_separable: ClassVar[bool] = True
-
-    log_masses: Float[Array, " bodies"]
-    log_gravitational_constant: Float[Array, ""]
-    masses = positive("masses", "The masses mᵢ.")
-    gravitational_constant = positive("gravitational_constant", "The gravitational constant G.")
-
-    def __init__(self, masses: Numbers = (1.0, 1.0), gravitational_constant: ArrayLike = 1.0):
-        self.log_masses = log_parameter(masses, "masses", (count_of(masses, "masses"),))
-        self.log_gravitational_constant = log_parameter(
-            gravitational_constant, "gravitational_constant"
-        )
-
-    def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """Return H(x), shape (); ValueError unless x has shape (4·bodies,)."""
-        self, x = at(self, x, 4 * self.masses.size)
-        m = self.masses
-        q, p = x.reshape(2, m.size, 2)  # (bodies, 2) each
-        i, j, squared = squared_distances(q)
-        kinetic = jnp.sum(jnp.sum(p**2, axis=1) / (2 * m))
-        return kinetic - self.gravitational_constant * jnp.sum(m[i] * m[j] / jnp.sqrt(squared))
-
-
-class PointVortices(AbstractHamiltonianSystem):
-    """Point vortices in an unbounded ideal fluid in the plane, n = 2·vortices.
-
-    Each vortex drifts with the velocity that the others induce,
-
-        ẋᵢ = −(1/2π) Σ_{j≠i} Γⱼ(yᵢ − yⱼ)/rᵢⱼ²,   ẏᵢ = (1/2π) Σ_{j≠i} Γⱼ(xᵢ − xⱼ)/rᵢⱼ²,
-
-    which is Kirchhoff's form Γᵢẋᵢ = ∂H/∂yᵢ, Γᵢẏᵢ = −∂H/∂xᵢ with
-
-        H = −(1/2π) Σ_{i<j} ΓᵢΓⱼ log rᵢⱼ.
-
-    Plane positions are thus canonical only up to the factors Γᵢ, which may be negative. With
-    sᵢ = sign Γᵢ the state
-
-        qᵢ = √|Γᵢ| xᵢ,   pᵢ = sᵢ√|Γᵢ| yᵢ
-
-    absorbs them. By the chain rule ∂H/∂yᵢ = sᵢ√|Γᵢ| ∂H/∂pᵢ and ∂H/∂xᵢ = √|Γᵢ| ∂H/∂qᵢ, so
-
-        q̇ᵢ = √|Γᵢ| ẋᵢ = (√|Γᵢ|/Γᵢ) sᵢ√|Γᵢ| ∂H/∂pᵢ = ∂H/∂pᵢ,
-        ṗᵢ = sᵢ√|Γᵢ| ẏᵢ = −(sᵢ√|Γᵢ|/Γᵢ) √|Γᵢ| ∂H/∂qᵢ = −∂H/∂qᵢ,
-
-    since Γᵢ = sᵢ|Γᵢ|: ẋ = J∇H for any nonzero circulations. `state` and `positions` map between the
-    plane [m] and the state [m²/√s]. H [m⁴/s²] is the energy per density, up to a constant. Where
-    two vortices meet it is infinite and the field NaN.
-
-    Args:
-        circulations: Γᵢ ≠ 0, shape (vortices,), two or more [m²/s]; positive turns
-            counter-clockwise.
-
-    Raises:
-        ValueError: circulations has the wrong shape, or an entry that is zero or not finite.
-
-    Source: Kirchhoff, Vorlesungen über mathematische Physik: Mechanik (Teubner, 1876), lecture 20;
-        Newton, The N-Vortex Problem (Springer, 2001), chapter 2.
-    """
-
-    circulations: Float[Array, " vortices"]
-
-    def __init__(self, circulations: Numbers = (1.0, 1.0)):
-        array = signed_parameter(
-            circulations, "circulations", (count_of(circulations, "circulations"),)
-        )
-        self.circulations = require.value(
-            array,
-            require.on_host(array) == 0,
-            lambda: f"circulations must not be zero, got {array}: leave out vortices without one.",
-        )
-
-    def state(self, positions: Num[ArrayLike, "vortices 2"]) -> Float[Array, " n"]:
-        """Return the state (q, p) of vortices at the given points of the plane.
-
-        Args:
-            positions: one row (xᵢ, yᵢ) for each vortex, shape (vortices, 2).
-
-        Returns:
-            The canonical state, shape (2·vortices,).
-
-        Raises:
-            ValueError: positions has another shape.
-        """
-        positions = require.floating(positions, "positions")
-        x, y = shaped(positions, "positions", (self.circulations.size, 2)).T
-        self = in_precision(self, x.dtype)
-        scale = jnp.sqrt(jnp.abs(self.circulations))
-        return jnp.concatenate([scale * x, jnp.sign(self.circulations) * scale * y])
-
-    def positions(self, x: Num[ArrayLike, " n"]) -> Float[Array, "vortices 2"]:
-        """Return the points (xᵢ, yᵢ) of the plane, shape (vortices, 2), of one state.
-
-        It is linear, so it takes velocities ẋ to velocities in the plane as well.
-
-        Raises:
-            ValueError: x is not one state of shape (2·vortices,).
-        """
-        self, x = at(self, x, 2 * self.circulations.size)
-        q, p = jnp.split(x, 2)
-        scale = jnp.sqrt(jnp.abs(self.circulations))
-        return jnp.stack([q / scale, jnp.sign(self.circulations) * p / scale], axis=1)
-
-    def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """Return H(x), shape (); ValueError unless x has shape (2·vortices,)."""
-        self, x = at(self, x, 2 * self.circulations.size)
-        i, j, squared = squared_distances(self.positions(x))
-        strengths = self.circulations[i] * self.circulations[j]
-        return -jnp.sum(strengths * jnp.log(squared)) / (4 * jnp.pi)
 
 
 class CartPole(AbstractHamiltonianSystem):
