@@ -35,9 +35,9 @@ def report(results: Results, experiments: Experiments, seeds: int) -> str:
     """Return Tables I and II of the paper beside the results, and the trajectory errors.
 
     Args:
-        results: of `summarise`.
-        experiments: what was run, with the published numbers.
-        seeds: how many noise seeds the results are over.
+        results: the return value of `summarise`.
+        experiments: the experiments that were run, with the published numbers.
+        seeds: the number of noise seeds in the results.
     """
     published = _published(results)
     head = (
@@ -71,12 +71,12 @@ def _published(results: Results) -> Results:
 
 
 def tuning_report(results: Results, experiments: Experiments, seeds: int) -> str:
-    """Return the table of tuned hyperparameters, and what it says.
+    """Return the table of tuned hyperparameters and a verdict on it in words.
 
     Args:
-        results: of `summarise`, with the reading "tuned".
-        experiments: what was run.
-        seeds: how many noise seeds were tuned.
+        results: the return value of `summarise`, with the reading "tuned".
+        experiments: the experiments that were run.
+        seeds: the number of noise seeds that were tuned.
     """
     rows = []
     for name, experiment in experiments.items():
@@ -160,7 +160,8 @@ def _hamiltonian_table(results: Results, experiments: Experiments) -> str:
     rows = []
     for name, experiment in experiments.items():
         published, readings = experiment.published, results[name]
-        quantities = next(iter(next(iter(readings.values())).values()))  # true: one for all
+        # The true Hamiltonian does not depend on reading or kernel: any of them has it.
+        quantities = next(iter(next(iter(readings.values())).values()))
         ours = {quantity: spread["median"] for quantity, spread in quantities.items()}
         rows += [
             (experiment.title,),
@@ -250,7 +251,7 @@ def _closest(
     model: str,
     quantities: Sequence[str],
 ) -> str:
-    """One sentence: which reading's medians the published numbers of a table are closest to."""
+    """A sentence that names the reading whose medians are closest to the published table."""
     systems: dict[str, list[tuple[float, str]]] = {}
     for name, experiment in experiments.items():
         system, _, detail = experiment.title.partition(", ")
@@ -270,9 +271,9 @@ def _closest(
     return f"{table} is closest to " + ",\nand to ".join(clauses) + "."
 
 
-# experiment -> reading -> model -> its tests
+# experiment -> reading -> model -> the tests of its fields
 Outcomes = dict[str, dict[str, dict[str, Outcome]]]
-# experiment -> model -> both ways to tune it
+# experiment -> model -> the choices of grid search and gradient
 Comparisons = dict[str, dict[str, Comparison]]
 Data = Mapping[str, tuple[Float[Array, "S N n"], Float[Array, "S N n"]]]
 
@@ -293,7 +294,7 @@ def reproduce(
             `summarise`.
         seeds: number of noise seeds, ≥ 1.
         progress: show a progress bar where the standard error is a terminal.
-        show: called with the report as soon as it is there, before the figures are drawn.
+        show: called with the report once it is complete, before the figures are drawn.
 
     Returns:
         The report, for printing, and the files written.
@@ -303,14 +304,15 @@ def reproduce(
             float64, or a fit failed.
     """
     path = pathlib.Path(out) / "results.json"
-    path.parent.mkdir(parents=True, exist_ok=True)  # before the work
+    # The folder is made first, so that an error is raised before the work.
+    path.parent.mkdir(parents=True, exist_ok=True)
     outcomes = _outcomes(_data(seeds), progress)
     results = summarise(outcomes)
     _write(results, path)
     text = report(results, experiments(), seeds)
     if show is not None:
         show(text)
-    # matplotlib loads after the numbers are safe
+    # Matplotlib loads once the numbers are saved.
     from hamkernel.paper._figures import paper_figures
 
     return text, [path, *paper_figures(outcomes, path.parent, progress)]
@@ -325,13 +327,13 @@ def retune(
 ) -> tuple[str, list[pathlib.Path]]:
     """Tune the hyperparameters on the data of `reproduce`, by grid search and by gradient.
 
-    Of the seeds the first 20 are taken. `results.json` gains the reading "tuned".
+    At most the first 20 seeds are used. `results.json` gains the reading "tuned".
 
     Args:
         out: folder that `reproduce` wrote its results to.
         seeds: number of noise seeds, ≥ 1.
         progress: show a progress bar where the standard error is a terminal.
-        show: called with the report as soon as it is there, before the figures are drawn.
+        show: called with the report once it is complete, before the figures are drawn.
 
     Returns:
         The report, for printing, and the files written.
@@ -343,7 +345,8 @@ def retune(
     path = pathlib.Path(out) / "results.json"
     if not path.exists():
         raise FileNotFoundError(f"no {path}: run hamkernel.paper.reproduce({str(out)!r}) first.")
-    seeds = min(seeds, 20)  # enough for a median
+    # The median of 20 seeds has a standard error of 1.25 σ/√20, 0.28 of their deviation σ.
+    seeds = min(seeds, 20)
     comparisons = _comparisons(_data(seeds), progress)
     results = json.loads(path.read_text())
     for name, models in comparisons.items():
@@ -409,7 +412,7 @@ def summarise(outcomes: Mapping[str, Mapping[str, Mapping[str, Outcome]]]) -> Re
 
     Returns:
         `[experiment][reading][model][quantity]["median" | "p10" | "p90"]`. `retune` adds a reading
-        "tuned" with the same quantities for the hyperparameters of the gradient, and besides
+        "tuned" with the same quantities for the hyperparameters of the gradient, and also
         `["tuned"][model][name]["grid" | "gradient"]["median" | "p10" | "p90"]` for the names
         lengthscale, regularization, loss, seconds and trajectory_error.
     """
