@@ -19,7 +19,7 @@ from hamkernel._gram import field_rounding
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._symplectic import AbstractSymplecticSolver, EqualSteps, step_counts
 
-Between = Literal["held", "linear"]
+Interpolation = Literal["held", "linear"]
 
 # The bound of a loop whose number of steps is not known beforehand: some seconds of a cheap field.
 _MAX_STEPS = 2**20
@@ -40,7 +40,7 @@ def simulate(
     adjoint: diffrax.AbstractAdjoint | None = None,
     throw: bool = True,
     inputs: Callable[[Float[Array, ""]], Any] | Num[ArrayLike, "T m"] | None = None,
-    between: Between = "held",
+    between: Interpolation = "held",
 ) -> diffrax.Solution:
     """Integrate ẋ = f(x) from x0 at time ts[0], and return the states at the times ts.
 
@@ -196,7 +196,7 @@ def _right_hand_side(
     inputs: Any,
     ts: Float[Array, " T"],
     first: Float[Array, ""],
-    between: Between,
+    between: Interpolation,
     constant_steps: bool,
 ) -> tuple[RightHandSide, Float[Array, ""] | None]:
     """The field with its inputs, and the time of the inputs at ts[0] = 0, for `args`."""
@@ -227,7 +227,7 @@ def _right_hand_side(
     return RightHandSide(field, _inputs(inputs, ts, between), held), start
 
 
-def _inputs(given: Any, ts: Float[Array, " T"], between: Between) -> Callable[[Array], Any]:
+def _inputs(given: Any, ts: Float[Array, " T"], between: Interpolation) -> Callable[[Array], Any]:
     """The inputs u as a function of the time; samples are at the times ts."""
     if between not in ("held", "linear"):
         raise ValueError(f"between must be 'held' or 'linear'; got {between!r}.")

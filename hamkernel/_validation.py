@@ -242,7 +242,7 @@ def held_out_rows(K, rows: Measurements, regularization, partition: Partition, b
     features = None if basis is None else features_of_rows(K, rows, basis, contrasted)
     found: Any
     if features is None:
-        found = _dense_held_out(gram(K, rows, contrasted), ridge, y, p, rows, partition)
+        found = _dense_held_out(gram_matrix(K, rows, contrasted), ridge, y, p, rows, partition)
     elif features.shape[1] > len(y) - max(map(len, partition.folds)):
         # The fit without a fold interpolates, and the low-rank gradient lost the square of the
         # condition: at 1e10 its error was 5 times itself. The data are then few enough for a dense
@@ -329,7 +329,7 @@ def _of_contrasts(K, rows: Measurements, ridge, basis: AbstractBasis | None) -> 
     """A of the contrasts, which do not depend on the constant of the energies."""
     if basis is not None:
         return LowRankSystem(features_of_rows(K, rows, basis, contrasted=True), ridge)
-    return DenseSystem(plus_ridge(gram(K, rows, contrasted=True), ridge))
+    return DenseSystem(plus_ridge(gram_matrix(K, rows, contrasted=True), ridge))
 
 
 # The Gram and the features of the rows, cheap to differentiate with respect to K.
@@ -348,7 +348,7 @@ def features_of_rows(
     return rows.contrast(features) if contrasted else features
 
 
-def gram(
+def gram_matrix(
     K: AbstractMatrixKernel, rows: Measurements, contrasted: bool = False
 ) -> Float[Array, "M M"]:
     """G, before the contrast or after it."""

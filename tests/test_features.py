@@ -17,7 +17,7 @@ import hamkernel as hk
 from hamkernel._features import features
 from hamkernel._fields.expansions import FeatureField
 from hamkernel._machine import orthonormal
-from hamkernel._solvers.least_squares import ridge_regression, triangle
+from hamkernel._solvers.least_squares import ridge_regression, triangle_of_design
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel.paper import datasets, experiments
 
@@ -580,7 +580,7 @@ def test_the_triangle_of_many_tiles_is_least_squares_in_numpy():
     rows = jnp.asarray(A)[:, None, :]
     index = jnp.arange(3000)[:, None]
     factor = np.asarray(
-        triangle(lambda X: rows[X[:, 0]], 6, index, jnp.asarray(y), jnp.asarray(ridge))
+        triangle_of_design(lambda X: rows[X[:, 0]], 6, index, jnp.asarray(y), jnp.asarray(ridge))
     )
     np.testing.assert_array_equal(factor, np.triu(factor))
     below = np.concatenate([A, np.sqrt(ridge) * np.eye(6)])

@@ -172,7 +172,7 @@ def compare(
     steps = ladder(n) if candidates is None else {}
     searched: dict[str, AbstractMatrixKernel] = {k: s.rung(scale, speed) for k, s in steps.items()}
     if candidates is not None:
-        searched = _checked(candidates, n, points)
+        searched = _checked_candidates(candidates, n, points)
     check_memory(rows, SEARCH_COPIES)
     ridge = jnp.asarray(1e-4 * speed**2 if ridge is None else ridge, rows.targets.dtype)
     found = []
@@ -235,7 +235,7 @@ def _data(X: Any, Y: Any) -> tuple[AbstractObservations, Any]:
     return X.observations, X.regularization
 
 
-def _checked(
+def _checked_candidates(
     candidates: Any, n: int, points: Float[np.ndarray, "P n"]
 ) -> dict[str, AbstractMatrixKernel]:
     """The candidates of the caller, which can hold for these states."""
@@ -333,7 +333,7 @@ def _answered(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D:
     if answers["energy"] != "yes":
         for key in ("friction", "reversible", "T + U"):
             say(key, "not tested", "it asks about an energy, and none was established")
-        return Comparison(table, _sorted(answers), reasons, differences, D)
+        return Comparison(table, _in_order(answers), reasons, differences, D)
     having = [row for row in table if "energy" in row.claims]
     ask("friction", having)
     ask("T + U", having)
@@ -343,7 +343,7 @@ def _answered(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D:
         ask("reversible", [row for row in having if "friction" not in row.claims])
     else:
         say("reversible", "not tested", "no data near those of backward motion")
-    return Comparison(table, _sorted(answers), reasons, differences, D)
+    return Comparison(table, _in_order(answers), reasons, differences, D)
 
 
 def _without_friction(damped: Candidate, among: list[Candidate]) -> Candidate | None:
@@ -360,7 +360,7 @@ def _score(row: Candidate) -> float:
     return row.score
 
 
-def _sorted(answers: dict[str, str]) -> dict[str, str]:
+def _in_order(answers: dict[str, str]) -> dict[str, str]:
     return {key: answers[key] for key in QUESTIONS}
 
 

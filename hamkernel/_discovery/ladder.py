@@ -160,7 +160,7 @@ def _signs(n: int, images: int) -> Float[np.ndarray, "images n"]:
     return np.stack([np.ones(n), -np.ones(n), reversal, -reversal])[:images]
 
 
-class Step(NamedTuple):
+class LadderStep(NamedTuple):
     """One step of the ladder.
 
     Attributes:
@@ -235,17 +235,17 @@ class Step(NamedTuple):
         return Reversible(K) if self.reversible else K
 
 
-def ladder(n: int) -> dict[str, Step]:
+def ladder(n: int) -> dict[str, LadderStep]:
     """Structures by name, the weakest first, with the products of their steps."""
-    found = {"any field": Step(Separable), "gradient": Step(CurlFree)}
+    found = {"any field": LadderStep(Separable), "gradient": LadderStep(CurlFree)}
     if n > 2:
-        found["divergence-free"] = Step(DivergenceFree)
+        found["divergence-free"] = LadderStep(DivergenceFree)
     if n % 2 == 0:
         found |= {
-            "energy": Step(Symplectic),
-            "energy, friction": Step(Symplectic, friction=True),
-            "T + U": Step(Symplectic, apart=True),
-            "T + U, friction": Step(Symplectic, apart=True, friction=True),
+            "energy": LadderStep(Symplectic),
+            "energy, friction": LadderStep(Symplectic, friction=True),
+            "T + U": LadderStep(Symplectic, apart=True),
+            "T + U, friction": LadderStep(Symplectic, apart=True, friction=True),
         }
     found |= {f"{name}, mirror": step._replace(mirror=True) for name, step in found.items()}
     if n % 2 == 0:  # T + U with a mirror has an even T, and is reversible

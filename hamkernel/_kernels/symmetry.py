@@ -193,7 +193,7 @@ def is_permutation(S: Float[np.ndarray, "n n"]) -> bool:
     return is_orthogonal(S) and bool(np.abs(np.abs(S) - np.round(np.abs(S))).max() < _SAME_MAP)
 
 
-T = TypeVar("T")
+Tree = TypeVar("Tree")
 
 
 class Symmetrised(AbstractScalarKernel):
@@ -293,7 +293,7 @@ class Symmetrised(AbstractScalarKernel):
         )
 
 
-def without_symmetry(tree: T) -> T:
+def without_symmetry(tree: Tree) -> Tree:
     """The kernel, or any PyTree, in which each mean over a group is replaced by its scalar kernel.
 
     Its values have the size of the terms that are added up and rounded: with a long lengthscale

@@ -62,7 +62,7 @@ class AbstractObservations(eqx.Module):
     def __add__(self, other: Any) -> AbstractObservations:
         if not isinstance(other, AbstractObservations):
             raise TypeError(_not_observations(self, other))
-        return Together(_terms(self) + _terms(other))
+        return Together(_summands(self) + _summands(other))
 
     def __radd__(self, other: Any) -> AbstractObservations:
         if isinstance(other, int) and other == 0:  # so that sum(data) works
@@ -110,7 +110,7 @@ class Together(AbstractObservations):
             yield from term.parts(count, given)
 
 
-def _terms(data: AbstractObservations) -> tuple[AbstractObservations, ...]:
+def _summands(data: AbstractObservations) -> tuple[AbstractObservations, ...]:
     return data.terms if isinstance(data, Together) else (data,)
 
 

@@ -290,7 +290,7 @@ def _shown(prepared, y, ridge, tolerance, max_iterations) -> _Found:
     from tqdm import tqdm  # so that importing the package does not load it
 
     products, truncation = prepared
-    state, done = _begun(products, y), 0
+    state, done = _first_iterate(products, y), 0
     with tqdm(total=max_iterations, desc="conjugate gradients", disable=None) as bar:
         while float(state.left) > 0.5 * float(tolerance) and done < max_iterations:
             state = _next(products, y, ridge, state)
@@ -302,7 +302,7 @@ def _shown(prepared, y, ridge, tolerance, max_iterations) -> _Found:
 
 
 @eqx.filter_jit
-def _begun(products: AbstractProducts, y) -> _Iterate:
+def _first_iterate(products: AbstractProducts, y) -> _Iterate:
     z = products.preconditioned(y)
     return _Iterate(jnp.zeros_like(y), y, z, jnp.sum(y * z), relative(y, y))
 

@@ -130,7 +130,7 @@ def _dense(problem: Problem, progress: bool, keep: bool = True) -> Any:
     K, rows, regularization = problem.kernel, problem.rows, problem.regularization
     _check_memory(problem)
     if not _is_in_place(problem):
-        found = (_compiled_conditional if keep else _field)(K, rows, regularization)
+        found = (_compiled_conditional if keep else _compiled_field)(K, rows, regularization)
         return found if keep else (None, *found)
     factor = factor_in_place(*_assembled(K, rows, problem.ridge, progress))
     found: Any = _of_factor(K, rows, regularization, factor)
@@ -156,15 +156,15 @@ _slab = eqx.filter_jit(strips_of_gram, donate="all-except-first")
 def _dense_system(K, rows: Measurements, regularization):
     ridge = rows.count * regularization
     factor, c = solution(regularized_gram(K, rows, ridge), rows.y)
-    return factor, *_learned(K, rows, regularization, c)
+    return factor, *_field_and_residual(K, rows, regularization, c)
 
 
 @eqx.filter_jit
 def _of_factor(K, rows: Measurements, regularization, factor: DenseFactor):
-    return _learned(K, rows, regularization, factor.solve(rows.y))
+    return _field_and_residual(K, rows, regularization, factor.solve(rows.y))
 
 
-def _learned(K, rows: Measurements, regularization, c):
+def _field_and_residual(K, rows: Measurements, regularization, c):
     """The coefficients c, their field, and the relative residual ‖y − (G + σ²I)c‖/‖y‖."""
     y, ridge = rows.y, rows.count * regularization
     values = gram_product(K, rows, c)  # without the Gram, which the factor has overwritten
@@ -178,7 +178,7 @@ _compiled_conditional = eqx.filter_jit(_dense_system)
 
 
 @eqx.filter_jit
-def _field(K, rows: Measurements, regularization):
+def _compiled_field(K, rows: Measurements, regularization):
     return _dense_system(K, rows, regularization)[1:]
 
 

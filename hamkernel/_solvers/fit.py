@@ -15,7 +15,7 @@ from hamkernel._machine import as_given, dense_bytes, memory_bytes, one_blas_thr
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.dense import Cholesky, copies
-from hamkernel._solvers.problem import AbstractSolver, Learned, Problem, problem
+from hamkernel._solvers.problem import AbstractSolver, LearnedField, Problem, problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.family import AbstractFamily
 from hamkernel._structures.joined import Controlled
@@ -69,13 +69,13 @@ def fit(
     Y: Num[ArrayLike, "N n"] | None = None,
     regularization: ArrayLike = 1e-4,
     *,
-    solver: AbstractSolver[Learned],
+    solver: AbstractSolver[LearnedField],
     mean: Mean | None = None,
     throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
     progress: bool = False,
-) -> Learned: ...
+) -> LearnedField: ...
 
 
 @one_blas_thread
@@ -142,13 +142,13 @@ def fit(
     """
     check_solver(solver)
     given = problem(K, X, Y, regularization, mean, inputs, parameters, throw)
-    return solved(given, solver, throw, progress)
+    return field_of_problem(given, solver, throw, progress)
 
 
-def solved(
+def field_of_problem(
     given: Problem, solver: AbstractSolver | None, throw: bool = True, progress: bool = False
 ) -> AbstractField:
-    """The field, by the default solver if there is none."""
+    """The field by this solver, or by the default one if it is None."""
     require.warn_of_float32(given.rows.targets)
     if solver is None:
         spread = rows_of(given.rows.points) is not None

@@ -162,14 +162,14 @@ def _chosen(
 ) -> tuple[Int[Array, " m"], Bool[Array, "m n"], Int[Array, ""]]:
     """The index of the chosen candidates, which of their columns are kept, and how many."""
     if not require.is_concrete(candidates, left, key):
-        return _first(_begin(candidates, left, key, most), most)
+        return _first_candidates(_begin(candidates, left, key, most), most)
     size = min(64, most)  # of the buffer, which doubles until it suffices
     drawn = _begin(candidates, left, key, size)
     while int(drawn.count) >= size and size < most:
         size = min(2 * size, most)
         drawn = _draw(candidates, left, _enlarged(drawn, size + BLOCK), size)
     blocks = max(1, -(-int(drawn.count) // BLOCK))
-    return _first(drawn, min(size, blocks * BLOCK))
+    return _first_candidates(drawn, min(size, blocks * BLOCK))
 
 
 @eqx.filter_jit
@@ -465,7 +465,7 @@ def masked(matrix: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[Array,
 
 
 @eqx.filter_jit
-def _first(drawn, size):
+def _first_candidates(drawn, size):
     """The first candidates drawn, at most `size`."""
     used = jnp.arange(size) < drawn.count
     kept = drawn.kept[:size] & used[:, None]

@@ -34,7 +34,7 @@ from hamkernel._machine import RowSharding, on_each
 Design = Callable[[Float[Array, "t n"]], Float[Array, "t n r"]]
 
 
-def triangle(
+def triangle_of_design(
     design: Design,
     columns: int,
     X: Float[Array, "N n"],
@@ -57,7 +57,7 @@ def triangle(
             return jnp.linalg.qr(jnp.concatenate([factor, below]), mode="r"), None
 
         on_diagonal = jnp.append(jnp.full(columns, jnp.sqrt(ridge)), jnp.zeros((), Y.dtype))
-        return over_tiles(step, jnp.diag(on_diagonal), (X, Y), _rows(columns))[0]
+        return over_tiles(step, jnp.diag(on_diagonal), (X, Y), _rows_of_tile(columns))[0]
 
     ridge = ridge if spread is None else ridge / spread.count
     return on_each(
@@ -102,7 +102,7 @@ def ridge_regression(
         spread: the devices over which points and targets are spread, if they are.
     """
     fixed, fixed_X, fixed_Y, fixed_ridge = constant((design, X, Y, ridge))
-    R = constant(triangle(fixed, columns, fixed_X, fixed_Y, fixed_ridge, spread))
+    R = constant(triangle_of_design(fixed, columns, fixed_X, fixed_Y, fixed_ridge, spread))
     R, rotated = R[:-1, :-1], R[:-1, -1]
     w = solve_triangular(R, rotated)
 
@@ -135,7 +135,7 @@ def residual(
         def step(_, tile):
             return None, tile[1] - design(tile[0]) @ w
 
-        return over_tiles(step, None, (X, Y), _rows(len(w)))[1]
+        return over_tiles(step, None, (X, Y), _rows_of_tile(len(w)))[1]
 
     return on_each(spread, own_residual, (design, w), X, Y, joined=True)
 
@@ -150,7 +150,7 @@ def _correlations(design, X, Y, w, spread: RowSharding | None) -> Float[Array, "
             rows = design(tile[0])
             return total + jnp.einsum("inr,in->r", rows, tile[1] - rows @ w), None
 
-        return over_tiles(step, jnp.zeros_like(w), (X, Y), _rows(len(w)))[0]
+        return over_tiles(step, jnp.zeros_like(w), (X, Y), _rows_of_tile(len(w)))[0]
 
     return on_each(spread, own_correlations, (design, w), X, Y, joined=False)
 
@@ -176,7 +176,7 @@ def over_tiles(step, carry, data: tuple[Array, Array], rows: int):
     return carry, jax.tree.map(lambda *parts: jnp.concatenate(parts), *outs)
 
 
-def _rows(columns: int) -> int:
+def _rows_of_tile(columns: int) -> int:
     """The rows of a tile.
 
     Appending `rows` rows to a factor of r columns costs (rows + r) r²; with 3r rows a quarter of

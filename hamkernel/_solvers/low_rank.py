@@ -443,7 +443,7 @@ def low_rank_conditional(
     Raises:
         RuntimeError: the least squares have no solution to rounding.
     """
-    conditional = _least_squares(span, rows, rows.count * regularization)
+    conditional = _low_rank_conditional(span, rows, rows.count * regularization)
     field = conditional.field
     cause = singular(field.offset.dtype)
     arrays, rest = eqx.partition(field, eqx.is_inexact_array)
@@ -457,7 +457,7 @@ def low_rank_conditional(
 
 
 @eqx.filter_jit
-def _least_squares(span, rows, ridge):
+def _low_rank_conditional(span, rows, ridge):
     F = rows.contrast(span.of_rows(rows))
     start = jnp.sqrt(ridge) * jnp.eye(F.shape[1], dtype=F.dtype)
     return _conditional(span, rows, ridge, *_below(start, jnp.zeros_like(F[0]), F, rows.y))

@@ -159,7 +159,7 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         return seen, trace_of_rows(self.kernel, rows)
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
-        solution = _solution(self, count, regularization)
+        solution = _landmark_solution(self, count, regularization)
         cure = (
             "Start anew with landmarks from a sample that looks like the data so far, and a "
             "max_points that suffices; or ask for a larger regularization;"
@@ -195,7 +195,7 @@ def _design(K, landmarks, rows):
 
 
 @eqx.filter_jit
-def _solution(fit, count, regularization):
+def _landmark_solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, norm, residual_norm = solve_sums(fit.sums, ridge)
     return Solution(
@@ -299,7 +299,7 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
         landmarks = self.landmarks(K, problem.rows, regularization)
         spread = rows_of(X)
         X, Y = split(spread, X), split(spread, Y)
-        solution = _fit(K, X, Y, regularization, landmarks, spread)
+        solution = _landmark_fit(K, X, Y, regularization, landmarks, spread)
         solution = solution._replace(residual=as_given(spread, solution.residual))
         return _checked_field(K, landmarks, solution, regularization, self.tolerance, CHOOSE, throw)
 
@@ -319,7 +319,7 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
 
 
 @eqx.filter_jit
-def _fit(K, X, Y, regularization, landmarks, spread):
+def _landmark_fit(K, X, Y, regularization, landmarks, spread):
     S, ridge = landmarks.points, len(X) * regularization
     T = whitening(K, landmarks)
     total = normal(Columns(K, landmarks), T, X, Y, spread)

@@ -194,10 +194,10 @@ class AbstractConditional(eqx.Module):
         """Fields drawn given the data, every leaf with a leading axis of `count`."""
 
 
-Learned = TypeVar("Learned", bound=AbstractField, covariant=True)
+LearnedField = TypeVar("LearnedField", bound=AbstractField, covariant=True)
 
 
-class AbstractSolver(eqx.Module, Generic[Learned]):
+class AbstractSolver(eqx.Module, Generic[LearnedField]):
     """A method by which `fit` finds the field."""
 
     no_factor: ClassVar[str | None] = None  # the reason why `_given` is not available, if so
@@ -211,7 +211,7 @@ class AbstractSolver(eqx.Module, Generic[Learned]):
         return None
 
     @abc.abstractmethod
-    def _fitted(self, problem: Problem, throw: bool = True, progress: bool = False) -> Learned:
+    def _fitted(self, problem: Problem, throw: bool = True, progress: bool = False) -> LearnedField:
         """The field. If the solve fails and `throw` is False, its numbers are NaN."""
 
     def _given(

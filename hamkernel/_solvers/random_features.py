@@ -77,8 +77,8 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
             return field
         spread = rows_of(problem.rows.points)
         X, Y = (split(spread, each) for each in problem.states)
-        field = _fit(problem.kernel, self, X, Y, problem.regularization, spread)
-        field = _checked(field, throw)
+        field = _feature_fit(problem.kernel, self, X, Y, problem.regularization, spread)
+        field = _if_solved(field, throw)
         if spread is None:
             return field
         residual = as_given(spread, field.residual)
@@ -110,20 +110,20 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
 
 
 @eqx.filter_jit
-def _fit(K, solver, X, Y, regularization, spread):
+def _feature_fit(K, solver, X, Y, regularization, spread):
     basis = solver._features(K, X.shape[1], X.dtype)
     ridge = len(X) * regularization
     weights, residual = ridge_regression(basis, basis.columns, X, Y, ridge, spread)
-    return _field(K, basis, weights, residual, regularization)
+    return _field_of_weights(K, basis, weights, residual, regularization)
 
 
-def _field(K, basis, w, residual, regularization, residual_norm=None):
+def _field_of_weights(K, basis, w, residual, regularization, residual_norm=None):
     rank = jnp.asarray(len(w))
     info = SolverInfo("RandomFeatures", rank=rank, residual_norm=residual_norm)
     return feature_field(K, basis, w, residual, regularization, info)
 
 
-def _checked(field: FeatureField, throw: bool = True) -> FeatureField:
+def _if_solved(field: FeatureField, throw: bool = True) -> FeatureField:
     """The field, if the least squares had a solution."""
 
     def learned(f: FeatureField):
@@ -183,7 +183,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
         return (Normal.of(design @ self.sums.basis, rows.targets),)
 
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
-        return _checked(_solution(self, count, regularization))
+        return _if_solved(_feature_solution(self, count, regularization))
 
 
 @eqx.filter_jit
@@ -207,8 +207,10 @@ def _start(K, basis, sample, regularization):
 
 
 @eqx.filter_jit
-def _solution(fit, count, regularization):
+def _feature_solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, _, residual_norm = solve_sums(fit.sums, ridge)
     unseen = jnp.zeros((0, fit.dimension), weights.dtype)
-    return _field(fit.kernel, fit.features, weights, unseen, regularization, residual_norm)
+    return _field_of_weights(
+        fit.kernel, fit.features, weights, unseen, regularization, residual_norm
+    )

@@ -38,7 +38,7 @@ from hamkernel._observations.measurements import (
 )
 from hamkernel._show import call, text
 from hamkernel._solvers.least_squares import Sums
-from hamkernel._solvers.problem import AbstractSolver, Learned, without_known
+from hamkernel._solvers.problem import AbstractSolver, LearnedField, without_known
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 Fit = TypeVar("Fit", bound="AbstractStreamingFit")
@@ -50,7 +50,7 @@ _START_ONCE = (
 )
 
 
-class AbstractStreamingFit(eqx.Module, Generic[Learned]):
+class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
     """A fit to the data added so far, made by `solver.start`.
 
     It has a fixed size. `add` returns a new one, and `field` solves for any λ:
@@ -133,7 +133,7 @@ class AbstractStreamingFit(eqx.Module, Generic[Learned]):
         """The totals of observations alone."""
 
     @abc.abstractmethod
-    def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> Learned:
+    def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> LearnedField:
         """`field` for a λ that has been checked, and the number of points, which is not 0."""
 
     def add(
@@ -292,7 +292,7 @@ def _two_sum(a: Array, b: Array) -> tuple[Array, Array]:
     return s, (a - (s - c)) + (b - c)
 
 
-class AbstractStreamingSolver(AbstractSolver[Learned], Generic[Learned, Fit]):
+class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField, Fit]):
     """A solver whose fit to all the data can be made from chunks of it."""
 
     @abc.abstractmethod

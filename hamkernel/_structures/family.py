@@ -104,11 +104,11 @@ class AbstractFamily(AbstractJoinedKernel):
     def __add__(self, other: Any) -> Any:
         if not isinstance(other, AbstractMatrixKernel):
             return NotImplemented
-        return FamilySum(self.terms + _terms(other))
+        return FamilySum(self.terms + _family_terms(other))
 
     def __radd__(self, other: Any) -> Any:
         if isinstance(other, AbstractMatrixKernel):
-            return FamilySum(_terms(other) + self.terms)
+            return FamilySum(_family_terms(other) + self.terms)
         return super().__radd__(other)
 
 
@@ -213,6 +213,6 @@ class FamilySum(AbstractFamily):
         return X, amplitude
 
 
-def _terms(K: AbstractMatrixKernel) -> tuple["Family", ...]:
+def _family_terms(K: AbstractMatrixKernel) -> tuple["Family", ...]:
     """The terms of a family; any other kernel is a family whose members are all the same."""
     return K.terms if isinstance(K, AbstractFamily) else (Family(K),)

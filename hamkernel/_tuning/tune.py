@@ -27,7 +27,7 @@ from hamkernel._machine import one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import observations
 from hamkernel._show import described
-from hamkernel._solvers.fit import check_solver, solved
+from hamkernel._solvers.fit import check_solver, field_of_problem
 from hamkernel._solvers.problem import AbstractSolver, Problem, problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._tuning.minimiser import MinimiserRun
@@ -249,7 +249,7 @@ def _tuned(
     dtype = space.low.dtype
     kernel, regularization, size = decode(space, jnp.asarray(found.best.u, dtype))
     given = dataclasses.replace(given, kernel=kernel, regularization=regularization)
-    field = solved(given, solver)
+    field = field_of_problem(given, solver)
     if not space.allows(regularization):
         raise ValueError(
             f"no lambda within bounds={{'regularization': ...}} can be solved with in {dtype}: "

@@ -252,7 +252,7 @@ def evaluate(
     ridge = jnp.asarray(regularization, X.dtype)
     if not ridge.ndim:  # the same hyperparameters for all data sets
         kernel, ridge = jax.tree.map(lambda a: jnp.stack([a] * len(X)), (kernel, ridge))
-    fields = _in_batches(_fit, (kernel, X, Y, ridge))
+    fields = _in_batches(_batch_of_fits, (kernel, X, Y, ridge))
     learned, error, quantities = _in_batches(
         lambda batch: _tests(batch, ts, true, points, accuracy), _padded(fields)
     )
@@ -270,7 +270,7 @@ def evaluate(
 
 
 @eqx.filter_jit
-def _fit(kernels_and_data) -> KernelField:
+def _batch_of_fits(kernels_and_data) -> KernelField:
     return jax.vmap(fit)(*kernels_and_data)
 
 
@@ -301,13 +301,13 @@ def _in_batches(fn: Callable, seeds):
 def _truth(
     system, starts: Float[Array, "B n"], ts: Float[Array, " P"], tolerance: Float[Array, ""]
 ) -> tuple[Float[Array, "B P n"], dict[str, Float[Array, ""]]]:
-    true = _trajectories(system, starts, ts, tolerance)
+    true = _test_trajectories(system, starts, ts, tolerance)
     energy = jax.vmap(system.hamiltonian)(true[0, : _TIMES + 1])
     return true, _moments("true_hamiltonian", energy)
 
 
 @eqx.filter_jit
-def _trajectories(
+def _test_trajectories(
     field: Callable[[Array], Array],
     starts: Float[Array, "B n"],
     ts: Float[Array, " P"],
@@ -327,7 +327,7 @@ def _tests(fields: KernelField, ts, true, points, tolerance):
     test = slice(_TIMES + 1)
 
     def one(field):
-        learned = _trajectories(field, true[:, 0], ts, tolerance)
+        learned = _test_trajectories(field, true[:, 0], ts, tolerance)
         error = jnp.linalg.norm(learned[0, test] - true[0, test], axis=1)
         quantities = {
             "trajectory_error_mean": error.mean(),
@@ -409,7 +409,7 @@ def compare(
     """
     make = STRUCTURES[structure]
 
-    def chosen(found: list[_Found], seconds: np.ndarray) -> Choice:
+    def chosen(found: list[_SearchEnd], seconds: np.ndarray) -> Choice:
         kernels = [make(Gaussian(each.lengthscale)) for each in found]
         kernels = jax.tree.map(lambda *leaves: jnp.stack(leaves), *kernels)
         lengthscale, regularization, loss = np.array(found).T
@@ -421,7 +421,7 @@ def compare(
     surfaces, grid_seconds = _timed(lambda x, y: _surface(make, x, y), X, Y)
     tuned, gradient_seconds = _timed(lambda x, y: _by_gradient(make, x, y), X, Y)
     return Comparison(
-        chosen([_lowest(surface) for surface in surfaces], grid_seconds),
+        chosen([_least_loss(surface) for surface in surfaces], grid_seconds),
         chosen(tuned, gradient_seconds),
         surfaces[0],
     )
@@ -438,7 +438,7 @@ def _timed(run, X, Y) -> tuple[list, np.ndarray]:
     return answers, np.array(seconds)
 
 
-class _Found(NamedTuple):
+class _SearchEnd(NamedTuple):
     """The end of one search."""
 
     lengthscale: float
@@ -451,16 +451,16 @@ def _surface(make, x, y) -> np.ndarray:
     return np.asarray(grid_losses(make, lengthscales, ridges, x, y, Partition(len(x), FOLDS)))
 
 
-def _lowest(surface: np.ndarray) -> _Found:
+def _least_loss(surface: np.ndarray) -> _SearchEnd:
     i, j = np.unravel_index(np.nanargmin(surface), surface.shape)
-    return _Found(GRID[0][i], GRID[1][j], surface[i, j])
+    return _SearchEnd(GRID[0][i], GRID[1][j], surface[i, j])
 
 
-def _by_gradient(make, x, y) -> _Found:
+def _by_gradient(make, x, y) -> _SearchEnd:
     tuned = tune(make(Gaussian(1.0)), x, y, 1e-3, FOLDS)
     # The only hyperparameter of these kernels, which is stored as a logarithm.
     (leaf,) = jax.tree.leaves(eqx.filter(tuned.kernel, eqx.is_inexact_array))
-    return _Found(float(np.exp(leaf)), float(tuned.regularization), float(tuned.loss))
+    return _SearchEnd(float(np.exp(leaf)), float(tuned.regularization), float(tuned.loss))
 
 
 @eqx.filter_jit

@@ -147,7 +147,7 @@ def _odd_error_table(results: Results, experiments: Experiments) -> str:
                 f"{published.odd_error_variance:.2f}",
             ),
             ("", "odd symplectic", "0.00", "0.00"),
-            *_models(results[name], ("odd_error_mean", "odd_error_variance")),
+            *_model_rows(results[name], ("odd_error_mean", "odd_error_variance")),
         ]
     title = (
         "Table I. Odd error ‖f(x) + f(-x)‖ at 10 000 points of the right half of the portraits,\n"
@@ -165,10 +165,12 @@ def _hamiltonian_table(results: Results, experiments: Experiments) -> str:
         ours = {quantity: spread["median"] for quantity, spread in quantities.items()}
         rows += [
             (experiment.title,),
-            _pair("published", "true", vars(published), "true_hamiltonian"),
-            _pair("here", "true", ours, "true_hamiltonian"),
-            _pair("published", "odd symplectic", vars(published), "learned_hamiltonian"),
-            *_models(readings, ("learned_hamiltonian_mean", "learned_hamiltonian_variance")),
+            _mean_and_variance("published", "true", vars(published), "true_hamiltonian"),
+            _mean_and_variance("here", "true", ours, "true_hamiltonian"),
+            _mean_and_variance(
+                "published", "odd symplectic", vars(published), "learned_hamiltonian"
+            ),
+            *_model_rows(readings, ("learned_hamiltonian_mean", "learned_hamiltonian_variance")),
         ]
     title = (
         "Table II. Hamiltonian along the test trajectory: the true one on the true trajectory,\n"
@@ -178,7 +180,7 @@ def _hamiltonian_table(results: Results, experiments: Experiments) -> str:
     return _table(title, ("", "Hamiltonian", "mean", "variance"), rows)
 
 
-def _pair(label: str, kernel: str, values: Mapping[str, float], quantity: str) -> Row:
+def _mean_and_variance(label: str, kernel: str, values: Mapping[str, float], quantity: str) -> Row:
     mean, variance = (values[f"{quantity}_{of}"] for of in ("mean", "variance"))
     return (label, kernel, f"{mean:.2f}", f"{variance:.1e}")
 
@@ -192,7 +194,7 @@ def _trajectory_table(results: Results, experiments: Experiments) -> str:
             for models in results[name].values()
             for quantities in models.values()
         ]
-        lines = _models(results[name], (error, "trajectory_error_max"))
+        lines = _model_rows(results[name], (error, "trajectory_error_max"))
         rows += [(*line, gain) for line, gain in zip(lines, gains, strict=True)]
     title = (
         "Trajectory error ‖x_true - x_learned‖ on the test trajectory, its mean and maximum over\n"
@@ -201,7 +203,7 @@ def _trajectory_table(results: Results, experiments: Experiments) -> str:
     return _table(title, ("", "kernel", "mean", "maximum", "gain"), rows)
 
 
-def _models(
+def _model_rows(
     readings: Mapping[str, Mapping[str, Mapping[str, dict[str, float]]]], quantities: Sequence[str]
 ) -> Iterable[Row]:
     """One row for each reading and model that has the quantities."""
@@ -219,11 +221,11 @@ def _median(values: Mapping[str, dict[str, float]], quantity: str) -> float:
 
 
 def _cell(spread: Mapping[str, float]) -> str:
-    median, p10, p90 = (_number(spread[key]) for key in ("median", "p10", "p90"))
+    median, p10, p90 = (_rounded(spread[key]) for key in ("median", "p10", "p90"))
     return f"{median} [{p10}, {p90}]"
 
 
-def _number(x: float) -> str:
+def _rounded(x: float) -> str:
     if x == 0 or 1e-3 <= abs(x) < 1e4:
         return f"{x:.4g}" if abs(x) >= 100 else f"{x:.3g}"
     return f"{x:.1e}"
@@ -306,7 +308,7 @@ def reproduce(
     path = pathlib.Path(out) / "results.json"
     # The folder is made first, so that an error is raised before the work.
     path.parent.mkdir(parents=True, exist_ok=True)
-    outcomes = _outcomes(_data(seeds), progress)
+    outcomes = _outcomes(_datasets_of_seeds(seeds), progress)
     results = summarise(outcomes)
     _write(results, path)
     text = report(results, experiments(), seeds)
@@ -347,10 +349,10 @@ def retune(
         raise FileNotFoundError(f"no {path}: run hamkernel.paper.reproduce({str(out)!r}) first.")
     # The median of 20 seeds has a standard error of 1.25 σ/√20, 0.28 of their deviation σ.
     seeds = min(seeds, 20)
-    comparisons = _comparisons(_data(seeds), progress)
+    comparisons = _comparisons(_datasets_of_seeds(seeds), progress)
     results = json.loads(path.read_text())
     for name, models in comparisons.items():
-        results[name]["tuned"] = {model: _tuned(each) for model, each in models.items()}
+        results[name]["tuned"] = {model: _tuned_quantities(each) for model, each in models.items()}
     _write(results, path)
     text = tuning_report(results, experiments(), seeds)
     if show is not None:
@@ -360,7 +362,7 @@ def retune(
     return text, [path, tuning_figure(comparisons, path.parent)]
 
 
-def _data(seeds: int) -> Data:
+def _datasets_of_seeds(seeds: int) -> Data:
     if seeds < 1:
         raise ValueError(f"seeds is {seeds}; at least one noise seed is needed.")
     if jnp.result_type(float) != jnp.float64:
@@ -425,7 +427,7 @@ def summarise(outcomes: Mapping[str, Mapping[str, Mapping[str, Outcome]]]) -> Re
     }
 
 
-def _tuned(comparison: Comparison) -> dict:
+def _tuned_quantities(comparison: Comparison) -> dict:
     choices: dict[str, Choice] = {"grid": comparison.grid, "gradient": comparison.gradient}
     both = {
         "lengthscale": lambda choice: choice.lengthscale,

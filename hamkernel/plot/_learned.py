@@ -25,19 +25,19 @@ from hamkernel.plot._style import (
     grid,
     in_plane,
     legend,
-    measured,
+    plane_data,
     plane_labels,
     two,
     with_unit,
 )
 
-Scalar = Callable[[Float[Array, "2"]], Float[Array, ""]]
+ScalarField = Callable[[Float[Array, "2"]], Float[Array, ""]]
 
 
 @drawn
 def hamiltonian(
-    learned: Scalar,
-    true: Scalar,
+    learned: ScalarField,
+    true: ScalarField,
     xlim: Limits,
     ylim: Limits,
     ax: Sequence[Axes] | None = None,
@@ -339,7 +339,7 @@ def deviation(
     """
     labels = plane_labels((0, 1), 2, units, names)
     q, p, points = grid(xlim, ylim, resolution)
-    X = measured(data)
+    X = plane_data(data)
     length = jax.tree_util.Partial(_length, fn)
     values = in_plane(length, points, (), "a deviation")
     ax = axes(ax, figsize=(5.4, 4.4))

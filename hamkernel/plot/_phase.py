@@ -22,9 +22,9 @@ from hamkernel.plot._style import (
     in_plane,
     legend,
     line_styles,
-    measured,
     named,
     on_points,
+    plane_data,
     plane_labels,
 )
 
@@ -72,8 +72,8 @@ def phase_portrait(
     labels = plane_labels((0, 1), 2, units, names)
     q, p, points = grid(xlim, ylim, resolution)
     velocities = in_plane(field, points, (2,), "a field")
-    X = measured(data)
-    curves = {} if trajectories is None else _checked(trajectories, 2)
+    X = plane_data(data)
+    curves = {} if trajectories is None else _checked_curves(trajectories, 2)
     ax = axes(ax, figsize=(5.2, 4.6))
     _stream(ax, q, p, velocities, density)
     _curves(ax, curves, (0, 1))
@@ -111,7 +111,7 @@ def trajectories(
         ValueError: an array is of another shape, there is none, `dims` are not two of the
             coordinates, or an argument is not a pair.
     """
-    curves = _checked(ys)
+    curves = _checked_curves(ys)
     n = next(iter(curves.values())).shape[-1]
     labels = plane_labels(dims, n, units, names)
     ax = axes(ax, figsize=(4.6, 4.2))
@@ -204,7 +204,7 @@ def _stream(
     ax.streamplot(x, y, u, v, color=color, linewidth=0.7, arrowsize=0.7, density=density, zorder=1)
 
 
-def _checked(curves: Curves, n: int | None = None) -> dict[str | None, np.ndarray]:
+def _checked_curves(curves: Curves, n: int | None = None) -> dict[str | None, np.ndarray]:
     """The curves by name, if all of them are trajectories of n coordinates, those of the first."""
     try:
         arrays = named(curves)

@@ -29,7 +29,7 @@ DATA = "#E69F00"
 
 BENEATH: Mapping[str, Any] = {"linewidth": 3.2, "zorder": 2.5}  # wide, under what may cover it
 
-P = ParamSpec("P")
+Arguments = ParamSpec("Arguments")
 R = TypeVar("R")
 
 Limits = tuple[float, float]
@@ -53,11 +53,11 @@ def axes(ax: Axes | None, **options: Any) -> Axes:
     return plt.subplots(layout="constrained", **options)[1]
 
 
-def drawn(plot: Callable[P, R]) -> Callable[P, R]:
+def drawn(plot: Callable[Arguments, R]) -> Callable[Arguments, R]:
     """The function `plot`, with a TypeError where JAX traces an argument."""
 
     @functools.wraps(plot)
-    def checked(*args: P.args, **options: P.kwargs) -> R:
+    def checked(*args: Arguments.args, **options: Arguments.kwargs) -> R:
         name = f"hk.plot.{plot.__name__}"
         require.untraced(name, "Return the arrays and draw them outside.", args, options)
         return plot(*args, **options)
@@ -117,7 +117,7 @@ def plane_labels(
     }
 
 
-def measured(data: Any) -> np.ndarray | None:
+def plane_data(data: Any) -> np.ndarray | None:
     """Measured states in the plane, if there are any."""
     X = None if data is None else np.asarray(data)
     if X is not None and (X.ndim != 2 or X.shape[1] != 2):
@@ -152,13 +152,13 @@ def grid(
 
 
 @eqx.filter_jit
-def _mapped(fn: Callable[[Array], Array], points: Float[Array, "P n"]) -> Array:
+def _at_each(fn: Callable[[Array], Array], points: Float[Array, "P n"]) -> Array:
     return jax.vmap(fn)(points)
 
 
 def on_points(fn: Callable[[Array], Array], points: np.ndarray) -> np.ndarray:
     """The values of fn at each row of `points`, in JAX's default float."""
-    return np.asarray(_mapped(fn, jnp.asarray(points, float)))
+    return np.asarray(_at_each(fn, jnp.asarray(points, float)))
 
 
 def in_plane(

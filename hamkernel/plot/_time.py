@@ -65,11 +65,11 @@ def trajectory_error(
     Raises:
         ValueError: a curve does not have one value per time, or no seed of it is finite.
     """
-    curves = _checked(ts, errors)
+    curves = _curves_over_time(ts, errors)
     ax = axes(ax, figsize=(5.6, 3.8))
     _bands(ax, ts, curves, quantiles, log)
     ax.set_ylabel(with_unit("trajectory error", unit))
-    return _finish(ax, ts, time_unit, title, show_legend)
+    return _with_time_axis(ax, ts, time_unit, title, show_legend)
 
 
 @drawn
@@ -105,7 +105,7 @@ def energy_drift(
             `relative`, and an energy is zero at the start.
     """
     changes = {}
-    for name, values in _checked(ts, energies).items():
+    for name, values in _curves_over_time(ts, energies).items():
         start = values[..., :1]
         if relative and not start.all():
             raise ValueError("H(x(0)) = 0 has no relative change: use relative=False.")
@@ -116,10 +116,10 @@ def energy_drift(
     change = r"|\Delta H|" if log else r"\Delta H"
     symbol = rf"${change} / |H(0)|$" if relative else f"${change}$"
     ax.set_ylabel(with_unit(f"energy drift {symbol}", None if relative else unit))
-    return _finish(ax, ts, time_unit, title, show_legend)
+    return _with_time_axis(ax, ts, time_unit, title, show_legend)
 
 
-def _checked(ts: ArrayLike, series: Series) -> dict[str | None, np.ndarray]:
+def _curves_over_time(ts: ArrayLike, series: Series) -> dict[str | None, np.ndarray]:
     """The curves by name, if each has one value for each time."""
     shape, curves = np.shape(ts), named(series)
     if len(shape) != 1:
@@ -175,7 +175,7 @@ def _finite_seeds(seeds: np.ndarray, of_name: str) -> np.ndarray:
     return seeds[finite]
 
 
-def _finish(
+def _with_time_axis(
     ax: Axes, ts: ArrayLike, time_unit: str | None, title: str | None, show_legend: bool
 ) -> Axes:
     ts = np.asarray(ts)
@@ -226,7 +226,7 @@ def smoothing(
         ValueError: there is no such run, or an argument does not have one entry per coordinate.
     """
     run, n = _position(run, len(runs)), runs.dimension
-    labels = _labels(n, units, names)
+    labels = _coordinate_labels(n, units, names)
     panels = _column(n, 1, ax)[:, 0]
     curves = runs.smoothing(_BETWEEN - 1)
     ts, mean = np.asarray(curves.times[run]), np.asarray(curves.states[run])
@@ -236,9 +236,9 @@ def smoothing(
         name = rf"$\pm{_SIGMAS:g}\sigma$"
         panel.fill_between(ts, low, high, color=BLUE, alpha=0.25, linewidth=0, label=name)
         panel.plot(ts, mean[:, c], color=BLUE, linewidth=1.4, label="smoothed")
-        _samples(panel, runs, run, c)
+        _draw_samples(panel, runs, run, c)
         _over_time(panel, ts, labels[c])
-    return _finished(panels, f"run {run}" if title is None else title, time_unit)
+    return _titled(panels, f"run {run}" if title is None else title, time_unit)
 
 
 @drawn
@@ -277,7 +277,7 @@ def fitted(
         ValueError: there is no such run, or an argument does not have one entry per coordinate.
     """
     run, n = _position(run, len(learned.runs)), learned.runs.dimension
-    labels = _labels(n, units, names)
+    labels = _coordinate_labels(n, units, names)
     panels = _column(n, 2, ax)
     ts, fit = np.asarray(learned.runs.times[run]), np.asarray(learned.states[run])
     grid = np.interp(np.arange(_BETWEEN * (len(ts) - 1) + 1) / _BETWEEN, np.arange(len(ts)), ts)
@@ -291,7 +291,7 @@ def fitted(
     residuals, misfit = np.asarray(learned.residuals[run]), np.asarray(learned.misfit[run])
     for c, (left, right) in enumerate(panels):
         left.plot(grid, path[:, c], color=BLUE, linewidth=1.4, label="fitted")
-        _samples(left, learned.runs, run, c)
+        _draw_samples(left, learned.runs, run, c)
         _over_time(left, ts, labels[c])
         right.axhspan(-_SIGMAS, _SIGMAS, color="0.9", linewidth=0)
         right.axhline(0.0, color="0.6", linewidth=0.8)
@@ -304,7 +304,7 @@ def fitted(
             right.set_ylim(-far, far)
     if title is None:
         title = f"run {run}, {float(learned.kept[run]):.0%} kept"
-    _finished(panels[:, 0], title, time_unit)
+    _titled(panels[:, 0], title, time_unit)
     panels[-1, 1].set_xlabel(with_unit("time $t$", time_unit))
     return tuple((left, right) for left, right in panels)
 
@@ -315,7 +315,7 @@ def _position(run: int, count: int) -> int:
     return range(count)[run]
 
 
-def _labels(
+def _coordinate_labels(
     n: int, units: Sequence[str | None] | None, names: Sequence[str | None] | None
 ) -> list[str]:
     """The label of each coordinate."""
@@ -345,7 +345,7 @@ def _column(n: int, width: int, ax: object) -> np.ndarray:
     return panels.reshape(n, width)
 
 
-def _samples(panel: Axes, runs: Runs, run: int, c: int) -> None:
+def _draw_samples(panel: Axes, runs: Runs, run: int, c: int) -> None:
     ts, x = np.asarray(runs.times[run]), np.asarray(runs.states[run])[:, c]
     style = {
         "mec": "black",
@@ -365,7 +365,7 @@ def _over_time(panel: Axes, ts: np.ndarray, label: str) -> None:
     panel.set_axisbelow(True)
 
 
-def _finished(panels: np.ndarray, title: str, time_unit: str | None) -> tuple[Axes, ...]:
+def _titled(panels: np.ndarray, title: str, time_unit: str | None) -> tuple[Axes, ...]:
     panels[0].set_title(title)
     panels[-1].set_xlabel(with_unit("time $t$", time_unit))
     legend(panels[0])

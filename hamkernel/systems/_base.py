@@ -17,7 +17,7 @@ from hamkernel._kernels.functions import as_pytree
 from hamkernel._show import described
 
 Numbers = ArrayLike | Sequence[ArrayLike]
-Field = TypeVar("Field", bound=Callable[[Array], Array])
+Function = TypeVar("Function", bound=Callable[[Array], Array])
 
 
 class AbstractHamiltonianSystem(eqx.Module):
@@ -63,7 +63,7 @@ def _velocity(system: AbstractHamiltonianSystem, x: Float[Array, " n"]) -> Float
     return jnp.concatenate([dp, -dq])
 
 
-def in_precision(field: Field, dtype: jnp.dtype) -> Field:
+def in_precision(field: Function, dtype: jnp.dtype) -> Function:
     """`field` with its real arrays in the dtype of the states; a plain function has none."""
 
     def cast_leaf(leaf):
@@ -73,7 +73,7 @@ def in_precision(field: Field, dtype: jnp.dtype) -> Field:
     return jax.tree.map(cast_leaf, field)
 
 
-def at(system: Field, x: Num[ArrayLike, " n"], n: int) -> tuple[Field, Float[Array, " n"]]:
+def at(system: Function, x: Num[ArrayLike, " n"], n: int) -> tuple[Function, Float[Array, " n"]]:
     """`system` in the dtype of x, and x, which must be one state of n coordinates."""
     x = require.point(x, n)
     return in_precision(system, x.dtype), x
@@ -93,7 +93,7 @@ def log_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:
     return jnp.log(shaped(array, name, *(shapes or ((),))))
 
 
-def positive(name: str, doc: str) -> Any:
+def positive_parameter(name: str, doc: str) -> Any:
     """The property that reads the positive parameter stored as the logarithm `log_<name>`."""
     return property(lambda system: jnp.exp(getattr(system, f"log_{name}")), doc=doc)
 
@@ -119,7 +119,7 @@ def squared_distances(positions: Float[Array, "bodies 2"]) -> tuple[np.ndarray, 
     return i, j, jnp.sum((positions[i] - positions[j]) ** 2, axis=1)
 
 
-System = Callable[[Any], Float[Array, " n"]]
+VectorField = Callable[[Any], Float[Array, " n"]]
 
 
 class Damped(eqx.Module):
@@ -216,10 +216,12 @@ class Driven(eqx.Module):
         `hk.systems.Driven(hk.systems.Damped(hk.systems.Pendulum()), [[0.0], [1.0]])`.
     """
 
-    system: System
+    system: VectorField
     inputs: Any
 
-    def __init__(self, system: System, inputs: ArrayLike | Callable[[Array], Any] | None = None):
+    def __init__(
+        self, system: VectorField, inputs: ArrayLike | Callable[[Array], Any] | None = None
+    ):
         if not callable(system):
             raise TypeError(f"Driven needs a system x -> (n,) first; got {system!r}.")
         if inputs is None:
@@ -241,7 +243,7 @@ class Driven(eqx.Module):
                 )
 
     @property
-    def drift(self) -> System:
+    def drift(self) -> VectorField:
         """The system without inputs."""
         return self.system
 

@@ -18,7 +18,7 @@ from hamkernel.systems._base import (
     count_of,
     in_precision,
     log_parameter,
-    positive,
+    positive_parameter,
     shaped,
     signed_parameter,
     squared_distances,
@@ -46,8 +46,10 @@ class Kepler(AbstractHamiltonianSystem):
 
     log_reduced_mass: Float[Array, ""]
     log_gravitational_parameter: Float[Array, ""]
-    reduced_mass = positive("reduced_mass", "The reduced mass μ.")
-    gravitational_parameter = positive("gravitational_parameter", "The gravitational parameter GM.")
+    reduced_mass = positive_parameter("reduced_mass", "The reduced mass μ.")
+    gravitational_parameter = positive_parameter(
+        "gravitational_parameter", "The gravitational parameter GM."
+    )
 
     def __init__(self, reduced_mass: ArrayLike = 1.0, gravitational_parameter: ArrayLike = 1.0):
         self.log_reduced_mass = log_parameter(reduced_mass, "reduced_mass")
@@ -86,8 +88,10 @@ class NBody(AbstractHamiltonianSystem):
 
     log_masses: Float[Array, " bodies"]
     log_gravitational_constant: Float[Array, ""]
-    masses = positive("masses", "The masses mᵢ.")
-    gravitational_constant = positive("gravitational_constant", "The gravitational constant G.")
+    masses = positive_parameter("masses", "The masses mᵢ.")
+    gravitational_constant = positive_parameter(
+        "gravitational_constant", "The gravitational constant G."
+    )
 
     def __init__(self, masses: Numbers = (1.0, 1.0), gravitational_constant: ArrayLike = 1.0):
         self.log_masses = log_parameter(masses, "masses", (count_of(masses, "masses"),))
@@ -216,14 +220,14 @@ class AbstractPoissonSystem(eqx.Module):
             ValueError: x is not one state of this system.
         """
         x = require.floating(x, "x")
-        return _velocity(self, x)
+        return _poisson_velocity(self, x)
 
     def __repr__(self) -> str:
         return described(self)
 
 
 @eqx.filter_jit
-def _velocity(system: AbstractPoissonSystem, x: Float[Array, " n"]) -> Float[Array, " n"]:
+def _poisson_velocity(system: AbstractPoissonSystem, x: Float[Array, " n"]) -> Float[Array, " n"]:
     system = in_precision(system, x.dtype)
     return system.tensor(x) @ jax.grad(system.hamiltonian)(x)
 
@@ -244,7 +248,7 @@ class RigidBody(AbstractPoissonSystem):
     """
 
     log_inertia: Float[Array, "3"]
-    inertia = positive("inertia", "The principal moments of inertia.")
+    inertia = positive_parameter("inertia", "The principal moments of inertia.")
 
     def __init__(self, inertia: Numbers = (1.0, 2.0, 3.0)):
         self.log_inertia = log_parameter(inertia, "inertia", (3,))
@@ -285,10 +289,10 @@ class LotkaVolterra(AbstractPoissonSystem):
     log_predation: Float[Array, ""]
     log_death: Float[Array, ""]
     log_reproduction: Float[Array, ""]
-    growth = positive("growth", "The growth of the prey.")
-    predation = positive("predation", "The rate at which each predator eats prey.")
-    death = positive("death", "The death rate of the predators.")
-    reproduction = positive("reproduction", "The growth of the predators by each prey.")
+    growth = positive_parameter("growth", "The growth of the prey.")
+    predation = positive_parameter("predation", "The rate at which each predator eats prey.")
+    death = positive_parameter("death", "The death rate of the predators.")
+    reproduction = positive_parameter("reproduction", "The growth of the predators by each prey.")
 
     def __init__(
         self,
@@ -333,7 +337,7 @@ class ChargedParticle(AbstractPoissonSystem):
     log_mass: Float[Array, ""]
     stiffness: Float[Array, ""]
     magnetic_field: Float[Array, ""]
-    mass = positive("mass", "The mass m.")
+    mass = positive_parameter("mass", "The mass m.")
 
     def __init__(
         self, mass: ArrayLike = 1.0, stiffness: ArrayLike = 1.0, magnetic_field: ArrayLike = 1.0

@@ -12,7 +12,7 @@ from hamkernel.systems._base import (
     Numbers,
     at,
     log_parameter,
-    positive,
+    positive_parameter,
     signed_parameter,
 )
 
@@ -36,8 +36,8 @@ class HarmonicOscillator(AbstractHamiltonianSystem):
 
     log_mass: Float[Array, ""]
     log_stiffness: Float[Array, ""]
-    mass = positive("mass", "The mass m.")
-    stiffness = positive("stiffness", "The spring constant k.")
+    mass = positive_parameter("mass", "The mass m.")
+    stiffness = positive_parameter("stiffness", "The spring constant k.")
 
     def __init__(self, mass: ArrayLike = 0.5, stiffness: ArrayLike = 1.0):
         self.log_mass = log_parameter(mass, "mass")
@@ -71,9 +71,9 @@ class Pendulum(AbstractHamiltonianSystem):
     log_mass: Float[Array, ""]
     log_length: Float[Array, ""]
     log_gravity: Float[Array, ""]
-    mass = positive("mass", "The mass m.")
-    length = positive("length", "The length l of the rod.")
-    gravity = positive("gravity", "The acceleration of gravity g.")
+    mass = positive_parameter("mass", "The mass m.")
+    length = positive_parameter("length", "The length l of the rod.")
+    gravity = positive_parameter("gravity", "The acceleration of gravity g.")
 
     def __init__(self, mass: ArrayLike = 0.5, length: ArrayLike = 1.0, gravity: ArrayLike = 9.81):
         self.log_mass = log_parameter(mass, "mass")
@@ -110,7 +110,7 @@ class Duffing(AbstractHamiltonianSystem):
     log_mass: Float[Array, ""]
     linear_stiffness: Float[Array, ""]
     cubic_stiffness: Float[Array, ""]
-    mass = positive("mass", "The mass m.")
+    mass = positive_parameter("mass", "The mass m.")
 
     def __init__(
         self,
@@ -183,8 +183,8 @@ class SpringChain(AbstractHamiltonianSystem):
     count: int = eqx.field(static=True)
     log_mass: Float[Array, "*count"]
     log_stiffness: Float[Array, "*springs"]
-    mass = positive("mass", "The masses m, shape () or (count,).")
-    stiffness = positive("stiffness", "The spring constants k, shape () or (count + 1,).")
+    mass = positive_parameter("mass", "The masses m, shape () or (count,).")
+    stiffness = positive_parameter("stiffness", "The spring constants k, shape () or (count + 1,).")
 
     def __init__(self, count: int = 10, mass: Numbers = 1.0, stiffness: Numbers = 1.0):
         self.count = require.count(count, "count")
@@ -224,9 +224,9 @@ class DoublePendulum(AbstractHamiltonianSystem):
     log_masses: Float[Array, "2"]
     log_lengths: Float[Array, "2"]
     log_gravity: Float[Array, ""]
-    masses = positive("masses", "The masses (m₁, m₂).")
-    lengths = positive("lengths", "The lengths (l₁, l₂) of the rods.")
-    gravity = positive("gravity", "The acceleration of gravity g.")
+    masses = positive_parameter("masses", "The masses (m₁, m₂).")
+    lengths = positive_parameter("lengths", "The lengths (l₁, l₂) of the rods.")
+    gravity = positive_parameter("gravity", "The acceleration of gravity g.")
 
     def __init__(
         self,
@@ -277,9 +277,9 @@ class CartPole(AbstractHamiltonianSystem):
     log_masses: Float[Array, "2"]
     log_length: Float[Array, ""]
     log_gravity: Float[Array, ""]
-    masses = positive("masses", "The masses (M, m).")
-    length = positive("length", "Half of the length of the pole, l.")
-    gravity = positive("gravity", "The acceleration of gravity g.")
+    masses = positive_parameter("masses", "The masses (M, m).")
+    length = positive_parameter("length", "Half of the length of the pole, l.")
+    gravity = positive_parameter("gravity", "The acceleration of gravity g.")
 
     def __init__(
         self, masses: Numbers = (0.5, 0.1), length: ArrayLike = 0.5, gravity: ArrayLike = 9.81
@@ -330,11 +330,11 @@ class Acrobot(AbstractHamiltonianSystem):
     log_centres: Float[Array, "2"]
     log_inertias: Float[Array, "2"]
     log_gravity: Float[Array, ""]
-    masses = positive("masses", "The masses (m₁, m₂).")
-    length = positive("length", "The length l of the first link.")
-    centres = positive("centres", "Where the centres of mass are, (c₁, c₂).")
-    inertias = positive("inertias", "The moments of inertia (I₁, I₂).")
-    gravity = positive("gravity", "The acceleration of gravity g.")
+    masses = positive_parameter("masses", "The masses (m₁, m₂).")
+    length = positive_parameter("length", "The length l of the first link.")
+    centres = positive_parameter("centres", "Where the centres of mass are, (c₁, c₂).")
+    inertias = positive_parameter("inertias", "The moments of inertia (I₁, I₂).")
+    gravity = positive_parameter("gravity", "The acceleration of gravity g.")
 
     def __init__(
         self,
