@@ -184,7 +184,8 @@ def gram_of_rows(
     return rows.contrast(rows.contrast(G).T) if contrasted and len(rows.energies) else G
 
 
-# The largest number of entries of a strip: some kernels hold 40 intermediate numbers for each.
+# The largest number of entries of a strip: some kernels hold 40 intermediate numbers for each, and
+# these are then 160 MB.
 _STRIP = 500_000
 
 

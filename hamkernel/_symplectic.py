@@ -295,8 +295,6 @@ class GaussLegendre6(AbstractGauss):
 
 # Splitting.
 
-_TRIPLE_JUMP = 1 / (2 - 2 ** (1 / 3))
-
 
 def is_separable(terms: Any) -> bool:
     """Whether the field under a Diffrax term says of itself that H = T(p) + U(q)."""
@@ -397,7 +395,9 @@ class Yoshida4(AbstractSplitting):
     """
 
     nominal_order: ClassVar[int] = 4
-    weights: ClassVar[tuple[float, ...]] = (_TRIPLE_JUMP, 1 - 2 * _TRIPLE_JUMP, _TRIPLE_JUMP)
+    weights: ClassVar[tuple[float, ...]] = tuple(
+        w / (2 - 2 ** (1 / 3)) for w in (1.0, -(2 ** (1 / 3)), 1.0)
+    )
     assume_separable: bool = False
 
 

@@ -19,8 +19,7 @@ from hamkernel._machine import compiled_by_size, orthonormal
 from hamkernel._structures.base import AbstractMatrixKernel
 
 # Gauss-Legendre nodes and weights on [0, 1]: exact for polynomials of degree 5.
-_LEGENDRE, _WEIGHTS = np.polynomial.legendre.leggauss(3)
-NODES, WEIGHTS = (1 + _LEGENDRE) / 2, _WEIGHTS / 2
+NODES, WEIGHTS = np.add(np.polynomial.legendre.leggauss(3), [[1.0], [0.0]]) / 2
 _PIECES = np.diff(np.concatenate([[0.0], NODES, [1.0]]))
 
 
