@@ -61,8 +61,9 @@ from hamkernel._solvers.random_features import FeatureFit, RandomFeatures
 from hamkernel._structures.base import Even, Invariant, Odd, Reversible, Sum
 from hamkernel._structures.custom_operator import Poisson, Structured
 from hamkernel._structures.family import Family
+from hamkernel._structures.friction import Friction, PortHamiltonian
 from hamkernel._structures.joined import Controlled, InputMatrix
-from hamkernel._structures.mechanics import Friction, PortHamiltonian, UnknownMasses
+from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
 from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.learned import Learned

@@ -97,6 +97,25 @@ def test_parts_are_saved_loaded_and_symmetrised(tmp_path):
     np.testing.assert_allclose(K(-x, x), -K(x, x), atol=1e-14)
 
 
+def test_a_rest_speed_that_was_not_given_has_the_units_of_the_momenta():
+    # With .1 dry friction of momenta of some thousandths looks like a viscous one.
+    forces = np.where([True, False], np.nan, Y)
+    slow, found = np.array([1.0, 1e-3]), {}
+    for unit in (1.0, 1e-3):
+        data = hk.Velocities(X * [1.0, unit], forces * [1.0, unit])
+        found[unit] = hk.fit(hk.Friction(0.1, 0.1 * unit), data, regularization=1e-6 * unit**2)
+    x = jnp.array([0.0, 0.1])
+    np.testing.assert_allclose(found[1e-3](x * slow), found[1.0](x) * slow, rtol=1e-6)
+    own = found[1.0].kernel.rest_speed
+    assert 1e-3 < own / np.abs(X[:, 1]).max() < 1e-2
+    assert f"rest_speed={own:.4g}" in repr(found[1.0])
+    both = hk.fit(hk.Friction() + hk.Friction(rest_speed=0.5), FORCES, regularization=1e-6)
+    assert [part.rest_speed for part in both.kernel.terms] == [own, 0.5]
+    still = hk.fit(hk.Friction(), X * [1.0, 0.0], Y, regularization=1e-6)  # no momenta were seen
+    assert still.kernel.rest_speed is None
+    assert still(x)[1] == 0.0
+
+
 def positions(starts, samples, rng):
     """Times and noisy positions of 8 s from these starts, in lists."""
     ts = np.linspace(0.0, 8.0, samples)

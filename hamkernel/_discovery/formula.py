@@ -17,7 +17,7 @@ from hamkernel import _require as require
 from hamkernel._fields.base import potential_of
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.joined import Controlled
-from hamkernel._structures.mechanics import UnknownMasses
+from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import AbstractPotentialKernel
 
 

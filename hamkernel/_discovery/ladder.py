@@ -17,7 +17,7 @@ from hamkernel._kernels.built_in import Gaussian
 from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._kernels.transforms import Select
 from hamkernel._structures.base import AbstractMatrixKernel, Odd, Reversible, total
-from hamkernel._structures.mechanics import PortHamiltonian
+from hamkernel._structures.friction import PortHamiltonian
 from hamkernel._structures.structure import (
     CurlFree,
     DivergenceFree,

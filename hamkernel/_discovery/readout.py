@@ -45,7 +45,7 @@ from hamkernel._posterior import Posterior
 from hamkernel._solvers.problem import problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.joined import Controlled, InputMatrix
-from hamkernel._structures.mechanics import UnknownMasses
+from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import CurlFree
 from hamkernel._trajectories.learned import Learned
 

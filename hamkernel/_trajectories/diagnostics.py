@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.mechanics import Friction, damped_coordinates
+from hamkernel._structures.friction import damped_coordinates, frictions
 from hamkernel._trajectories.preprocessing import Preprocessed
 from hamkernel._trajectories.runs import Runs
 
@@ -80,7 +80,7 @@ class FitQuality(NamedTuple):
             given or more would take too long; else 0.
         between: how inputs go on in a likelier way than was said; "" if they do not.
         gained: by how much friction in the kernel raises log p; 0 where that was not computed.
-        rest_speed: a hundredth of the largest momentum, for advice; 0 where there are no momenta.
+        has_momenta: whether half of the coordinates are momenta, on which friction can act.
         has_friction: whether the kernel has a `Friction`.
     """
 
@@ -100,7 +100,7 @@ class FitQuality(NamedTuple):
     few: int = 0
     between: str = ""
     gained: float = 0.0
-    rest_speed: float = 0.0
+    has_momenta: bool = False
     has_friction: bool = False
 
     @property
@@ -163,30 +163,20 @@ def _lacked(fit: FitQuality) -> str:
     """What the kernel may lack, with what to add."""
     if fit.gained > _FEW:
         return (
-            f"friction, with which log p would be {fit.gained:.0f} larger: add "
-            f"hk.Friction(rest_speed={fit.rest_speed:.2g}) to the drift, hk.Sum(energy=…, "
-            "friction=…); until then gains and the rest of the field may be wrong by more than "
-            "their bands"
+            f"friction, with which log p would be {fit.gained:.0f} larger: add hk.Friction() to "
+            "the drift, hk.Sum(energy=…, friction=hk.Friction()); until then gains and the rest of "
+            "the field may be wrong by more than their bands"
         )
     if fit.has_friction:
         such = "friction of another form (hk.Friction(stribeck=…), another rest_speed)"
-    elif fit.rest_speed > 0:
+    elif fit.has_momenta:
         such = (
-            f"friction (add hk.Friction(rest_speed={fit.rest_speed:.2g}) to the drift, or with "
-            "measured momenta take hk.PortHamiltonian)"
+            "friction (add hk.Friction() to the drift, or with measured momenta take "
+            "hk.PortHamiltonian)"
         )
     else:
         such = "friction or another force (add hk.CurlFree)"
     return f"a part of the motion that the kernel cannot have, such as {such}"
-
-
-def frictions(K: AbstractMatrixKernel) -> list[Friction]:
-    """The parts of K that are friction."""
-
-    def is_friction(node: object) -> bool:
-        return isinstance(node, Friction)
-
-    return [each for each in jax.tree.leaves(K, is_leaf=is_friction) if is_friction(each)]
 
 
 def warn_in_advance(
@@ -217,16 +207,17 @@ def warn_of_cost(data: Preprocessed, count: int) -> None:
 def warn_of_rest_speed(K: AbstractMatrixKernel, X: Float[np.ndarray, "N d"], n: int) -> None:
     """Warn of a `Friction` whose dry force fades over much of the momenta in X.
 
-    On a drive of at most .25 m/s a rest speed of .1 in place of .0025 left the drift 27 % off for
-    5.8 %, and a free run of 12 s 24 mm for 1.7 (`tests/benchmarks/machines.py`).
+    On a drive of at most .25 m/s a rest speed of .1 left the drift 27 % off for 3.7 %, and a free
+    run of 12 s 24 mm for 2.4 (`tests/benchmarks/machines.py`).
     """
     for part in frictions(K):
         fastest = float(np.abs(X[:, list(damped_coordinates(part.damped, n))]).max())
-        if 0 < fastest < 10 * part.rest_speed:
+        if part.rest_speed and 0 < fastest < 10 * part.rest_speed:
             require.warn(
                 f"the rest_speed of hk.Friction is {part.rest_speed:.3g} and the largest momentum "
-                f"of the runs {fastest:.3g}: dry friction then looks like a viscous one. A "
-                f"hundredth of that momentum is sharp: hk.Friction(rest_speed={fastest / 100:.2g})."
+                f"of the runs {fastest:.3g}: dry friction then looks like a viscous one. Leave it "
+                "out, or take a hundredth of that momentum: "
+                f"hk.Friction(rest_speed={fastest / 100:.2g})."
             )
 
 

@@ -22,13 +22,13 @@ from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.family import AbstractFamily
+from hamkernel._structures.friction import frictions, with_rest_speed
 from hamkernel._structures.joined import Controlled
-from hamkernel._structures.mechanics import UnknownMasses
+from hamkernel._structures.masses import UnknownMasses
 from hamkernel._trajectories.diagnostics import (
     FitQuality,
     check_identifiable,
     diagnose,
-    frictions,
     is_exact,
     warn_in_advance,
     whiteness,
@@ -138,8 +138,7 @@ def learn(
     require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
     K, given, process = _check(with_amplitude(matrix_kernel(K)), runs, noise, process_noise, solver)
     most = require.count(iterations, "iterations")
-    if masses:
-        K = with_masses(K, runs.dimension)
+    K = with_masses(K, runs.dimension) if masses else K
     known = known_part(K, mean, runs.dimension, jnp.float64)
     check_identifiable(runs, known)
     from tqdm import tqdm  # so that importing the package does not load it
@@ -153,6 +152,7 @@ def learn(
     if known is not None:
         Y = Y - np.asarray(jax.vmap(known)(jnp.asarray(X)))
     log_noise = jnp.log(jnp.asarray(_first_noise(data) if given is None else given))
+    K = with_rest_speed(K, jnp.asarray(X), runs.dimension)
     S, first, capped = landmarks(data, None if solver is None else solver.max_points)
     warn_in_advance(K, data, X, first)
 
@@ -217,7 +217,7 @@ def _learned(
     misfit = misfits(runs, states, noise)
     rows = now.field.points, now.rows, task.start_deviation
     z, counts = innovations(whitened_rows(now.model, *rows), now.rows), np.asarray(now.rows.counts)
-    fit = _quality(runs, end, alone, misfit, z, process, states)
+    fit = _quality(runs, end, alone, misfit, z, process)
     exact = is_exact(fit, noise, data.scale, given)
     if fit.kept.any() and not (exact or fit.white.is_enough):
         fit = _with_causes(fit, runs, end, alone)
@@ -271,7 +271,6 @@ def _quality(
     misfit: Float[np.ndarray, "R n"],
     z: Float[np.ndarray, "S L+1 n"],
     process: Float[np.ndarray, " n"],
-    states: list[Float[np.ndarray, "T n"]],
 ) -> FitQuality:
     """How well the field follows the runs; `z` are the innovations by segment."""
     now, data, times = end.now, end.task.data, runs.on_host()[0]
@@ -287,8 +286,6 @@ def _quality(
     speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
     spacing = np.median(np.concatenate([np.diff(t) for t in times]))
     swing = 2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)) / spacing
-    n = runs.dimension
-    least = 0.0 if n % 2 else 0.01 * max(float(np.abs(x[:, n // 2 :]).max()) for x in states)
     return FitQuality(
         kept=kept,
         dropped=_samples([piece for piece, good in pieces if not good], end, times),
@@ -303,19 +300,19 @@ def _quality(
         settled=end.settled,
         swing=float(swing),
         driven=runs.inputs is not None,
-        rest_speed=least,
+        has_momenta=runs.dimension % 2 == 0,
         has_friction=bool(frictions(now.field.kernel)),
     )
 
 
 def _with_causes(fit: FitQuality, runs: Runs, end: End, alone: End | None) -> FitQuality:
     """The same with what would make the rows likelier: the causes that warnings name."""
-    now, task, least = end.now, end.task, fit.rest_speed
+    now, task = end.now, end.task
     given = now.model, now.field.points, now.rows, task.start_deviation, whitening_of(now.model)
     return fit._replace(
         few=len(now.field.points) if task.capped or limited_by_landmarks(*given) else 0,
         between=likelier_between(runs, end if alone is None else alone),
-        gained=gain_of_friction(*given, task.data, least) if least > 0 else 0.0,
+        gained=gain_of_friction(*given, task.data) if fit.has_momenta else 0.0,
     )
 
 

@@ -14,9 +14,8 @@ from jaxtyping import Array, Bool, Float
 from hamkernel._machine import compiled_by_size
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.family import AbstractFamily
+from hamkernel._structures.friction import Friction, frictions, with_rest_speed
 from hamkernel._structures.joined import Controlled
-from hamkernel._structures.mechanics import Friction
-from hamkernel._trajectories.diagnostics import frictions
 from hamkernel._trajectories.likelihood import (
     ClosedForm,
     Condensed,
@@ -230,22 +229,20 @@ def gain_of_friction(
     start_deviation,
     whitening: Whitening,
     data: Preprocessed,
-    rest_speed: float,
 ) -> float:
     """The gain of log p from viscous and dry friction of the momenta beside the drift.
 
     All else stays. Forces as large as all of the motion are as good as free in the closed form. 0
     where the kernel has friction, or is that of a family.
     """
-    K = model.kernel
-    if frictions(K) or isinstance(K, AbstractFamily):
-        return 0.0
-    X, Y = sampled(data)
+    K, (X, Y) = model.kernel, sampled(data)
     n = Y.shape[1]
     force, fastest = np.sqrt(np.mean(Y[:, n // 2 :] ** 2)), np.abs(X[:, n // 2 : n]).max()
-    viscous = Friction(force / fastest, 1e-6 * force, rest_speed=rest_speed)
-    dry = Friction(1e-6 * force / fastest, force, rest_speed=rest_speed)
-    more = (K.drift if isinstance(K, Controlled) else K) + viscous + dry
+    if frictions(K) or isinstance(K, AbstractFamily) or not fastest > 0:
+        return 0.0
+    both = Friction(force / fastest, 1e-6 * force) + Friction(1e-6 * force / fastest, force)
+    drift = K.drift if isinstance(K, Controlled) else K
+    more = drift + with_rest_speed(both, jnp.asarray(X), n)
     more = Controlled(more, K.inputs, K.count) if isinstance(K, Controlled) else more
     S, rows = searched(jnp.asarray(S), rows)
     without, there = (

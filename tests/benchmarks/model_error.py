@@ -48,7 +48,7 @@ U_PART = hk.Controlled(
     hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0)), hk.InputMatrix(1.0, acts_on=(1,))
 )
 WITH_FRICTION = hk.Controlled(
-    hk.Sum(potential=U_PART.drift, friction=hk.Friction(0.1, 0.3, rest_speed=0.05)), U_PART.inputs
+    hk.Sum(potential=U_PART.drift, friction=hk.Friction(0.1, 0.3)), U_PART.inputs
 )
 LOGS = {"friction": "stiction", "timed": "delayed"}  # those of other cases
 

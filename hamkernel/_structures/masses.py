@@ -1,0 +1,192 @@
+"""States (q, q̇) in the place of (q, p), with unknown masses."""
+
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, ArrayLike, Float
+
+from hamkernel import _require as require
+from hamkernel._kernels.base import AbstractScalarKernel, Invariance, Point, Points
+from hamkernel._kernels.symmetry import LinearMap
+from hamkernel._show import described
+from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+
+
+class UnknownMasses(AbstractMatrixKernel):
+    """K′(y, z) = S⁻¹ K(Sy, Sz) S⁻ᵀ: states y = (q, q̇) of a structure for x = Sy = (q, p).
+
+    S = diag(I, M) with a constant mass matrix M, so p = M q̇, and a field f of K for (q, p) is
+    S⁻¹f(Sy) for (q, q̇). M is a hyperparameter: diagonal, or a full matrix that stays symmetric and
+    positive, M = L D Lᵀ with a unit lower triangle L. Its first entry is 1, since scaling H and M
+    together changes no motion; `field.hamiltonian(y)` is H in that unit.
+
+    What can be identified: with q̈ = −M⁻¹∇U(q), every M that makes M ∂q̈/∂q symmetric at all q
+    explains the motion. The ratio of two masses is seen only where the motion of one depends on the
+    other. A full matrix needs nonlinear forces: for linear oscillations every M under which their
+    modes are orthogonal explains the motion.
+
+    As the drift of `Controlled` it leaves the inputs in (q, q̇): G holds accelerations, M⁻¹ times
+    the forces, so a force on one coordinate moves several where M is full.
+
+    Args:
+        kernel: K, a matrix-valued kernel, such as `Symplectic(k)`.
+        masses: the first guess, m ≥ 2 degrees of freedom: shape (m,) for a diagonal M, (m, m) for a
+            full one, symmetric and positive definite. Its unit does not matter.
+
+    Raises:
+        TypeError: K is not matrix-valued, or it is `Controlled`. ValueError: a mass is not positive
+            and finite, a matrix is not symmetric and positive definite, or there is one degree of
+            freedom only.
+
+    Example: `hk.tune(hk.UnknownMasses(hk.Symplectic(k), [1.0, 1.0]), X, Y)`, or
+    `hk.learn(hk.UnknownMasses(hk.Symplectic(k), np.eye(2)), runs)`.
+    """
+
+    kernel: AbstractMatrixKernel
+    log_masses: Float[Array, " m-1"]  # the diagonal of D, over its first entry
+    coupling: Float[Array, " c"] | None  # the m(m − 1)/2 entries of L below its diagonal, by row
+
+    symplectic: ClassVar[bool] = False  # dq ∧ dp is kept, dq ∧ dq̇ is not
+
+    def __init__(self, kernel: AbstractMatrixKernel, masses: ArrayLike):
+        self.kernel = matrix_kernel(kernel, "the kernel of UnknownMasses", "Symplectic(k)")
+        if self.kernel.takes_inputs:
+            raise TypeError(
+                "the masses are those of the drift: Controlled(UnknownMasses(K, masses), …)."
+            )
+        guess = require.floating(masses, "masses")
+        if guess.shape not in ((len(guess),) * k for k in (1, 2)) or len(guess) < 2:
+            raise ValueError(
+                f"masses has shape {guess.shape}; two or more, shape (m,), or a matrix (m, m) are "
+                "needed. With one degree of freedom there is nothing to find: every mass explains "
+                "the same motion, and is only a unit of the energy. Leave UnknownMasses out."
+            )
+        self.coupling = None
+        if guess.ndim == 2:
+            guess, self.coupling = _factors(guess)
+        else:
+            guess = require.positive(guess, "masses", "One for each degree of freedom.")
+        self.log_masses = jnp.log(guess[1:] / guess[0])
+
+    def __repr__(self) -> str:
+        return described(self, positional=("kernel",))
+
+    @property
+    def masses(self) -> Float[Array, " m"] | Float[Array, "m m"]:
+        """The masses over the first one, shape (m,), or M over its first entry, (m, m)."""
+        D = self._diagonal
+        if self.coupling is None:
+            return D
+        L = self._triangle(D.dtype)
+        return jnp.einsum("ab,b,cb->ac", L, D, L)
+
+    @property
+    def _diagonal(self) -> Float[Array, " m"]:
+        """D, whose first entry is 1."""
+        return jnp.exp(jnp.pad(self.log_masses, (1, 0)))
+
+    def _triangle(self, dtype: Any) -> Float[Array, "m m"]:
+        """L."""
+        m = len(self.log_masses) + 1
+        below = jnp.asarray(self.coupling, dtype)
+        return jnp.eye(m, dtype=dtype).at[jnp.tril_indices(m, -1)].set(below)
+
+    def to_momenta(self, y: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """S y, for one state or many."""
+        q, v = jnp.split(y, 2, axis=-1)
+        M = self.masses.astype(y.dtype)
+        p = v * M.reshape((1,) * (v.ndim - 1) + M.shape) if M.ndim == 1 else v @ M
+        return jnp.concatenate([q, p], axis=-1)
+
+    def to_velocities(self, x: Float[Array, "... n"]) -> Float[Array, "... n"]:
+        """S⁻¹ x, and S⁻ᵀ x, which is the same; for one state or many."""
+        q, p = jnp.split(x, 2, axis=-1)
+        M = self.masses.astype(x.dtype)
+        if M.ndim == 1:
+            return jnp.concatenate([q, p / M.reshape((1,) * (p.ndim - 1) + M.shape)], axis=-1)
+        L, one = self._triangle(M.dtype), jnp.eye(len(M), dtype=M.dtype)
+        inverse = solve_triangular(L, one, lower=True, unit_diagonal=True)
+        scaled = inverse / self._diagonal.astype(M.dtype)[:, None]
+        return jnp.concatenate([q, p @ (inverse.T @ scaled)], axis=-1)  # M⁻¹ = L⁻ᵀ D⁻¹ L⁻¹
+
+    def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
+        u, v = self.to_velocities(u), self.to_velocities(v)
+        return self.kernel.form(self.to_momenta(x), u, self.to_momenta(z), v)
+
+    def expansion(self, x: Point, Z: Points, A: Points) -> Point:
+        x, Z, A = self.to_momenta(x), self.to_momenta(Z), self.to_velocities(A)
+        return self.to_velocities(self.kernel.expansion(x, Z, A))
+
+    def potential(self, x: Point, Z: Points, A: Points) -> Float[Array, ""]:
+        x, Z, A = self.to_momenta(x), self.to_momenta(Z), self.to_velocities(A)
+        return self.kernel.potential(x, Z, A)
+
+    def potential_covariance(self, x: Point, z: Point) -> Float[Array, ""]:
+        return self.kernel.potential_covariance(self.to_momenta(x), self.to_momenta(z))
+
+    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
+        # ∂H/∂x = S⁻ᵀ ∂H/∂y
+        return self.kernel.dissipated(self.to_momenta(x), self.to_velocities(slope))
+
+    @property
+    def no_potential(self) -> str | None:
+        return self.kernel.no_potential
+
+    @property
+    def has_hamiltonian(self) -> bool:
+        return self.kernel.has_hamiltonian
+
+    @property
+    def conserves(self) -> bool:
+        return self.kernel.conserves
+
+    def check_dimension(self, n: int) -> None:
+        count = len(self.log_masses) + 1
+        if n != 2 * count:
+            raise ValueError(
+                f"states have {n} coordinates and there are {count} masses: states (q, q̇) of "
+                f"{2 * count} coordinates are needed, or one mass for each degree of freedom."
+            )
+        self.kernel.check_dimension(n)
+
+    def check_points(self, X: Float[Array, "N n"]) -> None:
+        self.check_dimension(X.shape[1])
+        self.kernel.check_points(self.to_momenta(X))
+
+    def with_parity(self, parity: int) -> "UnknownMasses":
+        return eqx.tree_at(lambda K: K.kernel, self, self.kernel.with_parity(parity))
+
+    def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
+        raise TypeError("say the symmetry inside: UnknownMasses(Invariant(K, maps), masses).")
+
+    def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
+        return np.asarray(self.to_momenta(jnp.asarray(X)))
+
+    @property
+    def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
+        """The scalar kernels, functions of (q, p)."""
+        return self.kernel.scalar_kernels
+
+    @property
+    def invariance(self) -> Invariance:
+        return self.kernel.invariance  # S is linear
+
+
+def _factors(M: Array) -> tuple[Float[Array, " m"], Float[Array, " c"]]:
+    """D and L below its diagonal, of M = L D Lᵀ."""
+    guess = np.asarray(M)
+    if not np.isfinite(guess).all() or np.abs(guess - guess.T).max() > 1e-6 * np.abs(guess).max():
+        raise ValueError("masses, as a matrix, must be symmetric and finite.")
+    try:
+        C = np.linalg.cholesky(guess)
+    except np.linalg.LinAlgError:
+        lowest = np.linalg.eigvalsh(guess)[0]
+        raise ValueError(
+            f"masses, as a matrix, must be positive definite, as kinetic energy is; its lowest "
+            f"eigenvalue is {lowest:.3g}."
+        ) from None
+    L = C / np.diag(C)[None]
+    return jnp.asarray(np.diag(C) ** 2), jnp.asarray(L[np.tril_indices(len(L), -1)])
