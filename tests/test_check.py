@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._kernels.check import check_kernel
+from hamkernel import check_kernel
 
 ROOT3, ROOT5 = 3**0.5, 5**0.5
 

@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._save import load, save
+from hamkernel import load, save
 from hamkernel._tuning.space import hyperparameters
 
 RNG = np.random.default_rng(0)

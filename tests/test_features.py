@@ -14,11 +14,10 @@ import scipy.stats
 from kernels import canonical, gaussian_profile, matern_profile, periodic, radial, rational_profile
 
 import hamkernel as hk
+from hamkernel import FeatureField, RandomFeatures
 from hamkernel._features import features
-from hamkernel._fields.expansions import FeatureField
 from hamkernel._machine import orthonormal
 from hamkernel._solvers.least_squares import ridge_regression, triangle_of_design
-from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel.paper import datasets, experiments
 
 STRUCTURE = 1e-9  # relative; what sums of a thousand rounded terms leave of an exact zero

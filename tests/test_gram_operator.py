@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._gram_operator import TILE, gram_operator
+from hamkernel import gram_operator
+from hamkernel._gram_operator import TILE
 
 # Sums of a thousand terms of order one.
 ROUNDING = 1e-12

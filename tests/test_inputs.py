@@ -15,7 +15,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._save import load, save
+from hamkernel import load, save
 
 G, V = hk.Gaussian(1.3), hk.Gaussian(0.9)
 RNG = np.random.default_rng(0)

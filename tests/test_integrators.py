@@ -11,14 +11,8 @@ from jax.test_util import check_grads
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._symplectic import (
-    FixedPointToRounding,
-    GaussLegendre4,
-    GaussLegendre6,
-    ImplicitMidpoint,
-    StormerVerlet,
-    Yoshida4,
-)
+from hamkernel import GaussLegendre4, GaussLegendre6, ImplicitMidpoint, StormerVerlet, Yoshida4
+from hamkernel._symplectic import FixedPointToRounding
 
 GAUSS = [ImplicitMidpoint(), GaussLegendre4(), GaussLegendre6()]
 SPLITTING = [StormerVerlet(), Yoshida4()]

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._save import load, save
+from hamkernel import load, save
 
 G = hk.Gaussian(1.3)
 RNG = np.random.default_rng(0)

@@ -18,9 +18,9 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
+from hamkernel import RandomFeatures, load, save
 from hamkernel._kernels.symmetry import Symmetrised, identity
-from hamkernel._save import _ours, description, load, save, sealed, skeleton
-from hamkernel._solvers.random_features import RandomFeatures
+from hamkernel._save import _ours, description, sealed, skeleton
 
 RNG = np.random.default_rng(5)
 X = RNG.normal(size=(6, 2))

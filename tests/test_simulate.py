@@ -16,17 +16,17 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._kernels.built_in import Gaussian
-from hamkernel._simulate import simulate
-from hamkernel._structures.structure import Symplectic
-from hamkernel._symplectic import (
+from hamkernel import (
+    Gaussian,
     GaussLegendre4,
     GaussLegendre6,
     ImplicitMidpoint,
     StormerVerlet,
+    Symplectic,
     Yoshida4,
-    equal_steps,
+    simulate,
 )
+from hamkernel._symplectic import equal_steps
 
 SYMPLECTIC = [
     ImplicitMidpoint(),

@@ -15,11 +15,10 @@ import pytest
 from data import swings
 
 import hamkernel as hk
+from hamkernel import ConjugateGradient, Nystrom
 from hamkernel import _machine as _memory
 from hamkernel._solvers import fit as _fit
-from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.landmarks import choose_landmarks
-from hamkernel._solvers.nystrom import Nystrom
 
 K = hk.Symplectic(hk.Gaussian(1.5))
 RIDGE = 1e-4

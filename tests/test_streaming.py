@@ -12,10 +12,10 @@ import pytest
 from data import swings
 
 import hamkernel as hk
+from hamkernel import LandmarkFit, Nystrom
 from hamkernel._gram import gram_of_rows, rows_between
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of
-from hamkernel._solvers.nystrom import LandmarkFit, Nystrom
 from hamkernel._solvers.stream import AbstractStreamingSolver
 
 K = hk.Symplectic(hk.Gaussian(1.5))

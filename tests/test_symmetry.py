@@ -12,9 +12,9 @@ import pytest
 from kernels import BY_NAME, canonical, difference_mixed
 
 import hamkernel as hk
+from hamkernel import load, save
 from hamkernel._features import features as features_of
 from hamkernel._kernels.symmetry import symmetry_removed
-from hamkernel._save import load, save
 
 SYMMETRY = 1e-12
 RNG = np.random.default_rng(0)

@@ -18,8 +18,8 @@ import numpy as np
 from timing import in_turn
 
 import hamkernel as hk
+from hamkernel import RandomFeatures
 from hamkernel._features import features
-from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel.paper import READINGS, datasets, experiments
 
 DRAWS = 10

@@ -19,8 +19,7 @@ import numpy as np
 from timing import timed
 
 import hamkernel as hk
-from hamkernel._solvers.conjugate_gradient import ConjugateGradient
-from hamkernel._solvers.nystrom import Nystrom
+from hamkernel import ConjugateGradient, Nystrom
 
 
 def hamiltonian(x: jax.Array) -> jax.Array:
