@@ -112,8 +112,10 @@ def test_a_rest_speed_that_was_not_given_has_the_units_of_the_momenta():
     both = hk.fit(hk.Friction() + hk.Friction(rest_speed=0.5), FORCES, regularization=1e-6)
     assert [part.rest_speed for part in both.kernel.terms] == [own, 0.5]
     still = hk.fit(hk.Friction(), X * [1.0, 0.0], Y, regularization=1e-6)  # no momenta were seen
-    assert still.kernel.rest_speed is None
+    assert still.kernel.rest_speed == 0.1
     assert still(x)[1] == 0.0
+    with pytest.raises(TypeError, match=r"without a rest speed .* Name it: hk.Friction\(rest_sp"):
+        jax.jit(lambda X: hk.fit(hk.Friction(), X, Y, regularization=1e-6)(x))(X)
 
 
 def positions(starts, samples, rng):

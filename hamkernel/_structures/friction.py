@@ -32,7 +32,7 @@ from hamkernel._structures.structure import AbstractPotentialKernel, canonical, 
 # with log p of 13 586, 13 770 and 13 858 at .03, .01 and .003 runs free with 3.3, 3.2 and 2.3 mm
 # (`tests/benchmarks/machines.py`). A minute of a pendulum that sticks takes 17 ms, 6 with .01.
 _SHARP = 0.003
-_UNSEEN = 0.1  # the rest speed where no states are
+_UNSEEN = 0.1  # the rest speed where no momenta are
 
 
 def damped_coordinates(damped: tuple[int, ...] | None, n: int) -> tuple[int, ...]:
@@ -191,10 +191,11 @@ class Friction(AbstractMatrixKernel):
         rest_speed: ε > 0, the momentum below which dry friction fades to zero: no guess but a
             number that makes the force smooth, and is not trained. If None, three thousandths of
             the root mean square of the momenta, wherever a field is learned from states, and the
-            kernel of the result has the number; .1 where no states are seen, as in `hk.gram`, or
-            JAX traces them. Less costs a simulation more steps. Trained, it takes up what the log
-            has beside friction: on a real pendulum it rose from a hundredth to a fifth of the
-            largest speed, and the error of rollouts under another controller from .13 to .5 rad.
+            kernel of the result has the number; .1 where nothing is learned, as in `hk.gram`.
+            Under `jax.jit` it must be given. Less costs a simulation more steps. Trained, it takes
+            up what the log has beside friction: on a real pendulum it rose from a hundredth to a
+            fifth of the largest speed, and the error of rollouts under another controller from .13
+            to .5 rad.
         stribeck_speed: that of w, the momentum above which it slides.
         damped: the coordinates with friction, counted from 0; the momenta if None.
 
@@ -337,13 +338,13 @@ def frictions(K: AbstractMatrixKernel) -> list[Friction]:
 
 
 def with_rest_speed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> Any:
-    """K with a rest speed in every `Friction`, from the states X[:, :n] where they are not traced.
+    """K with a rest speed in every `Friction`, from the states X[:, :n].
 
-    With several momenta it is that of the slowest. Of systems at rest nothing is known.
+    With several momenta it is that of the slowest. Systems at rest say nothing and get .1.
     """
-    unknown = any(part.rest_speed is None for part in frictions(K))
-    if not unknown or not require.is_concrete(X):
+    if all(part.rest_speed is not None for part in frictions(K)):
         return K
+    require.untraced("hk.Friction() without a rest speed", "Name it: hk.Friction(rest_speed=…).", X)
     with require.eager():
         speeds = np.asarray(jnp.sqrt(jnp.mean(jnp.square(X[:, :n]), axis=0)))
 
@@ -352,7 +353,7 @@ def with_rest_speed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> 
             return node
         moving = [v for v in speeds[list(damped_coordinates(node.damped, n))] if v > 0]
         out = copy.copy(node)
-        object.__setattr__(out, "rest_speed", _SHARP * float(min(moving)) if moving else None)
+        object.__setattr__(out, "rest_speed", _SHARP * float(min(moving)) if moving else _UNSEEN)
         return out
 
     return jax.tree.map(at_speeds, K, is_leaf=_is_friction)
