@@ -12,7 +12,7 @@ from jax.flatten_util import ravel_pytree
 from kernels import BY_NAME, CASES, difference_mixed, fourth_power, mixed, slope
 
 import hamkernel as hk
-from hamkernel._kernels.base import Invariance, ScalarProduct, ScalarSum, as_scalar_kernel
+from hamkernel._kernels.base import Invariance, ScalarProduct, ScalarSum
 
 ROUNDING = 1e-12  # a few operations in float64, for values of order one
 DIFFERENCES = 1e-8  # what sixth-order differences of a formula leave
@@ -23,6 +23,11 @@ BUILTIN = pytest.mark.parametrize("case", [c for c in CASES if c.builtin], ids=s
 def clouds(n, N=4, seed=0):
     rng = np.random.default_rng(seed)
     return rng.normal(size=(N, n)), rng.normal(size=(N, n))
+
+
+def as_structures_take_it(k):
+    """The scalar kernel that a structure makes of any callable."""
+    return hk.Symplectic(k).kernel
 
 
 def mixed_block(k, x, z):
@@ -107,7 +112,7 @@ def test_a_kernel_of_the_distance_fails_the_same_checks():
 @pytest.mark.few(8)
 @pytest.mark.parametrize("case", [c for c in CASES if c.smoothness >= 1], ids=str)
 def test_third_derivatives_at_coincident_points_are_the_limit_from_neighbours(case):
-    k = as_scalar_kernel(case.make(4))
+    k = as_structures_take_it(case.make(4))
     X, directions = clouds(4, N=2)
 
     @jax.jit
@@ -127,7 +132,7 @@ def test_third_derivatives_at_coincident_points_are_the_limit_from_neighbours(ca
     "case", [c for c in CASES if c.name not in ("function", "lambda")], ids=str
 )
 def test_gradient_in_the_hyperparameters_at_coincident_points(case):
-    k = as_scalar_kernel(case.make(4))
+    k = as_structures_take_it(case.make(4))
     trained, static = eqx.partition(k, eqx.is_inexact_array)
     theta, unravel = ravel_pytree(trained)
     X, weights = clouds(4, N=1)
@@ -215,7 +220,7 @@ def test_declared_invariance_holds(case):
 
 @EVERY
 def test_invariance_is_declared_exactly_where_it_is_known(case):
-    declared = as_scalar_kernel(case.make(4)).invariance
+    declared = as_structures_take_it(case.make(4)).invariance
     assert (Invariance.REFLECTION in declared) == case.reflective
     assert (Invariance.TRANSLATION in declared) == case.stationary
     # The formulas agree: a kernel outside the list above would be caught, or is a user's.
@@ -279,7 +284,7 @@ def test_every_number_of_a_kernel_is_a_trainable_leaf(name, count):
 def test_arrays_bound_by_a_partial_are_the_leaves_of_the_kernel():
     w = jnp.asarray(slope(2))
     for partial in (functools.partial, jax.tree_util.Partial):
-        k = as_scalar_kernel(partial(BY_NAME["partial"].make(2).func, w))
+        k = as_structures_take_it(partial(BY_NAME["partial"].make(2).func, w))
         (leaf,) = jax.tree.leaves(k)
         np.testing.assert_array_equal(leaf, w)
 
@@ -289,7 +294,7 @@ def test_what_else_a_partial_binds_stays_static():
         return (jnp.sum(w * x * z) + offset) ** degree
 
     # A traced degree could not be a Python exponent; an array among the keywords is a leaf.
-    k = as_scalar_kernel(functools.partial(power, np.ones(2), degree=3, offset=jnp.array(0.5)))
+    k = as_structures_take_it(functools.partial(power, np.ones(2), degree=3, offset=jnp.array(0.5)))
     assert len(jax.tree.leaves(k)) == 2
     x, z = jnp.array([0.3, -1.0]), jnp.array([0.8, -0.1])
     np.testing.assert_allclose(jax.jit(lambda k: k(x, z))(k), 0.84**3, rtol=ROUNDING)
@@ -508,11 +513,11 @@ def test_a_negative_lengthscale_fails_under_jit_too():
 
 
 def test_a_user_kernel_of_more_than_a_scalar_is_refused():
-    k = as_scalar_kernel(lambda x, z: x * z)
+    k = as_structures_take_it(lambda x, z: x * z)
     with pytest.raises(ValueError, match=r"<lambda> returned an array of shape \(2,\).*one pair"):
         k(jnp.zeros(2), jnp.ones(2))
 
 
 def test_a_user_kernel_is_wrapped_without_change():
     x, z = jnp.array([0.3, -1.0]), jnp.array([0.8, -0.1])
-    np.testing.assert_array_equal(as_scalar_kernel(fourth_power)(x, z), fourth_power(x, z))
+    np.testing.assert_array_equal(as_structures_take_it(fourth_power)(x, z), fourth_power(x, z))

@@ -12,11 +12,10 @@ import pytest
 from data import swings
 
 import hamkernel as hk
-from hamkernel import LandmarkFit, Nystrom
+from hamkernel import LandmarkFit, Nystrom, RandomFeatures
 from hamkernel._gram import gram_of_rows, rows_between
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of
-from hamkernel._solvers.stream import AbstractStreamingSolver
 
 K = hk.Symplectic(hk.Gaussian(1.5))
 RIDGE = 1e-4
@@ -221,7 +220,7 @@ def test_the_ridge_is_that_of_the_start_unless_another_one_is_asked_for():
     [(given(S), "landmarks=30"), (hk.RandomFeatures(20, jax.random.key(0)), "features=40")],
     ids=["nystrom", "features"],
 )
-def test_both_solvers_stream_with_the_same_words(solver: AbstractStreamingSolver, size):
+def test_both_solvers_stream_with_the_same_words(solver: Nystrom | RandomFeatures, size):
     model = solver.start(K, X, RIDGE)
     for x, y in chunks(X, Y, 200):
         model = model.add(x, y)
