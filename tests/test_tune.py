@@ -948,3 +948,28 @@ def test_what_was_tuned_is_not_tuned_to_anything_worse():
     few = {"frozen": "lengthscale", "starts": 1, "max_steps": 5}
     again = hk.tune(once.kernel, X, Y, once.regularization, **few)
     assert again.loss <= once.loss * (1 + 1e-9)
+
+
+@pytest.mark.parametrize(("lengthscale", "ridge"), [(2.0, 1e-6), (50.0, 1e-3), (1.0, 1.0)])
+def test_parts_that_mislead_do_not_make_it_worse_nor_hide_that_it_has_not_converged(
+    lengthscale, ridge, monkeypatch
+):
+    # The first two parts see nothing but noise, far from where most of the data has none.
+    parts = [np.arange(count) for count in (12, 24, 60)]
+    monkeypatch.setattr("hamkernel._tuning.search.parts_of", lambda *_, **__: parts)
+    rng = np.random.default_rng(0)
+    noise = (np.arange(60) < 24)[:, None]
+    X = rng.uniform(-2, 2, size=(60, 2))
+    pendulum = 10 * np.stack([X[:, 1], -np.sin(X[:, 0])], axis=1)
+    X, Y = X + [100.0, 0.0] * noise, np.where(noise, rng.normal(size=X.shape), pendulum)
+
+    def loss(lengthscale, ridge):
+        return refit_loss(hk.Symplectic(hk.Gaussian(lengthscale)), X, Y, ridge, folds=60)
+
+    K = hk.Symplectic(hk.Gaussian(lengthscale))
+    tuned = hk.tune(K, X, Y, ridge, "loo", starts=1)
+    np.testing.assert_allclose(tuned.loss, loss(gaussian(tuned), tuned.regularization), rtol=FLOOR)
+    assert tuned.loss < loss(lengthscale, ridge)
+    near = [(a, b) for a in (0.9, 1.1) for b in (0.9, 1.1)]
+    losses = [loss(a * gaussian(tuned), b * tuned.regularization) for a, b in near]
+    assert tuned.converged == (min(losses) > tuned.loss * (1 - FLOOR))

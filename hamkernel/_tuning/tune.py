@@ -52,7 +52,8 @@ class Tuned(eqx.Module):
         loss: the objective there, shape (); for "marginal_likelihood" the NEGATIVE log density.
         field: the fit to all data with them.
         hyperparameters: the tuned values by the names of `bounds`, in their units.
-        converged: whether the run that found the best point met the tolerance, shape ().
+        converged: whether the run that found the best point met the tolerance on all data, shape
+            (). If two steps of correction did not suffice, tune again from the kernel and λ found.
         steps: the number of its optimiser steps, shape ().
         at_bounds: the names of the hyperparameters that rest on a bound of the search box, and of
             which coordinate: `kernel.lengthscale[1]`. The data prefers values beyond it: see "How
@@ -105,10 +106,11 @@ def tune(
     space-filling design in the box, on a subset of 64 points (of 256/n, with n > 4) if there are
     more. Where the runs end is compared on all data, together with the given point, and the best is
     finished there. From 2048/n points on this is done on 1024/n of them, and the best is corrected
-    on all data by two more steps: each takes the time of some ten factorisations. New data of
-    the same shape does not recompile, unless `Nystrom` takes another number of landmarks. Data
-    sharded over devices is gathered on one of them for the search; the field is fitted where the
-    data lies.
+    on all data by two more steps: each takes the time of some ten factorisations. Where the given
+    point is better than that on all data, the part has misled and a run from there is finished.
+    New data of the same shape does not recompile, unless `Nystrom` takes another number of
+    landmarks. Data sharded over devices is gathered on one of them for the search; the field is
+    fitted where the data lies.
 
     Args:
         K: a matrix-valued kernel; every inexact array leaf is a hyperparameter, and no Python
