@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 import scipy.stats
-from test_learn import damped, field_error, logs
+from test_learn import PENDULUM, damped, field_error, logs
 
 import hamkernel as hk
 from hamkernel._trajectories.diagnostics import (
@@ -239,6 +239,28 @@ def test_bands_are_widened_as_much_as_correlated_noise_widens_least_squares():
         # By more than needed where the noise has less power, never by much less.
         assert least < widening / np.var(estimates) < most
     assert whiteness(white_or_not(rng, 0.0, runs=40, length=200), counts).widening == 1.0
+
+
+@pytest.mark.parametrize(("noise", "friction"), [(0.0, 0.0), (1e-4, 0.0), (1e-5, 1e-4)])
+def test_good_sensors_are_not_exact_data(noise, friction):
+    """Friction of a ten-thousandth leaves 1.5e-4 of the states, fifteen times the noise."""
+    drag = jnp.array([0.0, friction])
+    _, _, true = logs(lambda x: PENDULUM(x) - drag * x, count=3, samples=40, length=8.0, spread=1.5)
+    scale = np.std(np.concatenate(true), axis=0)
+    rng, ts = np.random.default_rng(0), np.linspace(0, 8, 40)
+    states = [x + noise * scale * rng.standard_normal(x.shape) for x in true]
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = hk.learn(KERNEL, hk.Runs([ts] * 3, states), process_noise=0)
+    share = np.asarray(found.noise) / scale
+    if friction:
+        assert not found.converged
+        assert "innovations are not white" in str(said[0].message)
+        assert (share < 1e-3).all()
+    else:
+        assert found.converged
+        assert not said
+        np.testing.assert_allclose(share, max(noise, 1e-6), rtol=0.2)
 
 
 @pytest.mark.parametrize(("rest_speed", "said"), [(0.1, True), (0.01, False)])

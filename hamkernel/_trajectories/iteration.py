@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled_by_size
-from hamkernel._trajectories.diagnostics import NEGLIGIBLE, whiteness
+from hamkernel._trajectories.diagnostics import SETTLED, whiteness
 from hamkernel._trajectories.flow import (
     Expansion,
     Segments,
@@ -43,7 +43,6 @@ from hamkernel._trajectories.likelihood import (
 )
 from hamkernel._trajectories.preprocessing import Preprocessed
 from hamkernel._trajectories.search import (
-    LEAST_NOISE,
     Bounds,
     begun,
     limited_by_landmarks,
@@ -51,6 +50,7 @@ from hamkernel._trajectories.search import (
     most_likely,
     searched,
     solved,
+    without_noise,
 )
 from hamkernel._trajectories.segments import (
     LONG,
@@ -69,6 +69,7 @@ from hamkernel._trajectories.segments import (
 _ROUNDS = 4  # Levenberg steps before a segment is judged: without them up to 40 % were lost
 _SEARCH = 25  # steps of BFGS, which go on in the next iteration
 _SHORT_ROUNDS = 2  # iterations with short segments, in which a rough field stays near the samples
+_NOT_YET_EXACT = 1e-3  # of the states: residuals for which no segment without noise is dropped
 
 
 class Task(NamedTuple):
@@ -167,7 +168,7 @@ def iterate(
         # A hundredth of log σ, and of the objective by degree of freedom; or a field that stays:
         # without noise its digits end before the objective settles.
         small = float(done.gain) < 0.01 * max(now.free, 1.0)
-        settled = moved < 0.01 and (small or changed(task, before, now) < 1e-4)
+        settled = moved < 0.01 and (small or changed(task, before, now) < SETTLED)
         settled = settled and same and i > _SHORT_ROUNDS
         if settled:
             break
@@ -221,7 +222,7 @@ def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, It
         segments.starts,
         _ROUNDS,
     )
-    least = NEGLIGIBLE * task.data.scale
+    least = _NOT_YET_EXACT * task.data.scale
     was_asked = bool(np.isfinite(now.squares))
     good = trusted(before, segments, np.exp(np.asarray(now.model.log_noise)), least, was_asked)
     if not was_asked:  # the pieces are those of the smoothed paths
@@ -469,12 +470,13 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
         return False
     if not (end.settled and now.good.all()):
         return True
-    if _is_exact(end):
+    counts = noisy_counts(end)
+    if not counts.any():
         return False
     if limited_by_landmarks(now.model, *given, project_out_starts):
         return False
     z = innovations(whitened_rows(now.model, *given), now.rows)
-    if not whiteness(z, np.asarray(now.rows.counts)).is_enough:
+    if not whiteness(z, counts).is_enough:
         return True
     shares = np.log([1e-3, 1e-2, 1e-1])
     design = [now.model.log_process, *(impulse + share for share in shares)]
@@ -485,11 +487,10 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     return bool(values[0] - values.min() > price(end, impulse))
 
 
-def _is_exact(end: End) -> bool:
-    """Whether the field explains the samples as far as paths are integrated: no noise is left."""
-    noise, least = np.asarray(end.now.model.log_noise), np.log(LEAST_NOISE * end.task.data.scale)
-    moves = end.task.bounds.free[-2 * noise.size : -noise.size]
-    return bool(moves.any() and (noise < least + 0.1)[moves].all())
+def noisy_counts(end: End) -> Float[np.ndarray, "S L+1 n"]:
+    """How many samples there are where there is noise: zero in coordinates that are exact."""
+    task, now = end.task, end.now
+    return np.where(without_noise(now.model, task.bounds, task.data.scale), 0, now.rows.counts)
 
 
 def likelier(without: End, process: End) -> End:

@@ -29,7 +29,6 @@ from hamkernel._trajectories.diagnostics import (
     FitQuality,
     check_identifiable,
     diagnose,
-    is_exact,
     warn_in_advance,
     whiteness,
 )
@@ -43,6 +42,7 @@ from hamkernel._trajectories.iteration import (
     initial_loss,
     iterate,
     likelier,
+    noisy_counts,
     whitening_of,
 )
 from hamkernel._trajectories.kalman import (
@@ -218,8 +218,7 @@ def _learned(
     rows = now.field.points, now.rows, task.start_deviation
     z, counts = innovations(whitened_rows(now.model, *rows), now.rows), np.asarray(now.rows.counts)
     fit = _quality(runs, end, alone, misfit, z, process)
-    exact = is_exact(fit, noise, data.scale, given)
-    if fit.kept.any() and not (exact or fit.white.is_enough):
+    if fit.kept.any() and not fit.white.is_enough:
         fit = _with_causes(fit, runs, end, alone)
     converged = diagnose(fit, noise, data.scale, given)
     observations = as_observations(now.rows, now.model, task.mean, task.start_deviation)
@@ -294,7 +293,7 @@ def _quality(
         chi_squared=squares / max(free, 1.0),
         free=free,
         remaining=now.free,
-        white=whiteness(z, counts),
+        white=whiteness(z, noisy_counts(end)),
         process=None if alone is None else process,
         count=len(end.history),
         settled=end.settled,

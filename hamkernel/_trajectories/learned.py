@@ -73,7 +73,8 @@ class Learned(eqx.Module):
         whiteness: the probability that independent innovations are as correlated as these, by the
             test of Ljung and Box over ten lags, shape (). Below .05 the structure, or the timing
             of inputs, leaves residuals that persist from sample to sample; this counts against
-            `converged` where it makes bands more than 1.2 times too narrow.
+            `converged` where it makes bands more than 1.2 times too narrow. Coordinates whose noise
+            is a millionth of the states or less are exact, and not judged.
         widening: the factor on the variance of the noise in `posterior` where innovations are
             correlated, the peak of their spectrum over ten lags, shape (); 1 where they are white.
         disturbance: the mean of w from each sample to the next as far as the samples know it, for

@@ -50,6 +50,21 @@ _ENTRIES = 1_000_000
 LEAST_NOISE = 1e-6
 
 
+def without_noise(
+    model: Model, bounds: Bounds, scale: Float[np.ndarray, " n"]
+) -> Bool[np.ndarray, " n"]:
+    """The coordinates that the field explains as far as paths are integrated: no noise is left.
+
+    What is left there are errors of integration, which are never white. Of a pendulum with noise of
+    0, 1e-6, 1e-5, 1e-4 and 1e-3 of the states, 5 runs of 60 samples, the noise found is 1.0001 (the
+    least is 1), 1.0009, 9.9, 99 and 990 millionths, and the whiteness 6e-67, 1, 1, .98 and .99.
+    With process noise that is what is left, and it is judged.
+    """
+    n = len(scale)
+    least = np.asarray(model.log_noise) < np.log(LEAST_NOISE * scale) + 0.1
+    return bounds.free[-2 * n : -n] & least & (not model.is_disturbed)
+
+
 def _loss(model: Model, h, S, rows, start_deviation, whitening: Whitening):
     there = model.at(h)
     T = landmark_whitening(there.kernel, S)
