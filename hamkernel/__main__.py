@@ -41,7 +41,7 @@ def main() -> None:
 
 
 def _plan(out: str, seeds: int, tune: bool) -> str:
-    """What will be done, and how long it takes on two idle cores."""
+    """The plan in words, with the minutes that it takes on two idle cores."""
     # Half a minute compiles and draws, and 100 seeds take as long (README, "Install").
     first = 0.5 + 0.5 * seeds / 100
     lines = [

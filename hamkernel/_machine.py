@@ -55,7 +55,7 @@ class RowSharding:
 
 
 def rows_of(array: Array) -> RowSharding | None:
-    """How the rows of `array` are spread over devices; None if they are not, or if it is traced.
+    """The devices over which the rows of `array` are spread; None if it is on one, or traced.
 
     A traced array does not say where it lies, so inside `jax.jit` the compiler shards the loops:
     the results are right, but every device holds all rows.

@@ -331,7 +331,7 @@ def _range_of(U: Float[Array, "N m"], centre: float | None) -> Float[Array, "2 m
 
 
 def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
-    """Say so where k(x, x) = 1 to the last digit, as of built-in kernels that nobody scaled."""
+    """Warn where k(x, x) = 1 to the last digit, as in built-in kernels that nobody scaled."""
     if not require.is_concrete(K, X):
         return
     with require.eager():

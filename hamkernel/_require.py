@@ -1,4 +1,4 @@
-"""What the public functions require of their arguments, said before any long computation.
+"""Checks of the arguments of public functions, made before any long computation.
 
 Shapes, dtypes and configuration are known while tracing and raise at once. Values are checked
 by NumPy when they are concrete, for it compiles nothing; under `jax.jit` the same check becomes
@@ -52,7 +52,7 @@ def on_host(x: Array) -> Any:
 
 
 def not_finite(x: Array) -> Any:
-    """Where `x` is NaN or infinite, for `value`."""
+    """A mask of the entries of `x` that are NaN or infinite, as `value` takes it."""
     return ~(abs(on_host(x)) < np.inf)
 
 
@@ -67,9 +67,9 @@ def value(
 
     If not `throw`, `x` is NaN there.
 
-    `x` is an array or a PyTree of them: everything that would be wrong, for under jit a check is
-    dropped together with the value it hangs on.
-    Computed with `on_host`, `bad` is known wherever it can be, also for constants under jit.
+    `x` is an array or a PyTree of all arrays that would be wrong: under jit a check is dropped with
+    the value that carries it. With `on_host`, `bad` is known wherever it can be, also for constants
+    under jit.
     """
     bad = bad.any()  # type: ignore[union-attr]
     if not throw:

@@ -299,7 +299,7 @@ def _ours(cls: type) -> bool:
 
 @functools.cache
 def _classes() -> dict[str, type[eqx.Module]]:
-    """What a file may name."""
+    """The classes that a file may name, by name."""
     found: dict[str, type[eqx.Module]] = {}
     left = [eqx.Module]
     for cls in left:  # which grows
@@ -388,7 +388,7 @@ def skeleton(node: Node, codes: list[Any], where: str, given: Given) -> Any:
 
 
 def _difference(saved: Node, given: Node, where: str) -> str | None:
-    """Where two descriptions differ first, in words. What the given one leaves open may differ."""
+    """The first difference of two descriptions, in words; what `given` leaves open may differ."""
     match saved, given:
         case {"class": name, **nodes}, {"class": other, **others} if name == other:
             pairs = [(nodes[key], others[key], f"{where}.{key}") for key in nodes]

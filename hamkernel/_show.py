@@ -1,4 +1,4 @@
-"""How kernels, fields and results print: with the values of their hyperparameters."""
+"""The text of kernels, fields and results, with the values of their hyperparameters."""
 
 import dataclasses
 import textwrap

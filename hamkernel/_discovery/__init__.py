@@ -1,1 +1,1 @@
-"""What the data say beyond the field: a formula of its potential, and which physics they obey."""
+"""Beyond the field: a formula of its potential, and the physics that the data obey."""

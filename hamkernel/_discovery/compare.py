@@ -53,10 +53,10 @@ class Candidate(NamedTuple):
     """One row of the table.
 
     Attributes:
-        name: as it was given.
+        name: the name of the candidate.
         claims: the questions that its structure answers with yes.
         score: log p − ½ P log D.
-        difference: of the score to that of the best candidate, at most 0.
+        difference: the score less that of the best candidate, at most 0.
         log_likelihood: log p of the rows at the tuned hyperparameters.
         parameters: P, the count of trained numbers, λ among them.
         kernel: the tuned kernel.
@@ -77,13 +77,13 @@ class Candidate(NamedTuple):
 
 @dataclasses.dataclass(frozen=True)
 class Comparison:
-    """What `compare` found; it prints as a report.
+    """The candidates by score, and the answers that they give; it prints as a report.
 
     Attributes:
         table: the candidates, the best first.
         answers: "yes", "no", "undecided" or "not tested" for each of the questions "energy",
             "friction", "mirror", "reversible" and "T + U".
-        reasons: a sentence for each.
+        reasons: a sentence for each answer.
         differences: the score of the best yes less that of the best no; NaN where not tested.
         rows: D, the number of measured values.
     """
@@ -210,7 +210,7 @@ def _most_likely(
 
 
 def _data(X: Any, Y: Any) -> tuple[AbstractObservations, Any]:
-    """What was measured, and its λ if that is known."""
+    """The observations, and their λ where `learn` has found it."""
     if not isinstance(X, Learned):
         return observations(X, Y), None
     if Y is not None:

@@ -155,7 +155,7 @@ class Rung(AbstractMatrixKernel):
 
 
 def _signs(n: int, images: int) -> Float[np.ndarray, "images n"]:
-    """Those of x, −x, and, of four images, of backward motion."""
+    """The signs of the images x, −x and, of four, (q, −p) and (−q, p), which run backwards."""
     reversal = np.repeat([1.0, -1.0], [n // 2, n - n // 2])
     return np.stack([np.ones(n), -np.ones(n), reversal, -reversal])[:images]
 
@@ -164,7 +164,7 @@ class LadderStep(NamedTuple):
     """One step of the ladder.
 
     Attributes:
-        structure: its class; with friction `Symplectic` stands for `PortHamiltonian`.
+        structure: the class of the kernel; with friction `Symplectic` stands for `PortHamiltonian`.
         apart: whether H = T(p) + U(q).
         friction: whether there is friction on the momenta.
         mirror: whether f(−x) = −f(x).
@@ -179,7 +179,7 @@ class LadderStep(NamedTuple):
 
     @property
     def claims(self) -> frozenset[str]:
-        """The questions that every field of it answers with yes, as `compare.claims` finds."""
+        """The questions that each of its fields answers with yes, as `compare.claims` finds."""
         found = {"mirror"} if self.mirror else set()
         if self.structure is Symplectic:
             found.add("energy")
@@ -190,7 +190,7 @@ class LadderStep(NamedTuple):
         return frozenset(found)
 
     def rung(self, scale: Float[np.ndarray, " n"], speed: float) -> Rung:
-        """The kernel to search with, at first for fields of this size that change over 2 `scale`.
+        """The kernel of the step, first for fields of size `speed` that change over 2 `scale`.
 
         Args:
             scale: the standard deviation of each coordinate; 0 counts as 1.

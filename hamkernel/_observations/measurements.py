@@ -146,7 +146,7 @@ class Measurements:
         return self.scale * self.contrast_transpose(self.y)
 
     def joined(self, new: Measurements) -> Measurements:
-        """These rows followed by the new ones."""
+        """The measurements with the new rows behind these."""
         blocks = merged(self.blocks + new.blocks)
         return Measurements(blocks, jnp.concatenate([self.targets, new.targets]))
 

@@ -1,1 +1,1 @@
-"""How a field is found from data."""
+"""Solvers: dense, by conjugate gradients, of low rank, and of data in a stream."""

@@ -24,13 +24,14 @@ _FEW = 10  # degrees of freedom, from which σ is known to a fifth
 
 
 class Whiteness(NamedTuple):
-    """How far innovations are from white ones.
+    """The correlation of innovations from sample to sample, and what it costs.
 
     Attributes:
-        probability: that white innovations are as correlated, by Ljung and Box; 1 of too few.
+        probability: the probability that white innovations are as correlated, by the test of Ljung
+            and Box; 1 where there are too few.
         peak: the largest value of their spectra 1 + 2 Σ_k (1 − k/11) r_k cos(kω), k = 1 to 10; 1
             where they are white.
-        neighbours: their correlation at lag one, by coordinate, shape (n,).
+        neighbours: the correlation of innovations at lag one, by coordinate, shape (n,).
     """
 
     probability: float
@@ -39,7 +40,7 @@ class Whiteness(NamedTuple):
 
     @property
     def is_enough(self) -> bool:
-        """Whether they are as good as white.
+        """Whether the innovations are as good as white.
 
         False alarms are 5 % of logs. The noise of a part of the motion that is in one frequency is
         as much larger as the spectrum there; up to 1.44, a deviation of 1.2, at least 90 % lies
@@ -66,10 +67,11 @@ class FitQuality(NamedTuple):
 
     Attributes:
         kept: the share of each run that the field was learned from, shape (R,).
-        dropped: the parts it was not learned from: run, first sample, and the one after the last.
-        misfit: of each run and coordinate, in units of the noise, shape (R, n).
+        dropped: the parts that the field was not learned from, each as run, first sample, and the
+            sample after the last.
+        misfit: the misfit of each run and coordinate, in units of the noise, shape (R, n).
         chi_squared: χ² per degree of freedom, of the fit without process noise if q was estimated.
-        free: its degrees of freedom.
+        free: the degrees of freedom of that fit.
         remaining: the degrees of freedom that the fit leaves, process noise included.
         white: how white the innovations are.
         process: q if it was estimated, shape (n,); None where it was given.
@@ -151,7 +153,7 @@ def explains(chi_squared: float, free: float) -> bool:
 
 
 def _lacked(fit: FitQuality) -> str:
-    """What the kernel may lack, with what to add."""
+    """The forces that the kernel may lack, with the kernel to add, in words."""
     if fit.gained > _FEW:
         return (
             f"friction, with which log p would be {fit.gained:.0f} larger: add hk.Friction() to "
@@ -412,9 +414,9 @@ def whiteness(z: Float[np.ndarray, "S L+1 n"], counts: Float[np.ndarray, "S L+1 
 def autocorrelations(
     series: list[Float[np.ndarray, " T"]],
 ) -> tuple[Float[np.ndarray, " 10"], Float[np.ndarray, " 10"]]:
-    """Those of series of mean zero at lags 1 to 10, and how many pairs there are at each.
+    """The autocorrelations of series of mean zero at lags 1 to 10, and the pairs at each lag.
 
-    No pair is one of two series. Where nothing varies there are no pairs.
+    Both values of a pair are of one series. Where nothing varies there are no pairs.
     """
     total = sum(float(z @ z) for z in series)
     if total == 0:

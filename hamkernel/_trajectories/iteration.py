@@ -121,12 +121,12 @@ class Current(NamedTuple):
 
 
 class End(NamedTuple):
-    """Where the iterations ended.
+    """The end of the iterations.
 
     Attributes:
-        task: what was asked.
+        task: the task.
         now: the last step.
-        pieces: of the last step.
+        pieces: the pieces of the runs in the last step.
         history: one entry a step.
         settled: whether noise and objective settled.
     """
@@ -452,7 +452,7 @@ def price(end: End, impulse: Float[np.ndarray, " n"], pushes: int = 0) -> float:
 
 
 def whitening_of(model: Model) -> Whitening:
-    """How rows of this model are whitened."""
+    """The function that whitens the rows of this model."""
     return whiten if model.is_disturbed else project_out_starts
 
 

@@ -316,7 +316,7 @@ def _with_causes(fit: FitQuality, runs: Runs, end: End, alone: End | None) -> Fi
 
 
 def likelier_between(runs: Runs, end: End) -> str:
-    """How inputs go on in the likeliest way along the smoothed runs; "" if as was said."""
+    """The likeliest way in which inputs go on between samples; "" if it is that of the runs."""
     if runs.inputs is None or isinstance(runs.delay, str):
         return ""
     task, model = end.task, end.now.model

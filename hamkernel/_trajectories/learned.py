@@ -46,7 +46,7 @@ class Iteration(eqx.Module):
 
 
 class Learned(eqx.Module):
-    """What `learn` found.
+    """The field that `learn` found, with the paths, the noise and the diagnostics.
 
     Attributes:
         field: the learned field, the mean included.
@@ -59,7 +59,8 @@ class Learned(eqx.Module):
             over √time, shape (n,); 0 where the structure is the whole truth.
         states: the fitted path of each run at its times, missing coordinates filled in, (T, n).
         kept: for each run the share of its samples that the field is learned from, shape (R,).
-        dropped: what it is not learned from, as (run, first sample, the one behind the last).
+        dropped: the parts of the runs that the field is not learned from, each as (run, first
+            sample, sample after the last).
         misfit: for each run and coordinate the root mean square of (measured − fitted)/σ, shape
             (R, n); about one where the structure explains the run, NaN where nothing was measured.
         chi_squared: the sum of squares of all of them over the degrees of freedom that the fit
@@ -82,11 +83,11 @@ class Learned(eqx.Module):
         history: one entry an iteration.
         converged: whether noise and objective settled, where the field explains the runs at the
             noise found, with innovations that are white.
-        runs: what was given.
+        runs: the runs that were given.
         observations: what the runs say of the field near the fitted paths, starts projected out:
             linear functionals of it, with independent noise of variance one. `hk.fit(kernel,
             observations, regularization=regularization)` is the exact fit of which `field`
-            is the one on landmarks. None where there were too few samples.
+            is the approximation on landmarks. None where there were too few samples.
         mean: the known part of the field, if one was given.
     """
 

@@ -212,7 +212,7 @@ regression_loss.defvjp(_regression, _regression_backward)
 
 
 class Condensed(NamedTuple):
-    """What the rows say about w, in O(q²) memory.
+    """The information of the rows about the weights w, in O(q²) memory.
 
     Attributes:
         T: the whitening of the landmarks, shape (q, q).

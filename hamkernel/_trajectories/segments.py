@@ -46,10 +46,10 @@ class Piece(NamedTuple):
 
 
 class LinearisedSegments(NamedTuple):
-    """What the samples say of g = f − m, before the starts are projected out.
+    """The rows of samples, linear in g = f − m, before the starts are projected out.
 
     Attributes:
-        nodes: where g is evaluated, with inputs the points (x, u), d = n + m, shape (S, L, 3, d).
+        nodes: the points where g is evaluated, with inputs (x, u), d = n + m, shape (S, L, 3, d).
         across: Ψ, shape (S, L, n, n).
         weights: Γ, shape (S, L, 3, n, n).
         spans: the lengths of the intervals, shape (S, L).
@@ -58,8 +58,8 @@ class LinearisedSegments(NamedTuple):
         missed: the increment of x̂ less that of the Gauss rule for d x̂/dt, 0 for a solution, the
             same shape.
         residual: x − x̂, shape (S, L + 1, n).
-        counts: those of the segments, zero on what was dropped.
-        scatter: those of the segments, zero on what was dropped.
+        counts: the counts of the segments, zero on samples that were dropped.
+        scatter: the scatter of the segments, zero on samples that were dropped.
         prior_offset: the mean of the prior of the start, relative to x̂, shape (S, n).
     """
 

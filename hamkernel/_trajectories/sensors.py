@@ -1,4 +1,4 @@
-"""What sensors and controllers do to a log, said before anything is learned from it."""
+"""Warnings of faults that sensors and controllers leave in a log, before it is learned from."""
 
 import itertools
 from collections.abc import Sequence
@@ -126,7 +126,7 @@ def _straight(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> flo
 
 
 def _plateaus(x: Float[np.ndarray, " T"], value: float, quantum: float) -> int:
-    """How often x stays at this outermost value for three samples and enters or leaves at speed.
+    """The number of times x stays at this outermost value for three samples, and comes at speed.
 
     A smooth maximum that rounds to one value k times is a parabola that falls by less than
     ((k + 2)/k)² of a step of the resolution one sample further on, 2.8 for k = 3.

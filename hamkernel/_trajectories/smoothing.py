@@ -330,7 +330,7 @@ class Smoothing(eqx.Module):
     """Runs smoothed one coordinate at a time, to be looked at; no field is involved.
 
     Attributes:
-        times: of each run, shape (P,): those of its samples, and those asked for in between.
+        times: the times of each run, shape (P,): its samples, and times between them.
         states: the smoothed states there, shape (P, n); NaN where never measured.
         deviation: the standard deviation of each coordinate, the sensor noise left out, (P, n).
         noise: the standard deviation of the sensor noise of each coordinate, shape (n,).

@@ -138,7 +138,7 @@ class MinimiserRun(NamedTuple):
     converged: Bool[Any, ""]
 
     def going_on_from(self, runs: "MinimiserRun") -> "MinimiserRun":
-        """These runs with the curvature that others have learned on a similar function.
+        """The runs at these points, with the curvature of other `runs` on a similar function.
 
         The first step of a quasi-Newton method only evaluates the function at its point.
         """
@@ -149,7 +149,7 @@ class MinimiserRun(NamedTuple):
         return self._replace(state=known, steps=runs.steps)
 
     def with_curvature(self, inverse: Float[Array, "P P"]) -> "MinimiserRun":
-        """This run of `BoxBFGS` with an inverse Hessian that is known beforehand."""
+        """The run of `BoxBFGS` with this inverse Hessian in place of the identity."""
         state = eqx.tree_at(lambda state: state.f_info.hessian_inv.pytree, self.state, inverse)
         return self._replace(state=state)
 

@@ -1,4 +1,4 @@
-"""What `tune` minimises: a validation loss of the dense or of the low-rank fit, or the caller's.
+"""The functions that `tune` minimises: losses of the dense or low-rank fit, or the caller's.
 
 A search goes through parts of the observations, `parts_of`, each with a `SearchObjective`.
 """
