@@ -13,12 +13,12 @@ import scipy.stats
 import hamkernel as hk
 from hamkernel._trajectories.smoothing import (
     Process,
-    centred,
     negative_log_likelihood,
     padded,
     power_of_two,
     processes,
     smoothed,
+    without_means,
 )
 
 
@@ -156,7 +156,7 @@ def test_the_smoother_is_a_dense_gaussian_process_with_missing_entries():
     times, states = swings(missing=True)
     found = processes(times, states)
     paths = smoothed(found, times, states)
-    inside, means = centred(states)
+    inside, means = without_means(states)
     for r, t in enumerate(times):
         for c, coordinate in enumerate(found):
             seen = np.isfinite(states[r][:, c])

@@ -189,10 +189,10 @@ def regression_loss(M: Float[Array, "D q"], r: Float[Array, " D"]) -> Float[Arra
     Its derivatives are M(I + MᵀM)⁻¹ − (r − Mw)wᵀ in M and r − Mw in r. The first term is computed
     as (MR⁻¹)R⁻ᵀ, since MR⁻¹ is bounded by one however small the noise is.
     """
-    return _regression(M, r)[0]
+    return _regression_forward(M, r)[0]
 
 
-def _regression(M, r):
+def _regression_forward(M, r):
     q = M.shape[1]
     F = triangle(no_rows(q, M.dtype), M, r)
     R = F[:q, :q]
@@ -208,7 +208,7 @@ def _regression_backward(saved, bar):
     return bar * ((M @ inverse) @ inverse.T - misfit[:, None] * w[None, :]), bar * misfit
 
 
-regression_loss.defvjp(_regression, _regression_backward)
+regression_loss.defvjp(_regression_forward, _regression_backward)
 
 
 class Condensed(NamedTuple):

@@ -211,7 +211,7 @@ class Coordinate(NamedTuple):
         return float(np.sqrt(7.0) * np.exp(-self.process.log_rate))
 
 
-def centred(states: Sequence[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
+def without_means(states: Sequence[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
     """The states less the mean of each run, and those means, shape (R, n)."""
     means = np.array([_mean(x) for x in states])
     return [x - mean[None] for x, mean in zip(states, means, strict=True)], means
@@ -224,7 +224,7 @@ def _mean(x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, " n"]:
 
 def processes(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> list[Coordinate]:
     """The hyperparameters of each coordinate, by the marginal likelihood of all runs."""
-    states = centred(states)[0]
+    states = without_means(states)[0]
     # Pieces are filtered side by side, and of many some are taken: 100 000 samples then cost as
     # much as 16 000.
     pieces_t, pieces_x = cut(times, states, 256)
@@ -288,7 +288,7 @@ def _found(steps, y, seen, low, high) -> Float[Array, "3"]:
 
 
 @compiled_by_size
-def _smoothed(process: Process, steps, y, seen: Bool[Array, "R T"]) -> Smoothed:
+def _smooth_each(process: Process, steps, y, seen: Bool[Array, "R T"]) -> Smoothed:
     return jax.vmap(lambda dt, value, there: smooth(process, dt, value, there))(steps, y, seen)
 
 
@@ -308,7 +308,7 @@ def smoothed(
 
     A coordinate that was never measured is NaN; one that is constant stays so.
     """
-    states, means = centred(states)
+    states, means = without_means(states)
     runs = padded(times, states)
     steps = np.diff(runs.times, axis=1, prepend=0.0)
     paths = Paths(*(np.zeros(runs.states.shape) for _ in Paths._fields))
@@ -317,7 +317,7 @@ def smoothed(
             for path in paths:
                 path[:, :, c] = 0.0 if coordinate.seen else np.nan
         else:
-            one = _smoothed(
+            one = _smooth_each(
                 coordinate.process, steps, runs.states[:, :, c], jnp.asarray(runs.seen[:, :, c])
             )
             for path, values in zip(paths, one, strict=True):
