@@ -264,6 +264,7 @@ def features(
     Raises:
         TypeError: a kernel without a known spectral density, or an unknown structure.
     """
+    # Asked by name as every structure is here: a structure need not know of random features.
     if isinstance(K, Controlled):
         return _controlled(K, n, count, key, dtype)
     if isinstance(K, Sum):

@@ -286,6 +286,10 @@ def test_what_has_no_measurements_no_potential_or_too_many_subsets_is_refused():
     free = hk.condition(hk.Separable(2.0 * hk.Gaussian(1.0)), X, Y, LAMBDA)
     with pytest.raises(AttributeError, match="there is no potential to read a formula of"):
         hk.readout(free, TERMS)
+    theta = np.linspace(0.5, 1.0, len(X))[:, None]
+    family = hk.condition(hk.Family(KERNEL), X, Y, LAMBDA, parameters=theta)
+    with pytest.raises(TypeError, match="of one system and this is a family"):
+        hk.readout(family, TERMS)
     with pytest.raises(ValueError, match="all are compared: give fewer terms"):
         _selected(np.random.default_rng(0).normal(size=(90, 57)), np.ones(90), 6)
 

@@ -16,7 +16,6 @@ from jaxtyping import Array, ArrayLike, Float, Num
 from hamkernel import _require as require
 from hamkernel._fields.base import potential_of
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
-from hamkernel._structures.joined import Controlled
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import AbstractPotentialKernel
 
@@ -135,8 +134,7 @@ class Formula(eqx.Module):
 
 def operator_of(K: AbstractMatrixKernel) -> Callable[[Array, Array], Array]:
     """(x, v) -> B(x) v."""
-    if isinstance(K, Controlled):
-        return operator_of(K.drift)
+    K = K.of_states
     if isinstance(K, Sum):  # its terms share one operator, or it would have no potential
         return operator_of(K.terms[0])
     if isinstance(K, UnknownMasses):  # S⁻¹ B S⁻ᵀ in the coordinates y = S⁻¹x

@@ -40,11 +40,9 @@ from hamkernel._fields.joined import at_inputs, known_of
 from hamkernel._gram import gram_of_rows
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._kernels.symmetry import symmetry_removed
-from hamkernel._observations.measurements import inputs_of
 from hamkernel._posterior import Posterior
 from hamkernel._solvers.problem import problem
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.joined import Controlled, InputMatrix
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import CurlFree
 from hamkernel._trajectories.learned import Learned
@@ -146,7 +144,12 @@ def _measured(learned: Any) -> tuple[AbstractMatrixKernel, Any, Float[Array, ""]
             "readout takes what hk.learn or hk.condition returns, for the measurements in it; got "
             f"a {type(learned).__name__}. A field alone has none: hk.condition(K, X, Y, λ)."
         )
-    if isinstance(kernel, Controlled) and known is not None:
+    if kernel.given == "parameters":
+        raise TypeError(
+            "readout is of one system and this is a family: condition on the data of one member, "
+            "without parameters."
+        )
+    if kernel.takes_inputs and known is not None:
         known = at_inputs(known, 0, None)  # that of the drift
     return kernel, rows, ridge, known
 
@@ -178,7 +181,7 @@ def _checked(terms: Any, rows: Any) -> tuple[list[str], list[Callable[..., Any]]
 
 def _check_symmetry(K: Any, names: list[str], functions: list[Any], rows: Any) -> None:
     """ValueError where the symmetry of the kernel forbids a term."""
-    K = K.drift if isinstance(K, Controlled) else K
+    K = K.of_states
     found = [symmetry_removed(k) for k in K.scalar_kernels]
     n = rows.dimension
     if any(each is None for each in found) or isinstance(K, UnknownMasses):
@@ -209,7 +212,7 @@ def _same(g: Any, h: Any) -> bool:
 
 
 def _regression(
-    K: AbstractMatrixKernel, rows: Any, ridge: Float[Array, ""], functions: list[Any]
+    K: Any, rows: Any, ridge: Float[Array, ""], functions: list[Any]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """y, Φ, and what the entries of Φ are sums of, all with noise of variance `ridge`.
 
@@ -224,9 +227,9 @@ def _regression(
         typical.append(np.broadcast_to(np.asarray(values[1]), (block.size, len(functions))))
     columns = rows.contrast(jnp.concatenate(columns))
     y, columns = np.asarray(rows.y, float), np.asarray(columns, float)
-    if isinstance(K, Controlled) and isinstance(K.inputs, InputMatrix):
+    if K.takes_inputs and K.known_matrix is None:
         nothing = CurlFree(lambda x, z: jnp.zeros((), x.dtype))
-        of_inputs = Controlled(nothing, K.inputs, inputs_of(K))
+        of_inputs = K.with_states(nothing)
         C = np.asarray(eqx.filter_jit(gram_of_rows)(of_inputs, rows), float) / float(ridge)
         R = np.linalg.cholesky(np.eye(len(C)) + C)
         y, columns = np.linalg.solve(R, y), np.linalg.solve(R, columns)

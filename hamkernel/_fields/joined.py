@@ -25,8 +25,7 @@ from hamkernel._fields.base import (
 from hamkernel._fields.expansions import FeatureField, KernelField
 from hamkernel._gram_operator import placed_product
 from hamkernel._structures.base import Sum
-from hamkernel._structures.family import AbstractFamily
-from hamkernel._structures.joined import AbstractJoinedKernel, Controlled
+from hamkernel._structures.joined import AbstractJoinedKernel
 
 
 class AbstractJoinedField(AbstractField):
@@ -272,7 +271,8 @@ class FamilyField(AbstractJoinedField):
             ValueError: θ has another shape, or is not finite.
         """
         self._check_single()
-        p, K = self.kernel.input_count, self.kernel
+        K: Any = self.kernel
+        p = K.input_count
         theta = require.floating(theta, "θ")
         if theta.shape != (p,):
             hint = " Write field.at([θ]) for one." if theta.shape == () and p == 1 else ""
@@ -281,7 +281,6 @@ class FamilyField(AbstractJoinedField):
                 f"needed.{hint}"
             )
         theta = require.finite(theta, "θ").astype(self.offset.dtype)
-        assert isinstance(K, AbstractFamily)
         terms = tuple(
             at_inputs(
                 dataclasses.replace(self._expansion, kernel=t, mean=None), self.dimension, theta
@@ -416,11 +415,10 @@ def at_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
         return dataclasses.replace(bare, norm=root(square))
     if isinstance(part, FeatureField):
         assert isinstance(part.features, ControlledFeatures)
-        assert isinstance(part.kernel, Controlled)
         features = part.features.drift
         return dataclasses.replace(
             part,
-            kernel=part.kernel.drift,
+            kernel=part.kernel.of_states,
             features=features,
             weights=part.weights[..., : features.columns],
             residual=part.residual[..., :n],
@@ -435,7 +433,7 @@ def learned_field(field: Any, known: Any) -> Any:
         field = dataclasses.replace(field, mean=known)
     if not isinstance(field.kernel, AbstractJoinedKernel):
         return field
-    made = FamilyField if isinstance(field.kernel, AbstractFamily) else ControlledField
+    made = FamilyField if field.kernel.given == "parameters" else ControlledField
     return made(whole=field)  # pyright: ignore[reportCallIssue]
 
 

@@ -135,7 +135,7 @@ def inputs_or_parameters(inputs: Any, parameters: Any, K: Any = None) -> Any:
             "linearly, and a Family parameters, on which its members depend in any way. An input "
             "of a family may be one of its parameters."
         )
-    name = getattr(K, "given", None)
+    name = K.given if K is not None and K.takes_inputs else None
     given = "inputs" if inputs is not None else "parameters" if parameters is not None else name
     if name is not None and given != name:
         raise TypeError(f"{type(K).__name__} takes {name}, and {given} were given: {name}=….")

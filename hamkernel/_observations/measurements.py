@@ -271,9 +271,7 @@ def measurements(
     """
     if inputs is None and not isinstance(X, AbstractObservations) and not K.takes_inputs:
         return K, measurements_of_states(*placed(velocities_at(X, Y)))
-    return measurements_of(
-        K, placed(observations(X, Y, inputs, name=getattr(K, "given", "inputs")))
-    )
+    return measurements_of(K, placed(observations(X, Y, inputs, name=K.given)))
 
 
 def observations(
@@ -339,7 +337,7 @@ def measurements_of(
             TypeError: K takes no inputs.
     """
     K = with_input_count(K, data, part=previous is not None)
-    blocks, targets = zip(*data.parts(*_count_and_name(K)), strict=True)
+    blocks, targets = zip(*data.parts(inputs_of(K), K.given), strict=True)
     dtype = np.result_type(*[block.points.dtype for block in blocks])
     blocks = tuple(_cast(block, dtype) for block in blocks)
     divided = [
@@ -362,18 +360,13 @@ def sampled_points(
     """The kernel with its number of inputs, and the points (x, u), where nothing is measured."""
     data = Equilibria(X, given)
     K = with_input_count(K, data)
-    (block, _), *_ = data.parts(*_count_and_name(K))
+    (block, _), *_ = data.parts(inputs_of(K), K.given)
     return K, block.points
 
 
 def inputs_of(K: AbstractMatrixKernel) -> int:
     """m, the number of inputs; 0 for a kernel that takes none."""
     return K.input_count if isinstance(K, AbstractJoinedKernel) else 0
-
-
-def _count_and_name(K: AbstractMatrixKernel) -> tuple[int, str]:
-    """The number of inputs or parameters of a point, and which of the two names they have."""
-    return (K.input_count, K.given) if isinstance(K, AbstractJoinedKernel) else (0, "inputs")
 
 
 def with_input_count(

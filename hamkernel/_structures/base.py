@@ -40,6 +40,7 @@ class AbstractMatrixKernel(eqx.Module):
 
     matrix_valued: ClassVar[bool] = True
     takes_inputs: ClassVar[bool] = False  # whether its points are (x, u)
+    given: ClassVar[str] = "inputs"  # what u is called in `fit`; "parameters" of a family
     # Whether derivatives of its Gram are cheaper in reverse mode, as those of a closed form can be.
     differentiated_backward: ClassVar[bool] = False
     symplectic: eqx.AbstractVar[bool]  # whether flows keep dq ∧ dp, as those of J∇H do
@@ -120,6 +121,15 @@ class AbstractMatrixKernel(eqx.Module):
     def through_descriptor(self, n: int) -> Descriptor | None:
         """The descriptor and the directions along which K differentiates, where it has one."""
         return None
+
+    @property
+    def of_states(self) -> "AbstractMatrixKernel":
+        """The kernel of fields of x alone: this one, unless its points are (x, u)."""
+        return self
+
+    def with_states(self, K: "AbstractMatrixKernel") -> "AbstractMatrixKernel":
+        """This kernel with K in the place of `of_states`."""
+        return K
 
     def outputs(self, inputs: int) -> int:
         """The number of components of a field at points with `inputs` coordinates."""

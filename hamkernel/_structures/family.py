@@ -43,6 +43,13 @@ class AbstractFamily(AbstractJoinedKernel):
         first, *rest = (term.member for term in self.terms)
         return Sum(first, *rest) if rest else first
 
+    def with_states(self, K: AbstractMatrixKernel) -> "AbstractFamily":
+        """ValueError: a family has a kernel of states in each of its terms."""
+        raise ValueError(
+            "each term of a family has a kernel of its members, which is named there: for unknown "
+            "masses hk.Family(hk.UnknownMasses(K, masses), k)."
+        )
+
     @property
     def conserves(self) -> bool:
         """Whether every member conserves its H."""

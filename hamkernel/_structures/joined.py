@@ -39,12 +39,10 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
 
     Attributes:
         count: m; None until the data says it.
-        given: the name of u in `fit`: "inputs" or "parameters".
         inner: the part that may have a symmetry, as error messages call it.
     """
 
     count: eqx.AbstractVar[int | None]
-    given: eqx.AbstractClassVar[str]
     inner: eqx.AbstractClassVar[str]
 
     symplectic: ClassVar[bool] = False  # a flow moves the states alone
@@ -54,6 +52,10 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
     @abc.abstractmethod
     def of_states(self) -> AbstractMatrixKernel:
         """The kernel of fields of x alone: that of the drift, or of a member."""
+
+    @abc.abstractmethod
+    def with_states(self, K: AbstractMatrixKernel) -> "AbstractJoinedKernel":
+        """This kernel with K in the place of `of_states`."""
 
     @abc.abstractmethod
     def check_identified(self, U: Float[np.ndarray, "N m"]) -> None:
@@ -254,6 +256,9 @@ class Controlled(AbstractJoinedKernel):
     def of_states(self) -> AbstractMatrixKernel:
         """The kernel of the drift."""
         return self.drift
+
+    def with_states(self, K: AbstractMatrixKernel) -> "Controlled":
+        return Controlled(K, self.inputs, self.count)
 
     @property
     def known_matrix(self) -> KnownMatrix | None:

@@ -21,9 +21,7 @@ from hamkernel._observations.kinds import inputs_or_parameters
 from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.family import AbstractFamily
 from hamkernel._structures.friction import frictions, with_rest_speed
-from hamkernel._structures.joined import Controlled
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._trajectories.diagnostics import (
     FitQuality,
@@ -410,16 +408,14 @@ def _check(
     if K.takes_inputs and given is not None:
         # This refuses the one in the place of the other.
         inputs_or_parameters(runs.inputs, runs.parameters, K)
-    if isinstance(K, AbstractFamily) and given is None:
-        raise TypeError(
-            "a Family needs to know of which system each run is: hk.Runs(times, states, "
-            "parameters=[(0.5,), (0.8,), …]), for each run θ of shape (p,)."
-        )
     if K.takes_inputs and given is None:
-        raise TypeError(
-            f"{type(K).__name__} needs what was applied: hk.Runs(times, states, inputs), for each "
-            "run u at its times, shape (T, m)."
-        )
+        needed = {
+            "inputs": "what was applied: hk.Runs(times, states, inputs), for each run u at its "
+            "times, shape (T, m).",
+            "parameters": "to know of which system each run is: hk.Runs(times, states, "
+            "parameters=[(0.5,), (0.8,), …]), for each run θ of shape (p,).",
+        }
+        raise TypeError(f"a {type(K).__name__} kernel needs {needed[K.given]}")
     if runs.parameters is not None and not K.takes_inputs:
         raise TypeError(
             f"the runs have parameters and {type(K).__name__} takes none: say how systems are "
@@ -482,11 +478,7 @@ def with_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
             "only a unit of the energy, so there is nothing to find. Leave it out; (q, q̇) is "
             "(q, p) of a mass of one."
         )
-    if isinstance(K, Controlled):
-        return Controlled(with_masses(K.drift, n), K.inputs, K.count)
-    if isinstance(K, AbstractFamily):
-        raise ValueError(
-            "masses=True is for one system: for a family write hk.Family(hk.UnknownMasses(K, "
-            "masses), k)."
-        )
-    return K if isinstance(K, UnknownMasses) else UnknownMasses(K, jnp.ones(n // 2))
+    inner = K.of_states
+    return K.with_states(
+        inner if isinstance(inner, UnknownMasses) else UnknownMasses(inner, jnp.ones(n // 2))
+    )

@@ -13,9 +13,7 @@ from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled_by_size
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.family import AbstractFamily
 from hamkernel._structures.friction import Friction, frictions, with_rest_speed
-from hamkernel._structures.joined import Controlled
 from hamkernel._trajectories.likelihood import (
     ClosedForm,
     Condensed,
@@ -253,16 +251,14 @@ def gain_of_friction(
     K, (X, Y) = model.kernel, sampled(data)
     n = Y.shape[1]
     force, fastest = np.sqrt(np.mean(Y[:, n // 2 :] ** 2)), np.abs(X[:, n // 2 : n]).max()
-    if frictions(K) or isinstance(K, AbstractFamily) or not fastest > 0:
+    if frictions(K) or K.given == "parameters" or not fastest > 0:
         return 0.0
     both = Friction(force / fastest, 1e-6 * force) + Friction(1e-6 * force / fastest, force)
-    drift = K.drift if isinstance(K, Controlled) else K
-    more = drift + with_rest_speed(both, jnp.asarray(X), n)
-    more = Controlled(more, K.inputs, K.count) if isinstance(K, Controlled) else more
+    more = K.of_states + with_rest_speed(both, jnp.asarray(X), n)
     S, rows = searched(jnp.asarray(S), rows)
     without, there = (
         float(losses(each, each.flat[None], S, rows, start_deviation, whitening)[0])
-        for each in (model, model._replace(kernel=more))
+        for each in (model, model._replace(kernel=K.with_states(more)))
     )
     return without - there
 
