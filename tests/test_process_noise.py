@@ -19,6 +19,7 @@ from hamkernel._trajectories.diagnostics import (
     autocorrelations,
     ljung_box,
     warn_of_rest_speed,
+    warn_of_units,
     whiteness,
 )
 from hamkernel._trajectories.flow import WEIGHTS
@@ -261,6 +262,17 @@ def test_good_sensors_are_not_exact_data(noise, friction):
         assert found.converged
         assert not said
         np.testing.assert_allclose(share, max(noise, 1e-6), rtol=0.2)
+
+
+@pytest.mark.parametrize(("kernel", "said"), [(KERNEL, True), (hk.Gaussian(np.ones(2)), False)])
+def test_one_lengthscale_for_coordinates_of_other_sizes_is_said(kernel, said):
+    for ratio in (100.0, 1000.0):
+        with warnings.catch_warnings(record=True) as seen:
+            warnings.simplefilter("always")
+            warn_of_units(kernel, np.array([1.0, ratio]))
+        assert len(seen) == (said and ratio > 300)
+    some = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0))
+    warn_of_units(some, np.array([1e-6, 1e6]))  # a warning is an error here
 
 
 @pytest.mark.parametrize(("rest_speed", "said"), [(0.1, True), (0.01, False)])

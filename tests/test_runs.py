@@ -5,6 +5,8 @@
 # pyright: reportOperatorIssue=false
 # Wrong types are refused here, and any field is looked into.
 
+import warnings
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -102,6 +104,21 @@ def test_gaps_and_constant_columns_are_named():
         hk.Runs(t, np.column_stack([np.sin(t), np.cos(t)]))
     with pytest.warns(UserWarning, match=r"constant in all runs: coordinate 1 \(always 3\)"):
         hk.Runs(TIMES[0], np.column_stack([np.sin(TIMES[0]), np.full(len(TIMES[0]), 3.0)]))
+
+
+def test_inputs_that_cannot_be_told_apart_are_named():
+    t, rng = np.linspace(0, 10, 400), np.random.default_rng(0)
+    x, u = np.column_stack([np.sin(t), np.cos(t)]), rng.normal(size=(400, 3))
+    hk.Runs(t, x, u)  # a warning is an error here
+    with pytest.warns(UserWarning, match=r"constant in all runs: input 2 \(always 3\)\."):
+        hk.Runs(t, x, np.where([False, False, True], 3.0, u))
+    hk.Runs([t, t], [x, x], [0 * u[:, :1], 0 * u[:, :1] + 1])  # constant in each, not in both
+    for share, said in ((0.05, True), (0.5, False)):  # 2.5e-4 and .024
+        alike = np.column_stack([u[:, 0], u[:, 1], u[:, 0] - 2 * u[:, 1] + share * u[:, 2]])
+        with warnings.catch_warnings(record=True) as seen:
+            warnings.simplefilter("always")
+            hk.Runs(t, x, alike)
+        assert any("inputs 0, 1, 2 depend" in str(w.message) for w in seen) == said
 
 
 # What sensors and controllers do.

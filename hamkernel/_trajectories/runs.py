@@ -26,7 +26,12 @@ from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
 from hamkernel._trajectories.flow import NODES
-from hamkernel._trajectories.sensors import warn_of_feedback, warn_of_gaps, warn_of_sensors
+from hamkernel._trajectories.sensors import (
+    warn_of_feedback,
+    warn_of_gaps,
+    warn_of_inputs,
+    warn_of_sensors,
+)
 from hamkernel._trajectories.smoothing import (
     Smoothing,
     processes,
@@ -147,8 +152,8 @@ class Runs(eqx.Module):
 
     Warns:
         UserWarning: a jump of 2π, a long gap, a coordinate that never moves or stops while others
-            go on, a sensor that was clipped, samples that were repeated or interpolated, an input
-            that is a function of the states: once each, with the run.
+            go on, a sensor that was clipped, samples that were repeated or interpolated, inputs
+            that never change, depend on one another or are a function of the states: once each.
     """
 
     times: tuple[Float[Array, " T"], ...]
@@ -199,6 +204,7 @@ class Runs(eqx.Module):
         warn_of_gaps(times, states)
         warn_of_sensors(times, states)
         if self.inputs is not None:
+            warn_of_inputs([np.asarray(u, float) for u in self.inputs])
             lines = [self.applied(r, t) for r, t in enumerate(times)]
             warn_of_feedback(states, [np.concatenate([ends[:, 0], ends[-1:, 1]]) for ends in lines])
 

@@ -154,6 +154,34 @@ def _stuck(x: Float[np.ndarray, " T"], others: Float[np.ndarray, "T others"]):
     return first, stop
 
 
+def warn_of_inputs(inputs: Sequence[np.ndarray]) -> None:
+    """Warn of inputs that never change, or a combination of which hardly does.
+
+    Of inputs of variance one it has a variance below .01: the errors of its gain are ten times
+    those under independent inputs.
+    """
+    U = np.concatenate(inputs)
+    none = np.ptp(U, axis=0) == 0
+    varied, alike = np.flatnonzero(~none), []
+    if len(varied) > 1:
+        share, direction = (a[..., 0] for a in np.linalg.eigh(np.corrcoef(U[:, varied].T)))
+        if share < 0.01:
+            alike = [str(c) for c in varied[np.abs(direction) > 0.1]]
+    unless = "unless the matrix of the inputs is known, hk.Controlled(K, inputs=G)"
+    if none.any():
+        which = _some([f"{c} (always {inputs[0][0, c]:g})" for c in np.flatnonzero(none)])
+        require.warn(
+            f"constant in all runs: input {which}. What it does cannot be told from the drift, "
+            f"{unless}: leave it out, or log runs in which it varies."
+        )
+    if alike:
+        require.warn(
+            f"inputs {_some(alike)} depend on one another: a combination of them has less than 1 % "
+            f"of their variance. Their gains cannot be told apart, {unless}: leave out inputs that "
+            "repeat others, or vary each on its own."
+        )
+
+
 def warn_of_feedback(states: Sequence[np.ndarray], inputs: Sequence[np.ndarray]) -> None:
     """Warn of inputs that are a smooth function of the states: a cubic polynomial at most."""
     X, U = np.concatenate(states), np.concatenate(inputs)
