@@ -14,7 +14,8 @@ import pytest
 
 import hamkernel as hk
 from hamkernel import _machine
-from hamkernel._trajectories.diagnostics import warn_of_cost
+from hamkernel._trajectories import preprocessing
+from hamkernel._trajectories.diagnostics import warn_of_cost, warn_of_landmarks
 from hamkernel._trajectories.flow import Segments
 from hamkernel._trajectories.likelihood import (
     Model,
@@ -102,6 +103,20 @@ def test_a_long_computation_says_what_it_costs():
     said = r"about 13 s an iteration.*16000 measured numbers on 128 landmarks, 2048 columns"
     with pytest.warns(UserWarning, match=said):
         warn_of_cost(many, 128)
+
+
+def test_landmarks_that_a_solve_of_some_seconds_cannot_carry_are_known_and_named(monkeypatch):
+    t = np.linspace(0.0, 2.0, 21)
+    states = [np.column_stack([np.cos(t + i), -np.sin(t + i)]) * (1 + i / 20) for i in range(20)]
+    data = preprocessing.preprocess(hk.Runs([t] * 20, states), None)
+    sizes = []
+    for work in (3e7, 1e10):  # that of a solve with 96 landmarks, and more than all
+        monkeypatch.setattr(preprocessing, "_WORK", work)
+        S, first, capped = preprocessing.landmarks(data, None)
+        sizes.append((len(S), first, capped))
+    assert sizes == [(96, 48, True), (400, 48, False)]
+    with pytest.warns(UserWarning, match=r"limited by its 96 landmarks.*max_points=192"):
+        warn_of_landmarks(SimpleNamespace(few=96))
 
 
 def exact_regression_loss(M, r):

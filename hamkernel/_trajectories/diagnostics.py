@@ -130,6 +130,7 @@ def diagnose(
     warn_of_dropped(fit)
     if not fit.kept.any():
         return False
+    warn_of_landmarks(fit)
     warn_of_pushes(fit)
     left = np.sqrt(fit.chi_squared) * np.nanmax(noise / scale)
     within = not given and bool(left < SETTLED)
@@ -287,9 +288,6 @@ def warn_of_correlation(fit: FitQuality) -> None:
         timing = f"inputs that go on otherwise, between='{fit.between}' is likelier; {timing}"
     lacks = "" if fit.is_disturbed else f"{_lacked(fit)}; "
     more = "; process_noise=None" if fit.process is None else ""
-    if fit.few:
-        few = f"the {fit.few} landmarks are too few, and solver=hk.Nystrom(max_points="
-        timing = f"{few}{2 * fit.few}) takes four times as long; {timing}"
     require.warn(
         f"the innovations are not white (p = {white.probability:.2g} by Ljung and Box; the "
         f"correlation of neighbours is {white.neighbours[c]:.2f} in coordinate {c}): what the "
@@ -371,6 +369,16 @@ def warn_of_dropped(fit: FitQuality) -> None:
             f"dropped: samples {_parts(fit.dropped)}. The field does not follow them (a χ² "
             "above 25 times the median, or a tangent above 1e4). Look there: a jump, another "
             "system, or chaos with samples too far apart."
+        )
+
+
+def warn_of_landmarks(fit: FitQuality) -> None:
+    """Say that the field is limited by its landmarks, and what more of them cost."""
+    if fit.few:
+        require.warn(
+            f"the field is limited by its {fit.few} landmarks: the runs are likelier with more. "
+            f"solver=hk.Nystrom(max_points={2 * fit.few}) takes two to four times as long. Until "
+            "then noise, process noise and pushes may stand for what the landmarks cannot say."
         )
 
 

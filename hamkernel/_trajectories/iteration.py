@@ -80,7 +80,7 @@ class Task(NamedTuple):
         mean: what is known.
         S: the landmarks, as many as may be used.
         first: how many of them learning begins with.
-        capped: whether more landmarks would help but take too long.
+        capped: whether `S` are fewer than the intervals, since more would take too long.
         bounds: the box of hyperparameters.
         start_deviation: of the prior of starts.
     """
@@ -466,7 +466,7 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     """
     now, task = end.now, end.task
     given = now.field.points, now.rows, task.start_deviation
-    if task.capped:
+    if task.capped and task.first == len(task.S):
         return False
     if not (end.settled and now.good.all()):
         return True

@@ -105,7 +105,7 @@ def learn(
         solver: `hk.Nystrom(max_points=…)` sets how many landmarks carry the field, points that
             cover the paths. If None, 48 for n = 2 and 80 for n = 4, inputs counted as coordinates,
             and twice as many while the marginal likelihood grows by more than its error, as long
-            as a solve takes some seconds; then name a number to have more.
+            as a solve takes some seconds; a warning says where the runs ask for more.
         process_noise: the intensity q of white noise w in ẋ = f(x, u) + w, in units of the states
             over √time, a number or one for each coordinate, shape (n,): what stiction, timing or a
             flexible part move besides the field. 0 where the structure is the whole truth. If None,
@@ -130,8 +130,8 @@ def learn(
             enabled.
 
     Warns:
-        UserWarning: parts of runs were dropped or pushed, the structure does not explain the runs,
-            the runs are too few to find the noise, or the iterations did not settle.
+        UserWarning: parts of runs were dropped or pushed, landmarks or runs are too few, the
+            structure does not explain the runs, or the iterations did not settle.
     """
     require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
     K, given, process = _check(with_amplitude(matrix_kernel(K)), runs, noise, process_noise, solver)
@@ -216,7 +216,7 @@ def _learned(
     rows = now.field.points, now.rows, task.start_deviation
     z, counts = innovations(whitened_rows(now.model, *rows), now.rows), np.asarray(now.rows.counts)
     fit = _quality(runs, end, alone, misfit, z, process)
-    if fit.kept.any() and not fit.white.is_enough:
+    if fit.kept.any():
         fit = _with_causes(fit, runs, end, alone)
     converged = diagnose(fit, noise, data.scale, given)
     observations = as_observations(now.rows, now.model, task.mean, task.start_deviation)
@@ -304,10 +304,15 @@ def _quality(
 
 def _with_causes(fit: FitQuality, runs: Runs, end: End, alone: End | None) -> FitQuality:
     """The same with what would make the rows likelier: the causes that warnings name."""
-    now, task = end.now, end.task
+    now, task, used = end.now, end.task, len(end.now.field.points)
     given = now.model, now.field.points, now.rows, task.start_deviation, whitening_of(now.model)
+    capped = task.capped and used == len(task.S)
+    if capped or not fit.white.is_enough:
+        free = task.bounds.free[-2 * runs.dimension : -runs.dimension].any()  # the noise
+        fit = fit._replace(few=used * limited_by_landmarks(*given, capped and bool(free)))
+    if fit.white.is_enough:
+        return fit
     return fit._replace(
-        few=len(now.field.points) if task.capped or limited_by_landmarks(*given) else 0,
         between=likelier_between(runs, end if alone is None else alone),
         gained=gain_of_friction(*given, task.data) if fit.has_momenta else 0.0,
     )

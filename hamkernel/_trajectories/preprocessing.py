@@ -358,7 +358,7 @@ def first_landmarks(d: int) -> int:
 def landmarks(data: Preprocessed, count: int | None) -> tuple[Float[np.ndarray, "m d"], int, bool]:
     """Points of the paths, of which the first cover them, how many to begin with, and the cap.
 
-    The last is whether more than the first would be of use and take too long.
+    The last is whether there are fewer than intervals, since more would take too long.
 
     Each is the one farthest from those before, in standard deviations. They do not depend on
     hyperparameters, which are not known yet. There are at most as many as intervals: of a field on
@@ -385,5 +385,5 @@ def landmarks(data: Preprocessed, count: int | None) -> tuple[Float[np.ndarray, 
         if not distance.max() > 0:
             break
         chosen.append(int(np.argmax(distance)))
-    capped = count is None and most == first < intervals
+    capped = count is None and most < intervals
     return X[chosen], min(len(chosen), first if count is None else count), capped

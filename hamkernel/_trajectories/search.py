@@ -219,20 +219,32 @@ def solved(
 
 
 def limited_by_landmarks(
-    model: Model, S, rows: LinearisedSegments, start_deviation, whitening: Whitening
+    model: Model,
+    S,
+    rows: LinearisedSegments,
+    start_deviation,
+    whitening: Whitening,
+    with_less_noise: bool = False,
 ) -> bool:
     """Whether windows of the rows are likelier with a landmark in each of their intervals.
 
-    By more than √(q/2), by which q parameters leave −log p unknown.
+    By more than √(q/2), by which q parameters leave −log p unknown; at the noise that was found,
+    or less too. On too few landmarks all that they cannot say is noise, and with as much of it more
+    of them do not help: 400 runs of a double pendulum without noise have .002 to .008 on 160
+    landmarks, log p of windows of them is 1733, with more landmarks 1732, and with more of them and
+    a third or a hundredth of the noise 2002 and 2454.
     """
+    shares = np.array([1.0, 0.3, 0.1, 0.03] if with_less_noise else [1.0])
     width = (_ENTRIES / 3) ** 0.5
     part = windows(rows, int(width / rows.residual.shape[-1]))
-    own = exact(part)[0]
+    own, n = exact(part)[0], rows.residual.shape[-1]
+    less = np.tile(np.asarray(model.flat), (len(shares), 1))
+    less[:, -2 * n :] += np.log(shares)[:, None]
     few, many = (
-        float(losses(model, model.flat[None], points, part, start_deviation, whitening)[0])
-        for points in (S, own)
+        np.asarray(losses(model, jnp.asarray(flat), points, part, start_deviation, whitening)).min()
+        for points, flat in ((S, less[:1]), (own, less))
     )
-    return few - many > (rows.residual.shape[-1] * len(own) / 2) ** 0.5
+    return bool(few - many > (n * len(own) / 2) ** 0.5)
 
 
 def gain_of_friction(
