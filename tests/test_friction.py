@@ -13,6 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
+from hamkernel._trajectories.flow import Expansion, simulated, steps_for, stiffness
 
 VISCOUS, COULOMB, REST = 0.2, 0.6, 0.2
 
@@ -116,6 +117,26 @@ def test_a_rest_speed_that_was_not_given_has_the_units_of_the_momenta():
     assert still(x)[1] == 0.0
     with pytest.raises(TypeError, match=r"without a rest speed .* Name it: hk.Friction\(rest_sp"):
         jax.jit(lambda X: hk.fit(hk.Friction(), X, Y, regularization=1e-6)(x))(X)
+
+
+def test_steps_of_learn_are_short_enough_for_a_momentum_that_changes_its_sign():
+    rest, ts = 0.005, np.linspace(0.0, 2.0, 101)
+    K = hk.Friction(VISCOUS, COULOMB, rest_speed=rest)
+    at = jnp.array([[0.0, 1.0]])
+    forces = jnp.array([[0.0, -1.0 / K.curve(at[0])[1]]])
+    field = Expansion(K, at, forces, lambda x: jnp.array([x[1], -6.0 * jnp.sin(x[0])]))
+
+    def slope(t, x):
+        force = -6.0 * np.sin(x[0]) - VISCOUS * x[1] - COULOMB * np.tanh(x[1] / rest)
+        return np.array([x[1], force])
+
+    options = {"rtol": 1e-10, "atol": 1e-12, "t_eval": ts, "max_step": 1e-3}
+    true = solve_ivp(slope, (0, 2), [1.5, 0.5], "DOP853", **options).y.T
+    spans = np.diff(ts)[None]
+    steps = jnp.asarray(steps_for(spans, stiffness(field, true, true.std(axis=0))))
+    inputs = jnp.zeros((1, len(ts) - 1, 2, 0))
+    path = simulated(field, jnp.asarray(true[:1]), jnp.asarray(spans), steps, inputs).x[0]
+    assert np.abs(path - true).max() < 2e-4  # 1e-3 with steps for the usual ‖∂f/∂x‖
 
 
 def positions(starts, samples, rng):

@@ -20,8 +20,8 @@ from hamkernel._trajectories.flow import (
     Segments,
     shoot,
     steps_for,
+    stiffness,
     trusted,
-    with_tangent,
 )
 from hamkernel._trajectories.kalman import (
     SmoothedPath,
@@ -413,21 +413,10 @@ def _updated(paths, pieces: list[Piece], good, x: np.ndarray) -> list[np.ndarray
 _landmark_whitening = compiled_by_size(landmark_whitening)
 
 
-@compiled_by_size
-def _norms(field, X: Float[Array, "N d"], scale: Float[Array, " n"]) -> Float[Array, " N"]:
-    def norm(s):
-        D = with_tangent(field, s, len(scale))[1]
-        return jnp.linalg.norm(D * scale[None] / scale[:, None])
-
-    return jax.vmap(norm)(X)
-
-
 def _stiffness(field: Expansion, data: Preprocessed, paths: list[np.ndarray]) -> float:
-    """The .95 quantile of ‖∂f/∂x‖ along the paths, in standard deviations of the coordinates."""
+    """That of the field at some points along the paths."""
     X = np.concatenate([run.joined(path) for run, path in zip(data.runs, paths, strict=True)])
-    X = X[np.linspace(0, len(X) - 1, 256).round().astype(int)]
-    norms = np.asarray(_norms(field, jnp.asarray(X), jnp.asarray(data.scale)))
-    return float(np.nanquantile(np.where(np.isfinite(norms), norms, 0.0), 0.95))
+    return stiffness(field, X[np.linspace(0, len(X) - 1, 256).round().astype(int)], data.scale)
 
 
 def changed(task: Task, before: Current, now: Current) -> float:
