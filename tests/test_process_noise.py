@@ -4,12 +4,14 @@
 
 import functools
 import itertools
+import re
 import warnings
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.interpolate
 import scipy.linalg
 import scipy.stats
 from test_learn import PENDULUM, damped, field_error, logs
@@ -27,6 +29,7 @@ from hamkernel._trajectories.kalman import as_observations, innovations, smoothe
 from hamkernel._trajectories.likelihood import Model, WhitenedRows, landmark_whitening
 from hamkernel._trajectories.search import losses
 from hamkernel._trajectories.segments import LinearisedSegments
+from hamkernel._trajectories.sensors import timing
 
 # The filter.
 
@@ -262,6 +265,36 @@ def test_good_sensors_are_not_exact_data(noise, friction):
         assert found.converged
         assert not said
         np.testing.assert_allclose(share, max(noise, 1e-6), rtol=0.2)
+
+
+def test_one_in_many_of_clean_logs_is_told_that_its_times_are_off():
+    rng, ts = np.random.default_rng(5), np.linspace(0, 8, 40)
+    paths = [np.column_stack([np.sin(2 * ts + a), 2 * np.cos(2 * ts + a)]) for a in range(3)]
+    noise = [0.03, 0.02] * rng.standard_normal((300, 3, 40, 2))
+    clean = [timing([ts] * 3, list(each), paths) for each in noise]
+    assert np.mean([each.score for each in clean]) == pytest.approx(0, abs=0.2)
+    assert np.std([each.score for each in clean]) == pytest.approx(1, abs=0.2)
+    assert np.mean([each.is_off for each in clean]) < 0.01
+    slopes = np.stack([np.gradient(x, ts, axis=0) for x in paths])
+    off = 0.02 * rng.standard_normal((300, 3, 40, 1))
+    found = [timing([ts] * 3, list(each), paths) for each in noise + off * slopes]
+    assert np.mean([each.is_off for each in found]) > 0.95
+    assert np.median([each.off for each in found]) == pytest.approx(0.02, rel=0.1)
+
+
+def test_times_that_are_off_are_named():
+    """By .02 in a run of 40 samples .2 apart, beside noise of 1 %."""
+    rng, ts = np.random.default_rng(0), np.linspace(0, 8, 40)
+    _, _, true = logs(count=3, samples=40, length=8.0, spread=1.5)
+    states = []
+    for x in true:
+        path = scipy.interpolate.make_interp_spline(ts, x, 5)  # wrong by 1e-3 or less
+        at = ts + 0.02 * rng.standard_normal(40)
+        states.append(path(at) + 0.01 * rng.standard_normal(x.shape))
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        hk.learn(KERNEL, hk.Runs([ts] * 3, states), process_noise=0)
+    assert any(re.search(r"as if times were off by 0\.0[12]", str(w.message)) for w in said)
 
 
 @pytest.mark.parametrize(("kernel", "said"), [(KERNEL, True), (hk.Gaussian(np.ones(2)), False)])

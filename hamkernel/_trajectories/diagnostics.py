@@ -389,7 +389,7 @@ def warn_of_pushes(fit: FitQuality) -> None:
             f"pushed: samples {_parts(fit.pushed)}. Something that is not in the log moved the "
             "system there, by more than three deviations of the process noise of all other samples,"
             " and the field is hardly learned from them; .disturbance has how much. Look there: a "
-            "hand, a stop, a cable, or inputs that were not applied."
+            "hand, a stop, a cable, a sensor at its end, or inputs that were not applied."
         )
 
 

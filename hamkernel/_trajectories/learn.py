@@ -67,6 +67,7 @@ from hamkernel._trajectories.search import (
     limited_by_landmarks,
 )
 from hamkernel._trajectories.segments import Piece
+from hamkernel._trajectories.sensors import timing, warn_of_timing
 from hamkernel._trajectories.smoothing import interpolated, power_of_two
 
 
@@ -131,7 +132,8 @@ def learn(
 
     Warns:
         UserWarning: parts of runs were dropped or pushed, landmarks or runs are too few, the
-            structure does not explain the runs, or the iterations did not settle.
+            structure does not explain the runs, residuals grow with the speed, or the iterations
+            did not settle.
     """
     require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
     K, given, process = _check(with_amplitude(matrix_kernel(K)), runs, noise, process_noise, solver)
@@ -208,7 +210,7 @@ def _learned(
     mean = None if mean is None else as_pytree(mean)
     task, now, history = end.task, end.now, end.history
     field, data = now.field, task.data
-    times, _ = runs.on_host()
+    times, seen = runs.on_host()
     states = _at_all_times(end, times)
     noise = np.where(measured, np.exp(np.asarray(now.model.log_noise)), np.nan)
     process = np.exp(np.asarray(now.model.log_process))
@@ -219,6 +221,9 @@ def _learned(
     if fit.kept.any():
         fit = _with_causes(fit, runs, end, alone)
     converged = diagnose(fit, noise, data.scale, given)
+    if fit.kept.any() and not (fit.dropped or now.model.is_disturbed):
+        pairs, noisy = zip(seen, states, strict=True), noisy_counts(end).any((0, 1))
+        warn_of_timing(timing(times, [np.where(noisy, x - y, np.nan) for x, y in pairs], states))
     observations = as_observations(now.rows, now.model, task.mean, task.start_deviation)
     count = 1 if observations is None else sum(len(y) for _, y in observations.parts())
     regularization = jnp.asarray(1 / count)

@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -218,6 +219,60 @@ def warn_of_feedback(states: Sequence[np.ndarray], inputs: Sequence[np.ndarray])
             f"their errors are {1 / np.sqrt(max(share, 1e-12)):.2g} times those under an "
             "independent input. Add a known disturbance to the command, log other gains of the "
             "controller, or give the input matrix, hk.Controlled(K, inputs=[[0.0], [1.0]])."
+        )
+
+
+class Timing(NamedTuple):
+    """How residuals r grow with the speed v, as those of times that are off do.
+
+    Attributes:
+        score: of no growth in E r² = σ² + τ²v², N(0, 1) if there is none.
+        off: τ, the standard deviation of the times.
+        share: the largest share of τ²v² in the variance of a coordinate.
+    """
+
+    score: float
+    off: float
+    share: float
+
+    @property
+    def is_off(self) -> bool:
+        """Whether they do, and by a fifth of a variance, a tenth of a deviation.
+
+        Ten clean logs of a pendulum, 4 runs of 80 samples, have scores of −1 to .6. Three with
+        noise of .02 and times off by .02 have 12 to 16, and τ from .018 to .024 by coordinate.
+        """
+        return self.score > 3 and self.share > 0.2
+
+
+def timing(times: list[np.ndarray], residuals: list[np.ndarray], paths: list[np.ndarray]) -> Timing:
+    """Whether residuals grow with the speed along the paths; a coordinate without any is NaN."""
+    slopes = [np.gradient(x, t, axis=0) for t, x in zip(times, paths, strict=True)]
+    squares, speeds = np.concatenate(residuals) ** 2, np.concatenate(slopes) ** 2
+    scores, weights, growths, ratios = [], [], [], []
+    for r, v in zip(squares.T, speeds.T, strict=True):
+        r, v = r[np.isfinite(r)], v[np.isfinite(r)]
+        if len(r) < 20 or np.ptp(v) == 0:
+            continue
+        d, mean = v - v.mean(), r.mean()
+        scores.append(r @ d / mean / np.sqrt(2 * d @ d))
+        growths.append(r @ d / (d @ d))
+        weights.append(d @ d / mean**2)
+        ratios.append(v.mean() / mean)
+    if not scores:
+        return Timing(0.0, 0.0, 0.0)
+    growth = max(float(np.average(growths, weights=weights)), 0.0)
+    return Timing(sum(scores) / len(scores) ** 0.5, growth**0.5, growth * max(ratios))
+
+
+def warn_of_timing(found: Timing) -> None:
+    """Warn of residuals that grow with the speed."""
+    if found.is_off:
+        require.warn(
+            "residuals are larger where the states move faster, as if times were off by "
+            f"{found.off:.2g} (standard deviation). The noise is taken for one number, and bands "
+            "may be too narrow. Log the times at which the sensors measure, rather than those at "
+            "which samples arrive or were due; a noise that grows with the motion looks alike."
         )
 
 
