@@ -107,10 +107,11 @@ def tune(
     more. Where the runs end is compared on all data, together with the given point, and the best is
     finished there. From 2048/n points on this is done on 1024/n of them, and the best is corrected
     on all data by two more steps: each takes the time of some ten factorisations. Where the given
-    point is better than that on all data, the part has misled and a run from there is finished.
-    New data of the same shape does not recompile, unless `Nystrom` takes another number of
-    landmarks. Data sharded over devices is gathered on one of them for the search; the field is
-    fitted where the data lies.
+    point is better than that on all data, the part has misled and a run from there is finished: but
+    for the penalty of "The ridge" below, the loss is never above that of the given point. New data
+    of the same shape does not recompile, unless `Nystrom` takes another number of landmarks. Data
+    sharded over devices is gathered on one of them for the search; the field is fitted where the
+    data lies.
 
     Args:
         K: a matrix-valued kernel; every inexact array leaf is a hyperparameter, and no Python
