@@ -14,7 +14,7 @@ import pytest
 import scipy.interpolate
 import scipy.linalg
 import scipy.stats
-from test_learn import PENDULUM, damped, field_error, logs
+from test_learn import PENDULUM, damped, field_error, logs, moved_by_momentum
 
 import hamkernel as hk
 from hamkernel._trajectories.diagnostics import (
@@ -385,6 +385,17 @@ def test_little_process_noise_is_none():
     np.testing.assert_allclose(none.noise, little.noise, rtol=1e-3)
     assert np.asarray(none.process_noise).tolist() == [0.0, 0.0]
     assert not np.concatenate(none.disturbance).any()
+
+
+@pytest.mark.slow
+def test_friction_is_named_although_process_noise_whitens_the_innovations():
+    drag, given = jnp.array([0.0, 0.03]), {"count": 4, "samples": 80, "length": 7.9}
+    times, states, _ = logs(lambda x: PENDULUM(x) - drag * x, noise=0.01, **given)
+    positions = [np.column_stack([x[:, 0], np.full(len(x), np.nan)]) for x in states]
+    drift = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0))
+    with pytest.warns(UserWarning, match="friction, with which log p would be"):
+        found = hk.learn(drift, hk.Runs(times, positions), mean=moved_by_momentum)
+    assert found.whiteness > 0.05
 
 
 @pytest.mark.slow

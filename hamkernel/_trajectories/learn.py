@@ -315,12 +315,11 @@ def _with_causes(fit: FitQuality, runs: Runs, end: End, alone: End | None) -> Fi
     if capped or not fit.white.is_enough:
         free = task.bounds.free[-2 * runs.dimension : -runs.dimension].any()  # the noise
         fit = fit._replace(few=used * limited_by_landmarks(*given, capped and bool(free)))
+    if fit.has_momenta and (fit.is_disturbed or not fit.white.is_enough):
+        fit = fit._replace(gained=gain_of_friction(*given, task.data))
     if fit.white.is_enough:
         return fit
-    return fit._replace(
-        between=likelier_between(runs, end if alone is None else alone),
-        gained=gain_of_friction(*given, task.data) if fit.has_momenta else 0.0,
-    )
+    return fit._replace(between=likelier_between(runs, end if alone is None else alone))
 
 
 def likelier_between(runs: Runs, end: End) -> str:

@@ -257,8 +257,12 @@ def gain_of_friction(
 ) -> float:
     """The gain of log p from viscous and dry friction of the momenta beside the drift.
 
-    All else stays. Forces as large as all of the motion are as good as free in the closed form. 0
-    where the kernel has friction, or is that of a family.
+    Kernels stay. Process noise, or without it sensor noise, had to explain what friction would, and
+    may be a tenth or a hundredth with either. Forces as large as all of the motion are as good as
+    free in the closed form. 0 where the kernel has friction, or is that of a family.
+
+    Of four runs of positions of a pendulum, 80 samples each, with viscous friction of .1 and .03 it
+    is 75 and 33 beside the process noise found; with white pushes and no friction −9 to −6.
     """
     K, (X, Y) = model.kernel, sampled(data)
     n = Y.shape[1]
@@ -268,11 +272,14 @@ def gain_of_friction(
     both = Friction(force / fastest, 1e-6 * force) + Friction(1e-6 * force / fastest, force)
     more = K.of_states + with_rest_speed(both, jnp.asarray(X), n)
     S, rows = searched(jnp.asarray(S), rows)
-    without, there = (
-        float(losses(each, each.flat[None], S, rows, start_deviation, whitening)[0])
-        for each in (model, model._replace(kernel=K.with_states(more)))
-    )
-    return without - there
+    explains = slice(-n, None) if model.is_disturbed else slice(-2 * n, -n)
+
+    def least(model: Model) -> float:
+        design = np.tile(np.asarray(model.flat), (3, 1))
+        design[:, explains] += np.log([[1.0], [0.1], [0.01]])
+        return float(losses(model, jnp.asarray(design), S, rows, start_deviation, whitening).min())
+
+    return least(model) - least(model._replace(kernel=K.with_states(more)))
 
 
 def bounds_and_design(
