@@ -246,19 +246,27 @@ class Timing(NamedTuple):
 
 
 def timing(times: list[np.ndarray], residuals: list[np.ndarray], paths: list[np.ndarray]) -> Timing:
-    """Whether residuals grow with the speed along the paths; a coordinate without any is NaN."""
-    slopes = [np.gradient(x, t, axis=0) for t, x in zip(times, paths, strict=True)]
-    squares, speeds = np.concatenate(residuals) ** 2, np.concatenate(slopes) ** 2
+    """Whether residuals grow with the speed along the paths; a coordinate without any is NaN.
+
+    Speeds are compared within each run, since the noise may be larger in a run that is faster.
+    """
     scores, weights, growths, ratios = [], [], [], []
-    for r, v in zip(squares.T, speeds.T, strict=True):
-        r, v = r[np.isfinite(r)], v[np.isfinite(r)]
-        if len(r) < 20 or np.ptp(v) == 0:
+    for c in range(paths[0].shape[1]):
+        parts = []
+        for t, residual, path in zip(times, residuals, paths, strict=True):
+            r, v = residual[:, c] ** 2, np.gradient(path[:, c], t) ** 2
+            r, v = r[np.isfinite(r)], v[np.isfinite(r)]
+            if r.any():
+                parts.append((r, r / r.mean(), v, v - v.mean()))
+        if sum(len(part[0]) for part in parts) < 20:
             continue
-        d, mean = v - v.mean(), r.mean()
-        scores.append(r @ d / mean / np.sqrt(2 * d @ d))
+        r, relative, v, d = (np.concatenate(each) for each in zip(*parts, strict=True))
+        if not d.any():
+            continue
+        scores.append(relative @ d / np.sqrt(2 * d @ d))
         growths.append(r @ d / (d @ d))
-        weights.append(d @ d / mean**2)
-        ratios.append(v.mean() / mean)
+        weights.append(d @ d / r.mean() ** 2)
+        ratios.append(v.mean() / r.mean())
     if not scores:
         return Timing(0.0, 0.0, 0.0)
     growth = max(float(np.average(growths, weights=weights)), 0.0)
