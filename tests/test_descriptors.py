@@ -48,11 +48,12 @@ def by_hand(k, X, B=None):
 @pytest.mark.parametrize("inner", [hk.Gaussian(1.3), 2.0 * hk.Matern(2.5, 0.9)])
 def test_the_gram_of_a_warp_is_that_of_its_second_derivatives(inner, key):
     X = jax.random.normal(key, (5, 2))
-    K = hk.Symplectic(3.0 * hk.Warp(inner, angles))
-    J = np.array([[0.0, 1.0], [-1.0, 0.0]])
-    expected = by_hand(lambda x, z: 3.0 * inner(angles(x), angles(z)), X, J)
-    np.testing.assert_allclose(hk.gram(K, X), expected, atol=1e-13 * np.abs(expected).max())
-    np.testing.assert_allclose(hk.gram(K, X)[1, :, 2], K(X[1], X[2]), atol=1e-13)
+    k = 3.0 * hk.Warp(inner, angles)
+    J, R = np.array([[0.0, 1.0], [-1.0, 0.0]]), np.diag([0.0, 0.4])
+    for K, B in ((hk.Symplectic(k), J), (hk.PortHamiltonian(k, 0.4), J - R)):
+        expected = by_hand(lambda x, z: 3.0 * inner(angles(x), angles(z)), X, B)
+        np.testing.assert_allclose(hk.gram(K, X), expected, atol=1e-13 * np.abs(expected).max())
+        np.testing.assert_allclose(hk.gram(K, X)[1, :, 2], K(X[1], X[2]), atol=1e-13)
 
 
 def test_an_equivariant_warp_has_the_mean_over_both_arguments(molecules):
