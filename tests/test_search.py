@@ -186,6 +186,18 @@ def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free
     assert criterion.with_basis(waves).loss(K, rows, jnp.asarray(1.0))[0] < np.inf
 
 
+def test_the_ridge_of_a_subset_is_that_of_all_points():
+    some, lam = 8, 0.1
+    rows = measurements_of_states(jnp.asarray(X[:some]), jnp.asarray(Y[:some]))
+    criterion = criterion_of("generalized_cross_validation", some, 5)
+    objective = SearchObjective(space(), criterion, rows, *map(jnp.asarray, (N / some, 1.0, 1.0)))
+    _, loss = objective.at(K, jnp.asarray(lam), jnp.asarray(2.0))
+    D = 2 * some
+    A = np.asarray(hk.gram(K, X[:some])).reshape(D, D) + N * lam * np.eye(D)
+    a = np.linalg.solve(A, Y[:some].ravel())
+    np.testing.assert_allclose(loss, D * a @ a / np.trace(np.linalg.inv(A)) ** 2)
+
+
 @pytest.mark.parametrize(("N", "n", "parts"), [(64, 2, 1), (65, 2, 2), (2000, 2, 3), (600, 8, 3)])
 def test_many_points_are_searched_in_parts_that_grow_and_end_with_all(N, n, parts):
     criterion = criterion_of("cross_validation", N, 5)
