@@ -207,7 +207,6 @@ def test_driven_trajectories_are_those_of_scipy(name, steps):
     np.testing.assert_allclose(ys, reference(force), atol=2e-8)
 
 
-@pytest.mark.slow
 def test_constant_steps_keep_their_order_across_held_inputs():
     """Were the last stage to see the next sample, Dopri5 would be of first order."""
     exact = reference(DRIVES["held"][2])[-1]
