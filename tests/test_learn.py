@@ -5,6 +5,7 @@
 # pyright: reportOperatorIssue=false
 # Wrong types are refused here, and any field is looked into.
 
+import dataclasses
 import functools
 import itertools
 import re
@@ -34,6 +35,8 @@ from hamkernel._trajectories.kalman import as_observations
 from hamkernel._trajectories.likelihood import (
     Model,
     closed_form,
+    condensed,
+    conditional,
     landmark_whitening,
     project_out_starts,
 )
@@ -171,6 +174,30 @@ def test_the_likelihood_is_that_of_the_differences_but_for_a_constant():
         model = Model(kernel, jnp.full(2, np.log(sigma)), NO_PROCESS)
         S, spread = jnp.asarray(nodes), jnp.full(2, 1e4)
         ours.append(float(losses(model, model.flat[None], S, rows, spread, project_out_starts)[0]))
+    np.testing.assert_allclose(np.diff(ours), np.diff(theirs), rtol=1e-6)
+
+
+def test_the_likelihood_at_another_noise_is_that_of_every_sample_in_a_mean():
+    rows, spans, nodes, measured = one_segment()
+    kernel, sigma, count = hk.Symplectic(1.7 * hk.Gaussian(1.2)), 0.3, 4
+    apart = np.random.default_rng(1).standard_normal((len(measured), count, 2))
+    apart -= apart.mean(axis=1, keepdims=True)
+    scatter = jnp.asarray(np.sum(apart**2, axis=1)[None])
+    rows = rows._replace(counts=jnp.full_like(rows.counts, count), scatter=scatter)
+    S, spread = jnp.asarray(nodes), jnp.full(2, 1e4)
+    model = Model(kernel, jnp.full(2, np.log(sigma)), NO_PROCESS)
+    known = condensed(model, S, rows, spread, project_out_starts)
+    # Differences of successive samples, of which `count` have one time.
+    G, weights = differences(kernel, sigma, spans, nodes, measured)[:2]
+    from_start = np.kron(np.tri(len(measured), len(spans), -1), np.eye(2)) @ weights
+    moved = np.repeat(from_start.reshape(len(measured), 1, 2, -1), count, axis=1)
+    D = np.kron(np.diff(np.eye(len(measured) * count), axis=0), np.eye(2))
+    moved, d = D @ moved.reshape(D.shape[1], -1), D @ (measured[:, None] + apart).reshape(-1)
+    ours, theirs = [], []
+    for shift in (0.0, 0.4, -0.3):
+        A = moved @ G @ moved.T + (sigma * np.exp(shift)) ** 2 * D @ D.T
+        theirs.append(-scipy.stats.multivariate_normal(np.zeros(len(d)), A).logpdf(d))
+        ours.append(float(conditional(known, S, shift).loss))
     np.testing.assert_allclose(np.diff(ours), np.diff(theirs), rtol=1e-6)
 
 
@@ -479,3 +506,17 @@ def test_the_posterior_is_that_of_the_last_rows(learned):
     truth = np.asarray(jax.vmap(PENDULUM)(X))
     z = (exact - truth) / np.asarray(jax.vmap(posterior.deviation)(X))
     assert 0.3 < np.sqrt(np.mean(z**2)) < 2.0
+
+
+def test_noise_of_half_the_variance_in_the_posterior_is_that_of_every_observation_twice(learned):
+    found, true = learned
+    X = jnp.asarray(np.concatenate(true)[::25])
+    halved = dataclasses.replace(found, widening=jnp.asarray(0.5)).posterior
+    # The noise variance is Nλ, and there are twice as many.
+    twice = found.observations + found.observations
+    again = hk.condition(found.kernel, twice, regularization=found.regularization / 2)
+    for f, g in ((halved.field, again.field), (halved.deviation, again.deviation)):
+        of_f, of_g = (np.asarray(jax.vmap(each)(X)) for each in (f, g))
+        np.testing.assert_allclose(of_f, of_g, rtol=1e-6, atol=1e-6 * np.abs(of_g).max())
+    as_found = np.asarray(jax.vmap(found.posterior.deviation)(X))
+    assert (np.asarray(jax.vmap(halved.deviation)(X)) < 0.95 * as_found).all()
