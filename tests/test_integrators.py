@@ -122,7 +122,6 @@ class Driven(Term):
         return jnp.stack([x[1] + jnp.cos(2 * t), -x[0] + jnp.sin(3 * t)])
 
 
-@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("solver", "error"),
     [(ImplicitMidpoint(), 5e-3), (GaussLegendre4(), 1e-6), (StormerVerlet(), 5e-3)],
