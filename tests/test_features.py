@@ -470,8 +470,6 @@ def test_gradients_with_respect_to_hyperparameters_are_differences(make, key):
     np.testing.assert_allclose(curvatures[1], second, rtol=10 * DIFFERENCES)
 
 
-@pytest.mark.slow
-@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("make", "formula"),
     [
