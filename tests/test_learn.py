@@ -224,6 +224,16 @@ def test_landmarks_resolve_components_of_any_unit():
     np.testing.assert_allclose(T.T @ G @ T, np.eye(16), atol=1e-6)
 
 
+def test_landmarks_closer_than_rounding_resolves_span_what_they_span():
+    S = np.random.default_rng(0).uniform(-1, 1, (40, 2))
+    kernel = hk.Symplectic(hk.Gaussian(4.0))
+    G = np.asarray(hk.gram(kernel, S)).reshape(80, 80)
+    with pytest.raises(np.linalg.LinAlgError):
+        np.linalg.cholesky(G)
+    T = np.asarray(landmark_whitening(kernel, jnp.asarray(S)))
+    np.testing.assert_allclose(G @ T @ T.T @ G, G, atol=1e-9 * np.trace(G))
+
+
 def test_the_flow_and_its_tangent_are_exact_to_the_tolerance_of_the_integrator():
     starts = jnp.array([[1.0, 0.5], [-0.3, 1.2]])
     spans = np.full((2, 4), 0.2)
