@@ -525,6 +525,7 @@ def test_any_optimistix_minimiser_and_any_objective_will_do(simple):
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the labels in folds make 3 folds")
 @pytest.mark.parametrize("seed", [0, 6])
 def test_a_rollout_objective_keeps_what_the_field_loss_lets_fly_apart(seed):
     # A point left out of a trajectory lies between neighbours that the fit has seen, and on these
