@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import tqdm
 
 import hamkernel as hk
 from hamkernel import _machine
@@ -265,7 +266,13 @@ def test_short_runs_without_noise_are_learned_from_whole_and_no_noise_is_found()
 @pytest.mark.slow
 def test_progress_is_told_to_those_who_wait(capsys, monkeypatch):
     """After ten seconds, here at once; never to those who say so."""
-    monkeypatch.setattr("hamkernel._trajectories.learn._QUIET", 0.0)
+    bar, waits = tqdm.tqdm, []
+
+    def at_once(**options):
+        waits.append(options["delay"])
+        return bar(**options | {"delay": 0.0})
+
+    monkeypatch.setattr(tqdm, "tqdm", at_once)
     ts = np.linspace(0, 3, 8)
     runs = hk.Runs([ts] * 2, [np.column_stack([np.cos(ts + a), -np.sin(ts + a)]) for a in (0, 1)])
     options = {"process_noise": 0, "iterations": 1, "noise": 1e-3}
@@ -277,3 +284,4 @@ def test_progress_is_told_to_those_who_wait(capsys, monkeypatch):
         said.append(capsys.readouterr().err)
     assert "learning" in said[0]
     assert not said[1]
+    assert waits == [10.0, 10.0]
