@@ -61,7 +61,7 @@ def programs():
     )
 
     def features(X, Y, rows):
-        return random_features._fit(KERNEL, waves, X, Y, ridge, rows).residual
+        return random_features._feature_fit(KERNEL, waves, X, Y, ridge, rows).residual
 
     def gradients(X, Y, rows):
         N_ridge = len(X) * ridge
@@ -72,7 +72,7 @@ def programs():
 
     return {
         "product": lambda X, Y, rows: product(KERNEL, X, X, Y, rows, rows),
-        "Nystrom": lambda X, Y, rows: nystrom._fit(KERNEL, X, Y, ridge, S, rows),
+        "Nystrom": lambda X, Y, rows: nystrom._landmark_fit(KERNEL, X, Y, ridge, S, rows),
         "RandomFeatures": features,
         "ConjugateGradient": gradients,
     }
