@@ -301,7 +301,9 @@ def test_times_that_are_off_are_named():
     assert any(re.search(r"as if times were off by 0\.0[12]", str(w.message)) for w in said)
 
 
-@pytest.mark.parametrize(("kernel", "said"), [(KERNEL, True), (hk.Gaussian(np.ones(2)), False)])
+@pytest.mark.parametrize(
+    ("kernel", "said"), [(KERNEL, True), (hk.Symplectic(hk.Gaussian(np.ones(2))), False)]
+)
 def test_one_lengthscale_for_coordinates_of_other_sizes_is_said(kernel, said):
     for ratio in (100.0, 1000.0):
         with warnings.catch_warnings(record=True) as seen:

@@ -14,7 +14,6 @@ from hamkernel import _require as require
 from hamkernel._kernels.transforms import Select, Warp
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.friction import damped_coordinates, frictions
-from hamkernel._structures.joined import AbstractJoinedKernel
 from hamkernel._trajectories.preprocessing import Preprocessed
 from hamkernel._trajectories.runs import Runs
 
@@ -194,12 +193,11 @@ def warn_of_units(K: AbstractMatrixKernel, scale: Float[np.ndarray, " n"]) -> No
     least, most = float(np.nanmin(scale)), float(np.nanmax(scale))
     if not most > 300 * least > 0:
         return
-    drift = K.of_states if isinstance(K, AbstractJoinedKernel) else K
 
     def is_on_some(node: object) -> bool:
         return isinstance(node, Select | Warp)
 
-    paths, _ = tree_flatten_with_path(drift, is_leaf=is_on_some)
+    paths, _ = tree_flatten_with_path(K.of_states, is_leaf=is_on_some)
     if any(keystr(path).endswith(".log_lengthscale") and not leaf.shape for path, leaf in paths):
         require.warn(
             f"the states vary by {least:.2g} in coordinate {np.nanargmin(scale)} and by {most:.2g} "
