@@ -188,6 +188,26 @@ def test_it_is_found_from_positions_alone_and_the_motion_stops_where_it_sticks()
     assert np.abs(path - expected).max() < 0.05
 
 
+@pytest.mark.slow
+def test_it_is_found_in_metres_and_seconds_of_a_cantilever():
+    # In these units the guess .1 was kept, with friction of 1e-5 of the true one and converged.
+    metre, second, loss = 1e-8, 1e-6, 0.02
+    ts, rates = (
+        np.arange(0.0, 60.0, 0.3),
+        lambda t, x: [x[1], -x[0] - 0.1 * x[0] ** 3 - loss * x[1]],
+    )
+    q = solve_ivp(rates, (0, 60), [1.5, 0.0], "LSODA", rtol=1e-9, atol=1e-10, t_eval=ts).y[0]
+    q += 0.01 * np.random.default_rng(0).normal(size=ts.size)
+    log = hk.Runs(ts * second, np.column_stack([metre * q, np.full(ts.size, np.nan)]))
+    energy = hk.Symplectic(hk.Select(hk.Gaussian(metre), 0))
+    K = hk.Sum(energy=energy, friction=hk.Friction())
+    found = hk.learn(K, log, mean=kinematics, progress=False)
+    assert found.converged
+    assert not found.process_noise.any()
+    force = found.field.part("friction")(jnp.array([0.0, 0.7 * metre / second]))[1]
+    np.testing.assert_allclose(force, -loss * 0.7 * metre / second**2, rtol=0.05)
+
+
 @pytest.mark.parametrize(
     ("call", "error", "match"),
     [

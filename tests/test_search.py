@@ -124,6 +124,30 @@ def test_data_without_extent_or_size_has_the_box_of_one(k, parameter, low, high)
     np.testing.assert_allclose(np.exp(found), [low, high], rtol=1e-12)
 
 
+@pytest.mark.parametrize("unit", [1e-7, 1e4])
+def test_each_part_has_the_box_of_its_own_units(unit):
+    """Of positions and momenta in another unit, and of inputs in a third."""
+
+    def found(unit, of_input):
+        friction = hk.Friction(rest_speed=0.1 * unit)
+        K = hk.Sum(energy=hk.Symplectic(1.0 * hk.Gaussian(unit)), friction=friction)
+        K = hk.Controlled(K, hk.InputMatrix(1.0, acts_on=(1,)), count=1)
+        joined = jnp.column_stack([X * unit, U * of_input])
+        rms = unit * float(np.sqrt(np.mean(Y**2)))
+        each = hyperparameters(K, joined, rms, joined)
+        return {p.name.split(".", 1)[1]: np.exp([p.low, p.high]) for p in each}
+
+    U = RNG.normal(size=(len(X), 1))
+    here, there = found(1.0, 1.0), found(unit, 100.0)
+    for name, power in {
+        "friction.viscous": 1.0,
+        "friction.coulomb": unit,
+        "energy.kernel.scale": unit**4,
+        "kernel.scale": (unit / 100) ** 2,
+    }.items():
+        np.testing.assert_allclose(there[name], here[name] * power, rtol=1e-6, err_msg=name)
+
+
 def test_the_lengthscale_of_a_periodic_kernel_does_not_know_the_units_of_the_states():
     for units in (1.0, 1e4):
         K = hk.Separable(hk.Periodic(2.0 * units))
