@@ -43,6 +43,13 @@ def joined(sign: str, terms: list[str]) -> str:
     return line if _fits(line) else f"\n{sign} ".join(terms)
 
 
+def shortened(items: list[str]) -> list[str]:
+    """The items, or the first, how many there are between, and the last, if all take a page."""
+    if len(items) <= 3 or sum(map(len, items)) <= 300:
+        return items
+    return [items[0], f"… {len(items) - 2} more", items[-1]]
+
+
 def in_brackets(sum_of_terms: str) -> str:
     """The sum in brackets, to stand as a factor of a product."""
     if _fits(sum_of_terms):
@@ -93,7 +100,7 @@ def text(value: Any) -> str:
     if isinstance(value, float):
         return _number(value)
     if type(value) is tuple:
-        items = [text(item) for item in value]
+        items = shortened([text(item) for item in value])
         return f"({', '.join(items)}{',' if len(items) == 1 else ''})"
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key!r}: {text(item)}" for key, item in value.items()) + "}"

@@ -287,6 +287,14 @@ def weighted(x, z, weights):
     return jnp.sum(weights) * (x @ z)
 
 
+def test_many_observations_print_in_a_few_lines():
+    one = np.ones((1, 2))
+    parts = [hk.Velocities(one, i * one, noise=1.0) for i in range(20)]
+    lines = repr(sum(parts[1:], start=parts[0])).splitlines()
+    assert len(lines) == 3
+    assert "… 18 more" in lines[1]
+
+
 @pytest.mark.parametrize(
     ("weights", "text"),
     [

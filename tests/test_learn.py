@@ -313,6 +313,7 @@ def test_a_pendulum_is_learned_from_noisy_states(learned):
     assert np.nanmax(found.misfit) < 1.6
     assert found.residuals[0].shape == (30, 2)
     assert "Symplectic(" in repr(found.kernel)
+    assert len(repr(found).splitlines()) < 70  # whatever the number of runs and iterations
     x = jnp.array([0.3, 0.2])
     gradient = jax.grad(found.field.hamiltonian)(x)
     np.testing.assert_allclose(found.field(x), [gradient[1], -gradient[0]], atol=1e-10)

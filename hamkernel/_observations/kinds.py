@@ -25,7 +25,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components, Values
-from hamkernel._show import described, joined
+from hamkernel._show import described, joined, shortened
 
 
 class AbstractObservations(eqx.Module):
@@ -93,7 +93,7 @@ class Together(AbstractObservations):
             )
 
     def __repr__(self) -> str:
-        return joined("+", [repr(term) for term in self.terms])
+        return joined("+", shortened([repr(term) for term in self.terms]))
 
     @property
     def dimension(self) -> int:
