@@ -426,3 +426,18 @@ def test_friction_that_the_structure_lacks_is_process_noise_and_said():
     p = np.concatenate(true)[:, 1]
     w = np.concatenate(found.disturbance)[:, 1]
     assert np.corrcoef(p, w)[0, 1] < -0.2
+
+
+def test_a_system_without_inertia_is_named_and_its_rate_is_learned():
+    # Of a capacitor that discharges U = −q²/2τ² was learned, and converged, without a word.
+    dice, t, tau = np.random.default_rng(0), np.arange(0.0, 5.0, 0.1), 0.8
+    volts = [v * np.exp(-t / tau) + 0.01 * dice.normal(size=t.size) for v in (5.0, 3.0, -4.0)]
+    blind = [np.column_stack([v, np.full(t.size, np.nan)]) for v in volts]
+    K = hk.Symplectic(hk.Select(hk.Gaussian(2.0), 0))
+    known = {"mean": lambda x: jnp.stack([x[1], 0 * x[1]]), "progress": False}
+    with pytest.warns(UserWarning, match=r"one function of the position.*hk\.CurlFree"):
+        hk.learn(K, hk.Runs([t] * 3, blind), **known)
+    runs = hk.Runs([t] * 3, [v[:, None] for v in volts])
+    found = hk.learn(hk.CurlFree(hk.Gaussian(2.0)), runs, progress=False)
+    q = jnp.array([[-3.0], [2.0], [4.0]])
+    np.testing.assert_allclose(found.field.evaluate(q), -q / tau, atol=0.1)

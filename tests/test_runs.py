@@ -89,6 +89,18 @@ def test_a_wrapped_angle_is_named_with_its_cure():
     hk.Runs(t, np.column_stack([np.unwrap(angle[:, 0]), angle[:, 1]]))  # no warning: an error here
 
 
+def test_a_wrapped_angle_with_lost_samples_is_told_to_unwrap_those_that_were_measured():
+    # np.unwrap of all of them has NaN from the first lost one on.
+    t = np.linspace(0, 10, 60)
+    angle = np.column_stack([(2 * t) % (2 * np.pi), 2.0 + 0.1 * np.sin(t)])
+    angle[20] = np.nan
+    with pytest.warns(UserWarning, match=r"q\[ok\] = np\.unwrap\(q\[ok\]\)"):
+        hk.Runs(t, angle)
+    ok = np.isfinite(angle[:, 0])
+    angle[ok, 0] = np.unwrap(angle[ok, 0])
+    hk.Runs(t, angle)  # no warning: an error here
+
+
 def test_a_fast_wrapped_angle_is_named_and_a_momentum_across_a_gap_is_not():
     t = np.linspace(0, 6, 30)
     turning = (6.0 * t + np.pi) % (2 * np.pi) - np.pi  # 1.2 rad between samples

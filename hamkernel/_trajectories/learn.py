@@ -67,7 +67,7 @@ from hamkernel._trajectories.search import (
     limited_by_landmarks,
 )
 from hamkernel._trajectories.segments import Piece
-from hamkernel._trajectories.sensors import timing, warn_of_timing
+from hamkernel._trajectories.sensors import timing, warn_of_curve, warn_of_timing
 from hamkernel._trajectories.smoothing import interpolated, power_of_two
 
 
@@ -221,6 +221,8 @@ def _learned(
     if fit.kept.any():
         fit = _with_causes(fit, runs, end, alone)
     converged = diagnose(fit, noise, data.scale, given)
+    if fit.kept.any() and runs.inputs is None:
+        warn_of_curve(states)
     if fit.kept.any() and not (fit.dropped or now.model.is_disturbed):
         pairs, noisy = zip(seen, states, strict=True), noisy_counts(end).any((0, 1))
         warn_of_timing(timing(times, [np.where(noisy, x - y, np.nan) for x, y in pairs], states))
