@@ -165,9 +165,10 @@ def iterate(
         bar.set_postfix_str(f"noise {noise}, kept {float(done.kept):.0%}", refresh=False)
         bar.update()
         moved = float(jnp.abs(now.model.log_noise - before.model.log_noise).max())
-        # A hundredth of log σ, and of the objective by degree of freedom; or a field that stays:
-        # without noise its digits end before the objective settles.
-        small = float(done.gain) < 0.01 * max(now.free, 1.0)
+        # A hundredth of log σ, and a thousandth of the objective by degree of freedom; or a field
+        # that stays: without noise its digits end before the objective settles.
+        less = abs(float(history[-2].objective - done.objective)) if same and i else np.inf
+        small = less < 1e-3 * max(now.free, 1.0)
         settled = moved < 0.01 and (small or changed(task, before, now) < SETTLED)
         settled = settled and same and i > _SHORT_ROUNDS
         if settled:

@@ -150,14 +150,19 @@ def linearised(
 def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
     """The rows, or windows of them, evenly from all segments, with at most `samples` samples.
 
-    The start of a window is unknown, as that of a segment is.
+    The start of a window is unknown, as that of a segment is, and what adds up along a path is seen
+    in long windows only; four at least keep some variety. Of six runs of 240 samples of a pendulum
+    with friction .2, four seeds, windows of 12 samples gave .222, .191, .206 and .217, windows of
+    192 .197, .199, .197 and .197 in the same time, and all rows .199, .199, .198 and .200.
     """
     seen: Any = np.asarray(rows.counts).any(axis=2)
     if seen.size <= samples or not seen[:, 1:].any():
         return rows
     ends = np.where(seen.any(axis=1), seen.shape[1] - np.argmax(seen[:, ::-1], axis=1), 0)
-    # One length for runs that will be followed in longer segments: one program does for all.
-    length = SHORT if seen.shape[1] >= SHORT else int(ends.max())
+    # Of few lengths, so that few programs are compiled.
+    length = int(ends.max()) if seen.shape[1] < SHORT else SHORT
+    while 2 * length <= min(int(ends.max()), samples // 4):
+        length *= 2
     firsts = [
         (s, max(min(i, end - length), 0))
         for s, end in enumerate(ends)
