@@ -34,6 +34,8 @@ from hamkernel._trajectories.segments import (
     given_path,
     linearised,
     padded_count,
+    segmented,
+    short_pieces,
     windows,
 )
 
@@ -93,6 +95,16 @@ def test_noise_is_scaled_in_the_triangle_as_in_the_rows():
 def test_a_large_log_is_padded_by_less_than_a_small_one():
     assert [padded_count(50, large) for large in (False, True)] == [64, 56]
     assert [padded_count(count, True) for count in (3, 8, 20, 120, 129)] == [3, 8, 20, 128, 160]
+
+
+def test_many_short_runs_are_not_padded_in_length():
+    t = np.linspace(0.0, 1.0, 5)
+    states = [np.column_stack([np.cos(t + i), -np.sin(t + i)]) for i in range(450)]
+    runs = preprocessing.preprocess(hk.Runs([t] * 450, states), None).runs
+    segments = segmented(runs, short_pieces(runs), [run.path for run in runs])
+    assert segments.counts.shape == (512, 5, 2)
+    few = segmented(runs[:9], short_pieces(runs[:9]), [run.path for run in runs[:9]])
+    assert few.counts.shape == (16, 8, 2)
 
 
 def test_a_long_computation_says_what_it_costs():
