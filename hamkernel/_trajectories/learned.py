@@ -123,6 +123,12 @@ class Learned(eqx.Module):
         correlated the noise is larger by `widening`, and its mean somewhat smoother than `field`.
         It is made anew with every call: keep it.
 
+        Bands are those of a field of `kernel`. What no such field can be is not in them: a force
+        that repeats within less than a lengthscale, or a gain that a flexible part changes with the
+        frequency. Where you know of one, condition a kernel that has it on `observations`, at the
+        cost of a solve: `hk.condition(more, learned.observations,
+        regularization=learned.regularization * learned.widening, mean=learned.mean)`.
+
         Raises:
             ValueError: the runs had too few samples to learn from.
         """
