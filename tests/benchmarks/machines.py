@@ -139,7 +139,8 @@ def judged(case, logs, test, kernel, between, force, gain, count, unit):
     )
     if case == "drive, with friction":
         posterior = finer(found)
-        error = np.abs(np.asarray(jax.vmap(posterior.field.drift)(points))[:, 1] - truth)
+        drift = jax.vmap(posterior.field)(points, none)
+        error = np.abs(np.asarray(drift)[:, 1] - truth)
         deviation = np.asarray(jax.vmap(posterior.deviation)(points, none))[:, 1]
         missed = np.sqrt(np.mean(error**2) / np.mean(truth**2))
         print(
