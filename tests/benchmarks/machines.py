@@ -139,7 +139,7 @@ def judged(case, logs, test, kernel, between, force, gain, count, unit):
     )
     if case == "drive, with friction":
         posterior = finer(found)
-        drift = jax.vmap(posterior.field)(points, none)
+        drift = jax.vmap(posterior.field)(points, none)  # pyright: ignore[reportCallIssue]
         error = np.abs(np.asarray(drift)[:, 1] - truth)
         deviation = np.asarray(jax.vmap(posterior.deviation)(points, none))[:, 1]
         missed = np.sqrt(np.mean(error**2) / np.mean(truth**2))
