@@ -62,11 +62,10 @@ class Whiteness(NamedTuple):
         large, and the gain as wrong (`tests/benchmarks/disturbances.py`).
 
         It does not stand for forces that repeat with the state, which are no scatter: of a drive
-        with cogging .20 of the drift are inside two deviations with it and .17 without. A
-        covariance from the scores of blocks of the runs, the sandwich of Liang and Zeger with
-        blocks of 10 to 600 rows, is about the field that the kernel comes nearest to, too: .17 to
-        .19. With a term of the kernel that can say them it is .92, and the error .023 for .037
-        (`tests/benchmarks/machines.py`).
+        with cogging .20 of the drift are inside two deviations (`tests/benchmarks/machines.py`). A
+        covariance from the scores of blocks of the runs, the sandwich of Liang and Zeger, is about
+        the field that the kernel comes nearest to, too: .17 to .19 with blocks of 10 to 600 rows.
+        With a term of the kernel for them, whose force and length were given, it is .92.
         """
         return 1.0 if self.is_enough else self.peak
 
