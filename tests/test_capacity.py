@@ -174,6 +174,13 @@ def test_the_gradient_of_the_loss_is_that_of_its_values():
     np.testing.assert_allclose(slope, (up - down) / 2e-5, rtol=1e-7)
 
 
+def test_four_windows_of_long_rows_are_as_long_as_the_samples_allow():
+    """What adds up along a path, such as friction, is seen in long windows only."""
+    rows = rows_of(*arrays(6, 240))
+    for samples, shape in {1300: (6, 192), 600: (6, 96), 100: (4, 24), 30: (2, SHORT)}.items():
+        assert windows(rows, samples).counts.shape[:2] == shape
+
+
 def test_a_window_says_what_its_part_of_the_path_says():
     given = arrays(1, 40)
     rows = rows_of(*given)

@@ -14,6 +14,7 @@ import pytest
 import scipy.interpolate
 import scipy.linalg
 import scipy.stats
+from scipy.integrate import solve_ivp
 from test_learn import PENDULUM, damped, field_error, logs, moved_by_momentum
 
 import hamkernel as hk
@@ -29,7 +30,7 @@ from hamkernel._trajectories.kalman import as_observations, innovations, smoothe
 from hamkernel._trajectories.likelihood import Model, WhitenedRows, landmark_whitening
 from hamkernel._trajectories.search import losses
 from hamkernel._trajectories.segments import LinearisedSegments
-from hamkernel._trajectories.sensors import timing
+from hamkernel._trajectories.sensors import timing, warn_of_curve
 
 # The filter.
 
@@ -426,6 +427,33 @@ def test_friction_that_the_structure_lacks_is_process_noise_and_said():
     p = np.concatenate(true)[:, 1]
     w = np.concatenate(found.disturbance)[:, 1]
     assert np.corrcoef(p, w)[0, 1] < -0.2
+
+
+TS = np.arange(0.0, 5.0, 0.05)
+
+
+def turned(start, end):
+    ts = np.linspace(0, end, 100)
+    given = (lambda t, x: [x[1], -9.81 * np.sin(x[0])]), (0, end), start
+    return solve_ivp(*given, t_eval=ts, rtol=1e-9, atol=1e-9).y.T
+
+
+@pytest.mark.parametrize(
+    ("states", "said"),
+    [
+        ([np.outer(np.exp(-TS / 0.8), [v, -v / 0.8]) for v in (5.0, 3.0, -4.0)], True),
+        ([np.column_stack([(r - 0.3 * TS) ** 2, -0.6 * (r - 0.3 * TS)]) for r in (2, 1.7)], True),
+        ([turned([1.0, 0.0], 0.4)], False),
+        ([turned([0.0, 15.0], 5.0)], False),
+        ([np.column_stack([1 - 4.9 * TS**2, -9.8 * TS])], False),
+    ],
+    ids=["capacitor", "tank", "quarter swing", "rotation", "fall"],
+)
+def test_what_has_no_inertia_is_told_from_what_moves(states, said):
+    with warnings.catch_warnings(record=True) as seen:
+        warnings.simplefilter("always")
+        warn_of_curve(states)
+    assert bool(seen) == said
 
 
 def test_a_system_without_inertia_is_named_and_its_rate_is_learned():

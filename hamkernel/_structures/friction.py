@@ -194,11 +194,10 @@ class Friction(AbstractMatrixKernel):
             kernel of the result has the number; .1 where nothing is learned, as in `hk.gram`.
             Under `jax.jit` it must be given. Less costs a simulation more steps. A system that
             sticks creeps at about ε instead, and bands do not know of that: of a pendulum with
-            positions to a thousandth .83 of U′ are inside two deviations with ε = .009, about the
-            default (eight logs); of the worst of these motions .70, and .97 with ε = .0007.
-            Trained, it takes up what the log has beside friction: on a real pendulum it rose from a
-            hundredth to a fifth of the largest speed, and the error of rollouts under another
-            controller from .13 to .5 rad.
+            positions to a thousandth .89 of U′ are inside two deviations, fourteen logs
+            (`tests/benchmarks/model_error.py friction`). Trained, it takes up what the log has
+            beside friction: on a real pendulum it rose from a hundredth to a fifth of the largest
+            speed, and the error of rollouts under another controller from .13 to .5 rad.
         stribeck_speed: that of w, the momentum above which it slides.
         damped: the coordinates with friction, counted from 0; the momenta if None.
 

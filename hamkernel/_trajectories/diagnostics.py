@@ -62,10 +62,10 @@ class Whiteness(NamedTuple):
         large, and the gain as wrong (`tests/benchmarks/disturbances.py`).
 
         It does not stand for forces that repeat with the state, which are no scatter: of a drive
-        with cogging .20 of the drift are inside two deviations (`tests/benchmarks/machines.py`). A
-        covariance from the scores of blocks of the runs, the sandwich of Liang and Zeger, is about
-        the field that the kernel comes nearest to, too: .17 to .19 with blocks of 10 to 600 rows.
-        With a term of the kernel for them, whose force and length were given, it is .92.
+        with cogging .24 of the drift are inside two deviations (`tests/benchmarks/machines.py`). A
+        covariance from the scores of blocks of the runs, the sandwich of Liang and Zeger, would not
+        either: it is about the field that the kernel comes nearest to. With a term of the kernel
+        for them, whose force and length were given, it is .92.
         """
         return 1.0 if self.is_enough else self.peak
 
@@ -238,7 +238,7 @@ def warn_of_rest_speed(K: AbstractMatrixKernel, X: Float[np.ndarray, "N d"], n: 
     """Warn of a `Friction` whose dry force fades over much of the momenta in X.
 
     On a drive of at most .25 m/s a rest speed of .1 left the drift 27 % off for 3.7 %, and a free
-    run of 12 s 24 mm for 2.4 (`tests/benchmarks/machines.py`).
+    run of 12 s 20 mm for 2.7 (`tests/benchmarks/machines.py`).
     """
     for part in frictions(K):
         fastest = float(np.abs(X[:, list(damped_coordinates(part.damped, n))]).max())

@@ -320,7 +320,7 @@ def bounds_and_design(
     lengths, scales = called("lengthscale"), called("scale")
     forces = called("viscous", "coulomb", "stribeck")
     # The guesses of friction are numbers without units. Short windows, with which the search
-    # begins, tell none from another: of a cantilever in metres and seconds .1 became .12, for 630.
+    # begins, tell none from another: .1 stays where it is 2e4 a second (`tests/test_friction.py`).
     start = np.where(forces, np.clip(start, low, high), start)
     low, high = np.minimum(low, start), np.maximum(high, start)
     if spacing > 0:

@@ -28,13 +28,8 @@ deviations. Seeds 0 to 2: stiction 5.4 %, 6.4 %, .14 for .0042 rad. Seeds 0 to 1
 .30 %, .61 %, .0024 for .0063, .87. Seeds 0 to 13: friction .07 %, .01 %, .0008 for .0051, .89. One
 run of all, of flexible, is worse than the grey box. Without model error, seeds 7 to 18, the error
 is that of process_noise=0 and no process noise is found. White w alone does not stand for stiction:
-say that there is friction. The gain of `flexible` is .5 % too small, nine deviations, since slow
-motion, whose gain is one, is not what was logged.
-
-`friction`, seeds 0 to 7: U′ .050 %, and inside .83 on average with a rest speed of .009, which the
-default is near; .88 with .003. The motion of seed 4 with other noise, six and four draws: .70 with
-.009 and .97 with .0007. So bands lack the creep of tanh(v/ε) where a step sticks; without friction
-they hold .98 there, eight draws.
+say that there is friction. The gain of `flexible` is too small, since slow motion, whose gain is
+one, is not what was logged.
 """
 
 import argparse
@@ -69,8 +64,7 @@ def velocity_known(s, u):
 def after_friction(v, a, dry, h):
     """The velocity after a time h of constant force a and dry friction, exact where it turns.
 
-    With friction of the velocity after the kick, by steps of half a millisecond, each reversal left
-    up to 2 · dry · h, and the gain that is likeliest was three of its deviations too small.
+    Friction of the velocity after the kick instead is off by up to 2 · dry · h at each reversal.
     """
     slowing = dry - a * np.sign(v)
     if v and slowing * h < abs(v):
