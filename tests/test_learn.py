@@ -455,6 +455,10 @@ def moved_by_momentum(x):
     return jnp.array([x[1], 0.0])
 
 
+def moved_by_momenta(x):
+    return jnp.concatenate([x[2:], jnp.zeros(2)])
+
+
 def with_a_gap(times, states):
     """Logs of which the samples between 2.6 s and 4 s are lost."""
     kept = (times[0] < 2.6) | (times[0] > 4.0)
@@ -466,11 +470,72 @@ def test_no_short_piece_crosses_a_gap():
     data = preprocess(hk.Runs(*with_a_gap(times, states)), None)
     pieces = [(p.start, p.stop) for p in short_pieces(data.runs) if p.run == 1]
     (gap,) = data.runs[1].gaps
-    assert data.runs[1].times[gap] - data.runs[1].times[gap - 1] > 1.4
+    last = np.flatnonzero(np.isfinite(data.runs[1].states[:gap, 0]))[-1]
+    assert data.runs[1].times[gap] - data.runs[1].times[last] > 1.4
     assert gap in [start for start, _ in pieces]
     assert [pieces[0][0], pieces[-1][1]] == [0, len(data.runs[1].times)]
     assert all(a[1] == b[0] for a, b in itertools.pairwise(pieces))
     assert not preprocess(hk.Runs(times, states), None).runs[1].gaps.size  # an even log has none
+
+
+def test_long_intervals_of_an_uneven_run_are_cut_and_an_even_run_is_left():
+    times, states, _ = logs(samples=31)
+    lost = np.zeros(31, bool)
+    lost[[3, 4, 11, 19, 20, 21]] = True  # intervals of two to four times the usual
+    uneven = [t[~lost] for t in times], [x[~lost] for x in states]
+    for t, x, run in zip(*uneven, preprocess(hk.Runs(*uneven), None).runs, strict=True):
+        at = np.searchsorted(run.times, t - 1e-9)
+        np.testing.assert_allclose(run.times[at], t - t[0])
+        np.testing.assert_array_equal(run.states[at], x)
+        assert np.isnan(np.delete(run.states, at, axis=0)).all()
+        assert np.diff(run.times).max() < 1.6 * np.median(np.diff(t)) < np.diff(t).max()
+    for t, run in zip(times, preprocess(hk.Runs(times, states), None).runs, strict=True):
+        np.testing.assert_array_equal(run.times, t - t[0])
+
+
+def orbits(seed=2, samples=60):
+    """Positions, to .5 km, of three satellites at uneven times of six turns, a tenth lost."""
+    rng = np.random.default_rng(seed)
+    times, seen, true = [], [], []
+    for size, eccentricity in ((9000.0, 0.1), (12000.0, 0.25), (15000.0, 0.4)):
+        near = size * (1 - eccentricity)
+        fast = np.sqrt(EARTH * (1 + eccentricity) / near)
+        turns = 12 * np.pi * np.sqrt(size**3 / EARTH)
+        t = np.sort(rng.uniform(0, turns, samples))
+        t[0] = 0
+        phase = rng.uniform(0, 2 * np.pi)
+        c, s = np.cos(phase), np.sin(phase)
+        start = [near * c, near * s, -fast * s, fast * c]
+        found = solve_ivp(
+            attracted, (0, t[-1]), start, method="DOP853", rtol=1e-10, atol=1e-8, t_eval=t
+        )
+        true.append(found.y.T)
+        q = found.y[:2].T + 0.5 * rng.normal(size=(samples, 2))
+        seen.append(np.column_stack([q, np.full(q.shape, np.nan)]))
+        seen[-1][rng.random(samples) < 0.1] = np.nan
+        times.append(t)
+    return times, seen, np.concatenate(true)
+
+
+EARTH = 398600.4418  # km³/s²
+
+
+def attracted(_, x):
+    return np.concatenate([x[2:], -EARTH * x[:2] / np.hypot(*x[:2]) ** 3])
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:learning did not settle")
+@pytest.mark.filterwarnings("ignore:dropped. samples 0 to 0")  # a gap follows it
+def test_orbits_at_uneven_times_have_no_process_noise():
+    times, seen, true = orbits()
+    U = hk.Symplectic(hk.Select(hk.Gaussian(5000.0), (0, 1)))
+    found = hk.learn(U, hk.Runs(times, seen), mean=moved_by_momenta)
+    assert not np.asarray(found.process_noise).any()
+    assert np.asarray(found.kept).min() > 0.95
+    forces = np.array([attracted(0, x)[2:] for x in true])
+    off = np.asarray(found.field.evaluate(jnp.asarray(true)))[:, 2:] - forces
+    assert np.linalg.norm(off) < 0.006 * np.linalg.norm(forces)
 
 
 @pytest.mark.slow

@@ -138,12 +138,9 @@ class End(NamedTuple):
     settled: bool
 
 
-def iterate(
-    task: Task, model: Model, design: np.ndarray, process: bool, most: int, bar: Any
-) -> End:
+def iterate(task: Task, now: Current, most: int, bar: Any) -> End:
     """Gauss-Newton steps until noise and objective settle, at most `most` of them."""
-    runs, step = task.data.runs, iterated_with_process if process else iterated
-    now = (begin_with_process if process else begin)(task, model, design)
+    runs, process = task.data.runs, now.model.is_disturbed
     history: list[Iteration] = []
     pieces: list[Piece] = []
     settled = False
@@ -159,7 +156,7 @@ def iterate(
         else:
             wanted = halved(runs, pieces, now.good)
         before, same, pieces = now, wanted == pieces, wanted
-        now, done = step(task, now, pieces)
+        now, done = (iterated_with_process if process else iterated)(task, now, pieces)
         history.append(done)
         noise = ", ".join(f"{sigma:.3g}" for sigma in np.asarray(done.noise))
         bar.set_postfix_str(f"noise {noise}, kept {float(done.kept):.0%}", refresh=False)
@@ -483,6 +480,17 @@ def noisy_counts(end: End) -> Float[np.ndarray, "S L+1 n"]:
     """How many samples there are where there is noise: zero in coordinates that are exact."""
     task, now = end.task, end.now
     return np.where(without_noise(now.model, task.bounds, task.data.scale), 0, now.rows.counts)
+
+
+def retried(alone: End, process: End, most: int, bar: Any) -> End:
+    """The likelier of `alone` and of where steps without process noise end after those with it.
+
+    With it no path of a rough field has to be followed: each interval is linearised by itself.
+    """
+    model = process.now.model
+    model = model._replace(log_process=jnp.full_like(model.log_process, -jnp.inf))
+    again = iterate(alone.task, process.now._replace(model=model, pushed=1.0), most, bar)
+    return again if evidence(again) < evidence(alone) else alone
 
 
 def likelier(without: End, process: End) -> End:

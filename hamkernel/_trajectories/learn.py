@@ -36,11 +36,13 @@ from hamkernel._trajectories.iteration import (
     Task,
     asks_for_process,
     begin,
+    begin_with_process,
     field_values,
     initial_loss,
     iterate,
     likelier,
     noisy_counts,
+    retried,
     whitening_of,
 )
 from hamkernel._trajectories.kalman import (
@@ -165,8 +167,9 @@ def learn(
         return Task(data, known, S, first, capped, bounds, prior), model, design
 
     def ended(q: np.ndarray, spacing: float = 0.0, impulse: np.ndarray | None = None) -> End:
-        disturbed = bool(q.any()) or impulse is not None
-        return iterate(*asked(q, spacing, impulse), disturbed, most, bar)
+        start = begin_with_process if q.any() or impulse is not None else begin
+        task, model, design = asked(q, spacing, impulse)
+        return iterate(task, start(task, model, design), most, bar)
 
     none = np.zeros(runs.dimension)
     if not runs.is_decided:
@@ -180,16 +183,16 @@ def learn(
         end = alone = ended(none)
         impulse = impulses(K, jnp.asarray(S[:first]), Y, data)
         if asks_for_process(alone, impulse):
-            end = likelier(alone, ended(none, spacing, impulse))
+            end = ended(none, spacing, impulse)
+            if not (alone.settled and alone.now.good.all()):
+                alone = retried(alone, end, most, bar)
+            end = likelier(alone, end)
     bar.close()
     return _learned(runs, mean, end, alone, given is not None, measured)
 
 
 def _first_noise(data: Preprocessed) -> Float[np.ndarray, " n"]:
-    """The noise that smoothing found, of each coordinate.
-
-    It may have found none at all; then a share of 1e-6 of the states begins.
-    """
+    """The noise that smoothing found, of each coordinate; where it is none, 1e-6 of the states."""
     found = np.where(np.isfinite(data.noise), data.noise, data.scale)
     return np.maximum(found, 1e-6 * data.scale)
 
@@ -259,7 +262,7 @@ def _at_all_times(end: End, times: list[np.ndarray]) -> list[Float[np.ndarray, "
     now, data = end.now, end.task.data
     out = []
     for t, run, path in zip(times, data.runs, now.paths, strict=True):
-        if len(path) != len(t):
+        if not np.array_equal(run.times, t - t[0]):
             X, N = run.joined(path), len(path)
             X = np.pad(X, ((0, power_of_two(N) - N), (0, 0)), "edge")  # one program for many logs
             slope = np.asarray(field_values(now.field, jnp.asarray(X)))[:N]
