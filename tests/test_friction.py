@@ -246,3 +246,43 @@ def test_it_works_under_jit_vmap_and_grad():
     step = 1e-5
     more, less = (total(hk.Friction(0.3, 0.5 * np.exp(h), stribeck=0.2)) for h in (step, -step))
     np.testing.assert_allclose(slope, (more - less) / (2 * step), rtol=1e-6)
+
+
+def arm_masses(q):
+    """Two links, angles of the second from the first."""
+    c = jnp.cos(q[1])
+    return jnp.array([[1.9 + 0.8 * c, 0.4 + 0.4 * c], [0.4 + 0.4 * c, 0.4]])
+
+
+def joint_velocities(x):
+    return jnp.linalg.solve(arm_masses(x[:2]), x[2:])
+
+
+def rayleigh(x):
+    v = joint_velocities(x)
+    return jnp.concatenate([v**2 / 2, REST * jnp.logaddexp(v / REST, -v / REST)])
+
+
+def on_joints(x):
+    zero = jnp.zeros((2, 2))
+    return jnp.block([[zero, zero], [zero, -arm_masses(x[:2])]])
+
+
+def test_friction_of_joints_is_that_of_rayleighs_function_and_not_of_the_momenta():
+    rng = np.random.default_rng(1)
+    states, fresh = rng.uniform(-1.5, 1.5, size=(2, 60, 4))
+
+    def rubbed(X):
+        V = np.array([np.linalg.solve(arm_masses(x[:2]), x[2:]) for x in X])
+        return -np.array([0.3, 0.1]) * V - np.array([0.2, 0.5]) * np.tanh(V / REST)
+
+    weight = -3.0 * np.cos(states[:, :2])
+    forces = np.column_stack([np.zeros((60, 2)), weight + rubbed(states)])
+    energy = hk.Symplectic(10.0 * hk.Select(hk.Gaussian(1.5), (0, 1)))
+    joints = hk.Structured(1.0 * hk.Warp(lambda a, b: a @ b, rayleigh), on_joints)
+    off = {}
+    for name, friction in {"joints": joints, "momenta": hk.Friction(rest_speed=REST)}.items():
+        field = hk.fit(hk.Sum(energy=energy, friction=friction), states, forces, 1e-6)
+        found = np.asarray(jax.vmap(field.part("friction"))(fresh))[:, 2:]
+        off[name] = np.linalg.norm(found - rubbed(fresh)) / np.linalg.norm(rubbed(fresh))
+    assert off["joints"] < 0.01 < 0.2 < off["momenta"]

@@ -184,6 +184,20 @@ class Friction(AbstractMatrixKernel):
     the data is for: one more term `Odd(CurlFree(Select(k, 1)))`. The energy of the sum is that of
     its part, `field.part("energy").hamiltonian`.
 
+    A joint between links rubs with its own velocity, (M(q)⁻¹p)ᵢ or the difference of two, and not
+    with a momentum. Such friction is −∂D/∂v of Rayleigh's D(v) = ½ d v² + c ε log cosh v/ε, which
+    is −M(q) ∂D/∂p: a structure with that operator, and a kernel with one product for each term.
+
+        def terms(x):  # v: the velocities of the joints at x = (q, p)
+            v = velocities(x)
+            return jnp.concatenate([v**2 / 2, eps * jnp.logaddexp(v / eps, -v / eps)])
+
+        def operator(x):
+            zero = jnp.zeros((m, m))
+            return jnp.block([[zero, zero], [zero, -M(x[:m])]])
+
+        joints = hk.Structured(1.0 * hk.Warp(lambda a, b: a @ b, terms), operator)
+
     Args:
         viscous: the first guess of d, in units of the momentum's rate over the momentum.
         coulomb: that of c, a force.
