@@ -482,19 +482,18 @@ def noisy_counts(end: End) -> Float[np.ndarray, "S L+1 n"]:
     return np.where(without_noise(now.model, task.bounds, task.data.scale), 0, now.rows.counts)
 
 
-def retried(alone: End, process: End, most: int, bar: Any) -> End:
-    """The likelier of `alone` and of where steps without process noise end after those with it.
+def likelier(without: End, process: End, most: int, bar: Any) -> tuple[End, End]:
+    """The end without process noise, and the likelier of both ends, process noise at its price.
 
-    With it no path of a rough field has to be followed: each interval is linearised by itself.
+    Steps without it that lost their way go on from the field that those with it found, for which no
+    path of a rough field has to be followed: each interval is linearised by itself.
     """
-    model = process.now.model
-    model = model._replace(log_process=jnp.full_like(model.log_process, -jnp.inf))
-    again = iterate(alone.task, process.now._replace(model=model, pushed=1.0), most, bar)
-    return again if evidence(again) < evidence(alone) else alone
-
-
-def likelier(without: End, process: End) -> End:
-    """The likelier of both ends, process noise at its price."""
+    if not (without.settled and without.now.good.all()):
+        model = process.now.model
+        model = model._replace(log_process=jnp.full_like(model.log_process, -jnp.inf))
+        now = process.now._replace(model=model, pushed=1.0)
+        again = iterate(without.task, now, most, bar)
+        without = again if evidence(again) < evidence(without) else without
     pushes = int((process.now.rows.pushed > 1).sum())
     more = price(process, np.asarray(process.now.model.log_process), pushes)
-    return process if evidence(process) + more < evidence(without) else without
+    return without, process if evidence(process) + more < evidence(without) else without

@@ -32,6 +32,7 @@ from hamkernel._trajectories.diagnostics import (
 )
 from hamkernel._trajectories.flow import Expansion
 from hamkernel._trajectories.iteration import (
+    Current,
     End,
     Task,
     asks_for_process,
@@ -42,7 +43,6 @@ from hamkernel._trajectories.iteration import (
     iterate,
     likelier,
     noisy_counts,
-    retried,
     whitening_of,
 )
 from hamkernel._trajectories.kalman import (
@@ -158,35 +158,29 @@ def learn(
     S, first, capped = landmarks(data, None if solver is None else solver.max_points)
     warn_in_advance(K, data, X, first)
 
-    def asked(q: np.ndarray, spacing: float = 0.0, impulse: np.ndarray | None = None):
+    def asked(q: np.ndarray, spacing: float = 0.0, impulse: Any = None) -> tuple[Task, Current]:
         with np.errstate(divide="ignore"):
             model = Model(K, log_noise, jnp.log(jnp.asarray(q)))
         free = measured & (given is None)
         bounds, design = bounds_and_design(model, X, Y, data.scale, free, spacing, impulse)
-        prior = jnp.asarray(100 * data.scale)  # of a start, which says next to nothing
-        return Task(data, known, S, first, capped, bounds, prior), model, design
-
-    def ended(q: np.ndarray, spacing: float = 0.0, impulse: np.ndarray | None = None) -> End:
+        wide = jnp.asarray(100 * data.scale)  # a prior of starts that says next to nothing
+        task = Task(data, known, S, first, capped, bounds, wide)
         start = begin_with_process if q.any() or impulse is not None else begin
-        task, model, design = asked(q, spacing, impulse)
-        return iterate(task, start(task, model, design), most, bar)
+        return task, start(task, model, design)
 
     none = np.zeros(runs.dimension)
     if not runs.is_decided:
-        task, model, design = asked(none)
-        model = begin(task, model, design).model
-        runs, data = decided(runs, data, lambda data: initial_loss(task._replace(data=data), model))
+        task, at = asked(none)
+        runs, data = decided(runs, data, lambda d: initial_loss(task._replace(data=d), at.model))
     spacing = landmark_spacing(X, S[:first], data.scale)
     if process is not None:
-        end, alone = ended(process, spacing if process.any() else 0.0), None
+        end, alone = iterate(*asked(process, spacing * process.any()), most, bar), None
     else:
-        end = alone = ended(none)
+        end = alone = iterate(*asked(none), most, bar)
         impulse = impulses(K, jnp.asarray(S[:first]), Y, data)
         if asks_for_process(alone, impulse):
-            end = ended(none, spacing, impulse)
-            if not (alone.settled and alone.now.good.all()):
-                alone = retried(alone, end, most, bar)
-            end = likelier(alone, end)
+            end = iterate(*asked(none, spacing, impulse), most, bar)
+            alone, end = likelier(alone, end, most, bar)
     bar.close()
     return _learned(runs, mean, end, alone, given is not None, measured)
 
