@@ -114,7 +114,9 @@ def learn(
             flexible part move besides the field. 0 where the structure is the whole truth. If None,
             it is looked for where something says that the structure is not, and kept where the
             marginal likelihood pays for it. Where w is more than three deviations of the rest, as
-            where a hand pushed the system, it has a deviation of its own there.
+            where a hand pushed the system, it has a deviation of its own there. Rollouts over parts
+            of the log that were left out may prefer a share of what is found: on a real pendulum
+            half of it misses by .057 rad for .105 (`tests/benchmarks/real_logs.py`).
         masses: whether states are (q, q̇) with unknown masses instead of (q, p). Their ratios are
             then learned, `learned.kernel.masses`; see `UnknownMasses`, whose kernel K becomes.
             With inputs they are those of the drift, `learned.kernel.drift.masses`.
