@@ -15,7 +15,7 @@ import scipy.interpolate
 import scipy.linalg
 import scipy.stats
 from scipy.integrate import solve_ivp
-from test_learn import PENDULUM, damped, field_error, logs, moved_by_momentum
+from test_learn import PENDULUM, damped, field_error, logs, moved_by_momenta, moved_by_momentum
 
 import hamkernel as hk
 from hamkernel._trajectories.diagnostics import (
@@ -27,8 +27,13 @@ from hamkernel._trajectories.diagnostics import (
 )
 from hamkernel._trajectories.flow import WEIGHTS
 from hamkernel._trajectories.kalman import as_observations, innovations, smoothed_path, whiten
-from hamkernel._trajectories.likelihood import Model, WhitenedRows, landmark_whitening
-from hamkernel._trajectories.search import losses
+from hamkernel._trajectories.likelihood import (
+    Model,
+    WhitenedRows,
+    landmark_whitening,
+    project_out_starts,
+)
+from hamkernel._trajectories.search import gain_of_friction, gain_of_inertia, losses
 from hamkernel._trajectories.segments import LinearisedSegments
 from hamkernel._trajectories.sensors import timing, warn_of_curve
 
@@ -469,3 +474,41 @@ def test_a_system_without_inertia_is_named_and_its_rate_is_learned():
     found = hk.learn(hk.CurlFree(hk.Gaussian(2.0)), runs, progress=False)
     q = jnp.array([[-3.0], [2.0], [4.0]])
     np.testing.assert_allclose(found.field.evaluate(q), -q / tau, atol=0.1)
+
+
+def double_pendulum(_, x):
+    a, b, v, w = x
+    c, s = np.cos(a - b), np.sin(a - b)
+    forces = -s * w**2 - 12 * np.sin(a), s * v**2 - 6 * np.sin(b)
+    return [v, w, *np.linalg.solve([[2, c], [c, 1]], forces)]
+
+
+def coupled_pendula(_, x):
+    a, b, v, w = x
+    pull = 2 * (a - b)
+    return [v, w, -6 * np.sin(a) - pull - 0.2 * v, -6 * np.sin(b) + pull - 0.2 * w]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("system", [double_pendulum, coupled_pendula])
+def test_a_mass_matrix_that_depends_on_the_positions_is_told_from_friction(system, monkeypatch):
+    rng, t, gains = np.random.default_rng(0), np.linspace(0, 4, 80), []
+    states = []
+    for _ in range(4):
+        start = [*rng.uniform(-1.8, 1.8, 2), 0, 0]
+        q = solve_ivp(system, (0, 4), start, rtol=1e-9, atol=1e-9, t_eval=t).y[:2].T
+        q = q + 0.005 * rng.normal(size=q.shape)
+        states.append(np.column_stack([q, np.full(q.shape, np.nan)]))
+
+    def first_rows(task, now, most, bar):
+        rows = now.rows, task.start_deviation, project_out_starts, task.data
+        for gain in (gain_of_friction, gain_of_inertia):
+            gains.append(gain(now.model, now.field.points, *rows))
+        raise StopIteration
+
+    monkeypatch.setattr("hamkernel._trajectories.learn.iterate", first_rows)
+    K = hk.Symplectic(100.0 * hk.Select(hk.Gaussian(1.5), (0, 1)))
+    with pytest.raises(StopIteration):
+        hk.learn(K, hk.Runs([t] * 4, states), mean=moved_by_momenta)
+    friction, inertia = gains
+    assert (inertia > max(10, 3 * friction)) == (system is double_pendulum)

@@ -92,6 +92,7 @@ class FitQuality(NamedTuple):
             given or more would take too long; else 0.
         between: how inputs go on in a likelier way than was said; "" if they do not.
         gained: by how much friction in the kernel raises log p; 0 where that was not computed.
+        bent: the same of forces that go with the squares of the velocities.
         has_momenta: whether half of the coordinates are momenta, on which friction can act.
         has_friction: whether the kernel has a `Friction`.
     """
@@ -112,6 +113,7 @@ class FitQuality(NamedTuple):
     few: int = 0
     between: str = ""
     gained: float = 0.0
+    bent: float = 0.0
     has_momenta: bool = False
     has_friction: bool = False
 
@@ -163,6 +165,12 @@ def explains(chi_squared: float, free: float) -> bool:
 
 def _lacked(fit: FitQuality) -> str:
     """The forces that the kernel may lack, with the kernel to add, in words."""
+    if fit.bent > max(_FEW, 3 * fit.gained):  # see `gain_of_inertia`
+        return (
+            "a mass matrix that depends on the positions, as that of links: with forces of the "
+            f"squares of the velocities log p would be {fit.bent:.0f} larger. Velocities are no "
+            "momenta there; give the kinetic energy in mean, with p = M(q) v"
+        )
     if fit.gained > _FEW:
         return (
             f"friction, with which log p would be {fit.gained:.0f} larger: add hk.Friction() to "

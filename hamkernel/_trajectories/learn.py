@@ -64,6 +64,7 @@ from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.search import (
     bounds_and_design,
     gain_of_friction,
+    gain_of_inertia,
     impulses,
     landmark_spacing,
     limited_by_landmarks,
@@ -317,7 +318,8 @@ def _with_causes(fit: FitQuality, runs: Runs, end: End, alone: End | None) -> Fi
         free = task.bounds.free[-2 * runs.dimension : -runs.dimension].any()  # the noise
         fit = fit._replace(few=used * limited_by_landmarks(*given, capped and bool(free)))
     if fit.has_momenta and (fit.is_disturbed or not fit.white.is_enough):
-        fit = fit._replace(gained=gain_of_friction(*given, task.data))
+        gained, bent = (gain(*given, task.data) for gain in (gain_of_friction, gain_of_inertia))
+        fit = fit._replace(gained=gained, bent=bent)
     if fit.white.is_enough:
         return fit
     return fit._replace(between=likelier_between(runs, end if alone is None else alone))
