@@ -122,12 +122,13 @@ def test_landmarks_that_a_solve_of_some_seconds_cannot_carry_are_known_and_named
     t = np.linspace(0.0, 2.0, 21)
     states = [np.column_stack([np.cos(t + i), -np.sin(t + i)]) * (1 + i / 20) for i in range(20)]
     data = preprocessing.preprocess(hk.Runs([t] * 20, states), None)
-    sizes = []
+    found = []
     for work in (3e7, 1e10):  # that of a solve with 96 landmarks, and more than all
         monkeypatch.setattr(preprocessing, "_WORK", work)
-        S, first, capped = preprocessing.landmarks(data, None)
-        sizes.append((len(S), first, capped))
-    assert sizes == [(96, 48, True), (400, 48, False)]
+        monkeypatch.setattr(preprocessing, "_MOST_WORK", 4 * work)
+        S, *sizes = preprocessing.landmarks(data, None)
+        found.append((len(S), *sizes))
+    assert found == [(192, 48, 96, True), (400, 48, 400, False)]
     with pytest.warns(UserWarning, match=r"limited by its 96 landmarks.*max_points=192"):
         warn_of_landmarks(SimpleNamespace(few=96))
 
@@ -213,30 +214,33 @@ def test_few_rows_are_all_searched_and_many_are_not():
 
 
 def test_landmarks_are_doubled_while_the_rows_become_likelier():
-    """On rows of a rough field; those of a smooth one are content with the first."""
+    """On rows of a rough field; those of a smooth one are content with the first.
+
+    To more than are quick, 64 or 32, where they become likelier by ½ log 2 for each degree of
+    freedom: not with much noise.
+    """
     rng = np.random.default_rng(0)
     S = rng.uniform(-1, 1, (64, 2))
     spans, path, nodes, _, _ = arrays(16, 12)
     nodes = jnp.asarray(rng.uniform(-1, 1, nodes.shape))
     counts, limited = [], []
-    for length in (0.2, 3.0):
+    for length, noise in ((0.2, 0.01), (0.2, 1.0), (3.0, 0.01)):
         truth = hk.Symplectic(1.0 * hk.Gaussian(length))
         centres = jnp.asarray(rng.uniform(-1, 1, (200, 2)))
         K = hk.gram(truth, nodes.reshape(-1, 2), centres).reshape(*nodes.shape, -1)
         f = K @ jnp.asarray(rng.standard_normal(400)) / 10
         steps = jnp.einsum("slka,k,sl->sla", f, jnp.array([5, 8, 5]) / 18, spans)
         x = jnp.pad(jnp.cumsum(steps, axis=1), ((0, 0), (1, 0), (0, 0)))
-        noisy = x + 0.01 * jnp.asarray(rng.standard_normal(x.shape))
+        noisy = x + noise * jnp.asarray(rng.standard_normal(x.shape))
         rows = rows_of(spans, path, nodes, jnp.zeros_like(nodes), noisy)
-        model = Model(truth, jnp.log(jnp.full(2, 0.01)), NONE)
+        model = Model(truth, jnp.log(jnp.full(2, noise)), NONE)
         none = np.zeros(len(model.flat))
-        bounds = Bounds(none, none, none > 0)
-        found = solved(model, S, 16, rows, WIDE, project_out_starts, bounds)[1]
-        counts.append(len(found.points))
-        given = model, jnp.asarray(S[:16]), rows, WIDE, project_out_starts
-        limited.append(limited_by_landmarks(*given))
-    assert counts == [64, 16]
-    assert limited == [True, False]
+        given, bounds = (rows, WIDE, project_out_starts), Bounds(none, none, none > 0)
+        found = [solved(model, S, 16, quick, *given, bounds)[1] for quick in (64, 32)]
+        counts.append([len(each.points) for each in found])
+        limited.append(limited_by_landmarks(model, jnp.asarray(S[:16]), *given))
+    assert counts == [[64, 64], [64, 32], [16, 16]]
+    assert limited == [True, True, False]
 
 
 @pytest.mark.parametrize("size", [10, _machine._SMALL + 1])

@@ -37,6 +37,12 @@ class Expansion(eqx.Module):
         return learned if self.mean is None else self.mean(x).astype(x.dtype) + learned
 
 
+@compiled_by_size
+def field_values(field: Expansion, X: Float[Array, "N d"]) -> Float[Array, "N n"]:
+    """The field at many points."""
+    return jax.vmap(field)(X)
+
+
 def with_tangent(
     field: Callable[[Array], Array], s: Float[Array, " d"], n: int
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:

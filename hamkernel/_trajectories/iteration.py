@@ -8,7 +8,6 @@ rows are whitened by a Kalman filter.
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -18,6 +17,7 @@ from hamkernel._trajectories.diagnostics import SETTLED, whiteness
 from hamkernel._trajectories.flow import (
     Expansion,
     Segments,
+    field_values,
     shoot,
     steps_for,
     stiffness,
@@ -44,6 +44,7 @@ from hamkernel._trajectories.likelihood import (
 from hamkernel._trajectories.preprocessing import Preprocessed
 from hamkernel._trajectories.search import (
     Bounds,
+    agree,
     begun,
     limited_by_landmarks,
     losses,
@@ -80,7 +81,8 @@ class Task(NamedTuple):
         mean: what is known.
         S: the landmarks, as many as may be used.
         first: how many of them learning begins with.
-        capped: whether `S` are fewer than the intervals, since more would take too long.
+        quick: how many a solve of a second or two carries.
+        capped: whether these are fewer than the intervals.
         bounds: the box of hyperparameters.
         start_deviation: of the prior of starts.
     """
@@ -89,6 +91,7 @@ class Task(NamedTuple):
     mean: Any
     S: Float[np.ndarray, "m d"]
     first: int
+    quick: int
     capped: bool
     bounds: Bounds
     start_deviation: Float[Array, " n"]
@@ -107,6 +110,7 @@ class Current(NamedTuple):
         squares: the sum of their squared normalised residuals.
         free: the degrees of freedom that are left.
         pushed: by how much larger the deviation of w is in the intervals of the segments.
+        known: whether two searches on windows agreed on the kernel, which then stays.
     """
 
     model: Model
@@ -118,6 +122,7 @@ class Current(NamedTuple):
     squares: float
     free: float
     pushed: Array | float = 1.0
+    known: bool = False
 
 
 class End(NamedTuple):
@@ -159,7 +164,8 @@ def iterate(task: Task, now: Current, most: int, bar: Any) -> End:
         now, done = (iterated_with_process if process else iterated)(task, now, pieces)
         history.append(done)
         noise = ", ".join(f"{sigma:.3g}" for sigma in np.asarray(done.noise))
-        bar.set_postfix_str(f"noise {noise}, kept {float(done.kept):.0%}", refresh=False)
+        said = f"{len(now.field.points)} landmarks, noise {noise}, kept {float(done.kept):.0%}"
+        bar.set_postfix_str(said, refresh=False)
         bar.update()
         if not same or i <= _SHORT_ROUNDS:
             continue
@@ -203,14 +209,13 @@ def _first(
     S = task.S[:count]
     model, _ = most_likely(model, S, *given, task.bounds, _SEARCH, whitening)
     S = task.S if searched(jnp.asarray(S), rows)[1] is not rows else S
-    model, found = solved(model, S, task.first, *given, whitening, task.bounds)
+    model, found = solved(model, S, task.first, task.quick, *given, whitening, task.bounds)
     return model, found, Expansion(model.kernel, found.points, found.coefficients, task.mean), S
 
 
 def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, Iteration]:
     """One Gauss-Newton step: linearisation along the current field, closed form, line search."""
-    runs = task.data.runs
-    segments = segmented(runs, pieces, now.paths)
+    segments = segmented(task.data.runs, pieces, now.paths)
     count = steps_for(np.asarray(segments.spans), _stiffness(now.field, task.data, now.paths))
     steps = jnp.asarray(count)
     before = shoot(
@@ -232,7 +237,9 @@ def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, It
     # linearisation misses: of positions with gaps a lengthscale of 2.2 became 1, and the field
     # kept ripples, an error of .016 for .0014.
     longer = segments.counts.shape[1] > now.rows.counts.shape[1]
-    model, found, S, between = _solved(task, now, rows, project_out_starts, longer)
+    model, found, S, between = _solved(task, now, rows, project_out_starts, longer or now.known)
+    of_windows = searched(found.points, rows)[1] is not rows
+    known = was_asked and not longer and of_windows and agree(now.model, model)
 
     def trial(share: float) -> _Trial:
         weights, field = between(share)
@@ -249,7 +256,7 @@ def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, It
     paths = _updated(now.paths, pieces, good, best.x)
     step = _described(task, pieces, good, best, gain, taken, model, found.loss)
     free = float(found.free)
-    return Current(model, best.field, S, rows, paths, good, best.squares, free), step
+    return Current(model, best.field, S, rows, paths, good, best.squares, free, known=known), step
 
 
 class _Trial(NamedTuple):
@@ -270,7 +277,7 @@ def _solved(
     model, given, used = now.model, (rows, task.start_deviation), len(now.field.points)
     if not held:
         model, _ = most_likely(model, now.S[:used], *given, task.bounds, _SEARCH, whitening)
-    model, found = solved(model, now.S, used, *given, whitening, task.bounds)
+    model, found = solved(model, now.S, used, task.quick, *given, whitening, task.bounds)
     # The current field in the new basis: the one with its values at the landmarks.
     S = found.points
     T = _landmark_whitening(model.kernel, S)
@@ -352,8 +359,7 @@ def iterated_with_process(
         squares = float(squares) if np.isfinite(squares) else np.inf
         return _Trial(squares + float(weights @ weights), squares, field, np.asarray(there))
 
-    any_good = bool(good.any())
-    gain, taken, best = _searched(trial, any_good)
+    gain, taken, best = _searched(trial, bool(good.any()))
     good = np.asarray(good)[: len(pieces)]
     paths = _updated(now.paths, pieces, good, best.x)
     step = _described(task, pieces, good, best, gain, taken, model, found.loss)
@@ -428,12 +434,6 @@ def changed(task: Task, before: Current, now: Current) -> float:
     return float(np.linalg.norm(new - old) / max(np.linalg.norm(new), np.finfo(float).tiny))
 
 
-@compiled_by_size
-def field_values(field: Expansion, X: Float[Array, "N d"]) -> Float[Array, "N n"]:
-    """The field at many points."""
-    return jax.vmap(field)(X)
-
-
 def price(end: End, impulse: Float[np.ndarray, " n"], pushes: int = 0) -> float:
     """The gain in log p that pays for process noise: Schwarz's ½ log N for each deviation of w."""
     count = np.isfinite(impulse).sum() + pushes
@@ -443,6 +443,14 @@ def price(end: End, impulse: Float[np.ndarray, " n"], pushes: int = 0) -> float:
 def whitening_of(model: Model) -> Whitening:
     """The function that whitens the rows of this model."""
     return whiten if model.is_disturbed else project_out_starts
+
+
+def asks_for_landmarks(end: End) -> bool:
+    """Whether the rows are likelier with more landmarks, at less noise too if time is the limit."""
+    (task, now), n = end[:2], len(end.task.data.scale)
+    given = now.model, now.field.points, now.rows, task.start_deviation, whitening_of(now.model)
+    capped = task.capped and len(now.field.points) >= task.quick
+    return limited_by_landmarks(*given, capped and bool(task.bounds.free[-2 * n : -n].any()))
 
 
 def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
@@ -455,14 +463,14 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     """
     now, task = end.now, end.task
     given = now.field.points, now.rows, task.start_deviation
-    if task.capped and task.first == len(task.S):
+    if task.capped and task.first == task.quick:
         return False
     if not (end.settled and now.good.all()):
         return True
     counts = noisy_counts(end)
     if not counts.any():
         return False
-    if limited_by_landmarks(now.model, *given, project_out_starts):
+    if asks_for_landmarks(end):
         return False
     z = innovations(whitened_rows(now.model, *given), now.rows)
     if not whiteness(z, counts).is_enough:

@@ -251,7 +251,7 @@ def innovations(made: WhitenedRows, rows: LinearisedSegments) -> Float[np.ndarra
         root: Any = np.linalg.qr(np.concatenate([np.eye(len(y)), V.T]), mode="r")
         L = root.T * np.sign(np.diagonal(root))[None]
         out[at] = solve_triangular(L, y - V @ v, lower=True)
-        # A triangle above a block of d rows, in 2 d q² operations; a plain QR took 18 s of q = 2048.
+        # A triangle above a block of d rows, in 2 d q² operations; a plain QR took 18 s, q = 2048.
         both = np.column_stack([A, y])
         # It turns 32 columns at once; 16 to 64 take as long.
         known, *_ = lapack.dtpqrt(0, min(32, q + 1), known, both)  # type: ignore[attr-defined]

@@ -30,15 +30,15 @@ from hamkernel._trajectories.diagnostics import (
     warn_in_advance,
     whiteness,
 )
-from hamkernel._trajectories.flow import Expansion
+from hamkernel._trajectories.flow import Expansion, field_values
 from hamkernel._trajectories.iteration import (
     Current,
     End,
     Task,
+    asks_for_landmarks,
     asks_for_process,
     begin,
     begin_with_process,
-    field_values,
     initial_loss,
     iterate,
     likelier,
@@ -67,7 +67,6 @@ from hamkernel._trajectories.search import (
     gain_of_inertia,
     impulses,
     landmark_spacing,
-    limited_by_landmarks,
 )
 from hamkernel._trajectories.segments import Piece
 from hamkernel._trajectories.sensors import timing, warn_of_curve, warn_of_timing
@@ -109,7 +108,8 @@ def learn(
         solver: `hk.Nystrom(max_points=…)` sets how many landmarks carry the field, points that
             cover the paths. If None, 48 for n = 2 and 80 for n = 4, inputs counted as coordinates,
             and twice as many while the marginal likelihood grows by more than its error, as long
-            as a solve takes some seconds; a warning says where the runs ask for more.
+            as a solve takes one or two seconds, and up to ten where it says that half of what is
+            left is theirs; a warning says where the runs ask for more.
         process_noise: the intensity q of white noise w in ẋ = f(x, u) + w, in units of the states
             over √time, a number or one for each coordinate, shape (n,): what stiction, timing or a
             flexible part move besides the field. 0 where the structure is the whole truth. If None,
@@ -158,7 +158,7 @@ def learn(
         Y = Y - np.asarray(jax.vmap(known)(jnp.asarray(X)))
     log_noise = jnp.log(jnp.asarray(_first_noise(data) if given is None else given))
     K = with_rest_speed(K, jnp.asarray(X), runs.dimension)
-    S, first, capped = landmarks(data, None if solver is None else solver.max_points)
+    S, first, quick, capped = landmarks(data, None if solver is None else solver.max_points)
     warn_in_advance(K, data, X, first)
 
     def asked(q: np.ndarray, spacing: float = 0.0, impulse: Any = None) -> tuple[Task, Current]:
@@ -167,7 +167,7 @@ def learn(
         free = measured & (given is None)
         bounds, design = bounds_and_design(model, X, Y, data.scale, free, spacing, impulse)
         wide = jnp.asarray(100 * data.scale)  # a prior of starts that says next to nothing
-        task = Task(data, known, S, first, capped, bounds, wide)
+        task = Task(data, known, S, first, quick, capped, bounds, wide)
         start = begin_with_process if q.any() or impulse is not None else begin
         return task, start(task, model, design)
 
@@ -313,10 +313,8 @@ def _with_causes(fit: FitQuality, runs: Runs, end: End, alone: End | None) -> Fi
     """The same with what would make the rows likelier: the causes that warnings name."""
     now, task, used = end.now, end.task, len(end.now.field.points)
     given = now.model, now.field.points, now.rows, task.start_deviation, whitening_of(now.model)
-    capped = task.capped and used == len(task.S)
-    if capped or not fit.white.is_enough:
-        free = task.bounds.free[-2 * runs.dimension : -runs.dimension].any()  # the noise
-        fit = fit._replace(few=used * limited_by_landmarks(*given, capped and bool(free)))
+    if (task.capped and used >= task.quick) or not fit.white.is_enough:
+        fit = fit._replace(few=used * asks_for_landmarks(end))
     if fit.has_momenta and (fit.is_disturbed or not fit.white.is_enough):
         gained, bent = (gain(*given, task.data) for gain in (gain_of_friction, gain_of_inertia))
         fit = fit._replace(gained=gained, bent=bent)

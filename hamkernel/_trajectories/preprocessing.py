@@ -20,10 +20,12 @@ from hamkernel._trajectories.flow import NODES, with_tangent
 from hamkernel._trajectories.runs import Between, Runs, at_nodes, at_samples
 from hamkernel._trajectories.smoothing import Coordinate, interpolated, processes, smoothed
 
-# Rows times columns², 1 to 2 s for each solve. 20 runs of 50 samples with n = 8 have 128 landmarks
-# with it. With 256 a solve takes 6.5 s, and the field's error would be .0105 for .0145; with 512
-# and 768 it is .0105 too (`tests/benchmarks/capacity.py chain`).
-_WORK = 1e10
+# Rows times columns², 1 to 2 s for each solve, and up to ten where half of what is left is said to
+# be that of landmarks. 20 runs of 50 samples with n = 8 have 128 landmarks; with 256 a solve takes
+# 6.5 s, and the field's error would be .0105 for .0145; with 512 and 768 it is .0105 too. 400 runs
+# of a double pendulum have 640, and rollouts with an error of .0056; with 160 they have .033
+# (`tests/benchmarks/capacity.py`).
+_WORK, _MOST_WORK = 1e10, 5e10
 _POINTS = 1024  # from which boxes are taken, and landmarks if there are not more intervals
 
 
@@ -381,10 +383,12 @@ def first_landmarks(d: int) -> int:
     return {1: 24, 2: 48, 3: 64, 4: 80}.get(d, 128)
 
 
-def landmarks(data: Preprocessed, count: int | None) -> tuple[Float[np.ndarray, "m d"], int, bool]:
-    """Points of the paths, of which the first cover them, how many to begin with, and the cap.
+def landmarks(
+    data: Preprocessed, count: int | None
+) -> tuple[Float[np.ndarray, "m d"], int, int, bool]:
+    """Points of the paths, how many of them to begin with, how many are quick, and the cap.
 
-    The last is whether there are fewer than intervals, since more would take too long.
+    The last is whether quick ones are fewer than intervals.
 
     Each is the one farthest from those before, in standard deviations. They do not depend on
     hyperparameters, which are not known yet. There are at most as many as intervals: of a field on
@@ -396,12 +400,14 @@ def landmarks(data: Preprocessed, count: int | None) -> tuple[Float[np.ndarray, 
     """
     n, used = len(data.scale), zip(data.runs, data.usable, strict=True)
     intervals = max(sum(len(run.times) - 1 for run, use in used if use), 1)
-    affordable = int((_WORK / (n * intervals)) ** 0.5) // n
-    X, _ = sampled(data, max(_POINTS, min(intervals, 2 * affordable)))
+    affordable = (np.array([_WORK, _MOST_WORK]) / (n * intervals)) ** 0.5 // n
+    X, _ = sampled(data, max(_POINTS, min(intervals, 2 * int(affordable[1]))))
     first = first_landmarks(X.shape[1])
     # They are doubled: a last step to a few more would cost a compilation and a solve.
-    affordable = first * 2 ** int(np.log2(max(affordable / first, 1)))
-    most = max(first, min(intervals, affordable)) if count is None else count
+    affordable = first * 2 ** np.log2(np.maximum(affordable / first, 1)).astype(int)
+    quick, most = np.maximum(first, np.minimum(intervals, affordable)).tolist()
+    if count is not None:
+        first = quick = most = count
     spread = X[:, n:].std(axis=0)  # of the inputs
     points = X / np.concatenate([data.scale, np.where(spread > 0, spread, 1.0)])[None]
     chosen = [int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
@@ -411,5 +417,5 @@ def landmarks(data: Preprocessed, count: int | None) -> tuple[Float[np.ndarray, 
         if not distance.max() > 0:
             break
         chosen.append(int(np.argmax(distance)))
-    capped = count is None and most < intervals
-    return X[chosen], min(len(chosen), first if count is None else count), capped
+    capped = count is None and quick < intervals
+    return X[chosen], min(len(chosen), first), min(len(chosen), quick), capped
