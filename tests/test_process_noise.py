@@ -185,10 +185,10 @@ def test_innovations_are_those_of_the_dense_cholesky_factor():
 
 
 @pytest.mark.parametrize("size", [1.0, 1e4])
-def test_segment_after_segment_innovations_are_those_of_all_rows_together(size):
+def test_block_after_block_innovations_are_those_of_all_rows_together(size):
     rng = np.random.default_rng(0)
-    M, r = size * rng.standard_normal((3 * 8, 10)), rng.standard_normal(3 * 8)
-    rows = segment()._replace(residual=jnp.zeros((3, 4, 2)))
+    M, r = size * rng.standard_normal((75 * 8, 10)), rng.standard_normal(75 * 8)
+    rows = segment()._replace(residual=jnp.zeros((75, 4, 2)))
     z = innovations(WhitenedRows(jnp.asarray(M), jnp.asarray(r), jnp.zeros(()), None), rows)
     root = np.linalg.qr(np.concatenate([np.eye(len(r)), M.T]), mode="r")
     L = root.T * np.sign(np.diagonal(root))
