@@ -37,6 +37,7 @@ from hamkernel._trajectories.likelihood import (
     ClosedForm,
     Model,
     Whitening,
+    agree,
     closed_form,
     landmark_whitening,
     project_out_starts,
@@ -44,7 +45,6 @@ from hamkernel._trajectories.likelihood import (
 from hamkernel._trajectories.preprocessing import Preprocessed
 from hamkernel._trajectories.search import (
     Bounds,
-    agree,
     begun,
     limited_by_landmarks,
     losses,
@@ -65,6 +65,7 @@ from hamkernel._trajectories.segments import (
     segmented,
     short_pieces,
     smoothed_rows,
+    updated,
 )
 
 _ROUNDS = 4  # Levenberg steps before a segment is judged: without them up to 40 % were lost
@@ -253,7 +254,7 @@ def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, It
 
     gain, taken, best = _searched(trial, bool(good.any()))
     good = good[: len(pieces)]
-    paths = _updated(now.paths, pieces, good, best.x)
+    paths = updated(now.paths, pieces, good, best.x)
     step = _described(task, pieces, good, best, gain, taken, model, found.loss)
     free = float(found.free)
     return Current(model, best.field, S, rows, paths, good, best.squares, free, known=known), step
@@ -326,7 +327,7 @@ def begin_with_process(task: Task, model: Model, design: np.ndarray) -> Current:
     good = good[: len(pieces)]
     paths = [run.path for run in runs]
     x = _on_segments(paths, pieces, segments)
-    paths = _updated(paths, pieces, good, x + np.asarray(moves))
+    paths = updated(paths, pieces, good, x + np.asarray(moves))
     return Current(model, field, S, rows, paths, good, np.inf, float(found.free), pushed)
 
 
@@ -361,7 +362,7 @@ def iterated_with_process(
 
     gain, taken, best = _searched(trial, bool(good.any()))
     good = np.asarray(good)[: len(pieces)]
-    paths = _updated(now.paths, pieces, good, best.x)
+    paths = updated(now.paths, pieces, good, best.x)
     step = _described(task, pieces, good, best, gain, taken, model, found.loss)
     free = float(found.free)
     return Current(model, best.field, S, rows, paths, good, best.squares, free, pushed), step
@@ -405,15 +406,6 @@ def _on_segments(paths, pieces: list[Piece], segments: Segments) -> Float[np.nda
         x[s] = paths[r][stop - 1]
         x[s, : stop - start] = paths[r][start:stop]
     return x
-
-
-def _updated(paths, pieces: list[Piece], good, x: np.ndarray) -> list[np.ndarray]:
-    """The paths, with those of the pieces that were kept replaced by x."""
-    new = [path.copy() for path in paths]
-    for s, (r, start, stop) in enumerate(pieces):
-        if good[s] and np.isfinite(x[s]).all():
-            new[r][start:stop] = x[s, : stop - start]
-    return new
 
 
 _landmark_whitening = compiled_by_size(landmark_whitening)

