@@ -489,6 +489,10 @@ def coupled_pendula(_, x):
     return [v, w, -6 * np.sin(a) - pull - 0.2 * v, -6 * np.sin(b) + pull - 0.2 * w]
 
 
+def with_centrifugal_forces(x):
+    return moved_by_momenta(x) + jnp.array([0.0, 0.0, 0.1, 0.0]) * jnp.sin(x[0]) * x[3] ** 2
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("system", [double_pendulum, coupled_pendula])
 def test_a_mass_matrix_that_depends_on_the_positions_is_told_from_friction(system, monkeypatch):
@@ -502,8 +506,9 @@ def test_a_mass_matrix_that_depends_on_the_positions_is_told_from_friction(syste
 
     def first_rows(task, now, most, bar):
         rows = now.rows, task.start_deviation, project_out_starts, task.data
-        for gain in (gain_of_friction, gain_of_inertia):
-            gains.append(gain(now.model, now.field.points, *rows))
+        given = now.model, now.field.points, *rows
+        gains.extend([gain_of_friction(*given), gain_of_inertia(*given, task.mean)])
+        assert gain_of_inertia(*given, with_centrifugal_forces) == 0
         raise StopIteration
 
     monkeypatch.setattr("hamkernel._trajectories.learn.iterate", first_rows)

@@ -316,8 +316,8 @@ def _with_causes(fit: FitQuality, runs: Runs, end: End, alone: End | None) -> Fi
     if (task.capped and used >= task.quick) or not fit.white.is_enough:
         fit = fit._replace(few=used * asks_for_landmarks(end))
     if fit.has_momenta and (fit.is_disturbed or not fit.white.is_enough):
-        gained, bent = (gain(*given, task.data) for gain in (gain_of_friction, gain_of_inertia))
-        fit = fit._replace(gained=gained, bent=bent)
+        bent = gain_of_inertia(*given, task.data, task.mean)
+        fit = fit._replace(gained=gain_of_friction(*given, task.data), bent=bent)
     if fit.white.is_enough:
         return fit
     return fit._replace(between=likelier_between(runs, end if alone is None else alone))
