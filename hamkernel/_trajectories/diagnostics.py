@@ -92,7 +92,7 @@ class FitQuality(NamedTuple):
             given or more would take too long; else 0.
         between: how inputs go on in a likelier way than was said; "" if they do not.
         gained: by how much friction in the kernel raises log p; 0 where that was not computed.
-        bent: the same of forces that go with the squares of the velocities.
+        bent: the same of forces that are quadratic in the velocities.
         has_momenta: whether half of the coordinates are momenta, on which friction can act.
         has_friction: whether the kernel has a `Friction`.
     """
@@ -167,8 +167,8 @@ def _lacked(fit: FitQuality) -> str:
     """The forces that the kernel may lack, with the kernel to add, in words."""
     if fit.bent > max(_FEW, 3 * fit.gained):  # see `gain_of_inertia`
         return (
-            "a mass matrix that depends on the positions, as that of links: with forces of the "
-            f"squares of the velocities log p would be {fit.bent:.0f} larger. Velocities are no "
+            "a mass matrix that depends on the positions, as that of links: with forces quadratic "
+            f"in the velocities log p would be {fit.bent:.0f} larger. Velocities are no "
             "momenta there; give the kinetic energy in mean, with p = M(q) v"
         )
     if fit.gained > _FEW:

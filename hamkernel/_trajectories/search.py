@@ -299,7 +299,7 @@ def gain_of_inertia(
     data: Preprocessed,
     mean: Any,
 ) -> float:
-    """The gain of log p from forces that go with the squares of the velocities, beside the drift.
+    """The gain of log p from forces that are quadratic in the velocities, beside the drift.
 
     Velocities are no momenta where a mass matrix depends on the positions, and ½ vᵀ∂M/∂q v is such
     a force. They are the gradient in v of g(q, v), of degree three in v. It is 0 where the mean has
