@@ -20,6 +20,7 @@ from hamkernel._trajectories.diagnostics import warn_of_cost, warn_of_landmarks
 from hamkernel._trajectories.flow import Segments
 from hamkernel._trajectories.likelihood import (
     Model,
+    agree,
     closed_form,
     condensed,
     conditional,
@@ -241,6 +242,15 @@ def test_landmarks_are_doubled_while_the_rows_become_likelier():
         limited.append(limited_by_landmarks(model, jnp.asarray(S[:16]), *given))
     assert counts == [[64, 64], [64, 32], [16, 16]]
     assert limited == [True, True, False]
+
+
+def test_kernels_agree_to_a_tenth_whatever_the_noise():
+    one, close, far = (
+        Model(hk.Symplectic(size * hk.Gaussian(2.0)), jnp.log(jnp.full(2, noise)), NONE)
+        for size, noise in ((1.0, 0.1), (1.09, 1e-3), (1.2, 0.1))
+    )
+    assert agree(one, close)
+    assert not agree(one, far)
 
 
 @pytest.mark.parametrize("size", [10, _machine._SMALL + 1])

@@ -6,6 +6,7 @@ import functools
 import itertools
 import re
 import warnings
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ import hamkernel as hk
 from hamkernel._trajectories.diagnostics import (
     autocorrelations,
     ljung_box,
+    warn_of_process,
     warn_of_rest_speed,
     warn_of_units,
     whiteness,
@@ -487,6 +489,23 @@ def coupled_pendula(_, x):
     a, b, v, w = x
     pull = 2 * (a - b)
     return [v, w, -6 * np.sin(a) - pull - 0.2 * v, -6 * np.sin(b) + pull - 0.2 * w]
+
+
+@pytest.mark.parametrize(("n", "said"), [(2, False), (4, True)])
+@pytest.mark.parametrize(("gained", "has_friction"), [(0.0, False), (0.0, True), (50.0, False)])
+def test_friction_of_joints_is_spoken_of_where_there_may_be_links(n, said, gained, has_friction):
+    fit = SimpleNamespace(
+        process=np.ones(n),
+        misfit=np.ones((1, n)),
+        driven=False,
+        gained=gained,
+        bent=0.0,
+        has_momenta=True,
+        has_friction=has_friction,
+    )
+    with pytest.warns(UserWarning, match="friction") as seen:
+        warn_of_process(fit)
+    assert ("joints between links" in str(seen[0].message)) == said
 
 
 def with_centrifugal_forces(x):

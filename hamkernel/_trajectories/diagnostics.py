@@ -171,21 +171,21 @@ def _lacked(fit: FitQuality) -> str:
             f"in the velocities log p would be {fit.bent:.0f} larger. Velocities are no "
             "momenta there; give the kinetic energy in mean, with p = M(q) v"
         )
+    # `Friction` acts on each momentum by itself.
+    joints = "; joints between links have a kernel of their own, in the docstring of hk.Friction"
+    joints = joints if fit.misfit.shape[1] > 2 else ""
     if fit.gained > _FEW:
         return (
             f"friction, with which log p would be {fit.gained:.0f} larger: add hk.Friction() to "
-            "the drift, hk.Sum(energy=…, friction=hk.Friction()); until then gains and the rest of "
-            "the field may be wrong by more than their bands"
+            f"the drift, hk.Sum(energy=…, friction=hk.Friction()){joints}; until then gains and "
+            "the rest of the field may be wrong by more than their bands"
         )
     if fit.has_friction:
-        such = "friction of another form (hk.Friction(stribeck=…), another rest_speed"
-        if fit.misfit.shape[1] > 2:  # it acts on the difference of two velocities
-            such += "; that of a joint between two links belongs into mean"
-        such += ")"
+        such = f"friction of another form (hk.Friction(stribeck=…), another rest_speed{joints})"
     elif fit.has_momenta:
         such = (
             "friction (add hk.Friction() to the drift, or with measured momenta take "
-            "hk.PortHamiltonian)"
+            f"hk.PortHamiltonian{joints})"
         )
     else:
         such = "friction or another force (add hk.CurlFree)"
