@@ -28,6 +28,7 @@ from hamkernel._trajectories.diagnostics import (
     whiteness,
 )
 from hamkernel._trajectories.flow import WEIGHTS
+from hamkernel._trajectories.iteration import evidence, likelier
 from hamkernel._trajectories.kalman import as_observations, innovations, smoothed_path, whiten
 from hamkernel._trajectories.likelihood import (
     Model,
@@ -476,6 +477,28 @@ def test_a_system_without_inertia_is_named_and_its_rate_is_learned():
     found = hk.learn(hk.CurlFree(hk.Gaussian(2.0)), runs, progress=False)
     q = jnp.array([[-3.0], [2.0], [4.0]])
     np.testing.assert_allclose(found.field.evaluate(q), -q / tau, atol=0.1)
+
+
+def test_an_end_that_lost_its_path_is_never_the_likelier(monkeypatch):
+    """Of a driven oscillator with inputs held nothing was learned: its −log p was NaN."""
+    ends = []
+
+    def caught(without, process, *given):
+        ends.extend([without, process])
+        return likelier(without, process, *given)
+
+    monkeypatch.setattr("hamkernel._trajectories.learn.likelier", caught)
+    t, _, log = pushed_log(5.0)
+    log[:, 1] = np.nan
+    U = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0))
+    with pytest.warns(UserWarning, match="process noise"):
+        hk.learn(U, hk.Runs(t, log), mean=lambda x: jnp.array([x[1], 0.0]))
+    without, process = ends
+    model = without.now.model._replace(log_noise=jnp.array([jnp.nan, 0.0]))
+    lost = without._replace(now=without.now._replace(model=model), settled=True)
+    lost.now.good[:] = True
+    assert evidence(lost) == np.inf > evidence(without)
+    assert likelier(lost, process, 1, None)[1] is process
 
 
 def double_pendulum(_, x):

@@ -383,11 +383,12 @@ def _by_interval(
 
 
 def evidence(end: End) -> float:
-    """−log p of the runs, each in as few parts as may be, linearised about the path of the end."""
+    """−log p of the runs in as few parts as may be, about the path of the end; ∞ if it is lost."""
     task, model = end.task, end.now.model
     rows = _by_interval(task, end.now, equal_pieces(task.data.runs, LONG))[3]
     given = end.now.field.points, rows, task.start_deviation
-    return float(closed_form(model, *given, whiten).loss)
+    loss = closed_form(model, *given, whiten).loss
+    return float(jnp.where(jnp.isnan(loss), jnp.inf, loss))
 
 
 @compiled_by_size
