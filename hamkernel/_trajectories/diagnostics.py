@@ -62,7 +62,7 @@ class Whiteness(NamedTuple):
         large, and the gain as wrong (`tests/benchmarks/disturbances.py`).
 
         It does not stand for forces that repeat with the state, which are no scatter: of a drive
-        with cogging .24 of the drift are inside two deviations (`tests/benchmarks/machines.py`). A
+        with cogging .23 of the drift are inside two deviations (`tests/benchmarks/machines.py`). A
         covariance from the scores of blocks of the runs, the sandwich of Liang and Zeger, would not
         either: it is about the field that the kernel comes nearest to. With a term of the kernel
         for them, whose force and length were given, it is .92.

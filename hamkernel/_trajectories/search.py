@@ -305,10 +305,9 @@ def gain_of_inertia(
     a force. They are the gradient in v of g(q, v), of degree three in v. It is 0 where the mean has
     such forces, for families, and with one degree of freedom, where (q, v) is (q, p) of another q.
 
-    At the first step, of four runs of 80 positions of two double pendula, six logs, it is 16 to
-    100, and that of friction −15 to 15; of coupled pendula with friction, nine logs, 21 to 177 and
-    9 to 249; without friction, three logs, −44 to −29 and −19 to −15. So three times the gain of
-    friction tells them apart (`tests/test_process_noise.py` has two of the logs).
+    At the first step, of four runs of 80 positions of a double pendulum, three seeds, it is 43 to
+    55, and that of friction −7 to −5; of coupled pendula with friction 96 to 139, and 140 to 239.
+    So three times the gain of friction tells them apart (`tests/test_process_noise.py`).
     """
     K, (X, Y) = model.kernel, sampled(data)
     n = Y.shape[1]
