@@ -83,6 +83,7 @@ class FitQuality(NamedTuple):
         remaining: the degrees of freedom that the fit leaves, process noise included.
         white: how white the innovations are.
         process: q if it was estimated, shape (n,); None where it was given.
+        needed: whether it was estimated, and the runs are likelier with it.
         count: of iterations.
         settled: whether they ended by themselves.
         swing: how many samples there are in a swing.
@@ -105,6 +106,7 @@ class FitQuality(NamedTuple):
     remaining: float
     white: Whiteness
     process: Float[np.ndarray, " n"] | None
+    needed: bool
     count: int
     settled: bool
     swing: float
@@ -120,7 +122,7 @@ class FitQuality(NamedTuple):
     @property
     def is_disturbed(self) -> bool:
         """Whether process noise was found."""
-        return self.process is not None and bool(self.process.any())
+        return self.needed
 
 
 def diagnose(

@@ -1,8 +1,6 @@
-"""Gauss-Newton steps: a linearisation, a closed form and a line search, again and again.
+"""Gauss-Newton steps: a linearisation of each interval, a closed form and a line search.
 
-Without process noise a step is one of multiple shooting: the path solves the equation in each
-segment, and the starts are projected out. With it the path is moved by the process too, and the
-rows are whitened by a Kalman filter.
+The path is moved by the field and by process noise; rows are whitened by a Kalman filter.
 """
 
 from collections.abc import Callable
@@ -14,34 +12,18 @@ from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled_by_size
 from hamkernel._trajectories.diagnostics import SETTLED, whiteness
-from hamkernel._trajectories.flow import (
-    Expansion,
-    Segments,
-    field_values,
-    shoot,
-    steps_for,
-    stiffness,
-    trusted,
-)
+from hamkernel._trajectories.flow import Expansion, Segments, field_values, steps_for, stiffness
 from hamkernel._trajectories.kalman import (
     SmoothedPath,
     innovations,
     linearised_by_interval,
     process_covariance,
     smoothed_path,
-    whiten,
     whitened_rows,
 )
 from hamkernel._trajectories.learned import Iteration
-from hamkernel._trajectories.likelihood import (
-    ClosedForm,
-    Model,
-    Whitening,
-    agree,
-    closed_form,
-    landmark_whitening,
-    project_out_starts,
-)
+from hamkernel._trajectories.likelihood import ClosedForm, closed_form
+from hamkernel._trajectories.model import Model, landmark_whitening
 from hamkernel._trajectories.preprocessing import Preprocessed
 from hamkernel._trajectories.search import (
     Bounds,
@@ -54,24 +36,14 @@ from hamkernel._trajectories.search import (
     without_noise,
 )
 from hamkernel._trajectories.segments import (
-    LONG,
     LinearisedSegments,
     Piece,
-    equal_pieces,
-    grown,
-    halved,
-    linearised_along_field,
     linearised_along_smoothed,
     segmented,
-    short_pieces,
-    smoothed_rows,
     updated,
 )
 
-_ROUNDS = 4  # Levenberg steps before a segment is judged: without them up to 40 % were lost
 _SEARCH = 25  # steps of BFGS, which go on in the next iteration
-_SHORT_ROUNDS = 2  # iterations with short segments, in which a rough field stays near the samples
-_NOT_YET_EXACT = 1e-3  # of the states: residuals for which no segment without noise is dropped
 
 
 class Task(NamedTuple):
@@ -86,6 +58,7 @@ class Task(NamedTuple):
         capped: whether these are fewer than the intervals.
         bounds: the box of hyperparameters.
         start_deviation: of the prior of starts.
+        pieces: the runs, whole or in long parts.
     """
 
     data: Preprocessed
@@ -96,6 +69,17 @@ class Task(NamedTuple):
     capped: bool
     bounds: Bounds
     start_deviation: Float[Array, " n"]
+    pieces: list[Piece]
+
+    @property
+    def good(self) -> Bool[np.ndarray, " S"]:
+        return self.usable(len(self.pieces))
+
+    def usable(self, size: int) -> Bool[np.ndarray, " size"]:
+        """Which of `size` segments are usable."""
+        good = np.zeros(size, bool)
+        good[: len(self.pieces)] = [self.data.usable[piece.run] for piece in self.pieces]
+        return good
 
 
 class Current(NamedTuple):
@@ -111,7 +95,6 @@ class Current(NamedTuple):
         squares: the sum of their squared normalised residuals.
         free: the degrees of freedom that are left.
         pushed: by how much larger the deviation of w is in the intervals of the segments.
-        known: whether two searches on windows agreed on the kernel, which then stays.
     """
 
     model: Model
@@ -123,7 +106,6 @@ class Current(NamedTuple):
     squares: float
     free: float
     pushed: Array | float = 1.0
-    known: bool = False
 
 
 class End(NamedTuple):
@@ -132,43 +114,31 @@ class End(NamedTuple):
     Attributes:
         task: the task.
         now: the last step.
-        pieces: the pieces of the runs in the last step.
         history: one entry a step.
         settled: whether noise and objective settled.
     """
 
     task: Task
     now: Current
-    pieces: list[Piece]
     history: list[Iteration]
     settled: bool
 
 
 def iterate(task: Task, now: Current, most: int, bar: Any) -> End:
     """Gauss-Newton steps until noise and objective settle, at most `most` of them."""
-    runs, process = task.data.runs, now.model.is_disturbed
     history: list[Iteration] = []
-    pieces: list[Piece] = []
     settled = False
     bar.total = bar.n + 1 + most
     bar.update()
-    for i in range(most):
-        if process:
-            wanted = equal_pieces(runs, LONG)
-        elif i < _SHORT_ROUNDS:
-            wanted = short_pieces(runs)
-        elif i == _SHORT_ROUNDS:
-            wanted = grown(runs, pieces, now.good)
-        else:
-            wanted = halved(runs, pieces, now.good)
-        before, same, pieces = now, wanted == pieces, wanted
-        now, done = (iterated_with_process if process else iterated)(task, now, pieces)
+    while len(history) < most and not settled:
+        before = now
+        now, done = iterated(task, now)
         history.append(done)
         noise = ", ".join(f"{sigma:.3g}" for sigma in np.asarray(done.noise))
         said = f"{len(now.field.points)} landmarks, noise {noise}, kept {float(done.kept):.0%}"
         bar.set_postfix_str(said, refresh=False)
         bar.update()
-        if not same or i <= _SHORT_ROUNDS:
+        if len(history) < 2:
             continue
         moved = float(jnp.abs(now.model.log_noise - before.model.log_noise).max())
         # A hundredth of log σ, and a thousandth of the objective by degree of freedom, which may
@@ -177,87 +147,36 @@ def iterate(task: Task, now: Current, most: int, bar: Any) -> End:
         less = abs(float(history[-2].objective - done.objective))
         small = less < 1e-3 * max(now.free, 1.0)
         settled = moved < 0.01 and (small or changed(task, before, now) < SETTLED)
-        if settled:
-            break
-    return End(task, now, pieces, history, settled)
+    return End(task, now, history, settled)
 
 
 def initial_loss(task: Task, model: Model) -> float:
     """−log p of the rows along the smoothed runs, at the hyperparameters of `model`."""
-    *_, rows = smoothed_rows(task.data, task.mean)
-    given = jnp.asarray(task.S[: task.first]), rows, task.start_deviation, project_out_starts
+    given = jnp.asarray(task.S[: task.first]), _along_smoothed(task), task.start_deviation
     return float(losses(model, model.flat[None], *given)[0])
 
 
 def begin(task: Task, model: Model, design: np.ndarray) -> Current:
-    """The first model, from rows along the smoothed runs with the tangent of the mean.
-
-    Segments are short, since the errors of the smoothed path add up along a run.
-    """
-    pieces, good, rows = smoothed_rows(task.data, task.mean)
-    paths = [run.path for run in task.data.runs]
-    model, found, field, S = _first(task, model, design, rows, project_out_starts)
-    good = good[: len(pieces)]
-    return Current(model, field, S, rows, paths, good, np.inf, float(found.free))
-
-
-def _first(
-    task: Task, model: Model, design: np.ndarray, rows: LinearisedSegments, whitening: Whitening
-) -> tuple[Model, ClosedForm, Expansion, np.ndarray]:
-    """The likeliest model, from the best point of a design, its field, and landmarks for more."""
+    """The first model, field and path, from rows along the smoothed runs."""
+    runs, rows = task.data.runs, _along_smoothed(task)
     given = rows, task.start_deviation
-    model, count = begun(model, design, task.S, task.first, *given, whitening)
+    model, count = begun(model, design, task.S, task.first, *given)
     S = task.S[:count]
-    model, _ = most_likely(model, S, *given, task.bounds, _SEARCH, whitening)
+    model, _ = most_likely(model, S, *given, task.bounds, _SEARCH)
     S = task.S if searched(jnp.asarray(S), rows)[1] is not rows else S
-    model, found = solved(model, S, task.first, task.quick, *given, whitening, task.bounds)
-    return model, found, Expansion(model.kernel, found.points, found.coefficients, task.mean), S
+    model, found = solved(model, S, task.first, task.quick, *given, task.bounds)
+    field = Expansion(model.kernel, found.points, found.coefficients, task.mean)
+    moves, _, pushed = _smoothed(model, found, rows, task)
+    paths = [run.path for run in runs]
+    x = _on_segments(paths, task.pieces, segmented(runs, task.pieces, paths))
+    paths = updated(paths, task.pieces, task.good, x + np.asarray(moves))
+    return Current(model, field, S, rows, paths, task.good, np.inf, float(found.free), pushed)
 
 
-def iterated(task: Task, now: Current, pieces: list[Piece]) -> tuple[Current, Iteration]:
-    """One Gauss-Newton step: linearisation along the current field, closed form, line search."""
-    segments = segmented(task.data.runs, pieces, now.paths)
-    count = steps_for(np.asarray(segments.spans), _stiffness(now.field, task.data, now.paths))
-    steps = jnp.asarray(count)
-    before = shoot(
-        now.field,
-        segments,
-        now.model.log_noise,
-        task.start_deviation,
-        steps,
-        segments.starts,
-        _ROUNDS,
-    )
-    least = _NOT_YET_EXACT * task.data.scale
-    was_asked = bool(np.isfinite(now.squares))
-    good = trusted(before, segments, np.exp(np.asarray(now.model.log_noise)), least, was_asked)
-    if not was_asked:  # the pieces are those of the smoothed paths
-        good[: len(pieces)] &= now.good
-    rows = linearised_along_field(now.field, before.path, segments, jnp.asarray(good))
-    # Along longer segments the path is far off at first, and the kernel would bend to what the
-    # linearisation misses: of positions with gaps a lengthscale of 2.2 became 1, and the field
-    # kept ripples, an error of .016 for .0014.
-    longer = segments.counts.shape[1] > now.rows.counts.shape[1]
-    model, found, S, between = _solved(task, now, rows, project_out_starts, longer or now.known)
-    of_windows = searched(found.points, rows)[1] is not rows
-    known = was_asked and not longer and of_windows and agree(now.model, model)
-
-    def trial(share: float) -> _Trial:
-        weights, field = between(share)
-        starts = before.starts + share * found.moves
-        there = shoot(
-            field, segments, model.log_noise, task.start_deviation, steps, starts, _ROUNDS
-        )
-        squares = float(np.asarray(there.squares)[good].sum())
-        x = np.asarray(there.path.x)
-        return _Trial(squares + float(weights @ weights), squares, field, x)
-
-    gain, taken, best = _searched(trial, bool(good.any()))
-    good = good[: len(pieces)]
-    paths = updated(now.paths, pieces, good, best.x)
-    step = _described(task, pieces, good, best, gain, taken, model, found.loss)
-    free = float(found.free)
-    return Current(model, best.field, S, rows, paths, good, best.squares, free, known=known), step
+def _along_smoothed(task: Task) -> LinearisedSegments:
+    runs = task.data.runs
+    segments = segmented(runs, task.pieces, [run.path for run in runs])
+    return linearised_along_smoothed(task.data, task.pieces, segments, task.mean, task.usable(len(segments.starts)))
 
 
 class _Trial(NamedTuple):
@@ -268,17 +187,15 @@ class _Trial(NamedTuple):
 
 
 def _solved(
-    task: Task, now: Current, rows: LinearisedSegments, whitening: Whitening, held: bool = False
+    task: Task, now: Current, rows: LinearisedSegments
 ) -> tuple[Model, ClosedForm, np.ndarray, Callable[[float], tuple[Array, Expansion]]]:
     """The likeliest model, its closed form, landmarks for more, and the way to it: share -> (w, f).
 
-    Hyperparameters that are `held` stay. Rows that ask for no more landmarks once are not asked
-    again.
+    Rows that ask for no more landmarks once are not asked again.
     """
-    model, given, used = now.model, (rows, task.start_deviation), len(now.field.points)
-    if not held:
-        model, _ = most_likely(model, now.S[:used], *given, task.bounds, _SEARCH, whitening)
-    model, found = solved(model, now.S, used, task.quick, *given, whitening, task.bounds)
+    given, used = (rows, task.start_deviation), len(now.field.points)
+    model, _ = most_likely(now.model, now.S[:used], *given, task.bounds, _SEARCH)
+    model, found = solved(model, now.S, used, task.quick, *given, task.bounds)
     # The current field in the new basis: the one with its values at the landmarks.
     S = found.points
     T = _landmark_whitening(model.kernel, S)
@@ -304,31 +221,14 @@ def _searched(trial: Callable[[float], _Trial], any_good: bool) -> tuple[float, 
     return 0.0, 0.0, at_old
 
 
-def _described(task, pieces, good, best: _Trial, gain, taken, model: Model, loss) -> Iteration:
+def _described(task, good, best: _Trial, gain, taken, model: Model, loss) -> Iteration:
     samples = sum(len(run.times) for run in task.data.runs)
-    kept = sum(piece.stop - piece.start for piece, ok in zip(pieces, good, strict=True) if ok)
+    kept = sum(piece.stop - piece.start for piece, ok in zip(task.pieces, good, strict=True) if ok)
     numbers = (best.objective, gain, taken, kept / samples, loss)
     objective, gain, taken, kept, loss = (jnp.asarray(value) for value in numbers)
-    longest = max(piece.stop - piece.start for piece in pieces)
+    longest = max(piece.stop - piece.start for piece in task.pieces)
     noise, process = jnp.exp(model.log_noise), jnp.exp(model.log_process)
     return Iteration(longest, objective, gain, taken, noise, process, kept, loss)
-
-
-def begin_with_process(task: Task, model: Model, design: np.ndarray) -> Current:
-    """The first model with process noise, from the smoothed runs, whole or in long parts."""
-    runs = task.data.runs
-    pieces = equal_pieces(runs, LONG)
-    segments = segmented(runs, pieces, [run.path for run in runs])
-    good = np.zeros(len(segments.starts), bool)
-    good[: len(pieces)] = [task.data.usable[piece.run] for piece in pieces]
-    rows = linearised_along_smoothed(task.data, pieces, segments, task.mean, good)
-    model, found, field, S = _first(task, model, design, rows, whiten)
-    moves, _, pushed = _smoothed(model, found, rows, task)
-    good = good[: len(pieces)]
-    paths = [run.path for run in runs]
-    x = _on_segments(paths, pieces, segments)
-    paths = updated(paths, pieces, good, x + np.asarray(moves))
-    return Current(model, field, S, rows, paths, good, np.inf, float(found.free), pushed)
 
 
 def _smoothed(
@@ -338,16 +238,14 @@ def _smoothed(
     return smoothed_path(model, *given)
 
 
-def iterated_with_process(
-    task: Task, now: Current, pieces: list[Piece]
-) -> tuple[Current, Iteration]:
-    """One Gauss-Newton step with process noise: each interval is linearised by itself.
+def iterated(task: Task, now: Current) -> tuple[Current, Iteration]:
+    """One Gauss-Newton step: each interval is linearised by itself.
 
     The objective is ‖W (y − x)‖² + Σ dᵢᵀ (Cov ηᵢ)⁻¹ dᵢ + ‖f‖², d the defect of each interval.
     """
-    segments, x, steps, rows = _by_interval(task, now, pieces)
+    segments, x, steps, rows = _by_interval(task, now)
     good = rows.counts.any((1, 2))
-    model, found, S, between = _solved(task, now, rows, whiten)
+    model, found, S, between = _solved(task, now, rows)
     moves, _, pushed = _smoothed(model, found, rows, task)
     # A defect that the integrator may leave is none: see `steps_for`.
     covariance = process_covariance(model, rows, jnp.asarray(1e-6 * task.data.scale))
@@ -361,34 +259,24 @@ def iterated_with_process(
         return _Trial(squares + float(weights @ weights), squares, field, np.asarray(there))
 
     gain, taken, best = _searched(trial, bool(good.any()))
-    good = np.asarray(good)[: len(pieces)]
-    paths = updated(now.paths, pieces, good, best.x)
-    step = _described(task, pieces, good, best, gain, taken, model, found.loss)
+    good = np.asarray(good)[: len(task.pieces)]
+    paths = updated(now.paths, task.pieces, good, best.x)
+    step = _described(task, good, best, gain, taken, model, found.loss)
     free = float(found.free)
     return Current(model, best.field, S, rows, paths, good, best.squares, free, pushed), step
 
 
 def _by_interval(
-    task: Task, now: Current, pieces: list[Piece]
+    task: Task, now: Current
 ) -> tuple[Segments, Float[Array, "S L+1 n"], Array, LinearisedSegments]:
-    """The pieces, the path on them, Runge-Kutta steps, and the rows along it."""
-    segments = segmented(task.data.runs, pieces, now.paths)
+    """The segments, the path on them, Runge-Kutta steps, and the rows along it."""
+    segments = segmented(task.data.runs, task.pieces, now.paths)
     spans = np.asarray(segments.spans).reshape(-1, 1)
     steps = jnp.asarray(steps_for(spans, _stiffness(now.field, task.data, now.paths)))
-    x = jnp.asarray(_on_segments(now.paths, pieces, segments))
-    good = np.zeros(len(x), bool)
-    good[: len(pieces)] = [task.data.usable[piece.run] for piece in pieces]
+    x = jnp.asarray(_on_segments(now.paths, task.pieces, segments))
+    good = task.usable(len(x))
     rows = linearised_by_interval(now.field, x, segments, steps, jnp.asarray(good))
     return segments, x, steps, rows._replace(pushed=now.pushed * rows.pushed)
-
-
-def evidence(end: End) -> float:
-    """−log p of the runs in as few parts as may be, about the path of the end; ∞ if it is lost."""
-    task, model = end.task, end.now.model
-    rows = _by_interval(task, end.now, equal_pieces(task.data.runs, LONG))[3]
-    given = end.now.field.points, rows, task.start_deviation
-    loss = closed_form(model, *given, whiten).loss
-    return float(jnp.where(jnp.isnan(loss), jnp.inf, loss))
 
 
 @compiled_by_size
@@ -427,54 +315,12 @@ def changed(task: Task, before: Current, now: Current) -> float:
     return float(np.linalg.norm(new - old) / max(np.linalg.norm(new), np.finfo(float).tiny))
 
 
-def price(end: End, impulse: Float[np.ndarray, " n"], pushes: int = 0) -> float:
-    """The gain in log p that pays for process noise: Schwarz's ½ log N for each deviation of w."""
-    count = np.isfinite(impulse).sum() + pushes
-    return float(0.5 * count * np.log(np.asarray(end.now.rows.counts).sum()))
-
-
-def whitening_of(model: Model) -> Whitening:
-    """The function that whitens the rows of this model."""
-    return whiten if model.is_disturbed else project_out_starts
-
-
 def asks_for_landmarks(end: End) -> bool:
     """Whether the rows are likelier with more landmarks, at less noise too if time is the limit."""
     (task, now), n = end[:2], len(end.task.data.scale)
-    given = now.model, now.field.points, now.rows, task.start_deviation, whitening_of(now.model)
+    given = now.model, now.field.points, now.rows, task.start_deviation
     capped = task.capped and len(now.field.points) >= task.quick
     return limited_by_landmarks(*given, capped and bool(task.bounds.free[-2 * n : -n].any()))
-
-
-def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
-    """Whether anything suggests that the structure is not the whole truth.
-
-    Iterations that did not settle, parts that were dropped, innovations that are not white, or rows
-    that are likelier with process noise. Of innovations and rows it is not said where more
-    landmarks would explain them: what a field on too few cannot say looks like process noise. Where
-    parts are lost the lengthscale has often collapsed, and landmarks are always too few for that.
-    """
-    now, task = end.now, end.task
-    given = now.field.points, now.rows, task.start_deviation
-    if task.capped and task.first == task.quick:
-        return False
-    if not (end.settled and now.good.all()):
-        return True
-    counts = noisy_counts(end)
-    if not counts.any():
-        return False
-    if asks_for_landmarks(end):
-        return False
-    z = innovations(whitened_rows(now.model, *given), now.rows)
-    if not whiteness(z, counts).is_enough:
-        return True
-    shares = np.log([1e-3, 1e-2, 1e-1])
-    design = [now.model.log_process, *(impulse + share for share in shares)]
-    flat = np.tile(np.asarray(now.model.flat), (len(design), 1))
-    flat[:, -len(impulse) :] = design
-    part = searched(*given[:2])
-    values = np.asarray(losses(now.model, jnp.asarray(flat), *part, task.start_deviation, whiten))
-    return bool(values[0] - values.min() > price(end, impulse))
 
 
 def noisy_counts(end: End) -> Float[np.ndarray, "S L+1 n"]:
@@ -483,18 +329,34 @@ def noisy_counts(end: End) -> Float[np.ndarray, "S L+1 n"]:
     return np.where(without_noise(now.model, task.bounds, task.data.scale), 0, now.rows.counts)
 
 
-def likelier(without: End, process: End, most: int, bar: Any) -> tuple[End, End]:
-    """The end without process noise, and the likelier of both ends, process noise at its price.
 
-    Steps without it that lost their way go on from the field that those with it found, for which no
-    path of a rough field has to be followed: each interval is linearised by itself.
+
+def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
+    """Whether iterations with next to no process noise say that it is not enough.
+
+    They did not settle, innovations are not white, or rows are likelier with more of it.
     """
-    if not (without.settled and without.now.good.all()):
-        model = process.now.model
-        model = model._replace(log_process=jnp.full_like(model.log_process, -jnp.inf))
-        now = process.now._replace(model=model, pushed=1.0)
-        again = iterate(without.task, now, most, bar)
-        without = again if evidence(again) < evidence(without) else without
-    pushes = int((process.now.rows.pushed > 1).sum())
-    more = price(process, np.asarray(process.now.model.log_process), pushes)
-    return without, process if evidence(process) + more < evidence(without) else without
+    now, task = end.now, end.task
+    given = now.field.points, now.rows, task.start_deviation
+    counts = noisy_counts(end)
+    white = whiteness(innovations(whitened_rows(now.model, *given), now.rows), counts)
+    if not (end.settled and white.is_enough):
+        return True
+    levels = [now.model.log_process, *(impulse + np.log(share) for share in (1e-3, 1e-2, 1e-1))]
+    flat = jnp.stack([now.model._replace(log_process=jnp.asarray(q)).flat for q in levels])
+    part = searched(*given[:2])
+    values = np.asarray(losses(now.model, flat, *part, task.start_deviation))
+    return bool(values[0] - values.min() > price(end))
+
+
+def price(end: End) -> float:
+    """The gain in log p that pays for process noise: Schwarz's ½ log N for each deviation of w."""
+    count = np.isfinite(np.asarray(end.now.model.log_process)).sum() + (end.now.rows.pushed > 1).sum()
+    return float(0.5 * count * np.log(np.asarray(end.now.rows.counts).sum()))
+
+
+def evidence(end: End) -> float:
+    """−log p of the runs about the path of the end; ∞ if it is lost."""
+    rows = _by_interval(end.task, end.now)[3]
+    loss = closed_form(end.now.model, end.now.field.points, rows, end.task.start_deviation).loss
+    return float(jnp.where(jnp.isnan(loss), jnp.inf, loss))

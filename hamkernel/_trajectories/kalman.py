@@ -31,7 +31,7 @@ from jaxtyping import Array, Float
 from hamkernel._machine import compiled_by_size, orthonormal
 from hamkernel._observations.kinds import Functionals, Together
 from hamkernel._trajectories.flow import WEIGHTS, Expansion, Path, Segments, means, simulated
-from hamkernel._trajectories.likelihood import Model, WhitenedRows, columns, landmark_whitening
+from hamkernel._trajectories.model import Model, WhitenedRows, columns, landmark_whitening
 from hamkernel._trajectories.segments import LinearisedSegments, linearised
 
 
@@ -211,7 +211,6 @@ def linearised_by_interval(
         means(field.mean, nodes, slopes),
         segments,
         good,
-        is_solution=True,
     )
     return rows._replace(missed=jnp.where(good[:, None, None], defect, 0.0))
 

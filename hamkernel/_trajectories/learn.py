@@ -38,12 +38,11 @@ from hamkernel._trajectories.iteration import (
     asks_for_landmarks,
     asks_for_process,
     begin,
-    begin_with_process,
+    evidence,
     initial_loss,
     iterate,
-    likelier,
     noisy_counts,
-    whitening_of,
+    price,
 )
 from hamkernel._trajectories.kalman import (
     as_observations,
@@ -52,7 +51,7 @@ from hamkernel._trajectories.kalman import (
     whitened_rows,
 )
 from hamkernel._trajectories.learned import Learned, empty, misfits
-from hamkernel._trajectories.likelihood import Model, with_amplitude
+from hamkernel._trajectories.model import Model, with_amplitude
 from hamkernel._trajectories.preprocessing import (
     Preprocessed,
     decided,
@@ -62,13 +61,14 @@ from hamkernel._trajectories.preprocessing import (
 )
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.search import (
+    LEAST_NOISE,
     bounds_and_design,
     gain_of_friction,
     gain_of_inertia,
     impulses,
     landmark_spacing,
 )
-from hamkernel._trajectories.segments import Piece
+from hamkernel._trajectories.segments import LONG, Piece, equal_pieces
 from hamkernel._trajectories.sensors import timing, warn_of_curve, warn_of_timing
 from hamkernel._trajectories.smoothing import interpolated, power_of_two
 
@@ -161,31 +161,29 @@ def learn(
     S, first, quick, capped = landmarks(data, None if solver is None else solver.max_points)
     warn_in_advance(K, data, X, first)
 
-    def asked(q: np.ndarray, spacing: float = 0.0, impulse: Any = None) -> tuple[Task, Current]:
+    spacing = landmark_spacing(X, S[:first], data.scale)
+    impulse = impulses(K, jnp.asarray(S[:first]), Y, data)
+    wide = jnp.asarray(100 * data.scale)  # a prior of starts that says next to nothing
+
+    def asked(q: np.ndarray, sought: bool = False) -> tuple[Task, Current]:
         with np.errstate(divide="ignore"):
             model = Model(K, log_noise, jnp.log(jnp.asarray(q)))
-        free = measured & (given is None)
-        bounds, design = bounds_and_design(model, X, Y, data.scale, free, spacing, impulse)
-        wide = jnp.asarray(100 * data.scale)  # a prior of starts that says next to nothing
-        task = Task(data, known, S, first, quick, capped, bounds, wide)
-        start = begin_with_process if q.any() or impulse is not None else begin
-        return task, start(task, model, design)
+        free, moves = measured & (given is None), impulse if sought else None
+        bounds, design = bounds_and_design(model, X, Y, data.scale, free, spacing, moves)
+        pieces = equal_pieces(data.runs, LONG)
+        task = Task(data, known, S, first, quick, capped, bounds, wide, pieces)
+        return task, begin(task, model, design)
 
-    none = np.zeros(runs.dimension)
+    floor = LEAST_NOISE * np.exp(impulse)
     if not runs.is_decided:
-        task, at = asked(none)
+        task, at = asked(floor)
         runs, data = decided(runs, data, lambda d: initial_loss(task._replace(data=d), at.model))
-    spacing = landmark_spacing(X, S[:first], data.scale)
-    if process is not None:
-        end, alone = iterate(*asked(process, spacing * process.any()), most, bar), None
-    else:
-        end = alone = iterate(*asked(none), most, bar)
-        impulse = impulses(K, jnp.asarray(S[:first]), Y, data)
-        if asks_for_process(alone, impulse):
-            end = iterate(*asked(none, spacing, impulse), most, bar)
-            alone, end = likelier(alone, end, most, bar)
+    end = iterate(*asked(floor if process is None else process), most, bar)
+    if process is None and asks_for_process(end, impulse):
+        other = iterate(*asked(floor, sought=True), most, bar)
+        end = other if evidence(other) + price(other) < evidence(end) else end
     bar.close()
-    return _learned(runs, mean, end, alone, given is not None, measured)
+    return _learned(runs, mean, end, process is None, given is not None, measured)
 
 
 def _first_noise(data: Preprocessed) -> Float[np.ndarray, " n"]:
@@ -195,7 +193,7 @@ def _first_noise(data: Preprocessed) -> Float[np.ndarray, " n"]:
 
 
 def _learned(
-    runs: Runs, mean: Any, end: End, alone: End | None, given: bool, measured: np.ndarray
+    runs: Runs, mean: Any, end: End, sought: bool, given: bool, measured: np.ndarray
 ) -> Learned:
     """The result; warns where it must.
 
@@ -203,7 +201,7 @@ def _learned(
         runs: what was given.
         mean: what was given.
         end: where the iterations ended.
-        alone: where they ended without process noise, if that was to be found.
+        sought: whether process noise was to be found.
         given: whether the noise was given.
         measured: which coordinates were.
     """
@@ -217,13 +215,13 @@ def _learned(
     misfit = misfits(runs, states, noise)
     rows = now.field.points, now.rows, task.start_deviation
     z, counts = innovations(whitened_rows(now.model, *rows), now.rows), np.asarray(now.rows.counts)
-    fit = _quality(runs, end, alone, misfit, z, process)
+    fit = _quality(runs, end, sought, misfit, z, process)
     if fit.kept.any():
-        fit = _with_causes(fit, runs, end, alone)
+        fit = _with_causes(fit, runs, end)
     converged = diagnose(fit, noise, data.scale, given)
     if fit.kept.any() and runs.inputs is None:
         warn_of_curve(states)
-    if fit.kept.any() and not (fit.dropped or now.model.is_disturbed):
+    if fit.kept.any() and not (fit.dropped or fit.is_disturbed):
         pairs, noisy = zip(seen, states, strict=True), noisy_counts(end).any((0, 1))
         warn_of_timing(timing(times, [np.where(noisy, x - y, np.nan) for x, y in pairs], states))
     observations = as_observations(now.rows, now.model, task.mean, task.start_deviation)
@@ -271,7 +269,7 @@ def _at_all_times(end: End, times: list[np.ndarray]) -> list[Float[np.ndarray, "
 def _quality(
     runs: Runs,
     end: End,
-    alone: End | None,
+    sought: bool,
     misfit: Float[np.ndarray, "R n"],
     z: Float[np.ndarray, "S L+1 n"],
     process: Float[np.ndarray, " n"],
@@ -279,14 +277,11 @@ def _quality(
     """How well the field follows the runs; `z` are the innovations by segment."""
     now, data, times = end.now, end.task.data, runs.on_host()[0]
     counts = np.asarray(now.rows.counts)
-    kept, pieces = np.zeros(len(data.runs)), list(zip(end.pieces, now.good, strict=True))
+    kept, pieces = np.zeros(len(data.runs)), list(zip(end.task.pieces, now.good, strict=True))
     for (r, start, stop), good in pieces:
         kept[r] += good * (stop - start) / len(data.runs[r].times)
-    squares, free = now.squares, now.free
-    if alone is not None:
-        squares, free = alone.now.squares, alone.now.free
-    elif process.any():  # the path follows the samples: only what was expected can be judged
-        squares, free = float((z**2).sum()), float((counts > 0).sum())
+    # The path follows the samples: only what was expected can be judged.
+    squares, free = float((z**2).sum()), float((counts > 0).sum())
     speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
     spacing = np.median(np.concatenate([np.diff(t) for t in times]))
     swing = 2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)) / spacing
@@ -299,7 +294,8 @@ def _quality(
         free=free,
         remaining=now.free,
         white=whiteness(z, noisy_counts(end)),
-        process=None if alone is None else process,
+        process=process if sought else None,
+        needed=sought and bool(end.task.bounds.free[-len(process) :].any()),
         count=len(end.history),
         settled=end.settled,
         swing=float(swing),
@@ -309,10 +305,10 @@ def _quality(
     )
 
 
-def _with_causes(fit: FitQuality, runs: Runs, end: End, alone: End | None) -> FitQuality:
+def _with_causes(fit: FitQuality, runs: Runs, end: End) -> FitQuality:
     """The same with what would make the rows likelier: the causes that warnings name."""
     now, task, used = end.now, end.task, len(end.now.field.points)
-    given = now.model, now.field.points, now.rows, task.start_deviation, whitening_of(now.model)
+    given = now.model, now.field.points, now.rows, task.start_deviation
     if (task.capped and used >= task.quick) or not fit.white.is_enough:
         fit = fit._replace(few=used * asks_for_landmarks(end))
     if fit.has_momenta and (fit.is_disturbed or not fit.white.is_enough):
@@ -320,7 +316,7 @@ def _with_causes(fit: FitQuality, runs: Runs, end: End, alone: End | None) -> Fi
         fit = fit._replace(gained=gain_of_friction(*given, task.data), bent=bent)
     if fit.white.is_enough:
         return fit
-    return fit._replace(between=likelier_between(runs, end if alone is None else alone))
+    return fit._replace(between=likelier_between(runs, end))
 
 
 def likelier_between(runs: Runs, end: End) -> str:
@@ -354,7 +350,7 @@ def _pushed(end: End) -> list[Piece]:
     sizes = np.asarray(end.now.rows.pushed)
     return [
         Piece(r, start + int(i), start + int(i) + 1)
-        for s, (r, start, stop) in enumerate(end.pieces)
+        for s, (r, start, stop) in enumerate(end.task.pieces)
         for i in np.flatnonzero(sizes[s, : stop - start - 1] > 1)
     ]
 
@@ -377,7 +373,7 @@ def _samples(
 def _by_run(values: np.ndarray, end: End, empty: float) -> list[Float[np.ndarray, "T n"]]:
     """Values by segment put together to runs."""
     out = [np.full(run.path.shape, empty) for run in end.task.data.runs]
-    for s, ((r, start, stop), good) in enumerate(zip(end.pieces, end.now.good, strict=True)):
+    for s, ((r, start, stop), good) in enumerate(zip(end.task.pieces, end.now.good, strict=True)):
         if good:
             part = values[s, : stop - start]
             out[r][start : start + len(part)] = part

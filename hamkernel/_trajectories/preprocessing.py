@@ -40,7 +40,6 @@ class PreprocessedRun(NamedTuple):
         path: smoothed states at the times, no NaN, shape (T, n).
         nodes: the same at the Gauss nodes between them, shape (T − 1, 3, n).
         slopes: their velocities there.
-        gaps: the samples before which the path is a guess.
         inputs: at both ends of each interval, shape (T − 1, 2, m); m is 0 where there are none.
     """
 
@@ -51,7 +50,6 @@ class PreprocessedRun(NamedTuple):
     path: np.ndarray
     nodes: np.ndarray
     slopes: np.ndarray
-    gaps: np.ndarray
     inputs: np.ndarray
 
     @property
@@ -106,9 +104,9 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
         times, states, counts, scatter = (list(each) for each in zip(*condensed, strict=True))
     shortest = min(lengths, default=np.inf)
     refined = [_refined(*run, shortest) for run in zip(times, states, counts, scatter, strict=True)]
-    times, states, counts, scatter, gaps = (list(each) for each in zip(*refined, strict=True))
+    times, states, counts, scatter = (list(each) for each in zip(*refined, strict=True))
     inputs = [runs.applied(r, t + float(np.asarray(runs.times[r])[0])) for r, t in enumerate(times)]
-    path_runs = _with_paths(found, times, states, counts, scatter, inputs, gaps)
+    path_runs = _with_paths(found, times, states, counts, scatter, inputs)
     if not all(c.seen for c in found) or mean is not None:
         path_runs = [_completed(run, mean) for run in path_runs]
     noise = np.array([c.noise if c.seen else np.nan for c in found])
@@ -260,7 +258,7 @@ def _condensed(t, x, path, slope, block: float):
 
 
 def _refined(t, x, counts, scatter, lengthscale: float):
-    """The run, its long intervals cut at times at which nothing was measured, and its gaps.
+    """The run, its long intervals cut at times at which nothing was measured.
 
     Three Gauss nodes do not see how a field varies along a third of a swing, and Gauss-Newton steps
     that trust them go uphill. Steps of Runge and Kutta are as many as the longest interval needs.
@@ -270,9 +268,6 @@ def _refined(t, x, counts, scatter, lengthscale: float):
     """
     spans = np.diff(t)
     usual = np.median(spans)
-    # At .75 of it, two radians of a swing, three Gauss nodes are exact to 1e-4, and a smoothed path
-    # across 1.3 was seen to lead to a field with ripples, which fitted the samples.
-    gaps = 1 + np.flatnonzero((spans > 0.75 * lengthscale) & (spans > 3 * usual))
     # One radian: Gauss nodes, of order six, are exact to 1e-4/2⁶ there. Even runs are not cut.
     parts = np.ceil(spans / max(0.35 * lengthscale, 1.5 * usual))
     parts = np.clip(parts, 1, 16).astype(int)  # of a pause nothing is known in its midst
@@ -285,10 +280,10 @@ def _refined(t, x, counts, scatter, lengthscale: float):
         out[at] = a
         return out
 
-    return fine, placed(x, np.nan), placed(counts, 0.0), placed(scatter, 0.0), at[gaps]
+    return fine, placed(x, np.nan), placed(counts, 0.0), placed(scatter, 0.0)
 
 
-def _with_paths(found, times, states, counts, scatter, inputs, gaps) -> list[PreprocessedRun]:
+def _with_paths(found, times, states, counts, scatter, inputs) -> list[PreprocessedRun]:
     """The smoothed path at the samples and at the nodes between them."""
     grids, filled = [], []
     for t, x in zip(times, states, strict=True):
@@ -300,12 +295,12 @@ def _with_paths(found, times, states, counts, scatter, inputs, gaps) -> list[Pre
         filled.append(wide)
     paths = smoothed(found, grids, filled)
     out = []
-    each = zip(times, states, counts, scatter, inputs, gaps, strict=True)
-    for r, (t, x, count, about, ends, gap) in enumerate(each):
+    each = zip(times, states, counts, scatter, inputs, strict=True)
+    for r, (t, x, count, about, ends) in enumerate(each):
         size = 4 * len(t) - 3
         value, slope = (a[r, :size] for a in (paths.value, paths.slope))
         nodes, slopes = (a[:-1].reshape(len(t) - 1, 4, -1)[:, 1:] for a in (value, slope))
-        out.append(PreprocessedRun(t, x, count, about, value[::4], nodes, slopes, gap, ends))
+        out.append(PreprocessedRun(t, x, count, about, value[::4], nodes, slopes, ends))
     return out
 
 

@@ -17,17 +17,15 @@ from hamkernel._machine import compiled_by_size
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.custom_operator import Structured
 from hamkernel._structures.friction import Friction, frictions, with_rest_speed
+from hamkernel._trajectories.kalman import whiten
 from hamkernel._trajectories.likelihood import (
     ClosedForm,
     Condensed,
-    KernelRows,
-    Model,
-    Whitening,
     condensed,
     conditional,
-    landmark_whitening,
     regression_loss,
 )
+from hamkernel._trajectories.model import KernelRows, Model, landmark_whitening
 from hamkernel._trajectories.preprocessing import Preprocessed, sampled
 from hamkernel._trajectories.segments import LinearisedSegments, windows
 from hamkernel._tuning.minimiser import most_likely_in_box
@@ -59,17 +57,17 @@ def without_noise(
     What is left there are errors of integration, which are never white. Of a pendulum with noise of
     0, 1e-6, 1e-5, 1e-4 and 1e-3 of the states, 5 runs of 60 samples, the noise found is 1.0001 (the
     least is 1), 1.0009, 9.9, 99 and 990 millionths, and the whiteness 6e-67, 1, 1, .98 and .99.
-    With process noise that is what is left, and it is judged.
     """
     n = len(scale)
     least = np.asarray(model.log_noise) < np.log(LEAST_NOISE * scale) + 0.1
-    return bounds.free[-2 * n : -n] & least & (not model.is_disturbed)
+    still = not bounds.free[-n:].any()
+    return bounds.free[-2 * n : -n] & least & still
 
 
-def _loss(model: Model, h, S, rows, start_deviation, whitening: Whitening):
+def _loss(model: Model, h, S, rows, start_deviation):
     there = model.at(h)
     T = landmark_whitening(there.kernel, S)
-    made = whitening(there, S, T, rows, start_deviation)
+    made = whiten(there, S, T, rows, start_deviation)
     value = regression_loss(made.M, made.r) + made.constant
     return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
@@ -81,10 +79,9 @@ def losses(
     S,
     rows: LinearisedSegments,
     start_deviation,
-    whitening: Whitening,
 ):
     """−log p(rows) at some points h."""
-    return jax.lax.map(lambda h: _loss(model, h, S, rows, start_deviation, whitening), design)
+    return jax.lax.map(lambda h: _loss(model, h, S, rows, start_deviation), design)
 
 
 def searched(
@@ -115,12 +112,12 @@ def exact(rows: LinearisedSegments) -> tuple[Float[Array, "k d"], LinearisedSegm
 
 @compiled_by_size
 def _best(
-    model: Model, S, rows: LinearisedSegments, start_deviation, low, high, free, steps, whitening
+    model: Model, S, rows: LinearisedSegments, start_deviation, low, high, free, steps
 ):
     start = model.flat
 
     def loss(h):
-        return _loss(model, jnp.where(free, h, start), S, rows, start_deviation, whitening)
+        return _loss(model, jnp.where(free, h, start), S, rows, start_deviation)
 
     # N samples determine log σ to 1/√(2N); a lengthscale or an amplitude is known to some tenths.
     count = jnp.maximum(rows.counts.sum(axis=(0, 1)), 1)
@@ -138,7 +135,6 @@ def most_likely(
     start_deviation,
     bounds: Bounds,
     steps: int,
-    whitening: Whitening,
 ) -> tuple[Model, float]:
     """The model under which the rows are likeliest, by BFGS from this one, and −log p there.
 
@@ -147,9 +143,9 @@ def most_likely(
     S, rows = searched(jnp.asarray(S), rows)
     if not bounds.free.any():
         flat = model.flat[None]
-        return model, float(losses(model, flat, S, rows, start_deviation, whitening)[0])
+        return model, float(losses(model, flat, S, rows, start_deviation)[0])
     sides = jnp.asarray(bounds.low), jnp.asarray(bounds.high), jnp.asarray(bounds.free)
-    h, value = _best(model, S, rows, start_deviation, *sides, steps, whitening)
+    h, value = _best(model, S, rows, start_deviation, *sides, steps)
     return model.at(h), float(value)
 
 
@@ -160,7 +156,6 @@ def begun(
     first: int,
     rows: LinearisedSegments,
     start_deviation,
-    whitening: Whitening,
 ) -> tuple[Model, int]:
     """The most likely model of a design, and with how many landmarks to look for a better one.
 
@@ -176,7 +171,7 @@ def begun(
         sets[len(S)] = own
     best, count, start = np.inf, first, design[0]
     for size, some in sets.items():
-        values = np.asarray(losses(model, points, some, part, start_deviation, whitening))
+        values = np.asarray(losses(model, points, some, part, start_deviation))
         if values.min() < best - (n * len(some) / 2) ** 0.5:
             best, count, start = values.min(), size, design[int(np.argmin(values))]
     return model.at(jnp.asarray(start)), count
@@ -189,7 +184,6 @@ def solved(
     quick: int,
     rows: LinearisedSegments,
     start_deviation,
-    whitening: Whitening,
     bounds: "Bounds",
 ) -> tuple[Model, ClosedForm]:
     """The closed form of all rows on the first `count` landmarks or more, and the model with it.
@@ -203,13 +197,13 @@ def solved(
 
     def on(count: int) -> tuple[Condensed, ClosedForm]:
         points = jnp.asarray(S[:count])
-        known = condensed(model, points, rows, start_deviation, whitening)
+        known = condensed(model, points, rows, start_deviation)
         return known, conditional(known, points)
 
     known, found = on(count)
     while count < len(S):
         if count <= quick < min(2 * count, len(S)):
-            given = model, jnp.asarray(S[:count]), rows, start_deviation, whitening
+            given = model, jnp.asarray(S[:count]), rows, start_deviation
             if not limited_by_landmarks(*given, bool(free.any()), least=np.log(2) / 2):
                 break
         more = on(2 * count)
@@ -236,7 +230,6 @@ def limited_by_landmarks(
     S,
     rows: LinearisedSegments,
     start_deviation,
-    whitening: Whitening,
     with_less_noise: bool = False,
     least: float = 0.0,
 ) -> bool:
@@ -256,7 +249,7 @@ def limited_by_landmarks(
     less = np.tile(np.asarray(model.flat), (len(shares), 1))
     less[:, -2 * n :] += np.log(shares)[:, None]
     few, many = (
-        np.asarray(losses(model, jnp.asarray(flat), points, part, start_deviation, whitening)).min()
+        np.asarray(losses(model, jnp.asarray(flat), points, part, start_deviation)).min()
         for points, flat in ((S, less[:1]), (own, less))
     )
     freedom = float((part.counts > 0).sum()) - n * len(part.counts)
@@ -268,7 +261,6 @@ def gain_of_friction(
     S,
     rows: LinearisedSegments,
     start_deviation,
-    whitening: Whitening,
     data: Preprocessed,
 ) -> float:
     """The gain of log p from viscous and dry friction of the momenta beside the drift.
@@ -287,7 +279,7 @@ def gain_of_friction(
         return 0.0
     both = Friction(force / fastest, 1e-6 * force) + Friction(1e-6 * force / fastest, force)
     more = with_rest_speed(both, jnp.asarray(X), n)
-    return _gain(model, more, S, rows, start_deviation, whitening)
+    return _gain(model, more, S, rows, start_deviation)
 
 
 def gain_of_inertia(
@@ -295,7 +287,6 @@ def gain_of_inertia(
     S,
     rows: LinearisedSegments,
     start_deviation,
-    whitening: Whitening,
     data: Preprocessed,
     mean: Any,
 ) -> float:
@@ -321,7 +312,7 @@ def gain_of_inertia(
     lengths = Gaussian(np.maximum(data.scale[: n // 2], 1e-3 * data.scale[: n // 2].max()))
     cubic = Select(_cubic, tuple(range(n // 2, n)))
     more = Structured(size**2 * (Select(lengths, positions) * cubic), _on_momenta)
-    return _gain(model, more, S, rows, start_deviation, whitening)
+    return _gain(model, more, S, rows, start_deviation)
 
 
 def _cubic(v: Float[Array, " m"], w: Float[Array, " m"]) -> Float[Array, ""]:
@@ -338,7 +329,6 @@ def _gain(
     S,
     rows: LinearisedSegments,
     start_deviation,
-    whitening: Whitening,
 ) -> float:
     """The gain of log p from `more` beside the kernel of states, at less noise if that is likelier.
 
@@ -346,12 +336,12 @@ def _gain(
     """
     K, n = model.kernel, rows.residual.shape[-1]
     S, rows = searched(jnp.asarray(S), rows)
-    explains = slice(-n, None) if model.is_disturbed else slice(-2 * n, -n)
+    explains = slice(-2 * n, None)
 
     def least(model: Model) -> float:
         design = np.tile(np.asarray(model.flat), (3, 1))
         design[:, explains] += np.log([[1.0], [0.1], [0.01]])
-        return float(losses(model, jnp.asarray(design), S, rows, start_deviation, whitening).min())
+        return float(losses(model, jnp.asarray(design), S, rows, start_deviation).min())
 
     return least(model) - least(model._replace(kernel=K.with_states(K.of_states + more)))
 

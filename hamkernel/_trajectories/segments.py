@@ -25,7 +25,6 @@ from hamkernel._machine import compiled_by_size
 from hamkernel._trajectories.flow import (
     NODES,
     WEIGHTS,
-    Expansion,
     Path,
     Segments,
     broadcast_mask,
@@ -46,7 +45,7 @@ class Piece(NamedTuple):
 
 
 class LinearisedSegments(NamedTuple):
-    """The rows of samples, linear in g = f − m, before the starts are projected out.
+    """The rows of samples, linear in g = f − m, before they are whitened.
 
     Attributes:
         nodes: the points where g is evaluated, with inputs (x, u), d = n + m, shape (S, L, 3, d).
@@ -75,27 +74,6 @@ class LinearisedSegments(NamedTuple):
     scatter: Float[Array, "S L+1 n"]
     prior_offset: Float[Array, "S n"]
 
-    @property
-    def target(self) -> Float[Array, "S L+1 n"]:
-        """The sum x − x̂ + ô."""
-        moved = (self.drive + self.missed)[..., None]
-        return self.residual + accumulated(self.across, moved)[..., 0]
-
-
-def accumulated(
-    across: Float[Array, "S L n n"], local: Float[Array, "S L n q"]
-) -> Float[Array, "S L+1 n q"]:
-    """The sums sᵢ₊₁ = Ψᵢ sᵢ + localᵢ from s₀ = 0: Bv for localᵢ = Σ_k Γ_ik v_k."""
-
-    def step(s, at):
-        transition, own = at
-        s = jnp.einsum("sab,sbq->saq", transition, s) + own
-        return s, s
-
-    start = jnp.zeros_like(local[:, 0])
-    _, sums = jax.lax.scan(step, start, (jnp.moveaxis(across, 1, 0), jnp.moveaxis(local, 1, 0)))
-    return jnp.concatenate([start[:, None], jnp.moveaxis(sums, 0, 1)], axis=1)
-
 
 @compiled_by_size
 def linearised(
@@ -104,7 +82,6 @@ def linearised(
     mean: Float[Array, "S L 3 n"],
     segments: Segments,
     good: Bool[Array, " S"],
-    is_solution: bool,
 ) -> LinearisedSegments:
     """The rows along a path, given its slopes and the mean at the nodes.
 
@@ -114,8 +91,6 @@ def linearised(
         mean: m.
         segments: the samples.
         good: which segments to keep.
-        is_solution: whether the path solves ẋ = slope. If not, what the Gauss rule misses of its
-            increments is put back: for Φ = I the rows are then exact differences of the samples.
     """
     keep = good[:, None, None]
     x, nodes, to_end, across = (_where(good, a) for a in path)
@@ -129,9 +104,6 @@ def linearised(
     weights = shares[..., None, None] * to_end  # Γ_k = h w_k Ψ Φ_k⁻¹
     slopes, mean = _where(good, slopes), _where(good, mean)
     drive = jnp.einsum("slkab,slkb->sla", weights, slopes - mean)
-    missed = jnp.zeros_like(drive)
-    if not is_solution:
-        missed = jnp.diff(x, axis=1) - (shares[..., None] * slopes).sum(axis=2)
     return LinearisedSegments(
         nodes=nodes,
         across=across,
@@ -139,7 +111,7 @@ def linearised(
         spans=segments.spans,
         pushed=jnp.ones_like(segments.spans),
         drive=drive,
-        missed=missed,
+        missed=jnp.zeros_like(drive),
         residual=segments.measured - x,
         counts=_where(good, segments.counts),
         scatter=_where(good, segments.scatter),
@@ -262,7 +234,11 @@ def _linearised_along_smoothed(mean, along, good, segments: Segments) -> Lineari
     x, points, slopes = along
     path = given_path(x, points, segments.spans, jacobians(mean, points, x.shape[-1]))
     there = means(mean, points, slopes)
-    return linearised(path, slopes, there, segments, good, is_solution=False)
+    rows = linearised(path, slopes, there, segments, good)
+    # What the Gauss rule misses of the increments of a path that solves no equation is put back.
+    shares = segments.spans[:, :, None, None] * jnp.asarray(WEIGHTS, x.dtype)[None, None, :, None]
+    missed = jnp.diff(x, axis=1) - (shares * slopes).sum(axis=2)
+    return rows._replace(missed=jnp.where(good[:, None, None], missed, 0.0))
 
 
 SHORT = 12  # samples at most in a segment while the field is rough; 10 gave the same errors
@@ -274,49 +250,11 @@ def equal_pieces(runs: list[PreprocessedRun], most: int) -> list[Piece]:
     return [piece for r, run in enumerate(runs) for piece in _equal(r, 0, len(run.times), most)]
 
 
-def short_pieces(runs: list[PreprocessedRun]) -> list[Piece]:
-    """Short pieces, none of them across a gap, if it has three samples at least."""
-    pieces = []
-    for r, run in enumerate(runs):
-        start, T = 0, len(run.times)
-        for gap in run.gaps:
-            if min(gap - start, T - gap) >= 3:
-                pieces += _equal(r, start, int(gap), SHORT)
-                start = int(gap)
-        pieces += _equal(r, start, T, SHORT)
-    return pieces
-
-
 def _equal(run: int, start: int, stop: int, most: int) -> list[Piece]:
     # As many as the next power of two needs: runs of other lengths then have as many pieces.
     count = -(-power_of_two(stop - start) // most)
     ends = np.linspace(start, stop, count + 1).round().astype(int)
     return [Piece(run, int(a), int(b)) for a, b in itertools.pairwise(ends)]
-
-
-def grown(
-    runs: list[PreprocessedRun], pieces: list[Piece], good: Bool[np.ndarray, " S"]
-) -> list[Piece]:
-    """Runs whose pieces are all good in one piece, up to `LONG` samples; the others as they are."""
-    lost = {piece.run for piece, is_good in zip(pieces, good, strict=True) if not is_good}
-    whole = [piece for piece in equal_pieces(runs, LONG) if piece.run not in lost]
-    return whole + [piece for piece in pieces if piece.run in lost]
-
-
-def halved(
-    runs: list[PreprocessedRun], pieces: list[Piece], good: Bool[np.ndarray, " S"]
-) -> list[Piece]:
-    """The pieces, those that are not good cut at the gap in their middle, or in halves if long."""
-    out = []
-    for piece, is_good in zip(pieces, good, strict=True):
-        middle = (piece.start + piece.stop) // 2
-        gaps = [int(g) for g in runs[piece.run].gaps if piece.start < g < piece.stop]
-        if is_good or (not gaps and piece.stop - piece.start <= SHORT):
-            out.append(piece)
-            continue
-        middle = min(gaps, key=lambda gap: abs(gap - middle), default=middle)
-        out += [piece._replace(stop=middle), piece._replace(start=middle)]
-    return out
 
 
 def padded_count(count: int, large: bool) -> int:
@@ -345,29 +283,6 @@ def segmented(
         own = run.times, run.states, run.counts, run.scatter
         filled.append((*(a[part] for a in own), paths[r][start], run.inputs[start : stop - 1]))
     return segments_of(filled, size, length)
-
-
-def smoothed_rows(
-    data: Preprocessed, mean
-) -> tuple[list[Piece], Bool[np.ndarray, " S"], LinearisedSegments]:
-    """Short pieces of the smoothed runs, which of them are good, and their rows."""
-    pieces = short_pieces(data.runs)
-    segments = segmented(data.runs, pieces, [run.path for run in data.runs])
-    good = np.zeros(len(segments.starts), bool)
-    good[: len(pieces)] = [data.usable[piece.run] for piece in pieces]
-    return pieces, good, linearised_along_smoothed(data, pieces, segments, mean, good)
-
-
-@compiled_by_size
-def linearised_along_field(
-    field: Expansion, path: Path, segments: Segments, good
-) -> LinearisedSegments:
-    """The rows along the path of the current field."""
-    nodes = jnp.where(good[:, None, None, None], path.nodes, jnp.zeros_like(path.nodes))
-    slopes = jax.vmap(jax.vmap(jax.vmap(field)))(nodes)
-    return linearised(
-        path, slopes, means(field.mean, nodes, slopes), segments, good, is_solution=True
-    )
 
 
 def updated(paths, pieces: list[Piece], good, x: np.ndarray) -> list[np.ndarray]:
