@@ -27,12 +27,20 @@ from jaxtyping import Array, ArrayLike, Float, Num
 from hamkernel import _require as require
 from hamkernel._kernels.base import Descriptor, Invariance
 from hamkernel._kernels.symmetry import without_symmetry
-from hamkernel._machine import RowSharding, automatic, on_each, refuse_beyond_memory
+from hamkernel._machine import (
+    RowSharding,
+    automatic,
+    compiled,
+    full_precision,
+    on_each,
+    refuse_beyond_memory,
+)
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components
 from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 
+@full_precision
 def gram(
     K: AbstractMatrixKernel, X: Num[ArrayLike, "N n"], Z: Num[ArrayLike, "M n"] | None = None
 ) -> Float[Array, "N n M n"]:
@@ -63,7 +71,7 @@ def gram(
     return _compiled_gram(K, X, Z)
 
 
-@eqx.filter_jit
+@compiled
 def _compiled_gram(K, X, Z):
     return assemble(K, X, Z)
 
@@ -325,6 +333,7 @@ def _(perturbed, kernel_and_data, make, rowwise=False):
 
 
 @forward_differentiated.def_bwd
+@full_precision
 def _(saved, bar, perturbed, kernel_and_data, make, rowwise=False):
     K, data = kernel_and_data
 
@@ -411,7 +420,7 @@ def gram_rounding(trace: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.finfo(trace.dtype).eps * trace
 
 
-@eqx.filter_jit
+@compiled
 def field_rounding(
     K: AbstractMatrixKernel,
     x: Float[Array, " n"],

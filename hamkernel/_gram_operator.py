@@ -18,7 +18,15 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._gram import centred, diagonals, gram
-from hamkernel._machine import RowSharding, as_given, rows_of, split, sum_of_columns
+from hamkernel._machine import (
+    RowSharding,
+    as_given,
+    compiled,
+    full_precision,
+    rows_of,
+    split,
+    sum_of_columns,
+)
 from hamkernel._show import described
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.structure import group_expanded
@@ -85,6 +93,7 @@ class GramOperator(lx.AbstractLinearOperator):
     def columns(self) -> Float[Array, "M n"]:
         return self.X if self.Z is None else self.Z
 
+    @full_precision
     def mv(self, vector: Num[ArrayLike, "M n"]) -> Float[Array, "N n"]:
         """G a, shape (N, n).
 
@@ -100,6 +109,7 @@ class GramOperator(lx.AbstractLinearOperator):
         vector = require.floating(vector, "the vector")
         return _compiled(self.kernel, self.X, self.columns, vector, self.X_rows, self.Z_rows)
 
+    @full_precision
     def as_matrix(self) -> Float[Array, "Nn Mn"]:
         """The dense Gram, O(N M n²) memory."""
         G = gram(self.kernel, self.X, self.columns)
@@ -151,7 +161,7 @@ def _compiled(K, X, Z, A, X_rows, Z_rows):
     return as_given(X_rows, _product(K, X, Z, split(Z_rows, A), X_rows, Z_rows))
 
 
-_product = eqx.filter_jit(product)
+_product = compiled(product)
 
 
 def _tiled(K, X, Z, A):

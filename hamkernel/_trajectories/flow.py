@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hamkernel._gram import centred
-from hamkernel._machine import compiled_by_size, orthonormal
+from hamkernel._machine import compiled, compiled_by_size, orthonormal
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.friction import damped_coordinates, frictions
 
@@ -203,7 +203,7 @@ class Segments(NamedTuple):
     inputs: Float[Array, "S L 2 m"]
 
 
-@jax.jit
+@compiled
 def tangents(across: Float[Array, "S L n n"]) -> Float[Array, "S L+1 n n"]:
     """Φ at the samples, from the tangents across the intervals."""
     S, _, n, _ = across.shape

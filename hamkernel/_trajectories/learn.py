@@ -16,7 +16,7 @@ from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import learned_field
 from hamkernel._gram_operator import placed_product
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._machine import one_blas_thread
+from hamkernel._machine import full_precision, one_blas_thread
 from hamkernel._observations.kinds import inputs_or_parameters
 from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
@@ -74,6 +74,7 @@ from hamkernel._trajectories.smoothing import interpolated, power_of_two
 
 
 @one_blas_thread
+@full_precision
 def learn(
     K: AbstractMatrixKernel,
     runs: Runs,

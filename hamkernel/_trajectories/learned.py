@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
+from hamkernel._machine import full_precision
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._posterior import Posterior, condition
 from hamkernel._show import described
@@ -115,6 +116,7 @@ class Learned(eqx.Module):
         return described(self)
 
     @property
+    @full_precision
     def posterior(self) -> Posterior:
         """The Gaussian process of the field given the runs: bands, samples, updates.
 
@@ -145,6 +147,7 @@ class Learned(eqx.Module):
             mean=self.mean,
         )
 
+    @full_precision
     def sample_disturbance(
         self, key: Key[Array, ""], ts: Float[ArrayLike, " T"]
     ) -> Float[Array, "T n"]:

@@ -27,7 +27,7 @@ from jaxtyping import Array, Float
 
 from hamkernel._gram import assemble, forward_differentiated
 from hamkernel._kernels.base import Scaled
-from hamkernel._machine import compiled_by_size, orthonormal
+from hamkernel._machine import compiled_by_size, full_precision, orthonormal
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.joined import InputMatrix
 from hamkernel._structures.structure import AbstractStructure
@@ -202,6 +202,7 @@ def regression_loss(M: Float[Array, "D q"], r: Float[Array, " D"]) -> Float[Arra
     return _regression_forward(M, r)[0]
 
 
+@full_precision
 def _regression_forward(M, r):
     q = M.shape[1]
     F = triangle(no_rows(q, M.dtype), M, r)
@@ -210,6 +211,7 @@ def _regression_forward(M, r):
     return 0.5 * (F[q, q] ** 2 + log_det), (M, r, R, F[:q, q])
 
 
+@full_precision
 def _regression_backward(saved, bar):
     M, r, R, z = saved
     w = solve_triangular(R, z)

@@ -20,6 +20,7 @@ import optimistix as optx
 from jaxtyping import Float
 
 from hamkernel import _require as require
+from hamkernel._machine import compiled
 from hamkernel._observations.measurements import Measurements
 from hamkernel._tuning.minimiser import BoxBFGS, MinimiserRun, begun, minimised
 from hamkernel._tuning.objective import SearchCriterion, SearchObjective, parts_of
@@ -302,12 +303,12 @@ def _as_numpy(leaf: Any) -> Any:
     return np.asarray(leaf) if eqx.is_array(leaf) else leaf
 
 
-@eqx.filter_jit
+@compiled
 def _begun(objective, minimiser, us) -> MinimiserRun:
     return eqx.filter_vmap(functools.partial(begun, minimiser, objective))(us)
 
 
-@eqx.filter_jit
+@compiled
 def _minimised(objective, minimiser, runs: MinimiserRun, most, side_by_side) -> MinimiserRun:
     """The runs, each at its end or at its largest number of steps."""
     arrays, static = eqx.partition(runs, eqx.is_array)
