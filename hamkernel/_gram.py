@@ -37,6 +37,7 @@ from hamkernel._machine import (
 )
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components
 from hamkernel._observations.measurements import Measurements
+from hamkernel._sizes import sizes
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 
@@ -146,9 +147,7 @@ def trace(
 
     def of_points(K, X):
         of_point = jax.checkpoint(lambda x: block_traces(K, x[None])[0])
-        # The block of a kernel with a network takes kilobytes. The blocks of 1024 points of a
-        # Gaussian stay in the cache: 16 ms for a million points, and 90 ms with 4096 at once.
-        return jax.lax.map(of_point, X, batch_size=1024).sum()
+        return jax.lax.map(of_point, X, batch_size=sizes().trace_points).sum()
 
     return on_each(spread, of_points, K, X, joined=False)
 

@@ -28,12 +28,9 @@ from hamkernel._machine import (
     sum_of_columns,
 )
 from hamkernel._show import described
+from hamkernel._sizes import sizes
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.structure import group_expanded
-
-# Rows and columns of one tile of pairs: 1000 × 1000 doubles are 8 MB. Measured on two cores between
-# 125 × 4000 and 2000 × 1000, with n = 4 and 20; half and twice cost up to 15 % more.
-TILE = 1000
 
 
 def gram_operator(
@@ -168,8 +165,9 @@ def _tiled(K, X, Z, A):
     """`product` on one device."""
     K, Z, A = group_expanded(K, Z, A.astype(X.dtype))
     X, Z = centred(K, X, Z)
-    rows = tiles(X, X[:1], TILE)
-    columns = (tiles(Z, Z[:1], TILE), tiles(A, jnp.zeros_like(A[:1]), TILE))
+    side = sizes().tile
+    rows = tiles(X, X[:1], side)
+    columns = (tiles(Z, Z[:1], side), tiles(A, jnp.zeros_like(A[:1]), side))
 
     # Tiles are recomputed in the backward pass, which would otherwise keep every pair.
     @jax.checkpoint

@@ -27,6 +27,8 @@ from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import Array, Float
 
+from hamkernel import _sizes
+
 
 @dataclasses.dataclass(frozen=True)
 class RowSharding:
@@ -209,10 +211,14 @@ def dense_bytes(rows: int, columns: int, dtype: jnp.dtype, copies: int) -> int:
     return copies * rows * columns * jnp.dtype(dtype).itemsize
 
 
-@functools.cache
 def memory_bytes() -> int | None:
     """The memory of the default device, or of this machine or container; None if unknown."""
-    stats = jax.local_devices()[0].memory_stats() or {}
+    return _memory_of(_sizes.platform())
+
+
+@functools.cache
+def _memory_of(platform: str) -> int | None:
+    stats = jax.local_devices(backend=platform)[0].memory_stats() or {}
     if "bytes_limit" in stats:
         return stats["bytes_limit"]
     try:
@@ -339,7 +345,7 @@ def compiled_by_size(function: Callable[P, T]) -> Callable[P, T]:
     @functools.wraps(function)
     def sized(*args: P.args, **kwargs: P.kwargs) -> T:
         arrays = [a for a in jax.tree.leaves((args, kwargs)) if eqx.is_array(a)]
-        if any(isinstance(a, Tracer) for a in arrays) or not _options_are_known():
+        if any(isinstance(a, Tracer) for a in arrays) or not _options_are_known(_sizes.platform()):
             return plain(*args, **kwargs)
         small = sum(a.size for a in arrays) <= _SMALL
         return (fastest if small else fast)(*args, **kwargs)
@@ -348,9 +354,9 @@ def compiled_by_size(function: Callable[P, T]) -> Callable[P, T]:
 
 
 @functools.cache
-def _options_are_known() -> bool:
-    """Whether this is a CPU, and its compiler one that has these options."""
-    if jax.default_backend() != "cpu":
+def _options_are_known(platform: str) -> bool:
+    """Whether the platform is a CPU whose compiler has these options."""
+    if platform != "cpu":
         return False
     try:
         jax.jit(lambda: 0, compiler_options=_FASTEST).lower().compile()

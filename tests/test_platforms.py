@@ -7,6 +7,7 @@ import pytest
 from data import swings
 
 import hamkernel as hk
+from hamkernel._sizes import platform, sizes
 
 X, Y = map(jnp.asarray, swings(8))
 K = hk.Symplectic(hk.Gaussian(1.0))
@@ -41,3 +42,12 @@ def test_factorisations_of_a_batch_run_together_on_a_gpu_and_one_by_one_on_a_cpu
     function, batch, batched = BATCHES[name]
     assert batched in lowered(function, batch, platform="cuda")
     assert batched not in lowered(function, batch, platform="cpu")
+
+
+def test_sizes_follow_the_default_device():
+    with jax.default_device(jax.devices("cpu")[0]):
+        assert platform() == "cpu"
+        assert sizes().tile == 1000
+    with jax.default_device("cuda"):
+        assert platform() == "cuda"
+        assert sizes().tile > 1000

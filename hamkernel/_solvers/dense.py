@@ -29,6 +29,7 @@ from hamkernel._gram import (
 from hamkernel._machine import compiled, refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
+from hamkernel._sizes import sizes
 from hamkernel._solvers.factors import (
     ROWS_IN_PLACE,
     DenseFactor,
@@ -96,10 +97,6 @@ def dense_field(problem: Problem, throw: bool = True, progress: bool = False) ->
     return _unless_lost(field, left, problem.rows.count, throw)
 
 
-# The number of rows from which the Gram of velocities, 288 MB, is factored in its own memory.
-IN_PLACE = 6000
-
-
 def copies(problem: Problem) -> int:
     """The number of matrices of the size of the Gram that a dense fit holds at its peak.
 
@@ -111,7 +108,7 @@ def copies(problem: Problem) -> int:
 
 def _is_in_place(problem: Problem) -> bool:
     """Whether the Gram is factored in its own memory, which is not possible under `jax.jit`."""
-    has_states = problem.rows.size >= IN_PLACE and problem.states is not None
+    has_states = problem.rows.size >= sizes().rows_in_place and problem.states is not None
     return has_states and require.is_concrete(problem)
 
 
