@@ -12,7 +12,7 @@ import jax
 
 def platform() -> str:
     """The platform of the default device, such as "cpu" or "gpu"."""
-    device = jax.config.jax_default_device
+    device = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
     if device is None:
         return jax.default_backend()
     return device if isinstance(device, str) else device.platform
