@@ -10,6 +10,7 @@ import functools
 import itertools
 import re
 import warnings
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +22,7 @@ from scipy.integrate import solve_ivp
 
 import hamkernel as hk
 from hamkernel._machine import orthonormal
-from hamkernel._trajectories.diagnostics import warn_of_few, warn_of_noise
+from hamkernel._trajectories.diagnostics import degrees_of_freedom
 from hamkernel._trajectories.flow import (
     NODES,
     WEIGHTS,
@@ -344,16 +345,13 @@ def test_five_samples_a_swing_are_enough():
     np.testing.assert_allclose(found.noise, 0.05, rtol=0.2)
 
 
-def test_a_field_that_explains_nothing_says_so():
-    scale = np.array([1.3, 1.2])
-    with pytest.warns(UserWarning, match=r"explains little of the runs.* coordinate 1 is 1\.1"):
-        assert warn_of_noise(np.array([0.1, 1.1]), scale, 20.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert not warn_of_noise(np.array([0.4, np.nan]), scale, 20.0)
-        assert not warn_of_few(10.0)
-    with pytest.warns(UserWarning, match=r"leave 3\.2 degrees of freedom .* are a guess"):
-        assert warn_of_few(3.2)
+def test_noise_from_a_few_degrees_of_freedom_is_a_guess():
+    few, enough, given = (
+        degrees_of_freedom(SimpleNamespace(is_noise_known=known, remaining=left))
+        for known, left in ((False, 3.2), (False, 10.0), (True, 3.2))
+    )
+    assert (few.passes, enough.passes, given.passes) == (False, True, True)
+    assert "leave 3.2 degrees of freedom: noise and field are a guess" in few.meaning
 
 
 @pytest.mark.slow
@@ -373,9 +371,10 @@ def test_the_order_of_the_runs_does_not_matter(learned):
 def test_a_run_that_is_garbage_is_dropped_and_named():
     times, states, true = logs()
     states[2] = 3 * np.random.default_rng(9).standard_normal(states[2].shape)
-    with pytest.warns(UserWarning, match="dropped: samples 0 to 29 of run 2"):
+    with pytest.warns(UserWarning, match="parts left out|learned from"):
         found = hk.learn(K, hk.Runs(times, states))
     assert np.asarray(found.kept).tolist() == [1, 1, 0, 1, 1, 1]
+    assert found.dropped == ((2, 0, 30),)
     assert field_error(found.field, true) < 0.05
     assert all(np.isfinite(x).all() for x in found.states)
 

@@ -19,14 +19,8 @@ from scipy.integrate import solve_ivp
 from test_learn import PENDULUM, damped, field_error, logs, moved_by_momenta, moved_by_momentum
 
 import hamkernel as hk
-from hamkernel._trajectories.diagnostics import (
-    autocorrelations,
-    ljung_box,
-    warn_of_process,
-    warn_of_rest_speed,
-    warn_of_units,
-    whiteness,
-)
+from hamkernel._trajectories.diagnostics import lengthscales, missing_force
+from hamkernel._trajectories.diagnostics import rest_speed as rest_speed_row
 from hamkernel._trajectories.flow import WEIGHTS
 from hamkernel._trajectories.iteration import evidence, likelier
 from hamkernel._trajectories.kalman import as_observations, innovations, smoothed_path, whiten
@@ -38,7 +32,8 @@ from hamkernel._trajectories.likelihood import (
 )
 from hamkernel._trajectories.search import gain_of_friction, gain_of_inertia, losses
 from hamkernel._trajectories.segments import LinearisedSegments
-from hamkernel._trajectories.sensors import timing, warn_of_curve
+from hamkernel._trajectories.sensors import is_on_a_curve, timing
+from hamkernel._trajectories.whiteness import autocorrelations, ljung_box, whiteness
 
 # The filter.
 
@@ -304,35 +299,29 @@ def test_times_that_are_off_are_named():
         path = scipy.interpolate.make_interp_spline(ts, x, 5)  # wrong by 1e-3 or less
         at = ts + 0.02 * rng.standard_normal(40)
         states.append(path(at) + 0.01 * rng.standard_normal(x.shape))
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        hk.learn(KERNEL, hk.Runs([ts] * 3, states), process_noise=0)
-    assert any(re.search(r"as if times were off by 0\.0[12]", str(w.message)) for w in said)
+    with pytest.warns(UserWarning, match="learned.diagnostics"):
+        found = hk.learn(KERNEL, hk.Runs([ts] * 3, states), process_noise=0)
+    assert re.search(r"as if times were off by 0\.0[12]", found.diagnostics["timing"].meaning)
 
 
 @pytest.mark.parametrize(
     ("kernel", "said"), [(KERNEL, True), (hk.Symplectic(hk.Gaussian(np.ones(2))), False)]
 )
 def test_one_lengthscale_for_coordinates_of_other_sizes_is_said(kernel, said):
-    for ratio in (100.0, 1000.0):
-        with warnings.catch_warnings(record=True) as seen:
-            warnings.simplefilter("always")
-            warn_of_units(kernel, np.array([1.0, ratio]))
-        assert len(seen) == (said and ratio > 300)
+    assert lengthscales(kernel, np.array([1.0, 100.0])) is None
+    assert lengthscales(kernel, np.array([1.0, 1000.0])).passes != said
     some = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0))
-    warn_of_units(some, np.array([1e-6, 1e6]))  # a warning is an error here
+    assert lengthscales(some, np.array([1e-6, 1e6])).passes
 
 
 @pytest.mark.parametrize(("rest_speed", "said"), [(0.1, True), (0.01, False)])
 def test_dry_friction_that_fades_over_the_momenta_of_the_runs_is_said(rest_speed, said):
     drift = hk.Sum(energy=hk.Symplectic(hk.Gaussian()), dry=hk.Friction(rest_speed=rest_speed))
     X = np.array([[0.0, 0.25, 1.0], [1.0, -0.24, 0.0]])  # q, p and an input
-    with warnings.catch_warnings(record=True) as seen:
-        warnings.simplefilter("always")
-        warn_of_rest_speed(hk.Controlled(drift, hk.InputMatrix(1.0)), X, 2)
-    assert [str(w.message).endswith("hk.Friction(rest_speed=0.0025).") for w in seen] == [
-        True
-    ] * said
+    row = rest_speed_row(hk.Controlled(drift, hk.InputMatrix(1.0)), X, 2)
+    assert (row is not None) == said
+    if said:
+        assert "hk.Friction(rest_speed=0.0025)" in row.advice
 
 
 # What is learned.
@@ -408,8 +397,9 @@ def test_friction_is_named_although_process_noise_whitens_the_innovations():
     times, states, _ = logs(lambda x: PENDULUM(x) - drag * x, noise=0.01, **given)
     positions = [np.column_stack([x[:, 0], np.full(len(x), np.nan)]) for x in states]
     drift = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0))
-    with pytest.warns(UserWarning, match="friction, with which log p would be"):
+    with pytest.warns(UserWarning, match=r"friction \(log p \+ "):
         found = hk.learn(drift, hk.Runs(times, positions), mean=moved_by_momentum)
+    assert "missing force" in found.diagnostics.failing
     assert found.whiteness > 0.05
 
 
@@ -458,10 +448,10 @@ def turned(start, end):
     ids=["capacitor", "tank", "quarter swing", "rotation", "fall"],
 )
 def test_what_has_no_inertia_is_told_from_what_moves(states, said):
-    with warnings.catch_warnings(record=True) as seen:
-        warnings.simplefilter("always")
-        warn_of_curve(states)
-    assert bool(seen) == said
+    assert is_on_a_curve(states, np.zeros(2)) == said
+    dice = np.random.default_rng(0)
+    noisy = [x + 0.02 * dice.standard_normal(x.shape) for x in states]
+    assert is_on_a_curve(noisy, np.full(2, 0.02)) == said
 
 
 def test_a_system_without_inertia_is_named_and_its_rate_is_learned():
@@ -471,8 +461,10 @@ def test_a_system_without_inertia_is_named_and_its_rate_is_learned():
     blind = [np.column_stack([v, np.full(t.size, np.nan)]) for v in volts]
     K = hk.Symplectic(hk.Select(hk.Gaussian(2.0), 0))
     known = {"mean": lambda x: jnp.stack([x[1], 0 * x[1]]), "progress": False}
-    with pytest.warns(UserWarning, match=r"one function of the position.*hk\.CurlFree"):
-        hk.learn(K, hk.Runs([t] * 3, blind), **known)
+    with pytest.warns(UserWarning, match="one function of the position"):
+        found = hk.learn(K, hk.Runs([t] * 3, blind), **known)
+    assert not found.converged
+    assert "hk.CurlFree" in found.diagnostics["one curve"].advice
     runs = hk.Runs([t] * 3, [v[:, None] for v in volts])
     found = hk.learn(hk.CurlFree(hk.Gaussian(2.0)), runs, progress=False)
     q = jnp.array([[-3.0], [2.0], [4.0]])
@@ -521,14 +513,13 @@ def test_friction_of_joints_is_spoken_of_where_there_may_be_links(n, said, gaine
         process=np.ones(n),
         misfit=np.ones((1, n)),
         driven=False,
-        gained=gained,
-        bent=0.0,
+        friction_gain=gained,
+        inertia_gain=0.0,
         has_momenta=True,
         has_friction=has_friction,
     )
-    with pytest.warns(UserWarning, match="friction") as seen:
-        warn_of_process(fit)
-    assert ("joints between links" in str(seen[0].message)) == said
+    assert "friction" in missing_force(fit)
+    assert ("joints between links" in missing_force(fit)) == said
 
 
 def with_centrifugal_forces(x):

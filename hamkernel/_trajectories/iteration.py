@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled_by_size
-from hamkernel._trajectories.diagnostics import SETTLED, whiteness
+from hamkernel._trajectories.diagnostics import SETTLED
 from hamkernel._trajectories.flow import (
     Expansion,
     Segments,
@@ -67,6 +67,7 @@ from hamkernel._trajectories.segments import (
     smoothed_rows,
     updated,
 )
+from hamkernel._trajectories.whiteness import whiteness
 
 _ROUNDS = 4  # Levenberg steps before a segment is judged: without them up to 40 % were lost
 _SEARCH = 25  # steps of BFGS, which go on in the next iteration
