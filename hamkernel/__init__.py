@@ -31,8 +31,8 @@ those above it:
     systems, plot, paper
                   example systems, pictures, the paper's experiments
 
-`_require` checks arguments, `_show` prints objects, and `_machine` knows devices, memory,
-threads, and what stalls.
+`_require` checks arguments, `_show` prints objects, `_machine` knows devices, memory, precision,
+threads, and what stalls, and `_sizes` how much is computed at once.
 """
 
 import importlib

@@ -32,6 +32,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from hamkernel import _require as require
+from hamkernel._machine import full_precision
 from hamkernel._solvers.factors import AbstractSystem, Group
 
 Folds = int | Literal["loo"] | Int[ArrayLike, " N"] | Sequence[int]
@@ -120,6 +121,7 @@ def held_out(
     return _held_out_forward(system, y, partition)[0]
 
 
+@full_precision
 def _held_out_forward(system, y, partition):
     factor, a, _, trusted = _factored(system, y)
     C = factor.inverse()
@@ -133,6 +135,7 @@ def _held_out_forward(system, y, partition):
     return value, (C, a, blocks, r, ok)
 
 
+@full_precision
 def _held_out_backward(partition, saved, bars):
     C, a, blocks, r, ok = saved
     r_bar, a_bar = bars
@@ -155,6 +158,7 @@ def free_residuals(
     return _free_residuals_forward(system, y)[0]
 
 
+@full_precision
 def _free_residuals_forward(system, y):
     factor, a, _, trusted = _factored(system, y)
     squares, trace = a @ a, factor.inverse_trace
@@ -163,6 +167,7 @@ def _free_residuals_forward(system, y):
     return value, (factor, a, ok)
 
 
+@full_precision
 def _free_residuals_backward(saved, bars):
     factor, a, ok = saved
     squares_bar, trace_bar = bars
@@ -179,6 +184,7 @@ def log_density(system: AbstractSystem, y: Float[Array, " D"]) -> Float[Array, "
     return _log_density_forward(system, y)[0]
 
 
+@full_precision
 def _log_density_forward(system, y):
     factor, a, square, trusted = _factored(system, y)
     value = -0.5 * (square + factor.log_det + len(y) * jnp.log(2 * jnp.pi).astype(y.dtype))
@@ -186,6 +192,7 @@ def _log_density_forward(system, y):
     return jnp.where(ok, value, -jnp.inf), (factor, a, ok)
 
 
+@full_precision
 def _log_density_backward(saved, bar):
     factor, a, ok = saved
     system_bar = factor.inverse().pulled(0.5 * bar * a, a, inverse=-0.5 * bar)

@@ -27,12 +27,21 @@ from jaxtyping import Array, ArrayLike, Float, Num
 from hamkernel import _require as require
 from hamkernel._kernels.base import Descriptor, Invariance
 from hamkernel._kernels.symmetry import without_symmetry
-from hamkernel._machine import RowSharding, automatic, on_each, refuse_beyond_memory
+from hamkernel._machine import (
+    RowSharding,
+    automatic,
+    compiled,
+    full_precision,
+    on_each,
+    refuse_beyond_memory,
+)
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components
 from hamkernel._observations.measurements import Measurements
+from hamkernel._sizes import sizes
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 
+@full_precision
 def gram(
     K: AbstractMatrixKernel, X: Num[ArrayLike, "N n"], Z: Num[ArrayLike, "M n"] | None = None
 ) -> Float[Array, "N n M n"]:
@@ -63,7 +72,7 @@ def gram(
     return _compiled_gram(K, X, Z)
 
 
-@eqx.filter_jit
+@compiled
 def _compiled_gram(K, X, Z):
     return assemble(K, X, Z)
 
@@ -138,9 +147,7 @@ def trace(
 
     def of_points(K, X):
         of_point = jax.checkpoint(lambda x: block_traces(K, x[None])[0])
-        # The block of a kernel with a network takes kilobytes. The blocks of 1024 points of a
-        # Gaussian stay in the cache: 16 ms for a million points, and 90 ms with 4096 at once.
-        return jax.lax.map(of_point, X, batch_size=1024).sum()
+        return jax.lax.map(of_point, X, batch_size=sizes().trace_points).sum()
 
     return on_each(spread, of_points, K, X, joined=False)
 
@@ -325,6 +332,7 @@ def _(perturbed, kernel_and_data, make, rowwise=False):
 
 
 @forward_differentiated.def_bwd
+@full_precision
 def _(saved, bar, perturbed, kernel_and_data, make, rowwise=False):
     K, data = kernel_and_data
 
@@ -411,7 +419,7 @@ def gram_rounding(trace: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.finfo(trace.dtype).eps * trace
 
 
-@eqx.filter_jit
+@compiled
 def field_rounding(
     K: AbstractMatrixKernel,
     x: Float[Array, " n"],

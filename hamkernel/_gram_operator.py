@@ -18,14 +18,19 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._gram import centred, diagonals, gram
-from hamkernel._machine import RowSharding, as_given, rows_of, split, sum_of_columns
+from hamkernel._machine import (
+    RowSharding,
+    as_given,
+    compiled,
+    full_precision,
+    rows_of,
+    split,
+    sum_of_columns,
+)
 from hamkernel._show import described
+from hamkernel._sizes import sizes
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.structure import group_expanded
-
-# Rows and columns of one tile of pairs: 1000 × 1000 doubles are 8 MB. Measured on two cores between
-# 125 × 4000 and 2000 × 1000, with n = 4 and 20; half and twice cost up to 15 % more.
-TILE = 1000
 
 
 def gram_operator(
@@ -85,6 +90,7 @@ class GramOperator(lx.AbstractLinearOperator):
     def columns(self) -> Float[Array, "M n"]:
         return self.X if self.Z is None else self.Z
 
+    @full_precision
     def mv(self, vector: Num[ArrayLike, "M n"]) -> Float[Array, "N n"]:
         """G a, shape (N, n).
 
@@ -100,6 +106,7 @@ class GramOperator(lx.AbstractLinearOperator):
         vector = require.floating(vector, "the vector")
         return _compiled(self.kernel, self.X, self.columns, vector, self.X_rows, self.Z_rows)
 
+    @full_precision
     def as_matrix(self) -> Float[Array, "Nn Mn"]:
         """The dense Gram, O(N M n²) memory."""
         G = gram(self.kernel, self.X, self.columns)
@@ -151,15 +158,16 @@ def _compiled(K, X, Z, A, X_rows, Z_rows):
     return as_given(X_rows, _product(K, X, Z, split(Z_rows, A), X_rows, Z_rows))
 
 
-_product = eqx.filter_jit(product)
+_product = compiled(product)
 
 
 def _tiled(K, X, Z, A):
     """`product` on one device."""
     K, Z, A = group_expanded(K, Z, A.astype(X.dtype))
     X, Z = centred(K, X, Z)
-    rows = tiles(X, X[:1], TILE)
-    columns = (tiles(Z, Z[:1], TILE), tiles(A, jnp.zeros_like(A[:1]), TILE))
+    side = sizes().tile
+    rows = tiles(X, X[:1], side)
+    columns = (tiles(Z, Z[:1], side), tiles(A, jnp.zeros_like(A[:1]), side))
 
     # Tiles are recomputed in the backward pass, which would otherwise keep every pair.
     @jax.checkpoint

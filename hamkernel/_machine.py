@@ -27,6 +27,8 @@ from jax.core import Tracer
 from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec, SingleDeviceSharding
 from jaxtyping import Array, Float
 
+from hamkernel import _sizes
+
 
 @dataclasses.dataclass(frozen=True)
 class RowSharding:
@@ -209,10 +211,14 @@ def dense_bytes(rows: int, columns: int, dtype: jnp.dtype, copies: int) -> int:
     return copies * rows * columns * jnp.dtype(dtype).itemsize
 
 
-@functools.cache
 def memory_bytes() -> int | None:
     """The memory of the default device, or of this machine or container; None if unknown."""
-    stats = jax.local_devices()[0].memory_stats() or {}
+    return _memory_of(_sizes.platform())
+
+
+@functools.cache
+def _memory_of(platform: str) -> int | None:
+    stats = jax.local_devices(backend=platform)[0].memory_stats() or {}
     if "bytes_limit" in stats:
         return stats["bytes_limit"]
     try:
@@ -288,42 +294,69 @@ def _controller():
     return ThreadpoolController()
 
 
-# What compiles fast. On a CPU a search of hyperparameters takes 4.5 s to compile with XLA's own
-# options for n = 2, and 10.6 s for n = 8; without its fusion emitters 2.5 s and 7.4 s, and it is as
-# fast; without LLVM's optimisation as well .8 s and 1.7 s, and it takes twice as long, .25 s for
-# .11 and 7 s for 4. Learning from two runs of 61 samples, whose arguments have 7000 numbers, takes
-# 18 s for 55 if nothing is optimised, 24 s by this rule; 20 runs of 50 samples with n = 8, of
-# 20 000 to 400 000 numbers, run for 73 s and not 44 if nothing is, and compile for 21 s less.
+def full_precision(function: Callable[P, T]) -> Callable[P, T]:
+    """`function`, whose matrix products keep all digits of their type on every device.
+
+    On a GPU XLA computes float32 products in TF32, with 10 bits of mantissa, unless the program
+    asks for more. The Gram of 1000 states was then off by 6e-4, and by 1.5e-7 with the highest
+    precision, which took .58 ms for .70 (NVIDIA H200). The kernel of the caller is traced inside
+    `function` as well, so that its products are covered.
+    """
+
+    @functools.wraps(function)
+    def precise(*args: P.args, **kwargs: P.kwargs) -> T:
+        with jax.default_matmul_precision("highest"):
+            return function(*args, **kwargs)
+
+    return precise
+
+
+def compiled(function: Any = None, **options: Any) -> Any:
+    """`function` under `eqx.filter_jit` with products in full precision; `options` are of the jit.
+
+    The precision is set while JAX traces, and costs nothing in a call of the compiled program.
+    """
+    if function is None:
+        return functools.partial(compiled, **options)
+    return eqx.filter_jit(full_precision(function), **options)
+
+
+# Options of XLA for programs that compile for longer than they run. A search of hyperparameters on
+# a CPU takes, to compile and to run, for n = 2 and n = 8:
+#     XLA's own options             4.5 s / .11 s    10.6 s / 4 s
+#     without fusion emitters       2.5 s / .11 s     7.4 s / 4 s
+#     nor optimisation by LLVM       .8 s / .25 s     1.7 s / 7 s
+# So only small programs go without LLVM: learning from two runs of 61 samples, whose arguments have
+# 7000 numbers, takes 24 s by this rule, 18 s without LLVM and 55 s with XLA's own options. 20 runs
+# of 50 samples with n = 8, of 20 000 to 400 000 numbers, run for 44 s, and for 73 s without LLVM.
 _FAST = {"xla_cpu_use_fusion_emitters": False}
 _FASTEST = _FAST | {"xla_backend_optimization_level": 0}
 _SMALL = 16_384  # numbers in the arguments, up to which a program is not optimised
 
 
 def compiled_by_size(function: Callable[P, T]) -> Callable[P, T]:
-    """`function` under `eqx.filter_jit`, without optimisation where its arguments are small.
+    """`compiled` without optimisation by XLA where the arguments are small.
 
-    Small arguments make a program that compiles for longer than it runs. Inside of another
-    transformation the outer one says how to compile.
+    Inside another transformation the outer one chooses the options.
     """
-    jit: Any = eqx.filter_jit
-    plain = jit(function)
-    fast, fastest = (jit(function, compiler_options=each) for each in (_FAST, _FASTEST))
+    plain = compiled(function)
+    fast, fastest = (compiled(function, compiler_options=each) for each in (_FAST, _FASTEST))
 
     @functools.wraps(function)
-    def compiled(*args: P.args, **kwargs: P.kwargs) -> T:
+    def sized(*args: P.args, **kwargs: P.kwargs) -> T:
         arrays = [a for a in jax.tree.leaves((args, kwargs)) if eqx.is_array(a)]
-        if any(isinstance(a, Tracer) for a in arrays) or not _options_are_known():
+        if any(isinstance(a, Tracer) for a in arrays) or not _options_are_known(_sizes.platform()):
             return plain(*args, **kwargs)
         small = sum(a.size for a in arrays) <= _SMALL
         return (fastest if small else fast)(*args, **kwargs)
 
-    return compiled
+    return sized
 
 
 @functools.cache
-def _options_are_known() -> bool:
-    """Whether this is a CPU, and its compiler one that has these options."""
-    if jax.default_backend() != "cpu":
+def _options_are_known(platform: str) -> bool:
+    """Whether the platform is a CPU whose compiler has these options."""
+    if platform != "cpu":
         return False
     try:
         jax.jit(lambda: 0, compiler_options=_FASTEST).lower().compile()

@@ -23,7 +23,7 @@ from hamkernel._fields.joined import AbstractJoinedField, FamilyField, known_of,
 from hamkernel._gram import components
 from hamkernel._kernels.base import Invariance, Scaled
 from hamkernel._kernels.symmetry import without_symmetry
-from hamkernel._machine import one_blas_thread
+from hamkernel._machine import compiled, full_precision, one_blas_thread
 from hamkernel._observations.blocks import AbstractBlock, Values
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import inputs_of, observations
@@ -35,6 +35,7 @@ from hamkernel._structures.base import AbstractMatrixKernel
 
 
 @one_blas_thread
+@full_precision
 def condition(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
@@ -119,6 +120,7 @@ class Posterior(eqx.Module):
         rows = self.given.rows
         return f"Posterior(rows={rows.size}, dimension={rows.dimension}, field={text(self.field)})"
 
+    @full_precision
     def covariance(
         self,
         x: Num[ArrayLike, " n"],
@@ -160,6 +162,7 @@ class Posterior(eqx.Module):
             )
         return self.field._state(x)
 
+    @full_precision
     def deviation(
         self, x: Num[ArrayLike, " n"], u: Num[ArrayLike, " m"] | None = None
     ) -> Float[Array, " n"]:
@@ -178,6 +181,7 @@ class Posterior(eqx.Module):
         """
         return jnp.stack([root(variance) for variance in jnp.diagonal(self.covariance(x, u))])
 
+    @full_precision
     def energy_deviation(
         self,
         x: Num[ArrayLike, " n"],
@@ -214,6 +218,7 @@ class Posterior(eqx.Module):
         change = jnp.array([1.0, -1.0], both.points.dtype)
         return root(change @ _covariance(self.given, both) @ change)
 
+    @full_precision
     def updated(
         self,
         X: Num[ArrayLike, "M n"] | AbstractObservations,
@@ -255,6 +260,7 @@ class Posterior(eqx.Module):
         return Posterior(given, learned_field(given.field, known))
 
     @one_blas_thread
+    @full_precision
     def sample(
         self,
         key: Key[Array, ""] | UInt32[Array, "..."],
@@ -312,7 +318,7 @@ class Posterior(eqx.Module):
 
 
 # Without jit its operations are hundreds of small programs, which took 4 s to compile.
-@eqx.filter_jit
+@compiled
 def _covariance(
     given: AbstractConditional, left: AbstractBlock, right: AbstractBlock | None = None
 ) -> Float[Array, "d e"]:

@@ -17,6 +17,7 @@ from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import AbstractJoinedField
 from hamkernel._gram import field_rounding
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._machine import compiled, full_precision
 from hamkernel._symplectic import AbstractSymplecticSolver, EqualSteps, step_counts
 
 Interpolation = Literal["held", "linear"]
@@ -26,6 +27,7 @@ _MAX_STEPS = 2**20
 _RESULTS: Any = diffrax.RESULTS
 
 
+@full_precision
 def simulate(
     field: Callable[[Float[Array, " n"]], Float[Array, " n"]],
     x0: Num[ArrayLike, " n"],
@@ -437,7 +439,7 @@ def _integrate(
         ) from error
 
 
-@eqx.filter_jit
+@compiled
 def _at_caller_times(solution: Any, ts: Float[Array, " T"]) -> tuple[Any, Bool[Array, ""]]:
     """The solution at the caller's times, and whether it failed.
 

@@ -28,6 +28,8 @@ import optimistix as optx
 from equinox import AbstractClassVar, AbstractVar
 from jaxtyping import Array, Bool, Float, Int, Scalar
 
+from hamkernel._machine import compiled
+
 
 class Step(eqx.Module):
     """One step from (t0, y0) to t1, with its signed size h and the field f(t, y)."""
@@ -453,7 +455,7 @@ class EqualSteps(diffrax.AbstractSolver):
         return y1, None, {"y0": y0, "y1": y1}, None, solution.result
 
 
-@jax.jit
+@compiled
 def step_counts(ts: Float[Array, " T"], dt: Float[Array, ""]) -> Int[Array, " T-1"]:
     """The number of equal steps in each interval of ts."""
     return equal_steps(ts[1:] - ts[:-1], dt).astype(int)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +23,7 @@ from hamkernel._closed_forms import (
     log_density,
 )
 from hamkernel._gram import between_all, forward_differentiated, gram_of_rows, plus_ridge
-from hamkernel._machine import one_blas_thread, refuse_beyond_memory
+from hamkernel._machine import compiled, full_precision, one_blas_thread, refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock, Combinations
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.measurements import Measurements
@@ -36,6 +35,7 @@ from hamkernel._structures.base import AbstractMatrixKernel
 
 
 @one_blas_thread
+@full_precision
 def cross_validation_loss(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
@@ -82,6 +82,7 @@ def cross_validation_loss(
 
 
 @one_blas_thread
+@full_precision
 def cross_validation_residuals(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
@@ -107,6 +108,7 @@ def cross_validation_residuals(
 
 
 @one_blas_thread
+@full_precision
 def generalized_cross_validation(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
@@ -144,6 +146,7 @@ def generalized_cross_validation(
 
 
 @one_blas_thread
+@full_precision
 def log_marginal_likelihood(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
@@ -218,7 +221,7 @@ def partition_loss(K, rows: Measurements, regularization, partition: Partition, 
     return partition_loss_and_square(K, rows, regularization, partition, basis)[0]
 
 
-@eqx.filter_jit
+@compiled
 def partition_loss_and_square(
     K, rows: Measurements, regularization, partition: Partition, basis=None
 ):
@@ -226,7 +229,7 @@ def partition_loss_and_square(
     return jnp.asarray(partition.weights, left.dtype) @ left**2, a @ a
 
 
-@eqx.filter_jit
+@compiled
 def held_out_rows(K, rows: Measurements, regularization, partition: Partition, basis=None):
     """The residual of each row under the fit without its fold, in units of its noise, and A⁻¹y.
 
@@ -271,7 +274,7 @@ def generalized_loss(K, rows: Measurements, regularization, basis=None, least_fr
     return generalized_loss_and_square(K, rows, regularization, basis, least_free)[0]
 
 
-@eqx.filter_jit
+@compiled
 def generalized_loss_and_square(K, rows: Measurements, regularization, basis=None, least_free=0.0):
     # The loss is infinite where the share of free residuals, tr(I − S)/D, is below `least_free`.
     ridge = rows.count * regularization
@@ -280,7 +283,7 @@ def generalized_loss_and_square(K, rows: Measurements, regularization, basis=Non
     return jnp.where(enough, squares * rows.size / trace**2, jnp.inf), squares
 
 
-@eqx.filter_jit
+@compiled
 def log_likelihood(K, rows: Measurements, regularization, basis=None):
     """`log_marginal_likelihood` of the rows, with a flat prior for the constant of energies."""
     ridge = rows.count * regularization

@@ -9,7 +9,9 @@ import pytest
 
 import hamkernel as hk
 from hamkernel import gram_operator
-from hamkernel._gram_operator import TILE
+from hamkernel._sizes import sizes
+
+TILE = sizes().tile
 
 # Sums of a thousand terms of order one.
 ROUNDING = 1e-12

@@ -7,9 +7,9 @@
 
 import dataclasses
 import functools
-import itertools
 import re
 import warnings
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -20,29 +20,25 @@ import scipy.stats
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._machine import orthonormal
-from hamkernel._trajectories.diagnostics import warn_of_few, warn_of_noise
+from hamkernel._trajectories.diagnostics import degrees_of_freedom
 from hamkernel._trajectories.flow import (
     NODES,
     WEIGHTS,
     Segments,
-    back_substituted,
     jacobians,
     means,
     simulated,
 )
 from hamkernel._trajectories.kalman import as_observations
 from hamkernel._trajectories.likelihood import (
-    Model,
     closed_form,
     condensed,
     conditional,
-    landmark_whitening,
-    project_out_starts,
 )
+from hamkernel._trajectories.model import Model, landmark_whitening
 from hamkernel._trajectories.preprocessing import preprocess
 from hamkernel._trajectories.search import _loss, losses
-from hamkernel._trajectories.segments import given_path, linearised, short_pieces
+from hamkernel._trajectories.segments import given_path, linearised
 
 K = hk.Symplectic(hk.Gaussian(1.0))
 NO_PROCESS = jnp.full(2, -jnp.inf)
@@ -68,6 +64,20 @@ def field_error(field, true, system=PENDULUM):
 # The rows.
 
 
+def with_missed(rows, path, slopes, spans):
+    """Rows along a path that solves no equation: what the Gauss rule misses of its increments."""
+    steps = jnp.einsum("slka,k,sl->sla", jnp.asarray(slopes), jnp.asarray(WEIGHTS), spans)
+    return rows._replace(missed=jnp.diff(jnp.asarray(path), axis=1) - steps)
+
+
+def integrals(rows):
+    """The sum over the path of what drives the first segment: s of ds = Ψ s + drive, less x̂ − x."""
+    sums = [np.zeros(rows.residual.shape[-1])]
+    for across, drive, missed in zip(rows.across[0], rows.drive[0], rows.missed[0], strict=True):
+        sums.append(np.asarray(across) @ sums[-1] + np.asarray(drive + missed))
+    return np.asarray(rows.residual[0]) + np.array(sums)
+
+
 def one_segment(seed=0, T=7):
     """A rough path, samples that have nothing to do with it, and rows with the identity for Φ."""
     rng = np.random.default_rng(seed)
@@ -87,13 +97,9 @@ def one_segment(seed=0, T=7):
     none = jnp.zeros((1, T - 1, 2, 2))
     as_path = given_path(jnp.asarray(path), jnp.asarray(nodes), segments.spans, none)
     rows = linearised(
-        as_path,
-        jnp.asarray(slopes),
-        jnp.zeros_like(slopes),
-        segments,
-        jnp.array([True]),
-        is_solution=False,
+        as_path, jnp.asarray(slopes), jnp.zeros_like(slopes), segments, jnp.array([True])
     )
+    rows = with_missed(rows, path, slopes, segments.spans)
     return rows, spans[0], nodes[0].reshape(-1, 2), measured[0]
 
 
@@ -113,19 +119,11 @@ def test_without_a_tangent_rows_are_generalised_least_squares_on_differences():
     expected = G @ weights.T @ scipy.linalg.solve(A, d, assume_a="pos")
     S, spread = jnp.asarray(nodes), jnp.full(2, 1e4)
     model = Model(kernel, jnp.full(2, np.log(sigma)), NO_PROCESS)
-    found = closed_form(model, S, rows, spread, project_out_starts)
+    found = closed_form(model, S, rows, spread)
     field = np.einsum("iajb,jb->ia", hk.gram(kernel, nodes, nodes), found.coefficients)
     np.testing.assert_allclose(field.reshape(-1), expected, rtol=1e-5, atol=1e-6)
     used = np.trace(np.linalg.solve(A, weights @ G @ weights.T))  # of the parameters
     np.testing.assert_allclose(found.free, len(d) - used, rtol=1e-5)
-
-
-def test_starts_are_least_squares():
-    P, r = (np.random.default_rng(0).normal(size=shape) for shape in ((2, 7, 3), (2, 7)))
-    Q, U = orthonormal(jnp.asarray(P))
-    moves = back_substituted(U, jnp.einsum("sdn,sd->sn", Q, r))
-    expected = [np.linalg.lstsq(*pair)[0] for pair in zip(P, r, strict=True)]
-    np.testing.assert_allclose(moves, expected, rtol=1e-11)
 
 
 def test_along_a_true_path_rows_and_functionals_are_the_variation_of_constants():
@@ -144,11 +142,9 @@ def test_along_a_true_path_rows_and_functionals_are_the_variation_of_constants()
     segments = Segments(jnp.diff(ts)[None], x, counts, jnp.zeros_like(x), x[:, 0], none)
     path = given_path(x, nodes, segments.spans, jacobians(mean, nodes, n))
     slopes = jax.vmap(jax.vmap(jax.vmap(PENDULUM)))(nodes)
-    rows = linearised(
-        path, slopes, means(mean, nodes, slopes), segments, jnp.array([True]), is_solution=False
-    )
+    rows = linearised(path, slopes, means(mean, nodes, slopes), segments, jnp.array([True]))
     expected = [x[0, i] - scipy.linalg.expm(A * t) @ x[0, 0] for i, t in enumerate(ts)]
-    np.testing.assert_allclose(rows.target[0], expected, atol=1e-8)
+    np.testing.assert_allclose(integrals(rows), expected, atol=1e-8)
     assert np.abs(expected).max() > 0.1
 
     spread = jnp.full(n, 100.0)
@@ -173,7 +169,7 @@ def test_the_likelihood_is_that_of_the_differences_but_for_a_constant():
         theirs.append(-scipy.stats.multivariate_normal(np.zeros(len(d)), A).logpdf(d))
         model = Model(kernel, jnp.full(2, np.log(sigma)), NO_PROCESS)
         S, spread = jnp.asarray(nodes), jnp.full(2, 1e4)
-        ours.append(float(losses(model, model.flat[None], S, rows, spread, project_out_starts)[0]))
+        ours.append(float(losses(model, model.flat[None], S, rows, spread)[0]))
     np.testing.assert_allclose(np.diff(ours), np.diff(theirs), rtol=1e-6)
 
 
@@ -186,7 +182,7 @@ def test_the_likelihood_at_another_noise_is_that_of_every_sample_in_a_mean():
     rows = rows._replace(counts=jnp.full_like(rows.counts, count), scatter=scatter)
     S, spread = jnp.asarray(nodes), jnp.full(2, 1e4)
     model = Model(kernel, jnp.full(2, np.log(sigma)), NO_PROCESS)
-    known = condensed(model, S, rows, spread, project_out_starts)
+    known = condensed(model, S, rows, spread)
     # Differences of successive samples, of which `count` have one time.
     G, weights = differences(kernel, sigma, spans, nodes, measured)[:2]
     from_start = np.kron(np.tri(len(measured), len(spans), -1), np.eye(2)) @ weights
@@ -205,13 +201,11 @@ def test_the_gradient_of_the_likelihood_is_that_of_finite_differences():
     rows, _, nodes, _ = one_segment(1)
     model = Model(hk.Symplectic(1.7 * hk.Gaussian(1.2)), jnp.log(jnp.array([0.3, 0.2])), NO_PROCESS)
     S, spread = jnp.asarray(nodes[::2]), jnp.full(2, 100.0)
-    gradient = jax.jit(jax.grad(lambda h: _loss(model, h, S, rows, spread, project_out_starts)))(
-        model.flat
-    )
+    gradient = jax.jit(jax.grad(lambda h: _loss(model, h, S, rows, spread)))(model.flat)
     h = np.asarray(model.flat)
     step = 1e-5 * np.eye(len(h))[:-2]  # −inf is the noise of the process
     design = jnp.asarray(np.concatenate([h[None] + step, h[None] - step]))
-    up, down = np.asarray(losses(model, design, S, rows, spread, project_out_starts)).reshape(2, -1)
+    up, down = np.asarray(losses(model, design, S, rows, spread)).reshape(2, -1)
     np.testing.assert_allclose(gradient[:-2], (up - down) / 2e-5, rtol=1e-5, atol=1e-6)
 
 
@@ -344,16 +338,13 @@ def test_five_samples_a_swing_are_enough():
     np.testing.assert_allclose(found.noise, 0.05, rtol=0.2)
 
 
-def test_a_field_that_explains_nothing_says_so():
-    scale = np.array([1.3, 1.2])
-    with pytest.warns(UserWarning, match=r"explains little of the runs.* coordinate 1 is 1\.1"):
-        assert warn_of_noise(np.array([0.1, 1.1]), scale, 20.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert not warn_of_noise(np.array([0.4, np.nan]), scale, 20.0)
-        assert not warn_of_few(10.0)
-    with pytest.warns(UserWarning, match=r"leave 3\.2 degrees of freedom .* are a guess"):
-        assert warn_of_few(3.2)
+def test_noise_from_a_few_degrees_of_freedom_is_a_guess():
+    few, enough, given = (
+        degrees_of_freedom(SimpleNamespace(is_noise_known=known, remaining=left))
+        for known, left in ((False, 3.2), (False, 10.0), (True, 3.2))
+    )
+    assert (few.passes, enough.passes, given.passes) == (False, True, True)
+    assert "leave 3.2 degrees of freedom: noise and field are a guess" in few.meaning
 
 
 @pytest.mark.slow
@@ -373,9 +364,10 @@ def test_the_order_of_the_runs_does_not_matter(learned):
 def test_a_run_that_is_garbage_is_dropped_and_named():
     times, states, true = logs()
     states[2] = 3 * np.random.default_rng(9).standard_normal(states[2].shape)
-    with pytest.warns(UserWarning, match="dropped: samples 0 to 29 of run 2"):
+    with pytest.warns(UserWarning, match="parts left out|learned from"):
         found = hk.learn(K, hk.Runs(times, states))
     assert np.asarray(found.kept).tolist() == [1, 1, 0, 1, 1, 1]
+    assert found.dropped == ((2, 0, 30),)
     assert field_error(found.field, true) < 0.05
     assert all(np.isfinite(x).all() for x in found.states)
 
@@ -463,19 +455,6 @@ def with_a_gap(times, states):
     """Logs of which the samples between 2.6 s and 4 s are lost."""
     kept = (times[0] < 2.6) | (times[0] > 4.0)
     return [t[kept] for t in times], [x[kept] for x in states]
-
-
-def test_no_short_piece_crosses_a_gap():
-    times, states, _ = logs(samples=31)
-    data = preprocess(hk.Runs(*with_a_gap(times, states)), None)
-    pieces = [(p.start, p.stop) for p in short_pieces(data.runs) if p.run == 1]
-    (gap,) = data.runs[1].gaps
-    last = np.flatnonzero(np.isfinite(data.runs[1].states[:gap, 0]))[-1]
-    assert data.runs[1].times[gap] - data.runs[1].times[last] > 1.4
-    assert gap in [start for start, _ in pieces]
-    assert [pieces[0][0], pieces[-1][1]] == [0, len(data.runs[1].times)]
-    assert all(a[1] == b[0] for a, b in itertools.pairwise(pieces))
-    assert not preprocess(hk.Runs(times, states), None).runs[1].gaps.size  # an even log has none
 
 
 def test_long_intervals_of_an_uneven_run_are_cut_and_an_even_run_is_left():

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 from scipy.integrate import solve_ivp
+from test_learn import integrals
 
 import hamkernel as hk
 from hamkernel._trajectories.flow import NODES, Segments, jacobians, means, simulated
@@ -196,13 +197,13 @@ def test_along_a_true_path_rows_are_exact_with_inputs():
         path = given_path(x, nodes, segments.spans, jacobians(mean, nodes, 2))
         slopes = jax.vmap(jax.vmap(jax.vmap(joined)))(nodes)
         there = means(mean, nodes, slopes)
-        return linearised(path, slopes, there, segments, jnp.array([True]), is_solution=True)
+        return linearised(path, slopes, there, segments, jnp.array([True]))
 
     expected = [
         at - scipy.linalg.expm(A * t) @ true(0.0) for t, at in zip(ts, true(ts), strict=True)
     ]
     found = rows(ends)
-    np.testing.assert_allclose(found.target[0], expected, atol=1e-8)
+    np.testing.assert_allclose(integrals(found), expected, atol=1e-8)
     model = Model(K, jnp.zeros(2), jnp.full(2, -jnp.inf))
     observations = as_observations(found, model, mean, jnp.full(2, 100.0))
     assert observations is not None
@@ -211,7 +212,7 @@ def test_along_a_true_path_rows_are_exact_with_inputs():
         block.rows(jax.jit(jax.vmap(joined))(block.points)), targets, atol=1e-8
     )
     # The control: other inputs do not explain the same samples.
-    wrong = np.asarray(rows(0 * ends).target[0]) - expected
+    wrong = integrals(rows(0 * ends)) - expected
     assert np.abs(wrong).max() > 0.1
 
 
@@ -223,7 +224,7 @@ def test_segments_that_are_not_kept_stay_at_states_of_the_runs():
     nodes = jnp.full((2, 3, 3, 3), jnp.nan)
     path = given_path(jnp.full((2, 4, 2), 2.0), nodes, segments.spans, jnp.zeros((2, 3, 2, 2)))
     zero, none = jnp.zeros((2, 3, 3, 2)), jnp.zeros(2, bool)
-    rows = linearised(path, zero, zero, segments, none, is_solution=False)
+    rows = linearised(path, zero, zero, segments, none)
     np.testing.assert_array_equal(rows.nodes[..., :2], 2.0)
     np.testing.assert_array_equal(rows.counts, 0.0)
 

@@ -19,26 +19,16 @@ from scipy.integrate import solve_ivp
 from test_learn import PENDULUM, damped, field_error, logs, moved_by_momenta, moved_by_momentum
 
 import hamkernel as hk
-from hamkernel._trajectories.diagnostics import (
-    autocorrelations,
-    ljung_box,
-    warn_of_process,
-    warn_of_rest_speed,
-    warn_of_units,
-    whiteness,
-)
+from hamkernel._trajectories.diagnostics import lengthscales, missing_force
+from hamkernel._trajectories.diagnostics import rest_speed as rest_speed_row
 from hamkernel._trajectories.flow import WEIGHTS
-from hamkernel._trajectories.iteration import evidence, likelier
+from hamkernel._trajectories.iteration import evidence, iterate
 from hamkernel._trajectories.kalman import as_observations, innovations, smoothed_path, whiten
-from hamkernel._trajectories.likelihood import (
-    Model,
-    WhitenedRows,
-    landmark_whitening,
-    project_out_starts,
-)
+from hamkernel._trajectories.model import Model, WhitenedRows, landmark_whitening
 from hamkernel._trajectories.search import gain_of_friction, gain_of_inertia, losses
 from hamkernel._trajectories.segments import LinearisedSegments
-from hamkernel._trajectories.sensors import timing, warn_of_curve
+from hamkernel._trajectories.sensors import is_on_a_curve, timing
+from hamkernel._trajectories.whiteness import autocorrelations, ljung_box, whiteness
 
 # The filter.
 
@@ -122,7 +112,7 @@ def test_the_likelihood_is_that_of_the_dense_covariance():
         across = gram(each.kernel, nodes, LANDMARKS)
         G = across @ np.linalg.solve(gram(each.kernel, LANDMARKS, LANDMARKS), across.T)
         expected = -scipy.stats.multivariate_normal(np.zeros(len(r)), C + B @ G @ B.T).logpdf(r)
-        given = LANDMARKS, rows, jnp.asarray(SPREAD), whiten
+        given = LANDMARKS, rows, jnp.asarray(SPREAD)
         found = float(losses(each, each.flat[None], *given)[0])
         np.testing.assert_allclose(found, expected - 0.5 * len(r) * np.log(2 * np.pi), rtol=1e-10)
         # The control: without process noise it is another one.
@@ -192,7 +182,7 @@ def test_block_after_block_innovations_are_those_of_all_rows_together(size):
     rng = np.random.default_rng(0)
     M, r = size * rng.standard_normal((75 * 8, 10)), rng.standard_normal(75 * 8)
     rows = segment()._replace(residual=jnp.zeros((75, 4, 2)))
-    z = innovations(WhitenedRows(jnp.asarray(M), jnp.asarray(r), jnp.zeros(()), None), rows)
+    z = innovations(WhitenedRows(jnp.asarray(M), jnp.asarray(r), jnp.zeros(())), rows)
     root = np.linalg.qr(np.concatenate([np.eye(len(r)), M.T]), mode="r")
     L = root.T * np.sign(np.diagonal(root))
     expected = scipy.linalg.solve_triangular(L, r, lower=True)
@@ -304,35 +294,29 @@ def test_times_that_are_off_are_named():
         path = scipy.interpolate.make_interp_spline(ts, x, 5)  # wrong by 1e-3 or less
         at = ts + 0.02 * rng.standard_normal(40)
         states.append(path(at) + 0.01 * rng.standard_normal(x.shape))
-    with warnings.catch_warnings(record=True) as said:
-        warnings.simplefilter("always")
-        hk.learn(KERNEL, hk.Runs([ts] * 3, states), process_noise=0)
-    assert any(re.search(r"as if times were off by 0\.0[12]", str(w.message)) for w in said)
+    with pytest.warns(UserWarning, match="learned.diagnostics"):
+        found = hk.learn(KERNEL, hk.Runs([ts] * 3, states), process_noise=0)
+    assert re.search(r"as if times were off by 0\.0[12]", found.diagnostics["timing"].meaning)
 
 
 @pytest.mark.parametrize(
     ("kernel", "said"), [(KERNEL, True), (hk.Symplectic(hk.Gaussian(np.ones(2))), False)]
 )
 def test_one_lengthscale_for_coordinates_of_other_sizes_is_said(kernel, said):
-    for ratio in (100.0, 1000.0):
-        with warnings.catch_warnings(record=True) as seen:
-            warnings.simplefilter("always")
-            warn_of_units(kernel, np.array([1.0, ratio]))
-        assert len(seen) == (said and ratio > 300)
+    assert lengthscales(kernel, np.array([1.0, 100.0])) is None
+    assert lengthscales(kernel, np.array([1.0, 1000.0])).passes != said
     some = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0))
-    warn_of_units(some, np.array([1e-6, 1e6]))  # a warning is an error here
+    assert lengthscales(some, np.array([1e-6, 1e6])).passes
 
 
 @pytest.mark.parametrize(("rest_speed", "said"), [(0.1, True), (0.01, False)])
 def test_dry_friction_that_fades_over_the_momenta_of_the_runs_is_said(rest_speed, said):
     drift = hk.Sum(energy=hk.Symplectic(hk.Gaussian()), dry=hk.Friction(rest_speed=rest_speed))
     X = np.array([[0.0, 0.25, 1.0], [1.0, -0.24, 0.0]])  # q, p and an input
-    with warnings.catch_warnings(record=True) as seen:
-        warnings.simplefilter("always")
-        warn_of_rest_speed(hk.Controlled(drift, hk.InputMatrix(1.0)), X, 2)
-    assert [str(w.message).endswith("hk.Friction(rest_speed=0.0025).") for w in seen] == [
-        True
-    ] * said
+    row = rest_speed_row(hk.Controlled(drift, hk.InputMatrix(1.0)), X, 2)
+    assert (row is not None) == said
+    if said:
+        assert "hk.Friction(rest_speed=0.0025)" in row.advice
 
 
 # What is learned.
@@ -380,10 +364,10 @@ def test_a_push_leaves_the_field_as_it_is_and_is_named():
                 K, hk.Runs(t, log), mean=lambda x: jnp.array([x[1], 0.0]), process_noise=[0.0, 0.1]
             )
         errors.append(np.sqrt(np.mean((jax.vmap(learned.field)(X)[:, 1] - truth) ** 2)))
-        named = [str(w.message) for w in said if "pushed" in str(w.message)]
-        assert len(named) == (push > 0), named
+        assert learned.pushed == (((0, 80, 84),) if push else ())
+        assert ("pushes" in learned.diagnostics.failing) == (push > 0)
+        assert len(said) <= 1
         if push:
-            assert "pushed: samples 80 to 83 of run 0." in named[0]
             w = np.asarray(learned.disturbance[0])[:, 1]
             np.testing.assert_allclose(w[80:84], push, rtol=0.1)
     assert errors[1] < 1.5 * errors[0]
@@ -408,8 +392,9 @@ def test_friction_is_named_although_process_noise_whitens_the_innovations():
     times, states, _ = logs(lambda x: PENDULUM(x) - drag * x, noise=0.01, **given)
     positions = [np.column_stack([x[:, 0], np.full(len(x), np.nan)]) for x in states]
     drift = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0))
-    with pytest.warns(UserWarning, match="friction, with which log p would be"):
+    with pytest.warns(UserWarning, match=r"friction \(log p \+ "):
         found = hk.learn(drift, hk.Runs(times, positions), mean=moved_by_momentum)
+    assert "missing force" in found.diagnostics.failing
     assert found.whiteness > 0.05
 
 
@@ -458,10 +443,10 @@ def turned(start, end):
     ids=["capacitor", "tank", "quarter swing", "rotation", "fall"],
 )
 def test_what_has_no_inertia_is_told_from_what_moves(states, said):
-    with warnings.catch_warnings(record=True) as seen:
-        warnings.simplefilter("always")
-        warn_of_curve(states)
-    assert bool(seen) == said
+    assert is_on_a_curve(states, np.zeros(2)) == said
+    dice = np.random.default_rng(0)
+    noisy = [x + 0.02 * dice.standard_normal(x.shape) for x in states]
+    assert is_on_a_curve(noisy, np.full(2, 0.02)) == said
 
 
 def test_a_system_without_inertia_is_named_and_its_rate_is_learned():
@@ -471,8 +456,10 @@ def test_a_system_without_inertia_is_named_and_its_rate_is_learned():
     blind = [np.column_stack([v, np.full(t.size, np.nan)]) for v in volts]
     K = hk.Symplectic(hk.Select(hk.Gaussian(2.0), 0))
     known = {"mean": lambda x: jnp.stack([x[1], 0 * x[1]]), "progress": False}
-    with pytest.warns(UserWarning, match=r"one function of the position.*hk\.CurlFree"):
-        hk.learn(K, hk.Runs([t] * 3, blind), **known)
+    with pytest.warns(UserWarning, match="one function of the position"):
+        found = hk.learn(K, hk.Runs([t] * 3, blind), **known)
+    assert not found.converged
+    assert "hk.CurlFree" in found.diagnostics["one curve"].advice
     runs = hk.Runs([t] * 3, [v[:, None] for v in volts])
     found = hk.learn(hk.CurlFree(hk.Gaussian(2.0)), runs, progress=False)
     q = jnp.array([[-3.0], [2.0], [4.0]])
@@ -483,22 +470,21 @@ def test_an_end_that_lost_its_path_is_never_the_likelier(monkeypatch):
     """Of a driven oscillator with inputs held nothing was learned: its −log p was NaN."""
     ends = []
 
-    def caught(without, process, *given):
-        ends.extend([without, process])
-        return likelier(without, process, *given)
+    def caught(*given):
+        ends.append(iterate(*given))
+        return ends[-1]
 
-    monkeypatch.setattr("hamkernel._trajectories.learn.likelier", caught)
+    monkeypatch.setattr("hamkernel._trajectories.learn.iterate", caught)
     t, _, log = pushed_log(5.0)
     log[:, 1] = np.nan
     U = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0))
-    with pytest.warns(UserWarning, match="process noise"):
+    with pytest.warns(UserWarning, match="process noise|push"):
         hk.learn(U, hk.Runs(t, log), mean=lambda x: jnp.array([x[1], 0.0]))
-    without, process = ends
+    without = ends[0]
     model = without.now.model._replace(log_noise=jnp.array([jnp.nan, 0.0]))
     good = np.ones_like(without.now.good)
     lost = without._replace(now=without.now._replace(model=model, good=good), settled=True)
     assert evidence(lost) == np.inf > evidence(without)
-    assert likelier(lost, process, 1, None)[1] is process
 
 
 def double_pendulum(_, x):
@@ -521,14 +507,13 @@ def test_friction_of_joints_is_spoken_of_where_there_may_be_links(n, said, gaine
         process=np.ones(n),
         misfit=np.ones((1, n)),
         driven=False,
-        gained=gained,
-        bent=0.0,
+        friction_gain=gained,
+        inertia_gain=0.0,
         has_momenta=True,
         has_friction=has_friction,
     )
-    with pytest.warns(UserWarning, match="friction") as seen:
-        warn_of_process(fit)
-    assert ("joints between links" in str(seen[0].message)) == said
+    assert "friction" in missing_force(fit)
+    assert ("joints between links" in missing_force(fit)) == said
 
 
 def with_centrifugal_forces(x):
@@ -550,7 +535,7 @@ def test_a_mass_matrix_that_depends_on_the_positions_is_told_from_friction(
         states.append(np.column_stack([q, np.full(q.shape, np.nan)]))
 
     def first_rows(task, now, most, bar):
-        rows = now.rows, task.start_deviation, project_out_starts, task.data
+        rows = now.rows, task.start_deviation, task.data
         given = now.model, now.field.points, *rows
         gains.extend([gain_of_friction(*given), gain_of_inertia(*given, task.mean)])
         assert gain_of_inertia(*given, with_centrifugal_forces) == 0

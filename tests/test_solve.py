@@ -17,6 +17,7 @@ from data import swings
 import hamkernel as hk
 from hamkernel import ConjugateGradient, Nystrom
 from hamkernel import _machine as _memory
+from hamkernel._sizes import sizes
 from hamkernel._solvers import fit as _fit
 from hamkernel._solvers.landmarks import choose_landmarks
 
@@ -364,7 +365,8 @@ def test_iterations_that_are_shown_end_at_the_same_field(kind, capsys, monkeypat
 
 @pytest.mark.parametrize("ask", [hk.fit, hk.condition])
 def test_blocks_of_a_factorisation_are_shown(ask, capsys, monkeypatch):
-    monkeypatch.setattr("hamkernel._solvers.dense.IN_PLACE", 1000)
+    small = sizes()._replace(rows_in_place=1000)
+    monkeypatch.setattr("hamkernel._solvers.dense.sizes", lambda: small)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     model = hk.Odd(hk.Symplectic(2.0 * hk.Gaussian(1.0)))
     ask(model, *swings(600), regularization=RIDGE, progress=True)
@@ -498,7 +500,8 @@ def test_a_dense_fit_is_chosen_where_it_takes_half_of_the_memory(monkeypatch):
 def test_a_factor_made_in_place_is_that_of_lapack(monkeypatch):
     K, (X, Y) = hk.Symplectic(1.1 * hk.Gaussian(1.5)), swings(150)
     one = hk.condition(K, X, Y, RIDGE)
-    monkeypatch.setattr("hamkernel._solvers.dense.IN_PLACE", 200)
+    small = sizes()._replace(rows_in_place=200)
+    monkeypatch.setattr("hamkernel._solvers.dense.sizes", lambda: small)
     monkeypatch.setattr("hamkernel._solvers.factors.ROWS_IN_PLACE", 130)
     monkeypatch.setattr("hamkernel._solvers.dense.ROWS_IN_PLACE", 130)
     monkeypatch.setattr("hamkernel._gram._STRIP", 7000)
@@ -594,7 +597,7 @@ def test_memory_is_that_of_the_machine_or_of_a_smaller_container(
     if limit is not None:
         file.write_text(limit)
     monkeypatch.setattr(_memory, "_CGROUP_LIMIT", file)
-    assert _memory.memory_bytes.__wrapped__() == expected
+    assert _memory._memory_of.__wrapped__("cpu") == expected
 
 
 def test_the_memory_of_a_device_that_says_it_is_believed(monkeypatch):
@@ -602,14 +605,16 @@ def test_the_memory_of_a_device_that_says_it_is_believed(monkeypatch):
         def memory_stats(self):
             return {"bytes_in_use": 7, "bytes_limit": 12345}
 
-    monkeypatch.setattr(jax, "local_devices", lambda: [Device()])
-    assert _memory.memory_bytes.__wrapped__() == 12345
+    monkeypatch.setattr(jax, "local_devices", lambda backend: [Device()])
+    assert _memory._memory_of.__wrapped__("cpu") == 12345
 
 
 def test_where_the_system_does_not_say_its_memory_nothing_is_refused(monkeypatch):
     monkeypatch.delattr(os, "sysconf")
-    monkeypatch.setattr(jax, "local_devices", lambda: [types.SimpleNamespace(memory_stats=dict)])
-    assert _memory.memory_bytes.__wrapped__() is None
+    monkeypatch.setattr(
+        jax, "local_devices", lambda **_: [types.SimpleNamespace(memory_stats=dict)]
+    )
+    assert _memory._memory_of.__wrapped__("cpu") is None
     monkeypatch.setattr(_memory, "memory_bytes", lambda: None)
     monkeypatch.setattr(_fit, "memory_bytes", lambda: None)
     X, Y = swings(20)

@@ -23,7 +23,7 @@ from jaxtyping import Array, ArrayLike, Float, Num
 from hamkernel import _require as require
 from hamkernel._discovery.ladder import Rung, ladder
 from hamkernel._kernels.built_in import Gaussian
-from hamkernel._machine import one_blas_thread
+from hamkernel._machine import full_precision, one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.measurements import Measurements, observations
 from hamkernel._solvers.problem import problem
@@ -111,6 +111,7 @@ class Comparison:
         return "\n".join(lines)
 
 
+@full_precision
 def compare(
     X: Num[ArrayLike, "N n"] | AbstractObservations | Learned,
     Y: Num[ArrayLike, "N n"] | None = None,

@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._fields.base import potential_of
+from hamkernel._machine import full_precision
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import AbstractPotentialKernel
@@ -109,6 +110,7 @@ class Formula(eqx.Module):
         velocity = operator_of(self.kernel)(x, jax.grad(self._formula)(x))
         return velocity if self.mean is None else velocity + self.mean(x).astype(velocity.dtype)
 
+    @full_precision
     def potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """The potential u(x), that of the mean included.
 

@@ -40,6 +40,7 @@ from hamkernel._fields.joined import at_inputs, known_of
 from hamkernel._gram import gram_of_rows
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._kernels.symmetry import symmetry_removed
+from hamkernel._machine import full_precision
 from hamkernel._posterior import Posterior
 from hamkernel._solvers.problem import problem
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -50,6 +51,7 @@ from hamkernel._trajectories.learned import Learned
 _SAME = 1e-6  # of a function and its image under a symmetry, between rounding and a wrong sign
 
 
+@full_precision
 def readout(
     learned: Learned | Posterior,
     terms: Mapping[str, Callable[[Float[Array, " n"]], Any]],

@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._show import described
+from hamkernel._sizes import sizes
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.joined import AbstractJoinedKernel, KnownMatrix
 
@@ -336,8 +337,7 @@ def potential_of(field: Callable[..., Any], kernel: AbstractMatrixKernel) -> Sca
 
 def at_points(fn: Callable[..., Any], X: Float[Array, "N n"]) -> Float[Array, "N *out"]:
     """fn(x) at many states, in bounded memory, in their dtype."""
-    # 1024 states at once: with 1000 random features their waves take 8 MB.
-    return jax.lax.map(lambda x: jnp.asarray(fn(x)).astype(X.dtype), X, batch_size=1024)
+    return jax.lax.map(lambda x: jnp.asarray(fn(x)).astype(X.dtype), X, batch_size=sizes().states)
 
 
 def root(square: Float[Array, ""]) -> Float[Array, ""]:

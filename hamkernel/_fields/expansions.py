@@ -4,7 +4,6 @@ import dataclasses
 from collections.abc import Callable
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -13,7 +12,7 @@ from hamkernel._features import AbstractFeatures, SumFeatures
 from hamkernel._fields.base import AbstractField, SolverInfo, at_points, root
 from hamkernel._gram import centred
 from hamkernel._gram_operator import placed_product
-from hamkernel._machine import as_given, on_each, rows_of, split
+from hamkernel._machine import as_given, compiled, on_each, rows_of, split
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 
 
@@ -83,7 +82,7 @@ class KernelField(AbstractField):
         return dataclasses.replace(bare, norm=root(square))
 
 
-@eqx.filter_jit
+@compiled
 def _expansion(
     K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
 ) -> Float[Array, " n"]:
@@ -92,7 +91,7 @@ def _expansion(
     return K.expansion(x, Z, A)
 
 
-@eqx.filter_jit
+@compiled
 def _potential(
     K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
 ) -> Float[Array, ""]:
@@ -101,7 +100,7 @@ def _potential(
     return K.potential(x, Z, A)
 
 
-@eqx.filter_jit
+@compiled
 def _value_potential(
     K: AbstractMatrixKernel, x: Float[Array, " n"], S: Float[Array, "E n"], b: Float[Array, " E"]
 ) -> Float[Array, ""]:
@@ -110,7 +109,7 @@ def _value_potential(
     return b @ jax.vmap(K.potential_covariance, in_axes=(None, 0))(x, S)
 
 
-@eqx.filter_jit
+@compiled
 def _value_field(
     K: AbstractMatrixKernel, x: Float[Array, " n"], S: Float[Array, "E n"], b: Float[Array, " E"]
 ) -> Float[Array, " n"]:
@@ -127,7 +126,7 @@ def _value_field(
     return jax.grad(along)(jnp.zeros(K.outputs(len(x)), x.dtype))
 
 
-@eqx.filter_jit
+@compiled
 def _value_fields(K, X, S, b):
     return at_points(lambda x: _value_field(K, x, S, b), X)
 
@@ -236,16 +235,16 @@ def feature_field(
     )
 
 
-@eqx.filter_jit
+@compiled
 def _field_at(features, x, weights):
     return features.field(x, weights)
 
 
-@eqx.filter_jit
+@compiled
 def _potential_at(features, x, weights):
     return features.potential(x, weights)
 
 
-@eqx.filter_jit
+@compiled
 def _evaluate(field, X, spread):
     return on_each(spread, lambda field, X: at_points(field._learned, X), field, X, joined=True)

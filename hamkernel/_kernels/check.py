@@ -20,7 +20,7 @@ from jaxtyping import Array, ArrayLike, Num
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import UserKernel, as_scalar_kernel
-from hamkernel._machine import one_blas_thread
+from hamkernel._machine import full_precision, one_blas_thread
 
 _CURE = (
     "Write the kernel as a profile of the squared distance s = ‖x - z‖² with exact derivatives at "
@@ -37,6 +37,7 @@ class _Pairs(NamedTuple):
 
 
 @one_blas_thread
+@full_precision
 def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     """Raise if the scalar kernel `k` is unfit for the structured kernels; return None if sound.
 

@@ -25,7 +25,7 @@ from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import KernelField
 from hamkernel._gram import constant, gram_rounding, trace
 from hamkernel._gram_operator import product
-from hamkernel._machine import RowSharding, as_given, rows_of, split
+from hamkernel._machine import RowSharding, as_given, compiled, rows_of, split
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.dense import field_of_rows, gram_product, norm_of, relative
 from hamkernel._solvers.landmarks import whitening
@@ -234,12 +234,12 @@ def _prepared_rows(K, rows, ridge, landmarks):
     return _OfRows(K, rows, F, factor(F.T @ F, ridge_)), truncation
 
 
-@eqx.filter_jit
+@compiled
 def _prepared_alone(prepare, given):
     return prepare(*given)
 
 
-@eqx.filter_jit
+@compiled
 def _solve(prepare, given, y, ridge, tolerance, max_iterations):
     products, truncation = prepare(*given)
     return _iterated(products, truncation, y, ridge, tolerance, max_iterations)
@@ -301,13 +301,13 @@ def _shown(prepared, y, ridge, tolerance, max_iterations) -> _Found:
     return last._replace(iterations=last.iterations + done)
 
 
-@eqx.filter_jit
+@compiled
 def _first_iterate(products: AbstractProducts, y) -> _Iterate:
     z = products.preconditioned(y)
     return _Iterate(jnp.zeros_like(y), y, z, jnp.sum(y * z), relative(y, y))
 
 
-@eqx.filter_jit
+@compiled
 def _next(products: AbstractProducts, y, ridge, at: _Iterate) -> _Iterate:
     p = at.direction
     image = p + products.gram(p) / ridge
@@ -319,6 +319,6 @@ def _next(products: AbstractProducts, y, ridge, at: _Iterate) -> _Iterate:
     return _Iterate(c, residual, z + square / at.square * p, square, relative(residual, y))
 
 
-@eqx.filter_jit
+@compiled
 def _finished(products: AbstractProducts, truncation, y, ridge, tolerance, start) -> _Found:
     return _iterated(products, truncation, y, ridge, tolerance, 2, start)

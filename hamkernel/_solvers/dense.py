@@ -26,9 +26,10 @@ from hamkernel._gram import (
     rows_between,
     strips_of_gram,
 )
-from hamkernel._machine import refuse_beyond_memory
+from hamkernel._machine import compiled, refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
+from hamkernel._sizes import sizes
 from hamkernel._solvers.factors import (
     ROWS_IN_PLACE,
     DenseFactor,
@@ -96,10 +97,6 @@ def dense_field(problem: Problem, throw: bool = True, progress: bool = False) ->
     return _unless_lost(field, left, problem.rows.count, throw)
 
 
-# The number of rows from which the Gram of velocities, 288 MB, is factored in its own memory.
-IN_PLACE = 6000
-
-
 def copies(problem: Problem) -> int:
     """The number of matrices of the size of the Gram that a dense fit holds at its peak.
 
@@ -111,7 +108,7 @@ def copies(problem: Problem) -> int:
 
 def _is_in_place(problem: Problem) -> bool:
     """Whether the Gram is factored in its own memory, which is not possible under `jax.jit`."""
-    has_states = problem.rows.size >= IN_PLACE and problem.states is not None
+    has_states = problem.rows.size >= sizes().rows_in_place and problem.states is not None
     return has_states and require.is_concrete(problem)
 
 
@@ -150,7 +147,7 @@ def _assembled(K, rows: Measurements, ridge, progress: bool):
     return A, lambda blocks: tqdm(blocks, "factor", disable=off)
 
 
-_slab = eqx.filter_jit(strips_of_gram, donate="all-except-first")
+_slab = compiled(strips_of_gram, donate="all-except-first")
 
 
 def _dense_system(K, rows: Measurements, regularization):
@@ -159,7 +156,7 @@ def _dense_system(K, rows: Measurements, regularization):
     return factor, *_field_and_residual(K, rows, regularization, c)
 
 
-@eqx.filter_jit
+@compiled
 def _of_factor(K, rows: Measurements, regularization, factor: DenseFactor):
     return _field_and_residual(K, rows, regularization, factor.solve(rows.y))
 
@@ -174,10 +171,10 @@ def _field_and_residual(K, rows: Measurements, regularization, c):
     return c, field_of_rows(K, rows, c, residual, norm, regularization, info), left
 
 
-_compiled_conditional = eqx.filter_jit(_dense_system)
+_compiled_conditional = compiled(_dense_system)
 
 
-@eqx.filter_jit
+@compiled
 def _compiled_field(K, rows: Measurements, regularization):
     return _dense_system(K, rows, regularization)[1:]
 
@@ -202,7 +199,7 @@ def relative(error: Array, of: Array) -> Float[Array, ""]:
     return jnp.linalg.norm(error) / jnp.where(scale > 0, scale, jnp.ones_like(scale))
 
 
-@eqx.filter_jit
+@compiled
 def _extended(old: DenseConditional, new: Measurements):
     K, R, rows = old.field.kernel, old.factor.R, old.rows.joined(new)
     # The contrasts of new energies reach back to the old ones.
@@ -228,7 +225,7 @@ def _extended(old: DenseConditional, new: Measurements):
     return factor, c, field_of_rows(K, rows, c, residual, norm, regularization, info)
 
 
-@eqx.filter_jit
+@compiled
 def _corrected(given: DenseConditional, prior: Prior, key) -> KernelField:
     """Matheron's rule, for every draw of the prior."""
     rows = given.rows

@@ -25,6 +25,7 @@ Dubrule (1983), Mathematical Geology 15, for held-out points with an unknown tre
 """
 
 import abc
+import functools
 import itertools
 from collections.abc import Callable, Iterable
 from typing import Generic, TypeVar
@@ -35,6 +36,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float, Int
+
+from hamkernel._machine import compiled, full_precision
 
 
 class Group:
@@ -190,24 +193,37 @@ class CholeskyBlocks(AbstractBlocks):
 ROWS_IN_PLACE = 1000
 
 
-# Calls of LAPACK. Under `jax.vmap` they run one after the other: two batches of calls side by side
-# were seen to stall for ever on two cores, since jaxlib 0.10.2 waits for threads that wait for it.
+def _one_by_one_on_cpus(function: Callable[..., Array]) -> Callable[..., Array]:
+    """`function`, whose batches under `jax.vmap` run one after the other on CPUs.
+
+    A workaround for a deadlock in jaxlib 0.10.2: two batched calls of LAPACK that run at the same
+    time on two cores wait for each other. A GPU has no such calls, and 256 small fits one after
+    the other took 28 ms there for .47. `platform_dependent` chooses where the program is lowered,
+    so that one program may be exported for both.
+    """
+    one_by_one = sequential_vmap(function)
+
+    @functools.wraps(function)
+    def call(*args: Array) -> Array:
+        return jax.lax.platform_dependent(*args, cpu=one_by_one, default=function)
+
+    return call
 
 
-@sequential_vmap
+@_one_by_one_on_cpus
 def _lapack_cholesky(A):
     # Transposed twice, the matrix is never copied from the order of rows to that of columns.
     return jax.lax.linalg.cholesky(A.T, symmetrize_input=False).T
 
 
-@sequential_vmap
+@_one_by_one_on_cpus
 def _lapack_backward(R, b):
     # Rᵀ in the order of columns, which LAPACK asks for, is R as it lies in memory: without a copy a
     # solve with 2000 rows takes a third of the time.
     return jax.lax.linalg.triangular_solve(R.T, b, left_side=True, lower=True, transpose_a=True)
 
 
-@sequential_vmap
+@_one_by_one_on_cpus
 def _lapack_forward(R, b):
     return jax.lax.linalg.triangular_solve(R.T, b, left_side=True, lower=True)
 
@@ -239,6 +255,7 @@ def cholesky(A: Float[Array, "D D"]) -> Float[Array, "D D"]:
 
 
 @cholesky.defjvp
+@full_precision
 def _(primals, tangents):
     # dR = upper(R⁻ᵀ dA R⁻¹) R, with half of the diagonal: Murray (2016), arXiv 1602.07527.
     (A,), (dA,) = primals, tangents
@@ -330,10 +347,10 @@ def factor_in_place(A: Float[Array, "D D"], steps: Callable[[Iterable], Iterable
     return DenseFactor(A, size)
 
 
-_norm = jax.jit(jnp.linalg.norm)
+_norm = compiled(jnp.linalg.norm)
 
 
-@eqx.filter_jit(donate="all-except-first")
+@compiled(donate="all-except-first")
 def _rows_of_factor(at: tuple[int], A: Float[Array, "D D"]) -> Float[Array, "D D"]:
     start, D = at[0], len(A)
     b = min(ROWS_IN_PLACE, D - start)

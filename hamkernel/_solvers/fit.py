@@ -11,7 +11,14 @@ from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, Mean
 from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import ControlledField, FamilyField, learned_field
-from hamkernel._machine import as_given, dense_bytes, memory_bytes, one_blas_thread, rows_of
+from hamkernel._machine import (
+    as_given,
+    dense_bytes,
+    full_precision,
+    memory_bytes,
+    one_blas_thread,
+    rows_of,
+)
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.dense import Cholesky, copies
@@ -79,6 +86,7 @@ def fit(
 
 
 @one_blas_thread
+@full_precision
 def fit(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,

@@ -31,7 +31,7 @@ from hamkernel._gram import (
     gram_of_rows,
     gram_rounding,
 )
-from hamkernel._machine import rows_of, split
+from hamkernel._machine import compiled, full_precision, rows_of, split
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -172,7 +172,7 @@ def _chosen(
     return _first_candidates(drawn, min(size, blocks * BLOCK))
 
 
-@eqx.filter_jit
+@compiled
 def _gram_of_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r r"]:
     return landmarks.gram(K)
 
@@ -228,7 +228,7 @@ def _pruned(
     return Landmarks(tuple(parts), jnp.asarray(places), kept, count)
 
 
-@eqx.filter_jit
+@compiled
 def given_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Landmarks:
     """The landmarks with those columns kept that pivoted Cholesky finds independent.
 
@@ -350,7 +350,7 @@ class _Drawn(NamedTuple):
     rounds: Int[Array, ""]
 
 
-@eqx.filter_jit
+@compiled
 def _begin(candidates: AbstractCandidates, left, key, size):
     """The state after the first call of `_draw`."""
     traces, n = candidates.traces, candidates.outputs
@@ -378,7 +378,7 @@ def _enlarged(drawn: _Drawn, size: int) -> _Drawn:
     )
 
 
-@eqx.filter_jit
+@compiled
 def _draw(candidates: AbstractCandidates, left, drawn, size):
     """Draw blocks until the mean trace is at most `left` or `size` candidates are chosen."""
     goal = jnp.maximum(left, drawn.rounding).sum()
@@ -464,7 +464,7 @@ def masked(matrix: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[Array,
     return jnp.where(both, matrix, jnp.diag(~kept).astype(matrix.dtype))
 
 
-@eqx.filter_jit
+@compiled
 def _first_candidates(drawn, size):
     """The first candidates drawn, at most `size`."""
     used = jnp.arange(size) < drawn.count
@@ -478,6 +478,7 @@ def whitening(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r 
 
 
 @jax.custom_jvp
+@full_precision
 def _inverse_root(G: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[Array, "r r"]:
     L = jnp.linalg.cholesky(masked(G, kept))
     T = jax.scipy.linalg.solve_triangular(L, jnp.eye(len(G), dtype=G.dtype), lower=True).T
@@ -486,6 +487,7 @@ def _inverse_root(G: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[Arra
 
 
 @_inverse_root.defjvp
+@full_precision
 def _(primals, tangents):
     # Only T Tᵀ = G⁻¹ matters, and its derivative is the same with this dT as with that of the
     # Cholesky factor, whose rounding error grows with the condition of G.

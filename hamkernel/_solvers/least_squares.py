@@ -28,6 +28,7 @@ from jaxtyping import Array, Float
 
 from hamkernel._gram import constant, plus_ridge
 from hamkernel._machine import RowSharding, on_each
+from hamkernel._sizes import sizes
 
 # A design gives the rows of some points at once: (t, n) -> (t, n, r), row (i, a) of a field's
 # component a at point i.
@@ -248,8 +249,8 @@ def normal(
 
         square = jnp.zeros_like(basis)
         nothing = Normal(square, square[0], square[0, 0])
-        # A tile of 2²⁰ numbers, 8 MB, stays in the cache; see `_gram_operator.py`.
-        return over_tiles(step, nothing, (X, Y), max(1024, 2**20 // len(basis)))[0]
+        at_once = max(1024, sizes().design_entries // len(basis))
+        return over_tiles(step, nothing, (X, Y), at_once)[0]
 
     return on_each(spread, own_sums, (design, basis), X, Y, joined=False)
 

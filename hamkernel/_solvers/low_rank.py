@@ -45,6 +45,7 @@ from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import AbstractField, SolverInfo, root
 from hamkernel._fields.expansions import FeatureField, KernelField, feature_field, kernel_field
 from hamkernel._gram import between, block_traces, components, plus_ridge, trace_of_rows
+from hamkernel._machine import compiled
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks, whitening
@@ -140,7 +141,7 @@ def prior_draws(
     return _drawn(K, landmarks, of_draws, count)
 
 
-@eqx.filter_jit
+@compiled
 def _drawn(K, landmarks: Landmarks, key, count: int) -> Prior:
     S, T = landmarks.points, whitening(K, landmarks)
     m, d = S.shape
@@ -324,7 +325,7 @@ class LandmarkSpan(AbstractSpan):
         return _on_landmarks(self, weights, prior)
 
 
-@eqx.filter_jit
+@compiled
 def _on_landmarks(span: LandmarkSpan, weights, prior: Prior) -> KernelField:
     landmarks = span.landmarks
     # A draw of the prior less its projection on the span.
@@ -456,7 +457,7 @@ def low_rank_conditional(
     return eqx.tree_at(lambda c: c.field, conditional, eqx.combine(arrays, rest))
 
 
-@eqx.filter_jit
+@compiled
 def _low_rank_conditional(span, rows, ridge):
     F = rows.contrast(span.of_rows(rows))
     start = jnp.sqrt(ridge) * jnp.eye(F.shape[1], dtype=F.dtype)

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel._gram import plus_ridge
+from hamkernel._machine import full_precision
 from hamkernel._solvers.factors import (
     AbstractBlocks,
     AbstractFactor,
@@ -205,5 +206,5 @@ def gram_of_columns(rows: Float[Array, "D r"]) -> Float[Array, "r r"]:
 
 gram_of_columns.defvjp(
     lambda rows: (gram_of_columns(rows), rows),
-    lambda rows, bar: (rows @ (bar + bar.T),),
+    full_precision(lambda rows, bar: (rows @ (bar + bar.T),)),
 )

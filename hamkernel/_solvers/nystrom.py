@@ -24,7 +24,7 @@ from hamkernel._fields.base import root
 from hamkernel._fields.expansions import KernelField
 from hamkernel._gram import components, trace, trace_of_rows
 from hamkernel._gram_operator import product
-from hamkernel._machine import RowSharding, as_given, rows_of, split
+from hamkernel._machine import RowSharding, as_given, compiled, rows_of, split
 from hamkernel._observations.measurements import Measurements
 from hamkernel._show import text
 from hamkernel._solvers.landmarks import (
@@ -169,7 +169,7 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         )
 
 
-@eqx.filter_jit
+@compiled
 def start_fit(K, sample, regularization, landmarks, tolerance):
     T = whitening(K, landmarks)
     if sample.states is None:
@@ -194,7 +194,7 @@ def _design(K, landmarks, rows):
     return jnp.concatenate([landmarks.columns(K, block) for block in rows.blocks])
 
 
-@eqx.filter_jit
+@compiled
 def _landmark_solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, norm, residual_norm = solve_sums(fit.sums, ridge)
@@ -318,7 +318,7 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
         return start_fit(K, some, regularization, landmarks, self.tolerance)
 
 
-@eqx.filter_jit
+@compiled
 def _landmark_fit(K, X, Y, regularization, landmarks, spread):
     S, ridge = landmarks.points, len(X) * regularization
     T = whitening(K, landmarks)

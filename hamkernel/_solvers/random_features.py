@@ -10,7 +10,7 @@ from hamkernel import _require as require
 from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import FeatureField, feature_field
-from hamkernel._machine import RowSharding, as_given, refuse_beyond_memory, rows_of, split
+from hamkernel._machine import RowSharding, as_given, compiled, refuse_beyond_memory, rows_of, split
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.least_squares import (
     Normal,
@@ -109,7 +109,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
         return _start(K, basis, thinned(K, sample, 4096), regularization)
 
 
-@eqx.filter_jit
+@compiled
 def _feature_fit(K, solver, X, Y, regularization, spread):
     basis = solver._features(K, X.shape[1], X.dtype)
     ridge = len(X) * regularization
@@ -186,7 +186,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
         return _if_solved(_feature_solution(self, count, regularization))
 
 
-@eqx.filter_jit
+@compiled
 def _start(K, basis, sample, regularization):
     identity = jnp.eye(basis.columns, dtype=sample.targets.dtype)
     if sample.states is None:
@@ -206,7 +206,7 @@ def _start(K, basis, sample, regularization):
     )
 
 
-@eqx.filter_jit
+@compiled
 def _feature_solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, _, residual_norm = solve_sums(fit.sums, ridge)

@@ -27,7 +27,14 @@ from hamkernel import _require as require
 from hamkernel._fields.base import known_part
 from hamkernel._fields.joined import learned_field
 from hamkernel._gram import components
-from hamkernel._machine import RowSharding, one_blas_thread, rows_of, split
+from hamkernel._machine import (
+    RowSharding,
+    compiled,
+    full_precision,
+    one_blas_thread,
+    rows_of,
+    split,
+)
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import (
     Measurements,
@@ -137,6 +144,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
     def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> LearnedField:
         """`field` for a λ that has been checked, and the number of points, which is not 0."""
 
+    @full_precision
     def add(
         self: Fit,
         X: Num[ArrayLike, "N n"] | AbstractObservations,
@@ -225,6 +233,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         return learned_field(fit._solved(jnp.ones_like(self.count), one), self._known)
 
     @one_blas_thread
+    @full_precision
     def field(self, regularization: ArrayLike | None = None) -> Any:
         """The field learned from all data added so far; O(r³), and no pass over the data.
 
@@ -245,12 +254,12 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         return learned_field(self._solved(count, regularization), self._known)
 
 
-@eqx.filter_jit
+@compiled
 def _with_velocities(fit, X, Y, spread):
     return _plus(fit, fit._of_velocities(X, Y, spread), None, len(X))
 
 
-@eqx.filter_jit
+@compiled
 def _with_rows(fit, rows):
     return _plus(fit, fit._of_rows(rows), None, rows.count)
 
@@ -270,7 +279,7 @@ def _differ(one: Any, other: Any) -> Bool[ArrayLike, ""]:
     return ~xp.asarray(same, bool).all()
 
 
-@eqx.filter_jit
+@compiled
 def _plus(fit: Fit, more: Any, more_lost: Any, count: Int[ArrayLike, ""]) -> Fit:
     def added(a, b, a_lost, b_lost):
         s, left = _two_sum(a, b)
@@ -302,6 +311,7 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
     ) -> Fit:
         """`start` for arguments that have been checked."""
 
+    @full_precision
     def start(
         self,
         K: AbstractMatrixKernel,
@@ -348,6 +358,7 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
         return self._started(K, rows, require.ridge(regularization, rows.targets.dtype))
 
     @one_blas_thread
+    @full_precision
     def fit_chunks(
         self,
         K: AbstractMatrixKernel,

@@ -42,6 +42,7 @@ from hamkernel._kernels.symmetry import (
     without_symmetry,
 )
 from hamkernel._kernels.transforms import Warp
+from hamkernel._machine import compiled
 from hamkernel._show import call, described
 from hamkernel._structures.base import AbstractMatrixKernel
 
@@ -135,7 +136,7 @@ def _is_warp(node: object) -> bool:
     return isinstance(node, Warp)
 
 
-@eqx.filter_jit
+@compiled
 def _is_smooth(warp: Warp, X: Float[Array, "N n"]) -> Bool[Array, " N"]:
     """Whether the map and its Jacobian are finite at each point."""
 
@@ -180,7 +181,7 @@ def _operators_at(K: Any, X: Float[Array, "N n"]) -> Float[Array, "N n n"]:
     return jax.vmap(K.operator_at)(X)
 
 
-_compiled_operators_at = eqx.filter_jit(_operators_at)
+_compiled_operators_at = compiled(_operators_at)
 
 
 def check_symmetries(K: Any, X: Float[Array | np.ndarray, "N n"]) -> None:

@@ -205,5 +205,3 @@ class Segments(NamedTuple):
 
 def broadcast_mask(mask: Bool[Array, " S"], a: Array) -> Bool[Array, "S ..."]:
     return mask.reshape(-1, *([1] * (a.ndim - 1)))
-
-

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled_by_size
-from hamkernel._trajectories.diagnostics import SETTLED, whiteness
+from hamkernel._trajectories.diagnostics import SETTLED
 from hamkernel._trajectories.flow import Expansion, Segments, field_values, steps_for, stiffness
 from hamkernel._trajectories.kalman import (
     SmoothedPath,
@@ -42,6 +42,7 @@ from hamkernel._trajectories.segments import (
     segmented,
     updated,
 )
+from hamkernel._trajectories.whiteness import whiteness
 
 _SEARCH = 25  # steps of BFGS, which go on in the next iteration
 
@@ -176,7 +177,9 @@ def begin(task: Task, model: Model, design: np.ndarray) -> Current:
 def _along_smoothed(task: Task) -> LinearisedSegments:
     runs = task.data.runs
     segments = segmented(runs, task.pieces, [run.path for run in runs])
-    return linearised_along_smoothed(task.data, task.pieces, segments, task.mean, task.usable(len(segments.starts)))
+    return linearised_along_smoothed(
+        task.data, task.pieces, segments, task.mean, task.usable(len(segments.starts))
+    )
 
 
 class _Trial(NamedTuple):
@@ -329,8 +332,6 @@ def noisy_counts(end: End) -> Float[np.ndarray, "S L+1 n"]:
     return np.where(without_noise(now.model, task.bounds, task.data.scale), 0, now.rows.counts)
 
 
-
-
 def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     """Whether iterations with next to no process noise say that it is not enough.
 
@@ -351,7 +352,8 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
 
 def price(end: End) -> float:
     """The gain in log p that pays for process noise: Schwarz's ½ log N for each deviation of w."""
-    count = np.isfinite(np.asarray(end.now.model.log_process)).sum() + (end.now.rows.pushed > 1).sum()
+    deviations = np.isfinite(np.asarray(end.now.model.log_process)).sum()
+    count = deviations + (np.asarray(end.now.rows.pushed) > 1).sum()
     return float(0.5 * count * np.log(np.asarray(end.now.rows.counts).sum()))
 
 

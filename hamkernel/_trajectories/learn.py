@@ -16,21 +16,16 @@ from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import learned_field
 from hamkernel._gram_operator import placed_product
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._machine import one_blas_thread
+from hamkernel._machine import full_precision, one_blas_thread
 from hamkernel._observations.kinds import inputs_or_parameters
 from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.friction import frictions, with_rest_speed
 from hamkernel._structures.masses import UnknownMasses
-from hamkernel._trajectories.diagnostics import (
-    FitQuality,
-    check_identifiable,
-    diagnose,
-    warn_in_advance,
-    whiteness,
-)
+from hamkernel._trajectories.diagnostics import FitQuality, check_identifiable, diagnostics
 from hamkernel._trajectories.flow import Expansion, field_values
+from hamkernel._trajectories.free_run import error_over_constant, stretches
 from hamkernel._trajectories.iteration import (
     Current,
     End,
@@ -58,6 +53,7 @@ from hamkernel._trajectories.preprocessing import (
     landmarks,
     preprocess,
     sampled,
+    seconds_of_iteration,
 )
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.search import (
@@ -69,11 +65,13 @@ from hamkernel._trajectories.search import (
     landmark_spacing,
 )
 from hamkernel._trajectories.segments import LONG, Piece, equal_pieces
-from hamkernel._trajectories.sensors import timing, warn_of_curve, warn_of_timing
+from hamkernel._trajectories.sensors import is_on_a_curve, timing
 from hamkernel._trajectories.smoothing import interpolated, power_of_two
+from hamkernel._trajectories.whiteness import whiteness
 
 
 @one_blas_thread
+@full_precision
 def learn(
     K: AbstractMatrixKernel,
     runs: Runs,
@@ -136,9 +134,7 @@ def learn(
             enabled.
 
     Warns:
-        UserWarning: parts of runs were dropped or pushed, landmarks or runs are too few, the
-            structure does not explain the runs, residuals grow with the speed, or the iterations
-            did not settle.
+        UserWarning: once, where a row of `learned.diagnostics` falls short, with its meaning.
     """
     require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
     K, given, process = _check(with_amplitude(matrix_kernel(K)), runs, noise, process_noise, solver)
@@ -159,7 +155,7 @@ def learn(
     log_noise = jnp.log(jnp.asarray(_first_noise(data) if given is None else given))
     K = with_rest_speed(K, jnp.asarray(X), runs.dimension)
     S, first, quick, capped = landmarks(data, None if solver is None else solver.max_points)
-    warn_in_advance(K, data, X, first)
+    bar.set_description(f"learning, {seconds_of_iteration(data, first):.0f} s an iteration")
 
     spacing = landmark_spacing(X, S[:first], data.scale)
     impulse = impulses(K, jnp.asarray(S[:first]), Y, data)
@@ -178,12 +174,13 @@ def learn(
     if not runs.is_decided:
         task, at = asked(floor)
         runs, data = decided(runs, data, lambda d: initial_loss(task._replace(data=d), at.model))
-    end = iterate(*asked(floor if process is None else process), most, bar)
+    q = floor if process is None else np.maximum(process, floor)
+    end = iterate(*asked(q), most, bar)
     if process is None and asks_for_process(end, impulse):
         other = iterate(*asked(floor, sought=True), most, bar)
         end = other if evidence(other) + price(other) < evidence(end) else end
     bar.close()
-    return _learned(runs, mean, end, process is None, given is not None, measured)
+    return _learned(runs, mean, end, process, given is not None, measured)
 
 
 def _first_noise(data: Preprocessed) -> Float[np.ndarray, " n"]:
@@ -193,7 +190,12 @@ def _first_noise(data: Preprocessed) -> Float[np.ndarray, " n"]:
 
 
 def _learned(
-    runs: Runs, mean: Any, end: End, sought: bool, given: bool, measured: np.ndarray
+    runs: Runs,
+    mean: Any,
+    end: End,
+    given_process: np.ndarray | None,
+    given: bool,
+    measured: np.ndarray,
 ) -> Learned:
     """The result; warns where it must.
 
@@ -201,29 +203,31 @@ def _learned(
         runs: what was given.
         mean: what was given.
         end: where the iterations ended.
-        sought: whether process noise was to be found.
+        given_process: the process noise that was given, if any.
         given: whether the noise was given.
         measured: which coordinates were.
     """
     mean = None if mean is None else as_pytree(mean)
     task, now, history = end.task, end.now, end.history
     field, data = now.field, task.data
-    times, seen = runs.on_host()
+    times = runs.on_host()[0]
     states = _at_all_times(end, times)
     noise = np.where(measured, np.exp(np.asarray(now.model.log_noise)), np.nan)
-    process = np.exp(np.asarray(now.model.log_process))
+    # Without process noise q stands at the floor of the integrator, and is none.
+    is_free = task.bounds.free[-len(noise) :]
+    process = np.where(is_free, np.exp(np.asarray(now.model.log_process)), 0.0)
+    process = process if given_process is None else given_process
     misfit = misfits(runs, states, noise)
     rows = now.field.points, now.rows, task.start_deviation
     z, counts = innovations(whitened_rows(now.model, *rows), now.rows), np.asarray(now.rows.counts)
-    fit = _quality(runs, end, sought, misfit, z, process)
+    sought = given_process is None
+    fit = _quality(runs, end, misfit, z, process, states)
+    fit = fit._replace(noise=noise, is_noise_known=given, process=process if sought else None)
     if fit.kept.any():
         fit = _with_causes(fit, runs, end)
-    converged = diagnose(fit, noise, data.scale, given)
-    if fit.kept.any() and runs.inputs is None:
-        warn_of_curve(states)
-    if fit.kept.any() and not (fit.dropped or fit.is_disturbed):
-        pairs, noisy = zip(seen, states, strict=True), noisy_counts(end).any((0, 1))
-        warn_of_timing(timing(times, [np.where(noisy, x - y, np.nan) for x, y in pairs], states))
+    table = diagnostics(fit, field.kernel, sampled(data)[0])
+    if table.warning:
+        require.warn(table.warning)
     observations = as_observations(now.rows, now.model, task.mean, task.start_deviation)
     count = 1 if observations is None else sum(len(y) for _, y in observations.parts())
     regularization = jnp.asarray(1 / count)
@@ -236,6 +240,7 @@ def _learned(
         states=tuple(jnp.asarray(x) for x in states),
         kept=jnp.asarray(fit.kept),
         dropped=fit.dropped,
+        pushed=fit.pushed,
         misfit=jnp.asarray(misfit),
         chi_squared=jnp.asarray(fit.chi_squared),
         innovations=tuple(
@@ -243,9 +248,10 @@ def _learned(
         ),
         whiteness=jnp.asarray(fit.white.probability),
         widening=jnp.asarray(fit.white.widening),
-        disturbance=_disturbances(end, times),
+        disturbance=_disturbances(end, times, bool(process.any())),
         history=tuple(history),
-        converged=converged,
+        converged=table.is_usable,
+        diagnostics=table,
         runs=runs,
         observations=observations,
         mean=mean,
@@ -269,14 +275,15 @@ def _at_all_times(end: End, times: list[np.ndarray]) -> list[Float[np.ndarray, "
 def _quality(
     runs: Runs,
     end: End,
-    sought: bool,
     misfit: Float[np.ndarray, "R n"],
     z: Float[np.ndarray, "S L+1 n"],
     process: Float[np.ndarray, " n"],
+    states: list[np.ndarray],
 ) -> FitQuality:
     """How well the field follows the runs; `z` are the innovations by segment."""
-    now, data, times = end.now, end.task.data, runs.on_host()[0]
-    counts = np.asarray(now.rows.counts)
+    now, data = end.now, end.task.data
+    times, seen = runs.on_host()
+    counts, noise = np.asarray(now.rows.counts), np.exp(np.asarray(now.model.log_noise))
     kept, pieces = np.zeros(len(data.runs)), list(zip(end.task.pieces, now.good, strict=True))
     for (r, start, stop), good in pieces:
         kept[r] += good * (stop - start) / len(data.runs[r].times)
@@ -285,17 +292,33 @@ def _quality(
     speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
     spacing = np.median(np.concatenate([np.diff(t) for t in times]))
     swing = 2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)) / spacing
+    period = np.maximum(swing, 1.0) * spacing
+    dropped = _samples([piece for piece, good in pieces if not good], end, times)
+    residuals = [x - path for x, path in zip(seen, states, strict=True)]
+    logged = [np.where(np.isfinite(r.states), r.states, r.path) for r in data.runs]
+    timed = kept.any() and not (dropped or process.any())
+    noisy = noisy_counts(end).any((0, 1))
     return FitQuality(
+        noise=noise,
+        scale=data.scale,
+        is_noise_known=False,
         kept=kept,
-        dropped=_samples([piece for piece, good in pieces if not good], end, times),
+        dropped=dropped,
+        core=_core(residuals, noise),
+        share=float(np.max(process / np.sqrt(period) / np.maximum(speed, 1e-300))),
+        impulse=_largest_push(end),
         pushed=_samples(_pushed(end), end, times),
+        is_curve=runs.inputs is None and is_on_a_curve(logged, noise),
+        free_run=_free_run(end, kept, swing * spacing),
+        timing=timing(times, [np.where(noisy, r, np.nan) for r in residuals], states)
+        if timed
+        else None,
         misfit=misfit,
         chi_squared=squares / max(free, 1.0),
         free=free,
         remaining=now.free,
         white=whiteness(z, noisy_counts(end)),
-        process=process if sought else None,
-        needed=sought and bool(end.task.bounds.free[-len(process) :].any()),
+        process=process,
         count=len(end.history),
         settled=end.settled,
         swing=float(swing),
@@ -313,7 +336,8 @@ def _with_causes(fit: FitQuality, runs: Runs, end: End) -> FitQuality:
         fit = fit._replace(few=used * asks_for_landmarks(end))
     if fit.has_momenta and (fit.is_disturbed or not fit.white.is_enough):
         bent = gain_of_inertia(*given, task.data, task.mean)
-        fit = fit._replace(gained=gain_of_friction(*given, task.data), bent=bent)
+        gain = gain_of_friction(*given, task.data)
+        fit = fit._replace(friction_gain=gain, inertia_gain=bent)
     if fit.white.is_enough:
         return fit
     return fit._replace(between=likelier_between(runs, end))
@@ -331,11 +355,13 @@ def likelier_between(runs: Runs, end: End) -> str:
     return chosen.between if chosen.between != runs.between else ""
 
 
-def _disturbances(end: End, times: list[np.ndarray]) -> tuple[Float[Array, "T n"], ...]:
+def _disturbances(
+    end: End, times: list[np.ndarray], is_disturbed: bool
+) -> tuple[Float[Array, "T n"], ...]:
     """The smoothed w of each run, from each of its times to the next."""
     task, now = end.task, end.now
     w = np.zeros(now.rows.drive.shape)
-    if now.model.is_disturbed:
+    if is_disturbed:
         given = now.field.points, now.rows, task.start_deviation
         w = np.asarray(smoothed_path(now.model, now.field.coefficients, *given).disturbance)
     out = []
@@ -353,6 +379,42 @@ def _pushed(end: End) -> list[Piece]:
         for s, (r, start, stop) in enumerate(end.task.pieces)
         for i in np.flatnonzero(sizes[s, : stop - start - 1] > 1)
     ]
+
+
+def _core(residuals: list[np.ndarray], noise: np.ndarray) -> Float[np.ndarray, " n"]:
+    """1.4826 times the median of |residual| over σ, by coordinate; NaN where nothing was measured.
+
+    1.4826 is 1/Φ⁻¹(3/4), for which normal residuals have 1.
+    """
+    R = np.abs(np.concatenate(residuals))
+    seen = np.isfinite(R).any(axis=0)
+    out = np.full(R.shape[1], np.nan)
+    out[seen] = 1.4826 * np.nanmedian(R[:, seen], axis=0) / noise[seen]
+    return out
+
+
+def _free_run(end: End, kept: Float[np.ndarray, " R"], period: float) -> float:
+    """The error of free runs over two swings, relative to that of a constant."""
+    data, paths = end.task.data, end.now.paths
+    used = [(run, path) for run, path, k in zip(data.runs, paths, kept, strict=True) if k]
+    if not used:
+        return np.inf
+    spacing = np.median(np.concatenate([np.diff(run.times) for run, _ in used]))
+    length = int(np.clip(2 * period / spacing, 4, 64))
+    part = stretches([run for run, _ in used], [path for _, path in used], length)
+    return error_over_constant(end.now.field, part, data.scale)
+
+
+def _largest_push(end: End) -> float:
+    """The largest jump ∫w dt within one pushed interval, over the deviation of its coordinate."""
+    pushed = np.asarray(end.now.rows.pushed) > 1
+    if not np.any(pushed):
+        return 0.0
+    task, now = end.task, end.now
+    given = now.field.points, now.rows, task.start_deviation
+    w = np.asarray(smoothed_path(now.model, now.field.coefficients, *given).disturbance)
+    jump = np.abs(w[:, : pushed.shape[1]]) * np.asarray(now.rows.spans)[..., None]
+    return float((jump / task.data.scale)[pushed].max())
 
 
 def _samples(

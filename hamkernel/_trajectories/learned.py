@@ -10,11 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
+from hamkernel._machine import full_precision
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._posterior import Posterior, condition
-from hamkernel._show import described
+from hamkernel._show import described, text
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._trajectories.diagnostics import Diagnostics
 from hamkernel._trajectories.runs import Runs
 
 
@@ -61,6 +63,8 @@ class Learned(eqx.Module):
         kept: for each run the share of its samples that the field is learned from, shape (R,).
         dropped: the parts of the runs that the field is not learned from, each as (run, first
             sample, sample after the last).
+        pushed: the parts in which something that is neither in the log nor in the field pushed the
+            system, as those that were dropped. The field is hardly learned from them.
         misfit: for each run and coordinate the root mean square of (measured − fitted)/σ, shape
             (R, n); about one where the structure explains the run, NaN where nothing was measured.
         chi_squared: the sum of squares of all of them over the degrees of freedom that the fit
@@ -81,8 +85,10 @@ class Learned(eqx.Module):
         disturbance: the mean of w from each sample to the next as far as the samples know it, for
             each run, (T, n); 0 without process noise.
         history: one entry an iteration.
-        converged: whether noise and objective settled, where the field explains the runs at the
-            noise found, with innovations that are white.
+        converged: whether the field may be used: no row of `diagnostics` that decides falls short.
+        diagnostics: a table with one row for each question, such as whether the iterations settled,
+            whether the noise explains most of the motion, whether residuals are white, and whether
+            friction is missing; `.failing` has the names of the rows that fall short.
         runs: the runs that were given.
         observations: what the runs say of the field near the fitted paths, starts projected out:
             linear functionals of it, with independent noise of variance one. `hk.fit(kernel,
@@ -99,6 +105,7 @@ class Learned(eqx.Module):
     states: tuple[Float[Array, "T n"], ...]
     kept: Float[Array, " R"]
     dropped: tuple[tuple[int, int, int], ...] = eqx.field(static=True)
+    pushed: tuple[tuple[int, int, int], ...] = eqx.field(static=True)
     misfit: Float[Array, "R n"]
     chi_squared: Float[Array, ""]
     innovations: tuple[Float[Array, "T n"], ...]
@@ -107,14 +114,27 @@ class Learned(eqx.Module):
     disturbance: tuple[Float[Array, "T n"], ...]
     history: tuple[Iteration, ...]
     converged: bool = eqx.field(static=True)
+    diagnostics: Diagnostics = eqx.field(static=True)
     runs: Runs
     observations: AbstractObservations | None
     mean: Any
 
     def __repr__(self) -> str:
-        return described(self)
+        samples = sum(len(x) for x in self.states)
+        noisy = bool(np.any(np.asarray(self.process_noise)))
+        lines = [
+            f"Learned from {len(self.states)} runs, {samples} samples: "
+            + ("usable" if self.converged else "do not use this field"),
+            f"kernel         {text(self.kernel)}",
+            f"noise          {text(self.noise)}",
+            f"process noise  {text(self.process_noise) if noisy else 'none'}",
+            f"diagnostics    {', '.join(self.diagnostics.failing) or 'nothing'} falls short",
+            "next           .field, .diagnostics, .posterior, hk.simulate(learned.field, x0, ts)",
+        ]
+        return "\n".join(lines)
 
     @property
+    @full_precision
     def posterior(self) -> Posterior:
         """The Gaussian process of the field given the runs: bands, samples, updates.
 
@@ -145,6 +165,7 @@ class Learned(eqx.Module):
             mean=self.mean,
         )
 
+    @full_precision
     def sample_disturbance(
         self, key: Key[Array, ""], ts: Float[ArrayLike, " T"]
     ) -> Float[Array, "T n"]:

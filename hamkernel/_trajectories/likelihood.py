@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
-from hamkernel._machine import compiled_by_size
+from hamkernel._machine import compiled_by_size, full_precision
 from hamkernel._trajectories.kalman import whiten
 from hamkernel._trajectories.model import Model, landmark_whitening
 from hamkernel._trajectories.segments import LinearisedSegments
@@ -46,6 +46,7 @@ def regression_loss(M: Float[Array, "D q"], r: Float[Array, " D"]) -> Float[Arra
     return _regression_forward(M, r)[0]
 
 
+@full_precision
 def _regression_forward(M, r):
     q = M.shape[1]
     F = triangle(no_rows(q, M.dtype), M, r)
@@ -54,6 +55,7 @@ def _regression_forward(M, r):
     return 0.5 * (F[q, q] ** 2 + log_det), (M, r, R, F[:q, q])
 
 
+@full_precision
 def _regression_backward(saved, bar):
     M, r, R, z = saved
     w = solve_triangular(R, z)
@@ -108,9 +110,7 @@ class ClosedForm(NamedTuple):
 
 
 @compiled_by_size
-def condensed(
-    model: Model, S, rows: LinearisedSegments, start_deviation
-) -> Condensed:
+def condensed(model: Model, S, rows: LinearisedSegments, start_deviation) -> Condensed:
     """The rows in the triangle of their QR factorisation, a strip at a time."""
     T = landmark_whitening(model.kernel, S)
     (size, samples, n), q = rows.counts.shape, len(T)
@@ -152,8 +152,6 @@ def conditional(known: Condensed, S, shift: Array | float = 0.0) -> ClosedForm:
     return ClosedForm(w, S, coefficients, known.rows - used, used, squares, loss)
 
 
-def closed_form(
-    model: Model, S, rows: LinearisedSegments, start_deviation
-) -> ClosedForm:
+def closed_form(model: Model, S, rows: LinearisedSegments, start_deviation) -> ClosedForm:
     """The field given the rows."""
     return conditional(condensed(model, S, rows, start_deviation), S)

@@ -104,8 +104,6 @@ class WhitenedRows(NamedTuple):
     constant: Float[Array, ""]
 
 
-
-
 def columns(
     K: AbstractMatrixKernel,
     S: Float[Array, "m d"],

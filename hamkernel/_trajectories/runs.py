@@ -27,8 +27,10 @@ from jaxtyping import Array, Float, Int
 from hamkernel import _require as require
 from hamkernel._trajectories.flow import NODES
 from hamkernel._trajectories.sensors import (
+    impossible_samples,
     warn_of_feedback,
     warn_of_gaps,
+    warn_of_impossible,
     warn_of_inputs,
     warn_of_sensors,
 )
@@ -151,7 +153,8 @@ class Runs(eqx.Module):
             TypeError: something is not an array of real numbers.
 
     Warns:
-        UserWarning: a jump of 2π, a long gap, a coordinate that never moves or stops while others
+        UserWarning: samples that are impossible beside their neighbours, a jump of 2π, 360, 4096
+            or 65536, a long gap, a coordinate that never moves or stops while others
             go on, a sensor that was clipped, samples that were repeated or interpolated, inputs
             that never change, depend on one another or are a function of the states: once each.
     """
@@ -201,6 +204,7 @@ class Runs(eqx.Module):
         self.parameters = None if parameters is None else _members(parameters, len(times), inputs)
         _check_coordinates(self.states)
         times, states = self.on_host()
+        warn_of_impossible(self.impossible)
         warn_of_gaps(times, states)
         warn_of_sensors(times, states)
         if self.inputs is not None:
@@ -224,6 +228,11 @@ class Runs(eqx.Module):
                 delay = self.delay if isinstance(self.delay, str) else f"{self.delay:.4g}"
                 said.append(f"delay={delay}")
         return f"Runs({', '.join(said)})"
+
+    @property
+    def impossible(self) -> tuple[Int[np.ndarray, " k"], ...]:
+        """The samples of each run that are no measurements, such as −9999 or a row of zeros."""
+        return tuple(np.flatnonzero(impossible_samples(x)) for x in self.on_host()[1])
 
     @property
     def dimension(self) -> int:

@@ -111,9 +111,7 @@ def exact(rows: LinearisedSegments) -> tuple[Float[Array, "k d"], LinearisedSegm
 
 
 @compiled_by_size
-def _best(
-    model: Model, S, rows: LinearisedSegments, start_deviation, low, high, free, steps
-):
+def _best(model: Model, S, rows: LinearisedSegments, start_deviation, low, high, free, steps):
     start = model.flat
 
     def loss(h):

@@ -16,12 +16,11 @@ of the mean alone, the identity where there is none.
 import itertools
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hamkernel._machine import compiled_by_size
+from hamkernel._machine import compiled, compiled_by_size
 from hamkernel._trajectories.flow import (
     NODES,
     WEIGHTS,
@@ -149,7 +148,7 @@ def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
     return _windows(rows, jnp.asarray(s), jnp.asarray(first[:, None] + np.arange(length)[None]))
 
 
-@jax.jit
+@compiled
 def _windows(rows: LinearisedSegments, s, at) -> LinearisedSegments:
     inner, s = at[:, :-1], s[:, None]
     cut = {name: getattr(rows, name)[s, at] for name in ("residual", "counts", "scatter")}

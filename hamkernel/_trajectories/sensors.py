@@ -1,40 +1,46 @@
 """Warnings of faults that sensors and controllers leave in a log, before it is learned from."""
 
 import itertools
+import warnings
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from hamkernel import _require as require
 
 
 def warn_of_gaps(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> None:
     """Warn where an angle was wrapped, a gap is long, or a coordinate never moves."""
-    gaps, jumps, still, lost = [], [], [], False
+    gaps, still, lost = [], [], False
+    jumps: dict[float, list[str]] = {}
     for run, (t, x) in enumerate(zip(times, states, strict=True)):
         dt = np.diff(t)
         if len(dt) > 2 and dt.max() > 10 * np.median(dt):
             gaps.append(f"{dt.max():.3g} in run {run}, at a median spacing of {np.median(dt):.3g}")
         for c in range(x.shape[1]):
-            if _is_wrapped(t, x[:, c]):
-                jumps.append(f"coordinate {c} of run {run}")
+            period = wrapped_period(t, x[:, c])
+            if period:
+                jumps.setdefault(period, []).append(f"coordinate {c} of run {run}")
                 lost |= not np.isfinite(x[:, c]).all()
     X = np.concatenate(states)
     for c in range(X.shape[1]):
         column = X[np.isfinite(X[:, c]), c]
         if column.size and np.ptp(column) == 0:
             still.append(f"{c} (always {column[0]:g})")
-    if jumps:
+    for period, where in jumps.items():
+        full = "2π" if period == 2 * np.pi else f"{period:g}"
+        given = "" if period == 2 * np.pi else f", period={period:g}"
         measured = (  # np.unwrap leaves NaN from the first lost sample on
-            " of the samples that were measured alone, ok = np.isfinite(q); q[ok] = "
-            "np.unwrap(q[ok]), since after a NaN it leaves NaN"
+            f" of the samples that were measured alone, ok = np.isfinite(q); q[ok] = "
+            f"np.unwrap(q[ok]{given}), since after a NaN it leaves NaN"
         )
         require.warn(
-            f"{_some(jumps)} jumps by about 2π: a wrapped angle. A field is learned along "
-            f"continuous paths; use np.unwrap(states[:, c]) before{measured if lost else ''}, and a"
-            " kernel that is periodic, hk.Periodic or hk.Warp, where the field is."
+            f"{_some(where)} jumps by about {full}: a wrapped angle. A field is learned along "
+            f"continuous paths; use np.unwrap(states[:, c]{given}) before"
+            f"{measured if lost else ''}, and a kernel that is periodic, hk.Periodic or hk.Warp, "
+            "where the field is."
         )
     if gaps:
         require.warn(
@@ -121,7 +127,7 @@ def _straight(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> flo
     """
     off = [np.zeros(0)]
     for t, x in zip(times, columns, strict=True):
-        if _is_wrapped(t, x):
+        if wrapped_period(t, x):
             return 0.0
         t, x = t[np.isfinite(x)], x[np.isfinite(x)]
         if len(t) > 2:
@@ -278,52 +284,96 @@ def timing(times: list[np.ndarray], residuals: list[np.ndarray], paths: list[np.
     return Timing(sum(scores) / len(scores) ** 0.5, growth**0.5, growth * max(ratios))
 
 
-def warn_of_timing(found: Timing) -> None:
-    """Warn of residuals that grow with the speed."""
-    if found.is_off:
+# Where angles and encoder counts are wrapped: radians, degrees, and 12 and 16 bits.
+_PERIODS = (2 * np.pi, 360.0, 4096.0, 65536.0)
+
+
+def wrapped_period(t: Float[np.ndarray, " T"], x: Float[np.ndarray, " T"]) -> float:
+    """The period at which x is wrapped; 0.0 if it is not.
+
+    Its steps are then about the period, and no others are more than a third of the period. In units
+    other than radians x must also fill the period and no more.
+    """
+    t, x = t[np.isfinite(x)], x[np.isfinite(x)]
+    near = np.diff(t) <= 3 * np.median(np.diff(t)) if len(t) > 1 else slice(0)
+    for period in _PERIODS:
+        step = np.abs(np.diff(x))[near] / period  # across a gap a momentum may go as far
+        beyond = np.abs(step - 1)
+        full = beyond < 1 / 3
+        if not full.any() or (period > 7 and not 0.8 < np.ptp(x) / period <= 1.0):
+            continue
+        others = 0.0 if full.all() else step[~full].max()
+        if others < 1 / 3 and beyond[full].max() < 0.111 + others:
+            return period
+    return 0.0
+
+
+def impossible_samples(x: Float[np.ndarray, "T n"]) -> Bool[np.ndarray, " T"]:
+    """Rows of one run that no motion of the others passes through.
+
+    With d the distance of a sample from the mean of its two neighbours and σ the deviation of all
+    d, by their median so that one row in eight may be wrong, a row is impossible if in one of its
+    coordinates the neighbours agree to a fifth of d, and
+    - d > 20 σ, and the row lies outside the range of the others by twice that range, as −9999,
+      65535 and 1e30 do, or
+    - d > 6 σ, and the row is all zeros, which loggers write for a lost packet; then all rows of
+      zeros between others are.
+    """
+    bad = np.zeros(len(x), bool)
+    if len(x) < 5:
+        return bad
+    with np.errstate(over="ignore", invalid="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # columns that were never measured
+        d = np.abs(x[1:-1] - (x[:-2] + x[2:]) / 2)
+        sigma = 1.4826 * np.nanmedian(d, axis=0)
+        alone = np.abs(x[2:] - x[:-2]) < d / 5
+        low, high = (np.nanquantile(x, q, axis=0) for q in (0.1, 0.9))
+        beyond = (x < low - 2 * (high - low)) | (x > high + 2 * (high - low))
+        bad[1:-1] = (alone & (d > 20 * sigma) & beyond[1:-1]).any(axis=1)
+        for end, inner in ((0, 1), (-1, -2)):  # with one neighbour
+            bad[end] = (beyond[end] & (np.abs(x[end] - x[inner]) > 20 * sigma)).any()
+        zero = (x == 0).all(axis=1) & (x.shape[1] > 1)
+        if (zero[1:-1] & (alone & (d > 6 * sigma)).any(axis=1)).any():
+            beside = np.pad(zero, 1)
+            bad |= zero & ~(beside[:-2] | beside[2:])
+    return bad
+
+
+def warn_of_impossible(impossible: Sequence[Int[np.ndarray, " k"]]) -> None:
+    """Warn of samples that are no measurements."""
+    count = sum(map(len, impossible))
+    if count:
+        run = next(r for r, rows in enumerate(impossible) if len(rows))
         require.warn(
-            "residuals are larger where the states move faster, as if times were off by "
-            f"{found.off:.2g} (standard deviation). The noise is taken for one number, and bands "
-            "may be too narrow. Log the times at which the sensors measure, rather than those at "
-            "which samples arrive or were due; a noise that grows with the motion looks alike."
+            f"{count} samples are impossible beside their neighbours, the first of them sample "
+            f"{impossible[run][0]} of run {run}: what a logger writes for a lost measurement, such "
+            "as -9999, 65535 or zeros. Write NaN for them; runs.impossible has their indices, "
+            "by run."
         )
 
 
-def _is_wrapped(t: Float[np.ndarray, " T"], x: Float[np.ndarray, " T"]) -> bool:
-    """Whether x has steps of about 2π, and no other steps of more than a third of that."""
-    t, x = t[np.isfinite(x)], x[np.isfinite(x)]
-    near = np.diff(t) <= 3 * np.median(np.diff(t)) if len(t) > 1 else slice(0)
-    step = np.abs(np.diff(x))[near]  # across a gap a momentum may go as far
-    beyond = np.abs(step - 2 * np.pi)
-    full = beyond < 2 * np.pi / 3
-    if not full.any() or full.all():
-        return bool(full.any() and beyond.max() < 0.7)
-    others = step[~full].max()
-    return bool(others < 2 * np.pi / 3 and beyond[full].max() < 0.7 + others)
-
-
-def warn_of_curve(states: Sequence[Float[np.ndarray, "T n"]]) -> None:
-    """Warn where the momentum is one function of the position in all runs, with n = 2.
+def is_on_a_curve(states: Sequence[Float[np.ndarray, "T n"]], noise: np.ndarray) -> bool:
+    """Whether the momentum is one function of the position in the data of all runs, with n = 2.
 
     Of the variance of the momenta a cubic leaves 0 for a capacitor that discharges and 1.6e-3 for
     a tank; 9e-3 for a pendulum on a quarter of a swing, and all for one that turns over quickly,
-    whose momenta vary by a tenth about their mean (`tests/test_process_noise.py`).
+    whose momenta vary by a tenth about their mean (`tests/test_process_noise.py`). The noise of the
+    sensors comes on top, of the position by the slope of the curve.
     """
-    if states[0].shape[1] != 2:
-        return
     X = np.concatenate(states)
+    X = X[np.isfinite(X).all(axis=1)]
+    if X.shape[1] != 2 or len(X) < 10:
+        return False
+    off = np.abs(X - np.median(X, axis=0))
+    X = X[(off <= 15 * np.median(off, axis=0)).all(axis=1)]  # ten deviations: no measurements
     q, p = (X - X.mean(axis=0)).T
     cubic = np.polynomial.polynomial.polyvander(q / max(q.std(), 1e-300), 3)
     rest = p - cubic @ np.linalg.lstsq(cubic, p, rcond=None)[0]
-    if rest @ rest < 2e-3 * (p @ p):
-        require.warn(
-            "the momentum is one function of the position in all runs: they lie on a curve, and "
-            "say nothing of the field beside it. A system without inertia looks like this, such as"
-            " heat, a capacitor that discharges, or a motion that creeps; it has no Hamiltonian, "
-            "and this field is wrong from other starts. Log a run that passes a position with "
-            "another velocity. If there is none, learn the rate of the position alone, "
-            "hk.learn(hk.CurlFree(k), runs) with n = 1."
-        )
+    slope = (q @ p) / max(q @ q, 1e-300)
+    sensors = noise[1] ** 2 + (slope * noise[0]) ** 2
+    # Noise as large as a tenth of the momenta hides what a curve would be.
+    sensors = sensors if sensors < 0.01 * p.var() else 0.0
+    return bool(rest @ rest < 2e-3 * (p @ p) + 1.5 * len(X) * sensors)
 
 
 def _some(names: list[str]) -> str:

@@ -20,7 +20,9 @@ import optimistix as optx
 from jaxtyping import Float
 
 from hamkernel import _require as require
+from hamkernel._machine import compiled
 from hamkernel._observations.measurements import Measurements
+from hamkernel._sizes import platform
 from hamkernel._tuning.minimiser import BoxBFGS, MinimiserRun, begun, minimised
 from hamkernel._tuning.objective import SearchCriterion, SearchObjective, parts_of
 from hamkernel._tuning.space import SearchSpace
@@ -283,9 +285,10 @@ class Part:
     ) -> MinimiserRun:
         """The runs after up to `steps` more steps."""
         count, before = len(runs.u), runs.steps.sum()
-        # On a CPU runs one after the other took two thirds of the time; on a GPU a few hundred rows
-        # do not fill the device, and runs side by side are free.
-        side_by_side = jax.default_backend() != "cpu" and len(self.objective.rows.targets) <= 256
+        # On a CPU runs one after the other took two thirds of the time. On a GPU a few hundred rows
+        # do not fill the device, so runs go side by side, though a `while_loop` under `vmap` also
+        # computes the lanes that have finished.
+        side_by_side = platform() != "cpu" and len(self.objective.rows.targets) <= 256
         padded = _take(runs, np.resize(np.arange(count), self._most))
         padded = padded._replace(going=padded.going & (np.arange(self._most) < count))
         began = time.perf_counter()
@@ -302,12 +305,12 @@ def _as_numpy(leaf: Any) -> Any:
     return np.asarray(leaf) if eqx.is_array(leaf) else leaf
 
 
-@eqx.filter_jit
+@compiled
 def _begun(objective, minimiser, us) -> MinimiserRun:
     return eqx.filter_vmap(functools.partial(begun, minimiser, objective))(us)
 
 
-@eqx.filter_jit
+@compiled
 def _minimised(objective, minimiser, runs: MinimiserRun, most, side_by_side) -> MinimiserRun:
     """The runs, each at its end or at its largest number of steps."""
     arrays, static = eqx.partition(runs, eqx.is_array)

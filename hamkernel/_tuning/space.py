@@ -20,6 +20,7 @@ from hamkernel._gram import forward_differentiated, gram_of_rows, gram_rounding,
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, bounds_by_value
 from hamkernel._kernels.functions import Bound
 from hamkernel._kernels.symmetry import without_symmetry
+from hamkernel._machine import compiled
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
@@ -96,7 +97,7 @@ def constants(K: AbstractMatrixKernel) -> dict[str, float]:
     return found
 
 
-gram_trace = eqx.filter_jit(trace)
+gram_trace = compiled(trace)
 
 
 def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
@@ -121,7 +122,7 @@ def velocity_rms(K: AbstractMatrixKernel, rows: Measurements) -> float:
     return float(np.sqrt(ratio * float(gram_trace(K, rows.points)) / components))
 
 
-_gram_of_rows = eqx.filter_jit(gram_of_rows)
+_gram_of_rows = compiled(gram_of_rows)
 
 
 def _amplitude(K: AbstractMatrixKernel, X: Array, rms: float) -> float:
@@ -319,7 +320,7 @@ class SearchSpace(eqx.Module):
             high = jnp.maximum(self.given_ridge[1], low)
         return jnp.log(low), jnp.log(high)
 
-    @eqx.filter_jit
+    @compiled
     def encode_start(self) -> Float[Array, " P"]:
         """The u of the caller's values, moved a little inside the box where they are not."""
         ridge_low, ridge_high = self.ridge_bounds(self.size_of_gram(self.kernel))

@@ -23,7 +23,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 from hamkernel import _require as require
 from hamkernel._closed_forms import Folds
 from hamkernel._fields.base import AbstractField, Mean
-from hamkernel._machine import one_blas_thread
+from hamkernel._machine import compiled, full_precision, one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import observations
 from hamkernel._show import described
@@ -81,6 +81,7 @@ class Tuned(eqx.Module):
 
 
 @one_blas_thread
+@full_precision
 def tune(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
@@ -274,7 +275,7 @@ def _tuned(
     )
 
 
-decode = eqx.filter_jit(lambda space, u: space.decode(u))
+decode = compiled(lambda space, u: space.decode(u))
 
 
 def _check_optimiser(given: optx.AbstractMinimiser | None) -> None:

@@ -1,0 +1,88 @@
+"""Free runs: what a field predicts from one state on, without another look at the samples."""
+
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from hamkernel._trajectories.flow import simulated, steps_for, stiffness
+from hamkernel._trajectories.smoothing import power_of_two
+
+
+class Stretches(NamedTuple):
+    """Stretches of runs over which a field runs freely, padded with intervals of no length.
+
+    Attributes:
+        starts: the states at their beginnings, shape (S, n).
+        spans: the lengths of their intervals, shape (S, L).
+        inputs: at both ends of each interval, shape (S, L, 2, m).
+        measured: the samples at the ends of the intervals, NaN where there are none, (S, L, n).
+    """
+
+    starts: Float[np.ndarray, "S n"]
+    spans: Float[np.ndarray, "S L"]
+    inputs: Float[np.ndarray, "S L 2 m"]
+    measured: Float[np.ndarray, "S L n"]
+
+
+def stretches(runs: list, paths: list[np.ndarray], length: int) -> Stretches:
+    """Stretches of `length` intervals that cover the condensed runs, from states of their paths."""
+    parts = []
+    for run, path in zip(runs, paths, strict=True):
+        for first in range(0, len(path) - 1, length):
+            stop = min(first + length, len(path) - 1)
+            spans = np.diff(run.times[first : stop + 1])
+            measured = run.states[first + 1 : stop + 1]
+            parts.append((path[first], spans, run.inputs[first:stop], measured))
+    return padded(parts)
+
+
+def padded(parts: list[tuple]) -> Stretches:
+    """Stretches (start, spans, inputs, measured) of different lengths in arrays of one shape."""
+    L = power_of_two(max(len(spans) for _, spans, _, _ in parts))
+    starts, spans, inputs, measured = [], [], [], []
+    for start, own_spans, own_inputs, own_measured in parts:
+        missing = L - len(own_spans)
+        starts.append(start)
+        spans.append(np.pad(own_spans, (0, missing)))
+        inputs.append(np.pad(own_inputs, ((0, missing), (0, 0), (0, 0)), "edge"))
+        measured.append(np.pad(own_measured, ((0, missing), (0, 0)), constant_values=np.nan))
+    return Stretches(*map(np.array, (starts, spans, inputs, measured)))
+
+
+def predictions(
+    field: Any, part: Stretches, scale: Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "S L n"]:
+    """The states that the field predicts at the ends of the intervals; inf where it is lost.
+
+    Args:
+        field: a function of the points (x, u).
+        part: the stretches.
+        scale: the standard deviations of the coordinates.
+    """
+    ends = np.concatenate([part.starts, part.inputs[:, 0, 0]], axis=1)
+    steps = steps_for(part.spans, stiffness(field, ends, scale))
+    arrays = (jnp.asarray(part.starts), jnp.asarray(part.spans), jnp.asarray(steps))
+    path = simulated(field, *arrays, jnp.asarray(part.inputs))
+    x = np.asarray(path.x)[:, 1:]
+    return np.where(np.isfinite(x), x, np.inf)
+
+
+def error_over_constant(field: Any, part: Stretches, scale: Float[np.ndarray, " n"]) -> float:
+    """The RMS error of free runs over that of a constant, in standard deviations.
+
+    The constant is the state at the start of the stretch or the mean of its samples, whichever is
+    nearer. Errors count up to three deviations, since one path that is lost says no more.
+    """
+    measured = part.measured / scale
+    seen = np.isfinite(measured)
+    if not seen.any():
+        return 0.0
+    predicted = predictions(field, part, scale) / scale
+    error = np.clip(np.where(seen, predicted - measured, 0.0), -3, 3)
+    count = np.maximum(seen.sum(axis=1, keepdims=True), 1)
+    mean = np.where(seen, measured, 0.0).sum(axis=1, keepdims=True) / count
+    constants = (part.starts[:, None] / scale, mean)
+    least = min(float((np.where(seen, measured - c, 0.0) ** 2).sum()) for c in constants)
+    return float(np.sqrt((error**2).sum() / max(least, np.finfo(float).tiny)))

@@ -1,0 +1,155 @@
+"""Matrix products whose digits matter ask for all of them.
+
+XLA computes float32 products on a GPU in TF32, with 10 bits of mantissa, unless the program asks
+for the highest precision. No GPU is needed to see what a program asks for: the tests below look at
+every product that JAX is given while a public function runs, traced or not.
+"""
+
+import contextlib
+import traceback
+
+import jax
+import jax.numpy as jnp
+import kernels
+import numpy as np
+import pytest
+from data import swings
+
+import hamkernel as hk
+
+HIGHEST = jax.lax.Precision.HIGHEST
+
+
+@contextlib.contextmanager
+def imprecise_products():
+    """A list that collects the places of float products below the highest precision."""
+    primitive, places = jax.lax.dot_general_p, []
+    bind = primitive.bind
+
+    def spy(*args, **params):
+        precision = params["precision"]
+        full = precision is not None and all(p == HIGHEST for p in precision)
+        if jnp.issubdtype(args[0].dtype, jnp.floating) and not full:
+            frames = [f for f in traceback.extract_stack() if "hamkernel" in f.filename]
+            places.append([f"{f.filename}:{f.lineno} {f.line}" for f in frames][-3:])
+        return bind(*args, **params)
+
+    primitive.bind = spy
+    try:
+        yield places
+    finally:
+        del primitive.bind
+
+
+X, Y = map(jnp.asarray, swings(24))
+X4, Y4 = map(jnp.asarray, swings(12, n=4))
+LAMBDA = 1e-3
+FEATURES = hk.RandomFeatures(50, key=jax.random.key(0))
+LANDMARKS = hk.Nystrom(max_points=20)
+K = hk.Symplectic(hk.Gaussian(1.0))
+
+
+def posterior_answers():
+    posterior = hk.condition(K, X, Y, LAMBDA)
+    posterior.deviation(X[0])
+    posterior.covariance(X[0], x2=X[1])
+    posterior.energy_deviation(X[0], X[1])
+    fields = posterior.sample(jax.random.key(0), 2, jnp.array([[-2.0, -2.0], [2.0, 2.0]]))
+    jax.vmap(lambda field: field(X[0]))(fields)
+    posterior.updated(X[:3] + 0.1, Y[:3])
+
+
+def field_answers():
+    field = hk.fit(K, X, Y, LAMBDA)
+    jax.vmap(field)(X)
+    field.evaluate(X)
+    field.hamiltonian(X[0])
+    jax.jacfwd(field)(X[0])
+    jax.grad(field.hamiltonian)(X[0])
+    field.anchored(X[0])
+    hk.simulate(field, X[0], jnp.linspace(0.0, 1.0, 5))
+    hk.simulate(field, X[0], jnp.linspace(0.0, 1.0, 5), solver=hk.ImplicitMidpoint(), dt=0.1)
+
+
+def observations_of_each_kind():
+    data = (
+        hk.Velocities(X, Y, noise=0.1)
+        + hk.Energies(X[:5], jnp.arange(5.0))
+        + hk.Equilibria(jnp.zeros((1, 2)))
+        + hk.Functionals(X[None, :3], jnp.ones((1, 3, 2)), jnp.ones(1))
+    )
+    hk.condition(K, data, regularization=LAMBDA).deviation(X[0])
+
+
+def losses_and_gradients():
+    folds = np.arange(24) % 4
+    for loss in (
+        lambda K: hk.cross_validation_loss(K, X, Y, LAMBDA, folds),
+        lambda K: hk.generalized_cross_validation(K, X, Y, LAMBDA),
+        lambda K: hk.log_marginal_likelihood(K, X, Y, LAMBDA),
+    ):
+        jax.grad(lambda s, loss=loss: loss(hk.Symplectic(hk.Gaussian(s))))(1.0)
+
+
+def streams():
+    for solver in (hk.Nystrom(), FEATURES):
+        fit = solver.start(K, X, regularization=LAMBDA)
+        fit.add(X, Y).field()(X[0])
+
+
+def learning():
+    ts = jnp.linspace(0.0, 3.0, 16)
+    states = hk.simulate(hk.systems.Pendulum(), jnp.array([1.0, 0.0]), ts).ys
+    noise = 0.01 * np.random.default_rng(0).normal(size=states.shape)
+    hk.learn(K, hk.Runs([ts], [states + noise]), iterations=2)
+
+
+CALLS = {
+    "fields": field_answers,
+    "posterior": posterior_answers,
+    "observations": observations_of_each_kind,
+    "losses": losses_and_gradients,
+    "Nystrom": lambda: hk.condition(K, X, Y, LAMBDA, solver=LANDMARKS).deviation(X[0]),
+    "RandomFeatures": lambda: hk.fit(K, X, Y, LAMBDA, solver=FEATURES),
+    "ConjugateGradient": lambda: hk.fit(K, X, Y, LAMBDA, solver=hk.ConjugateGradient()),
+    "streams": streams,
+    "product": lambda: hk.gram_operator(K, X).mv(Y),
+    "tune": lambda: hk.tune(K, X, Y, LAMBDA, starts=2, max_steps=3),
+    "tune low rank": lambda: hk.tune(K, X, Y, LAMBDA, starts=2, max_steps=2, solver=LANDMARKS),
+    "molecule": lambda: hk.fit(
+        hk.Invariant(hk.CurlFree(hk.Gaussian(1.0)), [jnp.eye(4)[jnp.array([1, 0, 3, 2])]]),
+        X4,
+        Y4,
+        LAMBDA,
+    )(X4[0]),
+    "friction": lambda: hk.fit(hk.PortHamiltonian(hk.Gaussian(1.0)), X, Y, LAMBDA)(X[0]),
+    "check": lambda: hk.check_kernel(hk.Gaussian(1.0), X),
+    "readout": lambda: hk.readout(
+        hk.condition(K, X, Y, LAMBDA), {"p2": lambda x: x[1] ** 2, "q2": lambda x: x[0] ** 2}
+    ),
+    "learn": learning,
+}
+
+
+@pytest.mark.filterwarnings("ignore")  # two iterations do not settle, amplitudes are not tuned
+@pytest.mark.parametrize("name", CALLS)
+def test_products_of_public_functions_are_in_full_precision(name):
+    jax.clear_caches()
+    with imprecise_products() as places:
+        CALLS[name]()
+    assert not places, "\n".join(map(str, places[:5]))
+
+
+@pytest.mark.parametrize("case", kernels.CASES, ids=str)
+def test_products_of_every_kernel_are_in_full_precision(case):
+    jax.clear_caches()
+    k = case.make(2)
+    with imprecise_products() as places:
+        hk.gram(hk.Symplectic(k), X[:3])
+    assert not places, "\n".join(map(str, places[:5]))
+
+
+def test_the_spy_sees_a_product_at_default_precision():
+    with imprecise_products() as places:
+        jax.jit(lambda x: x @ x)(X[0])
+    assert places

@@ -1,0 +1,125 @@
+"""Whether `learn` says of logs that it has not met before if the field may be used."""
+
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import hamkernel as hk
+from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics
+
+K = hk.Symplectic(hk.Gaussian(1.0))
+FRICTION = hk.Sum(energy=hk.Symplectic(hk.Gaussian(1.0)), friction=hk.Friction())
+
+
+def pendulum(runs=3, samples=60, spacing=0.1, noise=0.02, friction=0.0, seed=0):
+    """Times and noisy (q, p) of a pendulum, by SciPy."""
+    rng = np.random.default_rng(seed)
+    t = spacing * np.arange(samples)
+    states = []
+    for _ in range(runs):
+        x0 = rng.uniform(-1.5, 1.5, 2)
+        path = solve_ivp(
+            lambda _, x: [x[1], -np.sin(x[0]) - friction * x[1]],
+            (0, t[-1]),
+            x0,
+            t_eval=t,
+            rtol=1e-10,
+            atol=1e-10,
+        ).y.T
+        states.append(path + noise * rng.standard_normal(path.shape))
+    return [t] * runs, states
+
+
+def animals(years=91, seed=0):
+    """Prey and predators, in thousands, whose growth the weather changes each year."""
+    rng = np.random.default_rng(seed)
+    x, log = np.array([30.0, 10.0]), []
+    for _ in range(years):
+        growth = 0.6 + 0.35 * rng.standard_normal()
+        x = solve_ivp(
+            lambda _, x, g: [g * x[0] * (1 - x[0] / 150) - 0.03 * x[0] * x[1],
+                             -0.8 * x[1] + 0.02 * x[0] * x[1]],
+            (0, 1), x, args=(growth,),
+        ).y[:, -1]  # fmt: skip
+        log.append(x * np.exp(0.1 * rng.standard_normal(2)))
+    return np.arange(float(years)), np.array(log)
+
+
+def learn_and_listen(K, runs, **options):
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        learned = hk.learn(K, runs, **options)
+    return learned, [str(each.message) for each in heard]
+
+
+def test_a_good_log_is_silent_and_usable():
+    learned, heard = learn_and_listen(K, hk.Runs(*pendulum()))
+    assert learned.converged
+    assert heard == []
+    assert learned.diagnostics.failing == ()
+    np.testing.assert_allclose(learned.noise, 0.02, rtol=0.2)
+
+
+@pytest.mark.parametrize("value", [-9999.0, 1e6])
+def test_one_row_that_is_no_measurement_is_named_and_spoils_no_field(value):
+    times, states = pendulum()
+    states[1][20] = value
+    with pytest.warns(UserWarning, match="Write NaN"):
+        runs = hk.Runs(times, states)
+    assert [list(rows) for rows in runs.impossible] == [[], [20], []]
+    learned, heard = learn_and_listen(K, runs)
+    # The run with that row is left out, or the field must not be used.
+    assert not learned.converged or np.allclose(learned.noise, 0.02, rtol=0.2)
+    assert len(heard) == 1
+    assert "one curve" not in learned.diagnostics.failing
+
+
+def test_dropouts_written_as_zeros_make_the_field_unusable():
+    times, states = pendulum()
+    for x in states:
+        x[::8] = 0.0
+    with pytest.warns(UserWarning, match="Write NaN"):
+        runs = hk.Runs(times, states)
+    learned, heard = learn_and_listen(K, runs)
+    assert not learned.converged
+    assert len(heard) == 1
+
+
+def test_animals_in_weather_are_no_hamiltonian_system():
+    years, log = animals()
+    learned, heard = learn_and_listen(K, hk.Runs([years], [log]))
+    assert not learned.converged
+    assert len(heard) == 1
+    assert "one curve" not in learned.diagnostics.failing
+
+
+def test_a_quantised_encoder_and_the_right_friction_are_silent():
+    times, states = pendulum(runs=3, samples=200, spacing=0.05, noise=0.0, friction=0.1)
+    step = 2 * np.pi / 4096
+    states = [np.column_stack([step * np.round(x[:, 0] / step), x[:, 1] * np.nan]) for x in states]
+    half = hk.Sum(energy=hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0)), friction=hk.Friction())
+    learned, heard = learn_and_listen(
+        half, hk.Runs(times, states), mean=lambda x: jnp.array([x[1], 0.0])
+    )
+    assert learned.converged, learned.diagnostics
+    assert heard == [], learned.diagnostics
+    np.testing.assert_allclose(learned.noise[0], step / np.sqrt(12), rtol=0.1)
+
+
+def test_the_table_prints_in_ascii_and_in_html():
+    table = Diagnostics(
+        (
+            Diagnostic("noise", "0.1", "0.5", True, "the field explains the runs"),
+            Diagnostic("a < b", "3", "2", False, "it fails", "Mend it.", decides=True),
+        )
+    )
+    assert table.failing == ("a < b",)
+    assert not table.is_usable
+    assert "Mend it." in repr(table)
+    assert "a &lt; b" in table._repr_html_()
+    assert table["noise"].passes
+    with pytest.raises(KeyError, match="there are noise, a < b"):
+        table["nothing"]
