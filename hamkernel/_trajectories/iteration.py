@@ -143,7 +143,7 @@ def iterate(task: Task, now: Current, most: int, bar: Any) -> End:
             continue
         moved = float(jnp.abs(now.model.log_noise - before.model.log_noise).max())
         # Half a nat, as much as one degree of freedom; or a field that stays: without noise −log p
-        # has no end. The objective is no sign: its defects are weighted with the integrator's error.
+        # has no end. The objective is no sign, since defects dominate it at first.
         likelier = abs(float(history[-2].loss - done.loss))
         settled = moved < 0.01 and (likelier < 0.5 or changed(task, before, now) < SETTLED)
     return End(task, now, history, settled)
