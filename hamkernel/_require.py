@@ -108,12 +108,12 @@ def traceable(name: str) -> Iterator[None]:
         ) from error
 
 
-def count(number: Any, name: str) -> int:
-    """`number` as a Python integer, at least 1."""
-    message = f"{name} must be a whole number, at least 1; got {number!r}."
+def count(number: Any, name: str, least: int = 1) -> int:
+    """`number` as a Python integer, at least `least`."""
+    message = f"{name} must be a whole number, at least {least}; got {number!r}."
     if isinstance(number, bool) or not hasattr(number, "__index__"):
         raise TypeError(message)
-    if operator.index(number) < 1:
+    if operator.index(number) < least:
         raise ValueError(message)
     return operator.index(number)
 

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
@@ -24,6 +25,7 @@ from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.friction import frictions, with_rest_speed
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._trajectories.diagnostics import FitQuality, check_identifiable, diagnostics
+from hamkernel._trajectories.evidence import Evidence
 from hamkernel._trajectories.flow import Expansion, field_values
 from hamkernel._trajectories.free_run import error_over_constant, stretches
 from hamkernel._trajectories.iteration import (
@@ -137,6 +139,17 @@ def learn(
         UserWarning: once, where a row of `learned.diagnostics` falls short, with its meaning.
     """
     require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
+    again = Partial(
+        learn,
+        K=K,
+        mean=None if mean is None else as_pytree(mean),
+        noise=noise,
+        solver=solver,
+        process_noise=process_noise,
+        masses=masses,
+        iterations=iterations,
+        progress=False,
+    )
     K, given, process = _check(with_amplitude(matrix_kernel(K)), runs, noise, process_noise, solver)
     most = require.count(iterations, "iterations")
     K = with_masses(K, runs.dimension) if masses else K
@@ -180,7 +193,7 @@ def learn(
         other = iterate(*asked(floor, sought=True), most, bar)
         end = other if evidence(other) + price(other) < evidence(end) else end
     bar.close()
-    return _learned(runs, mean, end, process, given is not None, measured)
+    return _learned(runs, mean, end, process, given is not None, measured, again)
 
 
 def _first_noise(data: Preprocessed) -> Float[np.ndarray, " n"]:
@@ -196,6 +209,7 @@ def _learned(
     given_process: np.ndarray | None,
     given: bool,
     measured: np.ndarray,
+    again: Partial,
 ) -> Learned:
     """The result; warns where it must.
 
@@ -206,6 +220,7 @@ def _learned(
         given_process: the process noise that was given, if any.
         given: whether the noise was given.
         measured: which coordinates were.
+        again: `learn` with all that was given besides the runs.
     """
     mean = None if mean is None else as_pytree(mean)
     task, now, history = end.task, end.now, end.history
@@ -214,8 +229,8 @@ def _learned(
     states = _at_all_times(end, times)
     noise = np.where(measured, np.exp(np.asarray(now.model.log_noise)), np.nan)
     # Without process noise q stands at the floor of the integrator, and is none.
-    is_free = task.bounds.free[-len(noise) :]
-    process = np.where(is_free, np.exp(np.asarray(now.model.log_process)), 0.0)
+    is_free = task.bounds.free[-2 * len(noise) :]
+    process = np.where(is_free[len(noise) :], np.exp(np.asarray(now.model.log_process)), 0.0)
     process = process if given_process is None else given_process
     misfit = misfits(runs, states, noise)
     rows = now.field.points, now.rows, task.start_deviation
@@ -255,6 +270,10 @@ def _learned(
         runs=runs,
         observations=observations,
         mean=mean,
+        evidence=Evidence(
+            now.model, field.points, now.rows, task.start_deviation, data.scale, is_free
+        ),
+        again=again,
     )
 
 

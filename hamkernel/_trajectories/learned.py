@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -10,14 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
+from hamkernel import _require as require
 from hamkernel._machine import full_precision
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._posterior import Posterior, condition
 from hamkernel._show import described, text
 from hamkernel._solvers.nystrom import Nystrom
-from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._trajectories.diagnostics import Diagnostics
+from hamkernel._trajectories.evidence import Evidence
 from hamkernel._trajectories.runs import Runs
+from hamkernel._trajectories.score import Score, scored
 
 
 class Iteration(eqx.Module):
@@ -95,6 +100,8 @@ class Learned(eqx.Module):
             observations, regularization=regularization)` is the exact fit of which `field`
             is the approximation on landmarks. None where there were too few samples.
         mean: the known part of the field, if one was given.
+        evidence: the rows along the paths with their likeliest model; see `log_evidence`, `gain`.
+        again: `learn` with what was given besides the runs.
     """
 
     field: Any
@@ -118,6 +125,8 @@ class Learned(eqx.Module):
     runs: Runs
     observations: AbstractObservations | None
     mean: Any
+    evidence: Evidence
+    again: Callable[..., Learned]
 
     def __repr__(self) -> str:
         samples = sum(len(x) for x in self.states)
@@ -155,8 +164,12 @@ class Learned(eqx.Module):
         if self.observations is None:
             raise ValueError("no run had enough samples to say anything of the field.")
         rows = sum(len(targets) for _, targets in self.observations.parts())
+        return self._posterior(on_landmarks=rows > 3000)
+
+    def _posterior(self, on_landmarks: bool) -> Posterior:
         whole = getattr(self.field, "whole", self.field)  # of the points (x, u) with inputs
-        solver = None if rows <= 3000 else Nystrom(points=whole.points)
+        solver = Nystrom(points=whole.points) if on_landmarks else None
+        assert self.observations is not None
         return condition(
             self.kernel,
             self.observations,
@@ -193,6 +206,93 @@ class Learned(eqx.Module):
         h = jnp.append(h, h[-1:])[:, None]
         draws = jax.random.normal(key, (len(h), len(self.noise)), self.noise.dtype)
         return self.process_noise[None] * draws / jnp.sqrt(h)
+
+    @property
+    def log_evidence(self) -> float:
+        """The logarithm of the marginal likelihood of the runs about the paths, but for a constant.
+
+        The constant is the same for every kernel, mean, `between=` and `delay=` with which the same
+        samples were learned from: whichever has the largest explains them best. A difference below
+        ½ log N for each more hyperparameter, N samples, says nothing.
+        """
+        return self.evidence.log_p
+
+    @full_precision
+    def gain(self, part: AbstractMatrixKernel) -> float:
+        """By how much `log_evidence` rises if the drift may have `part` too, at least 0.
+
+            learned.gain(hk.Friction())              # is there friction?
+            learned.gain(hk.Symplectic(hk.Gaussian()))  # a force of the velocities, too?
+
+        Hyperparameters of all parts are searched again, along the same paths, which takes about as
+        long as one iteration of `learn`. ½ log N for each hyperparameter of `part` is its price: a
+        smaller gain says that the runs do not ask for it.
+
+        Args:
+            part: a matrix-valued kernel for states of as many coordinates. Where the field has
+                inputs it stands beside the drift.
+
+        Raises:
+            TypeError: `part` is no matrix-valued kernel. ValueError: its dimension is another, or
+                the field is that of a family, each term of which has a kernel of its own.
+        """
+        return self.evidence.gain(matrix_kernel(part))
+
+    @full_precision
+    def score(self, runs: Runs | None = None, *, first: int = 10, draws: int = 64) -> Score:
+        """How well free runs follow runs, beside a linear model and the last value.
+
+            print(learned.score(hk.Runs(times, states)))
+
+        Each free run begins at the state that fits the first few samples of its run best, and sees
+        no sample after them.
+
+        Args:
+            runs: runs that were not learned from. If None, the last fifth of each run is held out,
+                the rest is learned from again, which takes as long as learning did, and the field
+                of the rest is scored.
+            first: how many samples a free run knows; of runs with fewer than twice as many, half.
+            draws: how many fields of the posterior the bands of `coverage` come from; 0 for none.
+
+        Returns:
+            A `Score`.
+
+        Raises:
+            TypeError: `runs` are no `Runs`, or have inputs or parameters where the learned ones
+                have none, or the other way round. ValueError: their dimension is another; no run
+                has ten samples, of which a fifth could be held out.
+        """
+        first, draws = require.count(first, "first"), require.count(draws, "draws", least=0)
+        if runs is None:
+            lengths = [len(t) for t in self.runs.times]
+            if max(lengths) < 10:
+                raise ValueError(
+                    "no run has ten samples, of which the last fifth could be held out: pass runs "
+                    "that were not learned from, learned.score(runs)."
+                )
+            cuts = [T - T // 5 if T >= 10 else T for T in lengths]
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # they are those of learning from all samples
+                rest = self.again(runs=self.runs.part([slice(0, cut) for cut in cuts]))
+            last = self.runs.part([slice(cut, None) for cut in cuts])
+            return rest.score(last, first=first, draws=draws)
+        if not isinstance(runs, Runs):
+            raise TypeError(f"score takes hk.Runs(times, states); got a {type(runs).__name__}.")
+        for name in ("inputs", "parameters"):
+            if (getattr(runs, name) is None) != (getattr(self.runs, name) is None):
+                has, lacks = (
+                    ("the learned", "these")
+                    if getattr(runs, name) is None
+                    else ("these", "the learned")
+                )
+                raise TypeError(f"{has} runs have {name} and {lacks} have none; both need them.")
+        if (runs.dimension, runs.input_count) != (self.runs.dimension, self.runs.input_count):
+            raise ValueError(
+                f"the runs have {runs.dimension} coordinates and {runs.input_count} inputs; the "
+                f"learned ones have {self.runs.dimension} and {self.runs.input_count}."
+            )
+        posterior = self._posterior(on_landmarks=True) if draws and self.observations else None
+        return scored(self, runs, first, posterior, draws)
 
     @property
     def residuals(self) -> tuple[Float[Array, "T n"], ...]:

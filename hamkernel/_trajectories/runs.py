@@ -314,8 +314,34 @@ class Runs(eqx.Module):
 
     def going_on(self, between: Between | Literal["auto"], delay: float) -> "Runs":
         """The same runs with inputs that go on in this way; nothing is checked again."""
+        return self._with(between=between, delay=delay)
+
+    def part(self, of_runs: Sequence[slice]) -> "Runs":
+        """The samples of each run in its slice, without runs of which none are left.
+
+        Inputs stay whole, so that they go on between samples as before.
+        """
+        kept = [
+            r
+            for r, (t, of_run) in enumerate(zip(self.times, of_runs, strict=True))
+            if len(t[of_run])
+        ]
+
+        def cut(arrays, slices=None):
+            if arrays is None:
+                return None
+            return tuple(arrays[r] if slices is None else arrays[r][slices[r]] for r in kept)
+
+        return self._with(
+            times=cut(self.times, of_runs),
+            states=cut(self.states, of_runs),
+            inputs=cut(self.inputs),
+            input_times=cut(self.input_times),
+            parameters=cut(self.parameters),
+        )
+
+    def _with(self, **given: Any) -> "Runs":
         new = object.__new__(Runs)
-        given = {"between": between, "delay": delay}
         for field in dataclasses.fields(self):
             object.__setattr__(new, field.name, given.get(field.name, getattr(self, field.name)))
         return new

@@ -1,0 +1,73 @@
+"""The evidence of learned runs: log p, and what another kernel beside the drift would add to it."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.friction import with_rest_speed
+from hamkernel._trajectories.likelihood import closed_form
+from hamkernel._trajectories.model import Model, with_amplitude
+from hamkernel._trajectories.search import LEAST_NOISE, Bounds, losses, most_likely, searched
+from hamkernel._trajectories.segments import LinearisedSegments
+
+# Amplitudes, lengthscales and noise may change by as much in either direction.
+_RANGE = np.log(1e4)
+_STEPS = 25  # of BFGS, as in each iteration of learning
+
+
+class Evidence(eqx.Module):
+    """The rows along the paths that were learned, with the model under which they are likeliest.
+
+    Attributes:
+        model: the kernel and both kinds of noise.
+        points: the landmarks, shape (m, d).
+        rows: the runs, linearised about their paths.
+        start_deviation: that of the prior of starts, shape (n,).
+        scale: the standard deviations of the coordinates, shape (n,).
+        is_free: which kinds of noise were estimated, sensor noise first, shape (2n,).
+    """
+
+    model: Model
+    points: Float[Array, "m d"]
+    rows: LinearisedSegments
+    start_deviation: Float[Array, " n"]
+    scale: Float[np.ndarray, " n"]
+    is_free: Bool[np.ndarray, " k"]
+
+    @property
+    def log_p(self) -> float:
+        """The log marginal likelihood of the rows, but for a constant of no kernel."""
+        return -self._loss(self.model)
+
+    def gain(self, part: AbstractMatrixKernel) -> float:
+        """By how much log p rises with `part` beside the kernel of the drift.
+
+        All hyperparameters are searched again, from those found and from a tenth and a hundredth of
+        the noise, which had to explain what `part` does.
+        """
+        n, K = len(self.scale), self.model.kernel
+        part = with_rest_speed(with_amplitude(part), self.points, n)
+        part.check_dimension(n)
+        larger = self.model._replace(kernel=K.with_states(K.of_states + part))
+        flat = np.asarray(larger.flat)
+        free = np.concatenate([np.ones(len(flat) - 2 * n, bool), self.is_free])
+        low, high = flat - _RANGE, flat + _RANGE
+        low[-2 * n : -n] = np.minimum(flat[-2 * n : -n], np.log(LEAST_NOISE * self.scale))
+        design = np.tile(flat, (3, 1))
+        design[:, -2 * n :] += np.log([[1.0], [0.1], [0.01]]) * self.is_free
+        design = np.maximum(design, low)
+        points, rows = searched(self.points, self.rows)
+        values = losses(larger, jnp.asarray(design), points, rows, self.start_deviation)
+        start = larger.at(jnp.asarray(design[int(np.argmin(np.asarray(values)))]))
+        bounds = Bounds(low, high, free)
+        given = self.points, self.rows, self.start_deviation
+        found, _ = most_likely(start, *given, bounds, _STEPS)
+        # Learning ends within half a nat of its optimum, and so may this search.
+        return max(self._loss(self.model) - self._loss(found), 0.0)
+
+    def _loss(self, model: Model) -> float:
+        return float(closed_form(model, self.points, self.rows, self.start_deviation).loss)

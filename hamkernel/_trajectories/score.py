@@ -1,0 +1,295 @@
+"""`Score`: how well a learned field predicts runs, beside two models that know no physics."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from hamkernel import _require as require
+from hamkernel._fields.base import known_part
+from hamkernel._machine import compiled
+from hamkernel._posterior import Posterior
+from hamkernel._show import text as number
+from hamkernel._trajectories.flow import simulated, steps_for, stiffness
+from hamkernel._trajectories.free_run import Stretches, padded, predictions
+from hamkernel._trajectories.preprocessing import preprocess, sampled
+from hamkernel._trajectories.runs import Runs
+
+_STEPS = 12  # of Levenberg and Marquardt; from smoothed states 4 are the rule
+
+
+class Score(eqx.Module):
+    """How well free runs of a learned field follow runs, with two baselines.
+
+    A free run begins at the state that fits the first few samples best, and sees no sample after
+    them; the root mean squares are over those that it does not see. A baseline knows the same
+    samples: with `persistence` the last of them stays, and `linear` is a free run of a linear model
+    ẋ = A x + B u + c by least squares on the runs that the field was learned from. Free runs that
+    leave every bound have infinite errors.
+
+    Attributes:
+        rmse: the root mean square of predicted − measured, in units of the states, shape (n,); NaN
+            where nothing was measured.
+        persistence: the same where the last known sample stays, shape (n,).
+        linear: the same of the linear model, shape (n,).
+        coverage: the share of samples inside the 95 % band of the posterior, with both kinds of
+            noise, shape (); NaN where no band was asked for. Honest bands hold about .95.
+        predictions: the free run of each run at its times, shape (T, n).
+        times: the times of each run, shape (T,).
+        errors: predicted − measured, (T, n), NaN where nothing was measured or it was known.
+        scale: the standard deviations of the coordinates in the learned runs, shape (n,).
+        first: how many samples each free run knows.
+    """
+
+    rmse: Float[Array, " n"]
+    persistence: Float[Array, " n"]
+    linear: Float[Array, " n"]
+    coverage: Float[Array, ""]
+    predictions: tuple[Float[Array, "T n"], ...]
+    times: tuple[Float[Array, " T"], ...]
+    errors: tuple[Float[Array, "T n"], ...]
+    scale: Float[Array, " n"]
+    first: int = eqx.field(static=True)
+
+    @property
+    def text(self) -> str:
+        """The verdict in one sentence."""
+        own, still, linear = (
+            float(jnp.sqrt(jnp.nanmean((each / self.scale) ** 2)))
+            for each in (self.rmse, self.persistence, self.linear)
+        )
+        if not own < still:
+            return (
+                f"is worse than saying that nothing moves: off by {number(self.rmse)}, where the "
+                f"last known sample is off by {number(self.persistence)}"
+            )
+        if not own < linear:
+            return f"is worse than a linear model ({number(self.rmse)} for {number(self.linear)})"
+        if not np.isfinite(linear):
+            return f"follows the runs to {number(self.rmse)}; a linear model leaves every bound"
+        return f"follows the runs {linear / max(own, 1e-300):.2g} times better than a linear model"
+
+    def horizon(self, error: ArrayLike) -> Float[Array, " R"]:
+        """The time for which the free run of each run stays within `error`, shape (R,).
+
+        From its first sample to the last before any coordinate is off by more.
+
+        Args:
+            error: in units of the states, a number or one for each coordinate, shape (n,).
+
+        Raises:
+            ValueError: the error is not positive.
+        """
+        bound = np.asarray(require.positive(error, "error"))
+        out = []
+        for t, e in zip(self.times, self.errors, strict=True):
+            t, off = np.asarray(t), np.abs(np.asarray(e)) > bound
+            beyond = np.flatnonzero(off.any(axis=1))
+            out.append((t[beyond[0] - 1] if len(beyond) else t[-1]) - t[0])
+        return jnp.asarray(out)
+
+    def __repr__(self) -> str:
+        rows = {
+            "free run": self.rmse,
+            "last sample stays": self.persistence,
+            "linear model": self.linear,
+        }
+        lines = [f"The field {self.text}.", "root mean square error"]
+        lines += [f"  {name.ljust(18)} {number(value)}" for name, value in rows.items()]
+        if np.isfinite(float(self.coverage)):
+            lines.append(f"  inside 95 % bands  {float(self.coverage):.0%}")
+        return "\n".join(lines)
+
+
+class _Linear(eqx.Module):
+    """ẋ = A x + B u + c."""
+
+    matrix: Float[Array, "n d"]
+    constant: Float[Array, " n"]
+    kernel: None = None
+
+    def __call__(self, s: Float[Array, " d"]) -> Float[Array, " n"]:
+        return self.matrix @ s + self.constant
+
+
+class _Disturbed(eqx.Module):
+    """f(x, u) + w, of points (x, u, w)."""
+
+    field: Any
+    count: int = eqx.field(static=True)  # of the coordinates of (x, u)
+
+    def __call__(self, s: Float[Array, " k"]) -> Float[Array, " n"]:
+        return self.field(s[: self.count]) + s[self.count :]
+
+
+def scored(learned: Any, runs: Runs, first: int, posterior: Posterior | None, draws: int) -> Score:
+    """The score of a learned field on `runs`; see `Learned.score`."""
+    known = known_part(learned.kernel, learned.mean, runs.dimension, jnp.float64)
+    training = preprocess(learned.runs, known)
+    scale = training.scale
+    noise = np.asarray(learned.noise)
+    deviation = np.maximum(np.where(np.isfinite(noise), noise, scale), 1e-6 * scale)
+    part = _whole_runs(runs, [run.path[0] for run in preprocess(runs, known).runs])
+    seen = [min(first, max(len(t) // 2, 1)) for t in runs.on_host()[0]]
+    field = getattr(learned.field, "whole", learned.field)  # of the points (x, u) with inputs
+
+    def free(field: Any) -> tuple[_Starts, np.ndarray]:
+        starts = _fitted(field, part, seen, deviation, scale)
+        return starts, predictions(field, part._replace(starts=starts.states), scale)
+
+    starts, predicted = free(field)
+    _, linear = free(_linear(*sampled(training)))
+    measured, later = part.measured, np.arange(part.spans.shape[1]) >= np.array(seen)[:, None]
+    judged = np.where(later[..., None], measured, np.nan)
+    last = np.stack([_last(y[:k]) for y, k in zip(measured, seen, strict=True)])[:, None]
+    coverage = np.nan
+    if posterior is not None:
+        bands = _draws(learned, posterior, part, starts, scale, draws)
+        low, high = np.quantile(bands, [0.025, 0.975], axis=0)
+        inside = (low <= judged) & (judged <= high)
+        coverage = float(inside[np.isfinite(judged)].mean())
+    times = runs.on_host()[0]
+    return Score(
+        rmse=_root_mean_square(predicted - judged),
+        persistence=_root_mean_square(last - judged),
+        linear=_root_mean_square(linear - judged),
+        coverage=jnp.asarray(coverage),
+        predictions=tuple(jnp.asarray(x[: len(t)]) for x, t in zip(predicted, times, strict=True)),
+        times=tuple(map(jnp.asarray, times)),
+        errors=tuple(
+            jnp.asarray(e[: len(t)]) for e, t in zip(predicted - judged, times, strict=True)
+        ),
+        scale=jnp.asarray(scale),
+        first=first,
+    )
+
+
+def _whole_runs(runs: Runs, starts: list[np.ndarray]) -> Stretches:
+    """The runs as stretches; an interval of no length before the first sample measures it too."""
+    parts = []
+    for r, (t, x) in enumerate(zip(*runs.on_host(), strict=True)):
+        inputs = runs.applied(r, t)
+        before = np.repeat(inputs[:1, :1], 2, axis=1)
+        spans = np.concatenate([[0.0], np.diff(t)])
+        parts.append((starts[r], spans, np.concatenate([before, inputs]), x))
+    return padded(parts)
+
+
+def _last(measured: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " n"]:
+    """The last sample of each coordinate; NaN where there is none."""
+    out = np.full(measured.shape[1], np.nan)
+    for y in measured:
+        out = np.where(np.isfinite(y), y, out)
+    return out
+
+
+def _root_mean_square(error: Float[np.ndarray, "S L n"]) -> Float[Array, " n"]:
+    counts = np.isfinite(error) | np.isinf(error)
+    total = np.where(counts, error, 0.0) ** 2
+    count = counts.sum((0, 1))
+    return jnp.asarray(np.where(count, np.sqrt(total.sum((0, 1)) / np.maximum(count, 1)), np.nan))
+
+
+def _linear(X: Float[np.ndarray, "N d"], Y: Float[np.ndarray, "N n"]) -> _Linear:
+    A = np.linalg.lstsq(np.column_stack([X, np.ones(len(X))]), Y, rcond=None)[0].T
+    return _Linear(jnp.asarray(A[:, :-1]), jnp.asarray(A[:, -1]))
+
+
+class _Starts(NamedTuple):
+    """The states at which free runs begin, and the roots of their covariances."""
+
+    states: Float[np.ndarray, "S n"]
+    roots: Float[np.ndarray, "S n n"]
+
+
+def _fitted(field: Any, part: Stretches, seen: list[int], deviation, scale) -> _Starts:
+    """The starts from which the field passes the first samples most closely.
+
+    Steps of Levenberg and Marquardt, from starts that are known to three standard deviations of the
+    coordinates: a momentum that was never measured may be unknown otherwise.
+    """
+    L = max(seen)
+    judged = np.where(
+        np.arange(L)[:, None] < np.array(seen)[:, None, None], part.measured[:, :L], np.nan
+    )
+    steps = jnp.asarray(steps_for(part.spans[:, :L], _stiffness(field, part, scale)))
+    rest = jnp.asarray(part.spans[:, :L]), steps, jnp.asarray(part.inputs[:, :L])
+    x, (S, n) = part.starts, part.starts.shape
+    prior = np.diag(1 / (3 * scale) ** 2)
+
+    def at(x):
+        path = simulated(field, jnp.asarray(x), *rest)
+        tangents, J = np.asarray(path.across), []
+        for i in range(L):
+            J.append(tangents[:, i] @ (J[-1] if J else np.eye(n)))
+        r = np.where(np.isfinite(judged), judged - np.asarray(path.x)[:, 1:], 0.0) / deviation
+        J = np.where(np.isfinite(judged)[..., None], np.stack(J, 1), 0.0) / deviation[:, None]
+        squares = (r**2).sum((1, 2)) + np.einsum(
+            "si,ij,sj->s", x - part.starts, prior, x - part.starts
+        )
+        return r, J, np.where(np.isfinite(squares), squares, np.inf)
+
+    damping, (r, J, least) = np.full(S, 1e-3), at(x)
+    H = np.einsum("slki,slkj->sij", J, J) + prior
+    for _ in range(_STEPS):
+        H = np.nan_to_num(np.einsum("slki,slkj->sij", J, J)) + prior
+        gradient = np.nan_to_num(np.einsum("slki,slk->si", J, r)) - (x - part.starts) @ prior
+        D = damping[:, None, None] * np.einsum("sii->si", H)[:, :, None] * np.eye(n)
+        there = x + np.linalg.solve(H + D, gradient[..., None])[..., 0]
+        found = at(there)
+        better = found[2] < least
+        x = np.where(better[:, None], there, x)
+        r, J, least = (
+            np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+            for new, old in zip(found, (r, J, least), strict=True)
+        )
+        damping = np.where(better, damping / 10, damping * 10)
+    return _Starts(x, np.linalg.inv(np.linalg.cholesky(H)).transpose(0, 2, 1))
+
+
+def _stiffness(field: Any, part: Stretches, scale: Float[np.ndarray, " n"]) -> float:
+    return stiffness(field, np.concatenate([part.starts, part.inputs[:, 0, 0]], axis=1), scale)
+
+
+def _draws(
+    learned: Any,
+    posterior: Posterior,
+    part: Stretches,
+    starts: _Starts,
+    scale: Float[np.ndarray, " n"],
+    draws: int,
+) -> np.ndarray:
+    """Free runs of draws of the posterior with both kinds of noise, shape (draws, S, L, n)."""
+    n, (S, L) = part.starts.shape[1], part.spans.shape
+    everywhere = np.concatenate([*map(np.asarray, learned.states), starts.states])
+    low, high = everywhere.min(axis=0), everywhere.max(axis=0)
+    margin = 0.2 * np.where(high > low, high - low, 1.0)
+    of_field, of_start, of_w, of_noise = jax.random.split(jax.random.key(0), 4)
+    region = np.stack([low - margin, high + margin])
+    fields = posterior.sample(of_field, draws, region)
+    lengths = np.maximum(part.spans, np.finfo(float).tiny)[None, ..., None]
+    w = np.asarray(jax.random.normal(of_w, (draws, S, L, n))) * np.asarray(learned.process_noise)
+    w = np.where(lengths > 1e-300, w / np.sqrt(lengths), 0.0)
+    z = np.asarray(jax.random.normal(of_start, (draws, S, n)))
+    x = starts.states + np.einsum("sij,dsj->dsi", starts.roots, z)
+    inputs = np.broadcast_to(part.inputs, (draws, *part.inputs.shape))
+    inputs = np.concatenate([inputs, np.repeat(w[:, :, :, None], 2, axis=3)], axis=-1)
+    field = getattr(learned.field, "whole", learned.field)
+    steps = jnp.asarray(steps_for(part.spans, _stiffness(field, part, scale)))
+    spans, d = jnp.asarray(part.spans), n + part.inputs.shape[-1]
+
+    @compiled
+    @jax.vmap
+    def run(field, x, inputs):
+        whole = getattr(field, "whole", field)
+        return simulated(_Disturbed(whole, d), x, spans, steps, inputs).x[:, 1:]
+
+    out = np.asarray(run(fields, jnp.asarray(x), jnp.asarray(inputs)))
+    noise = np.nan_to_num(np.asarray(learned.noise))
+    out = np.where(np.isfinite(out), out, np.inf)
+    return out + noise * np.asarray(jax.random.normal(of_noise, out.shape))
