@@ -95,16 +95,19 @@ def test_a_map_that_is_not_equivariant_is_refused(molecules):
         hk.gram(K, molecules)
 
 
+@pytest.mark.slow  # 110 s of compilation
 def test_atoms_in_one_place_are_named_before_any_solve(molecules):
     warp = hk.Warp(hk.Matern(2.5, 2.0), inverse_distances, equivariant=True)
     twice = hk.Warp(hk.Warp(hk.Gaussian(1.0), jnp.square), inverse_distances)
     kernels = warp, 2.0 * (warp + hk.Gaussian(1.0)) * hk.Gaussian(1.0), twice
     X = molecules.copy()
     X[7, 3:6] = X[7, :3]
-    for one in (*map(hk.CurlFree, kernels), hk.Invariant(hk.CurlFree(warp), GENERATORS)):
-        for use in (hk.fit, hk.log_marginal_likelihood):
-            with pytest.raises(ValueError, match=r"infinite at X\[7\]: two atoms in one place"):
-                use(one, X, np.ones_like(X), 1e-3)
+    for one in kernels:
+        with pytest.raises(ValueError, match=r"infinite at X\[7\]: two atoms in one place"):
+            hk.fit(hk.CurlFree(one), X, np.ones_like(X), 1e-3)
+    with pytest.raises(ValueError, match=r"infinite at X\[7\]: two atoms in one place"):
+        K = hk.Invariant(hk.CurlFree(warp), GENERATORS)
+        hk.log_marginal_likelihood(K, X, np.ones_like(X), 1e-3)
     field = hk.fit(hk.CurlFree(warp), molecules, np.ones_like(X), 1e-3)
     assert np.isnan(field(X[7])).all()
     assert np.isnan(field.potential(X[7]))

@@ -157,6 +157,7 @@ def energy_and_friction(guess):
     return hk.Sum(energy=hk.Symplectic(POTENTIAL), friction=friction)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::UserWarning")  # one iteration does not settle
 def test_it_is_found_whatever_the_guess():
     # From a guess of .003 alone the search ended at 1.2 times the force at ten times the speed.

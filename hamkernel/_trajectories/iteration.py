@@ -356,7 +356,12 @@ def price(end: End) -> float:
     return float(0.5 * count * np.log(np.asarray(end.now.rows.counts).sum()))
 
 
-def evidence(end: End) -> float:
+def likelier(end: End, other: End) -> End:
+    """`other`, which has process noise, where log p pays for it; else `end`."""
+    return other if _loss(other) + price(other) < _loss(end) else end
+
+
+def _loss(end: End) -> float:
     """−log p of the runs about the path of the end; ∞ if it is lost."""
     rows = _by_interval(end.task, end.now)[3]
     loss = closed_form(end.now.model, end.now.field.points, rows, end.task.start_deviation).loss

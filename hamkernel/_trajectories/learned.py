@@ -273,7 +273,7 @@ class Learned(eqx.Module):
             cuts = [T - T // 5 if T >= 10 else T for T in lengths]
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # they are those of learning from all samples
-                rest = self.again(runs=self.runs.part([slice(0, cut) for cut in cuts]))
+                rest = self.again(self.runs.part([slice(0, cut) for cut in cuts]))
             last = self.runs.part([slice(cut, None) for cut in cuts])
             return rest.score(last, first=first, draws=draws)
         if not isinstance(runs, Runs):

@@ -1,0 +1,187 @@
+"""How well learning ended: what the diagnostics are made of."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hamkernel._structures.friction import frictions
+from hamkernel._trajectories.diagnostics import FitQuality
+from hamkernel._trajectories.free_run import error_over_constant, stretches
+from hamkernel._trajectories.iteration import End, asks_for_landmarks, initial_loss, noisy_counts
+from hamkernel._trajectories.kalman import smoothed_path
+from hamkernel._trajectories.preprocessing import decided, sampled
+from hamkernel._trajectories.runs import Runs
+from hamkernel._trajectories.search import gain_of_friction, gain_of_inertia
+from hamkernel._trajectories.segments import Piece
+from hamkernel._trajectories.sensors import is_on_a_curve, timing
+from hamkernel._trajectories.whiteness import whiteness
+
+
+def quality(
+    runs: Runs,
+    end: End,
+    misfit: Float[np.ndarray, "R n"],
+    z: Float[np.ndarray, "S L+1 n"],
+    process: Float[np.ndarray, " n"],
+    states: list[np.ndarray],
+) -> FitQuality:
+    """How well the field follows the runs; `z` are the innovations by segment."""
+    now, data = end.now, end.task.data
+    times, seen = runs.on_host()
+    counts, noise = np.asarray(now.rows.counts), np.exp(np.asarray(now.model.log_noise))
+    kept, pieces = np.zeros(len(data.runs)), list(zip(end.task.pieces, now.good, strict=True))
+    for (r, start, stop), good in pieces:
+        kept[r] += good * (stop - start) / len(data.runs[r].times)
+    # The path follows the samples: only what was expected can be judged.
+    squares, free = float((z**2).sum()), float((counts > 0).sum())
+    speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
+    spacing = np.median(np.concatenate([np.diff(t) for t in times]))
+    swing = 2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)) / spacing
+    period = np.maximum(swing, 1.0) * spacing
+    dropped = _samples([piece for piece, good in pieces if not good], end, times)
+    residuals = [x - path for x, path in zip(seen, states, strict=True)]
+    logged = [np.where(np.isfinite(r.states), r.states, r.path) for r in data.runs]
+    timed = kept.any() and not (dropped or process.any())
+    noisy = noisy_counts(end).any((0, 1))
+    return FitQuality(
+        noise=noise,
+        scale=data.scale,
+        is_noise_known=False,
+        kept=kept,
+        dropped=dropped,
+        core=_core(residuals, noise),
+        share=float(np.max(process / np.sqrt(period) / np.maximum(speed, 1e-300))),
+        impulse=_largest_push(end),
+        pushed=_samples(_pushed(end), end, times),
+        is_curve=runs.inputs is None and is_on_a_curve(logged, noise),
+        free_run=_free_run(end, kept, swing * spacing),
+        timing=timing(times, [np.where(noisy, r, np.nan) for r in residuals], states)
+        if timed
+        else None,
+        misfit=misfit,
+        chi_squared=squares / max(free, 1.0),
+        free=free,
+        remaining=now.free,
+        white=whiteness(z, noisy_counts(end)),
+        process=process,
+        count=len(end.history),
+        settled=end.settled,
+        swing=float(swing),
+        driven=runs.inputs is not None,
+        has_momenta=runs.dimension % 2 == 0,
+        has_friction=bool(frictions(now.field.kernel)),
+    )
+
+
+def with_causes(fit: FitQuality, runs: Runs, end: End) -> FitQuality:
+    """The same with what would make the rows likelier: the causes that warnings name."""
+    now, task, used = end.now, end.task, len(end.now.field.points)
+    given = now.model, now.field.points, now.rows, task.start_deviation
+    if (task.capped and used >= task.quick) or not fit.white.is_enough:
+        fit = fit._replace(few=used * asks_for_landmarks(end))
+    if fit.has_momenta and (fit.is_disturbed or not fit.white.is_enough):
+        bent = gain_of_inertia(*given, task.data, task.mean)
+        gain = gain_of_friction(*given, task.data)
+        fit = fit._replace(friction_gain=gain, inertia_gain=bent)
+    if fit.white.is_enough:
+        return fit
+    return fit._replace(between=likelier_between(runs, end))
+
+
+def likelier_between(runs: Runs, end: End) -> str:
+    """The likeliest way in which inputs go on between samples; "" if it is that of the runs."""
+    if runs.inputs is None or isinstance(runs.delay, str):
+        return ""
+    task, model = end.task, end.now.model
+    any_way = runs.going_on("auto", runs.delay)
+    chosen, _ = decided(
+        any_way, task.data, lambda data: initial_loss(task._replace(data=data), model)
+    )
+    return chosen.between if chosen.between != runs.between else ""
+
+
+def disturbances(
+    end: End, times: list[np.ndarray], is_disturbed: bool
+) -> tuple[Float[Array, "T n"], ...]:
+    """The smoothed w of each run, from each of its times to the next."""
+    task, now = end.task, end.now
+    w = np.zeros(now.rows.drive.shape)
+    if is_disturbed:
+        given = now.field.points, now.rows, task.start_deviation
+        w = np.asarray(smoothed_path(now.model, now.field.coefficients, *given).disturbance)
+    out = []
+    for of_run, run, t in zip(by_run(w, end, 0.0), task.data.runs, times, strict=True):
+        i = np.searchsorted(run.times, t - t[0], "right") - 1
+        out.append(jnp.asarray(of_run[np.clip(i, 0, len(of_run) - 1)]))
+    return tuple(out)
+
+
+def _pushed(end: End) -> list[Piece]:
+    """The intervals in which something pushed the system, from one sample to the next."""
+    sizes = np.asarray(end.now.rows.pushed)
+    return [
+        Piece(r, start + int(i), start + int(i) + 1)
+        for s, (r, start, stop) in enumerate(end.task.pieces)
+        for i in np.flatnonzero(sizes[s, : stop - start - 1] > 1)
+    ]
+
+
+def _core(residuals: list[np.ndarray], noise: np.ndarray) -> Float[np.ndarray, " n"]:
+    """1.4826 times the median of |residual| over σ, by coordinate; NaN where nothing was measured.
+
+    1.4826 is 1/Φ⁻¹(3/4), for which normal residuals have 1.
+    """
+    R = np.abs(np.concatenate(residuals))
+    seen = np.isfinite(R).any(axis=0)
+    out = np.full(R.shape[1], np.nan)
+    out[seen] = 1.4826 * np.nanmedian(R[:, seen], axis=0) / noise[seen]
+    return out
+
+
+def _free_run(end: End, kept: Float[np.ndarray, " R"], period: float) -> float:
+    """The error of free runs over two swings, relative to that of a constant."""
+    data, paths = end.task.data, end.now.paths
+    used = [(run, path) for run, path, k in zip(data.runs, paths, kept, strict=True) if k]
+    if not used:
+        return np.inf
+    spacing = np.median(np.concatenate([np.diff(run.times) for run, _ in used]))
+    length = int(np.clip(2 * period / spacing, 4, 64))
+    part = stretches([run for run, _ in used], [path for _, path in used], length)
+    return error_over_constant(end.now.field, part, data.scale)
+
+
+def _largest_push(end: End) -> float:
+    """The largest jump ∫w dt within one pushed interval, over the deviation of its coordinate."""
+    pushed = np.asarray(end.now.rows.pushed) > 1
+    if not np.any(pushed):
+        return 0.0
+    task, now = end.task, end.now
+    given = now.field.points, now.rows, task.start_deviation
+    w = np.asarray(smoothed_path(now.model, now.field.coefficients, *given).disturbance)
+    jump = np.abs(w[:, : pushed.shape[1]]) * np.asarray(now.rows.spans)[..., None]
+    return float((jump / task.data.scale)[pushed].max())
+
+
+def _samples(
+    pieces: list[Piece], end: End, times: list[np.ndarray]
+) -> tuple[tuple[int, int, int], ...]:
+    """The run, the first sample and the one behind the last of pieces, joined where they touch."""
+    out: list[tuple[int, int, int]] = []
+    for r, start, stop in sorted(pieces):
+        t, at = times[r] - times[r][0], end.task.data.runs[r].times
+        first = int(np.searchsorted(t, at[start])) if start else 0
+        last = int(np.searchsorted(t, at[stop])) if stop < len(at) else len(t)
+        if out and out[-1][0] == r and out[-1][2] == first:
+            first = out.pop()[1]
+        out.append((r, first, last))
+    return tuple(out)
+
+
+def by_run(values: np.ndarray, end: End, empty: float) -> list[Float[np.ndarray, "T n"]]:
+    """Values by segment put together to runs."""
+    out = [np.full(run.path.shape, empty) for run in end.task.data.runs]
+    for s, ((r, start, stop), good) in enumerate(zip(end.task.pieces, end.now.good, strict=True)):
+        if good:
+            part = values[s, : stop - start]
+            out[r][start : start + len(part)] = part
+    return out
