@@ -105,8 +105,8 @@ def test_atoms_in_one_place_are_named_before_any_solve(molecules):
     for one in kernels:
         with pytest.raises(ValueError, match=r"infinite at X\[7\]: two atoms in one place"):
             hk.fit(hk.CurlFree(one), X, np.ones_like(X), 1e-3)
+    K = hk.Invariant(hk.CurlFree(warp), GENERATORS)
     with pytest.raises(ValueError, match=r"infinite at X\[7\]: two atoms in one place"):
-        K = hk.Invariant(hk.CurlFree(warp), GENERATORS)
         hk.log_marginal_likelihood(K, X, np.ones_like(X), 1e-3)
     field = hk.fit(hk.CurlFree(warp), molecules, np.ones_like(X), 1e-3)
     assert np.isnan(field(X[7])).all()
