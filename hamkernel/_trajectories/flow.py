@@ -1,8 +1,6 @@
-"""The flow of a field, its tangent, and multiple shooting along segments of the samples.
+"""The flow of a field and its tangent, along intervals between samples.
 
-Every interval between two samples has three Gauss nodes, at which the field is evaluated later.
-Multiple shooting simulates each segment with the current field and improves its start: Levenberg
-steps on the starts alone come before a segment is judged.
+Every interval has three Gauss nodes, at which the field is evaluated later.
 """
 
 from collections.abc import Callable
@@ -22,6 +20,7 @@ from hamkernel._structures.friction import damped_coordinates, frictions
 # Gauss-Legendre nodes and weights on [0, 1]: exact for polynomials of degree 5.
 NODES, WEIGHTS = np.add(np.polynomial.legendre.leggauss(3), [[1.0], [0.0]]) / 2
 _PIECES = np.diff(np.concatenate([[0.0], NODES, [1.0]]))
+_MOST_STEPS = 64  # between two nodes: 75 radians a sample, where 3 are what sampling can resolve
 
 
 class Expansion(eqx.Module):
@@ -106,9 +105,20 @@ def stiffness(
 
 def steps_for(spans: Float[np.ndarray, "S L"], stiffness: float) -> Int[np.ndarray, " L"]:
     """Runge-Kutta steps between two nodes, for intervals of these lengths and this ‖Df‖."""
+    return np.clip(np.nan_to_num(_needed(spans, stiffness), nan=1.0), 1, _MOST_STEPS).astype(int)
+
+
+def is_too_stiff(spans: Float[np.ndarray, "S L"], stiffness: float) -> bool:
+    """Whether a field needs more steps than `steps_for` allows in half of these intervals.
+
+    It moves by more than its range within a sample, and belongs to noise that was taken for motion.
+    """
+    return bool(np.median(_needed(spans[spans > 0][None], stiffness)) > _MOST_STEPS)
+
+
+def _needed(spans: Float[np.ndarray, "S L"], stiffness: float) -> Float[np.ndarray, " L"]:
     # A step of order four with ‖Df‖ dt = 0.15 is wrong by 0.15⁵/120 = 6e-7 of the change.
-    needed = np.ceil(spans.max(axis=0) * _PIECES.max() * stiffness / 0.15)
-    return np.clip(np.nan_to_num(needed, nan=1.0), 1, 64).astype(int)
+    return np.ceil(spans.max(axis=0) * _PIECES.max() * stiffness / 0.15)
 
 
 @compiled_by_size

@@ -12,7 +12,14 @@ from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled_by_size
 from hamkernel._trajectories.diagnostics import SETTLED
-from hamkernel._trajectories.flow import Expansion, Segments, field_values, steps_for, stiffness
+from hamkernel._trajectories.flow import (
+    Expansion,
+    Segments,
+    field_values,
+    is_too_stiff,
+    steps_for,
+    stiffness,
+)
 from hamkernel._trajectories.kalman import (
     SmoothedPath,
     innovations,
@@ -131,7 +138,7 @@ def iterate(task: Task, now: Current, most: int, bar: Any) -> End:
     settled = False
     bar.total = bar.n + 1 + most
     bar.update()
-    while len(history) < most and not settled:
+    while len(history) < most and not settled and not _is_lost(task, now):
         before = now
         now, done = iterated(task, now)
         history.append(done)
@@ -147,6 +154,11 @@ def iterate(task: Task, now: Current, most: int, bar: Any) -> End:
         likelier = abs(float(history[-2].loss - done.loss))
         settled = moved < 0.01 and (likelier < 0.5 or changed(task, before, now) < SETTLED)
     return End(task, now, history, settled)
+
+
+def _is_lost(task: Task, now: Current) -> bool:
+    spans = np.concatenate([np.diff(run.times) for run in task.data.runs])[None]
+    return is_too_stiff(spans, _stiffness(now.field, task.data, now.paths))
 
 
 def initial_loss(task: Task, model: Model) -> float:
