@@ -45,6 +45,7 @@ from hamkernel._discovery.readout import readout
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import FeatureField, KernelField
 from hamkernel._fields.joined import ControlledField, FamilyField
+from hamkernel._fields.kinetic import kinetic
 from hamkernel._gram import gram
 from hamkernel._gram_operator import gram_operator
 from hamkernel._kernels.built_in import Gaussian, Matern, Periodic, Polynomial, RationalQuadratic
@@ -68,6 +69,7 @@ from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable,
 from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.runs import Runs
+from hamkernel._trajectories.score import Score
 from hamkernel._tuning.tune import Tuned, tune
 from hamkernel._validation import (
     cross_validation_loss,
@@ -150,8 +152,10 @@ __all__ = [  # noqa: RUF022 - in reading order
     "Tuned",
     # Logged runs.
     "Runs",
+    "kinetic",
     "learn",
     "Learned",
+    "Score",
     # What the data say beyond the field.
     "compare",
     "readout",

@@ -294,6 +294,21 @@ def _controller():
     return ThreadpoolController()
 
 
+def in_doubles(function: Callable[P, T]) -> Callable[P, T]:
+    """`function`, whose arrays are NumPy's, computed in doubles whatever JAX is told elsewhere."""
+    if hasattr(jax, "enable_x64"):
+        context = jax.enable_x64
+    else:  # before jax 0.8
+        from jax.experimental import enable_x64 as context  # pyright: ignore
+
+    @functools.wraps(function)
+    def doubled(*args: P.args, **kwargs: P.kwargs) -> T:
+        with context(True):
+            return function(*args, **kwargs)
+
+    return doubled
+
+
 def full_precision(function: Callable[P, T]) -> Callable[P, T]:
     """`function`, whose matrix products keep all digits of their type on every device.
 

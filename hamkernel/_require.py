@@ -171,6 +171,41 @@ def _floating(x: Any, name: str) -> Array:
     )
 
 
+def doubles(x: Any, name: str) -> np.ndarray:
+    """`x` as a NumPy array of doubles, NaN where it is masked or missing.
+
+    The caller's log is kept with all of its digits, whatever JAX is told of its precision.
+    """
+    if x is None:
+        raise TypeError(f"{name} is None: an array of real numbers is needed.")
+    if isinstance(x, Iterator):
+        x = list(x)
+    if hasattr(x, "detach"):  # a tensor of PyTorch that may require a gradient
+        x = x.detach().cpu()
+    if isinstance(x, np.ma.MaskedArray):
+        x = np.ma.filled(x.astype(float), np.nan)
+    elif hasattr(x, "to_numpy"):  # pandas, whose missing values NumPy refuses, and polars
+        try:
+            x = x.to_numpy(dtype=float, na_value=np.nan)
+        except (TypeError, ValueError):
+            x = x.to_numpy()
+    try:
+        array = np.asarray(x)
+        if array.dtype == object:
+            array = array.astype(float)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"{name} must hold real numbers; got {reprlib.repr(x)}. Pass floats, an array of them, "
+            "or lists with rows of equal length."
+        ) from error
+    if not (array.dtype.kind in "fiub" or jnp.issubdtype(array.dtype, jnp.floating)):
+        raise TypeError(
+            f"{name} has dtype {array.dtype}; real numbers are needed. For complex data stack real "
+            "and imaginary parts."
+        )
+    return array.astype(float)
+
+
 def single_or_double(dtype: Any, whose: str) -> None:
     """Refuse a dtype with fewer digits than float32."""
     if jnp.finfo(dtype).bits < 32:

@@ -308,7 +308,8 @@ def check_even(n: int, whose: str) -> None:
     if n % 2:
         raise ValueError(
             f"{whose} needs states x = (q, p) of even dimension, got n = {n}. "
-            "Add the missing coordinate, or drop a column that is no state, such as time; for "
+            "Add the missing coordinate, or drop a column that is no state, such as time; of "
+            "positions alone hk.learn(K, runs, mass=m) finds the momenta; for "
             "conservative systems of any dimension use Poisson(k, tensor), for others CurlFree, "
             "DivergenceFree or Separable."
         )

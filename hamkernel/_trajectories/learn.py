@@ -15,6 +15,7 @@ from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo, known_part
 from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import learned_field
+from hamkernel._fields.kinetic import Kinetic, kinetic
 from hamkernel._gram_operator import placed_product
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._machine import full_precision, one_blas_thread
@@ -74,6 +75,7 @@ def learn(
     solver: Nystrom | None = None,
     *,
     process_noise: ArrayLike | None = None,
+    mass: ArrayLike | None = None,
     masses: bool = False,
     iterations: int = 8,
     progress: bool | None = None,
@@ -110,6 +112,9 @@ def learn(
             where a hand pushed the system, it has a deviation of its own there. Rollouts over parts
             of the log that were left out may prefer a share of what is found: on a real pendulum
             half of it misses by .057 rad for .105 (`tests/benchmarks/real_logs.py`).
+        mass: the known masses, one number or one for each position, shape (m,) or (m, m): the mean
+            is `hk.kinetic(mass)`, and K learns the forces. Runs of the m positions alone get
+            momenta that were not measured; a number is enough where there is one position.
         masses: whether states are (q, q̇) with unknown masses instead of (q, p). Their ratios are
             then learned, `learned.kernel.masses`; see `UnknownMasses`, whose kernel K becomes.
             With inputs they are those of the drift, `learned.kernel.drift.masses`.
@@ -133,16 +138,16 @@ def learn(
     require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
     options = {"mean": mean if mean is None else as_pytree(mean), "noise": noise, "solver": solver}
     options |= {"process_noise": process_noise, "masses": masses, "iterations": iterations}
+    options |= {"mass": mass}
     again = Partial(learn, K, progress=False, **options)
+    if mass is not None:
+        mean, runs = _of_known_mass(mass, mean, runs)
     K, given, process = _check(with_amplitude(matrix_kernel(K)), runs, noise, process_noise, solver)
     most = require.count(iterations, "iterations")
     K = with_masses(K, runs.dimension) if masses else K
     known = known_part(K, mean, runs.dimension, jnp.float64)
     check_identifiable(runs, known)
-    from tqdm import tqdm  # so that importing the package does not load it
-
-    quiet, wait = progress is False, 0.0 if progress else 10.0  # seconds
-    bar = tqdm(desc="learning", total=2 + most, disable=quiet, delay=wait)
+    bar = _bar(progress, total=2 + most)
     data = preprocess(runs, known)
     bar.update()
     measured = np.isfinite(data.noise)
@@ -177,6 +182,25 @@ def learn(
         end = likelier(end, iterate(*asked(floor, sought=True), most, bar))
     bar.close()
     return _learned(runs, mean, end, process, given is not None, measured, again)
+
+
+def _bar(progress: bool | None, total: int) -> Any:
+    """A progress bar, by default from ten seconds on."""
+    from tqdm import tqdm  # so that importing the package does not load it
+
+    wait = 0.0 if progress else 10.0
+    return tqdm(desc="learning", total=total, disable=progress is False, delay=wait)
+
+
+def _of_known_mass(mass: Any, mean: Any, runs: Any) -> tuple[Kinetic, Any]:
+    """The mean of known masses, and runs of positions and momenta."""
+    if mean is not None:
+        raise TypeError("mass= is a mean, hk.kinetic(mass): give one of mass and mean.")
+    mean = kinetic(mass)
+    positions = mean.mass.shape[0] if mean.mass.ndim else 1
+    if isinstance(runs, Runs) and runs.dimension == positions:
+        runs = runs.with_momenta()
+    return mean, runs
 
 
 def _first_noise(data: Preprocessed) -> Float[np.ndarray, " n"]:

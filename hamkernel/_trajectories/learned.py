@@ -248,9 +248,9 @@ class Learned(eqx.Module):
         no sample after them.
 
         Args:
-            runs: runs that were not learned from. If None, the last fifth of each run is held out,
-                the rest is learned from again, which takes as long as learning did, and the field
-                of the rest is scored.
+            runs: runs that were not learned from; of positions alone, if need be. If None, the last
+                fifth of each run is held out, the rest is learned from again, which takes as long
+                as learning did, and the field of the rest is scored.
             first: how many samples a free run knows; of runs with fewer than twice as many, half.
             draws: how many fields of the posterior the bands of `coverage` come from; 0 for none.
 
@@ -286,6 +286,8 @@ class Learned(eqx.Module):
                     else ("these", "the learned")
                 )
                 raise TypeError(f"{has} runs have {name} and {lacks} have none; both need them.")
+        if 2 * runs.dimension == self.runs.dimension:
+            runs = runs.with_momenta()
         if (runs.dimension, runs.input_count) != (self.runs.dimension, self.runs.input_count):
             raise ValueError(
                 f"the runs have {runs.dimension} coordinates and {runs.input_count} inputs; the "
@@ -298,7 +300,7 @@ class Learned(eqx.Module):
     def residuals(self) -> tuple[Float[Array, "T n"], ...]:
         """(measured − fitted)/σ for each run, NaN where nothing was measured."""
         pairs = zip(self.runs.states, self.states, strict=True)
-        return tuple((x - fit) / self.noise[None] for x, fit in pairs)
+        return tuple((jnp.asarray(x) - fit) / self.noise[None] for x, fit in pairs)
 
 
 def misfits(runs: Runs, states: list[np.ndarray], noise: np.ndarray) -> np.ndarray:

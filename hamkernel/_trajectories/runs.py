@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import dataclasses
 import operator
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -126,15 +126,19 @@ def at_nodes(ends: Float[Array | np.ndarray, "*S 2 m"]) -> Float[Array | np.ndar
 class Runs(eqx.Module):
     """Logged runs of one system: states at times, with noise, gaps and uneven steps.
 
-    Runs are kept as given; none is resampled. NaN means not measured: a whole coordinate, such as
-    the momenta of a log of positions, or single entries.
+    Runs are kept as given, in doubles of NumPy; none is resampled. NaN means not measured: a whole
+    coordinate, such as the momenta of a log of positions, or single entries. Masked entries of
+    NumPy and missing ones of pandas and polars are NaN.
 
     Args:
-        times: for each run the times of its samples, shape (T,), strictly increasing.
-        states: for each run the states, shape (T, n). Angles must be continuous: `np.unwrap`.
+        times: for each run the times of its samples, shape (T,), strictly increasing; or the
+            sampling interval, one number, with which runs begin at 0.
+        states: for each run the states, shape (T, n), or (T,) for one coordinate. Angles must be
+            continuous: `np.unwrap`.
         inputs: for each run what was applied, for `learn` with a `Controlled` kernel: u at the
-            times of the states, shape (T, m), or a pair (times, u) of shapes (P,) and (P, m) that
-            spans them, such as a command at 1 kHz beside a camera at 50 Hz; None if nothing.
+            times of the states, shape (T, m), or (T,) for one input; or a pair (times, u) of shapes
+            (P,) and (P, m) that spans them, such as a command at 1 kHz beside a camera at 50 Hz;
+            None if nothing.
         between: how inputs go on from a sample: "held" until the next, as a digital controller
             holds its command; "linear", for a measured force; "smooth", the quintic spline through
             the samples, for one that is sampled 4 to 20 times a period; or "auto", with which
@@ -145,7 +149,7 @@ class Runs(eqx.Module):
         delay: by how much later than logged an input acts, in the unit of the times: at time t it
             is u(t − delay). Or "fit", with which `learn` finds it.
 
-    A single run may be given as bare arrays (T,) and (T, n).
+    A single run may be given as bare arrays or lists of numbers, (T,) and (T, n).
 
     Raises:
         ValueError: shapes do not fit, a run has one sample only, times do not increase, an entry is
@@ -159,10 +163,10 @@ class Runs(eqx.Module):
             that never change, depend on one another or are a function of the states: once each.
     """
 
-    times: tuple[Float[Array, " T"], ...]
-    states: tuple[Float[Array, "T n"], ...]
-    inputs: tuple[Float[Array, "P m"], ...] | None
-    input_times: tuple[Float[Array, " P"], ...] | None
+    times: tuple[Float[np.ndarray, " T"], ...]
+    states: tuple[Float[np.ndarray, "T n"], ...]
+    inputs: tuple[Float[np.ndarray, "P m"], ...] | None
+    input_times: tuple[Float[np.ndarray, " P"], ...] | None
     between: Between | Literal["auto"] = eqx.field(static=True)
     delay: float | Literal["fit"] = eqx.field(static=True)
     parameters: tuple[Float[Array, " p"], ...] | None
@@ -176,14 +180,19 @@ class Runs(eqx.Module):
         parameters: Any = None,
         delay: float | Literal["fit"] = 0.0,
     ):
-        if hasattr(times, "ndim") and times.ndim == 1:  # one run
+        if _is_one_run(times, states):
             times, states = [times], [states]
             inputs = None if inputs is None else [inputs]  # an array, or a pair (times, u)
             parameters = None if parameters is None else [parameters]
-        times, states = list(times), list(states)
+        states = _entries(states, "states")
+        if _is_number(times):
+            times = [times] * len(states)  # the sampling interval of all runs
+        times = _entries(times, "times")
+        inputs = None if inputs is None else _entries(inputs, "inputs")
         inside = "Make it outside; the losses and hk.simulate work inside."
         require.untraced("hk.Runs", inside, times, states, inputs)
         _check_counts(times, states, inputs)
+        times = [_at_interval(t, x) for t, x in zip(times, states, strict=True)]
         self.times = tuple(_times(t, r) for r, t in enumerate(times))
         self.states = tuple(
             _rows(x, t, r, "states")
@@ -340,6 +349,11 @@ class Runs(eqx.Module):
             parameters=cut(self.parameters),
         )
 
+    def with_momenta(self) -> "Runs":
+        """Runs of positions as runs of states (q, p), with momenta that were not measured."""
+        states = tuple(np.concatenate([x, np.full_like(x, np.nan)], axis=1) for x in self.states)
+        return self._with(states=states)
+
     def _with(self, **given: Any) -> "Runs":
         new = object.__new__(Runs)
         for field in dataclasses.fields(self):
@@ -353,6 +367,38 @@ class Runs(eqx.Module):
                     f"coordinate {c} was measured in no run, so it has no velocities. hk.learn(K, "
                     "runs, mean=f) finds it where f says how it moves the others, as q̇ = p/m does."
                 )
+
+
+def _is_one_run(times: Any, states: Any) -> bool:
+    """Whether `times` are those of one run, or one sampling interval and `states` one array."""
+    if _is_number(times):
+        return hasattr(states, "ndim") or (isinstance(states, list) and _is_number(states[0]))
+    if hasattr(times, "ndim"):
+        return times.ndim == 1
+    return isinstance(times, list | tuple) and len(times) > 0 and _is_number(times[0])
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) or getattr(value, "ndim", None) == 0
+
+
+def _entries(values: Any, name: str) -> list[Any]:
+    """One entry a run."""
+    if isinstance(values, Iterable) and not isinstance(values, str | dict):
+        return list(values)
+    raise TypeError(
+        f"{name} must be a list with one array a run, or the array of one run; got {values!r}."
+    )
+
+
+def _at_interval(times: Any, states: Any) -> Any:
+    """The times of samples at a sampling interval, from 0 on; other times as they are."""
+    if not _is_number(times):
+        return times
+    interval = float(require.doubles(times, "the sampling interval"))
+    if not 0 < interval < np.inf:
+        raise ValueError(f"the sampling interval must be positive and finite; got {interval:g}.")
+    return interval * np.arange(len(states))
 
 
 def _check_counts(times: Sequence[Any], states: Sequence[Any], inputs: Any) -> None:
@@ -380,7 +426,9 @@ def _members(parameters: Any, count: int, inputs: Any) -> tuple[Float[Array, " p
             f"parameters has {got} and there are {count} runs: one θ of shape (p,) for each run is "
             "needed, such as [(0.5,), (0.8,)]."
         )
-    rows = tuple(require.floating(t, f"parameters[{r}]") for r, t in enumerate(parameters))
+    rows = tuple(
+        jnp.atleast_1d(require.floating(t, f"parameters[{r}]")) for r, t in enumerate(parameters)
+    )
     shapes = {theta.shape for theta in rows}
     if len(shapes) > 1 or rows[0].ndim != 1 or rows[0].size == 0:
         raise ValueError(
@@ -390,9 +438,9 @@ def _members(parameters: Any, count: int, inputs: Any) -> tuple[Float[Array, " p
     return tuple(require.finite(theta, f"parameters[{r}]") for r, theta in enumerate(rows))
 
 
-def _times(t: Any, run: int, of: str = "states") -> Float[Array, " T"]:
+def _times(t: Any, run: int, of: str = "states") -> Float[np.ndarray, " T"]:
     name = f"times[{run}]" if of == "states" else f"the times of {of}[{run}]"
-    t = require.floating(t, name)
+    given, t = getattr(t, "dtype", None), require.doubles(t, name)
     if t.ndim != 1:
         raise ValueError(f"{name} has shape {t.shape}; times of shape (T,) are needed.")
     if t.size < 2:
@@ -400,28 +448,32 @@ def _times(t: Any, run: int, of: str = "states") -> Float[Array, " T"]:
             f"run {run} has {t.size} sample{'s' * (t.size != 1)}: at least two are needed to see "
             "anything move. Leave it out."
         )
-    seen = np.asarray(t)
-    if not np.isfinite(seen).all():
-        raise ValueError(f"{name} contains NaN or inf at {np.flatnonzero(~np.isfinite(seen))[0]}.")
-    back = np.flatnonzero(np.diff(seen) <= 0)
+    if not np.isfinite(t).all():
+        raise ValueError(f"{name} contains NaN or inf at {np.flatnonzero(~np.isfinite(t))[0]}.")
+    back = np.flatnonzero(np.diff(t) <= 0)
     if back.size:
         i = int(back[0])
+        cure = "Sort by time and drop repeats; where a log starts anew, start a new run."
+        if given == np.float32 and (np.diff(t) >= 0).all() and abs(t[i]) > 1e5:
+            step = np.spacing(np.float32(t[i]))
+            cure = (
+                f"They are float32, which tells times near {t[i]:g} apart by {step:g} only: pass "
+                "NumPy arrays of float64, or subtract the first time before they are rounded."
+            )
         raise ValueError(
-            f"{name} must increase; sample {i + 1}, at {seen[i + 1]:g}, does not come after "
-            f"sample {i}, at {seen[i]:g} ({back.size} such). Sort by time and drop repeats; "
-            "where a log starts anew, start a new run."
+            f"{name} must increase; sample {i + 1}, at {t[i + 1]:g}, does not come after "
+            f"sample {i}, at {t[i]:g} ({back.size} such). {cure}"
         )
     return t
 
 
-def _rows(x: Any, t: Array, run: int, name: str) -> Float[Array, "T n"]:
-    x = require.floating(x, f"{name}[{run}]")
+def _rows(x: Any, t: np.ndarray, run: int, name: str) -> Float[np.ndarray, "T n"]:
+    x = require.doubles(x, f"{name}[{run}]")
+    x = x[:, None] if x.ndim == 1 and len(x) == len(t) else x
     if x.ndim != 2 or len(x) != len(t) or x.shape[1] == 0:
         hint = ""
         if x.ndim == 2 and x.shape[1] == len(t):
             hint = f" It seems transposed: {name}[{run}].T."
-        elif x.ndim == 1 and len(x) == len(t):
-            hint = f" One row a sample: {name}[{run}][:, None]."
         elif name == "inputs" and x.ndim == 2:
             hint = (
                 " Where inputs have times of their own, give pairs, inputs=[(times, u), …]; where "
@@ -437,15 +489,20 @@ def _rows(x: Any, t: Array, run: int, name: str) -> Float[Array, "T n"]:
 
 
 def _seconds(delay: Any) -> float:
-    if isinstance(delay, bool) or not isinstance(delay, int | float | np.number):
+    if isinstance(delay, bool | str | None) or np.ndim(delay):
         raise TypeError(f"delay must be a number, or 'fit'; got {delay!r}.")
+    delay = require.doubles(delay, "delay")
     if not np.isfinite(delay):
         raise ValueError(f"delay must be finite; got {delay!r}.")
     return float(delay)
 
 
-def _signal(u: Any, t: Array, run: int) -> tuple[Float[Array, " P"], Float[Array, "P m"]]:
+def _signal(
+    u: Any, t: np.ndarray, run: int
+) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, "P m"]]:
     """The times and values of the inputs of one run whose states have the times t."""
+    if isinstance(u, list) and len(u) == 2 != len(t) and np.ndim(u[0]) == 1:
+        u = tuple(u)  # a pair (times, u)
     if not isinstance(u, tuple):
         return t, _rows(u, t, run, "inputs")
     if len(u) != 2:
@@ -469,7 +526,7 @@ def _signal(u: Any, t: Array, run: int) -> tuple[Float[Array, " P"], Float[Array
     return own, values
 
 
-def _check_coordinates(states: tuple[Array, ...]) -> None:
+def _check_coordinates(states: tuple[np.ndarray, ...]) -> None:
     sizes = {x.shape[1] for x in states}
     if len(sizes) > 1:
         raise ValueError(
@@ -481,7 +538,7 @@ def _check_coordinates(states: tuple[Array, ...]) -> None:
             raise ValueError(f"nothing was measured in run {run}: leave it out.")
 
 
-def _check_inputs(inputs: tuple[Array, ...]) -> None:
+def _check_inputs(inputs: tuple[np.ndarray, ...]) -> None:
     sizes = {u.shape[1] for u in inputs}
     if len(sizes) > 1:
         raise ValueError(f"the runs have {sorted(sizes)} inputs: all need the same m.")

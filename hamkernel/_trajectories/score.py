@@ -219,37 +219,38 @@ def _fitted(field: Any, part: Stretches, seen: list[int], deviation, scale) -> _
     )
     steps = jnp.asarray(steps_for(part.spans[:, :L], _stiffness(field, part, scale)))
     rest = jnp.asarray(part.spans[:, :L]), steps, jnp.asarray(part.inputs[:, :L])
-    x, (S, n) = part.starts, part.starts.shape
-    prior = np.diag(1 / (3 * scale) ** 2)
+    S, n = part.starts.shape
+    prior = np.eye(n) / 9  # in units of `scale`, as all below
 
-    def at(x):
-        path = simulated(field, jnp.asarray(x), *rest)
+    def at(y):
+        path = simulated(field, jnp.asarray(part.starts + scale * y), *rest)
         tangents, J = np.asarray(path.across), []
         for i in range(L):
-            J.append(tangents[:, i] @ (J[-1] if J else np.eye(n)))
+            J.append(tangents[:, i] @ (J[-1] if J else np.diag(scale)))
         r = np.where(np.isfinite(judged), judged - np.asarray(path.x)[:, 1:], 0.0) / deviation
         J = np.where(np.isfinite(judged)[..., None], np.stack(J, 1), 0.0) / deviation[:, None]
-        squares = (r**2).sum((1, 2)) + np.einsum(
-            "si,ij,sj->s", x - part.starts, prior, x - part.starts
-        )
-        return r, J, np.where(np.isfinite(squares), squares, np.inf)
+        squares = (r**2).sum((1, 2)) + (y**2).sum(1) / 9
+        # A path that is lost says nothing of its start.
+        found = np.isfinite(squares) & (np.abs(J).max((1, 2, 3)) < 1e100)
+        r, J = np.where(found[:, None, None], r, 0.0), np.where(found[:, None, None, None], J, 0.0)
+        H, gradient = np.einsum("slki,slkj->sij", J, J), np.einsum("slki,slk->si", J, r)
+        return np.where(found, squares, np.inf), H + prior, gradient - y / 9
 
-    damping, (r, J, least) = np.full(S, 1e-3), at(x)
-    H = np.einsum("slki,slkj->sij", J, J) + prior
+    y, damping = np.zeros((S, n)), np.full(S, 1e-3)
+    least, H, gradient = at(y)
     for _ in range(_STEPS):
-        H = np.nan_to_num(np.einsum("slki,slkj->sij", J, J)) + prior
-        gradient = np.nan_to_num(np.einsum("slki,slk->si", J, r)) - (x - part.starts) @ prior
-        D = damping[:, None, None] * np.einsum("sii->si", H)[:, :, None] * np.eye(n)
-        there = x + np.linalg.solve(H + D, gradient[..., None])[..., 0]
+        D = np.einsum("s,sii->si", damping, H)[:, :, None] * np.eye(n)
+        there = y + np.linalg.solve(H + D, gradient[..., None])[..., 0]
         found = at(there)
-        better = found[2] < least
-        x = np.where(better[:, None], there, x)
-        r, J, least = (
-            np.where(better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
-            for new, old in zip(found, (r, J, least), strict=True)
-        )
+        better = found[0] < least
+        y = np.where(better[:, None], there, y)
+        least = np.where(better, found[0], least)
+        H = np.where(better[:, None, None], found[1], H)
+        gradient = np.where(better[:, None], found[2], gradient)
         damping = np.where(better, damping / 10, damping * 10)
-    return _Starts(x, np.linalg.inv(np.linalg.cholesky(H)).transpose(0, 2, 1))
+    values, vectors = np.linalg.eigh(H)
+    roots = vectors / np.sqrt(np.maximum(values, 1 / 9))[:, None]
+    return _Starts(part.starts + scale * y, scale[:, None] * roots)
 
 
 def _stiffness(field: Any, part: Stretches, scale: Float[np.ndarray, " n"]) -> float:

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hamkernel._machine import compiled_by_size
+from hamkernel._machine import compiled_by_size, in_doubles
 from hamkernel._show import described
 from hamkernel._tuning.minimiser import most_likely_in_box
 
@@ -222,6 +222,7 @@ def _mean(x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, " n"]:
     return np.where(seen, x, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
 
 
+@in_doubles
 def processes(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> list[Coordinate]:
     """The hyperparameters of each coordinate, by the marginal likelihood of all runs."""
     states = without_means(states)[0]
@@ -301,6 +302,7 @@ class Paths(NamedTuple):
     slope_deviation: Float[np.ndarray, "R T n"]
 
 
+@in_doubles
 def smoothed(
     found: list[Coordinate], times: Sequence[np.ndarray], states: Sequence[np.ndarray]
 ) -> Paths:

@@ -1,0 +1,86 @@
+"""`kinetic`: the kinetic energy of known masses, as a prior mean."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from hamkernel import _require as require
+from hamkernel._show import described
+
+
+class Kinetic(eqx.Module):
+    """The field (M⁻¹p, 0) of the energy T(p) = ½ pᵀM⁻¹p; made by `kinetic`.
+
+    Attributes:
+        mass: M, shape (), (m,) or (m, m).
+    """
+
+    is_separable: ClassVar[bool] = True
+    mass: Float[Array, "..."]
+
+    def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+        """The velocity (M⁻¹p, 0) of the state x = (q, p), shape (n,).
+
+        Raises:
+            ValueError: x is no state of as many positions as there are masses.
+        """
+        velocity = self._velocity(self._state(x))
+        return jnp.concatenate([velocity, jnp.zeros_like(velocity)])
+
+    def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        """The energy ½ pᵀM⁻¹p of the state x, shape ().
+
+        Raises:
+            ValueError: x is no state of as many positions as there are masses.
+        """
+        x = self._state(x)
+        return 0.5 * x[len(x) // 2 :] @ self._velocity(x)
+
+    def _state(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+        x = require.floating(x, "x")
+        n = 2 * self.mass.shape[0] if self.mass.ndim else None
+        if x.ndim != 1 or x.shape[0] % 2 or n not in (None, x.shape[0]):
+            raise ValueError(
+                f"x has shape {x.shape}; one state (q, p) of shape ({n or 'n'},), with a mass for "
+                "each q, is needed."
+            )
+        return x
+
+    def _velocity(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        p, mass = x[x.shape[0] // 2 :], self.mass.astype(x.dtype)
+        return jnp.linalg.solve(mass, p) if mass.ndim == 2 else p / mass
+
+    def __repr__(self) -> str:
+        return described(self)
+
+
+def kinetic(mass: ArrayLike) -> Kinetic:
+    """The prior mean (M⁻¹p, 0) for known masses: K then learns the forces.
+
+        hk.learn(K, hk.Runs(times, states), mean=hk.kinetic(mass=1.0))
+
+    It is saved with a field, so that `load` needs no `mean`, and its energy ½ pᵀM⁻¹p is part of
+    `field.hamiltonian`.
+
+    Args:
+        mass: one mass for all positions, one for each, shape (m,), or a symmetric positive definite
+            matrix (m, m).
+
+    Raises:
+        ValueError: the shape is another; a mass is not positive, or the matrix not symmetric
+            positive definite. TypeError: these are no real numbers.
+    """
+    given = require.floating(mass, "mass")
+    if given.ndim == 2 and given.shape[0] == given.shape[1]:
+        matrix = np.asarray(given)
+        if not np.allclose(matrix, matrix.T) or not (np.linalg.eigvalsh(matrix) > 0).all():
+            raise ValueError("a mass matrix must be symmetric and positive definite.")
+        return Kinetic(given)
+    if given.ndim > 1:
+        raise ValueError(f"mass has shape {given.shape}; (), (m,) or (m, m) is needed.")
+    return Kinetic(require.positive(mass, "mass"))

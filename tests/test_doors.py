@@ -1,0 +1,180 @@
+"""What people type: logs of every kind become runs, and known masses need no lambda."""
+
+# pyright: reportArgumentType=false
+
+import subprocess
+import sys
+import warnings
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hamkernel as hk
+
+T = np.linspace(0, 3, 40)
+X = np.stack([np.sin(2 * T), 2 * np.cos(2 * T)], 1)
+U = np.cos(3 * T) + 0.3 * np.sin(7 * T)
+
+
+def same(runs, times=T, states=X):
+    assert len(runs) == 1
+    np.testing.assert_array_equal(runs.times[0], times)
+    np.testing.assert_array_equal(runs.states[0], states)
+    assert runs.states[0].dtype == float
+
+
+def masked():
+    return np.ma.masked_array(X, mask=np.arange(80).reshape(40, 2) == 7)
+
+
+def with_nan():
+    out = X.copy()
+    out[3, 1] = np.nan
+    return out
+
+
+@pytest.mark.parametrize(
+    ("times", "states", "kept"),
+    [
+        (T, X, X),
+        (T.tolist(), X.tolist(), X),
+        ([T], [X], X),
+        (T.astype(">f8"), X.astype(">f8"), X),
+        (T, np.ma.masked_array(X, mask=False), X),
+        (T, masked(), with_nan()),
+        (T, X.astype(object), X),
+        (iter([T]), iter([X]), X),
+        (T, X[:, 0], X[:, :1]),
+        (T.tolist(), X[:, 0].tolist(), X[:, :1]),
+    ],
+)
+def test_logs_of_every_kind_are_runs(times, states, kept):
+    same(hk.Runs(times, states), states=kept)
+
+
+def test_missing_entries_of_pandas_are_nan():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame(X, columns=["q", "p"]).astype("Float64")
+    frame.loc[3, "p"] = pandas.NA
+    same(hk.Runs(pandas.Series(T), frame), states=with_nan())
+
+
+@pytest.mark.parametrize("interval", [0.02, np.float64(0.02), jnp.asarray(0.02)])
+def test_a_sampling_interval_stands_for_times(interval):
+    expected = float(interval) * np.arange(40)
+    same(hk.Runs(interval, X), expected)
+    two = hk.Runs(interval, [X, X[:20]])
+    np.testing.assert_array_equal(two.times[1], expected[:20])
+    with pytest.raises(ValueError, match=r"sampling interval must be positive and finite; got -1"):
+        hk.Runs(-1.0, X)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ((None, X), "times must be a list with one array a run"),
+        (([None], [X]), r"times\[0\] is None: an array of real numbers is needed"),
+        ((T, None), "states"),
+        ((T, X * 1j), r"states\[0\] has dtype complex128; real numbers are needed"),
+        ((T, [["a", "b"]] * 40), r"states\[0\]"),
+    ],
+)
+def test_what_is_no_log_is_refused_in_a_sentence(arguments, said):
+    with pytest.raises(TypeError, match=said):
+        hk.Runs(*arguments)
+
+
+@pytest.mark.parametrize(
+    "inputs", [U, U[:, None], U.tolist(), (T, U), [T, U], ([*T], [*U]), (T, U[:, None])]
+)
+def test_one_input_is_one_column(inputs):
+    runs = hk.Runs(T, X, inputs)
+    np.testing.assert_array_equal(runs.inputs[0], U[:, None])
+    np.testing.assert_array_equal(runs.input_times[0], T)
+
+
+def test_numbers_of_other_libraries_are_numbers():
+    assert hk.Runs(T, X, U, delay=np.array(0.1)).delay == 0.1
+    assert isinstance(hk.Runs(T, X, U, delay=jnp.asarray(0.5)).delay, float)
+    for delay in (True, None, [0.1, 0.2], "late"):
+        with pytest.raises(TypeError, match="delay must be a number"):
+            hk.Runs(T, X, U, delay=delay)
+    runs = hk.Runs([T, T], [X, X], parameters=[0.5, 0.8])
+    np.testing.assert_array_equal(np.concatenate(runs.parameters), [0.5, 0.8])
+
+
+def test_a_log_keeps_its_digits_whatever_jax_is_told():
+    """In float32, 1e5 + t has steps of .0469 and .0547 for .05."""
+    code = (
+        "import numpy as np, hamkernel as hk, jax\n"
+        "t = 1e5 + 0.05 * np.arange(60)\n"
+        "x = np.stack([np.sin(t), np.cos(t)], 1)\n"
+        "runs = hk.Runs(t, x)\n"
+        "print(np.ptp(np.diff(runs.times[0])) < 1e-9, runs.times[0].dtype)\n"
+        "X, Y, _ = hk.Runs(0.05 * np.arange(60), np.stack([np.sin(t - 1e5), np.cos(t - 1e5)], 1))"
+        ".velocities()\n"
+        "print(float(abs(Y - np.stack([X[:, 1], -X[:, 0]], 1)).max()) < 2e-3, X.dtype)\n"
+        "try:\n"
+        "    hk.Runs(np.float32(1.7e9) + np.arange(9, dtype=np.float32), x[:9])\n"
+        "except ValueError as error:\n"
+        "    print('float32, which tells times near 1.7e+09 apart by 128' in str(error))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "float64", "True", "float32", "True"], done.stdout
+
+
+@pytest.mark.parametrize("mass", [2.0, [2.0, 3.0], [[2.0, 0.5], [0.5, 3.0]]])
+def test_kinetic_energy_is_that_of_numpy(mass):
+    mean, x = hk.kinetic(mass), np.array([0.3, -0.4, 1.5, 0.7])
+    M = np.broadcast_to(mass, (2, 2)) if np.ndim(mass) == 2 else np.diag(np.broadcast_to(mass, 2))
+    v = np.linalg.solve(M, x[2:])
+    np.testing.assert_allclose(mean(x), [*v, 0, 0])
+    np.testing.assert_allclose(mean.hamiltonian(x), x[2:] @ v / 2)
+    assert "mass=" in repr(mean)
+
+
+@pytest.mark.parametrize(
+    ("mass", "said"),
+    [
+        (-1.0, "mass must be positive"),
+        ([[1.0, 2.0], [2.0, 1.0]], "symmetric and positive definite"),
+        ([[1.0, 0.5], [0.0, 1.0]], "symmetric and positive definite"),
+        (np.ones((2, 3)), r"\(\), \(m,\) or \(m, m\)"),
+    ],
+)
+def test_what_is_no_mass_is_refused(mass, said):
+    with pytest.raises(ValueError, match=said):
+        hk.kinetic(mass)
+
+
+def test_a_state_of_other_masses_is_refused():
+    with pytest.raises(ValueError, match=r"shape \(4,\), with a mass for each q"):
+        hk.kinetic([1.0, 2.0])(np.ones(2))
+
+
+def test_positions_and_a_mass_are_enough(tmp_path):
+    """A pendulum of mass 2: the field of (q, p), saved and loaded without a mean."""
+    dice = np.random.default_rng(0)
+    t, runs = np.linspace(0, 6, 60), []
+    system = hk.systems.Pendulum(2.0, 1.0, 6.0)
+    for start in ([1.0, 0.0], [0.3, 1.0], [-1.8, 2.0]):
+        q = np.asarray(hk.simulate(system, jnp.asarray(start), jnp.asarray(t)).ys)[:, 0]
+        runs.append(q + 1e-3 * dice.standard_normal(q.shape))
+    K = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        learned = hk.learn(K, hk.Runs([t] * 3, runs), mass=2.0, progress=False)
+    x = jnp.array([0.7, 1.3])
+    np.testing.assert_allclose(learned.field(x), system(x), rtol=0.01)
+    assert learned.field.is_separable
+    H = learned.field.hamiltonian
+    np.testing.assert_allclose(
+        H(x) - H(x * 0), system.hamiltonian(x) - system.hamiltonian(x * 0), rtol=0.01
+    )
+    hk.save(tmp_path / "field", learned.field)
+    np.testing.assert_array_equal(hk.load(tmp_path / "field")(x), learned.field(x))
+    with pytest.raises(TypeError, match="give one of mass and mean"):
+        hk.learn(K, learned.runs, mean=hk.kinetic(1.0), mass=1.0)
+    with pytest.raises(ValueError, match=r"positions alone hk\.learn\(K, runs, mass=m\)"):
+        hk.learn(K, hk.Runs(t, runs[0]))
