@@ -200,8 +200,8 @@ def doubles(x: Any, name: str) -> np.ndarray:
         ) from error
     if not (array.dtype.kind in "fiub" or jnp.issubdtype(array.dtype, jnp.floating)):
         raise TypeError(
-            f"{name} has dtype {array.dtype}; real numbers are needed. For complex data stack real "
-            "and imaginary parts."
+            f"{name} must hold real numbers and has dtype {array.dtype}. For complex data stack "
+            "real and imaginary parts."
         )
     return array.astype(float)
 

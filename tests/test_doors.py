@@ -76,7 +76,7 @@ def test_a_sampling_interval_stands_for_times(interval):
         ((None, X), "times must be a list with one array a run"),
         (([None], [X]), r"times\[0\] is None: an array of real numbers is needed"),
         ((T, None), "states"),
-        ((T, X * 1j), r"states\[0\] has dtype complex128; real numbers are needed"),
+        ((T, X * 1j), r"states\[0\] must hold real numbers and has dtype complex128"),
         ((T, [["a", "b"]] * 40), r"states\[0\]"),
     ],
 )

@@ -291,7 +291,6 @@ TWICE = np.repeat(THETA[:1], N, axis=0)
         (lambda: hk.Odd(K), TypeError, "say the symmetry of the members"),
         (lambda: hk.fit(K, X[:, :1], Y[:, :1], parameters=THETA), ValueError, "even"),
         (lambda: hk.Runs(*RUNS, parameters=[0.5]), ValueError, "there are 2 runs"),
-        (lambda: hk.Runs(*RUNS, parameters=[0.5, 0.8]), ValueError, r"shape \(p,\) for each run"),
         (lambda: hk.Runs(*RUNS, parameters=[(0.5,), (1.0, 2.0)]), ValueError, "with one p"),
         (
             lambda: hk.Runs(*RUNS, [X[:3], X[:3]], parameters=[(0.5,), (1.0,)]),

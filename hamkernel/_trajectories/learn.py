@@ -82,12 +82,12 @@ def learn(
 ) -> Learned:
     """Learn a field from noisy states at times, without velocities.
 
-    A sample is the start of its run plus the integral of the field along the path. The path is
-    first the smoothed one, then that of the current field, linearised in the field and the start
-    (Gauss-Newton multiple shooting). Each iteration is in closed form: starts are projected out,
-    hyperparameters and the noise of each coordinate follow from the marginal likelihood, and a line
-    search checks ‖W(x − x̂)‖² + ‖f‖² itself. Segments begin with up to 12 samples and grow to runs,
-    or to parts of them where a whole run cannot be followed.
+    Each interval between two samples is linearised about the current path, which is the smoothed
+    one at first. A Kalman filter makes its rows independent, and the field follows from them in
+    closed form; kernel and noise maximise the marginal likelihood. A smoother then gives the next
+    path, until log p rises by less than ½. The first pass has no process noise. Where it does not
+    settle, or more of it would pay, a second pass looks for its intensity, and the likelier of the
+    two is returned.
 
     Args:
         K: a matrix-valued kernel. Its hyperparameters are the first guess. A structure without an
