@@ -50,6 +50,7 @@ from hamkernel._gram import gram
 from hamkernel._gram_operator import gram_operator
 from hamkernel._kernels.built_in import Gaussian, Matern, Periodic, Polynomial, RationalQuadratic
 from hamkernel._kernels.check import check_kernel
+from hamkernel._kernels.parts import Shared, neighbours, pairs, sites
 from hamkernel._kernels.transforms import Select, Warp
 from hamkernel._observations.kinds import Energies, Equilibria, Functionals, Velocities
 from hamkernel._posterior import Posterior, condition
@@ -98,6 +99,10 @@ __all__ = [  # noqa: RUF022 - in reading order
     "Periodic",
     "Warp",
     "Select",
+    "Shared",
+    "pairs",
+    "neighbours",
+    "sites",
     "check_kernel",
     # Structured kernels.
     "Separable",

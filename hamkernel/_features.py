@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from hamkernel._kernels.base import AbstractScalarKernel, Spectrum
+from hamkernel._kernels.base import AbstractScalarKernel, ScalarSum, Scaled, Spectrum
+from hamkernel._kernels.parts import Shared
 from hamkernel._kernels.symmetry import symmetry_removed
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.joined import Controlled, KnownMatrix
@@ -47,6 +48,44 @@ class Waves(eqx.Module):
         return self.frequencies.T * (self.amplitudes * slopes)[None]
 
 
+class PartWaves(eqx.Module):
+    """The features of a law that many parts share, times a factor; they are exact, not random."""
+
+    kernel: Shared
+    scale: Float[Array, ""]
+
+    @property
+    def amplitudes(self) -> Float[Array, " w"]:
+        return jnp.ones(len(self.kernel.centres or ()))  # in `values`, for one law
+
+    def values(self, x: Float[Array, " n"]) -> Float[Array, " w"]:
+        return jnp.sqrt(self.scale).astype(x.dtype) * self.kernel.features(x)
+
+    def of_law(self, r: Float[Array, "..."]) -> Float[Array, " w"]:
+        """The features of the law itself at r."""
+        r = self.kernel.point(r)
+        return jnp.sqrt(self.scale).astype(r.dtype) * self.kernel.law(r)
+
+    def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n w"]:
+        return jnp.sqrt(self.scale).astype(x.dtype) * self.kernel.gradients(x)
+
+
+class JointWaves(eqx.Module):
+    """The features of a sum of scalar kernels, one after the other."""
+
+    terms: tuple[Any, ...]
+
+    @property
+    def amplitudes(self) -> Float[Array, " w"]:
+        return jnp.concatenate([term.amplitudes for term in self.terms])
+
+    def values(self, x: Float[Array, " n"]) -> Float[Array, " w"]:
+        return jnp.concatenate([term.values(x) for term in self.terms])
+
+    def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n w"]:
+        return jnp.concatenate([term.gradients(x) for term in self.terms], axis=1)
+
+
 class GroupWaves(eqx.Module):
     """Means of waves over a finite group, Σ_g χ(g) wave(g x)/|G|: features of the mean kernel."""
 
@@ -74,8 +113,11 @@ class GroupWaves(eqx.Module):
 
 def waves_of(
     k: AbstractScalarKernel, n: int, count: int, key: Key[Array, ""], dtype: Any
-) -> Waves | GroupWaves:
+) -> "Basis":
     """Waves with the spectrum of a scalar kernel, and with its symmetry."""
+    shared = part_waves(k)
+    if shared is not None:
+        return shared
     found = symmetry_removed(k)
     if found is None or found.parity is not None:  # which a `Spectrum` knows
         return Waves(k.spectra(n, count, key, dtype))
@@ -85,6 +127,41 @@ def waves_of(
         jnp.asarray(np.stack([g.matrix for g in group]), dtype),
         jnp.asarray([g.character for g in group], dtype),
     )
+
+
+def part_waves(k: AbstractScalarKernel, scale: Any = 1.0) -> PartWaves | JointWaves | None:
+    """The features of `Shared` kernels, their multiples and sums; None of any other kernel."""
+    if isinstance(k, Shared) and k.centres is not None:
+        return PartWaves(k, jnp.asarray(scale))
+    if isinstance(k, Scaled):
+        return part_waves(k.kernel, scale * k.scale)
+    if isinstance(k, ScalarSum):
+        terms = tuple(part_waves(term, scale) for term in k.terms)
+        return None if None in terms else JointWaves(terms)
+    return None
+
+
+def laws_of(waves: Any) -> list[tuple[PartWaves, slice]]:
+    """The laws among some features, with the positions of their weights."""
+    terms = waves.terms if isinstance(waves, JointWaves) else (waves,)
+    starts = np.cumsum([0, *(len(term.amplitudes) for term in terms)])
+    return [
+        (term, slice(int(start), int(stop)))
+        for term, start, stop in zip(terms, starts[:-1], starts[1:], strict=True)
+        if isinstance(term, PartWaves)
+    ]
+
+
+def is_of_parts(K: AbstractMatrixKernel) -> bool:
+    """Whether all of K is made from laws that many parts share, so that its features are exact."""
+    if isinstance(K, Controlled):
+        return is_of_parts(K.drift) and isinstance(K.inputs, KnownMatrix)
+    if isinstance(K, Sum):
+        return all(map(is_of_parts, K.terms))
+    return isinstance(K, AbstractPotentialKernel) and part_waves(K.kernel) is not None
+
+
+Basis = Waves | GroupWaves | PartWaves | JointWaves
 
 
 class AbstractFeatures(eqx.Module):
@@ -110,6 +187,10 @@ class AbstractFeatures(eqx.Module):
         """The potential of `field`; AttributeError if there is none."""
         raise AttributeError(f"{type(self).__name__} have no potential.")
 
+    def laws(self) -> list[tuple[PartWaves, slice]]:
+        """The laws that many parts share, with the positions of their weights."""
+        return []
+
     def __call__(self, X: Float[Array, "t n"]) -> Float[Array, "t n r"]:
         return jax.vmap(self.rows)(X)
 
@@ -118,7 +199,7 @@ class PotentialFeatures(AbstractFeatures):
     """φ = B∇(wave)."""
 
     structure: AbstractPotentialKernel
-    waves: Waves | GroupWaves
+    waves: Basis
 
     @property
     def columns(self) -> int:
@@ -133,11 +214,14 @@ class PotentialFeatures(AbstractFeatures):
     def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
         return self.waves.values(x) @ w
 
+    def laws(self) -> list[tuple[PartWaves, slice]]:
+        return laws_of(self.waves)
+
 
 class DivergenceFreeFeatures(AbstractFeatures):
     """φ = e_a ∂_b(wave) − e_b ∂_a(wave) for each pair a < b: an antisymmetric matrix potential."""
 
-    waves: Waves | GroupWaves
+    waves: Basis
     dimension: int = eqx.field(static=True)
 
     @property
@@ -164,7 +248,7 @@ class DivergenceFreeFeatures(AbstractFeatures):
 class SeparableFeatures(AbstractFeatures):
     """φ = e_a (wave) for each component a."""
 
-    waves: Waves | GroupWaves
+    waves: Basis
     dimension: int = eqx.field(static=True)
 
     @property
@@ -189,7 +273,7 @@ class ControlledFeatures(AbstractFeatures):
     """
 
     drift: AbstractFeatures
-    waves: Waves | GroupWaves | None
+    waves: Basis | None
     acts_on: tuple[int, ...] = eqx.field(static=True)
     count: int = eqx.field(static=True)
 
@@ -219,6 +303,9 @@ class ControlledFeatures(AbstractFeatures):
     def potential(self, x: Float[Array, " d"], w: Float[Array, " r"]) -> Float[Array, ""]:
         return self.drift.potential(x[: -self.count], w[: self.drift.columns])
 
+    def laws(self) -> list[tuple[PartWaves, slice]]:
+        return self.drift.laws()
+
 
 class SumFeatures(AbstractFeatures):
     """The features of all terms, one after the other."""
@@ -242,6 +329,14 @@ class SumFeatures(AbstractFeatures):
             (t.potential(x, w[self.slice(i)]) for i, t in enumerate(self.terms)),
             jnp.zeros((), x.dtype),
         )
+
+    def laws(self) -> list[tuple[PartWaves, slice]]:
+        starts = np.cumsum([0, *(term.columns for term in self.terms)])
+        return [
+            (waves, slice(start + at.start, start + at.stop))
+            for start, term in zip(starts, self.terms, strict=False)
+            for waves, at in term.laws()
+        ]
 
     def slice(self, index: int) -> slice:
         """The positions of the weights of one term."""

@@ -105,9 +105,10 @@ def _by_jacobians(
     A row of blocks costs n gradients of κ a pair and a product with the Jacobians of Z, where
     entries one by one cost n² second derivatives.
     """
+    jacobian = found.jacobian or jax.jacfwd(found.map)
 
     def described(x):
-        return found.map(x), jax.jacfwd(found.map)(x) @ found.directions(x)
+        return found.map(x), jacobian(x) @ found.directions(x)
 
     (D, J), (E, L) = jax.vmap(described)(X), jax.vmap(described)(Z)  # (N, m), (N, m, n)
 

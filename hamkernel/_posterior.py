@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 
 from hamkernel import _require as require
+from hamkernel._features import is_of_parts
 from hamkernel._fields.base import AbstractField, FieldSum, Mean, root
 from hamkernel._fields.joined import AbstractJoinedField, FamilyField, known_of, learned_field
 from hamkernel._gram import components
@@ -29,7 +30,8 @@ from hamkernel._observations.kinds import AbstractObservations, inputs_or_parame
 from hamkernel._observations.measurements import inputs_of, observations
 from hamkernel._show import text
 from hamkernel._solvers.dense import Cholesky
-from hamkernel._solvers.fit import check_solver
+from hamkernel._solvers.fit import check_solver, features_of_parts
+from hamkernel._solvers.low_rank import LowRankConditional
 from hamkernel._solvers.problem import AbstractConditional, AbstractSolver, new_rows, problem
 from hamkernel._structures.base import AbstractMatrixKernel
 
@@ -86,10 +88,11 @@ def condition(
         UserWarning: the amplitude of K is exactly 1, as that of built-in kernels is before tuning.
     """
     check_solver(solver)
-    solver = Cholesky() if solver is None else solver
-    if solver.no_factor:
+    if solver is not None and solver.no_factor:
         raise TypeError(solver.no_factor)
     asked = problem(K, X, Y, regularization, mean, inputs, parameters).on_one_device()
+    if solver is None:
+        solver = features_of_parts() if is_of_parts(asked.kernel) else Cholesky()
     require.warn_of_float32(asked.rows.targets)
     _warn_of_amplitude(asked.kernel, asked.rows.points)
     given = solver._given(asked, progress=progress)
@@ -180,6 +183,32 @@ class Posterior(eqx.Module):
                 field has no inputs.
         """
         return jnp.stack([root(variance) for variance in jnp.diagonal(self.covariance(x, u))])
+
+    @full_precision
+    def law_deviation(
+        self, r: Num[ArrayLike, "..."], r0: Num[ArrayLike, "..."], which: int = 0
+    ) -> Float[Array, ""]:
+        """The standard deviation of w(r) − w(r₀) for a law w of `hk.Shared`, shape ().
+
+        With what the centres of the law do not carry: where no part of the data came near r, it is
+        that of the prior.
+
+        Args:
+            r: an argument of the law, as in `field.law`.
+            r0: another.
+            which: which of several laws.
+
+        Raises:
+            AttributeError: no part of the kernel is `Shared`. TypeError: the posterior is not one
+                in features, as it is where all of the kernel is `Shared`.
+        """
+        given = self.given
+        if not isinstance(given, LowRankConditional):
+            raise TypeError(
+                "law_deviation needs a posterior in features: all terms of the kernel Shared, or "
+                "solver=hk.RandomFeatures(500, jax.random.key(0))."
+            )
+        return root(given.law_variance(r, r0, which))
 
     @full_precision
     def energy_deviation(

@@ -216,7 +216,8 @@ def _evaluable(saved: Any) -> AbstractField:
 
 def _probe(field: AbstractField) -> list[list[float]]:
     """A state and the velocity there, by which a kernel of the caller's code is known again."""
-    points = np.asarray(getattr(field, "points", np.zeros((1, field.dimension))))[:64]
+    n = field.dimension  # of features, a state in which no two particles are in one place
+    points = np.asarray(getattr(field, "points", np.cos(1.0 + np.arange(n))[None]))[:64]
     velocities = np.asarray(jax.vmap(_of_state(field))(jnp.asarray(points)))
     if not np.isfinite(velocities).all():
         raise ValueError(

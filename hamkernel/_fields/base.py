@@ -156,6 +156,33 @@ class AbstractField(eqx.Module):
             )
         return self.potential
 
+    def law(self, r: Num[ArrayLike, "..."], r0: Any = None, which: int = 0) -> Float[Array, ""]:
+        """The law w of `hk.Shared` at r, such as a pair potential at a distance, shape ().
+
+        Fields say nothing of its constant: w(r) − w(r₀) with `r0`.
+
+        Args:
+            r: a distance or difference as `hk.pairs` and `hk.neighbours` measure it, or one point
+                of your own parts, shape (d,); `jax.vmap(field.law)(r)` for many.
+            r0: where the law is zero; None for the constant of the smallest norm.
+            which: which of several laws, in the order of the kernel.
+
+        Raises:
+            AttributeError: no part of the kernel is `Shared`. IndexError: there is no such law.
+        """
+        laws = self._laws()
+        if not laws:
+            raise AttributeError(
+                "the field has no law: no part of its kernel is hk.Shared(k, parts)."
+            )
+        waves, weights = laws[which]
+        at = waves.of_law(r) if r0 is None else waves.of_law(r) - waves.of_law(r0)
+        return at.astype(weights.dtype) @ weights
+
+    def _laws(self) -> list[tuple[Any, Float[Array, " m"]]]:
+        """The features of each shared law, with their weights."""
+        return []
+
     def dissipation(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """The power that is lost at x, −dH/dt = ∇HᵀR∇H along the field, shape ().
 

@@ -8,12 +8,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hamkernel._features import AbstractFeatures, SumFeatures
+from hamkernel._features import AbstractFeatures, SumFeatures, laws_of, part_waves
 from hamkernel._fields.base import AbstractField, SolverInfo, at_points, root
 from hamkernel._gram import centred
 from hamkernel._gram_operator import placed_product
 from hamkernel._machine import as_given, compiled, on_each, rows_of, split
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.structure import AbstractPotentialKernel
 
 
 class KernelField(AbstractField):
@@ -70,6 +71,18 @@ class KernelField(AbstractField):
         """`of_field`, plus the contribution `of_values(K, x, s, b)` of the energies if any."""
         S, b = self.value_points, self.value_coefficients
         return of_field if S is None or b is None else of_field + of_values(self.kernel, x, S, b)
+
+    def _laws(self) -> list[tuple[Any, Float[Array, " m"]]]:
+        found, K = [], self.kernel
+        for term in K.terms if isinstance(K, Sum) else (K,):
+            if not isinstance(term, AbstractPotentialKernel):
+                continue
+            shared = part_waves(term.kernel)
+            for waves, _ in [] if shared is None else laws_of(shared):
+                directions = jax.vmap(term.apply_transpose)(self.points, self.coefficients)
+                slopes = jax.lax.map(waves.gradients, self.points)
+                found.append((waves, jnp.einsum("jnm,jn->m", slopes, directions)))
+        return found
 
     def _term(self, kernel: Sum, position: int) -> "KernelField":
         term, Z, A = kernel.terms[position], self.points, self.coefficients
@@ -198,6 +211,9 @@ class FeatureField(AbstractField):
 
     def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         return _potential_at(self.features, x, self.weights)
+
+    def _laws(self) -> list[tuple[Any, Float[Array, " m"]]]:
+        return [(waves, self.weights[at]) for waves, at in self.features.laws()]
 
     def _term(self, kernel: Sum, position: int) -> "FeatureField":
         assert isinstance(self.features, SumFeatures)

@@ -97,11 +97,13 @@ class Descriptor(NamedTuple):
     """A map d of points and a kernel κ of its values, k(x, z) = κ(d(x), d(z)).
 
     The derivatives of k follow from those of κ and the Jacobian of d, which each point needs once.
+    It is taken in forward mode, unless there is a better `jacobian`.
     """
 
     map: Callable[[Float[Array, " n"]], Float[Array, " m"]]
     kernel: "AbstractScalarKernel"
     directions: Callable[[Float[Array, " n"]], Float[Array, "n n"]] = lambda x: jnp.eye(len(x))
+    jacobian: Callable[[Float[Array, " n"]], Float[Array, "m n"]] | None = None
 
 
 class Spectrum(eqx.Module):

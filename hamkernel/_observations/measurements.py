@@ -38,6 +38,7 @@ from hamkernel._observations.kinds import (
     refuse_swapped,
 )
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.completed import shared_laws
 from hamkernel._structures.joined import AbstractJoinedKernel
 
 
@@ -269,9 +270,10 @@ def measurements(
     Raises:
         TypeError, ValueError: as `fit` says.
     """
+    many = bool(shared_laws(K))  # parts in a state: a few states of many coordinates are enough
     if inputs is None and not isinstance(X, AbstractObservations) and not K.takes_inputs:
-        return K, measurements_of_states(*placed(velocities_at(X, Y)))
-    return measurements_of(K, placed(observations(X, Y, inputs, name=K.given)))
+        return K, measurements_of_states(*placed(velocities_at(X, Y, part=many)))
+    return measurements_of(K, placed(observations(X, Y, inputs, many, K.given)))
 
 
 def observations(

@@ -5,9 +5,11 @@ from __future__ import annotations
 import dataclasses
 from typing import Any, overload
 
+import jax
 from jaxtyping import ArrayLike, Num
 
 from hamkernel import _require as require
+from hamkernel._features import is_of_parts
 from hamkernel._fields.base import AbstractField, Mean
 from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import ControlledField, FamilyField, learned_field
@@ -23,6 +25,7 @@ from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.dense import Cholesky, copies
 from hamkernel._solvers.problem import AbstractSolver, LearnedField, Problem, problem
+from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.family import AbstractFamily
 from hamkernel._structures.joined import Controlled
@@ -173,8 +176,18 @@ def check_solver(solver: Any) -> None:
         raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
 
 
-def default_solver(given: Problem) -> AbstractSolver[KernelField]:
-    """Cholesky where it takes at most half of the memory of one device, which has all the data."""
+def features_of_parts() -> RandomFeatures:
+    """The solver in the features of shared laws, which draws nothing."""
+    return RandomFeatures(1, jax.random.key(0))
+
+
+def default_solver(given: Problem) -> AbstractSolver[Any]:
+    """Cholesky where it takes at most half of the memory of one device, which has all the data.
+
+    Of laws that many parts share the features, which are exact and few.
+    """
+    if is_of_parts(given.kernel):
+        return features_of_parts()
     rows = given.rows
     needed = dense_bytes(rows.size, rows.size, rows.targets.dtype, copies(given))
     memory = memory_bytes()

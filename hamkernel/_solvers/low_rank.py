@@ -32,7 +32,7 @@ Wilson, Borovitskiy, Terenin, Mostowsky & Deisenroth (2020), arXiv 2002.09309.
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -421,6 +421,19 @@ class LowRankConditional(AbstractConditional):
 
     def _whitened_covariance(self, block: AbstractBlock) -> Float[Array, "r d"]:
         return solve_triangular(self.R, self.span.of(block).T, trans="T")
+
+    def law_variance(self, r: Any, r0: Any, which: int) -> Float[Array, ""]:
+        """The variance of w(r) − w(r₀) of a shared law w."""
+        laws = self.span.features.laws() if isinstance(self.span, FeatureSpan) else []
+        if not laws:
+            raise AttributeError("the posterior has no law: its kernel is no hk.Shared(k, parts).")
+        waves, at = laws[which]
+        dtype = self.R.dtype
+        known = jnp.zeros(len(self.R), dtype)
+        known = known.at[at].set((waves.of_law(r) - waves.of_law(r0)).astype(dtype))
+        rest = waves.kernel.missing(waves.kernel.point(r), waves.kernel.point(r0)).astype(dtype)
+        whitened = solve_triangular(self.R, known, trans="T")
+        return self.ridge * whitened @ whitened + waves.scale.astype(dtype) * rest
 
     def updated(self, new: Measurements) -> "LowRankConditional":
         rows = self.rows.joined(new)

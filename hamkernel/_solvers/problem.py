@@ -26,7 +26,7 @@ from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import Measurements, measurements, measurements_of
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.friction import with_rest_speed
+from hamkernel._structures.completed import completed
 from hamkernel._structures.joined import AbstractJoinedKernel
 
 
@@ -88,7 +88,7 @@ def problem(
     spread = rows_of(X) if isinstance(X, jax.Array) else None
     K, rows = measurements(matrix_kernel(K), X, Y, inputs_or_parameters(inputs, parameters, K))
     K.check_points(rows.points)
-    K = with_rest_speed(K, rows.points, rows.dimension)
+    K = completed(K, rows.points, rows.dimension)
     if len(rows.energies) and K.no_potential:
         raise AttributeError(f"energies were given, and {K.no_potential}")
     regularization = require.ridge(regularization, rows.targets.dtype)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.friction import with_rest_speed
+from hamkernel._structures.completed import completed
 from hamkernel._trajectories.likelihood import closed_form
 from hamkernel._trajectories.model import Model, with_amplitude
 from hamkernel._trajectories.search import LEAST_NOISE, Bounds, losses, most_likely, searched
@@ -50,7 +50,7 @@ class Evidence(eqx.Module):
         the noise, which had to explain what `part` does.
         """
         n, K = len(self.scale), self.model.kernel
-        part = with_rest_speed(with_amplitude(part), self.points, n)
+        part = completed(with_amplitude(part), self.points, n)
         part.check_dimension(n)
         larger = self.model._replace(kernel=K.with_states(K.of_states + part))
         flat = np.asarray(larger.flat)

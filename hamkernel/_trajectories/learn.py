@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,7 @@ from hamkernel._observations.kinds import inputs_or_parameters
 from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.friction import with_rest_speed
+from hamkernel._structures.completed import completed
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._trajectories.diagnostics import check_identifiable, diagnostics
 from hamkernel._trajectories.evidence import Evidence
@@ -34,9 +34,9 @@ from hamkernel._trajectories.iteration import (
     Task,
     asks_for_process,
     begin,
+    chosen,
     initial_loss,
     iterate,
-    likelier,
 )
 from hamkernel._trajectories.kalman import (
     as_observations,
@@ -151,37 +151,89 @@ def learn(
     data = preprocess(runs, known)
     bar.update()
     measured = np.isfinite(data.noise)
+    K = completed(K, jnp.asarray(sampled(data)[0]), runs.dimension)
+    most_landmarks = None if solver is None else solver.max_points
+    asked = _asked(K, known, data, given, landmarks(data, most_landmarks))
+    seconds = seconds_of_iteration(data, asked.landmarks[1])
+    bar.set_description(f"learning, {seconds:.0f} s an iteration")
+    if not runs.is_decided:
+        task, at = asked.begun(data)
+        runs, data = decided(runs, data, lambda d: initial_loss(task._replace(data=d), at.model))
+    q = asked.floor if process is None else np.maximum(process, asked.floor)
+    end = iterate(*asked.begun(data, q), most, bar)
+    if process is None and asks_for_process(end, asked.impulse):
+
+        def on_part(part: Preprocessed) -> tuple[End, End]:
+            ends = (asked.begun(part, sought=sought) for sought in (False, True))
+            first, second = (iterate(*begun, most, bar) for begun in ends)
+            return first, second
+
+        end = chosen(end, iterate(*asked.begun(data, sought=True), most, bar), on_part)
+    bar.close()
+    return _learned(runs, mean, end, process, given is not None, measured, again)
+
+
+class _Asked(NamedTuple):
+    """What all passes begin from.
+
+    Attributes:
+        kernel: the kernel.
+        known: the mean.
+        log_noise: the first guess of log σ, shape (n,).
+        free: the coordinates whose noise is estimated.
+        X: points along the smoothed runs.
+        Y: their velocities, less those of the mean.
+        landmarks: the landmarks, how many to begin with, how many are quick, and the cap.
+        spacing: the least lengthscale.
+        impulse: log of the process noise that would explain all of the motion.
+        floor: the process noise that stands for none.
+    """
+
+    kernel: AbstractMatrixKernel
+    known: Any
+    log_noise: Float[Array, " n"]
+    free: np.ndarray
+    X: np.ndarray
+    Y: np.ndarray
+    landmarks: tuple[np.ndarray, int, int, bool]
+    spacing: float
+    impulse: np.ndarray
+    floor: np.ndarray
+
+    def begun(
+        self, data: Preprocessed, q: np.ndarray | None = None, sought: bool = False
+    ) -> tuple[Task, Current]:
+        """The task and its first path, with process noise q, or with one that is looked for."""
+        with np.errstate(divide="ignore"):
+            log_q = jnp.log(jnp.asarray(self.floor if q is None else q))
+        model, moves = Model(self.kernel, self.log_noise, log_q), self.impulse if sought else None
+        given = self.X, self.Y, data.scale, self.free, self.spacing, moves
+        bounds, design = bounds_and_design(model, *given)
+        wide = jnp.asarray(100 * data.scale)  # a prior of starts that says next to nothing
+        pieces = equal_pieces(data.runs, LONG)
+        task = Task(data, self.known, *self.landmarks, bounds, wide, pieces)
+        return task, begin(task, model, design)
+
+
+def _asked(K, known, data: Preprocessed, given: np.ndarray | None, chosen) -> _Asked:
+    """What the passes need, from the smoothed runs; `chosen` are the landmarks."""
     X, Y = sampled(data)
     if known is not None:
         Y = Y - np.asarray(jax.vmap(known)(jnp.asarray(X)))
-    log_noise = jnp.log(jnp.asarray(_first_noise(data) if given is None else given))
-    K = with_rest_speed(K, jnp.asarray(X), runs.dimension)
-    S, first, quick, capped = landmarks(data, None if solver is None else solver.max_points)
-    bar.set_description(f"learning, {seconds_of_iteration(data, first):.0f} s an iteration")
-
-    spacing = landmark_spacing(X, S[:first], data.scale)
+    S, first = chosen[:2]
     impulse = impulses(K, jnp.asarray(S[:first]), Y, data)
-    wide = jnp.asarray(100 * data.scale)  # a prior of starts that says next to nothing
-
-    def asked(q: np.ndarray, sought: bool = False) -> tuple[Task, Current]:
-        with np.errstate(divide="ignore"):
-            model = Model(K, log_noise, jnp.log(jnp.asarray(q)))
-        free, moves = measured & (given is None), impulse if sought else None
-        bounds, design = bounds_and_design(model, X, Y, data.scale, free, spacing, moves)
-        pieces = equal_pieces(data.runs, LONG)
-        task = Task(data, known, S, first, quick, capped, bounds, wide, pieces)
-        return task, begin(task, model, design)
-
-    floor = LEAST_NOISE * np.exp(impulse)
-    if not runs.is_decided:
-        task, at = asked(floor)
-        runs, data = decided(runs, data, lambda d: initial_loss(task._replace(data=d), at.model))
-    q = floor if process is None else np.maximum(process, floor)
-    end = iterate(*asked(q), most, bar)
-    if process is None and asks_for_process(end, impulse):
-        end = likelier(end, iterate(*asked(floor, sought=True), most, bar))
-    bar.close()
-    return _learned(runs, mean, end, process, given is not None, measured, again)
+    return _Asked(
+        kernel=K,
+        known=known,
+        log_noise=jnp.log(jnp.asarray(_first_noise(data) if given is None else given)),
+        free=np.isfinite(data.noise) & (given is None),
+        X=X,
+        Y=Y,
+        landmarks=chosen,
+        spacing=landmark_spacing(X, S[:first], data.scale),
+        impulse=impulse,
+        floor=LEAST_NOISE * np.exp(impulse),
+    )
 
 
 def _bar(progress: bool | None, total: int) -> Any:

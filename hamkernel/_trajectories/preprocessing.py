@@ -56,6 +56,16 @@ class PreprocessedRun(NamedTuple):
     def duration(self) -> float:
         return float(self.times[-1] - self.times[0])
 
+    def part(self, samples: slice) -> "PreprocessedRun":
+        """The samples of a slice, and the intervals between them."""
+        first, stop, _ = samples.indices(len(self.times))
+        at, between = slice(first, stop), slice(first, stop - 1)
+        return PreprocessedRun(
+            self.times[at] - self.times[first],
+            *(each[at] for each in (self.states, self.counts, self.scatter, self.path)),
+            *(each[between] for each in (self.nodes, self.slopes, self.inputs)),
+        )
+
     def joined(self, path: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T d"]:
         """Points (x, u) at the samples, for a path there."""
         return np.concatenate([path, at_samples(self.inputs)], axis=1)
@@ -371,6 +381,12 @@ def sampled(
     Y = np.concatenate([run.slopes.reshape(-1, n) for run in runs])
     chosen = np.linspace(0, len(X) - 1, count).round().astype(int)
     return X[chosen], Y[chosen]
+
+
+def time_of_swing(data: Preprocessed) -> float:
+    """2π times the median over coordinates of deviation over speed: the period of a sine."""
+    speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
+    return float(2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)))
 
 
 def first_landmarks(d: int) -> int:

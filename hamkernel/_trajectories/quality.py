@@ -6,10 +6,10 @@ from jaxtyping import Array, Float
 
 from hamkernel._structures.friction import frictions
 from hamkernel._trajectories.diagnostics import FitQuality
-from hamkernel._trajectories.free_run import error_over_constant, stretches
+from hamkernel._trajectories.free_run import error_over_constant, of_two_swings
 from hamkernel._trajectories.iteration import End, asks_for_landmarks, initial_loss, noisy_counts
 from hamkernel._trajectories.kalman import smoothed_path
-from hamkernel._trajectories.preprocessing import decided, sampled
+from hamkernel._trajectories.preprocessing import decided, sampled, time_of_swing
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.search import gain_of_friction, gain_of_inertia
 from hamkernel._trajectories.segments import Piece
@@ -36,7 +36,7 @@ def quality(
     squares, free = float((z**2).sum()), float((counts > 0).sum())
     speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
     spacing = np.median(np.concatenate([np.diff(t) for t in times]))
-    swing = 2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)) / spacing
+    swing = time_of_swing(data) / spacing
     period = np.maximum(swing, 1.0) * spacing
     dropped = _samples([piece for piece, good in pieces if not good], end, times)
     residuals = [x - path for x, path in zip(seen, states, strict=True)]
@@ -144,9 +144,7 @@ def _free_run(end: End, kept: Float[np.ndarray, " R"], period: float) -> float:
     used = [(run, path) for run, path, k in zip(data.runs, paths, kept, strict=True) if k]
     if not used:
         return np.inf
-    spacing = np.median(np.concatenate([np.diff(run.times) for run, _ in used]))
-    length = int(np.clip(2 * period / spacing, 4, 64))
-    part = stretches([run for run, _ in used], [path for _, path in used], length)
+    part = of_two_swings([run for run, _ in used], [path for _, path in used], period)
     return error_over_constant(end.now.field, part, data.scale)
 
 

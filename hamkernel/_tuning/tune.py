@@ -22,12 +22,13 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._closed_forms import Folds
+from hamkernel._features import is_of_parts
 from hamkernel._fields.base import AbstractField, Mean
 from hamkernel._machine import compiled, full_precision, one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import observations
 from hamkernel._show import described
-from hamkernel._solvers.fit import check_solver, field_of_problem
+from hamkernel._solvers.fit import check_solver, features_of_parts, field_of_problem
 from hamkernel._solvers.problem import AbstractSolver, Problem, problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._tuning.minimiser import MinimiserRun
@@ -197,11 +198,13 @@ def tune(
     warn_of_constants(K)
     given = problem(K, X, Y, regularization, mean, inputs, parameters)
     K, rows = given.kernel, given.on_one_device().rows
+    if solver is None and is_of_parts(K):
+        solver = features_of_parts()
     if rows.states is not None:
         _warn_of_unequal_sizes(rows.states[1])
     inputs = inputs_or_parameters(inputs, parameters)
     plain = mean is None and inputs is None and not isinstance(X, AbstractObservations)
-    data: Any = rows.states if plain else (observations(X, Y, inputs), None)
+    data: Any = rows.states if plain else (observations(X, Y, inputs, part=True), None)
     criterion = criterion_of(objective, rows.count, folds, data)
     _warn_of_few_folds(criterion, folds)
     low_rank = solver is not None and solver.is_low_rank and not criterion.custom

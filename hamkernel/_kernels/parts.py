@@ -1,0 +1,337 @@
+"""Laws that many parts share: u(x) = Σ_p c_p w(φ_p(x)) with one unknown function w.
+
+A functional of u is the sum of the same functionals of w at the points φ_p(x), along Dφ_p(x) v. So
+one Gaussian process w ~ GP(0, k) of the parts gives u the kernel
+
+    k_S(x, z) = Σ_pq c_p c_q k(φ_p(x), φ_q(z)).
+
+In the span of centres c_1 … c_m in the space of the parts, w(r) = k(r, C) L⁻ᵀ a with L Lᵀ = k(C, C)
+and a ~ N(0, I), so that u(x) = Φ(x)·a with
+
+    Φ(x) = L⁻¹ Σ_p c_p k(C, φ_p(x)),   ∂Φ_j/∂x = Σ_p c_p Dφ_p(x)ᵀ ∇k(φ_p(x), ·),
+
+and a system of any size has m unknowns. One reverse derivative of the parts serves each of the m.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, ArrayLike, Float
+
+from hamkernel import _require as require
+from hamkernel._kernels.base import (
+    AbstractScalarKernel,
+    Descriptor,
+    Point,
+    as_scalar_kernel,
+    one_point,
+)
+from hamkernel._kernels.functions import as_pytree
+from hamkernel._show import call, described, text
+
+_CENTRES = 64  # a law of one variable: lengthscales from a thirtieth of the range on
+
+
+class Shared(AbstractScalarKernel):
+    """The kernel of u(x) = Σ_p c_p w(φ_p(x)): one unknown law w that many parts share.
+
+        K = hk.Symplectic(hk.Shared(hk.Matern(2.5, 1.0), hk.pairs(particles=30, dim=2)))
+        field = hk.fit(K, X, Y, 1e-6, mean=hk.kinetic(mass=1.0))
+        V = jax.vmap(field.law)(r)  # the pair potential, up to a constant
+
+    A constant in w moves nothing, so `field.law` is known up to one; of several laws a linear term
+    in one may be carried by another. Where φ takes no values in the data the law is unknown, and
+    `posterior.law_deviation` says so.
+
+    Args:
+        kernel: the kernel k of w, on points of the parts, (d,).
+        parts: x (n,) -> points (P, d), or (points, weights c) with weights (P,); `hk.pairs`,
+            `hk.neighbours`, `hk.sites`, or a function of your own.
+        centres: points of the parts, (m, d), that carry w. If None, up to 64 are spread over the
+            parts of the data when a fit begins.
+
+    Raises:
+        TypeError: `kernel` is no scalar kernel or `parts` no function. ValueError, when called:
+            `parts` returns something else.
+    """
+
+    kernel: AbstractScalarKernel
+    parts: Callable[..., Any]
+    # Python numbers, since arrays of a kernel are trained.
+    centres: tuple[tuple[float, ...], ...] | None = eqx.field(static=True)
+
+    def __init__(self, kernel: Any, parts: Callable[..., Any], centres: ArrayLike | None = None):
+        if not callable(parts) or isinstance(parts, AbstractScalarKernel):
+            raise TypeError(
+                "Shared needs a kernel and then a function x -> points (P, d), such as "
+                f"Shared(k, hk.pairs(particles=30, dim=2)); got {parts!r} as parts."
+            )
+        self.kernel = as_scalar_kernel(kernel)
+        self.parts = as_pytree(parts)
+        self.centres = None
+        if centres is not None:
+            given = np.asarray(centres, float)
+            given = given[:, None] if given.ndim == 1 else given
+            self.centres = tuple(tuple(map(float, point)) for point in given)
+
+    def __repr__(self) -> str:
+        said = [] if self.centres is None else [f"centres={len(self.centres)}"]
+        return call("Shared", [repr(self.kernel), text(self.parts), *said])
+
+    def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
+        if self.centres is not None:
+            return self.features(x) @ self.features(z)
+        (X, a), (Z, b) = self.of(x), self.of(z)
+        rows = jax.vmap(jax.vmap(self.kernel, (None, 0)), (0, None))(X, Z)
+        return a @ rows @ b
+
+    def of(self, x: Float[Array, " n"]) -> "Parts":
+        """The points and the weights of the parts of one state."""
+        x = one_point(x)
+        found = self.parts(x)
+        points, weights = found if isinstance(found, tuple) else (found, 1.0)
+        if jnp.ndim(points) != 2 or jnp.shape(weights) not in ((), jnp.shape(points)[:1]):
+            raise ValueError(
+                f"the parts of Shared are of shape {jnp.shape(points)}, with weights "
+                f"{jnp.shape(weights)}, for a state of shape {x.shape}; points (P, d), and weights "
+                "(P,) if any, are needed. For one number a part return points[:, None]."
+            )
+        points = require.floating(points, "the parts of Shared").astype(x.dtype)
+        weights = require.floating(weights, "the weights of Shared").astype(x.dtype)
+        return Parts(points, jnp.broadcast_to(weights, points.shape[:1]))
+
+    def features(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+        """Φ(x), with k_S(x, z) = Φ(x)·Φ(z)."""
+        points, weights = self.of(x)
+        return self._whitened(weights @ self._columns(points))
+
+    def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n m"]:
+        """The gradients of the features, by one reverse derivative of the parts for each."""
+        (points, weights), back = jax.vjp(self.of, x)
+        C = self._points(x.dtype)
+
+        def of_centre(c):
+            value, slope = jax.vmap(jax.value_and_grad(self.kernel), (0, None))(points, c)
+            return back(Parts(weights[:, None] * slope, value))[0]
+
+        return self._whitened(jax.lax.map(of_centre, C, batch_size=16)).T
+
+    def point(self, r: ArrayLike) -> Float[Array, " d"]:
+        """The point of the parts for an argument r of the law, such as log r for a distance r."""
+        point = jnp.atleast_1d(require.floating(r, "r"))
+        point = getattr(self.parts, "coordinate", lambda r: r)(point)
+        d = len((self.centres or ((0.0,),))[0])
+        if point.shape != (d,):
+            raise ValueError(
+                f"r has shape {point.shape} and the law takes one point of shape ({d},); "
+                "jax.vmap(field.law)(r) for many."
+            )
+        return point
+
+    def law(self, point: Float[Array, " d"]) -> Float[Array, " m"]:
+        """L⁻¹ k(C, point), the features of w at one point of the parts."""
+        return self._whitened(self._columns(point[None])[0])
+
+    def missing(self, point: Float[Array, " d"], other: Float[Array, " d"]) -> Float[Array, ""]:
+        """The prior variance of w(point) − w(other) that the centres do not carry."""
+        k = self.kernel
+        whole = k(point, point) - 2 * k(point, other) + k(other, other)
+        known = self.law(point) - self.law(other)
+        return jnp.maximum(whole - known @ known, 0.0)
+
+    def _points(self, dtype: Any) -> Float[Array, "m d"]:
+        assert self.centres is not None
+        return jnp.asarray(np.asarray(self.centres), dtype)
+
+    def _columns(self, points: Float[Array, "P d"]) -> Float[Array, "P m"]:
+        C = self._points(points.dtype)
+        return jax.vmap(jax.vmap(self.kernel, (None, 0)), (0, None))(points, C)
+
+    def _whitened(self, rows: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+        C = self._points(rows.dtype)
+        G = jax.vmap(jax.vmap(self.kernel, (None, 0)), (0, None))(C, C)
+        # A hundred times the rounding bounds how finely centres resolve, and biases nothing.
+        rounding = 100 * jnp.finfo(G.dtype).eps * len(G) * jnp.diagonal(G).mean()
+        L = jnp.linalg.cholesky(G + rounding * jnp.eye(len(G), dtype=G.dtype))
+        return solve_triangular(L, rows, lower=True)
+
+    def through_descriptor(self, n: int) -> Descriptor | None:
+        if self.centres is None:
+            return None
+        return Descriptor(self.features, InnerProduct(), jacobian=lambda x: self.gradients(x).T)
+
+    @property
+    def has_amplitude(self) -> bool:
+        return self.kernel.has_amplitude
+
+    def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N d"]:
+        return self.spread(X, 16 * _CENTRES)
+
+    def spread(self, X: Float[np.ndarray, "N n"], most: int) -> Float[np.ndarray, "m d"]:
+        """Up to `most` points of the parts of the states X, each the farthest from those before."""
+        rows = jnp.asarray(X[np.linspace(0, len(X) - 1, min(len(X), 256)).astype(int)])
+        found = np.asarray(jax.lax.map(lambda x: self.of(x).points, rows))
+        points = found.reshape(-1, found.shape[-1])
+        low, high = points.min(axis=0), points.max(axis=0)
+        if not (np.isfinite(low).all() and np.isfinite(high).all()):
+            raise ValueError(
+                "the parts of Shared are not finite at the data: two particles in one place have "
+                "no distance to take a logarithm of. Leave such states out."
+            )
+        unit = points / np.where(high > low, high - low, 1.0)
+        if points.shape[1] == 1 and len(points) > most:
+            # On a line: evenly over the range, each the nearest of the data.
+            order = np.argsort(points[:, 0])
+            wanted = np.linspace(low[0], high[0], most)
+            at = np.searchsorted(points[order, 0], wanted).clip(0, len(points) - 1)
+            return np.unique(points[order[at]], axis=0)
+        chosen = [int(np.argmin(unit[:, 0]))]
+        distance = np.full(len(unit), np.inf)
+        while len(chosen) < most:
+            distance = np.minimum(distance, np.linalg.norm(unit - unit[chosen[-1]], axis=1))
+            if not distance.max() > 1e-6:
+                break
+            chosen.append(int(np.argmax(distance)))
+        return points[chosen]
+
+    def with_centres(self, X: Float[np.ndarray, "N n"]) -> "Shared":
+        """The same with centres over the parts of the states X."""
+        return Shared(self.kernel, self.parts, self.spread(X, _CENTRES))
+
+
+class Parts(NamedTuple):
+    """The points of the parts of one state, shape (P, d), and their weights, shape (P,)."""
+
+    points: Float[Array, "P d"]
+    weights: Float[Array, " P"]
+
+
+class InnerProduct(AbstractScalarKernel):
+    """k(d, e) = d·e, of features."""
+
+    def __call__(self, x: Point, z: Point) -> Float[Array, ""]:
+        return x @ z
+
+
+class _Pairs(eqx.Module):
+    """Distances of pairs of particles; made by `pairs`."""
+
+    first: tuple[int, ...] = eqx.field(static=True)
+    second: tuple[int, ...] = eqx.field(static=True)
+    particles: int = eqx.field(static=True)
+    dim: int = eqx.field(static=True)
+    box: float | None = eqx.field(static=True)
+    of: str = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        return f"pairs({len(self.first)} of {self.particles} particles, of={self.of!r})"
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, "P 1"]:
+        size = self.particles * self.dim
+        if len(x) not in (size, 2 * size):
+            raise ValueError(
+                f"a state of {self.particles} particles in {self.dim} dimensions has {size} "
+                f"positions, and as many momenta; got {len(x)} coordinates."
+            )
+        q = x[:size].reshape(self.particles, self.dim)
+        apart = q[np.asarray(self.first)] - q[np.asarray(self.second)]
+        if self.box is not None:
+            apart = apart - self.box * jax.lax.stop_gradient(jnp.round(apart / self.box))
+        return self.coordinate(jnp.sqrt(jnp.sum(apart**2, axis=1)))[:, None]
+
+    def coordinate(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The coordinate in which the law is smooth: r, log r or 1/r."""
+        return {"distance": lambda r: r, "log": jnp.log, "inverse": lambda r: 1 / r}[self.of](r)
+
+
+def pairs(
+    particles: int,
+    dim: int,
+    box: float | None = None,
+    of: Literal["distance", "log", "inverse"] = "distance",
+    among: Sequence[int] | tuple[Sequence[int], Sequence[int]] | None = None,
+) -> Callable[..., Array]:
+    """The distances of all pairs of particles, x -> (P, 1), for `hk.Shared`.
+
+    States are (q, p), or q alone, with q the positions of the first particle, of the second, ….
+
+    Args:
+        particles: how many there are.
+        dim: the dimension of space.
+        box: the side of a periodic box, with the nearest image; None without one.
+        of: the coordinate of the law: "distance" r; "log" or "inverse" for laws that vary by
+            many orders, as of Lennard-Jones or gravity.
+        among: particles between which the law acts, or two groups of them, one against the other;
+            all if None. A sum of `Shared` has a law for each pair of species.
+
+    Raises:
+        ValueError: a number is not positive, `of` is unknown, or a particle is not there.
+    """
+    particles, dim = require.count(particles, "particles"), require.count(dim, "dim")
+    if of not in ("distance", "log", "inverse"):
+        raise ValueError(f"of must be 'distance', 'log' or 'inverse'; got {of!r}.")
+    if box is not None:
+        box = require.positive_number(box, "box")
+    groups: Any = range(particles) if among is None else among
+    left, right = groups if np.ndim(groups[0]) else (groups, groups)
+    two = sorted({(min(i, j), max(i, j)) for i in left for j in right if i != j})
+    if not two or min(i for i, _ in two) < 0 or max(j for _, j in two) >= particles:
+        raise ValueError(
+            f"there is no pair, or one of a particle that is not among 0 to {particles - 1}."
+        )
+    first, second = zip(*two, strict=True)
+    return _Pairs(tuple(map(int, first)), tuple(map(int, second)), particles, dim, box, of)
+
+
+class _Sites(eqx.Module):
+    """The positions of sites, or the differences of neighbours; made by `sites`, `neighbours`."""
+
+    count: int = eqx.field(static=True)
+    neighbours: bool = eqx.field(static=True)
+    periodic: bool = eqx.field(static=True)
+
+    def __repr__(self) -> str:
+        return described(self)
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, "P 1"]:
+        if len(x) not in (self.count, 2 * self.count):
+            raise ValueError(
+                f"a state of {self.count} sites has {self.count} positions, and as many momenta; "
+                f"got {len(x)} coordinates."
+            )
+        q = x[: self.count]
+        if not self.neighbours:
+            return q[:, None]
+        return (jnp.roll(q, -1) - q if self.periodic else jnp.diff(q))[:, None]
+
+
+def neighbours(sites: int, periodic: bool = False) -> Callable[..., Array]:
+    """The differences qᵢ₊₁ − qᵢ along a chain, x -> (P, 1), for `hk.Shared`.
+
+    Args:
+        sites: how many there are; states are (q, p), or q alone.
+        periodic: whether the first follows the last.
+
+    Raises:
+        ValueError: there are fewer than two sites.
+    """
+    if require.count(sites, "sites") < 2:
+        raise ValueError("a chain needs at least two sites.")
+    return _Sites(sites, neighbours=True, periodic=bool(periodic))
+
+
+def sites(count: int) -> Callable[..., Array]:
+    """The positions qᵢ of sites, x -> (P, 1), for a law of each site, for `hk.Shared`.
+
+    Args:
+        count: how many there are; states are (q, p), or q alone.
+
+    Raises:
+        ValueError: there is none.
+    """
+    return _Sites(require.count(count, "count"), neighbours=False, periodic=False)

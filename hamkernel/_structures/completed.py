@@ -1,0 +1,40 @@
+"""Kernels with what only the data can tell: rest speeds of friction, centres of shared laws."""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from hamkernel import _require as require
+from hamkernel._kernels.parts import Shared
+from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.friction import with_rest_speed
+
+
+def completed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> Any:
+    """K with a rest speed in every `Friction`, and centres in every `Shared`, from the states X."""
+    K = with_rest_speed(K, X, n)
+    if all(shared.centres is not None for shared in shared_laws(K)):
+        return K
+    require.untraced("hk.Shared() without centres", "Name them: hk.Shared(k, parts, centres).", X)
+    with require.eager():
+        states = np.asarray(X)[:, :n]
+
+    def carried(node: Any) -> Any:
+        return node.with_centres(states) if _lacks_centres(node) else node
+
+    return jax.tree.map(carried, K, is_leaf=_lacks_centres)
+
+
+def shared_laws(K: Any) -> list[Shared]:
+    """The laws within K that many parts share."""
+    return [node for node in jax.tree.leaves(K, is_leaf=_is_shared) if _is_shared(node)]
+
+
+def _is_shared(node: Any) -> bool:
+    return isinstance(node, Shared)
+
+
+def _lacks_centres(node: Any) -> bool:
+    return isinstance(node, Shared) and node.centres is None

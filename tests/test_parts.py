@@ -1,0 +1,208 @@
+"""Laws that many parts share: against double sums in NumPy, and against the law of the data."""
+
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hamkernel as hk
+
+RNG = np.random.default_rng(0)
+
+
+def spring(r):
+    return 0.5 * (r - 1.0) ** 2 + 0.3 * np.cos(3 * r)
+
+
+def forces(q):
+    """The forces of the spring law between all pairs, by a loop; q of shape (particles, 2)."""
+    out = np.zeros_like(q)
+    for i in range(len(q)):
+        for j in range(len(q)):
+            if i != j:
+                apart = q[i] - q[j]
+                r = np.linalg.norm(apart)
+                out[i] -= ((r - 1.0) - 0.9 * np.sin(3 * r)) * apart / r
+    return out
+
+
+def states(count, particles=5, noise=0.0):
+    q = RNG.normal(size=(count, particles, 2))
+    p = RNG.normal(size=(count, particles, 2))
+    X = np.concatenate([q.reshape(count, -1), p.reshape(count, -1)], axis=1)
+    F = np.stack([forces(each) for each in q]).reshape(count, -1)
+    Y = np.concatenate([p.reshape(count, -1), F], axis=1)
+    return X, Y + noise * RNG.normal(size=Y.shape)
+
+
+K = hk.Symplectic(100.0 * hk.Shared(hk.Gaussian(1.0), hk.pairs(particles=5, dim=2)))
+
+
+def test_the_kernel_is_the_double_sum():
+    inner, parts = hk.Matern(2.5, 0.7), hk.pairs(4, 2)
+    x, z = RNG.normal(size=(2, 16))
+
+    def distances(x):
+        q = x[:8].reshape(4, 2)
+        return [np.linalg.norm(q[i] - q[j]) for i in range(4) for j in range(i)]
+
+    wanted = sum(
+        float(inner(jnp.array([r]), jnp.array([s]))) for r in distances(x) for s in distances(z)
+    )
+    np.testing.assert_allclose(hk.Shared(inner, parts)(x, z), wanted)
+    # With centres everywhere among the parts the span has next to all of it.
+    centres = np.linspace(0.01, 6, 200)
+    np.testing.assert_allclose(hk.Shared(inner, parts, centres)(x, z), wanted, rtol=1e-4)
+
+
+def test_weights_and_points_may_be_of_any_kind():
+    def parts(x):
+        return jnp.stack([x[:2], x[2:]]), jnp.array([2.0, -1.0])
+
+    k = hk.Gaussian(1.3)
+    x, z = RNG.normal(size=(2, 4))
+    wanted = sum(
+        a * b * k(jnp.asarray(r), jnp.asarray(s))
+        for a, r in ((2.0, x[:2]), (-1.0, x[2:]))
+        for b, s in ((2.0, z[:2]), (-1.0, z[2:]))
+    )
+    np.testing.assert_allclose(hk.Shared(k, parts)(x, z), wanted)
+
+
+@pytest.mark.parametrize(
+    ("parts", "x", "wanted"),
+    [
+        (hk.neighbours(4), np.array([0.0, 1.0, 4.0, 9.0]), [1, 3, 5]),
+        (hk.neighbours(3, periodic=True), np.array([0.0, 1.0, 4.0, 9, 9, 9]), [1, 3, -4]),
+        (hk.sites(2), np.array([3.0, 7.0, 1.0, 1.0]), [3, 7]),
+        (hk.pairs(3, 1), np.array([0.0, 1.0, 5.0]), [1, 5, 4]),
+        (hk.pairs(3, 1, among=(1, 2)), np.array([0.0, 1.0, 5.0]), [4]),
+        (hk.pairs(3, 1, among=((0,), (1, 2))), np.array([0.0, 1.0, 5.0]), [1, 5]),
+        (hk.pairs(2, 1, box=4.0), np.array([0.5, 3.5]), [1]),
+        (hk.pairs(2, 1, of="log"), np.array([0.0, 2.0]), [np.log(2)]),
+        (hk.pairs(2, 1, of="inverse"), np.array([0.0, 2.0]), [0.5]),
+    ],
+)
+def test_ready_made_parts(parts, x, wanted):
+    np.testing.assert_allclose(np.ravel(parts(jnp.asarray(x))), wanted)
+    with pytest.raises(ValueError, match="got 7 coordinates"):
+        parts(jnp.zeros(7))
+
+
+def test_gradients_of_the_features_are_those_of_jax():
+    shared = hk.Shared(hk.Gaussian(0.8), hk.pairs(4, 2), np.linspace(0.1, 4, 12))
+    x = jnp.asarray(RNG.normal(size=16))
+    np.testing.assert_allclose(
+        shared.gradients(x), jax.jacrev(shared.features)(x).T, rtol=1e-6, atol=1e-9
+    )
+    G = hk.gram(hk.Symplectic(shared), x[None], 2 * x[None])[0, :, 0]
+    J = np.kron([[0, 1], [-1, 0]], np.eye(8))
+    mixed = jax.jacfwd(jax.jacrev(shared, argnums=0), argnums=1)(x, 2 * x)
+    np.testing.assert_allclose(G, J @ mixed @ J.T, rtol=1e-6, atol=1e-8)
+
+
+@pytest.fixture(scope="module")
+def learned():
+    X, Y = states(12)
+    return hk.fit(K, X, Y, 1e-10, mean=hk.kinetic(1.0)), X, Y
+
+
+def test_a_law_is_found_from_a_few_states(learned):
+    field, X, Y = learned
+    others, truth = states(10)
+    error = np.asarray(field.evaluate(others)) - truth
+    assert np.sqrt(np.mean(error**2) / np.mean(truth**2)) < 0.01
+    r = np.linspace(0.5, 3.0, 30)
+    law = jax.vmap(lambda r: field.law(r, 1.0))(r)
+    np.testing.assert_allclose(law, spring(r) - spring(1.0), atol=5e-3)
+    # Negative control: without the parts as many states say next to nothing.
+    with pytest.warns(UserWarning, match="fewer points than coordinates"):
+        plain = hk.fit(hk.Symplectic(hk.Gaussian(3.0)), X, Y, 1e-6, mean=hk.kinetic(1.0))
+    error = np.asarray(plain.evaluate(others)) - truth
+    assert np.sqrt(np.mean(error**2) / np.mean(truth**2)) > 0.1
+
+
+def test_all_solvers_find_the_same_law(learned):
+    field, X, Y = learned
+    for solver in (hk.Cholesky(), hk.Nystrom(max_points=12)):
+        other = hk.fit(K, X, Y, 1e-6, mean=hk.kinetic(1.0), solver=solver)
+        own = hk.fit(K, X, Y, 1e-6, mean=hk.kinetic(1.0))
+        np.testing.assert_allclose(other(X[0]), own(X[0]), rtol=1e-4, atol=1e-4)
+        np.testing.assert_allclose(other.law(1.7, 1.0), own.law(1.7, 1.0), atol=1e-4)
+    np.testing.assert_allclose(
+        field.potential(X[0]) - field.potential(X[1]),
+        _energy(X[0]) - _energy(X[1]),
+        atol=0.05,
+    )
+
+
+def _energy(x):
+    q = x[:10].reshape(5, 2)
+    pairs = sum(spring(np.linalg.norm(q[i] - q[j])) for i in range(5) for j in range(i))
+    return pairs + 0.5 * x[10:] @ x[10:]
+
+
+def test_the_band_of_the_law_is_wide_where_no_pair_was(learned):
+    _, X, Y = learned
+    noisy = Y + 0.05 * RNG.normal(size=Y.shape)
+    posterior = hk.condition(K, X, noisy, 0.05**2 / len(X), mean=hk.kinetic(1.0))
+    r = np.linspace(0.5, 3.0, 40)
+    error = np.array([posterior.field.law(s, 1.0) for s in r]) - (spring(r) - spring(1.0))
+    band = np.array([posterior.law_deviation(s, 1.0) for s in r])
+    assert 0.8 < np.mean(np.abs(error) < 2 * band + 1e-12) <= 1
+    assert posterior.law_deviation(15.0, 1.0) > 30 * band.max()
+    np.testing.assert_allclose(
+        posterior.law_deviation(15.0, 14.0) ** 2, 200 * (1 - np.exp(-0.5)), rtol=0.02
+    )
+    assert posterior.law_deviation(1.0, 1.0) == 0
+
+
+def test_a_shared_law_is_tuned_saved_and_read_back(learned, tmp_path):
+    _, X, Y = learned
+    tuned = hk.tune(K, X, Y, mean=hk.kinetic(1.0), objective="marginal_likelihood", starts=1)
+    assert tuned.field.kernel.kernel.kernel.centres is not None
+    hk.save(tmp_path / "field", tuned.field)
+    again = hk.load(tmp_path / "field")
+    np.testing.assert_array_equal(again.law(1.3, 1.0), tuned.field.law(1.3, 1.0))
+
+
+def test_two_species_have_a_law_each():
+    """Springs between unlike particles only; the law between like ones is flat."""
+    like = hk.pairs(4, 2, among=(0, 1))
+    unlike = hk.pairs(4, 2, among=((0, 1), (2, 3)))
+    q = RNG.normal(size=(15, 4, 2))
+    F = np.zeros_like(q)
+    for i in (0, 1):
+        for j in (2, 3):
+            apart = q[:, i] - q[:, j]
+            F[:, i] -= apart
+            F[:, j] += apart
+    k = hk.Gaussian(1.5)
+    K = hk.CurlFree(100.0 * hk.Shared(k, like) + 100.0 * hk.Shared(k, unlike))
+    field = hk.fit(K, q.reshape(15, 8), F.reshape(15, 8), 1e-10)
+    assert abs(field.law(1.5, 1.0, which=0)) < 1e-3
+    # −½ r², the potential of the force field ∇u.
+    np.testing.assert_allclose(field.law(1.5, 1.0, which=1), -0.5 * (1.5**2 - 1), atol=2e-3)
+
+
+def test_what_is_no_part_is_refused():
+    with pytest.raises(TypeError, match="Shared needs a kernel and then a function"):
+        hk.Shared(hk.Gaussian(1.0), 3)
+    with pytest.raises(ValueError, match=r"return points\[:, None\]"):
+        hk.Shared(hk.Gaussian(1.0), lambda x: x)(jnp.ones(3), jnp.ones(3))
+    with pytest.raises(ValueError, match="of must be"):
+        hk.pairs(3, 2, of="square")
+    with pytest.raises(ValueError, match="there is no pair"):
+        hk.pairs(1, 2)
+    with pytest.raises(AttributeError, match="the field has no law"):
+        hk.fit(hk.CurlFree(hk.Gaussian(1.0)), np.eye(2), np.eye(2), 1e-3).law(1.0)
+    together = np.zeros((2, 8))
+    with pytest.raises(ValueError, match="two particles in one place"):
+        hk.fit(
+            hk.CurlFree(hk.Shared(hk.Gaussian(1.0), hk.pairs(4, 2, of="log"))),
+            together,
+            together,
+            1e-3,
+        )
