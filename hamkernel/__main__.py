@@ -25,10 +25,11 @@ def main() -> None:
 
     print(_plan(arguments.out, arguments.seeds, arguments.tune), flush=True)
     jax.config.update("jax_enable_x64", True)  # before any array is made
+    from hamkernel._show import printable
     from hamkernel.paper import reproduce, retune
 
     def show(table: str) -> None:
-        print(f"\n{table}", flush=True)
+        print(printable(f"\n{table}"), flush=True)
 
     try:
         _, files = reproduce(arguments.out, arguments.seeds, show=show)

@@ -1,6 +1,7 @@
 """The text of kernels, fields and results, with the values of their hyperparameters."""
 
 import dataclasses
+import sys
 import textwrap
 from typing import Any
 
@@ -10,6 +11,45 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
+
+# What a terminal of ASCII, or of a code page of Windows, shows in the place of these.
+_ASCII = str.maketrans(
+    {
+        "λ": "lambda",
+        "σ": "sigma",  # noqa: RUF001
+        "χ": "chi",
+        "π": "pi",
+        "τ": "tau",
+        "ω": "omega",
+        "∇": "grad ",
+        "‖": "|",
+        "√": "sqrt",
+        "²": "^2",
+        "−": "-",  # noqa: RUF001
+        "–": "-",  # noqa: RUF001
+        "…": "...",
+        "½": "1/2",
+        "≤": "<=",
+        "≥": ">=",
+        "≈": "~",
+        "±": "+-",
+        "·": "*",
+        "×": "x",  # noqa: RUF001
+        "→": "->",
+        "ẋ": "dx/dt",
+        "∞": "inf",
+    }
+)
+
+
+def printable(text: str) -> str:
+    """The text in characters that the standard output can show."""
+    encoding = getattr(sys.stdout, "encoding", None) or "utf-8"
+    try:
+        text.encode(encoding)
+    except UnicodeEncodeError:
+        return text.translate(_ASCII).encode(encoding, "replace").decode(encoding)
+    return text
 
 
 def described(module: Any, positional: tuple[str, ...] = ()) -> str:

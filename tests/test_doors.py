@@ -2,6 +2,7 @@
 
 # pyright: reportArgumentType=false
 
+import os
 import subprocess
 import sys
 import warnings
@@ -178,3 +179,23 @@ def test_positions_and_a_mass_are_enough(tmp_path):
         hk.learn(K, learned.runs, mean=hk.kinetic(1.0), mass=1.0)
     with pytest.raises(ValueError, match=r"positions alone hk\.learn\(K, runs, mass=m\)"):
         hk.learn(K, hk.Runs(t, runs[0]))
+
+
+def test_what_is_printed_degrades_on_a_terminal_of_ascii():
+    code = (
+        "from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics\n"
+        "row = Diagnostic('chi', 'χ² is 2', '≤ 1', False, 'λ ≤ χ …', 'Ж')\n"
+        "print(Diagnostics((row,)))"
+    )
+    for encoding, said in (
+        ("ascii", "lambda <= chi ..."),
+        ("cp1252", "lambda"),
+        ("utf-8", "λ ≤ χ …"),
+    ):
+        run = subprocess.run(
+            [sys.executable, "-c", code],
+            capture_output=True,
+            env={**os.environ, "PYTHONIOENCODING": encoding},
+        )
+        assert run.returncode == 0, run.stderr
+        assert said in run.stdout.decode(encoding)

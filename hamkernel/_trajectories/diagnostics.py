@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.transforms import Select, Warp
+from hamkernel._show import printable
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.friction import damped_coordinates, frictions
 from hamkernel._trajectories.runs import Runs
@@ -117,7 +118,7 @@ class Diagnostics:
             if not row.passes:
                 said = f"{row.meaning}. {row.advice}".strip()
                 lines += textwrap.wrap(said, 84, initial_indent="    ", subsequent_indent="    ")
-        return "\n".join(lines)
+        return printable("\n".join(lines))
 
     def _repr_html_(self) -> str:
         head = "".join(f"<th>{name}</th>" for name in ("", "found", "limit", "meaning", "to do"))

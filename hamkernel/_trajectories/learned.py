@@ -16,7 +16,7 @@ from hamkernel import _require as require
 from hamkernel._machine import full_precision
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._posterior import Posterior, condition
-from hamkernel._show import described, text
+from hamkernel._show import described, printable, text
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._trajectories.diagnostics import Diagnostics
@@ -140,7 +140,7 @@ class Learned(eqx.Module):
             f"diagnostics    {', '.join(self.diagnostics.failing) or 'nothing'} falls short",
             "next           .field, .diagnostics, .posterior, hk.simulate(learned.field, x0, ts)",
         ]
-        return "\n".join(lines)
+        return printable("\n".join(lines))
 
     @property
     @full_precision

@@ -14,6 +14,7 @@ from hamkernel import _require as require
 from hamkernel._fields.base import known_part
 from hamkernel._machine import compiled
 from hamkernel._posterior import Posterior
+from hamkernel._show import printable
 from hamkernel._show import text as number
 from hamkernel._trajectories.flow import simulated, steps_for, stiffness
 from hamkernel._trajectories.free_run import Stretches, padded, predictions
@@ -103,7 +104,7 @@ class Score(eqx.Module):
         lines += [f"  {name.ljust(18)} {number(value)}" for name, value in rows.items()]
         if np.isfinite(float(self.coverage)):
             lines.append(f"  inside 95 % bands  {float(self.coverage):.0%}")
-        return "\n".join(lines)
+        return printable("\n".join(lines))
 
 
 class _Linear(eqx.Module):
