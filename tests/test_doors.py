@@ -6,6 +6,7 @@ import subprocess
 import sys
 import warnings
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -178,3 +179,23 @@ def test_positions_and_a_mass_are_enough(tmp_path):
         hk.learn(K, learned.runs, mean=hk.kinetic(1.0), mass=1.0)
     with pytest.raises(ValueError, match=r"positions alone hk\.learn\(K, runs, mass=m\)"):
         hk.learn(K, hk.Runs(t, runs[0]))
+
+
+def test_a_part_of_a_controlled_field_is_that_of_its_drift():
+    K = hk.Sum(energy=hk.Symplectic(hk.Gaussian(1.0)), friction=hk.Friction(0.3, 0.1))
+    K = hk.Controlled(K, inputs=[[0.0], [1.0]])
+    field = hk.fit(K, X, np.gradient(X, T, axis=0), 1e-3, inputs=U[:, None])
+    x = jnp.array([0.2, 0.5])
+    parts = [field.part("energy")(x), field.part("friction")(x)]
+    np.testing.assert_allclose(sum(parts), field(x, jnp.zeros(1)), atol=1e-10)
+    assert abs(parts[1][1]) > 1e-6
+    with pytest.raises(KeyError, match=r"no part 'rest'.*'energy', 'friction'"):
+        field.part("rest")
+
+
+@pytest.mark.parametrize("leaf", [None, True])
+def test_trees_without_arrays_have_a_text(leaf):
+    K = hk.Symplectic(2.0 * hk.Gaussian(1.0))
+    posterior = hk.condition(K, X, np.gradient(X, T, axis=0), 1e-3)
+    for tree, name in ((hk.Runs(T, X), "Runs("), (hk.Runs(T, X, U), "Runs("), (posterior, "Post")):
+        assert repr(jax.tree.map(lambda _: leaf, tree)).startswith(name)
