@@ -28,7 +28,7 @@ from hamkernel._machine import compiled, full_precision, one_blas_thread
 from hamkernel._observations.blocks import AbstractBlock, Values
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import inputs_of, observations
-from hamkernel._show import text
+from hamkernel._show import has_arrays, text
 from hamkernel._solvers.dense import Cholesky
 from hamkernel._solvers.fit import check_solver, features_of_parts
 from hamkernel._solvers.low_rank import LowRankConditional
@@ -120,6 +120,8 @@ class Posterior(eqx.Module):
         return self is other
 
     def __repr__(self) -> str:
+        if not has_arrays((self.given.rows.targets, self.given.rows.energies)):
+            return f"Posterior(field={text(self.field)})"
         rows = self.given.rows
         return f"Posterior(rows={rows.size}, dimension={rows.dimension}, field={text(self.field)})"
 

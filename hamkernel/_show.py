@@ -150,6 +150,11 @@ def text(value: Any) -> str:
     return repr(value) if name is None else name
 
 
+def has_arrays(tree: Any) -> bool:
+    """Whether all leaves are arrays, rather than None or bool as `jax.tree.map` may leave them."""
+    return all(map(eqx.is_array, jax.tree.leaves(tree, is_leaf=lambda leaf: leaf is None)))
+
+
 def _module(module: eqx.Module) -> str:
     """A module that does not print itself, such as a network: one line, however deep it is."""
     line = described(module)

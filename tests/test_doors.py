@@ -7,6 +7,7 @@ import subprocess
 import sys
 import warnings
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -199,3 +200,23 @@ def test_what_is_printed_degrades_on_a_terminal_of_ascii():
         )
         assert run.returncode == 0, run.stderr
         assert said in run.stdout.decode(encoding)
+
+
+def test_a_part_of_a_controlled_field_is_that_of_its_drift():
+    K = hk.Sum(energy=hk.Symplectic(hk.Gaussian(1.0)), friction=hk.Friction(0.3, 0.1))
+    K = hk.Controlled(K, inputs=[[0.0], [1.0]])
+    field = hk.fit(K, X, np.gradient(X, T, axis=0), 1e-3, inputs=U[:, None])
+    x = jnp.array([0.2, 0.5])
+    parts = [field.part("energy")(x), field.part("friction")(x)]
+    np.testing.assert_allclose(sum(parts), field(x, jnp.zeros(1)), atol=1e-10)
+    assert abs(parts[1][1]) > 1e-6
+    with pytest.raises(KeyError, match=r"no part 'rest'.*'energy', 'friction'"):
+        field.part("rest")
+
+
+@pytest.mark.parametrize("leaf", [None, True])
+def test_trees_without_arrays_have_a_text(leaf):
+    K = hk.Symplectic(2.0 * hk.Gaussian(1.0))
+    posterior = hk.condition(K, X, np.gradient(X, T, axis=0), 1e-3)
+    for tree, name in ((hk.Runs(T, X), "Runs("), (hk.Runs(T, X, U), "Runs("), (posterior, "Post")):
+        assert repr(jax.tree.map(lambda _: leaf, tree)).startswith(name)

@@ -199,6 +199,14 @@ class ControlledField(AbstractJoinedField):
     def _cure(self) -> str:
         return "field.drift"
 
+    def part(self, which: int | str) -> Any:
+        """The part of the drift with this position or name, `field.drift.part(which)`.
+
+        Raises:
+            KeyError: the drift has no such part (with the choices).
+        """
+        return self.drift.part(which)
+
     @property
     def drift(self) -> KernelField | FeatureField:
         """f, a field of its own: `field.drift(x)`, `field.drift.hamiltonian(x)`."""

@@ -25,6 +25,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
+from hamkernel._show import described, has_arrays
 from hamkernel._trajectories.flow import NODES
 from hamkernel._trajectories.sensors import (
     impossible_samples,
@@ -225,6 +226,8 @@ class Runs(eqx.Module):
         return len(self.times)
 
     def __repr__(self) -> str:
+        if not has_arrays((self.times, self.states, self.inputs or ())):
+            return described(self)
         samples = sum(len(t) for t in self.times)
         said = [
             f"{len(self)} run{'s' * (len(self) != 1)}",

@@ -85,8 +85,7 @@ def chain(sites, seed):
         d = np.roll(x[:sites], -1) - x[:sites]
         return 0.5 * x[sites:] @ x[sites:] + (d**2 / 2 + d**3 / 12 + d**4 / 40).sum()
 
-    method = {"method": hk.StormerVerlet(), "dt": 0.02}
-    ours = np.asarray(hk.simulate(field, x0, ts, **method).ys)
+    ours = np.asarray(hk.simulate(field, x0, ts, solver=hk.StormerVerlet(), dt=0.02).ys)
     true = np.asarray(hk.simulate(truth, x0, ts).ys)
     missed = np.sqrt(np.mean((ours - true)[-1, sites:] ** 2) / np.mean(true[-1, sites:] ** 2))
     kept = abs(energy(ours[-1]) / energy(ours[0]) - 1)
