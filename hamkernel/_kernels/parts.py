@@ -165,6 +165,9 @@ class Shared(AbstractScalarKernel):
             return None
         return Descriptor(self.features, InnerProduct(), jacobian=lambda x: self.gradients(x).T)
 
+    def supports(self, n: int) -> tuple[frozenset[int], ...]:
+        return (frozenset(range(getattr(self.parts, "positions", n))),)
+
     @property
     def has_amplitude(self) -> bool:
         return self.kernel.has_amplitude
@@ -231,8 +234,13 @@ class _Pairs(eqx.Module):
     def __repr__(self) -> str:
         return f"pairs({len(self.first)} of {self.particles} particles, of={self.of!r})"
 
+    @property
+    def positions(self) -> int:
+        """How many coordinates of a state the parts depend on, the first ones."""
+        return self.particles * self.dim
+
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, "P 1"]:
-        size = self.particles * self.dim
+        size = self.positions
         if len(x) not in (size, 2 * size):
             raise ValueError(
                 f"a state of {self.particles} particles in {self.dim} dimensions has {size} "
@@ -297,6 +305,11 @@ class _Sites(eqx.Module):
 
     def __repr__(self) -> str:
         return described(self)
+
+    @property
+    def positions(self) -> int:
+        """How many coordinates of a state the parts depend on, the first ones."""
+        return self.count
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, "P 1"]:
         if len(x) not in (self.count, 2 * self.count):
