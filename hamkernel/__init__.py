@@ -46,6 +46,7 @@ from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import FeatureField, KernelField
 from hamkernel._fields.joined import ControlledField, FamilyField
 from hamkernel._fields.kinetic import kinetic
+from hamkernel._fields.lagrangian import LagrangianField
 from hamkernel._gram import gram
 from hamkernel._gram_operator import gram_operator
 from hamkernel._kernels.built_in import Gaussian, Matern, Periodic, Polynomial, RationalQuadratic
@@ -65,6 +66,7 @@ from hamkernel._structures.custom_operator import Poisson, Structured
 from hamkernel._structures.family import Family
 from hamkernel._structures.friction import Friction, PortHamiltonian
 from hamkernel._structures.joined import Controlled, InputMatrix
+from hamkernel._structures.lagrangian import Lagrangian
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
 from hamkernel._trajectories.learn import learn
@@ -122,6 +124,7 @@ __all__ = [  # noqa: RUF022 - in reading order
     "Family",
     "InputMatrix",
     "UnknownMasses",
+    "Lagrangian",
     "Sum",
     # What was measured.
     "Velocities",
@@ -137,6 +140,7 @@ __all__ = [  # noqa: RUF022 - in reading order
     "FeatureField",
     "ControlledField",
     "FamilyField",
+    "LagrangianField",
     "LandmarkFit",
     "FeatureFit",
     "SolverInfo",

@@ -13,6 +13,7 @@ from hamkernel._features import is_of_parts
 from hamkernel._fields.base import AbstractField, Mean
 from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import ControlledField, FamilyField, learned_field
+from hamkernel._fields.lagrangian import LagrangianField
 from hamkernel._machine import (
     as_given,
     dense_bytes,
@@ -24,11 +25,24 @@ from hamkernel._machine import (
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.dense import Cholesky, copies
+from hamkernel._solvers.lagrangian import fit_lagrangian
 from hamkernel._solvers.problem import AbstractSolver, LearnedField, Problem, problem
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.family import AbstractFamily
 from hamkernel._structures.joined import Controlled
+from hamkernel._structures.lagrangian import Lagrangian
+
+
+@overload
+def fit(
+    K: Lagrangian,
+    X: Num[ArrayLike, "N n"],
+    Y: Num[ArrayLike, "N m"],
+    regularization: ArrayLike = ...,
+    *,
+    accelerations: Num[ArrayLike, "N m"],
+) -> LagrangianField: ...
 
 
 @overload
@@ -102,7 +116,8 @@ def fit(
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
     progress: bool = False,
-) -> AbstractField:
+    accelerations: Num[ArrayLike, "N m"] | None = None,
+) -> Any:
     """Learn the field f in the RKHS of K that minimises (1/N) Σᵢ‖f(xᵢ) − yᵢ‖² + λ‖f‖².
 
     By the representer theorem f(x) = Σⱼ K(x, xⱼ) aⱼ with (G + NλI) a = y. Nothing else is added
@@ -136,6 +151,7 @@ def fit(
         progress: show a progress bar where the standard error is a terminal: of the iterations of
             `ConjugateGradient`, with their residual, and of the blocks of `Cholesky` from 6000 rows
             on. Ctrl-C ends the fit between two of them; inside of one it waits for it.
+        accelerations: of a `Lagrangian`, shape (N, m); X are then states (q, v), and Y torques.
 
     Returns:
         The learned field. Works under jit, vmap and grad, with respect to every argument; new
@@ -152,6 +168,10 @@ def fit(
     Source: Smith & Egeland (2023), section 3, where "Nλ a_j" should read "Nλ a_i".
     """
     check_solver(solver)
+    if isinstance(K, Lagrangian):
+        return fit_lagrangian(K, X, Y, regularization, accelerations)
+    if accelerations is not None:
+        raise TypeError("accelerations= belongs to hk.Lagrangian(potential=…, inertia=…).")
     given = problem(K, X, Y, regularization, mean, inputs, parameters, throw)
     return field_of_problem(given, solver, throw, progress)
 

@@ -1,0 +1,161 @@
+"""Learned Lagrangian mechanics: a mass matrix, a potential, friction, and both dynamics."""
+
+from __future__ import annotations
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, ArrayLike, Float, Num
+
+from hamkernel import _require as require
+from hamkernel._show import described
+from hamkernel._structures.lagrangian import Lagrangian, LagrangianFeatures
+
+
+class LagrangianField(eqx.Module):
+    """The machine that torques and accelerations tell of; made by `fit` with a `Lagrangian`.
+
+    `field(x, u)` is ẋ = (v, a) of the state x = (q, v) under the torques u, so that
+    `hk.simulate(field, x0, ts, inputs=u)` runs it. Where M(q) is not positive definite there is no
+    acceleration, and it refuses.
+
+    Attributes:
+        features: the features of L and of friction, with the kernel.
+        weights: w, shape (r,).
+        triangle: R with RᵀR = AᵀA + σ²I of the torques' rows A, shape (r, r).
+        noise: σ, the standard deviation of the torques, shape ().
+        residual: measured less learned torques, shape (N, m).
+        least_inertia: the smallest eigenvalue of M over the data, shape ().
+        least_inertia_deviation: its standard deviation, shape ().
+    """
+
+    features: LagrangianFeatures
+    weights: Float[Array, " r"]
+    triangle: Float[Array, "r r"]
+    noise: Float[Array, ""]
+    residual: Float[Array, "N m"]
+    least_inertia: Float[Array, ""]
+    least_inertia_deviation: Float[Array, ""]
+
+    def __repr__(self) -> str:
+        return described(self)
+
+    @property
+    def kernel(self) -> Lagrangian:
+        """The kernel that the field was learned with."""
+        return self.features.kernel
+
+    @property
+    def dimension(self) -> int:
+        """N = 2m, the number of coordinates of a state (q, v)."""
+        return 2 * self.features.count
+
+    @property
+    def is_identified(self) -> bool:
+        """Whether M is positive definite at the data by two standard deviations."""
+        return bool(self.least_inertia > 2 * self.least_inertia_deviation)
+
+    def __call__(self, x: Num[ArrayLike, " n"], u: ArrayLike | None = None) -> Float[Array, " n"]:
+        """The velocity (v, a) of the state x under the torques u, zero if None.
+
+        Raises:
+            ValueError: x or u has another shape. RuntimeError: M(q) is not positive definite.
+        """
+        x = self._state(x)
+        q, v = jnp.split(x, 2)
+        torques = jnp.zeros_like(v) if u is None else self._position(u, "u")
+        M = self.mass_matrix(q)
+        positive = jnp.linalg.eigvalsh(M)[0] > 0
+        rest = self.inverse_dynamics(q, v, jnp.zeros_like(v))
+        a = require.value(
+            jnp.linalg.solve(M, torques - rest),
+            ~positive,
+            "the mass matrix is not positive definite at this state, so it has no acceleration: "
+            "the data do not identify M there. field.least_inertia and its deviation say so of the "
+            "data; more motions, a friction that is missing, or a longer lengthscale may help.",
+            RuntimeError,
+        )
+        return jnp.concatenate([v, a])
+
+    def mass_matrix(self, q: Num[ArrayLike, " m"]) -> Float[Array, "m m"]:
+        """M(q), symmetric, shape (m, m)."""
+        return self.features.of_mass_matrix(self._position(q)) @ self.weights
+
+    def mass_matrix_deviation(self, q: Num[ArrayLike, " m"]) -> Float[Array, "m m"]:
+        """The standard deviation of each entry of M(q), shape (m, m)."""
+        q, k = self._position(q), self.kernel.inertia
+        rows = self.features.of_mass_matrix(q)
+        m = rows.shape[0]
+        known = self._variance(rows.reshape(m * m, -1)).reshape(m, m)
+        missing = self._missing(k, q, q) * (2.0 + 2.0 * jnp.eye(m, dtype=known.dtype))
+        return jnp.sqrt(known + missing)
+
+    def potential(self, q: Num[ArrayLike, " m"]) -> Float[Array, ""]:
+        """V(q), known up to a constant, shape ()."""
+        return self.features.of_potential(self._position(q)) @ self.weights
+
+    def gravity(self, q: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
+        """∂V/∂q, the torques that hold the machine at rest at q, shape (m,)."""
+        return jax.grad(self.potential)(self._position(q))
+
+    def gravity_deviation(self, q: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
+        """The standard deviation of each entry of the gravity, shape (m,)."""
+        q, k = self._position(q), self.kernel.potential
+        rows = jax.jacfwd(self.features.of_potential)(q).T
+        mixed = jax.jacfwd(jax.jacrev(lambda a, b: self._missing(k, a, b)), argnums=1)(q, q)
+        return jnp.sqrt(self._variance(rows) + jnp.maximum(jnp.diagonal(mixed), 0.0))
+
+    def friction(self, v: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
+        """The friction of the joints at the velocities v, shape (m,)."""
+        return self.features.of_friction(self._position(v, "v")) @ self.weights
+
+    def momentum(self, x: Num[ArrayLike, " n"]) -> Float[Array, " m"]:
+        """P = ∂L/∂v = M(q) v of the state x = (q, v), shape (m,)."""
+        q, v = jnp.split(self._state(x), 2)
+        return self.mass_matrix(q) @ v
+
+    def lagrangian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        """L(q, v) = ½ vᵀM(q)v − V(q), shape ()."""
+        q, v = jnp.split(self._state(x), 2)
+        return 0.5 * v @ self.mass_matrix(q) @ v - self.potential(q)
+
+    def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
+        """The energy ½ vᵀM(q)v + V(q) of the state x = (q, v), up to a constant, shape ()."""
+        q, v = jnp.split(self._state(x), 2)
+        return 0.5 * v @ self.mass_matrix(q) @ v + self.potential(q)
+
+    def inverse_dynamics(
+        self, q: Num[ArrayLike, " m"], v: Num[ArrayLike, " m"], a: Num[ArrayLike, " m"]
+    ) -> Float[Array, " m"]:
+        """The torques τ = M(q) a + Coriolis forces + ∂V/∂q + friction, shape (m,)."""
+        x = jnp.concatenate([self._position(q), self._position(v, "v")])
+        return self.features.of_torques(x, self._position(a, "a")) @ self.weights
+
+    def _variance(self, rows: Float[Array, "k r"]) -> Float[Array, " k"]:
+        whitened = solve_triangular(self.triangle, rows.T, trans="T")
+        return self.noise**2 * jnp.sum(whitened**2, axis=0)
+
+    def _missing(self, k, q, other) -> Float[Array, ""]:
+        """The prior covariance of k at two positions that the centres do not carry."""
+        whole = k(self.kernel.placed(q), self.kernel.placed(other))
+        known = self.features.of_kernel(k, q) @ self.features.of_kernel(k, other)
+        return jnp.maximum(whole - known, 0.0) if q is other else whole - known
+
+    def _state(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
+        return require.point(x, self.dimension).astype(self.weights.dtype)
+
+    def _position(self, q: ArrayLike, name: str = "q") -> Float[Array, " m"]:
+        return require.point(q, self.features.count, name).astype(self.weights.dtype)
+
+
+def least_inertia(field: LagrangianField, X: Float[Array, "N n"]) -> tuple[Array, Array]:
+    """The smallest eigenvalue of M over the states X, and its standard deviation."""
+    Q = X[:, : field.features.count]
+    values, vectors = jax.vmap(lambda q: jnp.linalg.eigh(field.mass_matrix(q)))(Q)
+    at = int(np.argmin(np.asarray(values[:, 0])))
+    e = vectors[at, :, 0]
+    rows = jnp.einsum("i,j,ijr->r", e, e, field.features.of_mass_matrix(Q[at]))
+    missing = 4 * field._missing(field.kernel.inertia, Q[at], Q[at])
+    return values[at, 0], jnp.sqrt(field._variance(rows[None])[0] + missing)
