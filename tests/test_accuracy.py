@@ -76,6 +76,7 @@ def test_losses_below_rounding_are_infinite_and_not_large():
 # What fits say of themselves.
 
 
+@pytest.mark.slow
 def test_conjugate_gradients_name_cholesky_where_the_ridge_is_rounding():
     for regularization in (1e-12, 1e-14):
         with pytest.raises(RuntimeError, match=r"times the rounding.*hk\.Cholesky\(\)"):

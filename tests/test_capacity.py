@@ -62,6 +62,7 @@ def arrays(size, T, seed=0):
     return 0.2 + 0.1 * jnp.abs(spans), *rest
 
 
+@pytest.mark.slow
 def test_the_closed_form_in_strips_is_ridge_regression_on_all_rows():
     rows = rows_of(*arrays(4, 12))
     S = rows.nodes[:, 0, 0]  # eight columns: four strips
@@ -98,6 +99,7 @@ def test_a_large_log_is_padded_by_less_than_a_small_one():
     assert [padded_count(count, True) for count in (3, 8, 20, 120, 129)] == [3, 8, 20, 128, 160]
 
 
+@pytest.mark.slow
 def test_many_short_runs_are_not_padded_in_length():
     t = np.linspace(0.0, 1.0, 5)
     states = [np.column_stack([np.cos(t + i), -np.sin(t + i)]) for i in range(450)]
@@ -116,6 +118,7 @@ def test_a_long_computation_says_what_it_costs():
     np.testing.assert_allclose(preprocessing.seconds_of_iteration(many, 128), 13.4, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_landmarks_that_a_solve_of_some_seconds_cannot_carry_are_known_and_named(monkeypatch):
     t = np.linspace(0.0, 2.0, 21)
     states = [np.column_stack([np.cos(t + i), -np.sin(t + i)]) * (1 + i / 20) for i in range(20)]
@@ -207,6 +210,7 @@ def test_few_rows_are_all_searched_and_many_are_not():
     assert (len(some), len(part.counts)) == (24 * 11, 24)
 
 
+@pytest.mark.slow
 def test_landmarks_are_doubled_while_the_rows_become_likelier():
     """On rows of a rough field; those of a smooth one are content with the first.
 

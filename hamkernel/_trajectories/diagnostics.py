@@ -84,9 +84,12 @@ class Diagnostics:
         short = [row for row in self.rows if not row.passes]
         if not short:
             return ""
-        first = sorted(short, key=lambda row: not row.decides)
-        said = "; ".join(row.meaning.rstrip(".") for row in first[:2])
-        more = f"; and {', '.join(row.name for row in first[2:])}" if len(first) > 2 else ""
+        decide = [row for row in short if row.decides]
+        others = [row for row in short if not row.decides]
+        shown = [*decide[:1], *others[:1]] if decide and others else short[:2]
+        said = "; ".join(row.meaning.rstrip(".") for row in shown)
+        names = ", ".join(row.name for row in short if row not in shown)
+        more = f"; and {names}" if names else ""
         verdict = "look at" if self.is_usable else "do not use this field"
         return f"{verdict}: {said}{more}. learned.diagnostics says what to do."
 
@@ -218,13 +221,13 @@ def diagnostics(
         _free_run(fit),
         _outliers(fit),
         degrees_of_freedom(fit),
+        _force(fit),  # a cause with a cure, before its symptoms
         _chi_squared(fit),
         _whiteness(fit),
         _process_noise(fit),
         _pushes(fit),
         _parts_left_out(fit),
         _landmarks(fit),
-        _force(fit),
         _samples_per_swing(fit),
         _timing(fit),
         _curve(fit),

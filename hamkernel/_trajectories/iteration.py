@@ -185,6 +185,32 @@ def begin(task: Task, model: Model, design: np.ndarray) -> Current:
     return Current(model, field, S, rows, paths, task.good, np.inf, float(found.free), pushed)
 
 
+def with_process(task: Task, now: Current, q: Float[np.ndarray, " n"]) -> tuple[Task, Current]:
+    """The task and its path with the process noise q, held.
+
+    What process noise stood for is the sensors' now: their noise is the likeliest of what was
+    found, a hundredth, a tenth of the motion, where it is free.
+    """
+    n, model = len(q), now.model
+    free = task.bounds.free.copy()
+    moves = free[-2 * n : -n]
+    free[-n:] = False
+    with np.errstate(divide="ignore"):
+        model = model._replace(log_process=jnp.log(jnp.asarray(q)))
+    now = now._replace(model=model, pushed=1.0)
+    rows = _by_interval(task, now)[3]
+    noises = [np.asarray(model.log_noise)]
+    for share in (0.01, 0.1):
+        noises.append(
+            np.where(moves, np.maximum(noises[0], np.log(share * task.data.scale)), noises[0])
+        )
+    design = jnp.stack([model._replace(log_noise=jnp.asarray(noise)).flat for noise in noises])
+    part = searched(now.field.points, rows)
+    values = np.asarray(losses(model, design, *part, task.start_deviation))
+    task = task._replace(bounds=task.bounds._replace(free=free))
+    return task, now._replace(model=model.at(design[int(np.argmin(values))]))
+
+
 def _along_smoothed(task: Task) -> LinearisedSegments:
     runs = task.data.runs
     segments = segmented(runs, task.pieces, [run.path for run in runs])
@@ -397,9 +423,13 @@ def chosen(end: End, other: End, on_part: Callable[[Preprocessed], tuple[End, En
 
 def is_white(end: End) -> bool:
     """Whether the innovations of an end are as good as white."""
+    return whiteness(innovations_of(end), noisy_counts(end)).is_enough
+
+
+def innovations_of(end: End) -> Float[np.ndarray, "S L+1 n"]:
+    """The innovations of the rows of an end, in standard deviations."""
     now, given = end.now, (end.now.field.points, end.now.rows, end.task.start_deviation)
-    z = innovations(whitened_rows(now.model, *given), now.rows)
-    return whiteness(z, noisy_counts(end)).is_enough
+    return innovations(whitened_rows(now.model, *given), now.rows)
 
 
 def _split(data: Preprocessed, paths: list[np.ndarray]) -> tuple[Preprocessed, Stretches]:

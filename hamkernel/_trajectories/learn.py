@@ -36,13 +36,11 @@ from hamkernel._trajectories.iteration import (
     begin,
     chosen,
     initial_loss,
+    innovations_of,
     iterate,
+    with_process,
 )
-from hamkernel._trajectories.kalman import (
-    as_observations,
-    innovations,
-    whitened_rows,
-)
+from hamkernel._trajectories.kalman import as_observations
 from hamkernel._trajectories.learned import Learned, empty, misfits
 from hamkernel._trajectories.model import Model, with_amplitude
 from hamkernel._trajectories.preprocessing import (
@@ -53,7 +51,7 @@ from hamkernel._trajectories.preprocessing import (
     sampled,
     seconds_of_iteration,
 )
-from hamkernel._trajectories.quality import by_run, disturbances, quality, with_causes
+from hamkernel._trajectories.quality import by_run, chi_squared, disturbances, quality, with_causes
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.search import (
     LEAST_NOISE,
@@ -156,21 +154,22 @@ def learn(
     asked = _asked(K, known, data, given, landmarks(data, most_landmarks))
     seconds = seconds_of_iteration(data, asked.landmarks[1])
     bar.set_description(f"learning, {seconds:.0f} s an iteration")
+    task, now = asked.begun(data)
     if not runs.is_decided:
-        task, at = asked.begun(data)
-        runs, data = decided(runs, data, lambda d: initial_loss(task._replace(data=d), at.model))
+        runs, data = decided(runs, data, lambda d: initial_loss(task._replace(data=d), now.model))
+        task, now = asked.begun(data)
     q = asked.floor if process is None else np.maximum(process, asked.floor)
-    end = iterate(*asked.begun(data, q), most, bar)
+    end = first = iterate(*with_process(task, now, q), most, bar)
     if process is None and asks_for_process(end, asked.impulse):
 
         def on_part(part: Preprocessed) -> tuple[End, End]:
-            ends = (asked.begun(part, sought=sought) for sought in (False, True))
-            first, second = (iterate(*begun, most, bar) for begun in ends)
-            return first, second
+            task, now = asked.begun(part)
+            without = iterate(*with_process(task, now, q), most, bar)
+            return without, iterate(task, now, most, bar)
 
-        end = chosen(end, iterate(*asked.begun(data, sought=True), most, bar), on_part)
+        end = chosen(end, iterate(task, now, most, bar), on_part)
     bar.close()
-    return _learned(runs, mean, end, process, given is not None, measured, again)
+    return _learned(runs, mean, end, first, process, given is not None, measured, again)
 
 
 class _Asked(NamedTuple):
@@ -200,14 +199,15 @@ class _Asked(NamedTuple):
     impulse: np.ndarray
     floor: np.ndarray
 
-    def begun(
-        self, data: Preprocessed, q: np.ndarray | None = None, sought: bool = False
-    ) -> tuple[Task, Current]:
-        """The task and its first path, with process noise q, or with one that is looked for."""
-        with np.errstate(divide="ignore"):
-            log_q = jnp.log(jnp.asarray(self.floor if q is None else q))
-        model, moves = Model(self.kernel, self.log_noise, log_q), self.impulse if sought else None
-        given = self.X, self.Y, data.scale, self.free, self.spacing, moves
+    def begun(self, data: Preprocessed) -> tuple[Task, Current]:
+        """The task and its first path.
+
+        Process noise is looked for: it takes up the error of the smoothed path. Without it the
+        first kernel followed that error: of a pendulum with q alone at 5 Hz, noise .01, the field
+        was 7 % off in one of two logs, at a log p that is 58 lower than that of .2 %.
+        """
+        model = Model(self.kernel, self.log_noise, jnp.asarray(self.impulse))
+        given = self.X, self.Y, data.scale, self.free, self.impulse, self.spacing
         bounds, design = bounds_and_design(model, *given)
         wide = jnp.asarray(100 * data.scale)  # a prior of starts that says next to nothing
         pieces = equal_pieces(data.runs, LONG)
@@ -265,6 +265,7 @@ def _learned(
     runs: Runs,
     mean: Any,
     end: End,
+    first: End,
     given_process: np.ndarray | None,
     given: bool,
     measured: np.ndarray,
@@ -275,7 +276,8 @@ def _learned(
     Args:
         runs: what was given.
         mean: what was given.
-        end: where the iterations ended.
+        end: the end that is returned.
+        first: the end of the first pass, without process noise unless some was given.
         given_process: the process noise that was given, if any.
         given: whether the noise was given.
         measured: which coordinates were.
@@ -292,10 +294,10 @@ def _learned(
     process = np.where(is_free[len(noise) :], np.exp(np.asarray(now.model.log_process)), 0.0)
     process = process if given_process is None else given_process
     misfit = misfits(runs, states, noise)
-    rows = now.field.points, now.rows, task.start_deviation
-    z, counts = innovations(whitened_rows(now.model, *rows), now.rows), np.asarray(now.rows.counts)
+    z, counts = innovations_of(end), np.asarray(now.rows.counts)
     sought = given_process is None
     fit = quality(runs, end, misfit, z, process, states)
+    fit = fit if first is end else fit._replace(**chi_squared(first, innovations_of(first)))
     fit = fit._replace(noise=noise, is_noise_known=given, process=process if sought else None)
     fit = with_causes(fit, runs, end) if fit.kept.any() else fit
     table = diagnostics(fit, field.kernel, sampled(data)[0])

@@ -28,12 +28,10 @@ def quality(
     """How well the field follows the runs; `z` are the innovations by segment."""
     now, data = end.now, end.task.data
     times, seen = runs.on_host()
-    counts, noise = np.asarray(now.rows.counts), np.exp(np.asarray(now.model.log_noise))
+    noise = np.exp(np.asarray(now.model.log_noise))
     kept, pieces = np.zeros(len(data.runs)), list(zip(end.task.pieces, now.good, strict=True))
     for (r, start, stop), good in pieces:
         kept[r] += good * (stop - start) / len(data.runs[r].times)
-    # The path follows the samples: only what was expected can be judged.
-    squares, free = float((z**2).sum()), float((counts > 0).sum())
     speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
     spacing = np.median(np.concatenate([np.diff(t) for t in times]))
     swing = time_of_swing(data) / spacing
@@ -59,8 +57,7 @@ def quality(
         if timed
         else None,
         misfit=misfit,
-        chi_squared=squares / max(free, 1.0),
-        free=free,
+        **chi_squared(end, z),
         remaining=now.free,
         white=whiteness(z, noisy_counts(end)),
         process=process,
@@ -71,6 +68,16 @@ def quality(
         has_momenta=runs.dimension % 2 == 0,
         has_friction=bool(frictions(now.field.kernel)),
     )
+
+
+def chi_squared(end: End, z: Float[np.ndarray, "S L+1 n"]) -> dict[str, float]:
+    """χ² of the innovations z per degree of freedom, and the degrees of freedom.
+
+    A path with process noise follows the samples, so that only what was expected can be judged.
+    """
+    free = float((np.asarray(end.now.rows.counts) > 0).sum())
+    mean = float((z**2).sum()) / max(free, 1.0)
+    return {"chi_squared": mean if np.isfinite(mean) else np.inf, "free": free}
 
 
 def with_causes(fit: FitQuality, runs: Runs, end: End) -> FitQuality:
