@@ -344,37 +344,45 @@ def compiled(function: Any = None, **options: Any) -> Any:
 # So only small programs go without LLVM: learning from two runs of 61 samples, whose arguments have
 # 7000 numbers, takes 24 s by this rule, 18 s without LLVM and 55 s with XLA's own options. 20 runs
 # of 50 samples with n = 8, of 20 000 to 400 000 numbers, run for 44 s, and for 73 s without LLVM.
-_FAST = {"xla_cpu_use_fusion_emitters": False}
-_FASTEST = _FAST | {"xla_backend_optimization_level": 0}
+# On a GPU XLA times several versions of each product while it compiles: the first `tune` of 300
+# points took 78 s, and 15.5 s without, and `learn` 185 s and 60 s; later calls are as fast
+# (NVIDIA H200, jax 0.11). Products of large Grams are not compiled by size, and keep the choice.
+_FAST = {
+    "cpu": {"xla_cpu_use_fusion_emitters": False},
+    "gpu": {"xla_gpu_autotune_level": 0},
+}
+_FASTEST = {"cpu": _FAST["cpu"] | {"xla_backend_optimization_level": 0}, "gpu": _FAST["gpu"]}
 _SMALL = 16_384  # numbers in the arguments, up to which a program is not optimised
 
 
 def compiled_by_size(function: Callable[P, T]) -> Callable[P, T]:
-    """`compiled` without optimisation by XLA where the arguments are small.
+    """`compiled` with options of XLA that shorten compilation; on a CPU by size of the arguments.
 
     Inside another transformation the outer one chooses the options.
     """
     plain = compiled(function)
-    fast, fastest = (compiled(function, compiler_options=each) for each in (_FAST, _FASTEST))
+    fast, fastest = (
+        {name: compiled(function, compiler_options=options) for name, options in table.items()}
+        for table in (_FAST, _FASTEST)
+    )
 
     @functools.wraps(function)
     def sized(*args: P.args, **kwargs: P.kwargs) -> T:
         arrays = [a for a in jax.tree.leaves((args, kwargs)) if eqx.is_array(a)]
-        if any(isinstance(a, Tracer) for a in arrays) or not _options_are_known(_sizes.platform()):
+        platform = _sizes.platform()
+        if any(isinstance(a, Tracer) for a in arrays) or not _options_are_known(platform):
             return plain(*args, **kwargs)
         small = sum(a.size for a in arrays) <= _SMALL
-        return (fastest if small else fast)(*args, **kwargs)
+        return (fastest if small else fast)[platform](*args, **kwargs)
 
     return sized
 
 
 @functools.cache
 def _options_are_known(platform: str) -> bool:
-    """Whether the platform is a CPU whose compiler has these options."""
-    if platform != "cpu":
-        return False
+    """Whether the compiler of the platform has these options."""
     try:
-        jax.jit(lambda: 0, compiler_options=_FASTEST).lower().compile()
+        jax.jit(lambda: 0, compiler_options=_FASTEST[platform]).lower().compile()
     except Exception:  # jaxlib has no type of its own for it
         return False
     return True

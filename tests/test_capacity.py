@@ -258,8 +258,9 @@ def test_how_a_program_is_compiled_changes_neither_values_nor_derivatives(size):
 
 
 def test_options_that_a_compiler_does_not_know_are_left_out(monkeypatch):
-    monkeypatch.setattr(_machine, "_FASTEST", {"xla_no_such_option": True})
+    monkeypatch.setitem(_machine._FASTEST, "cpu", {"xla_no_such_option": True})
     assert not _machine._options_are_known.__wrapped__("cpu")
+    assert not _machine._options_are_known.__wrapped__("abacus")
     monkeypatch.setattr(_machine, "_options_are_known", lambda _: False)
     assert float(_machine.compiled_by_size(lambda x: 2 * x)(jnp.ones(()))) == 2.0
 

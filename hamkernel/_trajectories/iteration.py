@@ -206,7 +206,7 @@ def with_process(task: Task, now: Current, q: Float[np.ndarray, " n"]) -> tuple[
         )
     design = jnp.stack([model._replace(log_noise=jnp.asarray(noise)).flat for noise in noises])
     part = searched(now.field.points, rows)
-    values = np.asarray(losses(model, design, *part, task.start_deviation))
+    values = losses(model, design, *part, task.start_deviation)
     task = task._replace(bounds=task.bounds._replace(free=free))
     return task, now._replace(model=model.at(design[int(np.argmin(values))]))
 
@@ -382,7 +382,7 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     levels = [now.model.log_process, *(impulse + np.log(share) for share in (1e-3, 1e-2, 1e-1))]
     flat = jnp.stack([now.model._replace(log_process=jnp.asarray(q)).flat for q in levels])
     part = searched(*given[:2])
-    values = np.asarray(losses(now.model, flat, *part, task.start_deviation))
+    values = losses(now.model, flat, *part, task.start_deviation)
     return bool(values[0] - values.min() > price(end))
 
 

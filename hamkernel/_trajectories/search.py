@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from hamkernel._kernels.built_in import Gaussian
 from hamkernel._kernels.transforms import Select
@@ -75,16 +75,19 @@ def _loss(model: Model, h, S, rows, start_deviation):
     return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
 
-@compiled_by_size
+_compiled_loss = compiled_by_size(_loss)
+
+
 def losses(
     model: Model,
-    design: Float[Array, "count P"],
+    design: Float[ArrayLike, "count P"],
     S,
     rows: LinearisedSegments,
     start_deviation,
-):
-    """−log p(rows) at some points h."""
-    return jax.lax.map(lambda h: _loss(model, h, S, rows, start_deviation), design)
+) -> Float[np.ndarray, " count"]:
+    """−log p(rows) at some points h, one after another: designs of all sizes share a program."""
+    points = jnp.asarray(design)
+    return np.array([_compiled_loss(model, h, S, rows, start_deviation) for h in points])
 
 
 def searched(
@@ -165,14 +168,14 @@ def begun(
     smooth field with much noise, at which more of them do not help.
     """
     n, width = rows.residual.shape[-1], (_ENTRIES / 3) ** 0.5
-    points, part = jnp.asarray(design), windows(rows, int(width / n))
+    part = windows(rows, int(width / n))
     own = exact(part)[0]
     sets = {first: jnp.asarray(S[:first]) if n * first <= width else own}
     if len(own) > first < len(S):
         sets[len(S)] = own
     best, count, start = np.inf, first, design[0]
     for size, some in sets.items():
-        values = np.asarray(losses(model, points, some, part, start_deviation))
+        values = losses(model, design, some, part, start_deviation)
         if values.min() < best - (n * len(some) / 2) ** 0.5:
             best, count, start = values.min(), size, design[int(np.argmin(values))]
     return model.at(jnp.asarray(start)), count
@@ -250,7 +253,7 @@ def limited_by_landmarks(
     less = np.tile(np.asarray(model.flat), (len(shares), 1))
     less[:, -2 * n :] += np.log(shares)[:, None]
     few, many = (
-        np.asarray(losses(model, jnp.asarray(flat), points, part, start_deviation)).min()
+        losses(model, flat, points, part, start_deviation).min()
         for points, flat in ((S, less[:1]), (own, less))
     )
     freedom = float((part.counts > 0).sum()) - n * len(part.counts)
@@ -342,7 +345,7 @@ def _gain(
     def least(model: Model) -> float:
         design = np.tile(np.asarray(model.flat), (3, 1))
         design[:, explains] += np.log([[1.0], [0.1], [0.01]])
-        return float(losses(model, jnp.asarray(design), S, rows, start_deviation).min())
+        return float(losses(model, design, S, rows, start_deviation).min())
 
     return least(model) - least(model._replace(kernel=K.with_states(K.of_states + more)))
 
