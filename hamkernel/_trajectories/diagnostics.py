@@ -171,7 +171,7 @@ class FitQuality(NamedTuple):
         has_friction: whether the kernel has a `Friction`.
         is_curve: whether the momentum is one function of the position in the data.
         timing: how residuals grow with the speed; None where that cannot be told.
-        free_run: the error of free runs of two swings over that of a constant.
+        free_run: the error of free runs over that of a constant, over two swings or fewer.
     """
 
     noise: Float[np.ndarray, " n"]
@@ -278,7 +278,7 @@ def _free_run(fit: FitQuality) -> Diagnostic:
         f"{fit.free_run:.2g} of the error of a constant",
         "1",
         fit.free_run < 1,
-        f"over two swings free runs follow the log {closer:.2g} times closer than a constant"
+        f"free runs follow the log {closer:.2g} times closer than a constant"
         if fit.free_run < 1
         else "free runs of the field are no better than saying that nothing moves",
         "Look at hk.plot.fitted; the motion may not have this structure.",

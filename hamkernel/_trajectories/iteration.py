@@ -20,7 +20,7 @@ from hamkernel._trajectories.flow import (
     steps_for,
     stiffness,
 )
-from hamkernel._trajectories.free_run import Stretches, error_over_constant, of_two_swings
+from hamkernel._trajectories.free_run import Stretches, error_over_constant, of_swings
 from hamkernel._trajectories.kalman import (
     SmoothedPath,
     innovations,
@@ -170,45 +170,56 @@ def initial_loss(task: Task, model: Model) -> float:
 
 def begin(task: Task, model: Model, design: np.ndarray) -> Current:
     """The first model, field and path, from rows along the smoothed runs."""
-    runs, rows = task.data.runs, _along_smoothed(task)
-    given = rows, task.start_deviation
-    model, count = begun(model, design, task.S, task.first, *given)
-    S = task.S[:count]
-    model, _ = most_likely(model, S, *given, task.bounds, _SEARCH)
-    S = task.S if searched(jnp.asarray(S), rows)[1] is not rows else S
-    model, found = solved(model, S, task.first, task.quick, *given, task.bounds)
-    field = Expansion(model.kernel, found.points, found.coefficients, task.mean)
-    moves, _, pushed = _smoothed(model, found, rows, task)
-    paths = [run.path for run in runs]
-    x = _on_segments(paths, task.pieces, segmented(runs, task.pieces, paths))
-    paths = updated(paths, task.pieces, task.good, x + np.asarray(moves))
-    return Current(model, field, S, rows, paths, task.good, np.inf, float(found.free), pushed)
+    rows, paths = _along_smoothed(task), [run.path for run in task.data.runs]
+    model, count = begun(model, design, task.S, task.first, rows, task.start_deviation)
+    return _full_step(task, model, count, rows, paths)
 
 
 def with_process(task: Task, now: Current, q: Float[np.ndarray, " n"]) -> tuple[Task, Current]:
     """The task and its path with the process noise q, held.
 
     What process noise stood for is the sensors' now: their noise is the likeliest of what was
-    found, a hundredth, a tenth of the motion, where it is free.
+    found, a hundredth and a tenth of the motion, where it is free.
     """
     n, model = len(q), now.model
     free = task.bounds.free.copy()
     moves = free[-2 * n : -n]
     free[-n:] = False
+    task = task._replace(bounds=task.bounds._replace(free=free))
     with np.errstate(divide="ignore"):
         model = model._replace(log_process=jnp.log(jnp.asarray(q)))
-    now = now._replace(model=model, pushed=1.0)
-    rows = _by_interval(task, now)[3]
-    noises = [np.asarray(model.log_noise)]
-    for share in (0.01, 0.1):
-        noises.append(
-            np.where(moves, np.maximum(noises[0], np.log(share * task.data.scale)), noises[0])
-        )
-    design = jnp.stack([model._replace(log_noise=jnp.asarray(noise)).flat for noise in noises])
+    rows = _by_interval(task, now._replace(pushed=1.0))[3]
+    found = np.asarray(model.log_noise)
+    least = (np.log(share * task.data.scale) for share in (1e-300, 0.01, 0.1))
+    noises = [np.where(moves, np.maximum(found, each), found) for each in least]
+    design = np.stack([model._replace(log_noise=jnp.asarray(noise)).flat for noise in noises])
     part = searched(now.field.points, rows)
     values = losses(model, design, *part, task.start_deviation)
-    task = task._replace(bounds=task.bounds._replace(free=free))
-    return task, now._replace(model=model.at(design[int(np.argmin(values))]))
+    model = model.at(jnp.asarray(design[int(np.argmin(values))]))
+    return task, _full_step(task, model, len(now.field.points), rows, now.paths)
+
+
+def _full_step(
+    task: Task, model: Model, count: int, rows: LinearisedSegments, paths: list[np.ndarray]
+) -> Current:
+    """The likeliest model, field and path of rows along other paths, without a line search.
+
+    Args:
+        task: the task.
+        model: where the search for the likeliest model begins.
+        count: the number of landmarks in the search.
+        rows: the rows along the paths.
+        paths: the paths.
+    """
+    given = rows, task.start_deviation
+    model, _ = most_likely(model, task.S[:count], *given, task.bounds, _SEARCH)
+    model, found = solved(model, task.S, count, task.quick, *given, task.bounds)
+    field = Expansion(model.kernel, found.points, found.coefficients, task.mean)
+    moves, _, pushed = _smoothed(model, found, rows, task)
+    x = _on_segments(paths, task.pieces, segmented(task.data.runs, task.pieces, paths))
+    paths = updated(paths, task.pieces, task.good, x + np.asarray(moves))
+    S = task.S if len(found.points) > count else task.S[:count]
+    return Current(model, field, S, rows, paths, task.good, np.inf, float(found.free), pushed)
 
 
 def _along_smoothed(task: Task) -> LinearisedSegments:
@@ -441,7 +452,7 @@ def _split(data: Preprocessed, paths: list[np.ndarray]) -> tuple[Preprocessed, S
         for run, cut, path in zip(data.runs, cuts, paths, strict=True)
         if cut < len(run.times)
     ]
-    rest = of_two_swings([run for run, _ in last], [path for _, path in last], time_of_swing(data))
+    rest = of_swings([run for run, _ in last], [path for _, path in last], time_of_swing(data))
     return data._replace(runs=runs), rest
 
 
