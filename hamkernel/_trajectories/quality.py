@@ -148,9 +148,10 @@ def _core(residuals: list[np.ndarray], noise: np.ndarray) -> Float[np.ndarray, "
 def _free_run(end: End, kept: Float[np.ndarray, " R"], swing: float) -> float:
     """The error of free runs over two swings relative to that of a constant.
 
-    Where it is not below one, the least with that over one and half a swing. A pendulum that is balanced upright is lost after a swing whatever the field: the field of a
-    real one, right to .05 rad after a second, has .89, 1.4 and 2.5. Three simulated logs of animals
-    in weather, which no field predicts, have 1.02 to 1.5 (`tests/test_verdicts.py`).
+    Where it is not below one, the least of it and of those over one and half a swing: a pendulum
+    that is balanced upright is lost after a swing whatever the field. The field of a real one,
+    right to .05 rad after a second, has 2.5, 1.4 and .89. Three simulated logs of animals in
+    weather, which no field predicts, have 1.02 to 1.5 (`tests/test_verdicts.py`).
     """
     data, paths = end.task.data, end.now.paths
     used = [(run, path) for run, path, k in zip(data.runs, paths, kept, strict=True) if k]
