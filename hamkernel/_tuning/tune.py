@@ -198,9 +198,11 @@ def tune(
     warn_of_constants(K)
     given = problem(K, X, Y, regularization, mean, inputs, parameters)
     K, rows = given.kernel, given.on_one_device().rows
-    if solver is None and is_of_parts(K):
+    exact = solver is None and is_of_parts(K)
+    if exact:
         solver = features_of_parts()
-    if rows.states is not None:
+    # What a known kinetic energy leaves of the velocities of positions may be small, and is noise.
+    if rows.states is not None and not exact:
         _warn_of_unequal_sizes(rows.states[1])
     inputs = inputs_or_parameters(inputs, parameters)
     plain = mean is None and inputs is None and not isinstance(X, AbstractObservations)
@@ -208,6 +210,9 @@ def tune(
     criterion = criterion_of(objective, rows.count, folds, data)
     _warn_of_few_folds(criterion, folds)
     low_rank = solver is not None and solver.is_low_rank and not criterion.custom
+    if exact and low_rank:  # no Gram is needed, on few points either
+        assert solver is not None
+        criterion = criterion.with_basis(solver._basis(K, rows, given.regularization))
     parts = parts_of(rows, criterion, dense=True)
     if not low_rank and not criterion.custom:
         check_memory(rows, SEARCH_COPIES)
@@ -216,11 +221,14 @@ def tune(
     # For a low-rank fit λ stays above the rounding at which `choose_landmarks` drops a column.
     roundings = 2e4 if low_rank else 100.0
     kept, points = tuple(frozen), rows.points
+    # Features of a state with 5000 pairs take 6 ms, and those of one state show the size of K.
+    sizing = few.points[:1] if exact else few.points
     space = SearchSpace(
-        K, points, rms, given.regularization, kept, bounds or {}, roundings, few.points
+        K, points, rms, given.regularization, kept, bounds or {}, roundings, sizing
     )
     _warn_of_free_scale(space, criterion)
-    search = Search(space, criterion, rows, rms, starts, max_steps, optimiser, progress)
+    looks = 64 if exact else None  # each takes a tenth of a second with 5000 pairs
+    search = Search(space, criterion, rows, rms, starts, max_steps, optimiser, progress, looks)
 
     def of_low_rank(run: MinimiserRun) -> SearchCriterion:
         kernel, regularization, _ = decode(space, jnp.asarray(run.best.u, points.dtype))
