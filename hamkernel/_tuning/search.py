@@ -265,7 +265,9 @@ class Part:
             rows, chosen = rows.subset(chosen)
         self.count = rows.count
         numbers = (jnp.asarray(each, rows.targets.dtype) for each in (N / self.count, rms, 1.0))
-        self.objective = SearchObjective(space, criterion.on(space.kernel, rows, chosen), rows, *numbers)
+        self.objective = SearchObjective(
+            space, criterion.on(space.kernel, rows, chosen), rows, *numbers
+        )
 
     def measure_in(self, unit: float) -> None:
         """Divide the caller's objective by its size: tolerances are those of numbers of size 1."""

@@ -223,9 +223,7 @@ def tune(
     kept, points = tuple(frozen), rows.points
     # Features of a state with 5000 pairs take 6 ms, and those of one state show the size of K.
     sizing = few.points[:1] if exact else few.points
-    space = SearchSpace(
-        K, points, rms, given.regularization, kept, bounds or {}, roundings, sizing
-    )
+    space = SearchSpace(K, points, rms, given.regularization, kept, bounds or {}, roundings, sizing)
     _warn_of_free_scale(space, criterion)
     looks = 64 if exact else None  # each takes a tenth of a second with 5000 pairs
     search = Search(space, criterion, rows, rms, starts, max_steps, optimiser, progress, looks)
