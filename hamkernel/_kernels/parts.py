@@ -140,7 +140,7 @@ class Shared(AbstractScalarKernel):
         return back(Parts(weights[:, None] * slope, value))[0]
 
     def _over_centres(self, fn: Callable[..., Array], parts: int, dtype: Any) -> Array:
-        """fn at each centre; so many at once that memory does not grow with parts times centres."""
+        """`fn` at each centre, so many at once that memory does not grow with parts × centres."""
         # A checkpoint keeps the reverse derivative as small.
         at_once = int(np.clip(_AT_ONCE // parts, 1, len(self.centres or ())))
         return jax.lax.map(jax.checkpoint(fn), self._points(dtype), batch_size=at_once)
