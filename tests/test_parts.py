@@ -2,6 +2,8 @@
 
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -115,7 +117,7 @@ def test_memory_does_not_grow_with_states_parts_and_centres():
         features = hamkernel._features.features(k, 400, 1, jax.random.key(0), X.dtype)
         return jnp.sum(features(X) ** 2)
 
-    compiled = jax.jit(jax.grad(loss)).lower(K).compile()
+    compiled: Any = jax.jit(jax.grad(loss)).lower(K).compile()
     whole = 20 * 200 * 199 / 2 * 64 * 8  # bytes of one array of states, parts and centres
     assert compiled.memory_analysis().temp_size_in_bytes < whole / 4
 

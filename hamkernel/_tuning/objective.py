@@ -79,13 +79,15 @@ class SearchCriterion(eqx.Module):
         fn = jax.tree_util.Partial(self.fn.func, **(self.fn.keywords | known))
         return dataclasses.replace(self, fn=fn)
 
-    def on(
-        self, K: AbstractMatrixKernel, rows: Measurements, chosen: np.ndarray
-    ) -> "SearchCriterion":
+    def hearing(self, K: AbstractMatrixKernel, rows: Measurements) -> "SearchCriterion":
+        """This criterion, which knows the silent directions if no hyperparameter changes them."""
+        if self.fn.func is not _negative_log_likelihood or not has_constant_parts(K):
+            return self
+        # An eigenvalue problem of n × n for each point.
+        return self._with(heard=_heard(K, rows))
+
+    def on(self, rows: Measurements, chosen: np.ndarray) -> "SearchCriterion":
         """This criterion for the rows of a subset of the observations."""
-        if self.fn.func is _negative_log_likelihood and has_constant_parts(K):
-            # An eigenvalue problem of n × n for each point, the same for all hyperparameters.
-            return self._with(heard=_heard(K, rows))
         if self.partition is None:
             return self
         partition = partition_of_rows(rows, self.partition.labels[chosen])
