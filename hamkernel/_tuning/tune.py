@@ -199,8 +199,9 @@ def tune(
     given = problem(K, X, Y, regularization, mean, inputs, parameters)
     K, rows = given.kernel, given.on_one_device().rows
     exact = solver is None and is_of_parts(K)
-    if exact:
-        solver = features_of_parts()
+    solver = features_of_parts() if exact else solver
+    # With 5000 pairs a look takes .1 s, and the features of a state, which show the size of K, 6 ms.
+    looks, sizing = (64, 1) if exact else (None, None)
     # What a known kinetic energy leaves of the velocities of positions may be small, and is noise.
     if rows.states is not None and not exact:
         _warn_of_unequal_sizes(rows.states[1])
@@ -210,9 +211,7 @@ def tune(
     criterion = criterion_of(objective, rows.count, folds, data)
     _warn_of_few_folds(criterion, folds)
     low_rank = solver is not None and solver.is_low_rank and not criterion.custom
-    if exact and low_rank:  # no Gram is needed, on few points either
-        assert solver is not None
-        criterion = criterion.with_basis(solver._basis(K, rows, given.regularization))
+    criterion = _without_gram(criterion, given, solver) if exact and low_rank else criterion
     parts = parts_of(rows, criterion, dense=True)
     if not low_rank and not criterion.custom:
         check_memory(rows, SEARCH_COPIES)
@@ -221,11 +220,10 @@ def tune(
     # For a low-rank fit λ stays above the rounding at which `choose_landmarks` drops a column.
     roundings = 2e4 if low_rank else 100.0
     kept, points = tuple(frozen), rows.points
-    # Features of a state with 5000 pairs take 6 ms, and those of one state show the size of K.
-    sizing = few.points[:1] if exact else few.points
-    space = SearchSpace(K, points, rms, given.regularization, kept, bounds or {}, roundings, sizing)
+    space = SearchSpace(
+        K, points, rms, given.regularization, kept, bounds or {}, roundings, few.points[:sizing]
+    )
     _warn_of_free_scale(space, criterion)
-    looks = 64 if exact else None  # each takes a tenth of a second with 5000 pairs
     search = Search(space, criterion, rows, rms, starts, max_steps, optimiser, progress, looks)
 
     def of_low_rank(run: MinimiserRun) -> SearchCriterion:
@@ -238,6 +236,14 @@ def tune(
     runs = search.runs(of_low_rank if low_rank else None)
     check_found(best(runs))
     return _tuned(space, runs, starts, given, solver)
+
+
+def _without_gram(
+    criterion: SearchCriterion, given: Problem, solver: AbstractSolver | None
+) -> SearchCriterion:
+    """The criterion of the low-rank fit in features that no hyperparameter changes."""
+    assert solver is not None
+    return criterion.with_basis(solver._basis(given.kernel, given.rows, given.regularization))
 
 
 def check_found(found: MinimiserRun) -> None:
