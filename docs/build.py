@@ -22,7 +22,7 @@ ROOT = Path(__file__).parents[1]
 TEMPLATES = ROOT / "docs" / "templates"
 PAGES = sorted((ROOT / "docs").glob("*.md"))
 READING = ROOT / "docs" / "reading.md"  # what to read, and in which order
-COPIED = ["CHANGELOG.md", "CITATION.cff", "LICENSE", "docs/distributed.py"]
+COPIED = ["CHANGELOG.md", "CITATION.cff", "CONTRIBUTING.md", "LICENSE", "docs/distributed.py"]
 # At the top of every page, from the root of the site.
 LINKS = {
     "hamkernel": "index.html",

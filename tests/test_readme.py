@@ -2,6 +2,7 @@
 
 import json
 import re
+import tomllib
 from pathlib import Path
 
 import jax
@@ -13,6 +14,7 @@ import hamkernel as hk
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
+CONTRIBUTING = ROOT / "CONTRIBUTING.md"
 PAGES = {path: path.read_text() for path in sorted((ROOT / "docs").glob("*.md"))}
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
 
@@ -64,7 +66,7 @@ def test_the_readme_has_the_two_commands_that_ci_runs():
 
 def test_every_local_link_of_readme_and_notebooks_leads_to_a_file_and_a_heading():
     texts = {ROOT / "README.md": README, **{path: markdown(path) for path in NOTEBOOKS}}
-    texts |= PAGES
+    texts |= PAGES | {CONTRIBUTING: CONTRIBUTING.read_text()}
     headings = {
         path: {
             re.sub(r"\s+", "-", title.strip())
@@ -82,6 +84,29 @@ def test_every_local_link_of_readme_and_notebooks_leads_to_a_file_and_a_heading(
             assert target.exists(), f"{source.name}: {link}"
             there = lower if target.name == "README.md" else headings.get(target, {anchor})
             assert not anchor or anchor in there, f"{source.name}: {link}"
+
+
+def test_contributing_names_what_exists():
+    """Files, and the classes and methods that somebody who adds something needs."""
+    text = CONTRIBUTING.read_text()
+    paths = [*(ROOT / "hamkernel").rglob("*.py"), ROOT / "pyproject.toml"]
+    sources = "".join(path.read_text() for path in paths)
+    names = re.findall(r"`(\w+)(?:\(\w+(?:, \w+)*\))?`", text)
+    assert [name for name in names if not re.search(rf"\b{name}\b", sources)] == []
+    files = re.findall(r"`((?:hamkernel|tests|\.github)/[\w./]+)`", text)
+    assert len(files) > 10
+    assert [file for file in files if not (ROOT / file).exists()] == []
+
+
+def test_workflows_run_the_command_of_the_readme_on_the_pythons_that_are_supported():
+    tests = (ROOT / ".github" / "workflows" / "tests.yml").read_text()
+    (command,) = re.findall(r"run: eval \"\$\(grep -m1 -- '(.+)' README.md\)\"", tests)
+    assert command in README
+    assert f"grep -m1 -- '{command}' README.md" in (ROOT / ".ci" / "run").read_text()
+    (pythons,) = re.findall(r"python: \[(.+)\]", tests)
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    assert project["requires-python"] == f">={json.loads(f'[{pythons}]')[0]}"
+    assert {"Repository", "Issues"} <= set(project["urls"])
 
 
 def test_the_times_of_the_readme_are_those_of_the_table():
