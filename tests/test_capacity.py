@@ -26,7 +26,7 @@ from hamkernel._trajectories.likelihood import (
     regression_loss,
 )
 from hamkernel._trajectories.model import Model, landmark_whitening
-from hamkernel._trajectories.search import Bounds, limited_by_landmarks, losses, searched, solved
+from hamkernel._trajectories.search import Bounds, limited_by_landmarks, losses, search_sample, solve
 from hamkernel._trajectories.segments import (
     LONG,
     SHORT,
@@ -199,14 +199,14 @@ def test_a_window_says_what_its_part_of_the_path_says():
 
 def test_few_rows_are_all_searched_and_many_are_not():
     few, S = rows_of(*arrays(4, 12)), jnp.zeros((48, 2))
-    same, part = searched(S, few)
+    same, part = search_sample(S, few)
     assert part is few
     assert len(same) == 48
     many = jax.tree.map(lambda a: jnp.concatenate([a] * 512), few)
-    same, part = searched(S, many)
+    same, part = search_sample(S, many)
     assert len(same) == 48
     assert 2 * 48 * 3 * 2 * part.counts[..., 0].size < 1_000_000
-    some, part = searched(jnp.zeros((1000, 2)), many)
+    some, part = search_sample(jnp.zeros((1000, 2)), many)
     assert (len(some), len(part.counts)) == (24 * 11, 24)
 
 
@@ -234,7 +234,7 @@ def test_landmarks_are_doubled_while_the_rows_become_likelier():
         model = Model(truth, jnp.log(jnp.full(2, noise)), NONE)
         none = np.zeros(len(model.flat))
         given, bounds = (rows, WIDE), Bounds(none, none, none > 0)
-        found = [solved(model, S, 16, quick, *given, bounds)[1] for quick in (64, 32)]
+        found = [solve(model, S, 16, quick, *given, bounds)[1] for quick in (64, 32)]
         counts.append([len(each.points) for each in found])
         limited.append(limited_by_landmarks(model, jnp.asarray(S[:16]), *given))
     assert counts == [[64, 64], [64, 32], [16, 16]]

@@ -52,7 +52,7 @@ LEAST_NOISE = 1e-6
 _SHIFTS = (-1.5, -0.3, 0.9)
 
 
-def without_noise(
+def noise_free_coordinates(
     model: Model, bounds: Bounds, scale: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
     """The coordinates that the field explains as far as paths are integrated: no noise is left.
@@ -90,7 +90,7 @@ def losses(
     return np.array([_compiled_loss(model, h, S, rows, start_deviation) for h in points])
 
 
-def searched(
+def search_sample(
     S: Float[Array, "m d"], rows: LinearisedSegments
 ) -> tuple[Float[Array, "k d"], LinearisedSegments]:
     """The landmarks and rows on which hyperparameters are searched: all, if they are few.
@@ -132,7 +132,7 @@ def _best(model: Model, S, rows: LinearisedSegments, start_deviation, low, high,
     return jnp.where(free & (value < jnp.inf), found, start), value
 
 
-def most_likely(
+def maximise_likelihood(
     model: Model,
     S,
     rows: LinearisedSegments,
@@ -142,9 +142,9 @@ def most_likely(
 ) -> tuple[Model, float]:
     """The model under which the rows are likeliest, by BFGS from this one, and −log p there.
 
-    Of many rows some windows, see `searched`, and −log p of those.
+    Of many rows some windows, see `search_sample`, and −log p of those.
     """
-    S, rows = searched(jnp.asarray(S), rows)
+    S, rows = search_sample(jnp.asarray(S), rows)
     if not bounds.free.any():
         flat = model.flat[None]
         return model, float(losses(model, flat, S, rows, start_deviation)[0])
@@ -153,7 +153,7 @@ def most_likely(
     return model.at(h), float(value)
 
 
-def begun(
+def choose_start(
     model: Model,
     design: Float[np.ndarray, "count P"],
     S: Float[np.ndarray, "m d"],
@@ -181,7 +181,7 @@ def begun(
     return model.at(jnp.asarray(start)), count
 
 
-def solved(
+def solve(
     model: Model,
     S: Float[np.ndarray, "m d"],
     count: int,
@@ -215,7 +215,7 @@ def solved(
             break
         (known, found), count = more, 2 * count
     fixed = np.isfinite(np.asarray(model.log_process)) & ~free[-len(model.log_process) :]
-    many = searched(jnp.asarray(S[:count]), rows)[1] is not rows
+    many = search_sample(jnp.asarray(S[:count]), rows)[1] is not rows
     if many and free.any() and not fixed.any() and found.free > found.used and found.squares > 0:
         shift = jnp.log(found.squares / found.free) / 2
         if abs(shift) > 0.01:  # what is left depends on the noise: a secant, by a half to twice it
@@ -339,7 +339,7 @@ def _gain(
     Process noise, or without it sensor noise, had to explain what `more` would.
     """
     K, n = model.kernel, rows.residual.shape[-1]
-    S, rows = searched(jnp.asarray(S), rows)
+    S, rows = search_sample(jnp.asarray(S), rows)
     explains = slice(-2 * n, None)
 
     def least(model: Model) -> float:
