@@ -26,7 +26,13 @@ from hamkernel._trajectories.likelihood import (
     regression_loss,
 )
 from hamkernel._trajectories.model import Model, landmark_whitening
-from hamkernel._trajectories.search import Bounds, limited_by_landmarks, losses, search_sample, solve
+from hamkernel._trajectories.search import (
+    Bounds,
+    limited_by_landmarks,
+    losses,
+    search_sample,
+    solve,
+)
 from hamkernel._trajectories.segments import (
     LONG,
     SHORT,

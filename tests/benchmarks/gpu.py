@@ -126,9 +126,7 @@ def tasks(share: float) -> dict[str, Task]:
         f"product, N = {size(20_000)}, n = 4": Task(product(size(20_000), 4), 3, True),
         f"exact fit, N n = {4 * size(1000)}": Task(fitted(size(1000), 4), 3, True),
         f"Nystrom, N = {size(100_000)}, n = 2": Task(fitted(size(100_000), 2, hk.Nystrom()), 3),
-        f"RandomFeatures, N = {size(100_000)}, n = 2": Task(
-            fitted(size(100_000), 2, features), 3
-        ),
+        f"RandomFeatures, N = {size(100_000)}, n = 2": Task(fitted(size(100_000), 2, features), 3),
         "tune, N = 24, n = 2": Task(tuned(24, 2), 3),
         f"tune, N = {size(300)}, n = 2": Task(tuned(size(300), 2), 3),
         "vmap of fit, 256 x N = 24": Task(batched(False)),
