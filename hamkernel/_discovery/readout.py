@@ -131,8 +131,9 @@ def readout(
 def _measured(learned: Any) -> tuple[AbstractMatrixKernel, Any, Float[Array, ""], Any]:
     """Kernel, rows less what is known, the variance Nλ of their noise, and the mean."""
     if isinstance(learned, Posterior):
-        given = learned.given
-        kernel, rows, ridge = given.field.kernel, given.rows, given.ridge
+        conditional = learned.conditional
+        kernel, rows = conditional.field.kernel, conditional.rows
+        ridge = conditional.ridge
         known = known_of(learned.field)
     elif isinstance(learned, Learned):
         if learned.observations is None:
