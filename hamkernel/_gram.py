@@ -38,7 +38,8 @@ from hamkernel._machine import (
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components
 from hamkernel._observations.measurements import Measurements
 from hamkernel._sizes import sizes
-from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel, total
+from hamkernel._structures.structure import mixed
 
 
 @full_precision
@@ -81,7 +82,10 @@ def assemble(
     K: AbstractMatrixKernel, X: Float[Array, "N n"], Z: Float[Array, "M n"]
 ) -> Float[Array, "N n M n"]:
     """`gram` without its checks and its own compilation."""
-    descriptor = K.through_descriptor(X.shape[1])
+    n = X.shape[1]
+    if isinstance(K, Sum) and any(term.through_descriptor(n) for term in K.terms):
+        return total([assemble(term, X, Z) for term in K.terms])
+    descriptor = K.through_descriptor(n)
     if descriptor is not None:
         return _gram_of_descriptor(descriptor, X, Z)
     closed = K.blocks(X, Z)
@@ -89,7 +93,7 @@ def assemble(
         return closed
     X, Z = centred(K, X, Z)
     basis = jnp.eye(K.outputs(X.shape[1]), dtype=X.dtype)
-    # # Entries are computed in the order of memory. Computing blocks of K and transposing them took
+    # Entries are computed in the order of memory. Computing blocks of K and transposing them took
     # two to four times as long, most of it for a copy of the Gram.
     form = K.form
     for axis in (3, 2, 1, 0):  # b, zⱼ, a, xᵢ
@@ -113,15 +117,8 @@ def _gram_of_descriptor(
 
     Source: Chmiela, Sauceda, Müller & Tkatchenko (2018), Nature Communications 9, 3887.
     """
-    jacobian = descriptor.jacobian or jax.jacfwd(descriptor.map)
-
-    def image_and_directions(x):
-        return descriptor.map(x), jacobian(x) @ descriptor.directions(x)
-
-    (D, J), (E, L) = (
-        jax.vmap(image_and_directions)(X),
-        jax.vmap(image_and_directions)(Z),
-    )  # (N, m), (N, m, n)
+    # (N, m) and (N, m, n), (M, m) and (M, m, n)
+    (D, J), (E, L) = jax.vmap(descriptor.at)(X), jax.vmap(descriptor.at)(Z)
 
     def slope(d, v, e):
         """The gradient in e of the derivative of κ(d, e) along v, (m,)."""
@@ -147,7 +144,17 @@ def diagonals(
 
 def block_traces(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, " N"]:
     """The traces of the diagonal blocks of the Gram, tr K(xᵢ, xᵢ)."""
-    return diagonals(K, X, X).sum(axis=1)
+    if isinstance(K, Sum):
+        return total([block_traces(term, X) for term in K.terms])
+    found = K.through_descriptor(X.shape[1])
+    if found is None:
+        return diagonals(K, X, X).sum(axis=1)
+
+    def of_point(x):
+        d, J = found.at(x)
+        return jax.vmap(lambda v: mixed(found.kernel, d, v, d, v))(J.T).sum()
+
+    return jax.lax.map(of_point, X)
 
 
 def trace(
@@ -203,7 +210,7 @@ def gram_of_rows(
     return rows.contrast(rows.contrast(G).T) if contrasted and len(rows.energies) else G
 
 
-# # The largest number of entries of a strip. Some kernels hold 40 intermediate numbers for each
+# The largest number of entries of a strip. Some kernels hold 40 intermediate numbers for each
 # entry, which makes 160 MB.
 _STRIP = 500_000
 
@@ -296,7 +303,7 @@ def between(
         one = Combinations(groups=points[None], weights=weights[None])  # pyright: ignore[reportCallIssue]
         return _map_rows(K, one, right)
 
-    # # The covariances at the points of all groups may not fit in memory. Groups are batched so
+    # The covariances at the points of all groups may not fit in memory. Groups are batched so
     # that the covariances of one batch, Q n rows for each group, have about 10⁶ entries (8 MB).
     batch = max(1, 1_000_000 // (left.groups[0].size * right.points.size))
     out = jax.lax.map(rows_of_group, (left.groups, left.weights), batch_size=batch)
@@ -372,14 +379,14 @@ def _(saved, bar, perturbed, kernel_and_data, make, rowwise=False):
     flat, unravel = ravel_pytree(params)
 
     def slope(direction):
-        # # The barrier makes every intermediate depend on the direction. Otherwise XLA would move
+        # The barrier makes every intermediate depend on the direction. Otherwise XLA would move
         # the intermediates that do not out of the loop and keep several arrays of the size of the
         # Gram.
         here, direction = jax.lax.optimization_barrier((flat, direction))
         at = lambda h: pair(eqx.combine(unravel(h), static), data, bar)  # noqa: E731
         return jax.jvp(at, (here,), (direction,))[1]
 
-    # # Directions in one batch share the intermediates that do not depend on the direction. A batch
+    # Directions in one batch share the intermediates that do not depend on the direction. A batch
     # holds as many directions as give up to 200 000 entries of the array and its derivatives.
     largest = max(each.size for each in [bar, *jax.tree.leaves(arrays)])
     batch = min(flat.size, 200_000 // largest)

@@ -169,7 +169,7 @@ def _product_by_tiles(K, X, Z, A):
     rows = tiles(X, X[:1], side)
     columns = (tiles(Z, Z[:1], side), tiles(A, jnp.zeros_like(A[:1]), side))
 
-    # # The backward pass recomputes the tiles; otherwise it would keep every pair.
+    # The backward pass recomputes the tiles; otherwise it would keep every pair.
     @jax.checkpoint
     def tile(x, z, a):
         return jax.vmap(K.expansion, in_axes=(0, None, None))(x, z, a)
@@ -180,7 +180,7 @@ def _product_by_tiles(K, X, Z, A):
 
         return jax.lax.scan(add, jnp.zeros((len(x), A.shape[1]), x.dtype), columns)[0]
 
-    # # Reverse mode through a loop forgets the custom rule that makes a Matérn kernel smooth at x =
+    # Reverse mode through a loop forgets the custom rule that makes a Matérn kernel smooth at x =
     # z, and second derivatives become NaN. A single tile is therefore evaluated without a loop.
     if len(rows) == len(columns[0]) == 1:
         return tile(rows[0], columns[0][0], columns[1][0])

@@ -32,7 +32,7 @@ from hamkernel._show import has_arrays, text
 from hamkernel._solvers.dense import Cholesky
 from hamkernel._solvers.fit import check_solver, features_of_parts
 from hamkernel._solvers.low_rank import LowRankConditional
-from hamkernel._solvers.problem import AbstractConditional, AbstractSolver, new_rows, problem
+from hamkernel._solvers.problem import AbstractConditional, AbstractSolver, make_problem, new_rows
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -90,13 +90,13 @@ def condition(
     check_solver(solver)
     if solver is not None and solver.no_factor:
         raise TypeError(solver.no_factor)
-    problem_to_solve = problem(K, X, Y, regularization, mean, inputs, parameters).to_one_device()
+    problem = make_problem(K, X, Y, regularization, mean, inputs, parameters).to_one_device()
     if solver is None:
-        solver = features_of_parts() if is_of_parts(problem_to_solve.kernel) else Cholesky()
-    require.warn_of_float32(problem_to_solve.rows.targets)
-    _warn_of_amplitude(problem_to_solve.kernel, problem_to_solve.rows.points)
-    conditional = solver.condition(problem_to_solve, progress=progress)
-    return Posterior(conditional, learned_field(conditional.field, problem_to_solve.known))
+        solver = features_of_parts() if is_of_parts(problem.kernel) else Cholesky()
+    require.warn_of_float32(problem.rows.targets)
+    _warn_of_amplitude(problem.kernel, problem.rows.points)
+    conditional = solver.condition(problem, progress=progress)
+    return Posterior(conditional, learned_field(conditional.field, problem.known))
 
 
 class Posterior(eqx.Module):

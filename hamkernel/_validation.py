@@ -30,7 +30,7 @@ from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.factors import AbstractSystem, ContrastedSystem, DenseSystem
 from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._solvers.low_rank_factor import LowRankSystem
-from hamkernel._solvers.problem import problem
+from hamkernel._solvers.problem import make_problem
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -187,8 +187,10 @@ def _check_problem(
     K, X, Y, regularization, inputs, parameters
 ) -> tuple[Any, Measurements, Float[Array, ""]]:
     """The checked kernel, rows and λ."""
-    # # LAPACK calls on several devices at once can deadlock, see `_solvers/factors.py`.
-    checked = problem(K, X, Y, regularization, inputs=inputs, parameters=parameters).to_one_device()
+    # LAPACK calls on several devices at once can deadlock, see `_solvers/factors.py`.
+    checked = make_problem(
+        K, X, Y, regularization, inputs=inputs, parameters=parameters
+    ).to_one_device()
     check_memory(checked.rows, 3)  # matrices of the size of the Gram, with the gradient
     return checked.kernel, checked.rows, checked.regularization
 
@@ -212,7 +214,7 @@ def partition_of_rows(rows: Measurements, folds: Folds) -> Partition:
     return Partition(len(rows.targets), labels[rows.labels()])
 
 
-# # Some losses also return ‖a‖², with which `tune` bounds the rounding errors of a field.
+# Some losses also return ‖a‖², with which `tune` bounds the rounding errors of a field.
 
 
 def partition_loss(K, rows: Measurements, regularization, partition: Partition, basis=None):
@@ -246,7 +248,7 @@ def held_out_rows(K, rows: Measurements, regularization, partition: Partition, b
     if features is None:
         result = _dense_held_out(gram_matrix(K, rows, contrasted), ridge, y, p, rows, partition)
     elif features.shape[1] > len(y) - max(map(len, partition.folds)):
-        # # With fewer training rows than features the fit interpolates, and the low-rank gradient
+        # With fewer training rows than features the fit interpolates, and the low-rank gradient
         # loses digits like cond(A)²: at cond(A) = 1e10 its relative error was 5. There are then few
         # rows, so a dense factor is affordable.
         result = _dense_held_out(features @ features.T, ridge, y, p, rows, partition)
@@ -259,7 +261,7 @@ def _dense_held_out(G, ridge, y, p, rows: Measurements, partition: Partition):
     A = plus_ridge(G, ridge)
     if p is None:
         return held_out(DenseSystem(A), y, partition)
-    # # Let U = diag(units), A′ = UAU and y′ = Uy. Then C′ = U⁻¹CU⁻¹ and a′ = C′y′ = U⁻¹a, so r′_S =
+    # Let U = diag(units), A′ = UAU and y′ = Uy. Then C′ = U⁻¹CU⁻¹ and a′ = C′y′ = U⁻¹a, so r′_S =
     # (C′_SS)⁻¹a′_S = U r_S. In these units the direction Up of the constant is the same for all
     # energies, p ∝ 1/s and U = diag(s), so Up does not depend on the noise and needs no derivative.
     units = jnp.where(p == 0, jnp.ones_like(p), rows.scale)
@@ -276,7 +278,7 @@ def generalized_loss(K, rows: Measurements, regularization, basis=None, least_fr
 
 @compiled
 def generalized_loss_and_square(K, rows: Measurements, regularization, basis=None, least_free=0.0):
-    # # The loss is infinite if the share of free residuals, tr(I − S)/D, is below `least_free`.
+    # The loss is infinite if the share of free residuals, tr(I − S)/D, is below `least_free`.
     ridge = rows.count * regularization
     squares, trace = free_residuals(_contrasted_system(K, rows, ridge, basis), rows.y)
     enough = ridge * trace >= least_free * rows.size  # tr(I − S) = ridge tr A⁻¹
@@ -284,8 +286,11 @@ def generalized_loss_and_square(K, rows: Measurements, regularization, basis=Non
 
 
 @compiled
-def log_likelihood(K, rows: Measurements, regularization, basis=None):
-    """The log marginal likelihood of rows, with a flat prior for the constant of energies."""
+def log_likelihood(K, rows: Measurements, regularization, basis=None, projected=None):
+    """The log marginal likelihood of rows, with a flat prior for the constant of energies.
+
+    `projected` is `project_silent_directions(K, rows)`, if it is known already.
+    """
     # Rows are y_r = (measurement)_r / s_r, so log p(measurements) = log p(y) − Σ log s_r. The
     # constant of the energies enters y along s⁻¹ = ‖s⁻¹‖ p. A flat prior for the constant
     # integrates the density over this direction: log p(y) = log N(Ty; 0, TATᵀ) − log ‖s⁻¹‖ with the
@@ -293,7 +298,7 @@ def log_likelihood(K, rows: Measurements, regularization, basis=None):
     # Biometrika 61; Rasmussen & Williams (2006), eq. 2.45). The k silent directions are zeros of
     # variance ρ = Nλ in y, whose density −½ k log 2πρ is removed again.
     ridge = rows.count * regularization
-    y, silent = project_silent_directions(K, rows)
+    y, silent = project_silent_directions(K, rows) if projected is None else projected
     y, silent, ridge = jax.lax.optimization_barrier((y, silent, ridge))  # no LAPACK side by side
     density = log_density(_contrasted_system(K, rows, ridge, basis), y)
     density = density + 0.5 * silent * jnp.log(2 * jnp.pi * ridge)
@@ -323,10 +328,10 @@ def project_silent_directions(
 
     def project(pair):
         x, v = pair
-        J = jax.jacfwd(descriptor.map)(x) @ descriptor.directions(x)  # (m, n)
-        J = jax.lax.stop_gradient(J)  # # constant, for a map of constant rank
+        J = jax.jacfwd(descriptor.seen or descriptor.map)(x) @ descriptor.directions(x)  # (m, n)
+        J = jax.lax.stop_gradient(J)  # constant, for a map of constant rank
         squares, V = jnp.linalg.eigh(J.T @ J)
-        # # Zero eigenvalues are ε of the largest after rounding; a descriptor resolves more than
+        # Zero eigenvalues are ε of the largest after rounding; a descriptor resolves more than
         # ε^(1/3) of its largest singular value, whose square is ε^(2/3).
         is_visible = squares > jnp.finfo(x.dtype).eps ** (2 / 3) * squares[-1]
         return V @ jnp.where(is_visible, V.T @ v, jnp.zeros_like(v)), jnp.sum(~is_visible)

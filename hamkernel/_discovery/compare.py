@@ -26,7 +26,7 @@ from hamkernel._kernels.built_in import Gaussian
 from hamkernel._machine import full_precision, one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.measurements import Measurements, observations
-from hamkernel._solvers.problem import problem
+from hamkernel._solvers.problem import make_problem
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.structure import DivergenceFree, Separable
 from hamkernel._trajectories.learned import Learned
@@ -166,7 +166,7 @@ def compare(
 
     require.untraced("hk.compare", "Call it outside.", X, Y, candidates)
     data, ridge = _data(X, Y)
-    rows = problem(Separable(Gaussian(1.0)), data, None, 1.0).rows
+    rows = make_problem(Separable(Gaussian(1.0)), data, None, 1.0).rows
     points, n, D = np.asarray(rows.points), rows.dimension, rows.size
     scale = points.std(axis=0)
     speed = velocity_rms(Separable(Gaussian(jnp.asarray(np.where(scale > 0, scale, 1.0)))), rows)

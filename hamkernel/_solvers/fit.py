@@ -26,7 +26,7 @@ from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.dense import Cholesky, copies
 from hamkernel._solvers.lagrangian import fit_lagrangian
-from hamkernel._solvers.problem import AbstractSolver, LearnedField, Problem, problem
+from hamkernel._solvers.problem import AbstractSolver, LearnedField, Problem, make_problem
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.family import AbstractFamily
@@ -173,8 +173,8 @@ def fit(
         return fit_lagrangian(K, X, Y, regularization, accelerations)
     if accelerations is not None:
         raise TypeError("accelerations= belongs to hk.Lagrangian(potential=…, inertia=…).")
-    problem_to_solve = problem(K, X, Y, regularization, mean, inputs, parameters, throw)
-    return field_of_problem(problem_to_solve, solver, throw, progress)
+    problem = make_problem(K, X, Y, regularization, mean, inputs, parameters, throw)
+    return field_of_problem(problem, solver, throw, progress)
 
 
 def field_of_problem(

@@ -67,7 +67,7 @@ class Problem:
         return dataclasses.replace(self, rows=move)
 
 
-def problem(
+def make_problem(
     K: Any,
     X: Any,
     Y: Any,

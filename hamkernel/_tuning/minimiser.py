@@ -101,7 +101,7 @@ class BoxBFGS(optx.AbstractBFGS):
         promised = -(state.f_info.grad @ state.descent_state) / 2
         step = jnp.linalg.norm(state.y_eval - y)
         converged = promised < self.atol
-        # # A step below √ε relative to u changes the value by rounding errors alone.
+        # A step below √ε relative to u changes the value by rounding errors alone.
         stuck = step <= 1e-8 * (1 + jnp.linalg.norm(y))
         result = optx.RESULTS.where(
             stuck & ~converged, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
@@ -176,7 +176,7 @@ def step_once(
     u, state, aux = minimiser.step(with_args, run.u, *arguments, run.state, frozenset())
     stopped, result = minimiser.terminate(with_args, u, *arguments, state, frozenset())
     best = _better(run.best, aux)
-    # # After an accepted step optimistix returns the previous point; its state holds the new one.
+    # After an accepted step optimistix returns the previous point; its state holds the new one.
     best = _better(best, getattr(state, "aux", aux))
     successful = result == optx.RESULTS.successful
     return MinimiserRun(
@@ -217,7 +217,7 @@ def most_likely_in_box(
     `deviations` are rough standard deviations σ of h under the likelihood. With
     dh/du = (high − low) cos(u)/2 they give the first inverse Hessian of BFGS, (σ / (dh/du))².
     """
-    # # A hyperparameter within a tenth of its standard deviation of the best value is good enough;
+    # A hyperparameter within a tenth of its standard deviation of the best value is good enough;
     # there the quadratic −log p is ½ .1² = .005 above its minimum.
     bfgs = BoxBFGS(atol=jnp.asarray(0.005, start.dtype))
     u = from_box(start, low, high, 0.01)
@@ -247,10 +247,10 @@ def _with_slope_backward(fn: Minimisable) -> Callable[[Array, Any], tuple[Array,
 
     def evaluate(u):
         value, loss = fn(u)
-        # # optimistix begins with an `Evaluation` of zeros, in which `is_evaluated` is False.
+        # optimistix begins with an `Evaluation` of zeros, in which `is_evaluated` is False.
         is_evaluated = jnp.isfinite(u).all()
         point = Evaluation(is_evaluated, u, value.astype(u.dtype), loss.astype(u.dtype))
-        # # The line search interpolates values, so they must be finite.
+        # The line search interpolates values, so they must be finite.
         return jnp.where(jnp.isfinite(point.value), point.value, 1e30), point
 
     differentiable = jax.custom_jvp(evaluate)

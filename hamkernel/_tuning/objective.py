@@ -16,9 +16,11 @@ from jaxtyping import Array, Float, Int
 from hamkernel import _require as require
 from hamkernel._closed_forms import Folds, Partition
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._machine import compiled
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.completed import has_constant_parts
 from hamkernel._tuning.space import SearchSpace
 from hamkernel._validation import (
     cross_validation_loss,
@@ -28,12 +30,13 @@ from hamkernel._validation import (
     log_marginal_likelihood,
     partition_loss_and_square,
     partition_of_rows,
+    project_silent_directions,
 )
 
 Objective = Callable[[AbstractMatrixKernel, Array, Array, Array], Float[Array, ""]]
 Criterion = Literal["cross_validation", "generalized_cross_validation", "marginal_likelihood"]
 
-# # The smallest tr(I − S)/D for which generalised cross-validation is evaluated. If a fit
+# The smallest tr(I − S)/D for which generalised cross-validation is evaluated. If a fit
 # interpolates, tr(I − S) and the residual both vanish, the loss is 0/0 and can be small by
 # accident. On 24 points with noise, a search without the limit leaves less than a tenth of the
 # noise as residual, and with the limit more than half (`tests/test_tune.py`).
@@ -70,10 +73,21 @@ class SearchCriterion(eqx.Module):
 
     def with_basis(self, basis: AbstractBasis) -> "SearchCriterion":
         """This criterion, for the low-rank fit in a basis."""
-        # # A Partial of a Partial would be a new function, and compile anew, in each call of
-        # `tune`.
-        fn = jax.tree_util.Partial(self.fn.func, **self.fn.keywords, basis=basis)
+        return self._with(basis=basis)
+
+    def _with(self, **keywords: Any) -> "SearchCriterion":
+        # A Partial of a Partial would be a new function, and compile anew, in each call of `tune`.
+        fn = jax.tree_util.Partial(self.fn.func, **(self.fn.keywords | keywords))
         return dataclasses.replace(self, fn=fn)
+
+    def with_silent_directions(
+        self, K: AbstractMatrixKernel, rows: Measurements
+    ) -> "SearchCriterion":
+        """This criterion with the silent directions computed once, if they do not depend on u."""
+        if self.fn.func is not _negative_log_likelihood or not has_constant_parts(K):
+            return self
+        # An eigenvalue problem of n × n for each point.
+        return self._with(projected=_project(K, rows))
 
     def for_subset(self, rows: Measurements, chosen: np.ndarray) -> "SearchCriterion":
         """This criterion for the rows of a subset of the observations."""
@@ -158,7 +172,7 @@ def parts_of(
     N, n = rows.count, len(rows.targets) / rows.count
     if criterion.custom:  # it may need all the data
         return [np.arange(N)]
-    # # The first part has 256 rows or 64 points, whichever is fewer. With half as many, the best
+    # The first part has 256 rows or 64 points, whichever is fewer. With half as many, the best
     # run often leads to a poor optimum on all the data (`tests/benchmarks/tuning_speed.py`). The
     # second part has 1024 rows, and is used if all points have at least twice as many.
     counts = [min(64, max(int(256 / n), 2)), int(1024 / n)]
@@ -168,7 +182,7 @@ def parts_of(
         return [np.arange(N)]
     labels = np.zeros(N) if criterion.partition is None else criterion.partition.labels
     order = np.argsort(labels, kind="stable")
-    # # Evenly spaced over the folds and over the observations of each fold.
+    # Evenly spaced over the folds and over the observations of each fold.
     subsets = [np.sort(order[np.linspace(0, N - 1, count).round().astype(int)]) for count in counts]
     return [*subsets, np.arange(N)] if dense else subsets
 
@@ -219,5 +233,8 @@ def _custom_of_data(fn, data, K, rows, regularization):
     return fn(K, *data, regularization)
 
 
-def _negative_log_likelihood(K, rows, regularization, basis=None):
-    return -log_likelihood(K, rows, regularization, basis)
+_project = compiled(project_silent_directions)
+
+
+def _negative_log_likelihood(K, rows, regularization, basis=None, projected=None):
+    return -log_likelihood(K, rows, regularization, basis, projected)

@@ -85,7 +85,7 @@ class Search:
         parts = parts_of(self.rows, self.criterion, dense=low_rank is None)
         part = self._part(self.criterion, parts[0])
         only = len(parts) == 1 and low_rank is None
-        # # The tolerance is 1e-3 if more points follow. On seven problems of 120 points the number
+        # The tolerance is 1e-3 if more points follow. On seven problems of 120 points the number
         # of losses on the subset and on all points was 328 and 29 for 1e-2, 391 and 23 for 1e-3,
         # 476 and 22 for 1e-4, with the same fields.
         runs = self._first(part, _TOLERANCE if only else 1e-3)
@@ -96,7 +96,7 @@ class Search:
         for more in parts[1:]:
             steps = self.max_steps
             if more is last:
-                # # Two steps only. On all the data, further steps only overfit the folds: 1, 2, 3
+                # Two steps only. On all the data, further steps only overfit the folds: 1, 2, 3
                 # and 6 steps lower the median loss (.0126, .0118, .0114, .0112) but not the field
                 # error (.0025, .0025, .0026, .0026; pendulum, 141 runs, six seeds).
                 steps, ends = 2, _take(ends, [0])
@@ -121,7 +121,7 @@ class Search:
         """Runs from the caller's point and from the best points of a design."""
         minimiser, points = self._minimiser(tolerance), self._points
         runs_of_design = part.init(minimiser, points)
-        # # The first call compiles, so its time does not predict that of the next calls.
+        # The first call compiles, so its time does not predict that of the next calls.
         runs = self._evaluate(part, _take(runs_of_design, [0]), minimiser)
         if self.starts > 1:
             design_runs = self._evaluate(
@@ -149,7 +149,7 @@ class Search:
         minimiser = self._minimiser(_TOLERANCE)
         runs = part.init(minimiser, ends.best.u).with_curvature_of(ends)
         runs = _sort(self._evaluate(part, runs, minimiser))
-        # # With only one end, the search missed the better of two optima whose losses on the subset
+        # With only one end, the search missed the better of two optima whose losses on the subset
         # differ by a few per cent (96 points of `tuning_speed.py`, a loss 3 % larger).
         best_runs = self._descend(part, _take(runs, slice(2)), minimiser, steps)
         runs = _sort(_concatenate(best_runs, _take(runs, slice(2, None))))
@@ -189,7 +189,7 @@ class Search:
         """Step the runs until each has converged or used up its steps."""
         last_step = runs.steps.max() + steps
         while (active := runs.active & (runs.steps < last_step)).any():
-            # # A call makes one step, or as many as take a second, so that Ctrl-C works.
+            # A call makes one step, or as many as take a second, so that Ctrl-C works.
             steps_at_once = 1 if self.progress else max(1, int(1 / (part.seconds * active.sum())))
             runs = part.minimise(
                 minimiser, runs, min(steps_at_once, int(last_step - runs.steps[active].max()))
@@ -220,7 +220,7 @@ def _different(runs: MinimiserRun) -> list[int]:
     ends: list[int] = []
     for i in np.argsort(runs.best.value, kind="stable"):
         apart = [box_distance(runs.best.u[i], runs.best.u[j]) for j in ends]
-        # # Ends closer than a hundredth of the box are one, which saved 2 of 25 losses on all
+        # Ends closer than a hundredth of the box are one, which saved 2 of 25 losses on all
         # points.
         if runs.best.value[i] < np.inf and min(apart, default=1.0) > 0.01:
             ends.append(int(i))
@@ -273,7 +273,8 @@ class Part:
             rows, chosen = rows.subset(chosen)
         self.count = rows.count
         numbers = (jnp.asarray(number, rows.targets.dtype) for number in (N / self.count, rms, 1.0))
-        self.objective = SearchObjective(space, criterion.for_subset(rows, chosen), rows, *numbers)
+        criterion = criterion.for_subset(rows, chosen).with_silent_directions(space.kernel, rows)
+        self.objective = SearchObjective(space, criterion, rows, *numbers)
 
     def set_unit(self, unit: float) -> None:
         """Divide the caller's objective by `unit`, since tolerances assume values of size 1."""
@@ -293,7 +294,7 @@ class Part:
     ) -> MinimiserRun:
         """The runs after up to `steps` more steps."""
         count, before = len(runs.u), runs.steps.sum()
-        # # On a CPU, runs one after the other took two thirds of the time of batched runs. On a GPU
+        # On a CPU, runs one after the other took two thirds of the time of batched runs. On a GPU
         # a few hundred rows do not fill the device, so runs are batched, although a `while_loop`
         # under `vmap` also computes the runs that have finished.
         side_by_side = platform() != "cpu" and len(self.objective.rows.targets) <= 256

@@ -66,7 +66,7 @@ def hyperparameters(
     square of a component of the velocities.
     """
     inputs = np.asarray(X)
-    # # The amplitude that fits depends on the lengthscales; we take them in the middle of their
+    # The amplitude that fits depends on the lengthscales; we take them in the middle of their
     # boxes.
     arrays, rest = eqx.partition(K, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(arrays)
@@ -326,7 +326,7 @@ class SearchSpace(eqx.Module):
         """The u of the caller's values, moved into the box by a margin if they are outside."""
         ridge_low, ridge_high = self.ridge_bounds(self.size_of_gram(self.kernel))
         low, high = self.low.at[-1].set(ridge_low), self.high.at[-1].set(ridge_high)
-        # # If the kernel is not positive at the start, λ has no bounds and starts in the middle.
+        # If the kernel is not positive at the start, λ has no bounds and starts in the middle.
         # The margin is twice `_EDGE`, so that a start does not count as resting on a bound.
         return from_box(self.start, low, high, 2 * _EDGE)[jnp.asarray(self.free)]
 
