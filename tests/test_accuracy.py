@@ -139,7 +139,7 @@ LANDMARKS = hk.Nystrom(points=X[::12])
 @pytest.mark.parametrize("solver", [FEATURES, LANDMARKS], ids=["features", "landmarks"])
 def test_low_rank_fits_are_those_of_a_stable_least_squares(solver, way):
     span = bases_of(solver).span(K, X.shape[1], jnp.asarray(X).dtype)
-    rows, y = np.asarray(span.of(Components(jnp.asarray(X)))), np.asarray(Y).reshape(-1, 1)
+    rows, y = np.asarray(span.rows_of(Components(jnp.asarray(X)))), np.asarray(Y).reshape(-1, 1)
     largest = np.linalg.norm(rows, 2) ** 2
     for condition in (1e2, 1e5, 1e8, 1e11):
         ridge = largest / condition

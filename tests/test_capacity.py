@@ -247,7 +247,7 @@ def test_landmarks_are_doubled_while_the_rows_become_likelier():
     assert limited == [True, True, False]
 
 
-@pytest.mark.parametrize("size", [10, _machine._SMALL + 1])
+@pytest.mark.parametrize("size", [10, _machine._MAX_UNOPTIMISED + 1])
 def test_how_a_program_is_compiled_changes_neither_values_nor_derivatives(size):
     """Small ones without optimisation, and inside of others as those say."""
 
@@ -264,7 +264,7 @@ def test_how_a_program_is_compiled_changes_neither_values_nor_derivatives(size):
 
 
 def test_options_that_a_compiler_does_not_know_are_left_out(monkeypatch):
-    monkeypatch.setitem(_machine._FASTEST, "cpu", {"xla_no_such_option": True})
+    monkeypatch.setitem(_machine._UNOPTIMISED, "cpu", {"xla_no_such_option": True})
     assert not _machine._options_are_known.__wrapped__("cpu")
     assert not _machine._options_are_known.__wrapped__("abacus")
     monkeypatch.setattr(_machine, "_options_are_known", lambda _: False)

@@ -78,7 +78,7 @@ def test_the_warning_of_an_amplitude_of_one_is_told_to_scale_only_what_is_not_sc
 def test_the_covariance_of_energies_differentiated_twice_is_that_of_the_field(posterior):
     def energies(x, z):
         pair = [Values(point[None]) for point in (x, z)]
-        return posterior.given.covariance(*pair)[0, 0]
+        return posterior.conditional.covariance(*pair)[0, 0]
 
     J = canonical(2)
     x = jnp.asarray(INSIDE)
