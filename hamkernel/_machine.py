@@ -351,7 +351,10 @@ _BY_PLATFORM = {
     "cpu": {"xla_cpu_use_fusion_emitters": False},
     "gpu": {"xla_gpu_autotune_level": 0},
 }
-_UNOPTIMISED = {"cpu": _BY_PLATFORM["cpu"] | {"xla_backend_optimization_level": 0}, "gpu": _BY_PLATFORM["gpu"]}
+_UNOPTIMISED = {
+    "cpu": _BY_PLATFORM["cpu"] | {"xla_backend_optimization_level": 0},
+    "gpu": _BY_PLATFORM["gpu"],
+}
 _MAX_UNOPTIMISED = 16_384  # numbers in the arguments, up to which a program is not optimised
 
 

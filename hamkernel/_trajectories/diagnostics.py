@@ -36,11 +36,11 @@ class Diagnostic(NamedTuple):
 
     Attributes:
         name: the question, in a word or two.
-        value: what was found.
-        limit: what it is compared with.
+        value: the value found.
+        limit: the limit of the value.
         passes: whether the value is within the limit.
-        meaning: what the value says, in one sentence.
-        advice: what to do, in one sentence; "" where there is nothing to do.
+        meaning: the meaning of the value, in one sentence.
+        advice: the thing to do, in one sentence; "" where there is nothing to do.
         decides: whether a field that fails here must not be used.
     """
 
@@ -80,13 +80,13 @@ class Diagnostics:
 
     @property
     def warning(self) -> str:
-        """What falls short, in a line or two; "" where nothing does."""
+        """The rows that fall short, in a line or two; "" where none does."""
         short = [row for row in self.rows if not row.passes]
         if not short:
             return ""
         decide = [row for row in short if row.decides]
-        others = [row for row in short if not row.decides]
-        shown = [*decide[:1], *others[:1]] if decide and others else short[:2]
+        qualify = [row for row in short if not row.decides]
+        shown = [*decide[:1], *qualify[:1]] if decide and qualify else short[:2]
         said = "; ".join(row.meaning.rstrip(".") for row in shown)
         names = ", ".join(row.name for row in short if row not in shown)
         more = f"; and {names}" if names else ""
@@ -158,7 +158,7 @@ class FitQuality(NamedTuple):
             swing.
         impulse: the largest jump by a push, over the standard deviation of the coordinate.
         pushed: the parts in which something pushed the system, as those that were dropped.
-        count: of iterations.
+        count: the number of iterations.
         settled: whether they ended by themselves.
         swing: how many samples there are in a swing.
         driven: whether there are inputs.
