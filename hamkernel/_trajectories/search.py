@@ -93,10 +93,11 @@ def losses(
 def search_sample(
     S: Float[Array, "m d"], rows: LinearisedSegments
 ) -> tuple[Float[Array, "k d"], LinearisedSegments]:
-    """The landmarks and rows on which hyperparameters are searched: all, if they are few.
+    """The landmarks and rows of the search for hyperparameters: all of them if they are few.
 
-    Of many rows some windows. If the landmarks are too many for them, one in the middle of each
-    interval of the windows, which for a field that is smooth over an interval is as good as all.
+    A search on many rows uses a sample of windows. Where even the windows are too many for the
+    landmarks, the middle of each interval takes the place of the landmarks: for a field that is
+    smooth over an interval it is as good.
     """
     n = rows.residual.shape[-1]
     if 3 * n * rows.residual.size * len(S) <= _ENTRIES:
@@ -110,8 +111,8 @@ def search_sample(
 def exact(rows: LinearisedSegments) -> tuple[Float[Array, "k d"], LinearisedSegments]:
     """The rows with a landmark in the middle of each of their intervals.
 
-    Those of padding are the same point again and again, which adds nothing to the span; without
-    them rows of every length would be compiled for.
+    Intervals of padding repeat one point, which adds nothing to the span. Without the padding XLA
+    would compile for rows of every length.
     """
     return rows.nodes[:, :, 1].reshape(-1, rows.nodes.shape[-1]), rows
 
@@ -128,8 +129,8 @@ def _best(model: Model, S, rows: LinearisedSegments, start_deviation, low, high,
     kernel = jnp.full(start.size - 2 * count.size, 0.2, start.dtype)
     noise = 1 / jnp.sqrt(2 * count)
     deviations = jnp.concatenate([kernel, noise, noise])
-    found, value = most_likely_in_box(loss, start, low, high, deviations, steps)
-    return jnp.where(free & (value < jnp.inf), found, start), value
+    end, value = most_likely_in_box(loss, start, low, high, deviations, steps)
+    return jnp.where(free & (value < jnp.inf), end, start), value
 
 
 def maximise_likelihood(
@@ -140,9 +141,9 @@ def maximise_likelihood(
     bounds: Bounds,
     steps: int,
 ) -> tuple[Model, float]:
-    """The model under which the rows are likeliest, by BFGS from this one, and −log p there.
+    """The likeliest model of the rows, by BFGS from `model`, and −log p there.
 
-    Of many rows some windows, see `search_sample`, and −log p of those.
+    The search and its −log p use the rows of `search_sample`.
     """
     S, rows = search_sample(jnp.asarray(S), rows)
     if not bounds.free.any():
@@ -161,22 +162,22 @@ def choose_start(
     rows: LinearisedSegments,
     start_deviation,
 ) -> tuple[Model, int]:
-    """The most likely model of a design, and with how many landmarks to look for a better one.
+    """The likeliest model of a design, and the number of landmarks for the search from there.
 
-    With the first of them, or with all where −log p then falls by more than √(q/2), by which q
-    parameters leave it unknown. All of the design is compared: with too few landmarks the best is a
-    smooth field with much noise, at which more of them do not help.
+    The number is `first`, or all of them if −log p then falls by more than √(q/2), the uncertainty
+    of −log p with q weights. Every point of the design is evaluated with both numbers: on too few
+    landmarks the best point is a smooth field with much noise, where more landmarks do not help.
     """
     n, width = rows.residual.shape[-1], (_ENTRIES / 3) ** 0.5
     part = windows(rows, int(width / n))
-    own = exact(part)[0]
-    sets = {first: jnp.asarray(S[:first]) if n * first <= width else own}
-    if len(own) > first < len(S):
-        sets[len(S)] = own
+    middles = exact(part)[0]
+    sets = {first: jnp.asarray(S[:first]) if n * first <= width else middles}
+    if len(middles) > first < len(S):
+        sets[len(S)] = middles
     best, count, start = np.inf, first, design[0]
-    for size, some in sets.items():
-        values = losses(model, design, some, part, start_deviation)
-        if values.min() < best - (n * len(some) / 2) ** 0.5:
+    for size, points in sets.items():
+        values = losses(model, design, points, part, start_deviation)
+        if values.min() < best - (n * len(points) / 2) ** 0.5:
             best, count, start = values.min(), size, design[int(np.argmin(values))]
     return model.at(jnp.asarray(start)), count
 
@@ -190,43 +191,45 @@ def solve(
     start_deviation,
     bounds: "Bounds",
 ) -> tuple[Model, ClosedForm]:
-    """The closed form of all rows on the first `count` landmarks or more, and the model with it.
+    """The closed form of all rows on the first `count` landmarks or more, and its model.
 
-    Landmarks are doubled while −log p falls by more than √(q/2), by which q parameters leave it
-    unknown; to more than `quick` ones only where windows say that the variance left would halve.
-    Noise that was found on some of the rows is scaled to what all of them leave.
+    The number of landmarks is doubled while −log p falls by more than √(q/2), the uncertainty of
+    −log p with q weights. Beyond `quick` landmarks it is doubled only where windows predict half
+    of the remaining variance. If the search used a sample of the rows, both kinds of noise are
+    scaled to the residuals of all rows.
     """
     free, size = np.array(bounds.free), len(model.flat) - 2 * len(model.log_noise)
-    free[:size] = False  # what is left are both kinds of noise
+    free[:size] = False  # the kernel stays, both kinds of noise are scaled
 
-    def on(count: int) -> tuple[Condensed, ClosedForm]:
+    def solution(count: int) -> tuple[Condensed, ClosedForm]:
         points = jnp.asarray(S[:count])
-        known = condensed(model, points, rows, start_deviation)
-        return known, conditional(known, points)
+        triangle = condensed(model, points, rows, start_deviation)
+        return triangle, conditional(triangle, points)
 
-    known, found = on(count)
+    triangle, closed = solution(count)
     while count < len(S):
         if count <= quick < min(2 * count, len(S)):
-            given = model, jnp.asarray(S[:count]), rows, start_deviation
-            if not limited_by_landmarks(*given, bool(free.any()), least=np.log(2) / 2):
+            args = model, jnp.asarray(S[:count]), rows, start_deviation
+            if not limited_by_landmarks(*args, bool(free.any()), least=np.log(2) / 2):
                 break
-        more = on(2 * count)
-        if not more[1].loss < found.loss - (more[1].weights.size / 2) ** 0.5:
+        more = solution(2 * count)
+        if not more[1].loss < closed.loss - (more[1].weights.size / 2) ** 0.5:
             break
-        (known, found), count = more, 2 * count
-    fixed = np.isfinite(np.asarray(model.log_process)) & ~free[-len(model.log_process) :]
-    many = search_sample(jnp.asarray(S[:count]), rows)[1] is not rows
-    if many and free.any() and not fixed.any() and found.free > found.used and found.squares > 0:
-        shift = jnp.log(found.squares / found.free) / 2
-        if abs(shift) > 0.01:  # what is left depends on the noise: a secant, by a half to twice it
-            there = conditional(known, found.points, shift)
+        (triangle, closed), count = more, 2 * count
+    is_held = np.isfinite(np.asarray(model.log_process)) & ~free[-len(model.log_process) :]
+    is_sample = search_sample(jnp.asarray(S[:count]), rows)[1] is not rows
+    scales = is_sample and free.any() and not is_held.any()
+    if scales and closed.free > closed.used and closed.squares > 0:
+        shift = jnp.log(closed.squares / closed.free) / 2
+        if abs(shift) > 0.01:  # residuals depend on the noise: a secant step, a half to twice it
+            there = conditional(triangle, closed.points, shift)
             again = jnp.log(there.squares / there.free) / 2
             shift = shift / (1 - jnp.clip(again / shift, -1.0, 0.5))
         there = jnp.where(jnp.asarray(free), model.flat + shift, model.flat)
         there = jnp.clip(there, jnp.asarray(bounds.low), jnp.asarray(bounds.high))
         model = model.at(jnp.where(jnp.asarray(free), there, model.flat))
-        found = conditional(known, found.points, shift)
-    return model, found
+        closed = conditional(triangle, closed.points, shift)
+    return model, closed
 
 
 def limited_by_landmarks(
@@ -239,25 +242,25 @@ def limited_by_landmarks(
 ) -> bool:
     """Whether windows of the rows are likelier with a landmark in each of their intervals.
 
-    By more than √(q/2), by which q parameters leave −log p unknown, and by more than `least` for
-    each degree of freedom; at the noise that was found, or less too. On too few landmarks all that
-    they cannot say is noise, and with as much of it more of them do not help: 400 runs of a double
-    pendulum without noise have .002 to .008 on 160 landmarks, log p of windows of them is 1733,
-    with more landmarks 1732, and with more of them and a third or a hundredth of the noise 2002 and
-    2454.
+    The gain of log p must exceed √(q/2), its uncertainty with q weights, and `least` for each
+    degree of freedom. The search takes the field that too few landmarks cannot represent for noise,
+    and with so much noise more landmarks do not help: `with_less_noise` also tries less. 400 runs
+    of a double pendulum without noise end with noise of .002 to .008 on 160 landmarks. Windows of
+    them have a log p of 1733, of 1732 with more landmarks, and of 2002 and 2454 with more landmarks
+    and a third or a hundredth of the noise.
     """
     shares = np.array([1.0, 0.3, 0.1, 0.03] if with_less_noise else [1.0])
     width = (_ENTRIES / 3) ** 0.5
     part = windows(rows, int(width / rows.residual.shape[-1]))
-    own, n = exact(part)[0], rows.residual.shape[-1]
+    middles, n = exact(part)[0], rows.residual.shape[-1]
     less = np.tile(np.asarray(model.flat), (len(shares), 1))
     less[:, -2 * n :] += np.log(shares)[:, None]
     few, many = (
         losses(model, flat, points, part, start_deviation).min()
-        for points, flat in ((S, less[:1]), (own, less))
+        for points, flat in ((S, less[:1]), (middles, less))
     )
     freedom = float((part.counts > 0).sum()) - n * len(part.counts)
-    return bool(few - many > max((n * len(own) / 2) ** 0.5, least * freedom))
+    return bool(few - many > max((n * len(middles) / 2) ** 0.5, least * freedom))
 
 
 def gain_of_friction(
@@ -315,7 +318,7 @@ def gain_of_inertia(
     size, positions = force / (3 * fastest**2), tuple(range(n // 2))
     lengths = Gaussian(np.maximum(data.scale[: n // 2], 1e-3 * data.scale[: n // 2].max()))
     cubic = Select(_cubic, tuple(range(n // 2, n)))
-    more = Structured(size**2 * (Select(lengths, positions) * cubic), _on_momenta)
+    more = Structured(size**2 * (Select(lengths, positions) * cubic), _momentum_projection)
     return _gain(model, more, S, rows, start_deviation)
 
 
@@ -323,7 +326,7 @@ def _cubic(v: Float[Array, " m"], w: Float[Array, " m"]) -> Float[Array, ""]:
     return jnp.dot(v, w) ** 3
 
 
-def _on_momenta(x: Float[Array, " n"]) -> Float[Array, "n n"]:
+def _momentum_projection(x: Float[Array, " n"]) -> Float[Array, "n n"]:
     return jnp.diag((jnp.arange(len(x)) >= len(x) // 2).astype(x.dtype))
 
 
@@ -375,18 +378,18 @@ def bounds_and_design(
     leaves = hyperparameters(model.kernel, jnp.asarray(X), speed, jnp.asarray(X))
     start = np.asarray(model.flat)[: -len(scale)]  # without process noise
     size = len(start) - len(scale)
-    most = np.maximum(scale, np.exp(start[size:]))  # where next to nothing moves
+    largest = np.maximum(scale, np.exp(start[size:]))  # where next to nothing moves
     low = np.concatenate([*(p.low.ravel() for p in leaves), np.log(LEAST_NOISE * scale)])
-    high = np.concatenate([*(p.high.ravel() for p in leaves), np.log(2 * most)])
+    high = np.concatenate([*(p.high.ravel() for p in leaves), np.log(2 * largest)])
     free = np.concatenate([np.ones(size, bool), moves])
     names = [p.name for p in leaves for _ in range(p.low.size)]
     none = np.zeros(len(scale), bool)
 
-    def called(*kinds: str) -> Bool[np.ndarray, " P"]:
+    def is_named(*kinds: str) -> Bool[np.ndarray, " P"]:
         return np.append([name.split(".")[-1] in kinds for name in names], none).astype(bool)
 
-    lengths, scales = called("lengthscale"), called("scale")
-    forces = called("viscous", "coulomb", "stribeck")
+    lengths, scales = is_named("lengthscale"), is_named("scale")
+    forces = is_named("viscous", "coulomb", "stribeck")
     # The guesses of friction are numbers without units. Short windows, with which the search
     # begins, tell none from another: .1 stays where it is 2e4 a second (`tests/test_friction.py`).
     start = np.where(forces, np.clip(start, low, high), start)
@@ -396,27 +399,27 @@ def bounds_and_design(
         low[lengths] = np.clip(least, low, high - 0.1)[lengths]
         start = np.clip(start, low, high)
     extents = np.concatenate([*(_extents(p.low, X[:, : len(scale)]) for p in leaves), none])
-    kernels = [_amplified(model, start, scales, X, Y)]
+    kernels = [_scale_amplitudes(model, start, scales, X, Y)]
     for shift in _SHIFTS if lengths.any() else ():
         point = np.where(lengths, np.clip(extents + shift, low, high), start)
-        kernels.append(_amplified(model, point, scales, X, Y))
-    kernels += [_with_friction(kernels[-1], (low + high) / 2, forces)] if forces.any() else []
+        kernels.append(_scale_amplitudes(model, point, scales, X, Y))
+    kernels += [_add_friction(kernels[-1], (low + high) / 2, forces)] if forces.any() else []
     # From below, where noise explains nothing, no slope leads back: a second half of the design
     # begins with much of both kinds. With five samples a swing smoothing found no noise at all in
     # 3 of 5 logs with noise of 8 %.
     much = [np.append(h[:size], np.where(moves, np.log(0.1 * scale), h[size:])) for h in kernels]
     looked = np.isfinite(impulse)
-    least, some, more, most = (
+    least, some, more, limit = (
         np.where(looked, impulse + np.log(share), 0.0) for share in (1e-6, 0.01, 0.1, 3.0)
     )
     some, more = (np.where(looked, level, -np.inf) for level in (some, more))
-    pairs = (low, least), (high, most), (free, looked)
+    pairs = (low, least), (high, limit), (free, looked)
     design = [np.append(np.clip(h, low, high), some) for h in [start, *kernels]]
     design += [np.append(np.clip(h, low, high), more) for h in much]
     return Bounds(*map(np.concatenate, pairs)), np.array(design)
 
 
-def _with_friction(point, middle, forces) -> Float[np.ndarray, " P"]:
+def _add_friction(point, middle, forces) -> Float[np.ndarray, " P"]:
     """The point with friction of a third of all forces.
 
     Coefficients of friction are amplitudes too: from the caller's alone the search ended without
@@ -430,10 +433,10 @@ def _least_lengths(leaves, X, scale, spacing: float) -> Float[np.ndarray, " P"]:
     """The logarithm of `spacing` in units of the coordinates, or of the smallest of them."""
     spread = X.std(axis=0)
     spread[: len(scale)] = scale
-    each = [
+    spreads = [
         spread if p.low.size == len(spread) else np.full(p.low.size, scale.min()) for p in leaves
     ]
-    return np.log(spacing * np.maximum(np.concatenate(each), np.finfo(float).tiny))
+    return np.log(spacing * np.maximum(np.concatenate(spreads), np.finfo(float).tiny))
 
 
 def _extents(leaf: np.ndarray, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, " size"]:
@@ -444,7 +447,7 @@ def _extents(leaf: np.ndarray, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray,
     return np.full(leaf.size, np.log(np.hypot.reduce(ranges)))
 
 
-def _amplified(model: Model, h, scales, X, Y):
+def _scale_amplitudes(model: Model, h, scales, X, Y):
     """The point h with amplitudes at which velocities of the prior are twice those observed."""
     if not scales.any():
         return h
@@ -464,8 +467,8 @@ def impulses(K: AbstractMatrixKernel, S, Y, data: Preprocessed) -> Float[np.ndar
     """
     prior = np.asarray(KernelRows(S).rows(K, S)).reshape(len(S), len(data.scale), -1)
     velocity = np.sqrt(np.mean(Y**2, axis=0))
-    whole = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
-    time = np.median(data.scale / np.maximum(whole, np.finfo(float).tiny))
+    speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
+    time = np.median(data.scale / np.maximum(speed, np.finfo(float).tiny))
     with np.errstate(divide="ignore"):
         return np.where((prior != 0).any((0, 2)), np.log(velocity * np.sqrt(time)), -np.inf)
 
