@@ -24,7 +24,7 @@ CASES = {
 }
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("case", CASES)
 def test_every_loss_and_gradient_is_right_or_says_that_it_cannot_tell(case):
     problem, basis = CASES[case]
@@ -133,7 +133,7 @@ FEATURES = hk.RandomFeatures(7, jax.random.key(1))
 LANDMARKS = hk.Nystrom(points=X[::12])
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.filterwarnings("ignore:.*landmarks leave")
 @pytest.mark.parametrize("way", ["at once", "in chunks"])
 @pytest.mark.parametrize("solver", [FEATURES, LANDMARKS], ids=["features", "landmarks"])

@@ -176,6 +176,7 @@ def network():
     return hk.Symplectic(hk.Warp(hk.Gaussian(1.0), mlp))
 
 
+@pytest.mark.slow
 def test_jax_grad_passes_the_functions_inside_a_kernel():
     K, norm = network(), lambda K: hk.gram(K, X[:3])[0, 0, 0, 0]
     gradient = jax.grad(norm)(K)

@@ -202,7 +202,6 @@ def test_a_comparison_is_a_plain_record():
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_a_pendulum_has_an_energy_and_a_mirror_and_friction_is_found():
     # Slow for the compilation of its searches.
     found = hk.compare(X, Y)

@@ -334,7 +334,6 @@ def test_a_family_asks_for_its_parameters_and_says_where_its_energy_is(fields):
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_eight_short_runs_of_eight_pendulums_tell_of_a_ninth():
     rng = np.random.default_rng(0)
     lengths, ts = np.linspace(0.5, 1.5, 8), np.linspace(0.0, 3.0, 31)

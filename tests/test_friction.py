@@ -72,6 +72,7 @@ def test_the_curve_is_found_with_a_known_kinetic_energy_and_without(known):
     np.testing.assert_allclose(found(jnp.array([0.3, 1.0]))[0], 0.0, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_it_takes_energy_away_at_every_speed_where_a_gaussian_falls_to_zero():
     gaussian = hk.Sum(
         energy=hk.Symplectic(POTENTIAL),

@@ -198,6 +198,7 @@ def push(x, u):
 
 
 @pytest.mark.parametrize("mean", [sway, push, PENDULUM], ids=["of x", "of x and u", "system"])
+@pytest.mark.few(1)
 def test_a_mean_is_taken_off_the_data_and_added_to_the_field(mean):
     def at(x, u):
         return mean(jnp.asarray(x)) if mean is sway else mean(jnp.asarray(x), jnp.asarray(u))
@@ -221,6 +222,7 @@ def test_a_mean_is_taken_off_the_data_and_added_to_the_field(mean):
             field.hamiltonian(x)
 
 
+@pytest.mark.slow
 def test_a_known_input_matrix_is_a_mean():
     field = hk.fit(KNOWN, X, Y, RIDGE, inputs=U, mean=sway)
     matrix = np.array([[0.0, 0.5], [1.0, -0.3]])

@@ -125,6 +125,7 @@ def test_masses_are_those_of_a_drift_as_well():
         hk.UnknownMasses(hk.Controlled(kernel, GAIN), [1.0, RATIO])
 
 
+@pytest.mark.slow
 def test_tuning_finds_the_ratio():
     X = states(60)
     rng = np.random.default_rng(2)

@@ -193,6 +193,7 @@ def test_a_shared_law_is_tuned_saved_and_read_back(learned, tmp_path):
     np.testing.assert_array_equal(again.law(1.3, 1.0), tuned.field.law(1.3, 1.0))
 
 
+@pytest.mark.slow
 def test_two_species_have_a_law_each():
     """Springs between unlike particles only; the law between like ones is flat."""
     like = hk.pairs(4, 2, among=(0, 1))

@@ -61,6 +61,7 @@ def test_the_flow_keeps_the_sphere():
     np.testing.assert_allclose(np.sum(np.asarray(ys) ** 2, axis=1), X[0] @ X[0], rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_a_rigid_body_is_learned_better_with_its_tensor():
     body = hk.systems.RigidBody()
     rng = np.random.default_rng(1)

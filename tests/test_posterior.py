@@ -139,6 +139,7 @@ def test_an_update_is_a_refit_with_the_same_noise(mean):
     np.testing.assert_allclose(both.field.residual, whole.field.residual, atol=SOLVE)
 
 
+@pytest.mark.slow
 def test_rows_one_by_one_are_all_rows():
     posterior = hk.condition(K, X[:10], Y[:10], RIDGE)
     for x, y in zip(X[10:], Y[10:], strict=True):

@@ -104,6 +104,7 @@ def learning():
     hk.learn(K, hk.Runs([ts], [states + noise]), iterations=2)
 
 
+SLOW = ("learn", "tune low rank")  # 37 s and 18 s: they are traced and compiled anew
 CALLS = {
     "fields": field_answers,
     "posterior": posterior_answers,
@@ -132,7 +133,9 @@ CALLS = {
 
 
 @pytest.mark.filterwarnings("ignore")  # two iterations do not settle, amplitudes are not tuned
-@pytest.mark.parametrize("name", CALLS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name for name in CALLS]
+)
 def test_products_of_public_functions_are_in_full_precision(name):
     jax.clear_caches()
     with imprecise_products() as places:

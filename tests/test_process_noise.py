@@ -286,6 +286,7 @@ def test_one_in_many_of_clean_logs_is_told_that_its_times_are_off():
     assert np.median([each.off for each in found]) == pytest.approx(0.02, rel=0.1)
 
 
+@pytest.mark.slow
 def test_times_that_are_off_are_named():
     """By .02 in a run of 40 samples .2 apart, beside noise of 1 %."""
     rng, ts = np.random.default_rng(0), np.linspace(0, 8, 40)
