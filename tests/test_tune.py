@@ -499,7 +499,7 @@ def test_few_labels_are_warned_of_with_the_alternatives(simple, monkeypatch):
 
 
 def test_a_search_that_will_take_long_says_so_and_how_to_shorten_it(monkeypatch, capsys):
-    monkeypatch.setattr("hamkernel._tuning.search._LONG", 1e-9)
+    monkeypatch.setattr("hamkernel._tuning.search._WARN_SECONDS", 1e-9)
     with pytest.warns(UserWarning, match=r"minutes\. Pass fewer starts than 3"):
         hk.tune(SIMPLE, *scattered(), starts=3, progress=True)
     lines = capsys.readouterr().out.splitlines()
