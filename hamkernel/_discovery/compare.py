@@ -173,10 +173,10 @@ def compare(
     steps = ladder(n) if candidates is None else {}
     searched: dict[str, AbstractMatrixKernel] = {k: s.rung(scale, speed) for k, s in steps.items()}
     if candidates is not None:
-        searched = _checked_candidates(candidates, n, points)
+        searched = _check_candidates(candidates, n, points)
     check_memory(rows, SEARCH_COPIES)
     ridge = jnp.asarray(1e-4 * speed**2 if ridge is None else ridge, rows.targets.dtype)
-    found = []
+    candidate_rows = []
     for name, K in tqdm(searched.items(), "candidates", disable=None if progress else True):
         K, regularization, likelihood = _most_likely(K, rows, ridge, starts)
         K = steps[name].kernel(K) if isinstance(K, Rung) else K
@@ -185,10 +185,10 @@ def compare(
         score = likelihood - P / 2 * math.log(D)
         claimed = steps[name].claims if name in steps else claims(K, scale)
         tuned = (K, regularization, values)
-        found.append(Candidate(name, claimed, score, 0.0, likelihood, P, *tuned))
-    top = max(row.score for row in found)
-    table = [row._replace(difference=row.score - top) for row in found]
-    return _answered(tuple(sorted(table, key=lambda row: -row.score)), points, D)
+        candidate_rows.append(Candidate(name, claimed, score, 0.0, likelihood, P, *tuned))
+    top = max(row.score for row in candidate_rows)
+    table = [row._replace(difference=row.score - top) for row in candidate_rows]
+    return _answer(tuple(sorted(table, key=lambda row: -row.score)), points, D)
 
 
 @one_blas_thread
@@ -244,7 +244,7 @@ def _data(X: Any, Y: Any) -> tuple[AbstractObservations, Any]:
     return X.observations, X.regularization
 
 
-def _checked_candidates(
+def _check_candidates(
     candidates: Any, n: int, points: Float[np.ndarray, "P n"]
 ) -> dict[str, AbstractMatrixKernel]:
     """The candidates of the caller, which can hold for these states."""
@@ -285,27 +285,27 @@ def claims(K: AbstractMatrixKernel, scale: Float[np.ndarray, " n"]) -> frozenset
         wrong = jnp.linalg.norm(K(S * x, z) - character * S[:, None] * block)
         return bool(wrong < 1e-4 * jnp.linalg.norm(block))  # rounding, in single precision too
 
-    found = set()
+    answers = set()
     if is_unchanged(-np.ones(n), 1.0):
-        found.add("mirror")
+        answers.add("mirror")
     if n % 2 or not K.has_hamiltonian:
-        return frozenset(found)
-    found.add("energy")
+        return frozenset(answers)
+    answers.add("energy")
     if not K.conserves:
-        found.add("friction")
+        answers.add("friction")
     elif is_unchanged(_reversal(n), -1.0):
-        found.add("reversible")
+        answers.add("reversible")
     q, p = frozenset(range(m)), frozenset(range(m, n))
     if all(part <= q or part <= p for k in K.scalar_kernels for part in k.supports(n)):
-        found.add("T + U")
-    return frozenset(found)
+        answers.add("T + U")
+    return frozenset(answers)
 
 
 def _reversal(n: int) -> Float[np.ndarray, " n"]:
     return np.repeat([1.0, -1.0], n // 2)
 
 
-def _answered(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D: int) -> Comparison:
+def _answer(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D: int) -> Comparison:
     """The answers that the table gives."""
     n = points.shape[1]
     answers, reasons, differences = {}, {}, {}

@@ -26,7 +26,7 @@ from hamkernel._structures.structure import (
     canonical,
 )
 
-_NONE = -200.0  # the logarithm of a friction that is none: e⁻²⁰⁰ is lost in every sum
+NO_FRICTION = -200.0  # the logarithm of a friction that is none: e⁻²⁰⁰ is lost in every sum
 
 
 class Rung(AbstractMatrixKernel):
@@ -64,7 +64,7 @@ class Rung(AbstractMatrixKernel):
     def blocks(self, X: Float[Array, "N n"], Z: Float[Array, "M n"]) -> Float[Array, "N n M n"]:
         n, dtype = X.shape[1], X.dtype
         numbers = (self.masks, self.weights, self.structure)
-        masks, weights, (s, d, c, h) = (each.astype(dtype) for each in numbers)
+        masks, weights, (s, d, c, h) = (numbers_array.astype(dtype) for numbers_array in numbers)
         weights = weights / jnp.abs(weights).sum(axis=1, keepdims=True)
         weights = (weights * self.amplitudes().astype(dtype)[:, None]).reshape(-1)
         parts, images = self.weights.shape
@@ -82,27 +82,27 @@ class Rung(AbstractMatrixKernel):
         # entry of the blocks they took eight times as long.
         @jax.checkpoint
         def term(w, D, S, C):
-            apart = [x[:, None] - z[None] for x, z in zip(X.T, S[:, None] * Z.T, strict=True)]
-            k = w * jnp.exp(-0.5 * total([D[i] * apart[i] ** 2 for i in range(n)]))
-            left = [D[i] * apart[i] for i in range(n)]
-            right = [S[i] * left[i] for i in range(n)]
+            differences = [x[:, None] - z[None] for x, z in zip(X.T, S[:, None] * Z.T, strict=True)]
+            k = w * jnp.exp(-0.5 * total([D[i] * differences[i] ** 2 for i in range(n)]))
+            a = [D[i] * differences[i] for i in range(n)]
+            Sa = [S[i] * a[i] for i in range(n)]
             Ba, BSa = (
-                [total([B[i, j] * a[j] for j in range(n)]) for i in range(n)] for a in (left, right)
+                [total([B[i, j] * a[j] for j in range(n)]) for i in range(n)] for a in (a, Sa)
             )
             k, Ba, BSa = jax.lax.optimization_barrier((k, Ba, BSa))
 
             def entry(i, j):
                 block = C[i, j] - Ba[i] * BSa[j]
                 if n > 2:
-                    block = block + d * right[i] * left[j]
+                    block = block + d * Sa[i] * a[j]
                     if i == j:
-                        block = block - d * total([a * b for a, b in zip(left, right, strict=True)])
+                        block = block - d * total([a * b for a, b in zip(a, Sa, strict=True)])
                 return k * block
 
             return [[entry(i, j) for j in range(n)] for i in range(n)]
 
-        def add(found, one_term):
-            return jax.tree.map(jnp.add, found, term(*one_term)), None
+        def add(sums, one_term):
+            return jax.tree.map(jnp.add, sums, term(*one_term)), None
 
         nothing = [[jnp.zeros((len(X), len(Z)), dtype)] * n] * n
         found, _ = jax.lax.scan(add, nothing, (weights, D, S, C))
@@ -132,7 +132,7 @@ class Rung(AbstractMatrixKernel):
             return bounds_of_length(value, X, 0.3, 30.0)
         if name == "log_variances":
             return np.log(1e-5 * amplitude), np.log(1e5 * amplitude)
-        if value == _NONE:
+        if value == NO_FRICTION:
             return value, value
         return PortHamiltonian(Gaussian(1.0)).bounds(name, X, amplitude)
 
@@ -180,14 +180,14 @@ class LadderStep(NamedTuple):
     @property
     def claims(self) -> frozenset[str]:
         """The questions that each of its fields answers with yes, as `compare.claims` finds."""
-        found = {"mirror"} if self.mirror else set()
+        answers = {"mirror"} if self.mirror else set()
         if self.structure is Symplectic:
-            found.add("energy")
+            answers.add("energy")
             # T(p) + U(q) with a mirror has an even T.
             back = self.reversible or (self.apart and self.mirror)
-            found |= {"friction"} if self.friction else {"reversible"} if back else set()
-            found |= {"T + U"} if self.apart else set()
-        return frozenset(found)
+            answers |= {"friction"} if self.friction else {"reversible"} if back else set()
+            answers |= {"T + U"} if self.apart else set()
+        return frozenset(answers)
 
     def rung(self, scale: Float[np.ndarray, " n"], speed: float) -> Rung:
         """The kernel of the step, first for fields of size `speed` that change over 2 `scale`.
@@ -210,14 +210,14 @@ class LadderStep(NamedTuple):
                 [[1, even, 1, even] if self.reversible else [1, even]],
             )
         length = np.log(2 * np.where(scale > 0, scale, 1.0))
-        known = Separable, DivergenceFree, CurlFree, Symplectic
+        structures = Separable, DivergenceFree, CurlFree, Symplectic
         return Rung(
             log_variances=jnp.asarray(np.full(len(masks), 2 * np.log(speed))),
             log_lengthscales=jnp.asarray(length),
-            log_friction=jnp.asarray(np.float64(np.log(0.1) if self.friction else _NONE)),
+            log_friction=jnp.asarray(np.float64(np.log(0.1) if self.friction else NO_FRICTION)),
             masks=jnp.asarray(np.array(masks)),
             weights=jnp.asarray(np.array(weights, int)),
-            structure=jnp.asarray([int(self.structure is each) for each in known]),
+            structure=jnp.asarray([int(self.structure is structure) for structure in structures]),
         )
 
     def kernel(self, rung: Rung) -> AbstractMatrixKernel:
@@ -237,18 +237,18 @@ class LadderStep(NamedTuple):
 
 def ladder(n: int) -> dict[str, LadderStep]:
     """Structures by name, the weakest first, with the products of their steps."""
-    found = {"any field": LadderStep(Separable), "gradient": LadderStep(CurlFree)}
+    steps = {"any field": LadderStep(Separable), "gradient": LadderStep(CurlFree)}
     if n > 2:
-        found["divergence-free"] = LadderStep(DivergenceFree)
+        steps["divergence-free"] = LadderStep(DivergenceFree)
     if n % 2 == 0:
-        found |= {
+        steps |= {
             "energy": LadderStep(Symplectic),
             "energy, friction": LadderStep(Symplectic, friction=True),
             "T + U": LadderStep(Symplectic, apart=True),
             "T + U, friction": LadderStep(Symplectic, apart=True, friction=True),
         }
-    found |= {f"{name}, mirror": step._replace(mirror=True) for name, step in found.items()}
+    steps |= {f"{name}, mirror": step._replace(mirror=True) for name, step in steps.items()}
     if n % 2 == 0:  # T + U with a mirror has an even T, and is reversible
         for name in ("energy", "energy, mirror", "T + U"):
-            found[f"{name}, reversible"] = found[name]._replace(reversible=True)
-    return found
+            steps[f"{name}, reversible"] = steps[name]._replace(reversible=True)
+    return steps

@@ -189,7 +189,7 @@ def _walk(
             )
         elif child is not node:  # else a leaf that is no array: a degree, an activation
             if isinstance(kernel, AbstractJoinedKernel):
-                inside = kernel.seen_by(child, X, amplitude)
+                inside = kernel.child_inputs(child, X, amplitude)
             yield from _walk((*path, *key), child, inside[0], amplitudes, inside[1])
 
 
