@@ -364,14 +364,14 @@ def compiled_by_size(function: Callable[P, T]) -> Callable[P, T]:
     )
 
     @functools.wraps(function)
-    def sized(*args: P.args, **kwargs: P.kwargs) -> T:
+    def by_size(*args: P.args, **kwargs: P.kwargs) -> T:
         arrays = [a for a in jax.tree.leaves((args, kwargs)) if eqx.is_array(a)]
         if any(isinstance(a, Tracer) for a in arrays) or not _options_are_known(_sizes.platform()):
             return plain(*args, **kwargs)
         small = sum(a.size for a in arrays) <= _MAX_UNOPTIMISED
         return (fastest if small else fast)(*args, **kwargs)
 
-    return sized
+    return by_size
 
 
 @functools.cache

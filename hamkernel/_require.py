@@ -427,8 +427,8 @@ def velocity(field: Any, x: Float[Array, " n"], name: str = "field") -> jax.Shap
     if other_names is not None:
         raise TypeError(
             f"{name} takes ({other_names}); it is called with one argument, the state x of shape "
-            "(n,). Bind the others, as in `lambda x: f(0.0, x)` where time does not enter. A kernel "
-            "becomes a field by hk.fit."
+            "(n,). Bind the others, as in `lambda x: f(0.0, x)` where time does not enter. A "
+            "kernel becomes a field by hk.fit."
         )
     with traceable(name):
         out = eqx.filter_eval_shape(field, x)

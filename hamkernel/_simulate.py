@@ -220,9 +220,9 @@ def _right_hand_side(
     other_names = require.other_arguments(field, ts, ts)
     if other_names is not None:
         raise TypeError(
-            f"field takes ({other_names}); with inputs it is called with two arguments, the state x "
-            "and its inputs u: a field of a Controlled kernel, hk.systems.Driven(system, G), or a "
-            "function of yours. To simulate it without inputs, leave them out."
+            f"field takes ({other_names}); with inputs it is called with two arguments, the state "
+            "x and its inputs u: a field of a Controlled kernel, hk.systems.Driven(system, G), or "
+            "a function of yours. To simulate it without inputs, leave them out."
         )
     # Functions are called with the caller's time; the times of samples count from the start.
     start = first.astype(ts.dtype) if callable(inputs) else jnp.zeros((), ts.dtype)

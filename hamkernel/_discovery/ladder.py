@@ -1,8 +1,9 @@
-"""The ladder of structures and symmetries that `compare` climbs.
+"""The ladder of structures and symmetries for `compare`.
 
-A first comparison took 96 s, 90 of them to compile 15 searches. A `Rung` is any step of the ladder,
-with the choice between structures and symmetries in its arrays, so that one compiled search serves
-all steps with as many parts and images: three in place of 15.
+With one kernel type per step, a first comparison took 96 s, 90 s of them to compile 15 searches. A
+`Rung` is a kernel for any step of the ladder: its arrays choose between structures and symmetries.
+One compiled search then serves all steps with the same numbers of parts and images, and there are
+three such searches.
 """
 
 from typing import ClassVar, NamedTuple
@@ -26,23 +27,24 @@ from hamkernel._structures.structure import (
     canonical,
 )
 
-NO_FRICTION = -200.0  # the logarithm of a friction that is none: e⁻²⁰⁰ is lost in every sum
+NO_FRICTION = -200.0  # # the logarithm of zero friction: e⁻²⁰⁰ vanishes in every sum
 
 
 class Rung(AbstractMatrixKernel):
-    """Σᵢ Σ_g w_ig K_ig(x, z), K_ig of a structure from the Gaussian kernel of x and gz.
+    """The kernel Σᵢ Σ_g w_ig K_ig(x, z), K_ig of a structure from the Gaussian kernel of x and gz.
 
-    Each part i sees some of the coordinates, and each g changes signs. With
+    Each part i depends on some of the coordinates, and each g changes signs. With
     k = aᵢ exp(−‖(x − gz)/ℓ‖²/2) and M = ∂x ∂zᵀ k, the structure is
 
         s k I + d (tr(M) I − Mᵀ) + B M Bᵀ,    B = c I + h (J − R).
 
     Attributes:
-        log_variances: those of a component of the field, for each part. A potential that changes
-            over ℓ is ℓ² times as large, for the geometric mean of the ℓ that its part sees.
+        log_variances: the log variance of a component of the field, for each part. The variance of
+            a potential that changes over ℓ is ℓ² times as large, for the geometric mean of the ℓ of
+            the part.
         log_lengthscales: ℓ, one for each coordinate.
         log_friction: the diagonal of R on the momenta.
-        masks: 1 where the part sees the coordinate.
+        masks: 1 if the part depends on the coordinate, else 0.
         weights: w_ig up to the sum of their sizes, which is 1 for each part.
         structure: (s, d, c, h), one of which is 1.
     """
@@ -72,14 +74,18 @@ class Rung(AbstractMatrixKernel):
         S = jnp.tile(jnp.asarray(_signs(n, images), dtype), (parts, 1))
         one = jnp.eye(n, dtype=dtype)
         B = c * one + h * self._hamiltonian_operator(n).astype(dtype)
-        # With a = D (x − Sz), M is k (DS − a (Sa)ᵀ). C is the part of a block that is the same at
-        # all points, and d is for n > 2 alone: there are no steps with it below.
+        # # Let k = w exp(−½(x − Sz)ᵀD(x − Sz)), D and S diagonal, and a = D(x − Sz). Then ∂x k = −k
+        # a, ∂z k = k Sa and ∂x_i a_j = D_ij, ∂z_j a_i = −(DS)_ij, so
+        #     M = ∂x ∂zᵀ k = k (DS − a(Sa)ᵀ),     B M Bᵀ = k (B DS Bᵀ − (Ba)(BSa)ᵀ),
+        #     tr(M) I − Mᵀ = k ((tr DS − a·Sa) I − DS + (Sa)aᵀ).
+        # C holds the terms that are the same at all points: s I + B DS Bᵀ + d (tr(DS) I − DS). No
+        # step has d = 1 for n ≤ 2.
         C = s * one[None] + jnp.einsum("ac,tc,bc->tab", B, D * S, B)
         if n > 2:
             C = C + d * ((D * S).sum(axis=1)[:, None, None] - (D * S)[..., None]) * one[None]
 
-        # Components are arrays (N, M) of their own, made once and kept: fused by XLA into each
-        # entry of the blocks they took eight times as long.
+        # # The components of Ba and BSa are separate arrays (N, M), computed once and kept. If XLA
+        # fused them into each entry of the blocks, they took eight times as long.
         @jax.checkpoint
         def term(w, D, S, C):
             differences = [x[:, None] - z[None] for x, z in zip(X.T, S[:, None] * Z.T, strict=True)]
@@ -109,7 +115,7 @@ class Rung(AbstractMatrixKernel):
         return jnp.stack([jnp.stack(row, axis=-1) for row in found], axis=1)
 
     def _hamiltonian_operator(self, n: int) -> Float[Array, "n n"]:
-        """J − R; zero where there is no such thing."""
+        """The operator J − R; zero if n is odd."""
         m, odd = divmod(n, 2)
         if odd:
             return jnp.zeros((n, n), self.log_friction.dtype)
@@ -117,7 +123,7 @@ class Rung(AbstractMatrixKernel):
         return canonical(one) - jnp.exp(self.log_friction) * one.at[:m].set(0)
 
     def amplitudes(self) -> Float[Array, " parts"]:
-        """The aᵢ."""
+        """The amplitudes aᵢ."""
         masks = self.masks.astype(self.log_lengthscales.dtype)
         squares = 2 * (masks @ self.log_lengthscales) / masks.sum(axis=1)
         of_fields = self.structure[0] > 0
@@ -155,7 +161,7 @@ class Rung(AbstractMatrixKernel):
 
 
 def _signs(n: int, images: int) -> Float[np.ndarray, "images n"]:
-    """The signs of the images x, −x and, of four, (q, −p) and (−q, p), which run backwards."""
+    """The signs of the images x, −x and, if there are four, (q, −p) and (−q, p) (time reversal)."""
     reversal = np.repeat([1.0, -1.0], [n // 2, n - n // 2])
     return np.stack([np.ones(n), -np.ones(n), reversal, -reversal])[:images]
 
@@ -179,7 +185,7 @@ class LadderStep(NamedTuple):
 
     @property
     def claims(self) -> frozenset[str]:
-        """The questions that each of its fields answers with yes, as `compare.claims` finds."""
+        """The questions to which all fields of the step say yes, as in `compare.claims`."""
         answers = {"mirror"} if self.mirror else set()
         if self.structure is Symplectic:
             answers.add("energy")
@@ -190,7 +196,7 @@ class LadderStep(NamedTuple):
         return frozenset(answers)
 
     def rung(self, scale: Float[np.ndarray, " n"], speed: float) -> Rung:
-        """The kernel of the step, first for fields of size `speed` that change over 2 `scale`.
+        """The kernel of the step, with first values for fields of size `speed` over 2 `scale`.
 
         Args:
             scale: the standard deviation of each coordinate; 0 counts as 1.

@@ -301,7 +301,7 @@ def known_part(K: AbstractMatrixKernel, mean: Any, n: int, dtype: Any) -> Any:
         K: the kernel.
         mean: x (n,) -> (n,); of a controlled kernel it may be x, u -> (n,) too.
         n: the number of coordinates of a state.
-        dtype: of the states.
+        dtype: the dtype of the states.
 
     Returns:
         A PyTree that maps one point to one velocity; None if the prior mean is zero.

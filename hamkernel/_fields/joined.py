@@ -273,8 +273,8 @@ class FamilyField(AbstractJoinedField):
     def at(self, theta: Num[ArrayLike, " p"]) -> "KernelField | MemberField":
         """The member with the parameters θ, an ordinary field of K.
 
-        Its residual is empty, since the data are those of all members, and its λ and `info` are
-        those of the fit. New values of θ do not recompile.
+        The residual of the member is empty, since the data belong to all members; λ and `info`
+        belong to the fit. New values of θ do not recompile.
 
         Args:
             theta: θ, shape (p,).
@@ -404,7 +404,7 @@ def at_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
         if part.mean is None or not part.of_inputs:
             return part.mean
         if u is None:
-            # The drift has a potential where it knows one.
+            # # The attribute `drift` of the mean may know a potential.
             own = getattr(part.mean, "drift", None)
             return AtInputs(part.mean, jnp.zeros(part.count)) if own is None else own
         own = getattr(part.mean, "at", None)
@@ -440,7 +440,7 @@ def at_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
 
 
 def learned_field(field: Any, known: Any) -> Any:
-    """The field of a solver plus the prior mean `known`, of x and u if its kernel is joined."""
+    """The field of a solver plus the known part, a function of (x, u) for a joined kernel."""
     if known is not None:
         field = dataclasses.replace(field, mean=known)
     if not isinstance(field.kernel, AbstractJoinedKernel):

@@ -64,7 +64,7 @@ class AbstractBlock(eqx.Module):
         """The transpose of `rows`."""
 
     @abc.abstractmethod
-    def merge(self, other: "AbstractBlock") -> "AbstractBlock | None":
+    def merge(self, following: "AbstractBlock") -> "AbstractBlock | None":
         """One block of these rows followed by the rows of `other`; None if its kind differs."""
 
     @abc.abstractmethod
@@ -128,20 +128,22 @@ class Components(AbstractBlock):
             c = jnp.zeros(math.prod(self.values_shape), c.dtype).at[self.kept].set(c)
         return c.reshape(self.values_shape)
 
-    def merge(self, other: AbstractBlock) -> "Components | None":
-        if not isinstance(other, Components) or self.outputs != other.outputs:
+    def merge(self, following: AbstractBlock) -> "Components | None":
+        if not isinstance(following, Components) or self.outputs != following.outputs:
             return None
         kept = noise = None
-        sizes = [math.prod(block.values_shape) for block in (self, other)]
-        if self.kept is not None or other.kept is not None:
+        sizes = [math.prod(block.values_shape) for block in (self, following)]
+        if self.kept is not None or following.kept is not None:
             first_kept, second_kept = (
                 jnp.arange(size) if b.kept is None else b.kept
-                for b, size in zip((self, other), sizes, strict=True)
+                for b, size in zip((self, following), sizes, strict=True)
             )
             kept = jnp.concatenate([first_kept, second_kept + sizes[0]])
-        if self.noise is not None or other.noise is not None:
-            noise = jnp.concatenate([self.scale, other.scale])
-        return Components(jnp.concatenate([self.points, other.points]), kept, noise, self.outputs)
+        if self.noise is not None or following.noise is not None:
+            noise = jnp.concatenate([self.scale, following.scale])
+        return Components(
+            jnp.concatenate([self.points, following.points]), kept, noise, self.outputs
+        )
 
     def with_points(self, points: Float[Array, "P d"]) -> "Components":
         return Components(points, outputs=self.outputs)
@@ -203,10 +205,13 @@ class Combinations(AbstractBlock):
         S, R, Q, n = self.weights.shape
         return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(S * Q, n)
 
-    def merge(self, other: AbstractBlock) -> "Combinations | None":
-        if not isinstance(other, Combinations) or self.weights.shape[1:] != other.weights.shape[1:]:
+    def merge(self, following: AbstractBlock) -> "Combinations | None":
+        if (
+            not isinstance(following, Combinations)
+            or self.weights.shape[1:] != following.weights.shape[1:]
+        ):
             return None
-        pairs = (self.groups, other.groups), (self.weights, other.weights)
+        pairs = (self.groups, following.groups), (self.weights, following.weights)
         return Combinations(*map(jnp.concatenate, pairs))
 
     def with_points(self, points: Float[Array, "P d"]) -> Components:
@@ -257,13 +262,13 @@ class Values(AbstractBlock):
     def coefficients(self, c: Float[Array, " E"]) -> Float[Array, " E"]:
         return c if self.noise is None else c / self.noise
 
-    def merge(self, other: AbstractBlock) -> "Values | None":
-        if not isinstance(other, Values):
+    def merge(self, following: AbstractBlock) -> "Values | None":
+        if not isinstance(following, Values):
             return None
         noise = None
-        if self.noise is not None or other.noise is not None:
-            noise = jnp.concatenate([self.scale, other.scale])
-        return Values(jnp.concatenate([self.points, other.points]), noise, self.outputs)
+        if self.noise is not None or following.noise is not None:
+            noise = jnp.concatenate([self.scale, following.scale])
+        return Values(jnp.concatenate([self.points, following.points]), noise, self.outputs)
 
     def with_points(self, points: Float[Array, "E d"]) -> "Values":
         return Values(points, outputs=self.outputs)

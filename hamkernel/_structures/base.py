@@ -40,7 +40,7 @@ class AbstractMatrixKernel(eqx.Module):
 
     matrix_valued: ClassVar[bool] = True
     takes_inputs: ClassVar[bool] = False  # whether its points are (x, u)
-    given: ClassVar[str] = "inputs"  # what u is called in `fit`; "parameters" of a family
+    given: ClassVar[str] = "inputs"  # the name of u in `fit`; "parameters" for a family
     # Whether derivatives of its Gram are cheaper in reverse mode, as those of a closed form can be.
     differentiated_backward: ClassVar[bool] = False
     symplectic: eqx.AbstractVar[bool]  # whether flows keep dq ∧ dp, as those of J∇H do
