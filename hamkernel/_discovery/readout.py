@@ -209,8 +209,8 @@ def _check_symmetry(K: Any, names: list[str], functions: list[Any], rows: Any) -
     if bad:
         do, them = ("does", "it") if len(bad) == 1 else ("do", "them")
         raise ValueError(
-            f"the kernel believes in a symmetry of the potential that {_join_names(bad)} {do} not have:"
-            f" leave {them} out, or learn without the symmetry."
+            "the kernel believes in a symmetry of the potential that "
+            f"{_join_names(bad)} {do} not have: leave {them} out, or learn without the symmetry."
         )
 
 
