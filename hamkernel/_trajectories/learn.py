@@ -24,6 +24,7 @@ from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.completed import completed
+from hamkernel._structures.lagrangian import Lagrangian
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._trajectories.diagnostics import check_identifiable, diagnostics
 from hamkernel._trajectories.evidence import Evidence
@@ -43,6 +44,7 @@ from hamkernel._trajectories.kalman import (
     innovations,
     whitened_rows,
 )
+from hamkernel._trajectories.lagrangian import learn_lagrangian
 from hamkernel._trajectories.learned import Learned, empty, misfits
 from hamkernel._trajectories.model import Model, with_amplitude
 from hamkernel._trajectories.preprocessing import (
@@ -136,6 +138,9 @@ def learn(
         UserWarning: once, where a row of `learned.diagnostics` falls short, with its meaning.
     """
     require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
+    if isinstance(K, Lagrangian):
+        others = {"mean": mean, "solver": solver, "process_noise": process_noise, "mass": mass}
+        return learn_lagrangian(K, runs, noise, others | {"masses": masses})
     options = {"mean": mean if mean is None else as_pytree(mean), "noise": noise, "solver": solver}
     options |= {"process_noise": process_noise, "masses": masses, "iterations": iterations}
     options |= {"mass": mass}

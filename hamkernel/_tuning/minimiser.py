@@ -215,6 +215,19 @@ def most_likely_in_box(
     `deviations` are the standard deviations of h that the likelihood leaves, as far as they are
     known: their squares are the inverse Hessian that BFGS begins with.
     """
+    run = run_in_box(fn, start, low, high, deviations, steps)
+    return inside_box(run.best.u, low, high), run.best.value
+
+
+def run_in_box(
+    fn: Callable[[Float[Array, " P"]], Float[Array, ""]],
+    start: Float[Array, " P"],
+    low: Float[Array, " P"],
+    high: Float[Array, " P"],
+    deviations: Float[Array, " P"],
+    steps: Any,
+) -> MinimiserRun:
+    """The run that ends at the point of `most_likely_in_box`."""
     # No hyperparameter need be nearer to its best value than a tenth of its standard deviation,
     # where the quadratic −log p is ½ .1² above its minimum.
     bfgs = BoxBFGS(atol=jnp.asarray(0.005, start.dtype))
@@ -226,8 +239,7 @@ def most_likely_in_box(
         value = fn(inside_box(u, low, high))
         return jnp.where(jnp.isfinite(value), value, jnp.inf), value
 
-    run = minimised(bfgs, loss, begun(bfgs, loss, u).with_curvature(inverse), steps)
-    return inside_box(run.best.u, low, high), run.best.value
+    return minimised(bfgs, loss, begun(bfgs, loss, u).with_curvature(inverse), steps)
 
 
 def _better(one: Evaluation, other: Evaluation) -> Evaluation:
