@@ -173,7 +173,9 @@ def _sizes(pieces: Pieces, m: int, lengthscale: float) -> Sizes:
     acceleration = 2.7 * speed / lengthscale
     torque = np.sqrt(np.mean(pieces.targets[pieces.inside] ** 2)) / pieces.values[0].sum()
     # Free motions have no torques: any scale that the anchor sets is within the boxes.
-    return Sizes(float(torque) or acceleration, speed, acceleration)
+    torque = float(torque) or acceleration
+    white = np.sqrt(pieces.overlap[0, 0] * pieces.spacing) / pieces.values[0].sum()
+    return Sizes(torque, speed, acceleration, torque / float(white))
 
 
 class _WeakRows(eqx.Module):
@@ -231,7 +233,7 @@ def _diagnostics(
     field: LagrangianField, found: Any, sizes: Sizes, joints: tuple[int, ...]
 ) -> Diagnostics:
     least, deviation = float(field.least_inertia), float(field.least_inertia_deviation)
-    share = float(np.max(np.asarray(field.noise))) / sizes.torque
+    share = float(np.max(np.asarray(field.noise))) / sizes.error
     names = ", ".join(map(str, joints))
     swing = 2.3 * found.lengthscale / found.pieces.spacing  # 2π/ω, with the lengthscale 2.7/ω
     rows = len(field.residual) * field.features.count
@@ -267,7 +269,7 @@ def _diagnostics(
                 f"{share:.2g} unexplained",
                 "0.5",
                 share < 0.5,
-                f"errors of a torque are {share:.2g} of the torques"
+                f"errors of the torques, averaged over windows, are {share:.2g} of them"
                 if share < 0.5
                 else "the machine explains little of the torques",
                 "Likely causes: torques that act at other times than logged (delay=…), in other "

@@ -92,7 +92,9 @@ def learn(
     two is returned.
 
     Args:
-        K: a matrix-valued kernel. Its hyperparameters are the first guess. A structure without an
+        K: a `Lagrangian`, see there, with which a `LearnedLagrangian` is learned from positions, or
+            (q, v), and torques as inputs, and of the arguments below only `noise` has a meaning; or
+            a matrix-valued kernel. Its hyperparameters are the first guess. A structure without an
             amplitude gets one, `Symplectic(k)` becomes `Symplectic(1.0 * k)`. Runs with inputs need
             a `Controlled` one, and runs with parameters a `Family`.
         runs: what was logged; see `Runs`, and there how inputs go on between samples.

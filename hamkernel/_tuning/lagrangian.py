@@ -19,11 +19,19 @@ from hamkernel._tuning.space import Hyperparameter, boxes_of
 
 
 class Sizes(NamedTuple):
-    """Root mean squares, each of all joints together, that set the boxes of the search."""
+    """Root mean squares of all joints together, that set the boxes of the search.
+
+    Attributes:
+        torque: of torques, as rows see them.
+        speed: of velocities.
+        acceleration: of accelerations.
+        error: the deviation of a torque at a sample with which rows are as wrong as they are large.
+    """
 
     torque: float
     speed: float
     acceleration: float
+    error: float
 
 
 class Likeliest(NamedTuple):
@@ -74,8 +82,8 @@ def likeliest(
         np.concatenate([getattr(box, side).ravel() for box in boxes] + [np.zeros(m)])
         for side in ("low", "high")
     )
-    # Six decades: torques may be commanded exactly, or be wrong by more than they are.
-    low[len(leaves) :], high[len(leaves) :] = np.log(sizes.torque) + np.log([1e-6, 10.0])
+    # Six decades: torques may be commanded exactly, or be as wrong as they are large.
+    low[len(leaves) :], high[len(leaves) :] = np.log(sizes.error) + np.log([1e-6, 3.0])
     names = np.repeat([box.name for box in boxes], [box.low.size for box in boxes])
     is_length = np.array([n.endswith("lengthscale") for n in names])
     is_amplitude = np.array([n.endswith(".scale") for n in names])
@@ -84,7 +92,7 @@ def likeliest(
         longer = leaves + np.where(is_length, np.log(3.0), 0.0)
         kernels = [leaves, longer]
         kernels += [np.where(is_amplitude, middle, k) for k in kernels]
-        first = [np.full(m, share * sizes.torque) for share in (0.3, 0.03, 0.003)]
+        first = [np.full(m, share * sizes.error) for share in (0.3, 0.03, 0.003)]
     else:  # the kernel is good, and the path explains errors that the torques had to
         kernels, first = [leaves], [deviation * share for share in np.geomspace(1, 1e-3, 12)]
     design = np.array([np.append(k, np.log(d)) for k in kernels for d in first])
