@@ -69,8 +69,8 @@ from hamkernel._structures.joined import Controlled, InputMatrix
 from hamkernel._structures.lagrangian import Lagrangian
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
-from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.lagrangian import LearnedLagrangian
+from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.score import Score
