@@ -12,7 +12,12 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from hamkernel._machine import compiled_by_size
-from hamkernel._solvers.lagrangian import negative_log_likelihood, with_anchor
+from hamkernel._solvers.lagrangian import (
+    TorqueData,
+    negative_log_likelihood,
+    strong_rows,
+    with_anchor,
+)
 from hamkernel._structures.lagrangian import Lagrangian, LagrangianFeatures
 from hamkernel._tuning.minimiser import inside_box, run_in_box
 from hamkernel._tuning.space import Hyperparameter, boxes_of
@@ -162,3 +167,25 @@ def _boxes(K: Lagrangian, centres: np.ndarray, sizes: Sizes) -> list[Hyperparame
         side = (np.full(leaf.shape, size + s * np.log(1e3)) for s in (-1, 1))
         found.append(Hyperparameter(f"friction.{name[4:]}", True, *side))
     return found
+
+
+class StrongRows(eqx.Module):
+    """The rows of torques at known accelerations as the search calls them.
+
+    All joints have one deviation, as in `fit`: the geometric mean of those of the search.
+    """
+
+    data: TorqueData
+
+    def __call__(self, features: LagrangianFeatures, deviation: Float[Array, " m"]):
+        log_deviation = jnp.log(deviation).mean()
+        rows = strong_rows(features, self.data, jnp.exp(log_deviation))
+        return *rows, self.data.torques.size * log_deviation
+
+
+def sizes_of_torques(data: TorqueData) -> Sizes:
+    """The root mean squares of states, torques and accelerations."""
+    m = data.torques.shape[1]
+    arrays = data.torques, data.states[:, m:], data.accelerations
+    torque, speed, acceleration = (float(np.sqrt(np.mean(np.square(a)))) or 1.0 for a in arrays)
+    return Sizes(torque, speed, acceleration, torque)
