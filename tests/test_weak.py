@@ -33,7 +33,7 @@ def test_the_conditioned_path_is_that_of_the_kalman_smoother():
     centre = y.mean()
     wanted = smooth(PROCESS, steps, jnp.asarray(y - centre), jnp.ones(30, bool))
     counts = np.ones((30, 1))
-    (q, v), S = weak._conditioned(PROCESS, t, y[:, None], counts, (0.1, 0.0), t)
+    (q, v), S = weak._posterior_path(PROCESS, t, y[:, None], counts, (0.1, 0.0), t)
     np.testing.assert_allclose(q - centre, wanted.value, atol=1e-9)
     np.testing.assert_allclose(v, wanted.slope, atol=1e-8)
     deviations = np.sqrt(np.diagonal(S))
@@ -41,7 +41,7 @@ def test_the_conditioned_path_is_that_of_the_kalman_smoother():
     np.testing.assert_allclose(deviations[30:], wanted.slope_deviation, rtol=1e-6)
     both = np.column_stack([y, np.cos(t)])
     counts = np.ones((30, 2))
-    (_, w), T = weak._conditioned(PROCESS, t, both, counts, (0.1, 1e-3), t)
+    (_, w), T = weak._posterior_path(PROCESS, t, both, counts, (0.1, 1e-3), t)
     np.testing.assert_allclose(w, np.cos(t), atol=5e-3)
     assert np.diagonal(T)[:30].max() < np.diagonal(S)[:30].max()
 
@@ -77,7 +77,7 @@ def test_weak_rows_are_averages_of_the_torque_and_their_covariance_is_to_first_o
     found = weak.path_covariance(pendulum, piece)[0]
     np.testing.assert_allclose(found, D @ piece.covariance[0, 0] @ D.T, rtol=1e-6)
     deviation = jnp.array([0.3])
-    A, y, lost = weak.whitened(jnp.eye(2)[None, :, None], piece, found[None], deviation)
+    A, y, lost = weak.whiten(jnp.eye(2)[None, :, None], piece, found[None], deviation)
     C = found + 0.09 * piece.spacing * piece.overlap
     np.testing.assert_allclose(A.T @ A, np.linalg.inv(C), rtol=1e-8)
     np.testing.assert_allclose(lost, np.linalg.slogdet(C)[1] / 2, rtol=1e-10)

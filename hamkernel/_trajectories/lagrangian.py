@@ -32,7 +32,7 @@ from hamkernel._trajectories.weak import (
     path_covariance,
     smoothed_pieces,
     weak_rows,
-    whitened,
+    whiten,
 )
 from hamkernel._tuning.lagrangian import Sizes, likeliest
 
@@ -44,7 +44,7 @@ class LearnedLagrangian(eqx.Module):
         field: the machine, with the bands of what it says: `field.mass_matrix_deviation(q)`.
         kernel: the kernel with its hyperparameters.
         noise: the standard deviation of the sensor noise of each coordinate, shape (n,).
-        torque_noise: that of the torque of each joint at each sample, shape (m,).
+        torque_noise: the standard deviation of the torque of each joint at each sample, shape (m,).
         states: the smoothed states (q, v) of each run at its times, shape (T, 2m).
         log_evidence: the logarithm of the marginal likelihood of the weak rows, but for a constant.
             It compares kernels that were learned from the same runs.
@@ -83,31 +83,31 @@ class LearnedLagrangian(eqx.Module):
         return self.field
 
 
-def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, others: dict[str, Any]) -> Any:
+def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, unused: dict[str, Any]) -> Any:
     """The machine from runs of positions, or of (q, v), with torques as inputs; see `learn`.
 
     Args:
         K: the kernel.
         runs: the runs.
-        noise: that of the coordinates, if it is known.
-        others: arguments of `learn` that say nothing of a Lagrangian.
+        noise: the standard deviations of the coordinates, if they are known.
+        unused: arguments of `learn` that say nothing of a Lagrangian.
     """
-    m, noise = _check(K, runs, noise, others)
-    found = smoothed_pieces(runs, m, noise)
-    pieces = found.pieces
+    m, noise = _check(K, runs, noise, unused)
+    smoothing = smoothed_pieces(runs, m, noise)
+    pieces = smoothing.pieces
     X = jnp.asarray(pieces.states())
     features = lagrangian_features(K, X)
-    sizes = _sizes(pieces, m, found.lengthscale)
+    sizes = _sizes(pieces, m, smoothing.lengthscale)
     R = pieces.targets[0].size
     none = jnp.zeros((len(pieces.targets), R, R))
     first = likeliest(features, _WeakRows(pieces, none), sizes)
     shown = _with_kernel(features, first.kernel)
-    weights = _solved(shown, pieces, none, first.deviation)[1]
+    weights = _solve(shown, pieces, none, first.deviation)[1]
     covariance = _covariance(shown, weights, pieces)
     rows = _WeakRows(pieces, covariance)
     end = likeliest(_with_kernel(features, first.kernel), rows, sizes, np.asarray(first.deviation))
     shown = _with_kernel(features, end.kernel)
-    triangle, weights, A, y = _solved(shown, pieces, covariance, end.deviation)
+    triangle, weights, A, y = _solve(shown, pieces, covariance, end.deviation)
     raw = np.asarray(_rows(shown, pieces))
     residual = (pieces.targets - raw @ np.asarray(weights)) / pieces.values[0].sum()
     residual = jnp.asarray(residual[pieces.inside])
@@ -115,15 +115,15 @@ def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, others: dict[str, An
     joints = ()
     if K.friction is None:
         joints = missing_friction(A, y, _friction(shown, pieces, covariance, end.deviation))
-    table = _diagnostics(field, found, sizes, joints)
+    table = _diagnostics(field, smoothing, sizes, joints)
     if table.warning:
         require.warn(table.warning)
     return LearnedLagrangian(
         field=field,
         kernel=end.kernel,
-        noise=jnp.asarray(found.noise),
+        noise=jnp.asarray(smoothing.noise),
         torque_noise=end.deviation,
-        states=tuple(map(jnp.asarray, found.states)),
+        states=tuple(map(jnp.asarray, smoothing.states)),
         log_evidence=-end.loss,
         converged=table.is_usable,
         diagnostics=table,
@@ -131,12 +131,12 @@ def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, others: dict[str, An
     )
 
 
-def _check(K: Lagrangian, runs: Any, noise: Any, others: dict[str, Any]) -> tuple[int, Any]:
+def _check(K: Lagrangian, runs: Any, noise: Any, unused: dict[str, Any]) -> tuple[int, Any]:
     if not isinstance(runs, Runs):
         raise TypeError(f"learn takes hk.Runs(times, states); got a {type(runs).__name__}.")
-    given = [name for name, value in others.items() if value is not None and value is not False]
-    if given:
-        raise TypeError(f"{given[0]}= does not belong to learning a Lagrangian: leave it out.")
+    extra = [name for name, value in unused.items() if value is not None and value is not False]
+    if extra:
+        raise TypeError(f"{extra[0]}= does not belong to learning a Lagrangian: leave it out.")
     if runs.parameters is not None:
         raise TypeError("a Lagrangian has no parameters: leave them out of Runs.")
     if not runs.is_decided:
@@ -145,8 +145,8 @@ def _check(K: Lagrangian, runs: Any, noise: Any, others: dict[str, Any]) -> tupl
         )
     n = runs.dimension
     if runs.inputs is None:
-        known = K.known_mass_matrix
-        m = n if known is None else len(known[0])
+        anchor = K.known_mass_matrix
+        m = n if anchor is None else len(anchor[0])
         check_machine(K, np.zeros(1), m)
     else:
         m = runs.input_count
@@ -160,7 +160,7 @@ def _check(K: Lagrangian, runs: Any, noise: Any, others: dict[str, Any]) -> tupl
     if jnp.zeros(()).dtype != jnp.float64:
         raise ValueError("learn needs doubles: jax.config.update('jax_enable_x64', True) first.")
     if noise is not None:
-        noise = np.asarray(require.positive(noise, "noise", "Leave it out to have it found."))
+        noise = np.asarray(require.positive(noise, "noise", "Leave it out to have it smoothing."))
         if noise.shape not in ((), (n,)):
             raise ValueError(f"noise has shape {noise.shape}; a number or shape ({n},) is needed.")
         noise = np.broadcast_to(noise, (n,))
@@ -186,14 +186,14 @@ class _WeakRows(eqx.Module):
 
     def __call__(self, features: LagrangianFeatures, deviation: Float[Array, " m"]):
         rows = features.finished(weak_rows(features.of_motion, self.pieces))
-        return whitened(rows, self.pieces, self.covariance, deviation)
+        return whiten(rows, self.pieces, self.covariance, deviation)
 
 
 _with_kernel = compiled(lambda features, K: features.with_kernel(K))
 
 
 @compiled_by_size
-def _solved(features, pieces, covariance, deviation) -> tuple[Array, ...]:
+def _solve(features, pieces, covariance, deviation) -> tuple[Array, ...]:
     A, y, _ = _WeakRows(pieces, covariance)(features, deviation)
     return *solved(*with_anchor(features, A, y)), A, y
 
@@ -223,19 +223,21 @@ def _friction(features, pieces, covariance, deviation) -> Float[Array, "N k"]:
         columns = plain_friction(features, x[None, m:])[0]
         return jnp.zeros_like(columns), columns
 
-    return whitened(weak_rows(law, pieces), pieces, covariance, deviation)[0]
+    return whiten(weak_rows(law, pieces), pieces, covariance, deviation)[0]
 
 
 _LEAST_SWING = 5.0  # samples in a swing, as in `diagnostics`: with fewer noise hides the motion
 
 
 def _diagnostics(
-    field: LagrangianField, found: Any, sizes: Sizes, joints: tuple[int, ...]
+    field: LagrangianField, smoothing: Any, sizes: Sizes, joints: tuple[int, ...]
 ) -> Diagnostics:
     least, deviation = float(field.least_inertia), float(field.least_inertia_deviation)
     share = float(np.max(np.asarray(field.noise))) / sizes.error
     names = ", ".join(map(str, joints))
-    swing = 2.3 * found.lengthscale / found.pieces.spacing  # 2π/ω, with the lengthscale 2.7/ω
+    swing = (
+        2.3 * smoothing.lengthscale / smoothing.pieces.spacing
+    )  # 2π/ω, with the lengthscale 2.7/ω
     rows = len(field.residual) * field.features.count
     # tr (BᵀB (BᵀB + I)⁻¹) = r − ‖R⁻¹‖² in the norm of Frobenius.
     inverse = np.linalg.inv(np.asarray(field.triangle))
@@ -249,7 +251,7 @@ def _diagnostics(
                 field.is_identified,
                 field.refusal.split(". ")[0]
                 or "the mass matrix is positive definite all along the runs",
-                "Motions along one path do not tell inertia from gravity and friction: log others.",
+                "Motions along one path do not tell inertia from gravity and friction: log unused.",
                 decides=True,
             ),
             Diagnostic(

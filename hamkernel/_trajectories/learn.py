@@ -156,8 +156,8 @@ def learn(
     """
     require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
     if isinstance(K, Lagrangian):
-        others = {"mean": mean, "solver": solver, "process_noise": process_noise, "mass": mass}
-        return learn_lagrangian(K, runs, noise, others | {"masses": masses})
+        unused = {"mean": mean, "solver": solver, "process_noise": process_noise, "mass": mass}
+        return learn_lagrangian(K, runs, noise, unused | {"masses": masses})
     options = {"mean": mean if mean is None else as_pytree(mean), "noise": noise, "solver": solver}
     options |= {"process_noise": process_noise, "masses": masses, "iterations": iterations}
     options |= {"mass": mass}

@@ -44,13 +44,13 @@ class Pieces(NamedTuple):
 
     Attributes:
         path: smoothed positions and velocities at the nodes, shape (B, P, 2m).
-        covariance: that of the errors of (q, v) of each position, shape (B, m, 2P, 2P).
+        covariance: the covariance of the errors of (q, v) of each position, shape (B, m, 2P, 2P).
         values: φ dt of each window at the nodes, shape (W, P).
         slopes: φ̇ dt, shape (W, P).
         overlap: ∫ φ_r φ_s dt, shape (W, W).
         targets: ∫ φ c dt, shape (B, W, m).
         inside: whether a window is inside its run, shape (B, W).
-        spacing: of the samples, shape ().
+        spacing: the time between samples, shape ().
     """
 
     path: Float[np.ndarray, "B P n"]
@@ -70,7 +70,7 @@ class Pieces(NamedTuple):
 
 
 class Smoothed(NamedTuple):
-    """The pieces, with what smoothing found.
+    """The pieces, with what the smoother found.
 
     Attributes:
         pieces: the pieces.
@@ -98,33 +98,33 @@ def smoothed_pieces(runs: Runs, m: int, noise: Float[np.ndarray, " n"] | None) -
     """
     times, states = runs.on_host()
     positions = [x[:, :m] for x in states]
-    found = processes(times, positions)
-    for c, coordinate in enumerate(found):
+    coordinates = processes(times, positions)
+    for c, coordinate in enumerate(coordinates):
         if not np.isfinite(coordinate.process.log_amplitude):
             raise ValueError(
                 f"position {c} {'does not move' if coordinate.seen else 'is missing'}."
             )
     if noise is not None:
         log_noise = np.log(np.asarray(noise[:m], float))
-        found = [
+        coordinates = [
             c._replace(process=c.process._replace(log_noise=jnp.asarray(log_noise[i])))
-            for i, c in enumerate(found)
+            for i, c in enumerate(coordinates)
         ]
-    paths = smoothed(found, times, positions)
+    paths = smoothed(coordinates, times, positions)
     along = [
         np.concatenate([paths.value[r, : len(t)], paths.slope[r, : len(t)]], axis=1)
         for r, t in enumerate(times)
     ]
-    of_positions = np.array([c.noise for c in found])
+    of_positions = np.array([c.noise for c in coordinates])
     velocities = [x[:, m:] for x in states]
     of_slopes = np.array(
         [c.noise for c in processes(times, velocities)] if states[0].shape[1] > m else []
     )
     if noise is not None:
         of_slopes = np.asarray(noise[m:], float)
-    length = min(c.lengthscale for c in found)
+    length = min(c.lengthscale for c in coordinates)
     spacing = float(np.median(np.concatenate([np.diff(t) for t in times])))
-    times, states, counts = _averaged(times, states, max(1, int(length / (_SAMPLES * spacing))))
+    times, states, counts = _block_means(times, states, max(1, int(length / (_SAMPLES * spacing))))
     half = _NODES // 2
     step = _WIDTH * length / _NODES
     centres = half * (1 + np.arange(_WINDOWS))
@@ -140,10 +140,12 @@ def smoothed_pieces(runs: Runs, m: int, noise: Float[np.ndarray, " n"] | None) -
             for c in range(m):
                 deviations = of_positions[c], of_slopes[c] if len(of_slopes) else 0.0
                 samples = t[near], x[near][:, [c, m + c] if len(of_slopes) else [c]], count[near]
-                mean, covariance[c] = _conditioned(found[c].process, *samples, deviations, at)
+                mean, covariance[c] = _posterior_path(
+                    coordinates[c].process, *samples, deviations, at
+                )
                 path[:, c], path[:, m + c] = mean
             ends = at[centres + half]
-            target = _integrated(runs, r, at, centres, half * step, m)
+            target = _integrals(runs, r, at, centres, half * step, m)
             pieces.append((path, covariance, target, ends <= t[-1] + 1e-9 * step))
             start = float(at[-1])  # windows of two pieces do not overlap: their errors are apart
     if not pieces:
@@ -151,7 +153,7 @@ def smoothed_pieces(runs: Runs, m: int, noise: Float[np.ndarray, " n"] | None) -
             f"no run is as long as a window, {2 * half * step:.3g} in the unit of the times: weak "
             "rows need runs of several swings."
         )
-    stacked = (np.array(each) for each in zip(*pieces, strict=True))
+    stacked = (np.array(column) for column in zip(*pieces, strict=True))
     path, covariance, targets, inside = stacked
     targets = np.where(inside[:, :, None], targets, 0.0)
     overlap = phi @ phi.T * step
@@ -166,7 +168,7 @@ def _bump(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return rest**5, -10 * s * rest**4
 
 
-def _integrated(runs, r: int, at, centres, half_width: float, m: int) -> Float[np.ndarray, "W m"]:
+def _integrals(runs, r: int, at, centres, half_width: float, m: int) -> Float[np.ndarray, "W m"]:
     """∫ φ u dt of the inputs u of run r, exactly for inputs that are lines between nodes."""
     lines = runs.applied(r, at)
     if lines.shape[2] == 0:
@@ -180,7 +182,7 @@ def _integrated(runs, r: int, at, centres, half_width: float, m: int) -> Float[n
     return np.einsum("wpg,pgm,g->wm", phi, u, weights / 2 * step)
 
 
-def _averaged(times, states, size: int):
+def _block_means(times, states, size: int):
     """Means of `size` samples each, with how many of each coordinate are in them."""
     out = []
     for t, x in zip(times, states, strict=True):
@@ -191,7 +193,7 @@ def _averaged(times, states, size: int):
         sums = np.add.reduceat(np.where(there, x, 0.0), edges, axis=0)
         mean = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
         out.append((np.add.reduceat(t, edges) / sizes, mean, counts))
-    return (list(each) for each in zip(*out, strict=True))
+    return (list(column) for column in zip(*out, strict=True))
 
 
 def _covariances(process: Process, gaps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -204,7 +206,7 @@ def _covariances(process: Process, gaps: np.ndarray) -> tuple[np.ndarray, np.nda
     return decay * (1 + u + 0.4 * u**2 + u**3 / 15), first, second
 
 
-def _conditioned(
+def _posterior_path(
     process: Process,
     t: Float[np.ndarray, " T"],
     x: Float[np.ndarray, "T k"],
@@ -241,12 +243,12 @@ def weak_rows(law: Law, pieces: Pieces) -> Float[Array, "B W m *r"]:
     """∫ (φ b − φ̇ a) dt of the features (a, b) of a law, for each window."""
 
     @jax.checkpoint  # else the slopes of all nodes are kept for the derivatives
-    def of_piece(path):
+    def piece_result(path):
         a, b = jax.vmap(law)(path)
         values = jnp.einsum("wp,pi...->wi...", pieces.values, b)
         return values - jnp.einsum("wp,pi...->wi...", pieces.slopes, a)
 
-    rows = jax.lax.map(of_piece, jnp.asarray(pieces.path))
+    rows = jax.lax.map(piece_result, jnp.asarray(pieces.path))
     inside = jnp.asarray(pieces.inside)
     return jnp.where(inside.reshape(*inside.shape, *(1,) * (rows.ndim - 2)), rows, 0.0)
 
@@ -255,7 +257,7 @@ def path_covariance(law: Law, pieces: Pieces) -> Float[Array, "B R R"]:
     """D S Dᵀ of the rows of each piece, R = W m, for a law (m,) with known weights."""
     m = pieces.targets.shape[2]
 
-    def of_piece(piece):
+    def piece_result(piece):
         path, S = piece
         a, b = jax.vmap(jax.jacfwd(law))(path)  # (P, m, 2m)
         D = jnp.einsum("wp,pij->wipj", pieces.values, b)
@@ -264,10 +266,10 @@ def path_covariance(law: Law, pieces: Pieces) -> Float[Array, "B R R"]:
         D = D.reshape(-1, *D.shape[2:])
         return jnp.einsum("rqj,jqs,tsj->rt", D, S, D)
 
-    return jax.lax.map(of_piece, (jnp.asarray(pieces.path), jnp.asarray(pieces.covariance)))
+    return jax.lax.map(piece_result, (jnp.asarray(pieces.path), jnp.asarray(pieces.covariance)))
 
 
-def whitened(
+def whiten(
     rows: Float[Array, "B W m r"],
     pieces: Pieces,
     covariance: Float[Array, "B R R"],
@@ -283,7 +285,7 @@ def whitened(
     )
     m = len(deviation)
 
-    def of_piece(piece):
+    def piece_result(piece):
         A, y, C, inside = piece
         on = jnp.repeat(inside, m)
         C = jnp.where(on[:, None] & on[None], C + torques, jnp.eye(len(on), dtype=C.dtype))
@@ -292,6 +294,6 @@ def whitened(
         done = solve_triangular(L, both, lower=True)
         return done[:, :-1], done[:, -1], jnp.log(jnp.diagonal(L)).sum()
 
-    each = rows, jnp.asarray(pieces.targets), covariance, jnp.asarray(pieces.inside)
-    A, y, lost = jax.lax.map(of_piece, each)
+    inputs = rows, jnp.asarray(pieces.targets), covariance, jnp.asarray(pieces.inside)
+    A, y, lost = jax.lax.map(piece_result, inputs)
     return A.reshape(-1, A.shape[-1]), y.reshape(-1), lost.sum()

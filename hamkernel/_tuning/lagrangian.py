@@ -27,9 +27,9 @@ class Sizes(NamedTuple):
     """Root mean squares of all joints together, that set the boxes of the search.
 
     Attributes:
-        torque: of torques, as rows see them.
-        speed: of velocities.
-        acceleration: of accelerations.
+        torque: the size of torques, as rows see them.
+        speed: the size of velocities.
+        acceleration: the size of accelerations.
         error: the deviation of a torque at a sample with which rows are as wrong as they are large.
     """
 
@@ -73,10 +73,10 @@ def likeliest(
     """The likeliest lengthscales, amplitudes and deviations of torques, from several starts.
 
     Args:
-        features: those of the first guess, whose centres stay.
+        features: the features of the first guess; their centres stay.
         rows: (features, deviations of the torques (m,)) -> rows B (N, r) and targets y (N,), both
             over their noise, and the sum of the logarithms of that noise; a PyTree.
-        sizes: of the data.
+        sizes: the sizes of the data.
         deviation: a first guess of the deviations of torques; if None, some are tried.
         steps: how many the search takes at most.
     """
@@ -104,7 +104,7 @@ def likeliest(
     design = np.clip(design, low + 0.02 * (high - low), high - 0.02 * (high - low))
     dtype = features.centres.dtype
     space = jnp.asarray(design, dtype), jnp.asarray(low, dtype), jnp.asarray(high, dtype)
-    h, loss, converged, count = _searched(features, rows, space, steps)
+    h, loss, converged, count = _search(features, rows, space, steps)
     kernel = _with_leaves(K, h[: len(leaves)])
     share = (np.asarray(h) - low) / (high - low)
     at_edge = (share < 0.01) | (share > 0.99)
@@ -127,7 +127,7 @@ def likeliest(
 
 
 @compiled_by_size
-def _searched(features, rows, space, steps):
+def _search(features, rows, space, steps):
     m, (design, low, high) = features.count, space
 
     def loss(h):
@@ -158,15 +158,15 @@ def _boxes(K: Lagrangian, centres: np.ndarray, sizes: Sizes) -> list[Hyperparame
         "potential": sizes.torque**2,
         "inertia": (sizes.torque / sizes.acceleration) ** 2,
     }
-    found = []
+    boxes = []
     for name, amplitude in amplitudes.items():
-        found += boxes_of(getattr(K, name), name, centres, amplitude)
+        boxes += boxes_of(getattr(K, name), name, centres, amplitude)
     for name in () if K.friction is None else ("log_viscous", "log_coulomb"):
         leaf = np.asarray(getattr(K.friction, name))
         size = np.log(sizes.torque / (sizes.speed if name == "log_viscous" else 1.0))
         side = (np.full(leaf.shape, size + s * np.log(1e3)) for s in (-1, 1))
-        found.append(Hyperparameter(f"friction.{name[4:]}", True, *side))
-    return found
+        boxes.append(Hyperparameter(f"friction.{name[4:]}", True, *side))
+    return boxes
 
 
 class StrongRows(eqx.Module):

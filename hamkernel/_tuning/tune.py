@@ -162,9 +162,9 @@ def tune(
         inputs: u at each state, for a `Controlled` kernel, shape (N, m). An objective of your own
             is then called with (K, data, None, regularization), data the velocities with inputs.
         parameters: θ at each state, for a `Family`, shape (N, p); likewise.
-        accelerations: of a `Lagrangian`, shape (N, m). X are then states (q, v), Y torques, and
-            the objective is the marginal likelihood. Of the arguments above only `max_steps` is
-            used.
+        accelerations: q̈ at each state, for a `Lagrangian`, shape (N, m). X are then states (q, v),
+            Y torques, and the objective is the marginal likelihood. Of the arguments above only
+            `max_steps` is used.
 
     Returns:
         A `Tuned`. Its numbers are finite, since points where the objective is not finite cannot
@@ -319,21 +319,21 @@ def _result(
 def _tuned_lagrangian(K: Lagrangian, data: TorqueData, max_steps: int) -> Tuned:
     """The likeliest kernel and noise of a machine, and the fit with them."""
     features = lagrangian_features(K, data.states)
-    found = likeliest(features, StrongRows(data), sizes_of_torques(data), steps=max_steps)
-    deviation = jnp.exp(jnp.log(found.deviation).mean())
-    field = field_of_torques(found.kernel, data, deviation)
+    end = likeliest(features, StrongRows(data), sizes_of_torques(data), steps=max_steps)
+    deviation = jnp.exp(jnp.log(end.deviation).mean())
+    field = field_of_torques(end.kernel, data, deviation)
     regularization = deviation**2 / len(data.states)
     return Tuned(
-        kernel=cast(Any, found.kernel),
+        kernel=cast(Any, end.kernel),
         regularization=regularization,
-        loss=jnp.asarray(found.loss, deviation.dtype),
+        loss=jnp.asarray(end.loss, deviation.dtype),
         field=cast(Any, field),
-        hyperparameters=found.values | {RIDGE: regularization},
-        converged=jnp.asarray(found.converged),
-        steps=jnp.asarray(found.steps),
-        start_losses=jnp.asarray([found.loss], deviation.dtype),
-        at_bounds=found.at_bounds,
-        bounds=found.bounds,
+        hyperparameters=end.values | {RIDGE: regularization},
+        converged=jnp.asarray(end.converged),
+        steps=jnp.asarray(end.steps),
+        start_losses=jnp.asarray([end.loss], deviation.dtype),
+        at_bounds=end.at_bounds,
+        bounds=end.bounds,
     )
 
 
