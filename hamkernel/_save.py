@@ -45,6 +45,7 @@ from jax.experimental import multihost_utils
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._fields.joined import AbstractJoinedField
+from hamkernel._fields.lagrangian import LagrangianField
 from hamkernel._kernels.functions import Bound, Closure, as_pytree
 from hamkernel._kernels.symmetry import identity, reflection, time_reversal
 from hamkernel._solvers.stream import AbstractStreamingFit
@@ -54,7 +55,9 @@ _VERSION = 2  # of the format; 1 was an archive of NumPy's, before the first rel
 _FIRST_LINE = "hamkernel field, version {}, sha256 {}"
 
 
-def save(path: str | os.PathLike[str], field: AbstractField | AbstractStreamingFit) -> None:
+def save(
+    path: str | os.PathLike[str], field: AbstractField | AbstractStreamingFit | LagrangianField
+) -> None:
     """Write a learned field to one file: kernel, hyperparameters, data, coefficients, version.
 
     Or a fit to which chunks are added: after `load` it goes on with the next one.
@@ -190,15 +193,17 @@ def load(
 
 
 def _is_saved(cls: Any) -> bool:
-    kinds = AbstractField, AbstractStreamingFit
+    kinds = AbstractField, AbstractStreamingFit, LagrangianField
     return isinstance(cls, type) and issubclass(cls, kinds) and not inspect.isabstract(cls)
 
 
-def _of_state(field: AbstractField) -> Callable[[Array], Array]:
+def _of_state(field: Any) -> Callable[[Array], Array]:
     """The field as a function of the state alone: where it has inputs or parameters, they are 1."""
     if isinstance(field, AbstractJoinedField):
         u = jnp.ones(field.kernel.input_count, field.offset.dtype)
         return lambda x: field(x, u)
+    if isinstance(field, LagrangianField):  # which may have no acceleration
+        return lambda x: jnp.concatenate([field.momentum(x), field.rest_torques(x)])
     return field
 
 

@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -31,8 +31,11 @@ from hamkernel._observations.kinds import AbstractObservations, inputs_or_parame
 from hamkernel._observations.measurements import observations
 from hamkernel._show import described
 from hamkernel._solvers.fit import check_solver, features_of_parts, field_of_problem
+from hamkernel._solvers.lagrangian import TorqueData, field_of_torques, torque_data
 from hamkernel._solvers.problem import AbstractSolver, Problem, make_problem
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.lagrangian import Lagrangian, lagrangian_features
+from hamkernel._tuning.lagrangian import StrongRows, likeliest, sizes_of_torques
 from hamkernel._tuning.minimiser import MinimiserRun
 from hamkernel._tuning.objective import (
     Criterion,
@@ -87,7 +90,7 @@ class Tuned(eqx.Module):
 @one_blas_thread
 @full_precision
 def tune(
-    K: AbstractMatrixKernel,
+    K: AbstractMatrixKernel | Lagrangian,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
     Y: Num[ArrayLike, "N n"] | None = None,
     regularization: ArrayLike = 1e-3,
@@ -104,6 +107,7 @@ def tune(
     progress: bool = False,
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
+    accelerations: Num[ArrayLike, "N m"] | None = None,
 ) -> Tuned:
     """Tune every hyperparameter of K, and λ with them, down the gradient of a validation loss.
 
@@ -158,6 +162,9 @@ def tune(
         inputs: u at each state, for a `Controlled` kernel, shape (N, m). An objective of your own
             is then called with (K, data, None, regularization), data the velocities with inputs.
         parameters: θ at each state, for a `Family`, shape (N, p); likewise.
+        accelerations: q̈ at each state, for a `Lagrangian`, shape (N, m). X are then states (q, v),
+            Y torques, and the objective is the marginal likelihood. Of the arguments above only
+            `max_steps` is used.
 
     Returns:
         A `Tuned`. Its numbers are finite, since points where the objective is not finite cannot
@@ -197,6 +204,10 @@ def tune(
     also keeps cross-validation away from fields whose rounding errors are too large for an
     integrator, ‖a‖ tr(G) √ε > ‖y‖ for the coefficients a. The likelihood needs no penalty.
     """
+    if isinstance(K, Lagrangian):
+        return _tuned_lagrangian(K, torque_data(K, X, Y, accelerations), max_steps)
+    if accelerations is not None:
+        raise TypeError("accelerations= belongs to hk.Lagrangian(potential=…, inertia=…).")
     frozen = (frozen,) if isinstance(frozen, str) else frozen
     _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
     _check_optimiser(optimiser)
@@ -302,6 +313,27 @@ def _result(
         start_losses=jnp.asarray(losses, dtype),
         at_bounds=space.at_bounds(best_run.best.u),
         bounds=space.bounds(size),
+    )
+
+
+def _tuned_lagrangian(K: Lagrangian, data: TorqueData, max_steps: int) -> Tuned:
+    """The likeliest kernel and noise of a machine, and the fit with them."""
+    features = lagrangian_features(K, data.states)
+    end = likeliest(features, StrongRows(data), sizes_of_torques(data), steps=max_steps)
+    deviation = jnp.exp(jnp.log(end.deviation).mean())
+    field = field_of_torques(end.kernel, data, deviation)
+    regularization = deviation**2 / len(data.states)
+    return Tuned(
+        kernel=cast(Any, end.kernel),
+        regularization=regularization,
+        loss=jnp.asarray(end.loss, deviation.dtype),
+        field=cast(Any, field),
+        hyperparameters=end.values | {RIDGE: regularization},
+        converged=jnp.asarray(end.converged),
+        steps=jnp.asarray(end.steps),
+        start_losses=jnp.asarray([end.loss], deviation.dtype),
+        at_bounds=end.at_bounds,
+        bounds=end.bounds,
     )
 
 
