@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
@@ -136,10 +137,16 @@ def learn(
         UserWarning: once, where a row of `learned.diagnostics` falls short, with its meaning.
     """
     require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
-    options = {"mean": mean if mean is None else as_pytree(mean), "noise": noise, "solver": solver}
-    options |= {"process_noise": process_noise, "masses": masses, "iterations": iterations}
-    options |= {"mass": mass}
-    again = Partial(learn, K, progress=False, **options)
+    again = LearnAgain(
+        kernel=matrix_kernel(K),
+        mean=mean if mean is None else as_pytree(mean),
+        noise=noise,
+        solver=solver,
+        process_noise=process_noise,
+        masses=masses,
+        mass=mass,
+        iterations=iterations,
+    )
     if mass is not None:
         mean, runs = _of_known_mass(mass, mean, runs)
     K, given, process = _check(with_amplitude(matrix_kernel(K)), runs, noise, process_noise, solver)
@@ -171,6 +178,24 @@ def learn(
         end = chosen(end, iterate(*asked.begun(data, sought=True), most, bar), on_part)
     bar.close()
     return _learned(runs, mean, end, process, given is not None, measured, again)
+
+
+class LearnAgain(eqx.Module):
+    """`learn` with the arguments of an earlier call, for other runs."""
+
+    kernel: AbstractMatrixKernel
+    mean: Any
+    noise: Any
+    solver: Nystrom | None
+    process_noise: Any
+    masses: bool
+    mass: Any
+    iterations: int
+
+    def __call__(self, runs: Runs) -> Learned:
+        """The field of these runs."""
+        options = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return learn(options.pop("kernel"), runs, progress=False, **options)
 
 
 class _Asked(NamedTuple):
@@ -268,7 +293,7 @@ def _learned(
     given_process: np.ndarray | None,
     given: bool,
     measured: np.ndarray,
-    again: Partial,
+    again: LearnAgain,
 ) -> Learned:
     """The result; warns where it must.
 
