@@ -48,6 +48,7 @@ from hamkernel._kernels.functions import Bound, Closure, as_pytree
 from hamkernel._kernels.symmetry import identity, reflection, time_reversal
 from hamkernel._observations.measurements import Measurements
 from hamkernel._posterior import Posterior
+from hamkernel._solvers.problem import Problem
 from hamkernel._solvers.stream import AbstractStreamingFit
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics
@@ -289,7 +290,7 @@ _ROOMS = tuple(
     )
 )
 # Classes of results that are no modules of Equinox.
-_RECORDS = (Diagnostic, Diagnostics, LinearisedSegments, Measurements, Model)
+_RECORDS = (Diagnostic, Diagnostics, LinearisedSegments, Measurements, Model, Problem)
 _MAPS = {function.__name__: function for function in (identity, reflection, time_reversal)}
 
 Node = Any
