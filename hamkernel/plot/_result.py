@@ -83,6 +83,7 @@ def _force(ax: Axes, learned: Learned, posterior: Any) -> None:
     states = np.stack([q, np.zeros(_STATES)], axis=1)
     means, deviations = map(np.asarray, posterior.evaluate(states, *_inputs(learned, _STATES)))
     band(q, means[:, 1], deviations[:, 1], ax=ax, xlabel="$q$")
+    ax.locator_params(axis="x", nbins=6)
     ax.axhline(0.0, color="0.7", linewidth=0.8, zorder=1)
     ax.plot(
         visited, np.zeros_like(visited), "|", color=DATA, ms=7, transform=ax.get_xaxis_transform()
