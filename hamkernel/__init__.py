@@ -27,9 +27,11 @@ those above it:
     _discovery    a formula read off the data, and which physics they obey
     _symplectic, _simulate
                   symplectic integrators, and trajectories of any field
-    _save         fields in files
+    _save         fields and results in files
     systems, plot, paper
                   example systems, pictures, the paper's experiments
+    _report, _command
+                  a result as a page, and from CSV files to one
 
 `_require` checks arguments, `_show` prints objects, `_machine` knows devices, memory, precision,
 threads, and what stalls, and `_sizes` how much is computed at once.
@@ -55,6 +57,7 @@ from hamkernel._kernels.parts import Shared, neighbours, pairs, sites
 from hamkernel._kernels.transforms import Select, Warp
 from hamkernel._observations.kinds import Energies, Equilibria, Functionals, Velocities
 from hamkernel._posterior import Posterior, condition
+from hamkernel._report import report
 from hamkernel._save import load, save
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.dense import Cholesky
@@ -167,6 +170,7 @@ __all__ = [  # noqa: RUF022 - in reading order
     "Learned",
     "LearnedLagrangian",
     "Score",
+    "report",
     # What the data say beyond the field.
     "compare",
     "readout",

@@ -1,16 +1,21 @@
-"""`python -m hamkernel`: the paper's experiments from the first array to the last figure."""
+"""`python -m hamkernel`: the paper's experiments; with `learn`, a field from CSV files."""
 
 import argparse
+import sys
 
 import jax
 
 
 def main() -> None:
-    """Reproduce the paper and print its tables beside the published ones."""
+    """Reproduce the paper and print its tables beside the published ones; or learn."""
+    if sys.argv[1:2] == ["learn"]:
+        _learn(sys.argv[2:])
+        return
     parser = argparse.ArgumentParser(
         prog="python -m hamkernel",
         description="Reproduce the experiments of Smith & Egeland (2023): tables on the terminal, "
         "results.json and figures in a folder.",
+        epilog="python -m hamkernel learn --help: from logged runs in CSV files to a field.",
     )
     parser.add_argument("--out", default="results", help="folder for the files (%(default)s)")
     parser.add_argument(
@@ -39,6 +44,15 @@ def main() -> None:
         _, more = retune(arguments.out, arguments.seeds, show=show)
         files += more[1:]  # results.json is there
     print("\nWritten:", *(f"  {file}" for file in files), sep="\n")
+
+
+def _learn(arguments: list[str]) -> None:
+    """From CSV files to a report, a field and a script."""
+    jax.config.update("jax_enable_x64", True)  # before any array is made
+    from hamkernel._command import run
+    from hamkernel._show import printable
+
+    run(arguments, lambda text: print(printable(text), flush=True))
 
 
 def _plan(out: str, seeds: int, tune: bool) -> str:

@@ -32,7 +32,13 @@ from hamkernel._show import has_arrays, text
 from hamkernel._solvers.dense import Cholesky
 from hamkernel._solvers.fit import check_solver, features_of_parts
 from hamkernel._solvers.low_rank import LowRankConditional
-from hamkernel._solvers.problem import AbstractConditional, AbstractSolver, make_problem, new_rows
+from hamkernel._solvers.problem import (
+    AbstractConditional,
+    AbstractSolver,
+    Problem,
+    make_problem,
+    new_rows,
+)
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -86,10 +92,18 @@ def condition(
     Warns:
         UserWarning: the amplitude of K is exactly 1, as that of built-in kernels is before tuning.
     """
+    problem = make_problem(K, X, Y, regularization, mean, inputs, parameters)
+    return posterior_of_problem(problem, solver, progress)
+
+
+def posterior_of_problem(
+    problem: Problem, solver: AbstractSolver | None, progress: bool = False
+) -> Posterior:
+    """`condition` on a problem."""
     check_solver(solver)
     if solver is not None and solver.no_factor:
         raise TypeError(solver.no_factor)
-    problem = make_problem(K, X, Y, regularization, mean, inputs, parameters).to_one_device()
+    problem = problem.to_one_device()
     if solver is None:
         solver = features_of_parts() if is_of_parts(problem.kernel) else Cholesky()
     require.warn_of_float32(problem.rows.targets)
@@ -189,6 +203,31 @@ class Posterior(eqx.Module):
                 field has no inputs.
         """
         return jnp.stack([root(variance) for variance in jnp.diagonal(self.covariance(x, u))])
+
+    @one_blas_thread
+    @full_precision
+    def evaluate(
+        self, X: Num[ArrayLike, "N n"], U: Num[ArrayLike, "N m"] | None = None
+    ) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
+        """The means and standard deviations of f at many states, in bounded memory.
+
+        Args:
+            X: states, shape (N, n).
+            U: their inputs, or parameters of a family, shape (N, m), where the field has them.
+
+        Returns:
+            Means and deviations, (N, n) each, as of `field` and `deviation`.
+
+        Raises:
+            ValueError: a shape does not fit, or U is missing. TypeError: the field has no inputs.
+        """
+        is_joined = isinstance(self.field, AbstractJoinedField)
+        if U is not None and not is_joined:
+            raise TypeError("the field has no inputs: posterior.evaluate(X).")
+        means = self.field.evaluate(X, U) if is_joined else self.field.evaluate(X)
+        states = (jnp.asarray(X, means.dtype), *(() if U is None else (jnp.asarray(U),)))
+        # A state takes D n numbers for D rows: of 64 states and 3000 rows, 3 MB for n = 2.
+        return means, jax.lax.map(lambda s: self.deviation(*s), states, batch_size=64)
 
     @full_precision
     def law_deviation(
@@ -300,13 +339,13 @@ class Posterior(eqx.Module):
         self,
         key: Key[Array, ""] | UInt32[Array, "..."],
         count: int,
-        region: Num[ArrayLike, "2 n"],
+        region: Num[ArrayLike, "2 n"] | None = None,
     ) -> AbstractField:
         """Draw whole fields that agree with the data, each with its own Hamiltonian.
 
         The fields are one PyTree whose arrays have a leading axis, for `jax.vmap`:
 
-            fields = posterior.sample(jax.random.key(0), 64, region)
+            fields = posterior.sample(jax.random.key(0), 64)
             orbits = jax.vmap(lambda f: hk.simulate(f, x0, ts).ys)(fields)
 
         In the region and at the data, the mean and covariance of the draws are those of the
@@ -318,7 +357,8 @@ class Posterior(eqx.Module):
         Args:
             key: the random key.
             count: how many fields.
-            region: the lowest and the highest corner of a box of states, shape (2, n).
+            region: the lowest and the highest corner of a box of states, shape (2, n); if None, the
+                smallest box that holds the states of the data.
 
         Returns:
             Fields of the type of `field`. The norm of a draw is not finite.
@@ -330,6 +370,8 @@ class Posterior(eqx.Module):
         key, count = require.key(key), require.count(count, "count")
         rows = self.conditional.rows
         n, dtype = rows.dimension, rows.targets.dtype
+        if region is None:
+            region = _range_of(rows.points[:, :n], None)
         corners = require.floating(region, "region").astype(dtype)
         if corners.shape != (2, n):
             raise ValueError(

@@ -1,16 +1,15 @@
-"""`save` and `load`: a learned field in one file, which is read without running anything in it.
-
-A fit to which chunks are added is kept the same way.
+"""`save` and `load`: a field or a result in one file, which is read without running anything in it.
 
 A file is a line with the version of the format and the SHA-256 of the rest, a line of JSON that
-describes the field, and its arrays as Equinox writes the leaves of a PyTree, one after another in
+describes the object, and its arrays as Equinox writes the leaves of a PyTree, one after another in
 NumPy's `.npy` format. The digest finds a cut or changed file before anything is parsed. It does
 not authenticate: whoever rewrites a file can rewrite its digest, so what is parsed is checked too.
 
 The description has these nodes:
 
     {"class": name, field: …}            an object of the library, by its fields
-    {"array": "float64", "shape": […]}   an array, without its entries
+    {"array": "float64", "shape": […]}   an array, without its entries; of NumPy if "numpy": true
+    {"dict": {name: …}}                  a dictionary
     {"function": name}                   one of the functions in `_MAPS`
     {"code": name, "leaves": […]}        code of the caller's, which only the caller can give
     […]  0.5  "text"  true  null         a tuple, and plain values
@@ -48,19 +47,30 @@ from hamkernel._fields.joined import AbstractJoinedField
 from hamkernel._fields.lagrangian import LagrangianField
 from hamkernel._kernels.functions import Bound, Closure, as_pytree
 from hamkernel._kernels.symmetry import identity, reflection, time_reversal
+from hamkernel._observations.measurements import Measurements
+from hamkernel._posterior import Posterior
+from hamkernel._solvers.problem import Problem
 from hamkernel._solvers.stream import AbstractStreamingFit
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics
+from hamkernel._trajectories.learned import Learned
+from hamkernel._trajectories.model import Model
+from hamkernel._trajectories.segments import LinearisedSegments
+from hamkernel._tuning.tune import Tuned
 
 _VERSION = 2  # of the format; 1 was an archive of NumPy's, before the first release
 _FIRST_LINE = "hamkernel field, version {}, sha256 {}"
 
 
 def save(
-    path: str | os.PathLike[str], field: AbstractField | AbstractStreamingFit | LagrangianField
+    path: str | os.PathLike[str],
+    field: AbstractField | AbstractStreamingFit | LagrangianField | Learned | Tuned | Posterior,
 ) -> None:
     """Write a learned field to one file: kernel, hyperparameters, data, coefficients, version.
 
-    Or a fit to which chunks are added: after `load` it goes on with the next one.
+    Results are written whole: `learned` with its runs, noise, diagnostics and history, so that
+    `hk.load(path).posterior` and `.score(runs)` work; `tuned`; and a posterior with its factor. A
+    fit to which chunks are added goes on with the next one after `load`.
 
     The file at `path` is replaced in one step, so that no reader ever sees half of it. Code of
     your own (kernels, maps of a `Warp`, a mean) is not written, only its arrays are: see `load`.
@@ -70,20 +80,20 @@ def save(
 
     Args:
         path: the file. The name is taken as it is.
-        field: what `fit` returned, `tune(...).field`, or the `LandmarkFit` or `FeatureFit` of a
-            solver's `start`.
+        field: the result of `fit`, `learn`, `tune` or `condition`, or the `LandmarkFit` or
+            `FeatureFit` of a solver's `start`.
 
     Raises:
-        TypeError: `field` is no field of this library, or holds something that cannot be stored.
+        TypeError: `field` is none of these, or holds something that cannot be stored.
         ValueError: the call is inside `jax.jit`, where there are no numbers yet; the field is not
             finite.
         OSError: the file cannot be written; an older one at `path` is left as it was.
     """
     if not _is_saved(type(field)):
-        names = [name for name, cls in _classes().items() if _is_saved(cls)]
+        names = sorted(name for name, cls in _classes().items() if _is_saved(cls))
         raise TypeError(
-            f"save writes learned fields and streams ({', '.join(names)}), got "
-            f"{type(field).__name__}. For the result of tune pass tuned.field."
+            "save writes what fit, learn, tune, condition and start return "
+            f"({', '.join(names)}); got {type(field).__name__}."
         )
     if not require.is_concrete(field):
         raise ValueError(
@@ -126,11 +136,11 @@ def load(
     kernel: AbstractMatrixKernel | None = None,
     mean: Callable[..., Any] | None = None,
 ) -> Any:
-    """Read a field that `save` wrote: the same arrays bit by bit, so the same values of f.
+    """Read what `save` wrote: the same arrays bit by bit, so the same values of f.
 
     Nothing in the file is executed. Built-in kernels restore by themselves. For a kernel of your
-    own the file has the arrays but not the code: pass the kernel as it was given to `fit`, with
-    any values of its hyperparameters, and those of the file are put in.
+    own the file has the arrays but not the code: pass the kernel as `fit` or `learn` got it. Its
+    hyperparameters may have any values, and those of the file are put in.
 
     Args:
         path: the file.
@@ -139,7 +149,7 @@ def load(
             `hk.systems` are in the file.
 
     Returns:
-        The field, or the fit to which chunks are added, of the class that was saved.
+        An object of the class that was saved.
 
     Raises:
         ValueError: the file is no such file, cut off, changed, of another version, or in float64
@@ -169,7 +179,8 @@ def load(
         )
     given = kernel is not None or mean is not None
     try:
-        like = skeleton(node, [], "field", _given(kernel, mean))
+        as_fitted = node["class"] != Learned.__name__  # learn adds amplitudes and masses
+        like = skeleton(node, [], "field", _given(kernel, mean, as_fitted))
         with jax.ensure_compile_time_eval():  # a constant of what JAX traces around this call
             field = eqx.tree_deserialise_leaves(content, like)
         if content.read():
@@ -193,7 +204,7 @@ def load(
 
 
 def _is_saved(cls: Any) -> bool:
-    kinds = AbstractField, AbstractStreamingFit, LagrangianField
+    kinds = AbstractField, AbstractStreamingFit, LagrangianField, Learned, Tuned, Posterior
     return isinstance(cls, type) and issubclass(cls, kinds) and not inspect.isabstract(cls)
 
 
@@ -208,11 +219,12 @@ def _of_state(field: Any) -> Callable[[Array], Array]:
 
 
 def _evaluable(saved: Any) -> AbstractField:
-    """The field; that of a fit to chunks is the sum of its columns, which needs no data.
+    """The field of what was saved; that of a fit to chunks is the sum of its columns.
 
     Raises unless the parts fit each other: as many lengthscales as coordinates, and the like.
     """
-    field = saved.sum_of_columns() if isinstance(saved, AbstractStreamingFit) else saved
+    is_stream = isinstance(saved, AbstractStreamingFit)  # whose columns need no data
+    field = saved.sum_of_columns() if is_stream else getattr(saved, "field", saved)
     state = jax.ShapeDtypeStruct((field.dimension,), field.offset.dtype)
     if field.offset.shape or jax.eval_shape(_of_state(field), state).shape != state.shape:
         raise ValueError("its arrays have an axis more than those of one field.")
@@ -270,13 +282,18 @@ _ROOMS = tuple(
     for room in (
         "_kernels.",
         "_structures.",
-        "_observations.blocks",
+        "_observations.",
         "_features",
         "_fields.",
         "_solvers.",
+        "_posterior",
+        "_tuning.tune",
+        "_trajectories.",
         "systems.",
     )
 )
+# Classes of results that are no modules of Equinox.
+_RECORDS = (Diagnostic, Diagnostics, LinearisedSegments, Measurements, Model, Problem)
 _MAPS = {function.__name__: function for function in (identity, reflection, time_reversal)}
 
 Node = Any
@@ -287,10 +304,15 @@ class _NotGiven(ValueError):
     """The caller gave another kernel or mean than the saved one, or code is missing in it."""
 
 
-def _given(kernel: Any, mean: Any) -> Given:
-    """For each part of a field what the caller gave: its description or None, and its code."""
+def _given(kernel: Any, mean: Any, as_fitted: bool) -> Given:
+    """For each part of a field what the caller gave: its description or None, and its code.
+
+    Where the kernel in the file is not `as_fitted` it differs from the caller's in more than
+    numbers: then only its code is taken, and the saved velocity tells a wrong one.
+    """
     of_kernel, of_mean = [], []
     node = None if kernel is None else description(kernel, of_kernel, "field.kernel")
+    node = node if as_fitted else None
     if mean is not None:  # which may be a term of the mean of the field
         description(as_pytree(mean), of_mean, "field.mean")
     # Features hold the kernel again.
@@ -299,14 +321,19 @@ def _given(kernel: Any, mean: Any) -> Given:
 
 def _ours(cls: type) -> bool:
     """Whether a file may name the class; `Bound` and `Closure` only carry code of the caller's."""
-    found = issubclass(cls, eqx.Module) and cls.__module__.startswith(_ROOMS)
-    return found and cls not in (Bound, Closure)
+    is_module = issubclass(cls, eqx.Module) and cls.__module__.startswith(_ROOMS)
+    return cls in _RECORDS or (is_module and cls not in (Bound, Closure))
+
+
+def _fields(cls: type) -> list[str]:
+    """The names of the fields of a dataclass or of a named tuple."""
+    return list(getattr(cls, "_fields", ())) or [field.name for field in dataclasses.fields(cls)]
 
 
 @functools.cache
-def _classes() -> dict[str, type[eqx.Module]]:
+def _classes() -> dict[str, type]:
     """The classes that a file may name, by name."""
-    found: dict[str, type[eqx.Module]] = {}
+    found: dict[str, type] = {cls.__name__: cls for cls in _RECORDS}
     left = [eqx.Module]
     for cls in left:  # which grows
         left += cls.__subclasses__()
@@ -323,15 +350,20 @@ def description(value: Any, codes: list[Any], where: str) -> Node:
     """
     cls = type(value)
     if _ours(cls):
-        fields = {field.name: getattr(value, field.name) for field in dataclasses.fields(cls)}
-        nodes = {name: description(v, codes, f"{where}.{name}") for name, v in fields.items()}
+        parts = {name: getattr(value, name) for name in _fields(cls)}
+        nodes = {name: description(v, codes, f"{where}.{name}") for name, v in parts.items()}
         return {"class": cls.__name__, **nodes}
+    if isinstance(value, np.generic):
+        value, cls = value.item(), type(value.item())
     if eqx.is_array(value) or isinstance(value, np.ndarray):
         if np.dtype(value.dtype).kind not in "biuf":
             raise TypeError(f"{where} has dtype {value.dtype}, which cannot be stored.")
-        return {"array": str(value.dtype), "shape": list(value.shape)}
-    if isinstance(value, tuple):
+        node = {"array": str(value.dtype), "shape": list(value.shape)}
+        return node | {"numpy": True} if isinstance(value, np.ndarray) else node
+    if isinstance(value, tuple | list):
         return [description(v, codes, f"{where}[{i}]") for i, v in enumerate(value)]
+    if cls is dict and all(type(key) is str for key in value):
+        return {"dict": {k: description(v, codes, f"{where}[{k!r}]") for k, v in value.items()}}
     if value is None or cls in (bool, int, float, str):
         return value
     if any(value is function for function in _MAPS.values()):
@@ -364,21 +396,30 @@ def skeleton(node: Node, codes: list[Any], where: str, given: Given) -> Any:
             cls = _classes().get(name)
             if cls is None:
                 raise ValueError(f"{where} is of the unknown class {name[:80]!r}")
-            if nodes.keys() != {field.name for field in dataclasses.fields(cls)}:
+            if nodes.keys() != set(_fields(cls)):
                 raise ValueError(f"{where} does not have the fields of {name}")
-            replaced = given if _is_saved(cls) else {}
-            made = object.__new__(cls)  # past __init__, which takes no logarithms
+            parts = {}
             for key, child in nodes.items():
                 path, inside = f"{where}.{key}", (codes, given)
-                if key in replaced:
-                    differs = _difference(child, replaced[key][0], path)
+                if key in given:
+                    differs = _difference(child, given[key][0], path)
                     if differs:
                         raise _NotGiven(differs)
-                    inside = list(replaced[key][1]), {}
-                object.__setattr__(made, key, skeleton(child, inside[0], path, inside[1]))
+                    inside = list(given[key][1]), {}
+                parts[key] = skeleton(child, inside[0], path, inside[1])
+            if issubclass(cls, tuple):
+                return cls(**parts)
+            made = object.__new__(cls)  # past __init__, which takes no logarithms
+            for key, part in parts.items():
+                object.__setattr__(made, key, part)
             return made
+        case {"array": str(dtype), "shape": [*shape], "numpy": True}:
+            return np.broadcast_to(np.zeros((), dtype), shape)  # which takes no memory
         case {"array": str(dtype), "shape": [*shape]}:
             return jax.ShapeDtypeStruct(tuple(shape), np.dtype(dtype))
+        case {"dict": dict(items)}:
+            below = items.items()
+            return {k: skeleton(child, codes, f"{where}[{k!r}]", given) for k, child in below}
         case {"function": str(name)} if name in _MAPS:
             return _MAPS[name]
         case {"code": str(name), "leaves": list()}:
@@ -403,12 +444,21 @@ def _difference(saved: Node, given: Node, where: str) -> str | None:
             pairs = [(*pair, f"{where}[{i}]") for i, pair in both]
         case {"code": _, "leaves": first}, {"code": _, "leaves": second} if first == second:
             return None  # code of whatever name
+        case {"array": _, "shape": _}, {"array": _, "shape": _}:
+            keys = ("array", "shape")  # whether of NumPy or of JAX
+            if all(saved[key] == given[key] for key in keys):
+                return None
+            return _mismatch(saved, given, where)
         case _ if given is None or (type(saved) is type(given) and saved == given):
             return None
         case _:
-            here = f"{_summary(saved)} in the file and {_summary(given)} here"
-            return f"{where} is {here}: not the one saved"
+            return _mismatch(saved, given, where)
     return next(filter(None, (_difference(*pair) for pair in pairs)), None)
+
+
+def _mismatch(saved: Node, supplied: Node, where: str) -> str:
+    here = f"{_summary(saved)} in the file and {_summary(supplied)} here"
+    return f"{where} is {here}: not the one saved"
 
 
 def _summary(node: Node) -> str:

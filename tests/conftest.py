@@ -2,6 +2,7 @@
 
 import collections
 import os
+import warnings
 import zlib
 
 # Before NumPy loads. The threads of BLAS in two workers on two cores wait for each other: half of
@@ -16,6 +17,7 @@ os.environ.setdefault(
 )
 
 import jax
+import numpy as np
 import pytest
 
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -49,3 +51,24 @@ def _few_compiled_programs():
 @pytest.fixture
 def key() -> jax.Array:
     return jax.random.key(20231217)
+
+
+@pytest.fixture(scope="session")
+def learned():
+    """What `learn` finds in two short runs of a pendulum of known mass, q̈ = −sin q."""
+    import hamkernel as hk  # after the settings above
+
+    rng, ts, states = np.random.default_rng(0), np.linspace(0.0, 5.7, 20), []
+    for q, p in [(1.2, 0.0), (0.4, 1.0)]:
+        rows = []
+        for i in range(5701):  # leaps of a millisecond
+            if i % 300 == 0:
+                rows.append([q, p])
+            half = p - 0.0005 * np.sin(q)
+            q += 0.001 * half
+            p = half - 0.0005 * np.sin(q)
+        states.append(np.array(rows) + 0.01 * rng.normal(size=(20, 2)))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the log is short
+        K, runs = hk.Symplectic(hk.Gaussian(2.0)), hk.Runs([ts] * 2, states)
+        return hk.learn(K, runs, mass=1.0, iterations=2, progress=False)

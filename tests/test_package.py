@@ -38,6 +38,8 @@ ROOMS = [
     {"_simulate"},
     {"_save", "systems"},
     {"plot"},
+    {"_report"},
+    {"_command"},
     {"paper"},
     {"__init__", "__main__"},
 ]

@@ -372,3 +372,35 @@ def test_values_and_gradients_together_are_those_of_gpytorch():
     np.testing.assert_allclose(between(curl_free, values, values), theirs[:, 0, :, 0], atol=1e-6)
     ours = between(curl_free, values, slopes).reshape(5, 5, 2)
     np.testing.assert_allclose(ours, theirs[:, 0, :, 1:], atol=1e-6)
+
+
+def test_evaluate_and_the_default_region_are_those_of_single_states_and_of_the_data():
+    means, deviations = POSTERIOR.evaluate(X[:3])
+    np.testing.assert_allclose(means[1], POSTERIOR.field(X[1]), atol=1e-12)
+    np.testing.assert_allclose(deviations[1], POSTERIOR.deviation(X[1]), atol=1e-12)
+    with pytest.raises(TypeError, match="no inputs"):
+        POSTERIOR.evaluate(X, X)
+    corners = np.stack([X.min(axis=0), X.max(axis=0)])
+    draws = [POSTERIOR.sample(jax.random.key(0), 2, *region) for region in ((), (corners,))]
+    np.testing.assert_array_equal(*(draw.coefficients for draw in draws))
+
+
+def test_the_score_of_a_field_is_one_minus_the_share_of_the_variance_it_leaves():
+    at, there = data(9, 3)
+    there[2, 1] = np.nan
+    left = there - np.asarray(POSTERIOR.field.evaluate(at))
+    share = np.nansum(left**2) / np.nansum((there - np.nanmean(there, axis=0)) ** 2)
+    np.testing.assert_allclose(POSTERIOR.field.score(at, there), 1 - share)
+    with pytest.raises(ValueError, match="Y has shape"):
+        POSTERIOR.field.score(at, there[:4])
+
+
+def test_the_posterior_of_tune_is_that_of_condition_with_what_was_tuned():
+    tuned = hk.tune(K, X, Y, starts=1, max_steps=1, objective="marginal_likelihood")
+    np.testing.assert_allclose(tuned.noise_variance, 12 * tuned.regularization)
+    again = hk.condition(tuned.kernel, X, Y, tuned.regularization)
+    np.testing.assert_allclose(
+        tuned.posterior().covariance(INSIDE), again.covariance(INSIDE), atol=1e-12
+    )
+    assert "lengthscale = " in repr(tuned)
+    assert ".posterior()" in repr(tuned)

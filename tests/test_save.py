@@ -9,6 +9,7 @@ import pickle
 import re
 import subprocess
 import sys
+import warnings
 import zipfile
 
 import equinox as eqx
@@ -92,7 +93,8 @@ def same(a, b):
     first, first_tree = jax.tree.flatten(a)
     second, second_tree = jax.tree.flatten(b)
     arrays = all(
-        x.dtype == y.dtype and np.asarray(x).tobytes() == np.asarray(y).tobytes()
+        np.asarray(x).dtype == np.asarray(y).dtype
+        and np.asarray(x).tobytes() == np.asarray(y).tobytes()
         for x, y in zip(first, second, strict=True)
     )
     return arrays and first_tree == second_tree
@@ -363,7 +365,7 @@ def test_saving_replaces_the_file_and_leaves_no_other(saved):
 
 
 def test_only_fields_are_saved(tmp_path):
-    with pytest.raises(TypeError, match=r"KernelField.*tuned\.field"):
+    with pytest.raises(TypeError, match=r"KernelField.*Learned.*got Symplectic"):
         save(tmp_path / "f", hk.Symplectic(hk.Gaussian()))  # type: ignore[arg-type]
     assert not list(tmp_path.iterdir())
 
@@ -697,3 +699,72 @@ def test_a_field_that_is_nan_is_not_saved(tmp_path):
     with pytest.raises(ValueError, match="nothing to save"):
         hk.save(tmp_path / "field", field)
     assert not list(tmp_path.iterdir())
+
+
+# Results.
+
+
+def test_what_was_learned_is_loaded_whole(learned, tmp_path):
+    save(tmp_path / "f", learned)
+    loaded = load(tmp_path / "f")
+    assert same(loaded, learned)
+    assert repr(loaded) == repr(learned)
+    assert loaded.diagnostics == learned.diagnostics
+    assert all(type(t) is np.ndarray for t in loaded.runs.times)
+    x = jnp.array([0.3, -0.7])
+    np.testing.assert_array_equal(loaded.posterior.deviation(x), learned.posterior.deviation(x))
+    some = learned.runs.part([slice(None), slice(0, 0)])
+    np.testing.assert_array_equal(
+        loaded.score(some, draws=0).rmse, learned.score(some, draws=0).rmse
+    )
+    assert loaded.again.mass == 1.0
+    assert loaded.log_evidence == learned.log_evidence
+
+
+def test_code_of_a_learned_mean_and_kernel_is_asked_for(learned, tmp_path):
+    mine = eqx.tree_at(
+        lambda of: (of.field.mean, of.mean, of.again.mean),
+        learned,
+        (jax.tree_util.Partial(fall),) * 3,
+        is_leaf=lambda node: node is None,
+    )
+    save(tmp_path / "f", mine)
+    with pytest.raises(ValueError, match=r"fall.*not in the file.*mean=\.\.\."):
+        load(tmp_path / "f")
+    assert same(load(tmp_path / "f", mean=fall), mine)
+
+
+def fall(x):
+    return jnp.stack([x[1], 0 * x[0]])
+
+
+@pytest.mark.slow
+def test_a_kernel_of_the_user_is_given_to_load_as_it_was_to_learn(learned, tmp_path):
+    K = hk.Symplectic(turned(3.0, 0.1))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mine = hk.learn(K, learned.runs, iterations=1)
+    save(tmp_path / "f", mine)
+    assert same(load(tmp_path / "f", kernel=K), mine)  # which has an amplitude more
+    with pytest.raises(ValueError, match="has the velocity"):
+        load(tmp_path / "f", kernel=hk.Symplectic(cosine))
+
+
+@pytest.mark.parametrize("solver", [None, hk.Nystrom()], ids=["dense", "low rank"])
+def test_a_posterior_is_loaded_with_its_factor(solver, tmp_path):
+    K = hk.Symplectic(2.0 * hk.Gaussian(1.3))
+    posterior = hk.condition(K, X, Y, 1e-2, solver=solver)
+    save(tmp_path / "f", posterior)
+    loaded = load(tmp_path / "f")
+    assert same(loaded, posterior)
+    np.testing.assert_array_equal(loaded.covariance(X[0]), posterior.covariance(X[0]))
+    more = loaded.updated(X[:2] + 1, Y[:2])
+    np.testing.assert_allclose(more.field(X[0]), posterior.updated(X[:2] + 1, Y[:2]).field(X[0]))
+
+
+def test_the_result_of_tune_is_loaded_whole(tmp_path):
+    tuned = hk.tune(hk.Symplectic(hk.Gaussian()), X, Y, starts=1, max_steps=1)
+    save(tmp_path / "f", tuned)
+    loaded = load(tmp_path / "f")
+    assert same(loaded, tuned)
+    assert loaded.bounds == tuned.bounds

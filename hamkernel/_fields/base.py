@@ -104,6 +104,31 @@ class AbstractField(eqx.Module):
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         """The velocities at checked states, without the mean."""
 
+    def score(
+        self,
+        X: Num[ArrayLike, "N n"],
+        Y: Num[ArrayLike, "N n"],
+        U: Num[ArrayLike, "N m"] | None = None,
+    ) -> Float[Array, ""]:
+        """R² = 1 − Σ‖yᵢ − f(xᵢ)‖²/Σ‖yᵢ − ȳ‖² of velocities that were not learned from, shape ().
+
+        One for a perfect field, zero for the mean ȳ, negative for a worse one.
+
+        Args:
+            X: states, shape (N, n).
+            Y: measured velocities, shape (N, n); NaN where a component was not measured.
+            U: inputs or parameters, shape (N, m), where the field has them.
+
+        Raises:
+            ValueError: a shape does not fit.
+        """
+        velocities = self.evaluate(*(X,) if U is None else (X, U))
+        measured = require.points(Y, "Y").astype(velocities.dtype)
+        if measured.shape != velocities.shape:
+            raise ValueError(f"Y has shape {measured.shape} and X needs {velocities.shape}.")
+        spread = measured - jnp.nanmean(measured, axis=0, keepdims=True)
+        return 1 - jnp.nansum((measured - velocities) ** 2) / jnp.nansum(spread**2)
+
     def part(self: Field, which: int | str) -> Field:
         """The field of one term of a sum of kernels, by position or name.
 

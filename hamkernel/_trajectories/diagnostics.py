@@ -3,6 +3,7 @@
 Each function below answers one question about a `FitQuality` and returns a `Diagnostic`.
 """
 
+import dataclasses
 import html
 import textwrap
 from collections.abc import Callable, Iterator
@@ -53,6 +54,7 @@ class Diagnostic(NamedTuple):
     decides: bool = False
 
 
+@dataclasses.dataclass(frozen=True, repr=False)
 class Diagnostics:
     """A table with one row for each question that decides whether a learned field may be used.
 
@@ -64,9 +66,6 @@ class Diagnostics:
     """
 
     rows: tuple[Diagnostic, ...]
-
-    def __init__(self, rows: tuple[Diagnostic, ...]):
-        self.rows = rows
 
     @property
     def failing(self) -> tuple[str, ...]:
@@ -104,12 +103,6 @@ class Diagnostics:
 
     def __len__(self) -> int:
         return len(self.rows)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Diagnostics) and self.rows == other.rows
-
-    def __hash__(self) -> int:
-        return hash(self.rows)
 
     def __repr__(self) -> str:
         shown = [(row.name, row.value, row.limit) for row in self.rows]

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple, overload
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.tree_util import Partial
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
@@ -158,10 +159,16 @@ def learn(
     if isinstance(K, Lagrangian):
         unused = {"mean": mean, "solver": solver, "process_noise": process_noise, "mass": mass}
         return learn_lagrangian(K, runs, noise, unused | {"masses": masses})
-    options = {"mean": mean if mean is None else as_pytree(mean), "noise": noise, "solver": solver}
-    options |= {"process_noise": process_noise, "masses": masses, "iterations": iterations}
-    options |= {"mass": mass}
-    again = Partial(learn, K, progress=False, **options)
+    again = LearnAgain(
+        kernel=matrix_kernel(K),
+        mean=mean if mean is None else as_pytree(mean),
+        noise=noise,
+        solver=solver,
+        process_noise=process_noise,
+        masses=masses,
+        mass=mass,
+        iterations=iterations,
+    )
     if mass is not None:
         mean, runs = _kinetic_mean(mass, mean, runs)
     K, sigma, process = _check(with_amplitude(matrix_kernel(K)), runs, noise, process_noise, solver)
@@ -194,6 +201,24 @@ def learn(
         end = choose_end(end, iterate(task, now, max_steps, bar), ends_of_part)
     bar.close()
     return _result(runs, mean, end, first, process, sigma is not None, measured, again)
+
+
+class LearnAgain(eqx.Module):
+    """`learn` with the arguments of an earlier call, for other runs."""
+
+    kernel: AbstractMatrixKernel
+    mean: Any
+    noise: Any
+    solver: Nystrom | None
+    process_noise: Any
+    masses: bool
+    mass: Any
+    iterations: int
+
+    def __call__(self, runs: Runs) -> Learned:
+        """The field of these runs."""
+        options = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
+        return learn(options.pop("kernel"), runs, progress=False, **options)
 
 
 class _Start(NamedTuple):
@@ -294,7 +319,7 @@ def _result(
     given_process: np.ndarray | None,
     is_noise_given: bool,
     measured: np.ndarray,
-    again: Partial,
+    again: LearnAgain,
 ) -> Learned:
     """The result; warns where it must.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import html
+import importlib
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -130,17 +132,39 @@ class Learned(eqx.Module):
 
     def __repr__(self) -> str:
         samples = sum(len(x) for x in self.states)
-        noisy = bool(np.any(np.asarray(self.process_noise)))
+        count = len(self.states)
         lines = [
-            f"Learned from {len(self.states)} runs, {samples} samples: "
+            f"Learned from {count} run{'s' * (count != 1)}, {samples} samples: "
             + ("usable" if self.converged else "do not use this field"),
-            f"kernel         {text(self.kernel)}",
-            f"noise          {text(self.noise)}",
-            f"process noise  {text(self.process_noise) if noisy else 'none'}",
-            f"diagnostics    {', '.join(self.diagnostics.failing) or 'nothing'} falls short",
-            "next           .field, .diagnostics, .posterior, hk.simulate(learned.field, x0, ts)",
+            *(
+                name.ljust(15) + value.replace("\n", "\n" + 15 * " ")
+                for name, value in self._findings()
+            ),
+            "next           .plot(), .score(), .diagnostics, hk.simulate(learned.field, x0, ts)",
         ]
         return printable("\n".join(lines))
+
+    def _findings(self) -> list[tuple[str, str]]:
+        """The findings, each a name and a line of text."""
+        noisy = bool(np.any(np.asarray(self.process_noise)))
+        table = {row.name: row for row in self.diagnostics}
+        rows = [
+            ("kernel", text(self.kernel)),
+            ("noise", text(self.noise)),
+            ("process noise", text(self.process_noise) if noisy else "none"),
+        ]
+        rows += [(name, table[name].value) for name in ("iterations", "free run") if name in table]
+        short = [f"{name}: {table[name].meaning}" for name in self.diagnostics.failing]
+        return [*rows, *(("falls short", line) for line in short or ["nothing"])]
+
+    def _repr_html_(self) -> str:
+        rows = "".join(
+            f"<tr><th>{html.escape(name)}</th>"
+            f'<td><pre style="text-align:left">{html.escape(value)}</pre></td></tr>'
+            for name, value in self._findings()
+        )
+        head, *_, last = repr(self).splitlines()
+        return f"<b>{html.escape(head)}</b><table>{rows}</table>{html.escape(last)}"
 
     @property
     @full_precision
@@ -295,6 +319,21 @@ class Learned(eqx.Module):
             )
         posterior = self._posterior(on_landmarks=True) if draws and self.observations else None
         return scored(self, runs, first, posterior, draws)
+
+    def plot(self, run: int = 0, held_out: Runs | None = None) -> Any:
+        """One figure: fit, residuals in units of the noise, law with its band, free run.
+
+        It is that of `hk.plot.result`.
+
+        Args:
+            run: the run above, counted from 0, or from the end if negative.
+            held_out: runs that were not learned from, of which a free run is drawn.
+
+        Returns:
+            The Matplotlib figure.
+        """
+        plot = importlib.import_module("hamkernel.plot")  # a door; pictures load Matplotlib
+        return plot.result(self, run, held_out)
 
     @property
     def residuals(self) -> tuple[Float[Array, "T n"], ...]:

@@ -29,7 +29,8 @@ from hamkernel._fields.base import AbstractField, Mean
 from hamkernel._machine import compiled, full_precision, one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import observations
-from hamkernel._show import described
+from hamkernel._posterior import Posterior, posterior_of_problem
+from hamkernel._show import printable, text
 from hamkernel._solvers.fit import check_solver, features_of_parts, field_of_problem
 from hamkernel._solvers.lagrangian import TorqueData, field_of_torques, torque_data
 from hamkernel._solvers.problem import AbstractSolver, Problem, make_problem
@@ -70,6 +71,7 @@ class Tuned(eqx.Module):
             sorted in ascending order, with inf for runs whose end was not evaluated on all the
             data.
         bounds: the box that was searched: for each name the lowest and highest value.
+        problem: the data, less the prior mean, with the tuned kernel and λ.
     """
 
     kernel: AbstractMatrixKernel
@@ -82,9 +84,45 @@ class Tuned(eqx.Module):
     start_losses: Float[Array, " starts"]
     at_bounds: tuple[str, ...] = eqx.field(static=True)
     bounds: dict[str, tuple[float, float]]
+    problem: Problem
+
+    @property
+    def noise_variance(self) -> Float[Array, ""]:
+        """Nλ, the variance of the noise of a row of relative noise 1, in squared units of Y."""
+        return self.problem.ridge
+
+    def posterior(self, solver: AbstractSolver | None = None) -> Posterior:
+        """`hk.condition` on the same data, with the tuned kernel and λ.
+
+        Args:
+            solver: as in `hk.condition`, `Cholesky()` if None.
+
+        Raises:
+            TypeError: conjugate gradients, which keep no factor.
+
+        Warns:
+            UserWarning: the amplitude of the kernel is exactly 1, as in `hk.condition`.
+        """
+        return _posterior(self.problem, solver)
 
     def __repr__(self) -> str:
-        return described(self)
+        outcome = "converged" if bool(self.converged) else "did not converge"
+        values = ", ".join(
+            f"{name} = {text(value)}" for name, value in self.hyperparameters.items()
+        )
+        lines = [
+            f"Tuned: {outcome} after {text(self.steps)} steps, loss {text(self.loss)}",
+            f"kernel     {text(self.kernel)}",
+            f"found      {values}",
+            f"noise      {text(jnp.sqrt(self.noise_variance))} of a row, the root of N lambda",
+        ]
+        if self.at_bounds:
+            lines.append(f"at bounds  {', '.join(self.at_bounds)}: the data prefer values beyond")
+        lines.append("next       .field, .posterior(), .bounds")
+        return printable("\n".join(lines))
+
+
+_posterior = one_blas_thread(full_precision(posterior_of_problem))
 
 
 @one_blas_thread
@@ -313,6 +351,7 @@ def _result(
         start_losses=jnp.asarray(losses, dtype),
         at_bounds=space.at_bounds(best_run.best.u),
         bounds=space.bounds(size),
+        problem=dataclasses.replace(problem, spread=None),
     )
 
 

@@ -13,6 +13,7 @@ from hamkernel.plot._phase import (
     poincare_section,
     trajectories,
 )
+from hamkernel.plot._result import result
 from hamkernel.plot._style import COLORS
 from hamkernel.plot._time import energy_drift, fitted, smoothing, trajectory_error
 
@@ -30,6 +31,7 @@ __all__ = [
     "phase_portrait",
     "plane_slice",
     "poincare_section",
+    "result",
     "smoothing",
     "trajectories",
     "trajectory_error",

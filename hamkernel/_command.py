@@ -1,0 +1,129 @@
+"""`python -m hamkernel learn`: from CSV files to a report, a field and a script."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import pathlib
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+
+from hamkernel._kernels.built_in import Gaussian
+from hamkernel._report import report, script
+from hamkernel._save import save
+from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.friction import Friction
+from hamkernel._structures.joined import Controlled, InputMatrix
+from hamkernel._structures.structure import Symplectic
+from hamkernel._trajectories.learn import learn
+from hamkernel._trajectories.runs import Runs
+
+
+def parser() -> argparse.ArgumentParser:
+    """The options of the command."""
+    options = argparse.ArgumentParser(
+        prog="python -m hamkernel learn",
+        description="Learn a field from logged runs in CSV files with a header row, score it on "
+        "the last fifth of each run, and write report.html, learned.hk and simulate.py.",
+    )
+    options.add_argument("files", nargs="+", help="one CSV file a run, with a header row")
+    options.add_argument("--time", required=True, help="the column of times")
+    options.add_argument(
+        "--states",
+        required=True,
+        nargs="+",
+        help="the columns of the state: all positions, then all momenta; or with --mass the "
+        "positions alone",
+    )
+    options.add_argument("--inputs", nargs="+", default=[], help="the columns of what was applied")
+    options.add_argument("--friction", action="store_true", help="there is friction")
+    options.add_argument("--mass", type=float, nargs="+", help="the known masses, one or one each")
+    options.add_argument("--noise", type=float, nargs="+", help="the known noise, one or one each")
+    options.add_argument("--out", default="results", help="folder for the files (%(default)s)")
+    return options
+
+
+def columns(path: str, names: list[str]) -> Float[np.ndarray, "T k"]:
+    """The named columns of a CSV file; an empty cell is NaN.
+
+    Raises:
+        ValueError: the file has no such column, no rows, or a cell that is no number. OSError: the
+            file cannot be read.
+    """
+    with pathlib.Path(path).open(newline="", encoding="utf-8-sig") as file:
+        header, *rows = [*csv.reader(file)] or [[]]
+    header = [name.strip() for name in header]
+    for name in names:
+        if name not in header:
+            raise ValueError(f"{path} has no column {name!r}; its columns are {', '.join(header)}.")
+    places, table = [header.index(name) for name in names], []
+    for number, row in enumerate(rows, start=2):
+        if not row:
+            continue
+        cells = [row[place].strip() if place < len(row) else "" for place in places]
+        try:
+            table.append([float(cell) if cell else np.nan for cell in cells])
+        except ValueError as error:
+            raise ValueError(f"{path}, line {number}: {error}.") from error
+    if not table:
+        raise ValueError(f"{path} has a header and no rows.")
+    return np.array(table)
+
+
+def kernel(state_count: int, input_count: int, friction: bool) -> AbstractMatrixKernel:
+    """The kernel of the options: an energy, friction if asked for, and inputs that push momenta."""
+    K: AbstractMatrixKernel = Symplectic(1.0 * Gaussian(np.ones(state_count)))
+    K = K + Friction() if friction else K
+    if not input_count:
+        return K
+    momenta = tuple(range(state_count // 2, state_count))
+    return Controlled(K, inputs=InputMatrix(1.0, acts_on=momenta))
+
+
+def run(arguments: list[str], show: Callable[[str], None]) -> None:
+    """Learn, score and write the files; what happens is shown in words.
+
+    Raises:
+        SystemExit: an option or a file does not fit, with a sentence.
+    """
+    options = parser()
+    asked = options.parse_args(arguments)
+    try:
+        runs, out = _runs(asked), pathlib.Path(asked.out)
+        count = len(asked.states)
+        if count % 2 and asked.mass is None:
+            raise ValueError(
+                f"--states names {count} columns: all positions and then all momenta are needed, "
+                "or the positions alone with --mass."
+            )
+        is_position = asked.mass is not None and len(asked.mass) in (1, count) and count % 2 == 1
+        K = kernel(2 * count if is_position else count, runs.input_count, asked.friction)
+        out.mkdir(parents=True, exist_ok=True)
+        show(f"Learning from {runs!r}.")
+        learned = learn(K, runs, noise=_number(asked.noise), mass=_number(asked.mass))
+        save(out / "learned.hk", learned)
+        (out / "simulate.py").write_text(script("learned.hk", learned), encoding="utf-8")
+        show(f"{learned!r}\nScoring on the last fifth of each run, which learns once more.")
+        score = learned.score()
+        show(repr(score))
+        report(learned, out / "report.html", score)
+    except (ValueError, TypeError, OSError) as error:
+        options.error(str(error))
+    show(f"Written: report.html, learned.hk and simulate.py in {out}/.")
+
+
+def _runs(asked: argparse.Namespace) -> Runs:
+    """The runs of the files, one each."""
+    k = 1 + len(asked.states)
+    tables = [columns(file, [asked.time, *asked.states, *asked.inputs]) for file in asked.files]
+    inputs = [table[:, k:] for table in tables] if asked.inputs else None
+    return Runs([table[:, 0] for table in tables], [table[:, 1:k] for table in tables], inputs)
+
+
+def _number(values: list[float] | None) -> float | np.ndarray | None:
+    """One number, or one for each coordinate."""
+    if values is None:
+        return None
+    return values[0] if len(values) == 1 else np.array(values)

@@ -1,0 +1,118 @@
+"""`report`: the result of `learn` as one page that a browser shows, without Python."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import os
+import pathlib
+from typing import TYPE_CHECKING
+
+from hamkernel import _require as require
+from hamkernel._trajectories.learned import Learned
+
+if TYPE_CHECKING:
+    from hamkernel._trajectories.runs import Runs
+    from hamkernel._trajectories.score import Score
+
+_STYLE = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
+       color: #222; }
+h1 { font-size: 1.6rem; } h2 { font-size: 1.15rem; margin-top: 2.2rem; }
+pre { background: #f5f6f7; padding: .8rem 1rem; overflow-x: auto; font-size: .85rem; }
+table { border-collapse: collapse; font-size: .85rem; }
+th, td { padding: .3rem .7rem .3rem 0; border-bottom: 1px solid #ddd; vertical-align: top;
+         text-align: left; }
+img { max-width: 100%; }
+.verdict { padding: .6rem 1rem; border-left: .4rem solid; }
+.yes { border-color: #009E73; background: #eef8f4; }
+.no { border-color: #D55E00; background: #fdf1ea; }
+"""
+
+
+def script(file: str, learned: Learned) -> str:
+    """Ten lines that load the result in `file` and simulate its field."""
+    lines = [
+        "import jax",
+        'jax.config.update("jax_enable_x64", True)  # before any array',
+        "import jax.numpy as jnp",
+        "import hamkernel as hk",
+        "",
+        f"learned = hk.load({file!r})",
+        "x0 = learned.states[0][0]  # the start of the first run; any state will do",
+        "ts = jnp.linspace(0.0, learned.runs.times[0][-1] - learned.runs.times[0][0], 401)",
+    ]
+    call = "hk.simulate(learned.field, x0, ts)"
+    if learned.runs.input_count:
+        is_family = learned.runs.parameters is not None
+        zeros = f"jnp.zeros({learned.runs.input_count})"
+        value = "learned.runs.parameters[0]" if is_family else zeros
+        lines.append(f"u = {value}  # what is applied")
+        call = "hk.simulate(learned.field, x0, ts, inputs=lambda t: u)"
+    return "\n".join([*lines, f"print({call}.ys)"]) + "\n"
+
+
+def report(
+    learned: Learned,
+    path: str | os.PathLike[str],
+    score: Score | None = None,
+    held_out: Runs | None = None,
+    file: str = "learned.hk",
+) -> None:
+    """Write one self-contained page of HTML about a learned field, for readers without Python.
+
+    It has the verdict, the picture of `learned.plot()`, the table of `learned.diagnostics`, the
+    score, and ten lines that load and simulate the field.
+
+    Args:
+        learned: the result of `hk.learn`.
+        path: the file to write, such as "report.html".
+        score: the result of `learned.score(…)`, if it shall be shown.
+        held_out: runs that were not learned from; a free run of the first is drawn.
+        file: the name under which `hk.save` wrote the result, for the ten lines.
+
+    Raises:
+        TypeError: `learned` is no result of `hk.learn`. OSError: the file cannot be written.
+    """
+    if not isinstance(learned, Learned):
+        raise TypeError(f"report takes the result of hk.learn; got a {type(learned).__name__}.")
+    require.untraced("hk.report", "Call it outside.", learned)
+    verdict = "may be used" if learned.converged else "must not be used as it is"
+    short = learned.diagnostics.warning or "No diagnostic falls short."
+    parts = [
+        f"<h1>A field learned from {len(learned.runs)} run{'s' * (len(learned.runs) != 1)}</h1>",
+        f'<p class="verdict {"yes" if learned.converged else "no"}"><b>The field {verdict}.</b> '
+        f"{html.escape(short)}</p>",
+        f"<pre>{html.escape(repr(learned))}</pre>",
+    ]
+    if score is not None:
+        parts.append("<h2>Prediction of data that were not learned from</h2>")
+        parts.append(f"<pre>{html.escape(repr(score))}</pre>")
+    picture = _png(learned, held_out)
+    parts += [
+        "<h2>The runs and the field</h2>",
+        f'<img alt="fit, residuals, law" src="data:image/png;base64,{picture}">',
+        "<h2>Diagnostics</h2>",
+        learned.diagnostics._repr_html_(),
+        "<h2>Load and simulate</h2>",
+        f"<pre>{html.escape(script(file, learned))}</pre>",
+    ]
+    page = "\n".join(parts)
+    pathlib.Path(path).write_text(
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        f"<title>Learned field</title><style>{_STYLE}</style></head>\n<body>\n{page}\n"
+        "</body></html>\n",
+        encoding="utf-8",
+    )
+
+
+def _png(learned: Learned, held_out: Runs | None) -> str:
+    """The picture of the result, in base 64."""
+    figure = learned.plot(held_out=held_out)
+    content = io.BytesIO()
+    figure.savefig(content, dpi=120, format="png")
+    import matplotlib.pyplot as plt
+
+    plt.close(figure)
+    return base64.b64encode(content.getvalue()).decode()

@@ -1,0 +1,103 @@
+"""The picture, the page and the command of a learned field, read back."""
+
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+
+import base64
+import html
+import re
+
+import equinox as eqx
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+import hamkernel as hk
+from hamkernel._command import columns, kernel, run
+from hamkernel._report import script
+
+
+@pytest.fixture(autouse=True)
+def _close_figures():
+    yield
+    plt.close("all")
+
+
+def test_the_figure_has_the_fit_the_force_and_the_plane(learned):
+    panels = learned.plot(run=1).axes
+    assert len(panels) == 6
+    force = next(ax for ax in panels if ax.get_ylabel() == r"$\dot{p}$")
+    (mean,) = [line for line in force.lines if line.get_label() == "mean"]
+    q, p = np.asarray(mean.get_xydata()).T
+    np.testing.assert_allclose(p, -np.sin(q), atol=0.05)  # of a pendulum
+    assert [ax.get_title() for ax in panels][-1] == "all runs"
+    with pytest.raises(ValueError, match="there is no run 2"):
+        learned.plot(run=2)
+
+
+def test_a_summary_has_a_line_for_each_finding(learned):
+    lines = repr(learned).splitlines()
+    assert len(lines) < 10
+    assert lines[0].startswith("Learned from 2 runs, 40 samples: ")
+    assert ".plot()" in lines[-1]
+    assert "<table>" in learned._repr_html_()
+
+
+def test_a_page_has_all_of_it_inside(learned, tmp_path):
+    hk.report(learned, tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    (picture,) = re.findall('src="data:image/png;base64,([^"]*)"', page)
+    assert base64.b64decode(picture).startswith(b"\x89PNG")
+    assert "http" not in page  # nothing is fetched
+    for row in learned.diagnostics:
+        assert html.escape(row.name) in page
+    with pytest.raises(TypeError, match=r"report takes the result of hk\.learn"):
+        hk.report(learned.field, tmp_path / "other.html")
+
+
+def test_the_ten_lines_load_and_simulate(learned, tmp_path, capsys):
+    hk.save(tmp_path / "learned.hk", learned)
+    text = script(str(tmp_path / "learned.hk"), learned)
+    assert len(text.splitlines()) <= 10
+    exec(compile(text, "simulate.py", "exec"), {})
+    assert "[" in capsys.readouterr().out
+
+
+def test_columns_are_read_by_name_and_what_is_wrong_is_named(tmp_path):
+    file = tmp_path / "run.csv"
+    file.write_text("t, q ,p\n0,1,2\n1,,3\n\n", encoding="utf-8")
+    np.testing.assert_array_equal(columns(file, ["q", "t"]), [[1, 0], [np.nan, 1]])
+    with pytest.raises(ValueError, match=r"no column 'v'; its columns are t, q, p\."):
+        columns(file, ["v"])
+    file.write_text("t,q\n0,a\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"line 2: could not convert string to float: 'a'"):
+        columns(file, ["q"])
+    file.write_text("t,q\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="no rows"):
+        columns(file, ["q"])
+
+
+def test_the_command_refuses_with_a_sentence(tmp_path, capsys):
+    file = tmp_path / "run.csv"
+    file.write_text("t,q\n0,1\n1,2\n2,1\n", encoding="utf-8")
+    for options in (["--states", "q"], ["--states", "q", "p"]):
+        with pytest.raises(SystemExit):
+            run([str(file), "--time", "t", *options], print)
+    said = capsys.readouterr().err
+    assert "positions alone with --mass" in said
+    assert "no column 'p'" in said
+    assert kernel(4, 1, friction=True).inputs.acts_on == (2, 3)
+
+
+def test_the_command_writes_a_page_a_field_and_a_script(learned, tmp_path, monkeypatch):
+    file, said = tmp_path / "run.csv", []
+    rows = np.column_stack([learned.runs.times[0], learned.runs.states[0]])
+    np.savetxt(file, rows, delimiter=",", header="t,q,p", comments="")
+    score = hk.Score(*(np.ones(2),) * 3, np.array(np.nan), (), (), (), np.ones(2), first=1)
+    stub = eqx.tree_at(lambda of: of.again.iterations, learned, 2)
+    monkeypatch.setattr("hamkernel._command.learn", lambda K, runs, **options: stub)
+    monkeypatch.setattr(type(learned), "score", lambda self: score)
+    options = ["--time", "t", "--states", "q", "p", "--out", str(tmp_path / "out")]
+    run([str(file), *options], said.append)
+    names = {path.name for path in (tmp_path / "out").iterdir()}
+    assert names == {"report.html", "learned.hk", "simulate.py"}
+    assert said[-1].startswith("Written:")
