@@ -2,6 +2,7 @@
 
 # pyright: reportArgumentType=false
 
+import datetime
 import os
 import subprocess
 import sys
@@ -13,6 +14,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
+from hamkernel._closed_forms import Partition
 
 T = np.linspace(0, 3, 40)
 X = np.stack([np.sin(2 * T), 2 * np.cos(2 * T)], 1)
@@ -76,9 +78,9 @@ def test_a_sampling_interval_stands_for_times(interval):
     ("arguments", "said"),
     [
         ((None, X), "times must be a list with one array a run"),
-        (([None], [X]), r"times\[0\] is None: an array of real numbers is needed"),
+        (([None], [X]), r"times\[0\] must hold real numbers; got None"),
         ((T, None), "states"),
-        ((T, X * 1j), r"states\[0\] must hold real numbers and has dtype complex128"),
+        ((T, X * 1j), r"states\[0\] has dtype complex128; real numbers are needed"),
         ((T, [["a", "b"]] * 40), r"states\[0\]"),
     ],
 )
@@ -90,10 +92,150 @@ def test_what_is_no_log_is_refused_in_a_sentence(arguments, said):
 @pytest.mark.parametrize(
     "inputs", [U, U[:, None], U.tolist(), (T, U), [T, U], ([*T], [*U]), (T, U[:, None])]
 )
-def test_one_input_is_one_column(inputs):
+def test_one_input_of_runs_is_one_column(inputs):
     runs = hk.Runs(T, X, inputs)
     np.testing.assert_array_equal(runs.inputs[0], U[:, None])
     np.testing.assert_array_equal(runs.input_times[0], T)
+
+
+class Polars:
+    """A frame like that of polars: without `ndim`, and iterated by columns."""
+
+    def __init__(self, values, columns):
+        self.values, self.columns, self.shape = values, columns, values.shape
+
+    def to_numpy(self):
+        return self.values
+
+    def __iter__(self):
+        return iter(self.values.T)
+
+
+class Tensor:
+    """A tensor like that of PyTorch that requires a gradient."""
+
+    def __init__(self, values, free=False):
+        self.values, self.shape, self.free = values, values.shape, free
+
+    def detach(self):
+        return Tensor(self.values, free=True)
+
+    def cpu(self):
+        return self
+
+    def __array__(self, *args, **options):
+        if not self.free:
+            raise RuntimeError("Can't call numpy() on Tensor that requires grad.")
+        return self.values
+
+
+def table(values):
+    return np.array([*map(tuple, values)], dtype=[("q", float), ("p", float)])
+
+
+KINDS = {
+    "list": lambda x: x.tolist(),
+    "iterator": lambda x: iter(x.tolist()),
+    "big-endian": lambda x: x.astype(">f8"),
+    "objects": lambda x: x.astype(object),
+    "masked": lambda x: np.ma.masked_array(x, mask=False),
+    "structured": table,
+    "polars": lambda x: Polars(x, ["q", "p"]),
+    "tensor": Tensor,
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_arrays_of_every_kind_are_data(kind):
+    make = KINDS[kind]
+    data = hk.Velocities(make(X), make(2 * X), inputs=make(3 * X))
+    np.testing.assert_array_equal(data.X, X)
+    np.testing.assert_array_equal(data.Y, 2 * X)
+    np.testing.assert_array_equal(data.inputs, 3 * X)
+    with jax.enable_x64(False):
+        assert hk.Velocities(make(X), make(X)).X.dtype == jnp.float32
+
+
+def test_missing_entries_are_components_that_were_not_measured():
+    np.testing.assert_array_equal(hk.Velocities(X, masked()).Y, with_nan())
+    holes = with_nan().tolist()
+    holes[3][1] = None
+    np.testing.assert_array_equal(hk.Velocities(X, holes).Y, with_nan())
+
+
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        (np.datetime64("2026-01-01") + np.arange(40), r"np\.timedelta64\(1, 's'\)"),
+        (np.arange(40) * np.timedelta64(50, "ms"), "holds dates or durations"),
+        ([datetime.datetime(2026, 1, day) for day in range(1, 31)], "holds dates or durations"),
+        (T.astype(str), r"Text becomes numbers by \.astype\(float\)"),
+    ],
+)
+def test_dates_and_text_are_no_numbers(times, said):
+    with pytest.raises(TypeError, match=said):
+        hk.Runs(times, X[: len(times)])
+
+
+LABELS = np.repeat([0, 1, 2, 3], 10)
+
+
+@pytest.mark.parametrize(
+    "folds",
+    [
+        LABELS.astype(float) / 2,
+        [f"run {i}" for i in LABELS],
+        LABELS.astype(str),
+        LABELS.astype(object),
+        [("monday", i) for i in LABELS],
+        np.datetime64("2026-01-01") + LABELS,
+        iter(LABELS.tolist()),
+        Polars(LABELS, None),
+    ],
+)
+def test_labels_of_folds_are_labels_of_any_kind(folds):
+    partition = Partition(40, folds)
+    np.testing.assert_array_equal(partition.labels, LABELS)
+    assert partition.of_labels
+
+
+@pytest.mark.parametrize(
+    ("folds", "said"),
+    [
+        ([*LABELS[:-1], None], r"no label for point 39 \(None\)"),
+        (np.where(LABELS == 2, np.nan, LABELS), r"no label for point 20 \(nan\)"),
+        (LABELS[:, None], r"folds has shape \(40, 1\)"),
+        (["a", "b"], r"folds has shape \(2,\)"),
+        (2.5, r"got 2\.5"),
+        (np.array(2.5), r"got array\(2\.5\)"),
+        ("run", "'loo' or labels; got 'run'"),
+    ],
+)
+def test_folds_without_a_label_for_each_point_are_refused(folds, said):
+    with pytest.raises(ValueError, match=said):
+        Partition(40, folds)
+
+
+@pytest.fixture(scope="module")
+def controlled():
+    K = hk.Sum(energy=hk.Symplectic(hk.Gaussian(1.0)), friction=hk.Friction(0.3, 0.1))
+    K = hk.Controlled(K, inputs=[[0.0], [1.0]])
+    return hk.fit(K, X, np.gradient(X, T, axis=0), 1e-3, inputs=U)
+
+
+def test_one_input_is_one_column_everywhere(controlled):
+    np.testing.assert_array_equal(hk.Velocities(X, X, inputs=U).inputs, U[:, None])
+    np.testing.assert_array_equal(hk.Velocities(X, X, parameters=U).inputs, U[:, None])
+    x, u = X[0], U[:1]
+    np.testing.assert_array_equal(controlled(x, U[0]), controlled(x, u))
+    np.testing.assert_array_equal(controlled.evaluate(X, U), controlled.evaluate(X, U[:, None]))
+    driven = hk.systems.Driven(hk.systems.Pendulum(1.0), [[0.0], [1.0]])
+    column, one = (hk.simulate(driven, x, T, inputs=u).ys for u in (U[:, None], U))
+    np.testing.assert_array_equal(one, column)
+    vector, number = (
+        hk.simulate(driven, x, T, inputs=u).ys for u in (lambda t: jnp.sin(t)[None], jnp.sin)
+    )
+    np.testing.assert_array_equal(number, vector)
 
 
 def test_numbers_of_other_libraries_are_numbers():
@@ -202,10 +344,8 @@ def test_what_is_printed_degrades_on_a_terminal_of_ascii():
         assert said in run.stdout.decode(encoding)
 
 
-def test_a_part_of_a_controlled_field_is_that_of_its_drift():
-    K = hk.Sum(energy=hk.Symplectic(hk.Gaussian(1.0)), friction=hk.Friction(0.3, 0.1))
-    K = hk.Controlled(K, inputs=[[0.0], [1.0]])
-    field = hk.fit(K, X, np.gradient(X, T, axis=0), 1e-3, inputs=U[:, None])
+def test_a_part_of_a_controlled_field_is_that_of_its_drift(controlled):
+    field = controlled
     x = jnp.array([0.2, 0.5])
     parts = [field.part("energy")(x), field.part("friction")(x)]
     np.testing.assert_allclose(sum(parts), field(x, jnp.zeros(1)), atol=1e-10)
