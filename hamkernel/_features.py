@@ -47,6 +47,10 @@ class Waves(eqx.Module):
         slopes = jnp.concatenate([-jnp.sin(phase[: self.cosines]), jnp.cos(phase[self.cosines :])])
         return self.frequencies.T * (self.amplitudes * slopes)[None]
 
+    def slope(self, x: Float[Array, " n"], w: Float[Array, " w"]) -> Float[Array, " n"]:
+        """The gradient of the sum with weights w."""
+        return self.gradients(x) @ w
+
 
 class PartWaves(eqx.Module):
     """The features of a law that many parts share, times a factor; they are exact, not random."""
@@ -69,6 +73,9 @@ class PartWaves(eqx.Module):
     def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n w"]:
         return jnp.sqrt(self.scale).astype(x.dtype) * self.kernel.gradients(x)
 
+    def slope(self, x: Float[Array, " n"], w: Float[Array, " w"]) -> Float[Array, " n"]:
+        return jnp.sqrt(self.scale).astype(x.dtype) * self.kernel.slope(x, w)
+
 
 class JointWaves(eqx.Module):
     """The features of a sum of scalar kernels, one after the other."""
@@ -84,6 +91,11 @@ class JointWaves(eqx.Module):
 
     def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n w"]:
         return jnp.concatenate([term.gradients(x) for term in self.terms], axis=1)
+
+    def slope(self, x: Float[Array, " n"], w: Float[Array, " w"]) -> Float[Array, " n"]:
+        ends = np.cumsum([len(term.amplitudes) for term in self.terms])[:-1]
+        pieces = zip(self.terms, jnp.split(w, ends), strict=True)
+        return sum((term.slope(x, own) for term, own in pieces), jnp.zeros_like(x))
 
 
 class GroupWaves(eqx.Module):
@@ -105,6 +117,9 @@ class GroupWaves(eqx.Module):
         matrices, characters = self._constants()
         slopes = jax.vmap(self.waves.gradients)(matrices @ x)  # (G, n, w) at g x
         return jnp.einsum("g,gba,gbw->aw", characters, matrices, slopes) / len(characters)
+
+    def slope(self, x: Float[Array, " n"], w: Float[Array, " w"]) -> Float[Array, " n"]:
+        return self.gradients(x) @ w
 
     def _constants(self) -> tuple[Float[Array, "G n n"], Float[Array, " G"]]:
         """The group, which is not differentiated."""
@@ -192,7 +207,8 @@ class AbstractFeatures(eqx.Module):
         return []
 
     def __call__(self, X: Float[Array, "t n"]) -> Float[Array, "t n r"]:
-        return jax.vmap(self.rows)(X)
+        # Of laws that many parts share one state at a time: it has all their parts and centres.
+        return jax.lax.map(self.rows, X) if self.laws() else jax.vmap(self.rows)(X)
 
 
 class PotentialFeatures(AbstractFeatures):
@@ -209,7 +225,7 @@ class PotentialFeatures(AbstractFeatures):
         return self.structure.apply(x, self.waves.gradients(x))
 
     def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
-        return self.structure.apply(x, self.waves.gradients(x) @ w)
+        return self.structure.apply(x, self.waves.slope(x, w))
 
     def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
         return self.waves.values(x) @ w

@@ -38,7 +38,8 @@ from hamkernel._machine import (
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components
 from hamkernel._observations.measurements import Measurements
 from hamkernel._sizes import sizes
-from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel, total
+from hamkernel._structures.structure import mixed
 
 
 @full_precision
@@ -81,7 +82,10 @@ def assemble(
     K: AbstractMatrixKernel, X: Float[Array, "N n"], Z: Float[Array, "M n"]
 ) -> Float[Array, "N n M n"]:
     """`gram` without its checks and its own compilation."""
-    found = K.through_descriptor(X.shape[1])
+    n = X.shape[1]
+    if isinstance(K, Sum) and any(term.through_descriptor(n) for term in K.terms):
+        return total([assemble(term, X, Z) for term in K.terms])
+    found = K.through_descriptor(n)
     if found is not None:
         return _by_jacobians(found, X, Z)
     closed = K.blocks(X, Z)
@@ -105,12 +109,7 @@ def _by_jacobians(
     A row of blocks costs n gradients of κ a pair and a product with the Jacobians of Z, where
     entries one by one cost n² second derivatives.
     """
-    jacobian = found.jacobian or jax.jacfwd(found.map)
-
-    def described(x):
-        return found.map(x), jacobian(x) @ found.directions(x)
-
-    (D, J), (E, L) = jax.vmap(described)(X), jax.vmap(described)(Z)  # (N, m), (N, m, n)
+    (D, J), (E, L) = jax.vmap(found.at)(X), jax.vmap(found.at)(Z)  # (N, m), (N, m, n)
 
     def slope(d, v, e):
         """The gradient in e of the derivative of κ(d, e) along v, (m,)."""
@@ -136,7 +135,17 @@ def diagonals(
 
 def block_traces(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, " N"]:
     """The traces of the diagonal blocks of the Gram, tr K(xᵢ, xᵢ)."""
-    return diagonals(K, X, X).sum(axis=1)
+    if isinstance(K, Sum):
+        return total([block_traces(term, X) for term in K.terms])
+    found = K.through_descriptor(X.shape[1])
+    if found is None:
+        return diagonals(K, X, X).sum(axis=1)
+
+    def of_point(x):
+        d, J = found.at(x)
+        return jax.vmap(lambda v: mixed(found.kernel, d, v, d, v))(J.T).sum()
+
+    return jax.lax.map(of_point, X)
 
 
 def trace(

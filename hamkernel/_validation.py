@@ -284,10 +284,13 @@ def generalized_loss_and_square(K, rows: Measurements, regularization, basis=Non
 
 
 @compiled
-def log_likelihood(K, rows: Measurements, regularization, basis=None):
-    """`log_marginal_likelihood` of the rows, with a flat prior for the constant of energies."""
+def log_likelihood(K, rows: Measurements, regularization, basis=None, heard=None):
+    """`log_marginal_likelihood` of the rows, with a flat prior for the constant of energies.
+
+    `heard` is `without_silent_directions(K, rows)`, where that is known already.
+    """
     ridge = rows.count * regularization
-    y, silent = without_silent_directions(K, rows)
+    y, silent = without_silent_directions(K, rows) if heard is None else heard
     y, silent, ridge = jax.lax.optimization_barrier((y, silent, ridge))  # no LAPACK side by side
     density = log_density(_of_contrasts(K, rows, ridge, basis), y)
     density = density + 0.5 * silent * jnp.log(2 * jnp.pi * ridge)
@@ -317,7 +320,7 @@ def without_silent_directions(
 
     def of_point(pair):
         x, v = pair
-        J = jax.jacfwd(found.map)(x) @ found.directions(x)  # (m, n)
+        J = jax.jacfwd(found.seen or found.map)(x) @ found.directions(x)  # (m, n)
         J = jax.lax.stop_gradient(J)  # the projection of a map of full rank is constant
         squares, V = jnp.linalg.eigh(J.T @ J)
         # Rounding leaves ε of the largest, and a descriptor sees distances to more than √ε.

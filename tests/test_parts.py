@@ -2,12 +2,15 @@
 
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hamkernel as hk
+import hamkernel._features
 
 RNG = np.random.default_rng(0)
 
@@ -97,10 +100,26 @@ def test_gradients_of_the_features_are_those_of_jax():
     np.testing.assert_allclose(
         shared.gradients(x), jax.jacrev(shared.features)(x).T, rtol=1e-6, atol=1e-9
     )
+    w = jnp.asarray(RNG.normal(size=12))
+    np.testing.assert_allclose(shared.slope(x, w), shared.gradients(x) @ w, rtol=1e-9, atol=1e-9)
     G = hk.gram(hk.Symplectic(shared), x[None], 2 * x[None])[0, :, 0]
     J = np.kron([[0, 1], [-1, 0]], np.eye(8))
     mixed = jax.jacfwd(jax.jacrev(shared, argnums=0), argnums=1)(x, 2 * x)
     np.testing.assert_allclose(G, J @ mixed @ J.T, rtol=1e-6, atol=1e-8)
+
+
+def test_memory_does_not_grow_with_states_parts_and_centres():
+    shared = hk.Shared(hk.Gaussian(0.8), hk.pairs(200, 2), np.linspace(0.1, 4, 64))
+    X = jnp.asarray(RNG.normal(size=(20, 400)))
+    K = hk.Symplectic(shared)
+
+    def loss(k):
+        features = hamkernel._features.features(k, 400, 1, jax.random.key(0), X.dtype)
+        return jnp.sum(features(X) ** 2)
+
+    compiled: Any = jax.jit(jax.grad(loss)).lower(K).compile()
+    whole = 20 * 200 * 199 / 2 * 64 * 8  # bytes of one array of states, parts and centres
+    assert compiled.memory_analysis().temp_size_in_bytes < whole / 4
 
 
 @pytest.fixture(scope="module")
@@ -162,7 +181,9 @@ def test_the_band_of_the_law_is_wide_where_no_pair_was(learned):
 
 def test_a_shared_law_is_tuned_saved_and_read_back(learned, tmp_path):
     _, X, Y = learned
+    Y = Y + 0.05 * RNG.normal(size=Y.shape)
     tuned = hk.tune(K, X, Y, mean=hk.kinetic(1.0), objective="marginal_likelihood", starts=1)
+    assert np.sqrt(tuned.regularization * len(X)) == pytest.approx(0.05, rel=0.2)
     assert tuned.field.kernel.kernel.kernel.centres is not None
     hk.save(tmp_path / "field", tuned.field)
     again = hk.load(tmp_path / "field")

@@ -93,17 +93,34 @@ class Invariance(enum.Flag):
     TRANSLATION = 3
 
 
+def _identity(x: Float[Array, " n"]) -> Float[Array, "n n"]:
+    return jnp.eye(len(x), dtype=x.dtype)
+
+
 class Descriptor(NamedTuple):
     """A map d of points and a kernel κ of its values, k(x, z) = κ(d(x), d(z)).
 
     The derivatives of k follow from those of κ and the Jacobian of d, which each point needs once.
     It is taken in forward mode, unless there is a better `jacobian`.
+
+    Attributes:
+        map: d.
+        kernel: κ.
+        directions: the directions along which a field differentiates at a point, side by side.
+        jacobian: that of d; None for the one in forward mode.
+        seen: what k knows of a point for every κ; None for d itself.
     """
 
     map: Callable[[Float[Array, " n"]], Float[Array, " m"]]
     kernel: "AbstractScalarKernel"
-    directions: Callable[[Float[Array, " n"]], Float[Array, "n n"]] = lambda x: jnp.eye(len(x))
+    directions: Callable[[Float[Array, " n"]], Float[Array, "n n"]] = _identity
     jacobian: Callable[[Float[Array, " n"]], Float[Array, "m n"]] | None = None
+    seen: Callable[[Float[Array, " n"]], Float[Array, " s"]] | None = None
+
+    def at(self, x: Float[Array, " n"]) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+        """d(x), and its derivatives along the directions."""
+        jacobian = self.jacobian or jax.jacfwd(self.map)
+        return self.map(x), jacobian(x) @ self.directions(x)
 
 
 class Spectrum(eqx.Module):
@@ -269,12 +286,43 @@ class ScalarSum(AbstractScalarKernel):
     def summands(self, reflection: bool) -> tuple[AbstractScalarKernel, ...]:
         return self.terms
 
+    def through_descriptor(self, n: int) -> Descriptor | None:
+        """All descriptors side by side, and the point itself for terms that have none."""
+        found = [k.through_descriptor(n) for k in self.terms]
+        if not any(found):
+            return None
+        each = [d or Descriptor(lambda x: x, k) for d, k in zip(found, self.terms, strict=True)]
+        point = jax.ShapeDtypeStruct((n,), jnp.result_type(float))
+        lengths = tuple(jax.eval_shape(d.map, point).size for d in each)
+
+        def jacobian(x):
+            return jnp.concatenate([d._replace(directions=_identity).at(x)[1] for d in each])
+
+        return Descriptor(
+            lambda x: jnp.concatenate([d.map(x) for d in each]),
+            _SideBySide(tuple(d.kernel for d in each), lengths),
+            jacobian=jacobian,
+            seen=lambda x: jnp.concatenate([(d.seen or d.map)(x) for d in each]),
+        )
+
     def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
         return tuple(itertools.chain.from_iterable(_of_terms(self, n, count, key, dtype)))
 
     @property
     def has_amplitude(self) -> bool:
         return all(k.has_amplitude for k in self.terms)
+
+
+class _SideBySide(AbstractScalarKernel):
+    """Σᵢ kᵢ(xᵢ, zᵢ) of the pieces xᵢ of a point, one after the other."""
+
+    terms: tuple[AbstractScalarKernel, ...]
+    lengths: tuple[int, ...] = eqx.field(static=True)
+
+    def __call__(self, x: Point, z: Point) -> Float[Array, ""]:
+        ends = np.cumsum(self.lengths)[:-1]
+        pieces = zip(self.terms, jnp.split(x, ends), jnp.split(z, ends), strict=True)
+        return sum((k(a, b) for k, a, b in pieces), jnp.zeros((), x.dtype))
 
 
 class ScalarProduct(AbstractScalarKernel):

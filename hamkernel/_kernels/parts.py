@@ -20,6 +20,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Float
 
@@ -34,6 +35,7 @@ from hamkernel._kernels.base import (
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._show import call, described, text
 
+_AT_ONCE = 2**16  # parts times centres that are computed at once: arrays of 512 KB
 _CENTRES = 64  # a law of one variable: lengthscales from a thirtieth of the range on
 
 
@@ -108,18 +110,40 @@ class Shared(AbstractScalarKernel):
     def features(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """Φ(x), with k_S(x, z) = Φ(x)·Φ(z)."""
         points, weights = self.of(x)
-        return self._whitened(weights @ self._columns(points))
+
+        def of_centre(c):
+            return weights @ jax.vmap(self.kernel, (0, None))(points, c)
+
+        return self._whitened(self._over_centres(of_centre, len(points), x.dtype))
 
     def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n m"]:
         """The gradients of the features, by one reverse derivative of the parts for each."""
         (points, weights), back = jax.vjp(self.of, x)
-        C = self._points(x.dtype)
 
         def of_centre(c):
             value, slope = jax.vmap(jax.value_and_grad(self.kernel), (0, None))(points, c)
             return back(Parts(weights[:, None] * slope, value))[0]
 
-        return self._whitened(jax.lax.map(of_centre, C, batch_size=16)).T
+        return self._whitened(self._over_centres(of_centre, len(points), x.dtype)).T
+
+    def slope(self, x: Float[Array, " n"], w: Float[Array, " m"]) -> Float[Array, " n"]:
+        """`gradients(x) @ w`, by one reverse derivative of the parts."""
+        (points, weights), back = jax.vjp(self.of, x)
+        C = self._points(x.dtype)
+        of_centres = solve_triangular(self._factor(x.dtype), w, lower=True, trans="T")
+
+        def law(r):
+            return jax.vmap(self.kernel, (None, 0))(r, C) @ of_centres
+
+        at_once = max(1, _AT_ONCE // len(C))
+        value, slope = jax.lax.map(jax.value_and_grad(law), points, batch_size=at_once)
+        return back(Parts(weights[:, None] * slope, value))[0]
+
+    def _over_centres(self, fn: Callable[..., Array], parts: int, dtype: Any) -> Array:
+        """`fn` at each centre, so many at once that memory does not grow with parts × centres."""
+        # A checkpoint keeps the reverse derivative as small.
+        at_once = int(np.clip(_AT_ONCE // parts, 1, len(self.centres or ())))
+        return jax.lax.map(jax.checkpoint(fn), self._points(dtype), batch_size=at_once)
 
     def point(self, r: ArrayLike) -> Float[Array, " d"]:
         """The point of the parts for an argument r of the law, such as log r for a distance r."""
@@ -153,17 +177,25 @@ class Shared(AbstractScalarKernel):
         return jax.vmap(jax.vmap(self.kernel, (None, 0)), (0, None))(points, C)
 
     def _whitened(self, rows: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-        C = self._points(rows.dtype)
+        return solve_triangular(self._factor(rows.dtype), rows, lower=True)
+
+    def _factor(self, dtype: Any) -> Float[Array, "m m"]:
+        """L with L Lᵀ = k(C, C)."""
+        C = self._points(dtype)
         G = jax.vmap(jax.vmap(self.kernel, (None, 0)), (0, None))(C, C)
         # A hundred times the rounding bounds how finely centres resolve, and biases nothing.
         rounding = 100 * jnp.finfo(G.dtype).eps * len(G) * jnp.diagonal(G).mean()
-        L = jnp.linalg.cholesky(G + rounding * jnp.eye(len(G), dtype=G.dtype))
-        return solve_triangular(L, rows, lower=True)
+        return jnp.linalg.cholesky(G + rounding * jnp.eye(len(G), dtype=G.dtype))
 
     def through_descriptor(self, n: int) -> Descriptor | None:
         if self.centres is None:
             return None
-        return Descriptor(self.features, InnerProduct(), jacobian=lambda x: self.gradients(x).T)
+        return Descriptor(
+            self.features,
+            InnerProduct(),
+            jacobian=lambda x: self.gradients(x).T,
+            seen=lambda x: ravel_pytree(self.of(x))[0],
+        )
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
         return (frozenset(range(getattr(self.parts, "positions", n))),)

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Array, Float
@@ -30,6 +31,13 @@ def completed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> Any:
 def shared_laws(K: Any) -> list[Shared]:
     """The laws within K that many parts share."""
     return [node for node in jax.tree.leaves(K, is_leaf=_is_shared) if _is_shared(node)]
+
+
+def has_constant_parts(K: AbstractMatrixKernel) -> bool:
+    """Whether K is made of laws that many parts share, and no map to the parts is trained."""
+    laws = [shared_laws(k) for k in K.scalar_kernels]
+    parts = [shared.parts for each in laws for shared in each]
+    return all(laws) and not any(map(eqx.is_inexact_array, jax.tree.leaves(parts)))
 
 
 def _is_shared(node: Any) -> bool:

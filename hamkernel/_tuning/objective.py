@@ -16,9 +16,11 @@ from jaxtyping import Array, Float, Int
 from hamkernel import _require as require
 from hamkernel._closed_forms import Folds, Partition
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._machine import compiled
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.completed import has_constant_parts
 from hamkernel._tuning.space import SearchSpace
 from hamkernel._validation import (
     cross_validation_loss,
@@ -28,6 +30,7 @@ from hamkernel._validation import (
     log_marginal_likelihood,
     partition_loss_and_square,
     partition_of_rows,
+    without_silent_directions,
 )
 
 Objective = Callable[[AbstractMatrixKernel, Array, Array, Array], Float[Array, ""]]
@@ -69,9 +72,19 @@ class SearchCriterion(eqx.Module):
 
     def with_basis(self, basis: AbstractBasis) -> "SearchCriterion":
         """This criterion for the low-rank fit in a basis."""
+        return self._with(basis=basis)
+
+    def _with(self, **known: Any) -> "SearchCriterion":
         # A Partial of a Partial would be another function, to be compiled, for each call of `tune`.
-        fn = jax.tree_util.Partial(self.fn.func, **self.fn.keywords, basis=basis)
+        fn = jax.tree_util.Partial(self.fn.func, **(self.fn.keywords | known))
         return dataclasses.replace(self, fn=fn)
+
+    def hearing(self, K: AbstractMatrixKernel, rows: Measurements) -> "SearchCriterion":
+        """This criterion, which knows the silent directions if no hyperparameter changes them."""
+        if self.fn.func is not _negative_log_likelihood or not has_constant_parts(K):
+            return self
+        # An eigenvalue problem of n × n for each point.
+        return self._with(heard=_heard(K, rows))
 
     def on(self, rows: Measurements, chosen: np.ndarray) -> "SearchCriterion":
         """This criterion for the rows of a subset of the observations."""
@@ -213,5 +226,8 @@ def _custom_of_data(fn, data, K, rows, regularization):
     return fn(K, *data, regularization)
 
 
-def _negative_log_likelihood(K, rows, regularization, basis=None):
-    return -log_likelihood(K, rows, regularization, basis)
+_heard = compiled(without_silent_directions)
+
+
+def _negative_log_likelihood(K, rows, regularization, basis=None, heard=None):
+    return -log_likelihood(K, rows, regularization, basis, heard)

@@ -265,7 +265,8 @@ class Part:
             rows, chosen = rows.subset(chosen)
         self.count = rows.count
         numbers = (jnp.asarray(each, rows.targets.dtype) for each in (N / self.count, rms, 1.0))
-        self.objective = SearchObjective(space, criterion.on(rows, chosen), rows, *numbers)
+        criterion = criterion.on(rows, chosen).hearing(space.kernel, rows)
+        self.objective = SearchObjective(space, criterion, rows, *numbers)
 
     def measure_in(self, unit: float) -> None:
         """Divide the caller's objective by its size: tolerances are those of numbers of size 1."""

@@ -10,6 +10,7 @@ so the loss of an oscillator improves along ℓ -> ∞, λ -> 0 until only noise
 from __future__ import annotations
 
 import dataclasses
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -197,10 +198,14 @@ def tune(
     check_solver(solver)
     warn_of_constants(K)
     given = problem(K, X, Y, regularization, mean, inputs, parameters)
-    K, rows = given.kernel, given.on_one_device().rows
-    if solver is None and is_of_parts(K):
-        solver = features_of_parts()
-    if rows.states is not None:
+    alone = given.on_one_device()
+    K, rows = alone.kernel, alone.rows
+    exact = solver is None and is_of_parts(K)
+    solver = features_of_parts() if exact else solver
+    # With 5000 pairs a look takes .1 s, and features of a state, which show the size of K, 6 ms.
+    looks, sizing = (64, 1) if exact else (None, None)
+    # What a known kinetic energy leaves of the velocities of positions may be small, and is noise.
+    if rows.states is not None and not exact:
         _warn_of_unequal_sizes(rows.states[1])
     inputs = inputs_or_parameters(inputs, parameters)
     plain = mean is None and inputs is None and not isinstance(X, AbstractObservations)
@@ -208,6 +213,8 @@ def tune(
     criterion = criterion_of(objective, rows.count, folds, data)
     _warn_of_few_folds(criterion)
     low_rank = solver is not None and solver.is_low_rank and not criterion.custom
+    if exact and low_rank:
+        criterion = _of_basis(criterion, alone, solver)  # no Gram, on few points either
     parts = parts_of(rows, criterion, dense=True)
     if not low_rank and not criterion.custom:
         check_memory(rows, SEARCH_COPIES)
@@ -217,21 +224,38 @@ def tune(
     roundings = 2e4 if low_rank else 100.0
     kept, points = tuple(frozen), rows.points
     space = SearchSpace(
-        K, points, rms, given.regularization, kept, bounds or {}, roundings, few.points
+        K, points, rms, given.regularization, kept, bounds or {}, roundings, few.points[:sizing]
     )
     _warn_of_free_scale(space, criterion)
-    search = Search(space, criterion, rows, rms, starts, max_steps, optimiser, progress)
+    search = Search(space, criterion, rows, rms, starts, max_steps, optimiser, progress, looks)
 
-    def of_low_rank(run: MinimiserRun) -> SearchCriterion:
-        kernel, regularization, _ = decode(space, jnp.asarray(run.best.u, points.dtype))
-        assert solver is not None
-        basis = solver._basis(kernel, rows, regularization)
-        assert basis is not None
-        return criterion.with_basis(basis)
-
+    of_low_rank = functools.partial(_of_low_rank, space, criterion, alone, solver)
     runs = search.runs(of_low_rank if low_rank else None)
     check_found(best(runs))
     return _tuned(space, runs, starts, given, solver)
+
+
+def _of_basis(
+    criterion: SearchCriterion, given: Problem, solver: AbstractSolver | None
+) -> SearchCriterion:
+    """The criterion of the low-rank fit in the basis that the solver makes for a problem."""
+    assert solver is not None
+    basis = solver._basis(given.kernel, given.rows, given.regularization)
+    assert basis is not None
+    return criterion.with_basis(basis)
+
+
+def _of_low_rank(
+    space: SearchSpace,
+    criterion: SearchCriterion,
+    given: Problem,
+    solver: AbstractSolver | None,
+    run: MinimiserRun,
+) -> SearchCriterion:
+    """The same for the kernel and λ of the best run."""
+    kernel, regularization, _ = decode(space, jnp.asarray(run.best.u, space.low.dtype))
+    there = dataclasses.replace(given, kernel=kernel, regularization=regularization)
+    return _of_basis(criterion, there, solver)
 
 
 def check_found(found: MinimiserRun) -> None:
