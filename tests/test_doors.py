@@ -4,12 +4,15 @@
 
 import datetime
 import os
+import re
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -19,6 +22,41 @@ from hamkernel._closed_forms import Partition
 T = np.linspace(0, 3, 40)
 X = np.stack([np.sin(2 * T), 2 * np.cos(2 * T)], 1)
 U = np.cos(3 * T) + 0.3 * np.sin(7 * T)
+
+
+class Polars:
+    """A frame like that of polars: without `ndim`, and iterated by columns."""
+
+    def __init__(self, values, columns):
+        self.values, self.columns, self.shape = values, columns, values.shape
+
+    def to_numpy(self):
+        return self.values
+
+    def __iter__(self):
+        return iter(self.values.T)
+
+
+class Tensor:
+    """A tensor like that of PyTorch that requires a gradient."""
+
+    def __init__(self, values, free=False):
+        self.values, self.shape, self.free = values, values.shape, free
+
+    def detach(self):
+        return Tensor(self.values, free=True)
+
+    def cpu(self):
+        return self
+
+    def __array__(self, *args, **options):
+        if not self.free:
+            raise RuntimeError("Can't call numpy() on Tensor that requires grad.")
+        return self.values
+
+
+def table(values):
+    return np.array([*map(tuple, values)], dtype=[("q", float), ("p", float)])
 
 
 def same(runs, times=T, states=X):
@@ -74,6 +112,53 @@ def test_a_sampling_interval_stands_for_times(interval):
         hk.Runs(-1.0, X)
 
 
+def test_rows_as_lists_are_rows():
+    """Not 40 runs of two samples, where the sampling interval says nothing of their number."""
+    for rows in (X.tolist(), [*X]):
+        same(hk.Runs(0.1, rows), 0.1 * np.arange(40))
+    assert len(hk.Runs(0.1, [X[:, 0], X[:30, 1]])) == 2
+
+
+def test_times_of_all_runs_are_given_once():
+    both, u = np.stack([X, 2 * X]), np.stack([U, U])
+    for times in (T, T.tolist()):
+        runs = hk.Runs(times, both, u)
+        assert [len(runs), runs.input_count] == [2, 1]
+        np.testing.assert_array_equal(runs.times[1], T)
+        np.testing.assert_array_equal(runs.states[1], 2 * X)
+
+
+@pytest.mark.parametrize(
+    "states", [table(X), Polars(X, ["q", "p"]), [table(X)], [Polars(X, ["q", "p"])]]
+)
+def test_names_of_columns_are_kept(states):
+    times = [T] if isinstance(states, list) else T
+    runs = hk.Runs(times, states, [U] if isinstance(states, list) else U)
+    assert runs.names == ("q", "p")
+    assert repr(runs) == "Runs(1 run, 40 samples, n=2 (q, p), m=1 held)"
+    assert runs.part([slice(0, 9)]).names == ("q", "p")
+    assert hk.Runs(T, X).names is None
+
+
+def test_names_of_pandas_and_xarray_are_kept_and_used():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"t": T, "angle": X[:, 0], "speed": X[:, 1], "volts": U})
+    runs = hk.Runs(frame["t"], frame[["angle", "speed"]], frame["volts"])
+    assert repr(runs) == "Runs(1 run, 40 samples, n=2 (angle, speed), m=1 (volts) held)"
+    assert [panel.get_ylabel() for panel in hk.plot.smoothing(runs)] == ["angle", "speed"]
+    plt.close("all")
+    frame["speed"] = 3.0
+    with pytest.warns(UserWarning, match=r"constant in all runs: coordinate speed \(always 3\)"):
+        hk.Runs(frame["t"], frame[["angle", "speed"]])
+    columns = [frame[["angle", "volts"]], frame[["volts", "angle"]]]
+    with pytest.raises(ValueError, match=r"are angle, volts and those of states\[1\] volts, angle"):
+        hk.Runs([T, T], columns)
+    assert hk.Runs(frame["t"], frame["angle"]).with_momenta().names == ("angle", "p of angle")
+    xarray = pytest.importorskip("xarray")
+    array = xarray.DataArray(X, dims=("time", "c"), coords={"time": T, "c": ["q", "p"]})
+    assert hk.Runs(array.time, array).names == ("q", "p")
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
@@ -96,41 +181,6 @@ def test_one_input_of_runs_is_one_column(inputs):
     runs = hk.Runs(T, X, inputs)
     np.testing.assert_array_equal(runs.inputs[0], U[:, None])
     np.testing.assert_array_equal(runs.input_times[0], T)
-
-
-class Polars:
-    """A frame like that of polars: without `ndim`, and iterated by columns."""
-
-    def __init__(self, values, columns):
-        self.values, self.columns, self.shape = values, columns, values.shape
-
-    def to_numpy(self):
-        return self.values
-
-    def __iter__(self):
-        return iter(self.values.T)
-
-
-class Tensor:
-    """A tensor like that of PyTorch that requires a gradient."""
-
-    def __init__(self, values, free=False):
-        self.values, self.shape, self.free = values, values.shape, free
-
-    def detach(self):
-        return Tensor(self.values, free=True)
-
-    def cpu(self):
-        return self
-
-    def __array__(self, *args, **options):
-        if not self.free:
-            raise RuntimeError("Can't call numpy() on Tensor that requires grad.")
-        return self.values
-
-
-def table(values):
-    return np.array([*map(tuple, values)], dtype=[("q", float), ("p", float)])
 
 
 KINDS = {
@@ -322,6 +372,46 @@ def test_positions_and_a_mass_are_enough(tmp_path):
         hk.learn(K, learned.runs, mean=hk.kinetic(1.0), mass=1.0)
     with pytest.raises(ValueError, match=r"positions alone hk\.learn\(K, runs, mass=m\)"):
         hk.learn(K, hk.Runs(t, runs[0]))
+
+
+def test_the_line_of_the_readme_reads_a_csv_with_a_header(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    log = np.column_stack([T, X, U])
+    np.savetxt("run1.csv", log, delimiter=",", header="t,q,p,u", comments="")
+    text = (Path(__file__).parents[1] / "README.md").read_text()
+    (line,) = re.findall(r"`(table = np\.loadtxt\(.*?\))`", text)
+    (runs,) = re.findall(r"`(hk\.Runs\(table.*?\))`", text)
+    names = {"np": np, "hk": hk}
+    exec(line, names)
+    same(eval(runs, names))
+
+
+def test_a_run_at_rest_among_others_is_no_fast_logger():
+    swing = np.stack([np.sin(2 * T), 2 * np.cos(2 * T)], 1)
+    noisy = swing + 0.01 * np.random.default_rng(0).standard_normal(swing.shape)
+    rest = np.tile([0.3, 0.0], (60, 1))
+    runs = hk.Runs([T, 0.1 * np.arange(60)], [noisy, rest])  # a warning is an error here
+    assert runs.check().failing == ()
+    stays = np.concatenate([noisy, np.tile(noisy[-1], (40, 1))])
+    assert hk.Runs(0.1, [stays, stays]).check()["repeated samples"].passes
+    with pytest.warns(UserWarning, match=r"repeated samples: coordinate 0 \(75%\), 1 \(75%\)"):
+        hk.Runs([0.1 * np.arange(160), 0.1 * np.arange(60)], [np.repeat(noisy, 4, axis=0), rest])
+
+
+def test_the_table_of_a_log_says_what_was_found_and_what_to_do():
+    x = X.copy()
+    x[20] = -9999
+    with pytest.warns(UserWarning, match="the first of them sample 20 of run 0.*Write NaN"):
+        runs = hk.Runs(T, x, U)
+    found = runs.check()
+    assert found.failing == ("impossible samples",)
+    row = found["impossible samples"]
+    assert row.value == "1, the first of them sample 20 of run 0"
+    assert "Write NaN for them" in row.advice
+    names = "impossible samples, wrapped angles, gaps, constant, clipped sensors, dead sensors, "
+    names += "repeated samples, interpolated samples, constant inputs, dependent inputs, feedback"
+    assert [each.name for each in found] == names.split(", ")
+    assert "! impossible samples" in repr(found)
 
 
 def test_what_is_printed_degrades_on_a_terminal_of_ascii():
