@@ -1,6 +1,6 @@
 """What people type: logs of every kind become runs, and known masses need no lambda."""
 
-# pyright: reportArgumentType=false
+# pyright: reportArgumentType=false, reportOptionalSubscript=false, reportCallIssue=false
 
 import datetime
 import os
