@@ -144,6 +144,7 @@ def test_a_law_is_found_from_a_few_states(learned):
     assert np.sqrt(np.mean(error**2) / np.mean(truth**2)) > 0.1
 
 
+@pytest.mark.slow
 def test_all_solvers_find_the_same_law(learned):
     field, X, Y = learned
     for solver in (hk.Cholesky(), hk.Nystrom(max_points=12)):
@@ -164,6 +165,7 @@ def _energy(x):
     return pairs + 0.5 * x[10:] @ x[10:]
 
 
+@pytest.mark.slow
 def test_the_band_of_the_law_is_wide_where_no_pair_was(learned):
     _, X, Y = learned
     noisy = Y + 0.05 * RNG.normal(size=Y.shape)
@@ -179,6 +181,7 @@ def test_the_band_of_the_law_is_wide_where_no_pair_was(learned):
     assert posterior.law_deviation(1.0, 1.0) == 0
 
 
+@pytest.mark.slow
 def test_a_shared_law_is_tuned_saved_and_read_back(learned, tmp_path):
     _, X, Y = learned
     Y = Y + 0.05 * RNG.normal(size=Y.shape)

@@ -51,7 +51,7 @@ class FitQuality(NamedTuple):
             swing.
         impulse: the largest jump by a push, over the standard deviation of the coordinate.
         pushed: the parts in which something pushed the system, as those that were dropped.
-        count: of iterations.
+        count: the number of iterations.
         settled: whether they ended by themselves.
         swing: how many samples there are in a swing.
         driven: whether there are inputs.
@@ -64,7 +64,7 @@ class FitQuality(NamedTuple):
         has_friction: whether the kernel has a `Friction`.
         is_curve: whether the momentum is one function of the position in the data.
         timing: how residuals grow with the speed; None where that cannot be told.
-        free_run: the error of free runs of two swings over that of a constant.
+        free_run: the error of free runs over that of a constant, over two swings or fewer.
     """
 
     noise: Float[np.ndarray, " n"]
@@ -114,13 +114,13 @@ def diagnostics(
         _free_run(fit),
         _outliers(fit),
         degrees_of_freedom(fit),
+        _force(fit),  # a cause with a cure, before its symptoms
         _chi_squared(fit),
         _whiteness(fit),
         _process_noise(fit),
         _pushes(fit),
         _parts_left_out(fit),
         _landmarks(fit),
-        _force(fit),
         _samples_per_swing(fit),
         _timing(fit),
         _curve(fit),
@@ -171,7 +171,7 @@ def _free_run(fit: FitQuality) -> Diagnostic:
         f"{fit.free_run:.2g} of the error of a constant",
         "1",
         fit.free_run < 1,
-        f"over two swings free runs follow the log {closer:.2g} times closer than a constant"
+        f"free runs follow the log {closer:.2g} times closer than a constant"
         if fit.free_run < 1
         else "free runs of the field are no better than saying that nothing moves",
         "Look at hk.plot.fitted; the motion may not have this structure.",

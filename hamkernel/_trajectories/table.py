@@ -13,11 +13,11 @@ class Diagnostic(NamedTuple):
 
     Attributes:
         name: the question, in a word or two.
-        value: what was found.
-        limit: what it is compared with.
+        value: the value found.
+        limit: the limit of the value.
         passes: whether the value is within the limit.
-        meaning: what the value says, in one sentence.
-        advice: what to do, in one sentence; "" where there is nothing to do.
+        meaning: the meaning of the value, in one sentence.
+        advice: the thing to do, in one sentence; "" where there is nothing to do.
         decides: whether a field that fails here must not be used.
     """
 
@@ -57,13 +57,16 @@ class Diagnostics:
 
     @property
     def warning(self) -> str:
-        """What falls short, in a line or two; "" where nothing does."""
+        """The rows that fall short, in a line or two; "" where none does."""
         short = [row for row in self.rows if not row.passes]
         if not short:
             return ""
-        first = sorted(short, key=lambda row: not row.decides)
-        said = "; ".join(row.meaning.rstrip(".") for row in first[:2])
-        more = f"; and {', '.join(row.name for row in first[2:])}" if len(first) > 2 else ""
+        decide = [row for row in short if row.decides]
+        qualify = [row for row in short if not row.decides]
+        shown = [*decide[:1], *qualify[:1]] if decide and qualify else short[:2]
+        said = "; ".join(row.meaning.rstrip(".") for row in shown)
+        names = ", ".join(row.name for row in short if row not in shown)
+        more = f"; and {names}" if names else ""
         verdict = "look at" if self.is_usable else "do not use this field"
         return f"{verdict}: {said}{more}. learned.diagnostics says what to do."
 
