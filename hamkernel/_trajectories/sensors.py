@@ -157,6 +157,12 @@ def _of_sensors(log: Log) -> list[Diagnostic]:
             if found is not None:
                 a, b = (float(log.times[r][i]) for i in found)
                 dead.append(f"{name} of run {r} from {a:.4g} to {b:.4g}")
+    return _sensor_rows(clipped, dead, repeated, drawn)
+
+
+def _sensor_rows(
+    clipped: Sequence[str], dead: Sequence[str], repeated: Sequence[str], drawn: Sequence[str]
+) -> list[Diagnostic]:
     return [
         _row(
             "clipped sensors",
