@@ -132,7 +132,7 @@ def _of_sensors(log: Log) -> list[Diagnostic]:
     )
     unit = np.where(scale > 0, scale, 1.0)
     clipped, dead, repeated, drawn = [], [], [], []
-    for c in np.flatnonzero(scale):
+    for c in map(int, np.flatnonzero(scale)):
         columns, name = [x[:, c] for x in log.states], log.names[c]
         steps = [np.abs(np.diff(x[np.isfinite(x)])) for x in columns]
         moving = np.concatenate(steps)
@@ -276,9 +276,9 @@ def _of_inputs(log: Log) -> list[Diagnostic]:
     if len(varied) > 1:
         share, direction = (a[..., 0] for a in np.linalg.eigh(np.corrcoef(U[:, varied].T)))
         if share < 0.01:
-            alike = [log.input_names[c] for c in varied[np.abs(direction) > 0.1]]
+            alike = [log.input_names[int(c)] for c in varied[np.abs(direction) > 0.1]]
     unless = "unless the matrix of the inputs is known, hk.Controlled(K, inputs=G)"
-    still = [f"{log.input_names[c]} (always {U[0, c]:g})" for c in np.flatnonzero(none)]
+    still = [f"{log.input_names[int(c)]} (always {U[0, c]:g})" for c in np.flatnonzero(none)]
     return [
         _row(
             "constant inputs",
