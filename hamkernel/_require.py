@@ -191,13 +191,13 @@ def _plain(x: Any, name: str) -> Any:
         x = list(x)
     if hasattr(x, "__jax_array__") or _holds_jax(x):
         return x
-    given = x
+    original = x
     if hasattr(x, "detach"):
         x = x.detach().cpu()
     if isinstance(x, np.ma.MaskedArray):
         x = np.ma.filled(x.astype(float), np.nan) if x.dtype.kind in "fiubO" else x.data
     elif hasattr(x, "to_numpy"):  # pandas, whose missing values NumPy refuses, and polars
-        x = _of_frame(x)
+        x = _frame_values(x)
     try:
         array = np.asarray(x)
         if array.dtype.names:
@@ -205,7 +205,7 @@ def _plain(x: Any, name: str) -> Any:
         if array.dtype == object:
             array = array.astype(float)
     except (TypeError, ValueError) as error:
-        raise _no_numbers(given, name) from error
+        raise _no_numbers(original, name) from error
     if not (array.dtype.kind in "fiub" or jnp.issubdtype(array.dtype, jnp.floating)):
         raise _no_numbers(array, name)
     return array.astype(array.dtype.newbyteorder("="), copy=False)
@@ -214,11 +214,11 @@ def _plain(x: Any, name: str) -> Any:
 def _holds_jax(x: Any) -> bool:
     """Whether a list or tuple has an array of JAX in it, at any depth."""
     return isinstance(x, list | tuple) and any(
-        isinstance(each, jax.Array) or _holds_jax(each) for each in x
+        isinstance(entry, jax.Array) or _holds_jax(entry) for entry in x
     )
 
 
-def _of_frame(x: Any) -> Any:
+def _frame_values(x: Any) -> Any:
     """The array of a frame or column of pandas or polars, or of an array of xarray."""
     array = x.to_numpy()
     if getattr(array, "dtype", np.dtype(float)).kind == "O":  # with missing values
@@ -228,7 +228,7 @@ def _of_frame(x: Any) -> Any:
 
 
 def _no_numbers(x: Any, name: str) -> TypeError:
-    """What is wrong with an argument that does not hold real numbers."""
+    """The error for an argument that does not hold real numbers."""
     dtype = getattr(x, "dtype", None)
     kind = getattr(dtype, "kind", "")
     if kind in ("M", "m") or _first(x).__class__.__module__ == "datetime":

@@ -94,7 +94,7 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
     With inputs it is a function of the points (x, u).
     """
     times, states = runs.on_host()
-    times, states = [t - t[0] for t in times], [_without_rest(x) for x in states]
+    times, states = [t - t[0] for t in times], [_thin_rests(x) for x in states]
     found, usable = _robust_processes(times, states)
     counts = [np.isfinite(x).astype(float) for x in states]
     scatter = [np.zeros_like(x) for x in states]
@@ -129,8 +129,8 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
 _REST = 10  # equal states, from which a system is at rest
 
 
-def _without_rest(x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T n"]:
-    """The states of a run, without those inside of a stretch of equal ones.
+def _thin_rests(x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T n"]:
+    """The states of a run, NaN inside of a stretch of equal ones.
 
     At rest a quantised sensor repeats one error, which is one measurement of the noise and not one
     for each sample: with one run in four at rest σ was found as √(3/4) of what it is.

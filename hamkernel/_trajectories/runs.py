@@ -181,8 +181,7 @@ class Runs(eqx.Module):
         parameters: Any = None,
         delay: float | Literal["fit"] = 0.0,
     ):
-        given = (_listed(each) for each in (times, states, inputs, parameters))
-        times, states, inputs, parameters = given
+        times, states, inputs, parameters = map(_as_list, (times, states, inputs, parameters))
         if _is_one_run(times, states):
             times, states = [times], [states]
             inputs = None if inputs is None else [inputs]  # an array, or a pair (times, u)
@@ -234,23 +233,23 @@ class Runs(eqx.Module):
         said = [
             f"{len(self)} run{'s' * (len(self) != 1)}",
             f"{samples} samples",
-            f"n={self.dimension}" + _in_brackets(self.names),
+            f"n={self.dimension}" + _name_list(self.names),
         ]
         if self.inputs is not None:
-            said.append(f"m={self.input_count}{_in_brackets(self.input_names)} {self.between}")
+            said.append(f"m={self.input_count}{_name_list(self.input_names)} {self.between}")
             if self.delay != 0.0:
                 delay = self.delay if isinstance(self.delay, str) else f"{self.delay:.4g}"
                 said.append(f"delay={delay}")
         return f"Runs({', '.join(said)})"
 
     def check(self) -> Diagnostics:
-        """What sensors and controllers may have left in the log, as a table.
+        """A table of the faults that sensors and controllers may have left in the log.
 
         One row for each kind of fault: samples that are no measurements, wrapped angles, gaps,
-        coordinates that never move, sensors that are clipped or dead, repeated and interpolated
-        samples, and of inputs those that never change, depend on one another, or are feedback. Each
-        has what was found, its limit, what it means and what to do; `.failing` names the rows that
-        fall short. `Runs` has warned of them.
+        coordinates that never move, clipped and dead sensors, repeated and interpolated samples.
+        With inputs also: constant inputs, dependent ones, and feedback. Each row has a value, its
+        limit, its meaning and advice; `.failing` names the rows that fall short. `Runs` has warned
+        of them.
         """
         times, states = self.on_host()
         inputs = [np.asarray(u, float) for u in self.inputs or ()]
@@ -398,8 +397,8 @@ class Runs(eqx.Module):
                 )
 
 
-def _listed(values: Any) -> Any:
-    """What an iterator yields, as a list; anything else as it is."""
+def _as_list(values: Any) -> Any:
+    """The values of an iterator as a list; anything else as it is."""
     return list(values) if isinstance(values, Iterator) else values
 
 
@@ -446,16 +445,16 @@ def _entries(values: Any, name: str) -> list[Any]:
     )
 
 
-def _names(given: Sequence[Any], arrays: Sequence[np.ndarray], of: str) -> tuple[str, ...] | None:
+def _names(entries: Sequence[Any], arrays: Sequence[np.ndarray], of: str) -> tuple[str, ...] | None:
     """The names of the columns, which all runs must have in one order; None if there are none."""
-    names = [_column_names(x, a.shape[1]) for x, a in zip(given, arrays, strict=True)]
-    for run, own in enumerate(names):
-        if own and names[0] and own != names[0] and sorted(own) == sorted(names[0]):
+    names = [_column_names(x, a.shape[1]) for x, a in zip(entries, arrays, strict=True)]
+    for run, columns in enumerate(names):
+        if columns and names[0] and columns != names[0] and sorted(columns) == sorted(names[0]):
             raise ValueError(
                 f"the columns of {of}[0] are {', '.join(names[0])} and those of {of}[{run}] "
-                f"{', '.join(own)}: give all runs in one order."
+                f"{', '.join(columns)}: give all runs in one order."
             )
-    return names[0] if all(own == names[0] for own in names) else None
+    return names[0] if all(columns == names[0] for columns in names) else None
 
 
 def _column_names(values: Any, count: int) -> tuple[str, ...] | None:
@@ -469,11 +468,11 @@ def _column_names(values: Any, count: int) -> tuple[str, ...] | None:
     elif names is None:
         names = getattr(getattr(values, "dtype", None), "names", None)
     names = () if names is None else tuple(names)
-    is_text = len(names) == count and all(isinstance(each, str) for each in names)
+    is_text = len(names) == count and all(isinstance(name, str) for name in names)
     return tuple(map(str, names)) if is_text else None
 
 
-def _in_brackets(names: tuple[str, ...] | None) -> str:
+def _name_list(names: tuple[str, ...] | None) -> str:
     return f" ({', '.join(names)})" if names else ""
 
 

@@ -12,15 +12,15 @@ from hamkernel._trajectories.table import Diagnostic, Diagnostics
 
 
 class Log(NamedTuple):
-    """What was logged, one array a run.
+    """A log, one array a run.
 
     Attributes:
-        times: of the samples, shapes (T,).
-        states: at these times, shapes (T, n).
-        inputs: as they were logged, shapes (P, m); none if there are none.
-        applied: the inputs at the times of the states, shapes (T, m).
-        names: of the coordinates.
-        input_names: of the inputs.
+        times: times of the samples, shapes (T,).
+        states: states at these times, shapes (T, n).
+        inputs: inputs at their own times, shapes (P, m); empty if there are none.
+        applied: inputs at the times of the states, shapes (T, m).
+        names: names of the coordinates.
+        input_names: names of the inputs.
     """
 
     times: Sequence[np.ndarray]
@@ -33,17 +33,19 @@ class Log(NamedTuple):
 
 def faults(log: Log) -> Diagnostics:
     """The table of a log: one row for each kind of fault."""
-    rows = [_impossible(log), _wrapped(log), _gaps(log), _constant(log), *_of_sensors(log)]
+    rows = [_impossible(log), _wraps(log), _gaps(log), _constant(log), *_sensors(log)]
     if log.inputs:
-        rows += [*_of_inputs(log), _feedback(log)]
+        rows += [*_inputs(log), _feedback(log)]
     return Diagnostics(tuple(rows))
 
 
-def _row(name: str, found: Sequence[str], limit: str, meaning: str, advice: str) -> Diagnostic:
-    """A row that passes where nothing was found."""
-    if not found:
+def _row(
+    name: str, faults_found: Sequence[str], limit: str, meaning: str, advice: str
+) -> Diagnostic:
+    """A row that passes where nothing was faults_found."""
+    if not faults_found:
         return Diagnostic(name, "none", limit, True, "nothing of it in this log")
-    return Diagnostic(name, _some(found), limit, False, meaning, advice)
+    return Diagnostic(name, _some(faults_found), limit, False, meaning, advice)
 
 
 def _impossible(log: Log) -> Diagnostic:
@@ -62,7 +64,7 @@ def _impossible(log: Log) -> Diagnostic:
     )
 
 
-def _wrapped(log: Log) -> Diagnostic:
+def _wraps(log: Log) -> Diagnostic:
     """Angles and counts that jump by a full turn."""
     where: dict[float, list[str]] = {}
     lost = False
@@ -73,18 +75,18 @@ def _wrapped(log: Log) -> Diagnostic:
                 where.setdefault(period, []).append(f"coordinate {log.names[c]} of run {run}")
                 lost |= not np.isfinite(x[:, c]).all()
     full = {period: "2π" if period == 2 * np.pi else f"{period:g}" for period in where}
-    given = "".join(f", period={full[period]}" for period in list(where)[:1] if period > 7)
+    option = "".join(f", period={full[period]}" for period in list(where)[:1] if period > 7)
     measured = (  # np.unwrap leaves NaN from the first lost sample on
         f" of the samples that were measured alone, ok = np.isfinite(q); q[ok] = "
-        f"np.unwrap(q[ok]{given}), since after a NaN it leaves NaN"
+        f"np.unwrap(q[ok]{option}), since after a NaN it leaves NaN"
     )
-    jumps = "; ".join(f"{_some(each)} jumps by about {full[p]}" for p, each in where.items())
+    jumps = "; ".join(f"{_some(places)} jumps by about {full[p]}" for p, places in where.items())
     return _row(
         "wrapped angles",
-        [place for each in where.values() for place in each],
+        [place for places in where.values() for place in places],
         "2π, 360, 4096, 65536",
         f"{jumps}: a wrapped angle",
-        f"A field is learned along continuous paths; use np.unwrap(states[:, c]{given}) before"
+        f"A field is learned along continuous paths; use np.unwrap(states[:, c]{option}) before"
         f"{measured if lost else ''}, and a kernel that is periodic, hk.Periodic or hk.Warp, "
         "where the field is.",
     )
@@ -92,15 +94,17 @@ def _wrapped(log: Log) -> Diagnostic:
 
 def _gaps(log: Log) -> Diagnostic:
     """Long intervals without a sample."""
-    found = []
+    faults_found = []
     for run, dt in enumerate(map(np.diff, log.times)):
         if len(dt) > 2 and dt.max() > 10 * np.median(dt):
-            found.append(f"{dt.max():.3g} in run {run}, at a median spacing of {np.median(dt):.3g}")
+            faults_found.append(
+                f"{dt.max():.3g} in run {run}, at a median spacing of {np.median(dt):.3g}"
+            )
     return _row(
         "gaps",
-        found,
+        faults_found,
         "10 spacings",
-        f"a gap of {_some(found)}",
+        f"a gap of {_some(faults_found)}",
         "The path inside a gap is known from the field alone; cut the run in two there if the "
         "system was moved meanwhile.",
     )
@@ -108,16 +112,16 @@ def _gaps(log: Log) -> Diagnostic:
 
 def _constant(log: Log) -> Diagnostic:
     """Coordinates that never move."""
-    found = []
+    faults_found = []
     for name, column in zip(log.names, np.concatenate(log.states).T, strict=True):
         column = column[np.isfinite(column)]
         if column.size and np.ptp(column) == 0:
-            found.append(f"{name} (always {column[0]:g})")
+            faults_found.append(f"{name} (always {column[0]:g})")
     return _row(
         "constant",
-        found,
+        faults_found,
         "some motion",
-        f"constant in all runs: coordinate {_some(found)}",
+        f"constant in all runs: coordinate {_some(faults_found)}",
         "Leave it out of the states.",
     )
 
@@ -125,7 +129,7 @@ def _constant(log: Log) -> Diagnostic:
 _QUANTA = 4.0  # the steps of a log, above which a repeat is no rounding of a sensor at work
 
 
-def _of_sensors(log: Log) -> list[Diagnostic]:
+def _sensors(log: Log) -> list[Diagnostic]:
     """Coordinates that look clipped, dead, repeated or interpolated."""
     scale = np.array(
         [np.nanstd(x) if np.isfinite(x).any() else 0 for x in np.concatenate(log.states).T]
@@ -149,13 +153,14 @@ def _of_sensors(log: Log) -> list[Diagnostic]:
             repeated.append(f"{name} ({share:.0%})")
             continue
         share = _straight(log.times, columns)
-        whole = np.abs(moving / quantum - np.round(moving / quantum)).max() < 0.01  # a digital one
-        if share > 0.4 and not whole:  # every other sample interpolated makes .5
+        ratios = moving / quantum
+        is_digital = np.abs(ratios - np.round(ratios)).max() < 0.01
+        if share > 0.4 and not is_digital:  # every other sample interpolated makes .5
             drawn.append(f"{name} ({share:.0%})")
         for r, x in enumerate(columns):
-            found = _stuck(x, np.delete(log.states[r] / unit, c, axis=1))
-            if found is not None:
-                a, b = (float(log.times[r][i]) for i in found)
+            stretch = _stuck(x, np.delete(log.states[r] / unit, c, axis=1))
+            if stretch is not None:
+                a, b = (float(log.times[r][i]) for i in stretch)
                 dead.append(f"{name} of run {r} from {a:.4g} to {b:.4g}")
     return _sensor_rows(clipped, dead, repeated, drawn)
 
@@ -207,13 +212,13 @@ def _repeats(steps: Sequence[Float[np.ndarray, " T-1"]]) -> float:
     A stretch of equal values is a rest where it is a whole run, or ten times longer than half of
     all stretches are.
     """
-    lengths, whole = [], []
+    lengths, is_run = [], []
     for step in steps:
         ends = np.flatnonzero(np.concatenate([[True], step > 0, [True]]))
         lengths.append(np.diff(ends))
-        whole.append(np.full(len(ends) - 1, len(ends) == 2))
+        is_run.append(np.full(len(ends) - 1, len(ends) == 2))
     length = np.concatenate(lengths)
-    moves = ~np.concatenate(whole) & (length <= 10 * np.median(length))
+    moves = ~np.concatenate(is_run) & (length <= 10 * np.median(length))
     return float(1 - moves.sum() / max(length[moves].sum(), 1))
 
 
@@ -264,7 +269,7 @@ def _stuck(x: Float[np.ndarray, " T"], others: Float[np.ndarray, "T others"]):
     return first, stop
 
 
-def _of_inputs(log: Log) -> list[Diagnostic]:
+def _inputs(log: Log) -> list[Diagnostic]:
     """Inputs that never change, or a combination of which hardly does.
 
     Of inputs of variance one it has a variance below .01: the errors of its gain are ten times

@@ -82,8 +82,8 @@ class Diagnostics:
     def __len__(self) -> int:
         return len(self.rows)
 
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, Diagnostics) and self.rows == other.rows
+    def __eq__(self, table: object) -> bool:
+        return isinstance(table, Diagnostics) and self.rows == table.rows
 
     def __hash__(self) -> int:
         return hash(self.rows)
