@@ -146,13 +146,13 @@ def block_traces(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array
     """The traces of the diagonal blocks of the Gram, tr K(xᵢ, xᵢ)."""
     if isinstance(K, Sum):
         return total([block_traces(term, X) for term in K.terms])
-    found = K.through_descriptor(X.shape[1])
-    if found is None:
+    traces = K.through_descriptor(X.shape[1])
+    if traces is None:
         return diagonals(K, X, X).sum(axis=1)
 
     def of_point(x):
-        d, J = found.at(x)
-        return jax.vmap(lambda v: mixed(found.kernel, d, v, d, v))(J.T).sum()
+        d, J = traces.at(x)
+        return jax.vmap(lambda v: mixed(traces.kernel, d, v, d, v))(J.T).sum()
 
     return jax.lax.map(of_point, X)
 
@@ -388,7 +388,7 @@ def _(saved, bar, perturbed, kernel_and_data, make, rowwise=False):
 
     # Directions in one batch share the intermediates that do not depend on the direction. A batch
     # holds as many directions as give up to 200 000 entries of the array and its derivatives.
-    largest = max(each.size for each in [bar, *jax.tree.leaves(arrays)])
+    largest = max(array.size for array in [bar, *jax.tree.leaves(arrays)])
     batch = min(flat.size, 200_000 // largest)
     directions = jnp.eye(flat.size, dtype=flat.dtype)
     slopes = jax.lax.map(slope, directions, batch_size=batch if batch > 1 else None)

@@ -30,7 +30,7 @@ from hamkernel._machine import (
 from hamkernel._show import described
 from hamkernel._sizes import sizes
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.structure import group_expanded
+from hamkernel._structures.structure import expand_group
 
 
 def gram_operator(
@@ -163,7 +163,7 @@ _product = compiled(product)
 
 def _product_by_tiles(K, X, Z, A):
     """`product` on one device."""
-    K, Z, A = group_expanded(K, Z, A.astype(X.dtype))
+    K, Z, A = expand_group(K, Z, A.astype(X.dtype))
     X, Z = centred(K, X, Z)
     side = sizes().tile
     rows = tiles(X, X[:1], side)

@@ -1,12 +1,13 @@
 """The machine: devices, memory, the threads of BLAS, and batches of small matrices.
 
-Data whose rows are spread over devices, of one machine or of many, stay there. Each device runs
-the loops over its own rows, and only sums leave it. A product of all points with all points needs
-the rows of the other devices too: they travel around the ring of devices, one part at a time.
+Data whose rows are sharded over devices, of one machine or of many, stay on their devices. Each
+device runs the loops over its own rows and sends only sums. A product of all points with all points
+also needs the rows of the other devices: they travel around the ring of devices, one part at a
+time.
 
-The compiler would shard these loops by itself, but a loop over tiles of the rows makes it gather
-all rows on every device first. Hence `jax.shard_map` around the loops, and the compiler for the
-rest.
+The compiler could shard these loops, but it would first gather all rows on every device, because of
+the loop over tiles of rows. We therefore put `jax.shard_map` around the loops and leave the rest to
+the compiler.
 """
 
 import dataclasses
@@ -57,9 +58,9 @@ class RowSharding:
 
 
 def row_sharding(array: Array) -> RowSharding | None:
-    """The devices over which the rows of `array` are spread; None if it is on one, or traced.
+    """The sharding of the rows of `array`; None if it lies on one device or is traced.
 
-    A traced array does not say where it lies, so inside `jax.jit` the compiler shards the loops:
+    The devices of a traced array are unknown, so inside `jax.jit` the compiler shards the loops:
     the results are right, but every device holds all rows.
     """
     sharding = _on_mesh(array)
@@ -72,14 +73,14 @@ def row_sharding(array: Array) -> RowSharding | None:
 
 
 def shard(rows: RowSharding | None, array: Array) -> Array:
-    """The array spread over the devices of `rows`, on axes that leave the rest to the compiler."""
+    """The array with its rows sharded as `rows`, on automatic axes."""
     if rows is None:
         return automatic(array)
     return jax.device_put(array, NamedSharding(rows.mesh, rows.spec))
 
 
 def automatic(array: Array) -> Array:
-    """`array` where it is, on automatic axes."""
+    """The array on the same devices, on automatic axes of its mesh."""
     sharding = _on_mesh(array)
     if sharding is None:
         return array
@@ -122,7 +123,7 @@ def to_one_device(name: str, array: Array) -> Array:
 
 
 def to_caller_sharding(rows: RowSharding | None, array: Array) -> Array:
-    """The array, of one row for each row of the data, on the mesh on which the data came."""
+    """The array, with one row for each row of the data, on the caller's mesh."""
     if rows is None or isinstance(array, Tracer) or rows.caller.mesh == rows.mesh:
         return array
     return jax.device_put(array, rows.caller)
@@ -154,8 +155,8 @@ def on_each(
         result = function(eqx.combine(arrays, static), *parts)
         return result if joined else reduce(rows, result)
 
-    # Untracked: a user's kernel may contain anything, and tracking asks every loop to say whether
-    # its start differs between devices. Derivatives are right either way.
+    # `check_vma=False`: tracking would require every loop, also in a user's kernel, to state
+    # whether its start differs between devices. Derivatives are right either way.
     mapped = jax.shard_map(
         result_of_device,
         mesh=rows.mesh,
@@ -207,7 +208,7 @@ _CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
 def dense_bytes(rows: int, columns: int, dtype: jnp.dtype, copies: int) -> int:
-    """Bytes in so many matrices of that shape."""
+    """The number of bytes of `copies` matrices of this shape."""
     return copies * rows * columns * jnp.dtype(dtype).itemsize
 
 
@@ -242,24 +243,24 @@ def refuse_beyond_memory(
         )
 
 
-# One thread for LAPACK while the library computes. XLA's LAPACK on a CPU is SciPy's OpenBLAS, whose
-# threads wait by spinning. Beside one busy process on two cores a fit of 592 rows took 0.4 to 1 s
-# with two threads and 8 to 13 ms with one, and alone one is as fast: 88 ms and 76 ms to factor 2000
-# rows, 3.0 and 2.9 ms for 592 (`tests/benchmarks/busy.py`).
+# LAPACK uses one thread while the library computes. XLA's LAPACK on a CPU is SciPy's OpenBLAS,
+# whose threads wait by spinning. On two cores beside one busy process, a fit of 592 rows took 0.4
+# to 1 s with two threads and 8 to 13 ms with one. On idle cores one thread is as fast: 88 ms
+# against 76 ms to factor 2000 rows, 3.0 against 2.9 ms for 592 (`tests/benchmarks/busy.py`).
 
 P = ParamSpec("P")
 T = TypeVar("T")
 
 _lock = threading.Lock()
-_active_calls = 0  # calls that are going on, nested or of several threads
-_limit: Any = None  # what restores the number of threads after the last of them
+_active_calls = 0  # the number of active calls, nested or in several threads
+_limit: Any = None  # restores the number of threads after the last call
 
 
 def one_blas_thread(function: Callable[P, T]) -> Callable[P, T]:
     """`function`, and its result computed, with one thread of BLAS; restored afterwards.
 
-    Inside of the caller's own `jax.jit` nothing is computed while `function` runs, and nothing is
-    changed: there OPENBLAS_NUM_THREADS=1 in the environment is the cure.
+    Inside the caller's own `jax.jit` nothing is computed while `function` runs, so this decorator
+    has no effect; set OPENBLAS_NUM_THREADS=1 in the environment instead.
     """
 
     @functools.wraps(function)
@@ -295,7 +296,7 @@ def _controller():
 
 
 def in_doubles(function: Callable[P, T]) -> Callable[P, T]:
-    """`function`, whose arrays are NumPy's, computed in doubles whatever JAX is told elsewhere."""
+    """`function` of NumPy arrays, computed in float64 whatever the configuration of JAX."""
     if hasattr(jax, "enable_x64"):
         context = jax.enable_x64
     else:  # before jax 0.8
@@ -313,9 +314,9 @@ def full_precision(function: Callable[P, T]) -> Callable[P, T]:
     """`function`, whose matrix products keep all digits of their type on every device.
 
     On a GPU XLA computes float32 products in TF32, with 10 bits of mantissa, unless the program
-    asks for more. The Gram of 1000 states was then off by 6e-4, and by 1.5e-7 with the highest
-    precision, which took .58 ms for .70 (NVIDIA H200). The kernel of the caller is traced inside
-    `function` as well, so that its products are covered.
+    asks for more. The relative error of the Gram of 1000 states was then 6e-4, and 1.5e-7 with the
+    highest precision, which took .58 ms instead of .70 ms (NVIDIA H200). JAX traces the caller's
+    kernel inside `function` as well, so its products are covered.
     """
 
     @functools.wraps(function)
@@ -341,9 +342,10 @@ def compiled(function: Any = None, **options: Any) -> Any:
 #     XLA's own options             4.5 s / .11 s    10.6 s / 4 s
 #     without fusion emitters       2.5 s / .11 s     7.4 s / 4 s
 #     nor optimisation by LLVM       .8 s / .25 s     1.7 s / 7 s
-# So only small programs go without LLVM: learning from two runs of 61 samples, whose arguments have
-# 7000 numbers, takes 24 s by this rule, 18 s without LLVM and 55 s with XLA's own options. 20 runs
-# of 50 samples with n = 8, of 20 000 to 400 000 numbers, run for 44 s, and for 73 s without LLVM.
+# So only small programs skip LLVM's optimisation. Learning from two runs of 61 samples, with 7000
+# numbers in the arguments, takes 24 s by this rule, 18 s without LLVM and 55 s with XLA's own
+# options. Learning from 20 runs of 50 samples with n = 8, with 20 000 to 400 000 numbers, takes 44
+# s by this rule and 73 s without LLVM.
 # On a GPU XLA times several versions of each product while it compiles: the first `tune` of 300
 # points took 78 s, and 15.5 s without, and `learn` 185 s and 60 s; later calls are as fast
 # (NVIDIA H200, jax 0.11). Products of large Grams are not compiled by size, and keep the choice.
@@ -355,7 +357,7 @@ _UNOPTIMISED = {
     "cpu": _BY_PLATFORM["cpu"] | {"xla_backend_optimization_level": 0},
     "gpu": _BY_PLATFORM["gpu"],
 }
-_MAX_UNOPTIMISED = 16_384  # numbers in the arguments, up to which a program is not optimised
+_MAX_UNOPTIMISED = 16_384  # numbers in the arguments; larger programs are optimised
 
 
 def compiled_by_size(function: Callable[P, T]) -> Callable[P, T]:
@@ -370,7 +372,7 @@ def compiled_by_size(function: Callable[P, T]) -> Callable[P, T]:
     )
 
     @functools.wraps(function)
-    def sized(*args: P.args, **kwargs: P.kwargs) -> T:
+    def by_size(*args: P.args, **kwargs: P.kwargs) -> T:
         arrays = [a for a in jax.tree.leaves((args, kwargs)) if eqx.is_array(a)]
         platform = _sizes.platform()
         if any(isinstance(a, Tracer) for a in arrays) or not _options_are_known(platform):
@@ -378,7 +380,7 @@ def compiled_by_size(function: Callable[P, T]) -> Callable[P, T]:
         small = sum(a.size for a in arrays) <= _MAX_UNOPTIMISED
         return (fastest if small else fast)[platform](*args, **kwargs)
 
-    return sized
+    return by_size
 
 
 @functools.cache
@@ -391,17 +393,18 @@ def _options_are_known(platform: str) -> bool:
     return True
 
 
-# Batches of small matrices without batches of LAPACK calls: two of those in one program, such as
-# `jit(lambda a, b: (qr(a), qr(b)))` of shape (64, 48, 48), wait for each other for ever on two
-# cores (jaxlib 0.10.2).
+# A QR of batches of small matrices without batched LAPACK calls. Two batched calls in one
+# program, such as `jit(lambda a, b: (qr(a), qr(b)))` of shape (64, 48, 48), deadlock on two cores
+# in jaxlib 0.10.2; see `_solvers/factors.py`.
 
 
 def orthonormal(
     P: Float[Array, "B d n"],
 ) -> tuple[Float[Array, "B d n"], Float[Array, "B n n"]]:
-    """Q and U of P = QU, U upper triangular with a positive diagonal, for a batch.
+    """The factors Q and U of P = QU, U upper triangular with a positive diagonal, for a batch.
 
-    By Gram and Schmidt done twice, which is as good as Householder. The loop is over n.
+    Gram–Schmidt applied twice, which is orthonormal to rounding as Householder's QR is (Giraud,
+    Langou, Rozložník & van den Eshof (2005), Numer. Math. 101). The loop is over n.
     """
     Q = P[:, :, :0]
     for j in range(P.shape[2]):

@@ -1,8 +1,8 @@
 """`condition`: the Gaussian process of a field given data.
 
-A priori f ~ GP(mean, K), and the rows of the data have independent noise of variance σ² = Nλ, times
-their squared relative noise. Given the data f is Gaussian again. With c(x) the covariances of the
-rows with f(x), or with a difference of H,
+A priori f ~ GP(mean, K), and the rows of the data have independent noise of variance σ² = Nλ times
+their squared relative noise. Given the data, f is Gaussian again. Let c(x) be the covariances of
+the rows with f(x), or with a difference of H. Then
 
     Cov[f(x), f(z) | y] = K(x, z) − c(x)ᵀ A⁻¹ c(z),     A = G + σ²I.
 """
@@ -58,19 +58,18 @@ def condition(
         tuned = hk.tune(hk.Symplectic(1.0 * k), X, Y, objective="marginal_likelihood")
         posterior = hk.condition(tuned.kernel, X, Y, tuned.regularization)
 
-    Hyperparameters are treated as known, so bands are somewhat too narrow, those of orbits more so
-    than those of H.
+    The hyperparameters are treated as known, so error bars are somewhat too small, more so for
+    orbits than for H.
 
     Args:
         K: a matrix-valued kernel, with an amplitude: `2.0 * k`.
         X: states, shape (N, n); or observations, and then there is no Y.
         Y: velocities, shape (N, n).
         regularization: λ > 0; Nλ is the variance of the noise of a row of relative noise 1.
-        solver: `Cholesky()` if None, exact, or a solver of low rank: `Nystrom(…)`, whose field is
-            approximate if its landmarks are few, and whose deviation far from them is that of the
-            prior,
-            or `RandomFeatures(…)`, whose prior is that of its features.
-        mean: what is known already, x (n,) -> (n,), as in `fit`.
+        solver: `Cholesky()` if None, which is exact; or a low-rank solver. With `Nystrom(…)` the
+            field is approximate if there are few landmarks, and the deviation far from them is
+            that of the prior. With `RandomFeatures(…)` the prior is that of the features.
+        mean: the known part of the field, x (n,) -> (n,), as in `fit`.
         inputs: u at each state, for a `Controlled` kernel, shape (N, m). Predictions then need the
             inputs as well, `posterior.deviation(x, u)`.
         parameters: θ at each state, for a `Family`, shape (N, p): `posterior.deviation(x, θ)`. The
@@ -142,7 +141,7 @@ class Posterior(eqx.Module):
         """The covariance of f(x) with itself or with f(x₂), given the data, in squared units of Y.
 
         K(x, x₂) − K(x, X) A⁻¹ K(X, x₂): entry (i, j) is the covariance of the component i of f at x
-        and the component j of f at x₂, which is x if it is not given.
+        and the component j of f at x₂ (default x).
 
         Args:
             x: one state, shape (n,).
@@ -178,7 +177,7 @@ class Posterior(eqx.Module):
     ) -> Float[Array, " n"]:
         """The standard deviation of each component of f(x) or f(x, u), in units of Y.
 
-        This is that of the field, not of a new measurement, which adds noise of variance Nλ.
+        This is the deviation of the field. A new measurement adds noise of variance Nλ.
 
         Args:
             x: one state, shape (n,).
@@ -197,8 +196,8 @@ class Posterior(eqx.Module):
     ) -> Float[Array, ""]:
         """The standard deviation of w(r) − w(r₀) for a law w of `hk.Shared`, shape ().
 
-        With what the centres of the law do not carry: where no part of the data came near r, it is
-        that of the prior.
+        The deviation includes the prior outside the span of the centres of the law. If no part of
+        the data came near r, it is the deviation of the prior.
 
         Args:
             r: an argument of the law, as in `field.law`.
@@ -226,7 +225,7 @@ class Posterior(eqx.Module):
     ) -> Float[Array, ""]:
         """The standard deviation of H(x) − H(x₀), or of the difference of another potential.
 
-        For a field with inputs H is that of the drift, and for a family that of one member.
+        For a field with inputs H belongs to the drift, and for a family to one member.
 
         Args:
             x: one state, shape (n,).
@@ -263,7 +262,7 @@ class Posterior(eqx.Module):
         inputs: Num[ArrayLike, "M m"] | None = None,
         parameters: Num[ArrayLike, "M p"] | None = None,
     ) -> Posterior:
-        """The posterior given more data: the same as conditioning on all of it, at less cost.
+        """The posterior given more data: equal to conditioning on all the data, but cheaper.
 
         The noise variance σ² = Nλ stays, so λ becomes σ² divided by the number of all observations.
         O(D² M) time for M new rows.
@@ -305,16 +304,16 @@ class Posterior(eqx.Module):
     ) -> AbstractField:
         """Draw whole fields that agree with the data, each with its own Hamiltonian.
 
-        They come as one PyTree whose arrays have a leading axis, to be mapped over:
+        The fields are one PyTree whose arrays have a leading axis, for `jax.vmap`:
 
             fields = posterior.sample(jax.random.key(0), 64, region)
             orbits = jax.vmap(lambda f: hk.simulate(f, x0, ts).ys)(fields)
 
-        In the region, and at the data, their mean and covariance are those of the posterior. Far
-        outside they have errors of a few per cent for kernels with a spectrum, which are those
-        that `RandomFeatures` takes; for other kernels they are wrong there, with too little spread,
-        so choose a region that the orbits do not leave. Fields with inputs are drawn whole, drift
-        and G, and are affine in u: the region is one of states, and u may be any.
+        In the region and at the data, the mean and covariance of the draws are those of the
+        posterior. Far outside, draws have errors of a few per cent for kernels with a known
+        spectrum (those of `RandomFeatures`), and too little spread for other kernels. Choose a
+        region that the orbits do not leave. Draws of fields with inputs contain the drift and G and
+        are affine in u; the region is a region of states, and u may be any.
 
         Args:
             key: the random key.
@@ -322,7 +321,7 @@ class Posterior(eqx.Module):
             region: the lowest and the highest corner of a box of states, shape (2, n).
 
         Returns:
-            Fields of the kind that `field` is. The norm of a draw is not finite.
+            Fields of the type of `field`. The norm of a draw is not finite.
 
         Raises:
             ValueError: the region has another shape or a side without length, or count is no
@@ -353,7 +352,7 @@ class Posterior(eqx.Module):
         return jax.vmap(one)(draws)
 
 
-# Without jit its operations are hundreds of small programs, which took 4 s to compile.
+# Without jit the operations are hundreds of small programs, which took 4 s to compile.
 @compiled
 def _covariance(
     conditional: AbstractConditional, left: AbstractBlock, right: AbstractBlock | None = None
@@ -362,9 +361,9 @@ def _covariance(
 
 
 def _range_of(U: Float[Array, "N m"], centre: float | None) -> Float[Array, "2 m"]:
-    """The corners of the smallest box that holds the parameters, or of one around a centre.
+    """The corners of the smallest box that contains the parameters, or a box around a centre.
 
-    Around zero it holds the inputs, and is 1 where all of them are 0.
+    The box around zero contains the inputs, and has the half-width 1 if all inputs are 0.
     """
     if centre is None:
         return jnp.stack([U.min(axis=0), U.max(axis=0)])
@@ -373,7 +372,7 @@ def _range_of(U: Float[Array, "N m"], centre: float | None) -> Float[Array, "2 m
 
 
 def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
-    """Warn where k(x, x) = 1 to the last digit, as in built-in kernels that nobody scaled."""
+    """Warn if k(x, x) = 1 to the last digit, as in built-in kernels without an amplitude."""
     if not require.is_concrete(K, X):
         return
     with require.eager():

@@ -1,8 +1,8 @@
 """Checks of the arguments of public functions, made before any long computation.
 
-Shapes, dtypes and configuration are known while tracing and raise at once. Values are checked
-by NumPy when they are concrete, for it compiles nothing; under `jax.jit` the same check becomes
-`equinox.error_if` on the value that is returned, so it must be used by the caller.
+Shapes, dtypes and configuration are known while tracing, and errors in them raise at once. NumPy
+checks concrete values, since it compiles nothing. Under `jax.jit` the same check becomes
+`equinox.error_if` on the returned value, so the caller must use that value.
 """
 
 import inspect
@@ -29,15 +29,15 @@ def is_concrete(*values: object) -> bool:
 
 
 def eager(*values: object) -> AbstractContextManager[None]:
-    """The context in which operations on constants happen at once, also while JAX traces.
+    """A context in which operations on constants are evaluated at once, also while JAX traces.
 
-    Without it `jax.jit` makes a tracer of the sum of two constants, whose value nobody can check.
+    Otherwise the sum of two constants is a tracer under `jax.jit`, and its value cannot be checked.
     """
     return jax.ensure_compile_time_eval() if is_concrete(*values) else nullcontext()
 
 
 def untraced(name: str, instead: str, *values: object) -> None:
-    """TypeError where JAX traces one of `values`: the function decides by their numbers."""
+    """TypeError if JAX traces one of `values`, on whose numbers the function `name` branches."""
     if not is_concrete(*values):
         raise TypeError(
             f"{name} cannot run under jax.jit, jax.vmap or jax.grad: it decides in Python by the "
@@ -46,7 +46,7 @@ def untraced(name: str, instead: str, *values: object) -> None:
 
 
 def on_host(x: Array) -> Any:
-    """`x` as a NumPy array, where it is concrete and on one device; else `x` itself."""
+    """`x` as a NumPy array if it is concrete and on one device; else `x` itself."""
     if is_concrete(x) and len(x.sharding.device_set) == 1:
         return np.asarray(x)
     return x
@@ -64,13 +64,11 @@ def value(
     error: type[Exception] = ValueError,
     throw: bool = True,
 ) -> Any:
-    """Return `x`, or fail where `bad` holds: `error` on concrete values, at run time under jit.
+    """Return `x`, or fail if `bad` holds anywhere, at run time under jit and else at once.
 
-    If not `throw`, `x` is NaN there.
-
-    `x` is an array or a PyTree of all arrays that would be wrong: under jit a check is dropped with
-    the value that carries it. With `on_host`, `bad` is known wherever it can be, also for constants
-    under jit.
+    Without `throw`, a failure makes `x` NaN. Pass as `x` all arrays that would be wrong, as one
+    array or a PyTree: under jit the check is dropped if the caller does not use `x`. Compute `bad`
+    with `on_host`, so that it is concrete whenever possible, also for constants under jit.
     """
     bad = bad.any()  # type: ignore[union-attr]
     if not throw:
@@ -83,10 +81,10 @@ def value(
 
 
 def warn(message: str) -> None:
-    """Issue a UserWarning that names the line of the caller outside of this library.
+    """Issue a UserWarning that names the caller's line outside this library.
 
-    Equinox puts frames of its own between methods, so that the level is no constant. From Python
-    3.12 on `skip_file_prefixes` of `warnings.warn` does this.
+    Equinox inserts frames between methods, so the stack level varies. From Python 3.12 on, replace
+    this by `skip_file_prefixes` of `warnings.warn`.
     """
     level, frame = 1, sys._getframe()
     while frame.f_back:
@@ -99,7 +97,7 @@ def warn(message: str) -> None:
 
 @contextmanager
 def traceable(name: str) -> Iterator[None]:
-    """A TypeError that says what to do, in place of JAX's own where `name` is traced inside."""
+    """Replace JAX's error about traced values inside `name` by a TypeError with a remedy."""
     try:
         yield
     except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
@@ -119,21 +117,21 @@ def count(number: Any, name: str, least: int = 1) -> int:
     return operator.index(number)
 
 
-def coordinates(given: Any, name: str) -> tuple[int, ...]:
+def coordinates(numbers: Any, name: str) -> tuple[int, ...]:
     """Coordinates of the state, as a tuple of distinct integers ≥ 0."""
     try:
-        found = tuple(operator.index(i) for i in np.atleast_1d(given))
+        indices = tuple(operator.index(i) for i in np.atleast_1d(numbers))
     except TypeError:
-        found = ()
-    if not found or min(found) < 0 or len(set(found)) < len(found):
+        indices = ()
+    if not indices or min(indices) < 0 or len(set(indices)) < len(indices):
         raise ValueError(
-            f"{name} must be distinct coordinates, integers >= 0 such as (2, 3); got {given!r}."
+            f"{name} must be distinct coordinates, integers >= 0 such as (2, 3); got {numbers!r}."
         )
-    return found
+    return indices
 
 
 def positive_number(number: Any, name: str) -> float:
-    """`number` as a Python float, positive and finite: one that is compiled in."""
+    """`number` as a positive, finite Python float, which is a constant of compiled programs."""
     try:
         converted = float(number)
     except (TypeError, ValueError):
@@ -171,7 +169,7 @@ def _floating(x: Any, name: str) -> Array:
 def doubles(x: Any, name: str) -> np.ndarray:
     """`x` as a NumPy array of doubles, NaN where it is masked or missing.
 
-    The caller's log is kept with all of its digits, whatever JAX is told of its precision.
+    The caller's log keeps all its digits, whatever the precision of JAX.
     """
     plain = _plain(x, name)  # arrays of JAX stay as they are, and are looked at here
     return _plain(np.asarray(plain), name).astype(float)
@@ -264,10 +262,10 @@ def single_or_double(dtype: Any, whose: str) -> None:
 def positive(x: Any, name: str, cure: str = "") -> Array:
     """`x` as a float array whose every entry is finite and larger than zero."""
     array = floating(x, name)
-    seen = on_host(array)
+    values = on_host(array)
     return value(
         array,
-        ~((seen > 0) & (seen < np.inf)),
+        ~((values > 0) & (values < np.inf)),
         lambda: (
             f"{name} must be positive and finite"
             + (f", got {array}." if is_concrete(array) else ".")
@@ -291,7 +289,7 @@ def ridge(x: ArrayLike, dtype: jnp.dtype) -> Float[Array, ""]:
 
 
 def finite(x: Array, name: str, cure: str = "") -> Array:
-    """`x`, in which every entry must be finite."""
+    """`x`; ValueError if an entry is not finite."""
 
     def message() -> str:
         if not is_concrete(x):
@@ -306,7 +304,7 @@ def finite(x: Array, name: str, cure: str = "") -> Array:
 
 
 def key(key: Any) -> Key[Array, ""]:
-    """One random key, of the newer kind also where one of the older, `jax.random.PRNGKey`, came."""
+    """One typed random key. A legacy key from `jax.random.PRNGKey` is converted."""
     if getattr(key, "dtype", None) == jnp.uint32 and jnp.ndim(key):
         key = jax.random.wrap_key_data(key)
     dtype = getattr(key, "dtype", None)
@@ -321,14 +319,14 @@ def key(key: Any) -> Key[Array, ""]:
 
 
 def one_dtype(X: Array, Z: Array) -> tuple[Array, Array]:
-    """Both in the wider of their dtypes, under strict promotion too."""
+    """Both arrays in the wider of their dtypes, also under strict promotion."""
     dtype = np.promote_types(X.dtype, Z.dtype)
     with eager(X, Z):
         return X.astype(dtype), Z.astype(dtype)
 
 
 def same_space(X: Array, Z: Array) -> tuple[Array, Array]:
-    """Both in one dtype, if they hold states of the same number of coordinates."""
+    """Both arrays in one dtype; ValueError if their numbers of coordinates differ."""
     if X.shape[1] != Z.shape[1]:
         raise ValueError(
             f"X has {X.shape[1]} coordinates and Z has {Z.shape[1]}: both must be states of one "
@@ -338,7 +336,7 @@ def same_space(X: Array, Z: Array) -> tuple[Array, Array]:
 
 
 def points(X: ArrayLike, name: str = "X") -> Float[Array, "N n"]:
-    """States as a float array of shape (N, n), N ≥ 1, whose values are not checked."""
+    """States as a float array of shape (N, n), N ≥ 1, without a check of the values."""
     array = floating(X, name)
     if 0 in array.shape:
         raise ValueError(
@@ -359,7 +357,7 @@ def points(X: ArrayLike, name: str = "X") -> Float[Array, "N n"]:
 
 
 def point(x: ArrayLike, n: int, name: str = "x") -> Float[Array, " n"]:
-    """One state of `n` coordinates; for many, the caller is pointed to `jax.vmap`."""
+    """One state of `n` coordinates; the error for several states points to `jax.vmap`."""
     array = floating(x, name)
     if array.shape != (n,):
         hint = " Use `jax.vmap(...)` for a batch of states." if array.ndim > 1 else ""
@@ -377,7 +375,7 @@ def data(
 ) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
     """States and velocities: two finite float arrays of one shape (N, n) and one dtype.
 
-    Data with fewer points than coordinates is warned of, unless it is a `part` of the data. The
+    Fewer points than coordinates raise a warning, unless the points are a `part` of the data. The
     error about NaN in Y ends with `cure`.
     """
     X, Y = points(X, "X"), points(Y, "Y")
@@ -400,18 +398,18 @@ def data(
 def measured(X: ArrayLike, Y: ArrayLike) -> tuple[Array, Array, np.ndarray | None]:
     """States, velocities with NaN where a component was not measured, and the measured indices.
 
-    The indices count the components of all points, and are None if all were measured. NaN is
-    refused under jit where Y is traced, since it is not known which components were measured.
+    The indices count the components of all points, and are None if all were measured. If Y is
+    traced, NaN is refused, since the measured components are then unknown.
     """
     X, Y = points(X, "X"), points(Y, "Y")
-    seen = on_host(Y)
+    values = on_host(Y)
     if not is_concrete(Y):
         cure = (
             " Where NaN means that a component was not measured, make hk.Velocities(X, Y) outside "
             "of jax.jit: inside, it is not known which they are."
         )
         return *data(X, Y, part=True, cure=cure), None
-    if not (seen != seen).any():
+    if not (values != values).any():
         return *data(X, Y, part=True), None
     if not Y.is_fully_addressable:
         raise ValueError(
@@ -429,7 +427,7 @@ def measured(X: ArrayLike, Y: ArrayLike) -> tuple[Array, Array, np.ndarray | Non
 
 
 def warn_of_float32(X: Array) -> None:
-    """Warn where X is in float32, with the accuracy to expect."""
+    """Warn if X is in float32, and name the accuracy to expect."""
     if X.dtype == jnp.float32:
         warn(
             "fitting in float32: expect three digits, and a failed factorisation for a ridge "
@@ -452,15 +450,15 @@ def times(ts: ArrayLike, least: int) -> Float[Array, " T"]:
 def elapsed(ts: Float[Array, " T"], dtype: Any) -> Float[Array, " T"]:
     """The times since the first one, which must increase, in the dtype of the states.
 
-    A field does not depend on time, so the first time may be taken off. The difference is taken in
-    the dtype of `ts`: late times in float64 keep their distances when the states are in float32.
+    A field does not depend on time, so we may subtract the first time. We subtract in the dtype of
+    `ts`: late times in float64 then keep their differences if the states are in float32.
     """
     ts = on_host(ts)
     since = jnp.asarray((ts - ts[0]).astype(dtype))
-    seen = on_host(since)
+    values = on_host(since)
     return value(
         since,
-        seen[1:] <= seen[:-1],
+        values[1:] <= values[:-1],
         f"ts, the argument after x0, must be strictly increasing in {dtype}, the dtype of x0: sort "
         "the times and drop repeated ones. To go back in time, "
         "hk.simulate(lambda x: -field(x), ...).",
@@ -468,18 +466,18 @@ def elapsed(ts: Float[Array, " T"], dtype: Any) -> Float[Array, " T"]:
 
 
 def velocity(field: Any, x: Float[Array, " n"], name: str = "field") -> jax.ShapeDtypeStruct:
-    """Shape and dtype of `field(x)`, which must be one velocity. Errors inside `field` pass on."""
+    """The shape and dtype of `field(x)`, one velocity; errors inside `field` propagate."""
     if not callable(field):
         hint = " Pass its .field." if hasattr(field, "field") else ""
         raise TypeError(
             f"{name} is a {type(field).__name__}; a callable x (n,) -> (n,) is needed.{hint}"
         )
-    other = other_arguments(field, x)
-    if other is not None:
+    other_names = other_arguments(field, x)
+    if other_names is not None:
         raise TypeError(
-            f"{name} takes ({other}); it is called with one argument, the state x of shape (n,). "
-            "Bind the others, as in `lambda x: f(0.0, x)` where time does not enter. A kernel "
-            "becomes a field by hk.fit."
+            f"{name} takes ({other_names}); it is called with one argument, the state x of shape "
+            "(n,). Bind the others, as in `lambda x: f(0.0, x)` where time does not enter. A "
+            "kernel becomes a field by hk.fit."
         )
     with traceable(name):
         out = eqx.filter_eval_shape(field, x)

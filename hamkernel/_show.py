@@ -12,7 +12,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-# What a terminal of ASCII, or of a code page of Windows, shows in the place of these.
+# # Replacements for terminals of ASCII and for code pages of Windows.
 _ASCII = str.maketrans(
     {
         "λ": "lambda",

@@ -22,7 +22,7 @@ from hamkernel._symplectic import AbstractSymplecticSolver, EqualSteps, step_cou
 
 Interpolation = Literal["held", "linear"]
 
-# The bound of a loop whose number of steps is not known beforehand: some seconds of a cheap field.
+# The bound of a loop with an unknown number of steps: some seconds for a cheap field.
 _MAX_STEPS = 2**20
 _RESULTS: Any = diffrax.RESULTS
 
@@ -50,9 +50,9 @@ def simulate(
     into the fewest equal steps of at most `dt` (to √ε of it), so that each saved state is the end
     of a step and none is interpolated. Symplectic solvers need this: they keep the energy error
     bounded because every step is the same map, and a step chosen from the state is a different map
-    each time. With equally spaced `ts` all steps are of one size; unequal spacing changes the size
-    (by at most dt divided by the spacing) from interval to interval, still independently of the
-    state.
+    each time. With equally spaced `ts` all steps have one size. With unequal spacing the size
+    changes from interval to interval (relatively by at most dt over the spacing), but never with
+    the state.
 
     Args:
         field: x (n,) ↦ ẋ (n,), a function or a PyTree such as a fitted field or a system.
@@ -66,9 +66,9 @@ def simulate(
             learned field at least its rounding at x0, ε ‖Σⱼ |K(x0, xⱼ) aⱼ|‖ / ‖f(x0)‖, and at most
             1e-6: with a tolerance below the rounding every step would be rejected.
         atol: absolute tolerance, likewise, in the units of x.
-        max_steps: the most steps of the whole solve, or between two saved times where `dt` is given
-            and it or `ts` is traced. If None, enough where the number is known, else 2²⁰. It bounds
-            the memory of gradients (as its square root).
+        max_steps: the largest number of steps of the solve, or between two saved times if `dt` is
+            given and `dt` or `ts` is traced. If None, the number of steps if it is known, else 2²⁰.
+            The memory of gradients grows with its square root.
         progress: show a progress bar (tqdm); with `dt` it moves at every saved time.
         adjoint: how Diffrax differentiates; None is its default, for reverse mode alone.
             For `jax.jvp` and `jax.jacfwd` pass `diffrax.ForwardMode()`, for `jax.hessian`
@@ -95,11 +95,11 @@ def simulate(
     with require.eager(x0):
         x0 = _initial_state(x0)
     with require.eager(ts):
-        given = require.times(ts, least=2)
-        ts = require.elapsed(given, x0.dtype)
+        caller_times = require.times(ts, least=2)
+        ts = require.elapsed(caller_times, x0.dtype)
     solver = diffrax.Dopri8() if solver is None else solver
     _check_solver(solver, dt, rtol, atol, inputs is not None)
-    rhs, start = _right_hand_side(field, inputs, ts, given[0], between, dt is not None)
+    rhs, start = _right_hand_side(field, inputs, ts, caller_times[0], between, dt is not None)
     at_start = rhs.field if inputs is None else _AtStart(rhs, start)
     _check_field(at_start, x0)
     if max_steps is not None:
@@ -116,7 +116,7 @@ def simulate(
     else:
         steps = _equal_steps(solver, ts, dt, adjoint, max_steps)
     solution = _integrate(rhs, steps, ts, x0, start, adjoint, progress)
-    solution, failed = _at_caller_times(solution, given.astype(x0.dtype))
+    solution, failed = _restore_times(solution, caller_times.astype(x0.dtype))
     if steps.counts is not None:  # Diffrax counted the intervals around the equal steps
         total = jnp.asarray(require.on_host(steps.counts).sum())
         stats = {**solution.stats, "num_steps": total, "num_accepted_steps": total}
@@ -143,7 +143,7 @@ def _initial_state(x0: ArrayLike) -> Float[Array, " n"]:
 
 
 class Samples(eqx.Module):
-    """u(t) from its values at times ts: the last one before t, or on the line between two."""
+    """The inputs u(t) from samples at times ts: the last sample before t, or interpolated."""
 
     ts: Float[Array, " T"]
     values: Float[Array, "T m"]
@@ -169,17 +169,17 @@ class OneInput(eqx.Module):
 
 
 class RightHandSide(eqx.Module):
-    """The field as Diffrax calls it, f(t, x, args); with inputs `args` is the time at t = 0."""
+    """The field f(t, x, args) as Diffrax calls it; with inputs, `args` is the time at t = 0."""
 
     field: Any  # x -> velocity; or x, u -> velocity
     inputs: Callable[[Array], Any] | None
-    # Whether u is held at its value at t = 0 over a whole step; the last stage would otherwise see
-    # the next sample.
+    # Whether u keeps its value at t = 0 over a whole step; otherwise the last stage of a step
+    # would use the next sample.
     held: bool = eqx.field(static=True)
 
     @property
     def is_separable(self) -> bool:
-        """Whether H = T(p) + U(q), as the field says of itself."""
+        """Whether H = T(p) + U(q), according to the field."""
         return self.inputs is None and bool(getattr(self.field, "is_separable", False))
 
     def __call__(self, t: Any, x: Float[Array, " n"], args: Any) -> Float[Array, " n"]:
@@ -211,8 +211,9 @@ def _right_hand_side(
     constant_steps: bool,
 ) -> tuple[RightHandSide, Float[Array, ""] | None]:
     """The field with its inputs, and the time of the inputs at ts[0] = 0, for `args`."""
-    # The function inside of `jax.jit` may have attributes such as `is_separable`, and the loop is
-    # compiled anyway. Other functions with `__wrapped__`, by functools.wraps, are another field.
+    # The function inside `jax.jit` may have attributes such as `is_separable`, and the loop is
+    # compiled anyway. We do not unwrap `functools.wraps`, since its function may be a different
+    # field.
     while isinstance(field, (jax.stages.Wrapped, _FilterJit)):
         field = field.__wrapped__
     if getattr(field, "refusal", ""):
@@ -227,12 +228,12 @@ def _right_hand_side(
                 f"function t -> (m,) or samples (T, m) at ts. {alone}"
             )
         return RightHandSide(field, None, held=False), None
-    others = require.other_arguments(field, ts, ts)
-    if others is not None:
+    other_names = require.other_arguments(field, ts, ts)
+    if other_names is not None:
         raise TypeError(
-            f"field takes ({others}); with inputs it is called with two arguments, the state x and "
-            "its inputs u: a field of a Controlled kernel, hk.systems.Driven(system, G), or a "
-            "function of yours. To simulate it without inputs, leave them out."
+            f"field takes ({other_names}); with inputs it is called with two arguments, the state "
+            "x and its inputs u: a field of a Controlled kernel, hk.systems.Driven(system, G), or "
+            "a function of yours. To simulate it without inputs, leave them out."
         )
     # Functions are called with the caller's time; the times of samples count from the start.
     start = first.astype(ts.dtype) if callable(inputs) else jnp.zeros((), ts.dtype)
@@ -240,28 +241,28 @@ def _right_hand_side(
     return RightHandSide(field, _inputs(inputs, ts, between), held), start
 
 
-def _inputs(given: Any, ts: Float[Array, " T"], between: Interpolation) -> Callable[[Array], Any]:
+def _inputs(inputs: Any, ts: Float[Array, " T"], between: Interpolation) -> Callable[[Array], Any]:
     """The inputs u as a function of the time; samples are at the times ts."""
     if between not in ("held", "linear"):
         raise ValueError(f"between must be 'held' or 'linear'; got {between!r}.")
-    if callable(given):
-        others = require.other_arguments(given, ts[0])
-        if others is not None:
+    if callable(inputs):
+        other_names = require.other_arguments(inputs, ts[0])
+        if other_names is not None:
             raise TypeError(
-                f"inputs takes ({others}); it is called with one argument, the time. Feedback "
+                f"inputs takes ({other_names}); it is called with one argument, the time. Feedback "
                 "closes the loop instead: hk.simulate(lambda x: field(x, law(x)), x0, ts)."
             )
-        out = jax.eval_shape(given, jax.ShapeDtypeStruct((), ts.dtype))
+        out = jax.eval_shape(inputs, jax.ShapeDtypeStruct((), ts.dtype))
         shape = getattr(out, "shape", type(out).__name__)
         if shape == ():
-            return OneInput(as_pytree(given))
+            return OneInput(as_pytree(inputs))
         if not isinstance(shape, tuple) or len(shape) != 1:
             raise ValueError(
                 f"inputs(t) returns shape {shape}; one vector u of shape (m,) is needed, such as "
                 "jnp.array([jnp.sin(t)])."
             )
-        return as_pytree(given)
-    values = require.floating(given, "inputs")
+        return as_pytree(inputs)
+    values = require.floating(inputs, "inputs")
     values = values[:, None] if values.shape == ts.shape else values
     if values.ndim != 2 or len(values) != len(ts):
         hint = " A constant input is lambda t: jnp.array([…])." if values.ndim < 2 else ""
@@ -285,7 +286,7 @@ def _check_field(field: Callable[[Array], Array], x0: Float[Array, " n"]) -> Non
 
 
 class _Steps(NamedTuple):
-    """The steps as Diffrax takes them, and their number in each interval where it is known."""
+    """The steps in Diffrax's terms, and their number in each interval if it is known."""
 
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController
@@ -302,22 +303,22 @@ def _adaptive_steps(
     jumps: bool,
 ) -> _Steps:
     """Steps of these tolerances, rtol and atol; with `jumps` the field jumps at the saved times."""
-    # Steps end on ts: the interpolant of Dopri8 is of lower order, and was measured to break
-    # the conservation of energy by 1e-7 where the steps themselves keep it to 1e-10.
+    # Steps end on ts. The interpolant of Dopri8 has a lower order: it broke the conservation of
+    # energy by 1e-7, and the steps themselves by 1e-10.
     controller = diffrax.ClipStepSizeController(
         diffrax.PIDController(*tolerances),
         step_ts=ts,
-        # No step may have a stage on the other side of a jump.
+        # No step may have stages on both sides of a jump.
         jump_ts=ts[1:-1] if jumps else None,
     )
-    most = _MAX_STEPS + ts.size if max_steps is None else max_steps
-    return _Steps(solver, controller, diffrax.SaveAt(ts=ts), most)
+    limit = _MAX_STEPS + ts.size if max_steps is None else max_steps
+    return _Steps(solver, controller, diffrax.SaveAt(ts=ts), limit)
 
 
 def _tolerances(
     rhs: RightHandSide, start: Any, x0: Float[Array, " n"], rtol: Any, atol: Any
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The relative and the absolute tolerance, by default no less than the field rounds."""
+    """The relative and the absolute tolerance; the defaults are not below the rounding of f."""
     default = jnp.asarray(1e-10 if x0.dtype == jnp.float64 else 1e-5, x0.dtype)
     if rtol is None or atol is None:
         learned, point = rhs.field, x0
@@ -325,15 +326,16 @@ def _tolerances(
             learned, point = learned.whole, learned.joined(x0, rhs.inputs(start))
         if isinstance(learned, KernelField):
             Z, A = learned.points, learned.coefficients
-            # At an equilibrium f is zero and has no digits at all; with 1e-6 states have a few.
+            # At an equilibrium f is zero and has no digits; the limit 1e-6 still gives states a
+            # few digits.
             share = field_rounding(learned.kernel, point, Z, A, learned(point), 1e-6)
             default = jnp.maximum(default, share)
 
-    def tolerance(name: str, given: Any) -> Float[Array, ""]:
-        if given is None:
+    def tolerance(name: str, value: Any) -> Float[Array, ""]:
+        if value is None:
             return default
-        with require.eager(given):  # as an array: every new Python number would compile anew
-            return require.positive_scalar(given, name).astype(default.dtype)
+        with require.eager(value):  # as an array: every new Python number would compile anew
+            return require.positive_scalar(value, name).astype(default.dtype)
 
     return tolerance("rtol", rtol), tolerance("atol", atol)
 
@@ -357,28 +359,28 @@ def _equal_steps(
 
 
 def _bound(counts: Int[Array, " intervals"], max_steps: int | None) -> int:
-    """A number of steps that no save interval exceeds, where the counts are known."""
+    """A bound of the number of steps in a save interval; a default if the counts are traced."""
     if not require.is_concrete(counts):
         return max_steps or _MAX_STEPS
-    each = np.asarray(counts)
-    most = int(each.max())
-    if most >= np.iinfo(np.int32).max:
+    numbers = np.asarray(counts)
+    largest = int(numbers.max())
+    if largest >= np.iinfo(np.int32).max:
         raise ValueError(
             "dt is so small that more than two thousand million steps lie between two of ts: "
             "take a larger dt, in the unit of time of ts."
         )
     if max_steps is None:  # A power of two: neighbouring values of dt share one compiled loop.
-        return 2 ** (most - 1).bit_length()
-    if each.sum() > max_steps:
+        return 2 ** (largest - 1).bit_length()
+    if numbers.sum() > max_steps:
         raise ValueError(
-            f"dt cuts ts into {each.sum()} steps, more than max_steps={max_steps}: take a larger "
-            "dt, or leave max_steps None."
+            f"dt cuts ts into {numbers.sum()} steps, more than max_steps={max_steps}: take a "
+            "larger dt, or leave max_steps None."
         )
     return max_steps
 
 
 def _check_solver(solver: Any, dt: Any, rtol: Any, atol: Any, has_inputs: bool) -> None:
-    """ValueError or TypeError for an object that is no solver, and for options it cannot use."""
+    """ValueError or TypeError for an object that is no solver, or options it cannot use."""
     name = solver.__name__ if isinstance(solver, type) else type(solver).__name__
     symplectic = isinstance(solver, AbstractSymplecticSolver)
     if isinstance(solver, type) or not isinstance(solver, diffrax.AbstractSolver):
@@ -422,7 +424,7 @@ def _integrate(
     adjoint: diffrax.AbstractAdjoint,
     progress: bool,
 ) -> diffrax.Solution:
-    """The solution, whether it reached its end or not."""
+    """The solution, complete or not."""
     try:
         return diffrax.diffeqsolve(
             diffrax.ODETerm(rhs),
@@ -450,11 +452,11 @@ def _integrate(
 
 
 @compiled
-def _at_caller_times(solution: Any, ts: Float[Array, " T"]) -> tuple[Any, Bool[Array, ""]]:
+def _restore_times(solution: Any, ts: Float[Array, " T"]) -> tuple[Any, Bool[Array, ""]]:
     """The solution at the caller's times, and whether it failed.
 
     Times that the solve did not reach stay infinite. A state that is not finite is a failure:
-    adaptive steps reject such states, constant ones go through them.
+    adaptive steps reject such states, and constant steps continue with them.
     """
     reached_end = solution.result == _RESULTS.successful
     overflowed = reached_end & ~jnp.isfinite(solution.ys).all()
@@ -466,7 +468,7 @@ def _at_caller_times(solution: Any, ts: Float[Array, " T"]) -> tuple[Any, Bool[A
 
 
 def _reason_of_failure(solution: Any, field: Any, x0: Float[Array, " n"], adapts: bool) -> str:
-    """Why a solve failed, and what to do."""
+    """The reason for the failure of a solve, and a remedy."""
     reason = (
         "Too many steps, a step whose equations could not be solved, or a state that "
         "overflowed or became NaN."

@@ -1,9 +1,10 @@
 """Symplectic integrators as Diffrax solvers, and steps of one size between saved times.
 
-A one-step map x₁ = Ψ_h(x₀) is symplectic if (∂Ψ)ᵀ J ∂Ψ = J. Then, but for terms exponentially small
-in 1/h, it follows the flow of a nearby Hamiltonian H + O(hᵖ): the error in H stays bounded instead
-of growing (HLW, IX.8). That holds for one fixed map, so for a CONSTANT step: a step chosen from
-the state makes a different map at every state, and the property is gone (HLW, VIII.1).
+A one-step map x₁ = Ψ_h(x₀) is symplectic if (∂Ψ)ᵀ J ∂Ψ = J. Up to terms exponentially small in 1/h,
+such a map follows the flow of a nearby Hamiltonian H + O(hᵖ), so the error in H stays bounded
+instead of growing (HLW, IX.8). This holds for one fixed map, and therefore for a CONSTANT step. A
+step chosen from the state makes a different map at every state, and destroys the property (HLW,
+VIII.1).
 
 Two families, both with x = (q, p) in one array of shape (n,):
 
@@ -100,15 +101,17 @@ class AbstractSymplecticSolver(diffrax.AbstractSolver):
 class FixedPointToRounding(optx.AbstractFixedPointSolver):
     """Iterate y ← f(y) until the increments are rounding errors.
 
-    Stops when the increment is at most `rtol · max|y| + atol`, by default zero; or when it is below
-    √eps · max|y| without a new minimum for three iterations, where the rounding of f ends the
-    descent. That of a kernel sum with coefficients of 1e11, as of noise-free data, ends it earlier:
-    below ∛eps · max|y| nine such iterations suffice, and so they do below `options["rounding"]`,
-    since at an equilibrium f is nothing but rounding and no part of max|y| is small.
+    The iteration stops in one of three cases. The increment is at most `rtol · max|y| + atol`, by
+    default zero. Or it is below √eps · max|y| and has had no new minimum for three iterations: the
+    rounding of f has ended the descent. Or it is below ∛eps · max|y|, or below
+    `options["rounding"]`, and has had no new minimum for nine iterations. The first of these two
+    bounds serves kernel sums with coefficients of 1e11, as from noise-free data, which round
+    earlier; the second serves equilibria, where f consists of rounding errors alone.
 
-    Any tolerance, even eps, leaves an error of one sign in every step, and H drifts: in 3e6 steps
-    the midpoint rule changed an oscillator's energy by 1.6e-11 with eps and by less than 1e-12 with
-    zero, in the same time. For small steps of a non-stiff field it is cheaper than Newton.
+    Any tolerance, even eps, leaves an error of one sign in every step, and H drifts. In 3e6 steps
+    of the midpoint rule the energy of an oscillator changed by 1.6e-11 with a tolerance of eps and
+    by less than 1e-12 with zero, in the same time. For small steps of a non-stiff field the
+    iteration is cheaper than Newton's method.
 
     Source: HLW, VIII.6; Hairer, McLachlan & Razakarivony (2008), BIT 48, 231-243.
     """
@@ -117,7 +120,7 @@ class FixedPointToRounding(optx.AbstractFixedPointSolver):
     atol: float = 0.0
     norm: Callable[[Any], Scalar] = optx.max_norm
 
-    # Increments of an oscillation shrink every second iteration only, hence more than two.
+    # The increments of an oscillation shrink only every second iteration, so two are not enough.
     patience: ClassVar[int] = 3
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
@@ -143,11 +146,11 @@ class FixedPointToRounding(optx.AbstractFixedPointSolver):
         enough = jnp.maximum(eps ** (1 / 3) * size, options.get("rounding", 0.0))
         stalled |= (since >= 3 * self.patience) & (increment <= enough)
         # The increment is infinite before the first iteration, and NaN once the field overflows.
-        lost = jnp.isnan(increment)
+        is_nan = jnp.isnan(increment)
         result = optx.RESULTS.where(
-            lost, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
+            is_nan, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
         )
-        return done | stalled | lost, result
+        return done | stalled | is_nan, result
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
         """Return the last iterate as it is."""
@@ -188,9 +191,10 @@ class AbstractGauss(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
     symmetric, Ψ_h⁻¹ = Ψ_{−h}, because the nodes are (V.2). The state carried between steps is the
     last slopes, from which the next are guessed.
 
-    Rounded coefficients break that equation, and H drifts by a part of eps in every step. So what
-    is rounded is m_ij = a_ij/b_j, in increments l_i = h b_i k_i and stages x + Σ_j m_ij l_j: then
-    the equation is m_ij + m_ji = 1, which holds exactly in floating point, and no b breaks it.
+    Rounded coefficients violate the equation b_i a_ij + b_j a_ji = b_i b_j, and H drifts by a part
+    of eps in every step. We therefore round m_ij = a_ij/b_j instead, with increments l_i = h b_i
+    k_i and stages x + Σ_j m_ij l_j. The equation becomes m_ij + m_ji = 1, which holds exactly in
+    floating point for any rounding of b.
 
     Source: HLW; the increments are those of Antoñana, Makazaga & Murua (2017), Numer. Algorithms
         76, 861-880.
@@ -215,7 +219,7 @@ class AbstractGauss(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
         weights = step.h * tableau.b
         # One of each pair is in [1/2, 2], where 1 − m is exact in every precision.
         share = jnp.where(tableau.share < 0.5, 1 - tableau.share.T, tableau.share)
-        # Increments that move the state by less than √eps of it, and do not shrink, are rounding.
+        # Increments below √eps of the state that do not shrink are rounding errors.
         rounding = float(jnp.finfo(step.y0.dtype).eps) ** 0.5 * jnp.abs(step.y0 / step.h).max()
         solution = optx.fixed_point(
             _stage_slopes,
@@ -235,7 +239,7 @@ def _stage_slopes(
     k: Float[Array, "s n"],
     inputs: tuple[Step, Float[Array, " s"], Float[Array, "s s"], Float[Array, " s"]],
 ) -> Float[Array, "s n"]:
-    """The map whose fixed point are the slopes k of the stages."""
+    """The map with the slopes k of the stages as its fixed point."""
     step, times, share, weights = inputs
     return jax.vmap(step.field)(times, step.y0[None] + share @ (weights[:, None] * k))
 
@@ -299,7 +303,7 @@ class GaussLegendre6(AbstractGauss):
 
 
 def is_separable(terms: Any) -> bool:
-    """Whether the field under a Diffrax term says of itself that H = T(p) + U(q)."""
+    """Whether the field of a Diffrax term claims that H = T(p) + U(q)."""
     while not hasattr(terms, "vector_field") and hasattr(terms, "term"):
         terms = terms.term  # Diffrax wraps the user's term to set the direction of time.
     return bool(getattr(getattr(terms, "vector_field", None), "is_separable", False))
@@ -312,10 +316,10 @@ class AbstractSplitting(AbstractSymplecticSolver):
 
         p½ = p + h/2 f_p(q),   q₁ = q + h f_q(p½),   p₁ = p½ + h/2 f_p(q₁)
 
-    For any other field this is not symplectic, nor even consistent with order 2, and nothing in its
-    output shows it. So the field must have an attribute `is_separable` that is True, or the caller
-    must say so by `assume_separable=True`. f is evaluated whole, twice in every substep; the state
-    carried between steps is f_p(q₁), with which the next step begins.
+    For any other field this map is not symplectic, not even of order 2, and its output does not
+    show that. The field must therefore have an attribute `is_separable` that is True, or the caller
+    must pass `assume_separable=True`. f is evaluated twice in every substep. The state carried
+    between steps is f_p(q₁), with which the next step begins.
     """
 
     weights: AbstractClassVar[tuple[float, ...]]
@@ -406,10 +410,10 @@ class Yoshida4(AbstractSplitting):
 class EqualSteps(diffrax.AbstractSolver):
     """One long step made of ⌈(t1 − t0)/dt⌉ equal steps of another solver.
 
-    With `diffrax.StepTo(ts)` every time in `ts` is the end of a step: nothing is interpolated, and
-    memory is that of the saved points. The steps between two times have one size, at most `dt`,
-    whatever the state. Each long step starts at time 0, so that a small step is not lost in the
-    rounding of a large time; the `args` of a field with inputs are that time.
+    With `diffrax.StepTo(ts)` every time in `ts` is the end of a step, so nothing is interpolated,
+    and only the saved points take memory. The steps between two times have one size, at most `dt`,
+    independent of the state. Each long step starts at time 0, so that a small step does not vanish
+    in the rounding of a large time; `args` holds the true start time for fields with inputs.
     """
 
     solver: diffrax.AbstractSolver
@@ -449,7 +453,7 @@ class EqualSteps(diffrax.AbstractSolver):
             max_steps=self.max_steps,
             throw=False,
         )
-        # Infinite where the steps did not reach t1, as what Diffrax itself has not reached.
+        # Infinite if the steps did not reach t1, as in Diffrax.
         reached = solution.result == diffrax.RESULTS.successful
         y1 = jax.tree.map(lambda y: jnp.where(reached, y[-1], jnp.inf), solution.ys)
         return y1, None, {"y0": y0, "y1": y1}, None, solution.result
@@ -464,7 +468,7 @@ def step_counts(ts: Float[Array, " T"], dt: Float[Array, ""]) -> Int[Array, " T-
 def equal_steps(span: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:
     """The number of equal steps of at most `dt` that fill `span`: whole, at least 1.
 
-    With √eps of slack: a span of 10 dt that rounding made longer is 10 steps and not 11.
+    The slack is √eps, so that a span of 10 dt plus rounding errors takes 10 steps and not 11.
     """
     slack = 1 - float(jnp.finfo(span.dtype).eps) ** 0.5
     return jnp.maximum(jnp.ceil(span / jnp.asarray(dt, span.dtype) * slack), 1)

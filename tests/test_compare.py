@@ -16,7 +16,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._discovery.compare import Candidate, Comparison, _answered, _is_seen, claims
+from hamkernel._discovery.compare import Candidate, Comparison, _answer, _is_seen, claims
 from hamkernel._discovery.ladder import ladder
 
 RNG = np.random.default_rng(0)
@@ -126,7 +126,7 @@ def rows(*scores):
 
 
 def answers(*scores, points=X):
-    return _answered(rows(*scores), points, 48).answers
+    return _answer(rows(*scores), points, 48).answers
 
 
 ENERGY, FRICTION, BACK = {"energy"}, {"energy", "friction"}, {"energy", "reversible"}
@@ -198,7 +198,7 @@ def test_what_cannot_be_compared_is_refused(call, error, match):
 
 def test_a_comparison_is_a_plain_record():
     assert dataclasses.is_dataclass(Comparison)
-    assert math.isnan(_answered(rows((ENERGY, 0, 0), (set(), 0, 0)), X, 48).differences["friction"])
+    assert math.isnan(_answer(rows((ENERGY, 0, 0), (set(), 0, 0)), X, 48).differences["friction"])
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hamkernel as hk
-from hamkernel._discovery.readout import _selected
+from hamkernel._discovery.readout import _select
 
 TERMS = {
     "p**2": lambda x: x[1] ** 2,
@@ -123,7 +123,7 @@ def test_the_best_subset_is_that_of_a_loop_over_numpy_least_squares():
 
     every = [list(s) for k in (1, 2, 3) for s in itertools.combinations(range(6), k)]
     scores = np.array([score(s) for s in every])
-    found = _selected(Phi, y, 3)
+    found = _select(Phi, y, 3)
     assert list(found.subset) == every[int(scores.argmin())]
     weights = np.exp(-0.5 * (scores - scores.min()))
     np.testing.assert_allclose(found.probability, 1 / weights.sum(), rtol=1e-8)
@@ -148,7 +148,7 @@ def test_nearly_dependent_terms_cost_no_more_digits_than_their_condition(apart):
     Phi = rng.normal(size=(40, 3))
     Phi[:, 1] = Phi[:, 0] + apart * Phi[:, 1]
     y = Phi @ [1.0, 2.0, 3.0]
-    found = _selected(Phi, y, 3)
+    found = _select(Phi, y, 3)
     assert found.subset == (0, 1, 2)
     # The normal equations would lose twice as many digits: all of them at 1e-9.
     np.testing.assert_allclose(found.coefficients, [1.0, 2.0, 3.0], rtol=1e-14 / apart)
@@ -292,7 +292,7 @@ def test_what_has_no_measurements_no_potential_or_too_many_subsets_is_refused():
     with pytest.raises(TypeError, match="of one system and this is a family"):
         hk.readout(family, TERMS)
     with pytest.raises(ValueError, match="all are compared: give fewer terms"):
-        _selected(np.random.default_rng(0).normal(size=(90, 57)), np.ones(90), 6)
+        _select(np.random.default_rng(0).normal(size=(90, 57)), np.ones(90), 6)
 
 
 @pytest.mark.slow

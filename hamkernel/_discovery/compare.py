@@ -5,10 +5,11 @@ trained numbers and D rows its score is
 
     log p(rows) − ½ P log D,
 
-the evidence with the price of its hyperparameters (Schwarz 1978). A question is answered by the
-best candidate for which the answer is yes against the best for which it is no; so the ladder has
-the products of its steps, or the lack of one would speak against another. Friction is judged
-against the candidate that lacks nothing else.
+the evidence with the price of its hyperparameters (Schwarz 1978). The answer to a question compares
+the best candidate with the answer yes and the best candidate with the answer no. The ladder
+therefore contains every combination of its steps. Otherwise a candidate could lose one question
+because it lacks the answer to another. A candidate with friction is compared with the candidate
+that lacks only the friction.
 """
 
 import dataclasses
@@ -36,8 +37,8 @@ from hamkernel._tuning.space import RIDGE, SearchSpace, named_values, velocity_r
 from hamkernel._tuning.tune import SEARCH_COPIES, check_finite_loss, decode, warn_of_constants
 from hamkernel._validation import check_memory
 
-# A factor of e⁵ = 148 in the evidence. Of the confident answers none was wrong in the prototype at
-# 5, up to .05 at 3; see `tests/benchmarks/comparison.py`.
+# # A factor of e⁵ = 148 in the evidence. In the prototype no confident answer was wrong at 5, and
+# up to 5 % at 3; see `tests/benchmarks/comparison.py`.
 THRESHOLD = 5.0
 
 QUESTIONS = {
@@ -123,19 +124,19 @@ def compare(
     """Compare structures by their evidence, and answer which physics the data obey.
 
     Is there an energy, in the coordinates (q, p) of the states? Friction? Is the field odd,
-    f(−x) = f(x) with the sign changed? Does motion run backwards, H(q, −p) = H(q, p)? Is
-    H = T(p) + U(q)? Each answer is "yes" or "no" where the scores differ by more than 5, a factor
-    of 148 in the evidence, else "undecided"; "not tested" where the data cannot say:
+    f(−x) = −f(x)? Is the motion reversible, H(q, −p) = H(q, p)? Is H = T(p) + U(q)? An answer is
+    "yes" or "no" if the scores differ by more than 5, a factor of 148 in the evidence, else
+    "undecided". It is "not tested" if the data cannot decide:
 
-    - A symmetry, where less than a tenth of the points have another one within a standard
-      deviation of their image: nothing is known there.
-    - Friction, reversibility and T + U, where there is no energy; reversibility is that of the
-      motion without friction, and with friction the answer is no.
+    - A symmetry, if less than a tenth of the points have another point within a standard deviation
+      of their image.
+    - Friction, reversibility and T + U, if there is no energy. Reversibility concerns the motion
+      without friction; with friction the answer is no.
 
-    "No" to friction also says that its best value is within one deviation of zero: none was seen.
+    The answer to friction is also "no" if the best friction is within one deviation of zero.
 
-    From noisy runs do not smooth velocities for this: with them a third of the confident answers
-    was wrong. Learn once, with the weakest kernel, and compare on what the runs say:
+    Do not smooth noisy runs to velocities for this: a third of the confident answers was then
+    wrong. Learn once, with the weakest kernel, and compare on the result:
 
         hk.compare(hk.learn(hk.Separable(k), runs))
 
@@ -145,10 +146,10 @@ def compare(
         X: states, shape (N, n); observations, and then there is no Y; or what `learn` returned.
         Y: velocities, shape (N, n).
         candidates: kernels by name, in place of the ladder of all structures and symmetries with
-            Gaussian kernels. What they claim is found from their structure.
+            Gaussian kernels. Their claims follow from their structure.
         starts: the number of starts of each search, see `tune`. With two, one of 20 data sets of
-            runs got a wrong answer: half of its searches had ended at lengthscales shorter than the
-            steps between samples, where nothing is noise.
+            runs got a wrong answer: half of its searches ended at lengthscales below the sampling
+            interval, where the kernel fits the noise.
         progress: show a progress bar where the standard error is a terminal.
 
     Returns:
@@ -173,34 +174,34 @@ def compare(
     steps = ladder(n) if candidates is None else {}
     searched: dict[str, AbstractMatrixKernel] = {k: s.rung(scale, speed) for k, s in steps.items()}
     if candidates is not None:
-        searched = _checked_candidates(candidates, n, points)
+        searched = _check_candidates(candidates, n, points)
     check_memory(rows, SEARCH_COPIES)
     ridge = jnp.asarray(1e-4 * speed**2 if ridge is None else ridge, rows.targets.dtype)
-    found = []
+    candidate_rows = []
     for name, K in tqdm(searched.items(), "candidates", disable=None if progress else True):
-        K, regularization, likelihood = _most_likely(K, rows, ridge, starts)
+        K, regularization, likelihood = _maximise_evidence(K, rows, ridge, starts)
         K = steps[name].kernel(K) if isinstance(K, Rung) else K
         values = named_values(K, points) | {RIDGE: regularization}
         P = sum(np.size(value) for value in values.values())
         score = likelihood - P / 2 * math.log(D)
         claimed = steps[name].claims if name in steps else claims(K, scale)
         tuned = (K, regularization, values)
-        found.append(Candidate(name, claimed, score, 0.0, likelihood, P, *tuned))
-    top = max(row.score for row in found)
-    table = [row._replace(difference=row.score - top) for row in found]
-    return _answered(tuple(sorted(table, key=lambda row: -row.score)), points, D)
+        candidate_rows.append(Candidate(name, claimed, score, 0.0, likelihood, P, *tuned))
+    top = max(row.score for row in candidate_rows)
+    table = [row._replace(difference=row.score - top) for row in candidate_rows]
+    return _answer(tuple(sorted(table, key=lambda row: -row.score)), points, D)
 
 
 @one_blas_thread
-def _most_likely(
+def _maximise_evidence(
     K: AbstractMatrixKernel, rows: Measurements, ridge: Float[Array, ""], starts: int
 ) -> tuple[AbstractMatrixKernel, Float[Array, ""], float]:
     """The kernel and λ of the highest marginal likelihood, and log p there."""
     rms = velocity_rms(K, rows)
     space = SearchSpace(K, rows.points, rms, ridge, (), {})
     criterion = criterion_of("marginal_likelihood", rows.count, 2)
-    # A search like that of `tune`, with 32 points to start from in place of up to 256: the first
-    # point suits data of this size.
+    # # The search of `tune`, with a design of 32 points instead of up to 256, since the first point
+    # already has the size of the data.
     search = Search(
         space,
         criterion,
@@ -219,7 +220,7 @@ def _most_likely(
 
 
 def _data(X: Any, Y: Any) -> tuple[AbstractObservations, Any]:
-    """The observations, and their λ where `learn` has found it."""
+    """The observations, and λ if `learn` has found it."""
     if not isinstance(X, Learned):
         return observations(X, Y), None
     if Y is not None:
@@ -244,10 +245,10 @@ def _data(X: Any, Y: Any) -> tuple[AbstractObservations, Any]:
     return X.observations, X.regularization
 
 
-def _checked_candidates(
+def _check_candidates(
     candidates: Any, n: int, points: Float[np.ndarray, "P n"]
 ) -> dict[str, AbstractMatrixKernel]:
-    """The candidates of the caller, which can hold for these states."""
+    """The caller's candidates; ValueError if one cannot hold for these states."""
     if not isinstance(candidates, Mapping) or len(candidates) < 2:
         raise ValueError(
             'candidates must be at least two kernels by name, {"H": hk.Symplectic(k), '
@@ -285,28 +286,28 @@ def claims(K: AbstractMatrixKernel, scale: Float[np.ndarray, " n"]) -> frozenset
         wrong = jnp.linalg.norm(K(S * x, z) - character * S[:, None] * block)
         return bool(wrong < 1e-4 * jnp.linalg.norm(block))  # rounding, in single precision too
 
-    found = set()
+    answers = set()
     if is_unchanged(-np.ones(n), 1.0):
-        found.add("mirror")
+        answers.add("mirror")
     if n % 2 or not K.has_hamiltonian:
-        return frozenset(found)
-    found.add("energy")
+        return frozenset(answers)
+    answers.add("energy")
     if not K.conserves:
-        found.add("friction")
+        answers.add("friction")
     elif is_unchanged(_reversal(n), -1.0):
-        found.add("reversible")
+        answers.add("reversible")
     q, p = frozenset(range(m)), frozenset(range(m, n))
     if all(part <= q or part <= p for k in K.scalar_kernels for part in k.supports(n)):
-        found.add("T + U")
-    return frozenset(found)
+        answers.add("T + U")
+    return frozenset(answers)
 
 
 def _reversal(n: int) -> Float[np.ndarray, " n"]:
     return np.repeat([1.0, -1.0], n // 2)
 
 
-def _answered(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D: int) -> Comparison:
-    """The answers that the table gives."""
+def _answer(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D: int) -> Comparison:
+    """The answers to all questions, from the table of candidates."""
     n = points.shape[1]
     answers, reasons, differences = {}, {}, {}
 
@@ -342,7 +343,7 @@ def _answered(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D:
     if answers["energy"] != "yes":
         for key in ("friction", "reversible", "T + U"):
             say(key, "not tested", "it asks about an energy, and none was established")
-        return Comparison(table, _in_order(answers), reasons, differences, D)
+        return Comparison(table, _sort_answers(answers), reasons, differences, D)
     having = [row for row in table if "energy" in row.claims]
     ask("friction", having)
     ask("T + U", having)
@@ -352,14 +353,14 @@ def _answered(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D:
         ask("reversible", [row for row in having if "friction" not in row.claims])
     else:
         say("reversible", "not tested", "no data near those of backward motion")
-    return Comparison(table, _in_order(answers), reasons, differences, D)
+    return Comparison(table, _sort_answers(answers), reasons, differences, D)
 
 
 def _without_friction(damped: Candidate, among: list[Candidate]) -> Candidate | None:
-    """The candidate that lacks nothing but the friction; None if there is none.
+    """The candidate that lacks only the friction; None if there is none.
 
-    There are none that have friction and an H that is even in p, since their motion is not
-    reversible: one without friction may be better for that reason alone.
+    No candidate has friction and an H that is even in p. A candidate without friction may thus be
+    better for its reversibility alone, so we compare with the one that claims least.
     """
     same = [row for row in among if row.claims - {"reversible"} == damped.claims - {"friction"}]
     return min(same, key=lambda row: len(row.claims), default=None)
@@ -369,7 +370,7 @@ def _score(row: Candidate) -> float:
     return row.score
 
 
-def _in_order(answers: dict[str, str]) -> dict[str, str]:
+def _sort_answers(answers: dict[str, str]) -> dict[str, str]:
     return {key: answers[key] for key in QUESTIONS}
 
 

@@ -24,19 +24,19 @@ from hamkernel._structures.structure import AbstractPotentialKernel
 class Formula(eqx.Module):
     """u(x) = Σ θ_k φ_k(x), the potential as a formula; made by `readout`.
 
-    It is a field: `formula(x)` is the velocity B∇u of one state, so `hk.simulate(formula, x0, ts)`
-    follows it, and `formula.potential(x)`, of structures with an energy `formula.hamiltonian(x)`,
-    is u. A PyTree.
+    A formula is a field: `formula(x)` is the velocity B∇u at one state, so `hk.simulate(formula,
+    x0, ts)` works. `formula.potential(x)` is u, and so is `formula.hamiltonian(x)` for structures
+    with an energy. A PyTree.
 
     Attributes:
         terms: the names of the functions that were selected, in the order of the dictionary.
         coefficients: θ, shape (k,).
-        deviations: the standard deviations of θ, shape (k,). They count the noise and the selection
-            of the terms; the hyperparameters of the kernel, such as friction, are plugged in.
+        deviations: the standard deviations of θ, shape (k,). They include the noise and the
+            selection of the terms; hyperparameters of the kernel, such as friction, count as known.
         misfit: the root mean square of the residuals over the standard deviation √(Nλ) of the noise
             that the fit assumed, shape (): about one where the formula explains the data as well as
             the kernel does, larger where a term is missing.
-        probability: that of these terms among all subsets that were compared, shape ().
+        probability: the posterior probability of these terms among all subsets, shape ().
         rows: the number of rows.
         functions: the φ_k of the terms.
         kernel: the kernel, whose B makes velocities from gradients.

@@ -1,8 +1,9 @@
-"""The ladder of structures and symmetries that `compare` climbs.
+"""The ladder of structures and symmetries for `compare`.
 
-A first comparison took 96 s, 90 of them to compile 15 searches. A `Rung` is any step of the ladder,
-with the choice between structures and symmetries in its arrays, so that one compiled search serves
-all steps with as many parts and images: three in place of 15.
+With one kernel type per step, a first comparison took 96 s, 90 s of them to compile 15 searches. A
+`Rung` is a kernel for any step of the ladder: its arrays choose between structures and symmetries.
+One compiled search then serves all steps with the same numbers of parts and images, and there are
+three such searches.
 """
 
 from typing import ClassVar, NamedTuple
@@ -26,23 +27,24 @@ from hamkernel._structures.structure import (
     canonical,
 )
 
-_NONE = -200.0  # the logarithm of a friction that is none: e⁻²⁰⁰ is lost in every sum
+NO_FRICTION = -200.0  # # the logarithm of zero friction: e⁻²⁰⁰ vanishes in every sum
 
 
 class Rung(AbstractMatrixKernel):
-    """Σᵢ Σ_g w_ig K_ig(x, z), K_ig of a structure from the Gaussian kernel of x and gz.
+    """The kernel Σᵢ Σ_g w_ig K_ig(x, z), K_ig of a structure from the Gaussian kernel of x and gz.
 
-    Each part i sees some of the coordinates, and each g changes signs. With
+    Each part i depends on some of the coordinates, and each g changes signs. With
     k = aᵢ exp(−‖(x − gz)/ℓ‖²/2) and M = ∂x ∂zᵀ k, the structure is
 
         s k I + d (tr(M) I − Mᵀ) + B M Bᵀ,    B = c I + h (J − R).
 
     Attributes:
-        log_variances: those of a component of the field, for each part. A potential that changes
-            over ℓ is ℓ² times as large, for the geometric mean of the ℓ that its part sees.
+        log_variances: the log variance of a component of the field, for each part. The variance of
+            a potential that changes over ℓ is ℓ² times as large, for the geometric mean of the ℓ of
+            the part.
         log_lengthscales: ℓ, one for each coordinate.
         log_friction: the diagonal of R on the momenta.
-        masks: 1 where the part sees the coordinate.
+        masks: 1 if the part depends on the coordinate, else 0.
         weights: w_ig up to the sum of their sizes, which is 1 for each part.
         structure: (s, d, c, h), one of which is 1.
     """
@@ -64,7 +66,7 @@ class Rung(AbstractMatrixKernel):
     def blocks(self, X: Float[Array, "N n"], Z: Float[Array, "M n"]) -> Float[Array, "N n M n"]:
         n, dtype = X.shape[1], X.dtype
         numbers = (self.masks, self.weights, self.structure)
-        masks, weights, (s, d, c, h) = (each.astype(dtype) for each in numbers)
+        masks, weights, (s, d, c, h) = (numbers_array.astype(dtype) for numbers_array in numbers)
         weights = weights / jnp.abs(weights).sum(axis=1, keepdims=True)
         weights = (weights * self.amplitudes().astype(dtype)[:, None]).reshape(-1)
         parts, images = self.weights.shape
@@ -72,44 +74,48 @@ class Rung(AbstractMatrixKernel):
         S = jnp.tile(jnp.asarray(_signs(n, images), dtype), (parts, 1))
         one = jnp.eye(n, dtype=dtype)
         B = c * one + h * self._hamiltonian_operator(n).astype(dtype)
-        # With a = D (x − Sz), M is k (DS − a (Sa)ᵀ). C is the part of a block that is the same at
-        # all points, and d is for n > 2 alone: there are no steps with it below.
+        # # Let k = w exp(−½(x − Sz)ᵀD(x − Sz)), D and S diagonal, and a = D(x − Sz). Then ∂x k = −k
+        # a, ∂z k = k Sa and ∂x_i a_j = D_ij, ∂z_j a_i = −(DS)_ij, so
+        #     M = ∂x ∂zᵀ k = k (DS − a(Sa)ᵀ),     B M Bᵀ = k (B DS Bᵀ − (Ba)(BSa)ᵀ),
+        #     tr(M) I − Mᵀ = k ((tr DS − a·Sa) I − DS + (Sa)aᵀ).
+        # C holds the terms that are the same at all points: s I + B DS Bᵀ + d (tr(DS) I − DS). No
+        # step has d = 1 for n ≤ 2.
         C = s * one[None] + jnp.einsum("ac,tc,bc->tab", B, D * S, B)
         if n > 2:
             C = C + d * ((D * S).sum(axis=1)[:, None, None] - (D * S)[..., None]) * one[None]
 
-        # Components are arrays (N, M) of their own, made once and kept: fused by XLA into each
-        # entry of the blocks they took eight times as long.
+        # # The components of Ba and BSa are separate arrays (N, M), computed once and kept. If XLA
+        # fused them into each entry of the blocks, they took eight times as long.
         @jax.checkpoint
         def term(w, D, S, C):
-            apart = [x[:, None] - z[None] for x, z in zip(X.T, S[:, None] * Z.T, strict=True)]
-            k = w * jnp.exp(-0.5 * total([D[i] * apart[i] ** 2 for i in range(n)]))
-            left = [D[i] * apart[i] for i in range(n)]
-            right = [S[i] * left[i] for i in range(n)]
+            differences = [x[:, None] - z[None] for x, z in zip(X.T, S[:, None] * Z.T, strict=True)]
+            k = w * jnp.exp(-0.5 * total([D[i] * differences[i] ** 2 for i in range(n)]))
+            a = [D[i] * differences[i] for i in range(n)]
+            Sa = [S[i] * a[i] for i in range(n)]
             Ba, BSa = (
-                [total([B[i, j] * a[j] for j in range(n)]) for i in range(n)] for a in (left, right)
+                [total([B[i, j] * a[j] for j in range(n)]) for i in range(n)] for a in (a, Sa)
             )
             k, Ba, BSa = jax.lax.optimization_barrier((k, Ba, BSa))
 
             def entry(i, j):
                 block = C[i, j] - Ba[i] * BSa[j]
                 if n > 2:
-                    block = block + d * right[i] * left[j]
+                    block = block + d * Sa[i] * a[j]
                     if i == j:
-                        block = block - d * total([a * b for a, b in zip(left, right, strict=True)])
+                        block = block - d * total([a * b for a, b in zip(a, Sa, strict=True)])
                 return k * block
 
             return [[entry(i, j) for j in range(n)] for i in range(n)]
 
-        def add(found, one_term):
-            return jax.tree.map(jnp.add, found, term(*one_term)), None
+        def add(sums, one_term):
+            return jax.tree.map(jnp.add, sums, term(*one_term)), None
 
         nothing = [[jnp.zeros((len(X), len(Z)), dtype)] * n] * n
         found, _ = jax.lax.scan(add, nothing, (weights, D, S, C))
         return jnp.stack([jnp.stack(row, axis=-1) for row in found], axis=1)
 
     def _hamiltonian_operator(self, n: int) -> Float[Array, "n n"]:
-        """J − R; zero where there is no such thing."""
+        """The operator J − R; zero if n is odd."""
         m, odd = divmod(n, 2)
         if odd:
             return jnp.zeros((n, n), self.log_friction.dtype)
@@ -117,7 +123,7 @@ class Rung(AbstractMatrixKernel):
         return canonical(one) - jnp.exp(self.log_friction) * one.at[:m].set(0)
 
     def amplitudes(self) -> Float[Array, " parts"]:
-        """The aᵢ."""
+        """The amplitudes aᵢ."""
         masks = self.masks.astype(self.log_lengthscales.dtype)
         squares = 2 * (masks @ self.log_lengthscales) / masks.sum(axis=1)
         of_fields = self.structure[0] > 0
@@ -132,7 +138,7 @@ class Rung(AbstractMatrixKernel):
             return bounds_of_length(value, X, 0.3, 30.0)
         if name == "log_variances":
             return np.log(1e-5 * amplitude), np.log(1e5 * amplitude)
-        if value == _NONE:
+        if value == NO_FRICTION:
             return value, value
         return PortHamiltonian(Gaussian(1.0)).bounds(name, X, amplitude)
 
@@ -155,7 +161,7 @@ class Rung(AbstractMatrixKernel):
 
 
 def _signs(n: int, images: int) -> Float[np.ndarray, "images n"]:
-    """The signs of the images x, −x and, of four, (q, −p) and (−q, p), which run backwards."""
+    """The signs of the images x, −x and, if there are four, (q, −p) and (−q, p) (time reversal)."""
     reversal = np.repeat([1.0, -1.0], [n // 2, n - n // 2])
     return np.stack([np.ones(n), -np.ones(n), reversal, -reversal])[:images]
 
@@ -179,18 +185,18 @@ class LadderStep(NamedTuple):
 
     @property
     def claims(self) -> frozenset[str]:
-        """The questions that each of its fields answers with yes, as `compare.claims` finds."""
-        found = {"mirror"} if self.mirror else set()
+        """The questions to which all fields of the step say yes, as in `compare.claims`."""
+        answers = {"mirror"} if self.mirror else set()
         if self.structure is Symplectic:
-            found.add("energy")
+            answers.add("energy")
             # T(p) + U(q) with a mirror has an even T.
             back = self.reversible or (self.apart and self.mirror)
-            found |= {"friction"} if self.friction else {"reversible"} if back else set()
-            found |= {"T + U"} if self.apart else set()
-        return frozenset(found)
+            answers |= {"friction"} if self.friction else {"reversible"} if back else set()
+            answers |= {"T + U"} if self.apart else set()
+        return frozenset(answers)
 
     def rung(self, scale: Float[np.ndarray, " n"], speed: float) -> Rung:
-        """The kernel of the step, first for fields of size `speed` that change over 2 `scale`.
+        """The kernel of the step, with first values for fields of size `speed` over 2 `scale`.
 
         Args:
             scale: the standard deviation of each coordinate; 0 counts as 1.
@@ -210,14 +216,14 @@ class LadderStep(NamedTuple):
                 [[1, even, 1, even] if self.reversible else [1, even]],
             )
         length = np.log(2 * np.where(scale > 0, scale, 1.0))
-        known = Separable, DivergenceFree, CurlFree, Symplectic
+        structures = Separable, DivergenceFree, CurlFree, Symplectic
         return Rung(
             log_variances=jnp.asarray(np.full(len(masks), 2 * np.log(speed))),
             log_lengthscales=jnp.asarray(length),
-            log_friction=jnp.asarray(np.float64(np.log(0.1) if self.friction else _NONE)),
+            log_friction=jnp.asarray(np.float64(np.log(0.1) if self.friction else NO_FRICTION)),
             masks=jnp.asarray(np.array(masks)),
             weights=jnp.asarray(np.array(weights, int)),
-            structure=jnp.asarray([int(self.structure is each) for each in known]),
+            structure=jnp.asarray([int(self.structure is structure) for structure in structures]),
         )
 
     def kernel(self, rung: Rung) -> AbstractMatrixKernel:
@@ -237,18 +243,18 @@ class LadderStep(NamedTuple):
 
 def ladder(n: int) -> dict[str, LadderStep]:
     """Structures by name, the weakest first, with the products of their steps."""
-    found = {"any field": LadderStep(Separable), "gradient": LadderStep(CurlFree)}
+    steps = {"any field": LadderStep(Separable), "gradient": LadderStep(CurlFree)}
     if n > 2:
-        found["divergence-free"] = LadderStep(DivergenceFree)
+        steps["divergence-free"] = LadderStep(DivergenceFree)
     if n % 2 == 0:
-        found |= {
+        steps |= {
             "energy": LadderStep(Symplectic),
             "energy, friction": LadderStep(Symplectic, friction=True),
             "T + U": LadderStep(Symplectic, apart=True),
             "T + U, friction": LadderStep(Symplectic, apart=True, friction=True),
         }
-    found |= {f"{name}, mirror": step._replace(mirror=True) for name, step in found.items()}
+    steps |= {f"{name}, mirror": step._replace(mirror=True) for name, step in steps.items()}
     if n % 2 == 0:  # T + U with a mirror has an even T, and is reversible
         for name in ("energy", "energy, mirror", "T + U"):
-            found[f"{name}, reversible"] = found[name]._replace(reversible=True)
-    return found
+            steps[f"{name}, reversible"] = steps[name]._replace(reversible=True)
+    return steps

@@ -6,8 +6,8 @@ For f = B∇u with u = Σ θ_k φ_k they are a linear regression,
     y = Φθ + ε,    Φ_rk = L_r [B ∇φ_k],    θ = (ΦᵀΦ)⁻¹ Φᵀ y,    Cov θ = s² (ΦᵀΦ)⁻¹,
 
 on the measurements themselves. A regression on the values of a posterior mean would count the prior
-twice: a prototype of that found the terms of a pendulum in 0 to 10 % of data sets, and this one in
-all 30 of `tests/benchmarks/readout.py`.
+twice. A prototype of such a regression found the terms of a pendulum in 0 to 10 % of data sets; the
+regression on measurements finds them in all 30 of `tests/benchmarks/readout.py`.
 
 Selection. For a subset S of k of the D functions, with residual sum of squares RSS_S in R rows of
 unknown noise, the Bayesian information criterion with a uniform prior over the size of the subset
@@ -15,10 +15,10 @@ unknown noise, the Bayesian information criterion with a uniform prior over the 
 
     R log RSS_S + k log R + 2 log C(D, k),
 
-and exp(−½ score) is proportional to the posterior probability of S. All subsets are compared, for
-backward elimination found the terms in 10 to 40 %. The variance of a coefficient is averaged over
-the subsets with their probabilities w (Hoeting et al. 1999), Σ_S w_S (Var_S θ_k + (θ_k,S − θ_k)²),
-so that the deviations count the selection.
+and exp(−½ score) is proportional to the posterior probability of S. We compare all subsets, since
+backward elimination found the terms in only 10 to 40 % of data sets. The variance of a coefficient
+is an average over the subsets with their probabilities w (Hoeting et al. 1999), Σ_S w_S (Var_S θ_k
++ (θ_k,S − θ_k)²), so the deviations include the uncertainty of the selection.
 """
 
 from __future__ import annotations
@@ -48,7 +48,9 @@ from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import CurlFree
 from hamkernel._trajectories.learned import Learned
 
-_SAME = 1e-6  # of a function and its image under a symmetry, between rounding and a wrong sign
+# The relative difference of a function and its image under a symmetry, between the size of rounding
+# errors and that of a wrong sign.
+SYMMETRY_RTOL = 1e-6
 
 
 @full_precision
@@ -67,15 +69,15 @@ def readout(
     with the operator B of the structure; the kernel k has no part in them. All subsets of up to
     `most` terms are compared by the Bayesian information criterion, and the best is returned.
 
-    What the kernel holds is taken as known: the friction of `PortHamiltonian`, the masses of
-    `UnknownMasses`, a mean. The part G(x)u of a field with inputs stays the Gaussian process that
-    it is, and the formula is that of the drift. With a symmetric kernel (`Odd`, `Reversible`,
-    `Invariant`) all terms must have its symmetry.
+    The parameters inside the kernel count as known: the friction of `PortHamiltonian`, the masses
+    of `UnknownMasses`, a mean. For a field with inputs, G(x)u stays a Gaussian process, and the
+    formula describes the drift. With a symmetric kernel (`Odd`, `Reversible`, `Invariant`) all
+    terms must have the symmetry.
 
     Args:
-        learned: what `hk.learn` found, or a posterior of `hk.condition`. Learn or tune with a
-            kernel as flexible as the data need: the formula inherits the noise and the paths found.
-        terms: names and functions φ: x (n,) -> (), written with jax.numpy. A constant is none,
+        learned: the result of `hk.learn`, or a posterior of `hk.condition`. Learn or tune with a
+            kernel as flexible as the data need: the formula inherits the noise and the paths.
+        terms: names and functions φ: x (n,) -> (), written with jax.numpy. A constant is no term,
             since velocities do not depend on it.
         most: the largest number of terms in the formula.
 
@@ -98,15 +100,15 @@ def readout(
         for the criterion; Hoeting et al. (1999), Statistical Science 14, for the deviations.
     """
     require.untraced("hk.readout", "Call it outside, on what was learned.", learned)
-    kernel, rows, ridge, mean = _measured(learned)
+    kernel, rows, ridge, mean = _data_of(learned)
     most = require.count(most, "most")
     if kernel.no_potential:
         raise AttributeError(f"there is no potential to read a formula of: {kernel.no_potential}")
-    names, functions = _checked(terms, rows)
+    names, functions = _check_terms(terms, rows)
     _check_symmetry(kernel, names, functions, rows)
     y, columns, typical = _regression(kernel, rows, ridge, functions)
     _check_columns(names, columns, typical, y, float(jnp.finfo(rows.targets.dtype).eps))
-    found = _selected(columns, y, min(most, len(names)))
+    found = _select(columns, y, min(most, len(names)))
     misfit = math.sqrt(found.variance / float(ridge))
     if misfit > 2.0:  # three quarters of the residuals are then not noise
         require.warn(
@@ -128,20 +130,20 @@ def readout(
     )
 
 
-def _measured(learned: Any) -> tuple[AbstractMatrixKernel, Any, Float[Array, ""], Any]:
-    """Kernel, rows less what is known, the variance Nλ of their noise, and the mean."""
+def _data_of(learned: Any) -> tuple[AbstractMatrixKernel, Any, Float[Array, ""], Any]:
+    """The kernel, the rows minus the known part, the variance Nλ of their noise, and the mean."""
     if isinstance(learned, Posterior):
         conditional = learned.conditional
         kernel, rows = conditional.field.kernel, conditional.rows
         ridge = conditional.ridge
-        known = known_of(learned.field)
+        mean = known_of(learned.field)
     elif isinstance(learned, Learned):
         if learned.observations is None:
             raise ValueError("no run had enough samples to say anything of the field.")
         asked = make_problem(
             learned.kernel, learned.observations, None, learned.regularization, learned.mean
         )
-        kernel, rows, ridge, known = asked.kernel, asked.rows, asked.ridge, asked.known
+        kernel, rows, ridge, mean = asked.kernel, asked.rows, asked.ridge, asked.known
     else:
         raise TypeError(
             "readout takes what hk.learn or hk.condition returns, for the measurements in it; got "
@@ -152,13 +154,13 @@ def _measured(learned: Any) -> tuple[AbstractMatrixKernel, Any, Float[Array, ""]
             "readout is of one system and this is a family: condition on the data of one member, "
             "without parameters."
         )
-    if kernel.takes_inputs and known is not None:
-        known = at_inputs(known, 0, None)  # that of the drift
-    return kernel, rows, ridge, known
+    if kernel.takes_inputs and mean is not None:
+        mean = at_inputs(mean, 0, None)  # that of the drift
+    return kernel, rows, ridge, mean
 
 
-def _checked(terms: Any, rows: Any) -> tuple[list[str], list[Callable[..., Any]]]:
-    """Names and functions, each of one state to one real number."""
+def _check_terms(terms: Any, rows: Any) -> tuple[list[str], list[Callable[..., Any]]]:
+    """The names and functions; errors unless each function maps one state to one real number."""
     if not isinstance(terms, Mapping) or not terms:
         raise TypeError(
             'terms must be a dictionary of functions, {"p**2": lambda x: x[1] ** 2, …}, with at '
@@ -183,14 +185,16 @@ def _checked(terms: Any, rows: Any) -> tuple[list[str], list[Callable[..., Any]]
 
 
 def _check_symmetry(K: Any, names: list[str], functions: list[Any], rows: Any) -> None:
-    """ValueError where the symmetry of the kernel forbids a term."""
+    """ValueError if the symmetry of the kernel forbids a term."""
     K = K.of_states
-    found = [symmetry_removed(k) for k in K.scalar_kernels]
+    symmetry_means = [symmetry_removed(k) for k in K.scalar_kernels]
     n = rows.dimension
-    if any(each is None for each in found) or isinstance(K, UnknownMasses):
+    if any(mean is None for mean in symmetry_means) or isinstance(K, UnknownMasses):
         return
-    groups = [each.group(n) for each in found if each is not None]
-    shared = [g for g in groups[0] if all(any(_same(g, h) for h in group) for group in groups)]
+    groups = [mean.group(n) for mean in symmetry_means if mean is not None]
+    shared = [
+        g for g in groups[0] if all(any(_is_same_map(g, h) for h in group) for group in groups)
+    ]
     X = rows.points[:, :n]
     bad = []
     for name, fn in zip(names, functions, strict=True):
@@ -199,28 +203,29 @@ def _check_symmetry(K: Any, names: list[str], functions: list[Any], rows: Any) -
             change = np.asarray(jax.vmap(fn)(jax.vmap(g)(X))) - g.character * values
             # H is known up to a constant, which an odd potential has as well.
             constant = change.mean() if g.character < 0 else 0.0
-            if not np.abs(change - constant).max() <= _SAME * np.abs(values).max():
+            if not np.abs(change - constant).max() <= SYMMETRY_RTOL * np.abs(values).max():
                 bad.append(name)
                 break
     if bad:
         do, them = ("does", "it") if len(bad) == 1 else ("do", "them")
         raise ValueError(
-            f"the kernel believes in a symmetry of the potential that {_listed(bad)} {do} not have:"
-            f" leave {them} out, or learn without the symmetry."
+            "the kernel believes in a symmetry of the potential that "
+            f"{_join_names(bad)} {do} not have: leave {them} out, or learn without the symmetry."
         )
 
 
-def _same(g: Any, h: Any) -> bool:
-    return g.character == h.character and np.abs(g.matrix - h.matrix).max() < _SAME
+def _is_same_map(g: Any, h: Any) -> bool:
+    return g.character == h.character and np.abs(g.matrix - h.matrix).max() < SYMMETRY_RTOL
 
 
 def _regression(
     K: Any, rows: Any, ridge: Float[Array, ""], functions: list[Any]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """y, Φ, and what the entries of Φ are sums of, all with noise of variance `ridge`.
+    """The targets y, the columns Φ, and the sizes of the terms of their entries.
 
-    With an unknown input matrix the rows of G(x)u have the covariance C, and rows are multiplied
-    by R⁻ᵀ with RᵀR = I + C/ridge: generalised least squares, with G integrated out.
+    The noise of all rows has the variance `ridge`. With an unknown input matrix the rows of G(x)u
+    have the covariance C, and we multiply the rows by L⁻¹ with LLᵀ = I + C/ridge: generalised least
+    squares, with G integrated out.
     """
     of_fields, of_values = _of_dictionary(operator_of(K), tuple(functions), rows.dimension)
     columns, typical = [], []
@@ -232,18 +237,18 @@ def _regression(
     y, columns = np.asarray(rows.y, float), np.asarray(columns, float)
     if K.takes_inputs and K.known_matrix is None:
         nothing = CurlFree(lambda x, z: jnp.zeros((), x.dtype))
-        of_inputs = K.with_states(nothing)
-        C = np.asarray(eqx.filter_jit(gram_of_rows)(of_inputs, rows), float) / float(ridge)
+        input_kernel = K.with_states(nothing)
+        C = np.asarray(eqx.filter_jit(gram_of_rows)(input_kernel, rows), float) / float(ridge)
         R = np.linalg.cholesky(np.eye(len(C)) + C)
         y, columns = np.linalg.solve(R, y), np.linalg.solve(R, columns)
     return y, columns, np.concatenate(typical).max(axis=0)
 
 
 def _of_dictionary(operator: Any, functions: tuple[Any, ...], n: int) -> tuple[Any, Any]:
-    """Points -> the fields (P, n, D) or the potentials (P, D), and how large their parts are, (D,).
+    """Functions of points: the fields (P, n, D) or potentials (P, D), and the sizes of their terms.
 
-    A field B∇φ of rounding errors alone, as that of a Casimir, is small beside the sums
-    Σ_b |B_ab| |∂_b φ|.
+    The sizes (D,) are the maxima of Σ_b |B_ab| |∂_b φ|. If a field B∇φ consists of rounding errors
+    alone, as for a Casimir φ, it is small compared to its size.
     """
 
     def slopes(x):
@@ -256,27 +261,27 @@ def _of_dictionary(operator: Any, functions: tuple[Any, ...], n: int) -> tuple[A
         return jax.vmap(operator, in_axes=(None, 0), out_axes=1)(x, v), (abs(B) @ abs(v).T).max(0)
 
     def value(x):
-        found = jnp.stack([fn(x).astype(x.dtype) for fn in functions])
-        return found, abs(found)
+        values = jnp.stack([fn(x).astype(x.dtype) for fn in functions])
+        return values, abs(values)
 
-    def mapped(fn):
-        def of_points(points):
+    def evaluate_at_points(fn):
+        def at_points(points):
             values, typical = jax.vmap(fn)(points[:, :n])
             return values, typical.max(axis=0)
 
-        return eqx.filter_jit(of_points)
+        return eqx.filter_jit(at_points)
 
-    return mapped(field), mapped(value)
+    return evaluate_at_points(field), evaluate_at_points(value)
 
 
 def _check_columns(
     names: list[str], columns: np.ndarray, typical: np.ndarray, y: np.ndarray, eps: float
 ) -> None:
-    """ValueError where the dictionary cannot be told apart on these rows."""
+    """ValueError if the functions are not linearly independent on these rows."""
     bad = [name for name, column in zip(names, columns.T, strict=True) if not _finite(column)]
     if bad:
         raise ValueError(
-            f"{_listed(bad)} is not finite at some of the states, or has no derivative there: "
+            f"{_join_names(bad)} is not finite at some of the states, or has no derivative there: "
             "leave it out, or write it so that it has."
         )
     R, D = columns.shape
@@ -290,7 +295,7 @@ def _check_columns(
     bad = [name for name, a, b in zip(names, sizes, typical, strict=True) if a <= rounding * b]
     if bad:
         raise ValueError(
-            f"{_listed(bad)} leaves no trace in the data: its field B∇φ is zero, as that of a "
+            f"{_join_names(bad)} leaves no trace in the data: its field B∇φ is zero, as that of a "
             "constant or of a Casimir. Leave it out."
         )
     _, singular, V = np.linalg.svd(np.linalg.qr(columns / sizes, mode="r"))
@@ -298,7 +303,7 @@ def _check_columns(
         shares = np.abs(V[-1])
         bad = [name for name, share in zip(names, shares, strict=True) if share > 1e-3]
         raise ValueError(
-            f"{_listed(bad)} are linearly dependent on the data: a combination of them moves "
+            f"{_join_names(bad)} are linearly dependent on the data: a combination of them moves "
             "nothing, so no data like these can tell them apart. Leave one of them out."
         )
     if not np.abs(y).max() > 0:
@@ -309,13 +314,13 @@ def _finite(column: np.ndarray) -> bool:
     return bool(np.isfinite(column).all())
 
 
-def _listed(names: list[str]) -> str:
+def _join_names(names: list[str]) -> str:
     quoted = [repr(name) for name in names]
     return " and ".join([", ".join(quoted[:-1]), quoted[-1]] if len(quoted) > 1 else quoted)
 
 
 class _Selection(NamedTuple):
-    """The best subset, its coefficients and their deviations, its s² and its probability."""
+    """The best subset: coefficients, standard deviations, s², and probability."""
 
     subset: tuple[int, ...]
     coefficients: np.ndarray
@@ -324,67 +329,71 @@ class _Selection(NamedTuple):
     probability: float
 
 
-def _selected(columns: np.ndarray, y: np.ndarray, most: int) -> _Selection:
+def _select(columns: np.ndarray, y: np.ndarray, most: int) -> _Selection:
     """The best of all subsets of up to `most` columns.
 
-    [Φ, y] = QT once, and for each subset a QR of D + 1 rows of T: the residual is its last diagonal
-    entry. No normal equations, so nearly dependent columns lose no more digits than their own
-    condition takes.
+    [Φ, y] = QT is computed once, and for each subset a QR of the D + 1 rows of T, whose last
+    diagonal entry is the norm of the residual. Without normal equations, nearly dependent columns
+    lose digits like their condition number and not like its square.
     """
     R, D = columns.shape
     most = min(most, R - 1)
     count = sum(math.comb(D, k) for k in range(1, most + 1))
-    if count > 1_000_000:  # which take 4 s of CPU time and 150 MB
+    if count > 1_000_000:  # one million take 4 s of CPU time and 150 MB
         raise ValueError(
             f"{D} terms have {count} subsets of up to {most}, and all are compared: give fewer "
             f"terms or a smaller `most`, for at most 1000000 subsets."
         )
     sizes = np.linalg.norm(columns, axis=0)
     T = np.asarray(np.linalg.qr(np.column_stack([columns / sizes, y]), mode="r"))
-    # Below the rounding of y there is no residual that could be compared.
+    # # Residuals below the rounding of y cannot be compared.
     floor = (np.finfo(float).eps * np.linalg.norm(y)) ** 2 * R
-    scores, every = [], []
+    scores, batches = [], []
     for k in range(1, most + 1):
         prior = k * math.log(R) + 2 * math.log(math.comb(D, k))
         subsets = itertools.combinations(range(D), k)
-        # 20 000 of them in one stack of QR factorisations.
-        while len(some := np.array(list(itertools.islice(subsets, 20_000)), int)):
-            theta, inverse, squares = _least_squares(T, some)
+        # # 20 000 subsets in one stack of QR factorisations.
+        while len(batch := np.array(list(itertools.islice(subsets, 20_000)), int)):
+            theta, inverse, squares = _least_squares(T, batch)
             squares = np.maximum(squares, floor)
             scores.append(R * np.log(squares) + prior)
             variances = squares[:, None] / (R - k) * inverse
-            every.append((some, theta, variances, squares))
+            batches.append((batch, theta, variances, squares))
     total = np.concatenate(scores)
     weights = np.exp(-0.5 * (total - total.min()))
     weights /= weights.sum()
     best = int(total.argmin())
     starts = np.cumsum([0, *map(len, scores)])
     part = int(np.searchsorted(starts, best, side="right") - 1)
-    some, theta, _, squares = (each[best - starts[part]] for each in every[part])
-    square = np.zeros(len(some))  # Σ_S w_S (Var_S θ_k + (θ_k,S − θ_k)²)
-    for (subsets, values, variances, _), start in zip(every, starts[:-1], strict=True):
+    batch, theta, _, squares = (array[best - starts[part]] for array in batches[part])
+    square = np.zeros(len(batch))  # Σ_S w_S (Var_S θ_k + (θ_k,S − θ_k)²)
+    for (subsets, values, variances, _), start in zip(batches, starts[:-1], strict=True):
         w = weights[start : start + len(subsets)]
-        for i, term in enumerate(some):
+        for i, term in enumerate(batch):
             has = subsets == term
             present = has.any(axis=1)
             change = variances[has] + (values[has] - theta[i]) ** 2
             square[i] += w[present] @ change + w[~present].sum() * theta[i] ** 2
     return _Selection(
-        subset=tuple(some.tolist()),
-        coefficients=theta / sizes[some],
-        deviations=np.sqrt(square) / sizes[some],
-        variance=float(squares) / (R - len(some)),
+        subset=tuple(batch.tolist()),
+        coefficients=theta / sizes[batch],
+        deviations=np.sqrt(square) / sizes[batch],
+        variance=float(squares) / (R - len(batch)),
         probability=float(weights[best]),
     )
 
 
-def _least_squares(T: np.ndarray, some: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Coefficients (c, k), the diagonals of (ΦᵀΦ)⁻¹ (c, k), and residual squares (c,)."""
-    c, k = some.shape
+def _least_squares(T: np.ndarray, subsets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The coefficients (c, k), the diagonals of (ΦᵀΦ)⁻¹ (c, k), and residual squares (c,).
+
+    For each subset QR of [Φ_S, y] gives [[R, Qᵀy], [0, ρ]]: θ = R⁻¹Qᵀy, (ΦᵀΦ)⁻¹ = R⁻¹R⁻ᵀ and the
+    residual square ρ².
+    """
+    c, k = subsets.shape
     y = np.broadcast_to(T[:, -1:], (c, len(T), 1))
-    stack = np.concatenate([np.moveaxis(T[:, some], 0, 1), y], axis=2)
+    stack = np.concatenate([np.moveaxis(T[:, subsets], 0, 1), y], axis=2)
     triangle = np.asarray(np.linalg.qr(stack, mode="r"))
-    left = triangle[:, :k, :k]
-    inverse = np.linalg.inv(left)
+    R = triangle[:, :k, :k]
+    inverse = np.linalg.inv(R)
     theta = (inverse @ triangle[:, :k, k:])[..., 0]
     return theta, (inverse**2).sum(axis=2), triangle[:, k, k] ** 2

@@ -58,21 +58,21 @@ class AbstractField(eqx.Module):
 
         Known after a fit to a stream too, which keeps no residuals.
         """
-        kept = self.info.residual_norm
-        return jnp.linalg.norm(self.residual) if kept is None else kept
+        norm_of_stream = self.info.residual_norm
+        return jnp.linalg.norm(self.residual) if norm_of_stream is None else norm_of_stream
 
     def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
-        """The velocity f(x), that of the mean included."""
+        """The velocity f(x), including the mean."""
         x = self._state(x)
         learned = self._learned(x)
         return learned if self.mean is None else learned + self.mean(x).astype(learned.dtype)
 
     @abc.abstractmethod
     def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The velocity without that of the mean."""
+        """The velocity without the mean."""
 
     def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """The potential with whatever constant the representer and the mean have."""
+        """The potential, with the constant that the representer and the mean happen to have."""
         self.kernel.check_potential()
         x = self._state(x)
         learned = self._learned_potential(x)
@@ -82,7 +82,7 @@ class AbstractField(eqx.Module):
 
     @abc.abstractmethod
     def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
-        """The potential without that of the mean."""
+        """The potential without the mean."""
 
     def evaluate(self, X: Num[ArrayLike, "N n"]) -> Float[Array, "N n"]:
         """The velocities at many states, as `jax.vmap(field)(X)` but in bounded memory.
@@ -102,14 +102,14 @@ class AbstractField(eqx.Module):
 
     @abc.abstractmethod
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
-        """`evaluate`, without the mean, for states that have been checked."""
+        """The velocities at checked states, without the mean."""
 
     def part(self: Field, which: int | str) -> Field:
         """The field of one term of a sum of kernels, by position or name.
 
-        The parts add up to the field less its mean, and the squares of their norms to that of its
-        norm; an anchor of the whole is not theirs. `residual` and `info` are those of the whole
-        fit.
+        The parts add up to the field minus its mean, and the squares of their norms add up to the
+        square of its norm. A part does not inherit the anchor of the field. `residual` and `info`
+        belong to the complete fit.
 
         Raises:
             KeyError: there is no such part (with the choices).
@@ -141,8 +141,8 @@ class AbstractField(eqx.Module):
     def hamiltonian(self) -> Scalar:
         """The learned Hamiltonian H with f = B∇H, x (n,) -> (); B = J, J − R, Π(x) or your own.
 
-        Velocities determine H up to a constant: see `anchored`. That there is one does not say
-        that it is conserved: see `dissipation`.
+        Velocities determine H up to a constant: see `anchored`. H need not be conserved: see
+        `dissipation`.
 
         Raises:
             AttributeError: the field is not Hamiltonian by construction (with the reason).
@@ -176,17 +176,17 @@ class AbstractField(eqx.Module):
                 "the field has no law: no part of its kernel is hk.Shared(k, parts)."
             )
         waves, weights = laws[which]
-        at = waves.of_law(r) if r0 is None else waves.of_law(r) - waves.of_law(r0)
-        return at.astype(weights.dtype) @ weights
+        waves_at_r = waves.of_law(r) if r0 is None else waves.of_law(r) - waves.of_law(r0)
+        return waves_at_r.astype(weights.dtype) @ weights
 
     def _laws(self) -> list[tuple[Any, Float[Array, " m"]]]:
         """The features of each shared law, with their weights."""
         return []
 
     def dissipation(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """The power that is lost at x, −dH/dt = ∇HᵀR∇H along the field, shape ().
+        """The dissipated power at x, −dH/dt = ∇HᵀR∇H along the field, shape ().
 
-        Not negative with `PortHamiltonian`, zero where H is conserved, and of any sign with an
+        It is not negative with `PortHamiltonian`, zero if H is conserved, and of any sign with an
         operator of your own.
 
         Raises:
@@ -219,9 +219,9 @@ class AbstractField(eqx.Module):
         self._check_single()
         if jnp.shape(value) != ():
             raise ValueError(f"value has shape {jnp.shape(value)}; one number is needed.")
-        there = require.floating(value, "value").astype(self.offset.dtype)
+        anchor = require.floating(value, "value").astype(self.offset.dtype)
         x0 = require.point(x0, self.dimension, "x0")
-        offset = there - self.unanchored_potential(x0)
+        offset = anchor - self.unanchored_potential(x0)
         offset = require.value(
             offset,
             require.not_finite(offset),
@@ -266,7 +266,7 @@ class FieldSum(eqx.Module):
 
 
 class KnownPart(eqx.Module):
-    """A prior mean of x, or of x and u, plus G u where G is known; a function of a point (x, u)."""
+    """The known part of a field of points (x, u): a prior mean of x or (x, u), plus a known G u."""
 
     mean: Callable[..., Any] | None
     matrix: KnownMatrix | None
@@ -275,17 +275,17 @@ class KnownPart(eqx.Module):
 
     def __call__(self, s: Float[Array, " d"]) -> Float[Array, " n"]:
         x, u = s[: -self.count], s[-self.count :]
-        known = jnp.zeros_like(x)
+        value_of_inputs = jnp.zeros_like(x)
         if self.matrix is not None:
-            known = jnp.asarray(self.matrix.matrix, x.dtype) @ u
+            value_of_inputs = jnp.asarray(self.matrix.matrix, x.dtype) @ u
         if self.mean is None:
-            return known
+            return value_of_inputs
         value = self.mean(x, u) if self.of_inputs else self.mean(x)
-        return known + value.astype(x.dtype)
+        return value_of_inputs + value.astype(x.dtype)
 
 
 class AtInputs(eqx.Module):
-    """x -> f(x, u) of a function f, for one u."""
+    """The function x -> f(x, u) for one u."""
 
     field: Callable[..., Any]
     u: Float[Array, " m"]
@@ -301,7 +301,7 @@ def known_part(K: AbstractMatrixKernel, mean: Any, n: int, dtype: Any) -> Any:
         K: the kernel.
         mean: x (n,) -> (n,); of a controlled kernel it may be x, u -> (n,) too.
         n: the number of coordinates of a state.
-        dtype: of the states.
+        dtype: the dtype of the states.
 
     Returns:
         A PyTree that maps one point to one velocity; None if the prior mean is zero.
@@ -368,13 +368,13 @@ def at_points(fn: Callable[..., Any], X: Float[Array, "N n"]) -> Float[Array, "N
 
 
 def root(square: Float[Array, ""]) -> Float[Array, ""]:
-    """√square, and zero with a zero derivative where rounding, or data of zeros, leave it ≤ 0."""
+    """√square; zero, with a zero derivative, if rounding or data of zeros make `square` ≤ 0."""
     nothing = square <= 0
     return jnp.where(nothing, 0.0, jnp.sqrt(jnp.where(nothing, jnp.ones_like(square), square)))
 
 
 def _potential_of(field, x):
-    # The field is an argument, so that a potential is a PyTree whose arrays are no constants.
+    # The field is an argument, so that the arrays of a potential are leaves and not constants.
     return field.unanchored_potential(x) + field.offset
 
 
@@ -384,14 +384,14 @@ class SolverInfo(eqx.Module):
     Attributes:
         solver: the name of the solver.
         landmarks: the number of points that carry the field, shape ().
-        rank: of the low-rank Gram that was solved with, or that preconditioned, shape ().
-        truncation: trace(G − Ĝ)/(Nλ) for that low-rank Gram Ĝ of the training data, shape (). The
-            fitted values of Ĝ differ from those of G by at most this fraction of the residual.
+        rank: the rank of the low-rank Gram Ĝ of the fit or of the preconditioner, shape ().
+        truncation: trace(G − Ĝ)/(Nλ) for the low-rank Gram Ĝ of the training data, shape (). The
+            fitted values with Ĝ and with G differ by at most this fraction of the residual.
         residual_norm: ‖y − f(X)‖ of a stream, whose residual is not kept, good to 1e-8 of ‖y‖,
             shape ().
-        iterations: of conjugate gradients, shape ().
+        iterations: the number of iterations of conjugate gradients, shape ().
         relative_residual: ‖y − (G + NλI)a‖/‖y‖ of the coefficients, computed at the end, shape ().
-            It is about the training data: far from them a field was up to 250 times worse.
+            Far from the training data the relative error of a field was up to 250 times larger.
     """
 
     solver: str = eqx.field(static=True)

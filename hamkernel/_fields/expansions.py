@@ -20,17 +20,17 @@ from hamkernel._structures.structure import AbstractPotentialKernel
 class KernelField(AbstractField):
     """f(x) = Σⱼ K(x, zⱼ) aⱼ, the minimiser of the regularised least squares.
 
-    After energies the potential has the values Σₑ bₑ k(·, sₑ) besides, and a prior mean is added.
+    With energies the potential has the further terms Σₑ bₑ k(·, sₑ). A prior mean is added.
     Evaluating f or its potential costs O(M n) for M points.
 
     Attributes:
         kernel: K.
         points: zⱼ, shape (M, n): the data, or the landmarks of a low-rank solver.
         coefficients: aⱼ, shape (M, n).
-        residual: yᵢ − f(xᵢ) at the training data, shape (N, n); of shape (0, n) after a fit to a
-            stream, which is not kept; of other observations that of each row, in its own units,
-            shape (D,).
-        norm: ‖f‖ in the RKHS of K, of f less its mean, shape ().
+        residual: yᵢ − f(xᵢ) at the training data, shape (N, n); for other observations one residual
+            for each row, in the units of the row, shape (M,); of shape (0, n) after a fit to a
+            stream, whose data are not kept.
+        norm: the norm of f minus its mean in the RKHS of K, shape ().
         regularization: the λ of the fit, shape ().
         offset: the constant in the potential, shape ().
         info: the outcome of the solver.
@@ -57,23 +57,23 @@ class KernelField(AbstractField):
 
     def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         field = _expansion(self.kernel, x, self.points, self.coefficients)
-        return self._plus_values(field, _value_field, x)
+        return self._add_values(field, _value_field, x)
 
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         fields = placed_product(self.kernel, X, self.points, self.coefficients)
-        return self._plus_values(fields, _value_fields, X)
+        return self._add_values(fields, _value_fields, X)
 
     def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         potential = _potential(self.kernel, x, self.points, self.coefficients)
-        return self._plus_values(potential, _value_potential, x)
+        return self._add_values(potential, _value_potential, x)
 
-    def _plus_values(self, of_field: Array, of_values: Callable[..., Array], x: Array) -> Array:
+    def _add_values(self, field: Array, contribution: Callable[..., Array], x: Array) -> Array:
         """`of_field`, plus the contribution `of_values(K, x, s, b)` of the energies if any."""
         S, b = self.value_points, self.value_coefficients
-        return of_field if S is None or b is None else of_field + of_values(self.kernel, x, S, b)
+        return field if S is None or b is None else field + contribution(self.kernel, x, S, b)
 
     def _laws(self) -> list[tuple[Any, Float[Array, " m"]]]:
-        found, K = [], self.kernel
+        laws, K = [], self.kernel
         for term in K.terms if isinstance(K, Sum) else (K,):
             if not isinstance(term, AbstractPotentialKernel):
                 continue
@@ -81,15 +81,18 @@ class KernelField(AbstractField):
             for waves, _ in [] if shared is None else laws_of(shared):
                 directions = jax.vmap(term.apply_transpose)(self.points, self.coefficients)
                 slopes = jax.lax.map(waves.gradients, self.points)
-                found.append((waves, jnp.einsum("jnm,jn->m", slopes, directions)))
-        return found
+                laws.append((waves, jnp.einsum("jnm,jn->m", slopes, directions)))
+        return laws
 
     def _term(self, kernel: Sum, position: int) -> "KernelField":
         term, Z, A = kernel.terms[position], self.points, self.coefficients
-        square = jnp.sum(A * placed_product(term, Z, Z, A))  # ‖f‖² = aᵀGa
+        # ‖f‖² = aᵀG_aa a + 2aᵀG_ab b + bᵀG_bb b, where a are the coefficients of K(·, z) and b
+        # those of k(·, s). With doubled coefficients 2a the potential at the points S of the values
+        # is u(S) = 2G_ba a + G_bb b, so b·u(S) is the sum of the last two terms.
+        square = jnp.sum(A * placed_product(term, Z, Z, A))
         bare = dataclasses.replace(self, kernel=term, offset=jnp.zeros_like(self.offset), mean=None)
         S, b = self.value_points, self.value_coefficients
-        if S is not None and b is not None:  # 2 aᵀG_av b + bᵀG_vv b
+        if S is not None and b is not None:
             doubled = dataclasses.replace(bare, coefficients=2 * A)
             square = square + b @ at_points(doubled._learned_potential, S)
         return dataclasses.replace(bare, norm=root(square))
@@ -128,15 +131,15 @@ def _value_field(
 ) -> Float[Array, " n"]:
     """The field of `_value_potential`.
 
-    Its component along v is Cov(vᵀf(x), Σ bₑ u(sₑ)), the values at sₑ of the potential of K(·, x)v:
-    linear in v, so that its gradient is the field, and B need not be known.
+    The component along v is Cov(vᵀf(x), Σ bₑ u(sₑ)) = Σ bₑ (potential of K(·, x)v at sₑ). This
+    number is linear in v, so its gradient with respect to v is the field, and B need not be known.
     """
     x, S = centred(K, x, S)
 
-    def along(v):
+    def component(v):
         return b @ jax.vmap(lambda s: K.potential(s, x[None], v[None]))(S)
 
-    return jax.grad(along)(jnp.zeros(K.outputs(len(x)), x.dtype))
+    return jax.grad(component)(jnp.zeros(K.outputs(len(x)), x.dtype))
 
 
 @compiled
@@ -213,7 +216,7 @@ class FeatureField(AbstractField):
         return _potential_at(self.features, x, self.weights)
 
     def _laws(self) -> list[tuple[Any, Float[Array, " m"]]]:
-        return [(waves, self.weights[at]) for waves, at in self.features.laws()]
+        return [(waves, self.weights[place]) for waves, place in self.features.laws()]
 
     def _term(self, kernel: Sum, position: int) -> "FeatureField":
         assert isinstance(self.features, SumFeatures)

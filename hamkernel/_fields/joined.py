@@ -46,8 +46,8 @@ class AbstractJoinedField(AbstractField):
 
     @property
     @abc.abstractmethod
-    def _cure(self) -> str:
-        """The expression that gives a field of x alone, for an error."""
+    def _example(self) -> str:
+        """An expression for a field of x alone, for error messages."""
 
     @property
     def kernel(self) -> AbstractJoinedKernel:
@@ -74,12 +74,12 @@ class AbstractJoinedField(AbstractField):
 
     @property
     def residual(self) -> Float[Array, "..."]:
-        """yᵢ − f(xᵢ, uᵢ) at the training data, as that of `KernelField`."""
+        """The residual yᵢ − f(xᵢ, uᵢ) at the training data, as for `KernelField`."""
         return self.whole.residual
 
     @property
     def norm(self) -> Float[Array, ""]:
-        """‖f‖ in the RKHS of K, of f less what was known, shape ()."""
+        """The norm of f minus its known part, in the RKHS of K, shape ()."""
         return self.whole.norm
 
     @property
@@ -99,8 +99,12 @@ class AbstractJoinedField(AbstractField):
 
     @property
     def dimension(self) -> int:
-        whole = self.whole
-        shape = whole.coefficients if isinstance(whole, KernelField) else whole.residual
+        joint_field = self.whole
+        shape = (
+            joint_field.coefficients
+            if isinstance(joint_field, KernelField)
+            else joint_field.residual
+        )
         return shape.shape[-1]
 
     @property
@@ -117,8 +121,8 @@ class AbstractJoinedField(AbstractField):
             ValueError: u is missing, or x or u has another shape.
         """
         s = self.joined(x, u)
-        learned, known = self.whole._learned(s), self.whole.mean
-        return learned if known is None else learned + known(s).astype(learned.dtype)
+        learned, mean = self.whole._learned(s), self.whole.mean
+        return learned if mean is None else learned + mean(s).astype(learned.dtype)
 
     def joined(self, x: Any, u: Any) -> Float[Array, " d"]:
         """The point (x, u).
@@ -131,7 +135,7 @@ class AbstractJoinedField(AbstractField):
         if u is None:
             raise ValueError(
                 f"a {type(self).__name__} needs its {name}: field(x, u), and hk.simulate(field, "
-                f"x0, ts, inputs=u). A field of x alone is {self._cure}."
+                f"x0, ts, inputs=u). A field of x alone is {self._example}."
             )
         n, m = self.dimension, self.kernel.input_count
         u = _column(require.floating(u, "u"), 0, m)
@@ -166,13 +170,13 @@ class AbstractJoinedField(AbstractField):
                 f"field.evaluate(X, U) needs the {self.kernel.given} of every state, shape "
                 f"({len(X)}, {m}); got {None if inputs is None else inputs.shape}."
             )
-        S, known = jnp.concatenate([X, inputs], axis=1), self.whole.mean
+        S, mean = jnp.concatenate([X, inputs], axis=1), self.whole.mean
         learned = self.whole._evaluated(S)
-        return learned if known is None else learned + at_points(known, S).reshape(len(S), n)
+        return learned if mean is None else learned + at_points(mean, S).reshape(len(S), n)
 
     def part(self, which: int | str) -> "AbstractJoinedField":
-        """Refused: the parts are those of the field of x alone."""
-        raise KeyError(f"no part {which!r}: the parts are those of {self._cure}.part(…).")
+        """KeyError: a field of x alone has parts, a joint field has none."""
+        raise KeyError(f"no part {which!r}: the parts are those of {self._example}.part(…).")
 
     def _term(self, kernel: Sum, position: int) -> "AbstractJoinedField":
         return self.part(position)
@@ -202,7 +206,7 @@ class ControlledField(AbstractJoinedField):
         return self.drift.mean
 
     @property
-    def _cure(self) -> str:
+    def _example(self) -> str:
         return "field.drift"
 
     def part(self, which: int | str) -> Any:
@@ -269,14 +273,14 @@ class FamilyField(AbstractJoinedField):
         return self.whole.mean
 
     @property
-    def _cure(self) -> str:
+    def _example(self) -> str:
         return "field.at(θ)"
 
     def at(self, theta: Num[ArrayLike, " p"]) -> "KernelField | MemberField":
         """The member with the parameters θ, an ordinary field of K.
 
-        Its residual is empty, since the data are those of all members, and its λ and `info` are
-        those of the fit. New values of θ do not recompile.
+        The residual of the member is empty, since the data belong to all members; λ and `info`
+        belong to the fit. New values of θ do not recompile.
 
         Args:
             theta: θ, shape (p,).
@@ -300,10 +304,10 @@ class FamilyField(AbstractJoinedField):
             )
             for t in K.terms
         )
-        known = at_inputs(self.whole.mean, self.dimension, theta)
+        mean = at_inputs(self.whole.mean, self.dimension, theta)
         if len(terms) == 1:
-            return dataclasses.replace(terms[0], mean=known)
-        return MemberField(K.of_states, terms, self.offset, known)  # pyright: ignore
+            return dataclasses.replace(terms[0], mean=mean)
+        return MemberField(K.of_states, terms, self.offset, mean)  # pyright: ignore
 
     @property
     def potential(self) -> Scalar:
@@ -405,7 +409,7 @@ def at_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
         if part.mean is None or not part.of_inputs:
             return part.mean
         if u is None:
-            # The drift has a potential where it knows one.
+            # # The attribute `drift` of the mean may know a potential.
             own = getattr(part.mean, "drift", None)
             return AtInputs(part.mean, jnp.zeros(part.count)) if own is None else own
         own = getattr(part.mean, "at", None)
@@ -441,13 +445,13 @@ def at_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
 
 
 def learned_field(field: Any, known: Any) -> Any:
-    """The field of a solver plus the prior mean `known`, of x and u if its kernel is joined."""
+    """The field of a solver plus the known part, a function of (x, u) for a joined kernel."""
     if known is not None:
         field = dataclasses.replace(field, mean=known)
     if not isinstance(field.kernel, AbstractJoinedKernel):
         return field
-    made = FamilyField if field.kernel.given == "parameters" else ControlledField
-    return made(whole=field)  # pyright: ignore[reportCallIssue]
+    field_type = FamilyField if field.kernel.given == "parameters" else ControlledField
+    return field_type(whole=field)  # pyright: ignore[reportCallIssue]
 
 
 def known_of(field: AbstractField) -> Any:

@@ -75,12 +75,12 @@ def kinetic(mass: ArrayLike) -> Kinetic:
         ValueError: the shape is another; a mass is not positive, or the matrix not symmetric
             positive definite. TypeError: these are no real numbers.
     """
-    given = require.floating(mass, "mass")
-    if given.ndim == 2 and given.shape[0] == given.shape[1]:
-        matrix = np.asarray(given)
+    mass_array = require.floating(mass, "mass")
+    if mass_array.ndim == 2 and mass_array.shape[0] == mass_array.shape[1]:
+        matrix = np.asarray(mass_array)
         if not np.allclose(matrix, matrix.T) or not (np.linalg.eigvalsh(matrix) > 0).all():
             raise ValueError("a mass matrix must be symmetric and positive definite.")
-        return Kinetic(given)
-    if given.ndim > 1:
-        raise ValueError(f"mass has shape {given.shape}; (), (m,) or (m, m) is needed.")
+        return Kinetic(mass_array)
+    if mass_array.ndim > 1:
+        raise ValueError(f"mass has shape {mass_array.shape}; (), (m,) or (m, m) is needed.")
     return Kinetic(require.positive(mass, "mass"))

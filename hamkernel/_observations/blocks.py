@@ -1,9 +1,9 @@
 """Rows of linear functionals of a field f = B∇u and of its potential u, as maps from points.
 
-A block has points z and maps the values f(z) or u(z) there to rows: the components that were
-measured, weighted sums along groups of points, or the values of u. Each row is divided by its
-relative noise, so that all rows have noise of one variance. The transpose maps coefficients of the
-rows to coefficients at the points, so the representer of any observation is Σ K(x, z) a again.
+A block has points z and maps the values f(z) or u(z) to rows: the measured components, weighted
+sums over groups of points, or the values of u. Each row is divided by its relative noise, so that
+the noise of all rows has the same variance. The transpose of this map turns coefficients of the
+rows into coefficients at the points, so the representer of any observation is again Σ K(x, z) a.
 """
 
 import abc
@@ -43,7 +43,7 @@ class AbstractBlock(eqx.Module):
 
     @property
     def scale(self) -> Float[Array, " D"]:
-        """The relative noise of each row, by which it is divided."""
+        """The relative noise of each row; the row is divided by its noise."""
         return jnp.ones(self.size, self.points.dtype) if self.noise is None else self.noise
 
     @property
@@ -53,7 +53,7 @@ class AbstractBlock(eqx.Module):
 
     @abc.abstractmethod
     def labels(self) -> Int[np.ndarray, " D"]:
-        """The observation that each row belongs to, as an index from 0 to `count` − 1."""
+        """The index of the observation of each row, from 0 to `count` − 1."""
 
     @abc.abstractmethod
     def rows(self, values: Float[Array, "P *rest"]) -> Float[Array, "D *below"]:
@@ -64,8 +64,8 @@ class AbstractBlock(eqx.Module):
         """The transpose of `rows`."""
 
     @abc.abstractmethod
-    def merge(self, other: "AbstractBlock") -> "AbstractBlock | None":
-        """One block of these rows followed by the others; None if these are of another kind."""
+    def merge(self, following: "AbstractBlock") -> "AbstractBlock | None":
+        """One block of these rows followed by the rows of `other`; None if its kind differs."""
 
     @abc.abstractmethod
     def with_points(self, points: Float[Array, "P d"]) -> "AbstractBlock":
@@ -77,7 +77,7 @@ class AbstractBlock(eqx.Module):
 
         Returns:
             The new block, the indices of its rows in this block, and the indices of the
-            observations that those rows belong to.
+            observations of these rows.
         """
 
 
@@ -86,9 +86,9 @@ class Components(AbstractBlock):
 
     Attributes:
         kept: the rows that were measured, as indices into all P·n, shape (D,); None if all were.
-        noise: of each row that was measured; None if it is 1.
-        outputs: the components of the field at a point, None if there are as many as coordinates;
-            fewer at points (x, u) of a field with inputs.
+        noise: the relative noise of each measured row; None if it is 1.
+        outputs: the number of components of the field at a point; None if it is the number of
+            coordinates. At points (x, u) of a field with inputs it is smaller.
     """
 
     points: Float[Array, "P n"]
@@ -120,7 +120,7 @@ class Components(AbstractBlock):
     def rows(self, values: Float[Array, "P n *rest"]) -> Float[Array, "D *rest"]:
         rows = values.reshape(math.prod(values.shape[:2]), *values.shape[2:])
         rows = rows if self.kept is None else rows[self.kept]
-        return rows if self.noise is None else rows / _along(self.noise, rows)
+        return rows if self.noise is None else rows / _broadcast_noise(self.noise, rows)
 
     def coefficients(self, c: Float[Array, " D"]) -> Float[Array, "P n"]:
         c = c if self.noise is None else c / self.noise
@@ -128,20 +128,22 @@ class Components(AbstractBlock):
             c = jnp.zeros(math.prod(self.values_shape), c.dtype).at[self.kept].set(c)
         return c.reshape(self.values_shape)
 
-    def merge(self, other: AbstractBlock) -> "Components | None":
-        if not isinstance(other, Components) or self.outputs != other.outputs:
+    def merge(self, following: AbstractBlock) -> "Components | None":
+        if not isinstance(following, Components) or self.outputs != following.outputs:
             return None
         kept = noise = None
-        sizes = [math.prod(block.values_shape) for block in (self, other)]
-        if self.kept is not None or other.kept is not None:
-            own, others = (
+        sizes = [math.prod(block.values_shape) for block in (self, following)]
+        if self.kept is not None or following.kept is not None:
+            first_kept, second_kept = (
                 jnp.arange(size) if b.kept is None else b.kept
-                for b, size in zip((self, other), sizes, strict=True)
+                for b, size in zip((self, following), sizes, strict=True)
             )
-            kept = jnp.concatenate([own, others + sizes[0]])
-        if self.noise is not None or other.noise is not None:
-            noise = jnp.concatenate([self.scale, other.scale])
-        return Components(jnp.concatenate([self.points, other.points]), kept, noise, self.outputs)
+            kept = jnp.concatenate([first_kept, second_kept + sizes[0]])
+        if self.noise is not None or following.noise is not None:
+            noise = jnp.concatenate([self.scale, following.scale])
+        return Components(
+            jnp.concatenate([self.points, following.points]), kept, noise, self.outputs
+        )
 
     def with_points(self, points: Float[Array, "P d"]) -> "Components":
         return Components(points, outputs=self.outputs)
@@ -153,12 +155,12 @@ class Components(AbstractBlock):
             n = self.values_shape[1]
             all_kept = np.asarray(kept)[rows]
             kept = jnp.asarray(np.searchsorted(chosen, all_kept // n) * n + all_kept % n)
-        points, noise = _taken(self.points, chosen), _taken(self.noise, rows)
+        points, noise = _take(self.points, chosen), _take(self.noise, rows)
         return Components(points, kept, noise, self.outputs), rows, chosen
 
 
 class Combinations(AbstractBlock):
-    """Σ_q weights[s, r, q] · f(groups[s, q]), R rows for each of S groups of Q points."""
+    """The rows Σ_q weights[s, r, q] · f(groups[s, q]): R rows for each of S groups of Q points."""
 
     groups: Float[Array, "S Q d"]
     weights: Float[Array, "S R Q n"]
@@ -195,33 +197,37 @@ class Combinations(AbstractBlock):
     def rows(self, values: Float[Array, "SQ n *rest"]) -> Float[Array, "SR *rest"]:
         rest = values.shape[2:]
         S, R, Q, n = self.weights.shape
-        rows = self.weights.reshape(S, R, Q * n) @ values.reshape(S, Q * n, -1)  # (S, R, rest)
+        # (S, R, Q n) @ (S, Q n, rest) -> (S, R, rest)
+        rows = self.weights.reshape(S, R, Q * n) @ values.reshape(S, Q * n, -1)
         return rows.reshape(S * R, *rest)
 
     def coefficients(self, c: Float[Array, " SR"]) -> Float[Array, "SQ n"]:
         S, R, Q, n = self.weights.shape
         return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(S * Q, n)
 
-    def merge(self, other: AbstractBlock) -> "Combinations | None":
-        if not isinstance(other, Combinations) or self.weights.shape[1:] != other.weights.shape[1:]:
+    def merge(self, following: AbstractBlock) -> "Combinations | None":
+        if (
+            not isinstance(following, Combinations)
+            or self.weights.shape[1:] != following.weights.shape[1:]
+        ):
             return None
-        pairs = (self.groups, other.groups), (self.weights, other.weights)
+        pairs = (self.groups, following.groups), (self.weights, following.weights)
         return Combinations(*map(jnp.concatenate, pairs))
 
     def with_points(self, points: Float[Array, "P d"]) -> Components:
         return Components(points, outputs=self.weights.shape[3])
 
     def subset(self, chosen: Int[np.ndarray, " C"]) -> "Subset":
-        # Whole groups: the rows of one share its points.
+        # Groups are chosen completely, since all rows of a group share its points.
         R = self.weights.shape[1]
         groups = np.unique(chosen // R)
         rows = (groups[:, None] * R + np.arange(R)).reshape(-1)
-        own = {"groups": _taken(self.groups, groups), "weights": _taken(self.weights, groups)}
-        return Combinations(**own), rows, rows
+        arrays = {"groups": _take(self.groups, groups), "weights": _take(self.weights, groups)}
+        return Combinations(**arrays), rows, rows
 
 
 class Values(AbstractBlock):
-    """The potential at points; `noise` is that of each, None if it is 1.
+    """The potential at points; `noise` is the relative noise of each value, None if it is 1.
 
     At points (x, u) it is the potential of the drift, and u has no effect.
     """
@@ -251,29 +257,29 @@ class Values(AbstractBlock):
         return np.arange(len(self.points))
 
     def rows(self, values: Float[Array, "E *rest"]) -> Float[Array, "E *rest"]:
-        return values if self.noise is None else values / _along(self.noise, values)
+        return values if self.noise is None else values / _broadcast_noise(self.noise, values)
 
     def coefficients(self, c: Float[Array, " E"]) -> Float[Array, " E"]:
         return c if self.noise is None else c / self.noise
 
-    def merge(self, other: AbstractBlock) -> "Values | None":
-        if not isinstance(other, Values):
+    def merge(self, following: AbstractBlock) -> "Values | None":
+        if not isinstance(following, Values):
             return None
         noise = None
-        if self.noise is not None or other.noise is not None:
-            noise = jnp.concatenate([self.scale, other.scale])
-        return Values(jnp.concatenate([self.points, other.points]), noise, self.outputs)
+        if self.noise is not None or following.noise is not None:
+            noise = jnp.concatenate([self.scale, following.scale])
+        return Values(jnp.concatenate([self.points, following.points]), noise, self.outputs)
 
     def with_points(self, points: Float[Array, "E d"]) -> "Values":
         return Values(points, outputs=self.outputs)
 
     def subset(self, chosen: Int[np.ndarray, " C"]) -> "Subset":
-        points, noise = _taken(self.points, chosen), _taken(self.noise, chosen)
+        points, noise = _take(self.points, chosen), _take(self.noise, chosen)
         return Values(points, noise, self.outputs), chosen, chosen
 
 
-def _taken(array: Array | None, index: Int[np.ndarray, " C"]) -> Any:
-    """array[index], evaluated by NumPy, since JAX compiles anew for every number of entries."""
+def _take(array: Array | None, index: Int[np.ndarray, " C"]) -> Any:
+    """The entries array[index], by NumPy, since JAX would compile for every number of entries."""
     if array is None or isinstance(array, Tracer):
         return None if array is None else array[index]
     return jnp.asarray(np.asarray(array)[index])
@@ -282,14 +288,14 @@ def _taken(array: Array | None, index: Int[np.ndarray, " C"]) -> Any:
 Subset = tuple[AbstractBlock, Int[np.ndarray, " rows"], Int[np.ndarray, " observations"]]
 
 
-def merged(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:
-    """The same rows, with neighbouring blocks of one kind merged, which compile faster."""
-    found: list[AbstractBlock] = []
+def merge(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:
+    """The same rows, with neighbours of one kind merged, since fewer blocks compile faster."""
+    groups: list[AbstractBlock] = []
     for block in blocks:
-        both = found[-1].merge(block) if found else None
-        found = [*found[:-1], both] if both is not None else [*found, block]
-    return tuple(found)
+        both = groups[-1].merge(block) if groups else None
+        groups = [*groups[:-1], both] if both is not None else [*groups, block]
+    return tuple(groups)
 
 
-def _along(noise: Float[Array, " D"], rows: Float[Array, "D *rest"]) -> Array:
+def _broadcast_noise(noise: Float[Array, " D"], rows: Float[Array, "D *rest"]) -> Array:
     return noise.reshape(-1, *[1] * (rows.ndim - 1))

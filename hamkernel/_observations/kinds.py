@@ -1,6 +1,6 @@
 """Observations of a field and its potential: velocities, energies, equilibria, integrals.
 
-All of them are values of linear functionals of (u, f), and any of them add up:
+All are values of linear functionals of (u, f), and all kinds can be added:
 
     data = hk.Velocities(X, Y) + hk.Energies(Z, E) + hk.Equilibria(X0)
     field = hk.fit(K, data, regularization=1e-4)
@@ -8,8 +8,8 @@ All of them are values of linear functionals of (u, f), and any of them add up:
 The noise is relative: a row of relative noise s has the variance s² Nλ, where N counts all
 observations: points of velocities and equilibria, energies and functionals.
 
-A field with inputs is observed at points (x, u), and each kind but the energies, which are those of
-the drift, holds the inputs u of its points; for a family they hold its parameters in their place.
+A field with inputs is observed at points (x, u). Every kind except `Energies`, which belong to the
+drift, holds the inputs u of its points, or the parameters of a family.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class AbstractObservations(eqx.Module):
         """n, the number of coordinates of a state."""
 
     def given_inputs(self) -> Iterator[Float[Array, "*points m"]]:
-        """The inputs of each kind that has them."""
+        """The inputs of each kind of observation with inputs."""
         inputs = getattr(self, "inputs", None)  # energies have none
         if inputs is not None:
             yield inputs
@@ -49,14 +49,14 @@ class AbstractObservations(eqx.Module):
     def parts(
         self, count: int = 0, given: str = "inputs"
     ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
-        """The blocks of rows, one for each kind, and the values that were measured.
+        """The blocks of rows, one for each kind, and the measured values.
 
         Args:
             count: m, the number of inputs of the kernel. If it is not 0 the points are (x, u).
-            given: what u is, "inputs", or the "parameters" of a family.
+            given: "inputs", or "parameters" for a family: the name of u in errors.
 
         Raises:
-            ValueError: u is needed and was not given, or energies of a family were.
+            ValueError: u is missing, or there are energies of a family.
         """
 
     def __add__(self, other: Any) -> AbstractObservations:
@@ -115,7 +115,7 @@ def _summands(data: AbstractObservations) -> tuple[AbstractObservations, ...]:
 
 
 def refuse_swapped(X: Any, Y: Any, inputs: Any) -> None:
-    """Refuse X and inputs that seem to have changed places."""
+    """ValueError if X and inputs seem to be swapped."""
     if inputs is not None and np.shape(X) != np.shape(Y) == np.shape(inputs):
         raise ValueError(
             f"X has shape {np.shape(X)}, inputs {np.shape(inputs)} and Y {np.shape(Y)}: X and "
@@ -124,10 +124,10 @@ def refuse_swapped(X: Any, Y: Any, inputs: Any) -> None:
 
 
 def inputs_or_parameters(inputs: Any, parameters: Any, K: Any = None) -> Any:
-    """The inputs or the parameters, whichever were given; None if neither was.
+    """The caller's inputs or parameters; None without both.
 
     Raises:
-        TypeError: both are given, or K takes the other.
+        TypeError: both are given, or K takes inputs and parameters are given, or the reverse.
     """
     if inputs is not None and parameters is not None:
         raise TypeError(
@@ -136,25 +136,25 @@ def inputs_or_parameters(inputs: Any, parameters: Any, K: Any = None) -> Any:
             "of a family may be one of its parameters."
         )
     name = K.given if K is not None and K.takes_inputs else None
-    given = "inputs" if inputs is not None else "parameters" if parameters is not None else name
-    if name is not None and given != name:
-        raise TypeError(f"{type(K).__name__} takes {name}, and {given} were given: {name}=….")
+    passed = "inputs" if inputs is not None else "parameters" if parameters is not None else name
+    if name is not None and passed != name:
+        raise TypeError(f"{type(K).__name__} takes {name}, and {passed} were given: {name}=….")
     return parameters if inputs is None else inputs
 
 
 def inputs_at(
     X: Float[Array, "*points n"], inputs: Any, parameters: Any = None
 ) -> Float[Array, "*points m"] | None:
-    """The inputs, or parameters, of every state, finite and of its dtype; None if none are given.
+    """The inputs or parameters of every state, finite and in the dtype of X; None if not given.
 
     Raises:
         TypeError: both are given. ValueError: the shape does not fit, or a value is not finite.
     """
     name, letter = ("inputs", "U") if parameters is None else ("parameters", "Θ")
-    given = inputs_or_parameters(inputs, parameters)
-    if given is None:
+    values = inputs_or_parameters(inputs, parameters)
+    if values is None:
         return None
-    U = require.floating(given, name)
+    U = require.floating(values, name)
     U = U[..., None] if U.shape == X.shape[:-1] != () else U  # one for each state
     if U.ndim != X.ndim or U.shape[:-1] != X.shape[:-1] or U.shape[-1] == 0:
         hint = ""
@@ -192,8 +192,8 @@ class Velocities(AbstractObservations):
         Y: velocities, shape (N, n), in units of X per unit of time. NaN marks a component that was
             not measured; it adds no row.
         noise: relative standard deviations, positive: one number, one for each coordinate, shape
-            (n,), or one for each component, shape (N, n); 1 if None. Those of components that
-            were not measured have no effect.
+            (n,), or one for each component, shape (N, n); 1 if None. The noise of unmeasured
+            components has no effect.
         inputs: u at each state, shape (N, m), for a `Controlled` kernel.
         parameters: θ at each state, shape (N, p), for a `Family`.
 
@@ -243,9 +243,9 @@ class Velocities(AbstractObservations):
 class Energies(AbstractObservations):
     """Values of the potential, Eᵢ = H(xᵢ) + c + noise, with one unknown constant c.
 
-    The constant is estimated with the field, as generalised least squares do. It is the same for
-    all energies in a sum of observations, and takes one of the rows. With a `Controlled` kernel H
-    is that of the drift, whatever the inputs are.
+    A fit estimates the constant together with the field (generalised least squares). The constant
+    is the same for all energies in a sum of observations, and uses up one row. With a `Controlled`
+    kernel H belongs to the drift, whatever the inputs are.
 
     Args:
         X: states, shape (N, n).
@@ -306,7 +306,7 @@ class Equilibria(AbstractObservations):
 
     Args:
         X: states, shape (N, n), or one of shape (n,).
-        inputs: of a `Controlled` kernel: those that hold the states, shape (N, m) or (m,).
+        inputs: the inputs that hold the states, for a `Controlled` kernel, shape (N, m) or (m,).
         parameters: θ at each state, for a `Family`, shape (N, p) or (p,).
 
     Raises:
@@ -358,8 +358,8 @@ class Functionals(AbstractObservations):
         points: shape (R, Q, n): the Q points of each of R rows.
         weights: shape (R, Q, n): a vector for each of them, which multiplies f there.
         targets: shape (R,).
-        inputs: of a `Controlled` kernel: u at each point, shape (R, Q, m), or (S, Q, m).
-        parameters: of a `Family`: θ at each point, shape (R, Q, p), or (S, Q, p).
+        inputs: u at each point, for a `Controlled` kernel, shape (R, Q, m) or (S, Q, m).
+        parameters: θ at each point, for a `Family`, shape (R, Q, p) or (S, Q, p).
 
     Raises:
         ValueError: shapes do not fit, a value is not finite, or a row has weights that are all
@@ -383,14 +383,14 @@ class Functionals(AbstractObservations):
         arrays = [require.floating(array, name) for name, array in named.items()]
         dtype = np.result_type(*[array.dtype for array in arrays])
         require.single_or_double(dtype, "points, weights and targets have")
-        points, weights, targets = given = [array.astype(dtype) for array in arrays]
+        points, weights, targets = arrays = [array.astype(dtype) for array in arrays]
         if weights.ndim == 3:
             weights, targets = weights[:, None], targets[:, None]
         S, R, Q, n = weights.shape if weights.ndim == 4 else (0, 0, 0, 0)
         if points.shape != (S, Q, n) or targets.shape != (S, R) or weights.size == 0:
             raise ValueError(
                 "points, weights and targets have shapes "
-                + f"{', '.join(str(array.shape) for array in given)}; they must be (R, Q, n), "
+                + f"{', '.join(str(array.shape) for array in arrays)}; they must be (R, Q, n), "
                 "(R, Q, n) and (R,): Q points and as many vectors for each of R rows. Pad shorter "
                 "rows with weights of zero."
             )

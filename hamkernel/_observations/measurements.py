@@ -1,18 +1,18 @@
 """The normal form of all observations: y_r = L_r u + ε_r with one variance Nλ of all rows.
 
-Inputs are joined to their states here alone. With inputs a point is (x, u), of d = n + m
-coordinates, and the field there has n components; the Gram, the solvers and the losses need not
-know that some of the coordinates are inputs.
+This module joins inputs to their states. With inputs a point is (x, u), with d = n + m coordinates,
+and the field at a point has n components. The Gram, the solvers and the losses need not know which
+coordinates are inputs.
 
-Energies are known up to one constant c, the same for all of them: E = u(z) + c. In rows divided by
-their noise the constant has the direction p = 1/noise, and rows orthogonal to p do not depend on
-it. Such rows are the contrasts of each energy with the weighted mean of those before it,
+Energies are known up to one common constant c, E = u(z) + c. In rows divided by their noise the
+constant has the direction p = 1/noise, and linear combinations orthogonal to p do not depend on c.
+Such combinations are the contrasts of each energy with the weighted mean of the energies before it,
 
     q_i = (n_{i−1} e_i − (p_i/n_{i−1}) Σ_{j<i} p_j e_j)/n_i,   n_i² = Σ_{j≤i} p_j².
 
-The contrasts are orthonormal, so their noise is independent again: this is generalised least
-squares with the constant estimated, exactly, with one row fewer. They are Helmert's contrasts with
-weights, and a cumulative sum computes them.
+The contrasts are orthonormal, so their noise is independent again. A fit to the contrasts is
+exactly generalised least squares with an estimated constant, with one row fewer. These are
+Helmert's contrasts with weights; a cumulative sum computes them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
 from hamkernel._machine import automatic, is_on_one_device
-from hamkernel._observations.blocks import AbstractBlock, Components, merged
+from hamkernel._observations.blocks import AbstractBlock, Components, merge
 from hamkernel._observations.kinds import (
     AbstractObservations,
     Equilibria,
@@ -117,14 +117,14 @@ class Measurements:
         return block.points, self.targets.reshape(block.values_shape)
 
     def labels(self) -> Int[np.ndarray, " M"]:
-        """The observation, of N, that each of the M rows belongs to."""
+        """The index of the observation, of N, of each of the M rows."""
         starts = np.cumsum([0, *(block.count for block in self.blocks)])
         pairs = zip(starts, self.blocks, strict=False)
         return np.concatenate([start + block.labels() for start, block in pairs])
 
     @property
     def points(self) -> Float[Array, "P d"]:
-        """The points of all blocks, (x, u) where there are inputs."""
+        """The points of all blocks; (x, u) if there are inputs."""
         return jnp.concatenate([block.points for block in self.blocks])
 
     def of(
@@ -132,29 +132,29 @@ class Measurements:
         field: Callable[[Float[Array, "P n"]], Float[Array, "P n"]],
         potential: Callable[[Float[Array, "E n"]], Float[Array, " E"]],
     ) -> Float[Array, " M"]:
-        """The M rows of a field and its potential, which are functions of many points."""
+        """The M rows of a field and its potential, both functions of many points at once."""
         blocks = self.blocks
         return jnp.concatenate(
             [b.rows((potential if b.of_values else field)(b.points)) for b in blocks]
         )
 
-    def subtract(self, known: Float[Array, " M"]) -> Measurements:
-        """The measurements of f − g, where `known` are the M rows of a known field g."""
-        return dataclasses.replace(self, targets=self.targets - known)
+    def subtract(self, known_rows: Float[Array, " M"]) -> Measurements:
+        """The measurements of f − g, given the M rows of a known field g."""
+        return dataclasses.replace(self, targets=self.targets - known_rows)
 
     def measured(self) -> Float[Array, " M"]:
-        """The targets in the units of the data, energies less their weighted mean."""
+        """The targets in the units of the data, energies minus their weighted mean."""
         return self.scale * self.contrast_transpose(self.y)
 
-    def joined(self, new: Measurements) -> Measurements:
-        """The measurements with the new rows behind these."""
-        blocks = merged(self.blocks + new.blocks)
+    def append(self, new: Measurements) -> Measurements:
+        """These measurements followed by new rows."""
+        blocks = merge(self.blocks + new.blocks)
         return Measurements(blocks, jnp.concatenate([self.targets, new.targets]))
 
     def with_previous(self, new: Measurements) -> Measurements:
-        """The new rows, preceded by the energies among these, if the new rows have energies.
+        """The new rows, preceded by the old energies if there are new energies.
 
-        The contrasts of new energies need the old ones.
+        The contrasts of new energies need the old energies.
         """
         pairs = [(b, self.targets[rows]) for b, rows in zip(self.blocks, self.slices, strict=True)]
         old = [(b, y) for b, y in pairs if b.of_values and len(new.energies)]
@@ -166,49 +166,52 @@ class Measurements:
     ) -> tuple[Measurements, Int[np.ndarray, " chosen"]]:
         """The rows of some of the N observations, and the indices of these observations.
 
-        The indices `chosen` are in increasing order. Rows that share points stay together, and a
-        single energy, which says nothing, is left out.
+        The indices `chosen` are in increasing order. Rows that share points stay together. A single
+        energy has no contrast and is left out.
         """
         ends = np.cumsum([0, *(block.count for block in self.blocks)]).tolist()
-        own = [chosen[(a <= chosen) & (chosen < b)] - a for a, b in itertools.pairwise(ends)]
-        pairs = list(zip(self.blocks, own, strict=True))
-        energies = sum(len(each) for block, each in pairs if block.of_values)
+        local_indices = [
+            chosen[(a <= chosen) & (chosen < b)] - a for a, b in itertools.pairwise(ends)
+        ]
+        pairs = list(zip(self.blocks, local_indices, strict=True))
+        energies = sum(len(local) for block, local in pairs if block.of_values)
         blocks, targets, taken = [], [], []
-        for (block, each), place, start in zip(pairs, self.slices, ends, strict=False):
-            if len(each) and not (block.of_values and energies == 1):
-                part, rows, these = block.subset(each)
+        for (block, local), place, start in zip(pairs, self.slices, ends, strict=False):
+            if len(local) and not (block.of_values and energies == 1):
+                part, rows, labels = block.subset(local)
                 blocks.append(part)
                 targets.append(np.asarray(self.targets)[place][rows])
-                taken.append(start + these)
+                taken.append(start + labels)
         return Measurements(tuple(blocks), jnp.asarray(np.concatenate(targets))), np.concatenate(
             taken
         )
 
-    def residual(self, left: Float[Array, " D"]) -> Float[Array, "..."]:
-        """The residual y − f in the units of the data, from that of the D rows of the contrast.
+    def residual(self, contrasts: Float[Array, " D"]) -> Float[Array, "..."]:
+        """The residual y − f in the units of the data, from the residual of the D contrasts.
 
-        Its shape is (N, n) if the data are velocities that were all measured, else (M,).
+        The shape is (N, n) for completely measured velocities, else (M,).
         """
-        return self.in_units(self.contrast_transpose(left))
+        return self.in_units(self.contrast_transpose(contrasts))
 
-    def in_units(self, left: Float[Array, " M"]) -> Float[Array, "..."]:
-        """M rows in the units of the data; of shape (N, n) for velocities all measured."""
+    def in_units(self, values: Float[Array, " M"]) -> Float[Array, "..."]:
+        """M rows in the units of the data; shape (N, n) for completely measured velocities."""
         block = self.blocks[0]
-        whole = len(self.blocks) == 1 and isinstance(block, Components) and block.kept is None
-        left = self.scale * left
-        return left.reshape(block.values_shape) if whole else left
+        is_complete = len(self.blocks) == 1 and isinstance(block, Components) and block.kept is None
+        values = self.scale * values
+        return values.reshape(block.values_shape) if is_complete else values
 
     def contrast(self, rows: Float[Array, "M *rest"]) -> Float[Array, "D *rest"]:
         """The D contrasts of M rows, which do not depend on the constant of the energies."""
         where = self.energies
         if not len(where):
             return rows
+        # q_i = (n_{i−1} e_i − p_i before_i)/n_i with before_i = (Σ_{j<i} p_j e_j)/n_{i−1}
         p, sizes = self._constant(rows)
         energies = rows[where]
         before = jnp.cumsum(p * energies, axis=0)[:-1] / sizes[:-1]
         contrasts = (sizes[:-1] * energies[1:] - p[1:] * before) / sizes[1:]
-        kept = np.delete(np.arange(len(rows)), where[0])
-        return rows.at[where[1:]].set(contrasts)[kept]
+        remaining = np.delete(np.arange(len(rows)), where[0])
+        return rows.at[where[1:]].set(contrasts)[remaining]
 
     def contrast_transpose(self, c: Float[Array, "D *rest"]) -> Float[Array, "M *rest"]:
         """The transpose of the linear map `contrast`."""
@@ -219,14 +222,16 @@ class Measurements:
         rows = rows.at[np.delete(np.arange(len(rows)), where[0])].set(c)
         p, sizes = self._constant(rows)
         energies = rows[where][1:] / sizes[1:]
-        # The sums over i > j, accumulated from the last contrast on.
+        # The transpose has the entries Σ_i T_ij c_i = n_{j−1} c_j/n_j − p_j Σ_{i>j} p_i
+        # c_i/(n_{i−1} n_i) in the column j; the sums over i > j are accumulated from the last
+        # contrast backward.
         after = jnp.cumsum((p[1:] / sizes[:-1] * energies)[::-1], axis=0)[::-1]
         none = jnp.zeros_like(after[:1])
-        own = jnp.concatenate([none, sizes[:-1] * energies])
-        return rows.at[where].set(own - p * jnp.concatenate([after, none]))
+        direct = jnp.concatenate([none, sizes[:-1] * energies])
+        return rows.at[where].set(direct - p * jnp.concatenate([after, none]))
 
     def _constant(self, rows: Float[Array, "M *rest"]) -> tuple[Array, Array]:
-        """The p_i and n_i of the energies, shaped to multiply rows."""
+        """The arrays p_i and n_i of the energies, with trailing axes that broadcast over rows."""
         p = 1 / self.scale[self.energies]
         sizes = jnp.sqrt(jnp.cumsum(p**2))
         shape = (-1, *[1] * (rows.ndim - 1))
@@ -244,15 +249,15 @@ class Measurements:
     def representer(
         self, raw: Float[Array, " M"]
     ) -> tuple[Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]]:
-        """`coefficients` of the M rows before the contrast."""
+        """The representer of the M rows before the contrast, as `coefficients` of the D rows."""
         pairs = [(b, b.coefficients(raw[s])) for b, s in zip(self.blocks, self.slices, strict=True)]
         none = self.blocks[0].points[:1]
         fields = [(b.points, a) for b, a in pairs if not b.of_values]
         values = [(b.points, a) for b, a in pairs if b.of_values]
         fields = fields or [(none, jnp.zeros((1, self.dimension), raw.dtype))]
         values = values or [(none[:0], jnp.zeros(0, raw.dtype))]
-        Z, A = (jnp.concatenate(each) for each in zip(*fields, strict=True))
-        S, b = (jnp.concatenate(each) for each in zip(*values, strict=True))
+        Z, A = (jnp.concatenate(parts) for parts in zip(*fields, strict=True))
+        S, b = (jnp.concatenate(parts) for parts in zip(*values, strict=True))
         return Z, A, S, b
 
 
@@ -272,16 +277,16 @@ def measurements(
     """
     many = bool(shared_laws(K))  # parts in a state: a few states of many coordinates are enough
     if inputs is None and not isinstance(X, AbstractObservations) and not K.takes_inputs:
-        return K, measurements_of_states(*placed(velocities_at(X, Y, part=many)))
-    return measurements_of(K, placed(observations(X, Y, inputs, many, K.given)))
+        return K, measurements_of_states(*place(velocities_at(X, Y, part=many)))
+    return measurements_of(K, place(observations(X, Y, inputs, many, K.given)))
 
 
 def observations(
     X: Any, Y: Any, inputs: Any = None, part: bool = False, name: str = "inputs"
 ) -> AbstractObservations:
-    """X, if it is observations, and then there is no Y; else the velocities Y at the states X.
+    """The observations X, or the velocities Y at the states X.
 
-    `name` is "parameters" where that is what is given in the place of inputs.
+    `name` is "parameters" if `inputs` are the parameters of a family.
     """
     if not isinstance(X, AbstractObservations):
         return Velocities(*velocities_at(X, Y, inputs, part), **{name: inputs})
@@ -311,15 +316,15 @@ def velocities_at(
     return require.data(X, Y, part=part)
 
 
-def placed(data: Any) -> Any:
-    """The data with arrays that lie on a mesh of devices on automatic axes of it."""
+def place(data: Any) -> Any:
+    """The data, with arrays on a mesh of devices moved to automatic axes of the mesh."""
     if all(is_on_one_device(array) for array in jax.tree.leaves(data)):
         return data
     return jax.tree.map(automatic, data)
 
 
 def measurements_of_states(X: Float[Array, "N d"], Y: Float[Array, "N n"]) -> Measurements:
-    """The rows of velocities at points, all of one noise."""
+    """The rows of velocities at points, all with the same noise."""
     outputs = None if X.shape == Y.shape else Y.shape[1]
     return Measurements((Components(X, outputs=outputs),), Y.reshape(-1))
 
@@ -332,7 +337,7 @@ def measurements_of(
     Args:
         K: the kernel.
         data: the observations.
-        previous: the rows that `data` is added to, if any.
+        previous: the rows to which `data` is added, if any.
 
     Raises:
         ValueError: inputs are missing, or cannot be told from the drift; there is one energy.
@@ -346,7 +351,7 @@ def measurements_of(
         y.astype(dtype) if block.noise is None else y.astype(dtype) / block.noise
         for block, y in zip(blocks, targets, strict=True)
     ]
-    rows = Measurements(merged(blocks), jnp.concatenate(divided))
+    rows = Measurements(merge(blocks), jnp.concatenate(divided))
     before = 0 if previous is None else len(previous.energies)
     if before + len(rows.energies) == 1:
         raise ValueError(
@@ -357,17 +362,17 @@ def measurements_of(
 
 
 def sampled_points(
-    K: AbstractMatrixKernel, X: Float[Array, "N n"], given: Any
+    K: AbstractMatrixKernel, X: Float[Array, "N n"], inputs: Any
 ) -> tuple[AbstractMatrixKernel, Float[Array, "N d"]]:
-    """The kernel with its number of inputs, and the points (x, u), where nothing is measured."""
-    data = Equilibria(X, given)
+    """The kernel with its number of inputs, and points (x, u) without measurements."""
+    data = Equilibria(X, inputs)
     K = with_input_count(K, data)
     (block, _), *_ = data.parts(inputs_of(K), K.given)
     return K, block.points
 
 
 def inputs_of(K: AbstractMatrixKernel) -> int:
-    """m, the number of inputs; 0 for a kernel that takes none."""
+    """The number m of inputs; 0 for a kernel without inputs."""
     return K.input_count if isinstance(K, AbstractJoinedKernel) else 0
 
 
@@ -376,18 +381,19 @@ def with_input_count(
 ) -> AbstractMatrixKernel:
     """The kernel with its number of inputs, taken from the data.
 
-    The inputs, or parameters, of all data must vary; those of a `part` of it may be constant.
+    The inputs or parameters of complete data must vary. For a `part` of the data they may be
+    constant.
     """
-    given = list(data.given_inputs())
+    all_inputs = list(data.given_inputs())
     if not isinstance(K, AbstractJoinedKernel):
-        if given:
+        if all_inputs:
             raise TypeError(
                 f"{type(K).__name__} takes no inputs: say how they act, hk.Controlled(K, "
                 "inputs=hk.InputMatrix(k, acts_on=(1,))), and for the parameters of a family "
                 "hk.Family(K, k)."
             )
         return K
-    counts = {u.shape[-1] for u in given}
+    counts = {u.shape[-1] for u in all_inputs}
     if len(counts) > 1:
         raise ValueError(f"the observations have {sorted(counts)} {K.given}: all need as many.")
     if not counts:
@@ -398,8 +404,8 @@ def with_input_count(
         raise ValueError(f"{K.given} has {count} columns and the kernel {K.count} {K.given}.")
     K = K.with_count(count)
     K.check_dimension(data.dimension + count)
-    if not part and require.is_concrete(given):
-        K.check_identified(np.concatenate([np.asarray(u).reshape(-1, count) for u in given]))
+    if not part and require.is_concrete(all_inputs):
+        K.check_identified(np.concatenate([np.asarray(u).reshape(-1, count) for u in all_inputs]))
     return K
 
 

@@ -65,7 +65,7 @@ class DenseConditional(AbstractConditional):
 
     def updated(self, new: Measurements) -> "DenseConditional":
         factor, c, field = _extend(self, new)
-        rows = self.rows.joined(new)
+        rows = self.rows.append(new)
         return DenseConditional(
             _refuse_failure(field, jnp.sum(0 * c), rows.count), rows, self.ridge, factor, c
         )
@@ -207,7 +207,7 @@ def relative_error(error: Array, reference: Array) -> Float[Array, ""]:
 
 @compiled
 def _extend(old: DenseConditional, new: Measurements):
-    K, R, rows = old.field.kernel, old.factor.R, old.rows.joined(new)
+    K, R, rows = old.field.kernel, old.factor.R, old.rows.append(new)
     # A contrast of a new energy is a difference with the old energies, so their rows are needed
     # too.
     extended_rows, new_count = old.rows.with_previous(new), rows.size - old.rows.size

@@ -443,7 +443,7 @@ class LowRankConditional(AbstractConditional):
         return self.ridge * whitened @ whitened + waves.scale.astype(dtype) * rest
 
     def updated(self, new: Measurements) -> "LowRankConditional":
-        rows = self.rows.joined(new)
+        rows = self.rows.append(new)
         extended_rows, new_count = self.rows.with_previous(new), rows.size - self.rows.size
         new_rows = extended_rows.contrast(self.span.all_rows(extended_rows))[-new_count:]
         R, rotated = _append_rows(self.R, self.rotated, new_rows, rows.y[-new_count:])

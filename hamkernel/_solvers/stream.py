@@ -40,7 +40,7 @@ from hamkernel._observations.measurements import (
     Measurements,
     measurements_of,
     observations,
-    placed,
+    place,
     sampled_points,
 )
 from hamkernel._show import call, text
@@ -353,7 +353,7 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
         K = matrix_kernel(K)
         if isinstance(sample, AbstractObservations):
             K, rows = measurements_of(
-                K, placed(observations(sample, None, inputs_or_parameters(inputs, parameters)))
+                K, place(observations(sample, None, inputs_or_parameters(inputs, parameters)))
             )
             _refuse_energies(rows)
         else:

@@ -40,11 +40,11 @@ class AbstractMatrixKernel(eqx.Module):
 
     matrix_valued: ClassVar[bool] = True
     takes_inputs: ClassVar[bool] = False  # whether its points are (x, u)
-    given: ClassVar[str] = "inputs"  # what u is called in `fit`; "parameters" of a family
+    given: ClassVar[str] = "inputs"  # the name of u in `fit`; "parameters" for a family
     # Whether derivatives of its Gram are cheaper in reverse mode, as those of a closed form can be.
     differentiated_backward: ClassVar[bool] = False
     symplectic: eqx.AbstractVar[bool]  # whether flows keep dq ∧ dp, as those of J∇H do
-    no_potential: eqx.AbstractVar[str | None]  # why its fields have none; None if they have one
+    no_potential: eqx.AbstractVar[str | None]  # why fields have no potential; None if they have one
 
     @property
     def has_hamiltonian(self) -> bool:
@@ -98,14 +98,14 @@ class AbstractMatrixKernel(eqx.Module):
             raise AttributeError(self.no_potential)
 
     def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
-        """−dH/dt at x for ∇H = `slope`, shape (); for structures with a Hamiltonian."""
+        """The power −dH/dt at x for ∇H = `slope`, shape (); for structures with a Hamiltonian."""
         raise AttributeError(self.no_potential)
 
     def check_dimension(self, n: int) -> None:
         """ValueError if fields on ℝⁿ cannot have this structure; by default all can."""
 
     def check_points(self, X: Float[Array, "N d"]) -> None:
-        """ValueError if the structure cannot hold at these points, whose values may be traced."""
+        """ValueError if the structure cannot hold at these points; their values may be traced."""
         self.check_dimension(X.shape[1])
 
     def centre(self, Z: Float[Array, "M d"]) -> Float[Array, " d"] | None:
@@ -119,7 +119,7 @@ class AbstractMatrixKernel(eqx.Module):
         return None
 
     def through_descriptor(self, n: int) -> Descriptor | None:
-        """The descriptor and the directions along which K differentiates, where it has one."""
+        """The descriptor and the directions of differentiation; None if K has no descriptor."""
         return None
 
     @property
@@ -128,7 +128,7 @@ class AbstractMatrixKernel(eqx.Module):
         return self
 
     def with_states(self, K: "AbstractMatrixKernel") -> "AbstractMatrixKernel":
-        """This kernel with K in the place of `of_states`."""
+        """This kernel with `of_states` replaced by K."""
         return K
 
     def outputs(self, inputs: int) -> int:
@@ -152,13 +152,13 @@ class AbstractMatrixKernel(eqx.Module):
         return bounds_by_value(name, getattr(self, name))
 
     def transform_inputs(self, X: Float[np.ndarray, "N d"]) -> Float[np.ndarray, "N n"]:
-        """The data in the coordinates that the inner kernels see."""
+        """The data in the coordinates of the inner kernels."""
         return X
 
     @property
     @abc.abstractmethod
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
-        """The scalar kernels that the structure is made from."""
+        """The scalar kernels inside the structure."""
 
     @property
     @abc.abstractmethod
@@ -257,7 +257,7 @@ class Sum(AbstractMatrixKernel):
         )
 
     def _structures(self) -> Iterator[AbstractMatrixKernel]:
-        """All terms, with those of inner named sums."""
+        """All terms, including the terms of inner named sums."""
         for K in self.terms:
             yield from K._structures() if isinstance(K, Sum) else (K,)
 
@@ -423,7 +423,7 @@ def Invariant(k: Any, maps: Any) -> Any:
 
     Example: `hk.Symplectic(hk.Invariant(hk.Gaussian(1.0), [rotation, mirror]))`.
     """
-    given = linear_maps(maps)
+    generators = linear_maps(maps)
     if isinstance(k, AbstractMatrixKernel):
-        return k.averaged(given)
-    return symmetrised(as_scalar_kernel(k), given, (1.0,) * len(given))
+        return k.averaged(generators)
+    return symmetrised(as_scalar_kernel(k), generators, (1.0,) * len(generators))

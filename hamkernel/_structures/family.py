@@ -4,8 +4,8 @@ A member of the family is the field at one θ. With the kernel
 
     K((x, θ), (z, ϑ)) = k(θ, ϑ) K(x, z)
 
-the members are fields of K, with all its structure, and k is the correlation of two members: data
-of some members inform the fit of the others. Families with different k can be added.
+the members are fields of K, with all its structure, and k is the correlation between two members.
+Data of some members therefore inform the fit of the others. Families with different k can be added.
 """
 
 from typing import Any, ClassVar
@@ -39,7 +39,7 @@ class AbstractFamily(AbstractJoinedKernel):
 
     @property
     def of_states(self) -> AbstractMatrixKernel:
-        """K, the kernel of the members; of several terms their sum."""
+        """The kernel K of the members; for several terms the sum of their kernels."""
         first, *rest = (term.member for term in self.terms)
         return Sum(first, *rest) if rest else first
 
@@ -72,8 +72,10 @@ class AbstractFamily(AbstractJoinedKernel):
             )
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
-        (x, theta), (z, other) = self.split(x), self.split(z)
-        return total([t.parameters(theta, other) * t.member.form(x, u, z, v) for t in self.terms])
+        (x, theta), (z, other_theta) = self.split(x), self.split(z)
+        return total(
+            [t.parameters(theta, other_theta) * t.member.form(x, u, z, v) for t in self.terms]
+        )
 
     def expansion(self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Points) -> Point:
         (x, theta), (Z, T) = self.split(x), self.split(Z)
@@ -90,9 +92,12 @@ class AbstractFamily(AbstractJoinedKernel):
         self, x: Float[Array, " d"], z: Float[Array, " d"]
     ) -> Float[Array, ""]:
         self.check_potential()
-        (x, theta), (z, other) = self.split(x), self.split(z)
+        (x, theta), (z, other_theta) = self.split(x), self.split(z)
         return total(
-            [t.parameters(theta, other) * t.member.potential_covariance(x, z) for t in self.terms]
+            [
+                t.parameters(theta, other_theta) * t.member.potential_covariance(x, z)
+                for t in self.terms
+            ]
         )
 
     def centre(self, Z: Float[Array, "M d"]) -> Float[Array, " d"] | None:
@@ -122,34 +127,34 @@ class AbstractFamily(AbstractJoinedKernel):
 class Family(AbstractFamily):
     """A family of systems: K((x, θ), (z, ϑ)) = k(θ, ϑ) K(x, z).
 
-    θ, shape (p,), is what tells one member from another: a length, a load, the coefficients of a
-    potential, the time. Give the θ of each point: `hk.fit(hk.Family(K, k), X, Y, λ, parameters=Θ)`
+    The parameters θ, shape (p,), distinguish the members: a length, a load, the coefficients of a
+    potential, the time. Pass the θ of each point: `hk.fit(hk.Family(K, k), X, Y, λ, parameters=Θ)`
     with Θ of shape (N, p). The field is `field(x, θ)`; `field.at(θ)` is one member, an ordinary
-    field of K with its structure, to be simulated, plotted and saved as ever.
+    field of K, which can be simulated, plotted and saved.
 
-    Each part may have a dependence of its own, H = T(p) + U(q; θ):
+    The parts of a sum may depend on θ in different ways, H = T(p) + U(q; θ):
 
         T, U = hk.Symplectic(hk.Select(k, (1,))), hk.Symplectic(hk.Select(k, (0,)))
         K = hk.Family(T) + hk.Family(U, hk.Gaussian(1.0))
 
-    Give each part a k of its own where both change: T and U may follow θ over different lengths.
-    With one short run of each of eight pendulums, H even, the error of one that was not measured is
-    .0051 with one k for T + U and .0039 with two (`tests/benchmarks/families.py`).
+    If both parts change, give each part its own k, since T and U may have different lengthscales in
+    θ. With one short run of each of eight pendulums and an even H, the error of an unmeasured
+    pendulum was .0051 with one k for T + U, and .0039 with two (`tests/benchmarks/families.py`).
 
-    Between members that were seen this is interpolation, and better than a model for each. Outside
-    of their range it is extrapolation in θ, no better than a model of its own for each member, and
-    the deviation of `hk.condition` grows there, over a lengthscale of k, to that of the prior. It
-    is too small where the field changes faster with θ than among the members that were seen, as
-    1/θ² does towards zero, since built-in kernels k(θ, ϑ) know of θ − ϑ alone: choose a θ in which
-    the field changes evenly.
+    Between measured members a family interpolates, and is better than a separate model for each
+    member. Outside the range of measured θ it extrapolates, no better than separate models, and the
+    deviation of `hk.condition` grows to that of the prior over a lengthscale of k. The deviation is
+    too small if the field changes faster with θ there than among the measured members, as 1/θ² does
+    towards zero: built-in kernels depend on θ − ϑ alone. Choose a θ in which the field changes
+    evenly.
 
-    For a drive of known frequency take `Controlled` with u = (cos ωt, sin ωt) instead, which knows
-    that the drive enters linearly.
+    For a drive of known frequency use `Controlled` with u = (cos ωt, sin ωt) instead, in which the
+    drive enters linearly.
 
     Args:
         member: K, the structured kernel of each member.
-        parameters: k, a scalar kernel of θ, without an amplitude, since K has one. A lengthscale of
-            θ as long as the range of θ is a good start. None: the same for all members.
+        parameters: k, a scalar kernel of θ, without an amplitude, since K has one. The range of θ
+            is a good first lengthscale. If None, all members are the same.
         count: p. `fit` takes it from the data.
 
     Raises:
@@ -183,13 +188,16 @@ class Family(AbstractFamily):
         return (self,)
 
     def coefficients_at(self, u: Float[Array, " p"], U: Float[Array, "M p"], A: Points) -> Points:
-        """a_j k(θ, θ_j)."""
+        """The coefficients a_j k(θ, θ_j)."""
         return A * jax.vmap(self.parameters, in_axes=(None, 0))(u, U)[:, None]
 
-    def seen_by(
+    def child_inputs(
         self, child: Any, X: Float[np.ndarray, "N d"], amplitude: float
     ) -> tuple[Float[np.ndarray, "N _"], float]:
-        """K sees states, and k sees θ; one amplitude is enough, that of K if it has one."""
+        """K is evaluated at states and k at parameters.
+
+        Only the product of their amplitudes is identified, so k gets none if K has one.
+        """
         states, T = self.split(X)
         if child is self.member:
             return states, amplitude
@@ -213,10 +221,10 @@ class FamilySum(AbstractFamily):
     def __repr__(self) -> str:
         return joined("+", [repr(t) for t in self.terms])
 
-    def seen_by(
+    def child_inputs(
         self, child: Any, X: Float[np.ndarray, "N d"], amplitude: float
     ) -> tuple[Float[np.ndarray, "N d"], float]:
-        """The terms see joined points."""
+        """The terms are kernels of joined points."""
         return X, amplitude
 
 

@@ -1,7 +1,7 @@
 """Friction, of two kinds.
 
-`PortHamiltonian` has friction in its operator, J − R. `Friction` is a kernel of one curve, a force
-that is known everywhere but for a few numbers.
+`PortHamiltonian` has friction in its operator, J − R. `Friction` is the kernel of one force curve
+with a few unknown numbers.
 """
 
 import copy
@@ -26,20 +26,21 @@ from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.structure import AbstractPotentialKernel, canonical, check_even
 
-# The rest speed over the root mean square of the momenta. With .03, .006, .003 and .001 of it the
-# log of a real pendulum has log p of 6892, 6911, 6917 and 6917, and rollouts under a controller
-# that lets it rest miss by .16, .11, .11 and .12 rad (`tests/benchmarks/real_logs.py`). A drive
-# with log p of 13 586, 13 770 and 13 858 at .03, .01 and .003 runs free with 3.3, 3.2 and 2.3 mm
-# (`tests/benchmarks/machines.py`). A minute of a pendulum that sticks takes 17 ms, 6 with .01.
-_SHARP = 0.003
-_UNSEEN = 0.1  # the rest speed where no momenta are
+# The default rest speed, over the root mean square of the momenta. Measured at .03, .006, .003
+# and .001 for a real pendulum (`tests/benchmarks/real_logs.py`): log p 6892, 6911, 6917, 6917;
+# errors of rollouts under a controller that lets the pendulum rest .16, .11, .11, .12 rad. At .03,
+# .01 and .003 for a drive (`tests/benchmarks/machines.py`): log p 13 586, 13 770, 13 858; errors of
+# free runs 3.3, 3.2, 2.3 mm. A simulated minute of a sticking pendulum takes 17 ms, and 6 ms with
+# .01.
+REST_SPEED_FRACTION = 0.003
+DEFAULT_REST_SPEED = 0.1  # without data
 
 
 def damped_coordinates(damped: tuple[int, ...] | None, n: int) -> tuple[int, ...]:
-    """The coordinates with friction of a state of n: those that were given, else the momenta.
+    """The coordinates with friction, of a state of n coordinates; the momenta if `damped` is None.
 
     Raises:
-        ValueError: one of those that were given does not exist.
+        ValueError: `damped` names a coordinate that does not exist.
     """
     if damped is not None and max(damped) >= n:
         raise ValueError(
@@ -56,10 +57,10 @@ class PortHamiltonian(AbstractPotentialKernel):
     momenta damped q̇ = ∂H/∂p and ṗ = −∂H/∂q − r ∂H/∂p = −∂H/∂q − r q̇: viscous friction. Along the
     flow dH/dt = −∇HᵀR∇H, `field.dissipation(x)`.
 
-    The friction is a hyperparameter, found by every objective of `tune` and kept with
-    `frozen="friction"`. Friction on p is unique if ∂²H/∂p² is invertible. In a (nearly) linear
-    system only the sum of the frictions on q and p can be identified. A friction at the lower end
-    of its box, see `tuned.at_bounds`, means that none was found.
+    The friction is a hyperparameter: every objective of `tune` finds it, and `frozen="friction"`
+    keeps it. Friction on p is unique if ∂²H/∂p² is invertible. In a (nearly) linear system only the
+    sum of the frictions on q and p can be identified. If the friction rests on the lower end of its
+    box, see `tuned.at_bounds`, the data show none.
 
     Args:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
@@ -98,11 +99,11 @@ class PortHamiltonian(AbstractPotentialKernel):
         )
         array = require.positive(friction, "friction", cure)
         self.damped = None if damped is None else require.coordinates(damped, "damped")
-        most = array.size if self.damped is None else len(self.damped)
-        if array.ndim > 1 or (array.ndim and array.size != most):
+        max_size = array.size if self.damped is None else len(self.damped)
+        if array.ndim > 1 or (array.ndim and array.size != max_size):
             raise ValueError(
                 f"friction has shape {array.shape}; one number, or one for each of the "
-                f"{most} damped coordinates, is needed."
+                f"{max_size} damped coordinates, is needed."
             )
         self.log_friction = jnp.log(array)
 
@@ -112,13 +113,13 @@ class PortHamiltonian(AbstractPotentialKernel):
         return jnp.exp(self.log_friction)
 
     def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-        return canonical(v) - self._rubbed(v)
+        return canonical(v) - self._damping(v)
 
     def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
-        return -canonical(v) - self._rubbed(v)
+        return -canonical(v) - self._damping(v)
 
     def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
-        """∇HᵀR∇H, a sum of squares."""
+        """The dissipated power ∇HᵀR∇H, a sum of squares."""
         return jnp.sum(self.resistance(len(x)).astype(x.dtype) * slope**2)
 
     def resistance(self, n: int) -> Float[Array, " n"]:
@@ -126,12 +127,13 @@ class PortHamiltonian(AbstractPotentialKernel):
         zero = jnp.zeros(n, self.log_friction.dtype)
         return zero.at[np.asarray(damped_coordinates(self.damped, n))].set(self.friction)
 
-    def _rubbed(self, v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
+    def _damping(self, v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         r = self.resistance(len(v)).astype(v.dtype)
         return r.reshape(-1, *(1,) * (v.ndim - 1)) * v
 
     def operator_at(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-        # Frictions that are trained separately get different values: the square roots of 2, 3, 4, …
+        # Frictions that are trained separately get different generic values: the square roots of
+        # 2, 3, 4, …
         apart = jnp.sqrt(jnp.arange(2.0, 2 + self.log_friction.size)).astype(x.dtype)
         stand_in = jnp.log(apart.reshape(self.log_friction.shape))
         general = eqx.tree_at(lambda K: K.log_friction, self, stand_in)
@@ -147,7 +149,8 @@ class PortHamiltonian(AbstractPotentialKernel):
         if self.log_friction.ndim == 0:
             critical = critical.mean()
         # Bounds of the damping ratio, r over the critical friction: at 1e-5 an oscillation loses
-        # 6e-5 of its amplitude in a period, far less than data show; at 30 it creeps.
+        # 6e-5 of its amplitude in a period, far less than data can resolve; at 30 the motion
+        # creeps.
         return critical + np.log(1e-5), critical + np.log(30.0)
 
     def check_dimension(self, n: int) -> None:
@@ -158,10 +161,10 @@ class PortHamiltonian(AbstractPotentialKernel):
                 f"friction has {self.log_friction.size} numbers: give one for all momenta, or one "
                 f"for each; states of n = {n} coordinates have {len(coordinates)}."
             )
-        unseen = sorted(set(coordinates) - frozenset().union(*self.kernel.supports(n)))
-        if unseen:
+        unused = sorted(set(coordinates) - frozenset().union(*self.kernel.supports(n)))
+        if unused:
             raise ValueError(
-                f"friction on coordinate {unseen[0]} is -r ∂H/∂x there, and the kernel of H does "
+                f"friction on coordinate {unused[0]} is -r ∂H/∂x there, and the kernel of H does "
                 "not depend on that coordinate, so there would be none. Where the kinetic energy is"
                 " known as a mean, q̇ = p/m, add hk.Friction() to hk.Symplectic(k) instead."
             )
@@ -172,21 +175,21 @@ class Friction(AbstractMatrixKernel):
     """K_ii(x, z) = F(xᵢ) F(zᵢ): forces −a F(v) on the momenta, a ~ N(0, 1), for a sum of kernels.
 
     F(v) = d v + c tanh(v/ε) + s exp(−(v/w)²) tanh(v/ε): viscous, dry (Coulomb) and Stribeck
-    friction, with d, c, s and w > 0 as hyperparameters. F is odd and has the sign of v, so the
-    force takes energy away at every speed, measured or not, where a > 0; the closed form finds a,
-    and it is negative only for a motion that friction drives. A Gaussian kernel of the momentum
-    falls to zero outside the data instead, and with it the friction.
+    friction, with d, c, s and w > 0 as hyperparameters. F is odd and has the sign of v. With a > 0
+    the force therefore removes energy at every speed, measured or not; the fit finds a, which is
+    negative only if friction drives the motion. (With a Gaussian kernel of the momentum the
+    friction would fall to zero outside the data.)
 
-    It stands beside the kernel of the energy, `Sum(energy=Symplectic(k), friction=Friction())`, and
-    needs no energy that depends on the momenta: with q̇ = p/m known and
-    `Symplectic(Select(k, 0))` for the rest it is found from positions alone, where the R ∂H/∂p of
-    `PortHamiltonian` is zero. What the curve cannot say, a smooth remainder that vanishes outside
-    the data is for: one more term `Odd(CurlFree(Select(k, 1)))`. The energy of the sum is that of
-    its part, `field.part("energy").hamiltonian`.
+    Add this kernel to the kernel of the energy, `Sum(energy=Symplectic(k), friction=Friction())`.
+    The energy need not depend on the momenta: with q̇ = p/m known and `Symplectic(Select(k, 0))`
+    for the rest, friction is found from positions alone, where R ∂H/∂p of `PortHamiltonian` is
+    zero. If the curve is too simple, add a smooth term such as `Odd(CurlFree(Select(k, 1)))`. It
+    vanishes away from the data. The energy is `field.part("energy").hamiltonian`.
 
-    A joint between links rubs with its own velocity, (M(q)⁻¹p)ᵢ or the difference of two, and not
-    with a momentum. Such friction is −∂D/∂v of Rayleigh's D(v) = ½ d v² + c ε log cosh v/ε, which
-    is −M(q) ∂D/∂p: a structure with that operator, and a kernel with one product for each term.
+    The friction of a joint between links depends on the velocity of the joint, (M(q)⁻¹p)ᵢ or the
+    difference of two such velocities, and not on a momentum. It is −∂D/∂v = −M(q) ∂D/∂p with
+    Rayleigh's function D(v) = ½ d v² + c ε log cosh v/ε: a structure with the operator −M(q), and a
+    kernel with one product for each term.
 
         def terms(x):  # v: the velocities of the joints at x = (q, p)
             v = velocities(x)
@@ -200,19 +203,19 @@ class Friction(AbstractMatrixKernel):
 
     Args:
         viscous: the first guess of d, in units of the momentum's rate over the momentum.
-        coulomb: that of c, a force.
-        stribeck: that of s, the force by which sticking exceeds sliding; None for none.
-        rest_speed: ε > 0, the momentum below which dry friction fades to zero: no guess but a
-            number that makes the force smooth, and is not trained. If None, three thousandths of
-            the root mean square of the momenta, wherever a field is learned from states, and the
-            kernel of the result has the number; .1 where nothing is learned, as in `hk.gram`.
-            Under `jax.jit` it must be given. Less costs a simulation more steps. A system that
-            sticks creeps at about ε instead, and bands do not know of that: of a pendulum with
-            positions to a thousandth .89 of U′ are inside two deviations, fourteen logs
-            (`tests/benchmarks/model_error.py friction`). Trained, it takes up what the log has
-            beside friction: on a real pendulum it rose from a hundredth to a fifth of the largest
-            speed, and the error of rollouts under another controller from .13 to .5 rad.
-        stribeck_speed: that of w, the momentum above which it slides.
+        coulomb: the first guess of c, a force.
+        stribeck: the first guess of s, the force by which sticking exceeds sliding; None for none.
+        rest_speed: ε > 0, the momentum below which dry friction fades to zero. It makes the force
+            smooth and is not trained. If None, three thousandths of the root mean square of the
+            momenta when a field is learned from states (the kernel of the result has the number),
+            and .1 otherwise, as in `hk.gram`. Under `jax.jit` it must be given. A smaller ε costs a
+            simulation more steps. A system that should stick creeps at a speed of about ε, and the
+            error bars do not account for it: for a pendulum with position noise 1e-3, 89 % of the
+            true U′ lies within two standard deviations (14 logs; `tests/benchmarks/model_error.py
+            friction`). If ε were trained, it would absorb other effects than friction: on a real
+            pendulum ε rose from a hundredth to a fifth of the largest speed, and the error of
+            rollouts under another controller from .13 to .5 rad.
+        stribeck_speed: the first guess of w, the momentum above which the joint slides.
         damped: the coordinates with friction, counted from 0; the momenta if None.
 
     Each guess is a number for all damped coordinates, or an array with one for each.
@@ -251,8 +254,8 @@ class Friction(AbstractMatrixKernel):
     ):
         self.log_viscous = log_per_coordinate(viscous, "viscous")
         self.log_coulomb = log_per_coordinate(coulomb, "coulomb")
-        given = rest_speed is not None
-        self.rest_speed = require.positive_number(rest_speed, "rest_speed") if given else None
+        has_speed = rest_speed is not None
+        self.rest_speed = require.positive_number(rest_speed, "rest_speed") if has_speed else None
         self.log_stribeck = self.log_stribeck_speed = None
         if stribeck is not None:
             self.log_stribeck = log_per_coordinate(stribeck, "stribeck")
@@ -276,10 +279,10 @@ class Friction(AbstractMatrixKernel):
         return None if self.log_stribeck_speed is None else jnp.exp(self.log_stribeck_speed)
 
     def curve(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """F of the damped coordinates of a state, zero elsewhere."""
+        """The force F for the damped coordinates of a state, zero for the others."""
         damped = np.asarray(damped_coordinates(self.damped, len(x)))
         v = x[damped]
-        stick = jnp.tanh(v / (_UNSEEN if self.rest_speed is None else self.rest_speed))
+        stick = jnp.tanh(v / (DEFAULT_REST_SPEED if self.rest_speed is None else self.rest_speed))
         force = self.viscous.astype(x.dtype) * v + self.coulomb.astype(x.dtype) * stick
         if self.stribeck is not None and self.stribeck_speed is not None:
             fades = jnp.exp(-((v / self.stribeck_speed.astype(x.dtype)) ** 2))
@@ -304,13 +307,14 @@ class Friction(AbstractMatrixKernel):
         if getattr(self, name).ndim == 0:
             fastest = fastest.max()
         if name == "log_stribeck_speed":
-            # A swing through n samples passes its turning points in steps of 2π/n of the largest
-            # speed, so with fewer than 300 samples a swing a log does not resolve what is finer.
+            # Near the turning points of a swing of n samples the speed changes by 2π/n of the
+            # largest speed per sample, so with fewer than 300 samples a log does not resolve 2 % of
+            # it.
             return np.log(0.02 * fastest), np.log(fastest)
         force = 0.5 * np.log(amplitude)
         if name == "log_viscous":
             force = force - np.log(fastest)
-        # Three decades to both sides of a force that explains the velocities.
+        # Three decades on both sides of a force that explains the velocities.
         return force - np.log(1e3), force + np.log(1e3)
 
     def check_dimension(self, n: int) -> None:
@@ -349,14 +353,14 @@ class Friction(AbstractMatrixKernel):
 
 
 def frictions(K: AbstractMatrixKernel) -> list[Friction]:
-    """The parts of K that are friction."""
+    """The `Friction` kernels inside K."""
     return [node for node in jax.tree.leaves(K, is_leaf=_is_friction) if _is_friction(node)]
 
 
 def with_rest_speed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> Any:
     """K with a rest speed in every `Friction`, from the states X[:, :n].
 
-    With several momenta it is that of the slowest. Systems at rest say nothing and get .1.
+    With several momenta, the slowest one sets the rest speed. Systems at rest get .1.
     """
     if all(part.rest_speed is not None for part in frictions(K)):
         return K
@@ -364,15 +368,19 @@ def with_rest_speed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> 
     with require.eager():
         speeds = np.asarray(jnp.sqrt(jnp.mean(jnp.square(X[:, :n]), axis=0)))
 
-    def at_speeds(node: Any) -> Any:
+    def set_speed(node: Any) -> Any:
         if not _is_friction(node) or node.rest_speed is not None:
             return node
         moving = [v for v in speeds[list(damped_coordinates(node.damped, n))] if v > 0]
         out = copy.copy(node)
-        object.__setattr__(out, "rest_speed", _SHARP * float(min(moving)) if moving else _UNSEEN)
+        object.__setattr__(
+            out,
+            "rest_speed",
+            REST_SPEED_FRACTION * float(min(moving)) if moving else DEFAULT_REST_SPEED,
+        )
         return out
 
-    return jax.tree.map(at_speeds, K, is_leaf=_is_friction)
+    return jax.tree.map(set_speed, K, is_leaf=_is_friction)
 
 
 def _is_friction(node: Any) -> bool:

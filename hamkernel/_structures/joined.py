@@ -1,7 +1,7 @@
-"""Kernels of joined points (x, u): a state x, and the inputs or parameters u that belong to it.
+"""Kernels of joined points (x, u): a state x together with its inputs or parameters u.
 
-u holds the inputs of `Controlled`, or the parameters of the member of a `Family`. Points have n + m
-coordinates and fields n components, and all other modules ask a kernel for its `outputs`.
+u holds the inputs of `Controlled`, or the parameters of a member of a `Family`. Points have n + m
+coordinates and fields n components; other modules ask a kernel for its `outputs`.
 
 Fields with inputs are f(x, u) = f(x) + G(x) u. With independent priors of the drift f and of the
 input matrix G the kernel of two joined points is
@@ -38,8 +38,8 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
     """A kernel of points (x, u), u of shape (m,).
 
     Attributes:
-        count: m; None until the data says it.
-        inner: the part that may have a symmetry, as error messages call it.
+        count: m; None until the data determines it.
+            inner: the name, in error messages, of the part that may have a symmetry.
     """
 
     count: eqx.AbstractVar[int | None]
@@ -51,25 +51,25 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
     @property
     @abc.abstractmethod
     def of_states(self) -> AbstractMatrixKernel:
-        """The kernel of fields of x alone: that of the drift, or of a member."""
+        """The kernel of fields of x alone: of the drift, or of a member."""
 
     @abc.abstractmethod
     def with_states(self, K: AbstractMatrixKernel) -> "AbstractJoinedKernel":
-        """This kernel with K in the place of `of_states`."""
+        """This kernel with `of_states` replaced by K."""
 
     @abc.abstractmethod
     def check_identified(self, U: Float[np.ndarray, "N m"]) -> None:
-        """ValueError if data with these u cannot say how the field depends on u."""
+        """ValueError if data with these u cannot determine the dependence of the field on u."""
 
     @property
     def known_matrix(self) -> Any:
-        """The `KnownMatrix` G, where the field contains G u and the kernel learns the rest."""
+        """The `KnownMatrix` G if the field contains a known G u; else None."""
         return None
 
     def coefficients_at(self, u: Float[Array, " m"], U: Float[Array, "M m"], A: Points) -> Points:
         """The coefficients b with Σⱼ K((x, u), (zⱼ, uⱼ)) aⱼ = Σⱼ K_states(x, zⱼ) bⱼ.
 
-        For `Controlled` they are those at u = 0, and so b = a.
+        For `Controlled` this is the expansion of the drift, at u = 0, so b = a.
         """
         return A
 
@@ -94,7 +94,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
 
     @property
     def input_count(self) -> int:
-        """m; ValueError as long as it is not known."""
+        """The number m; ValueError as long as it is unknown."""
         if self.count is None:
             raise ValueError(
                 f"this {type(self).__name__} kernel does not know how many {self.given} there are: "
@@ -107,12 +107,13 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
         n = self.outputs(s.shape[-1])
         return s[..., :n], s[..., n:]
 
-    def seen_by(
+    def child_inputs(
         self, child: Any, X: Float[np.ndarray, "N d"], amplitude: float
     ) -> tuple[Float[np.ndarray, "N _"], float]:
-        """The data in the coordinates of a part of this kernel, and a plausible factor of it.
+        """The data in the coordinates of a part of this kernel, and its plausible amplitude.
 
-        Both set the bounds of the hyperparameters of the part. By default a part sees the states.
+        Both set the bounds of the hyperparameters of the part. By default the coordinates of a part
+        are the states.
         """
         return self.split(X)[0], amplitude
 
@@ -177,7 +178,7 @@ class InputMatrix(eqx.Module):
         return described(self, positional=("kernel",))
 
     def rows(self, n: int, dtype: Any) -> Float[Array, " n"]:
-        """1 for the rows of G that are not zero."""
+        """A vector with 1 for the nonzero rows of G and 0 for the others."""
         if self.acts_on is None:
             return jnp.ones(n, dtype)
         return jnp.zeros(n, dtype).at[np.asarray(self.acts_on)].set(1.0)
@@ -200,15 +201,15 @@ class KnownMatrix(eqx.Module):
 class Controlled(AbstractJoinedKernel):
     """Fields with inputs: f(x, u) = f(x) + G(x) u, f in the RKHS of K.
 
-    Give the inputs of each point to `fit`, `tune` and the losses: `hk.fit(K, X, Y, λ, inputs=U)`
-    with U of shape (N, m). The field is `field(x, u)`; `field.drift(x)` is f, with its Hamiltonian
-    and everything else that a field of K has, and `field.input_matrix(x)` is G.
+    Pass the inputs of each point to `fit`, `tune` and the losses: `hk.fit(K, X, Y, λ, inputs=U)`
+    with U of shape (N, m). The field is `field(x, u)`. `field.drift(x)` is f, an ordinary field of
+    K with its Hamiltonian, and `field.input_matrix(x)` is G.
 
     Time is an input like any other: with U the values of t, or of cos ωt and sin ωt, the field is
     f(x) + G(x) u(t), and `hk.simulate(field, x0, ts, inputs=lambda t: jnp.array([t]))` follows it.
 
     An input that is constant over all data cannot be distinguished from the drift, and is refused
-    unless G is known: vary it.
+    unless G is known. Vary every input.
 
     Args:
         drift: K, the structured kernel of f.
@@ -266,11 +267,11 @@ class Controlled(AbstractJoinedKernel):
 
     @property
     def conserves(self) -> bool:
-        """No: inputs have a power."""
+        """False: the inputs do work."""
         return False
 
     def check_identified(self, U: Float[np.ndarray, "N m"]) -> None:
-        """ValueError for inputs a combination of which is the same at all points."""
+        """ValueError if a linear combination of the inputs is the same at all points."""
         if self.known_matrix is not None:
             return
         rank = int(np.linalg.matrix_rank(U - U.mean(axis=0)))
@@ -283,12 +284,12 @@ class Controlled(AbstractJoinedKernel):
             )
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
-        (x, inputs), (z, others) = self.split(x), self.split(z)
+        (x, inputs), (z, other_inputs) = self.split(x), self.split(z)
         drift = self.drift.form(x, u, z, v)
         if isinstance(self.inputs, KnownMatrix):
             return drift
         rows = self.inputs.rows(len(x), x.dtype)
-        return drift + (inputs @ others) * self.inputs.kernel(x, z) * ((u * rows) @ v)
+        return drift + (inputs @ other_inputs) * self.inputs.kernel(x, z) * ((u * rows) @ v)
 
     def expansion(self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Points) -> Point:
         (x, u), (Z, U) = self.split(x), self.split(Z)
@@ -335,8 +336,8 @@ class Controlled(AbstractJoinedKernel):
 
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
-        own = (self.inputs.kernel,) if isinstance(self.inputs, InputMatrix) else ()
-        return (*self.drift.scalar_kernels, *own)
+        input_kernels = (self.inputs.kernel,) if isinstance(self.inputs, InputMatrix) else ()
+        return (*self.drift.scalar_kernels, *input_kernels)
 
 
 def _entries(matrix: Any) -> tuple[tuple[float, ...], ...]:

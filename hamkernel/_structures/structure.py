@@ -57,11 +57,13 @@ class AbstractStructure(AbstractMatrixKernel):
     operator_invariance: eqx.AbstractClassVar[Invariance]
 
     def __repr__(self) -> str:
-        found = symmetry_removed(self.kernel)
-        if found is None or found.parity is None:
+        symmetry_of_kernel = symmetry_removed(self.kernel)
+        if symmetry_of_kernel is None or symmetry_of_kernel.parity is None:
             return described(self, positional=("kernel",))
-        symmetry = "Odd" if self.field_parity * found.parity < 0 else "Even"
-        return call(symmetry, [repr(eqx.tree_at(lambda K: K.kernel, self, found.kernel))])
+        symmetry = "Odd" if self.field_parity * symmetry_of_kernel.parity < 0 else "Even"
+        return call(
+            symmetry, [repr(eqx.tree_at(lambda K: K.kernel, self, symmetry_of_kernel.kernel))]
+        )
 
     def with_parity(self, parity: int) -> "AbstractStructure":
         if Invariance.REFLECTION not in self.operator_invariance:
@@ -75,11 +77,11 @@ class AbstractStructure(AbstractMatrixKernel):
     def check_points(self, X: Float[Array, "N d"]) -> None:
         super().check_points(X)
         k = without_symmetry(self.kernel)
-        # Of rows that are spread over processes none can see all.
+        # No single process has all rows of a sharded X.
         if not (require.is_concrete(X, k) and jnp.asarray(X).is_fully_addressable):
             return
-        for warp, seen in _warps(k, np.asarray(X)):
-            smooth = np.asarray(_is_smooth(warp, jnp.asarray(seen)))
+        for warp, points in _warps(k, np.asarray(X)):
+            smooth = np.asarray(_is_smooth(warp, jnp.asarray(points)))
             if not smooth.all():
                 raise ValueError(
                     f"the map of Warp, or its derivative, is NaN or infinite at "
@@ -93,11 +95,13 @@ class AbstractStructure(AbstractMatrixKernel):
         return eqx.tree_at(lambda K: K.kernel, self, kernel)
 
     def shares_potential(self, other: AbstractMatrixKernel) -> bool:
-        """Whether both have one operator; operators with arrays, which are trained, never count."""
+        """Whether both have the same operator; operators with trained arrays count as unequal."""
         if type(self) is not type(other):
             return False
-        (own, tree), (others, other_tree) = (jax.tree.flatten(_operator(K)) for K in (self, other))
-        return tree == other_tree and not any(map(eqx.is_array, own)) and own == others
+        (arrays, tree), (other_arrays, other_tree) = (
+            jax.tree.flatten(_operator(K)) for K in (self, other)
+        )
+        return tree == other_tree and not any(map(eqx.is_array, arrays)) and arrays == other_arrays
 
     @abc.abstractmethod
     def transformed_coefficients(
@@ -120,7 +124,7 @@ class AbstractStructure(AbstractMatrixKernel):
 def _warps(
     k: AbstractScalarKernel, X: Float[np.ndarray, "N n"]
 ) -> Iterator[tuple[Warp, Float[np.ndarray, "N m"]]]:
-    """Each `Warp` within k, k itself among them, with the points that it sees."""
+    """Each `Warp` within k, including k itself, with its points."""
     if isinstance(k, Warp):
         yield k, X
 
@@ -140,10 +144,10 @@ def _is_warp(node: object) -> bool:
 def _is_smooth(warp: Warp, X: Float[Array, "N n"]) -> Bool[Array, " N"]:
     """Whether the map and its Jacobian are finite at each point."""
 
-    def at(x):
+    def is_finite(x):
         return jnp.isfinite(warp.warped(x)).all() & jnp.isfinite(jax.jacfwd(warp.warped)(x)).all()
 
-    return jax.lax.map(at, X)
+    return jax.lax.map(is_finite, X)
 
 
 def _operator(K: AbstractMatrixKernel) -> dict[str, Any]:
@@ -153,15 +157,15 @@ def _operator(K: AbstractMatrixKernel) -> dict[str, Any]:
 
 
 def row(k: AbstractScalarKernel, x: Point, Z: Points) -> Float[Array, " M"]:
-    """k(x, zⱼ) for all j."""
+    """The row k(x, zⱼ) for all j."""
     return jax.vmap(k, in_axes=(None, 0))(x, Z)
 
 
 def mixed(k: AbstractScalarKernel, x, u, z, v) -> Float[Array, ""]:
-    """uᵀ [∂x ∂zᵀ k(x, z)] v, forward in both arguments.
+    """The mixed derivative uᵀ [∂x ∂zᵀ k(x, z)] v, in forward mode for both arguments.
 
-    For k(x, z) = φ(s) this is φ″(s) ds(u) ds(v) + φ′(s) dds(u, v). An entry of a Gram costs a few
-    multiplications, since the factors of a point, and those of a pair of points, are computed once.
+    For k(x, z) = φ(s) it is φ″(s) ds(u) ds(v) + φ′(s) dds(u, v). Factors that depend on one point,
+    or on a pair of points, are computed once, so an entry of a Gram costs a few multiplications.
     """
 
     def slope(x):
@@ -171,8 +175,8 @@ def mixed(k: AbstractScalarKernel, x, u, z, v) -> Float[Array, ""]:
 
 
 def _operators(K: Any, X: Float[Array, "N n"]) -> Float[np.ndarray, "N n n"]:
-    # Compiled code takes 0.05 ms in place of 2. Under tracing it would be traced too, although B is
-    # known.
+    # Compiled code takes 0.05 ms instead of 2 ms. Under tracing, a compiled call would be traced
+    # although B is known.
     evaluate = _compiled_operators_at if require.is_concrete(K, X) else _operators_at
     return np.asarray(evaluate(K, X))
 
@@ -188,21 +192,24 @@ def check_symmetries(K: Any, X: Float[Array | np.ndarray, "N n"]) -> None:
     """ValueError unless B(Sx) = ± S B(x) Sᵀ for the maps S of the kernel, at these points."""
     n = X.shape[1]
     constant = Invariance.TRANSLATION in K.operator_invariance
-    maps = dict.fromkeys(each for mean in symmetries(K.kernel) for each in mean.maps)
-    found = {each: matrix_of(each, n) for each in maps}
+    maps = dict.fromkeys(S_map for mean in symmetries(K.kernel) for S_map in mean.maps)
+    matrices = {S_map: matrix_of(S_map, n) for S_map in maps}
     if constant:  # S = ±1 is a symmetry of every B
-        found = {e: S for e, S in found.items() if not np.array_equal(S, S[0, 0] * np.eye(n))}
-    if not found:
+        matrices = {e: S for e, S in matrices.items() if not np.array_equal(S, S[0, 0] * np.eye(n))}
+    if not matrices:
         return
     with jax.ensure_compile_time_eval():
         X = jnp.asarray(X)
-        here = _operators(K, X)
-        for S in found.values():
+        operators = _operators(K, X)
+        for S in matrices.values():
             moved = jnp.asarray(np.asarray(X) @ S.T, X.dtype)
-            there = here if constant else _operators(K, moved)
-            image = S @ here @ S.T
-            room = 1e-5 * np.abs(here).max()  # maps may come in float32
-            if min(np.abs(there - image).max(), np.abs(there + image).max()) > room:
+            moved_operators = operators if constant else _operators(K, moved)
+            image = S @ operators @ S.T
+            tolerance = 1e-5 * np.abs(operators).max()  # maps may come in float32
+            if (
+                min(np.abs(moved_operators - image).max(), np.abs(moved_operators + image).max())
+                > tolerance
+            ):
                 raise ValueError(
                     f"a map of the symmetry is not one of the fields of {type(K).__name__}: with "
                     f"S = {np.round(S, 3).tolist()} neither B(Sx) = S B(x) Sᵀ nor -S B(x) Sᵀ holds."
@@ -233,14 +240,14 @@ class AbstractPotentialKernel(AbstractStructure):
         return mixed(self.kernel, x, self.apply_transpose(x, u), z, self.apply_transpose(z, v))
 
     def through_descriptor(self, n: int) -> Descriptor | None:
-        found = self.kernel.through_descriptor(n)
-        if found is None:
+        descriptor = self.kernel.through_descriptor(n)
+        if descriptor is None:
             return None
 
         def directions(x):
             return jax.vmap(lambda v: self.apply_transpose(x, v))(jnp.eye(n, dtype=x.dtype)).T
 
-        return found._replace(directions=directions)
+        return descriptor._replace(directions=directions)
 
     def potential(self, x: Point, Z: Points, A: Points) -> Float[Array, ""]:
         directions = jax.vmap(self.apply_transpose)(Z, A)
@@ -259,13 +266,18 @@ class AbstractPotentialKernel(AbstractStructure):
         return -slope @ self.apply(x, slope)
 
     def operator_at(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-        """B(x) with stand-ins for its trained numbers, for which its symmetries must hold."""
+        """B(x) with generic values in place of the trained parameters.
+
+        A symmetry found for these values holds for all values.
+        """
         return self.apply(x, jnp.eye(len(x), dtype=x.dtype))
 
     def transformed_coefficients(
         self, S: Float[np.ndarray, "n n"]
     ) -> Float[np.ndarray, "n n"] | None:
-        # S B(z)ᵀ = ± B(Sz)ᵀ S⁻ᵀ, where B(Sz) = ± S B(z) Sᵀ. The sign is known for a constant B.
+        # K built from k(x, Sz) is B(x) ∂x[(∂₂ᵀk)(x, Sz)] S B(z)ᵀ. The symmetry B(Sz) = ± S B(z)
+        # Sᵀ gives S B(z)ᵀ = ± B(Sz)ᵀ S⁻ᵀ, so T = ± S⁻ᵀ. For a constant B the sign is + if S B Sᵀ =
+        # B, − if −B.
         if Invariance.TRANSLATION not in self.operator_invariance:
             return S if np.array_equal(S, np.eye(len(S))) else None
         with jax.ensure_compile_time_eval():
@@ -405,6 +417,7 @@ class DivergenceFree(AbstractStructure):
     )
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
+        # uᵀ(tr(M) I − Mᵀ)v = tr(M) u·v − vᵀMu with M_ab = ∂x_a ∂z_b k
         along_both = jax.vmap(lambda e: mixed(self.kernel, x, e, z, e))
         trace = along_both(jnp.eye(len(x), dtype=x.dtype)).sum()
         return trace * (u @ v) - mixed(self.kernel, x, v, z, u)
@@ -446,26 +459,27 @@ class DivergenceFree(AbstractStructure):
             )
 
 
-def group_expanded(
+def expand_group(
     K: AbstractMatrixKernel, Z: Float[Array, "M n"], A: Float[Array, "M n"]
 ) -> tuple[AbstractMatrixKernel, Float[Array, "L n"], Float[Array, "L n"]]:
     """The kernel without its group, with the images of the points and their coefficients.
 
-    The expansion Σ K(x, zⱼ) aⱼ stays the same. A one-sided mean over |G| maps is a sum over |G|
-    times as many points: with B(hz)ᵀ = ± h B(z)ᵀ hᵀ
+    The expansion Σ K(x, zⱼ) aⱼ stays the same. A one-sided mean (1/|G|) Σ_h k(x, hz) is a sum over
+    |G| times as many points, divided by |G| once (a two-sided mean would be divided by |G|²). With
+    B(hz)ᵀ = ± h B(z)ᵀ hᵀ
 
         Σⱼ ∂x ∂zᵀ k(x, hzⱼ) B(zⱼ)ᵀ aⱼ = ± Σⱼ (∂x ∂₂ᵀ k)(x, hzⱼ) B(hzⱼ)ᵀ h⁻ᵀ aⱼ.
 
     In a sum over many pairs this is cheaper than adding all terms for each pair, which fills the
-    registers. K, Z and A are returned unchanged where K has no group, or not a one-sided one.
+    registers. K, Z and A are returned unchanged if K has no group or a two-sided mean.
     """
     if not isinstance(K, AbstractStructure):
         return K, Z, A
-    found = symmetry_removed(K.kernel)
+    mean = symmetry_removed(K.kernel)
     n = Z.shape[1]
-    if found is None or not found.is_one_sided(n):
+    if mean is None or not mean.is_one_sided(n):
         return K, Z, A
-    group = found.group(n)
+    group = mean.group(n)
     images, coefficients = [], []
     for h in group:
         T = K.transformed_coefficients(h.matrix)
@@ -473,5 +487,5 @@ def group_expanded(
             return K, Z, A
         images.append(jax.vmap(h)(Z))
         coefficients.append(jax.vmap(h._replace(matrix=h.character * T))(A))
-    K = eqx.tree_at(lambda K: K.kernel, K, found.kernel)
+    K = eqx.tree_at(lambda K: K.kernel, K, mean.kernel)
     return K, jnp.concatenate(images), jnp.concatenate(coefficients) / len(group)

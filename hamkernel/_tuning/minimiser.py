@@ -138,7 +138,7 @@ class MinimiserRun(NamedTuple):
     converged: Bool[Any, ""]
 
     def with_curvature_of(self, runs: "MinimiserRun") -> "MinimiserRun":
-        """These points, with the inverse Hessian of `runs` on a similar function.
+        """The runs at these points, with the inverse Hessian of `runs` on a similar function.
 
         The first step of a quasi-Newton method only evaluates the function at its point.
         """

@@ -170,7 +170,7 @@ def parts_of(
 ) -> list[Int[np.ndarray, " _"]]:
     """The observations of each part of a search: a few, more, and all if the loss is dense."""
     N, n = rows.count, len(rows.targets) / rows.count
-    if criterion.custom:  # it may need all the data
+    if criterion.custom:  # a custom objective may need all the data
         return [np.arange(N)]
     # The first part has 256 rows or 64 points, whichever is fewer. With half as many, the best
     # run often leads to a poor optimum on all the data (`tests/benchmarks/tuning_speed.py`). The

@@ -178,7 +178,7 @@ class Search:
         self, part: "Part", runs: MinimiserRun, minimiser: optx.AbstractMinimiser
     ) -> MinimiserRun:
         """Evaluate the function at the current points of the runs."""
-        if isinstance(minimiser, optx.AbstractQuasiNewton):  # its first step does no more
+        if isinstance(minimiser, optx.AbstractQuasiNewton):  # the first step only evaluates
             return part.minimise(minimiser, runs, 1)
         bfgs = BoxBFGS(atol=jnp.asarray(_TOLERANCE))
         return runs._replace(best=part.minimise(bfgs, part.init(bfgs, runs.u), 1).best)

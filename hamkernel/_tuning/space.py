@@ -91,7 +91,7 @@ def constants(K: AbstractMatrixKernel) -> dict[str, float]:
     """The Python floats among the attributes of a kernel, which are not trained, by name."""
     values: dict[str, float] = {}
     for path, node in tree_flatten_with_path(K, is_leaf=lambda node: isinstance(node, Bound))[0]:
-        if isinstance(node, float) and not eqx.is_array(node):  # that of NumPy is both
+        if isinstance(node, float) and not eqx.is_array(node):  # a NumPy float is both
             values[keystr(path).removeprefix(".")] = node
         elif isinstance(node, Bound):
             values |= node.floats
@@ -106,7 +106,7 @@ def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, 
     terms = without_symmetry(K)
     trace = gram_trace(terms, X)
     if Invariance.REFLECTION in terms.invariance:
-        return trace  # that of the Gram is no larger
+        return trace  # the trace of the Gram is no larger
     return jnp.maximum(trace, gram_trace(K, X))
 
 
@@ -189,7 +189,7 @@ def _walk(
             )
         elif child is not node:  # else a leaf that is no array: a degree, an activation
             if isinstance(kernel, AbstractJoinedKernel):
-                inside = kernel.seen_by(child, X, amplitude)
+                inside = kernel.child_inputs(child, X, amplitude)
             yield from _walk((*path, *key), child, inside[0], amplitudes, inside[1])
 
 

@@ -7,9 +7,9 @@ program, `compare` tunes it on each by the paper's grid search and by `hamkernel
 
 The paper leaves three things open, so they are run side by side or stated with the results:
 
-- its text solves (G + NλI) a = y, its tables fit (G + λI) a = y: `READINGS` has both;
-- its text gives the pendulum the mass 0.5, its tables fit 1: both are experiments here;
-- the box in which the odd error is sampled is not given: `Experiment.box`, that of the portraits.
+- Its text solves (G + NλI) a = y, its tables fit (G + λI) a = y. `READINGS` has both.
+- Its text gives the pendulum the mass 0.5, its tables fit 1. Both are experiments here.
+- It does not give the box of the odd error. `Experiment.box` is the box of the portraits.
 
 Everything here needs float64: `jax.config.update("jax_enable_x64", True)` before arrays are made.
 """

@@ -80,16 +80,16 @@ class Experiment:
     """A system, the data taken from it, the models learned and their test.
 
     Attributes:
-        title: for people.
+        title: the name in reports.
         system: the true system.
-        initial_states: of the trajectories in the data.
+        initial_states: the initial states of the trajectories in the data.
         step: time between two data points [s].
         count: data points on each trajectory.
         noise: standard deviation on states and velocities.
-        test_state: where the test trajectory starts.
-        horizon: how long it runs [s].
+        test_state: the initial state of the test trajectory.
+        horizon: the duration of the test trajectory [s].
         box: (q limits, p limits) of the portraits; its right half is sampled for the odd error.
-        units: of q and p.
+        units: the units of q and p.
         models: the models by name.
         published: the paper's tables.
     """
@@ -194,7 +194,7 @@ def datasets(
     """Return states and velocities for each noise key, trajectory after trajectory.
 
     Args:
-        experiment: what is sampled.
+        experiment: the system and its sampling.
         keys: one key per seed.
     """
     ts = experiment.step * jnp.arange(experiment.count, dtype=float)
@@ -220,11 +220,13 @@ def evaluate(
 ) -> Outcome:
     """Fit `kernel` to every data set and test the learned fields.
 
-    The quantities are the mean and maximum of the trajectory error over the test horizon; mean and
-    variance of the odd error ‖f(x) + f(−x)‖ over the sampled points; and along the test
-    trajectory, mean and variance of the learned Hamiltonian on the learned trajectory (where the
-    kernel has one; with the constant that the representer gives it) and of the true Hamiltonian
-    on the true trajectory.
+    The quantities are:
+
+    - the mean and maximum of the trajectory error over the test horizon;
+    - the mean and variance of the odd error ‖f(x) + f(−x)‖ over the sampled points;
+    - the mean and variance of the learned Hamiltonian on the learned test trajectory, if there is a
+      Hamiltonian, with the constant of the representer, and of the true Hamiltonian on the true
+      trajectory.
 
     Args:
         experiment: the system and its test.
@@ -232,8 +234,8 @@ def evaluate(
             data set, as leaves with a leading axis S.
         X: states, shape (S, N, n), of `datasets`.
         Y: velocities, shape (S, N, n).
-        regularization: of `fit`, shape () for all data sets or (S,).
-        tolerance: of the integrator, relative and absolute.
+        regularization: the λ of `fit`, shape () for all data sets or (S,).
+        tolerance: the relative and absolute tolerance of the integrator.
 
     Raises:
         RuntimeError: a fit or an integration failed.
@@ -254,7 +256,7 @@ def evaluate(
         kernel, ridge = jax.tree.map(lambda a: jnp.stack([a] * len(X)), (kernel, ridge))
     fields = _in_batches(_batch_of_fits, (kernel, X, Y, ridge))
     learned, error, quantities = _in_batches(
-        lambda batch: _tests(batch, ts, true, points, accuracy), _padded(fields)
+        lambda batch: _tests(batch, ts, true, points, accuracy), _pad(fields)
     )
     test = slice(_TIMES + 1)
     return Outcome(
@@ -274,7 +276,7 @@ def _batch_of_fits(kernels_and_data) -> KernelField:
     return jax.vmap(fit)(*kernels_and_data)
 
 
-def _padded(fields: KernelField) -> KernelField:
+def _pad(fields: KernelField) -> KernelField:
     """The same fields with points that carry no weight, so that all experiments are one program."""
     extra = -fields.points.shape[1] % 24
 
@@ -380,8 +382,8 @@ class Comparison(NamedTuple):
     """Grid search and gradient on the same data.
 
     Attributes:
-        grid: what the grid search chose.
-        gradient: what `tune` chose.
+        grid: the choice of the grid search.
+        gradient: the choice of `tune`.
         surface: the losses of the grid for seed 0, shape (30, 25).
     """
 
@@ -418,8 +420,8 @@ def compare(
         outcome = evaluate(experiment, kernels, X, Y, regularization, tolerance=1e-6)
         return Choice(lengthscale, regularization, loss, seconds, outcome.quantities)
 
-    surfaces, grid_seconds = _timed(lambda x, y: _surface(make, x, y), X, Y)
-    tuned, gradient_seconds = _timed(lambda x, y: _by_gradient(make, x, y), X, Y)
+    surfaces, grid_seconds = _time(lambda x, y: _surface(make, x, y), X, Y)
+    tuned, gradient_seconds = _time(lambda x, y: _by_gradient(make, x, y), X, Y)
     return Comparison(
         chosen([_least_loss(surface) for surface in surfaces], grid_seconds),
         chosen(tuned, gradient_seconds),
@@ -427,7 +429,7 @@ def compare(
     )
 
 
-def _timed(run, X, Y) -> tuple[list, np.ndarray]:
+def _time(run, X, Y) -> tuple[list, np.ndarray]:
     """The results of `run` for each data set, and the seconds of each run after compilation."""
     run(X[0], Y[0])
     answers, seconds = [], []

@@ -39,7 +39,7 @@ def report(results: Results, experiments: Experiments, seeds: int) -> str:
         experiments: the experiments that were run, with the published numbers.
         seeds: the number of noise seeds in the results.
     """
-    published = _published(results)
+    published = _published_values(results)
     head = (
         f"Smith & Egeland (2023) with {seeds} noise seeds: median [10 %, 90 %];\n"
         "the published numbers are of one seed.\n\n"
@@ -62,7 +62,7 @@ def report(results: Results, experiments: Experiments, seeds: int) -> str:
     )
 
 
-def _published(results: Results) -> Results:
+def _published_values(results: Results) -> Results:
     """The results with the paper's hyperparameters alone."""
     return {
         name: {reading: readings[reading] for reading in READINGS if reading in readings}

@@ -73,13 +73,15 @@ def in_precision(field: Function, dtype: jnp.dtype) -> Function:
     return jax.tree.map(cast_leaf, field)
 
 
-def at(system: Function, x: Num[ArrayLike, " n"], n: int) -> tuple[Function, Float[Array, " n"]]:
+def cast_state(
+    system: Function, x: Num[ArrayLike, " n"], n: int
+) -> tuple[Function, Float[Array, " n"]]:
     """`system` in the dtype of x, and x, which must be one state of n coordinates."""
     x = require.point(x, n)
     return in_precision(system, x.dtype), x
 
 
-def shaped(x: Array, name: str, *shapes: tuple[int, ...]) -> Array:
+def require_shape(x: Array, name: str, *shapes: tuple[int, ...]) -> Array:
     """`x`, whose shape must be one of `shapes`."""
     if x.shape not in shapes:
         needed = " or ".join(map(str, shapes))
@@ -90,7 +92,7 @@ def shaped(x: Array, name: str, *shapes: tuple[int, ...]) -> Array:
 def log_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:
     """The logarithm of a positive parameter, by default a scalar."""
     array = require.positive(x, name)
-    return jnp.log(shaped(array, name, *(shapes or ((),))))
+    return jnp.log(require_shape(array, name, *(shapes or ((),))))
 
 
 def positive_parameter(name: str, doc: str) -> Any:
@@ -100,7 +102,7 @@ def positive_parameter(name: str, doc: str) -> Any:
 
 def signed_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:
     """A finite parameter of either sign, by default a scalar."""
-    array = shaped(require.floating(x, name), name, *(shapes or ((),)))
+    array = require_shape(require.floating(x, name), name, *(shapes or ((),)))
     bad = require.not_finite(array)
     return require.value(array, bad, lambda: f"{name} must be finite, got {array}.")
 
@@ -355,11 +357,11 @@ def _noise_level(level: ArrayLike, name: str, states: Float[Array, "B n"], key: 
     """A standard deviation in the dtype of the states, shape () or (n,)."""
     if key is None and not (require.is_concrete(level) and np.all(np.asarray(level) == 0)):
         raise ValueError(f"{name} needs randomness: pass `key=jax.random.key(...)`.")
-    array = shaped(require.floating(level, name), name, (), states.shape[1:])
-    seen = require.on_host(array)
+    array = require_shape(require.floating(level, name), name, (), states.shape[1:])
+    level_on_host = require.on_host(array)
     array = require.value(
         array,
-        ~((seen >= 0) & (seen < np.inf)),
+        ~((level_on_host >= 0) & (level_on_host < np.inf)),
         lambda: f"{name} is a standard deviation, finite and not negative; got {array}.",
     )
     return array.astype(states.dtype)

@@ -14,12 +14,12 @@ from hamkernel.poisson import charged_particle, lotka_volterra, rigid_body
 from hamkernel.systems._base import (
     AbstractHamiltonianSystem,
     Numbers,
-    at,
+    cast_state,
     count_of,
     in_precision,
     log_parameter,
     positive_parameter,
-    shaped,
+    require_shape,
     signed_parameter,
     squared_distances,
 )
@@ -59,7 +59,7 @@ class Kepler(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
-        self, x = at(self, x, 4)
+        self, x = cast_state(self, x, 4)
         q, p = jnp.split(x, 2)
         potential = -self.gravitational_parameter * self.reduced_mass / jnp.sqrt(q @ q)
         return p @ p / (2 * self.reduced_mass) + potential
@@ -101,7 +101,7 @@ class NBody(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4·bodies,)."""
-        self, x = at(self, x, 4 * self.masses.size)
+        self, x = cast_state(self, x, 4 * self.masses.size)
         m = self.masses
         q, p = x.reshape(2, m.size, 2)  # (bodies, 2) each
         i, j, squared = squared_distances(q)
@@ -170,7 +170,7 @@ class PointVortices(AbstractHamiltonianSystem):
             ValueError: positions has another shape.
         """
         positions = require.floating(positions, "positions")
-        x, y = shaped(positions, "positions", (self.circulations.size, 2)).T
+        x, y = require_shape(positions, "positions", (self.circulations.size, 2)).T
         self = in_precision(self, x.dtype)
         scale = jnp.sqrt(jnp.abs(self.circulations))
         return jnp.concatenate([scale * x, jnp.sign(self.circulations) * scale * y])
@@ -183,14 +183,14 @@ class PointVortices(AbstractHamiltonianSystem):
         Raises:
             ValueError: x is not one state of shape (2·vortices,).
         """
-        self, x = at(self, x, 2 * self.circulations.size)
+        self, x = cast_state(self, x, 2 * self.circulations.size)
         q, p = jnp.split(x, 2)
         scale = jnp.sqrt(jnp.abs(self.circulations))
         return jnp.stack([q / scale, jnp.sign(self.circulations) * p / scale], axis=1)
 
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2·vortices,)."""
-        self, x = at(self, x, 2 * self.circulations.size)
+        self, x = cast_state(self, x, 2 * self.circulations.size)
         i, j, squared = squared_distances(self.positions(x))
         strengths = self.circulations[i] * self.circulations[j]
         return -jnp.sum(strengths * jnp.log(squared)) / (4 * jnp.pi)
@@ -255,7 +255,7 @@ class RigidBody(AbstractPoissonSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "3"]) -> Float[Array, ""]:
         """Return H(L), shape (); ValueError unless L has shape (3,)."""
-        self, L = at(self, x, 3)
+        self, L = cast_state(self, x, 3)
         return jnp.sum(L**2 / (2 * self.inertia))
 
     def tensor(self, x: Num[ArrayLike, "3"]) -> Float[Array, "3 3"]:
@@ -308,7 +308,7 @@ class LotkaVolterra(AbstractPoissonSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
         """Return H(x, y), shape (); NaN where a population is negative."""
-        self, (prey, predators) = at(self, x, 2)
+        self, (prey, predators) = cast_state(self, x, 2)
         of_prey = self.reproduction * prey - self.death * jnp.log(prey)
         return of_prey + self.predation * predators - self.growth * jnp.log(predators)
 
@@ -348,11 +348,11 @@ class ChargedParticle(AbstractPoissonSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(q, p), shape (); ValueError unless x has shape (4,)."""
-        self, x = at(self, x, 4)
+        self, x = cast_state(self, x, 4)
         q, p = jnp.split(x, 2)
         return p @ p / (2 * self.mass) + self.stiffness * q @ q / 2
 
     def tensor(self, x: Num[ArrayLike, "4"]) -> Float[Array, "4 4"]:
         """Return Π = [[0, I], [−I, F]], F v = v × B."""
-        self, x = at(self, x, 4)
+        self, x = cast_state(self, x, 4)
         return charged_particle(lambda q: self.magnetic_field)(x)

@@ -10,7 +10,7 @@ from hamkernel import _require as require
 from hamkernel.systems._base import (
     AbstractHamiltonianSystem,
     Numbers,
-    at,
+    cast_state,
     log_parameter,
     positive_parameter,
     signed_parameter,
@@ -45,7 +45,7 @@ class HarmonicOscillator(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2,)."""
-        self, (q, p) = at(self, x, 2)
+        self, (q, p) = cast_state(self, x, 2)
         return p**2 / (2 * self.mass) + self.stiffness * q**2 / 2
 
 
@@ -82,7 +82,7 @@ class Pendulum(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2,)."""
-        self, (q, p) = at(self, x, 2)
+        self, (q, p) = cast_state(self, x, 2)
         kinetic = p**2 / (2 * self.mass * self.length**2)
         return kinetic + self.mass * self.gravity * self.length * (1 - jnp.cos(q))
 
@@ -124,7 +124,7 @@ class Duffing(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2,)."""
-        self, (q, p) = at(self, x, 2)
+        self, (q, p) = cast_state(self, x, 2)
         potential = self.linear_stiffness * q**2 / 2 + self.cubic_stiffness * q**4 / 4
         return p**2 / (2 * self.mass) + potential
 
@@ -154,7 +154,7 @@ class HenonHeiles(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
-        self, x = at(self, x, 4)
+        self, x = cast_state(self, x, 4)
         return x @ x / 2 + self.coupling * (x[0] ** 2 * x[1] - x[1] ** 3 / 3)
 
 
@@ -193,7 +193,7 @@ class SpringChain(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (2·count,)."""
-        self, x = at(self, x, 2 * self.count)
+        self, x = cast_state(self, x, 2 * self.count)
         q, p = jnp.split(x, 2)
         stretch = jnp.diff(jnp.pad(q, 1))  # (count + 1,)
         return jnp.sum(p**2 / (2 * self.mass)) + jnp.sum(self.stiffness * stretch**2) / 2
@@ -240,7 +240,7 @@ class DoublePendulum(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
-        self, (q1, q2, p1, p2) = at(self, x, 4)
+        self, (q1, q2, p1, p2) = cast_state(self, x, 4)
         (m1, m2), (l1, l2), g = self.masses, self.lengths, self.gravity
         # Momenta divided by the lengths; in them the kinetic energy does not contain the lengths.
         u1, u2 = p1 / l1, p2 / l2
@@ -290,7 +290,7 @@ class CartPole(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
-        self, x = at(self, x, 4)
+        self, x = cast_state(self, x, 4)
         (M, m), half, g = self.masses, self.length, self.gravity
         mixed = m * half * jnp.cos(x[1])
         kinetic = _kinetic(x[2:], M + m, mixed, 4 * m * half**2 / 3)
@@ -352,7 +352,7 @@ class Acrobot(AbstractHamiltonianSystem):
 
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
-        self, x = at(self, x, 4)
+        self, x = cast_state(self, x, 4)
         (m1, m2), (c1, c2), (i1, i2) = self.masses, self.centres, self.inertias
         link, g = self.length, self.gravity
         swing = m2 * link * c2 * jnp.cos(x[1])
