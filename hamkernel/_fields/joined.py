@@ -365,7 +365,7 @@ class MemberField(AbstractField):
 
     @property
     def residual(self) -> Float[Array, "..."]:
-        """Empty: the data are those of all members."""
+        """An empty array, since the data belong to all members."""
         return self.terms[0].residual
 
     @property
