@@ -52,10 +52,10 @@ from hamkernel._posterior import Posterior
 from hamkernel._solvers.problem import Problem
 from hamkernel._solvers.stream import AbstractStreamingFit
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.model import Model
 from hamkernel._trajectories.segments import LinearisedSegments
+from hamkernel._trajectories.table import Diagnostic, Diagnostics
 from hamkernel._tuning.tune import Tuned
 
 _VERSION = 2  # of the format; 1 was an archive of NumPy's, before the first release

@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics
+from hamkernel._trajectories.table import Diagnostic, Diagnostics
 
 K = hk.Symplectic(hk.Gaussian(1.0))
 FRICTION = hk.Sum(energy=hk.Symplectic(hk.Gaussian(1.0)), friction=hk.Friction())
@@ -87,6 +87,19 @@ def test_dropouts_written_as_zeros_make_the_field_unusable():
     learned, heard = learn_and_listen(K, runs)
     assert not learned.converged
     assert len(heard) == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [None, 0.05])
+def test_a_run_at_rest_is_one_measurement_of_the_noise(step):
+    times, states = pendulum(noise=0.02 if step is None else 0.0)
+    noise = 0.02
+    if step is not None:
+        states, noise = [step * np.round(x / step) for x in states], step / np.sqrt(12)
+    runs = hk.Runs([*times, times[0]], [*states, np.zeros_like(states[0])])
+    learned, heard = learn_and_listen(K, runs)
+    assert heard == []
+    np.testing.assert_allclose(learned.noise, noise, rtol=0.08)  # 13 % too small as 60 samples
 
 
 def test_animals_in_weather_are_no_hamiltonian_system():

@@ -25,8 +25,8 @@ from hamkernel._structures.lagrangian import (
     LagrangianFeatures,
     lagrangian_features,
 )
-from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics
 from hamkernel._trajectories.runs import Runs
+from hamkernel._trajectories.table import Diagnostic, Diagnostics
 from hamkernel._trajectories.weak import (
     Pieces,
     path_covariance,

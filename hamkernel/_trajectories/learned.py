@@ -21,10 +21,10 @@ from hamkernel._posterior import Posterior, condition
 from hamkernel._show import described, printable, text
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._trajectories.diagnostics import Diagnostics
 from hamkernel._trajectories.evidence import Evidence
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.score import Score, scored
+from hamkernel._trajectories.table import Diagnostics
 
 
 class Iteration(eqx.Module):
