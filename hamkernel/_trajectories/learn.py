@@ -43,6 +43,7 @@ from hamkernel._trajectories.kalman import (
     innovations,
     whitened_rows,
 )
+from hamkernel._trajectories.laws import are_learned_from_rows, learn_laws
 from hamkernel._trajectories.learned import Learned, empty, misfits
 from hamkernel._trajectories.model import Model, with_amplitude
 from hamkernel._trajectories.preprocessing import (
@@ -88,6 +89,10 @@ def learn(
     path, until log p rises by less than ½. The first pass has no process noise. Where it does not
     settle, or more of it would pay, a second pass looks for its intensity, and the likelier of the
     two is returned.
+
+    Laws that many parts share, K made of `hk.Shared`, are found without iterations, from any number
+    of coordinates on: by two solves with weak rows, ∫ φ f dt along a smoothed path, whose cost is
+    linear in n. There `solver` and `iterations` have no effect, and innovations are NaN.
 
     Args:
         K: a matrix-valued kernel. Its hyperparameters are the first guess. A structure without an
@@ -147,6 +152,8 @@ def learn(
     K = with_masses(K, runs.dimension) if masses else K
     known = known_part(K, mean, runs.dimension, jnp.float64)
     check_identifiable(runs, known)
+    if are_learned_from_rows(K) and process is None:
+        return learn_laws(K, runs, mean if mean is None else as_pytree(mean), given, again)
     bar = _bar(progress, total=2 + most)
     data = preprocess(runs, known)
     bar.update()
