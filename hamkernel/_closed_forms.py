@@ -1,12 +1,12 @@
-"""Held-out residuals, free residuals and the log density of y, from any kind of factor of A.
+"""Held-out residuals, free residuals and the log density of y, for every factor of A.
 
 Write A = G + ridge I and a = A⁻¹y for the system with ALL points, and let S be the rows of a
 held-out fold. Eliminating the other rows from A a = y by block inversion gives the residual that
 a fit WITHOUT S would have on S,
 
-    r_S = y_S − f₋S(X_S) = (C_SS)⁻¹ a_S,    C = A⁻¹,
+    r_S = y_S − f₋S(X_S) = (C_SS)⁻¹ a_S,    C = A⁻¹,                                   (1)
 
-so no fold is ever refitted.
+    without a refit for any fold.
 
 Their derivatives are written by hand, since differentiating through the factorisation costs
 several times as much as the factorisation. From dC = −C dA C, and with v_S = (C_SS)⁻¹ r̄_S for a
@@ -14,9 +14,11 @@ cotangent r̄,
 
     r̄·dr = Σ_S v_Sᵀ[(dC y)_S − dC_SS r_S]   so   Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − (C v) aᵀ,
 
-and a itself, with da = −C dA a, adds −(C ā) aᵀ.
+    where v has the entries v_S. With a cotangent ā of a, da = −C dA a adds −(C ā) aᵀ, so that
 
-A result that rounding has spoiled is infinite, with a derivative of zero.
+        Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − w aᵀ,   w = C(v + ā),   ȳ = w.                          (2)
+
+If A is too ill-conditioned, the result is infinite and its derivative zero.
 
 Source: for scalar outputs and single points, Rasmussen & Williams (2006), section 5.4.2; for
 folds, Ginsbourger & Schärer (2021), arXiv:2101.03108.
@@ -43,7 +45,7 @@ class Partition:
 
     Attributes:
         folds: the points of each of the F folds.
-        groups: the folds again, those of similar size together.
+        groups: the same folds, grouped by similar size.
         weights: 1 / (F |fold of i|) for each point, so that `weights @ squares` is the mean over
             folds of the mean over points, shape (N,).
     """
@@ -61,8 +63,8 @@ class Partition:
         # The sizes in a group are within a factor of two, so padding at most doubles the points.
         octave = np.floor(np.log2(sizes.max() / sizes)).astype(int)
         self.groups = [
-            Group(N, [self.folds[i] for i in np.flatnonzero(octave == each)])
-            for each in np.unique(octave)
+            Group(N, [self.folds[i] for i in np.flatnonzero(octave == size_class)])
+            for size_class in np.unique(octave)
         ]
 
     def __hash__(self) -> int:
@@ -103,35 +105,35 @@ def _labels(N: int, folds: Folds) -> Int[np.ndarray, " N"]:
     return array
 
 
-def _factored(system: AbstractSystem, y: Float[Array, " D"]):
-    """The factor of A, a = A⁻¹y, yᵀa, and whether these can be trusted.
+def _factor_and_solve(system: AbstractSystem, y: Float[Array, " D"]):
+    """The factor of A, a = A⁻¹y, yᵀa, and whether A is well-conditioned enough for them.
 
     Barriers keep calls of LAPACK from running side by side.
     """
     factor = system.factor()
-    factor, a, square = jax.lax.optimization_barrier((factor, *factor.solved(y)))
-    return jax.lax.optimization_barrier((factor, a, square, factor.trusted(y)))
+    factor, a, square = jax.lax.optimization_barrier((factor, *factor.solve_with_form(y)))
+    return jax.lax.optimization_barrier((factor, a, square, factor.is_well_conditioned(y)))
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def held_out(
     system: AbstractSystem, y: Float[Array, " D"], partition: Partition
 ) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
-    """r_S = (C_SS)⁻¹ a_S for each fold, in the order of y, and a; inf where not to be trusted."""
+    """The residuals r_S = (C_SS)⁻¹ a_S in the order of y, and a; inf if A is ill-conditioned."""
     return _held_out_forward(system, y, partition)[0]
 
 
 @full_precision
 def _held_out_forward(system, y, partition):
-    factor, a, _, trusted = _factored(system, y)
+    factor, a, _, is_trusted = _factor_and_solve(system, y)
     C = factor.inverse()
     r, blocks = jnp.zeros_like(a), []
     for group in partition.groups:
         C, r = jax.lax.optimization_barrier((C, r))  # not side by side
         blocks.append(C.blocks(group))
-        r = group.scattered(blocks[-1].solve(group.gather(a)), into=r)
-    ok = trusted & jnp.isfinite(r).all()
-    value = jax.tree.map(lambda each: jnp.where(ok, each, jnp.full_like(each, jnp.inf)), (r, a))
+        r = group.scatter(blocks[-1].solve(group.gather(a)), into=r)
+    ok = is_trusted & jnp.isfinite(r).all()
+    value = jax.tree.map(lambda array: jnp.where(ok, array, jnp.full_like(array, jnp.inf)), (r, a))
     return value, (C, a, blocks, r, ok)
 
 
@@ -140,11 +142,11 @@ def _held_out_backward(partition, saved, bars):
     C, a, blocks, r, ok = saved
     r_bar, a_bar = bars
     V, bar = [], r_bar
-    for group, own in zip(partition.groups, blocks, strict=True):
-        V.append(own.solve(group.gather(bar)))
+    for group, fold_blocks in zip(partition.groups, blocks, strict=True):
+        V.append(fold_blocks.solve(group.gather(bar)))
         bar = jax.lax.optimization_barrier((bar, V[-1]))[0]
     R = [group.gather(r) for group in partition.groups]
-    return _or_zero(ok, C.pulled_folds(a, partition.groups, V, R, (r_bar, a_bar)))
+    return _or_zero(ok, C.vjp_of_folds(a, partition.groups, V, R, (r_bar, a_bar)))
 
 
 held_out.defvjp(_held_out_forward, _held_out_backward)
@@ -154,15 +156,15 @@ held_out.defvjp(_held_out_forward, _held_out_backward)
 def free_residuals(
     system: AbstractSystem, y: Float[Array, " D"]
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """‖A⁻¹y‖² and tr A⁻¹; inf and 1 where they cannot be trusted."""
+    """The pair ‖A⁻¹y‖² and tr A⁻¹; inf and 1 if A is ill-conditioned."""
     return _free_residuals_forward(system, y)[0]
 
 
 @full_precision
 def _free_residuals_forward(system, y):
-    factor, a, _, trusted = _factored(system, y)
+    factor, a, _, is_trusted = _factor_and_solve(system, y)
     squares, trace = a @ a, factor.inverse_trace
-    ok = trusted & jnp.isfinite(squares) & jnp.isfinite(trace)
+    ok = is_trusted & jnp.isfinite(squares) & jnp.isfinite(trace)
     value = jnp.where(ok, squares, jnp.inf), jnp.where(ok, trace, jnp.ones_like(trace))
     return value, (factor, a, ok)
 
@@ -171,8 +173,10 @@ def _free_residuals_forward(system, y):
 def _free_residuals_backward(saved, bars):
     factor, a, ok = saved
     squares_bar, trace_bar = bars
+    # d‖a‖² = −2 aᵀC dA a + 2 aᵀC dy and d tr C = −tr(C² dA), so with w = 2 s̄ C a: Ā = −w aᵀ − t̄
+    # C².
     w = 2 * squares_bar * factor.solve(a)
-    return _or_zero(ok, (factor.inverse().pulled(-w, a, square=-trace_bar), w))
+    return _or_zero(ok, (factor.inverse().vjp(-w, a, square=-trace_bar), w))
 
 
 free_residuals.defvjp(_free_residuals_forward, _free_residuals_backward)
@@ -180,22 +184,23 @@ free_residuals.defvjp(_free_residuals_forward, _free_residuals_backward)
 
 @jax.custom_vjp
 def log_density(system: AbstractSystem, y: Float[Array, " D"]) -> Float[Array, ""]:
-    """The log density of y under N(0, A); −inf where it cannot be trusted."""
+    """The log density of y under N(0, A); −inf if A is ill-conditioned."""
     return _log_density_forward(system, y)[0]
 
 
 @full_precision
 def _log_density_forward(system, y):
-    factor, a, square, trusted = _factored(system, y)
+    factor, a, square, is_trusted = _factor_and_solve(system, y)
     value = -0.5 * (square + factor.log_det + len(y) * jnp.log(2 * jnp.pi).astype(y.dtype))
-    ok = trusted & jnp.isfinite(value)
+    ok = is_trusted & jnp.isfinite(value)
     return jnp.where(ok, value, -jnp.inf), (factor, a, ok)
 
 
 @full_precision
 def _log_density_backward(saved, bar):
     factor, a, ok = saved
-    system_bar = factor.inverse().pulled(0.5 * bar * a, a, inverse=-0.5 * bar)
+    # d log p = ½ aᵀdA a − ½ tr(C dA) − aᵀdy
+    system_bar = factor.inverse().vjp(0.5 * bar * a, a, inverse=-0.5 * bar)
     return _or_zero(ok, (system_bar, -bar * a))
 
 
@@ -203,5 +208,5 @@ log_density.defvjp(_log_density_forward, _log_density_backward)
 
 
 def _or_zero(ok: Bool[Array, ""], tree):
-    """Derivatives, zero in place of NaN where the value is infinite."""
-    return jax.tree.map(lambda each: jnp.where(ok, each, jnp.zeros_like(each)), tree)
+    """Derivatives, set to zero if the value is infinite."""
+    return jax.tree.map(lambda leaf: jnp.where(ok, leaf, jnp.zeros_like(leaf)), tree)

@@ -1,17 +1,17 @@
 """The dense Gram of a kernel: of points and of rows of observations, its derivatives and rounding.
 
 The rows of observations are linear functionals of a field and its potential. Their covariances are
-made of three, of which those with a value of u take fewer derivatives,
+combinations of three kinds,
 
     Cov(u(x), u(z)) = k(x, z),  Cov(u(x), vᵀf(z)) = ∂z k(x, z)·B(z)ᵀv,  Cov(uᵀf(x), vᵀf(z)) = uᵀKv,
 
-The second is the potential of the representer K(·, z)v, and the third is `K.form`. A block of
-observations maps the covariances at its points to rows.
+with none, one and two derivatives of k. The second is the potential of the representer K(·, z)v,
+and the third is `K.form`. A block of observations maps the covariances at its points to rows.
 
-Derivatives with respect to the hyperparameters of a kernel, of which there are few, are taken in
-forward mode: each costs about one assembly. Reverse mode through the pairs of points was measured
-at 6 to 60 assemblies, and takes several times as long to compile. A kernel that writes its Gram
-itself may say that reverse mode is cheaper: that of `hk.compare` takes four assemblies for all.
+A kernel has few hyperparameters, so their derivatives are taken in forward mode: each costs about
+one assembly of the Gram. Reverse mode through the pairs of points took 6 to 60 assemblies, and
+several times as long to compile. A kernel with a closed form of its Gram may choose reverse mode:
+the one of `hk.compare` takes four assemblies for all derivatives.
 """
 
 from __future__ import annotations
@@ -85,39 +85,48 @@ def assemble(
     n = X.shape[1]
     if isinstance(K, Sum) and any(term.through_descriptor(n) for term in K.terms):
         return total([assemble(term, X, Z) for term in K.terms])
-    found = K.through_descriptor(n)
-    if found is not None:
-        return _by_jacobians(found, X, Z)
+    descriptor = K.through_descriptor(n)
+    if descriptor is not None:
+        return _gram_of_descriptor(descriptor, X, Z)
     closed = K.blocks(X, Z)
     if closed is not None:
         return closed
     X, Z = centred(K, X, Z)
     basis = jnp.eye(K.outputs(X.shape[1]), dtype=X.dtype)
-    # Entries are computed in the order of memory. Blocks of K that are moved to their place
-    # afterwards took two to four times as long, most of it for a copy of the Gram.
+    # Entries are computed in the order of memory. Computing blocks of K and transposing them took
+    # two to four times as long, most of it for a copy of the Gram.
     form = K.form
     for axis in (3, 2, 1, 0):  # b, zⱼ, a, xᵢ
         form = jax.vmap(form, in_axes=[0 if i == axis else None for i in range(4)])
     return form(X, basis, Z, basis)  # (N, n, M, n)
 
 
-def _by_jacobians(
-    found: Descriptor, X: Float[Array, "N n"], Z: Float[Array, "M n"]
+def _gram_of_descriptor(
+    descriptor: Descriptor, X: Float[Array, "N n"], Z: Float[Array, "M n"]
 ) -> Float[Array, "N n M n"]:
-    """The Gram J(x)ᵀ [∂d ∂eᵀ κ(d, e)] J(z), with each Jacobian made once and not for each pair.
+    """The Gram of a kernel of descriptors, k(x, z) = κ(d(x), d(z)).
 
-    A row of blocks costs n gradients of κ a pair and a product with the Jacobians of Z, where
-    entries one by one cost n² second derivatives.
+    With the Jacobian J_d = ∂d/∂x, shape (m, n), and the directions D(x) along which the structure
+    differentiates, D = B(x)ᵀ, the chain rule gives
+
+        K(x, z) = (J_d(x) D(x))ᵀ [∂_d ∂_eᵀ κ(d, e)] (J_d(z) D(z)),    d = d(x), e = d(z).
+
+    Each Jacobian is computed once per point and not per pair. A row of blocks then costs n
+    gradients of κ per pair and a product with the Jacobians of Z; entries one by one would cost n²
+    second derivatives.
+
+    Source: Chmiela, Sauceda, Müller & Tkatchenko (2018), Nature Communications 9, 3887.
     """
-    (D, J), (E, L) = jax.vmap(found.at)(X), jax.vmap(found.at)(Z)  # (N, m), (N, m, n)
+    # (N, m) and (N, m, n), (M, m) and (M, m, n)
+    (D, J), (E, L) = jax.vmap(descriptor.at)(X), jax.vmap(descriptor.at)(Z)
 
     def slope(d, v, e):
         """The gradient in e of the derivative of κ(d, e) along v, (m,)."""
-        return jax.grad(lambda e: jax.jvp(lambda d: found.kernel(d, e), (d,), (v,))[1])(e)
+        return jax.grad(lambda e: jax.jvp(lambda d: descriptor.kernel(d, e), (d,), (v,))[1])(e)
 
     def rows(point):
         d, J = point
-        slopes = jax.vmap(jax.vmap(slope, (None, None, 0)), (None, 1, None))(d, J, E)
+        slopes = jax.vmap(jax.vmap(slope, (None, None, 0)), (None, 1, None))(d, J, E)  # (n, M, m)
         return jnp.einsum("ajm,jmb->ajb", slopes, L)  # (n, M, n)
 
     return jax.lax.map(rows, (D, J))
@@ -155,18 +164,18 @@ def trace(
     if Invariance.TRANSLATION in K.invariance:  # all blocks on the diagonal are K(0, 0)
         return len(X) * block_traces(K, jnp.zeros((1, X.shape[1]), X.dtype))[0]
 
-    def of_points(K, X):
-        of_point = jax.checkpoint(lambda x: block_traces(K, x[None])[0])
-        return jax.lax.map(of_point, X, batch_size=sizes().trace_points).sum()
+    def trace_of_points(K, X):
+        trace_of_point = jax.checkpoint(lambda x: block_traces(K, x[None])[0])
+        return jax.lax.map(trace_of_point, X, batch_size=sizes().trace_points).sum()
 
-    return on_each(spread, of_points, K, X, joined=False)
+    return on_each(spread, trace_of_points, K, X, joined=False)
 
 
 def centred(K: AbstractMatrixKernel, x: Array, Z: Float[Array, "M n"]) -> tuple[Array, Array]:
-    """Both arguments relative to the mean of Z, where K allows it.
+    """Both arguments relative to the mean of Z, if K is invariant under translations.
 
-    The product form x·x + z·z − 2x·z loses the digits of (‖x‖/ℓ)²: far from the origin and in
-    float32 that is all of them.
+    The product form x·x + z·z − 2x·z has a relative error of ε (‖x‖/ℓ)²; far from the origin, in
+    float32, no digit remains.
     """
     centre = jax.lax.stop_gradient(K.centre(Z))
     if centre is None:
@@ -180,10 +189,10 @@ def plus_ridge(G: Float[Array, "D D"], ridge: Float[Array, ""]) -> Float[Array, 
 
 
 def between_all(
-    K: AbstractMatrixKernel, block: AbstractBlock, others: tuple[AbstractBlock, ...]
+    K: AbstractMatrixKernel, block: AbstractBlock, blocks: tuple[AbstractBlock, ...]
 ) -> Float[Array, "d e"]:
-    """The covariances of the rows of a block with those of others."""
-    return jnp.concatenate([between(K, block, other) for other in others], axis=1)
+    """The covariances of the rows of one block with the rows of several blocks."""
+    return jnp.concatenate([between(K, block, right) for right in blocks], axis=1)
 
 
 def gram_of_rows(
@@ -193,16 +202,16 @@ def gram_of_rows(
     between_all: Any = between_all,
 ) -> Float[Array, "D D"]:
     """The Gram of all rows, after the contrast of the energies or before it."""
-    found = []
+    strips = []
     for i, (block, place) in enumerate(zip(rows.blocks, rows.slices, strict=True)):
-        left = [above[:, place].T for above in found]
-        found.append(jnp.concatenate([*left, between_all(K, block, rows.blocks[i:])], axis=1))
-    G = jnp.concatenate(found)
+        lower = [above[:, place].T for above in strips]
+        strips.append(jnp.concatenate([*lower, between_all(K, block, rows.blocks[i:])], axis=1))
+    G = jnp.concatenate(strips)
     return rows.contrast(rows.contrast(G).T) if contrasted and len(rows.energies) else G
 
 
-# The largest number of entries of a strip: some kernels hold 40 intermediate numbers for each, and
-# these are then 160 MB.
+# The largest number of entries of a strip. Some kernels hold 40 intermediate numbers for each
+# entry, which makes 160 MB.
 _STRIP = 500_000
 
 
@@ -210,30 +219,31 @@ def regularized_gram(
     K: AbstractMatrixKernel, rows: Measurements, ridge: Float[Array, ""]
 ) -> Float[Array, "D D"]:
     """The Gram of all rows, after the contrast of the energies, plus ridge I."""
-    if rows.states is None or rows.size <= 2000:  # in strips 2000 rows took a fifth longer
+    if rows.states is None or rows.size <= 2000:  # strips took 20 % longer for 2000 rows
         return plus_ridge(gram_of_rows(K, rows), ridge)
     empty = jnp.zeros((rows.size, rows.size), rows.targets.dtype)
     return strips_of_gram((K, rows.points, ridge, 0, len(rows.points)), empty)
 
 
-def strips_of_gram(asked: tuple, A: Float[Array, "D D"]) -> Float[Array, "D D"]:
-    """A, in which the rows of some points are replaced by those of the Gram plus ridge I.
+def strips_of_gram(args: tuple, A: Float[Array, "D D"]) -> Float[Array, "D D"]:
+    """The matrix A after the rows of some points are overwritten by those of the Gram plus ridge I.
 
     The rows are computed in strips, so that the intermediate arrays stay small.
 
     Args:
-        asked: the kernel, its points, the ridge, the first point whose rows are made, and the
-            number of such points, a Python integer.
-        A: the matrix, whose other rows are kept.
+        args: (kernel, points, ridge, first, count), packed into one tuple because everything else
+            is donated. Rows of the points first, …, first + count − 1 are computed; count is
+            static.
+        A: the matrix (D, D); its other rows are kept.
     """
-    K, X, ridge, first, count = asked
+    K, X, ridge, first, count = args
     D, n = len(A), len(A) // len(X)
     size = max(1, min(count, _STRIP // (n * D)))
 
     @jax.checkpoint
     def strip(K, X, ridge, start):
-        own = jax.lax.dynamic_slice_in_dim(X, start, size)
-        rows = assemble(K, own, X).reshape(size * n, D)
+        points = jax.lax.dynamic_slice_in_dim(X, start, size)
+        rows = assemble(K, points, X).reshape(size * n, D)
         on_diagonal = jnp.arange(D)[None] == (start * n + jnp.arange(size * n))[:, None]
         return rows + jnp.where(on_diagonal, ridge, jnp.zeros_like(ridge))
 
@@ -247,8 +257,10 @@ def strips_of_gram(asked: tuple, A: Float[Array, "D D"]) -> Float[Array, "D D"]:
 def rows_between(
     K: AbstractMatrixKernel, rows: Measurements, block: AbstractBlock
 ) -> Float[Array, "D d"]:
-    """The covariances of all rows with those of a block."""
-    return rows.contrast(jnp.concatenate([between(K, each, block) for each in rows.blocks]))
+    """The covariances of all rows with the rows of a block."""
+    return rows.contrast(
+        jnp.concatenate([between(K, row_block, block) for row_block in rows.blocks])
+    )
 
 
 def trace_of_rows(K: AbstractMatrixKernel, rows: Measurements) -> Float[Array, ""]:
@@ -264,11 +276,11 @@ def _trace(K: AbstractMatrixKernel, block: AbstractBlock) -> Float[Array, ""]:
     if not isinstance(block, Combinations):
         return jnp.sum(block.rows(diagonals(K, X, X)) / block.scale)
 
-    def of_group(group):
+    def trace_of_group(group):
         one = Combinations(groups=group[0][None], weights=group[1][None])  # pyright: ignore[reportCallIssue]
-        return jnp.trace(_mapped(K, one, one))
+        return jnp.trace(_map_rows(K, one, one))
 
-    return jax.lax.map(of_group, (block.groups, block.weights)).sum()
+    return jax.lax.map(trace_of_group, (block.groups, block.weights)).sum()
 
 
 def components(K: AbstractMatrixKernel, points: Float[Array, "P d"]) -> Components:
@@ -284,33 +296,35 @@ def between(
     if isinstance(right, Combinations) and not isinstance(left, Combinations):
         return between(K, right, left).T
     if not isinstance(left, Combinations):
-        return _mapped(K, left, right)
+        return _map_rows(K, left, right)
 
-    def of_group(group):
+    def rows_of_group(group):
         points, weights = group
         one = Combinations(groups=points[None], weights=weights[None])  # pyright: ignore[reportCallIssue]
-        return _mapped(K, one, right)
+        return _map_rows(K, one, right)
 
-    # The covariances at the points of all groups may not fit in memory. So many groups are taken
-    # at once that theirs, Q n rows for each group, have some million entries, 8 MB.
-    at_once = max(1, 1_000_000 // (left.groups[0].size * right.points.size))
-    out = jax.lax.map(of_group, (left.groups, left.weights), batch_size=at_once)
+    # The covariances at the points of all groups may not fit in memory. Groups are batched so
+    # that the covariances of one batch, Q n rows for each group, have about 10⁶ entries (8 MB).
+    batch = max(1, 1_000_000 // (left.groups[0].size * right.points.size))
+    out = jax.lax.map(rows_of_group, (left.groups, left.weights), batch_size=batch)
     return out.reshape(left.count, -1)
 
 
-def _mapped(K: AbstractMatrixKernel, left: AbstractBlock, right: AbstractBlock) -> Array:
+def _map_rows(K: AbstractMatrixKernel, left: AbstractBlock, right: AbstractBlock) -> Array:
     """The covariances of the rows of two blocks, from those of the field at their points."""
-    of_left = left.rows(_at_points(K, left, right))  # (D, P′, *n′)
-    return jax.vmap(right.rows)(of_left)
+    left_rows = left.rows(_covariances_at_points(K, left, right))  # (D, P′, *n′)
+    return jax.vmap(right.rows)(left_rows)
 
 
-def _at_points(K: AbstractMatrixKernel, left: AbstractBlock, right: AbstractBlock) -> Array:
-    """The covariances of f or u at the points of one block with f or u at those of the other."""
+def _covariances_at_points(
+    K: AbstractMatrixKernel, left: AbstractBlock, right: AbstractBlock
+) -> Array:
+    """The covariances of f or u at the points of one block with f or u at the points of another."""
     X, Z = left.points, right.points
     if not left.of_values and not right.of_values:
         return assemble(K, X, Z)  # (P, n, P′, n)
     if not left.of_values:
-        return jnp.moveaxis(_at_points(K, right, left), 0, -1)  # (P, n, P′)
+        return jnp.moveaxis(_covariances_at_points(K, right, left), 0, -1)  # (P, n, P′)
     X, Z = centred(K, X, Z)
     if right.of_values:
         pair = jax.vmap(K.potential_covariance, in_axes=(None, 0))
@@ -327,11 +341,15 @@ def _at_points(K: AbstractMatrixKernel, left: AbstractBlock, right: AbstractBloc
 
 @eqx.filter_custom_vjp
 def forward_differentiated(kernel_and_data, make, rowwise: bool = False):
-    """The array make(K, data), whose derivatives with respect to K are taken in forward mode.
+    """The array make(K, data); derivatives with respect to K use forward mode.
 
-    With `rowwise` the value of make(K, data) is a pair (rows, X) of a function and points, and the
-    array is rows(X), with one row for each point. Its derivatives take the memory of a strip of
-    rows.
+    For a cotangent Ḡ of the array G and a hyperparameter h_p, h̄_p = ⟨Ḡ, ∂G/∂h_p⟩: one JVP for each
+    hyperparameter, at the price of about one assembly of G each. Reverse mode would go backward
+    through N² pairs of points. For few hyperparameters forward mode is therefore cheaper.
+
+    With `rowwise` the value of make(K, data) is a pair (rows, X) of a function g and points, and
+    the array is G = g(X), with one row for each point. The pairing is then summed strip by strip,
+    h̄_p = Σ_i ⟨Ḡ_i, ∂g(x_i)/∂h_p⟩, and takes the memory of one strip.
     """
     return _array(make, rowwise, *kernel_and_data)
 
@@ -346,35 +364,36 @@ def _(perturbed, kernel_and_data, make, rowwise=False):
 def _(saved, bar, perturbed, kernel_and_data, make, rowwise=False):
     K, data = kernel_and_data
 
-    def paired(K, data, bar):
+    def pair(K, data, bar):
         if not rowwise:
             return jnp.vdot(bar, make(K, data))
         rows, X = make(K, data)
-        return _paired_by_rows(rows, X, bar)
+        return _pair_by_strips(rows, X, bar)
 
     params, static = eqx.partition(K, eqx.is_inexact_array)
     arrays, rest = eqx.partition(data, eqx.is_inexact_array)
-    of_data = any(jax.tree.leaves(perturbed[1]))
-    if K.differentiated_backward and not of_data:
+    perturbs_data = any(jax.tree.leaves(perturbed[1]))
+    if K.differentiated_backward and not perturbs_data:
         _, pull = jax.vjp(lambda p: _array(make, rowwise, eqx.combine(p, static), data), params)
         return pull(bar)[0], jax.tree.map(lambda _: None, arrays)
     flat, unravel = ravel_pytree(params)
 
     def slope(direction):
-        # The barrier makes every intermediate depend on the direction. XLA would compute those
-        # that do not before the loop and keep them, several arrays of the size of the Gram.
+        # The barrier makes every intermediate depend on the direction. Otherwise XLA would move
+        # the intermediates that do not out of the loop and keep several arrays of the size of the
+        # Gram.
         here, direction = jax.lax.optimization_barrier((flat, direction))
-        at = lambda h: paired(eqx.combine(unravel(h), static), data, bar)  # noqa: E731
+        at = lambda h: pair(eqx.combine(unravel(h), static), data, bar)  # noqa: E731
         return jax.jvp(at, (here,), (direction,))[1]
 
-    # Directions that are taken together share the intermediates that do not depend on them. So
-    # many are taken together that the array and its derivatives have up to 200 000 entries.
+    # Directions in one batch share the intermediates that do not depend on the direction. A batch
+    # holds as many directions as give up to 200 000 entries of the array and its derivatives.
     largest = max(each.size for each in [bar, *jax.tree.leaves(arrays)])
-    together = min(flat.size, 200_000 // largest)
+    batch = min(flat.size, 200_000 // largest)
     directions = jnp.eye(flat.size, dtype=flat.dtype)
-    slopes = jax.lax.map(slope, directions, batch_size=together if together > 1 else None)
+    slopes = jax.lax.map(slope, directions, batch_size=batch if batch > 1 else None)
     K_bar = unravel(slopes.astype(flat.dtype))
-    if not of_data:
+    if not perturbs_data:
         return K_bar, jax.tree.map(lambda _: None, arrays)
     _, pull = jax.vjp(lambda arrays: _array(make, rowwise, K, eqx.combine(arrays, rest)), arrays)
     return K_bar, pull(bar)[0]
@@ -387,35 +406,35 @@ def _array(make, rowwise: bool, K, data) -> Array:
     return rows(X)
 
 
-def _paired_by_rows(rows, X: Float[Array, "N n"], bar: Float[Array, "N ..."]) -> Float[Array, ""]:
+def _pair_by_strips(rows, X: Float[Array, "N n"], bar: Float[Array, "N ..."]) -> Float[Array, ""]:
     """⟨bar, rows(X)⟩, in strips.
 
-    The products of the strips are added entry by entry, and summed once at the end: a sum that XLA
-    fuses with the computation of its terms runs in one thread and takes four times as long. Each
-    strip is sliced out of `bar`, since `over_tiles` would reshape, and so copy, the whole array.
+    The products of the strips are added entry by entry, and summed once at the end. If XLA fuses a
+    sum with the computation of its terms, the sum runs in one thread and takes four times as long.
+    Each strip is sliced out of `bar`; `over_tiles` would reshape `bar` and thereby copy it.
     """
     N = len(X)
-    if bar.size <= 10_000:  # as fast at once, and sooner compiled
+    if bar.size <= 10_000:  # one strip is as fast, and compiles faster
         return jnp.vdot(bar, rows(X))
     # Strips of 200 000 entries, whose derivatives hold up to 13 arrays of this size. There are at
     # least four strips, since a shorter loop is unrolled.
     points = max(1, min(N // 4, 200_000 * N // bar.size))
 
     def strip(start, count):
-        x, own = (jax.lax.dynamic_slice_in_dim(each, start, count) for each in (X, bar))
-        return own * rows(x)
+        x, bar_strip = (jax.lax.dynamic_slice_in_dim(array, start, count) for array in (X, bar))
+        return bar_strip * rows(x)
 
     def add(total, start):
         return total + strip(start, points), None
 
     starts = jnp.arange(0, N - points + 1, points)
     total, _ = jax.lax.scan(add, jnp.zeros((points, *bar.shape[1:]), bar.dtype), starts)
-    left = N % points
-    return total.sum() + (strip(N - left, left).sum() if left else 0.0)
+    remainder = N % points
+    return total.sum() + (strip(N - remainder, remainder).sum() if remainder else 0.0)
 
 
-def constant(tree):
-    """The PyTree with `stop_gradient` applied to its arrays; leaves of other kinds are kept."""
+def without_gradient(tree):
+    """A copy of the PyTree whose arrays are constants for JAX's derivatives (`stop_gradient`)."""
     arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
     return eqx.combine(jax.tree.map(jax.lax.stop_gradient, arrays), rest)
 
@@ -423,8 +442,8 @@ def constant(tree):
 def gram_rounding(trace: Float[Array, "..."]) -> Float[Array, "..."]:
     """ε tr(G), the size of the rounding errors in products with the Gram G and in its factors.
 
-    A ridge or a pivot that is smaller than this number is lost in the rounding. `trace` may be that
-    of G, of its diagonal blocks, or of G/N, for a bound of λ.
+    A ridge or a pivot below this number is lost in the rounding. `trace` may be the trace of G, of
+    its diagonal blocks, or of G/N for a bound of λ.
     """
     return jnp.finfo(trace.dtype).eps * trace
 
@@ -436,16 +455,16 @@ def field_rounding(
     Z: Float[Array, "M n"],
     A: Float[Array, "M n"],
     velocity: Float[Array, " n"],
-    most: float = jnp.inf,
+    limit: float = jnp.inf,
 ) -> Float[Array, ""]:
     """ε ‖Σⱼ |K(x, zⱼ) aⱼ|‖ / ‖f(x)‖, the relative rounding error of f(x) = Σⱼ K(x, zⱼ) aⱼ.
 
-    The error is cut off at `most`, since it grows without bound where f(x) tends to zero. Where the
-    ridge is small the terms are large and of both signs, and each rounds to ε of itself.
+    If the ridge is small, the terms are large and of both signs, and each rounds to ε of its size.
+    The error is clipped at `limit`, since it grows without bound where f(x) tends to zero.
     """
     K = without_symmetry(K)
     terms = jax.vmap(lambda z, a: K.expansion(x, z[None], a[None]))(Z, A)
     size = jnp.linalg.norm(jnp.sum(jnp.abs(terms), axis=0))
-    least = jnp.finfo(x.dtype).tiny
-    share = jnp.finfo(x.dtype).eps * size / jnp.maximum(jnp.linalg.norm(velocity), least)
-    return jax.lax.stop_gradient(jnp.minimum(share, most).astype(x.dtype))
+    tiny = jnp.finfo(x.dtype).tiny
+    share = jnp.finfo(x.dtype).eps * size / jnp.maximum(jnp.linalg.norm(velocity), tiny)
+    return jax.lax.stop_gradient(jnp.minimum(share, limit).astype(x.dtype))

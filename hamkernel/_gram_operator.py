@@ -1,9 +1,9 @@
 """Products with the Gram that never form it, in O((N + M) n) memory.
 
-The sum over j of `K.expansion(xᵢ, Z, A)` for all i of a tile is, after fusion, one matrix product
-of the points and one pass over the scalar pairs. A tile is kept small enough for its temporaries
-to stay in the cache: above about 32 MB every temporary is fresh memory from the operating system,
-and its page faults cost more than the arithmetic.
+After fusion, `K.expansion(xᵢ, Z, A)` for all i of a tile is one matrix product of the points and
+one pass over the scalar pairs. The temporaries of a tile stay in the cache. Above about 32 MB every
+temporary would be new memory from the operating system, whose page faults cost more than the
+arithmetic.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from hamkernel import _require as require
 from hamkernel._gram import centred, diagonals, gram
 from hamkernel._machine import (
     RowSharding,
-    as_given,
     compiled,
     full_precision,
-    rows_of,
-    split,
+    row_sharding,
+    shard,
     sum_of_columns,
+    to_caller_sharding,
 )
 from hamkernel._show import described
 from hamkernel._sizes import sizes
@@ -68,10 +68,10 @@ def gram_operator(
     if Z is not None:
         X, Z = require.same_space(X, require.points(Z, "Z"))
     K.check_points(X)
-    X_rows = rows_of(X)
-    Z_rows = X_rows if Z is None else rows_of(Z)
-    Z = None if Z is None else split(Z_rows, Z)
-    return GramOperator(K, split(X_rows, X), Z, X_rows, Z_rows)
+    X_rows = row_sharding(X)
+    Z_rows = X_rows if Z is None else row_sharding(Z)
+    Z = None if Z is None else shard(Z_rows, Z)
+    return GramOperator(K, shard(X_rows, X), Z, X_rows, Z_rows)
 
 
 class GramOperator(lx.AbstractLinearOperator):
@@ -137,8 +137,8 @@ def product(
     X_rows: RowSharding | None = None,
     Z_rows: RowSharding | None = None,
 ) -> Float[Array, "N n"]:
-    """Σⱼ K(xᵢ, zⱼ) aⱼ for all i, tile by tile, on the devices where the rows are."""
-    return sum_of_columns(_tiled, K, X, Z, A, X_rows, Z_rows)
+    """The fields Σⱼ K(xᵢ, zⱼ) aⱼ for all i, tile by tile, on the devices that hold the rows."""
+    return sum_of_columns(_product_by_tiles, K, X, Z, A, X_rows, Z_rows)
 
 
 def placed_product(
@@ -147,21 +147,21 @@ def placed_product(
     Z: Float[Array, "M n"],
     A: Float[Array, "M n"],
 ) -> Float[Array, "N n"]:
-    """`product` for arrays whose own sharding says over which devices their rows are spread."""
-    X_rows, Z_rows = rows_of(X), rows_of(Z)
-    X, Z = split(X_rows, X), split(Z_rows, Z)
+    """`product` for arrays that carry their sharding."""
+    X_rows, Z_rows = row_sharding(X), row_sharding(Z)
+    X, Z = shard(X_rows, X), shard(Z_rows, Z)
     return _compiled(K, X, Z, A, X_rows, Z_rows)
 
 
 def _compiled(K, X, Z, A, X_rows, Z_rows):
-    """`product` for X and Z that have been split over the devices."""
-    return as_given(X_rows, _product(K, X, Z, split(Z_rows, A), X_rows, Z_rows))
+    """`product` for X and Z that are already sharded over the devices."""
+    return to_caller_sharding(X_rows, _product(K, X, Z, shard(Z_rows, A), X_rows, Z_rows))
 
 
 _product = compiled(product)
 
 
-def _tiled(K, X, Z, A):
+def _product_by_tiles(K, X, Z, A):
     """`product` on one device."""
     K, Z, A = group_expanded(K, Z, A.astype(X.dtype))
     X, Z = centred(K, X, Z)
@@ -169,7 +169,7 @@ def _tiled(K, X, Z, A):
     rows = tiles(X, X[:1], side)
     columns = (tiles(Z, Z[:1], side), tiles(A, jnp.zeros_like(A[:1]), side))
 
-    # Tiles are recomputed in the backward pass, which would otherwise keep every pair.
+    # The backward pass recomputes the tiles; otherwise it would keep every pair.
     @jax.checkpoint
     def tile(x, z, a):
         return jax.vmap(K.expansion, in_axes=(0, None, None))(x, z, a)
@@ -180,8 +180,8 @@ def _tiled(K, X, Z, A):
 
         return jax.lax.scan(add, jnp.zeros((len(x), A.shape[1]), x.dtype), columns)[0]
 
-    # A loop that is differentiated backward forgets the rule by which a Matérn kernel is smooth at
-    # x = z, and second derivatives are NaN: a single tile is evaluated without a loop.
+    # Reverse mode through a loop forgets the custom rule that makes a Matérn kernel smooth at x =
+    # z, and second derivatives become NaN. A single tile is therefore evaluated without a loop.
     if len(rows) == len(columns[0]) == 1:
         return tile(rows[0], columns[0][0], columns[1][0])
     return jax.lax.map(row, rows).reshape(-1, A.shape[1])[: len(X)]
@@ -194,9 +194,9 @@ def tiles(
     N, n = X.shape
     count = max(1, math.ceil(N / largest))
     size = max(1, math.ceil(N / count))
-    missing = count * size - N
-    if missing:
-        X = jnp.concatenate([X, jnp.broadcast_to(padding.astype(X.dtype), (missing, n))])
+    count_of_padding = count * size - N
+    if count_of_padding:
+        X = jnp.concatenate([X, jnp.broadcast_to(padding.astype(X.dtype), (count_of_padding, n))])
     return X.reshape(count, size, n)
 
 

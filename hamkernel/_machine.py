@@ -36,7 +36,7 @@ class RowSharding:
 
     mesh: Mesh
     axes: tuple[str, ...]
-    given: NamedSharding = dataclasses.field(compare=False)
+    caller: NamedSharding = dataclasses.field(compare=False)
 
     @property
     def count(self) -> int:
@@ -47,7 +47,7 @@ class RowSharding:
     def spec(self) -> PartitionSpec:
         return PartitionSpec(self.axes)
 
-    def whole(self, array: Array) -> Array:
+    def replicate(self, array: Array) -> Array:
         """The array with all rows on every device."""
         return jax.device_put(array, NamedSharding(self.mesh, PartitionSpec()))
 
@@ -56,7 +56,7 @@ class RowSharding:
         return jax.lax.psum(tree, self.axes)
 
 
-def rows_of(array: Array) -> RowSharding | None:
+def row_sharding(array: Array) -> RowSharding | None:
     """The devices over which the rows of `array` are spread; None if it is on one, or traced.
 
     A traced array does not say where it lies, so inside `jax.jit` the compiler shards the loops:
@@ -71,7 +71,7 @@ def rows_of(array: Array) -> RowSharding | None:
     return rows if rows.count > 1 else None
 
 
-def split(rows: RowSharding | None, array: Array) -> Array:
+def shard(rows: RowSharding | None, array: Array) -> Array:
     """The array spread over the devices of `rows`, on axes that leave the rest to the compiler."""
     if rows is None:
         return automatic(array)
@@ -106,7 +106,7 @@ def is_on_one_device(array: Array) -> bool:
     return isinstance(array, Tracer) or isinstance(array.sharding, SingleDeviceSharding)
 
 
-def on_one_device(name: str, array: Array) -> Array:
+def to_one_device(name: str, array: Array) -> Array:
     """`array` on one device of this process, and on automatic axes."""
     if isinstance(array, Tracer):
         return array
@@ -121,43 +121,43 @@ def on_one_device(name: str, array: Array) -> Array:
     return jnp.asarray(np.asarray(array))  # by the host: bound to no device
 
 
-def as_given(rows: RowSharding | None, array: Array) -> Array:
+def to_caller_sharding(rows: RowSharding | None, array: Array) -> Array:
     """The array, of one row for each row of the data, on the mesh on which the data came."""
-    if rows is None or isinstance(array, Tracer) or rows.given.mesh == rows.mesh:
+    if rows is None or isinstance(array, Tracer) or rows.caller.mesh == rows.mesh:
         return array
-    return jax.device_put(array, rows.given)
+    return jax.device_put(array, rows.caller)
 
 
 def on_each(
     rows: RowSharding | None,
     function: Callable[..., Any],
-    whole: Any,
+    replicated: Any,
     *parts: Array,
     joined: bool,
     reduce: Callable[[RowSharding, Any], Any] = RowSharding.sum,
 ) -> Any:
-    """`function(whole, *parts)`, evaluated by each device for its own rows of the parts.
+    """`function(replicated, *parts)`, evaluated by each device for its own rows of the parts.
 
     Args:
         rows: how the parts are spread; None if they are not, and the function is called once.
-        function: (whole, *parts) -> a PyTree of arrays.
-        whole: a PyTree, the same on all devices.
+        function: (replicated, *parts) -> a PyTree of arrays.
+        replicated: a PyTree, the same on all devices.
         parts: arrays with rows.
         joined: whether the results are rows to be put one after the other. Else they are reduced.
         reduce: the results of all devices -> one result, the same on all of them; their sum.
     """
     if rows is None:
-        return function(whole, *parts)
-    arrays, static = eqx.partition(whole, eqx.is_array)
+        return function(replicated, *parts)
+    arrays, static = eqx.partition(replicated, eqx.is_array)
 
-    def of_device(arrays, *parts):
+    def result_of_device(arrays, *parts):
         result = function(eqx.combine(arrays, static), *parts)
         return result if joined else reduce(rows, result)
 
     # Untracked: a user's kernel may contain anything, and tracking asks every loop to say whether
     # its start differs between devices. Derivatives are right either way.
     mapped = jax.shard_map(
-        of_device,
+        result_of_device,
         mesh=rows.mesh,
         in_specs=(PartitionSpec(), *(rows.spec for _ in parts)),
         out_specs=rows.spec if joined else PartitionSpec(),
@@ -186,7 +186,7 @@ def sum_of_columns(
         return on_each(Z_rows, lambda w, z, a: product(*w, z, a), (K, X), Z, A, joined=False)
     if (X_rows.mesh, X_rows.axes) != (Z_rows.mesh, Z_rows.axes):
         raise ValueError(
-            f"X and Z are spread over devices differently: {X_rows.given} and {Z_rows.given}. "
+            f"X and Z are spread over devices differently: {X_rows.caller} and {Z_rows.caller}. "
             "Put both on one mesh and the same axes, or one of them on every device."
         )
     ring = [(i, (i + 1) % X_rows.count) for i in range(X_rows.count)]
@@ -251,7 +251,7 @@ P = ParamSpec("P")
 T = TypeVar("T")
 
 _lock = threading.Lock()
-_inside = 0  # calls that are going on, nested or of several threads
+_active_calls = 0  # calls that are going on, nested or of several threads
 _limit: Any = None  # what restores the number of threads after the last of them
 
 
@@ -263,26 +263,26 @@ def one_blas_thread(function: Callable[P, T]) -> Callable[P, T]:
     """
 
     @functools.wraps(function)
-    def limited(*args: P.args, **kwargs: P.kwargs) -> T:
+    def with_one_thread(*args: P.args, **kwargs: P.kwargs) -> T:
         with _one_thread():
             return jax.block_until_ready(function(*args, **kwargs))
 
-    return limited
+    return with_one_thread
 
 
 @contextmanager
 def _one_thread():
-    global _inside, _limit
+    global _active_calls, _limit
     with _lock:
-        if _inside == 0:
+        if _active_calls == 0:
             _limit = _controller().limit(limits=1, user_api="blas")
-        _inside += 1
+        _active_calls += 1
     try:
         yield
     finally:
         with _lock:
-            _inside -= 1
-            if _inside == 0:
+            _active_calls -= 1
+            if _active_calls == 0:
                 _limit.restore_original_limits()
 
 
@@ -302,11 +302,11 @@ def in_doubles(function: Callable[P, T]) -> Callable[P, T]:
         from jax.experimental import enable_x64 as context  # pyright: ignore
 
     @functools.wraps(function)
-    def doubled(*args: P.args, **kwargs: P.kwargs) -> T:
+    def in_double_precision(*args: P.args, **kwargs: P.kwargs) -> T:
         with context(True):
             return function(*args, **kwargs)
 
-    return doubled
+    return in_double_precision
 
 
 def full_precision(function: Callable[P, T]) -> Callable[P, T]:
@@ -344,37 +344,48 @@ def compiled(function: Any = None, **options: Any) -> Any:
 # So only small programs go without LLVM: learning from two runs of 61 samples, whose arguments have
 # 7000 numbers, takes 24 s by this rule, 18 s without LLVM and 55 s with XLA's own options. 20 runs
 # of 50 samples with n = 8, of 20 000 to 400 000 numbers, run for 44 s, and for 73 s without LLVM.
-_FAST = {"xla_cpu_use_fusion_emitters": False}
-_FASTEST = _FAST | {"xla_backend_optimization_level": 0}
-_SMALL = 16_384  # numbers in the arguments, up to which a program is not optimised
+# On a GPU XLA times several versions of each product while it compiles: the first `tune` of 300
+# points took 78 s, and 15.5 s without, and `learn` 185 s and 60 s; later calls are as fast
+# (NVIDIA H200, jax 0.11). Products of large Grams are not compiled by size, and keep the choice.
+_BY_PLATFORM = {
+    "cpu": {"xla_cpu_use_fusion_emitters": False},
+    "gpu": {"xla_gpu_autotune_level": 0},
+}
+_UNOPTIMISED = {
+    "cpu": _BY_PLATFORM["cpu"] | {"xla_backend_optimization_level": 0},
+    "gpu": _BY_PLATFORM["gpu"],
+}
+_MAX_UNOPTIMISED = 16_384  # numbers in the arguments, up to which a program is not optimised
 
 
 def compiled_by_size(function: Callable[P, T]) -> Callable[P, T]:
-    """`compiled` without optimisation by XLA where the arguments are small.
+    """`compiled` with options of XLA that shorten compilation; on a CPU by size of the arguments.
 
     Inside another transformation the outer one chooses the options.
     """
     plain = compiled(function)
-    fast, fastest = (compiled(function, compiler_options=each) for each in (_FAST, _FASTEST))
+    fast, fastest = (
+        {name: compiled(function, compiler_options=options) for name, options in table.items()}
+        for table in (_BY_PLATFORM, _UNOPTIMISED)
+    )
 
     @functools.wraps(function)
     def sized(*args: P.args, **kwargs: P.kwargs) -> T:
         arrays = [a for a in jax.tree.leaves((args, kwargs)) if eqx.is_array(a)]
-        if any(isinstance(a, Tracer) for a in arrays) or not _options_are_known(_sizes.platform()):
+        platform = _sizes.platform()
+        if any(isinstance(a, Tracer) for a in arrays) or not _options_are_known(platform):
             return plain(*args, **kwargs)
-        small = sum(a.size for a in arrays) <= _SMALL
-        return (fastest if small else fast)(*args, **kwargs)
+        small = sum(a.size for a in arrays) <= _MAX_UNOPTIMISED
+        return (fastest if small else fast)[platform](*args, **kwargs)
 
     return sized
 
 
 @functools.cache
 def _options_are_known(platform: str) -> bool:
-    """Whether the platform is a CPU whose compiler has these options."""
-    if platform != "cpu":
-        return False
+    """Whether the compiler of the platform has these options."""
     try:
-        jax.jit(lambda: 0, compiler_options=_FASTEST).lower().compile()
+        jax.jit(lambda: 0, compiler_options=_UNOPTIMISED[platform]).lower().compile()
     except Exception:  # jaxlib has no type of its own for it
         return False
     return True

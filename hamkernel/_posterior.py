@@ -32,7 +32,7 @@ from hamkernel._show import has_arrays, text
 from hamkernel._solvers.dense import Cholesky
 from hamkernel._solvers.fit import check_solver, features_of_parts
 from hamkernel._solvers.low_rank import LowRankConditional
-from hamkernel._solvers.problem import AbstractConditional, AbstractSolver, new_rows, problem
+from hamkernel._solvers.problem import AbstractConditional, AbstractSolver, make_problem, new_rows
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -71,9 +71,9 @@ def condition(
             prior,
             or `RandomFeatures(…)`, whose prior is that of its features.
         mean: what is known already, x (n,) -> (n,), as in `fit`.
-        inputs: of a `Controlled` kernel: u at each state, shape (N, m). Predictions then need the
+        inputs: u at each state, for a `Controlled` kernel, shape (N, m). Predictions then need the
             inputs as well, `posterior.deviation(x, u)`.
-        parameters: of a `Family`: θ at each state, shape (N, p): `posterior.deviation(x, θ)`. The
+        parameters: θ at each state, for a `Family`, shape (N, p): `posterior.deviation(x, θ)`. The
             deviation grows to that of the prior outside of the range of θ.
         progress: show a progress bar of the blocks of `Cholesky`, as in `fit`.
 
@@ -90,13 +90,13 @@ def condition(
     check_solver(solver)
     if solver is not None and solver.no_factor:
         raise TypeError(solver.no_factor)
-    asked = problem(K, X, Y, regularization, mean, inputs, parameters).on_one_device()
+    problem = make_problem(K, X, Y, regularization, mean, inputs, parameters).to_one_device()
     if solver is None:
-        solver = features_of_parts() if is_of_parts(asked.kernel) else Cholesky()
-    require.warn_of_float32(asked.rows.targets)
-    _warn_of_amplitude(asked.kernel, asked.rows.points)
-    given = solver._given(asked, progress=progress)
-    return Posterior(given, learned_field(given.field, asked.known))
+        solver = features_of_parts() if is_of_parts(problem.kernel) else Cholesky()
+    require.warn_of_float32(problem.rows.targets)
+    _warn_of_amplitude(problem.kernel, problem.rows.points)
+    conditional = solver.condition(problem, progress=progress)
+    return Posterior(conditional, learned_field(conditional.field, problem.known))
 
 
 class Posterior(eqx.Module):
@@ -105,12 +105,17 @@ class Posterior(eqx.Module):
     A PyTree. Its methods take one state and work under jit, vmap and, with respect to states, grad.
 
     Attributes:
-        given: the Gaussian process given the data, less the prior mean.
+        conditional: the Gaussian process conditioned on the data, minus the prior mean.
         field: the posterior mean, the field that `fit` returns.
     """
 
-    given: AbstractConditional
+    conditional: AbstractConditional
     field: AbstractField
+
+    @property
+    def given(self) -> AbstractConditional:
+        """The old name of `conditional`, until version 0.2."""
+        return self.conditional
 
     # For jax.jit of its methods, as of fields.
     def __hash__(self) -> int:
@@ -120,9 +125,9 @@ class Posterior(eqx.Module):
         return self is other
 
     def __repr__(self) -> str:
-        if not has_arrays((self.given.rows.targets, self.given.rows.energies)):
+        if not has_arrays((self.conditional.rows.targets, self.conditional.rows.energies)):
             return f"Posterior(field={text(self.field)})"
-        rows = self.given.rows
+        rows = self.conditional.rows
         return f"Posterior(rows={rows.size}, dimension={rows.dimension}, field={text(self.field)})"
 
     @full_precision
@@ -152,10 +157,10 @@ class Posterior(eqx.Module):
         """
         if x2 is None and u2 is not None:
             raise TypeError("u2 came without x2: posterior.covariance(x, u, x2=z, u2=v).")
-        K = self.given.field.kernel
+        K = self.conditional.field.kernel
         here = components(K, self._point(x, u)[None])
         there = None if x2 is None else components(K, self._point(x2, u2)[None])
-        return _covariance(self.given, here, there)
+        return _covariance(self.conditional, here, there)
 
     def _point(self, x: Any, u: Any) -> Float[Array, " d"]:
         if isinstance(self.field, AbstractJoinedField):
@@ -204,13 +209,13 @@ class Posterior(eqx.Module):
             AttributeError: no part of the kernel is `Shared`. TypeError: the posterior is not one
                 in features, as it is where all of the kernel is `Shared`.
         """
-        given = self.given
-        if not isinstance(given, LowRankConditional):
+        conditional = self.conditional
+        if not isinstance(conditional, LowRankConditional):
             raise TypeError(
                 "law_deviation needs a posterior in features: all terms of the kernel Shared, or "
                 "solver=hk.RandomFeatures(500, jax.random.key(0))."
             )
-        return root(given.law_variance(r, r0, which))
+        return root(conditional.law_variance(r, r0, which))
 
     @full_precision
     def energy_deviation(
@@ -232,7 +237,7 @@ class Posterior(eqx.Module):
             AttributeError: the structure, or the mean, has no potential (with the reason).
             ValueError: a state does not fit.
         """
-        field, K = self.field, self.given.field.kernel
+        field, K = self.field, self.conditional.field.kernel
         if isinstance(field, FamilyField):
             n = field.dimension
             points = jnp.stack([field.joined(x, theta), field.joined(x0, theta)])
@@ -247,7 +252,7 @@ class Posterior(eqx.Module):
             points = jnp.pad(states, ((0, 0), (0, m))) if m else states
             both = Values(points, outputs=n if m else None)
         change = jnp.array([1.0, -1.0], both.points.dtype)
-        return root(change @ _covariance(self.given, both) @ change)
+        return root(change @ _covariance(self.conditional, both) @ change)
 
     @full_precision
     def updated(
@@ -266,29 +271,29 @@ class Posterior(eqx.Module):
         Args:
             X: states, shape (M, n), or observations, and then there is no Y.
             Y: velocities, shape (M, n).
-            inputs: of a `Controlled` kernel: u at each state, shape (M, m).
-            parameters: of a `Family`: θ at each state, shape (M, p).
+            inputs: u at each state, for a `Controlled` kernel, shape (M, m).
+            parameters: θ at each state, for a `Family`, shape (M, p).
 
         Raises:
             ValueError: the new data has another n, or does not fit itself. RuntimeError: the new
                 rows are so close to the old ones that the factor fails.
         """
-        given = inputs_or_parameters(inputs, parameters, self.given.field.kernel)
-        data, old = observations(X, Y, given, part=True), self.given.rows
+        data_inputs = inputs_or_parameters(inputs, parameters, self.conditional.field.kernel)
+        data, old = observations(X, Y, data_inputs, part=True), self.conditional.rows
         if data.dimension != old.dimension:
             raise ValueError(
                 f"the new data has {data.dimension} coordinates and the posterior {old.dimension}: "
                 "both must be of one system."
             )
         known = known_of(self.field)
-        new = new_rows(self.given.field.kernel, data, old, known)
+        new = new_rows(self.conditional.field.kernel, data, old, known)
         if new.targets.dtype != old.targets.dtype:
             raise TypeError(
                 f"the new data is {new.targets.dtype} and the posterior {old.targets.dtype}: cast "
                 "one of them."
             )
-        given = self.given.updated(new)
-        return Posterior(given, learned_field(given.field, known))
+        data_inputs = self.conditional.updated(new)
+        return Posterior(data_inputs, learned_field(data_inputs.field, known))
 
     @one_blas_thread
     @full_precision
@@ -324,7 +329,7 @@ class Posterior(eqx.Module):
                 positive number. TypeError: key is no key of JAX.
         """
         key, count = require.key(key), require.count(count, "count")
-        rows = self.given.rows
+        rows = self.conditional.rows
         n, dtype = rows.dimension, rows.targets.dtype
         corners = require.floating(region, "region").astype(dtype)
         if corners.shape != (2, n):
@@ -338,7 +343,7 @@ class Posterior(eqx.Module):
         corners = require.value(corners, bad, message)
         around = None if isinstance(self.field, FamilyField) else 0.0
         corners = jnp.concatenate([corners, _range_of(rows.points[:, n:], around)], axis=1)
-        draws, known = self.given.draws(key, count, corners), known_of(self.field)
+        draws, known = self.conditional.draws(key, count, corners), known_of(self.field)
 
         def one(draw):
             if draw.mean is None or known is None:
@@ -351,9 +356,9 @@ class Posterior(eqx.Module):
 # Without jit its operations are hundreds of small programs, which took 4 s to compile.
 @compiled
 def _covariance(
-    given: AbstractConditional, left: AbstractBlock, right: AbstractBlock | None = None
+    conditional: AbstractConditional, left: AbstractBlock, right: AbstractBlock | None = None
 ) -> Float[Array, "d e"]:
-    return given.covariance(left, left if right is None else right)
+    return conditional.covariance(left, left if right is None else right)
 
 
 def _range_of(U: Float[Array, "N m"], centre: float | None) -> Float[Array, "2 m"]:
@@ -363,8 +368,8 @@ def _range_of(U: Float[Array, "N m"], centre: float | None) -> Float[Array, "2 m
     """
     if centre is None:
         return jnp.stack([U.min(axis=0), U.max(axis=0)])
-    most = jnp.max(jnp.abs(U), axis=0)
-    return jnp.array([[-1.0], [1.0]], U.dtype) * jnp.where(most > 0, most, 1)[None]
+    largest = jnp.max(jnp.abs(U), axis=0)
+    return jnp.array([[-1.0], [1.0]], U.dtype) * jnp.where(largest > 0, largest, 1)[None]
 
 
 def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:

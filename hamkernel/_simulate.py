@@ -206,6 +206,8 @@ def _right_hand_side(
     # compiled anyway. Other functions with `__wrapped__`, by functools.wraps, are another field.
     while isinstance(field, (jax.stages.Wrapped, _FilterJit)):
         field = field.__wrapped__
+    if getattr(field, "refusal", ""):
+        raise RuntimeError(field.refusal)
     if inputs is None:
         if getattr(field, "takes_inputs", False):
             has, alone = "inputs", "Without inputs simulate its drift, field.drift."

@@ -1,9 +1,9 @@
 """Validation losses in closed form, each at the price of one factorisation.
 
-The public functions check their arguments and make the rows of the observations; the functions of
-rows, below, are the same losses for the dense fit and, in a `basis`, for the fit of low rank. Their
-residuals count in units of the relative noise of a row. Velocities X, Y that were all measured are
-the rows of one block, and pass through as they are.
+The public functions check their arguments and make the rows of the observations. The functions of
+rows, below, are the same losses, for the dense fit or, with a `basis`, for the low-rank fit. They
+measure residuals in units of the relative noise of a row. Completely measured velocities X, Y are
+one block of rows and need no copy.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.factors import AbstractSystem, ContrastedSystem, DenseSystem
 from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._solvers.low_rank_factor import LowRankSystem
-from hamkernel._solvers.problem import problem
+from hamkernel._solvers.problem import make_problem
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -63,21 +63,20 @@ def cross_validation_loss(
             single components would leak their siblings. Labels must be concrete under jit. Of
             observations N is the number of all: points, energies, functionals, in their order. A
             fold with all energies is compared up to their constant.
-        inputs: of a `Controlled` kernel, shape (N, m).
-        parameters: of a `Family`, shape (N, p).
+        inputs: u at each state for a `Controlled` kernel, shape (N, m).
+        parameters: θ at each state for a `Family`, shape (N, p).
 
     Returns:
-        The loss, in squared units of Y, and of observations in those of the rows over their
-        relative noise; inf where the matrix is not positive definite to rounding. Differentiable
-        in reverse mode: `jax.jacrev(jax.grad(loss))` is the Hessian, for there is no `jax.jvp`.
-        Vmappable, compiled once per shape and partition. O((N n)³) time,
-        three matrices of (N n)² numbers, with the gradient over K too.
+        The loss, in squared units of Y, or of the rows of observations over their relative noise;
+        inf if the matrix is not positive definite to rounding. Differentiable in reverse mode only:
+        `jax.jacrev(jax.grad(loss))` is the Hessian. Vmappable, compiled once per shape and
+        partition. O((N n)³) time and three matrices of (N n)² numbers, also for the gradient.
 
     Raises:
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
             matrices that do not fit in memory.
     """
-    K, rows, regularization = _checked_problem(K, X, Y, regularization, inputs, parameters)
+    K, rows, regularization = _check_problem(K, X, Y, regularization, inputs, parameters)
     return partition_loss(K, rows, regularization, partition_of_rows(rows, folds))
 
 
@@ -95,16 +94,16 @@ def cross_validation_residuals(
 ) -> Float[Array, "N n"]:
     """The residual yᵢ − f(xᵢ) of each point under the fit that has not seen its fold.
 
-    Args and errors are those of `cross_validation_loss`, which is the mean over folds of their mean
-    squares: with unequal folds not the mean of all squares.
+    Args and errors are those of `cross_validation_loss`, the mean over folds of the mean square of
+    these residuals. With unequal folds this is not the mean of all squares.
 
     Returns:
-        Shape (N, n), in units of Y; of observations one for each row, in its units; inf where the
-        matrix is not positive definite to rounding.
+        Shape (N, n), in units of Y; for observations one residual for each row, in the units of the
+        row. inf if the matrix is not positive definite to rounding.
     """
-    K, rows, regularization = _checked_problem(K, X, Y, regularization, inputs, parameters)
-    left = held_out_rows(K, rows, regularization, partition_of_rows(rows, folds))[0]
-    return rows.in_units(left)
+    K, rows, regularization = _check_problem(K, X, Y, regularization, inputs, parameters)
+    residuals = held_out_rows(K, rows, regularization, partition_of_rows(rows, folds))[0]
+    return rows.in_units(residuals)
 
 
 @one_blas_thread
@@ -121,16 +120,16 @@ def generalized_cross_validation(
     """Generalised cross-validation: the training error over the squared share of free residuals.
 
     With the smoother y -> Sy, S = G A⁻¹, and D = N n rows, it is (‖y − Sy‖²/D) / (tr(I − S)/D)²
-    = D ‖a‖² / (tr A⁻¹)². It needs no folds and does not depend on the order of the data, and is
-    leave-one-out with every leverage replaced by the mean one. For independent noise.
+    = D ‖a‖² / (tr A⁻¹)². This loss needs no folds, does not depend on the order of the data, and is
+    leave-one-out with every leverage replaced by their mean. It assumes independent noise.
 
     Args:
         K: a matrix-valued kernel.
         X: states, shape (N, n); or observations, and then there is no Y.
         Y: measured velocities, shape (N, n).
         regularization: λ > 0.
-        inputs: of a `Controlled` kernel, shape (N, m).
-        parameters: of a `Family`, shape (N, p).
+        inputs: u at each state, for a `Controlled` kernel, shape (N, m).
+        parameters: θ at each state, for a `Family`, shape (N, p).
 
     Returns:
         The loss, in squared units of Y; inf where the factorisation fails. Differentiable as
@@ -142,7 +141,7 @@ def generalized_cross_validation(
 
     Source: Golub, Heath & Wahba (1979), Technometrics 21.
     """
-    return generalized_loss(*_checked_problem(K, X, Y, regularization, inputs, parameters))
+    return generalized_loss(*_check_problem(K, X, Y, regularization, inputs, parameters))
 
 
 @one_blas_thread
@@ -158,18 +157,18 @@ def log_marginal_likelihood(
 ) -> Float[Array, ""]:
     """The log density of Y under f ~ GP(0, K) and independent noise of variance Nλ.
 
-    −½ yᵀA⁻¹y − ½ log det A − ½ N n log 2π with A = G + NλI. The best objective when the model is
-    believed (the truth resembles a draw of the prior); cross-validation trusts it less. A kernel of
-    a descriptor, `Warp(k, fn)`, may have directions along which no field of it points, such as
-    translations of a molecule: the density is that of the components of Y along all others.
+    −½ yᵀA⁻¹y − ½ log det A − ½ N n log 2π with A = G + NλI. This is the best objective if the truth
+    resembles a draw of the prior; cross-validation relies less on that. For a kernel of a
+    descriptor, `Warp(k, fn)`, no field may point along some directions, such as translations of a
+    molecule. The density is then the density of the components of Y along all other directions.
 
     Args:
         K: a matrix-valued kernel.
         X: states, shape (N, n); or observations, and then there is no Y.
         Y: measured velocities, shape (N, n).
         regularization: λ > 0; the noise variance is Nλ.
-        inputs: of a `Controlled` kernel, shape (N, m).
-        parameters: of a `Family`, shape (N, p).
+        inputs: u at each state, for a `Controlled` kernel, shape (N, m).
+        parameters: θ at each state, for a `Family`, shape (N, p).
 
     Returns:
         The log density; −inf where the factorisation fails. Differentiable as
@@ -181,17 +180,19 @@ def log_marginal_likelihood(
 
     Source: Rasmussen & Williams (2006), eq. 2.30.
     """
-    return log_likelihood(*_checked_problem(K, X, Y, regularization, inputs, parameters))
+    return log_likelihood(*_check_problem(K, X, Y, regularization, inputs, parameters))
 
 
-def _checked_problem(
+def _check_problem(
     K, X, Y, regularization, inputs, parameters
 ) -> tuple[Any, Measurements, Float[Array, ""]]:
-    """Kernel, rows and λ."""
-    # LAPACK on every device at once was seen to stall, see `_solvers/factors.py`.
-    given = problem(K, X, Y, regularization, inputs=inputs, parameters=parameters).on_one_device()
-    check_memory(given.rows, 3)  # matrices of the size of the Gram, with the gradient
-    return given.kernel, given.rows, given.regularization
+    """The checked kernel, rows and λ."""
+    # LAPACK calls on several devices at once can deadlock, see `_solvers/factors.py`.
+    checked = make_problem(
+        K, X, Y, regularization, inputs=inputs, parameters=parameters
+    ).to_one_device()
+    check_memory(checked.rows, 3)  # matrices of the size of the Gram, with the gradient
+    return checked.kernel, checked.rows, checked.regularization
 
 
 def check_memory(rows: Measurements, copies: int) -> None:
@@ -208,12 +209,12 @@ def check_memory(rows: Measurements, copies: int) -> None:
 
 
 def partition_of_rows(rows: Measurements, folds: Folds) -> Partition:
-    """The folds of the rows from those of the observations that they belong to."""
+    """The folds of the rows, from the folds of their observations."""
     labels = Partition(rows.count, folds).labels
     return Partition(len(rows.targets), labels[rows.labels()])
 
 
-# Some losses return ‖a‖² too, by which `tune` bounds the rounding errors of a field.
+# Some losses also return ‖a‖², with which `tune` bounds the rounding errors of a field.
 
 
 def partition_loss(K, rows: Measurements, regularization, partition: Partition, basis=None):
@@ -225,15 +226,15 @@ def partition_loss(K, rows: Measurements, regularization, partition: Partition, 
 def partition_loss_and_square(
     K, rows: Measurements, regularization, partition: Partition, basis=None
 ):
-    left, a = held_out_rows(K, rows, regularization, partition, basis)
-    return jnp.asarray(partition.weights, left.dtype) @ left**2, a @ a
+    residuals, a = held_out_rows(K, rows, regularization, partition, basis)
+    return jnp.asarray(partition.weights, residuals.dtype) @ residuals**2, a @ a
 
 
 @compiled
 def held_out_rows(K, rows: Measurements, regularization, partition: Partition, basis=None):
     """The residual of each row under the fit without its fold, in units of its noise, and A⁻¹y.
 
-    The residuals of a fold that holds all energies are those up to the best constant.
+    If a fold holds all energies, its residuals are computed up to the best constant.
     """
     energies, F = rows.energies, len(partition.folds)
     ridge = (rows.count - rows.count / F) * regularization
@@ -243,56 +244,63 @@ def held_out_rows(K, rows: Measurements, regularization, partition: Partition, b
         y, p = rows.y, None
         partition = Partition(rows.size, np.delete(partition.labels, energies[0]))
     features = None if basis is None else features_of_rows(K, rows, basis, contrasted)
-    found: Any
+    result: Any
     if features is None:
-        found = _dense_held_out(gram_matrix(K, rows, contrasted), ridge, y, p, rows, partition)
+        result = _dense_held_out(gram_matrix(K, rows, contrasted), ridge, y, p, rows, partition)
     elif features.shape[1] > len(y) - max(map(len, partition.folds)):
-        # The fit without a fold interpolates, and the low-rank gradient lost the square of the
-        # condition: at 1e10 its error was 5 times itself. The data are then few enough for a dense
-        # factor.
-        found = _dense_held_out(features @ features.T, ridge, y, p, rows, partition)
+        # With fewer training rows than features the fit interpolates, and the low-rank gradient
+        # loses digits like cond(A)²: at cond(A) = 1e10 its relative error was 5. There are then few
+        # rows, so a dense factor is affordable.
+        result = _dense_held_out(features @ features.T, ridge, y, p, rows, partition)
     else:
-        found = held_out(LowRankSystem(features, ridge, p), y, partition)
-    return tuple(map(rows.contrast_transpose, found)) if contrasted else found
+        result = held_out(LowRankSystem(features, ridge, p), y, partition)
+    return tuple(map(rows.contrast_transpose, result)) if contrasted else result
 
 
 def _dense_held_out(G, ridge, y, p, rows: Measurements, partition: Partition):
     A = plus_ridge(G, ridge)
     if p is None:
         return held_out(DenseSystem(A), y, partition)
-    # In the units of the energies the direction of their constant does not depend on the noise, and
-    # the derivative is complete.
+    # Let U = diag(units), A′ = UAU and y′ = Uy. Then C′ = U⁻¹CU⁻¹ and a′ = C′y′ = U⁻¹a, so r′_S =
+    # (C′_SS)⁻¹a′_S = U r_S. In these units the direction Up of the constant is the same for all
+    # energies, p ∝ 1/s and U = diag(s), so Up does not depend on the noise and needs no derivative.
     units = jnp.where(p == 0, jnp.ones_like(p), rows.scale)
     equal = jnp.where(p == 0, p, len(rows.energies) ** -0.5)
     system = ContrastedSystem(units[:, None] * A * units[None], equal)
-    found: Any = held_out(system, units * y, partition)
-    return found[0] / units, units * found[1]
+    result: Any = held_out(system, units * y, partition)
+    return result[0] / units, units * result[1]
 
 
 def generalized_loss(K, rows: Measurements, regularization, basis=None, least_free=0.0):
-    """`generalized_cross_validation` of the rows."""
+    """The loss `generalized_cross_validation`, of rows."""
     return generalized_loss_and_square(K, rows, regularization, basis, least_free)[0]
 
 
 @compiled
 def generalized_loss_and_square(K, rows: Measurements, regularization, basis=None, least_free=0.0):
-    # The loss is infinite where the share of free residuals, tr(I − S)/D, is below `least_free`.
+    # The loss is infinite if the share of free residuals, tr(I − S)/D, is below `least_free`.
     ridge = rows.count * regularization
-    squares, trace = free_residuals(_of_contrasts(K, rows, ridge, basis), rows.y)
+    squares, trace = free_residuals(_contrasted_system(K, rows, ridge, basis), rows.y)
     enough = ridge * trace >= least_free * rows.size  # tr(I − S) = ridge tr A⁻¹
     return jnp.where(enough, squares * rows.size / trace**2, jnp.inf), squares
 
 
 @compiled
-def log_likelihood(K, rows: Measurements, regularization, basis=None, heard=None):
-    """`log_marginal_likelihood` of the rows, with a flat prior for the constant of energies.
+def log_likelihood(K, rows: Measurements, regularization, basis=None, projected=None):
+    """The log marginal likelihood of rows, with a flat prior for the constant of energies.
 
-    `heard` is `without_silent_directions(K, rows)`, where that is known already.
+    `projected` is `project_silent_directions(K, rows)`, if it is known already.
     """
+    # Rows are y_r = (measurement)_r / s_r, so log p(measurements) = log p(y) − Σ log s_r. The
+    # constant of the energies enters y along s⁻¹ = ‖s⁻¹‖ p. A flat prior for the constant
+    # integrates the density over this direction: log p(y) = log N(Ty; 0, TATᵀ) − log ‖s⁻¹‖ with the
+    # contrasts Ty, and log ‖s⁻¹‖ = ½ log Σ_e s_e⁻² (restricted likelihood: Harville (1974),
+    # Biometrika 61; Rasmussen & Williams (2006), eq. 2.45). The k silent directions are zeros of
+    # variance ρ = Nλ in y, whose density −½ k log 2πρ is removed again.
     ridge = rows.count * regularization
-    y, silent = without_silent_directions(K, rows) if heard is None else heard
+    y, silent = project_silent_directions(K, rows) if projected is None else projected
     y, silent, ridge = jax.lax.optimization_barrier((y, silent, ridge))  # no LAPACK side by side
-    density = log_density(_of_contrasts(K, rows, ridge, basis), y)
+    density = log_density(_contrasted_system(K, rows, ridge, basis), y)
     density = density + 0.5 * silent * jnp.log(2 * jnp.pi * ridge)
     density = density - jnp.sum(jnp.log(rows.scale))
     if not len(rows.energies):
@@ -300,39 +308,40 @@ def log_likelihood(K, rows: Measurements, regularization, basis=None, heard=None
     return density - 0.5 * jnp.log(jnp.sum(rows.scale[rows.energies] ** -2))
 
 
-def without_silent_directions(
+def project_silent_directions(
     K: AbstractMatrixKernel, rows: Measurements
 ) -> tuple[Float[Array, " D"], Float[Array, ""]]:
-    """The targets without their components along which no field of K points, and their number.
+    """Project the targets on the directions in which fields of K point; also count the others.
 
-    A kernel of a descriptor d knows the field along the rows of the Jacobian of d alone. Forces
-    computed from a potential of distances have no component along the other directions, six for
-    each molecule, so that the likelihood would take them for measurements without any noise, and
-    drive λ to its bound. Each of them is an eigenvector of A with the eigenvalue Nλ.
+    A field with a kernel of a descriptor d points along the rows of the Jacobian of d. Forces from
+    a potential of distances have no component along the other, silent directions, six for each
+    molecule. The likelihood would take these zeros for measurements without noise and drive λ to
+    its bound. Each silent direction is an eigenvector of A with the eigenvalue Nλ.
     """
     y, none = rows.y, jnp.zeros((), rows.targets.dtype)
     if rows.states is None:
         return y, none
     X, Y = rows.states
-    found = K.through_descriptor(X.shape[1])
-    if found is None:
+    descriptor = K.through_descriptor(X.shape[1])
+    if descriptor is None:
         return y, none
 
-    def of_point(pair):
+    def project(pair):
         x, v = pair
-        J = jax.jacfwd(found.seen or found.map)(x) @ found.directions(x)  # (m, n)
-        J = jax.lax.stop_gradient(J)  # the projection of a map of full rank is constant
+        J = jax.jacfwd(descriptor.seen or descriptor.map)(x) @ descriptor.directions(x)  # (m, n)
+        J = jax.lax.stop_gradient(J)  # constant, for a map of constant rank
         squares, V = jnp.linalg.eigh(J.T @ J)
-        # Rounding leaves ε of the largest, and a descriptor sees distances to more than √ε.
-        seen = squares > jnp.finfo(x.dtype).eps ** (2 / 3) * squares[-1]
-        return V @ jnp.where(seen, V.T @ v, jnp.zeros_like(v)), jnp.sum(~seen)
+        # Zero eigenvalues are ε of the largest after rounding; a descriptor resolves more than
+        # ε^(1/3) of its largest singular value, whose square is ε^(2/3).
+        is_visible = squares > jnp.finfo(x.dtype).eps ** (2 / 3) * squares[-1]
+        return V @ jnp.where(is_visible, V.T @ v, jnp.zeros_like(v)), jnp.sum(~is_visible)
 
-    projected, counts = jax.lax.map(of_point, (X, Y))
+    projected, counts = jax.lax.map(project, (X, Y))
     return projected.reshape(-1), jnp.sum(counts).astype(y.dtype)
 
 
-def _of_contrasts(K, rows: Measurements, ridge, basis: AbstractBasis | None) -> AbstractSystem:
-    """A of the contrasts, which do not depend on the constant of the energies."""
+def _contrasted_system(K, rows: Measurements, ridge, basis: AbstractBasis | None) -> AbstractSystem:
+    """The system of the contrasts, which do not depend on the constant of the energies."""
     if basis is not None:
         return LowRankSystem(features_of_rows(K, rows, basis, contrasted=True), ridge)
     return DenseSystem(plus_ridge(gram_matrix(K, rows, contrasted=True), ridge))
@@ -344,46 +353,50 @@ def _of_contrasts(K, rows: Measurements, ridge, basis: AbstractBasis | None) -> 
 def features_of_rows(
     K, rows: Measurements, basis: AbstractBasis, contrasted: bool = False
 ) -> Float[Array, "M r"]:
-    """Φ, before the contrast or after it."""
+    """The features Φ of all rows, before or after the contrast."""
     like = rows.blocks[0].points
 
-    def of(K, basis):
-        return basis.span(K, like.shape[1], like.dtype).of
+    def rows_in_basis(K, basis):
+        return basis.span(K, like.shape[1], like.dtype).rows_of
 
-    features = jnp.concatenate([_by_points(K, block, basis, of) for block in rows.blocks])
+    features = jnp.concatenate(
+        [_rows_by_points(K, block, basis, rows_in_basis) for block in rows.blocks]
+    )
     return rows.contrast(features) if contrasted else features
 
 
 def gram_matrix(
     K: AbstractMatrixKernel, rows: Measurements, contrasted: bool = False
 ) -> Float[Array, "M M"]:
-    """G, before the contrast or after it."""
+    """The Gram G of all rows, before or after the contrast."""
 
-    def of(K, others):
-        return lambda block: between_all(K, block, others)
+    def gram_of_block(K, blocks):
+        return lambda block: between_all(K, block, blocks)
 
-    def by_points(K, block, others):
-        return _by_points(K, block, others, of)
+    def gram_by_points(K, block, blocks):
+        return _rows_by_points(K, block, blocks, gram_of_block)
 
-    return gram_of_rows(K, rows, contrasted, by_points)
+    return gram_of_rows(K, rows, contrasted, gram_by_points)
 
 
-def _by_points(K, block: AbstractBlock, data, of) -> Float[Array, "d e"]:
-    """The matrix that the function `of(K, data)` returns for a block, a row for each of its rows.
+def _rows_by_points(K, block: AbstractBlock, data, make_rows) -> Float[Array, "d e"]:
+    """The matrix `make_rows(K, data)(block)`, with one row for each row of the block.
 
-    The matrix is made point by point, so that only one point is differentiated at a time. That of
-    `Combinations`, which have more points than rows, is made at once.
+    The matrix is made point by point, so that derivatives hold one point at a time. For
+    `Combinations`, which have more points than rows, the matrix is made at once.
     """
     if isinstance(block, Combinations):
-        return forward_differentiated((K, (block, data)), lambda K, both: of(K, both[1])(both[0]))
+        return forward_differentiated(
+            (K, (block, data)), lambda K, both: make_rows(K, both[1])(both[0])
+        )
 
     def make(K, both):
-        rows = of(K, both[1])
+        rows = make_rows(K, both[1])
 
-        def at_points(x):
-            there = block.with_points(x)
-            return rows(there).reshape(*there.values_shape, -1)
+        def rows_at_point(x):
+            moved = block.with_points(x)
+            return rows(moved).reshape(*moved.values_shape, -1)
 
-        return at_points, both[0]
+        return rows_at_point, both[0]
 
     return block.rows(forward_differentiated((K, (block.points, data)), make, rowwise=True))

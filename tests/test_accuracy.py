@@ -76,6 +76,7 @@ def test_losses_below_rounding_are_infinite_and_not_large():
 # What fits say of themselves.
 
 
+@pytest.mark.slow
 def test_conjugate_gradients_name_cholesky_where_the_ridge_is_rounding():
     for regularization in (1e-12, 1e-14):
         with pytest.raises(RuntimeError, match=r"times the rounding.*hk\.Cholesky\(\)"):
@@ -138,7 +139,7 @@ LANDMARKS = hk.Nystrom(points=X[::12])
 @pytest.mark.parametrize("solver", [FEATURES, LANDMARKS], ids=["features", "landmarks"])
 def test_low_rank_fits_are_those_of_a_stable_least_squares(solver, way):
     span = bases_of(solver).span(K, X.shape[1], jnp.asarray(X).dtype)
-    rows, y = np.asarray(span.of(Components(jnp.asarray(X)))), np.asarray(Y).reshape(-1, 1)
+    rows, y = np.asarray(span.rows_of(Components(jnp.asarray(X)))), np.asarray(Y).reshape(-1, 1)
     largest = np.linalg.norm(rows, 2) ** 2
     for condition in (1e2, 1e5, 1e8, 1e11):
         ridge = largest / condition

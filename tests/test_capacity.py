@@ -26,7 +26,13 @@ from hamkernel._trajectories.likelihood import (
     regression_loss,
 )
 from hamkernel._trajectories.model import Model, landmark_whitening
-from hamkernel._trajectories.search import Bounds, limited_by_landmarks, losses, searched, solved
+from hamkernel._trajectories.search import (
+    Bounds,
+    limited_by_landmarks,
+    losses,
+    search_sample,
+    solve,
+)
 from hamkernel._trajectories.segments import (
     LONG,
     SHORT,
@@ -62,6 +68,7 @@ def arrays(size, T, seed=0):
     return 0.2 + 0.1 * jnp.abs(spans), *rest
 
 
+@pytest.mark.slow
 def test_the_closed_form_in_strips_is_ridge_regression_on_all_rows():
     rows = rows_of(*arrays(4, 12))
     S = rows.nodes[:, 0, 0]  # eight columns: four strips
@@ -98,6 +105,7 @@ def test_a_large_log_is_padded_by_less_than_a_small_one():
     assert [padded_count(count, True) for count in (3, 8, 20, 120, 129)] == [3, 8, 20, 128, 160]
 
 
+@pytest.mark.slow
 def test_many_short_runs_are_not_padded_in_length():
     t = np.linspace(0.0, 1.0, 5)
     states = [np.column_stack([np.cos(t + i), -np.sin(t + i)]) for i in range(450)]
@@ -116,6 +124,7 @@ def test_a_long_computation_says_what_it_costs():
     np.testing.assert_allclose(preprocessing.seconds_of_iteration(many, 128), 13.4, rtol=0.01)
 
 
+@pytest.mark.slow
 def test_landmarks_that_a_solve_of_some_seconds_cannot_carry_are_known_and_named(monkeypatch):
     t = np.linspace(0.0, 2.0, 21)
     states = [np.column_stack([np.cos(t + i), -np.sin(t + i)]) * (1 + i / 20) for i in range(20)]
@@ -196,17 +205,18 @@ def test_a_window_says_what_its_part_of_the_path_says():
 
 def test_few_rows_are_all_searched_and_many_are_not():
     few, S = rows_of(*arrays(4, 12)), jnp.zeros((48, 2))
-    same, part = searched(S, few)
+    same, part = search_sample(S, few)
     assert part is few
     assert len(same) == 48
     many = jax.tree.map(lambda a: jnp.concatenate([a] * 512), few)
-    same, part = searched(S, many)
+    same, part = search_sample(S, many)
     assert len(same) == 48
     assert 2 * 48 * 3 * 2 * part.counts[..., 0].size < 1_000_000
-    some, part = searched(jnp.zeros((1000, 2)), many)
+    some, part = search_sample(jnp.zeros((1000, 2)), many)
     assert (len(some), len(part.counts)) == (24 * 11, 24)
 
 
+@pytest.mark.slow
 def test_landmarks_are_doubled_while_the_rows_become_likelier():
     """On rows of a rough field; those of a smooth one are content with the first.
 
@@ -230,14 +240,14 @@ def test_landmarks_are_doubled_while_the_rows_become_likelier():
         model = Model(truth, jnp.log(jnp.full(2, noise)), NONE)
         none = np.zeros(len(model.flat))
         given, bounds = (rows, WIDE), Bounds(none, none, none > 0)
-        found = [solved(model, S, 16, quick, *given, bounds)[1] for quick in (64, 32)]
+        found = [solve(model, S, 16, quick, *given, bounds)[1] for quick in (64, 32)]
         counts.append([len(each.points) for each in found])
         limited.append(limited_by_landmarks(model, jnp.asarray(S[:16]), *given))
     assert counts == [[64, 64], [64, 32], [16, 16]]
     assert limited == [True, True, False]
 
 
-@pytest.mark.parametrize("size", [10, _machine._SMALL + 1])
+@pytest.mark.parametrize("size", [10, _machine._MAX_UNOPTIMISED + 1])
 def test_how_a_program_is_compiled_changes_neither_values_nor_derivatives(size):
     """Small ones without optimisation, and inside of others as those say."""
 
@@ -254,8 +264,9 @@ def test_how_a_program_is_compiled_changes_neither_values_nor_derivatives(size):
 
 
 def test_options_that_a_compiler_does_not_know_are_left_out(monkeypatch):
-    monkeypatch.setattr(_machine, "_FASTEST", {"xla_no_such_option": True})
+    monkeypatch.setitem(_machine._UNOPTIMISED, "cpu", {"xla_no_such_option": True})
     assert not _machine._options_are_known.__wrapped__("cpu")
+    assert not _machine._options_are_known.__wrapped__("abacus")
     monkeypatch.setattr(_machine, "_options_are_known", lambda _: False)
     assert float(_machine.compiled_by_size(lambda x: 2 * x)(jnp.ones(()))) == 2.0
 

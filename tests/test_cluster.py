@@ -86,14 +86,16 @@ def test_parts_add_up_to_one_pass_bit_for_bit_in_any_order(solver, regularizatio
 def test_what_rounding_takes_from_the_sums_is_what_keeps_the_order_from_showing():
     start = DENSE.start(K, X, 1e-13)
     parts = parts_of(start)
-    seen = [part.sums.seen.square for part in parts]
+    seen = [part.sums.normal_equations.square for part in parts]
     plain = [relative(reduce(jnp.add, seen[::step]), reduce(jnp.add, seen)) for step in (1, -1)]
     assert plain[0] == 0 < plain[1] < 1e-15  # 5e-11 in the field
     ours = merged(parts)
     exact: Any = sum(np.asarray(each, np.longdouble) for each in seen)
-    got = np.asarray(ours.sums.seen.square, np.longdouble) + np.asarray(ours.lost[0].square)
+    got = np.asarray(ours.sums.normal_equations.square, np.longdouble) + np.asarray(
+        ours.compensation[0].square
+    )
     assert float(abs(got - exact).max() / abs(exact).max()) < 1e-18
-    assert float(abs(ours.lost[0].square).max()) > 0
+    assert float(abs(ours.compensation[0].square).max()) > 0
 
 
 def test_merged_features_are_those_of_a_qr_in_numpy():

@@ -39,6 +39,7 @@ def kernels(n):
 
 
 @pytest.mark.parametrize("n", [2, 3, 4])
+@pytest.mark.few(1)
 def test_a_rung_of_the_ladder_is_the_kernel_that_is_shown_for_it(n):
     x, z = RNG.normal(size=(2, n))
     for rung, K in kernels(n):
@@ -95,6 +96,7 @@ def test_a_candidate_claims_what_its_structure_says(kernel, claimed):
     assert claims(kernel, np.array([1.0, 3.0])) == claimed
 
 
+@pytest.mark.slow
 def test_the_score_is_the_likelihood_less_the_price_of_the_numbers():
     found = hk.compare(X, Y, TWO)
     for row in found.table:

@@ -294,10 +294,12 @@ regularization, marks = jnp.asarray(1e-4), few.landmarks(
     K, measurements_of_states(jnp.asarray(X), jnp.asarray(Y)), jnp.asarray(1e-4)
 )
 fits = {
-    "nystrom": lambda X, Y, rows: nystrom._fit(K, X, Y, regularization, marks, rows),
-    "features": lambda X, Y, rows: random_features._fit(K, waves, X, Y, regularization, rows),
+    "nystrom": lambda X, Y, rows: nystrom._landmark_fit(K, X, Y, regularization, marks, rows),
+    "features": lambda X, Y, rows: random_features._feature_fit(
+        K, waves, X, Y, regularization, rows
+    ),
     "gradients": lambda X, Y, rows: conjugate_gradient._solve(
-        conjugate_gradient._prepared, (K, X, regularization, marks, rows),
+        conjugate_gradient._prepare_velocities, (K, X, regularization, marks, rows),
         Y, regularization, 1e-8, 9,
     ),
 }

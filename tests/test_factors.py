@@ -36,7 +36,7 @@ def test_every_primitive_is_that_of_numpy(kind, shape):
     A = np.asarray(rows @ rows.T) + float(ridge) * np.eye(len(rows))
     system = DenseSystem(jnp.asarray(A)) if kind == "dense" else LowRankSystem(rows, ridge)
     factor, y = system.factor(), np.cos(np.arange(len(rows)))
-    a, square = factor.solved(jnp.asarray(y))
+    a, square = factor.solve_with_form(jnp.asarray(y))
     expected = np.linalg.solve(A, y)
     np.testing.assert_allclose(a, expected, rtol=1e-11, atol=1e-12)
     np.testing.assert_allclose(factor.solve(jnp.asarray(y)), expected, rtol=1e-11, atol=1e-12)
@@ -60,7 +60,7 @@ def test_a_matrix_that_is_not_positive_gives_nan():
     factor = dense_factor(jnp.asarray(A))
     assert np.isnan(factor.inverse().C).all()
     assert np.isnan(factor.log_det)
-    assert not factor.trusted(jnp.ones(75))
+    assert not factor.is_well_conditioned(jnp.ones(75))
 
 
 @pytest.mark.parametrize("mode", ["forward", "backward", "twice"])
@@ -71,7 +71,7 @@ def test_derivatives_of_the_primitives_are_those_of_jax(mode):
 
     def ours(t):
         factor = dense_factor(A + t * dA)
-        a, square = factor.solved(y)
+        a, square = factor.solve_with_form(y)
         return factor.log_det + square + a @ jnp.sin(y) + factor.inverse_trace
 
     def reference(t):

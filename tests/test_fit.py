@@ -448,7 +448,7 @@ def test_a_norm_lost_in_rounding_is_nan_and_not_a_wrong_number():
 
 
 class Forbidden(AbstractSolver):
-    def _fitted(self, problem, throw=True, progress=False):
+    def fit(self, problem, throw=True, progress=False):
         raise AssertionError("the solver was called with bad input")
 
 

@@ -63,6 +63,7 @@ def tuned(known):
 
 
 @pytest.mark.parametrize("known", [True, False])
+@pytest.mark.few(1)
 def test_the_curve_is_found_with_a_known_kinetic_energy_and_without(known):
     found = tuned(known).field.part("friction")
     speeds = np.array([0.3, 1.0, 2.0, 3.0])
@@ -269,6 +270,7 @@ def on_joints(x):
     return jnp.block([[zero, zero], [zero, -arm_masses(x[:2])]])
 
 
+@pytest.mark.slow
 def test_friction_of_joints_is_that_of_rayleighs_function_and_not_of_the_momenta():
     rng = np.random.default_rng(1)
     states, fresh = rng.uniform(-1.5, 1.5, size=(2, 60, 4))

@@ -97,6 +97,7 @@ def test_the_posterior_is_that_of_gaussian_conditioning():
     agrees(landmarks, EXACT, 1e-5)
 
 
+@pytest.mark.slow
 def test_all_observations_with_inputs_are_functionals_of_the_same_process():
     masked = Y.copy()
     masked[2, 0] = masked[5, 1] = np.nan
@@ -149,6 +150,7 @@ def test_random_features_are_those_of_drift_and_input_matrix():
     np.testing.assert_allclose(features_of_gain @ features_of_gain.T, gain, atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_field_of_random_features_is_the_ridge_regression_in_them():
     solver = hk.RandomFeatures(20, jax.random.key(1))
     field = hk.fit(K, X, Y, RIDGE, inputs=U, solver=solver)
@@ -285,6 +287,7 @@ SOLVERS = {
 }
 
 
+@pytest.mark.slow
 def test_fields_of_every_solver_come_back_from_files(tmp_path):
     file = tmp_path / "field.npz"
     for solver in SOLVERS.values():

@@ -168,6 +168,7 @@ def damped_pendulum(N=40, friction=0.1, noise=0.01, seed=0):
     return np.stack([q, p], axis=1), f + noise * rng.normal(size=f.shape)
 
 
+@pytest.mark.slow
 def test_tune_finds_the_friction_and_keeps_it_where_told():
     X, Y = damped_pendulum()
     K = hk.PortHamiltonian(1.0 * hk.Gaussian(2.0), friction=0.5)

@@ -78,7 +78,7 @@ def test_the_warning_of_an_amplitude_of_one_is_told_to_scale_only_what_is_not_sc
 def test_the_covariance_of_energies_differentiated_twice_is_that_of_the_field(posterior):
     def energies(x, z):
         pair = [Values(point[None]) for point in (x, z)]
-        return posterior.given.covariance(*pair)[0, 0]
+        return posterior.conditional.covariance(*pair)[0, 0]
 
     J = canonical(2)
     x = jnp.asarray(INSIDE)
@@ -127,6 +127,7 @@ MEAN = hk.systems.HarmonicOscillator()
 
 
 @pytest.mark.parametrize("mean", [MEAN, pytest.param(None, marks=pytest.mark.slow)])
+@pytest.mark.few(1)
 def test_an_update_is_a_refit_with_the_same_noise(mean):
     old, new = (hk.Velocities(*data(12)) + ENERGIES, hk.Velocities(*data(5, 7)))
     more = hk.Energies(data(3, 8)[0], np.ones(3))
@@ -197,6 +198,7 @@ slow = pytest.mark.slow
         pytest.param("features", MEAN, marks=slow),
     ],
 )
+@pytest.mark.few(2)
 def test_draws_have_the_mean_and_the_covariance_of_the_posterior(solver, mean, key):
     posterior = hk.condition(K, X, Y, RIDGE, solver=SOLVERS[solver], mean=mean)
     points = jnp.asarray([INSIDE, X[0], OUTSIDE])
@@ -221,6 +223,7 @@ def test_draws_have_the_mean_and_the_covariance_of_the_posterior(solver, mean, k
     assert abs(changes.std() / deviation - 1) < 5 / (2 * SAMPLES) ** 0.5
 
 
+@pytest.mark.slow
 def test_draws_of_low_rank_leave_nothing_of_the_prior_at_the_landmarks(key):
     """There the rest of the prior is zero, and draws are as near to the mean as the data say."""
     posterior, points = hk.condition(K, X, Y, RIDGE, solver=hk.Nystrom(points=X)), jnp.asarray(X)
@@ -241,6 +244,7 @@ def test_draws_without_a_spectrum_are_right_in_the_region(key):
     assert abs(ratio - 1).max() < 5 / (2 * SAMPLES) ** 0.5
 
 
+@pytest.mark.slow
 def test_draws_are_ordinary_fields_whose_orbits_keep_their_own_energy(key, tmp_path):
     fields = POSTERIOR.sample(key, 3, REGION)
     ts = jnp.linspace(0.0, 2.0, 5)

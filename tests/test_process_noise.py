@@ -245,6 +245,7 @@ def test_bands_are_widened_as_much_as_correlated_noise_widens_least_squares():
 
 
 @pytest.mark.parametrize(("noise", "friction"), [(0.0, 0.0), (1e-4, 0.0), (1e-5, 1e-4)])
+@pytest.mark.few(1)
 def test_good_sensors_are_not_exact_data(noise, friction):
     """Friction of a ten-thousandth leaves 1.5e-4 of the states, fifteen times the noise."""
     drag = jnp.array([0.0, friction])
@@ -352,6 +353,7 @@ def pushed_log(push, seed=0):
     return t, states, states + 0.005 * rng.standard_normal(states.shape)
 
 
+@pytest.mark.slow
 def test_a_push_leaves_the_field_as_it_is_and_is_named():
     K = hk.Sum(potential=hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0)), friction=hk.Friction())
     errors, X = [], jnp.stack([jnp.linspace(-2, 2, 41), jnp.full(41, 1.0)], axis=1)

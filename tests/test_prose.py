@@ -19,7 +19,7 @@ VAGUE_OPENING = re.compile(r"(what|those|that|it|its|they|theirs|these|such)\b",
 VAGUE_ENTRY = re.compile(r"\w+: (of|that|those|what|it|theirs)\b")
 POINTER = re.compile(r"\b(that|those) of\b")
 
-PREPOSITIONS = set("of at in on with without by for from beside below above into less than".split())
+PREPOSITIONS = set("of at in on without by for beside below above into less than".split())
 PRONOUNS = set("own other others each both some most whole theirs mine it that those same".split())
 # Participles that do not end in -ed. `known`, `split` and the like are fine as adjectives.
 PARTICIPLES = set(

@@ -82,6 +82,7 @@ def test_coefficients_are_the_least_squares_of_numpy(formula):
     assert (np.asarray(formula.deviations) > 0.9 * alone).all()
 
 
+@pytest.mark.slow
 def test_masked_components_noise_energies_and_functionals_are_weighted_as_measured():
     relative = np.linspace(0.5, 2.0, len(X))
     masked = Y.copy()

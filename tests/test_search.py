@@ -14,9 +14,9 @@ from hamkernel._gram import gram_of_rows
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of, measurements_of_states
 from hamkernel._solvers.low_rank import WaveBasis
-from hamkernel._tuning.minimiser import BoxBFGS, begun, minimised, most_likely_in_box
+from hamkernel._tuning.minimiser import BoxBFGS, init, minimise, most_likely_in_box
 from hamkernel._tuning.objective import SearchObjective, criterion_of, parts_of
-from hamkernel._tuning.search import design, shares_apart, spread_out
+from hamkernel._tuning.search import box_distance, choose_starts, design
 from hamkernel._tuning.space import SearchSpace, full_trace, hyperparameters
 from hamkernel._validation import generalized_loss
 
@@ -194,7 +194,7 @@ def test_the_subset_has_its_share_of_every_fold():
 def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free():
     few, states, ridge = jnp.asarray(Y[:6]), jnp.asarray(X[:6]), jnp.asarray(1e-3)
     waves = WaveBasis(jax.random.key(0), 3)
-    features, gram = waves.span(K, 2, states.dtype).of(Components(states)), hk.gram(K, states)
+    features, gram = waves.span(K, 2, states.dtype).rows_of(Components(states)), hk.gram(K, states)
     rows = measurements_of_states(states, few)
     F, G = (np.asarray(each).reshape(12, -1) for each in (features, gram))
 
@@ -215,7 +215,7 @@ def test_the_ridge_of_a_subset_is_that_of_all_points():
     rows = measurements_of_states(jnp.asarray(X[:some]), jnp.asarray(Y[:some]))
     criterion = criterion_of("generalized_cross_validation", some, 5)
     objective = SearchObjective(space(), criterion, rows, *map(jnp.asarray, (N / some, 1.0, 1.0)))
-    _, loss = objective.at(K, jnp.asarray(lam), jnp.asarray(2.0))
+    _, loss = objective.value_and_loss(K, jnp.asarray(lam), jnp.asarray(2.0))
     D = 2 * some
     A = np.asarray(hk.gram(K, X[:some])).reshape(D, D) + N * lam * np.eye(D)
     a = np.linalg.solve(A, Y[:some].ravel())
@@ -265,10 +265,10 @@ def test_a_subset_of_observations_has_their_rows():
 
 def test_starts_are_no_neighbours():
     points = design((0, 1))
-    starts = points[spread_out(points, np.sum(points**2, axis=1), 6)]
-    gaps = [shares_apart(starts[i], starts[j]) for i in range(6) for j in range(i)]
+    starts = points[choose_starts(points, np.sum(points**2, axis=1), 6)]
+    gaps = [box_distance(starts[i], starts[j]) for i in range(6) for j in range(i)]
     assert min(gaps) >= 0.25 * 2**0.5
-    everywhere = spread_out(points, np.sum(points**2, axis=1), 60)
+    everywhere = choose_starts(points, np.sum(points**2, axis=1), 60)
     assert len(set(everywhere)) == 60  # full, but none is taken twice
 
 
@@ -292,9 +292,9 @@ def minimum(fn, start, minimiser=DEFAULT, max_steps=200, before=None):
     def with_loss(u):
         return fn(u), fn(u)
 
-    run = begun(minimiser, with_loss, jnp.asarray(start))
-    run = run if before is None else run.going_on_from(before)._replace(steps=jnp.array(0))
-    return minimised(minimiser, with_loss, run, max_steps)
+    run = init(minimiser, with_loss, jnp.asarray(start))
+    run = run if before is None else run.with_curvature_of(before)._replace(steps=jnp.array(0))
+    return minimise(minimiser, with_loss, run, max_steps)
 
 
 def rosenbrock(u):
@@ -362,7 +362,7 @@ def whole(kernel, Y, bounds=None):
     """The objective of the search on all of X."""
     rows, typical = measurements_of_states(jnp.asarray(X), jnp.asarray(Y)), speed(Y)
     given = SearchSpace(kernel, rows.points, typical, jnp.asarray(1e-3), (), bounds or {})
-    criterion = criterion_of("cross_validation", N, 5).on(rows, np.arange(N))
+    criterion = criterion_of("cross_validation", N, 5).for_subset(rows, np.arange(N))
     return SearchObjective(given, criterion, rows, *map(jnp.asarray, (1.0, typical, 1.0)))
 
 

@@ -124,6 +124,7 @@ def test_landmarks_are_rows_of_whatever_was_observed(kind, smoothness):
     assert float(info(low_rank.field).truncation) < 1e-6
 
 
+@pytest.mark.slow
 def test_observations_are_cut_off_at_the_tolerance():
     data = of_every_kind()["energies"]
     rough = hk.Symplectic(100.0 * hk.Matern(1.5, 1.0))

@@ -51,7 +51,7 @@ FOLDS = {
 
 
 def rows_of(basis):
-    return np.asarray(basis.span(K, n, X.dtype).of(Components(X)))
+    return np.asarray(basis.span(K, n, X.dtype).rows_of(Components(X)))
 
 
 @pytest.mark.few(1)

@@ -77,6 +77,7 @@ def test_one_row_that_is_no_measurement_is_named_and_spoils_no_field(value):
     assert "one curve" not in learned.diagnostics.failing
 
 
+@pytest.mark.slow
 def test_dropouts_written_as_zeros_make_the_field_unusable():
     times, states = pendulum()
     for x in states:

@@ -26,14 +26,14 @@ from hamkernel._kernels.built_in import Gaussian
 from hamkernel._machine import full_precision, one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.measurements import Measurements, observations
-from hamkernel._solvers.problem import problem
+from hamkernel._solvers.problem import make_problem
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.structure import DivergenceFree, Separable
 from hamkernel._trajectories.learned import Learned
 from hamkernel._tuning.objective import criterion_of
 from hamkernel._tuning.search import Search, best
 from hamkernel._tuning.space import RIDGE, SearchSpace, named_values, velocity_rms
-from hamkernel._tuning.tune import SEARCH_COPIES, check_found, decode, warn_of_constants
+from hamkernel._tuning.tune import SEARCH_COPIES, check_finite_loss, decode, warn_of_constants
 from hamkernel._validation import check_memory
 
 # A factor of e⁵ = 148 in the evidence. Of the confident answers none was wrong in the prototype at
@@ -166,7 +166,7 @@ def compare(
 
     require.untraced("hk.compare", "Call it outside.", X, Y, candidates)
     data, ridge = _data(X, Y)
-    rows = problem(Separable(Gaussian(1.0)), data, None, 1.0).rows
+    rows = make_problem(Separable(Gaussian(1.0)), data, None, 1.0).rows
     points, n, D = np.asarray(rows.points), rows.dimension, rows.size
     scale = points.std(axis=0)
     speed = velocity_rms(Separable(Gaussian(jnp.asarray(np.where(scale > 0, scale, 1.0)))), rows)
@@ -202,10 +202,18 @@ def _most_likely(
     # A search like that of `tune`, with 32 points to start from in place of up to 256: the first
     # point suits data of this size.
     search = Search(
-        space, criterion, rows, rms, starts, max_steps=64, optimiser=None, progress=False, looks=32
+        space,
+        criterion,
+        rows,
+        rms,
+        starts,
+        max_steps=64,
+        optimiser=None,
+        progress=False,
+        design_size=32,
     )
     run = best(search.runs())
-    check_found(run)
+    check_finite_loss(run)
     K, regularization, _ = decode(space, jnp.asarray(run.best.u, rows.targets.dtype))
     return K, regularization, -float(run.best.loss)
 

@@ -42,7 +42,7 @@ from hamkernel._kernels.functions import as_pytree
 from hamkernel._kernels.symmetry import symmetry_removed
 from hamkernel._machine import full_precision
 from hamkernel._posterior import Posterior
-from hamkernel._solvers.problem import problem
+from hamkernel._solvers.problem import make_problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import CurlFree
@@ -131,13 +131,14 @@ def readout(
 def _measured(learned: Any) -> tuple[AbstractMatrixKernel, Any, Float[Array, ""], Any]:
     """Kernel, rows less what is known, the variance Nλ of their noise, and the mean."""
     if isinstance(learned, Posterior):
-        given = learned.given
-        kernel, rows, ridge = given.field.kernel, given.rows, given.ridge
+        conditional = learned.conditional
+        kernel, rows = conditional.field.kernel, conditional.rows
+        ridge = conditional.ridge
         known = known_of(learned.field)
     elif isinstance(learned, Learned):
         if learned.observations is None:
             raise ValueError("no run had enough samples to say anything of the field.")
-        asked = problem(
+        asked = make_problem(
             learned.kernel, learned.observations, None, learned.regularization, learned.mean
         )
         kernel, rows, ridge, known = asked.kernel, asked.rows, asked.ridge, asked.known

@@ -12,7 +12,7 @@ from hamkernel._features import AbstractFeatures, SumFeatures, laws_of, part_wav
 from hamkernel._fields.base import AbstractField, SolverInfo, at_points, root
 from hamkernel._gram import centred
 from hamkernel._gram_operator import placed_product
-from hamkernel._machine import as_given, compiled, on_each, rows_of, split
+from hamkernel._machine import compiled, on_each, row_sharding, shard, to_caller_sharding
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.structure import AbstractPotentialKernel
 
@@ -206,8 +206,8 @@ class FeatureField(AbstractField):
         return _field_at(self.features, x, self.weights)
 
     def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
-        spread = rows_of(X)
-        return as_given(spread, _evaluate(self, split(spread, X), spread))
+        spread = row_sharding(X)
+        return to_caller_sharding(spread, _evaluate(self, shard(spread, X), spread))
 
     def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         return _potential_at(self.features, x, self.weights)

@@ -5,36 +5,38 @@ from __future__ import annotations
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
+from hamkernel._machine import compiled
 from hamkernel._show import described
 from hamkernel._structures.lagrangian import Lagrangian, LagrangianFeatures
 
 
 class LagrangianField(eqx.Module):
-    """The machine that torques and accelerations tell of; made by `fit` with a `Lagrangian`.
+    """The machine that torques tell of; made by `fit` and `learn` with a `Lagrangian`.
 
     `field(x, u)` is ẋ = (v, a) of the state x = (q, v) under the torques u, so that
     `hk.simulate(field, x0, ts, inputs=u)` runs it. Where M(q) is not positive definite there is no
     acceleration, and it refuses.
 
+    It is its own posterior: the methods that end in `_deviation` are standard deviations.
+
     Attributes:
         features: the features of L and of friction, with the kernel.
-        weights: w, shape (r,).
-        triangle: R with RᵀR = AᵀA + σ²I of the torques' rows A, shape (r, r).
-        noise: σ, the standard deviation of the torques, shape ().
-        residual: measured less learned torques, shape (N, m).
+        coefficients: those of the kernels at the centres, and of friction, shape (r,).
+        triangle: R with RᵀR = BᵀB + I of the torques' rows B, over their noise, shape (r, r).
+        noise: the standard deviation of the torque of each joint, shape (m,).
+        residual: measured less learned torques, shape (N, m); of `learn`, their means over windows.
         least_inertia: the smallest eigenvalue of M over the data, shape ().
         least_inertia_deviation: its standard deviation, shape ().
     """
 
     features: LagrangianFeatures
-    weights: Float[Array, " r"]
+    coefficients: Float[Array, " r"]
     triangle: Float[Array, "r r"]
-    noise: Float[Array, ""]
+    noise: Float[Array, " m"]
     residual: Float[Array, "N m"]
     least_inertia: Float[Array, ""]
     least_inertia_deviation: Float[Array, ""]
@@ -56,6 +58,19 @@ class LagrangianField(eqx.Module):
     def is_identified(self) -> bool:
         """Whether M is positive definite at the data by two standard deviations."""
         return bool(self.least_inertia > 2 * self.least_inertia_deviation)
+
+    @property
+    def refusal(self) -> str:
+        """Why `hk.simulate` does not run this field; "" where M is identified."""
+        if not require.is_concrete(self.least_inertia) or self.is_identified:
+            return ""
+        return (
+            "the mass matrix is not identified: its smallest eigenvalue at the data is "
+            f"{float(self.least_inertia):.3g}, with a standard deviation of "
+            f"{float(self.least_inertia_deviation):.3g}. Motions along one path do not tell "
+            "inertia from gravity and friction: add others, or hk.Lagrangian(…, friction=True) "
+            "where joints have friction."
+        )
 
     def __call__(self, x: Num[ArrayLike, " n"], u: ArrayLike | None = None) -> Float[Array, " n"]:
         """The velocity (v, a) of the state x under the torques u, zero if None.
@@ -81,20 +96,18 @@ class LagrangianField(eqx.Module):
 
     def mass_matrix(self, q: Num[ArrayLike, " m"]) -> Float[Array, "m m"]:
         """M(q), symmetric, shape (m, m)."""
-        return self.features.of_mass_matrix(self._position(q)) @ self.weights
+        return self.features.of_mass_matrix(self._position(q)) @ self.coefficients
 
     def mass_matrix_deviation(self, q: Num[ArrayLike, " m"]) -> Float[Array, "m m"]:
         """The standard deviation of each entry of M(q), shape (m, m)."""
-        q, k = self._position(q), self.kernel.inertia
+        q = self._position(q)
         rows = self.features.of_mass_matrix(q)
-        m = rows.shape[0]
-        known = self._variance(rows.reshape(m * m, -1)).reshape(m, m)
-        missing = self._missing(k, q, q) * (2.0 + 2.0 * jnp.eye(m, dtype=known.dtype))
-        return jnp.sqrt(known + missing)
+        missing = self._missing(self.kernel.inertia, q, q)
+        return jnp.sqrt(self._variance(rows) + missing * (2 + 2 * jnp.eye(len(q), dtype=q.dtype)))
 
     def potential(self, q: Num[ArrayLike, " m"]) -> Float[Array, ""]:
         """V(q), known up to a constant, shape ()."""
-        return self.features.of_potential(self._position(q)) @ self.weights
+        return self.features.of_potential(self._position(q)) @ self.coefficients
 
     def gravity(self, q: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
         """∂V/∂q, the torques that hold the machine at rest at q, shape (m,)."""
@@ -107,9 +120,28 @@ class LagrangianField(eqx.Module):
         mixed = jax.jacfwd(jax.jacrev(lambda a, b: self._missing(k, a, b)), argnums=1)(q, q)
         return jnp.sqrt(self._variance(rows) + jnp.maximum(jnp.diagonal(mixed), 0.0))
 
+    def energy_deviation(
+        self, x: Num[ArrayLike, " n"], x0: Num[ArrayLike, " n"]
+    ) -> Float[Array, ""]:
+        """The standard deviation of the difference of the energies at the states x and x0."""
+
+        def row(x):
+            q, v = jnp.split(self._state(x), 2)
+            kinetic = jnp.einsum("i,j,ijr->r", v, v, self.features.of_mass_matrix(q)) / 2
+            return kinetic + self.features.of_potential(q)
+
+        return jnp.sqrt(self._variance(row(x) - row(x0)))
+
+    def torque_deviation(
+        self, q: Num[ArrayLike, " m"], v: Num[ArrayLike, " m"], a: Num[ArrayLike, " m"]
+    ) -> Float[Array, " m"]:
+        """The standard deviation of each torque of `inverse_dynamics`, without noise, (m,)."""
+        x = jnp.concatenate([self._position(q), self._position(v, "v")])
+        return jnp.sqrt(self._variance(self.features.of_torques(x, self._position(a, "a"))))
+
     def friction(self, v: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
         """The friction of the joints at the velocities v, shape (m,)."""
-        return self.features.of_friction(self._position(v, "v")) @ self.weights
+        return self.features.of_friction(self._position(v, "v")) @ self.coefficients
 
     def momentum(self, x: Num[ArrayLike, " n"]) -> Float[Array, " m"]:
         """P = ∂L/∂v = M(q) v of the state x = (q, v), shape (m,)."""
@@ -131,31 +163,51 @@ class LagrangianField(eqx.Module):
     ) -> Float[Array, " m"]:
         """The torques τ = M(q) a + Coriolis forces + ∂V/∂q + friction, shape (m,)."""
         x = jnp.concatenate([self._position(q), self._position(v, "v")])
-        return self.features.of_torques(x, self._position(a, "a")) @ self.weights
+        return self.features.of_torques(x, self._position(a, "a")) @ self.coefficients
 
-    def _variance(self, rows: Float[Array, "k r"]) -> Float[Array, " k"]:
-        whitened = solve_triangular(self.triangle, rows.T, trans="T")
-        return self.noise**2 * jnp.sum(whitened**2, axis=0)
+    def _variance(self, rows: Float[Array, "*k r"]) -> Float[Array, "*k"]:
+        """The variance of rows in kernels, carried by the centres."""
+        done = self.features.finished(rows).reshape(-1, rows.shape[-1])
+        whitened = solve_triangular(self.triangle, done.T, trans="T")
+        return jnp.sum(whitened**2, axis=0).reshape(rows.shape[:-1])
 
     def _missing(self, k, q, other) -> Float[Array, ""]:
         """The prior covariance of k at two positions that the centres do not carry."""
         whole = k(self.kernel.placed(q), self.kernel.placed(other))
-        known = self.features.of_kernel(k, q) @ self.features.of_kernel(k, other)
-        return jnp.maximum(whole - known, 0.0) if q is other else whole - known
+        root = self.features.roots[0 if k is self.kernel.potential else 1]
+        mine, others = (
+            solve_triangular(root, self.features.of_kernel(k, at), lower=True) for at in (q, other)
+        )
+        return jnp.maximum(whole - mine @ others, 0.0) if q is other else whole - mine @ others
 
     def _state(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
-        return require.point(x, self.dimension).astype(self.weights.dtype)
+        return require.point(x, self.dimension).astype(self.coefficients.dtype)
 
     def _position(self, q: ArrayLike, name: str = "q") -> Float[Array, " m"]:
-        return require.point(q, self.features.count, name).astype(self.weights.dtype)
+        return require.point(q, self.features.count, name).astype(self.coefficients.dtype)
 
 
-def least_inertia(field: LagrangianField, X: Float[Array, "N n"]) -> tuple[Array, Array]:
-    """The smallest eigenvalue of M over the states X, and its standard deviation."""
-    Q = X[:, : field.features.count]
-    values, vectors = jax.vmap(lambda q: jnp.linalg.eigh(field.mass_matrix(q)))(Q)
-    at = int(np.argmin(np.asarray(values[:, 0])))
+def lagrangian_field(
+    features: LagrangianFeatures,
+    weights: Float[Array, " r"],
+    triangle: Float[Array, "r r"],
+    noise: Float[Array, " m"],
+    residual: Float[Array, "N m"],
+    X: Float[Array, "N n"],
+) -> LagrangianField:
+    """The field of these weights, with the smallest eigenvalue of M over the states X."""
+    zero = jnp.zeros((), weights.dtype)
+    coefficients = features.on_kernels(weights)
+    field = LagrangianField(features, coefficients, triangle, noise, residual, zero, zero)
+    both = lambda f: (f.least_inertia, f.least_inertia_deviation)  # noqa: E731
+    return eqx.tree_at(both, field, _least_inertia(field, X[:, : features.count]))
+
+
+@compiled
+def _least_inertia(field: LagrangianField, Q: Float[Array, "N m"]) -> tuple[Array, Array]:
+    values, vectors = jax.lax.map(lambda q: jnp.linalg.eigh(field.mass_matrix(q)), Q)
+    at = jnp.argmin(values[:, 0])
     e = vectors[at, :, 0]
-    rows = jnp.einsum("i,j,ijr->r", e, e, field.features.of_mass_matrix(Q[at]))
+    row = jnp.einsum("i,j,ijr->r", e, e, field.features.of_mass_matrix(Q[at]))
     missing = 4 * field._missing(field.kernel.inertia, Q[at], Q[at])
-    return values[at, 0], jnp.sqrt(field._variance(rows[None])[0] + missing)
+    return values[at, 0], jnp.sqrt(field._variance(row) + jnp.maximum(missing, 0.0))

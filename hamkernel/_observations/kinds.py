@@ -308,7 +308,7 @@ class Equilibria(AbstractObservations):
     Args:
         X: states, shape (N, n), or one of shape (n,).
         inputs: of a `Controlled` kernel: those that hold the states, shape (N, m) or (m,).
-        parameters: of a `Family`: θ at each state, shape (N, p) or (p,).
+        parameters: θ at each state, for a `Family`, shape (N, p) or (p,).
 
     Raises:
         ValueError: a shape does not fit, or a value is not finite.

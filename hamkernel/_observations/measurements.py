@@ -265,7 +265,7 @@ def measurements(
         K: the kernel.
         X: states, shape (N, n), or observations, and then there are no Y and no inputs.
         Y: velocities, shape (N, n).
-        inputs: of a `Controlled` kernel: u at each state, shape (N, m).
+        inputs: u at each state, for a `Controlled` kernel, shape (N, m).
 
     Raises:
         TypeError, ValueError: as `fit` says.

@@ -1,13 +1,13 @@
-"""The exact fit by conjugate gradients: products with the Gram only, O((N + m) n + r²) memory.
+"""The exact fit by conjugate gradients, from products with the Gram: O((N + m) n + r²) memory.
 
-The unknown is the residual of the fit, c = y − f(X) = Nλ a, so the system is (I + G/ρ) c = y with
-ρ = Nλ: both sides are in units of y. The preconditioner is the inverse for the low-rank Gram
-Ĝ = F Fᵀ of a Nyström fit,
+The unknown is the residual of the fit, c = y − f(X) = ρ a with ρ = Nλ. The system is (I + G/ρ) c =
+y, with both sides in units of y. The preconditioner is the inverse for the low-rank Gram Ĝ = F Fᵀ
+of a Nyström fit,
 
     (I + Ĝ/ρ)⁻¹ = I − F (FᵀF + ρI)⁻¹ Fᵀ,
 
-whose F = G_XS T is applied as a product with the Gram, so that it needs no memory of its own. If
-trace(G − Ĝ) ≤ τρ the condition is at most 1 + τ and the iterations do not depend on N.
+where F = G_XS T is applied as a product with the Gram and never stored. If trace(G − Ĝ) ≤ τρ, the
+condition number is at most 1 + τ and the number of iterations does not depend on N.
 """
 
 import abc
@@ -23,39 +23,46 @@ from jaxtyping import Array, Float, Int
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import KernelField
-from hamkernel._gram import constant, gram_rounding, trace
+from hamkernel._gram import gram_rounding, trace, without_gradient
 from hamkernel._gram_operator import product
-from hamkernel._machine import RowSharding, as_given, compiled, rows_of, split
+from hamkernel._machine import RowSharding, compiled, row_sharding, shard, to_caller_sharding
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.dense import field_of_rows, gram_product, norm_of, relative
+from hamkernel._solvers.dense import field_of_rows, gram_product, norm_of, relative_error
 from hamkernel._solvers.landmarks import whitening
 from hamkernel._solvers.least_squares import normal
-from hamkernel._solvers.low_rank import Columns, checked, factor, landmark_span, truncated
+from hamkernel._solvers.low_rank import (
+    Columns,
+    check_solution,
+    factor,
+    landmark_span,
+    truncation_of,
+)
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.problem import AbstractSolver
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
-class _Found(NamedTuple):
+class _Solution(NamedTuple):
     learned: tuple[Array, Array, Array]  # coefficients, residual and norm
     iterations: Int[Array, ""]
-    left: Float[Array, ""]  # the relative residual of the system
+    relative_residual: Float[Array, ""]  # the relative residual of the system
     truncation: Float[Array, ""]  # of the preconditioner
 
 
 class ConjugateGradient(AbstractSolver[KernelField]):
     """The exact fit without the Gram: preconditioned conjugate gradients on its products.
 
-    For N where the dense Gram does not fit in memory, and kernels for which `Nystrom` alone is not
-    exact enough. Each iteration costs one product with the Gram, O(N² n). The result carries
-    `field.info.iterations` and `.relative_residual`, computed anew at the end.
+    Use this solver if the dense Gram does not fit in memory and `Nystrom` alone is not exact
+    enough. Each iteration costs one product with the Gram, O(N² n). `field.info` has the number of
+    `iterations` and the `relative_residual`, computed anew at the end.
 
     Args:
         tolerance: the largest ‖y − (G + NλI)a‖/‖y‖, dimensionless; 1e-8 if None, and 1e-5 for data
             in float32.
         max_iterations: the largest number of iterations; the solve fails beyond it.
-        preconditioner: the low-rank Gram that preconditions. Its tolerance may be large, since the
-            condition is at most 1 + truncation; more landmarks mean fewer iterations.
+        preconditioner: the `Nystrom` solver whose low-rank Gram preconditions. Its tolerance may be
+            large, since the condition number is at most 1 + truncation; more landmarks mean fewer
+            iterations.
 
     Raises:
         ValueError: an argument is not positive. TypeError: `max_iterations` is not whole, or the
@@ -81,8 +88,8 @@ class ConjugateGradient(AbstractSolver[KernelField]):
         max_iterations: int = 100,
         preconditioner: Nystrom | None = None,
     ):
-        own = tolerance is not None
-        self.tolerance = require.positive_number(tolerance, "tolerance") if own else None
+        has_tolerance = tolerance is not None
+        self.tolerance = require.positive_number(tolerance, "tolerance") if has_tolerance else None
         self.max_iterations = require.count(max_iterations, "max_iterations")
         if preconditioner is None:
             preconditioner = Nystrom(tolerance=10.0, max_points=256)
@@ -92,48 +99,48 @@ class ConjugateGradient(AbstractSolver[KernelField]):
             )
         self.preconditioner = preconditioner
 
-    def _fitted(self, problem, throw=True, progress=False) -> KernelField:
+    def fit(self, problem, throw=True, progress=False) -> KernelField:
         if problem.states is None:
-            problem = problem.on_one_device()
+            problem = problem.to_one_device()
         K, rows, ridge = problem.kernel, problem.rows, problem.ridge
-        X, spread = rows.points, rows_of(rows.points)
+        X, spread = rows.points, row_sharding(rows.points)
         landmarks = self.preconditioner.landmarks(K, rows, problem.regularization)
         limits = self._tolerance(rows.targets.dtype), self.max_iterations
         prepare: Callable[..., tuple[AbstractProducts, Array]]
         if problem.states is None:
-            prepare, given, y = _prepared_rows, (K, rows, ridge, landmarks), rows.y
+            prepare, args, y = _prepare_rows, (K, rows, ridge, landmarks), rows.y
         else:
-            X, y = (split(spread, each) for each in problem.states)
-            prepare, given = _prepared, (K, X, ridge, landmarks, spread)
+            X, y = (shard(spread, array) for array in problem.states)
+            prepare, args = _prepare_velocities, (K, X, ridge, landmarks, spread)
         if progress and require.is_concrete(K, rows, ridge):
-            found = _shown(_prepared_alone(prepare, given), y, ridge, *limits)
+            result = _iterate_with_bar(_prepare(prepare, args), y, ridge, *limits)
         else:
-            found = _solve(prepare, given, y, ridge, *limits)
-        (c, left, norm), info = self._converged(K, X, ridge, landmarks, found, throw)
-        left = as_given(spread, rows.residual(left.reshape(-1)))
-        return field_of_rows(K, rows, c.reshape(-1), left, norm, problem.regularization, info)
+            result = _solve(prepare, args, y, ridge, *limits)
+        (c, residual, norm), info = self._check_convergence(K, X, ridge, landmarks, result, throw)
+        residual = to_caller_sharding(spread, rows.residual(residual.reshape(-1)))
+        return field_of_rows(K, rows, c.reshape(-1), residual, norm, problem.regularization, info)
 
     def _tolerance(self, dtype: jnp.dtype) -> Float[Array, ""]:
-        own = self.tolerance
+        tolerance = self.tolerance
         default = 1e-8 if dtype == jnp.float64 else 1e-5
-        # An array, since every new Python float would compile anew.
-        return jnp.asarray(default if own is None else own, dtype)
+        # As an array: every new Python float would compile a new program.
+        return jnp.asarray(default if tolerance is None else tolerance, dtype)
 
-    def _converged(self, K, X, ridge, landmarks, found: _Found, throw: bool):
-        """Coefficients, residual and norm, if the iterations converged, and the `SolverInfo`."""
-        learned, iterations, left, truncation = found
+    def _check_convergence(self, K, X, ridge, landmarks, result: _Solution, throw: bool):
+        """(coefficients, residual, norm) and the `SolverInfo`; RuntimeError without convergence."""
+        learned, iterations, relative_residual, truncation = result
         tolerance = self._tolerance(X.dtype)
 
         def message() -> str:
             reached = ""
-            if require.is_concrete(left, iterations, truncation):
+            if require.is_concrete(relative_residual, iterations, truncation):
                 reached = (
                     f" after {int(iterations)} iterations: the relative residual is "
-                    f"{float(left):.1e} and the tolerance {tolerance:.1e} "
+                    f"{float(relative_residual):.1e} and the tolerance {tolerance:.1e} "
                     f"({int(landmarks.count)} landmarks, truncation "
                     f"{float(truncation):.1e})"
                 )
-                rounding = float(gram_rounding(trace(K, X, rows_of(X))))
+                rounding = float(gram_rounding(trace(K, X, row_sharding(X))))
                 # On 87 points of an orbit the iterations converged with a ridge of 3e4 times the
                 # rounding and not with 3e2, where Cholesky left a residual of 4e-12.
                 if ridge < 1e4 * rounding:
@@ -156,22 +163,22 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                 "residual that is NaN the kernel is at fault: hk.check_kernel(k, X) finds out."
             )
 
-        failed = ~(require.on_host(left) <= require.on_host(tolerance))
+        failed = ~(require.on_host(relative_residual) <= require.on_host(tolerance))
         info = SolverInfo(
             "ConjugateGradient",
             landmarks=landmarks.count,
             rank=landmarks.kept.sum(),
             truncation=truncation,
             iterations=iterations,
-            relative_residual=left,
+            relative_residual=relative_residual,
         )
-        return checked(learned, landmarks, truncation, failed, message, throw), info
+        return check_solution(learned, landmarks, truncation, failed, message, throw), info
 
 
 class AbstractProducts(eqx.Module):
     """Products with the Gram and with the inverse of the low-rank Gram that preconditions.
 
-    The preconditioner changes how fast the answer is found, not the answer: it is not
+    The preconditioner changes the number of iterations and not the solution, so it is not
     differentiated.
     """
 
@@ -180,11 +187,11 @@ class AbstractProducts(eqx.Module):
         """G c."""
 
     @abc.abstractmethod
-    def preconditioned(self, c: Array) -> Array:
+    def precondition(self, c: Array) -> Array:
         """(I + Ĝ/ρ)⁻¹ c."""
 
 
-class _OfVelocities(AbstractProducts):
+class _VelocityProducts(AbstractProducts):
     kernel: AbstractMatrixKernel
     X: Float[Array, "N d"]
     T: Float[Array, "r r"]
@@ -195,14 +202,14 @@ class _OfVelocities(AbstractProducts):
     def gram(self, c):
         return product(self.kernel, self.X, self.X, c, self.spread, self.spread)
 
-    def preconditioned(self, c):
+    def precondition(self, c):
         K, X, S = self.fixed
         moment = self.T.T @ product(K, S, X, c, None, self.spread).reshape(-1)
         w = jax.scipy.linalg.cho_solve((self.R, True), moment)
         return c - product(K, X, S, (self.T @ w).reshape(len(S), -1), self.spread)
 
 
-class _OfRows(AbstractProducts):
+class _RowProducts(AbstractProducts):
     kernel: AbstractMatrixKernel
     rows: Measurements
     F: Float[Array, "D r"]
@@ -211,51 +218,51 @@ class _OfRows(AbstractProducts):
     def gram(self, c):
         return gram_product(self.kernel, self.rows, c)  # the rows of the field of c
 
-    def preconditioned(self, c):
+    def precondition(self, c):
         return c - self.F @ jax.scipy.linalg.cho_solve((self.R, True), self.F.T @ c)
 
 
-def _prepared(K, X, ridge, landmarks, spread):
-    """The products for velocities, and the truncation of the preconditioner."""
-    K_, X_, ridge_, marks = constant((K, X, ridge, landmarks))
+def _prepare_velocities(K, X, ridge, landmarks, spread):
+    """The products for velocities alone, and the truncation of the preconditioner."""
+    K_, X_, ridge_, marks = without_gradient((K, X, ridge, landmarks))
     T, nothing = whitening(K_, marks), jnp.zeros((len(X), K.outputs(X.shape[1])), X.dtype)
     square = normal(Columns(K_, marks), T, X_, nothing, spread).square
-    products = _OfVelocities(K, X, T, factor(square, ridge_), (K_, X_, marks.points), spread)
-    return products, truncated(trace(K_, X_, spread), jnp.trace(square), ridge_)
+    products = _VelocityProducts(K, X, T, factor(square, ridge_), (K_, X_, marks.points), spread)
+    return products, truncation_of(trace(K_, X_, spread), jnp.trace(square), ridge_)
 
 
-def _prepared_rows(K, rows, ridge, landmarks):
+def _prepare_rows(K, rows, ridge, landmarks):
     """The products for rows of any observations, and the truncation of the preconditioner."""
-    K_, rows_, ridge_, marks = constant((K, rows, ridge, landmarks))
+    K_, rows_, ridge_, marks = without_gradient((K, rows, ridge, landmarks))
     span = landmark_span(K_, marks)
-    all_rows = span.of_rows(rows_)
+    all_rows = span.all_rows(rows_)
     F = rows_.contrast(all_rows)
     truncation = span.truncation(rows_, all_rows, ridge_)
-    return _OfRows(K, rows, F, factor(F.T @ F, ridge_)), truncation
+    return _RowProducts(K, rows, F, factor(F.T @ F, ridge_)), truncation
 
 
 @compiled
-def _prepared_alone(prepare, given):
-    return prepare(*given)
+def _prepare(prepare, args):
+    return prepare(*args)
 
 
 @compiled
-def _solve(prepare, given, y, ridge, tolerance, max_iterations):
-    products, truncation = prepare(*given)
-    return _iterated(products, truncation, y, ridge, tolerance, max_iterations)
+def _solve(prepare, args, y, ridge, tolerance, max_iterations):
+    products, truncation = prepare(*args)
+    return _iterate(products, truncation, y, ridge, tolerance, max_iterations)
 
 
-def _iterated(
+def _iterate(
     products: AbstractProducts, truncation, y, ridge, tolerance, max_iterations, start=None
-) -> _Found:
-    """The solution of (I + G/ridge) c = y."""
+) -> _Solution:
+    """The solution of (I + G/ridge) c = y by preconditioned conjugate gradients."""
     structure = jax.ShapeDtypeStruct(y.shape, y.dtype)
     positive = lx.positive_semidefinite_tag
     gram = products.gram
     system = lx.FunctionLinearOperator(lambda c: c + gram(c) / ridge, structure, positive)
-    preconditioner = lx.FunctionLinearOperator(products.preconditioned, structure, positive)
-    # lineax has one bound for the residual and for the change of c, both in units of y. Half of the
-    # tolerance leaves room for the rounding errors in the recursion of the residual.
+    preconditioner = lx.FunctionLinearOperator(products.precondition, structure, positive)
+    # lineax has one bound for the residual and for the change of c, both in units of y. Half of
+    # the tolerance allows for the rounding errors of the recursion for the residual.
     scale = jnp.linalg.norm(jax.lax.stop_gradient(y))
     solver = lx.CG(
         rtol=0.0,
@@ -267,14 +274,17 @@ def _iterated(
     options = {"preconditioner": preconditioner} | ({} if start is None else {"y0": start})
     solution = lx.linear_solve(system, y, solver, options=options, throw=False)
     c = solution.value
-    values = gram(c) / ridge  # f(X)
-    # ‖f‖² = aᵀGa
+    # c = ρa, so f(X) = Ga = Gc/ρ and ‖f‖² = aᵀGa = c·f(X)/ρ. With the residual r = y − c − f(X) of
+    # the system, aᵀr = cᵀr/ρ estimates the error of ‖f‖², as in `norm_of`.
+    values = gram(c) / ridge
     norm = norm_of(jnp.sum(c * values) / ridge, jnp.sum(c * (y - c - values)) / ridge)
     learned = c / ridge, y - values, norm
-    return _Found(learned, solution.stats["num_steps"], relative(y - c - values, y), truncation)
+    return _Solution(
+        learned, solution.stats["num_steps"], relative_error(y - c - values, y), truncation
+    )
 
 
-# The same iterations one at a time, which a progress bar can show and Ctrl-C can end.
+# The same iterations one at a time, for the progress bar; Ctrl-C stops between two of them.
 
 
 class _Iterate(NamedTuple):
@@ -282,43 +292,43 @@ class _Iterate(NamedTuple):
     residual: Array
     direction: Array
     square: Float[Array, ""]  # rᵀM r of the residual, M the preconditioner
-    left: Float[Array, ""]  # its norm over that of y
+    relative_residual: Float[Array, ""]  # ‖r‖/‖y‖
 
 
-def _shown(prepared, y, ridge, tolerance, max_iterations) -> _Found:
-    """`_iterated` outside of any trace, with a progress bar."""
+def _iterate_with_bar(prepared, y, ridge, tolerance, max_iterations) -> _Solution:
+    """`_iterate` with a progress bar, outside any trace."""
     from tqdm import tqdm  # so that importing the package does not load it
 
     products, truncation = prepared
     state, done = _first_iterate(products, y), 0
     with tqdm(total=max_iterations, desc="conjugate gradients", disable=None) as bar:
-        while float(state.left) > 0.5 * float(tolerance) and done < max_iterations:
+        while float(state.relative_residual) > 0.5 * float(tolerance) and done < max_iterations:
             state = _next(products, y, ridge, state)
             done += 1
-            bar.set_postfix_str(f"residual {float(state.left):.1e}", refresh=False)
+            bar.set_postfix_str(f"residual {float(state.relative_residual):.1e}", refresh=False)
             bar.update()
-    last = _finished(products, truncation, y, ridge, tolerance, state.c)
+    last = _finish(products, truncation, y, ridge, tolerance, state.c)
     return last._replace(iterations=last.iterations + done)
 
 
 @compiled
 def _first_iterate(products: AbstractProducts, y) -> _Iterate:
-    z = products.preconditioned(y)
-    return _Iterate(jnp.zeros_like(y), y, z, jnp.sum(y * z), relative(y, y))
+    z = products.precondition(y)
+    return _Iterate(jnp.zeros_like(y), y, z, jnp.sum(y * z), relative_error(y, y))
 
 
 @compiled
-def _next(products: AbstractProducts, y, ridge, at: _Iterate) -> _Iterate:
-    p = at.direction
+def _next(products: AbstractProducts, y, ridge, state: _Iterate) -> _Iterate:
+    p = state.direction
     image = p + products.gram(p) / ridge
-    step = at.square / jnp.sum(p * image)
-    residual = at.residual - step * image
-    z = products.preconditioned(residual)
+    step = state.square / jnp.sum(p * image)
+    residual = state.residual - step * image
+    z = products.precondition(residual)
     square = jnp.sum(residual * z)
-    c = at.c + step * p
-    return _Iterate(c, residual, z + square / at.square * p, square, relative(residual, y))
+    c = state.c + step * p
+    return _Iterate(c, residual, z + square / state.square * p, square, relative_error(residual, y))
 
 
 @compiled
-def _finished(products: AbstractProducts, truncation, y, ridge, tolerance, start) -> _Found:
-    return _iterated(products, truncation, y, ridge, tolerance, 2, start)
+def _finish(products: AbstractProducts, truncation, y, ridge, tolerance, start) -> _Solution:
+    return _iterate(products, truncation, y, ridge, tolerance, 2, start)

@@ -1,11 +1,12 @@
-"""The exact fit by a dense factor of the Gram, and the Gaussian field that it keeps.
+"""The exact fit by a dense factor of the Gram, and the posterior that keeps this factor.
 
-With the covariances c of two linear functionals with the rows of the data, their covariance given
-the data is their prior covariance less c₁ᵀ A⁻¹ c₂, A = G + σ²I. A prediction is a linear functional
-as a measurement is, so both are blocks of rows, and every variance is one function.
+Let c₁ and c₂ be the covariances of two linear functionals with the rows of the data. The covariance
+of these functionals given the data is their prior covariance minus c₁ᵀ A⁻¹ c₂, with A = G + σ²I.
+A prediction is a linear functional just as a measurement is: both are blocks of rows, and one
+function computes every variance.
 
-New rows extend a factor: with A = RᵀR the factor of all is [[R, B], [0, S]], B = R⁻ᵀK₁₂ and
-SᵀS = K₂₂ + σ²I − BᵀB. The variance σ² of a row stays as it was.
+New rows extend the factor. If A = RᵀR, the factor of old and new rows is [[R, B], [0, S]] with
+B = R⁻ᵀK₁₂ and SᵀS = K₂₂ + σ²I − BᵀB. The noise variance σ² of a row does not change.
 """
 
 from typing import Any
@@ -45,7 +46,7 @@ from hamkernel._structures.base import AbstractMatrixKernel
 
 
 class DenseConditional(AbstractConditional):
-    """The Gaussian field by the Cholesky factor of A; `representer` is c = A⁻¹y."""
+    """The posterior from the Cholesky factor of A; `representer` is c = A⁻¹y."""
 
     field: KernelField
     rows: Measurements
@@ -55,53 +56,53 @@ class DenseConditional(AbstractConditional):
 
     def covariance(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
         whitened = self._whitened_covariance(left)
-        other = whitened if right is left else self._whitened_covariance(right)
-        return between(self.field.kernel, left, right) - whitened.T @ other
+        whitened_right = whitened if right is left else self._whitened_covariance(right)
+        return between(self.field.kernel, left, right) - whitened.T @ whitened_right
 
     def _whitened_covariance(self, block: AbstractBlock) -> Float[Array, "D d"]:
         """R⁻ᵀ c."""
         return self.factor.whiten(rows_between(self.field.kernel, self.rows, block))
 
     def updated(self, new: Measurements) -> "DenseConditional":
-        factor, c, field = _extended(self, new)
+        factor, c, field = _extend(self, new)
         rows = self.rows.joined(new)
         return DenseConditional(
-            _unless_lost(field, jnp.sum(0 * c), rows.count), rows, self.ridge, factor, c
+            _refuse_failure(field, jnp.sum(0 * c), rows.count), rows, self.ridge, factor, c
         )
 
     def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> KernelField:
         before, noise = jax.random.split(key)
         prior = prior_draws(self.field.kernel, self.rows.points, region, before, count)
-        return _corrected(self, prior, noise)
+        return _condition_draws(self, prior, noise)
 
 
 def dense_conditional(
     problem: Problem, throw: bool = True, progress: bool = False
 ) -> DenseConditional:
-    """The field given the rows, by the dense Gram of them: O(D³) time and O(D²) memory.
+    """The posterior given the rows, from their dense Gram: O(D³) time and O(D²) memory.
 
     Raises:
         ValueError: the matrices do not fit in memory. RuntimeError: A is not positive definite to
             rounding.
     """
     rows = problem.rows
-    factor, c, field, left = _dense(problem, progress)
+    factor, c, field, relative_residual = _dense(problem, progress)
     return DenseConditional(
-        _unless_lost(field, left, rows.count, throw), rows, problem.ridge, factor, c
+        _refuse_failure(field, relative_residual, rows.count, throw), rows, problem.ridge, factor, c
     )
 
 
 def dense_field(problem: Problem, throw: bool = True, progress: bool = False) -> KernelField:
     """The field of `dense_conditional` alone."""
-    _, _, field, left = _dense(problem, progress, keep=False)
-    return _unless_lost(field, left, problem.rows.count, throw)
+    _, _, field, relative_residual = _dense(problem, progress, keep=False)
+    return _refuse_failure(field, relative_residual, problem.rows.count, throw)
 
 
 def copies(problem: Problem) -> int:
     """The number of matrices of the size of the Gram that a dense fit holds at its peak.
 
-    A fit in place held 1.5 for all kernels. Other fits hold the Gram, its factor, what is returned,
-    and strips on the way: 3.4 (`test_the_peak_memory_of_a_dense_fit_is_what_is_planned`).
+    A fit in place held 1.5 for all kernels. Other fits hold the Gram, its factor, the returned copy
+    and strips of rows, together 3.4 (`test_the_peak_memory_of_a_dense_fit_is_what_is_planned`).
     """
     return 2 if _is_in_place(problem) else 4
 
@@ -123,19 +124,19 @@ def _check_memory(problem: Problem) -> None:
 
 
 def _dense(problem: Problem, progress: bool, keep: bool = True) -> Any:
-    """The factor, if it is to be kept, c, the field, and the relative residual."""
+    """Solve A c = y. Returns (factor or None, c, field, relative residual)."""
     K, rows, regularization = problem.kernel, problem.rows, problem.regularization
     _check_memory(problem)
     if not _is_in_place(problem):
-        found = (_compiled_conditional if keep else _compiled_field)(K, rows, regularization)
-        return found if keep else (None, *found)
-    factor = factor_in_place(*_assembled(K, rows, problem.ridge, progress))
-    found: Any = _of_factor(K, rows, regularization, factor)
-    return factor, *found
+        result = (_compiled_conditional if keep else _compiled_field)(K, rows, regularization)
+        return result if keep else (None, *result)
+    factor = factor_in_place(*_assemble(K, rows, problem.ridge, progress))
+    result: Any = _solve_with_factor(K, rows, regularization, factor)
+    return factor, *result
 
 
-def _assembled(K, rows: Measurements, ridge, progress: bool):
-    """A, made in slabs of rows, and the progress bar of its factorisation."""
+def _assemble(K, rows: Measurements, ridge, progress: bool):
+    """A, computed in slabs of rows, and the progress bar of its factorisation."""
     from tqdm import tqdm  # so that importing the package does not load it
 
     off = None if progress else True
@@ -157,7 +158,7 @@ def _dense_system(K, rows: Measurements, regularization):
 
 
 @compiled
-def _of_factor(K, rows: Measurements, regularization, factor: DenseFactor):
+def _solve_with_factor(K, rows: Measurements, regularization, factor: DenseFactor):
     return _field_and_residual(K, rows, regularization, factor.solve(rows.y))
 
 
@@ -165,10 +166,10 @@ def _field_and_residual(K, rows: Measurements, regularization, c):
     """The coefficients c, their field, and the relative residual ‖y − (G + σ²I)c‖/‖y‖."""
     y, ridge = rows.y, rows.count * regularization
     values = gram_product(K, rows, c)  # without the Gram, which the factor has overwritten
-    left = relative(y - values - ridge * c, y)
+    relative_residual = relative_error(y - values - ridge * c, y)
     residual, norm = rows.residual(ridge * c), norm_of(c @ values, c @ (y - values - ridge * c))
-    info = SolverInfo("Cholesky", relative_residual=left)
-    return c, field_of_rows(K, rows, c, residual, norm, regularization, info), left
+    info = SolverInfo("Cholesky", relative_residual=relative_residual)
+    return c, field_of_rows(K, rows, c, residual, norm, regularization, info), relative_residual
 
 
 _compiled_conditional = compiled(_dense_system)
@@ -180,40 +181,52 @@ def _compiled_field(K, rows: Measurements, regularization):
 
 
 def norm_of(square: Float[Array, ""], error: Float[Array, ""]) -> Float[Array, ""]:
-    """√square for ‖f‖² = cᵀGc; NaN where rounding may be a tenth of it or more.
+    """The norm √(cᵀGc) of the field; NaN if rounding may be a tenth of cᵀGc or more.
 
-    cᵀGc is a small difference of large numbers where the field is small beside the velocities.
+    If the field is small compared to the velocities, cᵀGc is a small difference of large numbers.
+
+    With Ac = y − r, cᵀGc = cᵀ(y − σ²c) − cᵀr, so the residual r changes the form by cᵀr.
 
     Args:
-        square: cᵀGc as it was computed.
-        error: an estimate of its error, such as cᵀr with the residual r of the linear system.
+        square: cᵀGc, as computed.
+        error: an estimate of the error of `square`, such as cᵀr with the residual r of A c = y.
     """
-    lost = ~(jnp.abs(jax.lax.stop_gradient(error)) <= 0.1 * square) & (square != 0)
-    return jnp.where(lost, jnp.nan, root(square)).astype(square.dtype)
+    inaccurate = ~(jnp.abs(jax.lax.stop_gradient(error)) <= 0.1 * square) & (square != 0)
+    return jnp.where(inaccurate, jnp.nan, root(square)).astype(square.dtype)
 
 
-def relative(error: Array, of: Array) -> Float[Array, ""]:
-    """‖error‖/‖of‖, and ‖error‖ where there is nothing to compare it with. Not differentiated."""
-    error, of = jax.lax.stop_gradient((error, of))
-    scale = jnp.linalg.norm(of)
+def relative_error(error: Array, reference: Array) -> Float[Array, ""]:
+    """The relative error ‖error‖/‖reference‖, or ‖error‖ if the reference is zero.
+
+    Gradients are stopped.
+    """
+    error, reference = jax.lax.stop_gradient((error, reference))
+    scale = jnp.linalg.norm(reference)
     return jnp.linalg.norm(error) / jnp.where(scale > 0, scale, jnp.ones_like(scale))
 
 
 @compiled
-def _extended(old: DenseConditional, new: Measurements):
+def _extend(old: DenseConditional, new: Measurements):
     K, R, rows = old.field.kernel, old.factor.R, old.rows.joined(new)
-    # The contrasts of new energies reach back to the old ones.
-    beside, fresh = old.rows.with_previous(new), rows.size - old.rows.size
-    across = [rows_between(K, old.rows, block) for block in beside.blocks]
-    across = beside.contrast(jnp.concatenate(across, axis=1).T)[-fresh:].T  # (D, fresh)
+    # A contrast of a new energy is a difference with the old energies, so their rows are needed
+    # too.
+    extended_rows, new_count = old.rows.with_previous(new), rows.size - old.rows.size
+    across = [rows_between(K, old.rows, block) for block in extended_rows.blocks]
+    across = extended_rows.contrast(jnp.concatenate(across, axis=1).T)[
+        -new_count:
+    ].T  # (D, new_count)
     B = old.factor.whiten(across)
-    own = plus_ridge(gram_of_rows(K, beside)[-fresh:, -fresh:], old.ridge) - B.T @ B
-    D, S = len(R), cholesky(own)
-    # Blocks that are written into zeros take a quarter of the time of joined blocks.
-    R = jnp.zeros((D + fresh,) * 2, R.dtype).at[:D, :D].set(R).at[:D, D:].set(B).at[D:, D:].set(S)
+    complement = (
+        plus_ridge(gram_of_rows(K, extended_rows)[-new_count:, -new_count:], old.ridge) - B.T @ B
+    )
+    D, S = len(R), cholesky(complement)
+    # Writing the blocks into zeros takes a quarter of the time of `jnp.block`.
+    above = jnp.zeros((D + new_count,) * 2, R.dtype).at[:D, :D].set(R).at[:D, D:].set(B)
+    R = above.at[D:, D:].set(S)
     factor = eqx.tree_at(lambda f: f.R, old.factor, R)
     y = rows.y
-    # (SᵀS) c₂ = y₂ − K₂₁ c with the c of the old rows, which become c − R⁻¹B c₂.
+    # Block elimination: (SᵀS) c₂ = y₂ − K₂₁ c with the old coefficients c = A⁻¹y₁, which then
+    # become c₁ = c − A⁻¹K₁₂ c₂ = c − R⁻¹B c₂.
     last = backward(S, forward(S, (y[D:] - across.T @ old.representer)[:, None]))
     first = old.representer - backward(old.factor.R, B @ last)[:, 0]
     c = jnp.concatenate([first, last[:, 0]])
@@ -226,12 +239,12 @@ def _extended(old: DenseConditional, new: Measurements):
 
 
 @compiled
-def _corrected(given: DenseConditional, prior: Prior, key) -> KernelField:
-    """Matheron's rule, for every draw of the prior."""
-    rows = given.rows
-    would = prior.rows(rows)  # (D, count)
-    noise = jnp.sqrt(given.ridge) * jax.random.normal(key, would.shape, would.dtype)
-    c = given.factor.solve(rows.y[:, None] - would - noise)
+def _condition_draws(conditional: DenseConditional, prior: Prior, key) -> KernelField:
+    """The draws of the posterior, from draws of the prior by Matheron's rule (`low_rank.py`)."""
+    rows = conditional.rows
+    prior_rows = prior.rows(rows)  # (D, count)
+    noise = jnp.sqrt(conditional.ridge) * jax.random.normal(key, prior_rows.shape, prior_rows.dtype)
+    c = conditional.factor.solve(rows.y[:, None] - prior_rows - noise)
     Z, A, S, b = jax.vmap(rows.coefficients, out_axes=(None, 0, None, 0))(c.T)
     return prior.plus(Z, A, S, b) if len(S) else prior.plus(Z, A)
 
@@ -252,56 +265,62 @@ def field_of_rows(
 def gram_product(
     K: AbstractMatrixKernel, rows: Measurements, c: Float[Array, " D"]
 ) -> Float[Array, " D"]:
-    """G c: the rows of the field with these coefficients, by products without the Gram."""
+    """G c, computed as the rows of the field with coefficients c, without forming G."""
     zero = jnp.zeros((), c.dtype)
     field = field_of_rows(K, rows, c, c, zero, zero, SolverInfo("none"))
     potential = jax.tree_util.Partial(at_points, field._learned_potential)
     return rows.contrast(rows.of(field._evaluated, potential))
 
 
-def _unless_lost(field: KernelField, left: Array, N: int, throw: bool = True) -> KernelField:
-    """The field, if the factorisation succeeded."""
+def _refuse_failure(
+    field: KernelField, relative_residual: Array, N: int, throw: bool = True
+) -> KernelField:
+    """The field; RuntimeError, or NaN without `throw`, if the factorisation failed."""
     regularization = field.regularization
 
     def message() -> str:
-        known = require.is_concrete(regularization, left)
-        number = f" = {N * float(regularization):.3g}" if known else ""
-        solved = known and jnp.isfinite(left)
-        share = f" (its solution leaves a relative residual of {left:.2g})" if solved else ""
+        is_known = require.is_concrete(regularization, relative_residual)
+        number = f" = {N * float(regularization):.3g}" if is_known else ""
+        solved = is_known and jnp.isfinite(relative_residual)
+        share = (
+            f" (its solution leaves a relative residual of {relative_residual:.2g})"
+            if solved
+            else ""
+        )
         return (
             f"the Gram plus the ridge N * regularization{number} is not positive definite to "
-            f"rounding in {left.dtype}{share}. Likely causes, in order: the regularization is too "
-            "small for this Gram (points that coincide or lie close together for the lengthscale "
-            "make it singular): raise it; noise levels that are too different; float32 where "
-            "float64 is needed: jax.config.update('jax_enable_x64', True); a kernel that is not "
-            "positive definite or not finite: hk.check_kernel(k, X) finds out."
+            f"rounding in {relative_residual.dtype}{share}. Likely causes, in order: the "
+            "regularization is too small for this Gram (points that coincide or lie close together "
+            "for the lengthscale make it singular): raise it; noise levels that are too different; "
+            "float32 where float64 is needed: jax.config.update('jax_enable_x64', True); a kernel "
+            "that is not positive definite or not finite: hk.check_kernel(k, X) finds out."
         )
 
-    def learned(f):
+    def learned_arrays(f):
         return f.coefficients, f.residual, f.norm, f.value_coefficients
 
-    # Fitted values were measured to be wrong by 1 to 10 times ‖y − (G + σ²I)c‖/‖y‖, from full
-    # accuracy down to none.
-    failed = ~(require.on_host(left) <= 1e-2)
+    # The relative error of the fitted values was 1 to 10 times ‖y − (G + σ²I)c‖/‖y‖, at every
+    # accuracy.
+    failed = ~(require.on_host(relative_residual) <= 1e-2)
     if throw and require.is_concrete(failed):  # the field need not be taken apart
         return require.value(field, failed, message, RuntimeError)
-    values = require.value(learned(field), failed, message, RuntimeError, throw)
-    return eqx.tree_at(learned, field, values, is_leaf=lambda leaf: leaf is None)
+    values = require.value(learned_arrays(field), failed, message, RuntimeError, throw)
+    return eqx.tree_at(learned_arrays, field, values, is_leaf=lambda leaf: leaf is None)
 
 
 class Cholesky(AbstractSolver[KernelField]):
     """The dense Gram and its Cholesky factor: exact, O((N n)³) time and O((N n)²) memory.
 
-    `field.info.relative_residual` is the error that rounding leaves in the linear system; a fit in
-    which it is more than one per cent of the velocities is refused.
+    `field.info.relative_residual` is the relative residual ‖y − (G + NλI)a‖/‖y‖ that rounding
+    leaves. A fit with a relative residual above one per cent is refused.
 
     Raises:
         ValueError, from `fit`: the matrices do not fit in memory. RuntimeError, from `fit`: the
             ridge is too small for this Gram (the text says what to do).
     """
 
-    def _fitted(self, problem, throw=True, progress=False) -> KernelField:
-        return dense_field(problem.on_one_device(), throw, progress)
+    def fit(self, problem, throw=True, progress=False) -> KernelField:
+        return dense_field(problem.to_one_device(), throw, progress)
 
-    def _given(self, problem, throw=True, progress=False) -> DenseConditional:
-        return dense_conditional(problem.on_one_device(), throw, progress)
+    def condition(self, problem, throw=True, progress=False) -> DenseConditional:
+        return dense_conditional(problem.to_one_device(), throw, progress)

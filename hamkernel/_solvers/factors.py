@@ -1,24 +1,26 @@
-"""Factors of A = G + ridge I, of which every loss and posterior is made, and the dense ones.
+"""Factors of A = G + ridge I: the interface that losses and posteriors use, and dense factors.
 
-A *system* says what A is; its cotangent has the same type. Its *factor* solves with it, and the
-*inverse* C = A⁻¹, which need not be a matrix, has what validation losses and their derivatives
-need.
+Three types represent A. A *system* stores A, and cotangents of A have the same type. A *factor*
+solves with A. An *inverse* represents C = A⁻¹, as a matrix or implicitly, for the validation losses
+and their gradients.
 
 **Dense.** A = RᵀR by LAPACK, U = R⁻¹ from blocks of columns,
 
     U_<j,j = −(U_<j,<j R_<j,j) U_jj,        C = A⁻¹ = U Uᵀ,
 
-and quadratic forms as ‖R⁻ᵀy‖². C is then positive by construction. A faster inversion by blocks of
-C itself was wrong by a factor of 1e14 at condition 1e13; `tests/benchmarks/accuracy.py` compares
-this one with 100 digits from condition 1e2 to 1e14.
+and quadratic forms are ‖R⁻ᵀy‖². C is then positive by construction. A faster block inversion,
+C_<j,j from C itself, was wrong by a factor of 1e14 at condition 1e13.
+`tests/benchmarks/accuracy.py` compares the inverse used here with 100 digits, for conditions 1e2 to
+1e14.
 
-**With an unknown constant** in the direction p, ‖p‖ = 1, that is estimated as well, C = A⁻¹ becomes
+**An unknown constant** along p, ‖p‖ = 1, is estimated together with the field. Then C = A⁻¹ becomes
 
     C = A⁻¹ − A⁻¹p (pᵀA⁻¹p)⁻¹ pᵀA⁻¹ = Tᵀ (T A Tᵀ)⁻¹ T,
 
-the rows of T an orthonormal basis of the complement of p. dC = −C dA C still holds, and so do the
-residuals of held-out rows, (C_SS)⁻¹ (C y)_S, and their derivatives: each fit without a fold finds
-the constant anew. T is the reflection of p to the first axis, without its first row.
+where the rows of T are an orthonormal basis of the complement of p. dC = −C dA C still holds. So do
+the residuals of held-out rows, (C_SS)⁻¹ (C y)_S, and their derivatives; each fit without a fold
+then estimates the constant again. T is the reflection that maps p to the first axis, without its
+first row.
 
 Source: Du Croz & Higham (1992), IMA J. Numer. Anal. 12, method 2, on the stability of inversions;
 Dubrule (1983), Mathematical Geology 15, for held-out points with an unknown trend.
@@ -41,7 +43,7 @@ from hamkernel._machine import compiled, full_precision
 
 
 class Group:
-    """F folds of similar size, padded to S points each so that they can be worked on together.
+    """F folds of similar size, padded to S points each so that one batched operation serves all.
 
     Attributes:
         members: the points of each fold, shape (F, S), padded with N, which is no point.
@@ -60,7 +62,7 @@ class Group:
             by_point = jnp.take(by_point, points, axis=0, mode="fill", fill_value=0)
         return by_point.reshape(len(self.members), -1, *array.shape[1:])
 
-    def scattered(
+    def scatter(
         self, values: Float[Array, "F Sn *r"], into: Float[Array, "Nn *r"]
     ) -> Float[Array, "Nn *r"]:
         """`into` with the rows of these folds replaced; the padding is dropped."""
@@ -94,10 +96,10 @@ class AbstractInverse(eqx.Module, Generic[System]):
 
     @abc.abstractmethod
     def blocks(self, group: Group) -> AbstractBlocks:
-        """The diagonal blocks of the folds of a group."""
+        """The diagonal blocks C_SS of the folds S of a group."""
 
     @abc.abstractmethod
-    def pulled(
+    def vjp(
         self,
         u: Float[Array, " D"],
         w: Float[Array, " D"],
@@ -107,7 +109,7 @@ class AbstractInverse(eqx.Module, Generic[System]):
         """The cotangent of the system for Ā = u wᵀ + inverse · C + square · C²."""
 
     @abc.abstractmethod
-    def pulled_folds(
+    def vjp_of_folds(
         self,
         a: Float[Array, " D"],
         groups: list[Group],
@@ -119,7 +121,7 @@ class AbstractInverse(eqx.Module, Generic[System]):
 
         Args:
             a: A⁻¹y.
-            groups: of the folds S.
+            groups: the folds S.
             V: v_S = (C_SS)⁻¹ r̄_S.
             R: r_S = (C_SS)⁻¹ a_S.
             bars: r̄ and ā.
@@ -127,7 +129,7 @@ class AbstractInverse(eqx.Module, Generic[System]):
 
 
 class AbstractFactor(eqx.Module, Generic[System]):
-    """A, factored; NaN where it is not positive definite to rounding."""
+    """A factorisation of A; NaN if A is not positive definite to rounding."""
 
     size: eqx.AbstractVar[Float[Array, ""]]
 
@@ -136,7 +138,7 @@ class AbstractFactor(eqx.Module, Generic[System]):
         """A⁻¹ b."""
 
     @abc.abstractmethod
-    def solved(self, y: Float[Array, " D"]) -> tuple[Float[Array, " D"], Float[Array, ""]]:
+    def solve_with_form(self, y: Float[Array, " D"]) -> tuple[Float[Array, " D"], Float[Array, ""]]:
         """The coefficients a = A⁻¹y, and yᵀA⁻¹y as a sum of squares."""
 
     @property
@@ -153,8 +155,8 @@ class AbstractFactor(eqx.Module, Generic[System]):
     def inverse(self) -> AbstractInverse[System]:
         """C = A⁻¹."""
 
-    def trusted(self, y: Float[Array, " D"]) -> Bool[Array, ""]:
-        """Whether ε cond(A) leaves digits, with ‖A⁻¹‖ from two steps of the power method.
+    def is_well_conditioned(self, y: Float[Array, " D"]) -> Bool[Array, ""]:
+        """Whether ε cond(A) ≤ 0.02, with ‖A⁻¹‖ estimated by two steps of the power method.
 
         The steps do not start from y, which may be an eigenvector.
         """
@@ -162,9 +164,9 @@ class AbstractFactor(eqx.Module, Generic[System]):
         c = self.solve(b / jnp.linalg.norm(b))
         c = self.solve(c / jnp.linalg.norm(c))
         condition = jax.lax.stop_gradient(self.size * jnp.linalg.norm(c))
-        # Up to a condition of 9e13. At 1e13 the worst value and gradient of
-        # `tests/benchmarks/accuracy.py` were 2e-3 and 6e-3 off, at 1e14 2e-2 and 0.13, and at 1e16
-        # by factors.
+        # cond(A) ≤ 9e13 in float64. The worst relative errors of a loss and of its gradient in
+        # `tests/benchmarks/accuracy.py` were 2e-3 and 6e-3 at condition 1e13, and 2e-2 and 0.13 at
+        # 1e14; at 1e16 no digit was right.
         return condition * jnp.finfo(y.dtype).eps <= 2e-2
 
 
@@ -173,11 +175,11 @@ class AbstractSystem(eqx.Module):
 
     @abc.abstractmethod
     def factor(self) -> AbstractFactor:
-        """Its factor."""
+        """The factor of A."""
 
 
 class CholeskyBlocks(AbstractBlocks):
-    """Blocks by their own lower Cholesky factors."""
+    """Diagonal blocks C_SS, each with its lower Cholesky factor."""
 
     lower: Float[Array, "F s s"]
 
@@ -188,8 +190,8 @@ class CholeskyBlocks(AbstractBlocks):
         return jax.scipy.linalg.cho_solve((self.lower, True), b[..., None])[..., 0]
 
 
-# Rows of R made at once by `factor_in_place`. Its temporaries are four blocks of rows, and every
-# block compiles a program of its own, in 0.2 s.
+# The number of rows of R that `factor_in_place` computes at once. The temporaries are four blocks
+# of rows. Each block has a different shape and so compiles a program of its own, in 0.2 s.
 ROWS_IN_PLACE = 1000
 
 
@@ -292,7 +294,7 @@ class DenseFactor(AbstractFactor[DenseSystem]):
     def solve(self, b: Float[Array, "D *m"]) -> Float[Array, "D *m"]:
         return backward(self.R, forward(self.R, b.reshape(len(b), -1))).reshape(b.shape)
 
-    def solved(self, y: Float[Array, " D"]) -> tuple[Float[Array, " D"], Float[Array, ""]]:
+    def solve_with_form(self, y: Float[Array, " D"]) -> tuple[Float[Array, " D"], Float[Array, ""]]:
         z = self.whiten(y)
         return backward(self.R, z[:, None])[:, 0], z @ z
 
@@ -313,28 +315,29 @@ class DenseFactor(AbstractFactor[DenseSystem]):
         U = jnp.zeros_like(R)
         for j in _blocks(len(R)):
             before = slice(0, j.start)
-            own = backward(R[j, j], jnp.eye(j.stop - j.start, dtype=R.dtype))
+            diagonal_inverse = backward(R[j, j], jnp.eye(j.stop - j.start, dtype=R.dtype))
             # The barrier makes each call of LAPACK wait for the one before.
-            R, own = jax.lax.optimization_barrier((R, own))
-            U = U.at[j, j].set(own)
-            U = U.at[before, j].set(-(U[before, before] @ R[before, j]) @ own)
+            R, diagonal_inverse = jax.lax.optimization_barrier((R, diagonal_inverse))
+            U = U.at[j, j].set(diagonal_inverse)
+            U = U.at[before, j].set(-(U[before, before] @ R[before, j]) @ diagonal_inverse)
         return U
 
 
 def dense_factor(A: Float[Array, "D D"]) -> DenseFactor:
-    """The factor of A, inside of a compiled program."""
+    """The factor of A, for use inside a compiled program."""
     A, size = jax.lax.optimization_barrier((A, jnp.linalg.norm(A)))  # A is not kept
     return DenseFactor(cholesky(A), size)
 
 
 def factor_in_place(A: Float[Array, "D D"], steps: Callable[[Iterable], Iterable]) -> DenseFactor:
-    """The factor of A in the memory of A, which is lost.
+    """Factor A in place. The buffer of A is donated and must not be used afterwards.
 
-    Rows of R are made one block after the other,
+    Rows of R are computed one block after the other,
 
         S = A_jk − Σ_{i<j} R_ijᵀ R_ik,    R_jj = chol(S_jj),    R_jk = R_jj⁻ᵀ S_jk    for k > j.
 
-    The routine of LAPACK takes a second matrix for its result and a third for what XLA returns.
+    LAPACK's routine would need a second matrix for its result and a third for the copy that XLA
+    returns.
 
     Args:
         A: a matrix outside of any trace.
@@ -351,18 +354,18 @@ _norm = compiled(jnp.linalg.norm)
 
 
 @compiled(donate="all-except-first")
-def _rows_of_factor(at: tuple[int], A: Float[Array, "D D"]) -> Float[Array, "D D"]:
-    start, D = at[0], len(A)
+def _rows_of_factor(position: tuple[int], A: Float[Array, "D D"]) -> Float[Array, "D D"]:
+    start, D = position[0], len(A)
     b = min(ROWS_IN_PLACE, D - start)
 
-    def less(i, S):
+    def subtract_rows(i, S):
         above = jax.lax.dynamic_slice(A, (i * ROWS_IN_PLACE, start), (ROWS_IN_PLACE, D - start))
         return S - above[:, :b].T @ above
 
-    S = jax.lax.fori_loop(0, start // ROWS_IN_PLACE, less, A[start : start + b, start:])
-    own = _lapack_cholesky(S[:, :b])
-    rest = _lapack_forward(own, S[:, b:])
-    rows = jnp.concatenate([jnp.zeros((b, start), A.dtype), own, rest], axis=1)
+    S = jax.lax.fori_loop(0, start // ROWS_IN_PLACE, subtract_rows, A[start : start + b, start:])
+    diagonal = _lapack_cholesky(S[:, :b])
+    rest = _lapack_forward(diagonal, S[:, b:])
+    rows = jnp.concatenate([jnp.zeros((b, start), A.dtype), diagonal, rest], axis=1)
     return jax.lax.dynamic_update_slice(A, rows, (start, 0))
 
 
@@ -375,14 +378,14 @@ def solution(
 
 
 class DenseInverse(AbstractInverse[DenseSystem]):
-    """C as a matrix."""
+    """C = A⁻¹ as a matrix."""
 
     C: Float[Array, "D D"]
 
     def blocks(self, group: Group) -> CholeskyBlocks:
         return CholeskyBlocks(group.diagonal_blocks(self.C))
 
-    def pulled(self, u, w, inverse=None, square=None) -> DenseSystem:
+    def vjp(self, u, w, inverse=None, square=None) -> DenseSystem:
         A_bar = u[:, None] * w[None, :]
         if inverse is not None:
             A_bar = A_bar + inverse * self.C
@@ -390,23 +393,30 @@ class DenseInverse(AbstractInverse[DenseSystem]):
             A_bar = A_bar + square * (self.C @ self.C)
         return DenseSystem(A_bar)
 
-    def pulled_folds(self, a, groups, V, R, bars) -> tuple[DenseSystem, Float[Array, " D"]]:
-        P, Q = [], []  # C_:S v_S and C_:S r_S, a column for each fold
+    def vjp_of_folds(self, a, groups, V, R, bars) -> tuple[DenseSystem, Float[Array, " D"]]:
+        # Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − w aᵀ = [P, −w][Q, a]ᵀ, equation (2) of `_closed_forms.py`;
+        # P and Q have one column, C_:S v_S and C_:S r_S, for each fold, and w = Σ_S C_:S v_S + C ā.
+        P, Q = [], []
         for group, v, r in zip(groups, V, R, strict=True):
-            rows = group.gather(self.C)  # sums of rows are three times as fast as of columns
+            rows = group.gather(self.C)  # (F, s, D): C_S:, since sums of rows are 3 times as fast
             P.append(jnp.einsum("fid,fi->df", rows, v))
             Q.append(jnp.einsum("fid,fi->df", rows, r))
         w = jnp.concatenate(P, axis=1).sum(axis=1) + self.C @ bars[1]
         left, right = jnp.column_stack([*P, -w]), jnp.column_stack([*Q, a])
-        # Without the barrier XLA computes these sums again for every entry of the product, which
-        # takes 10 times as long.
+        # Without the barrier XLA fuses these sums into the product and computes them again for
+        # every entry, which takes 10 times as long.
         left, right, w = jax.lax.optimization_barrier((left, right, w))
         return DenseSystem(left @ right.T), w
 
 
 def _outer_square(U: Float[Array, "D D"]) -> Float[Array, "D D"]:
-    """U Uᵀ of an upper triangular U, at a third of the price of the product."""
-    C = U  # in its place: no column after j needs those before
+    """U Uᵀ for an upper triangular U, at a third of the price of the full product.
+
+    U_ik = 0 for k < i, so (U Uᵀ)_ij = Σ_{k ≥ max(i, j)} U_ik U_jkᵀ: with i ≤ j only the columns
+    k ≥ j count, and the lower half of U Uᵀ is the transpose of the upper one.
+    """
+    # C overwrites U: step j reads the columns from j.start on and writes only those before j.stop.
+    C = U
     for j in _blocks(len(U)):
         columns = C[: j.stop, j.start :] @ C[j, j.start :].T
         C = C.at[: j.stop, j].set(columns).at[j, : j.start].set(columns[: j.start].T)
@@ -414,19 +424,18 @@ def _outer_square(U: Float[Array, "D D"]) -> Float[Array, "D D"]:
 
 
 def _blocks(D: int) -> list[slice]:
-    """Blocks of 128 rows, and at most 8 of them, as large as each other.
+    """At most 8 blocks of equal size, of 128 rows or more.
 
-    More blocks take longer to compile (1.7 s for 16, 0.7 s for 8), and fewer are slower to run
-    (D = 592 to 2000).
+    16 blocks compile in 1.7 s and 8 in 0.7 s; fewer are slower to run (D = 592 to 2000).
     """
     starts = np.linspace(0, D, min(-(-D // 128), 8) + 1).astype(int).tolist()
     return [slice(start, stop) for start, stop in itertools.pairwise(starts)]
 
 
 class ContrastedSystem(AbstractSystem):
-    """A of the rows before the contrast, and the direction p of the unknown constant.
+    """The matrix A before the contrast, and the direction p of the unknown constant.
 
-    No entry of p is negative, and p is not differentiated.
+    The entries of p are not negative, and p is not differentiated.
     """
 
     matrix: Float[Array, "M M"]
@@ -439,7 +448,7 @@ class ContrastedSystem(AbstractSystem):
 
 
 class ContrastedFactor(AbstractFactor[ContrastedSystem]):
-    """C = Tᵀ(T A Tᵀ)⁻¹T in the place of A⁻¹."""
+    """The factor of T A Tᵀ; `solve` applies C = Tᵀ(T A Tᵀ)⁻¹T instead of A⁻¹."""
 
     inner: DenseFactor
     constant: Float[Array, " M"]
@@ -448,8 +457,8 @@ class ContrastedFactor(AbstractFactor[ContrastedSystem]):
     def solve(self, b: Float[Array, "M *m"]) -> Float[Array, "M *m"]:
         return _uncontrast(self.constant, self.inner.solve(_contrast(self.constant, b)))
 
-    def solved(self, y: Float[Array, " M"]) -> tuple[Float[Array, " M"], Float[Array, ""]]:
-        a, square = self.inner.solved(_contrast(self.constant, y))
+    def solve_with_form(self, y: Float[Array, " M"]) -> tuple[Float[Array, " M"], Float[Array, ""]]:
+        a, square = self.inner.solve_with_form(_contrast(self.constant, y))
         return _uncontrast(self.constant, a), square
 
     @property
@@ -466,23 +475,23 @@ class ContrastedFactor(AbstractFactor[ContrastedSystem]):
             DenseInverse(_uncontrast(p, _uncontrast(p, self.inner.inverse().C).T))
         )
 
-    def trusted(self, y: Float[Array, " M"]) -> Bool[Array, ""]:
-        return self.inner.trusted(_contrast(self.constant, y))
+    def is_well_conditioned(self, y: Float[Array, " M"]) -> Bool[Array, ""]:
+        return self.inner.is_well_conditioned(_contrast(self.constant, y))
 
 
 class ContrastedInverse(AbstractInverse[ContrastedSystem]):
-    """C as a matrix."""
+    """C = Tᵀ(T A Tᵀ)⁻¹T as a matrix."""
 
     dense: DenseInverse
 
     def blocks(self, group: Group) -> AbstractBlocks:
         return self.dense.blocks(group)
 
-    def pulled(self, u, w, inverse=None, square=None) -> ContrastedSystem:
-        return _cotangent(self.dense.pulled(u, w, inverse, square))
+    def vjp(self, u, w, inverse=None, square=None) -> ContrastedSystem:
+        return _cotangent(self.dense.vjp(u, w, inverse, square))
 
-    def pulled_folds(self, a, groups, V, R, bars) -> tuple[ContrastedSystem, Float[Array, " M"]]:
-        dense, w = self.dense.pulled_folds(a, groups, V, R, bars)
+    def vjp_of_folds(self, a, groups, V, R, bars) -> tuple[ContrastedSystem, Float[Array, " M"]]:
+        dense, w = self.dense.vjp_of_folds(a, groups, V, R, bars)
         return _cotangent(dense), w
 
 
@@ -492,14 +501,14 @@ def _cotangent(dense: DenseSystem) -> ContrastedSystem:
 
 def _contrast(p: Float[Array, " M"], b: Float[Array, "M *m"]) -> Float[Array, "D *m"]:
     """T b."""
-    return _reflected(p, b)[1:]
+    return _reflect(p, b)[1:]
 
 
 def _uncontrast(p: Float[Array, " M"], c: Float[Array, "D *m"]) -> Float[Array, "M *m"]:
     """Tᵀ c."""
-    return _reflected(p, jnp.concatenate([jnp.zeros_like(c[:1]), c]))
+    return _reflect(p, jnp.concatenate([jnp.zeros_like(c[:1]), c]))
 
 
-def _reflected(p: Float[Array, " M"], b: Float[Array, "M *m"]) -> Float[Array, "M *m"]:
+def _reflect(p: Float[Array, " M"], b: Float[Array, "M *m"]) -> Float[Array, "M *m"]:
     v = p.at[0].add(1.0)  # the reflection is I − vvᵀ/(1 + p₀)
     return b - jnp.tensordot(v / (1 + p[0]), v @ b, axes=0)

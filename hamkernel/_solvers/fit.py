@@ -15,18 +15,18 @@ from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import ControlledField, FamilyField, learned_field
 from hamkernel._fields.lagrangian import LagrangianField
 from hamkernel._machine import (
-    as_given,
     dense_bytes,
     full_precision,
     memory_bytes,
     one_blas_thread,
-    rows_of,
+    row_sharding,
+    to_caller_sharding,
 )
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.dense import Cholesky, copies
 from hamkernel._solvers.lagrangian import fit_lagrangian
-from hamkernel._solvers.problem import AbstractSolver, LearnedField, Problem, problem
+from hamkernel._solvers.problem import AbstractSolver, LearnedField, Problem, make_problem
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.family import AbstractFamily
@@ -132,26 +132,27 @@ def fit(
         regularization: λ > 0, in squared units of Y over those of the kernel. With other
             observations Nλ is the variance of a row of relative noise 1, and N counts points of
             velocities and equilibria, energies and functionals.
-        solver: if None, `Cholesky()` if its matrices of (N n)² numbers (two of velocities from 6000
-            rows on, else four) take at most half of the memory, else `ConjugateGradient()`; both
-            are exact, and `field.info.solver` names the one used. `Nystrom()` is faster, and
-            approximate to a stated tolerance. If the rows of X are sharded over a mesh of devices
-            they stay there, and None means `ConjugateGradient()`; only `Cholesky()` gathers them on
-            one device.
+        solver: if None, `Cholesky()` as long as its matrices take at most half of the memory, and
+            `ConjugateGradient()` otherwise. (There are four matrices of (N n)² numbers, or two for
+            velocities from 6000 rows on.) Both solvers are exact; `field.info.solver` names the one
+            used. `Nystrom()` is faster, and approximate to a stated tolerance. If the rows of X are
+            sharded over a mesh of devices, None means `ConjugateGradient()`, and the rows stay
+            there; only `Cholesky()` gathers them on one device.
         mean: the known part of the field, x (n,) -> (n,): a learned field, one of `hk.systems`, any
             function of one state. The kernel learns the rest, and the field is the sum; it has a
             Hamiltonian if both parts have one.
-        throw: whether a failed solve raises. If False, the learned field is NaN, and so is
-            `field.norm`: for `jax.vmap` over many hyperparameters, where one failure would end them
-            all, and for your own objectives in `tune`, which turns away from NaN.
-        inputs: of a `Controlled` kernel: u at each state, shape (N, m). What is learned is then a
+        throw: whether a failed solve raises. If False, the numbers of the field and `field.norm`
+            are NaN. Use this under `jax.vmap` over many hyperparameters, where one failure would
+            end all of them, and in your own objectives of `tune`, which avoids NaN.
+        inputs: for a `Controlled` kernel, u at each state, shape (N, m). The result is a
             `ControlledField`, field(x, u).
-        parameters: of a `Family`: θ at each state, shape (N, p). What is learned is then a
-            `FamilyField`, field(x, θ), and `field.at(θ)` an ordinary field.
-        progress: show a progress bar where the standard error is a terminal: of the iterations of
-            `ConjugateGradient`, with their residual, and of the blocks of `Cholesky` from 6000 rows
-            on. Ctrl-C ends the fit between two of them; inside of one it waits for it.
-        accelerations: of a `Lagrangian`, shape (N, m); X are then states (q, v), and Y torques.
+        parameters: for a `Family`, θ at each state, shape (N, p). The result is a `FamilyField`,
+            field(x, θ), and `field.at(θ)` is an ordinary field.
+        progress: show a progress bar if the standard error is a terminal: for the iterations of
+            `ConjugateGradient`, with their residuals, and for the blocks of `Cholesky` from 6000
+            rows on. Ctrl-C stops the fit between two iterations or blocks.
+        accelerations: for a `Lagrangian`, the accelerations, shape (N, m); X are then states
+            (q, v), and Y torques.
 
     Returns:
         The learned field. Works under jit, vmap and grad, with respect to every argument; new
@@ -172,43 +173,45 @@ def fit(
         return fit_lagrangian(K, X, Y, regularization, accelerations)
     if accelerations is not None:
         raise TypeError("accelerations= belongs to hk.Lagrangian(potential=…, inertia=…).")
-    given = problem(K, X, Y, regularization, mean, inputs, parameters, throw)
-    return field_of_problem(given, solver, throw, progress)
+    problem = make_problem(K, X, Y, regularization, mean, inputs, parameters, throw)
+    return field_of_problem(problem, solver, throw, progress)
 
 
 def field_of_problem(
-    given: Problem, solver: AbstractSolver | None, throw: bool = True, progress: bool = False
+    problem: Problem, solver: AbstractSolver | None, throw: bool = True, progress: bool = False
 ) -> AbstractField:
-    """The field by this solver, or by the default one if it is None."""
-    require.warn_of_float32(given.rows.targets)
+    """The field that the solver finds for a problem; the default solver if None."""
+    require.warn_of_float32(problem.rows.targets)
     if solver is None:
-        spread = rows_of(given.rows.points) is not None
-        solver = ConjugateGradient() if spread else default_solver(given)
-    field = solver._fitted(given, throw, progress)
-    if given.spread is not None and given.states is not None:
-        field = dataclasses.replace(field, residual=as_given(given.spread, field.residual))
-    return learned_field(field, given.known)
+        spread = row_sharding(problem.rows.points) is not None
+        solver = ConjugateGradient() if spread else default_solver(problem)
+    field = solver.fit(problem, throw, progress)
+    if problem.spread is not None and problem.states is not None:
+        field = dataclasses.replace(
+            field, residual=to_caller_sharding(problem.spread, field.residual)
+        )
+    return learned_field(field, problem.known)
 
 
 def check_solver(solver: Any) -> None:
-    """TypeError if it is no solver, nor None."""
+    """TypeError unless `solver` is a solver or None."""
     if not (solver is None or isinstance(solver, AbstractSolver)):
         raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
 
 
 def features_of_parts() -> RandomFeatures:
-    """The solver in the features of shared laws, which draws nothing."""
+    """The solver in the features of shared laws, which has no random draws."""
     return RandomFeatures(1, jax.random.key(0))
 
 
-def default_solver(given: Problem) -> AbstractSolver[Any]:
-    """Cholesky where it takes at most half of the memory of one device, which has all the data.
+def default_solver(problem: Problem) -> AbstractSolver[Any]:
+    """The solver for data on one device: Cholesky if it takes at most half of the memory.
 
-    Of laws that many parts share the features, which are exact and few.
+    Otherwise conjugate gradients; for shared laws their features, which are exact and few.
     """
-    if is_of_parts(given.kernel):
+    if is_of_parts(problem.kernel):
         return features_of_parts()
-    rows = given.rows
-    needed = dense_bytes(rows.size, rows.size, rows.targets.dtype, copies(given))
+    rows = problem.rows
+    needed = dense_bytes(rows.size, rows.size, rows.targets.dtype, copies(problem))
     memory = memory_bytes()
     return Cholesky() if memory is None or needed <= memory / 2 else ConjugateGradient()

@@ -1,10 +1,12 @@
-"""The least squares of a Lagrangian: torques are linear in V, in the entries of M, in friction."""
+"""The least squares of a Lagrangian: torques are linear in V, in the entries of M, in friction.
+
+Rows B w = y + ε have independent errors of variance one, and w ~ N(0, I).
+"""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,22 +14,35 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._fields.lagrangian import LagrangianField, least_inertia
+from hamkernel._fields.lagrangian import LagrangianField, lagrangian_field
 from hamkernel._machine import compiled
-from hamkernel._structures.lagrangian import Lagrangian, lagrangian_features
+from hamkernel._structures.friction import Friction
+from hamkernel._structures.lagrangian import (
+    Lagrangian,
+    LagrangianFeatures,
+    friction_of_joints,
+    lagrangian_features,
+)
+
+# Of a known entry of M: its error, as a share of the entry.
+_ANCHOR = 1e-4
 
 
-def fit_lagrangian(
-    K: Lagrangian, X: Any, torques: Any, regularization: Any, accelerations: Any
-) -> LagrangianField:
-    """The field of a `Lagrangian` from states (q, v), torques and accelerations; see `fit`.
+class TorqueData(NamedTuple):
+    """States (q, v) of shape (N, 2m), torques (N, m) and accelerations (N, m)."""
 
-    It warns where the mass matrix is not positive definite at the data by two deviations.
-    """
+    states: Float[Array, "N n"]
+    torques: Float[Array, "N m"]
+    accelerations: Float[Array, "N m"]
+
+
+def torque_data(K: Lagrangian, X: Any, torques: Any, accelerations: Any) -> TorqueData:
+    """The data of a strong form, checked."""
     if accelerations is None or torques is None:
         raise TypeError(
-            "a Lagrangian is learned from states (q, v), torques and accelerations: "
-            "hk.fit(K, X, torques, 1e-6, accelerations=A)."
+            "a Lagrangian is learned from states (q, v), torques and accelerations, "
+            "hk.fit(K, X, torques, 1e-6, accelerations=A), or from positions alone, "
+            "hk.learn(K, hk.Runs(times, q, inputs=torques))."
         )
     X, torques = require.points(X, "X"), require.points(torques, "the torques")
     A = require.points(accelerations, "accelerations")
@@ -37,47 +52,177 @@ def fit_lagrangian(
             f"X has shape {X.shape}, the torques {torques.shape} and accelerations {A.shape}: "
             "states (q, v) of shape (N, 2m), and torques and accelerations (N, m), are needed."
         )
-    if K.angles and max(K.angles) >= m:
-        raise ValueError(f"angles are {K.angles} and there are {m} positions, counted from 0.")
+    check_machine(K, torques, m)
     require.untraced("hk.fit of a Lagrangian", "Call it outside.", K, X, torques, A)
     X, torques = require.one_dtype(X, torques)
     X, A = require.one_dtype(X, A)
     X, torques = require.finite(X, "X"), require.finite(torques, "the torques")
-    A = require.finite(A, "accelerations")
-    if not np.asarray(torques).any():
+    require.warn_of_float32(torques)
+    return TorqueData(X, torques, require.finite(A, "accelerations"))
+
+
+def check_machine(K: Lagrangian, torques: Any, m: int) -> None:
+    """Raise unless K is of m positions, and there is a torque or a known entry of M."""
+    if K.angles and max(K.angles) >= m:
+        raise ValueError(f"angles are {K.angles} and there are {m} positions, counted from 0.")
+    if K.known_mass_matrix is not None:
+        if len(K.known_mass_matrix[0]) != m:
+            raise ValueError(
+                f"known_mass_matrix is of {len(K.known_mass_matrix[0])} positions and the data of "
+                f"{m}."
+            )
+    elif not np.asarray(torques).any():
         raise ValueError(
             "all torques are zero: without a force the scale of L is not determined, and L = 0 "
-            "fits everything. Add motions with a torque or a known load."
+            "fits everything. Add motions with a torque or a known load, or give an entry of M "
+            "that is known, hk.Lagrangian(…, known_mass_matrix=(q, M)), with NaN for the others."
         )
-    require.warn_of_float32(torques)
-    ridge = N * require.ridge(regularization, torques.dtype)
-    features = lagrangian_features(K, X)
-    R, weights, residual = _solved(features, X, A, torques, ridge)
-    unknown = jnp.zeros((), weights.dtype)
-    field = LagrangianField(features, weights, R, jnp.sqrt(ridge), residual, unknown, unknown)
-    least, deviation = least_inertia(field, X)
-    both = lambda f: (f.least_inertia, f.least_inertia_deviation)  # noqa: E731
-    field = eqx.tree_at(both, field, (least, deviation))
-    if not field.is_identified:
-        require.warn(
-            f"the mass matrix is not identified: its smallest eigenvalue at the data is "
-            f"{float(least):.3g}, with a standard deviation of {float(deviation):.3g}. Motions "
-            "along one path do not tell inertia from gravity and friction: add others, or "
-            "hk.Lagrangian(…, friction=True) where joints have friction."
-        )
+
+
+def fit_lagrangian(
+    K: Lagrangian, X: Any, torques: Any, regularization: Any, accelerations: Any
+) -> LagrangianField:
+    """The field of a `Lagrangian` from states (q, v), torques and accelerations; see `fit`.
+
+    It warns where the mass matrix is not positive definite at the data by two deviations, and where
+    friction of the joints is missing.
+    """
+    data = torque_data(K, X, torques, accelerations)
+    deviation = jnp.sqrt(len(data.states) * require.ridge(regularization, data.torques.dtype))
+    return field_of_torques(K, data, deviation)
+
+
+def field_of_torques(
+    K: Lagrangian, data: TorqueData, deviation: Float[Array, ""]
+) -> LagrangianField:
+    """The field from torques with errors of this standard deviation; see `fit_lagrangian`."""
+    features = lagrangian_features(K, data.states)
+    B, y = strong_rows(features, data, deviation)
+    m = features.count
+    R, weights = _solved(features, B, y)
+    residual = deviation * (y - B @ weights).reshape(-1, m)
+    noise = jnp.broadcast_to(deviation, (m,))
+    field = lagrangian_field(features, weights, R, noise, residual, data.states)
+    joints = ()
+    if K.friction is None:
+        columns = plain_friction(features, data.states[:, m:]).reshape(-1, 2 * m)
+        joints = missing_friction(B, y, columns / deviation)
+    said = verdicts(field, joints)
+    if said:
+        require.warn(" ".join(said))
     return field
 
 
+def verdicts(field: LagrangianField, joints: tuple[int, ...]) -> list[str]:
+    """What is wrong with a learned machine, in words."""
+    said = [field.refusal] if field.refusal else []
+    if joints:
+        said.append(
+            f"the torques are much likelier with friction in joint {', '.join(map(str, joints))}: "
+            "without it the mass matrix is wrong. Take hk.Lagrangian(…, friction=True)."
+        )
+    return said
+
+
 @compiled
-def _solved(features, X, A, torques, ridge: Float[Array, ""]) -> tuple[Array, Array, Array]:
-    rows = jax.lax.map(lambda point: features.of_torques(*point), (X, A), batch_size=64)
-    design, y = rows.reshape(-1, rows.shape[-1]), torques.reshape(-1)
-    r = design.shape[1]
-    above = jnp.sqrt(ridge) * jnp.eye(r, dtype=y.dtype)
-    both = jnp.concatenate(
-        [jnp.column_stack([above, jnp.zeros(r, y.dtype)]), jnp.column_stack([design, y])]
-    )
-    Q = jnp.linalg.qr(both, mode="r")
-    R = Q[:r, :r]
-    weights = solve_triangular(R, Q[:r, r])
-    return R, weights, (y - design @ weights).reshape(torques.shape)
+def strong_rows(
+    features: LagrangianFeatures, data: TorqueData, deviation: Float[Array, ""]
+) -> tuple[Float[Array, "R r"], Float[Array, " R"]]:
+    """The rows of torques at known accelerations, over their standard deviation."""
+
+    @jax.checkpoint
+    def at(point):
+        return features.of_torques(*point)
+
+    rows = jax.lax.map(at, (data.states, data.accelerations), batch_size=64)
+    rows = features.finished(rows).reshape(-1, features.columns)
+    return rows / deviation, data.torques.reshape(-1) / deviation
+
+
+def with_anchor(
+    features: LagrangianFeatures, B: Float[Array, "R r"], y: Float[Array, " R"]
+) -> tuple[Float[Array, "S r"], Float[Array, " S"]]:
+    """The rows with one more for each known entry of the mass matrix."""
+    known = features.kernel.known_mass_matrix
+    if known is None:
+        return B, y
+    q, M = np.asarray(known[0]), np.asarray(known[1], float)  # None is NaN
+    i, j = np.nonzero(np.triu(np.isfinite(M)))
+    size = _ANCHOR * np.abs(M[i, j]).max()
+    rows = features.finished(features.of_mass_matrix(jnp.asarray(q, B.dtype))[i, j])
+    values = jnp.asarray(M[i, j] / size, B.dtype)
+    return jnp.concatenate([B, rows / size]), jnp.concatenate([y, values])
+
+
+def solved(
+    B: Float[Array, "R r"], y: Float[Array, " R"]
+) -> tuple[Float[Array, "r r"], Float[Array, " r"]]:
+    """R with RᵀR = BᵀB + I, and w = (RᵀR)⁻¹Bᵀy, by orthogonal triangularisation."""
+    r = B.shape[1]
+    above = jnp.eye(r, r + 1, dtype=B.dtype)
+    Q = jnp.linalg.qr(jnp.concatenate([above, jnp.column_stack([B, y])]), mode="r")
+    return Q[:r, :r], solve_triangular(Q[:r, :r], Q[:r, r])
+
+
+@compiled
+def _solved(features, B, y) -> tuple[Array, Array]:
+    return solved(*with_anchor(features, B, y))
+
+
+def negative_log_likelihood(B: Float[Array, "R r"], y: Float[Array, " R"]) -> Float[Array, ""]:
+    """−log p(y) of y ~ N(0, BBᵀ + I), but for a constant: ½(‖y − Bw‖² + ‖w‖² + log|BᵀB + I|).
+
+    Its derivatives are (B(BᵀB + I)⁻¹ − (y − Bw)wᵀ) and y − Bw, for w is where the square is least:
+    they come from a function with both held, and not from those of the triangularisation.
+    """
+    R, w = jax.lax.stop_gradient(solved(*jax.lax.stop_gradient((B, y))))
+    residual = y - B @ w
+    square = 0.5 * (residual @ residual + w @ w)
+    inverse = solve_triangular(R, jax.lax.stop_gradient(B).T, trans="T")
+    slope = jnp.sum(solve_triangular(R, inverse).T * B)
+    log_determinant = jnp.log(jnp.abs(jnp.diagonal(R))).sum()
+    return square + slope + jax.lax.stop_gradient(log_determinant - slope)
+
+
+def missing_friction(
+    B: Float[Array, "R r"], y: Float[Array, " R"], columns: Float[Array, "R k"]
+) -> tuple[int, ...]:
+    """The joints whose friction makes the torques much likelier; `columns` are v and tanh(v/ε).
+
+    The size of the noise is that which is likeliest, with and without friction, so that a ridge
+    that is too small or a kernel that is too stiff do not look like friction.
+    """
+    unit = columns / jnp.maximum(jnp.linalg.norm(columns, axis=0), 1e-300)[None]
+    unit = unit * jnp.linalg.norm(y)  # a priori friction may be as large as the torques
+    gains = _friction_gains(B, y, unit)
+    return tuple(int(i) for i in np.flatnonzero(np.asarray(gains) > _FRICTION_GAIN))
+
+
+# log p that friction must gain to be named: 10 is the limit of "missing force" in `learn`. With it
+# the residual also must fall by a twentieth, which exact data with any small misfit would not show.
+_FRICTION_GAIN = 10.0
+
+
+@compiled
+def _friction_gains(B, y, columns) -> Float[Array, " m"]:
+    def profile(B):
+        R, w = solved(B, y)
+        square = jnp.sum((y - B @ w) ** 2) + w @ w
+        value = 0.5 * len(y) * jnp.log(square) + jnp.log(jnp.abs(jnp.diagonal(R))).sum()
+        return value, square
+
+    before, square = profile(B)
+    m = columns.shape[1] // 2
+
+    def of_joint(i):
+        pair = columns[:, jnp.stack([i, m + i])]
+        after, left = profile(jnp.concatenate([B, pair], axis=1))
+        return jnp.where(left < 0.95 * square, before - after, 0.0)
+
+    return jax.lax.map(of_joint, jnp.arange(m))
+
+
+@compiled
+def plain_friction(features: LagrangianFeatures, V: Float[Array, "N m"]) -> Float[Array, "N m k"]:
+    """The columns v and tanh(v/ε) of each joint at the velocities V, k = 2m."""
+    return jax.vmap(lambda v: friction_of_joints(Friction(1.0, 1.0), v, features.rest_speed))(V)

@@ -1,14 +1,14 @@
-"""Landmarks: the few rows whose columns of the Gram carry all of it, to a stated tolerance.
+"""Landmarks: a few rows whose columns of the Gram span it to a stated tolerance.
 
 A landmark is a row of the observations, a linear functional of the field or of its potential, and
 its column of the Gram is the representer of that functional. The n rows of a velocity are chosen
 together.
 
 Randomly pivoted Cholesky draws candidates with probability proportional to the diagonal of the
-residual G − Ĝ, where Ĝ is the Gram of the columns drawn so far: it prefers points at which the
-data say something new, and stops when the trace of the residual is small. Candidates are drawn in
-blocks; inside a block a candidate is kept with the probability that drawing one by one would have
-given it (Epperly, Tropp & Webber), so blocks change nothing but the speed.
+residual G − Ĝ, where Ĝ is the Nyström approximation from the columns drawn so far. The draws prefer
+points that the landmarks do not explain yet, and stop when the trace of the residual is small.
+Candidates are drawn in blocks. Rejection inside a block makes the distribution the same as for
+draws one by one (Epperly, Tropp & Webber), so blocks only change the speed.
 """
 
 import abc
@@ -27,22 +27,22 @@ from hamkernel._gram import (
     between_all,
     block_traces,
     components,
-    constant,
     gram_of_rows,
     gram_rounding,
+    without_gradient,
 )
-from hamkernel._machine import compiled, full_precision, rows_of, split
+from hamkernel._machine import compiled, full_precision, row_sharding, shard
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel
 
-# Candidates drawn at once. The number of landmarks is rounded up to a multiple of it, so that
-# similar fits share their compiled programs.
+# The number of candidates drawn at once. The number of landmarks is rounded up to a multiple of
+# BLOCK, so that similar fits share their compiled programs.
 BLOCK = 16
 
 
 class Landmarks(eqx.Module):
-    """Rows of linear functionals, and which of their columns are independent to rounding.
+    """Linear functionals, and which of their columns of the Gram are independent to rounding.
 
     Attributes:
         blocks: the rows, before any contrast of energies.
@@ -80,7 +80,7 @@ class Landmarks(eqx.Module):
     def representer(
         self, c: Float[Array, " r"]
     ) -> tuple[Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]]:
-        """The function Σ c_r L_r K: its points and coefficients, and those of its values."""
+        """The points and coefficients of the function Σ c_r L_r K, of velocities and of values."""
         if self.index is not None:
             c = jnp.zeros(self.rows.targets.shape, c.dtype).at[self.index].add(c)
         return self.rows.representer(c)
@@ -89,20 +89,20 @@ class Landmarks(eqx.Module):
 def choose_landmarks(
     K: AbstractMatrixKernel,
     X: Float[Array, "N d"],
-    left: Float[Array, ""],
-    most: int,
+    target_trace: Float[Array, ""],
+    max_count: int,
     candidates: int,
     key: Key[Array, ""],
 ) -> Landmarks:
-    """Points of X after which the mean of trace(K(x, x)) over X falls to `left`, at most `most`.
+    """Choose points of X until the mean of tr(K(x, x) − K̂(x, x)) over X is `target_trace` or less.
 
     Nothing is differentiated: the landmarks are constants of a fit.
 
     Args:
         K: a matrix-valued kernel.
         X: points.
-        left: the mean of trace(G − Ĝ) per point to stop at.
-        most: how many landmarks to choose at most.
+        target_trace: the mean of trace(G − Ĝ) per point at which to stop, shape ().
+        max_count: the largest number of landmarks.
         candidates: the points to choose from: X, or a random part of it if X is longer.
         key: for the draws.
 
@@ -113,61 +113,65 @@ def choose_landmarks(
     Source: Chen, Epperly, Tropp & Webber (2023), arXiv 2207.06503; in blocks, Epperly, Tropp &
         Webber (2024), arXiv 2410.03969.
     """
-    K, X, left = constant((K, X, left))
-    rows = rows_of(X)
-    X = split(rows, X)
+    K, X, target_trace = without_gradient((K, X, target_trace))
+    rows = row_sharding(X)
+    X = shard(rows, X)
     if len(X) > candidates:
-        X = X[_stratified(jax.random.split(key)[0], len(X), candidates)]
+        X = X[_stratified_sample(jax.random.split(key)[0], len(X), candidates)]
     if rows is not None:
-        X = rows.whole(X)
-    index, kept, count = _chosen(PointCandidates(K, X), left, min(most, len(X)), key)
+        X = rows.replicate(X)
+    index, kept, count = _choose(PointCandidates(K, X), target_trace, min(max_count, len(X)), key)
     return Landmarks((components(K, X[index]),), None, kept.reshape(-1), count)
 
 
 def choose_rows(
     K: AbstractMatrixKernel,
     rows: Measurements,
-    left: Float[Array, ""],
-    most: int,
+    target_trace: Float[Array, ""],
+    max_count: int,
     candidates: int,
     key: Key[Array, ""],
 ) -> Landmarks:
-    """`choose_landmarks` out of the rows of any observations, one row at a time.
+    """Choose single rows of any observations as landmarks, as `choose_landmarks` chooses points.
 
-    The constant of the energies is not taken off: trace(G − Ĝ) of the contrasts is no larger.
+    The constant of the energies is not projected out, since trace(G − Ĝ) of the contrasts is no
+    larger.
 
     Args:
         K: a matrix-valued kernel.
         rows: the observations; a row counts relative to its noise.
-        left: the mean of trace(G − Ĝ) per row to stop at.
-        most: how many landmarks to choose at most.
+        target_trace: the mean of trace(G − Ĝ) per row at which to stop, shape ().
+        max_count: the largest number of landmarks.
         candidates: the rows to choose from: all, or the rows of a random part of the observations.
         key: for the draws.
 
     Returns:
         The landmarks. O(P² + P r²) time and O(P²) memory for P candidates and r landmarks.
     """
-    K, rows, left = constant((K, rows, left))
+    K, rows, target_trace = without_gradient((K, rows, target_trace))
     blocks = rows.blocks
     size = sum(block.size for block in blocks)
     if size > candidates:
         blocks = _part(blocks, candidates / size, jax.random.split(key)[0])
     G = _gram_of_landmarks(K, landmarks_of(*blocks))
-    index, kept, count = _chosen(RowCandidates(G), left, min(most, len(G)), key)
-    return _pruned(blocks, index, kept.reshape(-1), count)
+    index, kept, count = _choose(RowCandidates(G), target_trace, min(max_count, len(G)), key)
+    return _prune(blocks, index, kept.reshape(-1), count)
 
 
-def _chosen(
-    candidates: "AbstractCandidates", left: Float[Array, ""], most: int, key: Key[Array, ""]
+def _choose(
+    candidates: "AbstractCandidates",
+    target_trace: Float[Array, ""],
+    max_count: int,
+    key: Key[Array, ""],
 ) -> tuple[Int[Array, " m"], Bool[Array, "m n"], Int[Array, ""]]:
     """The index of the chosen candidates, which of their columns are kept, and how many."""
-    if not require.is_concrete(candidates, left, key):
-        return _first_candidates(_begin(candidates, left, key, most), most)
-    size = min(64, most)  # of the buffer, which doubles until it suffices
-    drawn = _begin(candidates, left, key, size)
-    while int(drawn.count) >= size and size < most:
-        size = min(2 * size, most)
-        drawn = _draw(candidates, left, _enlarged(drawn, size + BLOCK), size)
+    if not require.is_concrete(candidates, target_trace, key):
+        return _first_candidates(_begin(candidates, target_trace, key, max_count), max_count)
+    size = min(64, max_count)  # of the buffer, which doubles until it holds all landmarks
+    drawn = _begin(candidates, target_trace, key, size)
+    while int(drawn.count) >= size and size < max_count:
+        size = min(2 * size, max_count)
+        drawn = _draw(candidates, target_trace, _enlarge(drawn, size + BLOCK), size)
     blocks = max(1, -(-int(drawn.count) // BLOCK))
     return _first_candidates(drawn, min(size, blocks * BLOCK))
 
@@ -177,7 +181,7 @@ def _gram_of_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[A
     return landmarks.gram(K)
 
 
-def _stratified(key, N: int, count: int) -> Int[Array, " count"]:
+def _stratified_sample(key, N: int, count: int) -> Int[Array, " count"]:
     """A random index out of each of `count` equal parts of N, in O(count) memory."""
     ends = np.arange(count + 1) * N // count
     index: Int[Array, " count"] = jax.random.randint(key, (count,), ends[:-1], ends[1:])
@@ -188,40 +192,40 @@ def _part(
     blocks: tuple[AbstractBlock, ...], share: float, key: Key[Array, ""]
 ) -> tuple[AbstractBlock, ...]:
     """A random share of the observations of each block; evenly spaced ones under tracing."""
-    found = []
+    parts = []
     for block in blocks:
         count = max(1, int(share * block.count))
         traced = not require.is_concrete(block, key)
         if isinstance(getattr(block, "kept", None), Tracer):
-            found.append(block)  # which rows there are is not known
+            parts.append(block)  # the number of its rows is traced
             continue
         even = np.arange(count) * block.count // count
-        chosen = even if traced else np.asarray(_stratified(key, block.count, count))
-        found.append(block.subset(chosen)[0])
-    return tuple(found)
+        chosen = even if traced else np.asarray(_stratified_sample(key, block.count, count))
+        parts.append(block.subset(chosen)[0])
+    return tuple(parts)
 
 
-def _pruned(
+def _prune(
     blocks: tuple[AbstractBlock, ...],
     index: Int[Array, " r"],
     kept: Bool[Array, " r"],
     count: Int[Array, ""],
 ) -> Landmarks:
-    """The landmarks without observations of which no row is used; all of them under tracing."""
+    """Drop the observations of which no row is a landmark; under tracing keep all."""
     if not require.is_concrete(blocks, index, kept):
         return Landmarks(blocks, index, kept, count)
     rows, used = np.asarray(index), np.asarray(kept)
     parts, places = [], np.zeros(len(rows), int)
     start = size = 0
     for block in blocks:
-        own = used & (rows >= start) & (rows < start + block.size)
-        if own.any() or (block is blocks[-1] and not parts):
-            chosen = np.unique(block.labels()[rows[own] - start])
-            # Other observations fill up a multiple of the block.
+        in_block = used & (rows >= start) & (rows < start + block.size)
+        if in_block.any() or (block is blocks[-1] and not parts):
+            chosen = np.unique(block.labels()[rows[in_block] - start])
+            # Further observations pad the number to a multiple of BLOCK.
             wanted = min(block.count, max(1, -(-len(chosen) // BLOCK)) * BLOCK)
-            others = np.setdiff1d(np.arange(block.count), chosen)[: wanted - len(chosen)]
-            part, taken, _ = block.subset(np.sort(np.concatenate([chosen, others])))
-            places[own] = size + np.searchsorted(taken, rows[own] - start)
+            padding = np.setdiff1d(np.arange(block.count), chosen)[: wanted - len(chosen)]
+            part, taken, _ = block.subset(np.sort(np.concatenate([chosen, padding])))
+            places[in_block] = size + np.searchsorted(taken, rows[in_block] - start)
             parts.append(part)
             size += part.size
         start += block.size
@@ -230,13 +234,14 @@ def _pruned(
 
 @compiled
 def given_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Landmarks:
-    """The landmarks with those columns kept that pivoted Cholesky finds independent.
+    """Keep the columns of the landmarks that pivoted Cholesky finds independent.
 
     O(r³) time for r columns. Nothing is differentiated, as in `choose_landmarks`.
     """
-    K, landmarks = constant((K, landmarks))
+    K, landmarks = without_gradient((K, landmarks))
     G = landmarks.gram(K)
-    # In units in which the diagonal is 1: the rounding errors of Cholesky are relative to it.
+    # Scaled to a unit diagonal, since the rounding errors of Cholesky are relative to the
+    # diagonal.
     norms = jnp.sqrt(jnp.abs(jnp.diagonal(G)))
     norms = jnp.where(norms > 0, norms, jnp.ones_like(norms))
     rounding = _rounding(jnp.ones(1, G.dtype), len(G))
@@ -247,28 +252,28 @@ def given_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Landmarks:
 
 
 def landmarks_of(*blocks: AbstractBlock) -> Landmarks:
-    """The landmarks that consist of all rows of some blocks, dependent rows included."""
+    """Landmarks that use all rows of some blocks, dependent rows included."""
     size = sum(block.size for block in blocks)
     return Landmarks(blocks, None, jnp.ones(size, bool), jnp.asarray(size))
 
 
 def _independent(matrix, rounding):
-    """Independent columns of a Gram, by pivoted Cholesky until the largest pivot is rounding.
+    """A mask of independent columns of a Gram: pivoted Cholesky down to pivots of rounding size.
 
-    Without pivoting, columns whose pivots all exceed rounding may still depend on each other: only
-    with pivoting does a small eigenvalue show in a small pivot.
+    Without pivoting, columns with pivots above rounding may still be dependent. Only pivoting
+    makes a small eigenvalue show as a small pivot.
     """
 
     def more(carry):
-        rank, _, left, _ = carry
-        return (rank < len(matrix)) & (left.max() > rounding)
+        rank, _, diagonal, _ = carry
+        return (rank < len(matrix)) & (diagonal.max() > rounding)
 
     def column(carry):
-        rank, factor, left, kept = carry
-        c = jnp.argmax(left)
-        v = (matrix[c] - factor[:, c] @ factor) / jnp.sqrt(left[c])
-        left = (left - v**2).at[c].set(0.0)
-        return rank + 1, factor.at[rank].set(v), left, kept.at[c].set(True)
+        rank, factor, diagonal, kept = carry
+        c = jnp.argmax(diagonal)
+        v = (matrix[c] - factor[:, c] @ factor) / jnp.sqrt(diagonal[c])
+        diagonal = (diagonal - v**2).at[c].set(0.0)
+        return rank + 1, factor.at[rank].set(v), diagonal, kept.at[c].set(True)
 
     none = jnp.zeros(len(matrix), bool)
     start = (jnp.zeros((), int), jnp.zeros_like(matrix), jnp.diagonal(matrix), none)
@@ -278,7 +283,10 @@ def _independent(matrix, rounding):
 def _rounding(traces: Float[Array, " P"], columns: int) -> Float[Array, " P"]:
     """The rounding error of pivots that should be zero, given their traces before elimination.
 
-    The error of Cholesky's method is relative to the diagonal entry of the same row.
+    The error of Cholesky's method is relative to the diagonal entry of the same row: in exact
+    arithmetic a pivot is a_cc − Σ_k v_kc², whose r terms round to at most r ε a_cc together
+    (Higham (2002), theorem 10.3, with γ_{r+1} ≈ r ε). The factor 10 is a margin for the entries
+    of the Gram, which have a few roundings of their own.
     """
     return (10 * columns * gram_rounding(jnp.abs(traces))).astype(traces.dtype)
 
@@ -337,39 +345,39 @@ class RowCandidates(AbstractCandidates):
         return self.matrix[index]
 
 
-class _Drawn(NamedTuple):
-    """The state of the drawing, in buffers of m + BLOCK points."""
+class _Drawing(NamedTuple):
+    """The state of randomly pivoted Cholesky, in buffers of m + BLOCK points."""
 
     count: Int[Array, ""]
     index: Int[Array, " m"]
     kept: Bool[Array, "m n"]
     factor: Float[Array, "m n P n"]  # Ĝ = FᵀF over the candidates
-    left: Float[Array, " P"]  # the traces of the diagonal blocks of G − Ĝ
-    rounding: Float[Array, " P"]  # what a pivot must exceed
+    traces: Float[Array, " P"]  # the traces of the diagonal blocks of G − Ĝ
+    rounding: Float[Array, " P"]  # the smallest acceptable pivot
     key: Key[Array, ""]
     rounds: Int[Array, ""]
 
 
 @compiled
-def _begin(candidates: AbstractCandidates, left, key, size):
+def _begin(candidates: AbstractCandidates, target_trace, key, size):
     """The state after the first call of `_draw`."""
     traces, n = candidates.traces, candidates.outputs
     P, buffer = len(traces), size + BLOCK
     zero = jnp.zeros((), int)
-    drawn = _Drawn(
+    drawn = _Drawing(
         count=zero,
         index=jnp.zeros(buffer, int),
         kept=jnp.zeros((buffer, n), bool),
         factor=jnp.zeros((buffer, n, P, n), traces.dtype),
-        left=traces,
+        traces=traces,
         rounding=_rounding(traces, buffer * n),
-        key=jax.random.split(key)[1],  # the other is for the candidates
+        key=jax.random.split(key)[1],  # [0] is the key of the candidates
         rounds=zero,
     )
-    return _draw(candidates, left, drawn, size)
+    return _draw(candidates, target_trace, drawn, size)
 
 
-def _enlarged(drawn: _Drawn, size: int) -> _Drawn:
+def _enlarge(drawn: _Drawing, size: int) -> _Drawing:
     def longer(a):
         return jnp.concatenate([a, jnp.zeros((size - len(a), *a.shape[1:]), a.dtype)])
 
@@ -379,28 +387,31 @@ def _enlarged(drawn: _Drawn, size: int) -> _Drawn:
 
 
 @compiled
-def _draw(candidates: AbstractCandidates, left, drawn, size):
-    """Draw blocks until the mean trace is at most `left` or `size` candidates are chosen."""
-    goal = jnp.maximum(left, drawn.rounding).sum()
+def _draw(candidates: AbstractCandidates, target_trace, drawn, size):
+    """Draw blocks until the mean trace is at most `target_trace` or `size` points are chosen."""
+    goal = jnp.maximum(target_trace, drawn.rounding).sum()
 
     def more(drawn):
-        # The number of rounds is bounded, since rounding errors alone could go on for ever.
-        wanted = (drawn.left.sum() > goal) & (drawn.count < size) & (drawn.rounds < 4 * size)
+        # The number of rounds is bounded, since rounding errors could keep the trace above the
+        # goal.
+        wanted = (drawn.traces.sum() > goal) & (drawn.count < size) & (drawn.rounds < 4 * size)
         return wanted | (drawn.rounds == 0)
 
     return jax.lax.while_loop(more, lambda drawn: _draw_block(candidates, drawn), drawn)
 
 
-def _draw_block(candidates: AbstractCandidates, drawn: _Drawn) -> _Drawn:
-    P, n = len(drawn.left), drawn.kept.shape[1]
+def _draw_block(candidates: AbstractCandidates, drawn: _Drawing) -> _Drawing:
+    P, n = len(drawn.traces), drawn.kept.shape[1]
     key, draw, accept = jax.random.split(drawn.key, 3)
-    index = jax.random.choice(draw, P, (BLOCK,), p=drawn.left / drawn.left.sum())
+    index = jax.random.choice(draw, P, (BLOCK,), p=drawn.traces / drawn.traces.sum())
     size = len(drawn.index)
-    factor = drawn.factor.reshape(size * n, P * n)
-    at_index = drawn.factor[:, :, index].reshape(size * n, BLOCK * n)
+    factor = drawn.factor.reshape(size * n, P * n)  # (m, n, P, n) -> (m n, P n)
+    at_index = drawn.factor[:, :, index].reshape(size * n, BLOCK * n)  # (m, n, B, n) -> (m n, B n)
+    # The rows B of G − Ĝ with Ĝ = FᵀF: G_B: − (F_:B)ᵀF, (B n, P n). They become new rows of F by
+    # L⁻¹, where LLᵀ is the block of G − Ĝ of the accepted candidates.
     rows = candidates.gram(index) - at_index.T @ factor
     block = rows.reshape(BLOCK * n, P, n)[:, index].reshape(BLOCK * n, BLOCK * n)
-    L, kept = _accepted(accept, block, n, drawn.rounding[index])
+    L, kept = _accept(accept, block, n, drawn.rounding[index])
     new = jax.scipy.linalg.solve_triangular(L, rows, lower=True)
     new = jnp.where(kept[:, None], new, jnp.zeros_like(new))
 
@@ -409,29 +420,35 @@ def _draw_block(candidates: AbstractCandidates, drawn: _Drawn) -> _Drawn:
     chosen = kept.any(axis=1)
     order = jnp.argsort(~chosen, stable=True)
     new = new.reshape(BLOCK, n, P, n)
-    left = drawn.left - jnp.sum(new**2, axis=(0, 1, 3))
-    left = left.at[index].multiply(jnp.where(chosen, 0.0, 1.0).astype(left.dtype))
+    traces = drawn.traces - jnp.sum(new**2, axis=(0, 1, 3))
+    traces = traces.at[index].multiply(jnp.where(chosen, 0.0, 1.0).astype(traces.dtype))
 
-    def written(buffer, values):
+    def write(buffer, values):
         start = (drawn.count,) + (0,) * (buffer.ndim - 1)
         return jax.lax.dynamic_update_slice(buffer, values[order], start)
 
-    return _Drawn(
+    return _Drawing(
         count=drawn.count + chosen.sum(),
-        index=written(drawn.index, index.astype(drawn.index.dtype)),
-        kept=written(drawn.kept, kept),
-        factor=written(drawn.factor, new),
-        left=jnp.maximum(left, jnp.zeros_like(left)),
+        index=write(drawn.index, index.astype(drawn.index.dtype)),
+        kept=write(drawn.kept, kept),
+        factor=write(drawn.factor, new),
+        traces=jnp.maximum(traces, jnp.zeros_like(traces)),
         rounding=drawn.rounding,
         key=key,
         rounds=drawn.rounds + 1,
     )
 
 
-def _accepted(key, block, n, rounding):
-    """Cholesky of the accepted columns of `block`, with the identity in the place of the others.
+def _accept(key, block, n, rounding):
+    """The Cholesky factor of the accepted points of `block`; identity rows for the refused ones.
 
-    Point j is kept with a probability that is the ratio of its trace now to that before the block.
+    The candidates of a block were drawn with probabilities proportional to their traces t_j before
+    the block. Sequential sampling would draw candidate j in proportion to its trace t′_j after
+    the elimination of the points accepted before it. Accepting j with probability t′_j / t_j,
+    u t_j < t′_j for uniform u, gives it this probability (rejection sampling: t′_j ≤ t_j, because
+    elimination only lowers a diagonal). Epperly et al. state this for scalar pivots; the trace of
+    a point's n × n block takes the place of the pivot here. The candidates are independent given
+    the factor before the block, so the argument holds for each of them in turn.
     """
     before = jnp.diagonal(block).reshape(-1, n).sum(axis=1)
     thresholds = jnp.maximum(jax.random.uniform(key, before.shape, block.dtype) * before, rounding)
@@ -439,7 +456,11 @@ def _accepted(key, block, n, rounding):
 
 
 def _masked_cholesky(block, thresholds, n, rounding):
-    """Cholesky of the points whose trace exceeds its threshold when their turn comes."""
+    """Block Cholesky that skips points of small trace.
+
+    A point is skipped if its trace, after elimination of the points before it, is below its
+    threshold.
+    """
 
     def column(c, carry):
         block, L, kept, chosen = carry
@@ -455,32 +476,32 @@ def _masked_cholesky(block, thresholds, n, rounding):
     size = len(block)
     start = (block, jnp.zeros_like(block), jnp.zeros(size, bool), jnp.zeros((), bool))
     _, L, kept, _ = jax.lax.fori_loop(0, size, column, start)
-    return masked(jnp.tril(L), kept), kept
+    return mask_columns(jnp.tril(L), kept), kept
 
 
-def masked(matrix: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[Array, "r r"]:
-    """`matrix` on the kept rows and columns, the identity on the others."""
+def mask_columns(matrix: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[Array, "r r"]:
+    """The matrix with the rows and columns that are not kept replaced by those of the identity."""
     both = kept[:, None] & kept[None, :]
     return jnp.where(both, matrix, jnp.diag(~kept).astype(matrix.dtype))
 
 
 @compiled
 def _first_candidates(drawn, size):
-    """The first candidates drawn, at most `size`."""
+    """The first `size` chosen candidates: index, kept columns, and the number of candidates."""
     used = jnp.arange(size) < drawn.count
     kept = drawn.kept[:size] & used[:, None]
     return drawn.index[:size], kept, jnp.minimum(drawn.count, size)
 
 
 def whitening(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r r"]:
-    """T with T Tᵀ = G_SS⁻¹ on the kept columns, zero on the others."""
+    """A matrix T with T Tᵀ = G_SS⁻¹ on the kept columns, zero on the others."""
     return _inverse_root(landmarks.gram(K), landmarks.kept)
 
 
 @jax.custom_jvp
 @full_precision
 def _inverse_root(G: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[Array, "r r"]:
-    L = jnp.linalg.cholesky(masked(G, kept))
+    L = jnp.linalg.cholesky(mask_columns(G, kept))
     T = jax.scipy.linalg.solve_triangular(L, jnp.eye(len(G), dtype=G.dtype), lower=True).T
     both = kept[:, None] & kept[None, :]
     return jnp.where(both, T, jnp.zeros_like(T))
@@ -489,8 +510,10 @@ def _inverse_root(G: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[Arra
 @_inverse_root.defjvp
 @full_precision
 def _(primals, tangents):
-    # Only T Tᵀ = G⁻¹ matters, and its derivative is the same with this dT as with that of the
-    # Cholesky factor, whose rounding error grows with the condition of G.
+    # T Tᵀ = G⁻¹ gives dT Tᵀ + T dTᵀ = −G⁻¹ dG G⁻¹ = −T Tᵀ dG T Tᵀ, solved by dT = −½ T (Tᵀ dG T).
+    # All callers use T only through T Tᵀ, whose derivative this dT gives exactly. Note that dT is
+    # not the derivative of the triangular T returned here; the rounding error of that derivative
+    # would grow with the condition of G.
     (G, kept), (dG, _) = primals, tangents
     T = _inverse_root(G, kept)
     return T, -0.5 * T @ (T.T @ dG @ T)

@@ -1,21 +1,21 @@
 """Linear least squares whose rows Φ are made in tiles and never stored.
 
-minimise ‖Φw − y‖² + δ‖w‖² for a tall Φ (m, r). Two ways keep the digits that the normal equations
-ΦᵀΦ would lose.
+Minimise ‖Φw − y‖² + δ‖w‖² for a tall Φ (m, r). Two algorithms keep the digits that the normal
+equations ΦᵀΦ would lose.
 
-**A triangle.** The state is the triangular factor of [Φ y] alone, below √δ [I 0] from the start:
-orthogonal transformations of the rows change no norm, so the factor of the rows seen so far, with
-new rows below it, has the factor of all of them (Golub & Van Loan, section 6.5.3; Demmel et al.
-(2012), "tall and skinny QR").
+**A triangle.** The state is the triangular factor of √δ [I 0] above [Φ y]. Orthogonal
+transformations of the rows change no norm. The QR of this factor with new rows below it is
+therefore the factor of all rows (Golub & Van Loan, section 6.5.3; Demmel et al. (2012), "tall and
+skinny QR").
 
 **Sums in the basis of a sample.** The normal equations lose the digits of the condition of
 ΦᵀΦ + NλI, which is of order 1/λ, because small directions drown in the rounding of the large ones.
-So the sums are over the rows ΦR⁻¹ instead, where RᵀR = ΦᵀΦ/N + λI on a sample of the data: in this
-basis the system is near N times the identity and no direction is small. The rounding of ΦR⁻¹ is
-left, of order ε/√λ, as with a QR of all rows, which costs several times as much and waits for
-threads on a busy machine. This is the second pass of a Cholesky QR (Fukaya et al. (2020), "shifted
-Cholesky QR"), whose first pass needs to see a sample only. Rows that the sample does not resemble
-are treated no worse than by the normal equations.
+The sums therefore run over the rows of ΦR⁻¹, where RᵀR = ΦᵀΦ/N + λI on a sample of the data. In
+this basis the system is close to N times the identity and no direction is small. The rounding of
+ΦR⁻¹ remains, of order ε/√λ. A QR of all rows has the same rounding, costs several times as much and
+waits for threads on a busy machine. This is the second pass of a Cholesky QR (Fukaya et al. (2020),
+"shifted Cholesky QR"), whose first pass needs only a sample of the rows. If the sample is
+unrepresentative, the result is as accurate as the normal equations, not worse.
 """
 
 from collections.abc import Callable
@@ -26,12 +26,12 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
-from hamkernel._gram import constant, plus_ridge
+from hamkernel._gram import plus_ridge, without_gradient
 from hamkernel._machine import RowSharding, on_each
 from hamkernel._sizes import sizes
 
-# A design gives the rows of some points at once: (t, n) -> (t, n, r), row (i, a) of a field's
-# component a at point i.
+# A design maps t points to their rows, (t, n) -> (t, n, r); row (i, a) is component a of each of
+# the r fields at point i.
 Design = Callable[[Float[Array, "t n"]], Float[Array, "t n r"]]
 
 
@@ -43,18 +43,20 @@ def triangle_of_design(
     ridge: Float[Array, ""],
     spread: RowSharding | None = None,
 ) -> Float[Array, "k k"]:
-    """The upper triangular factor of √ridge [I 0] above [Φ y]: R, and Qᵀy beside it.
+    """The upper triangular factor [R, Qᵀy] of √ridge [I 0] above [Φ y], shape (r + 1, r + 1).
 
-    From the start with the ridge: a QR of Φ alone, where it has fewer rows than columns, divides by
-    the rounding errors of the dependent ones, again and again until these underflow to NaN.
+    The factorisation starts from the ridge rows √δ I. Without them a tile with fewer rows than
+    columns is rank deficient, and repeated updates divide by rounding errors until they underflow
+    to NaN.
     """
 
-    def own_triangle(whole, X, Y):
-        design, ridge = whole
+    def triangle_of_device(replicated, X, Y):
+        design, ridge = replicated
 
         def step(factor, tile):
             rows = design(tile[0])  # (t, n, r)
-            below = jnp.concatenate([rows, tile[1][..., None]], axis=2).reshape(-1, columns + 1)
+            below = jnp.concatenate([rows, tile[1][..., None]], axis=2)  # (t, n, r + 1)
+            below = below.reshape(-1, columns + 1)  # (t n, r + 1)
             return jnp.linalg.qr(jnp.concatenate([factor, below]), mode="r"), None
 
         on_diagonal = jnp.append(jnp.full(columns, jnp.sqrt(ridge)), jnp.zeros((), Y.dtype))
@@ -62,11 +64,13 @@ def triangle_of_design(
 
     ridge = ridge if spread is None else ridge / spread.count
     return on_each(
-        spread, own_triangle, (design, ridge), X, Y, joined=False, reduce=_merged_triangle
+        spread, triangle_of_device, (design, ridge), X, Y, joined=False, reduce=_merge_triangles
     )
 
 
-def _merged_triangle(spread: RowSharding, own: Float[Array, "k k"]) -> Float[Array, "k k"]:
+def _merge_triangles(
+    spread: RowSharding, device_triangle: Float[Array, "k k"]
+) -> Float[Array, "k k"]:
     """The triangular factor of the rows of all devices, from the factor `own` of each device.
 
     The factors are merged one after the other: no device holds more than two of them, and all
@@ -75,10 +79,10 @@ def _merged_triangle(spread: RowSharding, own: Float[Array, "k k"]) -> Float[Arr
 
     def join(device, factor):
         is_mine = jax.lax.axis_index(spread.axes) == device
-        theirs = spread.sum(jnp.where(is_mine, own, jnp.zeros_like(own)))
+        theirs = spread.sum(jnp.where(is_mine, device_triangle, jnp.zeros_like(device_triangle)))
         return jnp.linalg.qr(jnp.concatenate([factor, theirs]), mode="r")
 
-    return jax.lax.fori_loop(0, spread.count, join, jnp.zeros_like(own))
+    return jax.lax.fori_loop(0, spread.count, join, jnp.zeros_like(device_triangle))
 
 
 def ridge_regression(
@@ -100,16 +104,16 @@ def ridge_regression(
         X: points.
         Y: targets.
         ridge: δ > 0.
-        spread: the devices over which points and targets are spread, if they are.
+        spread: the sharding of points and targets; None if they lie on one device.
     """
-    fixed, fixed_X, fixed_Y, fixed_ridge = constant((design, X, Y, ridge))
-    R = constant(triangle_of_design(fixed, columns, fixed_X, fixed_Y, fixed_ridge, spread))
+    fixed, fixed_X, fixed_Y, fixed_ridge = without_gradient((design, X, Y, ridge))
+    R = without_gradient(triangle_of_design(fixed, columns, fixed_X, fixed_Y, fixed_ridge, spread))
     R, rotated = R[:-1, :-1], R[:-1, -1]
     w = solve_triangular(R, rotated)
 
-    # One step of iterative refinement, w + H⁻¹(Φᵀ(y − Φw) − δw) with H = ΦᵀΦ + δI = RᵀR. It equals
-    # H⁻¹Φᵀy for every w, so that its derivatives are exact although w and R are held constant,
-    # and no derivative of a QR is needed (it does not exist where R is singular).
+    # One step of iterative refinement, w + H⁻¹(Φᵀ(y − Φw) − δw) with H = ΦᵀΦ + δI = RᵀR. The step
+    # equals H⁻¹Φᵀy for every w. Its derivatives are therefore exact although w and R are held
+    # constant, and no derivative of a QR is needed (none exists if R is singular).
     def times_H(v):
         return ridge * v - _correlations(design, X, jnp.zeros_like(Y), v, spread)
 
@@ -128,24 +132,24 @@ def residual(
     w: Float[Array, " r"],
     spread: RowSharding | None = None,
 ) -> Float[Array, "N n"]:
-    """Y − Φw, tile by tile, where the rows are."""
+    """The residual Y − Φw, tile by tile, on the devices that hold the rows."""
 
-    def own_residual(whole, X, Y):
-        design, w = whole
+    def residual_of_device(replicated, X, Y):
+        design, w = replicated
 
         def step(_, tile):
             return None, tile[1] - design(tile[0]) @ w
 
         return over_tiles(step, None, (X, Y), _rows_of_tile(len(w)))[1]
 
-    return on_each(spread, own_residual, (design, w), X, Y, joined=True)
+    return on_each(spread, residual_of_device, (design, w), X, Y, joined=True)
 
 
 def _correlations(design, X, Y, w, spread: RowSharding | None) -> Float[Array, " r"]:
     """Φᵀ(Y − Φw)."""
 
-    def own_correlations(whole, X, Y):
-        design, w = whole
+    def correlations_of_device(replicated, X, Y):
+        design, w = replicated
 
         def step(total, tile):
             rows = design(tile[0])
@@ -153,7 +157,7 @@ def _correlations(design, X, Y, w, spread: RowSharding | None) -> Float[Array, "
 
         return over_tiles(step, jnp.zeros_like(w), (X, Y), _rows_of_tile(len(w)))[0]
 
-    return on_each(spread, own_correlations, (design, w), X, Y, joined=False)
+    return on_each(spread, correlations_of_device, (design, w), X, Y, joined=False)
 
 
 def over_tiles(step, carry, data: tuple[Array, Array], rows: int):
@@ -178,55 +182,57 @@ def over_tiles(step, carry, data: tuple[Array, Array], rows: int):
 
 
 def _rows_of_tile(columns: int) -> int:
-    """The rows of a tile.
+    """The number of rows of a tile.
 
-    Appending `rows` rows to a factor of r columns costs (rows + r) r²; with 3r rows a quarter of
-    that is spent on the factor.
+    Appending `rows` rows to a factor of r columns costs (rows + r) r². With 3r rows, a quarter of
+    the cost is spent on the factor.
     """
     return max(1024, 3 * columns)
 
 
 class Normal(eqx.Module):
-    """The sums over rows F with targets y; those of parts of the rows add up."""
+    """The normal equations of rows F with targets y; the sums of two sets of rows add up."""
 
     square: Float[Array, "r r"]  # FᵀF
     moment: Float[Array, " r"]  # Fᵀy
     energy: Float[Array, ""]  # yᵀy
 
     @classmethod
-    def of(cls, rows: Float[Array, "D r"], y: Float[Array, " D"]) -> "Normal":
-        """The sums over rows that were made already."""
+    def from_rows(cls, rows: Float[Array, "D r"], y: Float[Array, " D"]) -> "Normal":
+        """The normal equations of a matrix of rows."""
         return cls(rows.T @ rows, rows.T @ y, y @ y)
 
 
 class Sums(eqx.Module):
-    """The sums over all rows seen so far, r² numbers. Rows are those of a design, times `basis`.
+    """The normal equations of all rows so far, r² numbers. A row is one of a design times `basis`.
 
     Attributes:
         triangle: R, upper triangular, shape (r, r).
         basis: R⁻¹, or WR⁻¹ if Φ is a design times W, shape (r, r).
-        seen: the sums over ΦR⁻¹ and y.
+        normal_equations: the sums over the rows of ΦR⁻¹ and y.
     """
 
     triangle: Float[Array, "r r"]
     basis: Float[Array, "r r"]
-    seen: Normal
+    normal_equations: Normal
 
 
-def first_sums(seen: Normal, W: Float[Array, "r r"], count: int, ridge: Float[Array, ""]) -> Sums:
-    """The sums before the first row, in the basis of a sample and of λ = ridge.
+def first_sums(
+    normal_equations: Normal, W: Float[Array, "r r"], count: int, ridge: Float[Array, ""]
+) -> Sums:
+    """Sums over no rows yet, in the basis that a sample and λ = ridge define.
 
     Args:
-        seen: the sums over the rows of the sample, in the basis W.
-        W: the matrix that the rows of the design are multiplied with.
+        normal_equations: the sums over the rows of the sample, in the basis W.
+        W: the matrix by which the rows of the design are multiplied, shape (r, r).
         count: N, the observations in the sample.
         ridge: λ.
 
     Returns:
-        The sums; NaN where the kernel is not finite, or λ below rounding.
+        The sums; NaN if the kernel is not finite or λ is below rounding.
     """
-    R = jnp.linalg.cholesky(plus_ridge(seen.square / count, ridge)).T
-    nothing = jax.tree.map(jnp.zeros_like, seen)
+    R = jnp.linalg.cholesky(plus_ridge(normal_equations.square / count, ridge)).T
+    nothing = jax.tree.map(jnp.zeros_like, normal_equations)
     return Sums(R, solve_triangular(R, W.T, trans="T").T, nothing)
 
 
@@ -237,14 +243,14 @@ def normal(
     Y: Float[Array, "N n"],
     spread: RowSharding | None = None,
 ) -> Normal:
-    """The sums over the rows F = design(X) basis, tile by tile, on the devices where they are."""
+    """The normal equations of F = design(X) basis, tile by tile, on the devices that hold X."""
 
-    def own_sums(whole, X, Y):
-        design, basis = whole
+    def sums_of_device(replicated, X, Y):
+        design, basis = replicated
 
         def step(total, tile):
             rows = design(tile[0])  # (t, n, r)
-            new = Normal.of(rows.reshape(-1, rows.shape[-1]) @ basis, tile[1].reshape(-1))
+            new = Normal.from_rows(rows.reshape(-1, rows.shape[-1]) @ basis, tile[1].reshape(-1))
             return jax.tree.map(jnp.add, total, new), None
 
         square = jnp.zeros_like(basis)
@@ -252,25 +258,27 @@ def normal(
         at_once = max(1024, sizes().design_entries // len(basis))
         return over_tiles(step, nothing, (X, Y), at_once)[0]
 
-    return on_each(spread, own_sums, (design, basis), X, Y, joined=False)
+    return on_each(spread, sums_of_device, (design, basis), X, Y, joined=False)
 
 
 def solve_sums(
     sums: Sums, ridge: Float[Array, ""]
 ) -> tuple[Float[Array, " r"], Float[Array, ""], Float[Array, ""]]:
-    """For the minimiser w: its weights in the design, ‖w‖, and ‖Φw − y‖; NaN if it fails.
+    """The minimiser w, in the basis of the design, ‖w‖ and ‖Φw − y‖; NaN if the solve fails.
 
-    The last one has the digits of a difference of squares: it is good to 1e-8 ‖y‖ in float64.
+    ‖Φw − y‖² is a difference of squares, so ‖Φw − y‖ is accurate to 1e-8 ‖y‖ in float64.
     """
-    R, seen = sums.triangle, sums.seen
+    # Rows F = ΦR⁻¹ and v = R w: FᵀF v + δ R⁻ᵀR⁻¹ v = Fᵀy, w = R⁻¹v, and at the minimum
+    # ‖y − Fv‖² = yᵀy − vᵀFᵀy − δ‖w‖².
+    R, normal_equations = sums.triangle, sums.normal_equations
     inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype))
-    L = jnp.linalg.cholesky(seen.square + ridge * inverse.T @ inverse)
-    v = cho_solve((L, True), seen.moment)
+    L = jnp.linalg.cholesky(normal_equations.square + ridge * inverse.T @ inverse)
+    v = cho_solve((L, True), normal_equations.moment)
     norm = jnp.linalg.norm(inverse @ v)
-    left = seen.energy - seen.moment @ v - ridge * norm**2
-    return sums.basis @ v, norm, jnp.sqrt(jnp.maximum(left, jnp.zeros_like(left)))
+    square = normal_equations.energy - normal_equations.moment @ v - ridge * norm**2
+    return sums.basis @ v, norm, jnp.sqrt(jnp.maximum(square, jnp.zeros_like(square)))
 
 
 def trace_of_sums(sums: Sums) -> Float[Array, ""]:
     """The trace of ΦᵀΦ."""
-    return jnp.sum((sums.seen.square @ sums.triangle) * sums.triangle)
+    return jnp.sum((sums.normal_equations.square @ sums.triangle) * sums.triangle)

@@ -1,29 +1,30 @@
 """Fits in a span of r functions, the columns of landmarks or random features; draws of the prior.
 
-A span of landmarks has the columns K(·, s), made orthonormal in the RKHS; one of random features
-stands for a kernel of its own. A basis makes the span of every kernel: `tune` moves the kernel, and
-the landmarks, or the random key, stay.
+The span of landmarks consists of the columns K(·, s), orthonormalised in the RKHS. The span of
+random features defines a kernel of its own. A basis is a rule that makes the span of any kernel:
+while `tune` changes the kernel, the landmarks or the random key stay the same.
 
 The prior in a span is f(x) = Φ(x) w, w ~ N(0, I). With F the rows of the data and
 RᵀR = FᵀF + σ²I, the weights are N(R⁻¹R⁻ᵀFᵀy, σ² R⁻¹R⁻ᵀ), so that a covariance given the data is
-σ² Φ₁ R⁻¹R⁻ᵀ Φ₂ᵀ. The data say nothing of the part K − ΦΦᵀ of the prior, which landmarks do not
-span: it is added to the covariance, so that nothing is claimed to be known far from the landmarks.
-R comes from a QR of F below σI, not from FᵀF, and new rows update it by another QR.
+σ² Φ₁ R⁻¹R⁻ᵀ Φ₂ᵀ. The remainder K − ΦΦᵀ of the prior lies outside the span of the landmarks, and the
+data do not reduce it. It is added to the posterior covariance, which therefore returns to the prior
+covariance far from the landmarks. R comes from a QR of σI above F, not from FᵀF, and new rows
+update R by another QR.
 
-**Draws of the prior**, with which draws from a posterior begin. By Matheron's rule a draw f₀ of the
-prior and a draw ε of the noise would have given the rows L f₀ + ε, and a fit to the difference from
-the data corrects it:
+**Draws of the posterior** start from draws of the prior (Matheron's rule). A draw f₀ of the prior
+and a draw ε of the noise predict the rows L f₀ + ε. A fit to the difference from the data corrects
+the draw:
 
     f = f₀ + Σ K(·, x_j) a_j,     a = A⁻¹ (y − L f₀ − ε),
 
 so every draw is one function with one Hamiltonian, whose orbits keep their own energy.
 
-f₀ has coefficients α = T w at landmarks s of a region, with w ~ N(0, I) and G_SS⁻¹ = T Tᵀ, and so
-the covariance of the part of f that its values at the landmarks determine. The error of Cov(H) was
-6e-8 with 100 landmarks, and .33 with 512 random Fourier features alone. Outside of the region the
-landmarks determine little. The rest of the draw, g(x) − K(x, S) G_SS⁻¹ g(S), takes random features
-g, where the kernel has a spectrum. Every draw has frequencies of its own, so that the features add
-no error to the covariance over draws.
+f₀ = K(·, S) T w + g − K(·, S) G_SS⁻¹ g(S) with w ~ N(0, I), G_SS⁻¹ = T Tᵀ, and landmarks S of a
+region. The first term has the covariance of the part of f that its values at the landmarks
+determine. The error of Cov(H) was 6e-8 with 100 landmarks, and .33 with 512 random Fourier features
+alone. Outside the region the landmarks determine little; the other two terms add the rest, with
+random features g if the kernel has a spectrum. The frequencies differ between draws, so the
+features add no error to the covariance over draws.
 
 Source: Quiñonero-Candela & Rasmussen (2005), section 5, the deterministic training conditional;
 Wilson, Borovitskiy, Terenin, Mostowsky & Deisenroth (2020), arXiv 2002.09309.
@@ -54,7 +55,7 @@ from hamkernel._structures.base import AbstractMatrixKernel
 
 
 class Prior(eqx.Module):
-    """Draws f₀: coefficients at points that all share, and weights of features or None."""
+    """Draws f₀ of the prior: coefficients at common points, and weights of features or None."""
 
     kernel: AbstractMatrixKernel
     points: Float[Array, "m d"]
@@ -68,17 +69,19 @@ class Prior(eqx.Module):
 
     def raw_rows(self, rows: Measurements) -> Float[Array, "M count"]:
         """The rows of all draws before the contrast of the energies."""
-        at = components(self.kernel, self.points)
-        across = jnp.concatenate([between(self.kernel, each, at) for each in rows.blocks])
-        own = across @ self.coefficients.reshape(len(self.coefficients), -1).T
+        landmark_block = components(self.kernel, self.points)
+        across = jnp.concatenate(
+            [between(self.kernel, block, landmark_block) for block in rows.blocks]
+        )
+        landmark_rows = across @ self.coefficients.reshape(len(self.coefficients), -1).T
         if self.features is None:
-            return own
+            return landmark_rows
 
-        def of_features(basis, w):
+        def rows_of_features(basis, w):
             field = jax.vmap(lambda x: basis.field(x, w))
             return rows.of(field, jax.vmap(lambda x: basis.potential(x, w)))
 
-        return own + jax.vmap(of_features, out_axes=1)(self.features, self.weights)
+        return landmark_rows + jax.vmap(rows_of_features, out_axes=1)(self.features, self.weights)
 
     def plus(
         self,
@@ -92,11 +95,11 @@ class Prior(eqx.Module):
         zero, unknown = jnp.zeros((), A.dtype), jnp.zeros((0, A.shape[-1]), A.dtype)
         info = SolverInfo("draw")
 
-        def one(A, b, own, basis, w) -> KernelField:
+        def one(A, b, landmark_coefficients, basis, w) -> KernelField:
             return KernelField(
                 kernel=K,
                 points=points,
-                coefficients=jnp.concatenate([A, own]),
+                coefficients=jnp.concatenate([A, landmark_coefficients]),
                 residual=unknown,
                 norm=jnp.full_like(zero, jnp.inf),  # a draw of a Gaussian field has no finite norm
                 regularization=zero,
@@ -126,28 +129,29 @@ def prior_draws(
     key: Key[Array, ""],
     count: int,
 ) -> Prior:
-    """Draws from GP(0, K) that are right in the region and at the points X.
+    """Draws from GP(0, K) whose covariance is accurate in the region and at the points X.
 
-    A draw with inputs is affine in u, and right for every u if it is for those of the region.
+    A draw with inputs is affine in u, so it is accurate for every u if it is for the u of the
+    region.
     """
-    of_region, of_landmarks, of_draws = jax.random.split(key, 3)
+    region_key, landmark_key, draw_key = jax.random.split(key, 3)
     low, high = region
-    share = jax.random.uniform(of_region, (2048, len(low)), X.dtype)
+    share = jax.random.uniform(region_key, (2048, len(low)), X.dtype)
     X = jnp.concatenate([X, low[None] + (high - low)[None] * share])
-    # Landmarks are chosen until 1e-6 of tr K(x, x) is left over the region, or there are 192. In
-    # the plane 100 suffice for a region of a few lengthscales.
-    left = 1e-6 * jnp.mean(block_traces(K, X))
-    landmarks = choose_landmarks(K, X, left, 192, len(X), of_landmarks)
-    return _drawn(K, landmarks, of_draws, count)
+    # Landmarks are chosen until the residual trace is 1e-6 of tr K(x, x) on average over the
+    # region, or there are 192. In the plane 100 suffice for a region of a few lengthscales.
+    target_trace = 1e-6 * jnp.mean(block_traces(K, X))
+    landmarks = choose_landmarks(K, X, target_trace, 192, len(X), landmark_key)
+    return _draw_prior(K, landmarks, draw_key, count)
 
 
 @compiled
-def _drawn(K, landmarks: Landmarks, key, count: int) -> Prior:
+def _draw_prior(K, landmarks: Landmarks, key, count: int) -> Prior:
     S, T = landmarks.points, whitening(K, landmarks)
     m, d = S.shape
     n = K.outputs(d)
-    on_landmarks, of_frequencies, of_weights = jax.random.split(key, 3)
-    w = jax.random.normal(on_landmarks, (count, m * n), S.dtype)
+    landmark_key, frequency_key, weight_key = jax.random.split(key, 3)
+    w = jax.random.normal(landmark_key, (count, m * n), S.dtype)
 
     def basis(key):
         return features(K, d, 256, key, S.dtype)
@@ -156,15 +160,16 @@ def _drawn(K, landmarks: Landmarks, key, count: int) -> Prior:
         columns = eqx.filter_eval_shape(basis, key).columns
     except TypeError:  # no spectral density is known
         return Prior(K, S, (w @ T.T).reshape(count, m, n), None, None)
-    waves = jax.vmap(basis)(jax.random.split(of_frequencies, count))
-    weights = jax.random.normal(of_weights, (count, columns), S.dtype)
+    waves = jax.vmap(basis)(jax.random.split(frequency_key, count))
+    weights = jax.random.normal(weight_key, (count, columns), S.dtype)
 
-    def at_landmarks(draw):
+    def values_at_landmarks(draw):
         basis, weights = draw
         return jax.vmap(lambda x: basis.field(x, weights))(S).reshape(-1)
 
-    # Four draws are evaluated at once: 400 together took 1.5 GB and half as long again.
-    g = jax.lax.map(at_landmarks, (waves, weights), batch_size=4)  # (count, m n)
+    # Four draws at a time: all 400 together took 1.5 GB and 1.5 times as long.
+    g = jax.lax.map(values_at_landmarks, (waves, weights), batch_size=4)  # (count, m n)
+    # f₀ = K(·, S)Tw + g − K(·, S)TTᵀg(S), so the coefficients at S are α = T(w − Tᵀg(S)).
     return Prior(K, S, ((w - g @ T) @ T.T).reshape(count, m, n), waves, weights)
 
 
@@ -172,7 +177,7 @@ Arrays = TypeVar("Arrays")
 
 
 class Columns(eqx.Module):
-    """The columns of the Gram that belong to landmarks, at some points: (t, d) -> (t, n, r)."""
+    """The design of landmarks: their columns of the Gram at points, (t, d) -> (t, n, r)."""
 
     kernel: AbstractMatrixKernel
     landmarks: Landmarks
@@ -187,19 +192,19 @@ def factor(square: Float[Array, "r r"], ridge: Float[Array, ""]) -> Float[Array,
     return jnp.linalg.cholesky(plus_ridge(square, ridge))
 
 
-def truncated(
+def truncation_of(
     trace: Float[Array, ""], covered: Float[Array, ""], ridge: Float[Array, ""]
 ) -> Float[Array, ""]:
     """trace(G − Ĝ)/ridge from trace G and trace Ĝ; NaN if Ĝ is larger than G.
 
-    trace Ĝ exceeds trace G by rounding alone, 1e-16, if the kernel is positive definite, and by 4
-    per cent and more for kernels that were not.
+    If the kernel is positive definite, trace Ĝ exceeds trace G only by rounding, 1e-16; for kernels
+    that were not, by 4 % and more.
     """
-    left = jnp.where(covered - trace > 1e-3 * jnp.abs(trace), jnp.nan, trace - covered)
-    return jnp.maximum(left, jnp.zeros_like(left)) / ridge
+    difference = jnp.where(covered - trace > 1e-3 * jnp.abs(trace), jnp.nan, trace - covered)
+    return jnp.maximum(difference, jnp.zeros_like(difference)) / ridge
 
 
-def checked(
+def check_solution(
     learned: Arrays,
     landmarks: Landmarks,
     truncation: Float[Array, ""] | None,
@@ -207,9 +212,9 @@ def checked(
     message: str | Callable[[], str],
     throw: bool,
 ) -> Arrays:
-    """The arrays `learned`; a RuntimeError with `message` where the solve `failed`.
+    """The arrays `learned`; a RuntimeError with `message` if the solve `failed`.
 
-    A fit without landmarks has failed too, unless the Gram, and with it the field, is zero.
+    A fit without landmarks counts as failed, unless the Gram, and with it the field, is zero.
     """
     if truncation is None:
         return require.value(learned, failed, message, RuntimeError, throw)
@@ -234,23 +239,23 @@ def singular(dtype: jnp.dtype) -> str:
 
 
 class AbstractSpan(eqx.Module):
-    """r functions with Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z)."""
+    """Functions φ_1 … φ_r with Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z)."""
 
     kernel: eqx.AbstractVar[AbstractMatrixKernel]
 
     @abc.abstractmethod
-    def of(self, block: AbstractBlock) -> Float[Array, "d r"]:
-        """The rows of a block for each of the functions."""
+    def rows_of(self, block: AbstractBlock) -> Float[Array, "d r"]:
+        """The rows of a block, for each of the r functions."""
 
     @abc.abstractmethod
     def missing(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
-        """The prior covariance of the rows of two blocks less Φ₁ Φ₂ᵀ of the r functions."""
+        """The prior covariance of the rows of two blocks minus Φ₁Φ₂ᵀ."""
 
     @abc.abstractmethod
     def truncation(
         self, rows: Measurements, F: Float[Array, "M r"], ridge: Float[Array, ""]
     ) -> Float[Array, ""] | None:
-        """trace(G − FFᵀ)/ridge for the M rows; None where Σ φφᵀ is a kernel of its own."""
+        """The truncation trace(G − FFᵀ)/ridge for M rows; None if Σ φφᵀ is the kernel itself."""
 
     @abc.abstractmethod
     def field(
@@ -271,11 +276,11 @@ class AbstractSpan(eqx.Module):
         key: Key[Array, ""],
         region: Float[Array, "2 n"],
     ) -> AbstractField:
-        """The functions with these weights plus draws of the rest of the prior, as a batch."""
+        """A batch of fields: Σ_r w_r φ_r plus draws of the remainder of the prior."""
 
-    def of_rows(self, rows: Measurements) -> Float[Array, "M r"]:
-        """The rows of observations of each function, before the contrast of the energies."""
-        return jnp.concatenate([self.of(block) for block in rows.blocks])
+    def all_rows(self, rows: Measurements) -> Float[Array, "M r"]:
+        """The rows of all observations for each function, before the contrast of the energies."""
+        return jnp.concatenate([self.rows_of(block) for block in rows.blocks])
 
 
 def landmark_field(
@@ -300,20 +305,20 @@ def landmark_field(
 
 
 class LandmarkSpan(AbstractSpan):
-    """The columns K(·, s) of landmarks, times T, which makes them orthonormal."""
+    """The columns K(·, s) of landmarks, orthonormalised by T with T Tᵀ = G_SS⁻¹."""
 
     kernel: AbstractMatrixKernel
     landmarks: Landmarks
     T: Float[Array, "r r"]
 
-    def of(self, block: AbstractBlock) -> Float[Array, "d r"]:
+    def rows_of(self, block: AbstractBlock) -> Float[Array, "d r"]:
         return self.landmarks.columns(self.kernel, block) @ self.T
 
     def missing(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
-        return between(self.kernel, left, right) - self.of(left) @ self.of(right).T
+        return between(self.kernel, left, right) - self.rows_of(left) @ self.rows_of(right).T
 
     def truncation(self, rows, F, ridge) -> Float[Array, ""]:
-        return truncated(trace_of_rows(self.kernel, rows), jnp.sum(F**2), ridge)
+        return truncation_of(trace_of_rows(self.kernel, rows), jnp.sum(F**2), ridge)
 
     def field(self, w, residual, ridge, N, truncation) -> KernelField:
         c, norm = self.T @ w, root(w @ w)
@@ -322,28 +327,29 @@ class LandmarkSpan(AbstractSpan):
     def draws(self, weights, rows, key, region) -> KernelField:
         everywhere = jnp.concatenate([self.landmarks.rows.points, rows.points])
         prior = prior_draws(self.kernel, everywhere, region, key, len(weights))
-        return _on_landmarks(self, weights, prior)
+        return _landmark_draws(self, weights, prior)
 
 
 @compiled
-def _on_landmarks(span: LandmarkSpan, weights, prior: Prior) -> KernelField:
+def _landmark_draws(span: LandmarkSpan, weights, prior: Prior) -> KernelField:
     landmarks = span.landmarks
-    # A draw of the prior less its projection on the span.
-    drawn = prior.raw_rows(landmarks.rows)
-    drawn = drawn if landmarks.index is None else drawn[landmarks.index]
-    c = (weights - drawn.T @ span.T) @ span.T.T
+    # f = Φw̃ + f₀ − K(·, L)TTᵀ L f₀: weights w̃ in the span plus the draw f₀ minus its projection
+    # on the span, so the coefficients of the landmarks L are T(w̃ − Tᵀ L f₀).
+    prior_rows = prior.raw_rows(landmarks.rows)
+    prior_rows = prior_rows if landmarks.index is None else prior_rows[landmarks.index]
+    c = (weights - prior_rows.T @ span.T) @ span.T.T
     Z, A, S, b = jax.vmap(landmarks.representer, out_axes=(None, 0, None, 0))(c)
     return prior.plus(Z, A, S, b) if len(S) else prior.plus(Z, A)
 
 
 class FeatureSpan(AbstractSpan):
-    """Random Fourier features, which stand for a kernel of their own."""
+    """Random Fourier features, whose kernel is Σ φφᵀ itself."""
 
     kernel: AbstractMatrixKernel
     features: AbstractFeatures
     dimension: int = eqx.field(static=True)
 
-    def of(self, block: AbstractBlock) -> Float[Array, "d r"]:
+    def rows_of(self, block: AbstractBlock) -> Float[Array, "d r"]:
         if not block.of_values:
             return block.rows(self.features(block.points))
         none = jnp.zeros(self.features.columns, block.points.dtype)
@@ -357,10 +363,10 @@ class FeatureSpan(AbstractSpan):
         return None
 
     def field(self, w, residual, ridge, N, truncation) -> FeatureField:
-        left = jnp.linalg.norm(residual)
-        info = SolverInfo("RandomFeatures", rank=jnp.asarray(len(w)), residual_norm=left)
-        known = residual if residual.ndim == 2 else jnp.zeros((0, self.dimension), w.dtype)
-        return feature_field(self.kernel, self.features, w, known, ridge / N, info)
+        residual_norm = jnp.linalg.norm(residual)
+        info = SolverInfo("RandomFeatures", rank=jnp.asarray(len(w)), residual_norm=residual_norm)
+        kept_residual = residual if residual.ndim == 2 else jnp.zeros((0, self.dimension), w.dtype)
+        return feature_field(self.kernel, self.features, w, kept_residual, ridge / N, info)
 
     def draws(self, weights, rows, key, region) -> FeatureField:
         def one(w):
@@ -375,7 +381,7 @@ def landmark_span(K: AbstractMatrixKernel, landmarks: Landmarks) -> LandmarkSpan
 
 
 class AbstractBasis(eqx.Module):
-    """A rule that gives every kernel its span."""
+    """A rule that makes the span of any kernel."""
 
     @abc.abstractmethod
     def span(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> AbstractSpan:
@@ -383,7 +389,7 @@ class AbstractBasis(eqx.Module):
 
 
 class WaveBasis(AbstractBasis):
-    """Random Fourier features of one key: the frequencies scale with the kernel."""
+    """Random Fourier features of one random key; the frequencies scale with the kernel."""
 
     key: Key[Array, ""]
     count: int = eqx.field(static=True)
@@ -398,14 +404,15 @@ class LandmarkBasis(AbstractBasis):
     landmarks: Landmarks
 
     def span(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> LandmarkSpan:
-        own = landmark_span(K, given_landmarks(K, self.landmarks))
-        # Without a column a fit fails; the losses would be those of the zero field.
-        T = jnp.where(own.landmarks.count == 0, jnp.nan, own.T)
-        return eqx.tree_at(lambda span: span.T, own, T)
+        span = landmark_span(K, given_landmarks(K, self.landmarks))
+        # Without a column the losses would silently be those of the zero field; NaN makes them
+        # fail.
+        T = jnp.where(span.landmarks.count == 0, jnp.nan, span.T)
+        return eqx.tree_at(lambda span: span.T, span, T)
 
 
 class LowRankConditional(AbstractConditional):
-    """The Gaussian field by R with RᵀR = FᵀF + σ²I; the weights are w = R⁻¹ `rotated`."""
+    """The posterior from R with RᵀR = FᵀF + σ²I; the mean weights are w = R⁻¹ `rotated`."""
 
     field: AbstractField
     rows: Measurements
@@ -415,36 +422,36 @@ class LowRankConditional(AbstractConditional):
     rotated: Float[Array, " r"]
 
     def covariance(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
-        own = self._whitened_covariance(left)
-        other = own if right is left else self._whitened_covariance(right)
-        return self.span.missing(left, right) + self.ridge * own.T @ other
+        whitened = self._whitened_covariance(left)
+        whitened_right = whitened if right is left else self._whitened_covariance(right)
+        return self.span.missing(left, right) + self.ridge * whitened.T @ whitened_right
 
     def _whitened_covariance(self, block: AbstractBlock) -> Float[Array, "r d"]:
-        return solve_triangular(self.R, self.span.of(block).T, trans="T")
+        return solve_triangular(self.R, self.span.rows_of(block).T, trans="T")
 
     def law_variance(self, r: Any, r0: Any, which: int) -> Float[Array, ""]:
         """The variance of w(r) − w(r₀) of a shared law w."""
         laws = self.span.features.laws() if isinstance(self.span, FeatureSpan) else []
         if not laws:
             raise AttributeError("the posterior has no law: its kernel is no hk.Shared(k, parts).")
-        waves, at = laws[which]
+        waves, place = laws[which]
         dtype = self.R.dtype
-        known = jnp.zeros(len(self.R), dtype)
-        known = known.at[at].set((waves.of_law(r) - waves.of_law(r0)).astype(dtype))
+        difference = jnp.zeros(len(self.R), dtype)
+        difference = difference.at[place].set((waves.of_law(r) - waves.of_law(r0)).astype(dtype))
         rest = waves.kernel.missing(waves.kernel.point(r), waves.kernel.point(r0)).astype(dtype)
-        whitened = solve_triangular(self.R, known, trans="T")
+        whitened = solve_triangular(self.R, difference, trans="T")
         return self.ridge * whitened @ whitened + waves.scale.astype(dtype) * rest
 
     def updated(self, new: Measurements) -> "LowRankConditional":
         rows = self.rows.joined(new)
-        beside, fresh = self.rows.with_previous(new), rows.size - self.rows.size
-        new_rows = beside.contrast(self.span.of_rows(beside))[-fresh:]
-        R, rotated = _below(self.R, self.rotated, new_rows, rows.y[-fresh:])
+        extended_rows, new_count = self.rows.with_previous(new), rows.size - self.rows.size
+        new_rows = extended_rows.contrast(self.span.all_rows(extended_rows))[-new_count:]
+        R, rotated = _append_rows(self.R, self.rotated, new_rows, rows.y[-new_count:])
         return _conditional(self.span, rows, self.ridge, R, rotated)
 
     def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> AbstractField:
-        of_weights, rest = jax.random.split(key)
-        z = jax.random.normal(of_weights, (len(self.R), count), self.R.dtype)
+        weight_key, rest = jax.random.split(key)
+        z = jax.random.normal(weight_key, (len(self.R), count), self.R.dtype)
         w = solve_triangular(self.R, self.rotated[:, None] + jnp.sqrt(self.ridge) * z)
         return self.span.draws(w.T, self.rows, rest, region)
 
@@ -452,7 +459,7 @@ class LowRankConditional(AbstractConditional):
 def low_rank_conditional(
     span: AbstractSpan, rows: Measurements, regularization: Float[Array, ""], throw: bool = True
 ) -> LowRankConditional:
-    """The field given the rows in the span of some functions: O(D r²) time, O(D r) memory.
+    """The posterior given the rows, in a span of r functions: O(D r²) time, O(D r) memory.
 
     Raises:
         RuntimeError: the least squares have no solution to rounding.
@@ -464,7 +471,7 @@ def low_rank_conditional(
     failed = require.not_finite(field.norm)
     if isinstance(span, LandmarkSpan):
         truncation = field.info.truncation
-        arrays = checked(arrays, span.landmarks, truncation, failed, cause, throw)
+        arrays = check_solution(arrays, span.landmarks, truncation, failed, cause, throw)
     else:
         arrays = require.value(arrays, failed, cause, RuntimeError, throw)
     return eqx.tree_at(lambda c: c.field, conditional, eqx.combine(arrays, rest))
@@ -472,13 +479,13 @@ def low_rank_conditional(
 
 @compiled
 def _low_rank_conditional(span, rows, ridge):
-    F = rows.contrast(span.of_rows(rows))
+    F = rows.contrast(span.all_rows(rows))
     start = jnp.sqrt(ridge) * jnp.eye(F.shape[1], dtype=F.dtype)
-    return _conditional(span, rows, ridge, *_below(start, jnp.zeros_like(F[0]), F, rows.y))
+    return _conditional(span, rows, ridge, *_append_rows(start, jnp.zeros_like(F[0]), F, rows.y))
 
 
-def _below(R, rotated, F, y):
-    """The triangular factor of [R; F], and the right-hand side beside it."""
+def _append_rows(R, rotated, F, y):
+    """The QR update of (R, Qᵀy) by the rows F with targets y."""
     both = jnp.concatenate(
         [jnp.column_stack([R, rotated]), jnp.column_stack([F, y])],
     )
@@ -487,8 +494,8 @@ def _below(R, rotated, F, y):
 
 
 def _conditional(span, rows, ridge, R, rotated):
-    w, F = solve_triangular(R, rotated), span.of_rows(rows)
-    left = rows.y - rows.contrast(F @ w)
+    w, F = solve_triangular(R, rotated), span.all_rows(rows)
+    residual = rows.y - rows.contrast(F @ w)
     truncation = span.truncation(rows, F, ridge)
-    field = span.field(w, rows.residual(left), ridge, rows.count, truncation)
+    field = span.field(w, rows.residual(residual), ridge, rows.count, truncation)
     return LowRankConditional(field, rows, ridge, span, R, rotated)

@@ -5,16 +5,16 @@ With the thin factorisation of a stack, [Φ; √δ I] = [Q; P] R, R upper triang
     M = ΦᵀΦ + δI = RᵀR,   C = A⁻¹ = (I − QQᵀ)/δ,   log det A = log det M + (D − r) log δ,
     (C_SS)⁻¹ = δ (I − Q_S Q_Sᵀ)⁻¹ = δ (I + Q_S (I − Q_SᵀQ_S)⁻¹ Q_Sᵀ),
 
-the last of them for folds of more rows than features (Woodbury). Q and R come from Cholesky's QR,
-twice: products of matrices only, and Q orthonormal to rounding where the condition of A is below
-1/ε. The normal equations alone, with R from M and Q_S = Φ_S R⁻¹, give I − Q_S Q_Sᵀ an error of
-ε cond(A) where it is as small as 1/cond(A).
+where the last form (Woodbury) serves folds with more rows than features. Cholesky's QR, done twice,
+gives Q and R by matrix products alone, and Q is orthonormal to rounding if cond(A) < 1/ε. One pass,
+R from M and Q_S = Φ_S R⁻¹, would give I − Q_S Q_Sᵀ, which can be as small as 1/cond(A), an error of
+ε cond(A).
 
 The derivatives use CΦ = ΦM⁻¹ and C²Φ = ΦM⁻².
 
-Of rows that see an unknown constant, in the direction p with ‖p‖ = 1, C is that of
-`factors.py`. With Φ − ppᵀΦ in the place of Φ it is (I − ppᵀ − QQᵀ)/δ: the constant is one more
-orthonormal column beside Q, whose weight is free.
+If the rows contain an unknown constant along the unit vector p, C is the projected inverse defined
+in `factors.py`. Replace Φ by (I − ppᵀ)Φ; then C = (I − ppᵀ − QQᵀ)/δ, so the code stores p as one
+more column of Q.
 
 Source: Yamamoto, Nakatsukasa, Yanagisawa & Fukaya (2015), ETNA 44, on the second pass.
 """
@@ -39,12 +39,12 @@ from hamkernel._solvers.factors import (
 
 
 class LowRankSystem(AbstractSystem):
-    """A by its features at the data and its ridge.
+    """The features and the ridge that A is made of.
 
     Attributes:
         rows: Φ, shape (D, r).
         ridge: δ, shape ().
-        constant: p, shape (D,), which is not differentiated; None if there is none.
+        constant: p, shape (D,), not differentiated; None if no row contains an unknown constant.
     """
 
     rows: Float[Array, "D r"]
@@ -56,14 +56,15 @@ class LowRankSystem(AbstractSystem):
 
 
 class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem]):
-    """A and its inverse, by Q and R.
+    """The factors Q and R, from which both A and A⁻¹ are applied.
 
     Attributes:
         rows: Φ.
         ridge: δ.
-        Q: the rows of the orthonormal factor that belong to Φ, shape (D, r), and p beside them.
-        R: its triangular factor, shape (r, r).
-        size: ‖M‖ in the Frobenius norm: that of A without the directions that have no features.
+        Q: the orthonormal factor of Φ, shape (D, r), with p as one more column if there is one.
+        R: the triangular factor, shape (r, r).
+        size: the Frobenius norm of M = ΦᵀΦ + δI, used as an estimate of ‖A‖. (A has the
+            eigenvalues of M, and δ once more for every row beyond the number of features.)
     """
 
     rows: Float[Array, "D r"]
@@ -90,7 +91,7 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
 
     @property
     def _free(self) -> int:
-        """The number of directions without features or constant."""
+        """D − q, the dimension of the complement of the columns of Q, on which C = I/δ."""
         return len(self.rows) - self.Q.shape[1]
 
     @property
@@ -101,12 +102,12 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
     def solve(self, b: Float[Array, "D *m"]) -> Float[Array, "D *m"]:
         return (b - self.Q @ (self.Q.T @ b)) / self.ridge
 
-    def solved(self, y: Float[Array, " D"]) -> tuple[Float[Array, " D"], Float[Array, ""]]:
-        # yᵀA⁻¹y = ‖y − Φw‖²/δ + ‖w‖² with the weights w of the fit
+    def solve_with_form(self, y: Float[Array, " D"]) -> tuple[Float[Array, " D"], Float[Array, ""]]:
+        # yᵀA⁻¹y = ‖y − Φw‖²/δ + ‖w‖² with the weights w = M⁻¹Φᵀy = R⁻¹Qᵀy of the fit
         rotated = self.Q.T @ y
-        left = y - self.Q @ rotated
+        residual = y - self.Q @ rotated
         w = backward(self.R, rotated[: len(self.R), None])[:, 0]
-        return left / self.ridge, left @ left / self.ridge + w @ w
+        return residual / self.ridge, residual @ residual / self.ridge + w @ w
 
     @property
     def log_det(self) -> Float[Array, ""]:
@@ -114,7 +115,7 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
 
     @property
     def inverse_trace(self) -> Float[Array, ""]:
-        # (D − ‖Q‖²)/δ with ‖Q‖² + ‖P‖² = q and P = √δ R⁻¹
+        # tr C = (D − ‖Q‖²)/δ, ‖Q‖² + ‖P‖² = q and P = √δ R⁻¹, so tr C = (D − q)/δ + ‖R⁻¹‖².
         root = backward(self.R, jnp.eye(len(self.R), dtype=self.R.dtype))
         return self._free / self.ridge + jnp.sum(root**2)
 
@@ -128,7 +129,11 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
         one = jnp.eye(rows.shape[1], dtype=rows.dtype)
         return CholeskyBlocks((one[None] - rows @ rows.transpose(0, 2, 1)) / self.ridge)
 
-    def pulled(self, u, w, inverse=None, square=None) -> LowRankSystem:
+    def vjp(self, u, w, inverse=None, square=None) -> LowRankSystem:
+        # Ā = u wᵀ + α C + β C² with α = `inverse`, β = `square`. From dA = dΦ Φᵀ + Φ dΦᵀ + dδ I,
+        #     Φ̄ = (Ā + Āᵀ)Φ = u (wᵀΦ) + w (uᵀΦ) + 2α CΦ + 2β C²Φ,
+        #     δ̄ = tr Ā = u·w + α tr C + β tr C²,     tr Cᵏ = (D − q)/δᵏ + tr M⁻ᵏ,
+        # where tr M⁻¹ = ‖R⁻¹‖² and tr M⁻² = ‖R⁻¹R⁻ᵀ‖² in the Frobenius norm.
         rows = u[:, None] * (w @ self.rows)[None, :] + w[:, None] * (u @ self.rows)[None, :]
         ridge = u @ w
         T = self._images
@@ -137,33 +142,41 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
             ridge = ridge + inverse * self.inverse_trace
         if square is not None:
             root = backward(self.R, jnp.eye(len(self.R), dtype=T.dtype))
-            C_squared = _right_solve(self.R, _right_solve(self.R, T), transposed=True)  # C²Φ
+            # C²Φ = ΦM⁻² = (CΦ)M⁻¹ = (CΦ)R⁻¹R⁻ᵀ
+            C_squared = _right_solve(self.R, _right_solve(self.R, T), transposed=True)
             rows = rows + 2 * square * C_squared
             trace = self._free / self.ridge**2 + jnp.sum((root @ root.T) ** 2)
             ridge = ridge + square * trace
         return self._cotangent(rows, ridge)
 
-    def pulled_folds(self, a, groups, V, R, bars) -> tuple[LowRankSystem, Float[Array, " D"]]:
+    def vjp_of_folds(self, a, groups, V, R, bars) -> tuple[LowRankSystem, Float[Array, " D"]]:
         r_bar, a_bar = bars
-        Q, T, r_own = self.Q, self._images, len(self.R)
-        P = jnp.sqrt(self.ridge) * backward(self.R, jnp.eye(r_own, dtype=Q.dtype))
+        # Φ̄ of Σ_S (C_:S v_S)(C_:S r_S)ᵀ is C W, and W has v_S (r_SᵀT_S) + r_S (v_SᵀT_S) in the
+        # rows S.
+        Q, T, rank = self.Q, self._images, len(self.R)
+        P = jnp.sqrt(self.ridge) * backward(self.R, jnp.eye(rank, dtype=Q.dtype))
         v_all, W, ridge = jnp.zeros_like(a), jnp.zeros_like(T), jnp.zeros_like(self.ridge)
         for group, v, r in zip(groups, V, R, strict=True):
-            own = group.gather(T)
-            along_v, along_r = (jnp.einsum("fsr,fs->fr", own, each) for each in (v, r))
+            fold_rows = group.gather(T)
+            along_v, along_r = (jnp.einsum("fsr,fs->fr", fold_rows, vectors) for vectors in (v, r))
             each_row = v[..., None] * along_r[:, None] + r[..., None] * along_v[:, None]
-            W = group.scattered(each_row, into=W)
-            v_all = group.scattered(v, into=v_all)
-            # (C_:S v_S)·(C_:S r_S), from C_SS v_S = r̄_S and C_SS r_S = a_S in S, and outside by
-            # t = Q_Sᵀv_S/δ and Q_SᵀQ_S; of v and r alone it would lose the square of the condition.
-            own, fold_a = group.gather(Q), group.gather(a)
-            v_Q, r_Q, a_Q = (jnp.einsum("fsr,fs->fr", own, each) for each in (v, r, fold_a))
+            W = group.scatter(each_row, into=W)
+            v_all = group.scatter(v, into=v_all)
+            # The cotangent of δ needs (C_:S v_S)·(C_:S r_S). Rows inside S contribute r̄_S·a_S,
+            # since C_SS v_S = r̄_S and C_SS r_S = a_S. Outside S, C_:S = −Q Q_Sᵀ/δ; with QᵀQ + PᵀP
+            # = I and t_v = Q_Sᵀv_S/δ, t_r = Q_Sᵀr_S/δ the rows there contribute t_vᵀ(I − PᵀP −
+            # Q_SᵀQ_S)t_r = t_v·(Q_Sᵀa_S) − (P t_v)·(P t_r), for Q_Sᵀa_S = t_r − Q_SᵀQ_S t_r.
+            # Forming C_:S v_S and C_:S r_S instead loses twice as many digits.
+            fold_rows, fold_a = group.gather(Q), group.gather(a)
+            v_Q, r_Q, a_Q = (
+                jnp.einsum("fsr,fs->fr", fold_rows, vectors) for vectors in (v, r, fold_a)
+            )
             t_v, t_r = v_Q / self.ridge, r_Q / self.ridge
             inside = jnp.vdot(group.gather(r_bar), fold_a) + jnp.vdot(t_v, a_Q)
-            ridge = ridge + inside - jnp.vdot(t_v[:, :r_own] @ P.T, t_r[:, :r_own] @ P.T)
+            ridge = ridge + inside - jnp.vdot(t_v[:, :rank] @ P.T, t_r[:, :rank] @ P.T)
         w = self.solve(v_all + a_bar)
-        less = self.pulled(w, a)
-        return self._cotangent(self.solve(W) - less.rows, ridge - less.ridge), w
+        ridge_part = self.vjp(w, a)
+        return self._cotangent(self.solve(W) - ridge_part.rows, ridge - ridge_part.ridge), w
 
     def _cotangent(self, rows: Float[Array, "D r"], ridge: Float[Array, ""]) -> LowRankSystem:
         has_constant = self.Q.shape[1] > len(self.R)
@@ -171,7 +184,7 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
 
 
 class _ManyRows(AbstractBlocks):
-    """Blocks (I − Q_S Q_Sᵀ)/δ of folds with more rows than features, one after the other."""
+    """The blocks (I − Q_S Q_Sᵀ)/δ of folds with more rows than features, solved one by one."""
 
     rows: Float[Array, "F s r"]
     ridge: Float[Array, ""]
@@ -180,13 +193,13 @@ class _ManyRows(AbstractBlocks):
     def __init__(self, rows: Float[Array, "F s r"], ridge: Float[Array, ""]):
         one = jnp.eye(rows.shape[2], dtype=rows.dtype)
         self.rows, self.ridge = rows, ridge
-        self.factors = jax.lax.map(lambda own: cholesky(one - own.T @ own), rows)
+        self.factors = jax.lax.map(lambda fold_rows: cholesky(one - fold_rows.T @ fold_rows), rows)
 
     def solve(self, b: Float[Array, "F s"]) -> Float[Array, "F s"]:
         def one(fold):
-            own, R, b = fold
-            moment = backward(R, forward(R, (own.T @ b)[:, None]))[:, 0]
-            return self.ridge * (b + own @ moment)
+            fold_rows, R, b = fold
+            moment = backward(R, forward(R, (fold_rows.T @ b)[:, None]))[:, 0]
+            return self.ridge * (b + fold_rows @ moment)
 
         return jax.lax.map(one, (self.rows, self.factors, b))
 
@@ -200,7 +213,7 @@ def _right_solve(
 
 @jax.custom_vjp
 def gram_of_columns(rows: Float[Array, "D r"]) -> Float[Array, "r r"]:
-    """ΦᵀΦ, whose derivative is one product with Φ and not two."""
+    """ΦᵀΦ; the cotangent Φ(B + Bᵀ) of a cotangent B costs one product instead of two."""
     return rows.T @ rows
 
 

@@ -1,14 +1,15 @@
 """Regularised least squares in the span of landmarks: O(N r²) time, O(N n + r²) memory.
 
-With S the landmarks, L the Cholesky factor of their Gram and F = G_XS L⁻ᵀ, the Gram is nearly
-Ĝ = F Fᵀ, and the field Σⱼ K(x, sⱼ) αⱼ with α = L⁻ᵀw minimises ‖y − F w‖² + Nλ‖w‖². F is made tile
-by tile, and only the sums FᵀF and Fᵀy are kept.
+Let S be the landmarks, T Tᵀ = G_SS⁻¹, and F = G_XS T. The Gram is approximated by Ĝ = F Fᵀ. The
+field Σⱼ K(x, sⱼ) αⱼ with α = T w minimises ‖y − F w‖² + Nλ‖w‖². F is computed tile by tile, and
+only the sums FᵀF and Fᵀy are kept.
 
-The matrix FᵀF + NλI has the condition of G + NλI, not its square: these are no normal equations in
-α, which would lose twice the digits. The digits that the sums round off come back by one step of
-refinement with the residual of the data (Björck's corrected seminormal equations).
+The condition number of FᵀF + NλI is that of G + NλI. (The normal equations in α would square it and
+lose twice the digits.) One step of refinement with the residual of the data recovers the digits
+that the sums round off (Björck's corrected seminormal equations).
 
-A stream is seen once and leaves no residual; `least_squares.py` says how its sums keep digits.
+A stream has no second pass and therefore no residual; `least_squares.py` explains how its sums keep
+their digits.
 """
 
 import numbers
@@ -24,7 +25,7 @@ from hamkernel._fields.base import root
 from hamkernel._fields.expansions import KernelField
 from hamkernel._gram import components, trace, trace_of_rows
 from hamkernel._gram_operator import product
-from hamkernel._machine import RowSharding, as_given, compiled, rows_of, split
+from hamkernel._machine import RowSharding, compiled, row_sharding, shard, to_caller_sharding
 from hamkernel._observations.measurements import Measurements
 from hamkernel._show import text
 from hamkernel._solvers.landmarks import (
@@ -47,15 +48,15 @@ from hamkernel._solvers.low_rank import (
     Columns,
     LandmarkBasis,
     LowRankConditional,
-    checked,
+    check_solution,
     factor,
     landmark_field,
     landmark_span,
     low_rank_conditional,
     singular,
-    truncated,
+    truncation_of,
 )
-from hamkernel._solvers.stream import AbstractStreamingFit, AbstractStreamingSolver, thinned
+from hamkernel._solvers.stream import AbstractStreamingFit, AbstractStreamingSolver, thin
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -67,13 +68,15 @@ class Solution(NamedTuple):
     residual_norm: Float[Array, ""] | None = None
 
 
-def _checked_field(
+def _check_field(
     K, landmarks, solution, regularization, tolerance, cure, throw=True
 ) -> KernelField:
-    """The field of a solution; UserWarning where the landmarks do not reach the tolerance."""
+    """The field of a solution; UserWarning if the landmarks do not reach the tolerance."""
     dtype = landmarks.points.dtype
     failed = require.not_finite(solution.coefficients).any()
-    solution = checked(solution, landmarks, solution.truncation, failed, singular(dtype), throw)
+    solution = check_solution(
+        solution, landmarks, solution.truncation, failed, singular(dtype), throw
+    )
     warn_if_truncated(solution.truncation, landmarks.count, tolerance, cure)
     return landmark_field(K, landmarks, regularization, *solution)
 
@@ -87,7 +90,8 @@ CHOOSE = (
 def warn_if_truncated(truncation, count, tolerance, cure):
     if not require.is_concrete(truncation, count):
         return
-    # Landmarks that were chosen from a random part of the data may leave more of the whole.
+    # The landmarks reach the tolerance on their candidates, a random part of the data; on all of
+    # the data the truncation may be larger.
     if truncation > 2 * tolerance:
         if truncation.dtype == jnp.float32:
             cure = (
@@ -112,26 +116,26 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         field = model.field()
         better = model.add(X_new, Y_new).field()
 
-    `field.info.truncation` is that of all the data added: it shows whether the landmarks are still
-    enough.
+    `field.info.truncation` is the truncation for all the data added, and shows whether the
+    landmarks still suffice.
 
     Attributes:
         kernel: K.
         landmarks: the points that carry the field.
-        sums: the sums over the rows added, of which the least squares are solved.
-        trace: the trace of their Gram, shape ().
+        sums: the normal equations of the rows added.
+        trace: the trace of the Gram of these rows, shape ().
         lost: the rounding errors of the sums and the trace.
         count: N, the number of points added, shape ().
         regularization: the λ of `start`, shape ().
         dimension: n, the number of coordinates of a state.
-        tolerance: of the solver, for its warning.
+        tolerance: the tolerance of the solver, for the warning.
     """
 
     kernel: AbstractMatrixKernel
     landmarks: Landmarks
     sums: Sums
     trace: Float[Array, ""]
-    lost: tuple[Normal, Float[Array, ""]]
+    compensation: tuple[Normal, Float[Array, ""]]
     count: Int[Array, ""]
     regularization: Float[Array, ""]
     dimension: int = eqx.field(static=True)
@@ -145,26 +149,28 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 
     @property
     def _totals(self) -> tuple[Any, ...]:
-        return self.sums.seen, self.trace
+        return self.sums.normal_equations, self.trace
 
-    def _of_velocities(
+    def _totals_of_velocities(
         self, X: Float[Array, "N n"], Y: Float[Array, "N n"], spread: RowSharding | None
     ) -> tuple[Any, ...]:
-        seen = normal(Columns(self.kernel, self.landmarks), self.sums.basis, X, Y, spread)
-        return seen, trace(self.kernel, X, spread)
+        normal_equations = normal(
+            Columns(self.kernel, self.landmarks), self.sums.basis, X, Y, spread
+        )
+        return normal_equations, trace(self.kernel, X, spread)
 
-    def _of_rows(self, rows: Measurements) -> tuple[Any, ...]:
+    def _totals_of_rows(self, rows: Measurements) -> tuple[Any, ...]:
         design = _design(self.kernel, self.landmarks, rows)
-        seen = Normal.of(design @ self.sums.basis, rows.targets)
-        return seen, trace_of_rows(self.kernel, rows)
+        normal_equations = Normal.from_rows(design @ self.sums.basis, rows.targets)
+        return normal_equations, trace_of_rows(self.kernel, rows)
 
-    def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
+    def _solve(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
         solution = _landmark_solution(self, count, regularization)
         cure = (
             "Start anew with landmarks from a sample that looks like the data so far, and a "
             "max_points that suffices; or ask for a larger regularization;"
         )
-        return _checked_field(
+        return _check_field(
             self.kernel, self.landmarks, solution, regularization, self.tolerance, cure
         )
 
@@ -173,16 +179,19 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 def start_fit(K, sample, regularization, landmarks, tolerance):
     T = whitening(K, landmarks)
     if sample.states is None:
-        seen = Normal.of(_design(K, landmarks, sample) @ T, sample.targets)
+        normal_equations = Normal.from_rows(_design(K, landmarks, sample) @ T, sample.targets)
     else:
-        seen = normal(Columns(K, landmarks), T, *sample.states)
-    sums, nothing = first_sums(seen, T, sample.count, regularization), jnp.zeros((), T.dtype)
+        normal_equations = normal(Columns(K, landmarks), T, *sample.states)
+    sums, nothing = (
+        first_sums(normal_equations, T, sample.count, regularization),
+        jnp.zeros((), T.dtype),
+    )
     return LandmarkFit(
         kernel=K,
         landmarks=landmarks,
         sums=sums,
         trace=nothing,
-        lost=(sums.seen, nothing),
+        compensation=(sums.normal_equations, nothing),
         count=jnp.zeros((), int),
         regularization=regularization,
         dimension=sample.dimension,
@@ -202,7 +211,7 @@ def _landmark_solution(fit, count, regularization):
         coefficients=weights,
         residual=jnp.zeros((0, fit.dimension), weights.dtype),
         norm=norm,
-        truncation=truncated(fit.trace, trace_of_sums(fit.sums), ridge),
+        truncation=truncation_of(fit.trace, trace_of_sums(fit.sums), ridge),
         residual_norm=residual_norm,
     )
 
@@ -210,16 +219,16 @@ def _landmark_solution(fit, count, regularization):
 class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
     """A low-rank fit: the field lives on a few landmarks, chosen from the data.
 
-    Landmarks are drawn by randomly pivoted Cholesky until trace(G − Ĝ) ≤ tolerance · Nλ. Then the
-    fitted values ŷ differ from those of the exact fit by at most tolerance · ‖y − ŷ‖, since the
-    difference is Nλ (G + NλI)⁻¹ (G − Ĝ) (Ĝ + NλI)⁻¹ y. So more noise and a larger λ need fewer
-    landmarks, and N does not matter. Smooth kernels in few dimensions need tens to hundreds. The
-    result carries `field.info.landmarks`, `.rank` and the `.truncation` that was reached.
+    Randomly pivoted Cholesky draws landmarks until trace(G − Ĝ) ≤ tolerance · Nλ. The fitted values
+    ŷ then differ from the exact ones by at most tolerance · ‖y − ŷ‖, since the difference is Nλ (G
+    + NλI)⁻¹ (G − Ĝ) (Ĝ + NλI)⁻¹ y. More noise and a larger λ therefore need fewer landmarks, and N
+    does not matter. Smooth kernels in few dimensions need tens to hundreds. `field.info` has the
+    number of `landmarks`, the `rank`, and the `truncation` that was reached.
 
-    Under jit, vmap and grad the number of landmarks cannot depend on values: buffers have the size
-    of `max_points`. Outside of them it is rounded up to a multiple of 16, and each such number
-    compiles anew: for a sweep over hyperparameters give `points`. Derivatives hold the landmarks
-    fixed.
+    Under jit, vmap and grad the number of landmarks cannot depend on values, and buffers have the
+    size of `max_points`. Otherwise the number is rounded up to a multiple of 16, and each such
+    number compiles a new program: pass `points` for a sweep over hyperparameters. Derivatives hold
+    the landmarks fixed.
 
     Args:
         tolerance: the bound on trace(G − Ĝ)/(Nλ), dimensionless.
@@ -227,8 +236,8 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
             while they are chosen, and 16 (m n)² after that.
         candidates: landmarks are chosen from the data, or from a random part of this size.
         key: for the draws; `jax.random.key(0)` if None, so that a fit can be repeated.
-        points: the landmarks, shape (m, n), if they are not to be chosen; columns of theirs that
-            depend on others are left out. `max_points`, `candidates` and `key` have no effect.
+        points: landmarks to use instead of choosing them, shape (m, n). Linearly dependent columns
+            are dropped. `max_points`, `candidates` and `key` then have no effect.
 
     Raises:
         ValueError: an argument is not positive, `points` is not of shape (m, n), or the tolerance
@@ -271,7 +280,10 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
     def landmarks(
         self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
     ) -> Landmarks:
-        """The points given, or the rows that reach the tolerance, or as many as there may be."""
+        """The caller's `points`, if any; otherwise landmarks chosen from the data.
+
+        They are chosen until the tolerance is met or `max_points` is reached.
+        """
         if self.points is not None:
             d = rows.blocks[0].points.shape[1]
             if self.points.shape[1] != d:
@@ -280,42 +292,47 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
             points = self.points.astype(rows.targets.dtype)
             return given_landmarks(K, landmarks_of(components(K, points)))
         key = jax.random.key(0) if self.key is None else self.key
-        left, most = self.tolerance * regularization, self.max_points
+        target_trace, max_count = self.tolerance * regularization, self.max_points
         if rows.states is not None:
-            return choose_landmarks(K, rows.states[0], left, most, self.candidates, key)
-        left, most = left * (rows.count / len(rows.targets)), most * rows.dimension
-        return choose_rows(K, rows, left, most, self.candidates, key)
+            return choose_landmarks(
+                K, rows.states[0], target_trace, max_count, self.candidates, key
+            )
+        target_trace, max_count = (
+            target_trace * (rows.count / len(rows.targets)),
+            max_count * rows.dimension,
+        )
+        return choose_rows(K, rows, target_trace, max_count, self.candidates, key)
 
-    def _basis(
+    def low_rank_basis(
         self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
     ) -> LandmarkBasis:
         return LandmarkBasis(self.landmarks(K, rows, regularization))
 
-    def _fitted(self, problem, throw=True, progress=False) -> KernelField:
+    def fit(self, problem, throw=True, progress=False) -> KernelField:
         if problem.states is None:
-            field: Any = self._given(problem, throw).field
+            field: Any = self.condition(problem, throw).field
             return field
         K, (X, Y), regularization = problem.kernel, problem.states, problem.regularization
         landmarks = self.landmarks(K, problem.rows, regularization)
-        spread = rows_of(X)
-        X, Y = split(spread, X), split(spread, Y)
+        spread = row_sharding(X)
+        X, Y = shard(spread, X), shard(spread, Y)
         solution = _landmark_fit(K, X, Y, regularization, landmarks, spread)
-        solution = solution._replace(residual=as_given(spread, solution.residual))
-        return _checked_field(K, landmarks, solution, regularization, self.tolerance, CHOOSE, throw)
+        solution = solution._replace(residual=to_caller_sharding(spread, solution.residual))
+        return _check_field(K, landmarks, solution, regularization, self.tolerance, CHOOSE, throw)
 
-    def _given(self, problem, throw=True, progress=False) -> LowRankConditional:
-        problem = problem.on_one_device()
+    def condition(self, problem, throw=True, progress=False) -> LowRankConditional:
+        problem = problem.to_one_device()
         K, rows, regularization = problem.kernel, problem.rows, problem.regularization
         landmarks = self.landmarks(K, rows, regularization)
-        given = low_rank_conditional(landmark_span(K, landmarks), rows, regularization, throw)
-        truncation = given.field.info.truncation
+        conditional = low_rank_conditional(landmark_span(K, landmarks), rows, regularization, throw)
+        truncation = conditional.field.info.truncation
         warn_if_truncated(truncation, landmarks.count, self.tolerance, CHOOSE)
-        return given
+        return conditional
 
-    def _started(self, K, sample, regularization) -> LandmarkFit:
+    def _start_fit(self, K, sample, regularization) -> LandmarkFit:
         landmarks = self.landmarks(K, sample, regularization)
-        some = thinned(K, sample, self.candidates)
-        return start_fit(K, some, regularization, landmarks, self.tolerance)
+        subset = thin(K, sample, self.candidates)
+        return start_fit(K, subset, regularization, landmarks, self.tolerance)
 
 
 @compiled
@@ -327,14 +344,15 @@ def _landmark_fit(K, X, Y, regularization, landmarks, spread):
 
     def step(w, residual):
         """One step of refinement, from w and y − F w."""
+        # minus half of the gradient: Fᵀ(y − Fw) − ρw with F = G_XS T and ρ = Nλ, (r,)
         slope = T.T @ product(K, S, X, residual, None, spread).reshape(-1) - ridge * w
         correction = jax.scipy.linalg.cho_solve((R, True), slope)
         change = product(K, X, S, (T @ correction).reshape(len(S), -1), spread)
         return w + correction, residual - change
 
     w = jax.scipy.linalg.cho_solve((R, True), total.moment)
-    A = (T @ w).reshape(len(S), -1)
+    A = (T @ w).reshape(len(S), -1)  # (m, n)
     w, residual = step(w, Y - product(K, X, S, A, spread))
-    truncation = truncated(trace(K, X, spread), jnp.trace(total.square), ridge)
+    truncation = truncation_of(trace(K, X, spread), jnp.trace(total.square), ridge)
     # ‖f‖² = αᵀ G_SS α = ‖w‖²
     return Solution(T @ w, residual, root(w @ w), truncation)

@@ -1,9 +1,9 @@
 """The problem that a solver is given, and the interface of solvers.
 
 A `Problem` holds the rows of observations, a kernel, a ridge, and the known part of the field.
-`fit`, `condition`, `tune` and every loss begin here, and nothing after it asks which kinds of
-observations there were. A solver returns a field, or an `AbstractConditional`, the Gaussian field
-given the rows.
+`fit`, `condition`, `tune` and every loss make one first; later code does not ask which kinds of
+observations there were. A solver returns a field, or an `AbstractConditional`, the Gaussian process
+conditioned on the rows.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jaxtyping import Array, ArrayLike, Float, Key
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, KnownPart, at_points, known_part, potential_of
 from hamkernel._fields.joined import at_inputs
-from hamkernel._machine import RowSharding, is_on_one_device, on_one_device, rows_of
+from hamkernel._machine import RowSharding, is_on_one_device, row_sharding, to_one_device
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import Measurements, measurements, measurements_of
@@ -37,11 +37,10 @@ class Problem:
 
     Attributes:
         kernel: K.
-        rows: the observations less the known part, on automatic axes of a mesh of devices.
+        rows: the observations minus the known part, on automatic axes of a mesh of devices.
         regularization: λ, shape ().
         known: the mean at the points of the rows; None if it is zero.
-        spread: how the rows of the states that were given are spread over devices; None if they
-            are not.
+        spread: the sharding of the caller's X; None if X lies on one device.
     """
 
     kernel: AbstractMatrixKernel
@@ -60,15 +59,15 @@ class Problem:
         """Points and velocities if there are no other rows, which a solver can read in tiles."""
         return self.rows.states
 
-    def on_one_device(self) -> Problem:
-        """This problem with its rows on one device; ValueError if they are on several processes."""
+    def to_one_device(self) -> Problem:
+        """This problem with all rows on one device; ValueError if several processes hold them."""
         if all(is_on_one_device(array) for array in jax.tree.leaves(self.rows)):
             return self
-        move = jax.tree.map(lambda array: on_one_device("the data", array), self.rows)
+        move = jax.tree.map(lambda array: to_one_device("the data", array), self.rows)
         return dataclasses.replace(self, rows=move)
 
 
-def problem(
+def make_problem(
     K: Any,
     X: Any,
     Y: Any,
@@ -78,14 +77,14 @@ def problem(
     parameters: Any = None,
     throw: bool = True,
 ) -> Problem:
-    """The problem of the data, checked; X and Y are `Velocities(X, Y)`.
+    """The problem that the checked data pose; X and Y mean `Velocities(X, Y)`.
 
     Raises:
         TypeError, ValueError: as `fit` says. A mean that is not finite at the data, and data whose
             squares overflow, are refused only with `throw`. AttributeError: there are energies and
             K has no potential.
     """
-    spread = rows_of(X) if isinstance(X, jax.Array) else None
+    spread = row_sharding(X) if isinstance(X, jax.Array) else None
     K, rows = measurements(matrix_kernel(K), X, Y, inputs_or_parameters(inputs, parameters, K))
     K.check_points(rows.points)
     K = completed(K, rows.points, rows.dimension)
@@ -93,10 +92,10 @@ def problem(
         raise AttributeError(f"energies were given, and {K.no_potential}")
     regularization = require.ridge(regularization, rows.targets.dtype)
     known = known_part(K, mean, rows.dimension, rows.targets.dtype)
-    left = without_known(K, rows, known, throw)
+    remaining = without_known(K, rows, known, throw)
     if throw:
-        _refuse_overflow(left, regularization)
-    return Problem(K, left, regularization, known, spread)
+        _refuse_overflow(remaining, regularization)
+    return Problem(K, remaining, regularization, known, spread)
 
 
 def _refuse_overflow(rows: Measurements, regularization: Float[Array, ""]) -> None:
@@ -117,23 +116,23 @@ def _refuse_overflow(rows: Measurements, regularization: Float[Array, ""]) -> No
 def new_rows(
     K: AbstractMatrixKernel, data: AbstractObservations, old: Measurements, known: Any
 ) -> Measurements:
-    """The rows of new data that is added to other rows, less those of the known part."""
+    """The measurements of additional data, minus those of the known part."""
     return without_known(K, measurements_of(K, data, previous=old)[1], known)
 
 
 def without_known(
     K: AbstractMatrixKernel, rows: Measurements, known: Any, throw: bool = True
 ) -> Measurements:
-    """The rows of observations less those of the known part of the field.
+    """The rows of observations minus those of the known part of the field.
 
     Raises:
-        AttributeError: energies, and the known part has no potential. ValueError: the known part
-            is not finite at the data, if it is to `throw`.
+        AttributeError: there are energies and the known part has no potential.
+        ValueError: `throw`, and the known part is not finite at the data.
     """
     if known is None:
         return rows
     potential = _known_potential(K, known) if len(rows.energies) else known
-    field, potential = (jax.tree_util.Partial(at_points, each) for each in (known, potential))
+    field, potential = (jax.tree_util.Partial(at_points, part) for part in (known, potential))
     values = rows.of(field, potential)
     if throw:
         bad = require.not_finite(values)
@@ -171,7 +170,7 @@ Own = TypeVar("Own", bound="AbstractConditional")
 
 
 class AbstractConditional(eqx.Module):
-    """A Gaussian field f ~ GP(0, K) given rows of observations.
+    """The Gaussian process f ~ GP(0, K) conditioned on rows of observations.
 
     Attributes:
         field: the conditional mean.
@@ -189,35 +188,56 @@ class AbstractConditional(eqx.Module):
 
     @abc.abstractmethod
     def updated(self: Own, new: Measurements) -> Own:
-        """The Gaussian field given the old rows and new ones, with the same σ²."""
+        """This process conditioned on new rows as well, with the same σ²."""
 
     @abc.abstractmethod
     def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> AbstractField:
-        """Fields drawn given the data, every leaf with a leading axis of `count`."""
+        """Draws of the conditioned process: a field whose leaves have a leading axis of `count`."""
 
 
 LearnedField = TypeVar("LearnedField", bound=AbstractField, covariant=True)
 
 
 class AbstractSolver(eqx.Module, Generic[LearnedField]):
-    """A method by which `fit` finds the field."""
+    """A method that solves the regularised least squares of a `Problem`.
 
-    no_factor: ClassVar[str | None] = None  # the reason why `_given` is not available, if so
-    is_low_rank: ClassVar[bool] = False  # whether `tune` minimises the loss of its `_basis`
+    A solver of your own implements `fit`, and `condition` if it keeps a factor:
 
-    def _basis(
+        class Mine(AbstractSolver[KernelField]):
+            def fit(self, problem, throw=True, progress=False):
+                rows, ridge = problem.rows, problem.ridge
+                ...  # (G + ridge I) c = rows.y, then `field_of_rows(problem.kernel, rows, c, …)`
+    """
+
+    no_factor: ClassVar[str | None] = None  # why `condition` is not available; None if it is
+    is_low_rank: ClassVar[bool] = False  # whether `tune` minimises the loss in `low_rank_basis`
+
+    def low_rank_basis(
         self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
     ) -> Any:
-        """The rule that gives each kernel the functions of its low-rank fit; None if dense."""
+        """The rule that makes the functions of a low-rank fit for each kernel; None if dense."""
         del K, rows, regularization
         return None
 
     @abc.abstractmethod
-    def _fitted(self, problem: Problem, throw: bool = True, progress: bool = False) -> LearnedField:
-        """The field. If the solve fails and `throw` is False, its numbers are NaN."""
+    def fit(self, problem: Problem, throw: bool = True, progress: bool = False) -> LearnedField:
+        """The learned field, without the known part.
 
-    def _given(
+        Args:
+            problem: kernel, rows, and λ.
+            throw: whether a failed solve raises RuntimeError; otherwise the numbers of the field
+                are NaN.
+            progress: whether to show a progress bar.
+        """
+
+    def condition(
         self, problem: Problem, throw: bool = True, progress: bool = False
     ) -> AbstractConditional:
-        """The Gaussian field given the rows; TypeError if the solver keeps no factor."""
+        """The process GP(0, K) conditioned on the rows, with its factor.
+
+        Args are those of `fit`.
+
+        Raises:
+            TypeError: the solver keeps no factor.
+        """
         raise TypeError(self.no_factor)

@@ -1,4 +1,4 @@
-"""Least squares in random Fourier features, in memory that does not grow with the points."""
+"""Least squares in random Fourier features, in memory independent of the number of points."""
 
 from typing import Any, ClassVar
 
@@ -10,7 +10,14 @@ from hamkernel import _require as require
 from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import FeatureField, feature_field
-from hamkernel._machine import RowSharding, as_given, compiled, refuse_beyond_memory, rows_of, split
+from hamkernel._machine import (
+    RowSharding,
+    compiled,
+    refuse_beyond_memory,
+    row_sharding,
+    shard,
+    to_caller_sharding,
+)
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.least_squares import (
     Normal,
@@ -27,28 +34,29 @@ from hamkernel._solvers.low_rank import (
     low_rank_conditional,
     singular,
 )
-from hamkernel._solvers.stream import AbstractStreamingFit, AbstractStreamingSolver, thinned
+from hamkernel._solvers.stream import AbstractStreamingFit, AbstractStreamingSolver, thin
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
 class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
     """Ridge regression in random Fourier features: O(N n r²) time, O(r²) memory beside the data.
 
-    Solves for the weights of r features by QR, tile by tile, never through the normal equations.
-    The structure of the field is exact for every count; the kernel is approximate, with an error
-    that falls as count^(−1/2), and faster than that for fields that the features can represent.
-    For shift-invariant kernels: Gaussian, Matern, RationalQuadratic and Periodic, their sums,
-    products, multiples and Select, in every structure and parity.
+    The weights of r features come from a QR, tile by tile, and not from the normal equations. The
+    structure of the field is exact for every count. The kernel is approximate, with an error of
+    order count^(−1/2), or smaller for fields that the features can represent. For shift-invariant
+    kernels: Gaussian, Matern, RationalQuadratic and Periodic, their sums, products, multiples and
+    Select, in every structure and parity.
 
-    How to choose: from 500 frequencies in the plane; more for short lengthscales and rough kernels
-    (a field of Matern(1.5) has frequencies of infinite fourth moment, and converges slowly). Where
-    N n is a few thousands `Cholesky()` is exact and as fast; `Nystrom()` needs fewer columns for
-    the same accuracy, and places them on the data.
+    How to choose: start with 500 frequencies in the plane. Short lengthscales and rough kernels
+    need more; the frequencies of a field of Matern(1.5) have an infinite fourth moment, so the
+    error falls slowly. If N n is a few thousands, `Cholesky()` is exact and as fast. `Nystrom()`
+    needs fewer columns for the same accuracy, and places them on the data.
 
     Args:
-        count: frequencies for each term of each scalar kernel. Each has a cosine and a sine, of an
-            odd or even kernel only one of them; a divergence-free field has a set for each of the
-            n(n − 1)/2 planes, a separable one for each component.
+        count: the number of frequencies for each term of each scalar kernel. A frequency has a
+            cosine and a sine, or one of them for an odd or even kernel. A divergence-free field has
+            a set of frequencies for each of the n(n − 1)/2 planes, a separable field one for each
+            component.
         key: the random key, `jax.random.key(0)`. The same key draws the same features.
 
     Raises:
@@ -66,47 +74,48 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
         self.count = require.count(count, "count")
         self.key = require.key(key)
 
-    def _basis(
+    def low_rank_basis(
         self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
     ) -> WaveBasis:
         return WaveBasis(self.key, self.count)
 
-    def _fitted(self, problem, throw=True, progress=False) -> FeatureField:
+    def fit(self, problem, throw=True, progress=False) -> FeatureField:
         if problem.states is None:
-            field: Any = self._given(problem, throw).field
+            field: Any = self.condition(problem, throw).field
             return field
-        spread = rows_of(problem.rows.points)
-        X, Y = (split(spread, each) for each in problem.states)
+        spread = row_sharding(problem.rows.points)
+        X, Y = (shard(spread, array) for array in problem.states)
         field = _feature_fit(problem.kernel, self, X, Y, problem.regularization, spread)
-        field = _if_solved(field, throw)
+        field = _check_field(field, throw)
         if spread is None:
             return field
-        residual = as_given(spread, field.residual)
+        residual = to_caller_sharding(spread, field.residual)
         return eqx.tree_at(lambda f: f.residual, field, residual)
 
-    def _given(self, problem, throw=True, progress=False) -> LowRankConditional:
-        problem = problem.on_one_device()
+    def condition(self, problem, throw=True, progress=False) -> LowRankConditional:
+        problem = problem.to_one_device()
         K, rows, regularization = problem.kernel, problem.rows, problem.regularization
         basis = self._features(K, rows.points.shape[1], rows.targets.dtype)
         span = FeatureSpan(K, basis, rows.dimension)
         return low_rank_conditional(span, rows, regularization, throw)
 
     def _features(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> AbstractFeatures:
-        """The features of K for points of n coordinates, if a fit in them fits in memory."""
+        """The features of K for points of n coordinates; ValueError if a fit exceeds the memory."""
 
         def of_kernel(K, key):
             return features(K, n, self.count, key, dtype)
 
         r = eqx.filter_eval_shape(of_kernel, K, self.key).columns
         what, cure = f"a fit with count = {self.count}", "Take fewer features."
-        # Eight: the triangle, the tile of 3r rows below it, and their QR factorisation.
+        # Eight matrices of r² numbers: the triangle (1), the tile of 3r rows below it (3), and
+        # their QR factorisation (4).
         refuse_beyond_memory(what, r, r, dtype, 8, cure)
         return of_kernel(K, self.key)
 
-    def _started(self, K, sample, regularization) -> "FeatureFit":
+    def _start_fit(self, K, sample, regularization) -> "FeatureFit":
         basis = self._features(K, sample.points.shape[1], sample.targets.dtype)
-        # The points that set the basis of the sums, as many as `Nystrom` has candidates by default.
-        return _start(K, basis, thinned(K, sample, 4096), regularization)
+        # 4096 points set the basis of the sums, the default number of candidates of `Nystrom`.
+        return _start(K, basis, thin(K, sample, 4096), regularization)
 
 
 @compiled
@@ -123,16 +132,16 @@ def _field_of_weights(K, basis, w, residual, regularization, residual_norm=None)
     return feature_field(K, basis, w, residual, regularization, info)
 
 
-def _if_solved(field: FeatureField, throw: bool = True) -> FeatureField:
-    """The field, if the least squares had a solution."""
+def _check_field(field: FeatureField, throw: bool = True) -> FeatureField:
+    """The field; RuntimeError, or NaN without `throw`, if the least squares had no solution."""
 
-    def learned(f: FeatureField):
+    def learned_arrays(f: FeatureField):
         return f.weights, f.residual, f.norm
 
     failed = require.not_finite(field.weights)
     cause = singular(field.weights.dtype)
-    values = require.value(learned(field), failed, cause, RuntimeError, throw)
-    return eqx.tree_at(learned, field, values)
+    values = require.value(learned_arrays(field), failed, cause, RuntimeError, throw)
+    return eqx.tree_at(learned_arrays, field, values)
 
 
 class FeatureFit(AbstractStreamingFit[FeatureField]):
@@ -148,7 +157,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     Attributes:
         kernel: K.
         features: the features of K.
-        sums: the sums over the rows added, of which the least squares are solved.
+        sums: the normal equations of the rows added.
         lost: the rounding errors of the sums.
         count: N, the number of points added, shape ().
         regularization: the λ of `start`, shape ().
@@ -158,7 +167,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     kernel: AbstractMatrixKernel
     features: AbstractFeatures
     sums: Sums
-    lost: tuple[Normal]
+    compensation: tuple[Normal]
     count: Int[Array, ""]
     regularization: Float[Array, ""]
     dimension: int = eqx.field(static=True)
@@ -171,35 +180,35 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
 
     @property
     def _totals(self) -> tuple[Any, ...]:
-        return (self.sums.seen,)
+        return (self.sums.normal_equations,)
 
-    def _of_velocities(
+    def _totals_of_velocities(
         self, X: Float[Array, "N n"], Y: Float[Array, "N n"], spread: RowSharding | None
     ) -> tuple[Any, ...]:
         return (normal(self.features, self.sums.basis, X, Y, spread),)
 
-    def _of_rows(self, rows: Measurements) -> tuple[Any, ...]:
-        design = FeatureSpan(self.kernel, self.features, self.dimension).of_rows(rows)
-        return (Normal.of(design @ self.sums.basis, rows.targets),)
+    def _totals_of_rows(self, rows: Measurements) -> tuple[Any, ...]:
+        design = FeatureSpan(self.kernel, self.features, self.dimension).all_rows(rows)
+        return (Normal.from_rows(design @ self.sums.basis, rows.targets),)
 
-    def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
-        return _if_solved(_feature_solution(self, count, regularization))
+    def _solve(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
+        return _check_field(_feature_solution(self, count, regularization))
 
 
 @compiled
 def _start(K, basis, sample, regularization):
     identity = jnp.eye(basis.columns, dtype=sample.targets.dtype)
     if sample.states is None:
-        design = FeatureSpan(K, basis, sample.dimension).of_rows(sample)
-        seen = Normal.of(design, sample.targets)
+        design = FeatureSpan(K, basis, sample.dimension).all_rows(sample)
+        normal_equations = Normal.from_rows(design, sample.targets)
     else:
-        seen = normal(basis, identity, *sample.states)
-    sums = first_sums(seen, identity, sample.count, regularization)
+        normal_equations = normal(basis, identity, *sample.states)
+    sums = first_sums(normal_equations, identity, sample.count, regularization)
     return FeatureFit(
         kernel=K,
         features=basis,
         sums=sums,
-        lost=(sums.seen,),
+        compensation=(sums.normal_equations,),
         count=jnp.zeros((), int),
         regularization=regularization,
         dimension=sample.dimension,

@@ -1,13 +1,13 @@
 """Fits to data that comes in chunks: one pass, and memory that ignores the number of points.
 
-A low-rank solver compresses the rows that it has seen to r² numbers for r columns: sums over the
-rows, in a basis that `start` chose. More data adds to them, those of two parts of the data add up
-to those of both, and any λ is solved for from them.
+A low-rank solver with r columns compresses all rows into r² sums, in a basis that `start` chose.
+More data adds to these sums. The sums of two parts of the data add up to the sums of both, and the
+field for any λ follows from them.
 
-The sums are exact to rounding, but the coefficients of landmarks that nearly depend on each other
-amplify rounding errors: 600 points on 160 landmarks at λ = 1e-13, added in another order, gave a
-field 6e-7 away. So each sum carries its rounding error (Knuth's error-free addition), and the
-result does not depend on the order of the parts, which an engine on many machines does not fix.
+Plain sums are exact to rounding, but nearly dependent landmarks amplify rounding errors in the
+coefficients: 600 points on 160 landmarks at λ = 1e-13, added in another order, changed the field by
+6e-7. Each sum therefore carries its rounding error (Knuth's two-sum). The result then does not
+depend on the order in which a distributed engine adds the chunks.
 """
 
 import abc
@@ -32,8 +32,8 @@ from hamkernel._machine import (
     compiled,
     full_precision,
     one_blas_thread,
-    rows_of,
-    split,
+    row_sharding,
+    shard,
 )
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import (
@@ -73,7 +73,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
 
     kernel: eqx.AbstractVar[AbstractMatrixKernel]
     sums: eqx.AbstractVar[Sums]
-    lost: eqx.AbstractVar[Any]
+    compensation: eqx.AbstractVar[Any]
     count: eqx.AbstractVar[Int[Array, ""]]
     regularization: eqx.AbstractVar[Float[Array, ""]]
     dimension: eqx.AbstractVar[int]
@@ -104,22 +104,22 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
 
     @abc.abstractmethod
     def _size(self) -> str:
-        """The number of landmarks or features, as it is printed."""
+        """The number of landmarks or features, as text."""
 
     @property
     @abc.abstractmethod
     def _totals(self) -> tuple[Any, ...]:
-        """The sums over the data: all that `add` changes in this PyTree, but for the count."""
+        """The accumulated sums. `add` changes these leaves and `count`, nothing else."""
 
     @abc.abstractmethod
     def _columns(self) -> tuple[str, Any]:
-        """Landmarks or features, by name."""
+        """The word "landmarks" or "features", and the arrays."""
 
     def _from_start(self) -> dict[str, Any]:
-        """The parts, by name, in which two fits must agree bit by bit if they are to be added.
+        """The arrays, by name, that must agree bit by bit in two fits that are added.
 
         Functions in kernels cannot be compared. The basis depends on the kernel and on the sample,
-        so it differs where such functions do.
+        so two fits with different functions also differ in their basis.
         """
         name, columns = self._columns()
         return {
@@ -131,18 +131,18 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         }
 
     @abc.abstractmethod
-    def _of_velocities(
+    def _totals_of_velocities(
         self, X: Float[Array, "N n"], Y: Float[Array, "N n"], spread: RowSharding | None
     ) -> tuple[Any, ...]:
-        """The totals of velocities alone, whose rows may be spread over devices."""
+        """The totals of velocities; their rows may be sharded over devices."""
 
     @abc.abstractmethod
-    def _of_rows(self, rows: Measurements) -> tuple[Any, ...]:
-        """The totals of observations alone."""
+    def _totals_of_rows(self, rows: Measurements) -> tuple[Any, ...]:
+        """The totals of observations of any kind."""
 
     @abc.abstractmethod
-    def _solved(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> LearnedField:
-        """`field` for a λ that has been checked, and the number of points, which is not 0."""
+    def _solve(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> LearnedField:
+        """The field for a checked λ and a positive number of points."""
 
     @full_precision
     def add(
@@ -158,8 +158,8 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
             X: states, shape (N, n); or observations, and then there is no Y. The D rows of
                 observations take O(D r) memory, where velocities are seen tile by tile.
             Y: measured velocities, shape (N, n).
-            inputs: of a `Controlled` kernel: u at each state, shape (N, m).
-            parameters: of a `Family`: θ at each state, shape (N, p).
+            inputs: u at each state, for a `Controlled` kernel, shape (N, m).
+            parameters: θ at each state, for a `Family`, shape (N, p).
 
         Raises:
             ValueError: a shape does not fit, the data is not finite, or there are energies, whose
@@ -172,9 +172,9 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         )
         if rows.states is None:
             return _with_rows(self, rows)
-        X, Y = (each.astype(self.dtype) for each in rows.states)
-        spread = rows_of(X)
-        return _with_velocities(self, split(spread, X), split(spread, Y), spread)
+        X, Y = (array.astype(self.dtype) for array in rows.states)
+        spread = row_sharding(X)
+        return _with_velocities(self, shard(spread, X), shard(spread, Y), spread)
 
     def __add__(self: Fit, other: Any) -> Fit:
         """The fit to the data of both, the same bits in any order of the parts of the data.
@@ -197,7 +197,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         for name, at_start in self._from_start().items():
             cause = f"the two fits have different {name}, and do not add. {_START_ONCE}"
             totals = require.value(totals, _differ(at_start, other._from_start()[name]), cause)
-        return _plus(self, totals, other.lost, other.count)
+        return _plus(self, totals, other.compensation, other.count)
 
     __radd__ = __add__
 
@@ -207,10 +207,10 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         _, rows = measurements_of(self.kernel, data, previous=nothing)
         self._check(rows.targets.dtype, rows.dimension)
         _refuse_energies(rows)
-        return without_known(self.kernel, rows, self._known)
+        return without_known(self.kernel, rows, self._known_part)
 
     def _check(self, dtype: jnp.dtype | None, dimension: int) -> None:
-        """ValueError and TypeError unless the data is of this system, with no more digits."""
+        """ValueError for another number of coordinates, TypeError for a dtype of more digits."""
         if dimension != self.dimension:
             raise ValueError(f"the data has {dimension} coordinates and the fit {self.dimension}.")
         if dtype is not None and np.promote_types(dtype, self.dtype) != self.dtype:
@@ -220,17 +220,20 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
             )
 
     @property
-    def _known(self) -> Any:
-        """The part of the field that is known: G u of a known input matrix."""
+    def _known_part(self) -> Any:
+        """The known part of the field: G u for a known input matrix G."""
         return known_part(self.kernel, None, self.dimension, self.dtype)
 
     def sum_of_columns(self) -> Any:
-        """The field whose weights are all 1, by which a file recognises its kernel."""
+        """The field with all weights equal to 1.
+
+        `save` stores one of its velocities, and `load` compares it to detect a wrong kernel.
+        """
         nothing = jax.tree.map(jnp.zeros_like, self._totals)
         fit = eqx.tree_at(lambda f: f._totals, self, nothing)
-        fit = eqx.tree_at(lambda f: f.sums.seen.moment, fit, replace_fn=jnp.ones_like)
+        fit = eqx.tree_at(lambda f: f.sums.normal_equations.moment, fit, replace_fn=jnp.ones_like)
         one = jnp.ones((), self.dtype)
-        return learned_field(fit._solved(jnp.ones_like(self.count), one), self._known)
+        return learned_field(fit._solve(jnp.ones_like(self.count), one), self._known_part)
 
     @one_blas_thread
     @full_precision
@@ -238,7 +241,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         """The field learned from all data added so far; O(r³), and no pass over the data.
 
         Args:
-            regularization: λ > 0, as in `hk.fit`, with N the number of points added so far; that
+            regularization: λ > 0, as in `hk.fit`, with N the number of points added so far; the λ
                 of `start` if None.
 
         Raises:
@@ -251,28 +254,28 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         count = require.value(
             self.count, none, "no data yet: add(X, Y) before asking for the field."
         )
-        return learned_field(self._solved(count, regularization), self._known)
+        return learned_field(self._solve(count, regularization), self._known_part)
 
 
 @compiled
 def _with_velocities(fit, X, Y, spread):
-    return _plus(fit, fit._of_velocities(X, Y, spread), None, len(X))
+    return _plus(fit, fit._totals_of_velocities(X, Y, spread), None, len(X))
 
 
 @compiled
 def _with_rows(fit, rows):
-    return _plus(fit, fit._of_rows(rows), None, rows.count)
+    return _plus(fit, fit._totals_of_rows(rows), None, rows.count)
 
 
 def _to_jax(leaf: Any) -> Any:
     return jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf
 
 
-def _differ(one: Any, other: Any) -> Bool[ArrayLike, ""]:
+def _differ(first: Any, second: Any) -> Bool[ArrayLike, ""]:
     """Whether two PyTrees print differently or hold different arrays."""
-    pairs = [jax.tree.leaves(eqx.filter(each, eqx.is_array)) for each in (one, other)]
-    shapes, others = ([leaf.shape for leaf in leaves] for leaves in pairs)
-    if text(one) != text(other) or shapes != others:
+    pairs = [jax.tree.leaves(eqx.filter(tree, eqx.is_array)) for tree in (first, second)]
+    shapes, second_shapes = ([leaf.shape for leaf in leaves] for leaves in pairs)
+    if text(first) != text(second) or shapes != second_shapes:
         return np.asarray(True)
     xp = np if require.is_concrete(pairs) else jnp
     same = [xp.array_equal(a, b, equal_nan=True) for a, b in zip(*pairs, strict=True)]
@@ -280,23 +283,28 @@ def _differ(one: Any, other: Any) -> Bool[ArrayLike, ""]:
 
 
 @compiled
-def _plus(fit: Fit, more: Any, more_lost: Any, count: Int[ArrayLike, ""]) -> Fit:
-    def added(a, b, a_lost, b_lost):
-        s, left = _two_sum(a, b)
-        t, rest = _two_sum(a_lost, b_lost)
-        s, left = _two_sum(s, left + t)
-        return _two_sum(s, left + rest)
+def _plus(fit: Fit, more: Any, more_compensation: Any, count: Int[ArrayLike, ""]) -> Fit:
+    def add_compensated(a, b, a_error, b_error):
+        s, error = _two_sum(a, b)
+        t, error_of_errors = _two_sum(a_error, b_error)
+        s, error = _two_sum(s, error + t)
+        return _two_sum(s, error + error_of_errors)
 
-    if more_lost is None:
-        more_lost = jax.tree.map(jnp.zeros_like, more)
-    pairs = jax.tree.map(added, fit._totals, more, fit.lost, more_lost)
-    totals, lost = jax.tree.transpose(jax.tree.structure(more), jax.tree.structure((0, 0)), pairs)
-    new = (*totals, lost, fit.count + count)
-    return eqx.tree_at(lambda f: (*f._totals, f.lost, f.count), fit, new)
+    if more_compensation is None:
+        more_compensation = jax.tree.map(jnp.zeros_like, more)
+    pairs = jax.tree.map(add_compensated, fit._totals, more, fit.compensation, more_compensation)
+    totals, compensation = jax.tree.transpose(
+        jax.tree.structure(more), jax.tree.structure((0, 0)), pairs
+    )
+    new = (*totals, compensation, fit.count + count)
+    return eqx.tree_at(lambda f: (*f._totals, f.compensation, f.count), fit, new)
 
 
 def _two_sum(a: Array, b: Array) -> tuple[Array, Array]:
-    """The sum, rounded, and its rounding error (Knuth)."""
+    """(s, e) with s = fl(a + b) and s + e = a + b exactly.
+
+    Source: Knuth, The Art of Computer Programming, volume 2, section 4.2.2, theorem B.
+    """
     s = a + b
     c = s - a
     return s, (a - (s - c)) + (b - c)
@@ -306,10 +314,10 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
     """A solver whose fit to all the data can be made from chunks of it."""
 
     @abc.abstractmethod
-    def _started(
+    def _start_fit(
         self, K: AbstractMatrixKernel, sample: Measurements, regularization: Float[Array, ""]
     ) -> Fit:
-        """`start` for arguments that have been checked."""
+        """`start` for checked arguments."""
 
     @full_precision
     def start(
@@ -320,7 +328,7 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
         inputs: Num[ArrayLike, "N m"] | None = None,
         parameters: Num[ArrayLike, "N p"] | None = None,
     ) -> Fit:
-        """A fit without data yet, to which chunks are added: a `LandmarkFit` or a `FeatureFit`.
+        """An empty fit, to which chunks are added: a `LandmarkFit` or a `FeatureFit`.
 
         Args:
             K: a matrix-valued kernel.
@@ -331,8 +339,8 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
                 `RandomFeatures` only the rounding of the sums depends on them.
             regularization: the smallest λ that will be asked for, since the tolerance of `Nystrom`
                 is relative to it, and so are the digits that are kept: a smaller one loses some.
-            inputs: of a `Controlled` kernel: those of the sample, shape (N, m).
-            parameters: of a `Family`: those of the sample, shape (N, p).
+            inputs: u at each point of the sample, for a `Controlled` kernel, shape (N, m).
+            parameters: θ at each point of the sample, for a `Family`, shape (N, p).
 
         Where `field.info.truncation` of the data added exceeds the tolerance of `Nystrom`, start
         anew with a sample that looks like the data so far.
@@ -355,7 +363,7 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
         K.check_dimension(rows.points.shape[1])
         K = completed(K, rows.points, rows.dimension)
         require.warn_of_float32(rows.targets)
-        return self._started(K, rows, require.ridge(regularization, rows.targets.dtype))
+        return self._start_fit(K, rows, require.ridge(regularization, rows.targets.dtype))
 
     @one_blas_thread
     @full_precision
@@ -387,8 +395,8 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
             regularization: λ > 0, as in `hk.fit`, with N the number of all points.
             sample: states that look like all of the data, for `start`; the first chunk if None.
             progress: show a progress bar where the standard error is a terminal.
-            inputs: of a `Controlled` kernel: those of the sample, shape (S, m).
-            parameters: of a `Family`: those of the sample, shape (S, p).
+            inputs: u at each point of the sample, for a `Controlled` kernel, shape (S, m).
+            parameters: θ at each point of the sample, for a `Family`, shape (S, p).
 
         Raises:
             ValueError: there is no chunk, or as `hk.fit` for one of them. TypeError: as `hk.fit`.
@@ -416,10 +424,10 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
                 X, Y = require.data(*chunk[:2], part=True)
             U = chunk[2] if len(chunk) == 3 else None
             if model is None:
-                first, given = (
+                first, first_inputs = (
                     (X, U) if sample is None else (sample, inputs_or_parameters(inputs, parameters))
                 )
-                model = self.start(K, first, regularization, given)
+                model = self.start(K, first, regularization, first_inputs)
             # The next chunk is read while this one is added, and no further ones pile up.
             jax.block_until_ready(model)
             with _naming(i):
@@ -431,13 +439,13 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
 
 @contextlib.contextmanager
 def _naming(chunk: int) -> Iterator[None]:
-    """Errors say in which chunk they are."""
+    """Add the number of the chunk to the message of an error."""
     try:
         yield
     except (TypeError, ValueError) as error:
         kind = TypeError if isinstance(error, TypeError) else ValueError
         raise kind(f"chunk {chunk}, counted from 0: {error}") from error
-    except BaseException as error:  # whatever reading it raises, and Ctrl-C
+    except BaseException as error:  # whatever reading the chunk raises, and Ctrl-C
         error.add_note(f"in chunk {chunk}, counted from 0")
         raise
 
@@ -451,16 +459,16 @@ def _refuse_energies(rows: Measurements) -> None:
 
 
 def rows_at(K: AbstractMatrixKernel, points: Float[Array, "N d"]) -> Measurements:
-    """The rows of velocities at points, with no targets."""
+    """The rows of velocities at points, with targets of zero."""
     block = components(K, points)
     return Measurements((block,), jnp.zeros(block.size, points.dtype))
 
 
-def thinned(K: AbstractMatrixKernel, sample: Measurements, most: int) -> Measurements:
-    """Every k-th point of velocities, at most `most` of them, on every device; else all rows."""
+def thin(K: AbstractMatrixKernel, sample: Measurements, count: int) -> Measurements:
+    """Every k-th point, at most `most` of them, replicated; all rows if there are other rows."""
     if sample.states is None:
         return sample
     points = sample.points
-    spread = rows_of(points)
-    some = split(spread, points)[:: -(-len(points) // most)]
-    return rows_at(K, some if spread is None else spread.whole(some))
+    spread = row_sharding(points)
+    subset = shard(spread, points)[:: -(-len(points) // count)]
+    return rows_at(K, subset if spread is None else spread.replicate(subset))

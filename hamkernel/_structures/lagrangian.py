@@ -10,7 +10,8 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import AbstractScalarKernel, as_scalar_kernel
+from hamkernel._kernels.base import AbstractScalarKernel, Scaled, as_scalar_kernel
+from hamkernel._machine import compiled
 from hamkernel._show import call
 from hamkernel._structures.friction import Friction
 
@@ -20,47 +21,63 @@ _CENTRES = 64  # positions that carry V and each entry of M
 class Lagrangian(eqx.Module):
     """Machines with an unknown mass matrix: L = ½ vᵀM(q)v − V(q), with V and M learned.
 
-        K = hk.Lagrangian(potential=100.0 * hk.Gaussian(1.5), inertia=10.0 * hk.Gaussian(1.5))
-        field = hk.fit(K, X, torques, 1e-6, accelerations=A)  # X = (q, v)
+        K = hk.Lagrangian(potential=hk.Gaussian(1.5), inertia=hk.Gaussian(1.5), angles=(0, 1))
+        learned = hk.learn(K, hk.Runs(times, q, inputs=torques))
+        field = hk.fit(K, X, torques, 1e-6, accelerations=A)  # X = (q, v), where q̈ is known
         field.mass_matrix(q), field.gravity(q), field.inverse_dynamics(q, v, a)
 
     The equation of Euler and Lagrange, τ = d/dt ∂L/∂v − ∂L/∂q + friction(v), is linear in L, so
     torques are linear functionals of L ~ GP(0, k_V(q, q′) + k_M(q, q′) (v·v′)²) and one least
     squares finds V, M and the friction together. Both kernels are carried by 64 positions of the
-    data.
+    data. A joint without a motor has the torque zero.
 
     A constant in V is not determined. Without any torque the scale of L is not either, and L = 0
-    would fit everything: such data are refused. Friction of the joints that is there and not asked
-    for spoils M.
+    would fit everything: such data are refused, unless an entry of M is known. Friction of the
+    joints that is there and not asked for spoils M.
 
     Args:
-        potential: the kernel k_V of V, on positions.
-        inertia: the kernel k_M of the entries of ½M, on positions.
+        potential: the kernel k_V of V, on positions. A kernel without an amplitude gets one.
+        inertia: the kernel k_M of the entries of ½M, on positions; likewise.
         angles: the coordinates that are angles, for which kernels see (cos, sin).
         friction: whether joints have friction d v + c tanh(v/ε) with unknown d and c, one pair
             each; its standard deviations are `viscous` and `coulomb` of a `Friction`. True is
             `Friction(1.0, 1.0)`.
+        known_mass_matrix: a pair (q, M) of one position, shape (m,), and the mass matrix there,
+            shape (m, m), with NaN for entries that are not known. One entry fixes the scale of L,
+            as a known load or a link that was weighed gives it.
 
     Raises:
-        TypeError: a kernel is no scalar kernel. ValueError: `angles` are no coordinates.
+        TypeError: a kernel is no scalar kernel. ValueError: `angles` are no coordinates;
+            `known_mass_matrix` has other shapes, or no entry of it is known.
     """
 
     potential: AbstractScalarKernel
     inertia: AbstractScalarKernel
     angles: tuple[int, ...] = eqx.field(static=True)
     friction: Friction | None
+    known_mass_matrix: tuple[tuple[float, ...], tuple[tuple[float | None, ...], ...]] | None = (
+        eqx.field(static=True)
+    )
 
     def __init__(
-        self, potential: Any, inertia: Any, angles: Any = (), friction: Friction | bool = False
+        self,
+        potential: Any,
+        inertia: Any,
+        angles: Any = (),
+        friction: Friction | bool = False,
+        known_mass_matrix: tuple[Any, Any] | None = None,
     ):
-        self.potential, self.inertia = as_scalar_kernel(potential), as_scalar_kernel(inertia)
+        self.potential, self.inertia = map(_with_amplitude, (potential, inertia))
         self.angles = require.coordinates(angles, "angles") if np.size(angles) else ()
         self.friction = Friction(1.0, 1.0) if friction is True else (friction or None)
+        self.known_mass_matrix = None if known_mass_matrix is None else _known(known_mass_matrix)
 
     def __repr__(self) -> str:
         said = [f"potential={self.potential!r}", f"inertia={self.inertia!r}"]
         said += [f"angles={self.angles}"] if self.angles else []
-        return call("Lagrangian", said + ([f"friction={self.friction!r}"] if self.friction else []))
+        said += [f"friction={self.friction!r}"] if self.friction else []
+        said += ["known_mass_matrix=…"] if self.known_mass_matrix else []
+        return call("Lagrangian", said)
 
     def placed(self, q: Float[Array, " m"]) -> Float[Array, " d"]:
         """The coordinates that the kernels see: (cos, sin) of angles, all others as they are."""
@@ -71,21 +88,56 @@ class Lagrangian(eqx.Module):
         return jnp.concatenate(parts)
 
 
+def _with_amplitude(k: Any) -> AbstractScalarKernel:
+    k = as_scalar_kernel(k)
+    scaled = any(isinstance(node, Scaled) for node in jax.tree.leaves(k, is_leaf=_is_scaled))
+    return k if scaled else 1.0 * k
+
+
+def _is_scaled(node: Any) -> bool:
+    return isinstance(node, Scaled)
+
+
+def _known(given: Any) -> tuple[tuple[float, ...], tuple[tuple[float | None, ...], ...]]:
+    """The position and the mass matrix there, symmetric, checked; None is not known."""
+    if not isinstance(given, tuple | list) or len(given) != 2:
+        raise ValueError("known_mass_matrix must be a pair (q, M) of a position and M there.")
+    q = require.doubles(given[0], "the position of known_mass_matrix")
+    M = require.doubles(given[1], "known_mass_matrix")
+    if q.ndim != 1 or M.shape != (len(q), len(q)):
+        raise ValueError(
+            f"known_mass_matrix has a position of shape {q.shape} and a matrix of shape {M.shape}; "
+            "(m,) and (m, m) are needed, with NaN for entries that are not known."
+        )
+    M = np.where(np.isnan(M), M.T, M)
+    entries = M[np.isfinite(M)]
+    if not (np.isfinite(q).all() and entries.size and np.any(entries != 0)):
+        raise ValueError(
+            "known_mass_matrix must have a finite position and at least one known entry that is "
+            "not zero."
+        )
+    rows = (tuple(None if np.isnan(x) else x for x in row) for row in M.tolist())
+    return tuple(q.tolist()), tuple(rows)
+
+
 class LagrangianFeatures(eqx.Module):
     """Features Φ of L and of friction, with L = Φ(x)·w and w ~ N(0, I).
 
-    Those of V are −L⁻¹k_V(C, q). Those of Mᵢⱼ are L⁻¹k_M(C, q) times vᵢ² or √2 vᵢvⱼ, i < j, since
-    (v·v′)² is the sum of their products.
+    Those of V are −R⁻¹k_V(C, q). Those of Mᵢⱼ are R⁻¹k_M(C, q) times vᵢ² or √2 vᵢvⱼ, i < j, since
+    (v·v′)² is the sum of their products. R is a root of a Gram, R Rᵀ = k(C, C). Rows "in kernels"
+    are without R⁻¹, which `finished` applies to rows that were differentiated and integrated.
 
     Attributes:
         kernel: the Lagrangian kernel.
         centres: what the kernels see of the positions that carry V and M, shape (c, d).
+        roots: the roots of k_V and k_M at the centres, each of shape (c, c).
         rest_speed: ε of dry friction.
         count: m, the number of positions.
     """
 
     kernel: Lagrangian
     centres: Float[Array, "c d"]
+    roots: tuple[Float[Array, "c c"], Float[Array, "c c"]]
     rest_speed: Float[Array, ""]
     count: int = eqx.field(static=True)
 
@@ -93,34 +145,53 @@ class LagrangianFeatures(eqx.Module):
     def columns(self) -> int:
         """How many features there are, those of friction last."""
         m = self.count
-        return len(self.centres) * (1 + m * (m + 1) // 2) + 2 * m * (
-            self.kernel.friction is not None
-        )
+        return len(self.centres) * (1 + m * (m + 1) // 2) + self.friction_columns
+
+    @property
+    def friction_columns(self) -> int:
+        """How many of the features are of friction."""
+        return 2 * self.count * (self.kernel.friction is not None)
+
+    def with_kernel(self, kernel: Lagrangian) -> "LagrangianFeatures":
+        """The features of another kernel on the same centres."""
+        roots = _root(kernel.potential, self.centres), _root(kernel.inertia, self.centres)
+        return LagrangianFeatures(kernel, self.centres, roots, self.rest_speed, self.count)
 
     def of_kernel(self, k: AbstractScalarKernel, q: Float[Array, " m"]) -> Float[Array, " c"]:
-        """L⁻¹ k(C, q), L Lᵀ = k(C, C)."""
-        C = self.centres
-        G = jax.vmap(jax.vmap(k, (None, 0)), (0, None))(C, C)
-        # A hundred times the rounding bounds how finely centres resolve, and biases nothing.
-        rounding = 100 * jnp.finfo(G.dtype).eps * len(G) * jnp.diagonal(G).mean()
-        L = jnp.linalg.cholesky(G + rounding * jnp.eye(len(G), dtype=G.dtype))
-        return solve_triangular(L, jax.vmap(k, (None, 0))(self.kernel.placed(q), C), lower=True)
+        """k(C, q)."""
+        return jax.vmap(k, (None, 0))(self.kernel.placed(q), self.centres)
+
+    def finished(self, rows: Float[Array, "*k r"]) -> Float[Array, "*k r"]:
+        """Rows in kernels as rows in features: R⁻¹ on each block of centres."""
+        c, shape = len(self.centres), rows.shape[:-1]
+        rows = rows.reshape(-1, self.columns)
+        last = self.columns - self.friction_columns
+        blocks = rows[:, :last].reshape(len(rows), -1, c)
+        V = solve_triangular(self.roots[0], blocks[:, 0].T, lower=True).T
+        M = solve_triangular(self.roots[1], blocks[:, 1:].reshape(-1, c).T, lower=True).T
+        done = jnp.concatenate([V, M.reshape(len(rows), -1), rows[:, last:]], axis=1)
+        return done.reshape(*shape, self.columns)
+
+    def on_kernels(self, weights: Float[Array, " r"]) -> Float[Array, " r"]:
+        """The coefficients c with `finished(rows) @ weights` = rows @ c."""
+        return jax.linear_transpose(self.finished, weights)(weights)[0]
 
     def of_lagrangian(self, x: Float[Array, " n"]) -> Float[Array, " r"]:
-        """Φ(q, v) without friction."""
+        """L(q, v), in kernels."""
         q, v = jnp.split(x, 2)
         i, j = np.triu_indices(self.count)
         squares = v[i] * v[j] * np.where(i == j, 1.0, np.sqrt(2.0))
         inertia = squares[:, None] * self.of_kernel(self.kernel.inertia, q)[None]
-        return jnp.concatenate([-self.of_kernel(self.kernel.potential, q), inertia.reshape(-1)])
+        V, none = -self.of_kernel(self.kernel.potential, q), jnp.zeros(self.friction_columns)
+        return jnp.concatenate([V, inertia.reshape(-1), none.astype(V.dtype)])
 
     def of_potential(self, q: Float[Array, " m"]) -> Float[Array, " r"]:
-        """The features of V."""
+        """V(q), in kernels."""
         phi = self.of_kernel(self.kernel.potential, q)
         return jnp.pad(phi, (0, self.columns - len(phi)))
 
     def of_mass_matrix(self, q: Float[Array, " m"]) -> Float[Array, "m m r"]:
-        """The features of M(q) = ∂²L/∂v²."""
+        """M(q) = ∂²L/∂v², in kernels."""
         m, c = self.count, len(self.centres)
         i, j = np.triu_indices(m)
         phi = self.of_kernel(self.kernel.inertia, q)
@@ -129,33 +200,50 @@ class LagrangianFeatures(eqx.Module):
             i == j, 2.0, np.sqrt(2.0)
         )
         found = jnp.einsum("ijp,c->ijpc", jnp.asarray(shares, phi.dtype), phi).reshape(m, m, -1)
-        return jnp.pad(found, ((0, 0), (0, 0), (c, self.columns - c - found.shape[-1])))
+        return jnp.pad(found, ((0, 0), (0, 0), (c, self.friction_columns)))
 
     def of_friction(self, v: Float[Array, " m"]) -> Float[Array, "m r"]:
-        """The features of the friction of each joint."""
+        """The friction of each joint, in kernels."""
         friction, m = self.kernel.friction, self.count
         if friction is None:
             return jnp.zeros((m, self.columns), v.dtype)
-        slide = jnp.diag(jnp.broadcast_to(friction.viscous.astype(v.dtype), v.shape) * v)
-        dry = jnp.broadcast_to(friction.coulomb.astype(v.dtype), v.shape)
-        stick = jnp.diag(dry * jnp.tanh(v / self.rest_speed))
-        both = jnp.concatenate([slide, stick], axis=1)
-        return jnp.pad(both, ((0, 0), (self.columns - 2 * m, 0)))
+        return jnp.pad(
+            friction_of_joints(friction, v, self.rest_speed), ((0, 0), (self.columns - 2 * m, 0))
+        )
+
+    def of_motion(self, x: Float[Array, " n"]) -> tuple[Float[Array, "m r"], Float[Array, "m r"]]:
+        """The momentum p = ∂L/∂v and the force b = friction − ∂L/∂q of ṗ + b = τ, in kernels."""
+        m = self.count
+        slopes = jax.jacfwd(self.of_lagrangian)(x).T
+        return slopes[m:], self.of_friction(x[m:]) - slopes[:m]
 
     def of_torques(self, x: Float[Array, " n"], a: Float[Array, " m"]) -> Float[Array, "m r"]:
-        """The features of τ = D_(v,a) ∂L/∂v − ∂L/∂q + friction."""
-        m = self.count
-        slopes = jax.jacfwd(self.of_lagrangian)
-        here, along = jax.jvp(slopes, (x,), (jnp.concatenate([x[m:], a]),))
-        torques = (along[:, m:] - here[:, :m]).T
-        torques = jnp.pad(torques, ((0, 0), (0, self.columns - torques.shape[1])))
-        return torques + self.of_friction(x[m:])
+        """τ = D_(v,a) ∂L/∂v − ∂L/∂q + friction, in kernels."""
+        momentum = lambda x: self.of_motion(x)[0]  # noqa: E731
+        rate = jax.jvp(momentum, (x,), (jnp.concatenate([x[self.count :], a]),))[1]
+        return rate + self.of_motion(x)[1]
+
+
+def friction_of_joints(
+    friction: Friction, v: Float[Array, " m"], rest_speed: Float[Array, ""]
+) -> Float[Array, "m k"]:
+    """The columns v and tanh(v/ε) of each joint, times their standard deviations, k = 2m."""
+    slide = jnp.diag(jnp.broadcast_to(friction.viscous.astype(v.dtype), v.shape) * v)
+    dry = jnp.broadcast_to(friction.coulomb.astype(v.dtype), v.shape)
+    return jnp.concatenate([slide, jnp.diag(dry * jnp.tanh(v / rest_speed))], axis=1)
+
+
+def _root(k: AbstractScalarKernel, C: Float[Array, "c d"]) -> Float[Array, "c c"]:
+    G = jax.vmap(jax.vmap(k, (None, 0)), (0, None))(C, C)
+    # A hundred times the rounding bounds how finely centres resolve, and biases nothing.
+    rounding = 100 * jnp.finfo(G.dtype).eps * len(G) * jnp.diagonal(G).mean()
+    return jnp.linalg.cholesky(G + rounding * jnp.eye(len(G), dtype=G.dtype))
 
 
 def lagrangian_features(K: Lagrangian, X: Float[Array, "N n"]) -> LagrangianFeatures:
     """The features of K with centres among the positions of the states X, far from one another."""
     m = X.shape[1] // 2
-    placed = np.asarray(jax.vmap(K.placed)(X[:, :m]))
+    placed = np.asarray(_placed(K, X[:, :m]))
     unit = placed / np.where(np.ptp(placed, axis=0) > 0, np.ptp(placed, axis=0), 1.0)
     chosen, distance = [int(np.argmin(unit[:, 0]))], np.full(len(unit), np.inf)
     while len(chosen) < _CENTRES:
@@ -166,4 +254,11 @@ def lagrangian_features(K: Lagrangian, X: Float[Array, "N n"]) -> LagrangianFeat
     given = None if K.friction is None else K.friction.rest_speed
     # Dry friction changes its sign within a tenth of the speed of the slowest joint.
     rest = 0.1 * jnp.sqrt(jnp.mean(X[:, m:] ** 2, axis=0)).min() if given is None else given
-    return LagrangianFeatures(K, jnp.asarray(placed[chosen]), jnp.asarray(rest, X.dtype), m)
+    centres = jnp.asarray(placed[chosen])
+    none = jnp.zeros((0, 0), X.dtype)
+    start = LagrangianFeatures(K, centres, (none, none), jnp.asarray(rest, X.dtype), m)
+    return _with_kernel(start, K)
+
+
+_with_kernel = compiled(lambda features, K: features.with_kernel(K))
+_placed = compiled(lambda K, Q: jax.vmap(K.placed)(Q))

@@ -36,11 +36,11 @@ class Diagnostic(NamedTuple):
 
     Attributes:
         name: the question, in a word or two.
-        value: what was found.
-        limit: what it is compared with.
+        value: the value found.
+        limit: the limit of the value.
         passes: whether the value is within the limit.
-        meaning: what the value says, in one sentence.
-        advice: what to do, in one sentence; "" where there is nothing to do.
+        meaning: the meaning of the value, in one sentence.
+        advice: the thing to do, in one sentence; "" where there is nothing to do.
         decides: whether a field that fails here must not be used.
     """
 
@@ -80,13 +80,16 @@ class Diagnostics:
 
     @property
     def warning(self) -> str:
-        """What falls short, in a line or two; "" where nothing does."""
+        """The rows that fall short, in a line or two; "" where none does."""
         short = [row for row in self.rows if not row.passes]
         if not short:
             return ""
-        first = sorted(short, key=lambda row: not row.decides)
-        said = "; ".join(row.meaning.rstrip(".") for row in first[:2])
-        more = f"; and {', '.join(row.name for row in first[2:])}" if len(first) > 2 else ""
+        decide = [row for row in short if row.decides]
+        qualify = [row for row in short if not row.decides]
+        shown = [*decide[:1], *qualify[:1]] if decide and qualify else short[:2]
+        said = "; ".join(row.meaning.rstrip(".") for row in shown)
+        names = ", ".join(row.name for row in short if row not in shown)
+        more = f"; and {names}" if names else ""
         verdict = "look at" if self.is_usable else "do not use this field"
         return f"{verdict}: {said}{more}. learned.diagnostics says what to do."
 
@@ -155,7 +158,7 @@ class FitQuality(NamedTuple):
             swing.
         impulse: the largest jump by a push, over the standard deviation of the coordinate.
         pushed: the parts in which something pushed the system, as those that were dropped.
-        count: of iterations.
+        count: the number of iterations.
         settled: whether they ended by themselves.
         swing: how many samples there are in a swing.
         driven: whether there are inputs.
@@ -168,7 +171,7 @@ class FitQuality(NamedTuple):
         has_friction: whether the kernel has a `Friction`.
         is_curve: whether the momentum is one function of the position in the data.
         timing: how residuals grow with the speed; None where that cannot be told.
-        free_run: the error of free runs of two swings over that of a constant.
+        free_run: the error of free runs over that of a constant, over two swings or fewer.
     """
 
     noise: Float[np.ndarray, " n"]
@@ -218,13 +221,13 @@ def diagnostics(
         _free_run(fit),
         _outliers(fit),
         degrees_of_freedom(fit),
+        _force(fit),  # a cause with a cure, before its symptoms
         _chi_squared(fit),
         _whiteness(fit),
         _process_noise(fit),
         _pushes(fit),
         _parts_left_out(fit),
         _landmarks(fit),
-        _force(fit),
         _samples_per_swing(fit),
         _timing(fit),
         _curve(fit),
@@ -296,7 +299,7 @@ def _free_run(fit: FitQuality) -> Diagnostic:
         f"{fit.free_run:.2g} of the error of a constant",
         "1",
         fit.free_run < 1,
-        f"over two swings free runs follow the log {closer:.2g} times closer than a constant"
+        f"free runs follow the log {closer:.2g} times closer than a constant"
         if fit.free_run < 1
         else "free runs of the field are no better than saying that nothing moves",
         "Look at hk.plot.fitted; the motion may not have this structure.",

@@ -11,7 +11,13 @@ from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import completed
 from hamkernel._trajectories.likelihood import closed_form
 from hamkernel._trajectories.model import Model, with_amplitude
-from hamkernel._trajectories.search import LEAST_NOISE, Bounds, losses, most_likely, searched
+from hamkernel._trajectories.search import (
+    LEAST_NOISE,
+    Bounds,
+    losses,
+    maximise_likelihood,
+    search_sample,
+)
 from hamkernel._trajectories.segments import LinearisedSegments
 
 # Amplitudes, lengthscales and noise may change by as much in either direction.
@@ -60,12 +66,12 @@ class Evidence(eqx.Module):
         design = np.tile(flat, (3, 1))
         design[:, -2 * n :] += np.log([[1.0], [0.1], [0.01]]) * self.is_free
         design = np.maximum(design, low)
-        points, rows = searched(self.points, self.rows)
+        points, rows = search_sample(self.points, self.rows)
         values = losses(larger, jnp.asarray(design), points, rows, self.start_deviation)
         start = larger.at(jnp.asarray(design[int(np.argmin(np.asarray(values)))]))
         bounds = Bounds(low, high, free)
         given = self.points, self.rows, self.start_deviation
-        found, _ = most_likely(start, *given, bounds, _STEPS)
+        found, _ = maximise_likelihood(start, *given, bounds, _STEPS)
         # Learning ends within half a nat of its optimum, and so may this search.
         return max(self._loss(self.model) - self._loss(found), 0.0)
 

@@ -26,10 +26,10 @@ class Stretches(NamedTuple):
     measured: Float[np.ndarray, "S L n"]
 
 
-def of_two_swings(runs: list, paths: list[np.ndarray], swing: float) -> Stretches:
-    """Stretches over two swings, of 4 to 64 intervals, that cover the condensed runs."""
+def of_swings(runs: list, paths: list[np.ndarray], swing: float, count: float = 2.0) -> Stretches:
+    """Stretches over `count` swings, of 4 to 64 intervals, that cover the condensed runs."""
     spacing = np.median(np.concatenate([np.diff(run.times) for run in runs]))
-    return stretches(runs, paths, int(np.clip(2 * swing / spacing, 4, 64)))
+    return stretches(runs, paths, int(np.clip(count * swing / spacing, 4, 64)))
 
 
 def stretches(runs: list, paths: list[np.ndarray], length: int) -> Stretches:

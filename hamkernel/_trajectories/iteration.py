@@ -20,7 +20,7 @@ from hamkernel._trajectories.flow import (
     steps_for,
     stiffness,
 )
-from hamkernel._trajectories.free_run import Stretches, error_over_constant, of_two_swings
+from hamkernel._trajectories.free_run import Stretches, error_over_constant, of_swings
 from hamkernel._trajectories.kalman import (
     SmoothedPath,
     innovations,
@@ -35,13 +35,13 @@ from hamkernel._trajectories.model import Model, landmark_whitening
 from hamkernel._trajectories.preprocessing import Preprocessed, time_of_swing
 from hamkernel._trajectories.search import (
     Bounds,
-    begun,
+    choose_start,
     limited_by_landmarks,
     losses,
-    most_likely,
-    searched,
-    solved,
-    without_noise,
+    maximise_likelihood,
+    noise_free_coordinates,
+    search_sample,
+    solve,
 )
 from hamkernel._trajectories.segments import (
     LinearisedSegments,
@@ -60,13 +60,13 @@ class Task(NamedTuple):
 
     Attributes:
         data: the runs.
-        mean: what is known.
+        mean: the known part of the field.
         S: the landmarks, as many as may be used.
         first: how many of them learning begins with.
         quick: how many a solve of a second or two carries.
         capped: whether these are fewer than the intervals.
         bounds: the box of hyperparameters.
-        start_deviation: of the prior of starts.
+        start_deviation: the standard deviation of the prior of starts.
         pieces: the runs, whole or in long parts.
     """
 
@@ -98,7 +98,7 @@ class Current(NamedTuple):
         model: kernel and noise.
         field: the field.
         S: its landmarks, and those that may be added.
-        rows: what it was learned from.
+        rows: the rows that it was learned from.
         paths: the path of each run at its samples.
         good: which pieces were kept.
         squares: the sum of their squared normalised residuals.
@@ -133,15 +133,15 @@ class End(NamedTuple):
     settled: bool
 
 
-def iterate(task: Task, now: Current, most: int, bar: Any) -> End:
-    """Gauss-Newton steps until noise and objective settle, at most `most` of them."""
+def iterate(task: Task, now: Current, max_steps: int, bar: Any) -> End:
+    """Gauss-Newton steps until noise and objective settle, at most `max_steps` of them."""
     history: list[Iteration] = []
     settled = False
-    bar.total = bar.n + 1 + most
+    bar.total = bar.n + 1 + max_steps
     bar.update()
-    while len(history) < most and not settled and not _is_lost(task, now):
+    while len(history) < max_steps and not settled and not _is_lost(task, now):
         before = now
-        now, done = iterated(task, now)
+        now, done = take_step(task, now)
         history.append(done)
         noise = ", ".join(f"{sigma:.3g}" for sigma in np.asarray(done.noise))
         said = f"{len(now.field.points)} landmarks, noise {noise}, kept {float(done.kept):.0%}"
@@ -153,7 +153,7 @@ def iterate(task: Task, now: Current, most: int, bar: Any) -> End:
         # Half a nat, as much as one degree of freedom; or a field that stays: without noise −log p
         # has no end. The objective is no sign, since defects dominate it at first.
         likelier = abs(float(history[-2].loss - done.loss))
-        settled = moved < 0.01 and (likelier < 0.5 or changed(task, before, now) < SETTLED)
+        settled = moved < 0.01 and (likelier < 0.5 or relative_change(task, before, now) < SETTLED)
     return End(task, now, history, settled)
 
 
@@ -164,25 +164,63 @@ def _is_lost(task: Task, now: Current) -> bool:
 
 def initial_loss(task: Task, model: Model) -> float:
     """−log p of the rows along the smoothed runs, at the hyperparameters of `model`."""
-    given = jnp.asarray(task.S[: task.first]), _along_smoothed(task), task.start_deviation
-    return float(losses(model, model.flat[None], *given)[0])
+    S = jnp.asarray(task.S[: task.first])
+    rows = _along_smoothed(task)
+    return float(losses(model, model.flat[None], S, rows, task.start_deviation)[0])
 
 
 def begin(task: Task, model: Model, design: np.ndarray) -> Current:
     """The first model, field and path, from rows along the smoothed runs."""
-    runs, rows = task.data.runs, _along_smoothed(task)
-    given = rows, task.start_deviation
-    model, count = begun(model, design, task.S, task.first, *given)
-    S = task.S[:count]
-    model, _ = most_likely(model, S, *given, task.bounds, _SEARCH)
-    S = task.S if searched(jnp.asarray(S), rows)[1] is not rows else S
-    model, found = solved(model, S, task.first, task.quick, *given, task.bounds)
-    field = Expansion(model.kernel, found.points, found.coefficients, task.mean)
-    moves, _, pushed = _smoothed(model, found, rows, task)
-    paths = [run.path for run in runs]
-    x = _on_segments(paths, task.pieces, segmented(runs, task.pieces, paths))
+    rows, paths = _along_smoothed(task), [run.path for run in task.data.runs]
+    model, count = choose_start(model, design, task.S, task.first, rows, task.start_deviation)
+    return _full_step(task, model, count, rows, paths)
+
+
+def fix_process_noise(task: Task, now: Current, q: Float[np.ndarray, " n"]) -> tuple[Task, Current]:
+    """The task and its path with the process noise q, which the search no longer changes.
+
+    Sensor noise takes over from process noise: its search begins at the likeliest of the estimate,
+    a hundredth and a tenth of the motion.
+    """
+    n, model = len(q), now.model
+    free = task.bounds.free.copy()
+    moves = free[-2 * n : -n]
+    free[-n:] = False
+    task = task._replace(bounds=task.bounds._replace(free=free))
+    with np.errstate(divide="ignore"):
+        model = model._replace(log_process=jnp.log(jnp.asarray(q)))
+    rows = _linearise(task, now._replace(pushed=1.0))[3]
+    noise = np.asarray(model.log_noise)
+    floors = (np.log(share * task.data.scale) for share in (1e-300, 0.01, 0.1))
+    noises = [np.where(moves, np.maximum(noise, floor), noise) for floor in floors]
+    design = np.stack([model._replace(log_noise=jnp.asarray(sigma)).flat for sigma in noises])
+    values = losses(model, design, *search_sample(now.field.points, rows), task.start_deviation)
+    model = model.at(jnp.asarray(design[int(np.argmin(values))]))
+    return task, _full_step(task, model, len(now.field.points), rows, now.paths)
+
+
+def _full_step(
+    task: Task, model: Model, count: int, rows: LinearisedSegments, paths: list[np.ndarray]
+) -> Current:
+    """The likeliest model, field and path of rows along other paths, without a line search.
+
+    Args:
+        task: the task.
+        model: where the search for the likeliest model begins.
+        count: the number of landmarks in the search.
+        rows: the rows along the paths.
+        paths: the paths.
+    """
+    args = rows, task.start_deviation
+    model, _ = maximise_likelihood(model, task.S[:count], *args, task.bounds, _SEARCH)
+    model, closed = solve(model, task.S, task.first, task.quick, *args, task.bounds)
+    field = Expansion(model.kernel, closed.points, closed.coefficients, task.mean)
+    moves, _, pushed = _smooth(model, closed, rows, task)
+    x = _segment_paths(paths, task.pieces, segmented(task.data.runs, task.pieces, paths))
     paths = updated(paths, task.pieces, task.good, x + np.asarray(moves))
-    return Current(model, field, S, rows, paths, task.good, np.inf, float(found.free), pushed)
+    used = len(closed.points)
+    S = task.S if used > task.first else task.S[:used]
+    return Current(model, field, S, rows, paths, task.good, np.inf, float(closed.free), pushed)
 
 
 def _along_smoothed(task: Task) -> LinearisedSegments:
@@ -200,32 +238,32 @@ class _Trial(NamedTuple):
     x: np.ndarray
 
 
-def _solved(
+def _solve_rows(
     task: Task, now: Current, rows: LinearisedSegments
 ) -> tuple[Model, ClosedForm, np.ndarray, Callable[[float], tuple[Array, Expansion]]]:
     """The likeliest model, its closed form, landmarks for more, and the way to it: share -> (w, f).
 
     Rows that ask for no more landmarks once are not asked again.
     """
-    given, used = (rows, task.start_deviation), len(now.field.points)
-    model, _ = most_likely(now.model, now.S[:used], *given, task.bounds, _SEARCH)
-    model, found = solved(model, now.S, used, task.quick, *given, task.bounds)
+    args, used = (rows, task.start_deviation), len(now.field.points)
+    model, _ = maximise_likelihood(now.model, now.S[:used], *args, task.bounds, _SEARCH)
+    model, closed = solve(model, now.S, used, task.quick, *args, task.bounds)
     # The current field in the new basis: the one with its values at the landmarks.
-    S = found.points
+    S = closed.points
     T = _landmark_whitening(model.kernel, S)
     old = T.T @ field_values(
         Expansion(now.field.kernel, now.field.points, now.field.coefficients, None), S
     ).reshape(-1)
 
     def between(share: float) -> tuple[Float[Array, " q"], Expansion]:
-        weights = (1 - share) * old + share * found.weights
+        weights = (1 - share) * old + share * closed.weights
         coefficients = (T @ weights).reshape(len(S), -1)
         return weights, Expansion(model.kernel, S, coefficients, task.mean)
 
-    return model, found, np.asarray(S) if len(S) == used else now.S, between
+    return model, closed, np.asarray(S) if len(S) == used else now.S, between
 
 
-def _searched(trial: Callable[[float], _Trial], any_good: bool) -> tuple[float, float, _Trial]:
+def _line_search(trial: Callable[[float], _Trial], any_good: bool) -> tuple[float, float, _Trial]:
     """The gain, the share and the trial of the first share that makes the objective smaller."""
     at_old = trial(0.0)
     for share in 0.5 ** np.arange(5) if any_good else ():
@@ -235,7 +273,7 @@ def _searched(trial: Callable[[float], _Trial], any_good: bool) -> tuple[float, 
     return 0.0, 0.0, at_old
 
 
-def _described(task, good, best: _Trial, gain, taken, model: Model, loss) -> Iteration:
+def _history_entry(task, good, best: _Trial, gain, taken, model: Model, loss) -> Iteration:
     samples = sum(len(run.times) for run in task.data.runs)
     kept = sum(piece.stop - piece.start for piece, ok in zip(task.pieces, good, strict=True) if ok)
     numbers = (best.objective, gain, taken, kept / samples, loss)
@@ -245,22 +283,19 @@ def _described(task, good, best: _Trial, gain, taken, model: Model, loss) -> Ite
     return Iteration(longest, objective, gain, taken, noise, process, kept, loss)
 
 
-def _smoothed(
-    model: Model, found: ClosedForm, rows: LinearisedSegments, task: Task
-) -> SmoothedPath:
-    given = found.coefficients, found.points, rows, task.start_deviation
-    return smoothed_path(model, *given)
+def _smooth(model: Model, closed: ClosedForm, rows: LinearisedSegments, task: Task) -> SmoothedPath:
+    return smoothed_path(model, closed.coefficients, closed.points, rows, task.start_deviation)
 
 
-def iterated(task: Task, now: Current) -> tuple[Current, Iteration]:
+def take_step(task: Task, now: Current) -> tuple[Current, Iteration]:
     """One Gauss-Newton step: each interval is linearised by itself.
 
     The objective is ‖W (y − x)‖² + Σ dᵢᵀ (Cov ηᵢ)⁻¹ dᵢ + ‖f‖², d the defect of each interval.
     """
-    segments, x, steps, rows = _by_interval(task, now)
+    segments, x, steps, rows = _linearise(task, now)
     good = rows.counts.any((1, 2))
-    model, found, S, between = _solved(task, now, rows)
-    moves, _, pushed = _smoothed(model, found, rows, task)
+    model, closed, S, between = _solve_rows(task, now, rows)
+    moves, _, pushed = _smooth(model, closed, rows, task)
     # The next step removes defects to second order, so that a thousandth of the motion is no reason
     # to shorten this one: with the integrator's 1e-6, steps are cut to a quarter for nothing.
     covariance = process_covariance(model, rows, jnp.asarray(1e-3 * task.data.scale))
@@ -273,22 +308,22 @@ def iterated(task: Task, now: Current) -> tuple[Current, Iteration]:
         squares = float(squares) if np.isfinite(squares) else np.inf
         return _Trial(squares + float(weights @ weights), squares, field, np.asarray(there))
 
-    gain, taken, best = _searched(trial, bool(good.any()))
+    gain, taken, best = _line_search(trial, bool(good.any()))
     good = np.asarray(good)[: len(task.pieces)]
     paths = updated(now.paths, task.pieces, good, best.x)
-    step = _described(task, good, best, gain, taken, model, found.loss)
-    free = float(found.free)
+    step = _history_entry(task, good, best, gain, taken, model, closed.loss)
+    free = float(closed.free)
     return Current(model, best.field, S, rows, paths, good, best.squares, free, pushed), step
 
 
-def _by_interval(
+def _linearise(
     task: Task, now: Current
 ) -> tuple[Segments, Float[Array, "S L+1 n"], Array, LinearisedSegments]:
     """The segments, the path on them, Runge-Kutta steps, and the rows along it."""
     segments = segmented(task.data.runs, task.pieces, now.paths)
     spans = np.asarray(segments.spans).reshape(-1, 1)
     steps = jnp.asarray(steps_for(spans, _stiffness(now.field, task.data, now.paths)))
-    x = jnp.asarray(_on_segments(now.paths, task.pieces, segments))
+    x = jnp.asarray(_segment_paths(now.paths, task.pieces, segments))
     good = task.usable(len(x))
     rows = linearised_by_interval(now.field, x, segments, steps, jnp.asarray(good))
     return segments, x, steps, rows._replace(pushed=now.pushed * rows.pushed)
@@ -303,7 +338,7 @@ def _squares(x, defect, covariance, segments: Segments, counts, log_noise) -> Fl
     )
 
 
-def _on_segments(paths, pieces: list[Piece], segments: Segments) -> Float[np.ndarray, "S L+1 n"]:
+def _segment_paths(paths, pieces: list[Piece], segments: Segments) -> Float[np.ndarray, "S L+1 n"]:
     """The paths at the samples of each segment; after the last one they are constant."""
     x = np.repeat(np.asarray(segments.starts)[:, None], segments.measured.shape[1], axis=1)
     for s, (r, start, stop) in enumerate(pieces):
@@ -321,11 +356,11 @@ def _stiffness(field: Expansion, data: Preprocessed, paths: list[np.ndarray]) ->
     return stiffness(field, X[np.linspace(0, len(X) - 1, 256).round().astype(int)], data.scale)
 
 
-def changed(task: Task, before: Current, now: Current) -> float:
+def relative_change(task: Task, before: Current, now: Current) -> float:
     """The change of the field at the landmarks, relative to its size there."""
     old, new = (
-        np.asarray(field_values(each.field, now.field.points)) / task.data.scale[None]
-        for each in (before, now)
+        np.asarray(field_values(state.field, now.field.points)) / task.data.scale[None]
+        for state in (before, now)
     )
     return float(np.linalg.norm(new - old) / max(np.linalg.norm(new), np.finfo(float).tiny))
 
@@ -333,15 +368,16 @@ def changed(task: Task, before: Current, now: Current) -> float:
 def asks_for_landmarks(end: End) -> bool:
     """Whether the rows are likelier with more landmarks, at less noise too if time is the limit."""
     (task, now), n = end[:2], len(end.task.data.scale)
-    given = now.model, now.field.points, now.rows, task.start_deviation
+    args = now.model, now.field.points, now.rows, task.start_deviation
     capped = task.capped and len(now.field.points) >= task.quick
-    return limited_by_landmarks(*given, capped and bool(task.bounds.free[-2 * n : -n].any()))
+    return limited_by_landmarks(*args, capped and bool(task.bounds.free[-2 * n : -n].any()))
 
 
 def noisy_counts(end: End) -> Float[np.ndarray, "S L+1 n"]:
     """How many samples there are where there is noise: zero in coordinates that are exact."""
     task, now = end.task, end.now
-    return np.where(without_noise(now.model, task.bounds, task.data.scale), 0, now.rows.counts)
+    exact = noise_free_coordinates(now.model, task.bounds, task.data.scale)
+    return np.where(exact, 0, now.rows.counts)
 
 
 def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
@@ -350,13 +386,12 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     They did not settle, innovations are not white, or rows are likelier with more of it.
     """
     now, task = end.now, end.task
-    given = now.field.points, now.rows, task.start_deviation
     if not (end.settled and is_white(end)):
         return True
     levels = [now.model.log_process, *(impulse + np.log(share) for share in (1e-3, 1e-2, 1e-1))]
     flat = jnp.stack([now.model._replace(log_process=jnp.asarray(q)).flat for q in levels])
-    part = searched(*given[:2])
-    values = np.asarray(losses(now.model, flat, *part, task.start_deviation))
+    sample = search_sample(now.field.points, now.rows)
+    values = losses(now.model, flat, *sample, task.start_deviation)
     return bool(values[0] - values.min() > price(end))
 
 
@@ -367,12 +402,12 @@ def price(end: End) -> float:
     return float(0.5 * count * np.log(np.asarray(end.now.rows.counts).sum()))
 
 
-def likelier(end: End, other: End) -> End:
-    """`other`, which has process noise, where log p pays for it; else `end`."""
-    return other if _loss(other) + price(other) < _loss(end) else end
+def likelier(end: End, disturbed: End) -> End:
+    """The end with process noise if log p pays for the noise; else the end without."""
+    return disturbed if _loss(disturbed) + price(disturbed) < _loss(end) else end
 
 
-def chosen(end: End, other: End, on_part: Callable[[Preprocessed], tuple[End, End]]) -> End:
+def choose_end(end: End, disturbed: End, on_part: Callable[[Preprocessed], tuple[End, End]]) -> End:
     """The likelier end; by free runs over what is left out, where innovations of both refute log p.
 
     Two runs of a drive with cogging, which the kernel lacks, are likelier with process noise by
@@ -381,25 +416,33 @@ def chosen(end: End, other: End, on_part: Callable[[Preprocessed], tuple[End, En
 
     Args:
         end: the end without process noise.
-        other: the end with process noise.
+        disturbed: the end with process noise.
         on_part: both ends of learning from a part of the data.
     """
-    if likelier(end, other) is end or is_white(end) or is_white(other) or _loss(end) == np.inf:
-        return likelier(end, other)
+    if (
+        likelier(end, disturbed) is end
+        or is_white(end)
+        or is_white(disturbed)
+        or _loss(end) == np.inf
+    ):
+        return likelier(end, disturbed)
     if max(len(run.times) for run in end.task.data.runs) < 5:
-        return likelier(end, other)
-    part, rest = _split(end.task.data, other.now.paths)
-    errors = [
-        error_over_constant(each.now.field, rest, end.task.data.scale) for each in on_part(part)
-    ]
-    return end if errors[0] < min(errors[1], 1.0) else other
+        return likelier(end, disturbed)
+    part, rest = _split(end.task.data, disturbed.now.paths)
+    errors = [error_over_constant(e.now.field, rest, end.task.data.scale) for e in on_part(part)]
+    return end if errors[0] < min(errors[1], 1.0) else disturbed
 
 
 def is_white(end: End) -> bool:
     """Whether the innovations of an end are as good as white."""
-    now, given = end.now, (end.now.field.points, end.now.rows, end.task.start_deviation)
-    z = innovations(whitened_rows(now.model, *given), now.rows)
-    return whiteness(z, noisy_counts(end)).is_enough
+    return whiteness(innovations_of(end), noisy_counts(end)).is_enough
+
+
+def innovations_of(end: End) -> Float[np.ndarray, "S L+1 n"]:
+    """The innovations of the rows of an end, in standard deviations."""
+    now = end.now
+    rows = whitened_rows(now.model, now.field.points, now.rows, end.task.start_deviation)
+    return innovations(rows, now.rows)
 
 
 def _split(data: Preprocessed, paths: list[np.ndarray]) -> tuple[Preprocessed, Stretches]:
@@ -411,12 +454,12 @@ def _split(data: Preprocessed, paths: list[np.ndarray]) -> tuple[Preprocessed, S
         for run, cut, path in zip(data.runs, cuts, paths, strict=True)
         if cut < len(run.times)
     ]
-    rest = of_two_swings([run for run, _ in last], [path for _, path in last], time_of_swing(data))
+    rest = of_swings([run for run, _ in last], [path for _, path in last], time_of_swing(data))
     return data._replace(runs=runs), rest
 
 
 def _loss(end: End) -> float:
     """−log p of the runs about the path of the end; ∞ if it is lost."""
-    rows = _by_interval(end.task, end.now)[3]
+    rows = _linearise(end.task, end.now)[3]
     loss = closed_form(end.now.model, end.now.field.points, rows, end.task.start_deviation).loss
     return float(jnp.where(jnp.isnan(loss), jnp.inf, loss))

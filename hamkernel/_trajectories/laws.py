@@ -2,7 +2,7 @@
 
 Of each coordinate whose velocity the laws change there is a row for each window, see `windows.py`.
 The unknowns are the weights of the features of the laws, few in a system of any size, so that a
-solve is linear in the number of coordinates. Kernel and scatter of the rows maximise their likelihood.
+solve is linear in the number of coordinates. Kernel and scatter maximise the likelihood.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from hamkernel._trajectories.windows import (
     full_factor,
     smooth_channels,
     white_factors,
-    whitened,
+    whiten_rows,
     windows,
 )
 from hamkernel._tuning.minimiser import most_likely_in_box
@@ -77,7 +77,7 @@ class SmoothedRuns(NamedTuple):
     Attributes:
         pieces: in their order, with overlaps.
         noise: σ of each coordinate, shape (n,); NaN where nothing was measured.
-        masses: those of the positions, if momenta are to be found from them, shape (m,).
+        masses: the known mass of each position, shape (m,); None where no mean has them.
     """
 
     pieces: list[Piece]
@@ -94,7 +94,7 @@ def smoothed_runs(
     parts = _parts(runs)
     states = [np.zeros((s.stop - s.start, n)) for _, s in parts]
     roots: list[list[Any]] = [[None] * n for _ in parts]
-    found = np.full(n, np.nan)
+    sigma = np.full(n, np.nan)
     masses = None
     if isinstance(mean, Kinetic) and mean.mass.ndim < 2:
         masses = np.broadcast_to(np.asarray(mean.mass, float), (m,))
@@ -109,29 +109,29 @@ def smoothed_runs(
     for of_values, of_slopes, mass in groups:
         channels, means, size, unit = _channels(runs, parts, of_values, of_slopes, mass)
         slope_size = size / unit * mass
-        given = (
+        known_noise = (
             None if noise is None else float(np.median(noise[of_values])) / size,
             None
             if noise is None or of_slopes is None
             else float(np.median(noise[of_slopes])) / slope_size,
         )
-        h, smooth = smooth_channels(channels, given)
-        found[of_values] = size * np.exp(h.log_noise)
-        if of_slopes is not None and channels.slopes_seen.any():
-            found[of_slopes] = slope_size * np.exp(h.log_slope_noise)
+        h, smooth = smooth_channels(channels, known_noise)
+        sigma[of_values] = size * np.exp(h.log_noise)
+        if of_slopes is not None and channels.has_slope.any():
+            sigma[of_slopes] = slope_size * np.exp(h.log_slope_noise)
         for k, (_, samples) in enumerate(parts):
             T = samples.stop - samples.start
             states[k][:, of_values] = means[k] + size * np.asarray(smooth.values)[k, :T]
             if of_slopes is not None:
                 states[k][:, of_slopes] = slope_size * np.asarray(smooth.slopes)[k, :T]
-            own = [size * _root(np.asarray(S)[:T, :T]) for S in smooth.covariance[k]]
+            piece_roots = [size * _root(np.asarray(S)[:T, :T]) for S in smooth.covariance[k]]
             for i, c in enumerate(of_values):
-                roots[k][c] = own[i * len(own) // len(of_values)]
+                roots[k][c] = piece_roots[i * len(piece_roots) // len(of_values)]
     pieces = []
-    for (r, samples), path, own in zip(parts, states, roots, strict=True):
+    for (r, samples), path, piece_roots in zip(parts, states, roots, strict=True):
         x = runs.on_host()[1][r][samples]
-        pieces.append(Piece(r, samples, path, np.where(np.isfinite(x), x, path), own))
-    return SmoothedRuns(pieces, found, masses)
+        pieces.append(Piece(r, samples, path, np.where(np.isfinite(x), x, path), piece_roots))
+    return SmoothedRuns(pieces, sigma, masses)
 
 
 def _root(S: Float[np.ndarray, "T T"]) -> Float[np.ndarray, "T k"]:
@@ -169,36 +169,36 @@ def _channels(
     t = np.zeros((len(parts), T))
     x, v = np.full((2, len(parts), T, len(of_values)), np.nan)
     for k, (r, part) in enumerate(parts):
-        own, length = times[r][part], part.stop - part.start
-        t[k, :length], t[k, length:] = own - own[0], own[-1] - own[0]
+        clock, length = times[r][part], part.stop - part.start
+        t[k, :length], t[k, length:] = clock - clock[0], clock[-1] - clock[0]
         x[k, :length] = states[r][part][:, of_values]
         if of_slopes is not None:
             v[k, :length] = states[r][part][:, of_slopes] / mass
     unit = t[:, -1].max() / 2
-    seen, slopes_seen = np.isfinite(x), np.isfinite(v)
-    counts = np.maximum(seen.sum(axis=1, keepdims=True), 1)
-    means = np.where(seen, x, 0.0).sum(axis=1, keepdims=True) / counts
-    x = np.where(seen, x - means, 0.0)
-    size = float(np.sqrt((x**2).sum() / max(seen.sum(), 1))) or 1.0
-    v = np.where(slopes_seen, v, 0.0) * unit / size
-    return Channels(t / unit - 1, x / size, v, seen, slopes_seen), means, size, unit
+    is_measured, has_slope = np.isfinite(x), np.isfinite(v)
+    counts = np.maximum(is_measured.sum(axis=1, keepdims=True), 1)
+    means = np.where(is_measured, x, 0.0).sum(axis=1, keepdims=True) / counts
+    x = np.where(is_measured, x - means, 0.0)
+    size = float(np.sqrt((x**2).sum() / max(is_measured.sum(), 1))) or 1.0
+    v = np.where(has_slope, v, 0.0) * unit / size
+    return Channels(t / unit - 1, x / size, v, is_measured, has_slope), means, size, unit
 
 
 def chunks_of(runs: Runs, smooth: SmoothedRuns, of_rows: np.ndarray, depends: np.ndarray) -> Chunk:
     """The weak rows of some coordinates, in chunks of one shape, side by side."""
     times = runs.on_host()[0]
     raw: list[tuple] = []
-    most = max(_ROWS // len(of_rows), 2)
+    window_limit = max(_ROWS // len(of_rows), 2)
     for piece in smooth.pieces:
         t = times[piece.run][piece.samples]
         made = windows(t, WIDTH)
         R = len(made.value)
         if not R:
             continue
-        for index in np.array_split(np.arange(R), -(-R // most)):
+        for index in np.array_split(np.arange(R), -(-R // window_limit)):
             used = np.flatnonzero(made.value[index].any(axis=0) | made.slope[index].any(axis=0))
             samples = slice(used[0], used[-1] + 1)
-            value, slope, bend = (each[index][:, samples] for each in made)
+            value, slope, bend = (item[index][:, samples] for item in made)
             z = piece.raw[samples]
             rows = -slope @ z[:, of_rows]
             roots = slope[None] * smooth.noise[of_rows, None, None]
@@ -207,18 +207,20 @@ def chunks_of(runs: Runs, smooth: SmoothedRuns, of_rows: np.ndarray, depends: np
                     q = c - len(smooth.masses)
                     rows[:, i] = smooth.masses[q] * (bend @ z[:, q])
                     roots[i] = bend * smooth.masses[q] * smooth.noise[q]
-            own = [piece.roots[j][samples] for j in depends]
-            alike = all(each is own[0] or np.array_equal(each, own[0]) for each in own)
-            own = own[:1] if alike else own
-            raw.append((piece.states[samples], value, rows.T, roots, own))
-    R, T = (max(len(each[1]) for each in raw), max(len(each[0]) for each in raw))
-    G = max(len(each[4]) for each in raw)
-    k = max(root.shape[1] for each in raw for root in each[4])
+            path_roots = [piece.roots[j][samples] for j in depends]
+            alike = all(
+                item is path_roots[0] or np.array_equal(item, path_roots[0]) for item in path_roots
+            )
+            path_roots = path_roots[:1] if alike else path_roots
+            raw.append((piece.states[samples], value, rows.T, roots, path_roots))
+    R, T = (max(len(item[1]) for item in raw), max(len(item[0]) for item in raw))
+    G = max(len(item[4]) for item in raw)
+    k = max(root.shape[1] for item in raw for root in item[4])
     out = []
-    for points, value, rows, roots, own in raw:
+    for points, value, rows, roots, path_roots in raw:
         r, t = R - len(value), T - len(points)
-        own = own * (G // len(own))
-        padded = [np.pad(each, ((0, t), (0, k - each.shape[1]))) for each in own]
+        path_roots = path_roots * (G // len(path_roots))
+        padded = [np.pad(item, ((0, t), (0, k - item.shape[1]))) for item in path_roots]
         out.append(
             Chunk(
                 np.pad(points, ((0, t), (0, 0)), "edge"),
@@ -228,7 +230,7 @@ def chunks_of(runs: Runs, smooth: SmoothedRuns, of_rows: np.ndarray, depends: np
                 np.stack(padded),
             )
         )
-    return jax.tree.map(lambda *each: jnp.asarray(np.stack(each)), *out)
+    return jax.tree.map(lambda *item: jnp.asarray(np.stack(item)), *out)
 
 
 class LawModel(NamedTuple):
@@ -242,7 +244,7 @@ class LawModel(NamedTuple):
         leaves, _ = ravel_pytree(eqx.filter(self.kernel, eqx.is_inexact_array))
         return jnp.append(leaves, self.log_scatter)
 
-    def at(self, h: Float[Array, " P"]) -> LawModel:
+    def with_flat(self, h: Float[Array, " P"]) -> LawModel:
         params, static = eqx.partition(self.kernel, eqx.is_inexact_array)
         _, unravel = ravel_pytree(params)
         return LawModel(eqx.combine(unravel(h[:-1]), static), h[-1])
@@ -254,20 +256,20 @@ def _features_of(K: AbstractMatrixKernel, n: int) -> AbstractFeatures:
 
 def _design(K, chunk: Chunk, of_rows) -> Float[Array, "c R m"]:
     """∫ φ f_c dt of each feature."""
-    found = _features_of(K, chunk.points.shape[1])
+    basis = _features_of(K, chunk.points.shape[1])
 
-    def at(x):
-        return found.rows(x)[of_rows]
+    def features_at(x):
+        return basis.rows(x)[of_rows]
 
-    F = jax.lax.map(at, chunk.points)  # (T, c, m)
+    F = jax.lax.map(features_at, chunk.points)  # (T, c, m)
     return jnp.einsum("rt,tcm->crm", chunk.value, F)
 
 
-def _targets(mean, chunk: Chunk, of_rows) -> Float[Array, "c R"]:
+def _residual_rows(mean, chunk: Chunk, of_rows) -> Float[Array, "c R"]:
     if mean is None:
         return jnp.asarray(chunk.rows)
-    known = jax.vmap(lambda x: mean(x)[of_rows])(chunk.points)
-    return jnp.asarray(chunk.rows) - jnp.einsum("rt,tc->cr", chunk.value, known)
+    drift = jax.vmap(lambda x: mean(x)[of_rows])(chunk.points)
+    return jnp.asarray(chunk.rows) - jnp.einsum("rt,tc->cr", chunk.value, drift)
 
 
 def _rows(
@@ -277,8 +279,8 @@ def _rows(
 
     def one(both):
         chunk, L = both
-        F = whitened(L, _design(K, chunk, of_rows))
-        return F, whitened(L, _targets(mean, chunk, of_rows))
+        F = whiten_rows(L, _design(K, chunk, of_rows))
+        return F, whiten_rows(L, _residual_rows(mean, chunk, of_rows))
 
     F, y = jax.lax.map(one, (chunks, factors))
     return F.reshape(-1, F.shape[2]), y.reshape(-1)
@@ -297,14 +299,15 @@ def negative_log_likelihood(model: LawModel, chunks: Chunk, factors, mean, of_ro
 @compiled
 def _best_of(model, design, chunks, factors, mean, of_rows):
     return jax.lax.map(
-        lambda h: negative_log_likelihood(model.at(h), chunks, factors, mean, of_rows), design
+        lambda h: negative_log_likelihood(model.with_flat(h), chunks, factors, mean, of_rows),
+        design,
     )
 
 
 @compiled
-def _searched(model: LawModel, start, low, high, chunks, factors, mean, of_rows, steps):
+def _search(model: LawModel, start, low, high, chunks, factors, mean, of_rows, steps):
     def loss(h):
-        return negative_log_likelihood(model.at(h), chunks, factors, mean, of_rows)
+        return negative_log_likelihood(model.with_flat(h), chunks, factors, mean, of_rows)
 
     return most_likely_in_box(loss, start, low, high, jnp.full(len(start), 0.2), steps)
 
@@ -336,12 +339,12 @@ def _weights_of(model: LawModel, chunks, factors, mean, of_rows) -> Float[Array,
 
 
 @compiled
-def _compressed(model: LawModel, chunks: Chunk, factors, of_rows):
+def _compress(model: LawModel, chunks: Chunk, factors, of_rows):
     """The rows of all chunks as m orthonormal combinations: weights (Q, n, m) and targets (m,)."""
 
     def rows_of(both):
         chunk, L = both
-        return whitened(L, _design(model.kernel, chunk, of_rows)), whitened(L, chunk.rows)
+        return whiten_rows(L, _design(model.kernel, chunk, of_rows)), whiten_rows(L, chunk.rows)
 
     F, y = jax.lax.map(rows_of, (chunks, factors))
     S, D, m = F.shape
@@ -352,10 +355,12 @@ def _compressed(model: LawModel, chunks: Chunk, factors, of_rows):
         c, R = chunk.rows.shape
         solve = jax.scipy.linalg.solve_triangular
         if L.ndim == 3:
-            own = jax.vmap(lambda L, q: solve(L, q, lower=True, trans="T"))(L, Q.reshape(c, R, -1))
+            unwhitened = jax.vmap(lambda L, q: solve(L, q, lower=True, trans="T"))(
+                L, Q.reshape(c, R, -1)
+            )
         else:
-            own = solve(L, Q, lower=True, trans="T").reshape(c, R, -1)
-        on_rows = jnp.einsum("rt,crm->mtc", chunk.value, own)
+            unwhitened = solve(L, Q, lower=True, trans="T").reshape(c, R, -1)
+        on_rows = jnp.einsum("rt,crm->mtc", chunk.value, unwhitened)
         n = chunk.points.shape[1]
         return jnp.zeros((*on_rows.shape[:2], n)).at[:, :, of_rows].set(on_rows)
 
@@ -365,7 +370,7 @@ def _compressed(model: LawModel, chunks: Chunk, factors, of_rows):
 
 
 class Found(NamedTuple):
-    """What two solves found.
+    """The result of two solves.
 
     Attributes:
         model: the kernel and the scatter.
@@ -389,7 +394,7 @@ def find_laws(K: AbstractMatrixKernel, runs: Runs, mean: Any, noise: Any) -> Fou
     X = np.concatenate([piece.states for piece in smooth.pieces])
     K = completed(K, jnp.asarray(X), n)
     depends = sorted(set().union(*(s for k in K.scalar_kernels for s in k.supports(n))))
-    of_rows = _moved(K, X)
+    of_rows = _moving_coordinates(K, X)
     depends, of_rows = np.asarray(depends), jnp.asarray(of_rows)
     chunks = chunks_of(runs, smooth, np.asarray(of_rows), depends)
     part = _part(K, chunks)
@@ -397,20 +402,20 @@ def find_laws(K: AbstractMatrixKernel, runs: Runs, mean: Any, noise: Any) -> Fou
     low, high, design = _box(model, X, chunks)
     factors, losses = _white(chunks), []
     for first in (True, False):
-        own = jax.tree.map(lambda a: a[part], (chunks, factors))
-        given = *own, mean, of_rows
+        selected = jax.tree.map(lambda a: a[part], (chunks, factors))
+        args = *selected, mean, of_rows
         start = model.flat
         if first:
-            values = np.asarray(_best_of(model, design, *given))
+            values = np.asarray(_best_of(model, design, *args))
             start = design[int(np.nanargmin(values))]
-        h, loss = _searched(model, start, low, high, *given, _STEPS)
-        model = model.at(h)
+        h, loss = _search(model, start, low, high, *args, _STEPS)
+        model = model.with_flat(h)
         losses.append(float(loss))
         if first:
             w = _weights_of(model, chunks, factors, mean, of_rows)
             field = _FieldOfWeights(_features_of(model.kernel, n), w, mean)
             factors = _full(field, chunks, of_rows, jnp.asarray(depends))
-    weights, targets = _compressed(model, chunks, factors, of_rows)
+    weights, targets = _compress(model, chunks, factors, of_rows)
     points = chunks.points.reshape(1, -1, n)
     observations = Functionals(points, weights[None], targets[None])
     count = int((np.abs(np.asarray(chunks.value)).sum(axis=2) > 0).sum()) * len(of_rows)
@@ -427,11 +432,11 @@ class _FieldOfWeights(eqx.Module):
         return f if self.mean is None else f + self.mean(x)
 
 
-def _moved(K: AbstractMatrixKernel, X: Float[np.ndarray, "N n"]) -> np.ndarray:
+def _moving_coordinates(K: AbstractMatrixKernel, X: Float[np.ndarray, "N n"]) -> np.ndarray:
     """The coordinates whose velocities the laws change."""
-    found = _features_of(K, X.shape[1])
+    basis = _features_of(K, X.shape[1])
     some = jnp.asarray(X[np.linspace(0, len(X) - 1, min(len(X), 4)).astype(int)])
-    return np.flatnonzero(np.abs(np.asarray(found(some))).max(axis=(0, 2)) > 0)
+    return np.flatnonzero(np.abs(np.asarray(basis(some))).max(axis=(0, 2)) > 0)
 
 
 def _part(K: AbstractMatrixKernel, chunks: Chunk) -> np.ndarray:
@@ -489,21 +494,21 @@ def learn_laws(
             "learned: log more of them, or pass velocities to hk.fit."
         )
     n = runs.dimension
-    found = find_laws(K, runs, mean, noise)
-    scatter, count = float(jnp.exp(found.model.log_scatter)), len(found.observations.targets)
+    solution = find_laws(K, runs, mean, noise)
+    scatter, count = float(jnp.exp(solution.model.log_scatter)), len(solution.observations.targets)
     posterior = condition(
-        found.model.kernel, found.observations, regularization=scatter**2 / count, mean=mean
+        solution.model.kernel, solution.observations, regularization=scatter**2 / count, mean=mean
     )
-    states, measured = _paths(runs, found.smooth), runs.on_host()[1]
-    sigma = found.smooth.noise if noise is None else np.asarray(noise)
-    quality = _quality(runs, found, posterior.field, states, sigma, noise is not None)
+    states, measured = _paths(runs, solution.smooth), runs.on_host()[1]
+    sigma = solution.smooth.noise if noise is None else np.asarray(noise)
+    quality = _quality(runs, solution, posterior.field, states, sigma, noise is not None)
     table = diagnostics_of_rows(quality, scatter)
     if table.warning:
         require.warn(table.warning)
     unknown = tuple(jnp.full(x.shape, jnp.nan) for x in measured)
     return Learned(
         field=posterior.field,
-        kernel=found.model.kernel,
+        kernel=solution.model.kernel,
         regularization=jnp.asarray(1 / count),
         noise=jnp.asarray(sigma),
         process_noise=jnp.zeros(n),
@@ -517,13 +522,13 @@ def learn_laws(
         whiteness=jnp.asarray(jnp.nan),
         widening=jnp.asarray(scatter**2),
         disturbance=tuple(jnp.zeros(x.shape) for x in measured),
-        history=tuple(_iteration(loss, sigma, len(unknown[0])) for loss in found.losses),
+        history=tuple(_iteration(loss, sigma, len(unknown[0])) for loss in solution.losses),
         converged=table.is_usable,
         diagnostics=table,
         runs=runs,
-        observations=found.observations,
+        observations=solution.observations,
         mean=mean,
-        evidence=EvidenceOfRows(-found.losses[1]),
+        evidence=EvidenceOfRows(-solution.losses[1]),
         again=again,
     )
 
@@ -554,7 +559,9 @@ class _Log(NamedTuple):
     inputs: Float[np.ndarray, "T-1 2 0"]
 
 
-def _quality(runs: Runs, found: Found, field: Any, states, sigma, known: bool) -> FitQuality:
+def _quality(
+    runs: Runs, solution: Found, field: Any, states, sigma, is_noise_known: bool
+) -> FitQuality:
     times, measured = runs.on_host()
     every = np.concatenate(states)
     scale = np.where((size := every.std(axis=0)) > 0, size, 1.0)
@@ -564,13 +571,13 @@ def _quality(runs: Runs, found: Found, field: Any, states, sigma, known: bool) -
     swing = 2 * np.pi * np.median(scale / np.maximum(speed, np.finfo(float).tiny)) / spacing
     logs = [_Log(t, x, np.zeros((len(t) - 1, 2, 0))) for t, x in zip(times, measured, strict=True)]
     part = stretches(logs, states, int(np.clip(2 * swing, 4, 64)))
-    part = Stretches(*(each[:: max(len(part.starts) // 8, 1)] for each in part))
-    free = float(found.count - len(found.observations.targets))
-    scatter = float(jnp.exp(found.model.log_scatter))
+    part = Stretches(*(item[:: max(len(part.starts) // 8, 1)] for item in part))
+    free = float(solution.count - len(solution.observations.targets))
+    scatter = float(jnp.exp(solution.model.log_scatter))
     return FitQuality(
         noise=sigma,
         scale=scale,
-        is_noise_known=known,
+        is_noise_known=is_noise_known,
         kept=np.ones(len(states)),
         dropped=(),
         misfit=misfits(runs, states, sigma),

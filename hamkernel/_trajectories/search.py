@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
 from hamkernel._kernels.built_in import Gaussian
 from hamkernel._kernels.transforms import Select
@@ -47,9 +47,12 @@ _ENTRIES = 1_000_000
 # and below it the kernel would bend to their errors: of exact runs σ then fell to 1e-7, rose again
 # from iteration to iteration, and was joined by process noise of 1e-6.
 LEAST_NOISE = 1e-6
+# Logarithms of the lengthscales of the first points, in extents of the data: .22, .74 and 2.5 of
+# them.
+_SHIFTS = (-1.5, -0.3, 0.9)
 
 
-def without_noise(
+def noise_free_coordinates(
     model: Model, bounds: Bounds, scale: Float[np.ndarray, " n"]
 ) -> Bool[np.ndarray, " n"]:
     """The coordinates that the field explains as far as paths are integrated: no noise is left.
@@ -72,19 +75,22 @@ def _loss(model: Model, h, S, rows, start_deviation):
     return jnp.where(jnp.isfinite(value), value, jnp.inf)
 
 
-@compiled_by_size
+_compiled_loss = compiled_by_size(_loss)
+
+
 def losses(
     model: Model,
-    design: Float[Array, "count P"],
+    design: Float[ArrayLike, "count P"],
     S,
     rows: LinearisedSegments,
     start_deviation,
-):
-    """−log p(rows) at some points h."""
-    return jax.lax.map(lambda h: _loss(model, h, S, rows, start_deviation), design)
+) -> Float[np.ndarray, " count"]:
+    """−log p(rows) at some points h, one after another: designs of all sizes share a program."""
+    points = jnp.asarray(design)
+    return np.array([_compiled_loss(model, h, S, rows, start_deviation) for h in points])
 
 
-def searched(
+def search_sample(
     S: Float[Array, "m d"], rows: LinearisedSegments
 ) -> tuple[Float[Array, "k d"], LinearisedSegments]:
     """The landmarks and rows on which hyperparameters are searched: all, if they are few.
@@ -126,7 +132,7 @@ def _best(model: Model, S, rows: LinearisedSegments, start_deviation, low, high,
     return jnp.where(free & (value < jnp.inf), found, start), value
 
 
-def most_likely(
+def maximise_likelihood(
     model: Model,
     S,
     rows: LinearisedSegments,
@@ -136,9 +142,9 @@ def most_likely(
 ) -> tuple[Model, float]:
     """The model under which the rows are likeliest, by BFGS from this one, and −log p there.
 
-    Of many rows some windows, see `searched`, and −log p of those.
+    Of many rows some windows, see `search_sample`, and −log p of those.
     """
-    S, rows = searched(jnp.asarray(S), rows)
+    S, rows = search_sample(jnp.asarray(S), rows)
     if not bounds.free.any():
         flat = model.flat[None]
         return model, float(losses(model, flat, S, rows, start_deviation)[0])
@@ -147,7 +153,7 @@ def most_likely(
     return model.at(h), float(value)
 
 
-def begun(
+def choose_start(
     model: Model,
     design: Float[np.ndarray, "count P"],
     S: Float[np.ndarray, "m d"],
@@ -162,20 +168,20 @@ def begun(
     smooth field with much noise, at which more of them do not help.
     """
     n, width = rows.residual.shape[-1], (_ENTRIES / 3) ** 0.5
-    points, part = jnp.asarray(design), windows(rows, int(width / n))
+    part = windows(rows, int(width / n))
     own = exact(part)[0]
     sets = {first: jnp.asarray(S[:first]) if n * first <= width else own}
     if len(own) > first < len(S):
         sets[len(S)] = own
     best, count, start = np.inf, first, design[0]
     for size, some in sets.items():
-        values = np.asarray(losses(model, points, some, part, start_deviation))
+        values = losses(model, design, some, part, start_deviation)
         if values.min() < best - (n * len(some) / 2) ** 0.5:
             best, count, start = values.min(), size, design[int(np.argmin(values))]
     return model.at(jnp.asarray(start)), count
 
 
-def solved(
+def solve(
     model: Model,
     S: Float[np.ndarray, "m d"],
     count: int,
@@ -209,7 +215,7 @@ def solved(
             break
         (known, found), count = more, 2 * count
     fixed = np.isfinite(np.asarray(model.log_process)) & ~free[-len(model.log_process) :]
-    many = searched(jnp.asarray(S[:count]), rows)[1] is not rows
+    many = search_sample(jnp.asarray(S[:count]), rows)[1] is not rows
     if many and free.any() and not fixed.any() and found.free > found.used and found.squares > 0:
         shift = jnp.log(found.squares / found.free) / 2
         if abs(shift) > 0.01:  # what is left depends on the noise: a secant, by a half to twice it
@@ -247,7 +253,7 @@ def limited_by_landmarks(
     less = np.tile(np.asarray(model.flat), (len(shares), 1))
     less[:, -2 * n :] += np.log(shares)[:, None]
     few, many = (
-        np.asarray(losses(model, jnp.asarray(flat), points, part, start_deviation)).min()
+        losses(model, flat, points, part, start_deviation).min()
         for points, flat in ((S, less[:1]), (own, less))
     )
     freedom = float((part.counts > 0).sum()) - n * len(part.counts)
@@ -333,13 +339,13 @@ def _gain(
     Process noise, or without it sensor noise, had to explain what `more` would.
     """
     K, n = model.kernel, rows.residual.shape[-1]
-    S, rows = searched(jnp.asarray(S), rows)
+    S, rows = search_sample(jnp.asarray(S), rows)
     explains = slice(-2 * n, None)
 
     def least(model: Model) -> float:
         design = np.tile(np.asarray(model.flat), (3, 1))
         design[:, explains] += np.log([[1.0], [0.1], [0.01]])
-        return float(losses(model, jnp.asarray(design), S, rows, start_deviation).min())
+        return float(losses(model, design, S, rows, start_deviation).min())
 
     return least(model) - least(model._replace(kernel=K.with_states(K.of_states + more)))
 
@@ -350,8 +356,8 @@ def bounds_and_design(
     Y: np.ndarray,
     scale: np.ndarray,
     moves: np.ndarray,
+    impulse: np.ndarray,
     spacing: float = 0.0,
-    impulse: np.ndarray | None = None,
 ) -> tuple[Bounds, np.ndarray]:
     """The box of all hyperparameters, those of the caller inside, and a design of first points.
 
@@ -361,9 +367,9 @@ def bounds_and_design(
         Y: their velocities.
         scale: the standard deviations of the coordinates.
         moves: the coordinates whose noise is estimated.
-        spacing: the least lengthscale, in standard deviations of the coordinates.
         impulse: log of the process noise that would explain all of the motion, shape (n,); −inf
-            in coordinates without process noise, None if no coordinate has any.
+            in coordinates without process noise.
+        spacing: the least lengthscale, in standard deviations of the coordinates.
     """
     speed = float(np.sqrt(np.mean(Y**2)))
     leaves = hyperparameters(model.kernel, jnp.asarray(X), speed, jnp.asarray(X))
@@ -390,44 +396,34 @@ def bounds_and_design(
         low[lengths] = np.clip(least, low, high - 0.1)[lengths]
         start = np.clip(start, low, high)
     extents = np.concatenate([*(_extents(p.low, X[:, : len(scale)]) for p in leaves), none])
-    design = [start, _amplified(model, start, scales, X, Y)]
-    for shift in (-1.2, -0.6, 0.0, 0.6, 1.2, 2.0) if lengths.any() else ():
-        point = np.where(lengths, np.clip(extents - 0.7 + shift, low, high), start)
-        design.append(_amplified(model, point, scales, X, Y))
-    design = np.array(_with_friction(design, forces, (low + high) / 2))
-    noisy = [design]
-    # With five samples a swing smoothing cannot know the noise: it found none at all in 3 of 5 logs
-    # with noise of 8 %. Shares of the standard deviations stand beside what it found.
-    for share in (0.01, 0.1) if moves.any() else ():
-        noisy.append(design.copy())
-        noisy[-1][:, size:] = np.where(moves, np.log(share * scale), start[size:])
-    if impulse is None:
-        noisy, process = np.concatenate(noisy), np.asarray(model.log_process)[None]
-        impulse = np.full(len(scale), -np.inf)
-    else:
-        levels = [impulse + np.log(share) for share in (1e-4, 1e-2, 0.1)]
-        kept = np.where(np.isfinite(impulse), levels, np.asarray(model.log_process))
-        noisy, process = np.repeat(design, len(kept), axis=0), np.tile(kept, (len(design), 1))
-    design = np.clip(noisy, low, high)
-    process = np.broadcast_to(process, (len(design), len(scale)))
+    kernels = [_amplified(model, start, scales, X, Y)]
+    for shift in _SHIFTS if lengths.any() else ():
+        point = np.where(lengths, np.clip(extents + shift, low, high), start)
+        kernels.append(_amplified(model, point, scales, X, Y))
+    kernels += [_with_friction(kernels[-1], (low + high) / 2, forces)] if forces.any() else []
+    # From below, where noise explains nothing, no slope leads back: a second half of the design
+    # begins with much of both kinds. With five samples a swing smoothing found no noise at all in
+    # 3 of 5 logs with noise of 8 %.
+    much = [np.append(h[:size], np.where(moves, np.log(0.1 * scale), h[size:])) for h in kernels]
     looked = np.isfinite(impulse)
-    # Process noise of three times the motion moves everything, and of a millionth of it nothing. Of
-    # what is not free neither the box nor a step matters.
-    least, most = (np.where(looked, impulse + np.log(share), 0.0) for share in (1e-6, 3.0))
+    least, some, more, most = (
+        np.where(looked, impulse + np.log(share), 0.0) for share in (1e-6, 0.01, 0.1, 3.0)
+    )
+    some, more = (np.where(looked, level, -np.inf) for level in (some, more))
     pairs = (low, least), (high, most), (free, looked)
-    return Bounds(*map(np.concatenate, pairs)), np.concatenate([design, process], axis=1)
+    design = [np.append(np.clip(h, low, high), some) for h in [start, *kernels]]
+    design += [np.append(np.clip(h, low, high), more) for h in much]
+    return Bounds(*map(np.concatenate, pairs)), np.array(design)
 
 
-def _with_friction(design: list[np.ndarray], forces, middle) -> list[np.ndarray]:
-    """The design, and its points with friction of a third of all forces.
+def _with_friction(point, middle, forces) -> Float[np.ndarray, " P"]:
+    """The point with friction of a third of all forces.
 
     Coefficients of friction are amplitudes too: from the caller's alone the search ended without
     viscous friction in one of six logs of three runs, 63 nats above the best, and two of the runs
     were lost. The middle of the box is a friction as large as all forces together.
     """
-    if not forces.any():
-        return design
-    return [*design, *(np.where(forces, middle + np.log(0.3), point) for point in design)]
+    return np.where(forces, middle + np.log(0.3), point)
 
 
 def _least_lengths(leaves, X, scale, spacing: float) -> Float[np.ndarray, " P"]:

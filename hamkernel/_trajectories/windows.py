@@ -61,6 +61,11 @@ def windows(times: Float[np.ndarray, " T"], width: int) -> Windows:
         out.value[r, inside] = (1 - s**2) ** 3 * weights[inside]
         out.slope[r, inside] = -6 * s * (1 - s**2) ** 2 / reach * weights[inside]
         out.bend[r, inside] = -6 * (1 - s**2) * (1 - 5 * s**2) / reach**2 * weights[inside]
+        # Exact for constants, and for x = t and x = t²/2: the rule alone is off by 1e-3.
+        value = out.value[r, inside]
+        for rows, x in ((out.slope, t - t.mean()), (out.bend, (t - t.mean()) ** 2 / 2)):
+            rows[r, inside] -= value * rows[r, inside].sum() / value.sum()
+            rows[r, inside] *= value.sum() / abs(rows[r, inside] @ x)
     return out
 
 
@@ -80,15 +85,15 @@ class Channels(NamedTuple):
         times: from −1 to 1, shape (S, T); the last is repeated after the end of a piece.
         values: 0 where nothing was measured, shape (S, T, C).
         slopes: their derivatives in these units of time, likewise.
-        seen: which values were measured, (S, T, C).
-        slopes_seen: which slopes were.
+        has_value: which values were measured, (S, T, C).
+        has_slope: which slopes were.
     """
 
     times: Float[np.ndarray, "S T"]
     values: Float[np.ndarray, "S T C"]
     slopes: Float[np.ndarray, "S T C"]
-    seen: Bool[np.ndarray, "S T C"]
-    slopes_seen: Bool[np.ndarray, "S T C"]
+    has_value: Bool[np.ndarray, "S T C"]
+    has_slope: Bool[np.ndarray, "S T C"]
 
 
 class SmoothedChannels(NamedTuple):
@@ -112,16 +117,16 @@ def _prior(h: Smoother, t: Float[Array, " T"]) -> Float[Array, "2T 2T"]:
     return jnp.block([[value, -first], [first, second]]) + 1e2 * line
 
 
-def _noise(h: Smoother, seen, slopes_seen) -> Float[Array, "G 2T"]:
-    # What was not measured has the variance 1e6, ten thousand times that of a line.
-    both = jnp.where(seen, jnp.exp(2 * h.log_noise), 1e6)
-    slopes = jnp.where(slopes_seen, jnp.exp(2 * h.log_slope_noise), 1e6)
+def _noise(h: Smoother, has_value, has_slope) -> Float[Array, "G 2T"]:
+    # A missing sample has the variance 1e6, ten thousand times that of a line.
+    both = jnp.where(has_value, jnp.exp(2 * h.log_noise), 1e6)
+    slopes = jnp.where(has_slope, jnp.exp(2 * h.log_slope_noise), 1e6)
     return jnp.concatenate([both, slopes])
 
 
-def _grouped(channels: Channels) -> tuple[Array, ...]:
+def _groups(channels: Channels) -> tuple[Array, ...]:
     """Pieces with their channels in groups that were measured at the same times."""
-    alike = all((a == a[:, :, :1]).all() for a in (channels.seen, channels.slopes_seen))
+    alike = all((a == a[:, :, :1]).all() for a in (channels.has_value, channels.has_slope))
     G = 1 if alike else channels.values.shape[2]
 
     def split(a):
@@ -129,28 +134,28 @@ def _grouped(channels: Channels) -> tuple[Array, ...]:
         return jnp.asarray(a).reshape(S, T, G, C // G).transpose(0, 2, 1, 3)
 
     y = jnp.concatenate([split(channels.values), split(channels.slopes)], axis=2)
-    seen = split(channels.seen)[..., 0], split(channels.slopes_seen)[..., 0]
-    return jnp.asarray(channels.times), y, *seen  # (S, T), (S, G, 2T, C/G), (S, G, T) twice
+    has_value = split(channels.has_value)[..., 0], split(channels.has_slope)[..., 0]
+    return jnp.asarray(channels.times), y, *has_value  # (S, T), (S, G, 2T, C/G), (S, G, T) twice
 
 
 @compiled
-def _most_likely(pieces: tuple[Array, ...], low, high, is_free) -> Float[Array, "4"]:
+def _fit_process(pieces: tuple[Array, ...], low, high, is_free) -> Float[Array, "4"]:
     def loss(h):
         h = Smoother(*jnp.where(is_free, h, low))
 
-        def of_piece(piece):
-            t, y, seen, slopes_seen = piece
+        def piece_loss(piece):
+            t, y, has_value, has_slope = piece
             K = _prior(h, t)
 
-            def of_group(y, seen, slopes_seen):
-                L = jnp.linalg.cholesky(K + jnp.diag(_noise(h, seen, slopes_seen)))
+            def group_loss(y, has_value, has_slope):
+                L = jnp.linalg.cholesky(K + jnp.diag(_noise(h, has_value, has_slope)))
                 z = jax.scipy.linalg.solve_triangular(L, y, lower=True)
                 log_det = jnp.sum(jnp.log(jnp.diagonal(L)))
                 return 0.5 * jnp.sum(z**2) + y.shape[1] * log_det
 
-            return jax.vmap(of_group)(y, seen, slopes_seen).sum()
+            return jax.vmap(group_loss)(y, has_value, has_slope).sum()
 
-        return jax.lax.map(of_piece, pieces).sum()
+        return jax.lax.map(piece_loss, pieces).sum()
 
     shares = jnp.asarray([0.3, 0.5, 0.7])
     rates, noises = jnp.meshgrid(shares, jnp.asarray([0.2, 0.4, 0.6, 0.8]))
@@ -166,25 +171,25 @@ def _most_likely(pieces: tuple[Array, ...], low, high, is_free) -> Float[Array, 
     design = low[None] + (high - low)[None] * design
     values = jax.lax.map(loss, design)
     start = design[jnp.nanargmin(values)]
-    found = most_likely_in_box(loss, start, low, high, jnp.full(4, 0.1), 60)[0]
-    return jnp.where(is_free, found, low)
+    h = most_likely_in_box(loss, start, low, high, jnp.full(4, 0.1), 60)[0]
+    return jnp.where(is_free, h, low)
 
 
 @compiled
-def _given_samples(h: Smoother, pieces: tuple[Array, ...]):
-    def of_piece(piece):
-        t, y, seen, slopes_seen = piece
+def _condition(h: Smoother, pieces: tuple[Array, ...]):
+    def condition_piece(piece):
+        t, y, has_value, has_slope = piece
         K, T = _prior(h, t), len(t)
 
-        def of_group(y, seen, slopes_seen):
-            L = jnp.linalg.cholesky(K + jnp.diag(_noise(h, seen, slopes_seen)))
+        def condition_group(y, has_value, has_slope):
+            L = jnp.linalg.cholesky(K + jnp.diag(_noise(h, has_value, has_slope)))
             V = jax.scipy.linalg.solve_triangular(L, K, lower=True)
             mean = V.T @ jax.scipy.linalg.solve_triangular(L, y, lower=True)
             return mean, K[:T, :T] - V[:, :T].T @ V[:, :T]
 
-        return jax.vmap(of_group)(y, seen, slopes_seen)
+        return jax.vmap(condition_group)(y, has_value, has_slope)
 
-    return jax.lax.map(of_piece, pieces)
+    return jax.lax.map(condition_piece, pieces)
 
 
 def smooth_channels(
@@ -193,21 +198,21 @@ def smooth_channels(
     """Channels smoothed by one process, with hyperparameters by the likelihood of all of them.
 
     Args:
-        channels: of size 1 and time from −1 to 1.
-        noise: of values and of slopes, where it is known.
+        channels: functions of size 1 at times from −1 to 1.
+        noise: σ of values and σ of slopes, None where it is unknown.
     """
-    pieces = _grouped(channels)
+    pieces = _groups(channels)
     # A swing a hundred times as long as the data looks like a line; one faster than half a sample,
     # like noise.
     spacing = float(np.median(np.diff(channels.times[0])[np.diff(channels.times[0]) > 0]))
-    speed = float(np.sqrt(np.mean(channels.slopes**2) / max(np.mean(channels.slopes_seen), 1e-9)))
+    speed = float(np.sqrt(np.mean(channels.slopes**2) / max(np.mean(channels.has_slope), 1e-9)))
     low = np.log([0.01, 0.03, 1e-7, 1e-7 * max(speed, 1.0)])
     high = np.log([1e3, 3.0 / spacing, 2.0, 2.0 * max(speed, 1.0)])
     is_free = np.array([True, True, noise[0] is None, noise[1] is None and speed > 0])
     low = np.where(is_free, low, np.log([1, 1, noise[0] or 1.0, noise[1] or 1.0]))
     part = jax.tree.map(lambda a: a[np.linspace(0, len(a) - 1, min(len(a), 8)).astype(int)], pieces)
-    h = Smoother(*_most_likely(part, *map(jnp.asarray, (low, high, is_free))))
-    mean, covariance = _given_samples(h, pieces)
+    h = Smoother(*_fit_process(part, *map(jnp.asarray, (low, high, is_free))))
+    mean, covariance = _condition(h, pieces)
     S, G, T2, C = mean.shape
     both = mean.transpose(0, 2, 1, 3).reshape(S, T2, G * C)
     T = T2 // 2
@@ -236,17 +241,17 @@ class Chunk(NamedTuple):
 def white_factors(chunk: Chunk) -> Float[Array, "c R R"]:
     """The Cholesky factors of C₀, of each coordinate; the identity for empty windows."""
     C = jnp.einsum("crt,cst->crs", chunk.roots, chunk.roots)
-    return jnp.linalg.cholesky(C + _of_empty(chunk))
+    return jnp.linalg.cholesky(C + _empty_windows(chunk))
 
 
-def _of_empty(chunk: Chunk) -> Float[Array, "R R"]:
+def _empty_windows(chunk: Chunk) -> Float[Array, "R R"]:
     return jnp.diag(1.0 * (jnp.abs(chunk.value).sum(axis=1) == 0))
 
 
 def full_factor(chunk: Chunk, slopes: Float[Array, "T c j"]) -> Float[Array, "cR cR"]:
     """The Cholesky factor of C with ∂f_c/∂x_j along the path."""
     c, R, T = chunk.roots.shape
-    white = jnp.einsum("crt,cst->crs", chunk.roots, chunk.roots) + _of_empty(chunk)
+    white = jnp.einsum("crt,cst->crs", chunk.roots, chunk.roots) + _empty_windows(chunk)
     C = jax.scipy.linalg.block_diag(*white)
     k = chunk.path_roots.shape[2]
     by_coordinate = jnp.moveaxis(slopes, 2, 0)  # (j, T, c)
@@ -261,7 +266,7 @@ def full_factor(chunk: Chunk, slopes: Float[Array, "T c j"]) -> Float[Array, "cR
     return jnp.linalg.cholesky(C)
 
 
-def whitened(factor: Float[Array, "..."], rows: Float[Array, "c R *m"]) -> Float[Array, "cR *m"]:
+def whiten_rows(factor: Float[Array, "..."], rows: Float[Array, "c R *m"]) -> Float[Array, "cR *m"]:
     """L⁻¹ of rows, for the factors of C₀ or the factor of C."""
     solve = jax.scipy.linalg.solve_triangular
     c, R = rows.shape[:2]

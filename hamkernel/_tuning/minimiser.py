@@ -1,14 +1,13 @@
 """Minimisers of optimistix, stepped by hand so that many runs share one compiled program.
 
-A minimiser is followed through its `init`, `step` and `terminate`, the public interface of
-optimistix, from points of a box that is searched as h = low + (high − low)(1 + sin u)/2 over all
-real u, as MINUIT does: an unconstrained minimiser then respects the bounds and can rest on one,
-where a sigmoid would creep towards it. The side of the box is π long in u.
+We call the `init`, `step` and `terminate` methods of an optimistix minimiser ourselves. The
+hyperparameters are h = low + (high − low)(1 + sin u)/2 with u real, as in MINUIT, so h stays in its
+box and can reach a bound at a finite u (a sigmoid could not). The side of the box is π long in u.
 
-`BoxBFGS` is the default. It is the BFGS of optimistix with its own line search, limit of the step
-and tolerance, made from the classes that optimistix has for them. The line search of
-`optimistix.BFGS`, which halves the step, takes twice as many losses, and its tolerance, on
-differences of u and of the loss together, cannot say "less than 0.01 % is still to be gained".
+`BoxBFGS` is the default: the BFGS of optimistix with another line search, a limit of the step, and
+another tolerance, all built from the classes of optimistix. `optimistix.BFGS` halves the step in
+its line search, which takes twice as many losses. Its tolerance, on differences of u and of the
+loss together, cannot express "the next step promises less than 0.01 %".
 
 Source: Nocedal & Wright (2006), Numerical Optimization, algorithms 3.1 and 6.1.
 """
@@ -29,10 +28,10 @@ def inside_box(u: Array, low: Array, high: Array) -> Array:
 
 
 def from_box(h: Array, low: Array, high: Array, margin: float) -> Array:
-    """The u of a point h, which is moved into the box by the share `margin` of its sides.
+    """The u of a point h, after h has been moved into the box by the share `margin` of its sides.
 
-    On the edge itself the derivative of the sine is zero, and no slope would lead away from it. A
-    coordinate that is not finite becomes the middle of its side.
+    On the edge the derivative of the sine is zero, so a minimiser could not leave it. A coordinate
+    that is not finite becomes the middle of its side.
     """
     width = jnp.where(high > low, high - low, jnp.ones_like(low))
     share = jnp.clip((h - low) / width, margin, 1 - margin)
@@ -40,11 +39,11 @@ def from_box(h: Array, low: Array, high: Array, margin: float) -> Array:
 
 
 class LimitedNewton(optx.AbstractDescent):
-    """The direction −H g, H the inverse Hessian and g the slope, no longer than half of the box.
+    """The direction −H g, H the inverse Hessian and g the slope, at most half of the box long.
 
-    The quadratic model does not hold beyond half of the box, which is π wide. Where H is still the
-    identity, and the curvature unknown, the direction is the steepest descent, a tenth of the box
-    long.
+    The quadratic model does not hold beyond half of the box, which is π wide. While H is still the
+    identity, the curvature is unknown, and the direction is the steepest descent, a tenth of the
+    box long.
     """
 
     def init(self, y, f_info_struct):
@@ -55,8 +54,8 @@ class LimitedNewton(optx.AbstractDescent):
         direction = -(H @ slope)
         length = jnp.linalg.norm(direction)
         unknown = jnp.all(H == jnp.eye(len(y), dtype=H.dtype))
-        most = jnp.where(unknown, 0.1 * jnp.pi, jnp.minimum(length, 0.5 * jnp.pi))
-        return direction * (most / jnp.where(length > 0, length, jnp.ones_like(length)))
+        max_length = jnp.where(unknown, 0.1 * jnp.pi, jnp.minimum(length, 0.5 * jnp.pi))
+        return direction * (max_length / jnp.where(length > 0, length, jnp.ones_like(length)))
 
     def step(self, step_size, state):
         return step_size * state, optx.RESULTS.successful
@@ -65,10 +64,10 @@ class LimitedNewton(optx.AbstractDescent):
 class ParabolicSearch(optx.AbstractSearch):
     """A line search by parabolas, with the condition of Armijo.
 
-    A step is accepted if it lowers the value by 1e-4 of the decrease that the slope promises; the
-    share is small, since with a known curvature full steps are good and none should be refused. A
-    refused step is followed by a step to the minimum of the parabola through both values, a tenth
-    to a half as long.
+    A step is accepted if it lowers the value by 1e-4 of the decrease that the slope promises. The
+    share is small because full steps are good once the curvature is known. After a refused step,
+    the next one goes to the minimum of the parabola through both values and the slope, limited to
+    a tenth to a half of the refused step.
     """
 
     def init(self, y, f_info_struct):
@@ -78,15 +77,16 @@ class ParabolicSearch(optx.AbstractSearch):
         promised = f_info.grad @ (y_eval - y)
         change = f_eval_info.f - f_info.f
         accept = first_step | (change <= 1e-4 * promised)
+        # The parabola with f(0) = 0, f′(0) = p and f(1) = c has its minimum at −p/(2(c − p)).
         share = jnp.clip(-promised / (2 * (change - promised)), 0.1, 0.5)
         size = jnp.where(accept, jnp.ones_like(state), state * share)
         return size, accept, optx.RESULTS.successful, size
 
 
 class BoxBFGS(optx.AbstractBFGS):
-    """BFGS for a box in u that has converged where the next step promises less than `atol`.
+    """BFGS for a box in u; it has converged when the next step promises less than `atol`.
 
-    The quadratic model promises half of the decrease that the slope alone does.
+    The decrease that the quadratic model promises is half of the linear one, −g·Δu/2.
     """
 
     atol: Float[Array, ""] = eqx.field(converter=jnp.asarray)
@@ -101,7 +101,7 @@ class BoxBFGS(optx.AbstractBFGS):
         promised = -(state.f_info.grad @ state.descent_state) / 2
         step = jnp.linalg.norm(state.y_eval - y)
         converged = promised < self.atol
-        # A step that changes less than half of the digits of u sees rounding errors alone.
+        # A step below √ε relative to u changes the value by rounding errors alone.
         stuck = step <= 1e-8 * (1 + jnp.linalg.norm(y))
         result = optx.RESULTS.where(
             stuck & ~converged, optx.RESULTS.nonlinear_divergence, optx.RESULTS.successful
@@ -110,9 +110,9 @@ class BoxBFGS(optx.AbstractBFGS):
 
 
 class Evaluation(NamedTuple):
-    """A point at which the function was evaluated: its value, and the loss that is reported."""
+    """A point u, the value of the function there, and the loss to report."""
 
-    seen: Bool[Any, ""]
+    is_evaluated: Bool[Any, ""]
     u: Float[Any, " P"]
     value: Float[Any, ""]
     loss: Float[Any, ""]
@@ -126,7 +126,7 @@ class MinimiserRun(NamedTuple):
         state: the state of the minimiser.
         best: the best point so far.
         steps: the number of steps so far.
-        going: whether the run has not ended.
+        active: whether the run goes on.
         converged: whether the run met its tolerance.
     """
 
@@ -134,31 +134,31 @@ class MinimiserRun(NamedTuple):
     state: Any
     best: Evaluation
     steps: Int[Any, ""]
-    going: Bool[Any, ""]
+    active: Bool[Any, ""]
     converged: Bool[Any, ""]
 
-    def going_on_from(self, runs: "MinimiserRun") -> "MinimiserRun":
-        """The runs at these points, with the curvature of other `runs` on a similar function.
+    def with_curvature_of(self, runs: "MinimiserRun") -> "MinimiserRun":
+        """These points, with the inverse Hessian of `runs` on a similar function.
 
         The first step of a quasi-Newton method only evaluates the function at its point.
         """
         if not hasattr(runs.state, "hessian_update_state"):
             return self._replace(steps=runs.steps)
         new = self.state.first_step, self.state.y_eval
-        known = eqx.tree_at(lambda state: (state.first_step, state.y_eval), runs.state, new)
-        return self._replace(state=known, steps=runs.steps)
+        state = eqx.tree_at(lambda state: (state.first_step, state.y_eval), runs.state, new)
+        return self._replace(state=state, steps=runs.steps)
 
     def with_curvature(self, inverse: Float[Array, "P P"]) -> "MinimiserRun":
-        """The run of `BoxBFGS` with this inverse Hessian in place of the identity."""
+        """A run of `BoxBFGS` with this inverse Hessian in place of the identity."""
         state = eqx.tree_at(lambda state: state.f_info.hessian_inv.pytree, self.state, inverse)
         return self._replace(state=state)
 
 
-Minimised = Callable[[Float[Array, " P"]], tuple[Float[Array, ""], Float[Array, ""]]]
+Minimisable = Callable[[Float[Array, " P"]], tuple[Float[Array, ""], Float[Array, ""]]]
 
 
-def begun(minimiser: optx.AbstractMinimiser, fn: Minimised, u: Float[Array, " P"]) -> MinimiserRun:
-    """A run at u, where the function has not been evaluated yet."""
+def init(minimiser: optx.AbstractMinimiser, fn: Minimisable, u: Float[Array, " P"]) -> MinimiserRun:
+    """A run at u, before the first evaluation of the function."""
     number = jax.ShapeDtypeStruct((), u.dtype)
     flag = jax.ShapeDtypeStruct((), jnp.bool_)
     point = Evaluation(flag, u, number, number)
@@ -168,13 +168,15 @@ def begun(minimiser: optx.AbstractMinimiser, fn: Minimised, u: Float[Array, " P"
     return MinimiserRun(u, state, nothing, jnp.array(0), jnp.array(True), no)
 
 
-def stepped(minimiser: optx.AbstractMinimiser, fn: Minimised, run: MinimiserRun) -> MinimiserRun:
+def step_once(
+    minimiser: optx.AbstractMinimiser, fn: Minimisable, run: MinimiserRun
+) -> MinimiserRun:
     """The run after one more step of the minimisation of `fn`, u -> (value, loss)."""
     with_args, arguments = _with_slope_backward(fn), (None, {})
     u, state, aux = minimiser.step(with_args, run.u, *arguments, run.state, frozenset())
     stopped, result = minimiser.terminate(with_args, u, *arguments, state, frozenset())
     best = _better(run.best, aux)
-    # After an accepted step optimistix returns the previous point; the new one is in its state.
+    # After an accepted step optimistix returns the previous point; its state holds the new one.
     best = _better(best, getattr(state, "aux", aux))
     successful = result == optx.RESULTS.successful
     return MinimiserRun(
@@ -187,19 +189,19 @@ def stepped(minimiser: optx.AbstractMinimiser, fn: Minimised, run: MinimiserRun)
     )
 
 
-def minimised(
-    minimiser: optx.AbstractMinimiser, fn: Minimised, run: MinimiserRun, steps: Any
+def minimise(
+    minimiser: optx.AbstractMinimiser, fn: Minimisable, run: MinimiserRun, steps: Any
 ) -> MinimiserRun:
-    """The run at its end, or once it has taken `steps` steps."""
+    """Step the run until it ends or has taken `steps` steps."""
     arrays, static = eqx.partition(run, eqx.is_array)
 
-    def going(arrays):
-        return arrays.going & (arrays.steps < steps)
+    def active(arrays):
+        return arrays.active & (arrays.steps < steps)
 
     def step(arrays):
-        return eqx.filter(stepped(minimiser, fn, eqx.combine(arrays, static)), eqx.is_array)
+        return eqx.filter(step_once(minimiser, fn, eqx.combine(arrays, static)), eqx.is_array)
 
-    return eqx.combine(jax.lax.while_loop(going, step, arrays), static)
+    return eqx.combine(jax.lax.while_loop(active, step, arrays), static)
 
 
 def most_likely_in_box(
@@ -210,13 +212,13 @@ def most_likely_in_box(
     deviations: Float[Array, " P"],
     steps: Any,
 ) -> tuple[Float[Array, " P"], Float[Array, ""]]:
-    """The h in the box low ≤ h ≤ high where −log p = fn(h) is least, from `start`, and fn there.
+    """The minimiser h of fn(h) = −log p in the box low ≤ h ≤ high, from `start`, and fn(h).
 
-    `deviations` are the standard deviations of h that the likelihood leaves, as far as they are
-    known: their squares are the inverse Hessian that BFGS begins with.
+    `deviations` are rough standard deviations σ of h under the likelihood. With
+    dh/du = (high − low) cos(u)/2 they give the first inverse Hessian of BFGS, (σ / (dh/du))².
     """
-    # No hyperparameter need be nearer to its best value than a tenth of its standard deviation,
-    # where the quadratic −log p is ½ .1² above its minimum.
+    # A hyperparameter within a tenth of its standard deviation of the best value is good enough;
+    # there the quadratic −log p is ½ .1² = .005 above its minimum.
     bfgs = BoxBFGS(atol=jnp.asarray(0.005, start.dtype))
     u = from_box(start, low, high, 0.01)
     width = jnp.where(high > low, high - low, jnp.ones_like(low))
@@ -226,36 +228,36 @@ def most_likely_in_box(
         value = fn(inside_box(u, low, high))
         return jnp.where(jnp.isfinite(value), value, jnp.inf), value
 
-    run = minimised(bfgs, loss, begun(bfgs, loss, u).with_curvature(inverse), steps)
+    run = minimise(bfgs, loss, init(bfgs, loss, u).with_curvature(inverse), steps)
     return inside_box(run.best.u, low, high), run.best.value
 
 
-def _better(one: Evaluation, other: Evaluation) -> Evaluation:
-    better = other.seen & (other.value < one.value)
-    return jax.tree.map(lambda a, b: jnp.where(better, b, a), one, other)
+def _better(best: Evaluation, candidate: Evaluation) -> Evaluation:
+    better = candidate.is_evaluated & (candidate.value < best.value)
+    return jax.tree.map(lambda a, b: jnp.where(better, b, a), best, candidate)
 
 
-def _with_slope_backward(fn: Minimised) -> Callable[[Array, Any], tuple[Array, Evaluation]]:
+def _with_slope_backward(fn: Minimisable) -> Callable[[Array, Any], tuple[Array, Evaluation]]:
     """`fn` for optimistix, (u, args) -> (value, the `Evaluation` at u).
 
-    optimistix linearises in forward mode and transposes, while the derivatives of losses are
-    written in reverse mode: here the slope is computed together with the value. A value that is not
-    finite counts as huge, with a slope of zero.
+    optimistix linearises in forward mode and transposes, but the derivatives of losses are written
+    in reverse mode. We therefore compute the slope together with the value. A value that is not
+    finite counts as 1e30, with a slope of zero.
     """
 
-    def looked_at(u):
+    def evaluate(u):
         value, loss = fn(u)
-        # `seen` is False in the zeros that optimistix begins with.
-        seen = jnp.isfinite(u).all()
-        point = Evaluation(seen, u, value.astype(u.dtype), loss.astype(u.dtype))
-        # A line search can interpolate a huge number, and not infinity.
+        # optimistix begins with an `Evaluation` of zeros, in which `is_evaluated` is False.
+        is_evaluated = jnp.isfinite(u).all()
+        point = Evaluation(is_evaluated, u, value.astype(u.dtype), loss.astype(u.dtype))
+        # The line search interpolates values, so they must be finite.
         return jnp.where(jnp.isfinite(point.value), point.value, 1e30), point
 
-    differentiable = jax.custom_jvp(looked_at)
+    differentiable = jax.custom_jvp(evaluate)
 
     @differentiable.defjvp
     def _(primals, tangents):
-        (value, point), slope = jax.value_and_grad(looked_at, has_aux=True)(*primals)
+        (value, point), slope = jax.value_and_grad(evaluate, has_aux=True)(*primals)
         slope = jnp.where(jnp.isfinite(slope), slope, jnp.zeros_like(slope))
         zeros = jax.tree.map(
             lambda a: (

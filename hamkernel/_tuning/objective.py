@@ -1,6 +1,6 @@
-"""The functions that `tune` minimises: losses of the dense or low-rank fit, or the caller's.
+"""The functions that `tune` minimises: a loss of the dense or low-rank fit, or the caller's.
 
-A search goes through parts of the observations, `parts_of`, each with a `SearchObjective`.
+A search uses growing subsets of the observations, `parts_of`, each with a `SearchObjective`.
 """
 
 import dataclasses
@@ -30,28 +30,29 @@ from hamkernel._validation import (
     log_marginal_likelihood,
     partition_loss_and_square,
     partition_of_rows,
-    without_silent_directions,
+    project_silent_directions,
 )
 
 Objective = Callable[[AbstractMatrixKernel, Array, Array, Array], Float[Array, ""]]
 Criterion = Literal["cross_validation", "generalized_cross_validation", "marginal_likelihood"]
 
-# The least tr(I − S)/D of a fit that generalised cross-validation may judge. Where a fit
-# interpolates, both this share of free residuals and the loss are 0/0, and the loss can be small.
-# On 24 points with noise a search without the limit leaves less than a tenth of the noise as
-# residual, and with it more than half (`tests/test_tune.py`).
+# The smallest tr(I − S)/D for which generalised cross-validation is evaluated. If a fit
+# interpolates, tr(I − S) and the residual both vanish, the loss is 0/0 and can be small by
+# accident. On 24 points with noise, a search without the limit leaves less than a tenth of the
+# noise as residual, and with the limit more than half (`tests/test_tune.py`).
 LEAST_FREE = 0.2
 
 
 class SearchCriterion(eqx.Module):
-    """The function to minimise, in units in which a change of 0.01 is one per cent of a loss.
+    """The function to minimise, scaled so that a change of 0.01 means one per cent of a loss.
 
-    A loss is searched by its logarithm; a negative log density per half a row, which is the
-    logarithm of a square too; and the caller's objective as it is.
+    A loss is minimised on a log scale. A negative log density is divided by half the number of
+    rows, which makes it the logarithm of a mean square, too. The caller's objective is minimised
+    as it is.
     """
 
     fn: Any  # a function, or the `Partial` of one of ours
-    partition: Partition | None = eqx.field(static=True)  # of the observations; see `on`
+    partition: Partition | None = eqx.field(static=True)  # of the observations; see `for_subset`
     logarithmic: bool = eqx.field(static=True)
     custom: bool = eqx.field(static=True)  # the caller's, which may need all the data
 
@@ -71,22 +72,24 @@ class SearchCriterion(eqx.Module):
         return value, square
 
     def with_basis(self, basis: AbstractBasis) -> "SearchCriterion":
-        """This criterion for the low-rank fit in a basis."""
+        """This criterion, for the low-rank fit in a basis."""
         return self._with(basis=basis)
 
-    def _with(self, **known: Any) -> "SearchCriterion":
-        # A Partial of a Partial would be another function, to be compiled, for each call of `tune`.
-        fn = jax.tree_util.Partial(self.fn.func, **(self.fn.keywords | known))
+    def _with(self, **keywords: Any) -> "SearchCriterion":
+        # A Partial of a Partial would be a new function, and compile anew, in each call of `tune`.
+        fn = jax.tree_util.Partial(self.fn.func, **(self.fn.keywords | keywords))
         return dataclasses.replace(self, fn=fn)
 
-    def hearing(self, K: AbstractMatrixKernel, rows: Measurements) -> "SearchCriterion":
-        """This criterion, which knows the silent directions if no hyperparameter changes them."""
+    def with_silent_directions(
+        self, K: AbstractMatrixKernel, rows: Measurements
+    ) -> "SearchCriterion":
+        """This criterion with the silent directions computed once, if they do not depend on u."""
         if self.fn.func is not _negative_log_likelihood or not has_constant_parts(K):
             return self
         # An eigenvalue problem of n × n for each point.
-        return self._with(heard=_heard(K, rows))
+        return self._with(projected=_project(K, rows))
 
-    def on(self, rows: Measurements, chosen: np.ndarray) -> "SearchCriterion":
+    def for_subset(self, rows: Measurements, chosen: np.ndarray) -> "SearchCriterion":
         """This criterion for the rows of a subset of the observations."""
         if self.partition is None:
             return self
@@ -95,15 +98,16 @@ class SearchCriterion(eqx.Module):
 
 
 class SearchObjective(eqx.Module):
-    """The function u -> (value, loss): what is minimised, and the objective as it is reported.
+    """The function u -> (value, loss): the number to minimise, and the objective that is reported.
 
     Attributes:
-        space: of u.
-        criterion: of these rows.
+        space: maps u to a kernel and λ.
+        criterion: the loss on `rows`.
         rows: all observations, or a subset of them.
-        thinning: the number of all observations over that of these; the ridge Nλ is that of all.
+        thinning: the number of all observations over the number in `rows`. A fit to the subset has
+            the ridge Nλ of all the data.
         rms: the size of velocities, see `velocity_rms`.
-        unit: of the caller's objective, whose size may be any.
+        unit: the scale by which a custom objective is divided; 1 for built-in losses.
     """
 
     space: SearchSpace
@@ -114,12 +118,12 @@ class SearchObjective(eqx.Module):
     unit: Float[Array, ""]
 
     def __call__(self, u: Float[Array, " P"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        return self.at(*self.space.decode(u.astype(self.rms.dtype)))
+        return self.value_and_loss(*self.space.decode(u.astype(self.rms.dtype)))
 
-    def at(
+    def value_and_loss(
         self, K: AbstractMatrixKernel, regularization: Float[Array, ""], size: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The value and the loss of a kernel and λ, where tr(G)/N is `size`."""
+        """The value and the loss of a kernel and λ, given `size` = tr(G)/N."""
         loss, square = self.criterion.loss(K, self.rows, self.thinning * regularization)
         value = loss
         if self.criterion.logarithmic:
@@ -137,37 +141,40 @@ class SearchObjective(eqx.Module):
     ) -> Float[Array, ""]:
         """The penalty on fields whose rounding errors are too large to be integrated.
 
-        f(x) = Σ K(x, xⱼ) aⱼ rounds by up to ε tr(G) ‖a‖, of which an adaptive step, or the
-        iteration of an implicit one, sees 1e-2. This error should not exceed a share √ε of the
-        velocities: ‖a‖ tr(G) √ε ≤ ‖y‖. The penalty is the squared logarithm of the ratio of the
-        two sides where it is larger than 1: of 18 fields, for polynomial and trigonometric H with
-        noise of 0, 1 and 10 %, all can then be integrated (`tests/benchmarks/tuned_fields.py`).
-        The likelihood needs no penalty: its Nλ is the variance of y − f = Nλ a. An objective of the
-        caller's gets none, since its meaning is not known.
+        f(x) = Σ K(x, xⱼ) aⱼ rounds by up to ε tr(G) ‖a‖. An adaptive step, or the iteration of an
+        implicit step, sees about 1e-2 of that bound. The error should not exceed a share √ε of the
+        velocities, which means ‖a‖ tr(G) √ε ≤ ‖y‖. The penalty is the squared logarithm of the
+        ratio of the two sides if that ratio is larger than 1. All of 18 fields, with polynomial and
+        trigonometric H and noise of 0, 1 and 10 %, can then be integrated
+        (`tests/benchmarks/tuned_fields.py`). The likelihood needs no penalty, since its Nλ is the
+        variance of y − f = Nλ a. The caller's objective gets none, since its meaning is unknown.
 
         Args:
             square: ‖a‖², shape ().
             size: tr(G)/N, shape ().
         """
         X, dtype = self.rows.points, square.dtype
-        trace = self.thinning * len(X) * size  # of noise a is as large at every point
+        # The coefficients of noise, a = (y − f)/(Nλ), have the same size at every point, so ‖a‖/‖y‖
+        # of a subset is that of all the data, whose trace is N `size`.
+        trace = self.thinning * len(X) * size
         velocities = self.rms**2 * (len(X) * self.space.kernel.outputs(X.shape[1]))
         tiny, eps = jnp.finfo(dtype).tiny, jnp.log(jnp.finfo(dtype).eps).astype(dtype)
+        # log_ratio = log(‖a‖ tr(G) √ε / ‖y‖) with ‖y‖² = rms² times the number of components
         scale = trace**2 / jnp.maximum(velocities, tiny)
-        beyond = (jnp.log(jnp.maximum(square, tiny)) + jnp.log(scale) + eps) / 2
-        return jnp.maximum(beyond, 0) ** 2
+        log_ratio = (jnp.log(jnp.maximum(square, tiny)) + jnp.log(scale) + eps) / 2
+        return jnp.maximum(log_ratio, 0) ** 2
 
 
 def parts_of(
     rows: Measurements, criterion: SearchCriterion, dense: bool
 ) -> list[Int[np.ndarray, " _"]]:
-    """The observations of each part of a search: few, more, and all where the loss is dense."""
+    """The observations of each part of a search: a few, more, and all if the loss is dense."""
     N, n = rows.count, len(rows.targets) / rows.count
     if criterion.custom:  # it may need all the data
         return [np.arange(N)]
-    # The first part has 256 rows, or 64 points where these are fewer: with half as many the best
-    # run often leads to a poor optimum of all the data (`tests/benchmarks/tuning_speed.py`). The
-    # second part has 1024 rows, and is used where all points have at least twice as many.
+    # The first part has 256 rows or 64 points, whichever is fewer. With half as many, the best
+    # run often leads to a poor optimum on all the data (`tests/benchmarks/tuning_speed.py`). The
+    # second part has 1024 rows, and is used if all points have at least twice as many.
     counts = [min(64, max(int(256 / n), 2)), int(1024 / n)]
     if 2 * counts[1] > N:
         del counts[1]
@@ -175,19 +182,19 @@ def parts_of(
         return [np.arange(N)]
     labels = np.zeros(N) if criterion.partition is None else criterion.partition.labels
     order = np.argsort(labels, kind="stable")
-    # Spread evenly over the folds, and over the observations of each.
-    few = [np.sort(order[np.linspace(0, N - 1, count).round().astype(int)]) for count in counts]
-    return [*few, np.arange(N)] if dense else few
+    # Evenly spaced over the folds and over the observations of each fold.
+    subsets = [np.sort(order[np.linspace(0, N - 1, count).round().astype(int)]) for count in counts]
+    return [*subsets, np.arange(N)] if dense else subsets
 
 
 def criterion_of(
     objective: Criterion | Objective, N: int, folds: Folds, data: tuple[Any, Any] = (None, None)
 ) -> SearchCriterion:
-    """The criterion that the objective of `tune` stands for, of N observations.
+    """The criterion that the `objective` of `tune` means, for N observations.
 
-    A public loss is what its name is: it takes the folds and is searched by its logarithm. A
-    function of the caller's is called with what the caller gave, states and velocities, or
-    observations and None.
+    A public loss function may be passed in place of its name. It then uses `folds` and is minimised
+    on a log scale, exactly as the name would be. Any other function is called with the caller's
+    data: states and velocities, or observations and None.
     """
     partial = jax.tree_util.Partial
     if objective == "cross_validation" or objective is cross_validation_loss:
@@ -212,11 +219,11 @@ def criterion_of(
             "'marginal_likelihood' or a function (K, X, Y, regularization) -> (); "
             f"got {objective!r}."
         )
-    other = require.other_arguments(objective, "K", "X", "Y", "regularization")
-    if other is not None:
+    other_arguments = require.other_arguments(objective, "K", "X", "Y", "regularization")
+    if other_arguments is not None:
         raise TypeError(
             "an objective is called with (K, X, Y, regularization), by position, and returns one "
-            f"number; this one takes ({other})."
+            f"number; this one takes ({other_arguments})."
         )
     fn = partial(_custom_of_data, as_pytree(objective), data)
     return SearchCriterion(fn, None, logarithmic=False, custom=True)
@@ -226,8 +233,8 @@ def _custom_of_data(fn, data, K, rows, regularization):
     return fn(K, *data, regularization)
 
 
-_heard = compiled(without_silent_directions)
+_project = compiled(project_silent_directions)
 
 
-def _negative_log_likelihood(K, rows, regularization, basis=None, heard=None):
-    return -log_likelihood(K, rows, regularization, basis, heard)
+def _negative_log_likelihood(K, rows, regularization, basis=None, projected=None):
+    return -log_likelihood(K, rows, regularization, basis, projected)

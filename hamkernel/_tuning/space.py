@@ -1,7 +1,7 @@
-"""The hyperparameters of a kernel, the bounds that it takes from the data, and the search space.
+"""The hyperparameters of a kernel, their bounds from the data, and the search space.
 
-Every kernel gives the bounds of its own arrays, `bounds`, and the data in the coordinates that the
-kernels inside it see, `transform_inputs`: a `Select` or a `Warp` transforms them first.
+The method `bounds` of a kernel gives the bounds of its arrays. The method `transform_inputs` gives
+the data in the coordinates of the inner kernels: a `Select` or a `Warp` transforms them first.
 """
 
 import dataclasses
@@ -28,15 +28,15 @@ from hamkernel._structures.joined import AbstractJoinedKernel, Controlled
 from hamkernel._tuning.minimiser import from_box, inside_box
 
 RIDGE = "regularization"
-_EDGE = 0.01  # the share of the box that counts as resting on a bound
+_EDGE = 0.01  # a value within this share of the box counts as resting on a bound
 
 
 @dataclasses.dataclass(frozen=True)
 class Hyperparameter:
-    """One trainable leaf of a kernel and the box to look for it in.
+    """One trainable leaf of a kernel and its search box.
 
-    `low` and `high` have the shape of the leaf and are in its stored coordinates, which are
-    logarithms where `logarithmic` holds.
+    `low` and `high` have the shape of the leaf and its stored coordinates, which are logarithms if
+    `logarithmic`.
     """
 
     name: str
@@ -60,13 +60,14 @@ def hyperparameters(
     rms: float,
     states: Float[Array, "M n"],
 ) -> list[Hyperparameter]:
-    """The trainable leaves of K, in the order of its leaves, with their boxes from the data.
+    """The trainable leaves of K, in order, with their boxes from the data.
 
-    The size of K(x, x) is that at `states`, a subset of X or all, and `rms` that of velocities, the
-    root of the mean square of their components.
+    The size of K(x, x) is taken at `states`, a subset of X or all of X. `rms` is the root mean
+    square of a component of the velocities.
     """
     inputs = np.asarray(X)
-    # A fair amplitude depends on the lengthscales, which are taken in the middle of their boxes.
+    # The amplitude that fits depends on the lengthscales; we take them in the middle of their
+    # boxes.
     arrays, rest = eqx.partition(K, eqx.is_inexact_array)
     leaves, structure = jax.tree.flatten(arrays)
     middle = [
@@ -87,21 +88,21 @@ def named_values(K: AbstractMatrixKernel, X: Float[np.ndarray, "N n"]) -> dict[s
 
 
 def constants(K: AbstractMatrixKernel) -> dict[str, float]:
-    """The Python floats among the attributes of a kernel, which are no leaves to train."""
-    found: dict[str, float] = {}
+    """The Python floats among the attributes of a kernel, which are not trained, by name."""
+    values: dict[str, float] = {}
     for path, node in tree_flatten_with_path(K, is_leaf=lambda node: isinstance(node, Bound))[0]:
         if isinstance(node, float) and not eqx.is_array(node):  # that of NumPy is both
-            found[keystr(path).removeprefix(".")] = node
+            values[keystr(path).removeprefix(".")] = node
         elif isinstance(node, Bound):
-            found |= node.floats
-    return found
+            values |= node.floats
+    return values
 
 
 gram_trace = compiled(trace)
 
 
 def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
-    """The trace of the Gram before terms of odd and even kernels cancel: it sets the rounding."""
+    """The trace of the Gram before terms of odd and even kernels cancel, for its rounding."""
     terms = without_symmetry(K)
     trace = gram_trace(terms, X)
     if Invariance.REFLECTION in terms.invariance:
@@ -110,10 +111,10 @@ def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, 
 
 
 def velocity_rms(K: AbstractMatrixKernel, rows: Measurements) -> float:
-    """The root of the mean square of a component of a velocity, estimated from the rows.
+    """The root mean square of a component of a velocity, estimated from the rows.
 
-    Of rows that are no velocities the mean square is scaled by the ratio of the mean diagonals of
-    the two Grams, that of velocities at the points over that of the rows.
+    For other rows than velocities, the mean square is multiplied by the ratio of two mean
+    diagonals: of the Gram of velocities at the points, and of the Gram of the rows.
     """
     if isinstance(rows.blocks[0], Components) and len(rows.blocks) == 1:
         return float(np.sqrt(np.mean(np.asarray(rows.measured()) ** 2)))
@@ -126,7 +127,7 @@ _gram_of_rows = compiled(gram_of_rows)
 
 
 def _amplitude(K: AbstractMatrixKernel, X: Array, rms: float) -> float:
-    """The factor that gives K(x, x) the size of velocities squared: over its mean diagonal."""
+    """The amplitude rms²/mean diagonal, with which K(x, x) has the size of squared velocities."""
     trace = float(gram_trace(K, X))
     ratio = rms**2 * len(X) * K.outputs(X.shape[1]) / trace if trace > 0 else 0.0
     return ratio if np.isfinite(ratio) and ratio > 0 else 1.0
@@ -135,23 +136,23 @@ def _amplitude(K: AbstractMatrixKernel, X: Array, rms: float) -> float:
 def _amplitudes(
     K: AbstractMatrixKernel, middle: Any, X: Float[Array, "N d"], rms: float
 ) -> dict[int, float]:
-    """The factors of K and of its parts that give each alone the size of velocities squared.
+    """The amplitudes with which K, and each part of K alone, has the size of squared velocities.
 
-    By the `id` of the part, `middle` being K with hyperparameters in the middle of their boxes. The
-    parts have units of their own: with one factor for all, friction was looked for in the decade of
-    the energy, and of a spring in 1e-8 m and 1e-6 s, in metres and seconds, 9e-6 of it was found
-    (`tests/test_friction.py`).
+    The keys are the `id` of the parts; `middle` is K with hyperparameters in the middle of their
+    boxes. Parts have different units. With one common factor, the size of the energy set the
+    bounds for the friction. For a spring that moves by 1e-8 m in 1e-6 s, described in SI units,
+    only a fraction 9e-6 of the friction was found (`tests/test_friction.py`).
     """
-    found = {id(K): _amplitude(middle, X, rms)}
+    amplitudes = {id(K): _amplitude(middle, X, rms)}
     if isinstance(K, Sum):
         for term, of_middle in zip(K.terms, middle.terms, strict=True):
-            found |= _amplitudes(term, of_middle, X, rms)
+            amplitudes |= _amplitudes(term, of_middle, X, rms)
     elif isinstance(K, AbstractJoinedKernel):
-        found |= _amplitudes(K.of_states, middle.of_states, K.split(X)[0], rms)
+        amplitudes |= _amplitudes(K.of_states, middle.of_states, K.split(X)[0], rms)
         if isinstance(K, Controlled):
-            both, drift = found[id(K)], found[id(K.drift)]  # as 1/(a + b) and 1/a
-            found[id(K.inputs)] = 1 / (1 / both - 1 / drift) if both < drift else both
-    return found
+            both, drift = amplitudes[id(K)], amplitudes[id(K.drift)]  # as 1/(a + b) and 1/a
+            amplitudes[id(K.inputs)] = 1 / (1 / both - 1 / drift) if both < drift else both
+    return amplitudes
 
 
 def _walk(
@@ -161,7 +162,7 @@ def _walk(
     amplitudes: Mapping[int, float],
     amplitude: float = 1.0,
 ) -> Iterator[Hyperparameter]:
-    """Walk the kernel; X is the data in the coordinates that `node` sees."""
+    """Walk the kernel; X is the data in the coordinates of `node`."""
     kernel = node if isinstance(node, AbstractScalarKernel | AbstractMatrixKernel) else None
     amplitude = amplitudes.get(id(node), amplitude)
     inside = (X if kernel is None else kernel.transform_inputs(X)), amplitude
@@ -193,7 +194,7 @@ def _walk(
 
 
 def _children(node: object) -> list[tuple[tuple, Any]]:
-    """The nodes below this one with their keys; the terms of a sum by their names."""
+    """The children of a node with their keys; the terms of a sum by their names."""
     if isinstance(node, Sum):
         keys = [
             (GetAttrKey(name),) if name else (GetAttrKey("terms"), SequenceKey(i))
@@ -206,8 +207,8 @@ def _children(node: object) -> list[tuple[tuple, Any]]:
 class SearchSpace(eqx.Module):
     """The map u (P,) -> (kernel, λ) with h = low + (high − low)(1 + sin u)/2 for each entry.
 
-    The entries are those of the kernel's leaves, then log λ; `free` says which of them u moves.
-    The box of λ follows the kernel, see `ridge_bounds`.
+    The entries are those of the kernel's leaves, then log λ; `free` holds the indices of the
+    entries that u moves. The box of λ depends on the kernel, see `ridge_bounds`.
     """
 
     kernel: AbstractMatrixKernel
@@ -216,7 +217,7 @@ class SearchSpace(eqx.Module):
     regularization: Float[Array, ""]
     low: Float[Array, " entries"]
     high: Float[Array, " entries"]
-    given_ridge: tuple[Float[Array, ""], Float[Array, ""]] | None
+    ridge_interval: tuple[Float[Array, ""], Float[Array, ""]] | None
     entries: tuple[str, ...] = eqx.field(static=True)
     names: tuple[str, ...] = eqx.field(static=True)
     logarithmic: tuple[bool, ...] = eqx.field(static=True)
@@ -236,8 +237,8 @@ class SearchSpace(eqx.Module):
     ):
         """Make the space for data at X; the size of the Gram is taken on `states`, or X.
 
-        `rms` is the size of velocities, see `velocity_rms`. The least λ is `roundings` times the
-        rounding of the Gram, ε tr(G)/N: with 100 two digits are left.
+        `rms` is the size of velocities, see `velocity_rms`. The smallest λ is `roundings` times the
+        rounding of the Gram, ε tr(G)/N; with 100, two digits remain.
         """
         dtype = X.dtype
         self.roundings = roundings
@@ -257,14 +258,14 @@ class SearchSpace(eqx.Module):
             np.concatenate([*(side(p).ravel() for p in params), [0.0]])
             for side in (lambda p: p.low, lambda p: p.high)
         )
-        self.given_ridge = None
-        for name, given in bounds.items():
+        self.ridge_interval = None
+        for name, interval in bounds.items():
             matching = self._matching(name)
-            for i, *pair in zip(matching, *_checked_box(name, given, len(matching)), strict=True):
+            for i, *pair in zip(matching, *_check_box(name, interval, len(matching)), strict=True):
                 if self.logarithmic[i] and pair[0] <= 0:
-                    raise ValueError(f"bounds[{name!r}] must be positive, got {given}.")
+                    raise ValueError(f"bounds[{name!r}] must be positive, got {interval}.")
                 if i == len(self.names) - 1:
-                    self.given_ridge = jnp.asarray(pair[0], dtype), jnp.asarray(pair[1], dtype)
+                    self.ridge_interval = jnp.asarray(pair[0], dtype), jnp.asarray(pair[1], dtype)
                 else:
                     low[i], high[i] = np.log(pair) if self.logarithmic[i] else pair
         self.kernel = K
@@ -275,90 +276,90 @@ class SearchSpace(eqx.Module):
 
     @property
     def chooses_ridge(self) -> bool:
-        """Whether λ is searched in bounds that the caller has not given."""
-        return self.given_ridge is None and self._moves_ridge
+        """Whether λ is searched within the default bounds."""
+        return self.ridge_interval is None and self._moves_ridge
 
     @property
     def _moves_ridge(self) -> bool:
         return len(self.names) - 1 in self.free
 
     def allows(self, regularization: Float[Array, ""]) -> bool:
-        """Whether λ is below the upper bound that the caller gave, if it is searched in one."""
-        if self.given_ridge is None or not self._moves_ridge:
+        """Whether λ is below the caller's upper bound, if there is one and λ is searched."""
+        if self.ridge_interval is None or not self._moves_ridge:
             return True
-        return bool(regularization <= 1.01 * self.given_ridge[1])
+        return bool(regularization <= 1.01 * self.ridge_interval[1])
 
     def decode(
         self, u: Float[Array, " P"]
     ) -> tuple[AbstractMatrixKernel, Float[Array, ""], Float[Array, ""]]:
-        """The kernel and λ at u, and tr(G)/N there."""
+        """The kernel and λ at u, and tr(G)/N of this kernel."""
         n_leaves = len(self.start) - 1
-        every = jnp.zeros_like(self.start).at[jnp.asarray(self.free)].set(u)
+        all_entries = jnp.zeros_like(self.start).at[jnp.asarray(self.free)].set(u)
         is_free = np.isin(np.arange(len(self.start)), self.free)
-        h = jnp.where(is_free, inside_box(every, self.low, self.high), self.start)
+        h = jnp.where(is_free, inside_box(all_entries, self.low, self.high), self.start)
         params, static = eqx.partition(self.kernel, eqx.is_inexact_array)
         flat, unravel = ravel_pytree(params)
         kernel = eqx.combine(unravel(h[:n_leaves].astype(flat.dtype)), static)
         size = self.size_of_gram(kernel)
         if not is_free[-1]:
             return kernel, self.regularization, size
-        return kernel, jnp.exp(inside_box(every[-1], *self.ridge_bounds(size))), size
+        return kernel, jnp.exp(inside_box(all_entries[-1], *self.ridge_bounds(size))), size
 
     def size_of_gram(self, kernel: AbstractMatrixKernel) -> Float[Array, ""]:
         """tr(G)/N, before the terms of an odd or even kernel cancel."""
         return forward_differentiated((kernel, self.states), full_trace) / len(self.states)
 
     def ridge_bounds(self, size: Float[Array, ""]) -> tuple[Float[Array, ""], Float[Array, ""]]:
-        """The bounds of log λ: from the rounding of the Gram to where the field is almost zero.
+        """The bounds of log λ: from the rounding of the Gram to a field of almost zero.
 
         Args:
             size: `size_of_gram` of the kernel.
         """
         low, high = self.roundings * gram_rounding(size), 10 * size
-        if self.given_ridge is not None:
-            low = jnp.maximum(low, self.given_ridge[0])
-            high = jnp.maximum(self.given_ridge[1], low)
+        if self.ridge_interval is not None:
+            low = jnp.maximum(low, self.ridge_interval[0])
+            high = jnp.maximum(self.ridge_interval[1], low)
         return jnp.log(low), jnp.log(high)
 
     @compiled
     def encode_start(self) -> Float[Array, " P"]:
-        """The u of the caller's values, moved a little inside the box where they are not."""
+        """The u of the caller's values, moved into the box by a margin if they are outside."""
         ridge_low, ridge_high = self.ridge_bounds(self.size_of_gram(self.kernel))
         low, high = self.low.at[-1].set(ridge_low), self.high.at[-1].set(ridge_high)
-        # Where the kernel is not positive at the start there are no bounds of λ, and λ starts in
-        # the middle. The margin is twice the edge, on which a start would count as at a bound.
+        # If the kernel is not positive at the start, λ has no bounds and starts in the middle.
+        # The margin is twice `_EDGE`, so that a start does not count as resting on a bound.
         return from_box(self.start, low, high, 2 * _EDGE)[jnp.asarray(self.free)]
 
     @property
     def directions(self) -> tuple[int, ...]:
         """For each entry that u moves, the direction in which a design of starts moves it.
 
-        It is one for all logarithms in an array: those are lengthscales of several coordinates.
+        All logarithms in one array, the lengthscales of several coordinates, share one direction.
         """
         keys = [self.names[i] if self.logarithmic[i] else i for i in self.free]
         return tuple(list(dict.fromkeys(keys)).index(key) for key in keys)
 
     def at_bounds(self, u: Float[np.ndarray, " P"]) -> tuple[str, ...]:
-        """The hyperparameters that rest on a bound; of an array by name and coordinate."""
+        """The hyperparameters that rest on a bound; entries of arrays by name and coordinate."""
         at_edge = np.abs(np.sin(u)) > 1 - 2 * _EDGE
         return tuple(self.entries[i] for i in np.array(self.free)[at_edge])
 
     def bounds(self, size: Float[Array, ""]) -> dict[str, tuple[float, float]]:
-        """The lowest and highest value for each name, in its units; λ where the Gram has `size`."""
+        """The lowest and highest value for each name, in its units; λ for a Gram of this `size`."""
         low, high = np.array(self.low, float), np.array(self.high, float)
         low[-1], high[-1] = self.ridge_bounds(size)
         box: dict[str, tuple[float, float]] = {}
         for i in self.free:
             pair = np.array([low[i], high[i]])
-            least, most = (np.exp(pair) if self.logarithmic[i] else pair).tolist()
-            before = box.get(self.names[i], (least, most))
-            box[self.names[i]] = min(before[0], least), max(before[1], most)
+            lowest, highest = (np.exp(pair) if self.logarithmic[i] else pair).tolist()
+            before = box.get(self.names[i], (lowest, highest))
+            box[self.names[i]] = min(before[0], lowest), max(before[1], highest)
         return box
 
     def values(
         self, kernel: AbstractMatrixKernel, regularization: Float[Array, ""]
     ) -> dict[str, Array]:
-        """The hyperparameters that are searched, in their units, in the shapes of the leaves."""
+        """The free hyperparameters, in their units, in the shapes of the leaves."""
         names = iter(dict.fromkeys(self.names))
         leaves = jax.tree.leaves(eqx.filter(kernel, eqx.is_inexact_array))
         logarithmic = dict(zip(self.names, self.logarithmic, strict=True))
@@ -370,33 +371,33 @@ class SearchSpace(eqx.Module):
         return {name: values[name] for name in dict.fromkeys(self.names[i] for i in self.free)}
 
     def _matching(self, name: str, of_part: bool = False) -> list[int]:
-        """The entries whose full name ends in `name`, or, of a part, has it anywhere."""
-        found = [
+        """The entries whose full name ends in `name`, or with `of_part` contains `name`."""
+        indices = [
             i
             for i, (full, entry) in enumerate(zip(self.names, self.entries, strict=True))
             if f".{full}".endswith(f".{name}")
             or f".{entry}".endswith(f".{name}")
             or (of_part and f".{name}." in f".{full}")
         ]
-        if not found:
+        if not indices:
             raise ValueError(
                 f"no hyperparameter {name!r}; this kernel has "
                 f"{', '.join(dict.fromkeys(self.names))}."
             )
-        return found
+        return indices
 
 
-def _checked_box(
-    name: str, given: tuple[ArrayLike, ArrayLike], size: int
+def _check_box(
+    name: str, interval: tuple[ArrayLike, ArrayLike], size: int
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The lower and the upper bounds, one for each entry of that name."""
-    sides = [np.asarray(side, float) for side in given] if hasattr(given, "__len__") else []
+    """The lower and the upper bounds, one for each entry with this name."""
+    sides = [np.asarray(side, float) for side in interval] if hasattr(interval, "__len__") else []
     if len(sides) != 2 or any(side.shape not in ((), (size,)) for side in sides):
         raise ValueError(
             f"bounds[{name!r}] must be (low, high), both numbers or arrays of shape ({size},), "
-            f"one number for each entry; got {given}."
+            f"one number for each entry; got {interval}."
         )
     low, high = (np.broadcast_to(side, (size,)) for side in sides)
     if not (np.isfinite(low) & np.isfinite(high) & (low < high)).all():
-        raise ValueError(f"bounds[{name!r}] must be finite with low < high, got {given}.")
+        raise ValueError(f"bounds[{name!r}] must be finite with low < high, got {interval}.")
     return low, high

@@ -1,10 +1,11 @@
-"""Hyperparameters by following the gradient of a validation loss, inside a box, from many starts.
+"""`tune`: hyperparameters that minimise a validation loss in a box, from many starts.
 
-The ridge. λ is searched relative to the Gram. The residuals of a fit lose about ε tr(G)/(Nλ) of
-their digits, ε the rounding of the dtype, so Nλ ≥ 100 ε tr(G) is required at every point, with the
-G before the terms of an odd or even kernel cancel. A loss below this bound is rounding noise, and
-may look very good. This matters: a quadratic Hamiltonian is the flat limit of the Gaussian kernel,
-so the loss of an oscillator improves along ℓ -> ∞, λ -> 0 until only noise is left of it.
+The ridge. λ is searched relative to the Gram. The relative rounding error of the residuals of a fit
+is about ε tr(G)/(Nλ), with ε the rounding of the dtype. We therefore require Nλ ≥ 100 ε tr(G) at
+every point, for the G before the terms of an odd or even kernel cancel. For a smaller λ the loss is
+rounding noise and may look very good. This matters in practice: a quadratic Hamiltonian is the flat
+limit of the Gaussian kernel, so the loss of an oscillator improves along ℓ -> ∞, λ -> 0 until it is
+only rounding noise.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from hamkernel._observations.kinds import AbstractObservations, inputs_or_parame
 from hamkernel._observations.measurements import observations
 from hamkernel._show import described
 from hamkernel._solvers.fit import check_solver, features_of_parts, field_of_problem
-from hamkernel._solvers.problem import AbstractSolver, Problem, problem
+from hamkernel._solvers.problem import AbstractSolver, Problem, make_problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._tuning.minimiser import MinimiserRun
 from hamkernel._tuning.objective import (
@@ -51,19 +52,20 @@ class Tuned(eqx.Module):
     Attributes:
         kernel: the kernel with its tuned hyperparameters.
         regularization: the tuned λ, shape ().
-        loss: the objective there, shape (); for "marginal_likelihood" the NEGATIVE log density.
+        loss: the objective at the tuned values, shape (); for "marginal_likelihood" the NEGATIVE
+            log density.
         field: the fit to all data with them.
         hyperparameters: the tuned values by the names of `bounds`, in their units.
-        converged: whether the run that found the best point met the tolerance on all data, shape
-            (). If two steps of correction did not suffice, tune again from the kernel and λ found.
-        steps: the number of its optimiser steps, shape ().
-        at_bounds: the names of the hyperparameters that rest on a bound of the search box, and of
-            which coordinate: `kernel.lengthscale[1]`. The data prefers values beyond it: see "How
-            to choose" in the README.
-        start_losses: the loss on all data at the end of the run from each start, shape (starts,):
-            in the order of the starts, the caller's kernel first, or, where the runs were made on
-            a subset or are finished with a low-rank loss, in ascending order; inf of those that
-            were not looked at there.
+        converged: whether the best run met the tolerance on all data, shape (). If False, two
+            steps of correction did not suffice: tune again from this kernel and λ.
+        steps: the number of optimiser steps of the best run, shape ().
+        at_bounds: the names of the hyperparameters that rest on a bound of the search box, with
+            the coordinate, `kernel.lengthscale[1]`. The data prefers values beyond the bound: see
+            "How to choose" in the README.
+        start_losses: the loss on all data at the end of each run, shape (starts,). If every run
+            used all the data: in the order of the starts, the caller's kernel first. Otherwise
+            sorted in ascending order, with inf for runs whose end was not evaluated on all the
+            data.
         bounds: the box that was searched: for each name the lowest and highest value.
     """
 
@@ -106,105 +108,108 @@ def tune(
     """Tune every hyperparameter of K, and λ with them, down the gradient of a validation loss.
 
     The search starts from the given kernel and from `starts` − 1 further points, the best of a
-    space-filling design in the box, on a subset of 64 points (of 256/n, with n > 4) if there are
-    more. Where the runs end is compared on all data, together with the given point, and the best is
-    finished there. From 2048/n points on this is done on 1024/n of them, and the best is corrected
-    on all data by two more steps: each takes the time of some ten factorisations. Where the given
-    point is better than that on all data, the part has misled and a run from there is finished: but
-    for the penalty of "The ridge" below, the loss is never above that of the given point. New data
-    of the same shape does not recompile, unless `Nystrom` takes another number of landmarks. Data
-    sharded over devices is gathered on one of them for the search; the field is fitted where the
-    data lies.
+    space-filling design in the box. It uses a subset of 64 points (256/n points if n > 4). The ends
+    of the runs and the given kernel are compared on all data, and the best run is finished there.
+    From 2048/n points on, they are compared on 1024/n points instead, and two steps on all data
+    correct the best run; each of these steps takes the time of some ten factorisations. If the
+    given kernel still has the smaller loss on all the data, a last run starts from it. The returned
+    loss is therefore never larger than that of the given kernel, apart from the penalty described
+    under "The ridge".
+
+    New data of the same shape does not recompile, unless `Nystrom` takes another number of
+    landmarks. Data sharded over devices is gathered on one device for the search; the field is
+    fitted on the devices of the data.
 
     Args:
         K: a matrix-valued kernel; every inexact array leaf is a hyperparameter, and no Python
             float is one.
-        X: states, shape (N, n); or observations, and then there is no Y, and N is the number of
-            all: points, energies, functionals.
+        X: states, shape (N, n); or observations, without Y. N is then the number of all points,
+            energies and functionals.
         Y: measured velocities, shape (N, n).
         regularization: the first λ.
-        folds: as in `cross_validation_loss`; give trajectory labels for data from trajectories,
-            and see "The judge" below where there are few.
+        folds: as in `cross_validation_loss`. For data from trajectories pass the label of the
+            trajectory of each point; see "The judge" below if there are few trajectories.
         objective: "cross_validation", "generalized_cross_validation", "marginal_likelihood", or
-            a function (K, X, Y, regularization) -> () to minimise. The second ignores fits that
-            leave less than a fifth of the residuals free, tr(I − S) < 0.2 N n, since it is 0/0
-            where a fit interpolates. For the third give K an amplitude, `1.0 * k`: built-in kernels
-            have amplitude 1, and a signal larger than that is taken for noise. In a function of
-            your own, call `hk.fit` and `hk.simulate` with `throw=False`, and the latter with a
-            constant `dt`: somewhere in the box they fail, and a point with NaN cannot win.
-        frozen: names of what to keep: hyperparameters, such as "lengthscale", "regularization"
-            or "terms[0].kernel.scale", and parts of K, such as "rest" of Sum(rest=…). A name
-            means every hyperparameter that has it in its full name, at the end or before.
+            a function (K, X, Y, regularization) -> () to minimise. Generalised cross-validation
+            ignores fits with tr(I − S) < 0.2 N n, since it is 0/0 if a fit interpolates. For the
+            marginal likelihood give K an amplitude, `1.0 * k`: built-in kernels have amplitude 1,
+            and would explain a larger signal as noise. In a function of your own, call `hk.fit`
+            and `hk.simulate` with `throw=False`, and `hk.simulate` with a constant `dt`: somewhere
+            in the box they fail, and a point with NaN cannot win.
+        frozen: names of hyperparameters to keep, such as "lengthscale", "regularization" or
+            "terms[0].kernel.scale", and of parts of K, such as "rest" of Sum(rest=…). A name means
+            every hyperparameter whose full name contains it.
         bounds: {name: (low, high)} in place of the box from the data, in the units of the
             hyperparameter. A start outside the box is moved to its edge. A leaf h of your own has
-            the box h ± 10 max(1, |h|), which may be too small, and of both signs: store what is
-            positive as `log_…`, whose box is a factor of 1000 to either side, or say its bounds.
+            the box h ± 10 max(1, |h|), which may be too small and contains both signs. Store a
+            positive number as `log_…`, whose box is a factor of 1000 to either side, or pass
+            bounds.
         starts: the number of runs.
         optimiser: an optimistix minimiser. If None, BFGS until the loss would fall by less than
             0.01 %, on the subset 0.1 %.
-        max_steps: the largest number of steps of one run, on each part of the data; a step is one
-            look at the loss.
-        solver: how the final field is fitted; see `fit`. With `Nystrom` and `RandomFeatures` the
-            loss on all points is that of the low-rank fit, in O(N n r) memory; the landmarks are
-            those of the best kernel on the subset, and of the tuned one for the field.
-        mean: what is known already, x (n,) -> (n,), as in `fit`.
-        progress: print a line for each step: on how many points, how many runs go on, and the best
-            loss.
-        inputs: of a `Controlled` kernel, shape (N, m). An objective of your own is then called
-            with (K, data, None, regularization), data the velocities with their inputs.
-        parameters: of a `Family`, shape (N, p); likewise.
+        max_steps: the largest number of steps of one run on one subset of the data; a step
+            evaluates the loss once.
+        solver: the solver of the final field; see `fit`. With `Nystrom` and `RandomFeatures` the
+            loss on all points is the loss of the low-rank fit, in O(N n r) memory. Its landmarks
+            belong to the best kernel on the subset; the field has landmarks of the tuned kernel.
+        mean: the known part of the field, x (n,) -> (n,), as in `fit`.
+        progress: print a line for each step: the number of points, the number of active runs, and
+            the best loss.
+        inputs: u at each state, for a `Controlled` kernel, shape (N, m). An objective of your own
+            is then called with (K, data, None, regularization), data the velocities with inputs.
+        parameters: θ at each state, for a `Family`, shape (N, p); likewise.
 
     Returns:
-        A `Tuned`. NaN never comes out: points where the objective is not finite cannot win.
+        A `Tuned`. Its numbers are finite, since points where the objective is not finite cannot
+        win.
 
     Raises:
         TypeError: K is not matrix-valued or has complex leaves, the optimiser is not one of
-            optimistix, a function is given that is to be large, or an argument is traced.
-            ValueError: bad data, folds, names, or bounds; a dense loss that does not fit in
-            memory. RuntimeError: the objective is finite nowhere.
+            optimistix, the objective is `log_marginal_likelihood`, which should be maximised, or an
+            argument is traced. ValueError: bad data, folds, names, or bounds; a dense loss that
+            does not fit in memory. RuntimeError: the objective is finite nowhere.
 
-    The flat limit. When λ rests on its lower bound and a lengthscale on its upper one, the data
-    asks for a polynomial: the fit is good and its hyperparameters mean little.
+    The flat limit. If λ rests on its lower bound and a lengthscale on its upper bound, the best
+    field is nearly a polynomial: the fit is good and its hyperparameters mean little.
 
-    Units. `tune` warns if the velocities of two coordinates differ 100 times in size: the loss, a
-    sum of their squares, hardly depends on the smaller one. It also warns of Python floats in K,
-    which are not tuned, and of a free scale, if every term of K has an amplitude and the objective
-    is a cross-validation.
+    Units. `tune` warns if the velocities of two coordinates differ by a factor of 100: the loss, a
+    sum of squares, hardly depends on the smaller one. `tune` also warns of Python floats in K,
+    which are not tuned, and of an undetermined scale, if every term of K has an amplitude and the
+    objective is a cross-validation.
 
-    The judge. With an amplitude on the kernel and noise that is independent and of one size,
-    "marginal_likelihood" finds the better field, often by a factor of two. Where the noise or the
-    prior are not like that it can lose up to 40 %, and cross-validation is the safer judge: by
-    runs, if there are at least six of them, else by leave-one-out, folds="loo". With three runs no
-    judge is reliably better than another (`tests/benchmarks/judges.py`). `tune` warns of fewer than
-    five labels.
+    The judge. If the kernel has an amplitude and the noise is independent and of one size,
+    "marginal_likelihood" finds the better field, often by a factor of two. Otherwise it can lose up
+    to 40 %, and cross-validation is safer: by runs if there are at least six runs, else by
+    leave-one-out, folds="loo". With three runs no judge is reliably better than another
+    (`tests/benchmarks/judges.py`). `tune` warns of fewer than five labels.
 
-    A smaller loss. Where there is next to no noise, a loss of 1e-12 need not mean a better field
-    than one of 1e-9: it says how well points between others are met, and not how the field goes on
-    beside them. If you know the size of what no field of the state can explain, such as the pull
-    of another planet, say so: Nλ is its variance, bounds={"regularization": (variance / N, 1.0)}.
-    The smoothest field within one standard error of the least loss was no better: with noise its
-    error was 0.8 to 1.5 times as large, 1.2 in the median, by four rules, and without noise 1.0 to
-    1.7 (`tests/benchmarks/tuning_ties.py`). So the least loss decides.
+    A smaller loss. With almost no noise, a loss of 1e-12 need not mean a better field than a loss
+    of 1e-9. The loss measures interpolation between the data, not extrapolation. If you know the
+    variance of effects that no field of the state can explain, such as the pull of another planet,
+    pass it as a bound of Nλ: bounds={"regularization": (variance / N, 1.0)}. Choosing the smoothest
+    field within one standard error of the smallest loss was no better. With noise the errors of
+    four such rules were 0.8 to 1.5 times as large (1.2 in the median), without noise 1.0 to 1.7
+    times (`tests/benchmarks/tuning_ties.py`).
 
-    Time. A search that will take more than a minute says so before the long part of it.
+    Time. `tune` warns before a search of more than a minute.
 
-    The ridge. λ is never searched where rounding would decide. Unless λ is frozen or has `bounds`,
-    a penalty also keeps cross-validation away from fields with rounding errors too large to be
-    integrated, ‖a‖ tr(G) √ε > ‖y‖ for the coefficients a; the likelihood needs none.
+    The ridge. λ stays above the rounding of the Gram. Unless λ is frozen or has `bounds`, a penalty
+    also keeps cross-validation away from fields whose rounding errors are too large for an
+    integrator, ‖a‖ tr(G) √ε > ‖y‖ for the coefficients a. The likelihood needs no penalty.
     """
     frozen = (frozen,) if isinstance(frozen, str) else frozen
     _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
     _check_optimiser(optimiser)
     check_solver(solver)
     warn_of_constants(K)
-    given = problem(K, X, Y, regularization, mean, inputs, parameters)
-    alone = given.on_one_device()
-    K, rows = alone.kernel, alone.rows
+    problem = make_problem(K, X, Y, regularization, mean, inputs, parameters)
+    local = problem.to_one_device()
+    K, rows = local.kernel, local.rows
     exact = solver is None and is_of_parts(K)
     solver = features_of_parts() if exact else solver
-    # With 5000 pairs a look takes .1 s, and features of a state, which show the size of K, 6 ms.
-    looks, sizing = (64, 1) if exact else (None, None)
-    # What a known kinetic energy leaves of the velocities of positions may be small, and is noise.
+    # With 5000 pairs one loss takes .1 s, and the features of one state, for the size of K, 6 ms.
+    size, sizing = (64, 1) if exact else (None, None)
+    # The velocities of positions minus a known kinetic energy may be small, and are noise.
     if rows.states is not None and not exact:
         _warn_of_unequal_sizes(rows.states[1])
     inputs = inputs_or_parameters(inputs, parameters)
@@ -214,52 +219,50 @@ def tune(
     _warn_of_few_folds(criterion, folds)
     low_rank = solver is not None and solver.is_low_rank and not criterion.custom
     if exact and low_rank:
-        criterion = _of_basis(criterion, alone, solver)  # no Gram, on few points either
+        criterion = _low_rank_criterion(criterion, local, solver)  # no Gram, on few points either
     parts = parts_of(rows, criterion, dense=True)
     if not low_rank and not criterion.custom:
         check_memory(rows, SEARCH_COPIES)
-    few = rows if len(parts) == 1 else rows.subset(parts[0])[0]
-    rms = velocity_rms(K, few)
-    # For a low-rank fit λ stays above the rounding at which `choose_landmarks` drops a column.
+    subset = rows if len(parts) == 1 else rows.subset(parts[0])[0]
+    rms = velocity_rms(K, subset)
+    # For a low-rank fit λ stays above the rounding below which `choose_landmarks` drops a column.
     roundings = 2e4 if low_rank else 100.0
-    kept, points = tuple(frozen), rows.points
-    space = SearchSpace(
-        K, points, rms, given.regularization, kept, bounds or {}, roundings, few.points[:sizing]
-    )
+    frozen, points, ridge = tuple(frozen), rows.points, problem.regularization
+    sized = subset.points[:sizing]
+    space = SearchSpace(K, points, rms, ridge, frozen, bounds or {}, roundings, sized)
     _warn_of_free_scale(space, criterion)
-    search = Search(space, criterion, rows, rms, starts, max_steps, optimiser, progress, looks)
+    search = Search(space, criterion, rows, rms, starts, max_steps, optimiser, progress, size)
+    at_best_run = functools.partial(_criterion_at_best_run, space, criterion, local, solver)
+    runs = search.runs(at_best_run if low_rank else None)
+    check_finite_loss(best(runs))
+    return _result(space, runs, starts, problem, solver)
 
-    of_low_rank = functools.partial(_of_low_rank, space, criterion, alone, solver)
-    runs = search.runs(of_low_rank if low_rank else None)
-    check_found(best(runs))
-    return _tuned(space, runs, starts, given, solver)
 
-
-def _of_basis(
-    criterion: SearchCriterion, given: Problem, solver: AbstractSolver | None
+def _low_rank_criterion(
+    criterion: SearchCriterion, problem: Problem, solver: AbstractSolver | None
 ) -> SearchCriterion:
     """The criterion of the low-rank fit in the basis that the solver makes for a problem."""
     assert solver is not None
-    basis = solver._basis(given.kernel, given.rows, given.regularization)
+    basis = solver.low_rank_basis(problem.kernel, problem.rows, problem.regularization)
     assert basis is not None
     return criterion.with_basis(basis)
 
 
-def _of_low_rank(
+def _criterion_at_best_run(
     space: SearchSpace,
     criterion: SearchCriterion,
-    given: Problem,
+    problem: Problem,
     solver: AbstractSolver | None,
     run: MinimiserRun,
 ) -> SearchCriterion:
-    """The same for the kernel and λ of the best run."""
+    """The low-rank criterion for the kernel and λ of the best run."""
     kernel, regularization, _ = decode(space, jnp.asarray(run.best.u, space.low.dtype))
-    there = dataclasses.replace(given, kernel=kernel, regularization=regularization)
-    return _of_basis(criterion, there, solver)
+    problem_there = dataclasses.replace(problem, kernel=kernel, regularization=regularization)
+    return _low_rank_criterion(criterion, problem_there, solver)
 
 
-def check_found(found: MinimiserRun) -> None:
-    if not found.best.value < np.inf:
+def check_finite_loss(run: MinimiserRun) -> None:
+    if not run.best.value < np.inf:
         raise RuntimeError(
             "the objective is not finite at any start. Likely causes, in order: a kernel that "
             "is not positive definite or not finite (hk.check_kernel(k, X) tells); bounds in "
@@ -268,19 +271,19 @@ def check_found(found: MinimiserRun) -> None:
         )
 
 
-def _tuned(
+def _result(
     space: SearchSpace,
     runs: MinimiserRun,
     starts: int,
-    given: Problem,
+    problem: Problem,
     solver: AbstractSolver | None,
 ) -> Tuned:
-    """The result of the best run: its kernel, the fit with it, and the record of the search."""
-    found = best(runs)
+    """The `Tuned` of the best run: its kernel and λ, the field, and the record of the search."""
+    best_run = best(runs)
     dtype = space.low.dtype
-    kernel, regularization, size = decode(space, jnp.asarray(found.best.u, dtype))
-    given = dataclasses.replace(given, kernel=kernel, regularization=regularization)
-    field = field_of_problem(given, solver)
+    kernel, regularization, size = decode(space, jnp.asarray(best_run.best.u, dtype))
+    problem = dataclasses.replace(problem, kernel=kernel, regularization=regularization)
+    field = field_of_problem(problem, solver)
     if not space.allows(regularization):
         raise ValueError(
             f"no lambda within bounds={{'regularization': ...}} can be solved with in {dtype}: "
@@ -291,13 +294,13 @@ def _tuned(
     return Tuned(
         kernel=kernel,
         regularization=regularization,
-        loss=jnp.asarray(found.best.loss, dtype),
+        loss=jnp.asarray(best_run.best.loss, dtype),
         field=field,
         hyperparameters=space.values(kernel, regularization),
-        converged=jnp.asarray(found.converged),
-        steps=jnp.asarray(found.steps),
+        converged=jnp.asarray(best_run.converged),
+        steps=jnp.asarray(best_run.steps),
         start_losses=jnp.asarray(losses, dtype),
-        at_bounds=space.at_bounds(found.best.u),
+        at_bounds=space.at_bounds(best_run.best.u),
         bounds=space.bounds(size),
     )
 
@@ -305,13 +308,13 @@ def _tuned(
 decode = compiled(lambda space, u: space.decode(u))
 
 
-def _check_optimiser(given: optx.AbstractMinimiser | None) -> None:
-    golden = isinstance(given, optx.GoldenSearch)  # minimises functions of one number
-    if golden or not (given is None or isinstance(given, optx.AbstractMinimiser)):
+def _check_optimiser(optimiser: optx.AbstractMinimiser | None) -> None:
+    golden = isinstance(optimiser, optx.GoldenSearch)  # minimises functions of one number
+    if golden or not (optimiser is None or isinstance(optimiser, optx.AbstractMinimiser)):
         raise TypeError(
             "optimiser must be an optimistix minimiser of many variables, such as "
             "optimistix.BFGS(1e-3, 1e-3) or optimistix.OptaxMinimiser(optax.adam(0.1), 1e-3, 1e-3);"
-            f" got {given!r}."
+            f" got {optimiser!r}."
         )
 
 
@@ -334,10 +337,10 @@ def _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps) -
 
 
 def _warn_of_unequal_sizes(Y: Array) -> None:
-    """Warn where the velocities of one coordinate are lost beside those of another."""
+    """Warn if the velocities of one coordinate are much smaller than those of another."""
     sizes = np.asarray(Y).std(axis=0)
     sizes = sizes[sizes > 0]
-    if sizes.size and sizes.max() > 100 * sizes.min():  # and so 10 000 times in the loss
+    if sizes.size and sizes.max() > 100 * sizes.min():  # a factor of 10 000 in the loss
         require.warn(
             f"the velocities of one coordinate are {sizes.max() / sizes.min():.3g} times as large "
             "as those of another, and a loss sums the squares of both: the small one may be lost "
@@ -362,8 +365,8 @@ def _warn_of_few_folds(criterion: SearchCriterion, folds: object) -> None:
     if criterion.partition is None or criterion.custom or np.ndim(folds) == 0:  # type: ignore
         return
     count = len(criterion.partition.folds)
-    # The loss over few runs is noisy: on the pendulum of the paper, with three runs, the field
-    # error was .164 where that of the likelihood was .048 (`tests/benchmarks/judges.py`).
+    # The loss over few runs is noisy. On the pendulum of the paper, with three runs, the field
+    # error was .164 by cross-validation and .048 by the likelihood (`tests/benchmarks/judges.py`).
     if count < 5:
         require.warn(
             f"the labels in folds make {count} folds, and cross-validation by fewer than "
@@ -373,9 +376,9 @@ def _warn_of_few_folds(criterion: SearchCriterion, folds: object) -> None:
 
 
 def _warn_of_free_scale(space: SearchSpace, criterion: SearchCriterion) -> None:
-    """Warn of amplitudes on all terms where the loss depends on their ratios to λ alone."""
+    """Warn of amplitudes on all terms if the loss depends only on their ratios to λ."""
     free = {space.names[i] for i in space.free}
-    if not criterion.logarithmic or RIDGE not in free or space.given_ridge is not None:
+    if not criterion.logarithmic or RIDGE not in free or space.ridge_interval is not None:
         return
     if _has_amplitude(space):
         require.warn(
@@ -387,7 +390,7 @@ def _warn_of_free_scale(space: SearchSpace, criterion: SearchCriterion) -> None:
 
 
 def _has_amplitude(space: SearchSpace) -> bool:
-    """Whether factors that are searched multiply all of the kernel."""
+    """Whether every term of the kernel has a free amplitude."""
     leaves, structure = jax.tree.flatten(eqx.filter(space.kernel, eqx.is_inexact_array))
     last = np.cumsum([leaf.size for leaf in leaves]) - 1
     free = [leaf if i in space.free else None for leaf, i in zip(leaves, last, strict=True)]
@@ -395,4 +398,4 @@ def _has_amplitude(space: SearchSpace) -> bool:
     return bool(terms) and all(k.has_amplitude for k in terms)
 
 
-SEARCH_COPIES = 5  # matrices of the size of the Gram that the loop over a loss holds: 4.4 measured
+SEARCH_COPIES = 5  # matrices of the size of the Gram that a search holds; 4.4 were measured

@@ -170,7 +170,7 @@ def gram_of(basis, make, X):
 
     def low_rank(t):
         K = make(t)
-        return basis.span(K, X.shape[1], X.dtype).of(Components(X))
+        return basis.span(K, X.shape[1], X.dtype).rows_of(Components(X))
 
     return low_rank
 

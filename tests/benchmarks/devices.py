@@ -67,7 +67,7 @@ def programs():
         N_ridge = len(X) * ridge
         given = KERNEL, X, N_ridge, S, rows
         return conjugate_gradient._solve(
-            conjugate_gradient._prepared, given, Y, N_ridge, jnp.asarray(1e-8), 100
+            conjugate_gradient._prepare_velocities, given, Y, N_ridge, jnp.asarray(1e-8), 100
         )
 
     return {

@@ -90,7 +90,7 @@ def objective_of(K, X, Y) -> SearchObjective:
     """That of the search, on all points."""
     rows, rms = measurements_of_states(X, Y), float(jnp.sqrt(jnp.mean(Y**2)))
     space = SearchSpace(K, X, rms, jnp.asarray(START_RIDGE), (), {})
-    criterion = criterion_of("cross_validation", len(X), FOLDS).on(rows, np.arange(len(X)))
+    criterion = criterion_of("cross_validation", len(X), FOLDS).for_subset(rows, np.arange(len(X)))
     return SearchObjective(space, criterion, rows, *map(jnp.asarray, (1.0, rms, 1.0)))
 
 
@@ -98,7 +98,7 @@ def objective_of(K, X, Y) -> SearchObjective:
 def searched(objective: SearchObjective, tuned) -> jax.Array:
     """The same for what was tuned."""
     size = objective.space.size_of_gram(tuned.kernel)
-    return objective.at(tuned.kernel, tuned.regularization, size)[0]
+    return objective.value_and_loss(tuned.kernel, tuned.regularization, size)[0]
 
 
 def main() -> None:
