@@ -146,7 +146,7 @@ def waves_of(
 
 def part_waves(k: AbstractScalarKernel, scale: Any = 1.0) -> PartWaves | JointWaves | None:
     """The features of `Shared` kernels, their multiples and sums; None of any other kernel."""
-    if isinstance(k, Shared) and k.centres is not None:
+    if isinstance(k, Shared):
         return PartWaves(k, jnp.asarray(scale))
     if isinstance(k, Scaled):
         return part_waves(k.kernel, scale * k.scale)

@@ -11,6 +11,7 @@ import pytest
 
 import hamkernel as hk
 import hamkernel._features
+from hamkernel._trajectories import windows
 
 RNG = np.random.default_rng(0)
 
@@ -232,3 +233,58 @@ def test_what_is_no_part_is_refused():
             together,
             1e-3,
         )
+
+
+def test_weak_rows_integrate_by_parts():
+    """Against the exact integrals of a sine, and the smoother against a dense Gaussian process."""
+    t = np.linspace(0.0, 2.0, 61)
+    made = windows.windows(t, 12)
+    assert len(made.value) == 9
+    np.testing.assert_allclose(made.value @ np.cos(t), -made.slope @ np.sin(t), atol=3e-4)
+    np.testing.assert_allclose(made.value @ -np.sin(t), made.bend @ np.sin(t), atol=3e-4)
+    noisy = np.sin(3 * t)[None, :, None] + 0.1 * RNG.normal(size=(1, 61, 4))
+    none = np.zeros_like(noisy)
+    channels = windows.Channels(t[None] - 1, noisy, none, none == 0, none != 0)
+    h, found = windows.smooth_channels(channels, (0.1, None))
+    assert np.sqrt(np.mean((found.values[0] - np.sin(3 * t)[:, None]) ** 2)) < 0.06
+    k = hk.Matern(3.5, float(np.sqrt(7) * np.exp(-h.log_rate)))
+    K = np.exp(2 * h.log_amplitude) * jax.vmap(jax.vmap(k, (None, 0)), (0, None))(
+        t[:, None], t[:, None]
+    )
+    K = np.asarray(K) + 100 * (1 + np.outer(t - 1, t - 1))
+    wanted = K @ np.linalg.solve(K + 0.01 * np.eye(61), noisy[0])
+    np.testing.assert_allclose(found.values[0], wanted, atol=1e-5)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("momenta", [True, False])
+def test_a_law_is_learned_from_noisy_runs(momenta):
+    """Six particles with springs, from one run with noise, with momenta or without."""
+    rng = np.random.default_rng(2)
+    q, p = rng.normal(size=(2, 6, 2))
+    path = []
+    for _ in range(121):
+        path.append(np.concatenate([q.ravel(), p.ravel()]))
+        for _ in range(4):
+            p = p + 0.005 * forces(q)
+            q = q + 0.01 * p
+            p = p + 0.005 * forces(q)
+    X = np.array(path)
+    noisy = X + (0.01 if momenta else 0.001) * rng.normal(size=X.shape)
+    K = hk.Symplectic(hk.Shared(hk.Matern(2.5, 1.0), hk.pairs(particles=6, dim=2)))
+    learned = hk.learn(
+        K, hk.Runs([0.04 * np.arange(121)], [noisy[:, : 24 if momenta else 12]]), mass=1.0
+    )
+    assert learned.converged, learned.diagnostics
+    found = [float(n) for n in np.asarray(learned.noise)[[0, -1]]]
+    assert found[0] == pytest.approx(0.01 if momenta else 0.001, rel=0.3)
+    assert np.isnan(found[1]) != momenta
+    r = np.linspace(0.6, 2.5, 30)
+    law = np.array([float(learned.field.law(s, 1.0)) for s in r])
+    posterior = learned.posterior
+    band = np.array([float(posterior.law_deviation(s, 1.0)) for s in r])
+    error = law - (spring(r) - spring(1.0))
+    assert np.sqrt(np.mean(error**2)) < 0.02
+    assert np.mean(np.abs(error) < 3 * band + 1e-4) > 0.8
+    with pytest.raises(TypeError, match="compare log_evidence"):
+        learned.gain(hk.Friction())

@@ -77,3 +77,20 @@ class Evidence(eqx.Module):
 
     def _loss(self, model: Model) -> float:
         return float(closed_form(model, self.points, self.rows, self.start_deviation).loss)
+
+
+class EvidenceOfRows(eqx.Module):
+    """The evidence of weak rows, see `laws.py`.
+
+    Attributes:
+        log_p: the log marginal likelihood of the rows, but for a constant of no kernel.
+    """
+
+    log_p: float
+
+    def gain(self, part: AbstractMatrixKernel) -> float:
+        raise TypeError(
+            "gain compares fields along iterated paths, and laws that many parts share are learned "
+            "from weak rows: learn again with the part in the kernel, hk.learn(K + part, runs), "
+            "and compare log_evidence."
+        )

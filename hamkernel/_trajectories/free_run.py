@@ -81,11 +81,18 @@ def error_over_constant(field: Any, part: Stretches, scale: Float[np.ndarray, " 
     The constant is the state at the start of the stretch or the mean of its samples, whichever is
     nearer. Errors count up to three deviations, since one path that is lost says no more.
     """
+    return relative_error(predictions(field, part, scale), part, scale)
+
+
+def relative_error(
+    predicted: Float[np.ndarray, "S L n"], part: Stretches, scale: Float[np.ndarray, " n"]
+) -> float:
+    """The RMS error of predicted states over that of a constant, as `error_over_constant`."""
     measured = part.measured / scale
     seen = np.isfinite(measured)
     if not seen.any():
         return 0.0
-    predicted = predictions(field, part, scale) / scale
+    predicted = predicted / scale
     error = np.clip(np.where(seen, predicted - measured, 0.0), -3, 3)
     count = np.maximum(seen.sum(axis=1, keepdims=True), 1)
     mean = np.where(seen, measured, 0.0).sum(axis=1, keepdims=True) / count

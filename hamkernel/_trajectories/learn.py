@@ -44,6 +44,7 @@ from hamkernel._trajectories.iteration import (
 )
 from hamkernel._trajectories.kalman import as_observations
 from hamkernel._trajectories.lagrangian import LearnedLagrangian, learn_lagrangian
+from hamkernel._trajectories.laws import are_learned_from_rows, learn_laws
 from hamkernel._trajectories.learned import Learned, empty, misfits
 from hamkernel._trajectories.model import Model, with_amplitude
 from hamkernel._trajectories.preprocessing import (
@@ -105,6 +106,10 @@ def learn(
     path, until log p rises by less than ½. The first pass has no process noise. Where it does not
     settle, or more of it would pay, a second pass looks for its intensity, and the likelier of the
     two is returned.
+
+    Laws that many parts share, K made of `hk.Shared`, are found without iterations, from any number
+    of coordinates on: by two solves with weak rows, ∫ φ f dt along a smoothed path, whose cost is
+    linear in n. There `solver` and `iterations` have no effect, and innovations are NaN.
 
     Args:
         K: a `Lagrangian`, see there, with which a `LearnedLagrangian` is learned from positions, or
@@ -176,6 +181,8 @@ def learn(
     K = _unknown_masses(K, runs.dimension) if masses else K
     drift = known_part(K, mean, runs.dimension, jnp.float64)
     check_identifiable(runs, drift)
+    if are_learned_from_rows(K) and process is None:
+        return learn_laws(K, runs, mean if mean is None else as_pytree(mean), sigma, again)
     bar = _bar(progress, total=2 + max_steps)
     data = preprocess(runs, drift)
     bar.update()

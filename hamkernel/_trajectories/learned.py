@@ -21,7 +21,7 @@ from hamkernel._posterior import Posterior, condition
 from hamkernel._show import described, printable, text
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._trajectories.evidence import Evidence
+from hamkernel._trajectories.evidence import Evidence, EvidenceOfRows
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.score import Score, scored
 from hamkernel._trajectories.table import Diagnostics
@@ -127,7 +127,7 @@ class Learned(eqx.Module):
     runs: Runs
     observations: AbstractObservations | None
     mean: Any
-    evidence: Evidence
+    evidence: Evidence | EvidenceOfRows
     again: Callable[..., Learned]
 
     def __repr__(self) -> str:
@@ -192,7 +192,9 @@ class Learned(eqx.Module):
 
     def _posterior(self, on_landmarks: bool) -> Posterior:
         whole = getattr(self.field, "whole", self.field)  # of the points (x, u) with inputs
-        solver = Nystrom(points=whole.points) if on_landmarks else None
+        # A field in the features of laws has no points, and its posterior few unknowns.
+        points = getattr(whole, "points", None)
+        solver = None if points is None or not on_landmarks else Nystrom(points=points)
         assert self.observations is not None
         return condition(
             self.kernel,
