@@ -232,40 +232,17 @@ _LEAST_SWING = 5.0  # samples in a swing, as in `diagnostics`: with fewer noise 
 def _diagnostics(
     field: LagrangianField, smoothing: Any, sizes: Sizes, joints: tuple[int, ...]
 ) -> Diagnostics:
-    least, deviation = float(field.least_inertia), float(field.least_inertia_deviation)
     share = float(np.max(np.asarray(field.noise))) / sizes.error
-    names = ", ".join(map(str, joints))
-    swing = (
-        2.3 * smoothing.lengthscale / smoothing.pieces.spacing
-    )  # 2π/ω, with the lengthscale 2.7/ω
+    # A sinusoid of period 2π/ω has the lengthscale 2.7/ω.
+    swing = 2.3 * smoothing.lengthscale / smoothing.pieces.spacing
     rows = len(field.residual) * field.features.count
     # tr (BᵀB (BᵀB + I)⁻¹) = r − ‖R⁻¹‖² in the norm of Frobenius.
     inverse = np.linalg.inv(np.asarray(field.triangle))
     used = len(field.coefficients) - float(np.sum(inverse**2))
     return Diagnostics(
         (
-            Diagnostic(
-                "mass matrix",
-                f"{least:.3g} with a deviation of {deviation:.2g}",
-                "two deviations",
-                field.is_identified,
-                field.refusal.split(". ")[0]
-                or "the mass matrix is positive definite all along the runs",
-                "Motions along one path do not tell inertia from gravity and friction: log unused.",
-                decides=True,
-            ),
-            Diagnostic(
-                "friction",
-                f"joints {names}" if joints else "none is missing",
-                "log p + 10",
-                not joints,
-                f"the torques are much likelier with friction in joint {names}, without which the "
-                "mass matrix is wrong"
-                if joints
-                else "the torques do not ask for friction that the kernel lacks",
-                "Take hk.Lagrangian(…, friction=True).",
-                decides=True,
-            ),
+            _mass_matrix(field),
+            _friction_of(joints),
             Diagnostic(
                 "torques",
                 f"{share:.2g} unexplained",
@@ -296,4 +273,33 @@ def _diagnostics(
                 "Sample faster: with fewer than five, noise and motion cannot be told apart.",
             ),
         )
+    )
+
+
+def _mass_matrix(field: LagrangianField) -> Diagnostic:
+    least, deviation = float(field.least_inertia), float(field.least_inertia_deviation)
+    return Diagnostic(
+        "mass matrix",
+        f"{least:.3g} with a deviation of {deviation:.2g}",
+        "two deviations",
+        field.is_identified,
+        field.refusal.split(". ")[0] or "the mass matrix is positive definite all along the runs",
+        "Motions along one path do not tell inertia from gravity and friction: log unused.",
+        decides=True,
+    )
+
+
+def _friction_of(joints: tuple[int, ...]) -> Diagnostic:
+    names = ", ".join(map(str, joints))
+    return Diagnostic(
+        "friction",
+        f"joints {names}" if joints else "none is missing",
+        "log p + 10",
+        not joints,
+        f"the torques are much likelier with friction in joint {names}, without which the "
+        "mass matrix is wrong"
+        if joints
+        else "the torques do not ask for friction that the kernel lacks",
+        "Take hk.Lagrangian(…, friction=True).",
+        decides=True,
     )
