@@ -25,19 +25,21 @@ folds, Ginsbourger & Schärer (2021), arXiv:2101.03108.
 """
 
 import functools
-from collections.abc import Sequence
-from typing import Literal
+import operator
+import reprlib
+from collections.abc import Hashable, Iterable, Iterator
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int, Shaped
 
 from hamkernel import _require as require
 from hamkernel._machine import full_precision
 from hamkernel._solvers.factors import AbstractSystem, Group
 
-Folds = int | Literal["loo"] | Int[ArrayLike, " N"] | Sequence[int]
+Folds = int | Literal["loo"] | Shaped[ArrayLike, " N"] | Iterable[Hashable]
 
 
 class Partition:
@@ -46,13 +48,16 @@ class Partition:
     Attributes:
         folds: the points of each of the F folds.
         groups: the same folds, grouped by similar size.
+        of_labels: whether the caller gave a label for each point.
         weights: 1 / (F |fold of i|) for each point, so that `weights @ squares` is the mean over
             folds of the mean over points, shape (N,).
     """
 
     def __init__(self, N: int, folds: Folds):
+        folds = list(folds) if isinstance(folds, Iterator) else folds
         names, index, sizes = np.unique(_labels(N, folds), return_inverse=True, return_counts=True)
         self.labels = index
+        self.of_labels = not (isinstance(folds, str) or _is_number(folds))
         if len(names) < 2:
             raise ValueError(
                 f"cross-validation needs at least two folds, and these {N} points are in one. "
@@ -78,31 +83,59 @@ def _labels(N: int, folds: Folds) -> Int[np.ndarray, " N"]:
     """One integer for each point, the same within a fold."""
     if isinstance(folds, str):
         if folds != "loo":
-            raise ValueError(f"folds must be a number, 'loo' or an array of labels; got {folds!r}.")
+            raise ValueError(f"folds must be a number, 'loo' or labels; got {folds!r}.")
         return np.arange(N)
     if not require.is_concrete(folds):
         raise TypeError(
             "folds is traced: the labels decide the shapes of the computation, so they must be "
             "concrete. Close over them, or mark the argument static under jax.jit."
         )
-    array = np.asarray(folds)
-    if not np.issubdtype(array.dtype, np.integer):
-        cure = " Names become integers by np.unique(names, return_inverse=True)[1]."
-        raise ValueError(
-            "folds must be a whole number, 'loo' or an array of integer labels; got "
-            + (f"{folds!r}." if array.ndim == 0 else f"dtype {array.dtype}.{cure}")
-        )
-    if array.ndim == 0:
-        if not 2 <= array <= N:
-            raise ValueError(f"folds must be between 2 and the number of points, {N}; got {folds}.")
-        parts = np.array_split(np.arange(N), int(array))
+    if _is_number(folds):
+        count = operator.index(np.asarray(folds)[()])
+        if not 2 <= count <= N:
+            raise ValueError(f"folds must be between 2 and the number of points, {N}; got {count}.")
+        parts = np.array_split(np.arange(N), count)
         return np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    if array.shape != (N,):
+    return _integers(N, folds)
+
+
+def _is_number(folds: Any) -> bool:
+    """Whether `folds` is a whole number, also as an array of shape ()."""
+    return (
+        hasattr(folds, "__index__")
+        and np.shape(folds) == ()
+        and np.asarray(folds).dtype.kind in "iu"
+    )
+
+
+_MISSING = {"None", "nan", "NaT", "<NA>"}  # as text, since pandas' NA does not compare
+
+
+def _integers(N: int, labels: Any) -> Int[np.ndarray, " N"]:
+    """Labels of any kind as integers, in the order in which they appear; integers as they are."""
+    shape = getattr(labels, "shape", None)
+    if not isinstance(labels, Iterable) or shape == ():
         raise ValueError(
-            f"folds has shape {array.shape}; one integer label for each of the {N} points is "
-            "needed, shape (N,), or a number of folds, or 'loo'."
+            "folds must be a whole number, 'loo', or one label for each point; got "
+            f"{reprlib.repr(labels)}."
         )
-    return array
+    names = np.asarray(labels) if hasattr(labels, "dtype") else list(labels)
+    shape = (len(names),) if shape is None else shape
+    if shape != (N,) or any(isinstance(name, list | np.ndarray) for name in names):
+        raise ValueError(
+            f"folds has shape {shape}; one label for each of the {N} points is needed, shape (N,), "
+            "or a number of folds, or 'loo'."
+        )
+    if isinstance(names, np.ndarray) and names.dtype.kind in "iu":
+        return names
+    for i, name in enumerate(names):
+        if not isinstance(name, str) and str(name) in _MISSING:
+            raise ValueError(
+                f"folds has no label for point {i} ({name}). Each point needs one: leave out "
+                "points that belong to no run."
+            )
+    index = {name: i for i, name in enumerate(dict.fromkeys(names))}
+    return np.array([index[name] for name in names])
 
 
 def _factor_and_solve(system: AbstractSystem, y: Float[Array, " D"]):

@@ -70,12 +70,7 @@ def gram(
     X, Z = automatic(X), automatic(Z)
     cure = "hk.gram_operator(K, X, Z) multiplies with it and never forms it."
     refuse_beyond_memory("the Gram", X.size, Z.size, X.dtype, 1, cure)
-    return _compiled_gram(K, X, Z)
-
-
-@compiled
-def _compiled_gram(K, X, Z):
-    return assemble(K, X, Z)
+    return _assemble(K, X, Z)
 
 
 def assemble(
@@ -99,6 +94,9 @@ def assemble(
     for axis in (3, 2, 1, 0):  # b, zⱼ, a, xᵢ
         form = jax.vmap(form, in_axes=[0 if i == axis else None for i in range(4)])
     return form(X, basis, Z, basis)  # (N, n, M, n)
+
+
+_assemble = compiled(assemble)
 
 
 def _gram_of_descriptor(

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Bool, Float, Key
+from numpy.lib.recfunctions import structured_to_unstructured
 
 
 def is_concrete(*values: object) -> bool:
@@ -146,6 +147,8 @@ def floating(x: Any, name: str) -> Array:
     """`x` as a JAX array of real floats: integers and booleans become the default float."""
     if isinstance(x, bool | int | float):
         x = np.asarray(x, float)
+    elif not isinstance(x, jax.Array):
+        x = _plain(x, name)
     with eager(x):
         return _floating(x, name)
 
@@ -154,19 +157,13 @@ def _floating(x: Any, name: str) -> Array:
     try:
         array = x if isinstance(x, jax.Array) else jnp.asarray(x)
     except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"{name} must hold real numbers; got {reprlib.repr(x)}. Pass floats, a NumPy or JAX "
-            "array of them (of objects: .astype(float)), or lists with rows of equal length."
-        ) from error
+        raise _no_numbers(x, name) from error
     if jnp.issubdtype(array.dtype, jnp.floating):
         # No weak type: a Python float must not recompile.
         return array.astype(array.dtype) if array.weak_type else array
     if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
         return array.astype(float)
-    raise TypeError(
-        f"{name} has dtype {array.dtype}; real numbers are needed. "
-        f"Pass floats or integers (for complex data, stack real and imaginary parts)."
-    )
+    raise _no_numbers(array, name)
 
 
 def doubles(x: Any, name: str) -> np.ndarray:
@@ -174,34 +171,86 @@ def doubles(x: Any, name: str) -> np.ndarray:
 
     The caller's log keeps all its digits, whatever the precision of JAX.
     """
+    plain = _plain(x, name)  # arrays of JAX stay as they are, and are looked at here
+    return _plain(np.asarray(plain), name).astype(float)
+
+
+def _plain(x: Any, name: str) -> Any:
+    """`x` as an array of real numbers of NumPy; what holds arrays of JAX, as it is.
+
+    An iterator is read, entries that are masked or missing are NaN, columns with names form a
+    matrix, and a tensor of PyTorch leaves its graph. JAX takes none of these by itself.
+    """
+    if isinstance(x, jax.Array):
+        return x
     if x is None:
-        raise TypeError(f"{name} is None: an array of real numbers is needed.")
+        raise _no_numbers(x, name)
     if isinstance(x, Iterator):
         x = list(x)
-    if hasattr(x, "detach"):  # a tensor of PyTorch that may require a gradient
+    if hasattr(x, "__jax_array__") or _holds_jax(x):
+        return x
+    original = x
+    if hasattr(x, "detach"):
         x = x.detach().cpu()
     if isinstance(x, np.ma.MaskedArray):
-        x = np.ma.filled(x.astype(float), np.nan)
+        x = np.ma.filled(x.astype(float), np.nan) if x.dtype.kind in "fiubO" else x.data
     elif hasattr(x, "to_numpy"):  # pandas, whose missing values NumPy refuses, and polars
-        try:
-            x = x.to_numpy(dtype=float, na_value=np.nan)
-        except (TypeError, ValueError):
-            x = x.to_numpy()
+        x = _frame_values(x)
     try:
         array = np.asarray(x)
+        if array.dtype.names:
+            array = structured_to_unstructured(array)
         if array.dtype == object:
             array = array.astype(float)
     except (TypeError, ValueError) as error:
-        raise TypeError(
-            f"{name} must hold real numbers; got {reprlib.repr(x)}. Pass floats, an array of them, "
-            "or lists with rows of equal length."
-        ) from error
+        raise _no_numbers(original, name) from error
     if not (array.dtype.kind in "fiub" or jnp.issubdtype(array.dtype, jnp.floating)):
-        raise TypeError(
-            f"{name} must hold real numbers and has dtype {array.dtype}. For complex data stack "
-            "real and imaginary parts."
+        raise _no_numbers(array, name)
+    return array.astype(array.dtype.newbyteorder("="), copy=False)
+
+
+def _holds_jax(x: Any) -> bool:
+    """Whether a list or tuple has an array of JAX in it, at any depth."""
+    return isinstance(x, list | tuple) and any(
+        isinstance(entry, jax.Array) or _holds_jax(entry) for entry in x
+    )
+
+
+def _frame_values(x: Any) -> Any:
+    """The array of a frame or column of pandas or polars, or of an array of xarray."""
+    array = x.to_numpy()
+    if getattr(array, "dtype", np.dtype(float)).kind == "O":  # with missing values
+        with suppress(TypeError, ValueError):
+            return x.to_numpy(dtype=float, na_value=np.nan)
+    return array
+
+
+def _no_numbers(x: Any, name: str) -> TypeError:
+    """The error for an argument that does not hold real numbers."""
+    dtype = getattr(x, "dtype", None)
+    kind = getattr(dtype, "kind", "")
+    if kind in ("M", "m") or _first(x).__class__.__module__ == "datetime":
+        return TypeError(
+            f"{name} holds dates or durations; numbers are needed. For seconds since the first: "
+            "(t - t[0]) / np.timedelta64(1, 's')."
         )
-    return array.astype(float)
+    cure = {
+        "c": " For complex data stack real and imaginary parts.",
+        "U": " Text becomes numbers by .astype(float); a header of a file is left out by skiprows.",
+    }.get(kind)
+    if cure is not None:
+        return TypeError(f"{name} has dtype {dtype}; real numbers are needed.{cure}")
+    return TypeError(
+        f"{name} must hold real numbers; got {reprlib.repr(x)}. Pass floats, an array of them, or "
+        "lists with rows of equal length."
+    )
+
+
+def _first(x: Any) -> Any:
+    """The first entry of lists and arrays of any depth."""
+    while isinstance(x, list | tuple) or (isinstance(x, np.ndarray) and x.ndim):
+        x = x[0] if len(x) else None
+    return x
 
 
 def single_or_double(dtype: Any, whose: str) -> None:

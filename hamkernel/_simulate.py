@@ -159,6 +159,15 @@ class Samples(eqx.Module):
         return before + share * (self.values[index + 1] - before)
 
 
+class OneInput(eqx.Module):
+    """u(t) of shape (1,) from a function that returns a number."""
+
+    function: Callable[[Array], Any]
+
+    def __call__(self, t: Float[Array, ""]) -> Float[Array, " 1"]:
+        return self.function(t)[None]
+
+
 class RightHandSide(eqx.Module):
     """The field f(t, x, args) as Diffrax calls it; with inputs, `args` is the time at t = 0."""
 
@@ -245,6 +254,8 @@ def _inputs(inputs: Any, ts: Float[Array, " T"], between: Interpolation) -> Call
             )
         out = jax.eval_shape(inputs, jax.ShapeDtypeStruct((), ts.dtype))
         shape = getattr(out, "shape", type(out).__name__)
+        if shape == ():
+            return OneInput(as_pytree(inputs))
         if not isinstance(shape, tuple) or len(shape) != 1:
             raise ValueError(
                 f"inputs(t) returns shape {shape}; one vector u of shape (m,) is needed, such as "
@@ -252,12 +263,9 @@ def _inputs(inputs: Any, ts: Float[Array, " T"], between: Interpolation) -> Call
             )
         return as_pytree(inputs)
     values = require.floating(inputs, "inputs")
+    values = values[:, None] if values.shape == ts.shape else values
     if values.ndim != 2 or len(values) != len(ts):
-        hint = ""
-        if values.ndim == 1 and len(values) == len(ts):
-            hint = " For one input write U[:, None]."
-        elif values.ndim < 2:
-            hint = " A constant input is lambda t: jnp.array([…])."
+        hint = " A constant input is lambda t: jnp.array([…])." if values.ndim < 2 else ""
         raise ValueError(
             f"inputs has shape {values.shape}; a function t -> (m,) is needed, or samples (T, m) at"
             f" the T = {len(ts)} times ts.{hint}"

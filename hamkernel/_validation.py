@@ -58,8 +58,8 @@ def cross_validation_loss(
         Y: measured velocities, shape (N, n).
         regularization: λ > 0.
         folds: a number of folds, made of consecutive points as equal in size as possible; "loo"
-            for one point per fold; or an integer label for each point, shape (N,), to hold out,
-            say, one trajectory at a time. A fold always holds out whole points: leaving out
+            for one point per fold; or a label for each point, shape (N,), such as the name of its
+            run, to hold out one run at a time. A fold always holds out whole points: leaving out
             single components would leak their siblings. Labels must be concrete under jit. Of
             observations N is the number of all: points, energies, functionals, in their order. A
             fold with all energies is compared up to their constant.

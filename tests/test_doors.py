@@ -1,22 +1,62 @@
 """What people type: logs of every kind become runs, and known masses need no lambda."""
 
-# pyright: reportArgumentType=false
+# pyright: reportArgumentType=false, reportOptionalSubscript=false, reportCallIssue=false
 
+import datetime
 import os
+import re
 import subprocess
 import sys
 import warnings
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
 import hamkernel as hk
+from hamkernel._closed_forms import Partition
 
 T = np.linspace(0, 3, 40)
 X = np.stack([np.sin(2 * T), 2 * np.cos(2 * T)], 1)
 U = np.cos(3 * T) + 0.3 * np.sin(7 * T)
+
+
+class Polars:
+    """A frame like that of polars: without `ndim`, and iterated by columns."""
+
+    def __init__(self, values, columns):
+        self.values, self.columns, self.shape = values, columns, values.shape
+
+    def to_numpy(self):
+        return self.values
+
+    def __iter__(self):
+        return iter(self.values.T)
+
+
+class Tensor:
+    """A tensor like that of PyTorch that requires a gradient."""
+
+    def __init__(self, values, free=False):
+        self.values, self.shape, self.free = values, values.shape, free
+
+    def detach(self):
+        return Tensor(self.values, free=True)
+
+    def cpu(self):
+        return self
+
+    def __array__(self, *args, **options):
+        if not self.free:
+            raise RuntimeError("Can't call numpy() on Tensor that requires grad.")
+        return self.values
+
+
+def table(values):
+    return np.array([*map(tuple, values)], dtype=[("q", float), ("p", float)])
 
 
 def same(runs, times=T, states=X):
@@ -72,13 +112,60 @@ def test_a_sampling_interval_stands_for_times(interval):
         hk.Runs(-1.0, X)
 
 
+def test_rows_as_lists_are_rows():
+    """Not 40 runs of two samples, where the sampling interval says nothing of their number."""
+    for rows in (X.tolist(), [*X]):
+        same(hk.Runs(0.1, rows), 0.1 * np.arange(40))
+    assert len(hk.Runs(0.1, [X[:, 0], X[:30, 1]])) == 2
+
+
+def test_times_of_all_runs_are_given_once():
+    both, u = np.stack([X, 2 * X]), np.stack([U, U])
+    for times in (T, T.tolist()):
+        runs = hk.Runs(times, both, u)
+        assert [len(runs), runs.input_count] == [2, 1]
+        np.testing.assert_array_equal(runs.times[1], T)
+        np.testing.assert_array_equal(runs.states[1], 2 * X)
+
+
+@pytest.mark.parametrize(
+    "states", [table(X), Polars(X, ["q", "p"]), [table(X)], [Polars(X, ["q", "p"])]]
+)
+def test_names_of_columns_are_kept(states):
+    times = [T] if isinstance(states, list) else T
+    runs = hk.Runs(times, states, [U] if isinstance(states, list) else U)
+    assert runs.names == ("q", "p")
+    assert repr(runs) == "Runs(1 run, 40 samples, n=2 (q, p), m=1 held)"
+    assert runs.part([slice(0, 9)]).names == ("q", "p")
+    assert hk.Runs(T, X).names is None
+
+
+def test_names_of_pandas_and_xarray_are_kept_and_used():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"t": T, "angle": X[:, 0], "speed": X[:, 1], "volts": U})
+    runs = hk.Runs(frame["t"], frame[["angle", "speed"]], frame["volts"])
+    assert repr(runs) == "Runs(1 run, 40 samples, n=2 (angle, speed), m=1 (volts) held)"
+    assert [panel.get_ylabel() for panel in hk.plot.smoothing(runs)] == ["angle", "speed"]
+    plt.close("all")
+    frame["speed"] = 3.0
+    with pytest.warns(UserWarning, match=r"constant in all runs: coordinate speed \(always 3\)"):
+        hk.Runs(frame["t"], frame[["angle", "speed"]])
+    columns = [frame[["angle", "volts"]], frame[["volts", "angle"]]]
+    with pytest.raises(ValueError, match=r"are angle, volts and those of states\[1\] volts, angle"):
+        hk.Runs([T, T], columns)
+    assert hk.Runs(frame["t"], frame["angle"]).with_momenta().names == ("angle", "p of angle")
+    xarray = pytest.importorskip("xarray")
+    array = xarray.DataArray(X, dims=("time", "c"), coords={"time": T, "c": ["q", "p"]})
+    assert hk.Runs(array.time, array).names == ("q", "p")
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
         ((None, X), "times must be a list with one array a run"),
-        (([None], [X]), r"times\[0\] is None: an array of real numbers is needed"),
+        (([None], [X]), r"times\[0\] must hold real numbers; got None"),
         ((T, None), "states"),
-        ((T, X * 1j), r"states\[0\] must hold real numbers and has dtype complex128"),
+        ((T, X * 1j), r"states\[0\] has dtype complex128; real numbers are needed"),
         ((T, [["a", "b"]] * 40), r"states\[0\]"),
     ],
 )
@@ -90,10 +177,115 @@ def test_what_is_no_log_is_refused_in_a_sentence(arguments, said):
 @pytest.mark.parametrize(
     "inputs", [U, U[:, None], U.tolist(), (T, U), [T, U], ([*T], [*U]), (T, U[:, None])]
 )
-def test_one_input_is_one_column(inputs):
+def test_one_input_of_runs_is_one_column(inputs):
     runs = hk.Runs(T, X, inputs)
     np.testing.assert_array_equal(runs.inputs[0], U[:, None])
     np.testing.assert_array_equal(runs.input_times[0], T)
+
+
+KINDS = {
+    "list": lambda x: x.tolist(),
+    "iterator": lambda x: iter(x.tolist()),
+    "big-endian": lambda x: x.astype(">f8"),
+    "objects": lambda x: x.astype(object),
+    "masked": lambda x: np.ma.masked_array(x, mask=False),
+    "structured": table,
+    "polars": lambda x: Polars(x, ["q", "p"]),
+    "tensor": Tensor,
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_arrays_of_every_kind_are_data(kind):
+    make = KINDS[kind]
+    data = hk.Velocities(make(X), make(2 * X), inputs=make(3 * X))
+    np.testing.assert_array_equal(data.X, X)
+    np.testing.assert_array_equal(data.Y, 2 * X)
+    np.testing.assert_array_equal(data.inputs, 3 * X)
+    with jax.enable_x64(False):
+        assert hk.Velocities(make(X), make(X)).X.dtype == jnp.float32
+
+
+def test_missing_entries_are_components_that_were_not_measured():
+    np.testing.assert_array_equal(hk.Velocities(X, masked()).Y, with_nan())
+    holes = with_nan().tolist()
+    holes[3][1] = None
+    np.testing.assert_array_equal(hk.Velocities(X, holes).Y, with_nan())
+
+
+@pytest.mark.parametrize(
+    ("times", "said"),
+    [
+        (np.datetime64("2026-01-01") + np.arange(40), r"np\.timedelta64\(1, 's'\)"),
+        (np.arange(40) * np.timedelta64(50, "ms"), "holds dates or durations"),
+        ([datetime.datetime(2026, 1, day) for day in range(1, 31)], "holds dates or durations"),
+        (T.astype(str), r"Text becomes numbers by \.astype\(float\)"),
+    ],
+)
+def test_dates_and_text_are_no_numbers(times, said):
+    with pytest.raises(TypeError, match=said):
+        hk.Runs(times, X[: len(times)])
+
+
+LABELS = np.repeat([0, 1, 2, 3], 10)
+
+
+@pytest.mark.parametrize(
+    "folds",
+    [
+        LABELS.astype(float) / 2,
+        [f"run {i}" for i in LABELS],
+        LABELS.astype(str),
+        LABELS.astype(object),
+        [("monday", i) for i in LABELS],
+        np.datetime64("2026-01-01") + LABELS,
+        iter(LABELS.tolist()),
+        Polars(LABELS, None),
+    ],
+)
+def test_labels_of_folds_are_labels_of_any_kind(folds):
+    partition = Partition(40, folds)
+    np.testing.assert_array_equal(partition.labels, LABELS)
+    assert partition.of_labels
+
+
+@pytest.mark.parametrize(
+    ("folds", "said"),
+    [
+        ([*LABELS[:-1], None], r"no label for point 39 \(None\)"),
+        (np.where(LABELS == 2, np.nan, LABELS), r"no label for point 20 \(nan\)"),
+        (LABELS[:, None], r"folds has shape \(40, 1\)"),
+        (["a", "b"], r"folds has shape \(2,\)"),
+        (2.5, r"got 2\.5"),
+        (np.array(2.5), r"got array\(2\.5\)"),
+        ("run", "'loo' or labels; got 'run'"),
+    ],
+)
+def test_folds_without_a_label_for_each_point_are_refused(folds, said):
+    with pytest.raises(ValueError, match=said):
+        Partition(40, folds)
+
+
+@pytest.fixture(scope="module")
+def controlled():
+    K = hk.Sum(energy=hk.Symplectic(hk.Gaussian(1.0)), friction=hk.Friction(0.3, 0.1))
+    K = hk.Controlled(K, inputs=[[0.0], [1.0]])
+    return hk.fit(K, X, np.gradient(X, T, axis=0), 1e-3, inputs=U)
+
+
+def test_one_input_is_one_column_everywhere(controlled):
+    np.testing.assert_array_equal(hk.Velocities(X, X, inputs=U).inputs, U[:, None])
+    np.testing.assert_array_equal(hk.Velocities(X, X, parameters=U).inputs, U[:, None])
+    x, u = X[0], U[:1]
+    np.testing.assert_array_equal(controlled(x, U[0]), controlled(x, u))
+    np.testing.assert_array_equal(controlled.evaluate(X, U), controlled.evaluate(X, U[:, None]))
+    driven = hk.systems.Driven(hk.systems.Pendulum(1.0), [[0.0], [1.0]])
+    column, one = (hk.simulate(driven, x, T, inputs=u).ys for u in (U[:, None], U))
+    np.testing.assert_array_equal(one, column)
+    vector, number = (
+        hk.simulate(driven, x, T, inputs=u).ys for u in (lambda t: jnp.sin(t)[None], jnp.sin)
+    )
+    np.testing.assert_array_equal(number, vector)
 
 
 def test_numbers_of_other_libraries_are_numbers():
@@ -182,6 +374,46 @@ def test_positions_and_a_mass_are_enough(tmp_path):
         hk.learn(K, hk.Runs(t, runs[0]))
 
 
+def test_the_line_of_the_readme_reads_a_csv_with_a_header(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    log = np.column_stack([T, X, U])
+    np.savetxt("run1.csv", log, delimiter=",", header="t,q,p,u", comments="")
+    text = (Path(__file__).parents[1] / "README.md").read_text()
+    (line,) = re.findall(r"`(table = np\.loadtxt\(.*?\))`", text)
+    (runs,) = re.findall(r"`(hk\.Runs\(table.*?\))`", text)
+    names = {"np": np, "hk": hk}
+    exec(line, names)
+    same(eval(runs, names))
+
+
+def test_a_run_at_rest_among_others_is_no_fast_logger():
+    swing = np.stack([np.sin(2 * T), 2 * np.cos(2 * T)], 1)
+    noisy = swing + 0.01 * np.random.default_rng(0).standard_normal(swing.shape)
+    rest = np.tile([0.3, 0.0], (60, 1))
+    runs = hk.Runs([T, 0.1 * np.arange(60)], [noisy, rest])  # a warning is an error here
+    assert runs.check().failing == ()
+    stays = np.concatenate([noisy, np.tile(noisy[-1], (40, 1))])
+    assert hk.Runs(0.1, [stays, stays]).check()["repeated samples"].passes
+    with pytest.warns(UserWarning, match=r"repeated samples: coordinate 0 \(75%\), 1 \(75%\)"):
+        hk.Runs([0.1 * np.arange(160), 0.1 * np.arange(60)], [np.repeat(noisy, 4, axis=0), rest])
+
+
+def test_the_table_of_a_log_says_what_was_found_and_what_to_do():
+    x = X.copy()
+    x[20] = -9999
+    with pytest.warns(UserWarning, match="the first of them sample 20 of run 0.*Write NaN"):
+        runs = hk.Runs(T, x, U)
+    found = runs.check()
+    assert found.failing == ("impossible samples",)
+    row = found["impossible samples"]
+    assert row.value == "1, the first of them sample 20 of run 0"
+    assert "Write NaN for them" in row.advice
+    names = "impossible samples, wrapped angles, gaps, constant, clipped sensors, dead sensors, "
+    names += "repeated samples, interpolated samples, constant inputs, dependent inputs, feedback"
+    assert [each.name for each in found] == names.split(", ")
+    assert "! impossible samples" in repr(found)
+
+
 def test_what_is_printed_degrades_on_a_terminal_of_ascii():
     code = (
         "from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics\n"
@@ -202,10 +434,8 @@ def test_what_is_printed_degrades_on_a_terminal_of_ascii():
         assert said in run.stdout.decode(encoding)
 
 
-def test_a_part_of_a_controlled_field_is_that_of_its_drift():
-    K = hk.Sum(energy=hk.Symplectic(hk.Gaussian(1.0)), friction=hk.Friction(0.3, 0.1))
-    K = hk.Controlled(K, inputs=[[0.0], [1.0]])
-    field = hk.fit(K, X, np.gradient(X, T, axis=0), 1e-3, inputs=U[:, None])
+def test_a_part_of_a_controlled_field_is_that_of_its_drift(controlled):
+    field = controlled
     x = jnp.array([0.2, 0.5])
     parts = [field.part("energy")(x), field.part("friction")(x)]
     np.testing.assert_allclose(sum(parts), field(x, jnp.zeros(1)), atol=1e-10)

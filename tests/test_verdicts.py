@@ -89,6 +89,19 @@ def test_dropouts_written_as_zeros_make_the_field_unusable():
     assert len(heard) == 1
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize("step", [None, 0.05])
+def test_a_run_at_rest_is_one_measurement_of_the_noise(step):
+    times, states = pendulum(noise=0.02 if step is None else 0.0)
+    noise = 0.02
+    if step is not None:
+        states, noise = [step * np.round(x / step) for x in states], step / np.sqrt(12)
+    runs = hk.Runs([*times, times[0]], [*states, np.zeros_like(states[0])])
+    learned, heard = learn_and_listen(K, runs)
+    assert heard == []
+    np.testing.assert_allclose(learned.noise, noise, rtol=0.08)  # 13 % too small as 60 samples
+
+
 def test_animals_in_weather_are_no_hamiltonian_system():
     years, log = animals()
     learned, heard = learn_and_listen(K, hk.Runs([years], [log]))

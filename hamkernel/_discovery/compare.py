@@ -57,7 +57,7 @@ class Candidate(NamedTuple):
         name: the name of the candidate.
         claims: the questions that its structure answers with yes.
         score: log p − ½ P log D.
-        difference: the score less that of the best candidate, at most 0.
+        difference: the score minus the best score, at most 0.
         log_likelihood: log p of the rows at the tuned hyperparameters.
         parameters: P, the count of trained numbers, λ among them.
         kernel: the tuned kernel.
@@ -85,7 +85,7 @@ class Comparison:
         answers: "yes", "no", "undecided" or "not tested" for each of the questions "energy",
             "friction", "mirror", "reversible" and "T + U".
         reasons: a sentence for each answer.
-        differences: the score of the best yes less that of the best no; NaN where not tested.
+        differences: the score of the best yes minus the score of the best no; NaN if not tested.
         rows: D, the number of measured values.
     """
 

@@ -105,14 +105,14 @@ class Formula(eqx.Module):
         return theta @ jnp.stack(values)
 
     def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
-        """The velocity B(x)∇u(x), that of the mean included; without inputs."""
+        """The velocity B(x)∇u(x), including the mean, without inputs."""
         x = require.floating(x, "x")
         velocity = operator_of(self.kernel)(x, jax.grad(self._formula)(x))
         return velocity if self.mean is None else velocity + self.mean(x).astype(velocity.dtype)
 
     @full_precision
     def potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """The potential u(x), that of the mean included.
+        """The potential u(x), including the mean.
 
         Raises:
             AttributeError: the mean has no potential of this structure.
@@ -122,7 +122,7 @@ class Formula(eqx.Module):
         return value if self.mean is None else value + potential_of(self.mean, self.kernel)(x)
 
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """The energy H(x), that of the mean included.
+        """The energy H(x), including the mean.
 
         Raises:
             AttributeError: the structure has no energy, or the mean has none.

@@ -155,7 +155,7 @@ def _data_of(learned: Any) -> tuple[AbstractMatrixKernel, Any, Float[Array, ""],
             "without parameters."
         )
     if kernel.takes_inputs and mean is not None:
-        mean = at_inputs(mean, 0, None)  # that of the drift
+        mean = at_inputs(mean, 0, None)  # the mean of the drift
     return kernel, rows, ridge, mean
 
 

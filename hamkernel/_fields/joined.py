@@ -28,6 +28,11 @@ from hamkernel._structures.base import Sum
 from hamkernel._structures.joined import AbstractJoinedKernel
 
 
+def _column(u: Array, ndim: int, m: int) -> Array:
+    """Numbers as inputs of shape (…, 1), where there is one for each of the states."""
+    return u[..., None] if u.ndim == ndim and m == 1 else u
+
+
 class AbstractJoinedField(AbstractField):
     """f(x, u), one state (n,) and one u (m,) per call.
 
@@ -133,7 +138,8 @@ class AbstractJoinedField(AbstractField):
                 f"x0, ts, inputs=u). A field of x alone is {self._example}."
             )
         n, m = self.dimension, self.kernel.input_count
-        shapes = np.shape(x), np.shape(u)
+        u = _column(require.floating(u, "u"), 0, m)
+        shapes = np.shape(x), u.shape
         if shapes != ((n,), (m,)):
             swapped = " x and u are swapped." if shapes == ((m,), (n,)) else ""
             raise ValueError(
@@ -141,7 +147,7 @@ class AbstractJoinedField(AbstractField):
                 f"({m},) are needed, field(x, u).{swapped}"
             )
         x = self._state(x)
-        return jnp.concatenate([x, require.floating(u, "u").astype(x.dtype)])
+        return jnp.concatenate([x, u.astype(x.dtype)])
 
     def evaluate(
         self, X: Num[ArrayLike, "N n"], U: Num[ArrayLike, "N m"] | None = None
@@ -158,7 +164,7 @@ class AbstractJoinedField(AbstractField):
             is_swapped = getattr(U, "shape", None) == (len(X), n)
             swapped = " X and U are swapped." if is_swapped else ""
             raise ValueError(f"X has {X.shape[1]} coordinates and the field {n}.{swapped}")
-        inputs = None if U is None else require.points(U, "U").astype(X.dtype)
+        inputs = None if U is None else _column(require.floating(U, "U"), 1, m).astype(X.dtype)
         if inputs is None or inputs.shape != (len(X), m):
             raise ValueError(
                 f"field.evaluate(X, U) needs the {self.kernel.given} of every state, shape "
@@ -285,12 +291,11 @@ class FamilyField(AbstractJoinedField):
         self._check_single()
         K: Any = self.kernel
         p = K.input_count
-        theta = require.floating(theta, "θ")
+        theta = _column(require.floating(theta, "θ"), 0, p)
         if theta.shape != (p,):
-            hint = " Write field.at([θ]) for one." if theta.shape == () and p == 1 else ""
             raise ValueError(
                 f"θ has shape {theta.shape}; the parameters of one member, shape ({p},), are "
-                f"needed.{hint}"
+                "needed."
             )
         theta = require.finite(theta, "θ").astype(self.offset.dtype)
         terms = tuple(
@@ -360,7 +365,7 @@ class MemberField(AbstractField):
 
     @property
     def residual(self) -> Float[Array, "..."]:
-        """Empty: the data are those of all members."""
+        """An empty array, since the data belong to all members."""
         return self.terms[0].residual
 
     @property

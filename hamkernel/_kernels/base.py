@@ -1,9 +1,9 @@
 """Scalar kernels on one pair of points, k(x, z) -> (), and their algebra.
 
-A kernel is written once, for one pair. `jax.vmap` makes the Gram matrix, and automatic
-differentiation makes every structured kernel from it, so a kernel should be written with
-*products* of its arguments: `x @ z` under two vmaps becomes one matrix product, while
-`jnp.sum((x - z) ** 2)` becomes an (N, M, n) array and runs many times slower.
+A kernel is written once, for one pair of points. `jax.vmap` makes the Gram matrix, and automatic
+differentiation every structured kernel. Write a kernel with *products* of its arguments: `x @ z`
+under two vmaps becomes one matrix product, while `jnp.sum((x - z) ** 2)` becomes an (N, M, n) array
+and runs many times slower.
 """
 
 import abc
@@ -107,7 +107,7 @@ class Descriptor(NamedTuple):
         map: d.
         kernel: κ.
         directions: the directions along which a field differentiates at a point, side by side.
-        jacobian: that of d; None for the one in forward mode.
+        jacobian: the Jacobian of d; None for automatic differentiation in forward mode.
         seen: what k knows of a point for every κ; None for d itself.
     """
 

@@ -41,9 +41,9 @@ class _Pairs(NamedTuple):
 def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     """Raise if the scalar kernel `k` is unfit for the structured kernels; return None if sound.
 
-    It looks for these faults, in this order: a result that is not one differentiable real number;
-    a k that is not finite; a block M(x, x) = ∂x ∂zᵀ k that is not the limit of M(x, x + h), or has
-    no limit because the kernel is too rough; derivatives that are not finite; k(x, z) ≠ k(z, x); a
+    The faults, in the order of the checks: a result that is not one differentiable real number; a k
+    that is not finite; a block M(x, x) = ∂x ∂zᵀ k that is not the limit of M(x, x + h), or has no
+    limit because the kernel is too rough; derivatives that are not finite; k(x, z) ≠ k(z, x); a
     negative eigenvalue of the Gram of k or of M. A kernel that passes is sound at these points.
 
     Args:

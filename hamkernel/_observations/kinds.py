@@ -155,11 +155,10 @@ def inputs_at(
     if values is None:
         return None
     U = require.floating(values, name)
+    U = U[..., None] if U.shape == X.shape[:-1] != () else U  # one for each state
     if U.ndim != X.ndim or U.shape[:-1] != X.shape[:-1] or U.shape[-1] == 0:
         hint = ""
-        if U.shape == X.shape[:-1]:
-            hint = f" For one of them write {letter}[{':, ' * U.ndim}None]."
-        elif U.ndim == X.ndim == 2 and U.shape[1] == len(X):
+        if U.ndim == X.ndim == 2 and U.shape[1] == len(X):
             hint = f" They seem to be transposed: {letter}.T."
         elif U.ndim == 1:
             hint = f" Where all have the same: np.tile({letter}, ({len(X)}, 1))."

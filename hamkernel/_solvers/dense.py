@@ -76,28 +76,6 @@ class DenseConditional(AbstractConditional):
         return _condition_draws(self, prior, noise)
 
 
-def dense_conditional(
-    problem: Problem, throw: bool = True, progress: bool = False
-) -> DenseConditional:
-    """The posterior given the rows, from their dense Gram: O(D³) time and O(D²) memory.
-
-    Raises:
-        ValueError: the matrices do not fit in memory. RuntimeError: A is not positive definite to
-            rounding.
-    """
-    rows = problem.rows
-    factor, c, field, relative_residual = _dense(problem, progress)
-    return DenseConditional(
-        _refuse_failure(field, relative_residual, rows.count, throw), rows, problem.ridge, factor, c
-    )
-
-
-def dense_field(problem: Problem, throw: bool = True, progress: bool = False) -> KernelField:
-    """The field of `dense_conditional` alone."""
-    _, _, field, relative_residual = _dense(problem, progress, keep=False)
-    return _refuse_failure(field, relative_residual, problem.rows.count, throw)
-
-
 def copies(problem: Problem) -> int:
     """The number of matrices of the size of the Gram that a dense fit holds at its peak.
 
@@ -123,13 +101,12 @@ def _check_memory(problem: Problem) -> None:
     refuse_beyond_memory(f"a dense fit of {D} rows", D, D, dtype, copies(problem), cure)
 
 
-def _dense(problem: Problem, progress: bool, keep: bool = True) -> Any:
-    """Solve A c = y. Returns (factor or None, c, field, relative residual)."""
+def _solve(problem: Problem, progress: bool, keep: bool) -> Any:
+    """Solve A c = y. Returns (factor, or None unless to `keep`, c, field, relative residual)."""
     K, rows, regularization = problem.kernel, problem.rows, problem.regularization
     _check_memory(problem)
     if not _is_in_place(problem):
-        result = (_compiled_conditional if keep else _compiled_field)(K, rows, regularization)
-        return result if keep else (None, *result)
+        return _solve_in_memory(K, rows, regularization, keep)
     factor = factor_in_place(*_assemble(K, rows, problem.ridge, progress))
     result: Any = _solve_with_factor(K, rows, regularization, factor)
     return factor, *result
@@ -151,10 +128,11 @@ def _assemble(K, rows: Measurements, ridge, progress: bool):
 _slab = compiled(strips_of_gram, donate="all-except-first")
 
 
-def _dense_system(K, rows: Measurements, regularization):
+@compiled
+def _solve_in_memory(K, rows: Measurements, regularization, keep: bool):
     ridge = rows.count * regularization
     factor, c = solution(regularized_gram(K, rows, ridge), rows.y)
-    return factor, *_field_and_residual(K, rows, regularization, c)
+    return factor if keep else None, *_field_and_residual(K, rows, regularization, c)
 
 
 @compiled
@@ -170,14 +148,6 @@ def _field_and_residual(K, rows: Measurements, regularization, c):
     residual, norm = rows.residual(ridge * c), norm_of(c @ values, c @ (y - values - ridge * c))
     info = SolverInfo("Cholesky", relative_residual=relative_residual)
     return c, field_of_rows(K, rows, c, residual, norm, regularization, info), relative_residual
-
-
-_compiled_conditional = compiled(_dense_system)
-
-
-@compiled
-def _compiled_field(K, rows: Measurements, regularization):
-    return _dense_system(K, rows, regularization)[1:]
 
 
 def norm_of(square: Float[Array, ""], error: Float[Array, ""]) -> Float[Array, ""]:
@@ -320,7 +290,11 @@ class Cholesky(AbstractSolver[KernelField]):
     """
 
     def fit(self, problem, throw=True, progress=False) -> KernelField:
-        return dense_field(problem.to_one_device(), throw, progress)
+        _, _, field, relative_residual = _solve(problem.to_one_device(), progress, keep=False)
+        return _refuse_failure(field, relative_residual, problem.rows.count, throw)
 
     def condition(self, problem, throw=True, progress=False) -> DenseConditional:
-        return dense_conditional(problem.to_one_device(), throw, progress)
+        problem = problem.to_one_device()
+        factor, c, field, relative_residual = _solve(problem, progress, keep=True)
+        field = _refuse_failure(field, relative_residual, problem.rows.count, throw)
+        return DenseConditional(field, problem.rows, problem.ridge, factor, c)

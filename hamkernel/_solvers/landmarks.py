@@ -153,7 +153,7 @@ def choose_rows(
     size = sum(block.size for block in blocks)
     if size > candidates:
         blocks = _part(blocks, candidates / size, jax.random.split(key)[0])
-    G = _gram_of_landmarks(K, landmarks_of(*blocks))
+    G = _gram(landmarks_of(*blocks), K)
     index, kept, count = _choose(RowCandidates(G), target_trace, min(max_count, len(G)), key)
     return _prune(blocks, index, kept.reshape(-1), count)
 
@@ -176,9 +176,7 @@ def _choose(
     return _first_candidates(drawn, min(size, blocks * BLOCK))
 
 
-@compiled
-def _gram_of_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Float[Array, "r r"]:
-    return landmarks.gram(K)
+_gram = compiled(Landmarks.gram)
 
 
 def _stratified_sample(key, N: int, count: int) -> Int[Array, " count"]:

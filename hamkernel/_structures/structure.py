@@ -107,7 +107,7 @@ class AbstractStructure(AbstractMatrixKernel):
     def transformed_coefficients(
         self, S: Float[np.ndarray, "n n"]
     ) -> Float[np.ndarray, "n n"] | None:
-        """The matrix T that turns the coefficient a of a point z into that of its image S z.
+        """The matrix T that maps the coefficient of a point z to the coefficient of its image S z.
 
         K built from k(x, Sz), times a, is K(x, Sz) built from k, times Ta. None if T is unknown.
         """

@@ -7,6 +7,7 @@ scatter of the block about its mean is kept, since it determines σ.
 """
 
 import functools
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple, get_args
 
@@ -93,7 +94,7 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
     With inputs it is a function of the points (x, u).
     """
     times, states = runs.on_host()
-    times = [t - t[0] for t in times]
+    times, states = [t - t[0] for t in times], [_thin_rests(x) for x in states]
     found, usable = _robust_processes(times, states)
     counts = [np.isfinite(x).astype(float) for x in states]
     scatter = [np.zeros_like(x) for x in states]
@@ -123,6 +124,24 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
     good = [run.path for run, use in zip(path_runs, usable, strict=True) if use]
     scale = np.concatenate(good).std(axis=0)
     return Preprocessed(path_runs, noise, np.where(scale > 0, scale, 1.0), usable)
+
+
+_REST = 10  # equal states, from which a system is at rest
+
+
+def _thin_rests(x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T n"]:
+    """The states of a run, NaN inside of a stretch of equal ones.
+
+    At rest a quantised sensor repeats one error, which is one measurement of the noise and not one
+    for each sample: with one run in four at rest σ was found as √(3/4) of what it is.
+    """
+    same = (np.diff(x, axis=0) == 0) | np.isnan(x).all(axis=0)
+    ends = np.flatnonzero(np.concatenate([[True], ~same.all(axis=1), [True]]))
+    kept = x.copy()
+    for first, stop in itertools.pairwise(ends):
+        if stop - first > _REST:
+            kept[first + 1 : stop - 1] = np.nan
+    return kept
 
 
 def averaging_time(found: list[Coordinate], times, deviation: Float[np.ndarray, "R T n"]) -> float:

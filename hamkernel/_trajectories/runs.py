@@ -16,7 +16,8 @@ from __future__ import annotations
 
 import dataclasses
 import operator
-from collections.abc import Iterable, Sequence
+import reprlib
+from collections.abc import Iterable, Iterator, Sequence
 from typing import Any, Literal, get_args
 
 import equinox as eqx
@@ -27,20 +28,14 @@ from jaxtyping import Array, Float, Int
 from hamkernel import _require as require
 from hamkernel._show import described, has_arrays
 from hamkernel._trajectories.flow import NODES
-from hamkernel._trajectories.sensors import (
-    impossible_samples,
-    warn_of_feedback,
-    warn_of_gaps,
-    warn_of_impossible,
-    warn_of_inputs,
-    warn_of_sensors,
-)
+from hamkernel._trajectories.sensors import Log, faults, impossible_samples
 from hamkernel._trajectories.smoothing import (
     Smoothing,
     processes,
     smoothed,
     smoothing,
 )
+from hamkernel._trajectories.table import Diagnostics
 
 Between = Literal["held", "linear", "smooth"]
 
@@ -129,11 +124,14 @@ class Runs(eqx.Module):
 
     Runs are kept as given, in doubles of NumPy; none is resampled. NaN means not measured: a whole
     coordinate, such as the momenta of a log of positions, or single entries. Masked entries of
-    NumPy and missing ones of pandas and polars are NaN.
+    NumPy and missing ones of pandas and polars are NaN. Names of columns are kept, in `names` and
+    `input_names`, for what is printed and drawn. `check()` is a table of what sensors and
+    controllers may have left in the log.
 
     Args:
         times: for each run the times of its samples, shape (T,), strictly increasing; or the
-            sampling interval, one number, with which runs begin at 0.
+            sampling interval, one number, with which runs begin at 0. Times (T,) of states
+            (R, T, n) are those of all R runs.
         states: for each run the states, shape (T, n), or (T,) for one coordinate. Angles must be
             continuous: `np.unwrap`.
         inputs: for each run what was applied, for `learn` with a `Controlled` kernel: u at the
@@ -171,6 +169,8 @@ class Runs(eqx.Module):
     between: Between | Literal["auto"] = eqx.field(static=True)
     delay: float | Literal["fit"] = eqx.field(static=True)
     parameters: tuple[Float[Array, " p"], ...] | None
+    names: tuple[str, ...] | None = eqx.field(static=True)
+    input_names: tuple[str, ...] | None = eqx.field(static=True)
 
     def __init__(
         self,
@@ -181,13 +181,14 @@ class Runs(eqx.Module):
         parameters: Any = None,
         delay: float | Literal["fit"] = 0.0,
     ):
+        times, states, inputs, parameters = map(_as_list, (times, states, inputs, parameters))
         if _is_one_run(times, states):
             times, states = [times], [states]
             inputs = None if inputs is None else [inputs]  # an array, or a pair (times, u)
             parameters = None if parameters is None else [parameters]
         states = _entries(states, "states")
-        if _is_number(times):
-            times = [times] * len(states)  # the sampling interval of all runs
+        if _are_of_all_runs(times, states):
+            times = [times] * len(states)
         times = _entries(times, "times")
         inputs = None if inputs is None else _entries(inputs, "inputs")
         inside = "Make it outside; the losses and hk.simulate work inside."
@@ -205,22 +206,22 @@ class Runs(eqx.Module):
             )
         self.between = between
         self.delay = "fit" if isinstance(delay, str) and delay == "fit" else _seconds(delay)
-        self.inputs = self.input_times = None
+        self.names = _names(states, self.states, "states")
+        self.inputs = self.input_times = self.input_names = None
         if inputs is not None:
             pairs = zip(inputs, self.times, strict=True)
             signals = [_signal(u, t, r) for r, (u, t) in enumerate(pairs)]
             self.input_times, self.inputs = (tuple(each) for each in zip(*signals, strict=True))
             _check_inputs(self.inputs)
+            of_values = [
+                u[1] if _is_pair(u, t) else u for u, t in zip(inputs, self.times, strict=True)
+            ]
+            self.input_names = _names(of_values, self.inputs, "inputs")
         self.parameters = None if parameters is None else _members(parameters, len(times), inputs)
         _check_coordinates(self.states)
-        times, states = self.on_host()
-        warn_of_impossible(self.impossible)
-        warn_of_gaps(times, states)
-        warn_of_sensors(times, states)
-        if self.inputs is not None:
-            warn_of_inputs([np.asarray(u, float) for u in self.inputs])
-            lines = [self.applied(r, t) for r, t in enumerate(times)]
-            warn_of_feedback(states, [np.concatenate([ends[:, 0], ends[-1:, 1]]) for ends in lines])
+        for row in self.check():
+            if not row.passes:
+                require.warn(f"{row.meaning}. {row.advice}")
 
     def __len__(self) -> int:
         return len(self.times)
@@ -232,14 +233,37 @@ class Runs(eqx.Module):
         said = [
             f"{len(self)} run{'s' * (len(self) != 1)}",
             f"{samples} samples",
-            f"n={self.dimension}",
+            f"n={self.dimension}" + _name_list(self.names),
         ]
         if self.inputs is not None:
-            said.append(f"m={self.input_count} {self.between}")
+            said.append(f"m={self.input_count}{_name_list(self.input_names)} {self.between}")
             if self.delay != 0.0:
                 delay = self.delay if isinstance(self.delay, str) else f"{self.delay:.4g}"
                 said.append(f"delay={delay}")
         return f"Runs({', '.join(said)})"
+
+    def check(self) -> Diagnostics:
+        """A table of the faults that sensors and controllers may have left in the log.
+
+        One row for each kind of fault: samples that are no measurements, wrapped angles, gaps,
+        coordinates that never move, clipped and dead sensors, repeated and interpolated samples.
+        With inputs also: constant inputs, dependent ones, and feedback. Each row has a value, its
+        limit, its meaning and advice; `.failing` names the rows that fall short. `Runs` has warned
+        of them.
+        """
+        times, states = self.on_host()
+        inputs = [np.asarray(u, float) for u in self.inputs or ()]
+        lines = [self.applied(r, t) for r, t in enumerate(times)] if inputs else []
+        return faults(
+            Log(
+                times,
+                states,
+                inputs,
+                [np.concatenate([ends[:, 0], ends[-1:, 1]]) for ends in lines],
+                self.names or [str(c) for c in range(self.dimension)],
+                self.input_names or [str(c) for c in range(self.input_count)],
+            )
+        )
 
     @property
     def impossible(self) -> tuple[Int[np.ndarray, " k"], ...]:
@@ -355,7 +379,8 @@ class Runs(eqx.Module):
     def with_momenta(self) -> "Runs":
         """Runs of positions as runs of states (q, p), with momenta that were not measured."""
         states = tuple(np.concatenate([x, np.full_like(x, np.nan)], axis=1) for x in self.states)
-        return self._with(states=states)
+        names = self.names and (*self.names, *(f"p of {name}" for name in self.names))
+        return self._with(states=states, names=names)
 
     def _with(self, **given: Any) -> "Runs":
         new = object.__new__(Runs)
@@ -372,31 +397,88 @@ class Runs(eqx.Module):
                 )
 
 
+def _as_list(values: Any) -> Any:
+    """The values of an iterator as a list; anything else as it is."""
+    return list(values) if isinstance(values, Iterator) else values
+
+
+def _depth(values: Any) -> int | None:
+    """The number of axes of an array, a frame, or nested lists; None if it is none of them."""
+    if hasattr(values, "shape"):
+        return len(values.shape)
+    if isinstance(values, list | tuple):
+        return 1 + (_depth(values[0]) or 0) if len(values) else None
+    return 0 if isinstance(values, int | float) else None
+
+
 def _is_one_run(times: Any, states: Any) -> bool:
-    """Whether `times` are those of one run, or one sampling interval and `states` one array."""
-    if _is_number(times):
-        return hasattr(states, "ndim") or (isinstance(states, list) and _is_number(states[0]))
-    if hasattr(times, "ndim"):
-        return times.ndim == 1
-    return isinstance(times, list | tuple) and len(times) > 0 and _is_number(times[0])
+    """Whether these are the times and states of one run."""
+    t, x = _depth(times), _depth(states)
+    if x is None or x > 2:
+        return False
+    if t == 2 and x == 1:
+        raise ValueError(
+            "times have two axes and states one: they seem to be swapped, hk.Runs(times, states)."
+        )
+    if t == 0 and isinstance(states, list | tuple) and x == 2:  # of rows, or of runs
+        return len(states[0]) < len(states)
+    if t == 2 and hasattr(times, "shape"):  # a frame of one column
+        return times.shape[1] == 1 and len(states) == len(times)
+    return t in (0, 1)
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) or getattr(value, "ndim", None) == 0
+def _are_of_all_runs(times: Any, states: Any) -> bool:
+    """Whether `times` are one sampling interval, or the times of each run."""
+    if _depth(times) == 1:
+        return _depth(states) == 3 and len(times) == len(states[0])
+    return _depth(times) == 0
 
 
 def _entries(values: Any, name: str) -> list[Any]:
     """One entry a run."""
-    if isinstance(values, Iterable) and not isinstance(values, str | dict):
+    is_frame = hasattr(values, "columns") or hasattr(values, "data_vars")
+    if isinstance(values, Iterable) and not isinstance(values, str | bytes | dict) and not is_frame:
         return list(values)
+    got = f"one {type(values).__name__}" if is_frame else reprlib.repr(values)
     raise TypeError(
-        f"{name} must be a list with one array a run, or the array of one run; got {values!r}."
+        f"{name} must be a list with one array a run, or the array of one run; got {got}."
     )
+
+
+def _names(entries: Sequence[Any], arrays: Sequence[np.ndarray], of: str) -> tuple[str, ...] | None:
+    """The names of the columns, which all runs must have in one order; None if there are none."""
+    names = [_column_names(x, a.shape[1]) for x, a in zip(entries, arrays, strict=True)]
+    for run, columns in enumerate(names):
+        if columns and names[0] and columns != names[0] and sorted(columns) == sorted(names[0]):
+            raise ValueError(
+                f"the columns of {of}[0] are {', '.join(names[0])} and those of {of}[{run}] "
+                f"{', '.join(columns)}: give all runs in one order."
+            )
+    return names[0] if all(columns == names[0] for columns in names) else None
+
+
+def _column_names(values: Any, count: int) -> tuple[str, ...] | None:
+    """The names of the columns of a frame, a structured array, or an array of xarray."""
+    names = getattr(values, "columns", None)  # pandas and polars
+    if names is None and getattr(values, "dims", None):  # xarray
+        last = values.coords.get(values.dims[-1]) if len(values.dims) == 2 else None
+        names = [values.name] if last is None else last.values
+    elif names is None and hasattr(values, "to_numpy"):  # one column of pandas or polars
+        names = [getattr(values, "name", None)]
+    elif names is None:
+        names = getattr(getattr(values, "dtype", None), "names", None)
+    names = () if names is None else tuple(names)
+    is_text = len(names) == count and all(isinstance(name, str) for name in names)
+    return tuple(map(str, names)) if is_text else None
+
+
+def _name_list(names: tuple[str, ...] | None) -> str:
+    return f" ({', '.join(names)})" if names else ""
 
 
 def _at_interval(times: Any, states: Any) -> Any:
     """The times of samples at a sampling interval, from 0 on; other times as they are."""
-    if not _is_number(times):
+    if _depth(times) != 0:
         return times
     interval = float(require.doubles(times, "the sampling interval"))
     if not 0 < interval < np.inf:
@@ -422,6 +504,8 @@ def _members(parameters: Any, count: int, inputs: Any) -> tuple[Float[Array, " p
             "runs have inputs or parameters: those of a Controlled kernel or those of a Family. An "
             "input of a family may be one of the parameters of hk.fit."
         )
+    if hasattr(parameters, "columns"):
+        parameters = require.doubles(parameters, "parameters")  # one row a run
     length = len(parameters) if hasattr(parameters, "__len__") else None
     if length != count:
         got = "no entries" if length is None else f"{length} entries"
@@ -444,6 +528,7 @@ def _members(parameters: Any, count: int, inputs: Any) -> tuple[Float[Array, " p
 def _times(t: Any, run: int, of: str = "states") -> Float[np.ndarray, " T"]:
     name = f"times[{run}]" if of == "states" else f"the times of {of}[{run}]"
     given, t = getattr(t, "dtype", None), require.doubles(t, name)
+    t = t[:, 0] if t.ndim == 2 and t.shape[1] == 1 else t  # a frame of one column
     if t.ndim != 1:
         raise ValueError(f"{name} has shape {t.shape}; times of shape (T,) are needed.")
     if t.size < 2:
@@ -500,13 +585,18 @@ def _seconds(delay: Any) -> float:
     return float(delay)
 
 
+def _is_pair(u: Any, t: np.ndarray) -> bool:
+    """Whether the inputs of a run with the times t are a pair (times, u)."""
+    return isinstance(u, tuple) or (
+        isinstance(u, list) and len(u) == 2 != len(t) and _depth(u[0]) == 1
+    )
+
+
 def _signal(
     u: Any, t: np.ndarray, run: int
 ) -> tuple[Float[np.ndarray, " P"], Float[np.ndarray, "P m"]]:
     """The times and values of the inputs of one run whose states have the times t."""
-    if isinstance(u, list) and len(u) == 2 != len(t) and np.ndim(u[0]) == 1:
-        u = tuple(u)  # a pair (times, u)
-    if not isinstance(u, tuple):
+    if not _is_pair(u, t):
         return t, _rows(u, t, run, "inputs")
     if len(u) != 2:
         raise ValueError(

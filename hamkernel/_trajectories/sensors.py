@@ -1,4 +1,4 @@
-"""Warnings of faults that sensors and controllers leave in a log, before it is learned from."""
+"""Faults that sensors and controllers leave in a log, each a row of the table of `Runs.check`."""
 
 import itertools
 import warnings
@@ -6,117 +6,220 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from hamkernel import _require as require
+from hamkernel._trajectories.table import Diagnostic, Diagnostics
 
 
-def warn_of_gaps(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> None:
-    """Warn where an angle was wrapped, a gap is long, or a coordinate never moves."""
-    gaps, still, lost = [], [], False
-    jumps: dict[float, list[str]] = {}
-    for run, (t, x) in enumerate(zip(times, states, strict=True)):
-        dt = np.diff(t)
-        if len(dt) > 2 and dt.max() > 10 * np.median(dt):
-            gaps.append(f"{dt.max():.3g} in run {run}, at a median spacing of {np.median(dt):.3g}")
+class Log(NamedTuple):
+    """A log, one array a run.
+
+    Attributes:
+        times: times of the samples, shapes (T,).
+        states: states at these times, shapes (T, n).
+        inputs: inputs at their own times, shapes (P, m); empty if there are none.
+        applied: inputs at the times of the states, shapes (T, m).
+        names: names of the coordinates.
+        input_names: names of the inputs.
+    """
+
+    times: Sequence[np.ndarray]
+    states: Sequence[np.ndarray]
+    inputs: Sequence[np.ndarray]
+    applied: Sequence[np.ndarray]
+    names: Sequence[str]
+    input_names: Sequence[str]
+
+
+def faults(log: Log) -> Diagnostics:
+    """The table of a log: one row for each kind of fault."""
+    rows = [_impossible(log), _wraps(log), _gaps(log), _constant(log), *_sensors(log)]
+    if log.inputs:
+        rows += [*_inputs(log), _feedback(log)]
+    return Diagnostics(tuple(rows))
+
+
+def _row(
+    name: str, faults_found: Sequence[str], limit: str, meaning: str, advice: str
+) -> Diagnostic:
+    """A row that passes where nothing was faults_found."""
+    if not faults_found:
+        return Diagnostic(name, "none", limit, True, "nothing of it in this log")
+    return Diagnostic(name, _some(faults_found), limit, False, meaning, advice)
+
+
+def _impossible(log: Log) -> Diagnostic:
+    """Samples that are no measurements."""
+    where = [np.flatnonzero(impossible_samples(x)) for x in log.states]
+    count = sum(map(len, where))
+    run = next((r for r, rows in enumerate(where) if len(rows)), 0)
+    first = f"the first of them sample {where[run][0]} of run {run}" if count else ""
+    return _row(
+        "impossible samples",
+        [f"{count}, {first}"] * bool(count),
+        "20 deviations, or a row of zeros",
+        f"{count} samples are impossible beside their neighbours, {first}: what a logger writes "
+        "for a lost measurement, such as -9999, 65535 or zeros",
+        "Write NaN for them; runs.impossible has their indices, by run.",
+    )
+
+
+def _wraps(log: Log) -> Diagnostic:
+    """Angles and counts that jump by a full turn."""
+    where: dict[float, list[str]] = {}
+    lost = False
+    for run, (t, x) in enumerate(zip(log.times, log.states, strict=True)):
         for c in range(x.shape[1]):
             period = wrapped_period(t, x[:, c])
             if period:
-                jumps.setdefault(period, []).append(f"coordinate {c} of run {run}")
+                where.setdefault(period, []).append(f"coordinate {log.names[c]} of run {run}")
                 lost |= not np.isfinite(x[:, c]).all()
-    X = np.concatenate(states)
-    for c in range(X.shape[1]):
-        column = X[np.isfinite(X[:, c]), c]
+    full = {period: "2π" if period == 2 * np.pi else f"{period:g}" for period in where}
+    option = "".join(f", period={full[period]}" for period in list(where)[:1] if period > 7)
+    measured = (  # np.unwrap leaves NaN from the first lost sample on
+        f" of the samples that were measured alone, ok = np.isfinite(q); q[ok] = "
+        f"np.unwrap(q[ok]{option}), since after a NaN it leaves NaN"
+    )
+    jumps = "; ".join(f"{_some(places)} jumps by about {full[p]}" for p, places in where.items())
+    return _row(
+        "wrapped angles",
+        [place for places in where.values() for place in places],
+        "2π, 360, 4096, 65536",
+        f"{jumps}: a wrapped angle",
+        f"A field is learned along continuous paths; use np.unwrap(states[:, c]{option}) before"
+        f"{measured if lost else ''}, and a kernel that is periodic, hk.Periodic or hk.Warp, "
+        "where the field is.",
+    )
+
+
+def _gaps(log: Log) -> Diagnostic:
+    """Long intervals without a sample."""
+    faults_found = []
+    for run, dt in enumerate(map(np.diff, log.times)):
+        if len(dt) > 2 and dt.max() > 10 * np.median(dt):
+            faults_found.append(
+                f"{dt.max():.3g} in run {run}, at a median spacing of {np.median(dt):.3g}"
+            )
+    return _row(
+        "gaps",
+        faults_found,
+        "10 spacings",
+        f"a gap of {_some(faults_found)}",
+        "The path inside a gap is known from the field alone; cut the run in two there if the "
+        "system was moved meanwhile.",
+    )
+
+
+def _constant(log: Log) -> Diagnostic:
+    """Coordinates that never move."""
+    faults_found = []
+    for name, column in zip(log.names, np.concatenate(log.states).T, strict=True):
+        column = column[np.isfinite(column)]
         if column.size and np.ptp(column) == 0:
-            still.append(f"{c} (always {column[0]:g})")
-    for period, where in jumps.items():
-        full = "2π" if period == 2 * np.pi else f"{period:g}"
-        given = "" if period == 2 * np.pi else f", period={period:g}"
-        measured = (  # np.unwrap leaves NaN from the first lost sample on
-            f" of the samples that were measured alone, ok = np.isfinite(q); q[ok] = "
-            f"np.unwrap(q[ok]{given}), since after a NaN it leaves NaN"
-        )
-        require.warn(
-            f"{_some(where)} jumps by about {full}: a wrapped angle. A field is learned along "
-            f"continuous paths; use np.unwrap(states[:, c]{given}) before"
-            f"{measured if lost else ''}, and a kernel that is periodic, hk.Periodic or hk.Warp, "
-            "where the field is."
-        )
-    if gaps:
-        require.warn(
-            f"a gap of {_some(gaps)}. The path inside a gap is known from the field alone; cut the "
-            "run in two there if the system was moved meanwhile."
-        )
-    if still:
-        require.warn(
-            f"constant in all runs: coordinate {_some(still)}. Leave it out of the states."
-        )
+            faults_found.append(f"{name} (always {column[0]:g})")
+    return _row(
+        "constant",
+        faults_found,
+        "some motion",
+        f"constant in all runs: coordinate {_some(faults_found)}",
+        "Leave it out of the states.",
+    )
 
 
 _QUANTA = 4.0  # the steps of a log, above which a repeat is no rounding of a sensor at work
 
 
-def warn_of_sensors(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> None:
-    """Warn of coordinates that look clipped, stuck, repeated or interpolated."""
-    X = np.concatenate(states)
-    scale = np.array([np.nanstd(x) if np.isfinite(x).any() else np.nan for x in X.T])
+def _sensors(log: Log) -> list[Diagnostic]:
+    """Coordinates that look clipped, dead, repeated or interpolated."""
+    scale = np.array(
+        [np.nanstd(x) if np.isfinite(x).any() else 0 for x in np.concatenate(log.states).T]
+    )
     unit = np.where(scale > 0, scale, 1.0)
-    clipped, stuck, repeated, drawn = [], [], [], []
-    for c in range(X.shape[1]):
-        columns = [x[:, c] for x in states]
-        seen = [np.isfinite(x) for x in columns]
-        if not (scale[c] > 0):
-            continue
-        steps = np.abs(np.concatenate([np.diff(x[s]) for x, s in zip(columns, seen, strict=True)]))
-        moving = steps[steps > 0]
-        if not moving.size:
-            continue
+    clipped, dead, repeated, drawn = [], [], [], []
+    for c in map(int, np.flatnonzero(scale)):
+        columns, name = [x[:, c] for x in log.states], log.names[c]
+        steps = [np.abs(np.diff(x[np.isfinite(x)])) for x in columns]
+        moving = np.concatenate(steps)
+        moving = moving[moving > 0]
         quantum = moving.min()
-        flat = {
-            value: sum(_plateaus(x, value, quantum) for x in columns)
-            for value in (np.nanmin(X[:, c]), np.nanmax(X[:, c]))
-        }
+        ends = [f(np.concatenate(columns)) for f in (np.nanmin, np.nanmax)]
+        flat = {end: sum(_plateaus(x, end, quantum) for x in columns) for end in ends}
         if max(flat.values()) >= 2:
-            clipped += [f"{c} at {value:.4g}" for value, count in flat.items() if count]
+            clipped += [f"{name} at {value:.4g}" for value, count in flat.items() if count]
             continue
         # A real log of a motor repeats a quarter of the positions, and can be learned from.
-        if np.mean(steps == 0) > 0.3 and np.median(moving) > _QUANTA * quantum:
-            repeated.append(f"{c} ({np.mean(steps == 0):.0%})")
+        share = _repeats(steps)
+        if share > 0.3 and np.median(moving) > _QUANTA * quantum:
+            repeated.append(f"{name} ({share:.0%})")
             continue
-        share = _straight(times, columns)
-        whole = np.abs(moving / quantum - np.round(moving / quantum)).max() < 0.01  # a digital one
-        if share > 0.4 and not whole:  # every other sample interpolated makes .5
-            drawn.append(f"{c} ({share:.0%})")
+        share = _straight(log.times, columns)
+        ratios = moving / quantum
+        is_digital = np.abs(ratios - np.round(ratios)).max() < 0.01
+        if share > 0.4 and not is_digital:  # every other sample interpolated makes .5
+            drawn.append(f"{name} ({share:.0%})")
         for r, x in enumerate(columns):
-            others = np.delete(states[r] / unit, c, axis=1)
-            found = _stuck(x, others)
-            if found is not None:
-                a, b = (float(times[r][i]) for i in found)
-                stuck.append(f"{c} of run {r} from {a:.4g} to {b:.4g}")
-    if clipped:
-        require.warn(
+            stretch = _stuck(x, np.delete(log.states[r] / unit, c, axis=1))
+            if stretch is not None:
+                a, b = (float(log.times[r][i]) for i in stretch)
+                dead.append(f"{name} of run {r} from {a:.4g} to {b:.4g}")
+    return _sensor_rows(clipped, dead, repeated, drawn)
+
+
+def _sensor_rows(
+    clipped: Sequence[str], dead: Sequence[str], repeated: Sequence[str], drawn: Sequence[str]
+) -> list[Diagnostic]:
+    return [
+        _row(
+            "clipped sensors",
+            clipped,
+            "two plateaus",
             f"a sensor seems clipped: coordinate {_some(clipped)} stays at its outermost value and "
-            "arrives there at speed. Write NaN for these samples; the field then says where it went"
-            "."
-        )
-    if stuck:
-        require.warn(
-            f"a sensor seems dead: coordinate {_some(stuck)} keeps one value while others move by "
-            "more than a standard deviation. Write NaN for these samples."
-        )
-    if repeated:
-        require.warn(
+            "arrives there at speed",
+            "Write NaN for these samples; the field then says where it went.",
+        ),
+        _row(
+            "dead sensors",
+            dead,
+            "one deviation of the others",
+            f"a sensor seems dead: coordinate {_some(dead)} keeps one value while others move by "
+            "more than a standard deviation",
+            "Write NaN for these samples.",
+        ),
+        _row(
+            "repeated samples",
+            repeated,
+            "30%",
             f"repeated samples: coordinate {_some(repeated)} is often exactly the sample before, "
             "and else goes on by many steps of its resolution. The log was written faster than the "
-            "sensor measures, so times are late and the noise looks smaller than it is: keep the "
-            "first of equal samples and write NaN for the others."
-        )
-    if drawn:
-        require.warn(
+            "sensor measures, so times are late and the noise looks smaller than it is",
+            "Keep the first of equal samples and write NaN for the others.",
+        ),
+        _row(
+            "interpolated samples",
+            drawn,
+            "40%",
             f"interpolated samples: coordinate {_some(drawn)} lies on straight lines between some "
             "of its samples. What was interpolated is no measurement, and the noise looks smaller "
-            "than it is: give the samples at their own times, hk.Runs does not need equal ones."
-        )
+            "than it is",
+            "Give the samples at their own times, hk.Runs does not need equal ones.",
+        ),
+    ]
+
+
+def _repeats(steps: Sequence[Float[np.ndarray, " T-1"]]) -> float:
+    """The share of samples that repeat the one before, without stretches at rest.
+
+    A stretch of equal values is a rest where it is a whole run, or ten times longer than half of
+    all stretches are.
+    """
+    lengths, is_run = [], []
+    for step in steps:
+        ends = np.flatnonzero(np.concatenate([[True], step > 0, [True]]))
+        lengths.append(np.diff(ends))
+        is_run.append(np.full(len(ends) - 1, len(ends) == 2))
+    length = np.concatenate(lengths)
+    moves = ~np.concatenate(is_run) & (length <= 10 * np.median(length))
+    return float(1 - moves.sum() / max(length[moves].sum(), 1))
 
 
 def _straight(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> float:
@@ -166,41 +269,71 @@ def _stuck(x: Float[np.ndarray, " T"], others: Float[np.ndarray, "T others"]):
     return first, stop
 
 
-def warn_of_inputs(inputs: Sequence[np.ndarray]) -> None:
-    """Warn of inputs that never change, or a combination of which hardly does.
+def _inputs(log: Log) -> list[Diagnostic]:
+    """Inputs that never change, or a combination of which hardly does.
 
     Of inputs of variance one it has a variance below .01: the errors of its gain are ten times
     those under independent inputs.
     """
-    U = np.concatenate(inputs)
+    U = np.concatenate(log.inputs)
     none = np.ptp(U, axis=0) == 0
     varied, alike = np.flatnonzero(~none), []
     if len(varied) > 1:
         share, direction = (a[..., 0] for a in np.linalg.eigh(np.corrcoef(U[:, varied].T)))
         if share < 0.01:
-            alike = [str(c) for c in varied[np.abs(direction) > 0.1]]
+            alike = [log.input_names[int(c)] for c in varied[np.abs(direction) > 0.1]]
     unless = "unless the matrix of the inputs is known, hk.Controlled(K, inputs=G)"
-    if none.any():
-        which = _some([f"{c} (always {inputs[0][0, c]:g})" for c in np.flatnonzero(none)])
-        require.warn(
-            f"constant in all runs: input {which}. What it does cannot be told from the drift, "
-            f"{unless}: leave it out, or log runs in which it varies."
-        )
-    if alike:
-        require.warn(
+    still = [f"{log.input_names[int(c)]} (always {U[0, c]:g})" for c in np.flatnonzero(none)]
+    return [
+        _row(
+            "constant inputs",
+            still,
+            "some change",
+            f"constant in all runs: input {_some(still)}. What it does cannot be told from the "
+            f"drift, {unless}",
+            "Leave it out, or log runs in which it varies.",
+        ),
+        _row(
+            "dependent inputs",
+            alike,
+            "1% of the variance",
             f"inputs {_some(alike)} depend on one another: a combination of them has less than 1 % "
-            f"of their variance. Their gains cannot be told apart, {unless}: leave out inputs that "
-            "repeat others, or vary each on its own."
-        )
+            f"of their variance. Their gains cannot be told apart, {unless}",
+            "Leave out inputs that repeat others, or vary each on its own.",
+        ),
+    ]
 
 
-def warn_of_feedback(states: Sequence[np.ndarray], inputs: Sequence[np.ndarray]) -> None:
-    """Warn of inputs that are a smooth function of the states: a cubic polynomial at most."""
-    X, U = np.concatenate(states), np.concatenate(inputs)
+def _feedback(log: Log) -> Diagnostic:
+    """Inputs that are a smooth function of the states."""
+    share = _free_of_states(np.concatenate(log.states), np.concatenate(log.applied))
+    many = len(log.input_names) > 1
+    error = 1 / np.sqrt(max(share, 1e-12))
+    return Diagnostic(
+        "feedback",
+        f"{share:.2g} of the variance is free of the states",
+        "0.1",  # where the error of a gain is √10 times that under independent inputs
+        share >= 0.1,
+        "the inputs vary by themselves"
+        if share >= 0.1
+        else f"{'a combination of the inputs' if many else 'the input'} is a function of the "
+        f"states but for {share:.2g} of its variance: feedback without excitation. Gain and drift "
+        f"are then told apart by what is left alone, and their errors are {error:.2g} times those "
+        "under an independent input",
+        "Add a known disturbance to the command, log other gains of the controller, or give the "
+        "input matrix, hk.Controlled(K, inputs=[[0.0], [1.0]]).",
+    )
+
+
+def _free_of_states(X: Float[np.ndarray, "N n"], U: Float[np.ndarray, "N m"]) -> float:
+    """The share of the variance of U, of its least free combination, that no cubic of X leaves.
+
+    1 where nothing can be said.
+    """
     X = X[:, np.isfinite(X).any(axis=0)]
     use = np.isfinite(X).all(axis=1)
     if use.sum() < 2 or not X.size:
-        return
+        return 1.0
     X, U = X[use], U[use] - U[use].mean(axis=0)
     Z = (X - X.mean(axis=0)) / np.where(X.std(axis=0) > 0, X.std(axis=0), 1.0)
     powers = [np.ones(len(Z))]
@@ -211,26 +344,14 @@ def warn_of_feedback(states: Sequence[np.ndarray], inputs: Sequence[np.ndarray])
             break
         powers += new
     A = np.column_stack(powers)
-    if A.shape[1] == 1:
-        return
-    left = U - A @ np.linalg.lstsq(A, U, rcond=None)[0]
-    # Some combination of the inputs: the least of what is left, relative to what there was.
     varied = U.std(axis=0) > 0
-    if not varied.any():
-        return
+    if A.shape[1] == 1 or not varied.any():
+        return 1.0
+    left = U - A @ np.linalg.lstsq(A, U, rcond=None)[0]
     R = np.linalg.qr(U[:, varied], mode="r")
     if np.abs(np.diag(R)).min() <= 1e-9 * np.abs(R).max():
-        return  # inputs that depend on one another are refused by `learn`
-    share = np.linalg.svd(left[:, varied] @ np.linalg.inv(R), compute_uv=False)[-1] ** 2
-    if share < 0.1:  # where the error of a gain is √10 times that under independent inputs
-        which = "the input is" if U.shape[1] == 1 else "a combination of the inputs is"
-        require.warn(
-            f"{which} a function of the states but for {share:.2g} of its variance: feedback "
-            "without excitation. Gain and drift are then told apart by what is left alone, and "
-            f"their errors are {1 / np.sqrt(max(share, 1e-12)):.2g} times those under an "
-            "independent input. Add a known disturbance to the command, log other gains of the "
-            "controller, or give the input matrix, hk.Controlled(K, inputs=[[0.0], [1.0]])."
-        )
+        return 1.0  # inputs that depend on one another are refused by `learn`
+    return float(np.linalg.svd(left[:, varied] @ np.linalg.inv(R), compute_uv=False)[-1] ** 2)
 
 
 class Timing(NamedTuple):
@@ -339,19 +460,6 @@ def impossible_samples(x: Float[np.ndarray, "T n"]) -> Bool[np.ndarray, " T"]:
     return bad
 
 
-def warn_of_impossible(impossible: Sequence[Int[np.ndarray, " k"]]) -> None:
-    """Warn of samples that are no measurements."""
-    count = sum(map(len, impossible))
-    if count:
-        run = next(r for r, rows in enumerate(impossible) if len(rows))
-        require.warn(
-            f"{count} samples are impossible beside their neighbours, the first of them sample "
-            f"{impossible[run][0]} of run {run}: what a logger writes for a lost measurement, such "
-            "as -9999, 65535 or zeros. Write NaN for them; runs.impossible has their indices, "
-            "by run."
-        )
-
-
 def is_on_a_curve(states: Sequence[Float[np.ndarray, "T n"]], noise: np.ndarray) -> bool:
     """Whether the momentum is one function of the position in the data of all runs, with n = 2.
 
@@ -376,6 +484,6 @@ def is_on_a_curve(states: Sequence[Float[np.ndarray, "T n"]], noise: np.ndarray)
     return bool(rest @ rest < 2e-3 * (p @ p) + 1.5 * len(X) * sensors)
 
 
-def _some(names: list[str]) -> str:
+def _some(names: Sequence[str]) -> str:
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return ", ".join(names[:3]) + more

@@ -224,7 +224,7 @@ def tune(
     plain = mean is None and inputs is None and not isinstance(X, AbstractObservations)
     data: Any = rows.states if plain else (observations(X, Y, inputs, part=True), None)
     criterion = criterion_of(objective, rows.count, folds, data)
-    _warn_of_few_folds(criterion, folds)
+    _warn_of_few_folds(criterion)
     low_rank = solver is not None and solver.is_low_rank and not criterion.custom
     if exact and low_rank:
         criterion = _low_rank_criterion(criterion, local, solver)  # no Gram, on few points either
@@ -392,9 +392,9 @@ def warn_of_constants(K: AbstractMatrixKernel) -> None:
         )
 
 
-def _warn_of_few_folds(criterion: SearchCriterion, folds: object) -> None:
+def _warn_of_few_folds(criterion: SearchCriterion) -> None:
     """Warn of so few labels that the loss depends on the choice of the groups."""
-    if criterion.partition is None or criterion.custom or np.ndim(folds) == 0:  # type: ignore
+    if criterion.partition is None or criterion.custom or not criterion.partition.of_labels:
         return
     count = len(criterion.partition.folds)
     # The loss over few runs is noisy. On the pendulum of the paper, with three runs, the field

@@ -215,7 +215,7 @@ def smoothing(
         run: the position of the run, counted from 0, or from the end if negative.
         ax: n axes, one for each coordinate; new ones if None.
         units: of the coordinates.
-        names: of the coordinates, if they are not q and p.
+        names: of the coordinates; those of the columns of the log, else q and p, if None.
         time_unit: of the times.
         title: above the first panel; the number of the run if None.
 
@@ -226,7 +226,7 @@ def smoothing(
         ValueError: there is no such run, or an argument does not have one entry per coordinate.
     """
     run, n = _position(run, len(runs)), runs.dimension
-    labels = _coordinate_labels(n, units, names)
+    labels = _coordinate_labels(n, units, names or runs.names)
     panels = _column(n, 1, ax)[:, 0]
     curves = runs.smoothing(_BETWEEN - 1)
     ts, mean = np.asarray(curves.times[run]), np.asarray(curves.states[run])
@@ -265,7 +265,7 @@ def fitted(
         run: which run, counted from 0, or from the end if negative.
         ax: n pairs of axes; new ones if None.
         units: of the coordinates.
-        names: of the coordinates, if they are not q and p.
+        names: of the coordinates; those of the columns of the log, else q and p, if None.
         time_unit: of the times.
         title: above the first panel; if None, the number of the run and the share of it from which
             the field was learned.
@@ -277,7 +277,7 @@ def fitted(
         ValueError: there is no such run, or an argument does not have one entry per coordinate.
     """
     run, n = _position(run, len(learned.runs)), learned.runs.dimension
-    labels = _coordinate_labels(n, units, names)
+    labels = _coordinate_labels(n, units, names or learned.runs.names)
     panels = _column(n, 2, ax)
     ts, fit = np.asarray(learned.runs.times[run]), np.asarray(learned.states[run])
     grid = np.interp(np.arange(_BETWEEN * (len(ts) - 1) + 1) / _BETWEEN, np.arange(len(ts)), ts)
