@@ -72,6 +72,7 @@ from hamkernel._structures.joined import Controlled, InputMatrix
 from hamkernel._structures.lagrangian import Lagrangian
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
+from hamkernel._trajectories.lagrangian import LearnedLagrangian
 from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.runs import Runs
@@ -167,6 +168,7 @@ __all__ = [  # noqa: RUF022 - in reading order
     "kinetic",
     "learn",
     "Learned",
+    "LearnedLagrangian",
     "Score",
     "report",
     # What the data say beyond the field.

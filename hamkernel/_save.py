@@ -44,6 +44,7 @@ from jax.experimental import multihost_utils
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._fields.joined import AbstractJoinedField
+from hamkernel._fields.lagrangian import LagrangianField
 from hamkernel._kernels.functions import Bound, Closure, as_pytree
 from hamkernel._kernels.symmetry import identity, reflection, time_reversal
 from hamkernel._observations.measurements import Measurements
@@ -63,7 +64,7 @@ _FIRST_LINE = "hamkernel field, version {}, sha256 {}"
 
 def save(
     path: str | os.PathLike[str],
-    field: AbstractField | AbstractStreamingFit | Learned | Tuned | Posterior,
+    field: AbstractField | AbstractStreamingFit | LagrangianField | Learned | Tuned | Posterior,
 ) -> None:
     """Write a learned field to one file: kernel, hyperparameters, data, coefficients, version.
 
@@ -203,15 +204,17 @@ def load(
 
 
 def _is_saved(cls: Any) -> bool:
-    kinds = AbstractField, AbstractStreamingFit, Learned, Tuned, Posterior
+    kinds = AbstractField, AbstractStreamingFit, LagrangianField, Learned, Tuned, Posterior
     return isinstance(cls, type) and issubclass(cls, kinds) and not inspect.isabstract(cls)
 
 
-def _of_state(field: AbstractField) -> Callable[[Array], Array]:
+def _of_state(field: Any) -> Callable[[Array], Array]:
     """The field as a function of the state alone: where it has inputs or parameters, they are 1."""
     if isinstance(field, AbstractJoinedField):
         u = jnp.ones(field.kernel.input_count, field.offset.dtype)
         return lambda x: field(x, u)
+    if isinstance(field, LagrangianField):  # which may have no acceleration
+        return lambda x: jnp.concatenate([field.momentum(x), field.rest_torques(x)])
     return field
 
 

@@ -100,6 +100,27 @@ def test_the_features_of_torques_are_euler_and_lagrange_by_differences(arm):
         np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-3)
 
 
+def test_a_saved_machine_is_the_same(arm, tmp_path):
+    hk.save(tmp_path / "arm", arm)
+    loaded = hk.load(tmp_path / "arm")
+    q = np.array([0.3, -0.7])
+    for name in ("mass_matrix", "mass_matrix_deviation", "gravity"):
+        np.testing.assert_array_equal(getattr(loaded, name)(q), getattr(arm, name)(q))
+    assert loaded.kernel.angles == (0, 1)
+
+
+@pytest.mark.slow
+def test_tune_finds_the_noise_and_lengthscales():
+    X, tau, A = data(100, 5, noise=0.05)
+    start = hk.Lagrangian(SMOOTH, SMOOTH, angles=(0, 1))
+    tuned = hk.tune(start, X, tau, accelerations=A)
+    np.testing.assert_allclose(jnp.sqrt(100 * tuned.regularization), 0.05, rtol=0.2)
+    assert max(errors(tuned.field)) < 0.01
+    assert tuned.hyperparameters["potential.kernel.lengthscale"] > 1
+    again = hk.fit(tuned.kernel, X, tau, tuned.regularization, accelerations=A)
+    np.testing.assert_allclose(again.mass_matrix(X[0, :2]), tuned.field.mass_matrix(X[0, :2]))
+
+
 def test_a_free_motion_is_scipys(arm):
     def rates(t, x):
         q, v = x[:2], x[2:]

@@ -83,7 +83,7 @@ class LagrangianField(eqx.Module):
         torques = jnp.zeros_like(v) if u is None else self._position(u, "u")
         M = self.mass_matrix(q)
         positive = jnp.linalg.eigvalsh(M)[0] > 0
-        rest = self.inverse_dynamics(q, v, jnp.zeros_like(v))
+        rest = self.rest_torques(x)
         a = require.value(
             jnp.linalg.solve(M, torques - rest),
             ~positive,
@@ -164,6 +164,16 @@ class LagrangianField(eqx.Module):
         """The torques τ = M(q) a + Coriolis forces + ∂V/∂q + friction, shape (m,)."""
         x = jnp.concatenate([self._position(q), self._position(v, "v")])
         return self.features.of_torques(x, self._position(a, "a")) @ self.coefficients
+
+    def rest_torques(self, x: Num[ArrayLike, " n"]) -> Float[Array, " m"]:
+        """The torques with which the state x = (q, v) has no acceleration, shape (m,)."""
+        q, v = jnp.split(self._state(x), 2)
+        return self.inverse_dynamics(q, v, jnp.zeros_like(v))
+
+    @property
+    def offset(self) -> Float[Array, ""]:
+        """0, the constant of the potential, as fields of a Hamiltonian have one."""
+        return jnp.zeros_like(self.least_inertia)
 
     def _variance(self, rows: Float[Array, "*k r"]) -> Float[Array, "*k"]:
         """The variance of rows in kernels, carried by the centres."""

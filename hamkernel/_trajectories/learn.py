@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, overload
 
 import equinox as eqx
 import jax
@@ -25,6 +25,7 @@ from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.completed import completed
+from hamkernel._structures.lagrangian import Lagrangian
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._trajectories.diagnostics import check_identifiable, diagnostics
 from hamkernel._trajectories.evidence import Evidence
@@ -42,6 +43,7 @@ from hamkernel._trajectories.iteration import (
     iterate,
 )
 from hamkernel._trajectories.kalman import as_observations
+from hamkernel._trajectories.lagrangian import LearnedLagrangian, learn_lagrangian
 from hamkernel._trajectories.learned import Learned, empty, misfits
 from hamkernel._trajectories.model import Model, with_amplitude
 from hamkernel._trajectories.preprocessing import (
@@ -64,8 +66,9 @@ from hamkernel._trajectories.segments import LONG, equal_pieces
 from hamkernel._trajectories.smoothing import interpolated, power_of_two
 
 
-@one_blas_thread
-@full_precision
+@overload
+def learn(K: Lagrangian, runs: Runs, *, noise: ArrayLike | None = None) -> LearnedLagrangian: ...
+@overload
 def learn(
     K: AbstractMatrixKernel,
     runs: Runs,
@@ -78,7 +81,22 @@ def learn(
     masses: bool = False,
     iterations: int = 8,
     progress: bool | None = None,
-) -> Learned:
+) -> Learned: ...
+@one_blas_thread
+@full_precision
+def learn(
+    K: AbstractMatrixKernel | Lagrangian,
+    runs: Runs,
+    mean: Callable[..., Array] | None = None,
+    noise: ArrayLike | None = None,
+    solver: Nystrom | None = None,
+    *,
+    process_noise: ArrayLike | None = None,
+    mass: ArrayLike | None = None,
+    masses: bool = False,
+    iterations: int = 8,
+    progress: bool | None = None,
+) -> Any:
     """Learn a field from noisy states at times, without velocities.
 
     Each interval between two samples is linearised about the current path, which is the smoothed
@@ -89,7 +107,9 @@ def learn(
     two is returned.
 
     Args:
-        K: a matrix-valued kernel. Its hyperparameters are the first guess. A structure without an
+        K: a `Lagrangian`, see there, with which a `LearnedLagrangian` is learned from positions, or
+            (q, v), and torques as inputs, and of the arguments below only `noise` has a meaning; or
+            a matrix-valued kernel. Its hyperparameters are the first guess. A structure without an
             amplitude gets one, `Symplectic(k)` becomes `Symplectic(1.0 * k)`. Runs with inputs need
             a `Controlled` one, and runs with parameters a `Family`.
         runs: the log; see `Runs`, which also says how inputs go on between samples.
@@ -136,6 +156,9 @@ def learn(
         UserWarning: once, where a row of `learned.diagnostics` falls short, with its meaning.
     """
     require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
+    if isinstance(K, Lagrangian):
+        unused = {"mean": mean, "solver": solver, "process_noise": process_noise, "mass": mass}
+        return learn_lagrangian(K, runs, noise, unused | {"masses": masses})
     again = LearnAgain(
         kernel=matrix_kernel(K),
         mean=mean if mean is None else as_pytree(mean),

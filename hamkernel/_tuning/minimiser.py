@@ -217,6 +217,19 @@ def most_likely_in_box(
     `deviations` are rough standard deviations σ of h under the likelihood. With
     dh/du = (high − low) cos(u)/2 they give the first inverse Hessian of BFGS, (σ / (dh/du))².
     """
+    run = run_in_box(fn, start, low, high, deviations, steps)
+    return inside_box(run.best.u, low, high), run.best.value
+
+
+def run_in_box(
+    fn: Callable[[Float[Array, " P"]], Float[Array, ""]],
+    start: Float[Array, " P"],
+    low: Float[Array, " P"],
+    high: Float[Array, " P"],
+    deviations: Float[Array, " P"],
+    steps: Any,
+) -> MinimiserRun:
+    """The run that ends at the point of `most_likely_in_box`."""
     # A hyperparameter within a tenth of its standard deviation of the best value is good enough;
     # there the quadratic −log p is ½ .1² = .005 above its minimum.
     bfgs = BoxBFGS(atol=jnp.asarray(0.005, start.dtype))
@@ -228,8 +241,7 @@ def most_likely_in_box(
         value = fn(inside_box(u, low, high))
         return jnp.where(jnp.isfinite(value), value, jnp.inf), value
 
-    run = minimise(bfgs, loss, init(bfgs, loss, u).with_curvature(inverse), steps)
-    return inside_box(run.best.u, low, high), run.best.value
+    return minimise(bfgs, loss, init(bfgs, loss, u).with_curvature(inverse), steps)
 
 
 def _better(best: Evaluation, candidate: Evaluation) -> Evaluation:

@@ -155,6 +155,13 @@ def _amplitudes(
     return amplitudes
 
 
+def boxes_of(
+    k: AbstractScalarKernel, name: str, X: Float[np.ndarray, "N n"], amplitude: float
+) -> list[Hyperparameter]:
+    """The trainable leaves of the scalar kernel `name`, with their boxes from points X."""
+    return list(_walk((GetAttrKey(name),), k, X, {}, amplitude))
+
+
 def _walk(
     path: tuple,
     node: object,

@@ -13,7 +13,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -32,8 +32,11 @@ from hamkernel._observations.measurements import observations
 from hamkernel._posterior import Posterior, posterior_of_problem
 from hamkernel._show import printable, text
 from hamkernel._solvers.fit import check_solver, features_of_parts, field_of_problem
+from hamkernel._solvers.lagrangian import field_of_torques, torque_data
 from hamkernel._solvers.problem import AbstractSolver, Problem, make_problem
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.lagrangian import Lagrangian, lagrangian_features
+from hamkernel._tuning.lagrangian import StrongRows, likeliest, sizes_of_torques
 from hamkernel._tuning.minimiser import MinimiserRun
 from hamkernel._tuning.objective import (
     Criterion,
@@ -125,7 +128,7 @@ _posterior = one_blas_thread(full_precision(posterior_of_problem))
 @one_blas_thread
 @full_precision
 def tune(
-    K: AbstractMatrixKernel,
+    K: AbstractMatrixKernel | Lagrangian,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
     Y: Num[ArrayLike, "N n"] | None = None,
     regularization: ArrayLike = 1e-3,
@@ -142,6 +145,7 @@ def tune(
     progress: bool = False,
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
+    accelerations: Num[ArrayLike, "N m"] | None = None,
 ) -> Tuned:
     """Tune every hyperparameter of K, and λ with them, down the gradient of a validation loss.
 
@@ -196,6 +200,9 @@ def tune(
         inputs: u at each state, for a `Controlled` kernel, shape (N, m). An objective of your own
             is then called with (K, data, None, regularization), data the velocities with inputs.
         parameters: θ at each state, for a `Family`, shape (N, p); likewise.
+        accelerations: q̈ at each state, for a `Lagrangian`, shape (N, m). X are then states (q, v),
+            Y torques, and the objective is the marginal likelihood. Of the arguments above only
+            `max_steps` is used.
 
     Returns:
         A `Tuned`. Its numbers are finite, since points where the objective is not finite cannot
@@ -235,6 +242,8 @@ def tune(
     also keeps cross-validation away from fields whose rounding errors are too large for an
     integrator, ‖a‖ tr(G) √ε > ‖y‖ for the coefficients a. The likelihood needs no penalty.
     """
+    if isinstance(K, Lagrangian) or accelerations is not None:
+        return _tuned_lagrangian(K, X, Y, accelerations, max_steps)
     frozen = (frozen,) if isinstance(frozen, str) else frozen
     _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
     _check_optimiser(optimiser)
@@ -243,8 +252,7 @@ def tune(
     problem = make_problem(K, X, Y, regularization, mean, inputs, parameters)
     local = problem.to_one_device()
     K, rows = local.kernel, local.rows
-    exact = solver is None and is_of_parts(K)
-    solver = features_of_parts() if exact else solver
+    solver = features_of_parts() if (exact := solver is None and is_of_parts(K)) else solver
     # With 5000 pairs one loss takes .1 s, and the features of one state, for the size of K, 6 ms.
     size, sizing = (64, 1) if exact else (None, None)
     # The velocities of positions minus a known kinetic energy may be small, and are noise.
@@ -341,6 +349,30 @@ def _result(
         at_bounds=space.at_bounds(best_run.best.u),
         bounds=space.bounds(size),
         problem=dataclasses.replace(problem, spread=None),
+    )
+
+
+def _tuned_lagrangian(K: Any, X: Any, Y: Any, accelerations: Any, max_steps: int) -> Tuned:
+    """The likeliest kernel and noise of a machine, and the fit with them."""
+    if not isinstance(K, Lagrangian):
+        raise TypeError("accelerations= belongs to hk.Lagrangian(potential=…, inertia=…).")
+    data = torque_data(K, X, Y, accelerations)
+    features = lagrangian_features(K, data.states)
+    end = likeliest(features, StrongRows(data), sizes_of_torques(data), steps=max_steps)
+    deviation = jnp.exp(jnp.log(end.deviation).mean())
+    field = field_of_torques(end.kernel, data, deviation)
+    regularization = deviation**2 / len(data.states)
+    return Tuned(
+        kernel=cast(Any, end.kernel),
+        regularization=regularization,
+        loss=jnp.asarray(end.loss, deviation.dtype),
+        field=cast(Any, field),
+        hyperparameters=end.values | {RIDGE: regularization},
+        converged=jnp.asarray(end.converged),
+        steps=jnp.asarray(end.steps),
+        start_losses=jnp.asarray([end.loss], deviation.dtype),
+        at_bounds=end.at_bounds,
+        bounds=end.bounds,
     )
 
 

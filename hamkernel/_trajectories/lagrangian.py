@@ -1,0 +1,305 @@
+"""Learning a `Lagrangian` from positions and torques: weak rows, solved for twice."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hamkernel import _require as require
+from hamkernel._fields.lagrangian import LagrangianField, lagrangian_field
+from hamkernel._machine import compiled, compiled_by_size
+from hamkernel._show import printable, text
+from hamkernel._solvers.lagrangian import (
+    check_machine,
+    missing_friction,
+    plain_friction,
+    solved,
+    with_anchor,
+)
+from hamkernel._structures.lagrangian import (
+    Lagrangian,
+    LagrangianFeatures,
+    lagrangian_features,
+)
+from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics
+from hamkernel._trajectories.runs import Runs
+from hamkernel._trajectories.weak import (
+    Pieces,
+    path_covariance,
+    smoothed_pieces,
+    weak_rows,
+    whiten,
+)
+from hamkernel._tuning.lagrangian import Sizes, likeliest
+
+
+class LearnedLagrangian(eqx.Module):
+    """The machine that `learn` found with a `Lagrangian`.
+
+    Attributes:
+        field: the machine, with the bands of what it says: `field.mass_matrix_deviation(q)`.
+        kernel: the kernel with its hyperparameters.
+        noise: the standard deviation of the sensor noise of each coordinate, shape (n,).
+        torque_noise: the standard deviation of the torque of each joint at each sample, shape (m,).
+        states: the smoothed states (q, v) of each run at its times, shape (T, 2m).
+        log_evidence: the logarithm of the marginal likelihood of the weak rows, but for a constant.
+            It compares kernels that were learned from the same runs.
+        converged: whether the field may be used: no row of `diagnostics` that decides falls short.
+        diagnostics: a table with one row for each question; `.failing` has the names of the rows
+            that fall short.
+        runs: the runs that were given.
+    """
+
+    field: LagrangianField
+    kernel: Lagrangian
+    noise: Float[Array, " n"]
+    torque_noise: Float[Array, " m"]
+    states: tuple[Float[Array, "T n"], ...]
+    log_evidence: float = eqx.field(static=True)
+    converged: bool = eqx.field(static=True)
+    diagnostics: Diagnostics = eqx.field(static=True)
+    runs: Runs
+
+    def __repr__(self) -> str:
+        samples = sum(len(x) for x in self.states)
+        lines = [
+            f"LearnedLagrangian from {len(self.states)} runs, {samples} samples: "
+            + ("usable" if self.converged else "do not use this field"),
+            f"kernel         {text(self.kernel)}",
+            f"noise          {text(self.noise)}",
+            f"torque noise   {text(self.torque_noise)}",
+            f"diagnostics    {', '.join(self.diagnostics.failing) or 'nothing'} falls short",
+            "next           .field.mass_matrix(q), .field.mass_matrix_deviation(q), .diagnostics",
+        ]
+        return printable("\n".join(lines))
+
+    @property
+    def posterior(self) -> LagrangianField:
+        """The field, which keeps its factor: its methods `…_deviation` are the bands."""
+        return self.field
+
+
+def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, unused: dict[str, Any]) -> Any:
+    """The machine from runs of positions, or of (q, v), with torques as inputs; see `learn`.
+
+    Args:
+        K: the kernel.
+        runs: the runs.
+        noise: the standard deviations of the coordinates, if they are known.
+        unused: arguments of `learn` that say nothing of a Lagrangian.
+    """
+    m, noise = _check(K, runs, noise, unused)
+    smoothing = smoothed_pieces(runs, m, noise)
+    pieces = smoothing.pieces
+    X = jnp.asarray(pieces.states())
+    features = lagrangian_features(K, X)
+    sizes = _sizes(pieces, m, smoothing.lengthscale)
+    R = pieces.targets[0].size
+    none = jnp.zeros((len(pieces.targets), R, R))
+    first = likeliest(features, _WeakRows(pieces, none), sizes)
+    shown = _with_kernel(features, first.kernel)
+    weights = _solve(shown, pieces, none, first.deviation)[1]
+    covariance = _covariance(shown, weights, pieces)
+    rows = _WeakRows(pieces, covariance)
+    end = likeliest(_with_kernel(features, first.kernel), rows, sizes, np.asarray(first.deviation))
+    shown = _with_kernel(features, end.kernel)
+    triangle, weights, A, y = _solve(shown, pieces, covariance, end.deviation)
+    raw = np.asarray(_rows(shown, pieces))
+    residual = (pieces.targets - raw @ np.asarray(weights)) / pieces.values[0].sum()
+    residual = jnp.asarray(residual[pieces.inside])
+    field = lagrangian_field(shown, weights, triangle, end.deviation, residual, X)
+    joints = ()
+    if K.friction is None:
+        joints = missing_friction(A, y, _friction(shown, pieces, covariance, end.deviation))
+    table = _diagnostics(field, smoothing, sizes, joints)
+    if table.warning:
+        require.warn(table.warning)
+    return LearnedLagrangian(
+        field=field,
+        kernel=end.kernel,
+        noise=jnp.asarray(smoothing.noise),
+        torque_noise=end.deviation,
+        states=tuple(map(jnp.asarray, smoothing.states)),
+        log_evidence=-end.loss,
+        converged=table.is_usable,
+        diagnostics=table,
+        runs=runs,
+    )
+
+
+def _check(K: Lagrangian, runs: Any, noise: Any, unused: dict[str, Any]) -> tuple[int, Any]:
+    if not isinstance(runs, Runs):
+        raise TypeError(f"learn takes hk.Runs(times, states); got a {type(runs).__name__}.")
+    extra = [name for name, value in unused.items() if value is not None and value is not False]
+    if extra:
+        raise TypeError(f"{extra[0]}= does not belong to learning a Lagrangian: leave it out.")
+    if runs.parameters is not None:
+        raise TypeError("a Lagrangian has no parameters: leave them out of Runs.")
+    if not runs.is_decided:
+        raise ValueError(
+            "between='auto' and delay='fit' are not looked for with a Lagrangian: give both."
+        )
+    n = runs.dimension
+    if runs.inputs is None:
+        anchor = K.known_mass_matrix
+        m = n if anchor is None else len(anchor[0])
+        check_machine(K, np.zeros(1), m)
+    else:
+        m = runs.input_count
+        check_machine(K, np.concatenate(runs.inputs), m)
+    if n not in (m, 2 * m):
+        raise ValueError(
+            f"states have {n} coordinates and there are {m} torques: a Lagrangian is learned from "
+            "positions (T, m), or positions and velocities (T, 2m), with a torque for each "
+            "position, zero where a joint has no motor."
+        )
+    if jnp.zeros(()).dtype != jnp.float64:
+        raise ValueError("learn needs doubles: jax.config.update('jax_enable_x64', True) first.")
+    if noise is not None:
+        noise = np.asarray(require.positive(noise, "noise", "Leave it out to have it smoothing."))
+        if noise.shape not in ((), (n,)):
+            raise ValueError(f"noise has shape {noise.shape}; a number or shape ({n},) is needed.")
+        noise = np.broadcast_to(noise, (n,))
+    return m, noise
+
+
+def _sizes(pieces: Pieces, m: int, lengthscale: float) -> Sizes:
+    """Torques as means over windows; a sinusoid has the lengthscale 2.7/ω, see `preprocess`."""
+    speed = float(np.sqrt(np.mean(pieces.states()[:, m:] ** 2)))
+    acceleration = 2.7 * speed / lengthscale
+    torque = np.sqrt(np.mean(pieces.targets[pieces.inside] ** 2)) / pieces.values[0].sum()
+    # Free motions have no torques: any scale that the anchor sets is within the boxes.
+    torque = float(torque) or acceleration
+    white = np.sqrt(pieces.overlap[0, 0] * pieces.spacing) / pieces.values[0].sum()
+    return Sizes(torque, speed, acceleration, torque / float(white))
+
+
+class _WeakRows(eqx.Module):
+    """The rows of all pieces as the search calls them."""
+
+    pieces: Pieces
+    covariance: Float[Array, "B R R"]
+
+    def __call__(self, features: LagrangianFeatures, deviation: Float[Array, " m"]):
+        rows = features.finished(weak_rows(features.of_motion, self.pieces))
+        return whiten(rows, self.pieces, self.covariance, deviation)
+
+
+_with_kernel = compiled(lambda features, K: features.with_kernel(K))
+
+
+@compiled_by_size
+def _solve(features, pieces, covariance, deviation) -> tuple[Array, ...]:
+    A, y, _ = _WeakRows(pieces, covariance)(features, deviation)
+    return *solved(*with_anchor(features, A, y)), A, y
+
+
+@compiled_by_size
+def _rows(features, pieces) -> Float[Array, "B W m r"]:
+    return features.finished(weak_rows(features.of_motion, pieces))
+
+
+@compiled_by_size
+def _covariance(features, weights, pieces) -> Float[Array, "B R R"]:
+    coefficients = features.on_kernels(weights)
+
+    def law(x):
+        a, b = features.of_motion(x)
+        return a @ coefficients, b @ coefficients
+
+    return path_covariance(law, pieces)
+
+
+@compiled_by_size
+def _friction(features, pieces, covariance, deviation) -> Float[Array, "N k"]:
+    """The rows of friction v and tanh(v/ε), whitened as those of the Lagrangian."""
+    m = features.count
+
+    def law(x):
+        columns = plain_friction(features, x[None, m:])[0]
+        return jnp.zeros_like(columns), columns
+
+    return whiten(weak_rows(law, pieces), pieces, covariance, deviation)[0]
+
+
+_LEAST_SWING = 5.0  # samples in a swing, as in `diagnostics`: with fewer noise hides the motion
+
+
+def _diagnostics(
+    field: LagrangianField, smoothing: Any, sizes: Sizes, joints: tuple[int, ...]
+) -> Diagnostics:
+    share = float(np.max(np.asarray(field.noise))) / sizes.error
+    # A sinusoid of period 2π/ω has the lengthscale 2.7/ω.
+    swing = 2.3 * smoothing.lengthscale / smoothing.pieces.spacing
+    rows = len(field.residual) * field.features.count
+    # tr (BᵀB (BᵀB + I)⁻¹) = r − ‖R⁻¹‖² in the norm of Frobenius.
+    inverse = np.linalg.inv(np.asarray(field.triangle))
+    used = len(field.coefficients) - float(np.sum(inverse**2))
+    return Diagnostics(
+        (
+            _mass_matrix(field),
+            _friction_of(joints),
+            Diagnostic(
+                "torques",
+                f"{share:.2g} unexplained",
+                "0.5",
+                share < 0.5,
+                f"errors of the torques, averaged over windows, are {share:.2g} of them"
+                if share < 0.5
+                else "the machine explains little of the torques",
+                "Likely causes: torques that act at other times than logged (delay=…), in other "
+                "units, or on other joints; friction; a flexible part.",
+                decides=True,
+            ),
+            Diagnostic(
+                "degrees of freedom",
+                f"{rows - used:.0f} of {rows}",
+                "10",
+                rows - used >= 10,
+                f"{rows} rows determine {used:.0f} numbers",
+                "Log more.",
+                decides=True,
+            ),
+            Diagnostic(
+                "sampling",
+                f"{swing:.1f} samples a swing",
+                f"{_LEAST_SWING:.0f}",
+                swing >= _LEAST_SWING,
+                f"there are {swing:.1f} samples a swing",
+                "Sample faster: with fewer than five, noise and motion cannot be told apart.",
+            ),
+        )
+    )
+
+
+def _mass_matrix(field: LagrangianField) -> Diagnostic:
+    least, deviation = float(field.least_inertia), float(field.least_inertia_deviation)
+    return Diagnostic(
+        "mass matrix",
+        f"{least:.3g} with a deviation of {deviation:.2g}",
+        "two deviations",
+        field.is_identified,
+        field.refusal.split(". ")[0] or "the mass matrix is positive definite all along the runs",
+        "Motions along one path do not tell inertia from gravity and friction: log unused.",
+        decides=True,
+    )
+
+
+def _friction_of(joints: tuple[int, ...]) -> Diagnostic:
+    names = ", ".join(map(str, joints))
+    return Diagnostic(
+        "friction",
+        f"joints {names}" if joints else "none is missing",
+        "log p + 10",
+        not joints,
+        f"the torques are much likelier with friction in joint {names}, without which the "
+        "mass matrix is wrong"
+        if joints
+        else "the torques do not ask for friction that the kernel lacks",
+        "Take hk.Lagrangian(…, friction=True).",
+        decides=True,
+    )

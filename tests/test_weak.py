@@ -1,0 +1,158 @@
+"""Weak rows and `hk.learn` with a `Lagrangian`, beside closed forms."""
+
+# pyright: reportArgumentType=false, reportAttributeAccessIssue=false, reportCallIssue=false
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.integrate import solve_ivp
+
+import hamkernel as hk
+from hamkernel._trajectories import weak
+from hamkernel._trajectories.smoothing import Process, smooth
+
+PROCESS = Process(jnp.log(1.3), jnp.log(2.0), jnp.log(0.1))
+
+
+def test_covariances_are_derivatives_of_one_another():
+    gaps, h = np.array([-1.3, -0.2, 0.4, 2.0]), 1e-5
+    k, first, second = weak._covariances(PROCESS, gaps)
+    above, below = (weak._covariances(PROCESS, gaps + s * h) for s in (1, -1))
+    np.testing.assert_allclose(first, (above[0] - below[0]) / (2 * h), rtol=1e-7)
+    np.testing.assert_allclose(second, -(above[1] - below[1]) / (2 * h), rtol=1e-7)
+    np.testing.assert_allclose(weak._covariances(PROCESS, np.zeros(1))[0], 1.3**2)
+    assert k[1] > k[0]
+
+
+def test_the_conditioned_path_is_that_of_the_kalman_smoother():
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(0.05, 0.3, 30))
+    y = np.sin(t) + 0.1 * rng.normal(size=30)
+    steps = jnp.asarray(np.diff(t, prepend=t[0]))
+    centre = y.mean()
+    wanted = smooth(PROCESS, steps, jnp.asarray(y - centre), jnp.ones(30, bool))
+    counts = np.ones((30, 1))
+    (q, v), S = weak._posterior_path(PROCESS, t, y[:, None], counts, (0.1, 0.0), t)
+    np.testing.assert_allclose(q - centre, wanted.value, atol=1e-9)
+    np.testing.assert_allclose(v, wanted.slope, atol=1e-8)
+    deviations = np.sqrt(np.diagonal(S))
+    np.testing.assert_allclose(deviations[:30], wanted.deviation, rtol=1e-6)
+    np.testing.assert_allclose(deviations[30:], wanted.slope_deviation, rtol=1e-6)
+    both = np.column_stack([y, np.cos(t)])
+    counts = np.ones((30, 2))
+    (_, w), T = weak._posterior_path(PROCESS, t, both, counts, (0.1, 1e-3), t)
+    np.testing.assert_allclose(w, np.cos(t), atol=5e-3)
+    assert np.diagonal(T)[:30].max() < np.diagonal(S)[:30].max()
+
+
+def pendulum(x):
+    """Momentum 2v and force 3 sin q, so that 2a + 3 sin q is the torque."""
+    q, v = x
+    return jnp.array([2.0 * v]), jnp.array([3.0 * jnp.sin(q)])
+
+
+def one_piece(path):
+    nodes, half = len(path), 12
+    s = (np.arange(nodes)[None] - np.array([12, 24])[:, None]) / half
+    phi, slope = weak._bump(s)
+    step = 0.02
+    S = np.random.default_rng(1).normal(size=(1, 1, 2 * nodes, 2 * nodes))
+    S = S @ np.swapaxes(S, 2, 3)
+    inside = np.ones((1, 2), bool)
+    targets = np.zeros((1, 2, 1))
+    windows = phi * step, slope / half
+    return weak.Pieces(path[None], S, *windows, phi @ phi.T * step, targets, inside, step)
+
+
+def test_weak_rows_are_averages_of_the_torque_and_their_covariance_is_to_first_order():
+    t = 0.02 * np.arange(37)
+    q, v, a = np.sin(3 * t), 3 * np.cos(3 * t), -9 * np.sin(3 * t)
+    piece = one_piece(np.column_stack([q, v]))
+    rows = weak.weak_rows(pendulum, piece).reshape(2)
+    wanted = piece.values @ (2 * a + 3 * np.sin(q))
+    np.testing.assert_allclose(rows, wanted, rtol=1e-5)
+    slopes = jax.jacfwd(lambda path: weak.weak_rows(pendulum, piece._replace(path=path)))
+    D = np.swapaxes(slopes(piece.path).reshape(2, 37, 2), 1, 2).reshape(2, 74)
+    found = weak.path_covariance(pendulum, piece)[0]
+    np.testing.assert_allclose(found, D @ piece.covariance[0, 0] @ D.T, rtol=1e-6)
+    deviation = jnp.array([0.3])
+    A, y, lost = weak.whiten(jnp.eye(2)[None, :, None], piece, found[None], deviation)
+    C = found + 0.09 * piece.spacing * piece.overlap
+    np.testing.assert_allclose(A.T @ A, np.linalg.inv(C), rtol=1e-8)
+    np.testing.assert_allclose(lost, np.linalg.slogdet(C)[1] / 2, rtol=1e-10)
+    assert not y.any()
+
+
+def swings(count=3, noise=1e-3, viscous=0.0, dry=0.0, seed=0):
+    """A pendulum 2a + 20 sin q + friction = u, 15 s at 50 Hz, driven by two sines."""
+    rng, ts = np.random.default_rng(seed), np.arange(751) / 50
+    logs = []
+    for _ in range(count):
+        w, p, b = rng.uniform(1, 5, 2), rng.uniform(0, 6, 2), rng.uniform(3, 9, 2)
+
+        def motor(t, w=w, p=p, b=b):
+            return float(b @ np.sin(w * t + p))
+
+        def rates(t, x, motor=motor):
+            rubs = viscous * x[1] + dry * np.tanh(x[1] / 0.1)
+            return [x[1], (motor(t) - 20 * np.sin(x[0]) - rubs) / 2]
+
+        run = solve_ivp(rates, (0, 15), rng.uniform(-1, 1, 2), t_eval=ts, rtol=1e-9, atol=1e-9)
+        q = run.y[0] + noise * rng.normal(size=len(ts))
+        logs.append((q[:, None], np.array([[motor(t)] for t in ts])))
+    q, u = zip(*logs, strict=True)
+    return hk.Runs([ts] * count, list(q), inputs=list(u), between="linear")
+
+
+ONE = hk.Lagrangian(hk.Gaussian(1.0), hk.Gaussian(1.0), angles=(0,))
+
+
+@pytest.mark.slow
+def test_a_motor_on_a_pendulum_is_learned_from_its_angle():
+    learned = hk.learn(ONE, swings())
+    assert learned.converged
+    assert learned.posterior is learned.field
+    Q = np.linspace(-1.2, 1.2, 20)[:, None]
+    M, G = (jax.vmap(f)(Q).ravel() for f in (learned.field.mass_matrix, learned.field.gravity))
+    np.testing.assert_allclose(M, 2.0, rtol=0.01)
+    np.testing.assert_allclose(G, 20 * np.sin(Q[:, 0]), atol=0.1)
+    band = jax.vmap(learned.field.mass_matrix_deviation)(Q).ravel()
+    assert np.mean(np.abs(M - 2.0) < 3 * band + 2e-4) > 0.9
+    assert "usable" in repr(learned)
+    np.testing.assert_allclose(learned.noise, 1e-3, rtol=0.2)
+
+
+@pytest.mark.slow
+def test_friction_that_is_missing_is_named_and_found():
+    runs = swings(viscous=0.8, dry=0.6, seed=1)
+    with pytest.warns(UserWarning, match="friction in joint 0"):
+        learned = hk.learn(ONE, runs)
+    assert "friction" in learned.diagnostics.failing
+    assert not learned.converged
+    field = hk.learn(hk.Lagrangian(ONE.potential, ONE.inertia, (0,), friction=True), runs).field
+    np.testing.assert_allclose(field.mass_matrix(np.zeros(1)), 2.0, rtol=0.01)
+    np.testing.assert_allclose(field.friction(np.ones(1)), 0.8 + 0.6, rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "said"),
+    [
+        ({"mean": lambda x: x}, TypeError, "mean= does not belong"),
+        ({"masses": True}, TypeError, "masses= does not belong"),
+        ({"runs": 1}, TypeError, r"hk\.Runs"),
+        ({"inputs": None}, ValueError, "known_mass_matrix"),
+        ({"inputs": [np.zeros((40, 3))]}, ValueError, "with a torque for each position"),
+        ({"noise": -1.0}, ValueError, "positive"),
+    ],
+)
+@pytest.mark.filterwarnings("ignore::UserWarning")
+def test_runs_of_which_no_machine_can_be_learned_are_refused(change, error, said):
+    t = np.arange(40) / 10
+    u = change.pop("inputs", [np.sin(np.arange(80.0)).reshape(40, 2)])
+    if u is not None and u[0].shape[1] == 3:
+        u = [np.sin(np.arange(120.0)).reshape(40, 3)]
+    runs = change.pop("runs", hk.Runs([t], [np.cos(np.outer(t, [1, 2]))], inputs=u))
+    K = hk.Lagrangian(hk.Gaussian(1.0), hk.Gaussian(1.0))
+    with pytest.raises(error, match=said):
+        hk.learn(K, runs, **change)
