@@ -221,10 +221,12 @@ class Posterior(eqx.Module):
         Raises:
             ValueError: a shape does not fit, or U is missing. TypeError: the field has no inputs.
         """
-        is_joined = isinstance(self.field, AbstractJoinedField)
-        if U is not None and not is_joined:
+        if isinstance(self.field, AbstractJoinedField):
+            means = self.field.evaluate(X, U)
+        elif U is None:
+            means = self.field.evaluate(X)
+        else:
             raise TypeError("the field has no inputs: posterior.evaluate(X).")
-        means = self.field.evaluate(X, U) if is_joined else self.field.evaluate(X)
         states = (jnp.asarray(X, means.dtype), *(() if U is None else (jnp.asarray(U),)))
         # A state takes D n numbers for D rows: of 64 states and 3000 rows, 3 MB for n = 2.
         return means, jax.lax.map(lambda s: self.deviation(*s), states, batch_size=64)

@@ -25,8 +25,8 @@ from hamkernel._structures.lagrangian import (
     LagrangianFeatures,
     lagrangian_features,
 )
+from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics
 from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.table import Diagnostic, Diagnostics
 from hamkernel._trajectories.weak import (
     Pieces,
     path_covariance,
@@ -233,7 +233,7 @@ def _diagnostics(
     field: LagrangianField, smoothing: Any, sizes: Sizes, joints: tuple[int, ...]
 ) -> Diagnostics:
     share = float(np.max(np.asarray(field.noise))) / sizes.error
-    # A swing is 2π/ω long, and the lengthscale of the smoother 2.7/ω.
+    # A sinusoid of period 2π/ω has the lengthscale 2.7/ω.
     swing = 2.3 * smoothing.lengthscale / smoothing.pieces.spacing
     rows = len(field.residual) * field.features.count
     # tr (BᵀB (BᵀB + I)⁻¹) = r − ‖R⁻¹‖² in the norm of Frobenius.
@@ -241,7 +241,8 @@ def _diagnostics(
     used = len(field.coefficients) - float(np.sum(inverse**2))
     return Diagnostics(
         (
-            *_machine_rows(field, joints),
+            _mass_matrix(field),
+            _friction_of(joints),
             Diagnostic(
                 "torques",
                 f"{share:.2g} unexplained",
@@ -275,31 +276,30 @@ def _diagnostics(
     )
 
 
-def _machine_rows(field: LagrangianField, joints: tuple[int, ...]) -> tuple[Diagnostic, ...]:
-    """The rows of the mass matrix and of missing friction."""
+def _mass_matrix(field: LagrangianField) -> Diagnostic:
     least, deviation = float(field.least_inertia), float(field.least_inertia_deviation)
+    return Diagnostic(
+        "mass matrix",
+        f"{least:.3g} with a deviation of {deviation:.2g}",
+        "two deviations",
+        field.is_identified,
+        field.refusal.split(". ")[0] or "the mass matrix is positive definite all along the runs",
+        "Motions along one path do not tell inertia from gravity and friction: log unused.",
+        decides=True,
+    )
+
+
+def _friction_of(joints: tuple[int, ...]) -> Diagnostic:
     names = ", ".join(map(str, joints))
-    return (
-        Diagnostic(
-            "mass matrix",
-            f"{least:.3g} with a deviation of {deviation:.2g}",
-            "two deviations",
-            field.is_identified,
-            field.refusal.split(". ")[0]
-            or "the mass matrix is positive definite all along the runs",
-            "Motions along one path do not tell inertia from gravity and friction: log unused.",
-            decides=True,
-        ),
-        Diagnostic(
-            "friction",
-            f"joints {names}" if joints else "none is missing",
-            "log p + 10",
-            not joints,
-            f"the torques are much likelier with friction in joint {names}, without which the "
-            "mass matrix is wrong"
-            if joints
-            else "the torques do not ask for friction that the kernel lacks",
-            "Take hk.Lagrangian(…, friction=True).",
-            decides=True,
-        ),
+    return Diagnostic(
+        "friction",
+        f"joints {names}" if joints else "none is missing",
+        "log p + 10",
+        not joints,
+        f"the torques are much likelier with friction in joint {names}, without which the "
+        "mass matrix is wrong"
+        if joints
+        else "the torques do not ask for friction that the kernel lacks",
+        "Take hk.Lagrangian(…, friction=True).",
+        decides=True,
     )

@@ -22,7 +22,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.smoothing import Process, processes, smoothed
+from hamkernel._trajectories.smoothing import Coordinate, Process, processes, smoothed
 
 # In lengthscales of the smoothed positions. Of a two-link arm at 100 Hz, with noise 1e-3 rad, M was
 # off by .22, .09 and .10 % with windows (1 − s²)³ of .35, .7 and 1.2; (1 − s²)⁵ of 1.2 times their
@@ -98,18 +98,7 @@ def smoothed_pieces(runs: Runs, m: int, noise: Float[np.ndarray, " n"] | None) -
     """
     times, states = runs.on_host()
     positions = [x[:, :m] for x in states]
-    coordinates = processes(times, positions)
-    for c, coordinate in enumerate(coordinates):
-        if not np.isfinite(coordinate.process.log_amplitude):
-            raise ValueError(
-                f"position {c} {'does not move' if coordinate.seen else 'is missing'}."
-            )
-    if noise is not None:
-        log_noise = np.log(np.asarray(noise[:m], float))
-        coordinates = [
-            c._replace(process=c.process._replace(log_noise=jnp.asarray(log_noise[i])))
-            for i, c in enumerate(coordinates)
-        ]
+    coordinates = _processes(times, positions, noise)
     paths = smoothed(coordinates, times, positions)
     along = [
         np.concatenate([paths.value[r, : len(t)], paths.slope[r, : len(t)]], axis=1)
@@ -160,6 +149,21 @@ def smoothed_pieces(runs: Runs, m: int, noise: Float[np.ndarray, " n"] | None) -
     windows = phi * step, slope / half
     made = Pieces(path, covariance, *windows, overlap, targets, inside, spacing)
     return Smoothed(made, np.concatenate([of_positions, of_slopes]), along, length)
+
+
+def _processes(times, positions, noise: Float[np.ndarray, " n"] | None) -> list[Coordinate]:
+    """The Gaussian process in time of each position, with its noise where that is known."""
+    coordinates = processes(times, positions)
+    for c, coordinate in enumerate(coordinates):
+        if not np.isfinite(coordinate.process.log_amplitude):
+            raise ValueError(
+                f"position {c} {'does not move' if coordinate.seen else 'is missing'}."
+            )
+        if noise is not None:
+            log_noise = jnp.log(jnp.asarray(noise[c], float))
+            process = coordinate.process._replace(log_noise=log_noise)
+            coordinates[c] = coordinate._replace(process=process)
+    return coordinates
 
 
 def _bump(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

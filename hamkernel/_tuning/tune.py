@@ -32,7 +32,7 @@ from hamkernel._observations.measurements import observations
 from hamkernel._posterior import Posterior, posterior_of_problem
 from hamkernel._show import printable, text
 from hamkernel._solvers.fit import check_solver, features_of_parts, field_of_problem
-from hamkernel._solvers.lagrangian import TorqueData, field_of_torques, torque_data
+from hamkernel._solvers.lagrangian import field_of_torques, torque_data
 from hamkernel._solvers.problem import AbstractSolver, Problem, make_problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.lagrangian import Lagrangian, lagrangian_features
@@ -242,10 +242,8 @@ def tune(
     also keeps cross-validation away from fields whose rounding errors are too large for an
     integrator, ‖a‖ tr(G) √ε > ‖y‖ for the coefficients a. The likelihood needs no penalty.
     """
-    if isinstance(K, Lagrangian):
-        return _tuned_lagrangian(K, torque_data(K, X, Y, accelerations), max_steps)
-    if accelerations is not None:
-        raise TypeError("accelerations= belongs to hk.Lagrangian(potential=…, inertia=…).")
+    if isinstance(K, Lagrangian) or accelerations is not None:
+        return _tuned_lagrangian(K, X, Y, accelerations, max_steps)
     frozen = (frozen,) if isinstance(frozen, str) else frozen
     _check_options(K, X, Y, regularization, frozen, bounds, starts, max_steps)
     _check_optimiser(optimiser)
@@ -254,8 +252,7 @@ def tune(
     problem = make_problem(K, X, Y, regularization, mean, inputs, parameters)
     local = problem.to_one_device()
     K, rows = local.kernel, local.rows
-    exact = solver is None and is_of_parts(K)
-    solver = features_of_parts() if exact else solver
+    solver = features_of_parts() if (exact := solver is None and is_of_parts(K)) else solver
     # With 5000 pairs one loss takes .1 s, and the features of one state, for the size of K, 6 ms.
     size, sizing = (64, 1) if exact else (None, None)
     # The velocities of positions minus a known kinetic energy may be small, and are noise.
@@ -355,8 +352,11 @@ def _result(
     )
 
 
-def _tuned_lagrangian(K: Lagrangian, data: TorqueData, max_steps: int) -> Tuned:
+def _tuned_lagrangian(K: Any, X: Any, Y: Any, accelerations: Any, max_steps: int) -> Tuned:
     """The likeliest kernel and noise of a machine, and the fit with them."""
+    if not isinstance(K, Lagrangian):
+        raise TypeError("accelerations= belongs to hk.Lagrangian(potential=…, inertia=…).")
+    data = torque_data(K, X, Y, accelerations)
     features = lagrangian_features(K, data.states)
     end = likeliest(features, StrongRows(data), sizes_of_torques(data), steps=max_steps)
     deviation = jnp.exp(jnp.log(end.deviation).mean())
