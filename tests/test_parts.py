@@ -240,8 +240,8 @@ def test_weak_rows_integrate_by_parts():
     t = np.linspace(0.0, 2.0, 61)
     made = windows.windows(t, 12)
     assert len(made.value) == 9
-    np.testing.assert_allclose(made.value @ np.cos(t), -made.slope @ np.sin(t), atol=3e-4)
-    np.testing.assert_allclose(made.value @ -np.sin(t), made.bend @ np.sin(t), atol=3e-4)
+    np.testing.assert_allclose(made.value @ np.cos(t), -made.slope @ np.sin(t), atol=5e-6)
+    np.testing.assert_allclose(made.value @ -np.sin(t), made.bend @ np.sin(t), atol=1e-4)
     noisy = np.sin(3 * t)[None, :, None] + 0.1 * RNG.normal(size=(1, 61, 4))
     none = np.zeros_like(noisy)
     channels = windows.Channels(t[None] - 1, noisy, none, none == 0, none != 0)

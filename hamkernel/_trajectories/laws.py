@@ -293,7 +293,7 @@ def negative_log_likelihood(model: LawModel, chunks: Chunk, factors, mean, of_ro
     ridge = jnp.exp(2 * model.log_scatter)
     empty = jnp.sum(jnp.abs(chunks.value).sum(axis=2) == 0) * len(of_rows)
     density = log_density(LowRankSystem(F, ridge), y)
-    return -density - 0.5 * empty * jnp.log(2 * jnp.pi * ridge)
+    return -density - 0.5 * empty.astype(ridge.dtype) * jnp.log(2 * jnp.pi * ridge)
 
 
 @compiled
@@ -454,7 +454,7 @@ def _box(model: LawModel, X, chunks: Chunk):
     """The box of hyperparameters, and a design of first points."""
     reach = jnp.maximum(chunks.value.sum(axis=2), 1e-300)[:, None]
     forces = jnp.where(chunks.rows != 0, chunks.rows / reach, 0.0)
-    rms = float(jnp.sqrt(jnp.sum(forces**2) / jnp.sum(chunks.rows != 0)))
+    rms = float(np.sqrt(float(jnp.sum(forces**2)) / np.sum(np.asarray(chunks.rows) != 0)))
     some = jnp.asarray(X[np.linspace(0, len(X) - 1, min(len(X), 64)).astype(int)])
     leaves = hyperparameters(model.kernel, some, rms, some[:1])
     low = np.concatenate([*(p.low.ravel() for p in leaves), [-1.0]])

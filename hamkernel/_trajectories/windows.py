@@ -245,7 +245,7 @@ def white_factors(chunk: Chunk) -> Float[Array, "c R R"]:
 
 
 def _empty_windows(chunk: Chunk) -> Float[Array, "R R"]:
-    return jnp.diag(1.0 * (jnp.abs(chunk.value).sum(axis=1) == 0))
+    return jnp.diag(jnp.where(jnp.abs(chunk.value).sum(axis=1) == 0, 1.0, 0.0))
 
 
 def full_factor(chunk: Chunk, slopes: Float[Array, "T c j"]) -> Float[Array, "cR cR"]:
