@@ -186,7 +186,6 @@ def learn(
     bar = _bar(progress, total=2 + max_steps)
     data = preprocess(runs, drift)
     bar.update()
-    measured = np.isfinite(data.noise)
     K = completed(K, jnp.asarray(sampled(data)[0]), runs.dimension)
     most_landmarks = None if solver is None else solver.max_points
     start = _start(K, drift, data, sigma, landmarks(data, most_landmarks))
@@ -207,7 +206,7 @@ def learn(
 
         end = choose_end(end, iterate(task, now, max_steps, bar), ends_of_part)
     bar.close()
-    return _result(runs, mean, end, first, process, sigma is not None, measured, again)
+    return _result(runs, mean, end, first, process, sigma is not None, again)
 
 
 class LearnAgain(eqx.Module):
@@ -325,7 +324,6 @@ def _result(
     first: End,
     given_process: np.ndarray | None,
     is_noise_given: bool,
-    measured: np.ndarray,
     again: LearnAgain,
 ) -> Learned:
     """The result; warns where it must.
@@ -337,7 +335,6 @@ def _result(
         first: the end of the first pass, without process noise unless some was given.
         given_process: the process noise of the caller, if any.
         is_noise_given: whether the caller gave the noise.
-        measured: the coordinates that some run measured.
         again: `learn` with all arguments but the runs.
     """
     mean = None if mean is None else as_pytree(mean)
@@ -345,7 +342,7 @@ def _result(
     field, data = now.field, task.data
     times = runs.on_host()[0]
     states = _fitted_states(end, times)
-    noise = np.where(measured, np.exp(np.asarray(now.model.log_noise)), np.nan)
+    noise = np.where(np.isfinite(data.noise), np.exp(np.asarray(now.model.log_noise)), np.nan)
     # Without process noise q stands at the floor of the integrator, and is none.
     is_free = task.bounds.free[-2 * len(noise) :]
     process = np.where(is_free[len(noise) :], np.exp(np.asarray(now.model.log_process)), 0.0)
