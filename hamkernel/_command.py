@@ -34,8 +34,8 @@ def parser() -> argparse.ArgumentParser:
         "--states",
         required=True,
         nargs="+",
-        help="the columns of the state: all positions, then all momenta; or with --mass the "
-        "positions alone",
+        help="the columns of the state: all positions, then all momenta; or the positions alone "
+        "with --mass and one mass for each",
     )
     options.add_argument("--inputs", nargs="+", default=[], help="the columns of what was applied")
     options.add_argument("--friction", action="store_true", help="there is friction")
@@ -98,7 +98,8 @@ def run(arguments: list[str], show: Callable[[str], None]) -> None:
                 f"--states names {count} columns: all positions and then all momenta are needed, "
                 "or the positions alone with --mass."
             )
-        is_position = asked.mass is not None and len(asked.mass) in (1, count) and count % 2 == 1
+        masses = len(asked.mass or [])
+        is_position = masses == count or (masses == 1 and count % 2 == 1)
         K = kernel(2 * count if is_position else count, runs.input_count, asked.friction)
         out.mkdir(parents=True, exist_ok=True)
         show(f"Learning from {runs!r}.")

@@ -272,9 +272,8 @@ def test_a_law_is_learned_from_noisy_runs(momenta):
     X = np.array(path)
     noisy = X + (0.01 if momenta else 0.001) * rng.normal(size=X.shape)
     K = hk.Symplectic(hk.Shared(hk.Matern(2.5, 1.0), hk.pairs(particles=6, dim=2)))
-    learned = hk.learn(
-        K, hk.Runs([0.04 * np.arange(121)], [noisy[:, : 24 if momenta else 12]]), mass=1.0
-    )
+    runs = hk.Runs([0.04 * np.arange(121)], [noisy[:, : 24 if momenta else 12]])
+    learned = hk.learn(K, runs, mass=1.0 if momenta else np.ones(12))
     assert learned.converged, learned.diagnostics
     found = [float(n) for n in np.asarray(learned.noise)[[0, -1]]]
     assert found[0] == pytest.approx(0.01 if momenta else 0.001, rel=0.3)
@@ -288,3 +287,5 @@ def test_a_law_is_learned_from_noisy_runs(momenta):
     assert np.mean(np.abs(error) < 3 * band + 1e-4) > 0.8
     with pytest.raises(TypeError, match="compare log_evidence"):
         learned.gain(hk.Friction())
+    with pytest.raises(ValueError, match=r"mass=np.ones\(12\)"):
+        hk.learn(K, hk.Runs([0.04 * np.arange(121)], [noisy[:, :12]]), mass=1.0)

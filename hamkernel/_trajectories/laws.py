@@ -394,8 +394,14 @@ def find_laws(K: AbstractMatrixKernel, runs: Runs, mean: Any, noise: Any) -> Fou
     X = np.concatenate([piece.states for piece in smooth.pieces])
     K = completed(K, jnp.asarray(X), n)
     depends = sorted(set().union(*(s for k in K.scalar_kernels for s in k.supports(n))))
-    of_rows = _moving_coordinates(K, X)
-    depends, of_rows = np.asarray(depends), jnp.asarray(of_rows)
+    missing = [j for j in depends if smooth.pieces[0].roots[j] is None]
+    if missing:
+        raise ValueError(
+            f"the laws depend on coordinate {missing[0]}, which is a momentum in runs of {n} "
+            f"coordinates (q, p). If all of them are positions, give a mass for each: "
+            f"mass=np.ones({n})."
+        )
+    depends, of_rows = np.asarray(depends), jnp.asarray(_moving_coordinates(K, X))
     chunks = chunks_of(runs, smooth, np.asarray(of_rows), depends)
     part = _part(K, chunks)
     model = LawModel(K, jnp.asarray(np.log(2.0)))

@@ -1,5 +1,7 @@
 """How well learning ended: what the diagnostics are made of."""
 
+from typing import Any
+
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -70,7 +72,7 @@ def quality(
     )
 
 
-def chi_squared(end: End, z: Float[np.ndarray, "S L+1 n"]) -> dict[str, float]:
+def chi_squared(end: End, z: Float[np.ndarray, "S L+1 n"]) -> dict[str, Any]:
     """χ² of the innovations z per degree of freedom, and the degrees of freedom.
 
     A path with process noise follows the samples, so that only what was expected can be judged.
@@ -153,11 +155,11 @@ def _free_run(end: End, kept: Float[np.ndarray, " R"], swing: float) -> float:
     right to .05 rad after a second, has 2.5, 1.4 and .89. Three simulated logs of animals in
     weather, which no field predicts, have 1.02 to 1.5 (`tests/test_verdicts.py`).
     """
-    data, paths = end.task.data, end.now.paths
-    used = [(run, path) for run, path, k in zip(data.runs, paths, kept, strict=True) if k]
-    if not used:
+    data = end.task.data
+    runs = [run for run, share in zip(data.runs, kept, strict=True) if share]
+    paths = [path for path, share in zip(end.now.paths, kept, strict=True) if share]
+    if not runs:
         return np.inf
-    runs, paths = ([pair[i] for pair in used] for i in (0, 1))
     least = np.inf
     for count in (2.0, 1.0, 0.5):
         part = of_swings(runs, paths, swing, count)

@@ -241,7 +241,7 @@ class Chunk(NamedTuple):
 def white_factors(chunk: Chunk) -> Float[Array, "c R R"]:
     """The Cholesky factors of C₀, of each coordinate; the identity for empty windows."""
     C = jnp.einsum("crt,cst->crs", chunk.roots, chunk.roots)
-    return jnp.linalg.cholesky(C + _empty_windows(chunk))
+    return jnp.linalg.cholesky(C + _empty_windows(chunk)[None])
 
 
 def _empty_windows(chunk: Chunk) -> Float[Array, "R R"]:
@@ -251,7 +251,7 @@ def _empty_windows(chunk: Chunk) -> Float[Array, "R R"]:
 def full_factor(chunk: Chunk, slopes: Float[Array, "T c j"]) -> Float[Array, "cR cR"]:
     """The Cholesky factor of C with ∂f_c/∂x_j along the path."""
     c, R, T = chunk.roots.shape
-    white = jnp.einsum("crt,cst->crs", chunk.roots, chunk.roots) + _empty_windows(chunk)
+    white = jnp.einsum("crt,cst->crs", chunk.roots, chunk.roots) + _empty_windows(chunk)[None]
     C = jax.scipy.linalg.block_diag(*white)
     k = chunk.path_roots.shape[2]
     by_coordinate = jnp.moveaxis(slopes, 2, 0)  # (j, T, c)

@@ -71,7 +71,8 @@ class Tuned(eqx.Module):
             sorted in ascending order, with inf for runs whose end was not evaluated on all the
             data.
         bounds: the box that was searched: for each name the lowest and highest value.
-        problem: the data, less the prior mean, with the tuned kernel and λ.
+        problem: the data, less the prior mean, with the tuned kernel and λ; None for a Lagrangian,
+            whose field keeps its posterior.
     """
 
     kernel: AbstractMatrixKernel
@@ -84,11 +85,13 @@ class Tuned(eqx.Module):
     start_losses: Float[Array, " starts"]
     at_bounds: tuple[str, ...] = eqx.field(static=True)
     bounds: dict[str, tuple[float, float]]
-    problem: Problem
+    problem: Problem | None
 
     @property
     def noise_variance(self) -> Float[Array, ""]:
         """Nλ, the variance of the noise of a row of relative noise 1, in squared units of Y."""
+        if self.problem is None:
+            return self.regularization * len(cast(Any, self.field).residual)
         return self.problem.ridge
 
     def posterior(self, solver: AbstractSolver | None = None) -> Posterior:
@@ -98,11 +101,16 @@ class Tuned(eqx.Module):
             solver: as in `hk.condition`, `Cholesky()` if None.
 
         Raises:
-            TypeError: conjugate gradients, which keep no factor.
+            TypeError: conjugate gradients, which keep no factor; a Lagrangian.
 
         Warns:
             UserWarning: the amplitude of the kernel is exactly 1, as in `hk.condition`.
         """
+        if self.problem is None:
+            raise TypeError(
+                "the field of a Lagrangian keeps its posterior: take its bands, "
+                "tuned.field.mass_matrix_deviation(q), .gravity_deviation(q), …"
+            )
         return _posterior(self.problem, solver)
 
     def __repr__(self) -> str:
@@ -373,6 +381,7 @@ def _tuned_lagrangian(K: Any, X: Any, Y: Any, accelerations: Any, max_steps: int
         start_losses=jnp.asarray([end.loss], deviation.dtype),
         at_bounds=end.at_bounds,
         bounds=end.bounds,
+        problem=None,
     )
 
 
