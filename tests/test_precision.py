@@ -99,7 +99,7 @@ def streams():
 
 def learning():
     ts = jnp.linspace(0.0, 3.0, 16)
-    states = hk.simulate(hk.systems.Pendulum(), jnp.array([1.0, 0.0]), ts).ys
+    states = np.asarray(hk.simulate(hk.systems.Pendulum(), jnp.array([1.0, 0.0]), ts).ys)
     noise = 0.01 * np.random.default_rng(0).normal(size=states.shape)
     hk.learn(K, hk.Runs([ts], [states + noise]), iterations=2)
 

@@ -1,6 +1,7 @@
 """Process noise in `learn`: the Kalman filter against dense covariances, the test of whiteness."""
 
 # pyright: reportArgumentType=false, reportAttributeAccessIssue=false
+# pyright: reportOptionalMemberAccess=false
 
 import functools
 import itertools

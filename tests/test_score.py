@@ -89,9 +89,17 @@ def test_a_score_without_runs_holds_out_the_last_fifth(learned):
 def of_errors(own, still, linear, scale=1.0):
     t = jnp.arange(4.0)
     errors = jnp.array([[np.nan], [0.1], [0.2], [0.4]])
-    arrays = (jnp.array([each]) for each in (own, still, linear))
+    own, still, linear = (jnp.array([each]) for each in (own, still, linear))
     return Score(
-        *arrays, jnp.array(np.nan), (errors,), (t,), (errors,), jnp.array([scale]), first=1
+        rmse=own,
+        persistence=still,
+        linear=linear,
+        coverage=jnp.array(np.nan),
+        predictions=(errors,),
+        times=(t,),
+        errors=(errors,),
+        scale=jnp.array([scale]),
+        first=1,
     )
 
 
