@@ -121,6 +121,7 @@ def test_tune_finds_the_noise_and_lengthscales():
     np.testing.assert_allclose(again.mass_matrix(X[0, :2]), tuned.field.mass_matrix(X[0, :2]))
 
 
+@pytest.mark.slow
 def test_a_free_motion_is_scipys(arm):
     def rates(t, x):
         q, v = x[:2], x[2:]
@@ -151,6 +152,7 @@ def test_friction_is_found_and_spoils_the_mass_matrix_where_it_is_ignored():
     assert errors(ignored)[0] > 30 * errors(field)[0]
 
 
+@pytest.mark.slow
 def test_bands_hold_the_truth():
     inside = []
     for seed in range(3):

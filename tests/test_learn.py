@@ -229,6 +229,7 @@ def test_landmarks_closer_than_rounding_resolves_span_what_they_span():
     np.testing.assert_allclose(G @ T @ T.T @ G, G, atol=1e-9 * np.trace(G))
 
 
+@pytest.mark.slow
 def test_the_flow_and_its_tangent_are_exact_to_the_tolerance_of_the_integrator():
     starts = jnp.array([[1.0, 0.5], [-0.3, 1.2]])
     spans = np.full((2, 4), 0.2)

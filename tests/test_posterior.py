@@ -86,6 +86,7 @@ def test_the_covariance_of_energies_differentiated_twice_is_that_of_the_field(po
     np.testing.assert_allclose(J @ mixed @ J.T, posterior.covariance(x), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_variances_are_positive_and_vanish_where_nothing_is_unknown():
     close = hk.condition(K, X, Y, 1e-12)
     for posterior in (POSTERIOR, BOTH, close):

@@ -173,6 +173,7 @@ def test_friction_is_that_of_the_kernel():
         hk.readout(hk.condition(KERNEL, X, Y, LAMBDA), TERMS)
 
 
+@pytest.mark.slow
 def test_a_mean_is_taken_off_and_inputs_do_not_enter_the_drift():
     kinetic = hk.systems.HarmonicOscillator(mass=1.0, stiffness=1e-12)
     posterior = hk.condition(KERNEL, X, Y, LAMBDA, mean=kinetic)

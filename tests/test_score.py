@@ -127,6 +127,7 @@ def test_the_horizon_ends_before_the_first_larger_error():
         score.horizon(-1.0)
 
 
+@pytest.mark.slow
 def test_friction_raises_log_p_where_there_is_some_and_only_there(learned):
     price = 0.5 * np.log(4 * 32 * 2)
     assert learned[0.0].gain(hk.Friction()) < 2 * price

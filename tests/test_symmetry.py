@@ -233,6 +233,7 @@ def test_saved_fields_come_back(tmp_path):
     load(file, kernel=K)
 
 
+@pytest.mark.slow
 def test_works_under_jit_vmap_and_grad():
     def norm(log_lengthscale):
         k = hk.Gaussian(jnp.exp(log_lengthscale))

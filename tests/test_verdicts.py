@@ -64,6 +64,7 @@ def test_a_good_log_is_silent_and_usable():
 
 
 @pytest.mark.parametrize("value", [-9999.0, 1e6])
+@pytest.mark.few(1)
 def test_one_row_that_is_no_measurement_is_named_and_spoils_no_field(value):
     times, states = pendulum()
     states[1][20] = value
@@ -110,6 +111,7 @@ def test_animals_in_weather_are_no_hamiltonian_system():
     assert "one curve" not in learned.diagnostics.failing
 
 
+@pytest.mark.slow
 def test_a_quantised_encoder_and_the_right_friction_are_silent():
     times, states = pendulum(runs=3, samples=200, spacing=0.05, noise=0.0, friction=0.1)
     step = 2 * np.pi / 4096
