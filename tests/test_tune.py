@@ -286,7 +286,7 @@ def test_bounds_are_obeyed_for_lambda_and_each_coordinate_and_reported_by_the_wi
         ({"frozen": ("lengthscale", "regularization")}, "nothing to tune"),
         ({"starts": 0}, "starts must be a whole number, at least 1; got 0"),
         ({"max_steps": 0}, "max_steps must be a whole number, at least 1; got 0"),
-        ({"folds": 5.0}, r"folds must be a whole number, 'loo' .* got 5\.0\.$"),
+        ({"folds": 5.0}, r"folds must be a whole number, 'loo', or one label .* got 5\.0\.$"),
         ({"objective": "loo"}, "objective must be"),
         ({"folds": 99}, "between 2 and the number of points"),
         ({"regularization": 0.0}, "positive"),
