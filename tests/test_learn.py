@@ -402,7 +402,7 @@ def damped(x):
 @pytest.mark.parametrize("seed", [0, 1])
 @pytest.mark.parametrize("guess", [1 / 30, 1.0, 30.0])
 def test_few_positions_are_enough_whatever_the_first_lengthscale(seed, guess):
-    """Ten runs of ten seconds at 5 Hz; with process noise held at first 5.4 % in seed 0."""
+    """Ten runs of ten seconds at 5 Hz, with a second optimum at a short lengthscale."""
     pendulum = hk.systems.Pendulum(0.5, 1.0, 6.0)
     rng, ts = np.random.default_rng(seed), np.linspace(0, 10, 51)
     way = rng.uniform(-1, 1, (10, 2))

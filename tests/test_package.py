@@ -277,6 +277,7 @@ print(json.dumps([refused(lambda: k(X, X)), refused(lambda: K(x, jnp.zeros(3)))]
 
 
 @pytest.mark.slow
+@pytest.mark.ci
 def test_annotations_hold_when_they_are_executed(tmp_path):
     here, file = str(Path(__file__).parent), str(tmp_path / "field.npz")
     done = subprocess.run(

@@ -562,7 +562,7 @@ class _Log(NamedTuple):
 
     times: Float[np.ndarray, " T"]
     states: Float[np.ndarray, "T n"]
-    inputs: Float[np.ndarray, "T-1 2 0"]
+    inputs: Float[np.ndarray, "S 2 0"]
 
 
 def _quality(

@@ -259,8 +259,8 @@ class _Start(NamedTuple):
 
         Process noise is free and takes up the error of the smoothed path. With process noise held
         at its floor the kernel followed this error. One of two logs of a pendulum, q alone at 5 Hz,
-        noise .01, then ended at a field error of 5.4 %, for .18 % at a log p that is 76 higher
-        (`tests/benchmarks/trajectories.py`, seed 0).
+        noise .01, then ended at a field error of 5.4 %, for .18 %
+        (`tests/benchmarks/trajectories.py "only q 5 Hz .01"`, seed 0).
         """
         model = Model(self.kernel, self.log_noise, jnp.asarray(self.impulse))
         log = self.X, self.Y, data.scale, self.free, self.impulse, self.spacing

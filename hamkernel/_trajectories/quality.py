@@ -72,7 +72,7 @@ def quality(
     )
 
 
-def chi_squared(end: End, z: Float[np.ndarray, "S L+1 n"]) -> dict[str, Any]:
+def chi_squared(end: End, z: Float[np.ndarray, "S K n"]) -> dict[str, Any]:
     """χ² of the innovations z per degree of freedom, and the degrees of freedom.
 
     A path with process noise follows the samples, so that only what was expected can be judged.

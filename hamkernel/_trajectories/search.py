@@ -404,9 +404,8 @@ def bounds_and_design(
         kernels.append(_scale_amplitudes(model, point, scales, X, Y))
     kernels += [_add_friction(kernels[-1], (low + high) / 2, forces)] if forces.any() else []
     # The smoother found no noise at all in 3 of 5 logs with five samples a swing and noise of 8 %,
-    # and from too little noise no slope leads back. So each kernel stands beside three noises.
-    # In 13 logs with six seeds the likeliest of these points led to the best optimum found from 60
-    # points; with process noise of a tenth of the motion in the second half it did in 11.
+    # and from too little noise no slope leads back. So each kernel stands beside three noises, as
+    # `test_few_positions_are_enough_whatever_the_first_lengthscale` needs (`tests/test_learn.py`).
     sigmas = [start[size:], *(np.log(share * scale) for share in (0.01, 0.1))]
     noisy = [
         np.append(h[:size], np.where(moves, sigma, start[size:]))

@@ -206,7 +206,7 @@ def _sensor_rows(
     ]
 
 
-def _repeats(steps: Sequence[Float[np.ndarray, " T-1"]]) -> float:
+def _repeats(steps: Sequence[Float[np.ndarray, " _"]]) -> float:
     """The share of samples that repeat the one before, without stretches at rest.
 
     A stretch of equal values is a rest where it is a whole run, or ten times longer than half of
