@@ -352,7 +352,7 @@ _landmark_whitening = compiled_by_size(landmark_whitening)
 
 def _stiffness(field: Expansion, data: Preprocessed, paths: list[np.ndarray]) -> float:
     """The stiffness of the field at 256 points along the paths."""
-    X = np.concatenate([run.joined(path) for run, path in zip(data.runs, paths, strict=True)])
+    X = np.concatenate([run.points(path) for run, path in zip(data.runs, paths, strict=True)])
     return stiffness(field, X[np.linspace(0, len(X) - 1, 256).round().astype(int)], data.scale)
 
 

@@ -23,7 +23,7 @@ from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._trajectories.evidence import Evidence, EvidenceOfRows
 from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.score import Score, scored
+from hamkernel._trajectories.score import Score, compute_score
 from hamkernel._trajectories.table import Diagnostics
 
 
@@ -320,7 +320,7 @@ class Learned(eqx.Module):
                 f"learned ones have {self.runs.dimension} and {self.runs.input_count}."
             )
         posterior = self._posterior(on_landmarks=True) if draws and self.observations else None
-        return scored(self, runs, first, posterior, draws)
+        return compute_score(self, runs, first, posterior, draws)
 
     def plot(self, run: int = 0, held_out: Runs | None = None) -> Any:
         """One figure: fit, residuals in units of the noise, law with its band, free run.

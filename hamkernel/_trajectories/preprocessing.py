@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled_by_size
 from hamkernel._trajectories.flow import NODES, with_tangent
-from hamkernel._trajectories.runs import Between, Runs, at_nodes, at_samples
+from hamkernel._trajectories.runs import Between, Runs, inputs_at_nodes, inputs_at_samples
 from hamkernel._trajectories.smoothing import Coordinate, interpolated, processes, smoothed
 
 # Rows times columns², 1 to 2 s for each solve, and up to ten where half of what is left is said to
@@ -67,9 +67,9 @@ class PreprocessedRun(NamedTuple):
             *(each[between] for each in (self.nodes, self.slopes, self.inputs)),
         )
 
-    def joined(self, path: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T d"]:
+    def points(self, path: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T d"]:
         """Points (x, u) at the samples, for a path there."""
-        return np.concatenate([path, at_samples(self.inputs)], axis=1)
+        return np.concatenate([path, inputs_at_samples(self.inputs)], axis=1)
 
 
 class Preprocessed(NamedTuple):
@@ -109,17 +109,17 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
         averaged = 0.5 * averaging_time(found, times, paths.deviation)
         block = min(block, max(averaged, shortest))
         condensed = [
-            _condensed(t, x, paths.value[r, : len(t)], paths.slope[r, : len(t)], block)
+            _condense(t, x, paths.value[r, : len(t)], paths.slope[r, : len(t)], block)
             for r, (t, x) in enumerate(zip(times, states, strict=True))
         ]
         times, states, counts, scatter = (list(each) for each in zip(*condensed, strict=True))
     shortest = min(lengths, default=np.inf)
-    refined = [_refined(*run, shortest) for run in zip(times, states, counts, scatter, strict=True)]
+    refined = [_refine(*run, shortest) for run in zip(times, states, counts, scatter, strict=True)]
     times, states, counts, scatter = (list(each) for each in zip(*refined, strict=True))
     inputs = [runs.applied(r, t + float(np.asarray(runs.times[r])[0])) for r, t in enumerate(times)]
-    path_runs = _with_paths(found, times, states, counts, scatter, inputs)
+    path_runs = _add_paths(found, times, states, counts, scatter, inputs)
     if not all(c.seen for c in found) or mean is not None:
-        path_runs = [_completed(run, mean) for run in path_runs]
+        path_runs = [_complete(run, mean) for run in path_runs]
     noise = np.array([c.noise if c.seen else np.nan for c in found])
     good = [run.path for run, use in zip(path_runs, usable, strict=True) if use]
     scale = np.concatenate(good).std(axis=0)
@@ -183,7 +183,7 @@ def with_inputs(data: Preprocessed, runs: Runs) -> Preprocessed:
     )
 
 
-def decided(
+def choose_inputs(
     runs: Runs, data: Preprocessed, loss: Callable[[Preprocessed], float]
 ) -> tuple[Runs, Preprocessed]:
     """The likeliest way in which inputs go on between samples, and their likeliest delay.
@@ -266,7 +266,7 @@ def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:
     return processes([times[r] for r in chosen], [states[r] for r in chosen]), usable
 
 
-def _condensed(t, x, path, slope, block: float):
+def _condense(t, x, path, slope, block: float):
     """Times, means, counts and scatter of blocks of samples that span at most `block`."""
     edges = [0]
     for i in range(1, len(t)):
@@ -286,7 +286,7 @@ def _condensed(t, x, path, slope, block: float):
     return middle, np.where(counts > 0, there + means, np.nan), counts, scatter
 
 
-def _refined(t, x, counts, scatter, lengthscale: float):
+def _refine(t, x, counts, scatter, lengthscale: float):
     """The run, its long intervals cut at times at which nothing was measured.
 
     Three Gauss nodes do not see how a field varies along a third of a swing, and Gauss-Newton steps
@@ -304,15 +304,15 @@ def _refined(t, x, counts, scatter, lengthscale: float):
     fine = np.interp(np.arange(at[-1] + 1), at, t)
     fine[at] = t
 
-    def placed(a: np.ndarray, empty: float) -> np.ndarray:
+    def place(a: np.ndarray, empty: float) -> np.ndarray:
         out = np.full((len(fine), a.shape[1]), empty)
         out[at] = a
         return out
 
-    return fine, placed(x, np.nan), placed(counts, 0.0), placed(scatter, 0.0)
+    return fine, place(x, np.nan), place(counts, 0.0), place(scatter, 0.0)
 
 
-def _with_paths(found, times, states, counts, scatter, inputs) -> list[PreprocessedRun]:
+def _add_paths(found, times, states, counts, scatter, inputs) -> list[PreprocessedRun]:
     """The smoothed path at the samples and at the nodes between them."""
     grids, filled = [], []
     for t, x in zip(times, states, strict=True):
@@ -333,7 +333,7 @@ def _with_paths(found, times, states, counts, scatter, inputs) -> list[Preproces
     return out
 
 
-def _completed(run: PreprocessedRun, mean: Callable[[Array], Array] | None) -> PreprocessedRun:
+def _complete(run: PreprocessedRun, mean: Callable[[Array], Array] | None) -> PreprocessedRun:
     """The run with its unmeasured coordinates found from how they move the others.
 
     Given q̇ and a mean with q̇ = p/m, that is p = m q̇; in general Newton's method for the
@@ -350,7 +350,7 @@ def _completed(run: PreprocessedRun, mean: Callable[[Array], Array] | None) -> P
         )
     n = run.states.shape[1]
     nodes, slopes = run.nodes.reshape(-1, n), run.slopes.reshape(-1, n)
-    u = np.asarray(at_nodes(run.inputs)).reshape(len(nodes), -1)
+    u = np.asarray(inputs_at_nodes(run.inputs)).reshape(len(nodes), -1)
     there = np.array(_solved_for(mean, np.nan_to_num(nodes), u, np.nan_to_num(slopes), missing))
     span = np.diff(run.times)
     inner = (run.times[:-1, None] + span[:, None] * NODES[None]).ravel()
@@ -386,7 +386,7 @@ def _solved_for(mean, X, U, slopes, missing):
     return jax.lax.map(lambda each: one(*each), (X, U, slopes))
 
 
-def sampled(
+def sample_points(
     data: Preprocessed, count: int = _POINTS
 ) -> tuple[Float[np.ndarray, "N d"], Float[np.ndarray, "N n"]]:
     """Points, (x, u) with inputs, and velocities of the smoothed runs at some of their nodes.
@@ -395,7 +395,7 @@ def sampled(
     """
     n = len(data.scale)
     runs = [run for run, use in zip(data.runs, data.usable, strict=True) if use]
-    points = [np.concatenate([run.nodes, at_nodes(run.inputs)], axis=-1) for run in runs]
+    points = [np.concatenate([run.nodes, inputs_at_nodes(run.inputs)], axis=-1) for run in runs]
     X = np.concatenate([each.reshape(-1, each.shape[-1]) for each in points])
     Y = np.concatenate([run.slopes.reshape(-1, n) for run in runs])
     chosen = np.linspace(0, len(X) - 1, count).round().astype(int)
@@ -404,7 +404,7 @@ def sampled(
 
 def time_of_swing(data: Preprocessed) -> float:
     """2π times the median over coordinates of deviation over speed: the period of a sine."""
-    speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
+    speed = np.sqrt(np.mean(sample_points(data)[1] ** 2, axis=0))
     return float(2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)))
 
 
@@ -442,7 +442,7 @@ def landmarks(
     n, used = len(data.scale), zip(data.runs, data.usable, strict=True)
     intervals = max(sum(len(run.times) - 1 for run, use in used if use), 1)
     affordable = (np.array([_WORK, _MOST_WORK]) / (n * intervals)) ** 0.5 // n
-    X, _ = sampled(data, max(_POINTS, min(intervals, 2 * int(affordable[1]))))
+    X, _ = sample_points(data, max(_POINTS, min(intervals, 2 * int(affordable[1]))))
     first = first_landmarks(X.shape[1])
     # They are doubled: a last step to a few more would cost a compilation and a solve.
     affordable = first * 2 ** np.log2(np.maximum(affordable / first, 1)).astype(int)

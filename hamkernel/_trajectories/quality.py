@@ -11,7 +11,7 @@ from hamkernel._trajectories.diagnostics import FitQuality
 from hamkernel._trajectories.free_run import error_over_constant, of_swings
 from hamkernel._trajectories.iteration import End, asks_for_landmarks, initial_loss, noisy_counts
 from hamkernel._trajectories.kalman import smoothed_path
-from hamkernel._trajectories.preprocessing import decided, sampled, time_of_swing
+from hamkernel._trajectories.preprocessing import choose_inputs, sample_points, time_of_swing
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.search import gain_of_friction, gain_of_inertia
 from hamkernel._trajectories.segments import Piece
@@ -34,7 +34,7 @@ def quality(
     kept, pieces = np.zeros(len(data.runs)), list(zip(end.task.pieces, now.good, strict=True))
     for (r, start, stop), good in pieces:
         kept[r] += good * (stop - start) / len(data.runs[r].times)
-    speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
+    speed = np.sqrt(np.mean(sample_points(data)[1] ** 2, axis=0))
     spacing = np.median(np.concatenate([np.diff(t) for t in times]))
     swing = time_of_swing(data) / spacing
     period = np.maximum(swing, 1.0) * spacing
@@ -52,7 +52,7 @@ def quality(
         core=_core(residuals, noise),
         share=float(np.max(process / np.sqrt(period) / np.maximum(speed, 1e-300))),
         impulse=_largest_push(end),
-        pushed=_samples(_pushed(end), end, times),
+        pushed=_samples(_push_intervals(end), end, times),
         is_curve=runs.inputs is None and is_on_a_curve(logged, noise),
         free_run=_free_run(end, kept, swing * spacing),
         timing=timing(times, [np.where(noisy, r, np.nan) for r in residuals], states)
@@ -103,7 +103,7 @@ def likelier_between(runs: Runs, end: End) -> str:
         return ""
     task, model = end.task, end.now.model
     any_way = runs.going_on("auto", runs.delay)
-    chosen, _ = decided(
+    chosen, _ = choose_inputs(
         any_way, task.data, lambda data: initial_loss(task._replace(data=data), model)
     )
     return chosen.between if chosen.between != runs.between else ""
@@ -119,13 +119,13 @@ def disturbances(
         given = now.field.points, now.rows, task.start_deviation
         w = np.asarray(smoothed_path(now.model, now.field.coefficients, *given).disturbance)
     out = []
-    for of_run, run, t in zip(by_run(w, end, 0.0), task.data.runs, times, strict=True):
+    for of_run, run, t in zip(join_runs(w, end, 0.0), task.data.runs, times, strict=True):
         i = np.searchsorted(run.times, t - t[0], "right") - 1
         out.append(jnp.asarray(of_run[np.clip(i, 0, len(of_run) - 1)]))
     return tuple(out)
 
 
-def _pushed(end: End) -> list[Piece]:
+def _push_intervals(end: End) -> list[Piece]:
     """The intervals in which something pushed the system, from one sample to the next."""
     sizes = np.asarray(end.now.rows.pushed)
     return [
@@ -196,7 +196,7 @@ def _samples(
     return tuple(out)
 
 
-def by_run(values: np.ndarray, end: End, empty: float) -> list[Float[np.ndarray, "T n"]]:
+def join_runs(values: np.ndarray, end: End, empty: float) -> list[Float[np.ndarray, "T n"]]:
     """Values by segment put together to runs."""
     out = [np.full(run.path.shape, empty) for run in end.task.data.runs]
     for s, ((r, start, stop), good) in enumerate(zip(end.task.pieces, end.now.good, strict=True)):

@@ -74,7 +74,7 @@ def values(
     return u[i] + share[:, None] * (u[i + 1] - u[i])
 
 
-def in_intervals(
+def lines_in_intervals(
     t: Float[np.ndarray, " T"],
     u: Float[np.ndarray, "T m"],
     at: Float[np.ndarray, " R"],
@@ -103,7 +103,7 @@ def in_intervals(
     return np.stack([m0 - 3 * m1, m0 + 3 * m1], axis=1)
 
 
-def at_samples(ends: Float[np.ndarray, "intervals 2 m"]) -> Float[np.ndarray, "R m"]:
+def inputs_at_samples(ends: Float[np.ndarray, "intervals 2 m"]) -> Float[np.ndarray, "R m"]:
     """U at the ends of the intervals; where it jumps, the mean of both sides."""
     before, after = (
         np.concatenate([ends[:1, 0], ends[:, 1]]),
@@ -112,7 +112,9 @@ def at_samples(ends: Float[np.ndarray, "intervals 2 m"]) -> Float[np.ndarray, "R
     return (before + after) / 2
 
 
-def at_nodes(ends: Float[Array | np.ndarray, "*S 2 m"]) -> Float[Array | np.ndarray, "*S 3 m"]:
+def inputs_at_nodes(
+    ends: Float[Array | np.ndarray, "*S 2 m"],
+) -> Float[Array | np.ndarray, "*S 3 m"]:
     """U at the Gauss nodes."""
     shares = NODES.reshape((1,) * (ends.ndim - 2) + (3, 1))
     first, last = ends[..., :1, :], ends[..., 1:, :]
@@ -194,7 +196,7 @@ class Runs(eqx.Module):
         inside = "Make it outside; the losses and hk.simulate work inside."
         require.untraced("hk.Runs", inside, times, states, inputs)
         _check_counts(times, states, inputs)
-        times = [_at_interval(t, x) for t, x in zip(times, states, strict=True)]
+        times = [_sample_times(t, x) for t, x in zip(times, states, strict=True)]
         self.times = tuple(_times(t, r) for r, t in enumerate(times))
         self.states = tuple(
             _rows(x, t, r, "states")
@@ -346,7 +348,7 @@ class Runs(eqx.Module):
         between = "linear" if self.between == "auto" else self.between
         delay = 0.0 if isinstance(self.delay, str) else self.delay
         t, u = (np.asarray(a[run], float) for a in (self.input_times, self.inputs))
-        return in_intervals(t, u, np.asarray(at) - delay, between)
+        return lines_in_intervals(t, u, np.asarray(at) - delay, between)
 
     def going_on(self, between: Between | Literal["auto"], delay: float) -> "Runs":
         """The same runs with inputs that go on in this way; nothing is checked again."""
@@ -476,7 +478,7 @@ def _name_list(names: tuple[str, ...] | None) -> str:
     return f" ({', '.join(names)})" if names else ""
 
 
-def _at_interval(times: Any, states: Any) -> Any:
+def _sample_times(times: Any, states: Any) -> Any:
     """The times of samples at a sampling interval, from 0 on; other times as they are."""
     if _depth(times) != 0:
         return times

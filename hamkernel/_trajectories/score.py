@@ -18,7 +18,7 @@ from hamkernel._show import printable
 from hamkernel._show import text as number
 from hamkernel._trajectories.flow import simulated, steps_for, stiffness
 from hamkernel._trajectories.free_run import Stretches, padded, predictions
-from hamkernel._trajectories.preprocessing import preprocess, sampled
+from hamkernel._trajectories.preprocessing import preprocess, sample_points
 from hamkernel._trajectories.runs import Runs
 
 _STEPS = 12  # of Levenberg and Marquardt; from smoothed states 4 are the rule
@@ -128,23 +128,25 @@ class _Disturbed(eqx.Module):
         return self.field(s[: self.count]) + s[self.count :]
 
 
-def scored(learned: Any, runs: Runs, first: int, posterior: Posterior | None, draws: int) -> Score:
+def compute_score(
+    learned: Any, runs: Runs, first: int, posterior: Posterior | None, draws: int
+) -> Score:
     """The score of a learned field on `runs`; see `Learned.score`."""
     known = known_part(learned.kernel, learned.mean, runs.dimension, jnp.float64)
     training = preprocess(learned.runs, known)
     scale = training.scale
     noise = np.asarray(learned.noise)
     deviation = np.maximum(np.where(np.isfinite(noise), noise, scale), 1e-6 * scale)
-    part = _whole_runs(runs, [run.path[0] for run in preprocess(runs, known).runs])
+    part = _as_stretches(runs, [run.path[0] for run in preprocess(runs, known).runs])
     seen = [min(first, max(len(t) // 2, 1)) for t in runs.on_host()[0]]
     field = getattr(learned.field, "whole", learned.field)  # of the points (x, u) with inputs
 
     def free(field: Any) -> tuple[_Starts, np.ndarray]:
-        starts = _fitted(field, part, seen, deviation, scale)
+        starts = _fit_starts(field, part, seen, deviation, scale)
         return starts, predictions(field, part._replace(starts=starts.states), scale)
 
     starts, predicted = free(field)
-    _, linear = free(_linear(*sampled(training)))
+    _, linear = free(_linear(*sample_points(training)))
     measured, later = part.measured, np.arange(part.spans.shape[1]) >= np.array(seen)[:, None]
     judged = np.where(later[..., None], measured, np.nan)
     last = np.stack([_last(y[:k]) for y, k in zip(measured, seen, strict=True)])[:, None]
@@ -170,7 +172,7 @@ def scored(learned: Any, runs: Runs, first: int, posterior: Posterior | None, dr
     )
 
 
-def _whole_runs(runs: Runs, starts: list[np.ndarray]) -> Stretches:
+def _as_stretches(runs: Runs, starts: list[np.ndarray]) -> Stretches:
     """The runs as stretches; an interval of no length before the first sample measures it too."""
     parts = []
     for r, (t, x) in enumerate(zip(*runs.on_host(), strict=True)):
@@ -208,7 +210,7 @@ class _Starts(NamedTuple):
     roots: Float[np.ndarray, "S n n"]
 
 
-def _fitted(field: Any, part: Stretches, seen: list[int], deviation, scale) -> _Starts:
+def _fit_starts(field: Any, part: Stretches, seen: list[int], deviation, scale) -> _Starts:
     """The starts from which the field passes the first samples most closely.
 
     Steps of Levenberg and Marquardt, from starts that are known to three standard deviations of the

@@ -31,7 +31,7 @@ from hamkernel._trajectories.flow import (
     means,
 )
 from hamkernel._trajectories.preprocessing import Preprocessed, PreprocessedRun
-from hamkernel._trajectories.runs import at_nodes
+from hamkernel._trajectories.runs import inputs_at_nodes
 from hamkernel._trajectories.smoothing import power_of_two
 
 
@@ -223,7 +223,7 @@ def linearised_along_smoothed(
         x[s, :T] = run.path[start:stop]
         nodes[s, : T - 1] = run.nodes[start : stop - 1]
         slopes[s, : T - 1] = run.slopes[start : stop - 1]
-    points = np.concatenate([nodes, at_nodes(np.asarray(segments.inputs))], axis=-1)
+    points = np.concatenate([nodes, inputs_at_nodes(np.asarray(segments.inputs))], axis=-1)
     along = jnp.asarray(x), jnp.asarray(points), jnp.asarray(slopes)
     return _linearised_along_smoothed(mean, along, jnp.asarray(good), segments)
 

@@ -45,7 +45,7 @@ def _row(
     """A row that passes where nothing was faults_found."""
     if not faults_found:
         return Diagnostic(name, "none", limit, True, "nothing of it in this log")
-    return Diagnostic(name, _some(faults_found), limit, False, meaning, advice)
+    return Diagnostic(name, _short_list(faults_found), limit, False, meaning, advice)
 
 
 def _impossible(log: Log) -> Diagnostic:
@@ -484,6 +484,6 @@ def is_on_a_curve(states: Sequence[Float[np.ndarray, "T n"]], noise: np.ndarray)
     return bool(rest @ rest < 2e-3 * (p @ p) + 1.5 * len(X) * sensors)
 
 
-def _some(names: Sequence[str]) -> str:
+def _short_list(names: Sequence[str]) -> str:
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return ", ".join(names[:3]) + more
