@@ -81,7 +81,9 @@ def _wraps(log: Log) -> Diagnostic:
         f" of the samples that were measured alone, ok = np.isfinite(q); q[ok] = "
         f"np.unwrap(q[ok]{option}), since after a NaN it leaves NaN"
     )
-    jumps = "; ".join(f"{_some(places)} jumps by about {full[p]}" for p, places in where.items())
+    jumps = "; ".join(
+        f"{_short_list(places)} jumps by about {full[p]}" for p, places in where.items()
+    )
     return _row(
         "wrapped angles",
         [place for places in where.values() for place in places],
@@ -105,7 +107,7 @@ def _gaps(log: Log) -> Diagnostic:
         "gaps",
         faults_found,
         "10 spacings",
-        f"a gap of {_some(faults_found)}",
+        f"a gap of {_short_list(faults_found)}",
         "The path inside a gap is known from the field alone; cut the run in two there if the "
         "system was moved meanwhile.",
     )
@@ -122,7 +124,7 @@ def _constant(log: Log) -> Diagnostic:
         "constant",
         faults_found,
         "some motion",
-        f"constant in all runs: coordinate {_some(faults_found)}",
+        f"constant in all runs: coordinate {_short_list(faults_found)}",
         "Leave it out of the states.",
     )
 
@@ -174,7 +176,7 @@ def _sensor_rows(
             "clipped sensors",
             clipped,
             "two plateaus",
-            f"a sensor seems clipped: coordinate {_some(clipped)} stays at its outermost value and "
+            f"a sensor seems clipped: coordinate {_short_list(clipped)} stays at its outermost value and "
             "arrives there at speed",
             "Write NaN for these samples; the field then says where it went.",
         ),
@@ -182,7 +184,7 @@ def _sensor_rows(
             "dead sensors",
             dead,
             "one deviation of the others",
-            f"a sensor seems dead: coordinate {_some(dead)} keeps one value while others move by "
+            f"a sensor seems dead: coordinate {_short_list(dead)} keeps one value while others move by "
             "more than a standard deviation",
             "Write NaN for these samples.",
         ),
@@ -190,7 +192,7 @@ def _sensor_rows(
             "repeated samples",
             repeated,
             "30%",
-            f"repeated samples: coordinate {_some(repeated)} is often exactly the sample before, "
+            f"repeated samples: coordinate {_short_list(repeated)} is often exactly the sample before, "
             "and else goes on by many steps of its resolution. The log was written faster than the "
             "sensor measures, so times are late and the noise looks smaller than it is",
             "Keep the first of equal samples and write NaN for the others.",
@@ -199,7 +201,7 @@ def _sensor_rows(
             "interpolated samples",
             drawn,
             "40%",
-            f"interpolated samples: coordinate {_some(drawn)} lies on straight lines between some "
+            f"interpolated samples: coordinate {_short_list(drawn)} lies on straight lines between some "
             "of its samples. What was interpolated is no measurement, and the noise looks smaller "
             "than it is",
             "Give the samples at their own times, hk.Runs does not need equal ones.",
@@ -290,7 +292,7 @@ def _inputs(log: Log) -> list[Diagnostic]:
             "constant inputs",
             still,
             "some change",
-            f"constant in all runs: input {_some(still)}. What it does cannot be told from the "
+            f"constant in all runs: input {_short_list(still)}. What it does cannot be told from the "
             f"drift, {unless}",
             "Leave it out, or log runs in which it varies.",
         ),
@@ -298,7 +300,7 @@ def _inputs(log: Log) -> list[Diagnostic]:
             "dependent inputs",
             alike,
             "1% of the variance",
-            f"inputs {_some(alike)} depend on one another: a combination of them has less than 1 % "
+            f"inputs {_short_list(alike)} depend on one another: a combination of them has less than 1 % "
             f"of their variance. Their gains cannot be told apart, {unless}",
             "Leave out inputs that repeat others, or vary each on its own.",
         ),
