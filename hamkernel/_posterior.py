@@ -28,7 +28,7 @@ from hamkernel._machine import compiled, full_precision, one_blas_thread
 from hamkernel._observations.blocks import AbstractBlock, Values
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import inputs_of, observations
-from hamkernel._show import has_arrays, text
+from hamkernel._show import Shown, has_arrays, text
 from hamkernel._solvers.dense import Cholesky
 from hamkernel._solvers.fit import check_solver, features_of_parts
 from hamkernel._solvers.low_rank import LowRankConditional
@@ -112,7 +112,7 @@ def posterior_of_problem(
     return Posterior(conditional, learned_field(conditional.field, problem.known))
 
 
-class Posterior(eqx.Module):
+class Posterior(Shown, eqx.Module):
     """A field learned from data, with its uncertainty; made by `condition`.
 
     A PyTree. Its methods take one state and work under jit, vmap and, with respect to states, grad.
@@ -137,11 +137,18 @@ class Posterior(eqx.Module):
     def __eq__(self, other: object) -> bool:
         return self is other
 
-    def __repr__(self) -> str:
-        if not has_arrays((self.conditional.rows.targets, self.conditional.rows.energies)):
-            return f"Posterior(field={text(self.field)})"
+    def _summary(self) -> tuple[str, list[tuple[str, str]]]:
         rows = self.conditional.rows
-        return f"Posterior(rows={rows.size}, dimension={rows.dimension}, field={text(self.field)})"
+        has_sizes = has_arrays((rows.targets, rows.energies))
+        of = f" of {rows.size} rows, {rows.dimension} coordinates" if has_sizes else ""
+        u = ", u" if isinstance(self.field, AbstractJoinedField) else ""
+        U = ", U" if u else ""
+        return f"Posterior{of}", [
+            ("field", text(self.field)),
+            ("kernel", text(self.conditional.field.kernel)),
+            ("lambda", text(self.conditional.field.regularization)),
+            ("next", f".field, .deviation(x{u}), .evaluate(X{U}), .sample(key, 5), .updated(X, Y)"),
+        ]
 
     @full_precision
     def covariance(

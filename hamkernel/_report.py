@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 import os
 import pathlib
 from typing import TYPE_CHECKING
 
 from hamkernel import _require as require
+from hamkernel._trajectories.lagrangian import LearnedLagrangian
 from hamkernel._trajectories.learned import Learned
 
 if TYPE_CHECKING:
@@ -31,7 +30,7 @@ img { max-width: 100%; }
 """
 
 
-def script(file: str, learned: Learned) -> str:
+def script(file: str, learned: Learned | LearnedLagrangian) -> str:
     """Ten lines that load the result in `file` and simulate its field."""
     lines = [
         "import jax",
@@ -54,7 +53,7 @@ def script(file: str, learned: Learned) -> str:
 
 
 def report(
-    learned: Learned,
+    learned: Learned | LearnedLagrangian,
     path: str | os.PathLike[str],
     score: Score | None = None,
     held_out: Runs | None = None,
@@ -63,7 +62,8 @@ def report(
     """Write one self-contained page of HTML about a learned field, for readers without Python.
 
     It has the verdict, the picture of `learned.plot()`, the table of `learned.diagnostics`, the
-    score, and ten lines that load and simulate the field.
+    score, and ten lines that load and simulate the field. A learned Lagrangian has no score, and no
+    free run of `held_out`.
 
     Args:
         learned: the result of `hk.learn`.
@@ -75,7 +75,7 @@ def report(
     Raises:
         TypeError: `learned` is no result of `hk.learn`. OSError: the file cannot be written.
     """
-    if not isinstance(learned, Learned):
+    if not isinstance(learned, Learned | LearnedLagrangian):
         raise TypeError(f"report takes the result of hk.learn; got a {type(learned).__name__}.")
     require.untraced("hk.report", "Call it outside.", learned)
     verdict = "may be used" if learned.converged else "must not be used as it is"
@@ -89,10 +89,9 @@ def report(
     if score is not None:
         parts.append("<h2>Prediction of data that were not learned from</h2>")
         parts.append(f"<pre>{html.escape(repr(score))}</pre>")
-    picture = _png(learned, held_out)
     parts += [
         "<h2>The runs and the field</h2>",
-        f'<img alt="fit, residuals, law" src="data:image/png;base64,{picture}">',
+        _picture(learned, held_out),
         "<h2>Diagnostics</h2>",
         learned.diagnostics._repr_html_(),
         "<h2>Load and simulate</h2>",
@@ -107,12 +106,15 @@ def report(
     )
 
 
-def _png(learned: Learned, held_out: Runs | None) -> str:
-    """The picture of the result, in base 64."""
-    figure = learned.plot(held_out=held_out)
-    content = io.BytesIO()
-    figure.savefig(content, dpi=120, format="png")
+def _picture(learned: Learned | LearnedLagrangian, held_out: Runs | None) -> str:
+    """The picture of the result, inside of HTML."""
     import matplotlib.pyplot as plt
 
-    plt.close(figure)
-    return base64.b64encode(content.getvalue()).decode()
+    from hamkernel.plot._result import image
+
+    options = {} if held_out is None else {"held_out": held_out}
+    figure = learned.plot(**options)
+    try:
+        return image(figure, "fit, residuals, law")
+    finally:
+        plt.close(figure)

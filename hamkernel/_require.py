@@ -240,6 +240,12 @@ def _no_numbers(x: Any, name: str) -> TypeError:
     }.get(kind)
     if cure is not None:
         return TypeError(f"{name} has dtype {dtype}; real numbers are needed.{cure}")
+    if hasattr(x, "columns") and hasattr(x, "select_dtypes"):
+        text = ", ".join(map(str, x.select_dtypes(exclude="number").columns))
+        return TypeError(
+            f"{name} has columns that hold no numbers: {text}. Choose those of the state, "
+            "frame[['q', 'p']]."
+        )
     return TypeError(
         f"{name} must hold real numbers; got {reprlib.repr(x)}. Pass floats, an array of them, or "
         "lists with rows of equal length."

@@ -52,6 +52,7 @@ from hamkernel._posterior import Posterior
 from hamkernel._solvers.problem import Problem
 from hamkernel._solvers.stream import AbstractStreamingFit
 from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._trajectories.lagrangian import LearnedLagrangian
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.model import Model
 from hamkernel._trajectories.segments import LinearisedSegments
@@ -64,7 +65,13 @@ _FIRST_LINE = "hamkernel field, version {}, sha256 {}"
 
 def save(
     path: str | os.PathLike[str],
-    field: AbstractField | AbstractStreamingFit | LagrangianField | Learned | Tuned | Posterior,
+    field: AbstractField
+    | AbstractStreamingFit
+    | LagrangianField
+    | Learned
+    | LearnedLagrangian
+    | Tuned
+    | Posterior,
 ) -> None:
     """Write a learned field to one file: kernel, hyperparameters, data, coefficients, version.
 
@@ -179,7 +186,8 @@ def load(
         )
     given = kernel is not None or mean is not None
     try:
-        as_fitted = node["class"] != Learned.__name__  # learn adds amplitudes and masses
+        results = Learned.__name__, LearnedLagrangian.__name__
+        as_fitted = node["class"] not in results  # learn adds amplitudes and masses
         like = skeleton(node, [], "field", _given(kernel, mean, as_fitted))
         with jax.ensure_compile_time_eval():  # a constant of what JAX traces around this call
             field = eqx.tree_deserialise_leaves(content, like)
@@ -204,7 +212,8 @@ def load(
 
 
 def _is_saved(cls: Any) -> bool:
-    kinds = AbstractField, AbstractStreamingFit, LagrangianField, Learned, Tuned, Posterior
+    results = Learned, LearnedLagrangian, Tuned, Posterior
+    kinds = AbstractField, AbstractStreamingFit, LagrangianField, *results
     return isinstance(cls, type) and issubclass(cls, kinds) and not inspect.isabstract(cls)
 
 

@@ -1,8 +1,10 @@
 """The text of kernels, fields and results, with the values of their hyperparameters."""
 
 import dataclasses
+import html
 import sys
 import textwrap
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -38,6 +40,20 @@ _ASCII = str.maketrans(
         "→": "->",
         "ẋ": "dx/dt",
         "∞": "inf",
+        "θ": "theta",
+        "Θ": "Theta",
+        "φ": "phi",
+        "ε": "eps",
+        "μ": "mu",
+        "Σ": "sum ",
+        "∂": "d",
+        "ᵀ": "^T",
+        "ᵢ": "_i",
+        "₁": "_1",
+        "₂": "_2",
+        "ṗ": "dp/dt",
+        "\u0307": "'",  # a dot above the letter before it, as of q̇
+        "é": "e",
     }
 )
 
@@ -50,6 +66,39 @@ def printable(text: str) -> str:
     except UnicodeEncodeError:
         return text.translate(_ASCII).encode(encoding, "replace").decode(encoding)
     return text
+
+
+class Shown:
+    """Prints as one head and a line for each finding; a notebook shows the lines as a table."""
+
+    def _summary(self) -> tuple[str, list[tuple[str, str]]]:
+        """The head, and the findings, each a name and a text of one or more lines."""
+        raise NotImplementedError
+
+    def __repr__(self) -> str:
+        head, findings = self._summary()
+        width = max((len(name) for name, _ in findings), default=0) + 2
+        lines = [name.ljust(width) + t.replace("\n", "\n" + width * " ") for name, t in findings]
+        return printable("\n".join([head, *lines]))
+
+    def _repr_html_(self) -> str:
+        head, findings = self._summary()
+        return f"<b>{html.escape(head)}</b>{html_table(findings)}"
+
+
+def html_table(rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
+    """A table of HTML from rows of plain text; the first cell of a row is its name."""
+    top = "".join(f"<th>{html.escape(cell)}</th>" for cell in head)
+    body = "".join(
+        "<tr>"
+        + "".join(
+            f'<{tag} style="text-align:left;white-space:pre-wrap">{html.escape(cell)}</{tag}>'
+            for tag, cell in zip(["th", *["td"] * (len(row) - 1)], row, strict=True)
+        )
+        + "</tr>"
+        for row in rows
+    )
+    return f"<table>{f'<thead><tr>{top}</tr></thead>' if head else ''}<tbody>{body}</tbody></table>"
 
 
 def described(module: Any, positional: tuple[str, ...] = ()) -> str:
@@ -132,6 +181,8 @@ def _is_short(value: Any) -> bool:
 
 def text(value: Any) -> str:
     """A value as it would be written; arrays of many numbers by their shape."""
+    if isinstance(value, Shown):
+        return value._summary()[0]
     if _is_short(value):
         digits: Any = {"float_kind": _number}
         return np.array2string(np.asarray(value), formatter=digits, separator=", ")

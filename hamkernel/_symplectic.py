@@ -17,6 +17,7 @@ and their derivative by the implicit function theorem.
 Source: "HLW" below is Hairer, Lubich & Wanner, Geometric Numerical Integration, 2nd ed. (2006).
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, ClassVar, NamedTuple
 
@@ -203,6 +204,13 @@ class AbstractGauss(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
     tableau: AbstractClassVar[GaussTableau]
     root_finder: AbstractVar[Any]
     root_find_max_steps: AbstractVar[int]
+
+    def __repr__(self) -> str:
+        usual, names = type(self)(), [field.name for field in dataclasses.fields(self)]
+        values = [(name, getattr(self, name), getattr(usual, name)) for name in names]
+        # Equal rather than identical, which a default is no longer after pickling.
+        changed = [f"{name}={v!r}" for name, v, u in values if eqx.tree_equal(v, u) is not True]
+        return f"{type(self).__name__}({', '.join(changed)})"
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> Float[Array, "s n"]:
         """Return the first guess of the stage slopes."""

@@ -174,6 +174,17 @@ def test_what_is_no_log_is_refused_in_a_sentence(arguments, said):
         hk.Runs(*arguments)
 
 
+def test_columns_of_text_are_named():
+    frame = pytest.importorskip("pandas").DataFrame({"q": T, "tag": ["a"] * 40})
+    with pytest.raises(TypeError, match=r"states\[0\] has columns that hold no numbers: tag\. Ch"):
+        hk.Runs(T, frame)
+
+
+def test_a_flat_list_of_rows_is_refused_with_the_line_that_makes_rows():
+    with pytest.raises(ValueError, match=r"Rows of one flat list: np.reshape\(values, \(40, 2\)\)"):
+        hk.Runs(T, X.ravel().tolist())
+
+
 @pytest.mark.parametrize(
     "inputs", [U, U[:, None], U.tolist(), (T, U), [T, U], ([*T], [*U]), (T, U[:, None])]
 )
@@ -407,7 +418,7 @@ def test_the_table_of_a_log_says_what_was_found_and_what_to_do():
     assert found.failing == ("impossible samples",)
     row = found["impossible samples"]
     assert row.value == "1, the first of them sample 20 of run 0"
-    assert "Write NaN for them" in row.advice
+    assert "Write NaN there" in row.advice
     names = "impossible samples, wrapped angles, gaps, constant, clipped sensors, dead sensors, "
     names += "repeated samples, interpolated samples, constant inputs, dependent inputs, feedback"
     assert [each.name for each in found] == names.split(", ")
@@ -417,11 +428,11 @@ def test_the_table_of_a_log_says_what_was_found_and_what_to_do():
 def test_what_is_printed_degrades_on_a_terminal_of_ascii():
     code = (
         "from hamkernel._trajectories.table import Diagnostic, Diagnostics\n"
-        "row = Diagnostic('chi', 'χ² is 2', '≤ 1', False, 'λ ≤ χ …', 'Ж')\n"
+        "row = Diagnostic('chi', 'χ² is 2', '≤ 1', False, 'λ ≤ χ … ∂ q̇', 'Ж')\n"
         "print(Diagnostics((row,)))"
     )
     for encoding, said in (
-        ("ascii", "lambda <= chi ..."),
+        ("ascii", "lambda <= chi ... d q'"),
         ("cp1252", "lambda"),
         ("utf-8", "λ ≤ χ …"),
     ):

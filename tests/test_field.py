@@ -207,13 +207,16 @@ def test_kernels_and_fields_print_the_values_of_their_hyperparameters():
     K = hk.CurlFree(2.0 * hk.Gaussian(jnp.array([0.5, 3.28333333])))
     assert repr(K) == "CurlFree(2 * Gaussian(lengthscale=[0.5, 3.283]))"
     text = repr(fitted(hk.Symplectic))
-    assert "regularization=0.001" in text
+    assert text.startswith("KernelField of 2 coordinates\nkernel    Symplectic(")
+    assert "lambda    0.001\nsolver    Cholesky, relative residual" in text
     assert "lengthscale=" in text
-    assert "points=f64[6,2]" in text
     # Nothing has a value while it is traced.
     traced = []
     jax.eval_shape(lambda K: traced.append(repr(K)), K)
     assert "log_lengthscale=f64[2]" in traced[0]
+    jax.eval_shape(lambda field: traced.append(repr(field)) or field, fitted(hk.Symplectic))
+    assert traced[1].startswith("KernelField: no numbers yet")
+    assert "<th" in fitted(hk.Symplectic)._repr_html_()
 
 
 def quadratic(x, z):

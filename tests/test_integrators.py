@@ -1,5 +1,7 @@
 """Order, symplecticity and reversibility, each beside a solver for which the check fails."""
 
+import pickle
+
 import diffrax
 import equinox as eqx
 import jax
@@ -173,6 +175,13 @@ def test_only_symmetric_methods_come_back_by_integrating_backwards(solver):
         assert gap > 1e-8
     else:
         assert gap < 1e-13  # 80 steps of rounding
+
+
+def test_an_integrator_prints_what_differs_from_its_defaults():
+    copy = pickle.loads(pickle.dumps(ImplicitMidpoint()))
+    assert repr(copy) == repr(ImplicitMidpoint()) == "ImplicitMidpoint()"
+    changed = GaussLegendre4(root_find_max_steps=7)
+    assert repr(changed) == "GaussLegendre4(root_find_max_steps=7)"
 
 
 def test_gauss_coefficients_are_those_of_the_tables():

@@ -306,10 +306,10 @@ def test_times_that_are_off_are_named():
     ("kernel", "said"), [(KERNEL, True), (hk.Symplectic(hk.Gaussian(np.ones(2))), False)]
 )
 def test_one_lengthscale_for_coordinates_of_other_sizes_is_said(kernel, said):
-    assert lengthscales(kernel, np.array([1.0, 100.0])) is None
-    assert lengthscales(kernel, np.array([1.0, 1000.0])).passes != said
+    assert lengthscales(kernel, np.array([1.0, 100.0]), "qp") is None
+    assert lengthscales(kernel, np.array([1.0, 1000.0]), "qp").passes != said
     some = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0))
-    assert lengthscales(some, np.array([1e-6, 1e6])).passes
+    assert lengthscales(some, np.array([1e-6, 1e6]), "qp").passes
 
 
 @pytest.mark.parametrize(("rest_speed", "said"), [(0.1, True), (0.01, False)])

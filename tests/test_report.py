@@ -39,7 +39,10 @@ def test_a_summary_has_a_line_for_each_finding(learned):
     assert len(lines) < 10
     assert lines[0].startswith("Learned from 2 runs, 40 samples: ")
     assert ".plot()" in lines[-1]
-    assert "<table>" in learned._repr_html_()
+    shown = learned._repr_html_()
+    assert "<table>" in shown
+    (picture,) = re.findall('src="data:image/png;base64,([^"]*)"', shown)
+    assert base64.b64decode(picture).startswith(b"\x89PNG")
 
 
 def test_a_page_has_all_of_it_inside(learned, tmp_path):

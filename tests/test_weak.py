@@ -4,11 +4,13 @@
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
+from hamkernel._report import script
 from hamkernel._trajectories import weak
 from hamkernel._trajectories.smoothing import Process, smooth
 
@@ -135,9 +137,35 @@ def swings(count=3, noise=1e-3, viscous=0.0, dry=0.0, seed=0):
 ONE = hk.Lagrangian(hk.Gaussian(1.0), hk.Gaussian(1.0), angles=(0,))
 
 
+@pytest.fixture(scope="module")
+def motor():
+    return hk.learn(ONE, swings())
+
+
 @pytest.mark.slow
-def test_a_motor_on_a_pendulum_is_learned_from_its_angle():
-    learned = hk.learn(ONE, swings())
+def test_a_machine_is_saved_drawn_and_reported(motor, tmp_path):
+    hk.save(tmp_path / "learned.hk", motor)
+    loaded = hk.load(tmp_path / "learned.hk")
+    q = np.array([0.3])
+    np.testing.assert_array_equal(loaded.field.gravity(q), motor.field.gravity(q))
+    assert repr(loaded) == repr(motor)
+    panels = loaded.plot(run=-1).axes
+    assert [ax.get_ylabel() for ax in panels] == [
+        "$q_{1}$", "$M_{11}$", r"$\partial V/\partial q_{1}$"
+    ]  # fmt: skip
+    q, M = panels[1].lines[0].get_xydata().T
+    np.testing.assert_allclose(M, 2.0, rtol=0.02)
+    plt.close("all")
+    hk.report(loaded, tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "data:image/png" in page
+    assert "The field may be used" in page
+    exec(script(str(tmp_path / "learned.hk"), loaded), {})
+
+
+@pytest.mark.slow
+def test_a_motor_on_a_pendulum_is_learned_from_its_angle(motor):
+    learned = motor
     assert learned.converged
     assert learned.posterior is learned.field
     Q = np.linspace(-1.2, 1.2, 20)[:, None]

@@ -27,6 +27,7 @@ from hamkernel._kernels.built_in import Gaussian
 from hamkernel._machine import full_precision, one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.measurements import Measurements, observations
+from hamkernel._show import html_table, printable
 from hamkernel._solvers.problem import make_problem
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.structure import DivergenceFree, Separable
@@ -109,7 +110,19 @@ class Comparison:
         for row in self.table:
             numbers = f"{row.difference:10.1f}  {row.log_likelihood:14.1f}  {row.parameters:7d}"
             lines.append(f"  {row.name:{width}s}  {numbers}")
-        return "\n".join(lines)
+        return printable("\n".join(lines))
+
+    def _repr_html_(self) -> str:
+        answers = [(q, self.answers[key], self.reasons[key]) for key, q in QUESTIONS.items()]
+        scores = [
+            (row.name, f"{row.difference:.1f}", f"{row.log_likelihood:.1f}", str(row.parameters))
+            for row in self.table
+        ]
+        head = ("candidate", "difference", "log likelihood", "numbers")
+        return (
+            f"<b>Which physics do these {self.rows} values obey?</b>"
+            f"{html_table(answers)}{html_table(scores, head)}"
+        )
 
 
 @full_precision

@@ -74,6 +74,9 @@ class Formula(eqx.Module):
             f"probability {float(self.probability):.2f}]"
         )
 
+    def _repr_latex_(self) -> str:
+        return f"${self.latex()}$"
+
     def latex(self) -> str:
         r"""The formula in LaTeX, such as `H = 0.5002(12)\,p^{2} - 0.981(4)\,\cos(q)`.
 

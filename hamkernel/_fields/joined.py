@@ -108,6 +108,12 @@ class AbstractJoinedField(AbstractField):
         return shape.shape[-1]
 
     @property
+    def _next(self) -> str:
+        return (
+            f"field(x, u), .evaluate(X, U), {self._example}, hk.simulate(field, x0, ts, inputs=u)"
+        )
+
+    @property
     def takes_inputs(self) -> bool:
         """True: a velocity needs u as well. `hk.simulate` reads this."""
         return True

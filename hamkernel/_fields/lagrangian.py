@@ -10,11 +10,11 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._machine import compiled
-from hamkernel._show import described
+from hamkernel._show import Shown, has_arrays, text
 from hamkernel._structures.lagrangian import Lagrangian, LagrangianFeatures
 
 
-class LagrangianField(eqx.Module):
+class LagrangianField(Shown, eqx.Module):
     """The machine that torques tell of; made by `fit` and `learn` with a `Lagrangian`.
 
     `field(x, u)` is ẋ = (v, a) of the state x = (q, v) under the torques u, so that
@@ -41,8 +41,14 @@ class LagrangianField(eqx.Module):
     least_inertia: Float[Array, ""]
     least_inertia_deviation: Float[Array, ""]
 
-    def __repr__(self) -> str:
-        return described(self)
+    def _summary(self) -> tuple[str, list[tuple[str, str]]]:
+        rows = [("kernel", text(self.kernel))]
+        if has_arrays(self.noise) and require.is_concrete(self):
+            least, deviation = text(self.least_inertia), text(self.least_inertia_deviation)
+            rows.append(("torque noise", text(self.noise)))
+            rows.append(("least inertia", f"{least} with a deviation of {deviation}"))
+        rows.append(("next", ".mass_matrix(q), .gravity(q), .inverse_dynamics(q, v, a)"))
+        return f"LagrangianField of {self.features.count} joints", rows
 
     @property
     def kernel(self) -> Lagrangian:

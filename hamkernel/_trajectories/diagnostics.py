@@ -3,7 +3,7 @@
 Each function below answers one question about a `FitQuality` and returns a `Diagnostic`.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -33,6 +33,7 @@ class FitQuality(NamedTuple):
     """How well the field follows the runs.
 
     Attributes:
+        names: the names of the coordinates, those of the columns of the log if it has any.
         noise: σ of each coordinate, shape (n,), NaN where it was never measured.
         scale: the standard deviations of the coordinates, shape (n,).
         is_noise_known: whether the caller gave the noise.
@@ -67,6 +68,7 @@ class FitQuality(NamedTuple):
         free_run: the error of free runs over that of a constant, over two swings or fewer.
     """
 
+    names: Sequence[str]
     noise: Float[np.ndarray, " n"]
     scale: Float[np.ndarray, " n"]
     is_noise_known: bool
@@ -124,7 +126,7 @@ def diagnostics(
         _samples_per_swing(fit),
         _timing(fit),
         _curve(fit),
-        lengthscales(K, fit.scale),
+        lengthscales(K, fit.scale, fit.names),
         rest_speed(K, X, len(fit.scale)),
     ]
     return Diagnostics(tuple(row for row in rows if row is not None))
@@ -176,7 +178,8 @@ def _noise_against_motion(fit: FitQuality) -> Diagnostic:
         "0.5",
         bool(share[c] < 0.5),
         f"the field explains {'the runs' if share[c] < 0.5 else 'little of the runs'}: the noise "
-        f"of coordinate {c} is {fit.noise[c]:.3g}, and its states vary by {fit.scale[c]:.3g}",
+        f"of coordinate {fit.names[c]} is {fit.noise[c]:.3g}, and its states vary by "
+        f"{fit.scale[c]:.3g}",
         "Look for a sample that is no measurement, a jump, a structure that the motion does not "
         f"have, or one lengthscale for coordinates of different sizes (hk.Gaussian(np.ones({n})) "
         "has one for each).",
@@ -217,7 +220,8 @@ def _outliers(fit: FitQuality) -> Diagnostic | None:
         bool(core[c] > 0.5),
         "most residuals are as large as the noise that was found"
         if core[c] > 0.5
-        else f"a few samples of coordinate {c} are far off, and the noise found is theirs",
+        else f"a few samples of coordinate {fit.names[c]} are far off, and the noise found is "
+        "theirs",
         "Look at learned.residuals for samples that are no measurements, such as the zeros of a "
         "dropout, and write NaN for them.",
         decides=True,
@@ -252,8 +256,8 @@ def _chi_squared(fit: FitQuality) -> Diagnostic:
         f"{_chi_squared_limit(fit.free):.3g}",
         passes or exact or (fit.is_disturbed and not fit.is_noise_known),
         f"χ² is {fit.chi_squared:.3g} per degree of freedom at the noise "
-        f"{'given' if fit.is_noise_known else 'found'}; residuals are largest in coordinate {c} of "
-        f"run {run}, {fit.misfit[run, c]:.2g} standard deviations",
+        f"{'given' if fit.is_noise_known else 'found'}; residuals are largest in coordinate "
+        f"{fit.names[c]} of run {run}, {fit.misfit[run, c]:.2g} standard deviations",
         f"Likely causes: {missing_force(fit)}; (q, q̇) given where (q, p) is needed (masses=True "
         "finds the ratios of masses); a wrong unit; a jump or push in a run.",
         decides=not fit.is_disturbed,
@@ -287,7 +291,7 @@ def _whiteness(fit: FitQuality) -> Diagnostic:
         "p = 0.05, or 1.2",
         white.is_enough,
         f"the innovations are {'' if white.is_enough else 'not '}white: the correlation of "
-        f"neighbours is {white.neighbours[c]:.2f} in coordinate {c}",
+        f"neighbours is {white.neighbours[c]:.2f} in coordinate {fit.names[c]}",
         f"Likely causes: {causes}; sensors that are filtered or resampled.",
         decides=True,
     )
@@ -454,7 +458,9 @@ def _curve(fit: FitQuality) -> Diagnostic | None:
     )
 
 
-def lengthscales(K: AbstractMatrixKernel, scale: Float[np.ndarray, " n"]) -> Diagnostic | None:
+def lengthscales(
+    K: AbstractMatrixKernel, scale: Float[np.ndarray, " n"], names: Sequence[str]
+) -> Diagnostic | None:
     """Whether one lengthscale serves coordinates whose sizes differ by more than 300.
 
     With noise of a hundredth, the field of a pendulum has an error of .004 where they differ by 3
@@ -476,8 +482,8 @@ def lengthscales(K: AbstractMatrixKernel, scale: Float[np.ndarray, " n"]) -> Dia
         "one" if single else "one for each coordinate",
         "sizes within 300",
         not single,
-        f"the states vary by {least:.2g} in coordinate {np.nanargmin(scale)} and by {most:.2g} in "
-        f"coordinate {np.nanargmax(scale)}"
+        f"the states vary by {least:.2g} in coordinate {names[np.nanargmin(scale)]} and by "
+        f"{most:.2g} in coordinate {names[np.nanargmax(scale)]}"
         + (", and the kernel has one lengthscale for both" if single else ""),
         f"Give each coordinate its own, hk.Gaussian(np.ones({len(scale)})), or take units in which "
         "all are near one.",
@@ -514,7 +520,8 @@ def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> Non
     never = ~np.any([np.isfinite(np.asarray(x)).any(axis=0) for x in runs.states], axis=0)
     if not never.any():
         return
-    which = ", ".join(str(c) for c in np.flatnonzero(never))
+    names = runs.coordinate_names
+    which = ", ".join(names[c] for c in np.flatnonzero(never))
     if mean is None:
         raise ValueError(
             f"coordinate {which} was measured in no run. From the others alone it is known only up "
@@ -530,6 +537,6 @@ def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> Non
     blind = [c for c in np.flatnonzero(never) if not np.abs(D[:, ~never, c]).max() > 0]
     if blind:
         raise ValueError(
-            f"coordinate {blind[0]} was measured in no run, and the velocities of the mean do not "
-            "depend on it: give a mean that says how it moves the others, such as q̇ = p/m."
+            f"coordinate {names[blind[0]]} was measured in no run, and the velocities of the mean "
+            "do not depend on it: give a mean that says how it moves the others, such as q̇ = p/m."
         )

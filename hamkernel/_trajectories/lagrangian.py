@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._fields.lagrangian import LagrangianField, lagrangian_field
 from hamkernel._machine import compiled, compiled_by_size
-from hamkernel._show import printable, text
+from hamkernel._show import Shown, text
 from hamkernel._solvers.lagrangian import (
     check_machine,
     missing_friction,
@@ -26,6 +26,7 @@ from hamkernel._structures.lagrangian import (
     lagrangian_features,
 )
 from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics
+from hamkernel._trajectories.learned import learned_from
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.weak import (
     Channels,
@@ -40,7 +41,7 @@ from hamkernel._trajectories.weak import (
 from hamkernel._tuning.lagrangian import Sizes, likeliest
 
 
-class LearnedLagrangian(eqx.Module):
+class LearnedLagrangian(Shown, eqx.Module):
     """The machine that `learn` found with a `Lagrangian`.
 
     Attributes:
@@ -67,18 +68,31 @@ class LearnedLagrangian(eqx.Module):
     diagnostics: Diagnostics = eqx.field(static=True)
     runs: Runs
 
-    def __repr__(self) -> str:
-        samples = sum(len(x) for x in self.states)
-        lines = [
-            f"LearnedLagrangian from {len(self.states)} runs, {samples} samples: "
-            + ("usable" if self.converged else "do not use this field"),
-            f"kernel         {text(self.kernel)}",
-            f"noise          {text(self.noise)}",
-            f"torque noise   {text(self.torque_noise)}",
-            f"diagnostics    {', '.join(self.diagnostics.failing) or 'nothing'} falls short",
-            "next           .field.mass_matrix(q), .field.mass_matrix_deviation(q), .diagnostics",
+    def _summary(self) -> tuple[str, list[tuple[str, str]]]:
+        table = self.diagnostics
+        short = [f"{name}: {table[name].meaning}" for name in table.failing]
+        return learned_from(self), [
+            ("kernel", text(self.kernel)),
+            ("noise", text(self.noise)),
+            ("torque noise", text(self.torque_noise)),
+            *(("falls short", line) for line in short or ["nothing"]),
+            ("next", ".plot(), .field.mass_matrix(q), .field.mass_matrix_deviation(q)"),
         ]
-        return printable("\n".join(lines))
+
+    def plot(self, run: int = 0) -> Any:
+        """One figure: the positions of one run with their smoothed paths, gravity and inertia.
+
+        It is that of `hk.plot.machine`.
+
+        Args:
+            run: the run, counted from 0, or from the end if negative.
+
+        Returns:
+            The Matplotlib figure.
+        """
+        import hamkernel  # the door to pictures, which load Matplotlib
+
+        return hamkernel.plot.machine(self, run)
 
     @property
     def posterior(self) -> LagrangianField:

@@ -403,6 +403,7 @@ def _quality(
     free = float(solution.count - len(solution.observations.targets))
     scatter = float(jnp.exp(solution.model.log_scatter))
     return FitQuality(
+        names=runs.coordinate_names,
         noise=sigma,
         scale=scale,
         is_noise_known=is_noise_known,

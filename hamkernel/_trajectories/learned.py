@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import html
-import importlib
 import warnings
 from collections.abc import Callable
 from typing import Any
@@ -18,7 +16,7 @@ from hamkernel import _require as require
 from hamkernel._machine import full_precision
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._posterior import Posterior, condition
-from hamkernel._show import described, printable, text
+from hamkernel._show import Shown, described, text
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._trajectories.evidence import Evidence, EvidenceOfRows
@@ -54,7 +52,7 @@ class Iteration(eqx.Module):
         return described(self)
 
 
-class Learned(eqx.Module):
+class Learned(Shown, eqx.Module):
     """The field that `learn` found, with the paths, the noise and the diagnostics.
 
     Attributes:
@@ -130,22 +128,7 @@ class Learned(eqx.Module):
     evidence: Evidence | EvidenceOfRows
     again: Callable[..., Learned]
 
-    def __repr__(self) -> str:
-        samples = sum(len(x) for x in self.states)
-        count = len(self.states)
-        lines = [
-            f"Learned from {count} run{'s' * (count != 1)}, {samples} samples: "
-            + ("usable" if self.converged else "do not use this field"),
-            *(
-                name.ljust(15) + value.replace("\n", "\n" + 15 * " ")
-                for name, value in self._findings()
-            ),
-            "next           .plot(), .score(), .diagnostics, hk.simulate(learned.field, x0, ts)",
-        ]
-        return printable("\n".join(lines))
-
-    def _findings(self) -> list[tuple[str, str]]:
-        """The findings, each a name and a line of text."""
+    def _summary(self) -> tuple[str, list[tuple[str, str]]]:
         noisy = bool(np.any(np.asarray(self.process_noise)))
         table = {row.name: row for row in self.diagnostics}
         rows = [
@@ -155,16 +138,14 @@ class Learned(eqx.Module):
         ]
         rows += [(name, table[name].value) for name in ("iterations", "free run") if name in table]
         short = [f"{name}: {table[name].meaning}" for name in self.diagnostics.failing]
-        return [*rows, *(("falls short", line) for line in short or ["nothing"])]
+        rows += [("falls short", line) for line in short or ["nothing"]]
+        rows.append(("next", ".plot(), .score(), .diagnostics, hk.simulate(learned.field, x0, ts)"))
+        return learned_from(self), rows
 
     def _repr_html_(self) -> str:
-        rows = "".join(
-            f"<tr><th>{html.escape(name)}</th>"
-            f'<td><pre style="text-align:left">{html.escape(value)}</pre></td></tr>'
-            for name, value in self._findings()
-        )
-        head, *_, last = repr(self).splitlines()
-        return f"<b>{html.escape(head)}</b><table>{rows}</table>{html.escape(last)}"
+        import hamkernel  # the door to pictures, which load Matplotlib
+
+        return super()._repr_html_() + hamkernel.plot.thumbnail(self)
 
     @property
     @full_precision
@@ -334,14 +315,22 @@ class Learned(eqx.Module):
         Returns:
             The Matplotlib figure.
         """
-        plot = importlib.import_module("hamkernel.plot")  # a door; pictures load Matplotlib
-        return plot.result(self, run, held_out)
+        import hamkernel  # the door to pictures, which load Matplotlib
+
+        return hamkernel.plot.result(self, run, held_out)
 
     @property
     def residuals(self) -> tuple[Float[Array, "T n"], ...]:
         """(measured − fitted)/σ for each run, NaN where nothing was measured."""
         pairs = zip(self.runs.states, self.states, strict=True)
         return tuple((jnp.asarray(x) - fit) / self.noise[None] for x, fit in pairs)
+
+
+def learned_from(learned: Any) -> str:
+    """The first line of a result: what was learned from, and whether to use it."""
+    count, samples = len(learned.states), sum(len(x) for x in learned.states)
+    of = f"{type(learned).__name__} from {count} run{'s' * (count != 1)}, {samples} samples"
+    return f"{of}: {'usable' if learned.converged else 'do not use this field'}"
 
 
 def misfits(runs: Runs, states: list[np.ndarray], noise: np.ndarray) -> np.ndarray:

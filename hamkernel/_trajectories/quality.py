@@ -44,6 +44,7 @@ def quality(
     timed = kept.any() and not (dropped or process.any())
     noisy = noisy_counts(end).any((0, 1))
     return FitQuality(
+        names=runs.coordinate_names,
         noise=noise,
         scale=data.scale,
         is_noise_known=False,

@@ -260,7 +260,7 @@ class Runs(eqx.Module):
                 states,
                 inputs,
                 [np.concatenate([ends[:, 0], ends[-1:, 1]]) for ends in lines],
-                self.names or [str(c) for c in range(self.dimension)],
+                self.coordinate_names,
                 self.input_names or [str(c) for c in range(self.input_count)],
             )
         )
@@ -321,6 +321,11 @@ class Runs(eqx.Module):
         return [np.asarray(t, float) for t in self.times], [
             np.asarray(x, float) for x in self.states
         ]
+
+    @property
+    def coordinate_names(self) -> tuple[str, ...]:
+        """The names of the columns; 0, 1, … if the log has none."""
+        return self.names or tuple(map(str, range(self.dimension)))
 
     @property
     def input_count(self) -> int:
@@ -392,8 +397,9 @@ class Runs(eqx.Module):
         for c in range(self.dimension):
             if not any(np.isfinite(np.asarray(x)[:, c]).any() for x in self.states):
                 raise ValueError(
-                    f"coordinate {c} was measured in no run, so it has no velocities. hk.learn(K, "
-                    "runs, mean=f) finds it where f says how it moves the others, as q̇ = p/m does."
+                    f"coordinate {self.coordinate_names[c]} was measured in no run, so it has no "
+                    "velocities. hk.learn(K, runs, mean=f) finds it where f says how it moves the "
+                    "others, as q̇ = p/m does."
                 )
 
 
@@ -562,6 +568,8 @@ def _rows(x: Any, t: np.ndarray, run: int, name: str) -> Float[np.ndarray, "T n"
         hint = ""
         if x.ndim == 2 and x.shape[1] == len(t):
             hint = f" It seems transposed: {name}[{run}].T."
+        elif x.ndim == 1 and len(x) and len(x) % len(t) == 0:
+            hint = f" Rows of one flat list: np.reshape(values, ({len(t)}, {len(x) // len(t)}))."
         elif name == "inputs" and x.ndim == 2:
             hint = (
                 " Where inputs have times of their own, give pairs, inputs=[(times, u), …]; where "

@@ -14,7 +14,7 @@ from hamkernel import _require as require
 from hamkernel._fields.base import known_part
 from hamkernel._machine import compiled
 from hamkernel._posterior import Posterior
-from hamkernel._show import printable
+from hamkernel._show import Shown
 from hamkernel._show import text as number
 from hamkernel._trajectories.flow import simulated, steps_for, stiffness
 from hamkernel._trajectories.free_run import Stretches, padded, predictions
@@ -24,7 +24,7 @@ from hamkernel._trajectories.runs import Runs
 _STEPS = 12  # of Levenberg and Marquardt; from smoothed states 4 are the rule
 
 
-class Score(eqx.Module):
+class Score(Shown, eqx.Module):
     """How well free runs of a learned field follow runs, with two baselines.
 
     A free run begins at the state that fits the first few samples best, and sees no sample after
@@ -94,17 +94,15 @@ class Score(eqx.Module):
             out.append((t[beyond[0] - 1] if len(beyond) else t[-1]) - t[0])
         return jnp.asarray(out)
 
-    def __repr__(self) -> str:
-        rows = {
-            "free run": self.rmse,
-            "last sample stays": self.persistence,
-            "linear model": self.linear,
-        }
-        lines = [f"The field {self.text}.", "root mean square error"]
-        lines += [f"  {name.ljust(18)} {number(value)}" for name, value in rows.items()]
+    def _summary(self) -> tuple[str, list[tuple[str, str]]]:
+        rows = [
+            ("error of free runs", f"{number(self.rmse)}, root mean square"),
+            ("last sample stays", number(self.persistence)),
+            ("linear model", number(self.linear)),
+        ]
         if np.isfinite(float(self.coverage)):
-            lines.append(f"  inside 95 % bands  {float(self.coverage):.0%}")
-        return printable("\n".join(lines))
+            rows.append(("inside 95 % bands", f"{float(self.coverage):.0%}"))
+        return f"The field {self.text}.", rows
 
 
 class _Linear(eqx.Module):

@@ -58,9 +58,10 @@ def _impossible(log: Log) -> Diagnostic:
         "impossible samples",
         [f"{count}, {first}"] * bool(count),
         "20 deviations, or a row of zeros",
-        f"{count} samples are impossible beside their neighbours, {first}: what a logger writes "
-        "for a lost measurement, such as -9999, 65535 or zeros",
-        "Write NaN for them; runs.impossible has their indices, by run.",
+        f"{count} {'sample is' if count == 1 else 'samples are'} impossible beside "
+        f"{'its' if count == 1 else 'their'} neighbours, {first}: what a logger writes for a lost "
+        "measurement, such as -9999, 65535 or zeros",
+        "Write NaN there; runs.impossible has the indices, by run.",
     )
 
 

@@ -30,7 +30,7 @@ from hamkernel._machine import compiled, full_precision, one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import observations
 from hamkernel._posterior import Posterior, posterior_of_problem
-from hamkernel._show import printable, text
+from hamkernel._show import Shown, text
 from hamkernel._solvers.fit import check_solver, features_of_parts, field_of_problem
 from hamkernel._solvers.lagrangian import field_of_torques, torque_data
 from hamkernel._solvers.problem import AbstractSolver, Problem, make_problem
@@ -50,7 +50,7 @@ from hamkernel._tuning.space import RIDGE, SearchSpace, constants, velocity_rms
 from hamkernel._validation import check_memory
 
 
-class Tuned(eqx.Module):
+class Tuned(Shown, eqx.Module):
     """The result of `tune`.
 
     Attributes:
@@ -113,21 +113,23 @@ class Tuned(eqx.Module):
             )
         return _posterior(self.problem, solver)
 
-    def __repr__(self) -> str:
+    def _summary(self) -> tuple[str, list[tuple[str, str]]]:
         outcome = "converged" if bool(self.converged) else "did not converge"
         values = ", ".join(
             f"{name} = {text(value)}" for name, value in self.hyperparameters.items()
         )
-        lines = [
-            f"Tuned: {outcome} after {text(self.steps)} steps, loss {text(self.loss)}",
-            f"kernel     {text(self.kernel)}",
-            f"found      {values}",
-            f"noise      {text(jnp.sqrt(self.noise_variance))} of a row, the root of N lambda",
+        rows = [
+            ("kernel", text(self.kernel)),
+            ("found", values),
+            ("noise", f"{text(jnp.sqrt(self.noise_variance))} of a row, the root of N lambda"),
         ]
         if self.at_bounds:
-            lines.append(f"at bounds  {', '.join(self.at_bounds)}: the data prefer values beyond")
-        lines.append("next       .field, .posterior(), .bounds")
-        return printable("\n".join(lines))
+            rows.append(
+                ("at bounds", f"{', '.join(self.at_bounds)}: the data prefer values beyond")
+            )
+        rows.append(("next", ".field, .posterior(), .bounds"))
+        head = f"Tuned: {outcome} after {text(self.steps)} steps, loss {text(self.loss)}"
+        return head, rows
 
 
 _posterior = one_blas_thread(full_precision(posterior_of_problem))

@@ -13,7 +13,7 @@ from hamkernel.plot._phase import (
     poincare_section,
     trajectories,
 )
-from hamkernel.plot._result import result
+from hamkernel.plot._result import machine, result, thumbnail
 from hamkernel.plot._style import COLORS
 from hamkernel.plot._time import energy_drift, fitted, smoothing, trajectory_error
 
@@ -28,11 +28,13 @@ __all__ = [
     "fitted",
     "hamiltonian",
     "loss_surface",
+    "machine",
     "phase_portrait",
     "plane_slice",
     "poincare_section",
     "result",
     "smoothing",
+    "thumbnail",
     "trajectories",
     "trajectory_error",
 ]

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
+import base64
+import io
 from typing import TYPE_CHECKING, Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 
 from hamkernel import _require as require
 from hamkernel.plot._learned import band
 from hamkernel.plot._style import BLUE, COLORS, DATA, coordinate, legend
-from hamkernel.plot._time import fitted
+from hamkernel.plot._time import fitted, index_of_run
 
 if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-
+    from hamkernel._trajectories.lagrangian import LearnedLagrangian
     from hamkernel._trajectories.learned import Learned
     from hamkernel._trajectories.runs import Runs
 
@@ -66,6 +69,83 @@ def result(learned: Learned, run: int = 0, held_out: Runs | None = None) -> Figu
     else:
         _uncertainty(right, learned, posterior)
     return figure
+
+
+def machine(learned: LearnedLagrangian, run: int = 0) -> Figure:
+    """Draw a learned Lagrangian on one page: positions, and inertia and gravity along the run.
+
+    One row for each joint i: its position over time, measured and smoothed; the inertia M_ii and
+    the gravity ∂V/∂q_i at the positions of the run, over q_i, each in its band of two deviations.
+
+    Args:
+        learned: the result of `hk.learn` with a `Lagrangian`.
+        run: the run, counted from 0, or from the end if negative.
+
+    Returns:
+        The Matplotlib figure; `figure.savefig("learned.png")` writes it.
+
+    Raises:
+        ValueError: there is no such run.
+    """
+    import matplotlib.pyplot as plt  # starts a backend, so only where a figure must be made
+
+    require.untraced("hk.plot.machine", "Draw outside.", learned)
+    run = index_of_run(run, len(learned.runs))
+    field, path, m = learned.field, np.asarray(learned.states[run]), learned.field.features.count
+    t, q = learned.runs.times[run], path[:, :m]
+    shown = q[np.linspace(0, len(q) - 1, min(_STATES, len(q))).astype(int)]
+
+    def laws(q):
+        M, M_deviation = field.mass_matrix(q), field.mass_matrix_deviation(q)
+        return jnp.diag(M), jnp.diag(M_deviation), field.gravity(q), field.gravity_deviation(q)
+
+    inertia, inertia_off, gravity, gravity_off = map(np.asarray, jax.lax.map(laws, shown))
+    figure, rows = plt.subplots(
+        m, 3, figsize=(9.6, 1.2 + 1.8 * m), layout="constrained", squeeze=False
+    )
+    names = learned.runs.names or [f"$q_{{{i + 1}}}$" for i in range(m)]
+    for i, (left, middle, right) in enumerate(rows):
+        left.plot(t, learned.runs.states[run][:, i], ".", color=DATA, ms=3, label="measured")
+        left.plot(t, q[:, i], color=BLUE, linewidth=1.0, label="smoothed")
+        left.set(ylabel=names[i])
+        order = np.argsort(shown[:, i])
+        for ax, values, off, name in (
+            (middle, inertia, inertia_off, f"$M_{{{i + 1}{i + 1}}}$"),
+            (right, gravity, gravity_off, rf"$\partial V/\partial q_{{{i + 1}}}$"),
+        ):
+            low, high = ((values + s * off)[order, i] for s in (-2, 2))
+            ax.fill_between(shown[order, i], low, high, color=BLUE, alpha=0.2, linewidth=0)
+            ax.plot(shown[order, i], values[order, i], color=BLUE, linewidth=1.2)
+            ax.set(ylabel=name, xlabel=names[i] if i == m - 1 else "")
+        for ax in (left, middle, right):
+            ax.grid(True, color="0.92", linewidth=0.6)
+    rows[0, 0].set_title(f"run {run}", fontsize="small")
+    rows[-1, 0].set_xlabel("time $t$")
+    legend(rows[0, 0])
+    return figure
+
+
+def thumbnail(learned: Learned) -> str:
+    """The first coordinate of the first run, measured and fitted, as a small image of HTML.
+
+    A notebook shows it below the summary of a result.
+    """
+    figure = Figure(figsize=(4.6, 1.7), layout="constrained")
+    ax = figure.subplots()
+    t, n = learned.runs.times[0], learned.runs.dimension
+    ax.plot(t, np.asarray(learned.runs.states[0])[:, 0], ".", color=DATA, ms=4, label="measured")
+    ax.plot(t, np.asarray(learned.states[0])[:, 0], color=BLUE, linewidth=1.2, label="fitted")
+    ax.set(xlabel="time $t$", ylabel=(learned.runs.names or [coordinate(0, n)])[0])
+    legend(ax, fontsize="x-small")
+    return image(figure, "first run", 80)
+
+
+def image(figure: Figure, text: str, dpi: int = 120) -> str:
+    """An <img> of HTML that holds the figure itself."""
+    content = io.BytesIO()
+    figure.savefig(content, dpi=dpi, format="png")
+    data = base64.b64encode(content.getvalue()).decode()
+    return f'<img alt="{text}" src="data:image/png;base64,{data}">'
 
 
 def _inputs(learned: Learned, count: int) -> tuple[Any, ...]:

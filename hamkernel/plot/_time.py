@@ -225,7 +225,7 @@ def smoothing(
     Raises:
         ValueError: there is no such run, or an argument does not have one entry per coordinate.
     """
-    run, n = _position(run, len(runs)), runs.dimension
+    run, n = index_of_run(run, len(runs)), runs.dimension
     labels = _coordinate_labels(n, units, names or runs.names)
     panels = _column(n, 1, ax)[:, 0]
     curves = runs.smoothing(_BETWEEN - 1)
@@ -276,7 +276,7 @@ def fitted(
     Raises:
         ValueError: there is no such run, or an argument does not have one entry per coordinate.
     """
-    run, n = _position(run, len(learned.runs)), learned.runs.dimension
+    run, n = index_of_run(run, len(learned.runs)), learned.runs.dimension
     labels = _coordinate_labels(n, units, names or learned.runs.names)
     panels = _column(n, 2, ax)
     ts, fit = np.asarray(learned.runs.times[run]), np.asarray(learned.states[run])
@@ -309,7 +309,7 @@ def fitted(
     return tuple((left, right) for left, right in panels)
 
 
-def _position(run: int, count: int) -> int:
+def index_of_run(run: int, count: int) -> int:
     if not -count <= run < count:
         raise ValueError(f"there is no run {run}: there are {count}, counted from 0.")
     return range(count)[run]
