@@ -45,8 +45,8 @@ from hamkernel._tuning.minimiser import best_in_box, inside_box
 from hamkernel._tuning.space import hyperparameters
 
 _SEARCHED = 4_000_000  # states times parts times centres of a loss: .1 s
-# In lengthscales. With windows of 1.0 one run of six particles on springs, of four lengthscales, has
-# 72 rows for 64 unknowns.
+# In lengthscales. With windows of 1.0 a run of six particles on springs, of four lengthscales, has
+# only 72 rows for 64 unknowns.
 _WIDTH = 0.5
 _STEPS = 40  # of BFGS
 # Of a force, as a share of it, so that rows of exact samples have a covariance.
