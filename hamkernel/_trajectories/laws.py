@@ -57,7 +57,7 @@ class States(eqx.Module):
     """The states x of smoothed channels z: z itself, or (q, p) of z = (q, q̇) with known masses.
 
     Attributes:
-        mass: of each position, shape (m,); None where z is x.
+        mass: the mass of each position, shape (m,); None where z is x.
     """
 
     mass: Float[Array, " m"] | None
@@ -67,12 +67,12 @@ class States(eqx.Module):
 
 
 def _channels(runs: Runs, mean: Any, noise: Any, is_canonical: bool) -> tuple[Channels, States]:
-    """What is smoothed: q with p/m as its slope where masses are known, else all coordinates."""
+    """The channels: q with p/m as its slope where masses are known, else all coordinates."""
     X, n = runs.on_host()[1], runs.dimension
     m = n // 2
     if isinstance(mean, Kinetic) and mean.mass.ndim < 2:
         mass = np.broadcast_to(np.asarray(mean.mass, float), (m,))
-        groups = [np.flatnonzero(mass == each) for each in np.unique(mass)]
+        groups = [np.flatnonzero(mass == m_i) for m_i in np.unique(mass)]
         values, slopes = [x[:, :m] for x in X], [x[:, m:] / mass[None] for x in X]
         if noise is not None:
             noise = np.stack([noise[:m], noise[m:] / mass])
@@ -114,8 +114,8 @@ class Rows(NamedTuple):
 
     Attributes:
         pieces: the smoothed runs.
-        state: what makes states of them.
-        mean: what is known of the field.
+        state: the map from the channels to states.
+        mean: the known part of the field.
         of_rows: the coordinates that have rows.
     """
 
@@ -143,7 +143,7 @@ class Rows(NamedTuple):
         """−∫ φ̇ x dt less what the mean says of it."""
         return weak_rows(self.law(None), self.pieces)
 
-    def of_features(self, K: AbstractMatrixKernel) -> Float[Array, "B W m r"]:
+    def feature_rows(self, K: AbstractMatrixKernel) -> Float[Array, "B W m r"]:
         """∫ φ f dt of each feature f of the kernel."""
 
         def law(z):
@@ -163,10 +163,12 @@ class Rows(NamedTuple):
 
 
 @compiled
-def _whitened(model: LawModel, rows: Rows, L) -> tuple[Float[Array, "N m"], Float[Array, " N"]]:
+def _rows_over_noise(
+    model: LawModel, rows: Rows, L
+) -> tuple[Float[Array, "N m"], Float[Array, " N"]]:
     """Features and what the mean leaves, over their noise; zero for windows outside of the runs."""
-    both = rows.of_features(model.kernel), rows.known()
-    return tuple(whiten(L, each) * jnp.exp(-model.log_scatter) for each in both)
+    both = rows.feature_rows(model.kernel), rows.known()
+    return tuple(whiten(L, a) * jnp.exp(-model.log_scatter) for a in both)
 
 
 @compiled
@@ -175,7 +177,9 @@ def _search(model: LawModel, design, low, high, rows: Rows, L):
 
     def loss(h):
         shown = model.with_flat(h)
-        return negative_log_likelihood(*_whitened(shown, rows, L)) + count * shown.log_scatter
+        return (
+            negative_log_likelihood(*_rows_over_noise(shown, rows, L)) + count * shown.log_scatter
+        )
 
     run = best_in_box(loss, design, low, high, jnp.full_like(low, 0.2), _STEPS)
     return inside_box(run.best.u, low, high), run.best.value
@@ -190,7 +194,7 @@ def _factors(rows: Rows, field: Any, deviation):
 @compiled
 def _weights_of(model: LawModel, rows: Rows, L) -> Float[Array, " m"]:
     """The mean of the weights of the features."""
-    return solved(*_whitened(model, rows, L))[1]
+    return solved(*_rows_over_noise(model, rows, L))[1]
 
 
 @compiled
@@ -198,7 +202,7 @@ def _compress(model: LawModel, rows: Rows, L):
     """All rows as m orthonormal combinations: weights (m, Q, n) at points (Q, n), targets (m,)."""
     p, n = rows.pieces, rows.state(rows.pieces.path[0, 0]).shape[0]
     F, y = (
-        whiten(L, a) for a in (rows.of_features(model.kernel), rows._replace(mean=None).known())
+        whiten(L, a) for a in (rows.feature_rows(model.kernel), rows._replace(mean=None).known())
     )
     Q, _ = jnp.linalg.qr(F)
 

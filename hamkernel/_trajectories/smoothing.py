@@ -132,7 +132,7 @@ def _filtered(process: Process, steps, y, seen, slopes: Any = None):
     stationary = _stationary(process)
     rate, one = jnp.exp(process.log_rate), jnp.ones_like(process.log_rate)
 
-    def observed(m, P, i, unit, sample, there, log_noise):
+    def update(m, P, i, unit, sample, there, log_noise):
         row = unit * P[i]
         S = unit * row[i] + jnp.exp(2 * log_noise)
         error = jnp.where(there, sample - unit * m[i], jnp.zeros_like(sample))
@@ -147,9 +147,9 @@ def _filtered(process: Process, steps, y, seen, slopes: Any = None):
         m = A @ m
         P = stationary + A @ (P - stationary) @ A.T
         P = (P + P.T) / 2
-        after, Q, S, error, loss = observed(m, P, 0, one, value, there, process.log_noise)
+        after, Q, S, error, loss = update(m, P, 0, one, value, there, process.log_noise)
         if slope:
-            after, Q, _, _, more = observed(after, Q, 1, rate, *slope, slopes[2])
+            after, Q, _, _, more = update(after, Q, 1, rate, *slope, slopes[2])
             loss = loss + more
         return (after, Q), (m, P, S, error, A, loss)
 
@@ -271,9 +271,9 @@ def processes(
         # As many as 64 pieces of eight coordinates say enough of a few numbers.
         part = np.unique(np.linspace(0, len(arrays[0]) - 1, 512).round().astype(int))
         arrays = [a[part] for a in (np.repeat(steps, len(g), 0), *arrays)]
-        found = _process(*arrays, longest, spacing)
+        coordinate = _process(*arrays, longest, spacing)
         for c in g:
-            out[c] = found._replace(seen=bool(pieces.seen[:, :, c].any()))
+            out[c] = coordinate._replace(seen=bool(pieces.seen[:, :, c].any()))
     return out
 
 

@@ -5,12 +5,13 @@ A law d/dt a(z) + b(z) = c with a and b linear in its weights becomes
     ∫ (φ b − φ̇ a) dt = ∫ φ c dt,      φ(t) = (1 − s²)⁵, s = (t − t₀)/T, in −1 < s < 1,
 
 in which nothing is differentiated twice in time. The channels of a run, its positions or all its
-coordinates, are Gaussian processes in time, those of `smoothing`, so that the path z of the
-channels, and of their slopes where the law needs these, and the covariance S of its errors follow
-from the samples. Runs are cut into pieces with windows that overlap by half. Let D be the
-derivative of the rows of a piece with respect to the path. Their errors then have the covariance
-D S Dᵀ, to first order. D depends on the law, so a law is solved for twice: first without the part
-of this covariance that belongs to what is not known of the law, and then with all of it.
+coordinates, are the Gaussian processes in time of `smoothing`. So the samples determine the path z
+of the channels, with their slopes if the law needs these, and the covariance S of its errors.
+
+Runs are cut into pieces with windows that overlap by half. Let D be the derivative of the rows of a
+piece with respect to the path. Their errors then have the covariance D S Dᵀ, to first order. D
+depends on the law, so a law is solved for twice: first with the part of D that is known, and then
+with all of it.
 """
 
 from collections.abc import Callable
@@ -41,7 +42,7 @@ Law = Callable[[Float[Array, " z"]], tuple[Float[Array, "m *r"], Float[Array, "m
 
 
 class Channels(NamedTuple):
-    """What is smoothed: C channels of each run, with samples of their slopes if there are any.
+    """The C channels of each run, with samples of their slopes if there are any.
 
     Attributes:
         values: their samples, shape (T, C), NaN where nothing was measured.
@@ -49,7 +50,7 @@ class Channels(NamedTuple):
         groups: channels that are alike and have one process, as indices.
         has_slopes: whether the path contains the slopes.
         noise: the standard deviations of values and of slopes, shape (2, C); None if unknown.
-        width: of the windows, in lengthscales of the smoothed channels.
+        width: the width of the windows, in lengthscales of the smoothed channels.
     """
 
     values: list[Float[np.ndarray, "T C"]]
@@ -118,86 +119,117 @@ def smoothed_pieces(runs: Runs, channels: Channels) -> Smoothed:
 
     Args:
         runs: the runs, whose inputs are c.
-        channels: what is smoothed.
+        channels: the channels of these runs.
 
     Raises:
         ValueError: no run has 13 samples, or a channel does not move.
     """
-    times = samples_at = runs.on_host()[0]
+    times, C = runs.on_host()[0], channels.values[0].shape[1]
     if max(map(len, times)) < _FEWEST:
         raise ValueError(
             f"no run has the {_FEWEST} samples that weak rows need: log more of them, or pass "
             "velocities to hk.fit."
         )
-    C = channels.values[0].shape[1]
-    coordinates, noise = _processes(times, channels)
-    length = min(c.lengthscale for c in coordinates)
-    spacing = float(np.median(np.concatenate([np.diff(t) for t in times])))
-    both = [np.stack(each, axis=1) for each in zip(channels.values, channels.slopes, strict=True)]
-    counts = [np.isfinite(x).astype(float) for x in both]
-    if 2 * spacing < (block := length / _SAMPLES):
-        paths = smoothed(coordinates, times, channels.values)
-        for r, (t, x) in enumerate(zip(times, both, strict=True)):
-            z = np.concatenate([paths.value[r, : len(t)], paths.slope[r, : len(t)]], axis=1)
-            rates = np.gradient(z, t, axis=0)
-            t, means, count, _ = condensed(t, x.reshape(len(t), -1), z, rates, block)
-            times[r], both[r], counts[r] = t, means.reshape(-1, 2, C), count.reshape(-1, 2, C)
-    sets = list(channels.groups)
-    if any((x[:, :, g] != x[:, :, g[:1]]).any() for x in counts for g in sets):
-        sets = [np.array([c]) for c in range(C)]  # of samples at different times
-    durations = [t[-1] - t[0] for t in samples_at]
-    half, orders = _NODES // 2, 1 + channels.has_slopes
-    step = min(channels.width * length, float(np.median(durations))) / _NODES
+    samples = _samples(times, channels)
+    durations = [t[-1] - t[0] for t in times]
+    half = _NODES // 2
+    step = min(channels.width * samples.length, float(np.median(durations))) / _NODES
     W = int(np.clip(_ROWS // C, 2, _WINDOWS))
     centres = half * (1 + np.arange(W))
     P = half * (W + 1) + 1
     phi, slope = _bump((np.arange(P)[None] - centres[:, None]) / half)
-    # With the rounding of a run's end.
-    starts = [
-        (r, samples_at[r][0] + step * half * (W + 1) * i)  # windows of two pieces do not overlap:
-        for r, duration in enumerate(durations)  # their errors are apart
-        for i in range(int((duration / step - 2 * half + 1e-9) // (half * (W + 1))) + 1)
-    ]
-    path, inside, targets = np.zeros((len(starts), P, 2 * C)), [], []
-    roots = [[np.zeros((0, 0))] * len(sets) for _ in starts]
-
-    def smooth(r: int, at: np.ndarray, out: np.ndarray, errors: list | None = None) -> None:
-        t = times[r]
-        near = (t >= at[0] - _MARGIN * length) & (t <= at[-1] + _MARGIN * length)
-        for i, g in enumerate(sets):
-            variance = noise[:, g] ** 2 / np.maximum(counts[r][near][:, :, g], 1)
-            samples = t[near], both[r][near][:, :, g], variance[:, :, 0]
-            found = _posterior_path(coordinates[g[0]].process, *samples, at, errors is not None)
-            out[:, g], out[:, C + g] = np.split(found[0], 2)
-            if errors is not None:
-                errors[i] = _root(found[1][: orders * len(at), : orders * len(at)])
-
-    for b, (r, start) in enumerate(starts):
-        at = start + step * np.arange(P)
-        smooth(r, at, path[b], roots[b])
-        inside.append(at[centres + half] <= samples_at[r][-1] + 1e-9 * step)
-        targets.append(_integrals(runs, r, at, centres, half * step, C))
-    along = [np.zeros((len(t), 2 * C)) for t in samples_at]
-    for r, t in enumerate(samples_at):
-        for part in np.array_split(np.arange(len(t)), -(-len(t) // _TOGETHER)):
-            values = np.zeros((len(part), 2 * C))
-            smooth(r, t[part], values)
-            along[r][part] = values
+    path, roots, inside, targets = [], [], [], []
+    for r, (t, duration) in enumerate(zip(times, durations, strict=True)):
+        # Windows of two pieces do not overlap: their errors are apart. 1e-9 is for rounding.
+        count = (duration / step - 2 * half + 1e-9) // (half * (W + 1)) + 1
+        for i in range(int(count)):
+            at = t[0] + step * (half * (W + 1) * i + np.arange(P))
+            z, errors = samples.path(r, at, 1 + channels.has_slopes)
+            path.append(z)
+            roots.append(errors)
+            inside.append(at[centres + half] <= t[-1] + 1e-9 * step)
+            targets.append(_integrals(runs, r, at, centres, half * step, C))
+    # A power of two, so that other data do not compile anew.
+    k = power_of_two(max(E.shape[1] for piece in roots for E in piece))
     is_inside = np.array(inside)
-    # So that other data do not compile anew.
-    k = power_of_two(max(E.shape[1] for each in roots for E in each))
     pieces = Pieces(
-        path[:, :, : orders * C],
-        np.array([[np.pad(E, ((0, 0), (0, k - E.shape[1]))) for E in each] for each in roots]),
-        np.array([next(i for i, g in enumerate(sets) if c in g) for c in range(C)]),
+        np.array(path)[:, :, : (1 + channels.has_slopes) * C],
+        np.array([[np.pad(E, ((0, 0), (0, k - E.shape[1]))) for E in piece] for piece in roots]),
+        np.array([next(i for i, g in enumerate(samples.sets) if c in g) for c in range(C)]),
         phi * step,
         slope / half,
         phi @ phi.T * step,
         np.where(is_inside[:, :, None], np.array(targets), 0.0),
         is_inside,
-        spacing,
+        float(np.median(np.concatenate([np.diff(t) for t in times]))),
     )
-    return Smoothed(pieces, noise, along, length)
+    along = [
+        np.concatenate(
+            [samples.path(r, at)[0] for at in np.array_split(t, -(-len(t) // _TOGETHER))]
+        )
+        for r, t in enumerate(times)
+    ]
+    return Smoothed(pieces, samples.noise, along, samples.length)
+
+
+class _Samples(NamedTuple):
+    """Samples of the channels and of their slopes, averaged where they are fast.
+
+    Attributes:
+        times: the times of each run, shape (T,).
+        both: the samples, NaN where nothing was measured, shape (T, 2, C).
+        counts: how many samples each is the mean of.
+        coordinates: the process of each channel.
+        noise: the standard deviations of the noise of a sample, shape (2, C).
+        sets: channels that have one process and were measured at the same times.
+        length: the shortest lengthscale.
+    """
+
+    times: list[np.ndarray]
+    both: list[np.ndarray]
+    counts: list[np.ndarray]
+    coordinates: list[Coordinate]
+    noise: Float[np.ndarray, "2 C"]
+    sets: list[Int[np.ndarray, " g"]]
+    length: float
+
+    def path(
+        self, r: int, at: Float[np.ndarray, " P"], orders: int = 0
+    ) -> tuple[Float[np.ndarray, "P Z"], list[Float[np.ndarray, "Q k"]]]:
+        """Channels and slopes of run r, and roots of the covariance of so many orders of a set."""
+        t, reach = self.times[r], _MARGIN * self.length
+        near = (t >= at[0] - reach) & (t <= at[-1] + reach)
+        C, Q = len(self.coordinates), orders * len(at)
+        out, roots = np.zeros((len(at), 2 * C)), []
+        for g in self.sets:
+            variance = self.noise[:, g] ** 2 / np.maximum(self.counts[r][near][:, :, g], 1)
+            samples = t[near], self.both[r][near][:, :, g], variance[:, :, 0]
+            mean, S = _posterior_path(self.coordinates[g[0]].process, *samples, at, orders > 0)
+            out[:, g], out[:, C + g] = np.split(mean, 2)
+            roots += [] if S is None else [_root(S[:Q, :Q])]
+        return out, roots
+
+
+def _samples(times: list[np.ndarray], channels: Channels) -> _Samples:
+    """The samples, means over 60 in a lengthscale if there are more."""
+    coordinates, noise = _processes(times, channels)
+    length = min(c.lengthscale for c in coordinates)
+    both = [np.stack(pair, axis=1) for pair in zip(channels.values, channels.slopes, strict=True)]
+    counts = [np.isfinite(x).astype(float) for x in both]
+    C, block = len(coordinates), length / _SAMPLES
+    if any(2 * np.median(np.diff(t)) < block for t in times):
+        paths = smoothed(coordinates, times, channels.values)
+        means = []
+        for r, (t, x) in enumerate(zip(times, both, strict=True)):
+            z = np.concatenate([paths.value[r, : len(t)], paths.slope[r, : len(t)]], axis=1)
+            slopes = np.gradient(z, t, axis=0)
+            means.append(condensed(t, x.reshape(len(t), -1), z, slopes, block)[:3])
+        times, both, counts = (list(column) for column in zip(*means, strict=True))
+        both, counts = ([x.reshape(-1, 2, C) for x in runs] for runs in (both, counts))
+    sets = list(channels.groups)
+    if any((x[:, :, g] != x[:, :, g[:1]]).any() for x in counts for g in sets):
+        sets = [np.array([c]) for c in range(C)]
+    return _Samples(times, both, counts, coordinates, noise, sets, length)
 
 
 def _processes(times, channels: Channels) -> tuple[list[Coordinate], Float[np.ndarray, "2 C"]]:
@@ -333,8 +365,8 @@ def factors(
 ) -> Float[Array, "B R R"]:
     """The Cholesky factors of the covariance of the rows of each piece.
 
-    It is that of the path, and that of a white c with these deviations at each sample. The identity
-    for windows outside of the runs.
+    Both the path and a white c, with these deviations at each sample, contribute. The identity for
+    windows outside of the runs.
     """
     white = jnp.asarray(pieces.overlap) * pieces.spacing
     white = jnp.kron(white, jnp.diag(jnp.square(deviation)))
