@@ -49,7 +49,7 @@ from hamkernel._trajectories.learned import Learned, empty, misfits
 from hamkernel._trajectories.model import Model, with_amplitude
 from hamkernel._trajectories.preprocessing import (
     Preprocessed,
-    choose_inputs,
+    decide,
     landmarks,
     preprocess,
     sample_points,
@@ -199,9 +199,7 @@ def learn(
     bar.set_description(f"learning, {seconds:.0f} s an iteration")
     task, now = start.begin(data)
     if not runs.is_decided:
-        runs, data = choose_inputs(
-            runs, data, lambda d: initial_loss(task._replace(data=d), now.model)
-        )
+        runs, data = decide(runs, data, lambda d: initial_loss(task._replace(data=d), now.model))
         task, now = start.begin(data)
     q = start.floor if process is None else np.maximum(process, start.floor)
     end = first = iterate(*fix_process_noise(task, now, q), max_steps, bar)

@@ -192,7 +192,7 @@ def with_inputs(data: Preprocessed, runs: Runs) -> Preprocessed:
     )
 
 
-def choose_inputs(
+def decide(
     runs: Runs, data: Preprocessed, loss: Callable[[Preprocessed], float]
 ) -> tuple[Runs, Preprocessed]:
     """The runs with the likeliest `between` and `delay` of their inputs.

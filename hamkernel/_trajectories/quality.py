@@ -11,7 +11,7 @@ from hamkernel._trajectories.diagnostics import FitQuality
 from hamkernel._trajectories.free_run import error_over_constant, of_swings
 from hamkernel._trajectories.iteration import End, asks_for_landmarks, initial_loss, noisy_counts
 from hamkernel._trajectories.kalman import smoothed_path
-from hamkernel._trajectories.preprocessing import choose_inputs, sample_points, time_of_swing
+from hamkernel._trajectories.preprocessing import decide, sample_points, time_of_swing
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.search import gain_of_friction, gain_of_inertia
 from hamkernel._trajectories.segments import Piece
@@ -105,7 +105,7 @@ def likelier_between(runs: Runs, end: End) -> str:
         return ""
     task, model = end.task, end.now.model
     any_way = runs.going_on("auto", runs.delay)
-    chosen, _ = choose_inputs(
+    chosen, _ = decide(
         any_way, task.data, lambda data: initial_loss(task._replace(data=data), model)
     )
     return chosen.between if chosen.between != runs.between else ""
