@@ -111,7 +111,7 @@ def diagnostics(
     if not fit.kept.any():
         return Diagnostics((_parts_left_out(fit),))
     rows = [
-        _free_run(fit),  # what a user notices, and so what a warning says first
+        _free_run(fit),  # first, so that a warning begins with it: users see this failure
         _settling(fit),
         _noise_against_motion(fit),
         _outliers(fit),
