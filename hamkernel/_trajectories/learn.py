@@ -378,9 +378,7 @@ def _result(
         pushed=fit.pushed,
         misfit=jnp.asarray(misfit),
         chi_squared=jnp.asarray(fit.chi_squared),
-        innovations=tuple(
-            map(jnp.asarray, join_runs(np.where(counts > 0, z, np.nan), end, np.nan))
-        ),
+        innovations=tuple(map(jnp.asarray, join_runs(np.where(counts > 0, z, np.nan), end))),
         whiteness=jnp.asarray(fit.white.probability),
         widening=jnp.asarray(fit.white.widening),
         disturbance=disturbances(end, times, bool(process.any())),

@@ -199,7 +199,9 @@ def _samples(
     return tuple(out)
 
 
-def join_runs(values: np.ndarray, end: End, empty: float) -> list[Float[np.ndarray, "T n"]]:
+def join_runs(
+    values: np.ndarray, end: End, empty: float = np.nan
+) -> list[Float[np.ndarray, "T n"]]:
     """Values by segment, joined to runs; `empty` where no segment is."""
     out = [np.full(run.path.shape, empty) for run in end.task.data.runs]
     for s, ((r, start, stop), good) in enumerate(zip(end.task.pieces, end.now.good, strict=True)):
