@@ -360,9 +360,12 @@ _UNOPTIMISED = {
 _MAX_UNOPTIMISED = 16_384  # numbers in the arguments; larger programs are optimised
 
 
-def compiled_by_size(function: Callable[P, T]) -> Callable[P, T]:
+def compiled_by_size(
+    function: Callable[P, T], unoptimised_up_to: int = _MAX_UNOPTIMISED
+) -> Callable[P, T]:
     """`compiled` with options of XLA that shorten compilation; on a CPU by size of the arguments.
 
+    Programs with at most `unoptimised_up_to` numbers in their arguments skip LLVM's optimisation.
     Inside another transformation the outer one chooses the options.
     """
     plain = compiled(function)
@@ -377,10 +380,19 @@ def compiled_by_size(function: Callable[P, T]) -> Callable[P, T]:
         platform = _sizes.platform()
         if any(isinstance(a, Tracer) for a in arrays) or not _options_are_known(platform):
             return plain(*args, **kwargs)
-        small = sum(a.size for a in arrays) <= _MAX_UNOPTIMISED
+        small = sum(a.size for a in arrays) <= unoptimised_up_to
         return (fastest if small else fast)[platform](*args, **kwargs)
 
     return by_size
+
+
+def compiled_without_emitters(function: Callable[P, T]) -> Callable[P, T]:
+    """`compiled` without XLA's fusion emitters, of integrations, which have few large fusions.
+
+    `hk.simulate` of a field of 24 points over 1000 saved times takes 2.7 s to compile for 4.4, and
+    114 ms to run for 136. A Gram of 500 states takes 12 ms without emitters, and 3.5 ms with them.
+    """
+    return compiled_by_size(function, unoptimised_up_to=0)
 
 
 @functools.cache
