@@ -18,6 +18,7 @@ from hamkernel._machine import (
     dense_bytes,
     full_precision,
     memory_bytes,
+    on_device_of_data,
     one_blas_thread,
     row_sharding,
     to_caller_sharding,
@@ -102,6 +103,7 @@ def fit(
 ) -> LearnedField: ...
 
 
+@on_device_of_data
 @one_blas_thread
 @full_precision
 def fit(

@@ -31,6 +31,7 @@ from hamkernel._machine import (
     RowSharding,
     compiled,
     full_precision,
+    on_device_of_data,
     one_blas_thread,
     row_sharding,
     shard,
@@ -144,6 +145,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
     def _solve(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> LearnedField:
         """The field for a checked λ and a positive number of points."""
 
+    @on_device_of_data
     @full_precision
     def add(
         self: Fit,
@@ -235,6 +237,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         one = jnp.ones((), self.dtype)
         return learned_field(fit._solve(jnp.ones_like(self.count), one), self._known_part)
 
+    @on_device_of_data
     @one_blas_thread
     @full_precision
     def field(self, regularization: ArrayLike | None = None) -> Any:
@@ -319,6 +322,7 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
     ) -> Fit:
         """`start` for checked arguments."""
 
+    @on_device_of_data
     @full_precision
     def start(
         self,
@@ -365,6 +369,7 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
         require.warn_of_float32(rows.targets)
         return self._start_fit(K, rows, require.ridge(regularization, rows.targets.dtype))
 
+    @on_device_of_data
     @one_blas_thread
     @full_precision
     def fit_chunks(
