@@ -1,6 +1,6 @@
 """Products with the Gram that never form it, in O((N + M) n) memory.
 
-After fusion, `K.expansion(xᵢ, Z, A)` for all i of a tile is one matrix product of the points and
+After fusion, `K.along(xᵢ, Z, A)` for all i of a tile is one matrix product of the points and
 one pass over the scalar pairs. The temporaries of a tile stay in the cache. Above about 32 MB every
 temporary would be new memory from the operating system, whose page faults cost more than the
 arithmetic.
@@ -174,7 +174,7 @@ def _product_by_tiles(K, X, Z, A):
     # The backward pass recomputes the tiles; otherwise it would keep every pair.
     @jax.checkpoint
     def tile(x, z, a):
-        return jax.vmap(K.expansion, in_axes=(0, None, None))(x, z, a)
+        return jax.vmap(K.along, in_axes=(0, None, None))(x, z, a)
 
     def row(x):
         def add(total, column):

@@ -70,6 +70,10 @@ KERNELS = {
     "divergence_free": hk.DivergenceFree(hk.RationalQuadratic(1.5, 1.1)),
     "sum": hk.Sum(hk.CurlFree(hk.Polynomial(3)), 0 + hk.Symplectic(hk.Gaussian(1.0))),
     "callable": hk.Symplectic(lambda x, z: jnp.cosh(x @ z)),
+    "poisson_invariant": hk.Poisson(
+        hk.Invariant(hk.Gaussian(1.0), [-np.eye(2)]),
+        lambda x: (1 + x[0] ** 2) * jnp.array([[0.0, 1.0], [-1.0, 0.0]]),
+    ),
     **{name: parity(K) for name, (parity, K) in PARITIES.items()},
 }
 

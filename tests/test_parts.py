@@ -11,7 +11,6 @@ import pytest
 
 import hamkernel as hk
 import hamkernel._features
-from hamkernel._trajectories import windows
 
 RNG = np.random.default_rng(0)
 
@@ -233,27 +232,6 @@ def test_what_is_no_part_is_refused():
             together,
             1e-3,
         )
-
-
-def test_weak_rows_integrate_by_parts():
-    """Against the exact integrals of a sine, and the smoother against a dense Gaussian process."""
-    t = np.linspace(0.0, 2.0, 61)
-    made = windows.windows(t, 12)
-    assert len(made.value) == 9
-    np.testing.assert_allclose(made.value @ np.cos(t), -made.slope @ np.sin(t), atol=5e-6)
-    np.testing.assert_allclose(made.value @ -np.sin(t), made.bend @ np.sin(t), atol=1e-4)
-    noisy = np.sin(3 * t)[None, :, None] + 0.1 * RNG.normal(size=(1, 61, 4))
-    none = np.zeros_like(noisy)
-    channels = windows.Channels(t[None] - 1, noisy, none, none == 0, none != 0)
-    h, found = windows.smooth_channels(channels, (0.1, None))
-    assert np.sqrt(np.mean((found.values[0] - np.sin(3 * t)[:, None]) ** 2)) < 0.06
-    k = hk.Matern(3.5, float(np.sqrt(7) * np.exp(-h.log_rate)))
-    K = np.exp(2 * h.log_amplitude) * jax.vmap(jax.vmap(k, (None, 0)), (0, None))(
-        t[:, None], t[:, None]
-    )
-    K = np.asarray(K) + 100 * (1 + np.outer(t - 1, t - 1))
-    wanted = K @ np.linalg.solve(K + 0.01 * np.eye(61), noisy[0])
-    np.testing.assert_allclose(found.values[0], wanted, atol=1e-5)
 
 
 @pytest.mark.slow

@@ -34,17 +34,22 @@ def test_the_conditioned_path_is_that_of_the_kalman_smoother():
     steps = jnp.asarray(np.diff(t, prepend=t[0]))
     centre = y.mean()
     wanted = smooth(PROCESS, steps, jnp.asarray(y - centre), jnp.ones(30, bool))
-    counts = np.ones((30, 1))
-    (q, v), S = weak._posterior_path(PROCESS, t, y[:, None], counts, (0.1, 0.0), t)
+    # Two channels side by side; their slopes were not measured.
+    none, variance = np.full((30, 2), np.nan), np.tile([0.01, np.nan], (30, 1))
+    x = np.stack([np.column_stack([y, 2 * y]), none], axis=1)
+    found, S = weak._posterior_path(PROCESS, t, x, variance, t)
+    q, v = np.split(found[:, 0], 2)
     np.testing.assert_allclose(q - centre, wanted.value, atol=1e-9)
+    np.testing.assert_allclose(found[:, 1], 2 * found[:, 0], atol=1e-12)
+    E = weak._root(S)
+    np.testing.assert_allclose(E @ E.T, S, atol=1e-5 * S.max())
     np.testing.assert_allclose(v, wanted.slope, atol=1e-8)
     deviations = np.sqrt(np.diagonal(S))
     np.testing.assert_allclose(deviations[:30], wanted.deviation, rtol=1e-6)
     np.testing.assert_allclose(deviations[30:], wanted.slope_deviation, rtol=1e-6)
-    both = np.column_stack([y, np.cos(t)])
-    counts = np.ones((30, 2))
-    (_, w), T = weak._posterior_path(PROCESS, t, both, counts, (0.1, 1e-3), t)
-    np.testing.assert_allclose(w, np.cos(t), atol=5e-3)
+    x[:, 1, 0], variance[:, 1] = np.cos(t), 1e-6
+    found, T = weak._posterior_path(PROCESS, t, x[:, :, :1], variance, t)
+    np.testing.assert_allclose(found[30:, 0], np.cos(t), atol=5e-3)
     assert np.diagonal(T)[:30].max() < np.diagonal(S)[:30].max()
 
 
@@ -59,12 +64,12 @@ def one_piece(path):
     s = (np.arange(nodes)[None] - np.array([12, 24])[:, None]) / half
     phi, slope = weak._bump(s)
     step = 0.02
-    S = np.random.default_rng(1).normal(size=(1, 1, 2 * nodes, 2 * nodes))
-    S = S @ np.swapaxes(S, 2, 3)
+    roots = np.random.default_rng(1).normal(size=(1, 1, 2 * nodes, 5))
     inside = np.ones((1, 2), bool)
     targets = np.zeros((1, 2, 1))
     windows = phi * step, slope / half
-    return weak.Pieces(path[None], S, *windows, phi @ phi.T * step, targets, inside, step)
+    overlap, owner = phi @ phi.T * step, np.zeros(1, int)
+    return weak.Pieces(path[None], roots, owner, *windows, overlap, targets, inside, step)
 
 
 def test_weak_rows_are_averages_of_the_torque_and_their_covariance_is_to_first_order():
@@ -77,13 +82,35 @@ def test_weak_rows_are_averages_of_the_torque_and_their_covariance_is_to_first_o
     slopes = jax.jacfwd(lambda path: weak.weak_rows(pendulum, piece._replace(path=path)))
     D = np.swapaxes(slopes(piece.path).reshape(2, 37, 2), 1, 2).reshape(2, 74)
     found = weak.path_covariance(pendulum, piece)[0]
-    np.testing.assert_allclose(found, D @ piece.covariance[0, 0] @ D.T, rtol=1e-6)
+    E = D @ piece.roots[0, 0]
+    np.testing.assert_allclose(found, E @ E.T, rtol=1e-6)
     deviation = jnp.array([0.3])
-    A, y, lost = weak.whiten(jnp.eye(2)[None, :, None], piece, found[None], deviation)
+    L = weak.factors(piece, found[None], deviation)
+    A = weak.whiten(L, jnp.eye(2)[None, :, None])
     C = found + 0.09 * piece.spacing * piece.overlap
     np.testing.assert_allclose(A.T @ A, np.linalg.inv(C), rtol=1e-8)
-    np.testing.assert_allclose(lost, np.linalg.slogdet(C)[1] / 2, rtol=1e-10)
-    assert not y.any()
+    np.testing.assert_allclose(weak.log_scale(L), np.linalg.slogdet(C)[1] / 2, rtol=1e-10)
+
+
+@pytest.mark.slow
+def test_channels_that_are_alike_share_a_process_and_its_errors():
+    rng, t = np.random.default_rng(2), np.arange(90) / 20
+    waves = np.column_stack([np.sin(2 * t), np.cos(2 * t)])
+    noisy = waves + 0.03 * rng.normal(size=waves.shape)
+    runs = hk.Runs([t], [noisy])
+    none = np.full(noisy.shape, np.nan)
+    channels = weak.Channels([noisy], [none], [np.arange(2)], has_slopes=False)
+    found = weak.smoothed_pieces(runs, channels)
+    assert found.pieces.roots.shape[1] == 1
+    np.testing.assert_allclose(found.noise[0], 0.03, rtol=0.3)
+    assert np.isnan(found.noise[1]).all()
+    assert np.sqrt(np.mean((found.states[0][:, :2] - waves) ** 2)) < 0.02
+    assert np.sqrt(np.mean((found.states[0][:, 2:] - 2 * waves[:, ::-1] * [1, -1]) ** 2)) < 0.12
+    noisy[40, 0] = np.nan  # no longer measured at the same times
+    apart = weak.smoothed_pieces(runs, channels._replace(noise=np.full((2, 2), 0.03)))
+    assert apart.pieces.roots.shape[1] == 2
+    np.testing.assert_array_equal(apart.pieces.owner, [0, 1])
+    np.testing.assert_allclose(apart.pieces.path, found.pieces.path, atol=0.03)
 
 
 def swings(count=3, noise=1e-3, viscous=0.0, dry=0.0, seed=0):

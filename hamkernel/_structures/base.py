@@ -86,6 +86,14 @@ class AbstractMatrixKernel(eqx.Module):
     def expansion(self, x: Point, Z: Points, A: Points) -> Point:
         """Σⱼ K(x, zⱼ) aⱼ, without the blocks."""
 
+    def directions(self, Z: Points, A: Points) -> Points:
+        """The directions vⱼ along which `expansion` differentiates at zⱼ, if it does so; else A."""
+        return A
+
+    def along(self, x: Point, Z: Points, V: Points) -> Point:
+        """`expansion` with `directions` in the place of A."""
+        return self.expansion(x, Z, V)
+
     def potential(self, x: Point, Z: Points, A: Points) -> Float[Array, ""]:
         """The potential of `expansion`; AttributeError if there is none."""
         raise AttributeError(self.no_potential)

@@ -103,15 +103,6 @@ class AbstractStructure(AbstractMatrixKernel):
         )
         return tree == other_tree and not any(map(eqx.is_array, arrays)) and arrays == other_arrays
 
-    @abc.abstractmethod
-    def transformed_coefficients(
-        self, S: Float[np.ndarray, "n n"]
-    ) -> Float[np.ndarray, "n n"] | None:
-        """The matrix T that maps the coefficient of a point z to the coefficient of its image S z.
-
-        K built from k(x, Sz), times a, is K(x, Sz) built from k, times Ta. None if T is unknown.
-        """
-
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
         return (self.kernel,)
@@ -250,15 +241,22 @@ class AbstractPotentialKernel(AbstractStructure):
         return descriptor._replace(directions=directions)
 
     def potential(self, x: Point, Z: Points, A: Points) -> Float[Array, ""]:
-        directions = jax.vmap(self.apply_transpose)(Z, A)
-        _, slopes = jax.jvp(lambda Z: row(self.kernel, x, Z), (Z,), (directions,))
-        return slopes.sum()
+        return self._slope(x, Z, self.directions(Z, A))
+
+    def _slope(self, x: Point, Z: Points, V: Points) -> Float[Array, ""]:
+        return jax.jvp(lambda Z: row(self.kernel, x, Z), (Z,), (V,))[1].sum()
 
     def potential_covariance(self, x: Point, z: Point) -> Float[Array, ""]:
         return self.kernel(x, z)
 
     def expansion(self, x: Point, Z: Points, A: Points) -> Point:
-        return self.apply(x, jax.grad(self.potential)(x, Z, A))
+        return self.along(x, Z, self.directions(Z, A))
+
+    def directions(self, Z: Points, A: Points) -> Points:
+        return jax.vmap(self.apply_transpose)(Z, A)
+
+    def along(self, x: Point, Z: Points, V: Points) -> Point:
+        return self.apply(x, jax.grad(self._slope)(x, Z, V))
 
     def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
         if self.conserves:
@@ -271,20 +269,6 @@ class AbstractPotentialKernel(AbstractStructure):
         A symmetry found for these values holds for all values.
         """
         return self.apply(x, jnp.eye(len(x), dtype=x.dtype))
-
-    def transformed_coefficients(
-        self, S: Float[np.ndarray, "n n"]
-    ) -> Float[np.ndarray, "n n"] | None:
-        # K built from k(x, Sz) is B(x) ∂x[(∂₂ᵀk)(x, Sz)] S B(z)ᵀ. The symmetry B(Sz) = ± S B(z)
-        # Sᵀ gives S B(z)ᵀ = ± B(Sz)ᵀ S⁻ᵀ, so T = ± S⁻ᵀ. For a constant B the sign is + if S B Sᵀ =
-        # B, − if −B.
-        if Invariance.TRANSLATION not in self.operator_invariance:
-            return S if np.array_equal(S, np.eye(len(S))) else None
-        with jax.ensure_compile_time_eval():
-            B = np.asarray(self.operator_at(jnp.zeros(len(S))))
-        image = S @ B @ S.T
-        sign = 1.0 if np.abs(image - B).max() < np.abs(image + B).max() else -1.0
-        return sign * np.linalg.inv(S).T
 
     def check_dimension(self, n: int) -> None:
         if Invariance.TRANSLATION in self.operator_invariance:  # B is the same everywhere
@@ -389,9 +373,6 @@ class Separable(AbstractStructure):
     def expansion(self, x: Point, Z: Points, A: Points) -> Point:
         return row(self.kernel, x, Z) @ A
 
-    def transformed_coefficients(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-        return np.eye(len(S))
-
 
 class DivergenceFree(AbstractStructure):
     """K(x, z) = tr(M) I − Mᵀ with M = ∂x ∂zᵀ k(x, z): fields with div f = 0, any n ≥ 2.
@@ -438,9 +419,6 @@ class DivergenceFree(AbstractStructure):
         basis = jnp.eye(len(x), dtype=x.dtype)
         return jax.vmap(term)(basis).sum(axis=0)
 
-    def transformed_coefficients(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-        return S  # ±1, see `__check_init__`
-
     def __check_init__(self):
         if any(mean.parity is None for mean in symmetries(self.kernel)):
             self.averaged(())
@@ -462,30 +440,24 @@ class DivergenceFree(AbstractStructure):
 def expand_group(
     K: AbstractMatrixKernel, Z: Float[Array, "M n"], A: Float[Array, "M n"]
 ) -> tuple[AbstractMatrixKernel, Float[Array, "L n"], Float[Array, "L n"]]:
-    """The kernel without its group, with the images of the points and their coefficients.
+    """The kernel without its group, with the images of the points and of their directions.
 
-    The expansion Σ K(x, zⱼ) aⱼ stays the same. A one-sided mean (1/|G|) Σ_h k(x, hz) is a sum over
-    |G| times as many points, divided by |G| once (a two-sided mean would be divided by |G|²). With
-    B(hz)ᵀ = ± h B(z)ᵀ hᵀ
+    So that Σⱼ K(x, zⱼ) aⱼ stays the same in `along`. With a one-sided mean of k,
 
-        Σⱼ ∂x ∂zᵀ k(x, hzⱼ) B(zⱼ)ᵀ aⱼ = ± Σⱼ (∂x ∂₂ᵀ k)(x, hzⱼ) B(hzⱼ)ᵀ h⁻ᵀ aⱼ.
+        Σⱼ ∂_vⱼ k_G(x, zⱼ) = Σⱼ Σ_h χ(h)/|G| ∂_(h vⱼ) k(x, h zⱼ),
 
-    In a sum over many pairs this is cheaper than adding all terms for each pair, which fills the
-    registers. K, Z and A are returned unchanged if K has no group or a two-sided mean.
+    functionals of u are functionals of the u without symmetry at the images, divided by |G| once (a
+    two-sided mean would be divided by |G|²). In a sum over many pairs this is cheaper than adding
+    all terms for each pair, which fills the registers. K and Z are returned unchanged if K has no
+    group or a two-sided mean.
     """
-    if not isinstance(K, AbstractStructure):
-        return K, Z, A
-    mean = symmetry_removed(K.kernel)
-    n = Z.shape[1]
+    V, n = K.directions(Z, A), Z.shape[1]
+    mean = symmetry_removed(K.kernel) if isinstance(K, AbstractStructure) else None
     if mean is None or not mean.is_one_sided(n):
-        return K, Z, A
+        return K, Z, V
     group = mean.group(n)
-    images, coefficients = [], []
-    for h in group:
-        T = K.transformed_coefficients(h.matrix)
-        if T is None:
-            return K, Z, A
-        images.append(jax.vmap(h)(Z))
-        coefficients.append(jax.vmap(h._replace(matrix=h.character * T))(A))
+    moves = K.field_parity < 0  # else values are added up, and not slopes along V
+    images = [h.character * (jax.vmap(h)(V) if moves else V) for h in group]
     K = eqx.tree_at(lambda K: K.kernel, K, mean.kernel)
-    return K, jnp.concatenate(images), jnp.concatenate(coefficients) / len(group)
+    points = jnp.concatenate([jax.vmap(h)(Z) for h in group])
+    return K, points, jnp.concatenate(images) / len(group)

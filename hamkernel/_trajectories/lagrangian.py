@@ -29,7 +29,10 @@ from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics
 from hamkernel._trajectories.learned import learned_from
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.weak import (
+    Channels,
     Pieces,
+    factors,
+    log_scale,
     path_covariance,
     smoothed_pieces,
     weak_rows,
@@ -107,7 +110,14 @@ def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, unused: dict[str, An
         unused: arguments of `learn` that say nothing of a Lagrangian.
     """
     m, noise = _check(K, runs, noise, unused)
-    smoothing = smoothed_pieces(runs, m, noise)
+    states = runs.on_host()[1]
+    q, v = ([x[:, part] for x in states] for part in (slice(m), slice(m, None)))
+    if not v[0].shape[1]:
+        v = [np.full(x.shape, np.nan) for x in q]
+    if noise is not None:
+        noise = np.append(noise, np.full(2 * m - len(noise), np.nan)).reshape(2, m)
+    channels = Channels(q, v, [np.array([c]) for c in range(m)], noise=noise)
+    smoothing = smoothed_pieces(runs, channels)
     pieces = smoothing.pieces
     X = jnp.asarray(pieces.states())
     features = lagrangian_features(K, X)
@@ -135,7 +145,7 @@ def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, unused: dict[str, An
     return LearnedLagrangian(
         field=field,
         kernel=end.kernel,
-        noise=jnp.asarray(smoothing.noise),
+        noise=jnp.asarray(smoothing.noise.ravel()[: runs.dimension]),
         torque_noise=end.deviation,
         states=tuple(map(jnp.asarray, smoothing.states)),
         log_evidence=-end.loss,
@@ -200,7 +210,8 @@ class _WeakRows(eqx.Module):
 
     def __call__(self, features: LagrangianFeatures, deviation: Float[Array, " m"]):
         rows = features.finished(weak_rows(features.of_motion, self.pieces))
-        return whiten(rows, self.pieces, self.covariance, deviation)
+        L = factors(self.pieces, self.covariance, deviation)
+        return whiten(L, rows), whiten(L, jnp.asarray(self.pieces.targets)), log_scale(L)
 
 
 _with_kernel = compiled(lambda features, K: features.with_kernel(K))
@@ -237,7 +248,7 @@ def _friction(features, pieces, covariance, deviation) -> Float[Array, "N k"]:
         columns = plain_friction(features, x[None, m:])[0]
         return jnp.zeros_like(columns), columns
 
-    return whiten(weak_rows(law, pieces), pieces, covariance, deviation)[0]
+    return whiten(factors(pieces, covariance, deviation), weak_rows(law, pieces))
 
 
 _LEAST_SWING = 5.0  # samples in a swing, as in `diagnostics`: with fewer noise hides the motion

@@ -1,8 +1,8 @@
 """Laws that many parts share, learned from noisy runs by two solves with weak rows.
 
-Of each coordinate whose velocity the laws change there is a row for each window, see `windows.py`.
-The unknowns are the weights of the features of the laws, few in a system of any size, so that a
-solve is linear in the number of coordinates. Kernel and scatter maximise the likelihood.
+Of each coordinate whose velocity the laws change there is a row for each window, see `weak.py`. The
+unknowns are the weights of the features of the laws, few in a system of any size, so that a solve
+is linear in the number of coordinates. Kernel and scatter maximise the likelihood.
 """
 
 from __future__ import annotations
@@ -15,16 +15,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
-from hamkernel._closed_forms import log_density
 from hamkernel._features import AbstractFeatures, features, is_of_parts
 from hamkernel._fields.kinetic import Kinetic
 from hamkernel._machine import compiled
 from hamkernel._observations.kinds import Functionals
 from hamkernel._posterior import condition
-from hamkernel._solvers.low_rank_factor import LowRankSystem
+from hamkernel._solvers.lagrangian import negative_log_likelihood, solved
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import completed, shared_laws
 from hamkernel._trajectories.diagnostics import FitQuality, diagnostics_of_rows
@@ -32,205 +31,61 @@ from hamkernel._trajectories.evidence import EvidenceOfRows
 from hamkernel._trajectories.free_run import Stretches, relative_error, stretches
 from hamkernel._trajectories.learned import Iteration, Learned, misfits
 from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.whiteness import Whiteness
-from hamkernel._trajectories.windows import (
+from hamkernel._trajectories.weak import (
     Channels,
-    Chunk,
-    full_factor,
-    smooth_channels,
-    white_factors,
-    whiten_rows,
-    windows,
+    Pieces,
+    factors,
+    path_covariance,
+    smoothed_pieces,
+    weak_rows,
+    whiten,
 )
-from hamkernel._tuning.minimiser import most_likely_in_box
+from hamkernel._trajectories.whiteness import Whiteness
+from hamkernel._tuning.minimiser import best_in_box, inside_box
 from hamkernel._tuning.space import hyperparameters
 
-_ROWS = 2048  # factored at once: .3 s
-_LONGEST = 256  # samples smoothed at once: a factor of 512 rows takes 5 ms
 _SEARCHED = 4_000_000  # states times parts times centres of a loss: .1 s
+# In lengthscales. With windows of 1.0 a run of six particles on springs, of four lengthscales, has
+# only 72 rows for 64 unknowns.
+_WIDTH = 0.5
 _STEPS = 40  # of BFGS
-
-WIDTH = 12  # intervals of a window
-
-
-class Piece(NamedTuple):
-    """A part of a run, smoothed at once.
-
-    Attributes:
-        run: its number.
-        samples: which of them.
-        states: the smoothed states, shape (T, n).
-        raw: the samples, those that were not measured replaced by smoothed ones, shape (T, n).
-        roots: B_j with B_j B_jᵀ the covariance of x_j, of each coordinate, (T, k).
-    """
-
-    run: int
-    samples: slice
-    states: Float[np.ndarray, "T n"]
-    raw: Float[np.ndarray, "T n"]
-    roots: list[Float[np.ndarray, "T k"]]
+# Of a force, as a share of it, so that rows of exact samples have a covariance.
+_EXACT = 1e-6
 
 
-class SmoothedRuns(NamedTuple):
-    """Runs, smoothed.
+class States(eqx.Module):
+    """The states x of smoothed channels z: z itself, or (q, p) of z = (q, q̇) with known masses.
 
     Attributes:
-        pieces: in their order, with overlaps.
-        noise: σ of each coordinate, shape (n,); NaN where nothing was measured.
-        masses: the known mass of each position, shape (m,); None where no mean has them.
+        mass: the mass of each position, shape (m,); None where z is x.
     """
 
-    pieces: list[Piece]
-    noise: Float[np.ndarray, " n"]
-    masses: Float[np.ndarray, " m"] | None
+    mass: Float[Array, " m"] | None
+
+    def __call__(self, z: Float[Array, " z"]) -> Float[Array, " n"]:
+        return z if self.mass is None else z * jnp.append(jnp.ones_like(self.mass), self.mass)
 
 
-def smoothed_runs(
-    runs: Runs, mean: Any, noise: Float[np.ndarray, " n"] | None, is_canonical: bool
-) -> SmoothedRuns:
-    """The runs smoothed: q with p/m as its derivative where masses are known, else alone."""
-    n = runs.dimension
+def _channels(runs: Runs, mean: Any, noise: Any, is_canonical: bool) -> tuple[Channels, States]:
+    """The channels: q with p/m as its slope where masses are known, else all coordinates."""
+    X, n = runs.on_host()[1], runs.dimension
     m = n // 2
-    parts = _parts(runs)
-    states = [np.zeros((s.stop - s.start, n)) for _, s in parts]
-    roots: list[list[Any]] = [[None] * n for _ in parts]
-    sigma = np.full(n, np.nan)
-    masses = None
     if isinstance(mean, Kinetic) and mean.mass.ndim < 2:
-        masses = np.broadcast_to(np.asarray(mean.mass, float), (m,))
-        groups = [
-            (np.flatnonzero(masses == mass), np.flatnonzero(masses == mass) + m, mass)
-            for mass in np.unique(masses)
-        ]
-    elif is_canonical:
-        groups = [(np.arange(m), None, 1.0), (np.arange(m, n), None, 1.0)]
+        mass = np.broadcast_to(np.asarray(mean.mass, float), (m,))
+        groups = [np.flatnonzero(mass == m_i) for m_i in np.unique(mass)]
+        values, slopes = [x[:, :m] for x in X], [x[:, m:] / mass[None] for x in X]
+        if noise is not None:
+            noise = np.stack([noise[:m], noise[m:] / mass])
+        state = States(jnp.asarray(mass))
     else:
-        groups = [(np.arange(n), None, 1.0)]
-    for of_values, of_slopes, mass in groups:
-        channels, means, size, unit = _channels(runs, parts, of_values, of_slopes, mass)
-        slope_size = size / unit * mass
-        known_noise = (
-            None if noise is None else float(np.median(noise[of_values])) / size,
-            None
-            if noise is None or of_slopes is None
-            else float(np.median(noise[of_slopes])) / slope_size,
-        )
-        h, smooth = smooth_channels(channels, known_noise)
-        sigma[of_values] = size * np.exp(h.log_noise)
-        if of_slopes is not None and channels.has_slope.any():
-            sigma[of_slopes] = slope_size * np.exp(h.log_slope_noise)
-        for k, (_, samples) in enumerate(parts):
-            T = samples.stop - samples.start
-            states[k][:, of_values] = means[k] + size * np.asarray(smooth.values)[k, :T]
-            if of_slopes is not None:
-                states[k][:, of_slopes] = slope_size * np.asarray(smooth.slopes)[k, :T]
-            piece_roots = [size * _root(np.asarray(S)[:T, :T]) for S in smooth.covariance[k]]
-            for i, c in enumerate(of_values):
-                roots[k][c] = piece_roots[i * len(piece_roots) // len(of_values)]
-    pieces = []
-    for (r, samples), path, piece_roots in zip(parts, states, roots, strict=True):
-        x = runs.on_host()[1][r][samples]
-        pieces.append(Piece(r, samples, path, np.where(np.isfinite(x), x, path), piece_roots))
-    return SmoothedRuns(pieces, sigma, masses)
-
-
-def _root(S: Float[np.ndarray, "T T"]) -> Float[np.ndarray, "T k"]:
-    """B with B Bᵀ = S but for a millionth of its trace."""
-    squares, V = np.linalg.eigh(S)
-    order = np.argsort(-squares)
-    squares, V = np.maximum(squares[order], 0.0), V[:, order]
-    k = int(np.searchsorted(np.cumsum(squares), (1 - 1e-6) * squares.sum())) + 1
-    return V[:, :k] * np.sqrt(squares[:k])
-
-
-def _parts(runs: Runs) -> list[tuple[int, slice]]:
-    """Parts of runs that are smoothed at once, which overlap by half of a window."""
-    out = []
-    for r, t in enumerate(runs.on_host()[0]):
-        start, stop = 0, 0
-        while stop < len(t):
-            stop = start + _LONGEST
-            stop = stop if len(t) - stop > 2 * WIDTH else len(t)
-            out.append((r, slice(start, stop)))
-            start = stop - WIDTH // 2 - 1
-    return out
-
-
-def _channels(
-    runs: Runs,
-    parts: list[tuple[int, slice]],
-    of_values: np.ndarray,
-    of_slopes: np.ndarray | None,
-    mass: float,
-) -> tuple[Channels, Float[np.ndarray, "S 1 C"], float, float]:
-    """Coordinates as channels, their means, their size, and the unit of time."""
-    times, states = runs.on_host()
-    T = max(s.stop - s.start for _, s in parts)
-    t = np.zeros((len(parts), T))
-    x, v = np.full((2, len(parts), T, len(of_values)), np.nan)
-    for k, (r, part) in enumerate(parts):
-        clock, length = times[r][part], part.stop - part.start
-        t[k, :length], t[k, length:] = clock - clock[0], clock[-1] - clock[0]
-        x[k, :length] = states[r][part][:, of_values]
-        if of_slopes is not None:
-            v[k, :length] = states[r][part][:, of_slopes] / mass
-    unit = t[:, -1].max() / 2
-    is_measured, has_slope = np.isfinite(x), np.isfinite(v)
-    counts = np.maximum(is_measured.sum(axis=1, keepdims=True), 1)
-    means = np.where(is_measured, x, 0.0).sum(axis=1, keepdims=True) / counts
-    x = np.where(is_measured, x - means, 0.0)
-    size = float(np.sqrt((x**2).sum() / max(is_measured.sum(), 1))) or 1.0
-    v = np.where(has_slope, v, 0.0) * unit / size
-    return Channels(t / unit - 1, x / size, v, is_measured, has_slope), means, size, unit
-
-
-def chunks_of(runs: Runs, smooth: SmoothedRuns, of_rows: np.ndarray, depends: np.ndarray) -> Chunk:
-    """The weak rows of some coordinates, in chunks of one shape, side by side."""
-    times = runs.on_host()[0]
-    raw: list[tuple] = []
-    window_limit = max(_ROWS // len(of_rows), 2)
-    for piece in smooth.pieces:
-        t = times[piece.run][piece.samples]
-        made = windows(t, WIDTH)
-        R = len(made.value)
-        if not R:
-            continue
-        for index in np.array_split(np.arange(R), -(-R // window_limit)):
-            used = np.flatnonzero(made.value[index].any(axis=0) | made.slope[index].any(axis=0))
-            samples = slice(used[0], used[-1] + 1)
-            value, slope, bend = (item[index][:, samples] for item in made)
-            z = piece.raw[samples]
-            rows = -slope @ z[:, of_rows]
-            roots = slope[None] * smooth.noise[of_rows, None, None]
-            for i, c in enumerate(of_rows):
-                if np.isnan(smooth.noise[c]) and smooth.masses is not None:
-                    q = c - len(smooth.masses)
-                    rows[:, i] = smooth.masses[q] * (bend @ z[:, q])
-                    roots[i] = bend * smooth.masses[q] * smooth.noise[q]
-            path_roots = [piece.roots[j][samples] for j in depends]
-            alike = all(
-                item is path_roots[0] or np.array_equal(item, path_roots[0]) for item in path_roots
-            )
-            path_roots = path_roots[:1] if alike else path_roots
-            raw.append((piece.states[samples], value, rows.T, roots, path_roots))
-    R, T = (max(len(item[1]) for item in raw), max(len(item[0]) for item in raw))
-    G = max(len(item[4]) for item in raw)
-    k = max(root.shape[1] for item in raw for root in item[4])
-    out = []
-    for points, value, rows, roots, path_roots in raw:
-        r, t = R - len(value), T - len(points)
-        path_roots = path_roots * (G // len(path_roots))
-        padded = [np.pad(item, ((0, t), (0, k - item.shape[1]))) for item in path_roots]
-        out.append(
-            Chunk(
-                np.pad(points, ((0, t), (0, 0)), "edge"),
-                np.pad(value, ((0, r), (0, t))),
-                np.pad(rows, ((0, 0), (0, r))),
-                np.pad(roots, ((0, 0), (0, r), (0, t))),
-                np.stack(padded),
-            )
-        )
-    return jax.tree.map(lambda *item: jnp.asarray(np.stack(item)), *out)
+        groups = [np.arange(m), np.arange(m, n)] if is_canonical else [np.arange(n)]
+        values, slopes, state = X, [np.full(x.shape, np.nan) for x in X], States(None)
+        noise = None if noise is None else np.stack([noise, noise])
+    if noise is not None:  # alike channels have one
+        noise = noise.copy()
+        for g in groups:
+            noise[:, g] = np.median(noise[:, g], axis=1, keepdims=True)
+    return Channels(values, slopes, groups, state.mass is not None, noise, _WIDTH), state
 
 
 class LawModel(NamedTuple):
@@ -254,119 +109,113 @@ def _features_of(K: AbstractMatrixKernel, n: int) -> AbstractFeatures:
     return features(K, n, 1, jax.random.key(0), jnp.float64)
 
 
-def _design(K, chunk: Chunk, of_rows) -> Float[Array, "c R m"]:
-    """∫ φ f_c dt of each feature."""
-    basis = _features_of(K, chunk.points.shape[1])
+class Rows(NamedTuple):
+    """The weak rows of laws.
 
-    def features_at(x):
-        return basis.rows(x)[of_rows]
+    Attributes:
+        pieces: the smoothed runs.
+        state: the map from the channels to states.
+        mean: the known part of the field.
+        of_rows: the coordinates that have rows.
+    """
 
-    F = jax.lax.map(features_at, chunk.points)  # (T, c, m)
-    return jnp.einsum("rt,tcm->crm", chunk.value, F)
+    pieces: Pieces
+    state: States
+    mean: Any
+    of_rows: Int[np.ndarray, " m"]
 
+    @property
+    def count(self) -> int:
+        """How many rows there are in windows inside of the runs."""
+        return int(np.sum(np.asarray(self.pieces.inside))) * len(self.of_rows)
 
-def _residual_rows(mean, chunk: Chunk, of_rows) -> Float[Array, "c R"]:
-    if mean is None:
-        return jnp.asarray(chunk.rows)
-    drift = jax.vmap(lambda x: mean(x)[of_rows])(chunk.points)
-    return jnp.asarray(chunk.rows) - jnp.einsum("rt,tc->cr", chunk.value, drift)
+    def law(self, field: Any) -> Any:
+        """d/dt x − field(x) − mean(x) = 0 as `weak_rows` takes it."""
 
+        def law(z):
+            x = self.state(z)
+            drift = sum((f(x) for f in (field, self.mean) if f is not None), jnp.zeros_like(x))
+            return x[self.of_rows], -drift[self.of_rows]
 
-def _rows(
-    K, chunks: Chunk, factors, mean, of_rows
-) -> tuple[Float[Array, "D m"], Float[Array, " D"]]:
-    """The whitened rows of the features, and of what the mean leaves; zero for empty windows."""
+        return law
 
-    def one(both):
-        chunk, L = both
-        F = whiten_rows(L, _design(K, chunk, of_rows))
-        return F, whiten_rows(L, _residual_rows(mean, chunk, of_rows))
+    def known(self) -> Float[Array, "B W m"]:
+        """−∫ φ̇ x dt less what the mean says of it."""
+        return weak_rows(self.law(None), self.pieces)
 
-    F, y = jax.lax.map(one, (chunks, factors))
-    return F.reshape(-1, F.shape[2]), y.reshape(-1)
+    def feature_rows(self, K: AbstractMatrixKernel) -> Float[Array, "B W m r"]:
+        """∫ φ f dt of each feature f of the kernel."""
+
+        def law(z):
+            x = self.state(z)
+            F = _features_of(K, len(x)).rows(x)[self.of_rows]
+            return jnp.zeros_like(F), F
+
+        return weak_rows(law, self.pieces)
+
+    def part(self, chosen: np.ndarray) -> Rows:
+        """The rows of some of the pieces."""
+        p = self.pieces
+        by_piece = {
+            name: getattr(p, name)[chosen] for name in ("path", "roots", "targets", "inside")
+        }
+        return self._replace(pieces=p._replace(**by_piece))
 
 
 @compiled
-def negative_log_likelihood(model: LawModel, chunks: Chunk, factors, mean, of_rows):
-    """−log p of the whitened rows, y ~ N(0, ΦΦᵀ + s²I)."""
-    F, y = _rows(model.kernel, chunks, factors, mean, of_rows)
-    ridge = jnp.exp(2 * model.log_scatter)
-    empty = jnp.sum(jnp.abs(chunks.value).sum(axis=2) == 0) * len(of_rows)
-    density = log_density(LowRankSystem(F, ridge), y)
-    return -density - 0.5 * empty.astype(ridge.dtype) * jnp.log(2 * jnp.pi * ridge)
+def _rows_over_noise(
+    model: LawModel, rows: Rows, L
+) -> tuple[Float[Array, "N m"], Float[Array, " N"]]:
+    """Features and what the mean leaves, over their noise; zero for windows outside of the runs."""
+    both = rows.feature_rows(model.kernel), rows.known()
+    return tuple(whiten(L, a) * jnp.exp(-model.log_scatter) for a in both)
 
 
 @compiled
-def _best_of(model, design, chunks, factors, mean, of_rows):
-    return jax.lax.map(
-        lambda h: negative_log_likelihood(model.with_flat(h), chunks, factors, mean, of_rows),
-        design,
-    )
+def _search(model: LawModel, design, low, high, rows: Rows, L):
+    count = jnp.sum(rows.pieces.inside, dtype=low.dtype) * len(rows.of_rows)
 
-
-@compiled
-def _search(model: LawModel, start, low, high, chunks, factors, mean, of_rows, steps):
     def loss(h):
-        return negative_log_likelihood(model.with_flat(h), chunks, factors, mean, of_rows)
+        shown = model.with_flat(h)
+        return (
+            negative_log_likelihood(*_rows_over_noise(shown, rows, L)) + count * shown.log_scatter
+        )
 
-    return most_likely_in_box(loss, start, low, high, jnp.full(len(start), 0.2), steps)
-
-
-@compiled
-def _white(chunks: Chunk):
-    return jax.lax.map(white_factors, chunks)
-
-
-@compiled
-def _full(field, chunks: Chunk, of_rows, depends):
-    def one(chunk):
-        def slope(x):
-            inner = lambda part: field(x.at[depends].set(part))[of_rows]  # noqa: E731
-            return jax.jacfwd(inner)(x[depends])
-
-        return full_factor(chunk, jax.lax.map(slope, chunk.points))
-
-    return jax.lax.map(one, chunks)
+    run = best_in_box(loss, design, low, high, jnp.full_like(low, 0.2), _STEPS)
+    return inside_box(run.best.u, low, high), run.best.value
 
 
 @compiled
-def _weights_of(model: LawModel, chunks, factors, mean, of_rows) -> Float[Array, " m"]:
+def _factors(rows: Rows, field: Any, deviation):
+    """The factors of the covariance of the rows with this field in the laws."""
+    return factors(rows.pieces, path_covariance(rows.law(field), rows.pieces), deviation)
+
+
+@compiled
+def _weights_of(model: LawModel, rows: Rows, L) -> Float[Array, " m"]:
     """The mean of the weights of the features."""
-    F, y = _rows(model.kernel, chunks, factors, mean, of_rows)
-    m = F.shape[1]
-    Q, R = jnp.linalg.qr(jnp.concatenate([F, jnp.exp(model.log_scatter) * jnp.eye(m)]))
-    return jax.scipy.linalg.solve_triangular(R, Q[: len(y)].T @ y)
+    return solved(*_rows_over_noise(model, rows, L))[1]
 
 
 @compiled
-def _compress(model: LawModel, chunks: Chunk, factors, of_rows):
-    """The rows of all chunks as m orthonormal combinations: weights (Q, n, m) and targets (m,)."""
-
-    def rows_of(both):
-        chunk, L = both
-        return whiten_rows(L, _design(model.kernel, chunk, of_rows)), whiten_rows(L, chunk.rows)
-
-    F, y = jax.lax.map(rows_of, (chunks, factors))
-    S, D, m = F.shape
-    Q, _ = jnp.linalg.qr(F.reshape(S * D, m))
+def _compress(model: LawModel, rows: Rows, L):
+    """All rows as m orthonormal combinations: weights (m, Q, n) at points (Q, n), targets (m,)."""
+    p, n = rows.pieces, rows.state(rows.pieces.path[0, 0]).shape[0]
+    F, y = (
+        whiten(L, a) for a in (rows.feature_rows(model.kernel), rows._replace(mean=None).known())
+    )
+    Q, _ = jnp.linalg.qr(F)
 
     def back(both):
-        chunk, L, Q = both
-        c, R = chunk.rows.shape
-        solve = jax.scipy.linalg.solve_triangular
-        if L.ndim == 3:
-            unwhitened = jax.vmap(lambda L, q: solve(L, q, lower=True, trans="T"))(
-                L, Q.reshape(c, R, -1)
-            )
-        else:
-            unwhitened = solve(L, Q, lower=True, trans="T").reshape(c, R, -1)
-        on_rows = jnp.einsum("rt,crm->mtc", chunk.value, unwhitened)
-        n = chunk.points.shape[1]
-        return jnp.zeros((*on_rows.shape[:2], n)).at[:, :, of_rows].set(on_rows)
+        L, Q = both
+        combined = jax.scipy.linalg.solve_triangular(L, Q, lower=True, trans="T")
+        combined = combined.reshape(len(p.values), -1, Q.shape[1])
+        on_rows = jnp.einsum("wp,wcm->mpc", p.values, combined)
+        return jnp.zeros((*on_rows.shape[:2], n)).at[:, :, rows.of_rows].set(on_rows)
 
-    weights = jax.lax.map(back, (chunks, factors, Q.reshape(S, D, -1)))  # (S, m, T, n)
-    weights = jnp.moveaxis(weights, 1, 0).reshape(Q.shape[1], -1, weights.shape[3])
-    return weights, Q.T @ y.reshape(-1)
+    weights = jax.lax.map(back, (L, Q.reshape(*L.shape[:2], -1)))  # (B, m, P, n)
+    points = jax.vmap(rows.state)(p.path.reshape(-1, p.path.shape[2]))
+    return points, jnp.moveaxis(weights, 1, 0).reshape(Q.shape[1], -1, n), Q.T @ y
 
 
 class Found(NamedTuple):
@@ -375,14 +224,16 @@ class Found(NamedTuple):
     Attributes:
         model: the kernel and the scatter.
         observations: functionals that say all that the rows say of the laws, with unit noise.
-        smooth: the smoothed runs.
+        states: the smoothed states at the samples of each run, shape (T, n).
+        noise: σ of each coordinate, shape (n,); NaN where nothing was measured.
         losses: −log p of both solves.
         count: the number of rows.
     """
 
     model: LawModel
     observations: Functionals
-    smooth: SmoothedRuns
+    states: list[Float[np.ndarray, "T n"]]
+    noise: Float[np.ndarray, " n"]
     losses: tuple[float, float]
     count: int
 
@@ -390,52 +241,43 @@ class Found(NamedTuple):
 def find_laws(K: AbstractMatrixKernel, runs: Runs, mean: Any, noise: Any) -> Found:
     """The laws by two solves."""
     n = runs.dimension
-    smooth = smoothed_runs(runs, mean, noise, K.has_hamiltonian)
-    X = np.concatenate([piece.states for piece in smooth.pieces])
+    channels, state = _channels(runs, mean, noise, K.has_hamiltonian)
+    smooth = smoothed_pieces(runs, channels)
+    unit = np.ones(n) if state.mass is None else np.append(np.ones(n // 2), state.mass)
+    states, sigma = [x[:, :n] * unit[None] for x in smooth.states], smooth.noise.ravel()[:n] * unit
+    X = np.concatenate(states)
     K = completed(K, jnp.asarray(X), n)
     depends = sorted(set().union(*(s for k in K.scalar_kernels for s in k.supports(n))))
-    missing = [j for j in depends if smooth.pieces[0].roots[j] is None]
-    if missing:
+    if state.mass is not None and depends[-1] >= n // 2:
         raise ValueError(
-            f"the laws depend on coordinate {missing[0]}, which is a momentum in runs of {n} "
-            f"coordinates (q, p). If all of them are positions, give a mass for each: "
+            f"the laws depend on coordinate {max(depends[0], n // 2)}, which is a momentum in runs "
+            f"of {n} coordinates (q, p). If all of them are positions, give a mass for each: "
             f"mass=np.ones({n})."
         )
-    depends, of_rows = np.asarray(depends), jnp.asarray(_moving_coordinates(K, X))
-    chunks = chunks_of(runs, smooth, np.asarray(of_rows), depends)
-    part = _part(K, chunks)
+    of_rows = _moving_coordinates(K, X)
+    rows = Rows(smooth.pieces, state, mean, of_rows)
     model = LawModel(K, jnp.asarray(np.log(2.0)))
-    low, high, design = _box(model, X, chunks)
-    factors, losses = _white(chunks), []
-    for first in (True, False):
-        selected = jax.tree.map(lambda a: a[part], (chunks, factors))
-        args = *selected, mean, of_rows
-        start = model.flat
-        if first:
-            values = np.asarray(_best_of(model, design, *args))
-            start = design[int(np.nanargmin(values))]
-        h, loss = _search(model, start, low, high, *args, _STEPS)
-        model = model.with_flat(h)
+    low, high, design, error = _box(model, X, rows)
+    deviation = jnp.full(len(of_rows), _EXACT * error)
+    L, part, losses = _factors(rows, None, deviation), _part(K, rows), []
+    for field in (True, False):
+        h, loss = _search(model, design, low, high, rows.part(part), L[part])
+        model, design = model.with_flat(h), design.at[0].set(h)
         losses.append(float(loss))
-        if first:
-            w = _weights_of(model, chunks, factors, mean, of_rows)
-            field = _FieldOfWeights(_features_of(model.kernel, n), w, mean)
-            factors = _full(field, chunks, of_rows, jnp.asarray(depends))
-    weights, targets = _compress(model, chunks, factors, of_rows)
-    points = chunks.points.reshape(1, -1, n)
-    observations = Functionals(points, weights[None], targets[None])
-    count = int((np.abs(np.asarray(chunks.value)).sum(axis=2) > 0).sum()) * len(of_rows)
-    return Found(model, observations, smooth, (losses[0], losses[1]), count)
+        if field:
+            w = _weights_of(model, rows, L)
+            L = _factors(rows, _FieldOfWeights(_features_of(model.kernel, n), w), deviation)
+    points, weights, targets = _compress(model, rows, L)
+    observations = Functionals(points[None], weights[None], targets[None])
+    return Found(model, observations, states, sigma, (losses[0], losses[1]), rows.count)
 
 
 class _FieldOfWeights(eqx.Module):
     features: AbstractFeatures
     weights: Float[Array, " m"]
-    mean: Any
 
     def __call__(self, x):
-        f = self.features.field(x, self.weights)
-        return f if self.mean is None else f + self.mean(x)
+        return self.features.field(x, self.weights)
 
 
 def _moving_coordinates(K: AbstractMatrixKernel, X: Float[np.ndarray, "N n"]) -> np.ndarray:
@@ -445,22 +287,26 @@ def _moving_coordinates(K: AbstractMatrixKernel, X: Float[np.ndarray, "N n"]) ->
     return np.flatnonzero(np.abs(np.asarray(basis(some))).max(axis=(0, 2)) > 0)
 
 
-def _part(K: AbstractMatrixKernel, chunks: Chunk) -> np.ndarray:
-    """Which chunks the search of hyperparameters takes."""
+def _part(K: AbstractMatrixKernel, rows: Rows) -> np.ndarray:
+    """Which pieces the search of hyperparameters takes."""
+    B, P = rows.pieces.path.shape[:2]
+    x = jax.eval_shape(rows.state, rows.pieces.path[0, 0])
     parts = sum(
-        jax.eval_shape(law.of, chunks.points[0, 0]).weights.shape[0] * len(law.centres or ())
+        jax.eval_shape(law.of, x).weights.shape[0] * len(law.centres or ())
         for law in shared_laws(K)
     )
-    S, T = chunks.points.shape[:2]
-    count = int(np.clip(_SEARCHED // max(parts * T, 1), 1, S))
-    return np.linspace(0, S - 1, count).astype(int)
+    count = int(np.clip(_SEARCHED // max(parts * P, 1), 1, B))
+    return np.linspace(0, B - 1, count).astype(int)
 
 
-def _box(model: LawModel, X, chunks: Chunk):
-    """The box of hyperparameters, and a design of first points."""
-    reach = jnp.maximum(chunks.value.sum(axis=2), 1e-300)[:, None]
-    forces = jnp.where(chunks.rows != 0, chunks.rows / reach, 0.0)
-    rms = float(np.sqrt(float(jnp.sum(forces**2)) / np.sum(np.asarray(chunks.rows) != 0)))
+def _box(model: LawModel, X, rows: Rows):
+    """The box of hyperparameters, a design of first points, and the size of white forces.
+
+    With an error of a force of this size at each sample rows are as wrong as they are large.
+    """
+    pieces = rows.pieces
+    y = np.asarray(rows._replace(mean=None).known())[pieces.inside]
+    rms = float(np.sqrt(np.mean(y**2))) / pieces.values[0].sum()
     some = jnp.asarray(X[np.linspace(0, len(X) - 1, min(len(X), 64)).astype(int)])
     leaves = hyperparameters(model.kernel, some, rms, some[:1])
     low = np.concatenate([*(p.low.ravel() for p in leaves), [-1.0]])
@@ -474,7 +320,8 @@ def _box(model: LawModel, X, chunks: Chunk):
             shares = [{"lengthscale": length, "scale": size}.get(name) for name in names]
             at = [low[i] + (high[i] - low[i]) * s if s else start[i] for i, s in enumerate(shares)]
             design.append(np.array(at))
-    return tuple(map(jnp.asarray, (low, high, np.array(design))))
+    white = np.sqrt(pieces.overlap[0, 0] * pieces.spacing) / pieces.values[0].sum()
+    return *map(jnp.asarray, (low, high, np.array(design))), rms / white
 
 
 def are_learned_from_rows(K: AbstractMatrixKernel) -> bool:
@@ -489,24 +336,15 @@ def learn_laws(
     noise: Float[np.ndarray, " n"] | None,
     again: Callable[..., Learned],
 ) -> Learned:
-    """`learn` for laws that many parts share; see there.
-
-    Raises:
-        ValueError: no run has the 13 samples of a window.
-    """
-    if max(len(t) for t in runs.times) <= WIDTH:
-        raise ValueError(
-            f"no run has the {WIDTH + 1} samples of a window, from which laws of many parts are "
-            "learned: log more of them, or pass velocities to hk.fit."
-        )
+    """`learn` for laws that many parts share; see there."""
     n = runs.dimension
     solution = find_laws(K, runs, mean, noise)
     scatter, count = float(jnp.exp(solution.model.log_scatter)), len(solution.observations.targets)
     posterior = condition(
         solution.model.kernel, solution.observations, regularization=scatter**2 / count, mean=mean
     )
-    states, measured = _paths(runs, solution.smooth), runs.on_host()[1]
-    sigma = solution.smooth.noise if noise is None else np.asarray(noise)
+    states, measured = solution.states, runs.on_host()[1]
+    sigma = solution.noise if noise is None else np.asarray(noise)
     quality = _quality(runs, solution, posterior.field, states, sigma, noise is not None)
     table = diagnostics_of_rows(quality, scatter)
     if table.warning:
@@ -543,18 +381,6 @@ def _iteration(loss: float, sigma: np.ndarray, samples: int) -> Iteration:
     unknown, one = jnp.asarray(jnp.nan), jnp.asarray(1.0)
     noise, none = jnp.asarray(sigma), jnp.zeros(len(sigma))
     return Iteration(samples, unknown, unknown, one, noise, none, one, jnp.asarray(loss))
-
-
-def _paths(runs: Runs, smooth: SmoothedRuns) -> list[Float[np.ndarray, "T n"]]:
-    """The smoothed states of each run; where two pieces overlap, half of each."""
-    out = [np.zeros(np.shape(x)) for x in runs.states]
-    done = [0] * len(out)
-    for piece in smooth.pieces:
-        start, stop = piece.samples.start, piece.samples.stop
-        first = (start + done[piece.run]) // 2 if start else 0
-        out[piece.run][first:stop] = piece.states[first - start :]
-        done[piece.run] = stop
-    return out
 
 
 class _Log(NamedTuple):

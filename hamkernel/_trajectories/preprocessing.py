@@ -109,7 +109,7 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
         averaged = 0.5 * averaging_time(found, times, paths.deviation)
         block = min(block, max(averaged, shortest))
         condensed = [
-            _condensed(t, x, paths.value[r, : len(t)], paths.slope[r, : len(t)], block)
+            condensed(t, x, paths.value[r, : len(t)], paths.slope[r, : len(t)], block)
             for r, (t, x) in enumerate(zip(times, states, strict=True))
         ]
         times, states, counts, scatter = (list(each) for each in zip(*condensed, strict=True))
@@ -266,7 +266,7 @@ def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:
     return processes([times[r] for r in chosen], [states[r] for r in chosen]), usable
 
 
-def _condensed(t, x, path, slope, block: float):
+def condensed(t, x, path, slope, block: float):
     """Times, means, counts and scatter of blocks of samples that span at most `block`."""
     edges = [0]
     for i in range(1, len(t)):

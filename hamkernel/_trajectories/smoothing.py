@@ -18,7 +18,7 @@ process regression models"; Bierman (1973) for the smoother.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hamkernel._machine import compiled_by_size, in_doubles
 from hamkernel._show import described
-from hamkernel._tuning.minimiser import most_likely_in_box
+from hamkernel._tuning.minimiser import best_in_box, inside_box
 
 
 class Padded(NamedTuple):
@@ -122,29 +122,39 @@ def _stationary(process: Process) -> Float[Array, "4 4"]:
     return jnp.exp(2 * process.log_amplitude) * jnp.asarray(_STATIONARY, dtype)
 
 
-def _filtered(process: Process, steps, y, seen):
+def _filtered(process: Process, steps, y, seen, slopes: Any = None):
     """The forward pass: what the backward pass needs at each time, and the log likelihood.
 
-    `steps` are the times since the sample before, and 0 for the first.
+    `steps` are the times since the sample before, and 0 for the first. `slopes` are samples of the
+    derivative, which of them were measured, and the logarithm of their noise; the backward pass
+    knows of none.
     """
     stationary = _stationary(process)
-    variance = jnp.exp(2 * process.log_noise)
+    rate, one = jnp.exp(process.log_rate), jnp.ones_like(process.log_rate)
+
+    def update(m, P, i, unit, sample, there, log_noise):
+        row = unit * P[i]
+        S = unit * row[i] + jnp.exp(2 * log_noise)
+        error = jnp.where(there, sample - unit * m[i], jnp.zeros_like(sample))
+        gain = jnp.where(there, row / S, jnp.zeros_like(row))
+        loss = jnp.where(there, error**2 / S + jnp.log(2 * jnp.pi * S), jnp.zeros_like(S))
+        return m + gain * error, P - gain[:, None] * row[None, :], S, error, loss
 
     def step(carry, sample):
         m, P = carry
-        dt, value, there = sample
+        dt, value, there, *slope = sample
         A = _transition(jnp.exp(process.log_rate) * dt)
         m = A @ m
         P = stationary + A @ (P - stationary) @ A.T
         P = (P + P.T) / 2
-        S = P[0, 0] + variance
-        error = jnp.where(there, value - m[0], jnp.zeros_like(value))
-        gain = jnp.where(there, P[0] / S, jnp.zeros_like(P[0]))
-        loss = jnp.where(there, error**2 / S + jnp.log(2 * jnp.pi * S), jnp.zeros_like(S))
-        return (m + gain * error, P - gain[:, None] * P[0][None, :]), (m, P, S, error, A, loss)
+        after, Q, S, error, loss = update(m, P, 0, one, value, there, process.log_noise)
+        if slope:
+            after, Q, _, _, more = update(after, Q, 1, rate, *slope, slopes[2])
+            loss = loss + more
+        return (after, Q), (m, P, S, error, A, loss)
 
     start = jnp.zeros(4, y.dtype), stationary
-    _, out = jax.lax.scan(step, start, (steps, y, seen))
+    _, out = jax.lax.scan(step, start, (steps, y, seen, *(slopes or ())[:2]))
     return out
 
 
@@ -153,10 +163,15 @@ def negative_log_likelihood(
     steps: Float[Array, "R T"],
     y: Float[Array, "R T"],
     seen: Bool[Array, "R T"],
+    slopes: Any = None,
 ) -> Float[Array, ""]:
-    """−log p(y) of several independent runs; `steps` as in `smooth`."""
-    one = jax.vmap(lambda dt, value, there: _filtered(process, dt, value, there)[-1].sum())
-    return 0.5 * one(steps, y, seen).sum()
+    """−log p(y) of several independent runs; `steps` as in `smooth`, `slopes` as in `_filtered`."""
+
+    def one(dt, value, there, *slope):
+        rates = (*slope, slopes[2]) if slope else None
+        return _filtered(process, dt, value, there, rates)[-1].sum()
+
+    return 0.5 * jax.vmap(one)(steps, y, seen, *(slopes or ())[:2]).sum()
 
 
 def smooth(
@@ -195,11 +210,13 @@ def smooth(
 class Coordinate(NamedTuple):
     """A process of one coordinate in the units of the states.
 
-    `seen` is False where the coordinate was never measured; the rest is NaN then.
+    `seen` is False where the coordinate was never measured; the rest is NaN then. `slope_noise` is
+    that of samples of its derivative, NaN without any.
     """
 
     process: Process
     seen: bool
+    slope_noise: float = np.nan
 
     @property
     def noise(self) -> float:
@@ -223,12 +240,23 @@ def _mean(x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, " n"]:
 
 
 @in_doubles
-def processes(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> list[Coordinate]:
-    """The hyperparameters of each coordinate, by the marginal likelihood of all runs."""
-    states = without_means(states)[0]
+def processes(
+    times: Sequence[np.ndarray],
+    states: Sequence[np.ndarray],
+    groups: Sequence[np.ndarray] | None = None,
+    slopes: Sequence[np.ndarray] | None = None,
+) -> list[Coordinate]:
+    """The hyperparameters of each coordinate, by the marginal likelihood of all runs.
+
+    Coordinates of one of the `groups`, as indices, have one process; if None, each has its own.
+    `slopes` are samples of their derivatives.
+    """
+    states, n = without_means(states)[0], states[0].shape[1]
+    slopes = [np.full(x.shape, np.nan) for x in states] if slopes is None else slopes
+    both = [np.concatenate(pair, axis=1) for pair in zip(states, slopes, strict=True)]
     # Pieces are filtered side by side, and of many some are taken: 100 000 samples then cost as
     # much as 16 000.
-    pieces_t, pieces_x = cut(times, states, 256)
+    pieces_t, pieces_x = cut(times, both, 256)
     if len(pieces_t) > 64:
         chosen = np.linspace(0, len(pieces_t) - 1, 64).round().astype(int)
         pieces_t, pieces_x = [pieces_t[i] for i in chosen], [pieces_x[i] for i in chosen]
@@ -236,56 +264,64 @@ def processes(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> list
     steps = np.diff(pieces.times, axis=1, prepend=0.0)
     longest = max(t[-1] - t[0] for t in times)
     spacing = np.median(np.concatenate([np.diff(t) for t in pieces_t if len(t) > 1]))
-    return [
-        _process(steps, pieces.states[:, :, c], pieces.seen[:, :, c], longest, spacing)
-        for c in range(states[0].shape[1])
-    ]
+    out: list[Any] = [None] * n
+    for g in map(np.atleast_1d, range(n) if groups is None else groups):
+        arrays = [a[:, :, c] for c in (g, n + g) for a in (pieces.states, pieces.seen)]
+        arrays = [a.swapaxes(1, 2).reshape(-1, a.shape[1]) for a in arrays]
+        # As many as 64 pieces of eight coordinates say enough of a few numbers.
+        part = np.unique(np.linspace(0, len(arrays[0]) - 1, 512).round().astype(int))
+        arrays = [a[part] for a in (np.repeat(steps, len(g), 0), *arrays)]
+        coordinate = _process(*arrays, longest, spacing)
+        for c in g:
+            out[c] = coordinate._replace(seen=bool(pieces.seen[:, :, c].any()))
+    return out
 
 
-def _process(steps, y, seen, longest: float, spacing: float) -> Coordinate:
+def _process(steps, y, seen, v, seen_slope, longest: float, spacing: float) -> Coordinate:
     scale = y[seen].std() if seen.any() else 0.0
     if not scale > 0:  # never measured, or constant
         nothing = Process(*(jnp.asarray(v) for v in (-np.inf, -np.log(longest), -np.inf)))
         return Coordinate(nothing, bool(seen.any()))
     # A swing a hundred times as long as the data looks like a line; one faster than half a sample,
     # like noise. The noise is at least the rounding of the states.
-    low = np.log([0.3, 0.03 / longest, 1e-7])
-    high = np.log([1e3, 3.0 / spacing, 2.0])
-    found = _found(jnp.asarray(steps), jnp.asarray(y / scale), jnp.asarray(seen), low, high)
-    log_amplitude, log_rate, log_noise = np.asarray(found)
+    low, high = [0.3, 0.03 / longest, 1e-7], [1e3, 3.0 / spacing, 2.0]
+    slopes = None
+    if seen_slope.any():
+        speed = (v[seen_slope].std() or 1.0) / scale
+        low, high = [*low, 1e-7 * speed], [*high, 2.0 * speed]
+        slopes = jnp.asarray(v / scale), jnp.asarray(seen_slope)
+    data = jnp.asarray(steps), jnp.asarray(y / scale), jnp.asarray(seen), slopes
+    log_amplitude, log_rate, *log_noise = np.asarray(_found(*data, np.log(low), np.log(high)))
     shift = np.log(scale)
-    return Coordinate(
-        Process(*(jnp.asarray(v) for v in (log_amplitude + shift, log_rate, log_noise + shift))),
-        True,
-    )
+    logs = log_amplitude + shift, log_rate, log_noise[0] + shift
+    slope_noise = float(np.exp(log_noise[1] + shift)) if slopes else np.nan
+    return Coordinate(Process(*map(jnp.asarray, logs)), True, slope_noise)
 
 
 @compiled_by_size
-def _found(steps, y, seen, low, high) -> Float[Array, "3"]:
-    """(log amplitude, log rate, log noise) by BFGS from the best point of a grid."""
+def _found(steps, y, seen, slopes, low, high) -> Float[Array, " h"]:
+    """(log amplitude, log rate, log noise, and that of slopes) by BFGS from the best of a grid."""
     low, high = jnp.asarray(low, y.dtype), jnp.asarray(high, y.dtype)
 
     def loss(h):
-        return negative_log_likelihood(Process(*h), steps, y, seen)
+        rates = None if slopes is None else (*slopes, h[3])
+        return negative_log_likelihood(Process(*h[:3]), steps, y, seen, rates)
 
     rates = np.linspace(0.1, 0.95, 12)
     noises = np.log([1e-5, 1e-3, 1e-2, 0.1, 0.5])
     rate, noise = (each.ravel() for each in np.meshgrid(rates, noises))
-    design = jnp.stack(
-        [
-            jnp.full(rate.shape, np.log(1.5), y.dtype),
-            low[1] + (high[1] - low[1]) * jnp.asarray(rate, y.dtype),
-            jnp.asarray(noise, y.dtype),
-        ],
-        axis=1,
-    )
-    values = jax.lax.map(loss, design, batch_size=12)
-    values = jnp.where(jnp.isfinite(values), values, jnp.inf)
+    columns = [
+        jnp.full(rate.shape, np.log(1.5), y.dtype),
+        low[1] + (high[1] - low[1]) * jnp.asarray(rate, y.dtype),
+        jnp.asarray(noise, y.dtype),
+    ]
     count = jnp.maximum(seen.sum(), 1).astype(y.dtype)
-    sizes = jnp.stack(
-        [jnp.full_like(count, 0.2), jnp.full_like(count, 0.1), 1 / jnp.sqrt(2 * count)]
-    )
-    return most_likely_in_box(loss, design[jnp.argmin(values)], low, high, sizes, steps=40)[0]
+    sizes = [jnp.full_like(count, 0.2), jnp.full_like(count, 0.1), 1 / jnp.sqrt(2 * count)]
+    if slopes is not None:  # as large a share of them
+        columns, sizes = [*columns, columns[2] + high[3] - high[2]], [*sizes, sizes[2]]
+    design, sizes = jnp.stack(columns, axis=1), jnp.stack(sizes)
+    run = best_in_box(loss, design, low, high, sizes, 40, batch_size=12)
+    return inside_box(run.best.u, low, high)
 
 
 @compiled_by_size

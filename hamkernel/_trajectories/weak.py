@@ -1,15 +1,17 @@
 """Weak rows: a law of motion tested against functions of compact support, along smoothed runs.
 
-A law d/dt a(x) + b(x) = c with a and b linear in its weights becomes
+A law d/dt a(z) + b(z) = c with a and b linear in its weights becomes
 
     ∫ (φ b − φ̇ a) dt = ∫ φ c dt,      φ(t) = (1 − s²)⁵, s = (t − t₀)/T, in −1 < s < 1,
 
-in which nothing is differentiated twice in time. Positions are Gaussian processes in time, those of
-`smoothing`, so that the path x = (q, v) and the covariance S of its errors follow from the samples.
+in which nothing is differentiated twice in time. The channels of a run, its positions or all its
+coordinates, are the Gaussian processes in time of `smoothing`. So the samples determine the path z
+of the channels, with their slopes if the law needs these, and the covariance S of its errors.
+
 Runs are cut into pieces with windows that overlap by half. Let D be the derivative of the rows of a
 piece with respect to the path. Their errors then have the covariance D S Dᵀ, to first order. D
-depends on the law, so a law is solved for twice: with torques as the only source of errors, and
-then with this covariance.
+depends on the law, so a law is solved for twice: first with the part of D that is known, and then
+with all of it.
 """
 
 from collections.abc import Callable
@@ -19,32 +21,57 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from hamkernel._trajectories.preprocessing import condensed
 from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.smoothing import Coordinate, Process, processes, smoothed
+from hamkernel._trajectories.smoothing import Coordinate, Process, power_of_two, processes, smoothed
 
-# In lengthscales of the smoothed positions. Of a two-link arm at 100 Hz, with noise 1e-3 rad, M was
-# off by .22, .09 and .10 % with windows (1 − s²)³ of .35, .7 and 1.2; (1 − s²)⁵ of 1.2 times their
-# width has the same variance.
-_WIDTH = 1.0
 # In a window. By the trapezoidal rule ∫ (φ b − φ̇ a) dt of a sinusoid with b = ȧ and 2.2 rad in a
 # window is then wrong by 2e-6 of its size, and with (1 − s²)³ by 7e-5.
 _NODES = 24
 _WINDOWS = 10  # in a piece, whose covariances are matrices of 2 · 133 nodes
+_ROWS = 2048  # in a piece, at most: their Cholesky factor takes .3 s
 _MARGIN = 1.5  # lengthscales of samples beyond a piece, after which they say nothing more of it
 # Samples in a lengthscale, at most. Means over ℓ/60 flatten a sinusoid of period 2.3 ℓ by 1e-4.
 _SAMPLES = 60
+_FEWEST = 13  # samples of the longest run
+_TOGETHER = 256  # samples smoothed at once: a factor of 512 rows takes 5 ms
 
-Law = Callable[[Float[Array, " n"]], tuple[Float[Array, "m *r"], Float[Array, "m *r"]]]
+Law = Callable[[Float[Array, " z"]], tuple[Float[Array, "m *r"], Float[Array, "m *r"]]]
+
+
+class Channels(NamedTuple):
+    """The C channels of each run, with samples of their slopes if there are any.
+
+    Attributes:
+        values: their samples, shape (T, C), NaN where nothing was measured.
+        slopes: samples of their derivatives, likewise.
+        groups: channels that are alike and have one process, as indices.
+        has_slopes: whether the path contains the slopes.
+        noise: the standard deviations of values and of slopes, shape (2, C); None if unknown.
+        width: the width of the windows, in lengthscales of the smoothed channels.
+    """
+
+    values: list[Float[np.ndarray, "T C"]]
+    slopes: list[Float[np.ndarray, "T C"]]
+    groups: list[Int[np.ndarray, " g"]]
+    has_slopes: bool = True
+    noise: Float[np.ndarray, "2 C"] | None = None
+    # Of a two-link arm at 100 Hz, with noise 1e-3 rad, M was off by .22, .09 and .10 % with windows
+    # (1 − s²)³ of .35, .7 and 1.2; (1 − s²)⁵ of 1.2 times their width has the same variance.
+    width: float = 1.0
 
 
 class Pieces(NamedTuple):
-    """B parts of runs, each with P nodes and W windows, for m positions.
+    """B parts of runs, each with P nodes and W windows of m rows, for C channels.
 
     Attributes:
-        path: smoothed positions and velocities at the nodes, shape (B, P, 2m).
-        covariance: the covariance of the errors of (q, v) of each position, shape (B, m, 2P, 2P).
+        path: smoothed channels at the nodes, and then their slopes if the law needs them, shape
+            (B, P, Z).
+        roots: E with E Eᵀ the covariance of the errors of a channel at the nodes, and then of its
+            slope, shape (B, G, Q, k).
+        owner: which of the roots belongs to each channel, shape (C,).
         values: φ dt of each window at the nodes, shape (W, P).
         slopes: φ̇ dt, shape (W, P).
         overlap: ∫ φ_r φ_s dt, shape (W, W).
@@ -53,8 +80,9 @@ class Pieces(NamedTuple):
         spacing: the time between samples, shape ().
     """
 
-    path: Float[np.ndarray, "B P n"]
-    covariance: Float[np.ndarray, "B m Q Q"]
+    path: Float[np.ndarray, "B P Z"]
+    roots: Float[np.ndarray, "B G Q k"]
+    owner: Int[np.ndarray, " C"]
     values: Float[np.ndarray, "W P"]
     slopes: Float[np.ndarray, "W P"]
     overlap: Float[np.ndarray, "W W"]
@@ -62,7 +90,7 @@ class Pieces(NamedTuple):
     inside: Bool[np.ndarray, "B W"]
     spacing: float
 
-    def states(self) -> Float[np.ndarray, "N n"]:
+    def states(self) -> Float[np.ndarray, "N Z"]:
         """The smoothed states at all nodes of windows inside the runs."""
         near = np.abs(self.values) > 0
         used = np.einsum("bw,wp->bp", self.inside, near) > 0
@@ -74,96 +102,151 @@ class Smoothed(NamedTuple):
 
     Attributes:
         pieces: the pieces.
-        noise: the standard deviation of the noise of each coordinate, shape (n,).
-        states: (q, v) at the samples of each run, (T, 2m).
-        lengthscale: the shortest of the positions in time.
+        noise: the standard deviations of the noise of values and of slopes, shape (2, C), NaN where
+            nothing was measured.
+        states: the smoothed channels and their slopes at the samples of each run, (T, 2C).
+        lengthscale: the shortest of the channels in time.
     """
 
     pieces: Pieces
-    noise: Float[np.ndarray, " n"]
+    noise: Float[np.ndarray, "2 C"]
     states: list[Float[np.ndarray, "T n"]]
     lengthscale: float
 
 
-def smoothed_pieces(runs: Runs, m: int, noise: Float[np.ndarray, " n"] | None) -> Smoothed:
-    """The runs in pieces: m positions come first in the states, their velocities, if any, last.
+def smoothed_pieces(runs: Runs, channels: Channels) -> Smoothed:
+    """The runs in pieces; no window is longer than the median run.
 
     Args:
         runs: the runs, whose inputs are c.
-        m: the number of positions.
-        noise: the standard deviations of the coordinates, where they are known.
+        channels: the channels of these runs.
 
     Raises:
-        ValueError: no run is as long as a window.
+        ValueError: no run has 13 samples, or a channel does not move.
     """
-    times, states = runs.on_host()
-    positions = [x[:, :m] for x in states]
-    coordinates = _processes(times, positions, noise)
-    paths = smoothed(coordinates, times, positions)
+    times, C = runs.on_host()[0], channels.values[0].shape[1]
+    if max(map(len, times)) < _FEWEST:
+        raise ValueError(
+            f"no run has the {_FEWEST} samples that weak rows need: log more of them, or pass "
+            "velocities to hk.fit."
+        )
+    samples = _samples(times, channels)
+    durations = [t[-1] - t[0] for t in times]
+    half = _NODES // 2
+    step = min(channels.width * samples.length, float(np.median(durations))) / _NODES
+    W = int(np.clip(_ROWS // C, 2, _WINDOWS))
+    centres = half * (1 + np.arange(W))
+    P = half * (W + 1) + 1
+    phi, slope = _bump((np.arange(P)[None] - centres[:, None]) / half)
+    path, roots, inside, targets = [], [], [], []
+    for r, (t, duration) in enumerate(zip(times, durations, strict=True)):
+        # Windows of two pieces do not overlap: their errors are apart. 1e-9 is for rounding.
+        count = (duration / step - 2 * half + 1e-9) // (half * (W + 1)) + 1
+        for i in range(int(count)):
+            at = t[0] + step * (half * (W + 1) * i + np.arange(P))
+            z, errors = samples.path(r, at, 1 + channels.has_slopes)
+            path.append(z)
+            roots.append(errors)
+            inside.append(at[centres + half] <= t[-1] + 1e-9 * step)
+            targets.append(_integrals(runs, r, at, centres, half * step, C))
+    # A power of two, so that other data do not compile anew.
+    k = power_of_two(max(E.shape[1] for piece in roots for E in piece))
+    is_inside = np.array(inside)
+    pieces = Pieces(
+        np.array(path)[:, :, : (1 + channels.has_slopes) * C],
+        np.array([[np.pad(E, ((0, 0), (0, k - E.shape[1]))) for E in piece] for piece in roots]),
+        np.array([next(i for i, g in enumerate(samples.sets) if c in g) for c in range(C)]),
+        phi * step,
+        slope / half,
+        phi @ phi.T * step,
+        np.where(is_inside[:, :, None], np.array(targets), 0.0),
+        is_inside,
+        float(np.median(np.concatenate([np.diff(t) for t in times]))),
+    )
     along = [
-        np.concatenate([paths.value[r, : len(t)], paths.slope[r, : len(t)]], axis=1)
+        np.concatenate(
+            [samples.path(r, at)[0] for at in np.array_split(t, -(-len(t) // _TOGETHER))]
+        )
         for r, t in enumerate(times)
     ]
-    of_positions = np.array([c.noise for c in coordinates])
-    velocities = [x[:, m:] for x in states]
-    of_slopes = np.array(
-        [c.noise for c in processes(times, velocities)] if states[0].shape[1] > m else []
-    )
-    if noise is not None:
-        of_slopes = np.asarray(noise[m:], float)
+    return Smoothed(pieces, samples.noise, along, samples.length)
+
+
+class _Samples(NamedTuple):
+    """Samples of the channels and of their slopes, averaged where they are fast.
+
+    Attributes:
+        times: the times of each run, shape (T,).
+        both: the samples, NaN where nothing was measured, shape (T, 2, C).
+        counts: how many samples each is the mean of.
+        coordinates: the process of each channel.
+        noise: the standard deviations of the noise of a sample, shape (2, C).
+        sets: channels that have one process and were measured at the same times.
+        length: the shortest lengthscale.
+    """
+
+    times: list[np.ndarray]
+    both: list[np.ndarray]
+    counts: list[np.ndarray]
+    coordinates: list[Coordinate]
+    noise: Float[np.ndarray, "2 C"]
+    sets: list[Int[np.ndarray, " g"]]
+    length: float
+
+    def path(
+        self, r: int, at: Float[np.ndarray, " P"], orders: int = 0
+    ) -> tuple[Float[np.ndarray, "P Z"], list[Float[np.ndarray, "Q k"]]]:
+        """Channels and slopes of run r, and roots of the covariance of so many orders of a set."""
+        t, reach = self.times[r], _MARGIN * self.length
+        near = (t >= at[0] - reach) & (t <= at[-1] + reach)
+        C, Q = len(self.coordinates), orders * len(at)
+        out, roots = np.zeros((len(at), 2 * C)), []
+        for g in self.sets:
+            variance = self.noise[:, g] ** 2 / np.maximum(self.counts[r][near][:, :, g], 1)
+            samples = t[near], self.both[r][near][:, :, g], variance[:, :, 0]
+            mean, S = _posterior_path(self.coordinates[g[0]].process, *samples, at, orders > 0)
+            out[:, g], out[:, C + g] = np.split(mean, 2)
+            roots += [] if S is None else [_root(S[:Q, :Q])]
+        return out, roots
+
+
+def _samples(times: list[np.ndarray], channels: Channels) -> _Samples:
+    """The samples, means over 60 in a lengthscale if there are more."""
+    coordinates, noise = _processes(times, channels)
     length = min(c.lengthscale for c in coordinates)
-    spacing = float(np.median(np.concatenate([np.diff(t) for t in times])))
-    times, states, counts = _block_means(times, states, max(1, int(length / (_SAMPLES * spacing))))
-    half = _NODES // 2
-    step = _WIDTH * length / _NODES
-    centres = half * (1 + np.arange(_WINDOWS))
-    P = half * (_WINDOWS + 1) + 1
-    phi, slope = _bump((np.arange(P)[None] - centres[:, None]) / half)
-    pieces = []
-    for r, (t, x, count) in enumerate(zip(times, states, counts, strict=True)):
-        start = float(t[0])
-        while start + 2 * half * step <= t[-1]:
-            at = start + step * np.arange(P)
-            near = (t >= at[0] - _MARGIN * length) & (t <= at[-1] + _MARGIN * length)
-            path, covariance = np.zeros((P, 2 * m)), np.zeros((m, 2 * P, 2 * P))
-            for c in range(m):
-                deviations = of_positions[c], of_slopes[c] if len(of_slopes) else 0.0
-                samples = t[near], x[near][:, [c, m + c] if len(of_slopes) else [c]], count[near]
-                mean, covariance[c] = _posterior_path(
-                    coordinates[c].process, *samples, deviations, at
-                )
-                path[:, c], path[:, m + c] = mean
-            ends = at[centres + half]
-            target = _integrals(runs, r, at, centres, half * step, m)
-            pieces.append((path, covariance, target, ends <= t[-1] + 1e-9 * step))
-            start = float(at[-1])  # windows of two pieces do not overlap: their errors are apart
-    if not pieces:
-        raise ValueError(
-            f"no run is as long as a window, {2 * half * step:.3g} in the unit of the times: weak "
-            "rows need runs of several swings."
-        )
-    stacked = (np.array(column) for column in zip(*pieces, strict=True))
-    path, covariance, targets, inside = stacked
-    targets = np.where(inside[:, :, None], targets, 0.0)
-    overlap = phi @ phi.T * step
-    windows = phi * step, slope / half
-    made = Pieces(path, covariance, *windows, overlap, targets, inside, spacing)
-    return Smoothed(made, np.concatenate([of_positions, of_slopes]), along, length)
+    both = [np.stack(pair, axis=1) for pair in zip(channels.values, channels.slopes, strict=True)]
+    counts = [np.isfinite(x).astype(float) for x in both]
+    C, block = len(coordinates), length / _SAMPLES
+    if any(2 * np.median(np.diff(t)) < block for t in times):
+        paths = smoothed(coordinates, times, channels.values)
+        means = []
+        for r, (t, x) in enumerate(zip(times, both, strict=True)):
+            z = np.concatenate([paths.value[r, : len(t)], paths.slope[r, : len(t)]], axis=1)
+            slopes = np.gradient(z, t, axis=0)
+            means.append(condensed(t, x.reshape(len(t), -1), z, slopes, block)[:3])
+        times, both, counts = (list(column) for column in zip(*means, strict=True))
+        both, counts = ([x.reshape(-1, 2, C) for x in runs] for runs in (both, counts))
+    sets = list(channels.groups)
+    if any((x[:, :, g] != x[:, :, g[:1]]).any() for x in counts for g in sets):
+        sets = [np.array([c]) for c in range(C)]
+    return _Samples(times, both, counts, coordinates, noise, sets, length)
 
 
-def _processes(times, positions, noise: Float[np.ndarray, " n"] | None) -> list[Coordinate]:
-    """The Gaussian process in time of each position, with its noise where that is known."""
-    coordinates = processes(times, positions)
+def _processes(times, channels: Channels) -> tuple[list[Coordinate], Float[np.ndarray, "2 C"]]:
+    """The process of each channel, and the noise of its values and slopes."""
+    coordinates = processes(times, channels.values, channels.groups, channels.slopes)
     for c, coordinate in enumerate(coordinates):
         if not np.isfinite(coordinate.process.log_amplitude):
-            raise ValueError(
-                f"position {c} {'does not move' if coordinate.seen else 'is missing'}."
-            )
-        if noise is not None:
-            log_noise = jnp.log(jnp.asarray(noise[c], float))
-            process = coordinate.process._replace(log_noise=log_noise)
-            coordinates[c] = coordinate._replace(process=process)
-    return coordinates
+            said = "does not move" if coordinate.seen else "is missing"
+            raise ValueError(f"position {c} {said}.")
+    noise = np.array([[c.noise for c in coordinates], [c.slope_noise for c in coordinates]])
+    if channels.noise is not None:
+        noise = np.where(np.isnan(noise), np.nan, channels.noise)
+        coordinates = [
+            c._replace(process=c.process._replace(log_noise=jnp.log(jnp.asarray(s))))
+            for c, s in zip(coordinates, noise[0], strict=True)
+        ]
+    return coordinates, noise
 
 
 def _bump(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -186,20 +269,6 @@ def _integrals(runs, r: int, at, centres, half_width: float, m: int) -> Float[np
     return np.einsum("wpg,pgm,g->wm", phi, u, weights / 2 * step)
 
 
-def _block_means(times, states, size: int):
-    """Means of `size` samples each, with how many of each coordinate are in them."""
-    out = []
-    for t, x in zip(times, states, strict=True):
-        edges = np.arange(0, len(t), size)
-        sizes = np.diff(np.append(edges, len(t)))
-        there = np.isfinite(x)
-        counts = np.add.reduceat(there.astype(float), edges, axis=0)
-        sums = np.add.reduceat(np.where(there, x, 0.0), edges, axis=0)
-        mean = np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
-        out.append((np.add.reduceat(t, edges) / sizes, mean, counts))
-    return (list(column) for column in zip(*out, strict=True))
-
-
 def _covariances(process: Process, gaps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """K, dk/dt and −d²k/dt² of the Matérn-7/2 process at times `gaps` apart."""
     variance, rate = np.exp(2 * float(process.log_amplitude)), np.exp(float(process.log_rate))
@@ -213,34 +282,43 @@ def _covariances(process: Process, gaps: np.ndarray) -> tuple[np.ndarray, np.nda
 def _posterior_path(
     process: Process,
     t: Float[np.ndarray, " T"],
-    x: Float[np.ndarray, "T k"],
-    counts: Float[np.ndarray, "T n"],
-    deviations: tuple[float, float],
+    x: Float[np.ndarray, "T 2 c"],
+    variance: Float[np.ndarray, "T 2"],
     at: Float[np.ndarray, " P"],
-) -> tuple[tuple[np.ndarray, np.ndarray], Float[np.ndarray, "Q Q"]]:
-    """The mean of (q, q̇) at the times `at`, and the covariance of both, q first."""
+    has_errors: bool = True,
+) -> tuple[Float[np.ndarray, "Q c"], Float[np.ndarray, "Q Q"] | None]:
+    """The means of channels and of their slopes at the times `at`, and the covariance of both.
+
+    All channels were measured at the same times. `variance` is that of the noise of each sample.
+    """
     from scipy.linalg import cho_factor, cho_solve  # so that importing does not load it
 
-    there = np.isfinite(x)
-    t0, t1 = t[there[:, 0]], t[there[:, 1]] if x.shape[1] == 2 else t[:0]
-    y0 = x[there[:, 0], 0]
-    y1 = x[there[:, 1], 1] if x.shape[1] == 2 else t[:0]
-    centre = y0.mean() if len(y0) else 0.0
+    is_value, is_slope = np.isfinite(x[:, :, 0]).T
+    y = x[is_value, 0]
+    centre = y.mean(axis=0) if len(y) else np.zeros(x.shape[2])
 
     def joint(a0, a1, b0, b1):
         blocks = [[_covariances(process, a[:, None] - b[None]) for b in (b0, b1)] for a in (a0, a1)]
         return np.block([[blocks[0][0][0], -blocks[0][1][1]], [blocks[1][0][1], blocks[1][1][2]]])
 
-    K = joint(t0, t1, t0, t1)
-    share = counts[:, : x.shape[1]]
-    noise = [deviations[0] ** 2 / share[there[:, 0], 0]]
-    noise += [deviations[1] ** 2 / share[there[:, 1], 1]] if x.shape[1] == 2 else []
-    K[np.diag_indices_from(K)] += np.concatenate(noise)
-    cross = joint(at, at, t0, t1)
+    samples = t[is_value], t[is_slope]
+    K = joint(*samples, *samples)
+    K[np.diag_indices_from(K)] += np.append(variance[is_value, 0], variance[is_slope, 1])
     factor = cho_factor(K)
-    mean = cross @ cho_solve(factor, np.concatenate([y0 - centre, y1]))
-    S = joint(at, at, at, at) - cross @ cho_solve(factor, cross.T)
-    return (mean[: len(at)] + centre, mean[len(at) :]), (S + S.T) / 2
+    cross = joint(at, at, *samples)
+    mean = cross @ cho_solve(factor, np.concatenate([y - centre[None], x[is_slope, 1]]))
+    mean[: len(at)] += centre[None]
+    S = joint(at, at, at, at) - cross @ cho_solve(factor, cross.T) if has_errors else None
+    return mean, S
+
+
+def _root(S: Float[np.ndarray, "Q Q"]) -> Float[np.ndarray, "Q k"]:
+    """E with E Eᵀ = S but for a millionth of the correlations."""
+    unit = np.sqrt(np.maximum(np.diagonal(S), np.finfo(float).tiny))
+    squares, V = np.linalg.eigh(S / unit[:, None] / unit[None])
+    squares, V = np.maximum(squares[::-1], 0.0), V[:, ::-1]
+    k = int(np.searchsorted(np.cumsum(squares), (1 - 1e-6) * squares.sum())) + 1
+    return unit[:, None] * V[:, :k] * np.sqrt(squares[:k])
 
 
 def weak_rows(law: Law, pieces: Pieces) -> Float[Array, "B W m *r"]:
@@ -259,45 +337,54 @@ def weak_rows(law: Law, pieces: Pieces) -> Float[Array, "B W m *r"]:
 
 def path_covariance(law: Law, pieces: Pieces) -> Float[Array, "B R R"]:
     """D S Dᵀ of the rows of each piece, R = W m, for a law (m,) with known weights."""
-    m = pieces.targets.shape[2]
+    C, Z = len(pieces.owner), pieces.path.shape[2]
 
     def piece_result(piece):
-        path, S = piece
-        a, b = jax.vmap(jax.jacfwd(law))(path)  # (P, m, 2m)
-        D = jnp.einsum("wp,pij->wipj", pieces.values, b)
-        D = D - jnp.einsum("wp,pij->wipj", pieces.slopes, a)
-        D = jnp.concatenate([D[..., :m], D[..., m:]], axis=2)  # (W, m, 2P, m): q, then v
-        D = D.reshape(-1, *D.shape[2:])
-        return jnp.einsum("rqj,jqs,tsj->rt", D, S, D)
+        path, roots = piece
 
-    return jax.lax.map(piece_result, (jnp.asarray(pieces.path), jnp.asarray(pieces.covariance)))
+        def slopes(index):
+            tangent = jnp.zeros(Z, path.dtype).at[index].set(1.0)
+            a, b = jax.vmap(lambda z: jax.jvp(law, (z,), (tangent,))[1])(path)
+            D = jnp.einsum("wp,pi->wip", pieces.values, b)
+            return D - jnp.einsum("wp,pi->wip", pieces.slopes, a)
+
+        def add(total, c):
+            D = jnp.concatenate([slopes(c + shift) for shift in range(0, Z, C)], axis=2)
+            E = D.reshape(-1, D.shape[2]) @ roots[jnp.asarray(pieces.owner)[c]]
+            return total + E @ E.T, None
+
+        m = jax.eval_shape(law, path[0])[1].shape[0]
+        R = len(pieces.values) * m
+        return jax.lax.scan(add, jnp.zeros((R, R), path.dtype), jnp.arange(C))[0]
+
+    return jax.lax.map(piece_result, (jnp.asarray(pieces.path), jnp.asarray(pieces.roots)))
 
 
-def whiten(
-    rows: Float[Array, "B W m r"],
-    pieces: Pieces,
-    covariance: Float[Array, "B R R"],
-    deviation: Float[Array, " m"],
-) -> tuple[Float[Array, "N r"], Float[Array, " N"], Float[Array, ""]]:
-    """Rows and targets with independent errors of variance one, and the log of what they lost.
+def factors(
+    pieces: Pieces, covariance: Float[Array, "B R R"], deviation: Float[Array, " m"]
+) -> Float[Array, "B R R"]:
+    """The Cholesky factors of the covariance of the rows of each piece.
 
-    The errors have the covariance of the path and that of white torques, of these deviations at
-    each sample. Windows outside of the runs are zero.
+    Both the path and a white c, with these deviations at each sample, contribute. The identity for
+    windows outside of the runs.
     """
-    torques = jnp.kron(
-        jnp.asarray(pieces.overlap) * pieces.spacing, jnp.diag(jnp.square(deviation))
+    white = jnp.asarray(pieces.overlap) * pieces.spacing
+    white = jnp.kron(white, jnp.diag(jnp.square(deviation)))
+    on = jnp.repeat(jnp.asarray(pieces.inside), len(deviation), axis=1)
+    one = jnp.eye(len(white), dtype=covariance.dtype)
+    C = jnp.where(on[:, :, None] & on[:, None], covariance + white[None], one[None])
+    return jax.lax.map(jnp.linalg.cholesky, C)
+
+
+def whiten(factors: Float[Array, "B R R"], rows: Float[Array, "B W m *r"]) -> Float[Array, "N *r"]:
+    """Rows with independent errors of variance one."""
+    B, R, _ = factors.shape
+    done = jax.lax.map(
+        lambda both: solve_triangular(*both, lower=True), (factors, rows.reshape(B, R, -1))
     )
-    m = len(deviation)
+    return done.reshape(B * R, *rows.shape[3:])
 
-    def piece_result(piece):
-        A, y, C, inside = piece
-        on = jnp.repeat(inside, m)
-        C = jnp.where(on[:, None] & on[None], C + torques, jnp.eye(len(on), dtype=C.dtype))
-        L = jnp.linalg.cholesky(C)
-        both = jnp.concatenate([A.reshape(len(on), -1), y.reshape(-1, 1)], axis=1)
-        done = solve_triangular(L, both, lower=True)
-        return done[:, :-1], done[:, -1], jnp.log(jnp.diagonal(L)).sum()
 
-    inputs = rows, jnp.asarray(pieces.targets), covariance, jnp.asarray(pieces.inside)
-    A, y, lost = jax.lax.map(piece_result, inputs)
-    return A.reshape(-1, A.shape[-1]), y.reshape(-1), lost.sum()
+def log_scale(factors: Float[Array, "B R R"]) -> Float[Array, ""]:
+    """The sum of the logarithms of the deviations that `whiten` divides rows by."""
+    return jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)).sum()

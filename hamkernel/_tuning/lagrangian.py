@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
@@ -19,7 +18,7 @@ from hamkernel._solvers.lagrangian import (
     with_anchor,
 )
 from hamkernel._structures.lagrangian import Lagrangian, LagrangianFeatures
-from hamkernel._tuning.minimiser import inside_box, run_in_box
+from hamkernel._tuning.minimiser import best_in_box, inside_box
 from hamkernel._tuning.space import Hyperparameter, boxes_of
 
 
@@ -135,10 +134,7 @@ def _search(features, rows, space, steps):
         B, y, lost = rows(shown, jnp.exp(h[-m:]))
         return negative_log_likelihood(*with_anchor(shown, B, y)) + lost
 
-    losses = jax.lax.map(loss, design)
-    losses = jnp.where(jnp.isfinite(losses), losses, jnp.inf)
-    start = design[jnp.argmin(losses)]
-    run = run_in_box(loss, start, low, high, jnp.full_like(start, 0.3), steps)
+    run = best_in_box(loss, design, low, high, jnp.full_like(low, 0.3), steps)
     return inside_box(run.best.u, low, high), run.best.value, run.converged, run.steps
 
 

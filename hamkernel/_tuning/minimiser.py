@@ -244,6 +244,21 @@ def run_in_box(
     return minimise(bfgs, loss, init(bfgs, loss, u).with_curvature(inverse), steps)
 
 
+def best_in_box(
+    fn: Callable[[Float[Array, " P"]], Float[Array, ""]],
+    design: Float[Array, "D P"],
+    low: Float[Array, " P"],
+    high: Float[Array, " P"],
+    deviations: Float[Array, " P"],
+    steps: Any,
+    batch_size: int | None = None,
+) -> MinimiserRun:
+    """`run_in_box` from the best of the points of a design, so many of which are tried at once."""
+    values = jax.lax.map(fn, design, batch_size=batch_size)
+    start = design[jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))]
+    return run_in_box(fn, start, low, high, deviations, steps)
+
+
 def _better(best: Evaluation, candidate: Evaluation) -> Evaluation:
     better = candidate.is_evaluated & (candidate.value < best.value)
     return jax.tree.map(lambda a, b: jnp.where(better, b, a), best, candidate)
