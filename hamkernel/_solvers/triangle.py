@@ -11,9 +11,8 @@ the condition κ of the scaled S is above 1/√ε, and leaves S₁ with a condit
 not orthonormal to one half, or there are NaNs, QR takes over, so that R is never less accurate.
 
 Weights, residuals and determinants of S with κ from 1e2 to 1e14 are as accurate as with QR
-(`tests/benchmarks/accuracy.py`, against 100 digits). On one core of a CPU products take four times
-as long as QR, 3.0 s for .72 s with 4001 rows and 1001 columns; on an NVIDIA H200 half as long, 3.7 ms
-for 7.7, and 9.0 for 21.9 with 17 001 rows.
+(`tests/benchmarks/accuracy.py`, against 100 digits). With 4001 rows and 1001 columns products take
+3.7 ms for 7.7 on an NVIDIA H200, 17 001 rows 9.0 for 21.9; on one core of a CPU 3.0 s for .72.
 
 Source: Fukaya, Kannan, Nakatsukasa, Yamamoto & Yanagisawa (2020), SIAM J. Sci. Comput. 42, "shifted
 Cholesky QR".
