@@ -9,6 +9,7 @@ from collections.abc import Callable
 
 import numpy as np
 from jaxtyping import Float
+from numpy.lib.recfunctions import unstructured_to_structured
 
 from hamkernel._kernels.built_in import Gaussian
 from hamkernel._report import report, script
@@ -18,7 +19,9 @@ from hamkernel._structures.friction import Friction
 from hamkernel._structures.joined import Controlled, InputMatrix
 from hamkernel._structures.structure import Symplectic
 from hamkernel._trajectories.learn import learn
+from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.runs import Runs
+from hamkernel._trajectories.score import Score
 
 
 def parser() -> argparse.ArgumentParser:
@@ -107,20 +110,33 @@ def run(arguments: list[str], show: Callable[[str], None]) -> None:
         save(out / "learned.hk", learned)
         (out / "simulate.py").write_text(script("learned.hk", learned), encoding="utf-8")
         show(f"{learned!r}\nScoring on the last fifth of each run, which learns once more.")
-        score = learned.score()
-        show(repr(score))
+        score = _score(learned, show)
         report(learned, out / "report.html", score)
     except (ValueError, TypeError, OSError) as error:
         options.error(str(error))
     show(f"Written: report.html, learned.hk and simulate.py in {out}/.")
 
 
+def _score(learned: Learned, show: Callable[[str], None]) -> Score | None:
+    """The score on the last fifth of each run; None where the runs are too short for one."""
+    try:
+        score = learned.score()
+    except ValueError as error:
+        show(f"No score: {error}")
+        return None
+    show(repr(score))
+    return score
+
+
 def _runs(asked: argparse.Namespace) -> Runs:
-    """The runs of the files, one each."""
+    """The runs of the files, one each, with the names of their columns."""
     k = 1 + len(asked.states)
     tables = [columns(file, [asked.time, *asked.states, *asked.inputs]) for file in asked.files]
-    inputs = [table[:, k:] for table in tables] if asked.inputs else None
-    return Runs([table[:, 0] for table in tables], [table[:, 1:k] for table in tables], inputs)
+    states = [unstructured_to_structured(x[:, 1:k], names=asked.states) for x in tables]
+    inputs = None
+    if asked.inputs:
+        inputs = [unstructured_to_structured(x[:, k:], names=asked.inputs) for x in tables]
+    return Runs([table[:, 0] for table in tables], states, inputs)
 
 
 def _number(values: list[float] | None) -> float | np.ndarray | None:

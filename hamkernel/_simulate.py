@@ -18,6 +18,7 @@ from hamkernel._fields.joined import AbstractJoinedField
 from hamkernel._gram import field_rounding
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._machine import compiled, full_precision
+from hamkernel._structures.laws import outside
 from hamkernel._symplectic import AbstractSymplecticSolver, EqualSteps, step_counts
 
 Interpolation = Literal["held", "linear"]
@@ -121,6 +122,10 @@ def simulate(
         total = jnp.asarray(require.on_host(steps.counts).sum())
         stats = {**solution.stats, "num_steps": total, "num_accepted_steps": total}
         solution = eqx.tree_at(lambda s: s.stats, solution, stats)
+    if require.is_concrete(field, solution.ys):
+        warning = outside(getattr(field, "kernel", None), solution.ys)
+        if warning:
+            require.warn(warning)
     if not throw:
         return solution
     message = jax.tree_util.Partial(_reason_of_failure, solution, at_start, x0, dt is None)

@@ -15,7 +15,7 @@ NOTEBOOKS = sorted(FOLDER.glob("*.ipynb"))
 IN_CI = {"quickstart"}
 PACKAGES = {"planets": ["jplephem", "skyfield_data"], "guide_cluster": ["dask", "distributed"]}
 # Without pictures: what they show is numbers and error messages.
-NUMBERS = {"guide_cluster", "guide_deploy", "guide_sharp_bits"}
+NUMBERS = {"guide_cluster", "guide_deploy", "guide_sharp_bits", "guide_you_asked"}
 # No claim about speed: only so that a kernel that hangs ends the test.
 TIMEOUT = 1200
 

@@ -11,6 +11,7 @@ import pytest
 
 import hamkernel as hk
 import hamkernel._features
+from hamkernel._structures.laws import outside, undetermined_terms
 
 RNG = np.random.default_rng(0)
 
@@ -142,6 +143,39 @@ def test_a_law_is_found_from_a_few_states(learned):
         plain = hk.fit(hk.Symplectic(hk.Gaussian(3.0)), X, Y, 1e-6, mean=hk.kinetic(1.0))
     error = np.asarray(plain.evaluate(others)) - truth
     assert np.sqrt(np.mean(error**2) / np.mean(truth**2)) > 0.1
+
+
+def test_what_no_data_tell_of_laws_is_said(learned):
+    constant = "a constant added to the law changes no velocity"
+    assert learned[0].undetermined == (constant,)
+    k, half = hk.Gaussian(1.0), lambda x: -2 * jnp.diff(x)[:, None]
+    ring = hk.CurlFree(hk.Shared(k, hk.neighbours(4, periodic=True)))
+    assert undetermined_terms(ring, 4) == (constant, "r added to the law changes no velocity")
+    both = hk.CurlFree(hk.Shared(k, hk.neighbours(4)) + hk.Shared(k, half))
+    said = undetermined_terms(both, 4)
+    assert len(said) == 3
+    assert any("1 times r added to law 0" in s and "r added to law 1 together" in s for s in said)
+
+
+def test_states_beyond_the_data_of_a_law_are_named(learned):
+    field, X, _ = learned
+    assert not outside(field.kernel, jnp.asarray(X))
+    X = X[:2].copy()
+    X[1, 2:4] = X[1, :2] + 0.01
+    said = outside(field.kernel, jnp.asarray(X))
+    assert said.startswith("two particles come as close as 0.0141, and in the data no closer than")
+    chain = hk.CurlFree(hk.Shared(hk.Gaussian(1.0), hk.neighbours(4), centres=[-1.0, 1.0]))
+    assert not outside(chain, jnp.array([[0.0, 1.0, 0.5, 0.2]]))
+    assert "reach from [-2.] to [1.]" in outside(chain, jnp.array([[0.0, 1.0, -1.0, 0.0]]))
+
+
+@pytest.mark.slow
+def test_a_simulation_that_leaves_the_data_of_a_law_says_so(learned):
+    field, X, _ = learned
+    close = X[0].copy()
+    close[2:4] = close[:2] + 0.01
+    with pytest.warns(UserWarning, match="two particles come as close as"):
+        hk.simulate(field, close, [0.0, 1e-4], dt=1e-4)
 
 
 @pytest.mark.slow

@@ -91,6 +91,46 @@ def test_the_command_refuses_with_a_sentence(tmp_path, capsys):
     assert kernel(4, 1, friction=True).inputs.acts_on == (2, 3)
 
 
+@pytest.mark.parametrize(
+    ("options", "momenta", "given"),
+    [
+        (["--states", "q", "p", "--inputs", "u", "--friction"], (1,), (None, None)),
+        (["--states", "q", "--mass", "2", "--noise", "0.1"], None, (2.0, 0.1)),
+        (["--states", "q", "p", "--mass", "1", "2", "--noise", "1", "3"], None, ([1, 2], [1, 3])),
+        (["--states", "q", "--inputs", "u", "v", "--mass", "2"], (1,), (2.0, None)),
+    ],
+)
+def test_options_of_the_command_reach_the_kernel_and_learn(
+    tmp_path, monkeypatch, options, momenta, given
+):
+    rng, file, asked = np.random.default_rng(0), tmp_path / "run.csv", []
+    rows = np.column_stack([0.1 * np.arange(40), rng.normal(size=(40, 4))])
+    np.savetxt(file, rows, delimiter=",", header="t,q,p,u,v", comments="")
+
+    def record(K, runs, **given):
+        asked.append((K, runs, given))
+        raise ValueError("enough")
+
+    monkeypatch.setattr("hamkernel._command.learn", record)
+    with pytest.raises(SystemExit):
+        run([str(file), "--time", "t", *options, "--out", str(tmp_path)], lambda text: None)
+    ((K, runs, options_of_learn),) = asked
+    names = [name for name in options if name in ("q", "p", "u", "v")]
+    count = runs.dimension
+    assert runs.names == tuple(names[:count])
+    assert runs.input_names == (tuple(names[count:]) or None)
+    np.testing.assert_array_equal(runs.states[0][:, 0], rows[:, 1])
+    if momenta is None:
+        assert isinstance(K, hk.Symplectic)
+        assert runs.inputs is None
+    else:
+        assert K.inputs.acts_on == momenta
+        np.testing.assert_array_equal(runs.inputs[0][:, 0], rows[:, 3])
+        assert isinstance(K.drift, hk.Sum) == ("--friction" in options)
+    for name, value in zip(("mass", "noise"), given, strict=True):
+        np.testing.assert_array_equal(options_of_learn[name], value)
+
+
 def test_the_command_writes_a_page_a_field_and_a_script(learned, tmp_path, monkeypatch):
     file, said = tmp_path / "run.csv", []
     rows = np.column_stack([learned.runs.times[0], learned.runs.states[0]])
@@ -104,3 +144,12 @@ def test_the_command_writes_a_page_a_field_and_a_script(learned, tmp_path, monke
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {"report.html", "learned.hk", "simulate.py"}
     assert said[-1].startswith("Written:")
+
+    def too_short(self):
+        raise ValueError("no run has ten samples")
+
+    monkeypatch.setattr(type(learned), "score", too_short)
+    (tmp_path / "out" / "report.html").unlink()
+    run([str(file), *options], said.append)
+    assert said[-2:] == ["No score: no run has ten samples", said[-1]]
+    assert (tmp_path / "out" / "report.html").exists()

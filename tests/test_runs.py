@@ -87,6 +87,24 @@ def test_a_wrapped_angle_is_named_with_its_cure():
     hk.Runs(t, np.column_stack([np.unwrap(angle[:, 0]), angle[:, 1]]))  # no warning: an error here
 
 
+@pytest.mark.parametrize("period", [360, 4096, 65536])
+def test_an_angle_in_degrees_or_counts_of_an_encoder_is_unwrapped_by_its_period(period):
+    t = np.arange(100) / 20
+    angle = np.column_stack([0.7 * period * t % period, np.sin(t)])
+    with pytest.warns(UserWarning, match=rf"jumps by about {period}: .*, period={period}\)"):
+        hk.Runs(t, angle)
+
+
+@pytest.mark.parametrize("value", [-9999.0, 65535.0, 1e30])
+def test_a_sample_that_a_logger_wrote_for_a_lost_one_is_named(value):
+    t = np.arange(60) / 10
+    states = np.column_stack([np.sin(t), np.cos(t)])
+    states[20, 0] = value
+    with pytest.warns(UserWarning, match=r"^1 sample is impossible .* sample 20 of run 0"):
+        runs = hk.Runs(t, states)
+    assert [list(rows) for rows in runs.impossible] == [[20]]
+
+
 def test_a_wrapped_angle_with_lost_samples_is_told_to_unwrap_those_that_were_measured():
     # np.unwrap of all of them has NaN from the first lost one on.
     t = np.linspace(0, 10, 60)

@@ -17,6 +17,7 @@ from hamkernel._show import Shown, described, has_arrays, text
 from hamkernel._sizes import sizes
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.joined import AbstractJoinedKernel, KnownMatrix
+from hamkernel._structures.laws import undetermined_terms
 
 Field = TypeVar("Field", bound="AbstractField")
 Mean = Callable[..., Float[Array, " n"]]
@@ -125,11 +126,11 @@ class AbstractField(Shown, eqx.Module):
         X = require.points(X, "X").astype(self.offset.dtype)
         if X.shape[1] != self.dimension:
             raise ValueError(f"X has {X.shape[1]} coordinates and the field {self.dimension}.")
-        learned = self._evaluated(X)
+        learned = self._velocities(X)
         return learned if self.mean is None else learned + at_points(self.mean, X)
 
     @abc.abstractmethod
-    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+    def _velocities(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         """The velocities at checked states, without the mean."""
 
     def score(
@@ -232,6 +233,15 @@ class AbstractField(Shown, eqx.Module):
         waves, weights = laws[which]
         waves_at_r = waves.of_law(r) if r0 is None else waves.of_law(r) - waves.of_law(r0)
         return waves_at_r.astype(weights.dtype) @ weights
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """The changes of the laws of `hk.Shared` that no data tell, a sentence for each.
+
+        A constant in a law changes no velocity. Nor does a linear term, if the sum of its parts is
+        constant or if another law has the same sum.
+        """
+        return undetermined_terms(self.kernel, self.dimension)
 
     def _laws(self) -> list[tuple[Any, Float[Array, " m"]]]:
         """The features of each shared law, with their weights."""

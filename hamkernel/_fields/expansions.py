@@ -59,7 +59,7 @@ class KernelField(AbstractField):
         field = _expansion(self.kernel, x, self.points, self.coefficients)
         return self._add_values(field, _value_field, x)
 
-    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+    def _velocities(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         fields = placed_product(self.kernel, X, self.points, self.coefficients)
         return self._add_values(fields, _value_fields, X)
 
@@ -208,7 +208,7 @@ class FeatureField(AbstractField):
     def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return _field_at(self.features, x, self.weights)
 
-    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+    def _velocities(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         spread = row_sharding(X)
         return to_caller_sharding(spread, _evaluate(self, shard(spread, X), spread))
 

@@ -179,7 +179,7 @@ class AbstractJoinedField(AbstractField):
                 f"({len(X)}, {m}); got {None if inputs is None else inputs.shape}."
             )
         S, mean = jnp.concatenate([X, inputs], axis=1), self.whole.mean
-        learned = self.whole._evaluated(S)
+        learned = self.whole._velocities(S)
         return learned if mean is None else learned + at_points(mean, S).reshape(len(S), n)
 
     def part(self, which: int | str) -> "AbstractJoinedField":
@@ -249,8 +249,8 @@ class ControlledField(AbstractJoinedField):
         """The potential of the drift, without the constant of `anchored`."""
         return self.drift.unanchored_potential(x)
 
-    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
-        return self.drift._evaluated(X)
+    def _velocities(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+        return self.drift._velocities(X)
 
     def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return self.drift._learned(x)
@@ -334,7 +334,7 @@ class FamilyField(AbstractJoinedField):
         """Refused: each member has its own, `field.at(θ).hamiltonian`."""
         return self.potential
 
-    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+    def _velocities(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         raise AttributeError("a family is evaluated at states and parameters.")
 
     def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -394,8 +394,8 @@ class MemberField(AbstractField):
     def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return sum((t._learned(x) for t in self.terms), jnp.zeros_like(x))
 
-    def _evaluated(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
-        return sum((t._evaluated(X) for t in self.terms), jnp.zeros_like(X))
+    def _velocities(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
+        return sum((t._velocities(X) for t in self.terms), jnp.zeros_like(X))
 
     def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         return sum((t._learned_potential(x) for t in self.terms), jnp.zeros((), x.dtype))

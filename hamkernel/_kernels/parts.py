@@ -288,6 +288,10 @@ class _Pairs(eqx.Module):
         """The coordinate in which the law is smooth: r, log r or 1/r."""
         return {"distance": lambda r: r, "log": jnp.log, "inverse": lambda r: 1 / r}[self.of](r)
 
+    def distance(self, coordinate: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The distance of a coordinate."""
+        return jnp.exp(coordinate) if self.of == "log" else self.coordinate(coordinate)
+
 
 def pairs(
     particles: int,

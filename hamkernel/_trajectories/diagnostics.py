@@ -111,9 +111,9 @@ def diagnostics(
     if not fit.kept.any():
         return Diagnostics((_parts_left_out(fit),))
     rows = [
+        _free_run(fit),  # first, so that a warning begins with it: users see this failure
         _settling(fit),
         _noise_against_motion(fit),
-        _free_run(fit),
         _outliers(fit),
         degrees_of_freedom(fit),
         _force(fit),  # a cause with a cure, before its symptoms

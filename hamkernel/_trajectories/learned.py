@@ -300,7 +300,12 @@ class Learned(Shown, eqx.Module):
                 f"the runs have {runs.dimension} coordinates and {runs.input_count} inputs; the "
                 f"learned ones have {self.runs.dimension} and {self.runs.input_count}."
             )
-        posterior = self._posterior(on_landmarks=True) if draws and self.observations else None
+        posterior = None
+        if draws and self.observations is not None:
+            with warnings.catch_warnings():
+                # Whether the landmarks are enough is a row of `diagnostics`.
+                warnings.simplefilter("ignore")
+                posterior = self._posterior(on_landmarks=True)
         return scored(self, runs, first, posterior, draws)
 
     def plot(self, run: int = 0, held_out: Runs | None = None) -> Any:

@@ -70,8 +70,9 @@ def _wraps(log: Log) -> Diagnostic:
     where: dict[float, list[str]] = {}
     lost = False
     for run, (t, x) in enumerate(zip(log.times, log.states, strict=True)):
+        real = np.where(impossible_samples(x)[:, None], np.nan, x)  # 65535 is no turn of 65536
         for c in range(x.shape[1]):
-            period = wrapped_period(t, x[:, c])
+            period = wrapped_period(t, real[:, c])
             if period:
                 where.setdefault(period, []).append(f"coordinate {log.names[c]} of run {run}")
                 lost |= not np.isfinite(x[:, c]).all()

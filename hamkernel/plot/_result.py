@@ -132,10 +132,10 @@ def thumbnail(learned: Learned) -> str:
     """
     figure = Figure(figsize=(4.6, 1.7), layout="constrained")
     ax = figure.subplots()
-    t, n = learned.runs.times[0], learned.runs.dimension
+    t = learned.runs.times[0]
     ax.plot(t, np.asarray(learned.runs.states[0])[:, 0], ".", color=DATA, ms=4, label="measured")
     ax.plot(t, np.asarray(learned.states[0])[:, 0], color=BLUE, linewidth=1.2, label="fitted")
-    ax.set(xlabel="time $t$", ylabel=(learned.runs.names or [coordinate(0, n)])[0])
+    ax.set(xlabel="time $t$", ylabel=_labels(learned)[0])
     legend(ax, fontsize="x-small")
     return image(figure, "first run", 80)
 
@@ -146,6 +146,12 @@ def image(figure: Figure, text: str, dpi: int = 120) -> str:
     figure.savefig(content, dpi=dpi, format="png")
     data = base64.b64encode(content.getvalue()).decode()
     return f'<img alt="{text}" src="data:image/png;base64,{data}">'
+
+
+def _labels(learned: Learned) -> list[str]:
+    """The names of the columns of the log, else q and p."""
+    n = learned.runs.dimension
+    return list(learned.runs.names or (coordinate(c, n) for c in range(n)))
 
 
 def _inputs(learned: Learned, count: int) -> tuple[Any, ...]:
@@ -162,7 +168,7 @@ def _force(ax: Axes, learned: Learned, posterior: Any) -> None:
     q = np.linspace(visited.min(), visited.max(), _STATES)
     states = np.stack([q, np.zeros(_STATES)], axis=1)
     means, deviations = map(np.asarray, posterior.evaluate(states, *_inputs(learned, _STATES)))
-    band(q, means[:, 1], deviations[:, 1], ax=ax, xlabel="$q$")
+    band(q, means[:, 1], deviations[:, 1], ax=ax, xlabel=_labels(learned)[0])
     ax.locator_params(axis="x", nbins=6)
     ax.axhline(0.0, color="0.7", linewidth=0.8, zorder=1)
     ax.plot(
@@ -195,7 +201,8 @@ def _plane(ax: Axes, learned: Learned) -> None:
         style = {"color": DATA, "ms": 3, "mec": "black", "mew": 0.3}
         ax.plot(*np.asarray(x)[:, [i, j]].T, "o", label=name[0], zorder=3, **style)
         ax.plot(*np.asarray(path)[:, [i, j]].T, color=BLUE, linewidth=1.2, label=name[1])
-    ax.set(xlabel=coordinate(i, n), ylabel=coordinate(j, n), title="all runs")
+    labels = _labels(learned)
+    ax.set(xlabel=labels[i], ylabel=labels[j], title="all runs")
     ax.title.set_fontsize("small")
     ax.grid(True, color="0.92", linewidth=0.6)
     legend(ax)
@@ -209,9 +216,8 @@ def _uncertainty(ax: Axes, learned: Learned, posterior: Any) -> None:
     means, deviations = map(np.asarray, posterior.evaluate(states, *_inputs(learned, len(states))))
     speeds = np.sqrt((means**2).mean(axis=0))
     shares = deviations / np.where(speeds > 0, speeds, 1.0)
-    labels = [coordinate(c, n) for c in range(n)]
     ax.boxplot(shares, whis=(5, 95), showfliers=False, medianprops={"color": BLUE})
-    ax.set_xticks(range(1, n + 1), labels)
+    ax.set_xticks(range(1, n + 1), _labels(learned))
     ax.set(
         ylabel="deviation / speed", yscale="log", title="uncertainty of the field along the runs"
     )
@@ -227,7 +233,7 @@ def _free_run(ax: Axes, learned: Learned, held_out: Runs) -> None:
     ax.plot(t, np.asarray(score.predictions[0])[:, 0], color=BLUE, linewidth=1.4, label="free run")
     first = min(score.first, max(len(t) // 2, 1)) - 1
     ax.axvspan(t[0], t[first], color="0.9", linewidth=0, label="seen", zorder=0)
-    ax.set(xlabel="time $t$", ylabel=coordinate(0, learned.runs.dimension))
+    ax.set(xlabel="time $t$", ylabel=_labels(learned)[0])
     ax.set_title(f"held out: error {float(score.rmse[0]):.3g} after the first samples")
     ax.title.set_fontsize("small")
     ax.set_xlim(t[0], t[-1])

@@ -1,0 +1,116 @@
+"""Limits of what data say of laws that many parts share: in words, for fields and simulations."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hamkernel._kernels.parts import Shared
+from hamkernel._machine import compiled
+from hamkernel._structures.base import Sum
+from hamkernel._structures.completed import shared_laws
+from hamkernel._structures.structure import AbstractPotentialKernel
+
+_ZERO = 1e-5  # of the largest singular value, above the rounding of float32
+_CLOSER = 0.05  # of the range of the data, which is known from 256 of their states
+
+
+def undetermined_terms(K: Any, n: int) -> tuple[str, ...]:
+    """The changes of the laws within K that change no field, a sentence for each.
+
+    The linear function r_j as a law gives the potential Σ_p c_p φ_pj(x). Combinations of such
+    functions, and of constants, are undetermined if their fields are zero at random states.
+    """
+    terms = [t for t in (K.terms if isinstance(K, Sum) else (K,)) if _has_potential(t)]
+    laws = [(term, law) for term in terms for law in shared_laws(term.kernel)]
+    X, columns, names = np.random.default_rng(0).normal(size=(8, n)), [], []
+    for i, (term, law) in enumerate(laws):
+        fields = np.asarray(_linear_fields(term, law, jnp.asarray(X)))
+        fields = fields.reshape(-1, fields.shape[2]).T
+        columns += list(fields / (np.abs(fields).max() or 1.0))
+        coordinates = ["r"] if len(fields) == 2 else [f"r[{j}]" for j in range(len(fields) - 1)]
+        place = f"law {i}" if len(laws) > 1 else "the law"
+        names += [f"{name} added to {place}" for name in ("a constant", *coordinates)]
+    said = []
+    for shares in _null_vectors(np.array(columns).T) if columns else ():
+        parts = [(s, name) for s, name in zip(shares, names, strict=True) if s]
+        one = len(parts) == 1
+        text = " and ".join(name if one else f"{s:.3g} times {name}" for s, name in parts)
+        said.append(f"{text} {'changes' if one else 'together change'} no velocity")
+    return tuple(said)
+
+
+def _has_potential(K: Any) -> bool:
+    return isinstance(K, AbstractPotentialKernel)
+
+
+@compiled
+def _linear_fields(K: Any, law: Shared, X: Float[Array, "N n"]) -> Float[Array, "N n k"]:
+    """The fields of a constant and of the coordinates as laws."""
+
+    def potentials(x):
+        points, weights = law.of(x)
+        return jnp.append(weights.sum(), weights @ points)
+
+    return jax.lax.map(lambda x: K.apply(x, jax.jacrev(potentials)(x).T), X)
+
+
+def _null_vectors(M: Float[np.ndarray, "R Q"]) -> Float[np.ndarray, "d Q"]:
+    """The space of v with M v = 0, by vectors with as many zeros as elimination finds."""
+    _, sizes, V = np.linalg.svd(M)
+    sizes = np.append(sizes, np.zeros(len(V) - len(sizes)))
+    space, first = V[sizes <= _ZERO * max(sizes.max(), 1.0)], 0
+    for column in range(space.shape[1]):
+        if first == len(space):
+            break
+        pivot = first + int(np.argmax(np.abs(space[first:, column])))
+        if abs(space[pivot, column]) > _ZERO:
+            space[[first, pivot]] = space[[pivot, first]]
+            space[first] /= space[first, column]
+            rest = np.arange(len(space)) != first
+            space[rest] -= space[rest, column][:, None] * space[first][None]
+            first += 1
+    return np.where(np.abs(space) > 10 * _ZERO, space, 0.0)
+
+
+def outside(K: Any, X: Float[Array, "T n"]) -> str:
+    """A sentence if parts of the states X are not among those of the data, else "".
+
+    For distances only those are meant that are smaller than all of the data.
+    """
+    for law in shared_laws(K) if K is not None else ():
+        if law.centres is None:
+            continue
+        lowest, highest = (np.asarray(a) for a in _range(law, X))
+        C = np.asarray(law.centres)
+        low, high = C.min(axis=0), C.max(axis=0)
+        reach = _CLOSER * (high - low)
+        distance = getattr(law.parts, "distance", None)
+        if distance is not None:
+            closest = min(float(distance(low[0])), float(distance(high[0])))
+            now = min(float(distance(lowest[0])), float(distance(highest[0])))
+            if now < (1 - _CLOSER) * closest:
+                return (
+                    f"two particles come as close as {now:.3g}, and in the data no closer than "
+                    f"{closest:.3g}: there the law is not known, see posterior.law_deviation."
+                )
+        elif (lowest < low - reach).any() or (highest > high + reach).any():
+            return (
+                f"the parts of a shared law reach from {lowest} to {highest}, and in the data from "
+                f"{low} to {high}: there the law is not known, see posterior.law_deviation."
+            )
+    return ""
+
+
+@compiled
+def _range(law: Shared, X: Float[Array, "T n"]) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
+    """The lowest and highest coordinates of the parts of the states."""
+
+    def extremes(x):
+        points = law.of(x).points
+        return points.min(axis=0), points.max(axis=0)
+
+    low, high = jax.lax.map(extremes, X)
+    return low.min(axis=0), high.max(axis=0)
