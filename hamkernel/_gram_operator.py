@@ -21,8 +21,8 @@ from hamkernel._gram import centred, diagonals, gram
 from hamkernel._machine import (
     RowSharding,
     compiled,
+    follow_data,
     full_precision,
-    on_device_of_data,
     row_sharding,
     shard,
     sum_of_columns,
@@ -91,7 +91,7 @@ class GramOperator(lx.AbstractLinearOperator):
     def columns(self) -> Float[Array, "M n"]:
         return self.X if self.Z is None else self.Z
 
-    @on_device_of_data
+    @follow_data
     @full_precision
     def mv(self, vector: Num[ArrayLike, "M n"]) -> Float[Array, "N n"]:
         """G a, shape (N, n).

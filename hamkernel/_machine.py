@@ -246,7 +246,7 @@ def refuse_beyond_memory(
         )
 
 
-def on_device_of_data(function: Callable[P, T]) -> Callable[P, T]:
+def follow_data(function: Callable[P, T]) -> Callable[P, T]:
     """`function` with the device of its arguments as JAX's default device.
 
     Data put on a CPU beside a GPU are computed on the CPU. Sizes, memory and options of the
@@ -255,14 +255,14 @@ def on_device_of_data(function: Callable[P, T]) -> Callable[P, T]:
     """
 
     @functools.wraps(function)
-    def on_device(*args: P.args, **kwargs: P.kwargs) -> T:
+    def wrapper(*args: P.args, **kwargs: P.kwargs) -> T:
         device = _device_of_data((args, kwargs))
         if device is None or device.platform == _sizes.platform():
             return function(*args, **kwargs)
         with jax.default_device(device):
             return function(*args, **kwargs)
 
-    return on_device
+    return wrapper
 
 
 def _device_of_data(tree: Any) -> Any:

@@ -3,7 +3,7 @@
 A CPU wants pieces that stay in its cache, a GPU pieces that fill it. JAX decides on a device when
 it lowers a program, later than Python cuts the data into pieces, so `sizes` asks for the default
 device: of the process, or of `with jax.default_device(…)` around the call. Public functions make
-the device of their data the default one (`_machine.on_device_of_data`).
+the device of their data the default one (`_machine.follow_data`).
 """
 
 from typing import NamedTuple

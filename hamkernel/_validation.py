@@ -25,8 +25,8 @@ from hamkernel._closed_forms import (
 from hamkernel._gram import between_all, forward_differentiated, gram_of_rows, plus_ridge
 from hamkernel._machine import (
     compiled,
+    follow_data,
     full_precision,
-    on_device_of_data,
     one_blas_thread,
     refuse_beyond_memory,
 )
@@ -40,7 +40,7 @@ from hamkernel._solvers.problem import make_problem
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
-@on_device_of_data
+@follow_data
 @one_blas_thread
 @full_precision
 def cross_validation_loss(
@@ -87,7 +87,7 @@ def cross_validation_loss(
     return partition_loss(K, rows, regularization, partition_of_rows(rows, folds))
 
 
-@on_device_of_data
+@follow_data
 @one_blas_thread
 @full_precision
 def cross_validation_residuals(
@@ -114,7 +114,7 @@ def cross_validation_residuals(
     return rows.in_units(residuals)
 
 
-@on_device_of_data
+@follow_data
 @one_blas_thread
 @full_precision
 def generalized_cross_validation(
@@ -153,7 +153,7 @@ def generalized_cross_validation(
     return generalized_loss(*_check_problem(K, X, Y, regularization, inputs, parameters))
 
 
-@on_device_of_data
+@follow_data
 @one_blas_thread
 @full_precision
 def log_marginal_likelihood(

@@ -8,11 +8,11 @@ import pytest
 from data import swings
 
 import hamkernel as hk
-from hamkernel._machine import on_device_of_data
+from hamkernel._machine import follow_data
 from hamkernel._sizes import platform, sizes
 from hamkernel._solvers import dense
 from hamkernel._solvers.problem import make_problem
-from hamkernel._solvers.triangle import by_products, triangle
+from hamkernel._solvers.triangle import cholesky_triangle, triangle
 
 X, Y = map(jnp.asarray, swings(8))
 K = hk.Symplectic(hk.Gaussian(1.0))
@@ -60,7 +60,7 @@ def test_sizes_follow_the_default_device(monkeypatch):
 def test_sizes_follow_the_device_of_the_data(monkeypatch):
     on_cpu = jax.device_put(X, jax.devices("cpu")[0])
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
-    tile = on_device_of_data(lambda data: sizes().tile)
+    tile = follow_data(lambda data: sizes().tile)
     assert tile({"x": np.asarray(X)}) == tile(jnp.zeros(2)) == jax.jit(tile)(on_cpu) == 4000
     assert tile({"n": 3, "x": on_cpu}) == 1000
 
@@ -91,7 +91,10 @@ def test_a_triangle_of_products_is_as_accurate_as_one_of_reflections(digits):
         found = np.sign(np.diagonal(found))[:, None] * found
         return np.abs(found - R).max(axis=1) / np.abs(R).max(axis=1)
 
-    made, peer = error(np.asarray(by_products(jnp.asarray(S)))), error(np.linalg.qr(S, mode="r"))
+    made, peer = (
+        error(np.asarray(cholesky_triangle(jnp.asarray(S)))),
+        error(np.linalg.qr(S, mode="r")),
+    )
     assert made.max() < 4 * peer.max() + 1e-14
     assert made.max() < 1e-15 * 10 ** (digits + 1)
 
@@ -100,9 +103,9 @@ def test_a_triangle_of_products_is_as_accurate_as_one_of_reflections(digits):
     "S", [jnp.ones((6, 3)), jnp.zeros((6, 3)), jnp.eye(6)[:, :3].at[:, 1].set(0)]
 )
 def test_where_columns_are_dependent_reflections_take_over(S):
-    R = by_products(S)
+    R = cholesky_triangle(S)
     np.testing.assert_allclose(R.T @ R, S.T @ S, atol=1e-14)
-    assert bool(jnp.isnan(by_products(S.at[0, 0].set(jnp.nan))).any())
+    assert bool(jnp.isnan(cholesky_triangle(S.at[0, 0].set(jnp.nan))).any())
 
 
 def test_a_triangle_is_made_of_products_on_a_gpu_alone():

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._machine import full_precision, on_device_of_data
+from hamkernel._machine import follow_data, full_precision
 from hamkernel._show import Shown, described, has_arrays, text
 from hamkernel._sizes import sizes
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
@@ -112,7 +112,7 @@ class AbstractField(Shown, eqx.Module):
     def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         """The potential without the mean."""
 
-    @on_device_of_data
+    @follow_data
     def evaluate(self, X: Num[ArrayLike, "N n"]) -> Float[Array, "N n"]:
         """The velocities at many states, as `jax.vmap(field)(X)` but in bounded memory.
 

@@ -24,7 +24,7 @@ from hamkernel._fields.base import (
 )
 from hamkernel._fields.expansions import FeatureField, KernelField
 from hamkernel._gram_operator import placed_product
-from hamkernel._machine import on_device_of_data
+from hamkernel._machine import follow_data
 from hamkernel._structures.base import Sum
 from hamkernel._structures.joined import AbstractJoinedKernel
 
@@ -156,7 +156,7 @@ class AbstractJoinedField(AbstractField):
         x = self._state(x)
         return jnp.concatenate([x, u.astype(x.dtype)])
 
-    @on_device_of_data
+    @follow_data
     def evaluate(
         self, X: Num[ArrayLike, "N n"], U: Num[ArrayLike, "N m"] | None = None
     ) -> Float[Array, "N n"]:

@@ -16,9 +16,9 @@ from hamkernel._fields.joined import ControlledField, FamilyField, learned_field
 from hamkernel._fields.lagrangian import LagrangianField
 from hamkernel._machine import (
     dense_bytes,
+    follow_data,
     full_precision,
     memory_bytes,
-    on_device_of_data,
     one_blas_thread,
     row_sharding,
     to_caller_sharding,
@@ -103,7 +103,7 @@ def fit(
 ) -> LearnedField: ...
 
 
-@on_device_of_data
+@follow_data
 @one_blas_thread
 @full_precision
 def fit(

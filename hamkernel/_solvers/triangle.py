@@ -27,15 +27,15 @@ from hamkernel._solvers.factors import cholesky, forward
 
 def triangle(S: Float[Array, "m k"]) -> Float[Array, "k k"]:
     """R, upper triangular with RᵀR = SᵀS, for m ≥ k. The signs of its rows depend on the device."""
-    return jax.lax.platform_dependent(S, cpu=by_reflections, default=by_products)
+    return jax.lax.platform_dependent(S, cpu=householder_triangle, default=cholesky_triangle)
 
 
-def by_reflections(S: Float[Array, "m k"]) -> Float[Array, "k k"]:
+def householder_triangle(S: Float[Array, "m k"]) -> Float[Array, "k k"]:
     """R by Householder's QR."""
     return jnp.linalg.qr(S, mode="r")
 
 
-def by_products(S: Float[Array, "m k"]) -> Float[Array, "k k"]:
+def cholesky_triangle(S: Float[Array, "m k"]) -> Float[Array, "k k"]:
     """R by shifted Cholesky QR, or by QR where that fails."""
     G = S.T @ S
     one, norms = jnp.eye(len(G), dtype=G.dtype), jnp.sqrt(jnp.diagonal(G))
@@ -51,4 +51,4 @@ def by_products(S: Float[Array, "m k"]) -> Float[Array, "k k"]:
         R = last @ R
     # G = S₂ᵀS₂. The condition of S₂ is then below √3, and the last factor is exact to rounding.
     is_orthonormal = jnp.linalg.norm(G - one) <= 0.5
-    return jax.lax.cond(is_orthonormal, lambda S, R: R, lambda S, R: by_reflections(S), S, R)
+    return jax.lax.cond(is_orthonormal, lambda S, R: R, lambda S, R: householder_triangle(S), S, R)

@@ -34,7 +34,7 @@ from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of_states
 from hamkernel._solvers.landmarks import landmarks_of
 from hamkernel._solvers.low_rank import LandmarkBasis, WaveBasis
-from hamkernel._solvers.triangle import by_products, by_reflections
+from hamkernel._solvers.triangle import cholesky_triangle, householder_triangle
 from hamkernel._validation import (
     generalized_loss,
     log_likelihood,
@@ -258,7 +258,7 @@ def print_triangles(conditions: tuple[float, ...]) -> None:
         features = U * np.logspace(0, -np.log10(condition), 11) @ V.T
         y = features @ rng.normal(size=11) + 1e-3 * rng.normal(size=60)
         stacks.append(np.column_stack([features, y]))
-    for name, method in (("reflections", by_reflections), ("products", by_products)):
+    for name, method in (("reflections", householder_triangle), ("products", cholesky_triangle)):
         line = "".join(f"{triangle_error(S, method):>10.1e}" for S in stacks)
         print(f"{'triangle of ' + name:<32}{line}", flush=True)
 
