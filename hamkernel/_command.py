@@ -12,6 +12,7 @@ from jaxtyping import Float
 from numpy.lib.recfunctions import unstructured_to_structured
 
 from hamkernel._kernels.built_in import Gaussian
+from hamkernel._kernels.transforms import Select
 from hamkernel._report import report, script
 from hamkernel._save import save
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -42,7 +43,12 @@ def parser() -> argparse.ArgumentParser:
     )
     options.add_argument("--inputs", nargs="+", default=[], help="the columns of what was applied")
     options.add_argument("--friction", action="store_true", help="there is friction")
-    options.add_argument("--mass", type=float, nargs="+", help="the known masses, one or one each")
+    options.add_argument(
+        "--mass",
+        type=float,
+        nargs="+",
+        help="the known masses, one or one each; what is left to learn is the potential U(q)",
+    )
     options.add_argument("--noise", type=float, nargs="+", help="the known noise, one or one each")
     options.add_argument("--out", default="results", help="folder for the files (%(default)s)")
     return options
@@ -75,9 +81,19 @@ def columns(path: str, names: list[str]) -> Float[np.ndarray, "T k"]:
     return np.array(table)
 
 
-def kernel(state_count: int, input_count: int, friction: bool) -> AbstractMatrixKernel:
-    """The kernel of the options: an energy, friction if asked for, and inputs that push momenta."""
-    K: AbstractMatrixKernel = Symplectic(1.0 * Gaussian(np.ones(state_count)))
+def kernel(
+    state_count: int, input_count: int, friction: bool, has_mass: bool = False
+) -> AbstractMatrixKernel:
+    """The kernel of the options: an energy, friction if asked for, and inputs that push momenta.
+
+    If the masses are known, the kernel has the potential of the positions alone. An unknown energy
+    of the momenta as well would leave momenta that are not measured free up to a constant.
+    """
+    k = 1.0 * Gaussian(np.ones(state_count))
+    if has_mass:
+        m = state_count // 2
+        k = 1.0 * Select(Gaussian(np.ones(m)), tuple(range(m)))
+    K: AbstractMatrixKernel = Symplectic(k)
     K = K + Friction() if friction else K
     if not input_count:
         return K
@@ -103,7 +119,8 @@ def run(arguments: list[str], show: Callable[[str], None]) -> None:
             )
         masses = len(asked.mass or [])
         is_position = masses == count or (masses == 1 and count % 2 == 1)
-        K = kernel(2 * count if is_position else count, runs.input_count, asked.friction)
+        state_count = 2 * count if is_position else count
+        K = kernel(state_count, runs.input_count, asked.friction, bool(masses))
         out.mkdir(parents=True, exist_ok=True)
         show(f"Learning from {runs!r}.")
         learned = learn(K, runs, noise=_number(asked.noise), mass=_number(asked.mass))

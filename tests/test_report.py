@@ -127,6 +127,9 @@ def test_options_of_the_command_reach_the_kernel_and_learn(
         assert K.inputs.acts_on == momenta
         np.testing.assert_array_equal(runs.inputs[0][:, 0], rows[:, 3])
         assert isinstance(K.drift, hk.Sum) == ("--friction" in options)
+    assert (getattr(K, "drift", K).scalar_kernels[0].kernel.__class__ is hk.Select) == bool(
+        given[0]
+    )
     for name, value in zip(("mass", "noise"), given, strict=True):
         np.testing.assert_array_equal(options_of_learn[name], value)
 

@@ -108,11 +108,11 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
         shortest = _shortest_block(sum(t[-1] for t in times), runs.dimension, runs.input_count)
         averaged = 0.5 * averaging_time(found, times, paths.deviation)
         block = min(block, max(averaged, shortest))
-        condensed = [
+        averages = [
             condensed(t, x, paths.value[r, : len(t)], paths.slope[r, : len(t)], block)
             for r, (t, x) in enumerate(zip(times, states, strict=True))
         ]
-        times, states, counts, scatter = (list(each) for each in zip(*condensed, strict=True))
+        times, states, counts, scatter = (list(each) for each in zip(*averages, strict=True))
     shortest = min(lengths, default=np.inf)
     refined = [_refined(*run, shortest) for run in zip(times, states, counts, scatter, strict=True)]
     times, states, counts, scatter = (list(each) for each in zip(*refined, strict=True))

@@ -197,9 +197,11 @@ def _plane(ax: Axes, learned: Learned) -> None:
     n = learned.runs.dimension
     i, j = 0, min(n // 2, n - 1)
     for r, (x, path) in enumerate(zip(learned.runs.states, learned.states, strict=True)):
+        points = np.asarray(x)[:, [i, j]]
         name = ("measured", "fitted") if r == 0 else (None, None)
         style = {"color": DATA, "ms": 3, "mec": "black", "mew": 0.3}
-        ax.plot(*np.asarray(x)[:, [i, j]].T, "o", label=name[0], zorder=3, **style)
+        if np.isfinite(points).all(axis=1).any():
+            ax.plot(*points.T, "o", label=name[0], zorder=3, **style)
         ax.plot(*np.asarray(path)[:, [i, j]].T, color=BLUE, linewidth=1.2, label=name[1])
     labels = _labels(learned)
     ax.set(xlabel=labels[i], ylabel=labels[j], title="all runs")
