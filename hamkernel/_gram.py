@@ -208,11 +208,6 @@ def gram_of_rows(
     return rows.contrast(rows.contrast(G).T) if contrasted and len(rows.energies) else G
 
 
-# The largest number of entries of a strip. Some kernels hold 40 intermediate numbers for each
-# entry, which makes 160 MB.
-_STRIP = 500_000
-
-
 def regularized_gram(
     K: AbstractMatrixKernel, rows: Measurements, ridge: Float[Array, ""]
 ) -> Float[Array, "D D"]:
@@ -236,7 +231,7 @@ def strips_of_gram(args: tuple, A: Float[Array, "D D"]) -> Float[Array, "D D"]:
     """
     K, X, ridge, first, count = args
     D, n = len(A), len(A) // len(X)
-    size = max(1, min(count, _STRIP // (n * D)))
+    size = max(1, min(count, sizes().strip_entries // (n * D)))
 
     @jax.checkpoint
     def strip(K, X, ridge, start):

@@ -501,11 +501,11 @@ def test_a_dense_fit_is_chosen_where_it_takes_half_of_the_memory(monkeypatch):
 def test_a_factor_made_in_place_is_that_of_lapack(monkeypatch):
     K, (X, Y) = hk.Symplectic(1.1 * hk.Gaussian(1.5)), swings(150)
     one = hk.condition(K, X, Y, RIDGE)
-    small = sizes()._replace(rows_in_place=200)
+    small = sizes()._replace(rows_in_place=200, strip_entries=7000)
     monkeypatch.setattr("hamkernel._solvers.dense.sizes", lambda: small)
     monkeypatch.setattr("hamkernel._solvers.factors.ROWS_IN_PLACE", 130)
     monkeypatch.setattr("hamkernel._solvers.dense.ROWS_IN_PLACE", 130)
-    monkeypatch.setattr("hamkernel._gram._STRIP", 7000)
+    monkeypatch.setattr("hamkernel._gram.sizes", lambda: small)
     blocks = hk.condition(K, X, Y, RIDGE)
     A = dense(K, X) + len(X) * RIDGE * np.eye(X.size)
     given: Any = blocks.given

@@ -32,6 +32,7 @@ from hamkernel._kernels.base import (
     one_point,
 )
 from hamkernel._kernels.symmetry import LinearMap, linear_maps, symmetrised, time_reversal
+from hamkernel._machine import full_precision
 from hamkernel._show import call, described, joined
 
 
@@ -67,6 +68,7 @@ class AbstractMatrixKernel(eqx.Module):
     def form(self, x: Point, u: Point, z: Point, v: Point) -> Float[Array, ""]:
         """uᵀ K(x, z) v for one pair of points."""
 
+    @full_precision
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, "n n"]:
         """The block K(x, z) for one pair of points.
 

@@ -19,7 +19,7 @@ from hamkernel._fields.joined import learned_field
 from hamkernel._fields.kinetic import Kinetic, kinetic
 from hamkernel._gram_operator import placed_product
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._machine import full_precision, one_blas_thread
+from hamkernel._machine import follow_data, full_precision, one_blas_thread
 from hamkernel._observations.kinds import inputs_or_parameters
 from hamkernel._observations.measurements import sampled_points
 from hamkernel._solvers.nystrom import Nystrom
@@ -89,6 +89,7 @@ def learn(
     iterations: int = 8,
     progress: bool | None = None,
 ) -> Learned: ...
+@follow_data
 @one_blas_thread
 @full_precision
 def learn(
