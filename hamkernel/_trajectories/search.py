@@ -463,12 +463,17 @@ def _scale_amplitudes(model: Model, h, scales, X, Y):
     return out
 
 
+@compiled_by_size
+def _prior_rows(K: AbstractMatrixKernel, S: Float[Array, "m d"]) -> Float[Array, "m n q"]:
+    return KernelRows(S).rows(K, S)
+
+
 def impulses(K: AbstractMatrixKernel, S, Y, data: Preprocessed) -> Float[np.ndarray, " n"]:
     """The logarithm of the process noise that would move each coordinate as much as the field does.
 
     It is the velocity times the root of the time over which it lasts; −inf where K moves nothing.
     """
-    prior = np.asarray(KernelRows(S).rows(K, S)).reshape(len(S), len(data.scale), -1)
+    prior = np.asarray(_prior_rows(K, S)).reshape(len(S), len(data.scale), -1)
     velocity = np.sqrt(np.mean(Y**2, axis=0))
     speed = np.sqrt(np.mean(sample_points(data)[1] ** 2, axis=0))
     time = np.median(data.scale / np.maximum(speed, np.finfo(float).tiny))
