@@ -183,6 +183,7 @@ def test_the_flow_is_driven_to_the_tolerance_of_the_integrator():
     np.testing.assert_allclose(path.nodes[0, ..., 2], u + slope * inner, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_along_a_true_path_rows_are_exact_with_inputs():
     """Of ẋ = Ax + g(x, u): x(t) − exp(At) x(0) is the integral of exp(A(t − s)) g(x(s), u(s))."""
     A, ts, (u, slope) = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.linspace(0.0, 0.8, 9), (0.7, -2.0)
