@@ -20,7 +20,7 @@ from hamkernel._trajectories.flow import (
     steps_for,
     stiffness,
 )
-from hamkernel._trajectories.free_run import Stretches, error_over_constant, of_swings
+from hamkernel._trajectories.free_run import Stretches, error_over_constant, stretches_of_swings
 from hamkernel._trajectories.kalman import (
     SmoothedPath,
     innovations,
@@ -454,7 +454,9 @@ def _split(data: Preprocessed, paths: list[np.ndarray]) -> tuple[Preprocessed, S
         for run, cut, path in zip(data.runs, cuts, paths, strict=True)
         if cut < len(run.times)
     ]
-    rest = of_swings([run for run, _ in last], [path for _, path in last], time_of_swing(data))
+    rest = stretches_of_swings(
+        [run for run, _ in last], [path for _, path in last], time_of_swing(data)
+    )
     return data._replace(runs=runs), rest
 
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 
 from hamkernel._structures.friction import frictions
 from hamkernel._trajectories.diagnostics import FitQuality
-from hamkernel._trajectories.free_run import error_over_constant, of_swings
+from hamkernel._trajectories.free_run import error_over_constant, stretches_of_swings
 from hamkernel._trajectories.iteration import End, asks_for_landmarks, initial_loss, noisy_counts
 from hamkernel._trajectories.kalman import smoothed_path
 from hamkernel._trajectories.preprocessing import decide, sample_points, time_of_swing
@@ -165,7 +165,7 @@ def _free_run(end: End, kept: Float[np.ndarray, " R"], swing: float) -> float:
         return np.inf
     least = np.inf
     for count in (2.0, 1.0, 0.5):
-        part = of_swings(runs, paths, swing, count)
+        part = stretches_of_swings(runs, paths, swing, count)
         least = min(least, error_over_constant(end.now.field, part, data.scale))
         if least < 1:
             break
