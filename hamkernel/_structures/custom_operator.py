@@ -1,6 +1,7 @@
 """Fields B(x)∇H with an operator of the caller's; where it is antisymmetric, Poisson systems."""
 
 import abc
+import inspect
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -15,7 +16,12 @@ from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._show import call, text
-from hamkernel._structures.structure import AbstractPotentialKernel, check_symmetries
+from hamkernel._structures.linear_operator import StructuredByOperator
+from hamkernel._structures.structure import (
+    AbstractPotentialKernel,
+    AbstractStructure,
+    check_symmetries,
+)
 
 Operator = Callable[[Float[Array, " n"]], Any]
 
@@ -24,6 +30,7 @@ class AbstractCustomOperator(AbstractPotentialKernel):
     """A structure whose B(x) is a function of the caller's, the attribute named by `role`."""
 
     role: AbstractClassVar[str]
+    name: AbstractClassVar[str]  # by which users know the structure
 
     operator_invariance: ClassVar[Invariance] = Invariance.NONE
     symplectic: ClassVar[bool] = False
@@ -41,7 +48,7 @@ class AbstractCustomOperator(AbstractPotentialKernel):
     def _matrix(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
         """B(x), in the dtype of x."""
         value, n = getattr(self, self.role)(x), len(x)
-        name = f"{self.role} of {type(self).__name__}"
+        name = f"{self.role} of {self.name}"
         if jnp.shape(value) != (n, n):
             raise ValueError(
                 f"the {name} returned shape {jnp.shape(value)} for a state of shape ({n},); an "
@@ -51,7 +58,7 @@ class AbstractCustomOperator(AbstractPotentialKernel):
         return require.floating(value, f"the {name}").astype(x.dtype)
 
     def check_dimension(self, n: int) -> None:
-        with require.traceable(f"the {self.role} of {type(self).__name__}"):
+        with require.traceable(f"the {self.role} of {self.name}"):
             state = jax.ShapeDtypeStruct((n,), jnp.result_type(float))
             jax.eval_shape(lambda x: self.operator_at(x), state)
 
@@ -63,30 +70,51 @@ class AbstractCustomOperator(AbstractPotentialKernel):
         bad = ~np.isfinite(matrices).all(axis=(1, 2))
         if bad.any():
             raise ValueError(
-                f"{text(getattr(self, self.role))} of {type(self).__name__} is NaN or infinite at "
+                f"{text(getattr(self, self.role))} of {self.name} is NaN or infinite at "
                 f"X[{int(bad.argmax())}]: it must be defined at every state of the data."
             )
         self._check_values(matrices, X)
         check_symmetries(self, X[:16])  # at a single point B may happen to be zero
 
 
-class Structured(AbstractCustomOperator):
-    """K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ: fields f = B(x)∇H for an operator B of your own.
+class StructuredByMatrix(AbstractCustomOperator):
+    """K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ: fields f = B(x)∇H for an operator B of the caller."""
 
-    The rest of the library works with it: `tune` tunes the arrays in B, a field has its
-    `.hamiltonian(x)` and its `.dissipation(x)` = −∇HᵀB∇H, and `save` keeps the arrays. As with
-    kernels of your own, `load` needs the kernel again, since the file does not contain its code.
+    kernel: AbstractScalarKernel
+    operator: Operator
+
+    role: ClassVar[str] = "operator"
+    name: ClassVar[str] = "Structured"
+    conserves: ClassVar[bool] = False
+
+    def __repr__(self) -> str:
+        return call("Structured", [repr(self.kernel), text(self.operator)])
+
+
+def Structured(kernel: Any, operator: Callable[..., Any]) -> AbstractStructure:
+    """The kernel of the fields f = L u, with a linear operator L of your own on a potential u.
+
+        operator(x) -> (n, n)        f(x) = B(x)∇u(x),    K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ
+        operator(u, x) -> (n,)       f(x) = (L u)(x),     K(x, z) = L_x L_z k(x, z)
+
+    The rest of the library works with both: `tune` tunes the arrays in the operator, and `save`
+    keeps the arrays. As with kernels of your own, `load` needs the kernel again, since the file
+    does not contain its code. A field of B(x) has its `.hamiltonian(x)` and its `.dissipation(x)` =
+    −∇HᵀB∇H and is the fast case; one of L has its `.potential(x)`.
 
     Args:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
-        operator: B, a function x (n,) -> (n, n) written with jax.numpy. The array leaves of an
-            Equinox module are trained; store what is positive as `log_…`.
+        operator: a function written with jax.numpy. Of one argument it is B. Of two it is L: u is a
+            function (n,) -> () that `jax.grad`, `jax.hessian` and so on differentiate, to any
+            order p for which k has 2p derivatives, and the value must be linear in u. The array
+            leaves of an Equinox module are trained; store what is positive as `log_…`.
 
     Raises:
         TypeError: `kernel` is not a scalar kernel, or `operator` not a function. ValueError, with
-            data: it does not return an (n, n) array, or is not finite there.
+            data: the value has another shape, or is not finite there; L is not linear in u, or k is
+            too rough for it.
 
-    Example: friction that grows with the height of a pendulum,
+    Example: friction that grows with the height of a pendulum, and the flow of a vorticity,
 
         class Draught(eqx.Module):
             log_strength: jax.Array = jnp.log(jnp.array(0.1))
@@ -97,17 +125,28 @@ class Structured(AbstractCustomOperator):
 
         field = hk.fit(hk.Structured(hk.Gaussian(1.0), Draught()), X, Y)
         field.hamiltonian(x), field.dissipation(x)
+
+        def flow(u, x):  # J∇(u − Δu)
+            return J @ jax.grad(lambda x: u(x) - jnp.trace(jax.hessian(u)(x)))(x)
+
+        field = hk.fit(hk.Structured(hk.Gaussian(1.0), flow), X, Y)
     """
+    function = _operator_function(operator, "Structured", "operator")
+    of = StructuredByOperator if _takes_potential(operator) else StructuredByMatrix
+    return of(as_scalar_kernel(kernel), function)
 
-    kernel: AbstractScalarKernel
-    operator: Operator
 
-    role: ClassVar[str] = "operator"
-    conserves: ClassVar[bool] = False
+def _takes_potential(operator: Callable[..., Any]) -> bool:
+    """Whether a function has two arguments without defaults, (u, x), and not one, x."""
+    try:
+        arguments = inspect.signature(operator).parameters.values()
+    except (TypeError, ValueError):  # such as a function of C
+        return False
+    needed = [a for a in arguments if a.default is a.empty and a.kind in _BY_POSITION]
+    return len(needed) == 2
 
-    def __init__(self, kernel: Any, operator: Operator):
-        self.kernel = as_scalar_kernel(kernel)
-        self.operator = _operator_function(operator, "Structured", "operator")
+
+_BY_POSITION = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 
 
 class Poisson(AbstractCustomOperator):
@@ -137,6 +176,7 @@ class Poisson(AbstractCustomOperator):
     tensor: Operator
 
     role: ClassVar[str] = "tensor"
+    name: ClassVar[str] = "Poisson"
     conserves: ClassVar[bool] = True
 
     def __init__(self, kernel: Any, tensor: Operator):
