@@ -26,7 +26,7 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import Descriptor, Invariance
-from hamkernel._kernels.symmetry import without_symmetry
+from hamkernel._kernels.symmetry import drop_symmetry
 from hamkernel._machine import (
     RowSharding,
     automatic,
@@ -208,11 +208,6 @@ def gram_of_rows(
     return rows.contrast(rows.contrast(G).T) if contrasted and len(rows.energies) else G
 
 
-# The largest number of entries of a strip. Some kernels hold 40 intermediate numbers for each
-# entry, which makes 160 MB.
-_STRIP = 500_000
-
-
 def regularized_gram(
     K: AbstractMatrixKernel, rows: Measurements, ridge: Float[Array, ""]
 ) -> Float[Array, "D D"]:
@@ -236,7 +231,7 @@ def strips_of_gram(args: tuple, A: Float[Array, "D D"]) -> Float[Array, "D D"]:
     """
     K, X, ridge, first, count = args
     D, n = len(A), len(A) // len(X)
-    size = max(1, min(count, _STRIP // (n * D)))
+    size = max(1, min(count, sizes().strip_entries // (n * D)))
 
     @jax.checkpoint
     def strip(K, X, ridge, start):
@@ -460,7 +455,7 @@ def field_rounding(
     If the ridge is small, the terms are large and of both signs, and each rounds to ε of its size.
     The error is clipped at `limit`, since it grows without bound where f(x) tends to zero.
     """
-    K = without_symmetry(K)
+    K = drop_symmetry(K)
     terms = jax.vmap(lambda z, a: K.expansion(x, z[None], a[None]))(Z, A)
     size = jnp.linalg.norm(jnp.sum(jnp.abs(terms), axis=0))
     tiny = jnp.finfo(x.dtype).tiny

@@ -21,6 +21,7 @@ from hamkernel._gram import centred, diagonals, gram
 from hamkernel._machine import (
     RowSharding,
     compiled,
+    follow_data,
     full_precision,
     row_sharding,
     shard,
@@ -90,6 +91,7 @@ class GramOperator(lx.AbstractLinearOperator):
     def columns(self) -> Float[Array, "M n"]:
         return self.X if self.Z is None else self.Z
 
+    @follow_data
     @full_precision
     def mv(self, vector: Num[ArrayLike, "M n"]) -> Float[Array, "N n"]:
         """G a, shape (N, n).

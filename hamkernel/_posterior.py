@@ -23,8 +23,8 @@ from hamkernel._fields.base import AbstractField, FieldSum, Mean, root
 from hamkernel._fields.joined import AbstractJoinedField, FamilyField, known_of, learned_field
 from hamkernel._gram import components
 from hamkernel._kernels.base import Invariance, Scaled
-from hamkernel._kernels.symmetry import without_symmetry
-from hamkernel._machine import compiled, full_precision, one_blas_thread
+from hamkernel._kernels.symmetry import drop_symmetry
+from hamkernel._machine import compiled, follow_data, full_precision, one_blas_thread
 from hamkernel._observations.blocks import AbstractBlock, Values
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import inputs_of, observations
@@ -42,6 +42,7 @@ from hamkernel._solvers.problem import (
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
+@follow_data
 @one_blas_thread
 @full_precision
 def condition(
@@ -211,6 +212,7 @@ class Posterior(Shown, eqx.Module):
         """
         return jnp.stack([root(variance) for variance in jnp.diagonal(self.covariance(x, u))])
 
+    @follow_data
     @one_blas_thread
     @full_precision
     def evaluate(
@@ -342,6 +344,7 @@ class Posterior(Shown, eqx.Module):
         data_inputs = self.conditional.updated(new)
         return Posterior(data_inputs, learned_field(data_inputs.field, known))
 
+    @follow_data
     @one_blas_thread
     @full_precision
     def sample(
@@ -428,7 +431,7 @@ def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
         return
     with require.eager():
         x = X[0, : K.outputs(X.shape[1])]
-    for k in without_symmetry(K).scalar_kernels:
+    for k in drop_symmetry(K).scalar_kernels:
         with require.eager():
             one = Invariance.TRANSLATION in k.invariance and np.asarray(k(x, x)) == 1.0
         if one:

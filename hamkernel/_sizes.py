@@ -2,7 +2,8 @@
 
 A CPU wants pieces that stay in its cache, a GPU pieces that fill it. JAX decides on a device when
 it lowers a program, later than Python cuts the data into pieces, so `sizes` asks for the default
-device: of the process, or of `with jax.default_device(…)` around the call.
+device: of the process, or of `with jax.default_device(…)` around the call. Public functions make
+the device of their data the default one (`_machine.follow_data`).
 """
 
 from typing import NamedTuple
@@ -25,30 +26,56 @@ class Sizes(NamedTuple):
         tile: rows and columns of a tile of a product with the Gram.
         states: states at which a field is evaluated at once.
         trace_points: points whose diagonal blocks of the Gram are computed at once.
-        design_entries: entries of a tile of features in a least-squares problem.
-        rows_in_place: rows from which the Gram is factored in its own memory.
+        design_entries: entries of a tile of features whose normal equations are added up.
+        triangle_entries: entries of a tile of features that is appended to a triangle; a tile has
+            at least three times as many rows as columns.
+        strip_entries: entries of a strip of rows of the Gram.
+        rows_in_place: rows from which the Gram is factored in its own memory; None if it is where
+            a fit outside of it would not fit in memory.
     """
 
     tile: int
     states: int
     trace_points: int
     design_entries: int
-    rows_in_place: int
+    triangle_entries: int
+    strip_entries: int
+    rows_in_place: int | None
 
 
 # tile: 1000 × 1000 doubles are 8 MB; measured on two cores between 125 × 4000 and 2000 × 1000, with
 # n = 4 and 20, half and twice cost up to 15 % more. states: with 1000 random features the waves of
 # 1024 states take 8 MB. trace_points: the blocks of 1024 points of a Gaussian stay in the cache,
 # 16 ms for a million points, and 90 ms with 4096 at once. design_entries: 2²⁰ numbers, 8 MB, stay
-# in the cache. rows_in_place: 6000 rows are 288 MB.
-_CPU = Sizes(tile=1000, states=1024, trace_points=1024, design_entries=2**20, rows_in_place=6000)
+# in the cache. triangle_entries: with 2²⁰ a fit of 100, 250 and 500 random features took 28, 14 and
+# 12 % longer than with three times as many rows as columns. strip_entries: some kernels hold 40
+# numbers for each entry, 160 MB. rows_in_place: 6000 rows are 288 MB.
+_CPU = Sizes(
+    tile=1000,
+    states=1024,
+    trace_points=1024,
+    design_entries=2**20,
+    triangle_entries=0,
+    strip_entries=500_000,
+    rows_in_place=6000,
+)
 
 # Measured on an NVIDIA H200, jax 0.11. tile: a product of 100 000 states with n = 4 in float64 took
 # 337 ms with tiles of 1000, 184 with 4000 and 175 with 10 000. states: evaluating 24 data points at
-# a million states took 14.1 ms in batches of 1024 and .92 ms at once. rows_in_place: 16 000 rows
-# took 107 ms in place and 54 ms not, so only memory decides; 40 000 rows are 12.8 GB.
+# a million states took 14.1 ms in batches of 1024 and .92 ms at once. triangle_entries: 250 random
+# features of 100 000 points took 391 ms with QR and three times as many rows as columns, and 53 ms
+# with products and 2²⁴ entries. rows_in_place: 16 000 rows took 107 ms in place and 54 ms not, so
+# only memory decides. Not measured, but derived: trace_points as states; design_entries are 134 MB,
+# products of 33 GFLOP with 1000 features, .6 ms at 57 TFLOP/s, beside 5 µs to start a kernel;
+# strip_entries with 40 numbers each take 1.3 GB.
 _GPU = Sizes(
-    tile=4000, states=2**17, trace_points=2**17, design_entries=2**24, rows_in_place=40_000
+    tile=4000,
+    states=2**17,
+    trace_points=2**17,
+    design_entries=2**24,
+    triangle_entries=2**24,
+    strip_entries=2**22,
+    rows_in_place=None,
 )
 
 

@@ -23,7 +23,13 @@ from hamkernel._closed_forms import (
     log_density,
 )
 from hamkernel._gram import between_all, forward_differentiated, gram_of_rows, plus_ridge
-from hamkernel._machine import compiled, full_precision, one_blas_thread, refuse_beyond_memory
+from hamkernel._machine import (
+    compiled,
+    follow_data,
+    full_precision,
+    one_blas_thread,
+    refuse_beyond_memory,
+)
 from hamkernel._observations.blocks import AbstractBlock, Combinations
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.measurements import Measurements
@@ -34,6 +40,7 @@ from hamkernel._solvers.problem import make_problem
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
+@follow_data
 @one_blas_thread
 @full_precision
 def cross_validation_loss(
@@ -80,6 +87,7 @@ def cross_validation_loss(
     return partition_loss(K, rows, regularization, partition_of_rows(rows, folds))
 
 
+@follow_data
 @one_blas_thread
 @full_precision
 def cross_validation_residuals(
@@ -106,6 +114,7 @@ def cross_validation_residuals(
     return rows.in_units(residuals)
 
 
+@follow_data
 @one_blas_thread
 @full_precision
 def generalized_cross_validation(
@@ -144,6 +153,7 @@ def generalized_cross_validation(
     return generalized_loss(*_check_problem(K, X, Y, regularization, inputs, parameters))
 
 
+@follow_data
 @one_blas_thread
 @full_precision
 def log_marginal_likelihood(

@@ -46,7 +46,8 @@ X4, Y4 = map(jnp.asarray, swings(12, n=4))
 LAMBDA = 1e-3
 FEATURES = hk.RandomFeatures(50, key=jax.random.key(0))
 LANDMARKS = hk.Nystrom(max_points=20)
-K = hk.Symplectic(hk.Gaussian(1.0))
+G = hk.Gaussian(1.0)
+K = hk.Symplectic(G)
 
 
 def posterior_answers():
@@ -56,6 +57,7 @@ def posterior_answers():
     posterior.energy_deviation(X[0], X[1])
     fields = posterior.sample(jax.random.key(0), 2, jnp.array([[-2.0, -2.0], [2.0, 2.0]]))
     jax.vmap(lambda field: field(X[0]))(fields)
+    posterior.evaluate(X[:3])
     posterior.updated(X[:3] + 0.1, Y[:3])
 
 
@@ -81,6 +83,17 @@ def observations_of_each_kind():
     hk.condition(K, data, regularization=LAMBDA).deviation(X[0])
 
 
+def other_answers_of_fields():
+    K(X[0], X[1])
+    turn = jnp.array([[0.0, 1.0], [-1.0, 0.0]])
+    hk.fit(K, X, Y, LAMBDA, mean=lambda x: turn @ x)(X[0])
+    hk.fit(K, X, Y, LAMBDA, mean=hk.kinetic(1.0)).hamiltonian(X[0])
+    K_of_law = hk.Symplectic(hk.Shared(G, hk.sites(1), centres=jnp.linspace(-2.0, 2.0, 5)[:, None]))
+    posterior = hk.condition(K_of_law, X, Y, LAMBDA)
+    posterior.field.law(jnp.ones(1))
+    posterior.law_deviation(jnp.ones(1), jnp.zeros(1))
+
+
 def losses_and_gradients():
     folds = np.arange(24) % 4
     for loss in (
@@ -104,9 +117,14 @@ def learning():
     hk.learn(K, hk.Runs([ts], [states + noise]), iterations=2)
 
 
-SLOW = ("learn", "tune low rank")  # 37 s and 18 s: they are traced and compiled anew
+SLOW = (
+    "learn",
+    "tune low rank",
+    "other answers",
+)  # 37 s and 18 s: they are traced and compiled anew
 CALLS = {
     "fields": field_answers,
+    "other answers": other_answers_of_fields,
     "posterior": posterior_answers,
     "observations": observations_of_each_kind,
     "losses": losses_and_gradients,
@@ -149,6 +167,81 @@ def test_products_of_every_kernel_are_in_full_precision(case):
     k = case.make(2)
     with imprecise_products() as places:
         hk.gram(hk.Symplectic(k), X[:3])
+    assert not places, "\n".join(map(str, places[:5]))
+
+
+POINTS3 = jnp.concatenate([X, X[:, :1] ** 2], axis=1)
+# A kernel and its data: X, Y, and keywords of `fit`.
+STRUCTURES = {
+    "curl free": (hk.CurlFree(G), X, Y, {}),
+    "divergence free": (hk.DivergenceFree(G), X4, Y4, {}),
+    "separable": (hk.Separable(G), X, Y, {}),
+    "poisson": (hk.Poisson(G, hk.poisson.rigid_body), POINTS3, POINTS3, {}),
+    "structured": (
+        hk.Structured(G, lambda x: jnp.array([[0.0, 1.0], [-1.0, -(x[0] ** 2)]])),
+        X,
+        Y,
+        {},
+    ),
+    "parity": (hk.Reversible(hk.Even(hk.Symplectic(G))), X, Y, {}),
+    "sum": (
+        hk.Sum(energy=hk.Odd(hk.Symplectic(G)), rest=hk.Friction(0.3, 0.1, rest_speed=0.1)),
+        X,
+        Y,
+        {},
+    ),
+    "controlled": (
+        hk.Controlled(hk.Symplectic(G), hk.InputMatrix(1.0, acts_on=(1,))),
+        X,
+        Y,
+        {"inputs": X[:, :1]},
+    ),
+    "family": (hk.Family(hk.Symplectic(G), G), X, Y, {"parameters": X[:, :1]}),
+    "masses": (hk.UnknownMasses(hk.Symplectic(G), [2.0, 1.0]), X4, Y4, {}),
+    "shared": (
+        hk.Symplectic(hk.Shared(G, hk.sites(2), centres=jnp.linspace(-2.0, 2.0, 5)[:, None])),
+        X4,
+        Y4,
+        {},
+    ),
+}
+
+
+@pytest.mark.few(3)
+@pytest.mark.parametrize("name", STRUCTURES)
+def test_products_of_every_structure_are_in_full_precision(name):
+    jax.clear_caches()
+    K, X, Y, more = STRUCTURES[name]
+
+    def loss_and_field(X, Y, ridge):
+        if not more:
+            return hk.fit(K, X, Y, ridge, throw=False)(X[0]), hk.generalized_cross_validation(
+                K, X, Y, ridge
+            )
+        return hk.fit(K, X, Y, ridge, throw=False, **more).evaluate(X, *more.values())
+
+    with imprecise_products() as places:  # traced, and not compiled
+        jax.eval_shape(jax.jacrev(loss_and_field, 2), X, Y, LAMBDA)
+    assert not places, "\n".join(map(str, places[:5]))
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:the mass matrix")  # velocities are no torques
+def test_products_of_a_machine_are_in_full_precision():
+    jax.clear_caches()
+    K, (q, v) = hk.Lagrangian(G, G, angles=(0, 1)), jnp.split(X4[0], 2)
+
+    def answers(field, q, v):
+        x = jnp.concatenate([q, v])
+        of_q = field.mass_matrix, field.mass_matrix_deviation, field.potential, field.gravity
+        of_x = field.momentum, field.lagrangian, field.hamiltonian, field.rest_torques
+        rest = field.inverse_dynamics(q, v, v), field.torque_deviation(q, v, v)
+        rest += field.gravity_deviation(q), field.friction(v), field.energy_deviation(x, 2 * x)
+        return [f(q) for f in of_q], [f(x) for f in of_x], rest
+
+    with imprecise_products() as places:
+        field = hk.fit(K, X4, X4[:, :2], LAMBDA, accelerations=X4[:, 2:])
+        jax.eval_shape(answers, field, q, v)
     assert not places, "\n".join(map(str, places[:5]))
 
 

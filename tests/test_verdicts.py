@@ -105,6 +105,7 @@ def test_a_run_at_rest_is_one_measurement_of_the_noise(step):
     np.testing.assert_allclose(learned.noise, noise, rtol=0.08)  # 13 % too small as 60 samples
 
 
+@pytest.mark.slow
 def test_animals_in_weather_are_no_hamiltonian_system():
     years, log = animals()
     learned, heard = learn_and_listen(K, hk.Runs([years], [log]))

@@ -12,6 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._machine import follow_data, full_precision
 from hamkernel._show import Shown, described, has_arrays, text
 from hamkernel._sizes import sizes
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
@@ -89,12 +90,15 @@ class AbstractField(Shown, eqx.Module):
         """The velocity f(x), including the mean."""
         x = self._state(x)
         learned = self._learned(x)
-        return learned if self.mean is None else learned + self.mean(x).astype(learned.dtype)
+        if self.mean is None:
+            return learned
+        return learned + full_precision(self.mean)(x).astype(learned.dtype)
 
     @abc.abstractmethod
     def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """The velocity without the mean."""
 
+    @full_precision
     def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """The potential, with the constant that the representer and the mean happen to have."""
         self.kernel.check_potential()
@@ -108,6 +112,7 @@ class AbstractField(Shown, eqx.Module):
     def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         """The potential without the mean."""
 
+    @follow_data
     def evaluate(self, X: Num[ArrayLike, "N n"]) -> Float[Array, "N n"]:
         """The velocities at many states, as `jax.vmap(field)(X)` but in bounded memory.
 
@@ -205,6 +210,7 @@ class AbstractField(Shown, eqx.Module):
             )
         return self.potential
 
+    @full_precision
     def law(self, r: Num[ArrayLike, "..."], r0: Any = None, which: int = 0) -> Float[Array, ""]:
         """The law w of `hk.Shared` at r, such as a pair potential at a distance, shape ().
 

@@ -24,6 +24,7 @@ from hamkernel._fields.base import (
 )
 from hamkernel._fields.expansions import FeatureField, KernelField
 from hamkernel._gram_operator import placed_product
+from hamkernel._machine import follow_data
 from hamkernel._structures.base import Sum
 from hamkernel._structures.joined import AbstractJoinedKernel
 
@@ -155,6 +156,7 @@ class AbstractJoinedField(AbstractField):
         x = self._state(x)
         return jnp.concatenate([x, u.astype(x.dtype)])
 
+    @follow_data
     def evaluate(
         self, X: Num[ArrayLike, "N n"], U: Num[ArrayLike, "N m"] | None = None
     ) -> Float[Array, "N n"]:

@@ -9,7 +9,7 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._machine import compiled
+from hamkernel._machine import compiled, full_precision
 from hamkernel._show import Shown, has_arrays, text
 from hamkernel._structures.lagrangian import Lagrangian, LagrangianFeatures
 
@@ -78,6 +78,7 @@ class LagrangianField(Shown, eqx.Module):
             "where joints have friction."
         )
 
+    @full_precision
     def __call__(self, x: Num[ArrayLike, " n"], u: ArrayLike | None = None) -> Float[Array, " n"]:
         """The velocity (v, a) of the state x under the torques u, zero if None.
 
@@ -100,10 +101,12 @@ class LagrangianField(Shown, eqx.Module):
         )
         return jnp.concatenate([v, a])
 
+    @full_precision
     def mass_matrix(self, q: Num[ArrayLike, " m"]) -> Float[Array, "m m"]:
         """M(q), symmetric, shape (m, m)."""
         return self.features.of_mass_matrix(self._position(q)) @ self.coefficients
 
+    @full_precision
     def mass_matrix_deviation(self, q: Num[ArrayLike, " m"]) -> Float[Array, "m m"]:
         """The standard deviation of each entry of M(q), shape (m, m)."""
         q = self._position(q)
@@ -111,14 +114,17 @@ class LagrangianField(Shown, eqx.Module):
         missing = self._missing(self.kernel.inertia, q, q)
         return jnp.sqrt(self._variance(rows) + missing * (2 + 2 * jnp.eye(len(q), dtype=q.dtype)))
 
+    @full_precision
     def potential(self, q: Num[ArrayLike, " m"]) -> Float[Array, ""]:
         """V(q), known up to a constant, shape ()."""
         return self.features.of_potential(self._position(q)) @ self.coefficients
 
+    @full_precision
     def gravity(self, q: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
         """∂V/∂q, the torques that hold the machine at rest at q, shape (m,)."""
         return jax.grad(self.potential)(self._position(q))
 
+    @full_precision
     def gravity_deviation(self, q: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
         """The standard deviation of each entry of the gravity, shape (m,)."""
         q, k = self._position(q), self.kernel.potential
@@ -126,6 +132,7 @@ class LagrangianField(Shown, eqx.Module):
         mixed = jax.jacfwd(jax.jacrev(lambda a, b: self._missing(k, a, b)), argnums=1)(q, q)
         return jnp.sqrt(self._variance(rows) + jnp.maximum(jnp.diagonal(mixed), 0.0))
 
+    @full_precision
     def energy_deviation(
         self, x: Num[ArrayLike, " n"], x0: Num[ArrayLike, " n"]
     ) -> Float[Array, ""]:
@@ -138,6 +145,7 @@ class LagrangianField(Shown, eqx.Module):
 
         return jnp.sqrt(self._variance(row(x) - row(x0)))
 
+    @full_precision
     def torque_deviation(
         self, q: Num[ArrayLike, " m"], v: Num[ArrayLike, " m"], a: Num[ArrayLike, " m"]
     ) -> Float[Array, " m"]:
@@ -145,25 +153,30 @@ class LagrangianField(Shown, eqx.Module):
         x = jnp.concatenate([self._position(q), self._position(v, "v")])
         return jnp.sqrt(self._variance(self.features.of_torques(x, self._position(a, "a"))))
 
+    @full_precision
     def friction(self, v: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
         """The friction of the joints at the velocities v, shape (m,)."""
         return self.features.of_friction(self._position(v, "v")) @ self.coefficients
 
+    @full_precision
     def momentum(self, x: Num[ArrayLike, " n"]) -> Float[Array, " m"]:
         """P = ∂L/∂v = M(q) v of the state x = (q, v), shape (m,)."""
         q, v = jnp.split(self._state(x), 2)
         return self.mass_matrix(q) @ v
 
+    @full_precision
     def lagrangian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """L(q, v) = ½ vᵀM(q)v − V(q), shape ()."""
         q, v = jnp.split(self._state(x), 2)
         return 0.5 * v @ self.mass_matrix(q) @ v - self.potential(q)
 
+    @full_precision
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """The energy ½ vᵀM(q)v + V(q) of the state x = (q, v), up to a constant, shape ()."""
         q, v = jnp.split(self._state(x), 2)
         return 0.5 * v @ self.mass_matrix(q) @ v + self.potential(q)
 
+    @full_precision
     def inverse_dynamics(
         self, q: Num[ArrayLike, " m"], v: Num[ArrayLike, " m"], a: Num[ArrayLike, " m"]
     ) -> Float[Array, " m"]:
@@ -171,6 +184,7 @@ class LagrangianField(Shown, eqx.Module):
         x = jnp.concatenate([self._position(q), self._position(v, "v")])
         return self.features.of_torques(x, self._position(a, "a")) @ self.coefficients
 
+    @full_precision
     def rest_torques(self, x: Num[ArrayLike, " n"]) -> Float[Array, " m"]:
         """The torques with which the state x = (q, v) has no acceleration, shape (m,)."""
         q, v = jnp.split(self._state(x), 2)

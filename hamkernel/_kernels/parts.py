@@ -180,12 +180,7 @@ class Shared(AbstractScalarKernel):
         return solve_triangular(self._factor(rows.dtype), rows, lower=True)
 
     def _factor(self, dtype: Any) -> Float[Array, "m m"]:
-        """L with L Lᵀ = k(C, C)."""
-        C = self._points(dtype)
-        G = jax.vmap(jax.vmap(self.kernel, (None, 0)), (0, None))(C, C)
-        # A hundred times the rounding bounds how finely centres resolve, and biases nothing.
-        rounding = 100 * jnp.finfo(G.dtype).eps * len(G) * jnp.diagonal(G).mean()
-        return jnp.linalg.cholesky(G + rounding * jnp.eye(len(G), dtype=G.dtype))
+        return root_at(self.kernel, self._points(dtype))
 
     def through_descriptor(self, n: int) -> Descriptor | None:
         if self.centres is None:
@@ -225,18 +220,30 @@ class Shared(AbstractScalarKernel):
             wanted = np.linspace(low[0], high[0], most)
             at = np.searchsorted(points[order, 0], wanted).clip(0, len(points) - 1)
             return np.unique(points[order[at]], axis=0)
-        chosen = [int(np.argmin(unit[:, 0]))]
-        distance = np.full(len(unit), np.inf)
-        while len(chosen) < most:
-            distance = np.minimum(distance, np.linalg.norm(unit - unit[chosen[-1]], axis=1))
-            if not distance.max() > 1e-6:
-                break
-            chosen.append(int(np.argmax(distance)))
-        return points[chosen]
+        return points[far_apart(unit, most)]
 
     def with_centres(self, X: Float[np.ndarray, "N n"]) -> "Shared":
         """The same with centres over the parts of the states X."""
         return Shared(self.kernel, self.parts, self.spread(X, _CENTRES))
+
+
+def root_at(k: AbstractScalarKernel, C: Float[Array, "m d"]) -> Float[Array, "m m"]:
+    """L with L Lᵀ = k(C, C)."""
+    G = jax.vmap(jax.vmap(k, (None, 0)), (0, None))(C, C)
+    # A hundred times the rounding bounds how finely centres resolve, and biases nothing.
+    rounding = 100 * jnp.finfo(G.dtype).eps * len(G) * jnp.diagonal(G).mean()
+    return jnp.linalg.cholesky(G + rounding * jnp.eye(len(G), dtype=G.dtype))
+
+
+def far_apart(points: Float[np.ndarray, "N d"], count: int) -> list[int]:
+    """Up to `count` points, as indices, each the farthest from those before; none twice."""
+    chosen, distance = [int(np.argmin(points[:, 0]))], np.full(len(points), np.inf)
+    while len(chosen) < count:
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+        if not distance.max() > 1e-6:
+            break
+        chosen.append(int(np.argmax(distance)))
+    return chosen
 
 
 class Parts(NamedTuple):

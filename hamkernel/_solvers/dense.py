@@ -27,7 +27,7 @@ from hamkernel._gram import (
     rows_between,
     strips_of_gram,
 )
-from hamkernel._machine import compiled, refuse_beyond_memory
+from hamkernel._machine import compiled, dense_bytes, memory_bytes, refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._sizes import sizes
@@ -87,8 +87,12 @@ def copies(problem: Problem) -> int:
 
 def _is_in_place(problem: Problem) -> bool:
     """Whether the Gram is factored in its own memory, which is not possible under `jax.jit`."""
-    has_states = problem.rows.size >= sizes().rows_in_place and problem.states is not None
-    return has_states and require.is_concrete(problem)
+    D, least, memory = problem.rows.size, sizes().rows_in_place, memory_bytes()
+    if least is None:
+        fits = memory is None or dense_bytes(D, D, problem.rows.targets.dtype, 4) <= memory
+    else:
+        fits = D < least
+    return not fits and problem.states is not None and require.is_concrete(problem)
 
 
 def _check_memory(problem: Problem) -> None:

@@ -16,6 +16,7 @@ from hamkernel._fields.joined import ControlledField, FamilyField, learned_field
 from hamkernel._fields.lagrangian import LagrangianField
 from hamkernel._machine import (
     dense_bytes,
+    follow_data,
     full_precision,
     memory_bytes,
     one_blas_thread,
@@ -102,6 +103,7 @@ def fit(
 ) -> LearnedField: ...
 
 
+@follow_data
 @one_blas_thread
 @full_precision
 def fit(

@@ -29,6 +29,7 @@ from jaxtyping import Array, Float
 from hamkernel._gram import plus_ridge, without_gradient
 from hamkernel._machine import RowSharding, on_each
 from hamkernel._sizes import sizes
+from hamkernel._solvers.triangle import triangle
 
 # A design maps t points to their rows, (t, n) -> (t, n, r); row (i, a) is component a of each of
 # the r fields at point i.
@@ -57,7 +58,7 @@ def triangle_of_design(
             rows = design(tile[0])  # (t, n, r)
             below = jnp.concatenate([rows, tile[1][..., None]], axis=2)  # (t, n, r + 1)
             below = below.reshape(-1, columns + 1)  # (t n, r + 1)
-            return jnp.linalg.qr(jnp.concatenate([factor, below]), mode="r"), None
+            return triangle(jnp.concatenate([factor, below])), None
 
         on_diagonal = jnp.append(jnp.full(columns, jnp.sqrt(ridge)), jnp.zeros((), Y.dtype))
         return over_tiles(step, jnp.diag(on_diagonal), (X, Y), _rows_of_tile(columns))[0]
@@ -80,7 +81,7 @@ def _merge_triangles(
     def join(device, factor):
         is_mine = jax.lax.axis_index(spread.axes) == device
         theirs = spread.sum(jnp.where(is_mine, device_triangle, jnp.zeros_like(device_triangle)))
-        return jnp.linalg.qr(jnp.concatenate([factor, theirs]), mode="r")
+        return triangle(jnp.concatenate([factor, theirs]))
 
     return jax.lax.fori_loop(0, spread.count, join, jnp.zeros_like(device_triangle))
 
@@ -185,9 +186,9 @@ def _rows_of_tile(columns: int) -> int:
     """The number of rows of a tile.
 
     Appending `rows` rows to a factor of r columns costs (rows + r) r². With 3r rows, a quarter of
-    the cost is spent on the factor.
+    the cost is spent on the factor. A GPU takes more rows, to be busy.
     """
-    return max(1024, 3 * columns)
+    return max(1024, 3 * columns, sizes().triangle_entries // columns)
 
 
 class Normal(eqx.Module):

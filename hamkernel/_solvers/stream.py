@@ -30,6 +30,7 @@ from hamkernel._gram import components
 from hamkernel._machine import (
     RowSharding,
     compiled,
+    follow_data,
     full_precision,
     one_blas_thread,
     row_sharding,
@@ -144,6 +145,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
     def _solve(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> LearnedField:
         """The field for a checked λ and a positive number of points."""
 
+    @follow_data
     @full_precision
     def add(
         self: Fit,
@@ -235,6 +237,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         one = jnp.ones((), self.dtype)
         return learned_field(fit._solve(jnp.ones_like(self.count), one), self._known_part)
 
+    @follow_data
     @one_blas_thread
     @full_precision
     def field(self, regularization: ArrayLike | None = None) -> Any:
@@ -319,6 +322,7 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
     ) -> Fit:
         """`start` for checked arguments."""
 
+    @follow_data
     @full_precision
     def start(
         self,
@@ -365,6 +369,7 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
         require.warn_of_float32(rows.targets)
         return self._start_fit(K, rows, require.ridge(regularization, rows.targets.dtype))
 
+    @follow_data
     @one_blas_thread
     @full_precision
     def fit_chunks(

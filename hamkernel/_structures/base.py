@@ -31,7 +31,8 @@ from hamkernel._kernels.base import (
     common_invariance,
     one_point,
 )
-from hamkernel._kernels.symmetry import LinearMap, linear_maps, symmetrised, time_reversal
+from hamkernel._kernels.symmetry import LinearMap, linear_maps, symmetrise, time_reversal
+from hamkernel._machine import full_precision
 from hamkernel._show import call, described, joined
 
 
@@ -67,6 +68,7 @@ class AbstractMatrixKernel(eqx.Module):
     def form(self, x: Point, u: Point, z: Point, v: Point) -> Float[Array, ""]:
         """uᵀ K(x, z) v for one pair of points."""
 
+    @full_precision
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, "n n"]:
         """The block K(x, z) for one pair of points.
 
@@ -434,4 +436,4 @@ def Invariant(k: Any, maps: Any) -> Any:
     generators = linear_maps(maps)
     if isinstance(k, AbstractMatrixKernel):
         return k.averaged(generators)
-    return symmetrised(as_scalar_kernel(k), generators, (1.0,) * len(generators))
+    return symmetrise(as_scalar_kernel(k), generators, (1.0,) * len(generators))

@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Scaled, as_scalar_kernel
+from hamkernel._kernels.parts import far_apart, root_at
 from hamkernel._machine import compiled
 from hamkernel._show import call
 from hamkernel._structures.friction import Friction
@@ -154,8 +155,9 @@ class LagrangianFeatures(eqx.Module):
 
     def with_kernel(self, kernel: Lagrangian) -> "LagrangianFeatures":
         """The features of another kernel on the same centres."""
-        roots = _root(kernel.potential, self.centres), _root(kernel.inertia, self.centres)
-        return LagrangianFeatures(kernel, self.centres, roots, self.rest_speed, self.count)
+        C = self.centres
+        roots = root_at(kernel.potential, C), root_at(kernel.inertia, C)
+        return LagrangianFeatures(kernel, C, roots, self.rest_speed, self.count)
 
     def of_kernel(self, k: AbstractScalarKernel, q: Float[Array, " m"]) -> Float[Array, " c"]:
         """k(C, q)."""
@@ -233,28 +235,15 @@ def friction_of_joints(
     return jnp.concatenate([slide, jnp.diag(dry * jnp.tanh(v / rest_speed))], axis=1)
 
 
-def _root(k: AbstractScalarKernel, C: Float[Array, "c d"]) -> Float[Array, "c c"]:
-    G = jax.vmap(jax.vmap(k, (None, 0)), (0, None))(C, C)
-    # A hundred times the rounding bounds how finely centres resolve, and biases nothing.
-    rounding = 100 * jnp.finfo(G.dtype).eps * len(G) * jnp.diagonal(G).mean()
-    return jnp.linalg.cholesky(G + rounding * jnp.eye(len(G), dtype=G.dtype))
-
-
 def lagrangian_features(K: Lagrangian, X: Float[Array, "N n"]) -> LagrangianFeatures:
     """The features of K with centres among the positions of the states X, far from one another."""
     m = X.shape[1] // 2
     placed = np.asarray(_placed(K, X[:, :m]))
     unit = placed / np.where(np.ptp(placed, axis=0) > 0, np.ptp(placed, axis=0), 1.0)
-    chosen, distance = [int(np.argmin(unit[:, 0]))], np.full(len(unit), np.inf)
-    while len(chosen) < _CENTRES:
-        distance = np.minimum(distance, np.linalg.norm(unit - unit[chosen[-1]], axis=1))
-        if not distance.max() > 1e-6:
-            break
-        chosen.append(int(np.argmax(distance)))
     given = None if K.friction is None else K.friction.rest_speed
     # Dry friction changes its sign within a tenth of the speed of the slowest joint.
     rest = 0.1 * jnp.sqrt(jnp.mean(X[:, m:] ** 2, axis=0)).min() if given is None else given
-    centres = jnp.asarray(placed[chosen])
+    centres = jnp.asarray(placed[far_apart(unit, _CENTRES)])
     none = jnp.zeros((0, 0), X.dtype)
     start = LagrangianFeatures(K, centres, (none, none), jnp.asarray(rest, X.dtype), m)
     return _with_kernel(start, K)

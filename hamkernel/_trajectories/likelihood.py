@@ -19,16 +19,17 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
 from hamkernel._machine import compiled_by_size, full_precision
+from hamkernel._solvers.triangle import triangle
 from hamkernel._trajectories.kalman import whiten
 from hamkernel._trajectories.model import Model, landmark_whitening
 from hamkernel._trajectories.segments import LinearisedSegments
 
 
-def triangle(
+def with_rows(
     above: Float[Array, "k k"], M: Float[Array, "D q"], r: Float[Array, " D"]
 ) -> Float[Array, "k k"]:
     """The triangle of the QR factorisation of `above` over (M, r), k = q + 1."""
-    return jnp.linalg.qr(jnp.concatenate([above, jnp.column_stack([M, r])]), mode="r")
+    return triangle(jnp.concatenate([above, jnp.column_stack([M, r])]))
 
 
 def no_rows(q: int, dtype) -> Float[Array, "k k"]:
@@ -49,7 +50,7 @@ def regression_loss(M: Float[Array, "D q"], r: Float[Array, " D"]) -> Float[Arra
 @full_precision
 def _regression_forward(M, r):
     q = M.shape[1]
-    F = triangle(no_rows(q, M.dtype), M, r)
+    F = with_rows(no_rows(q, M.dtype), M, r)
     R = F[:q, :q]
     log_det = 2 * jnp.log(jnp.abs(jnp.diagonal(R))).sum()
     return 0.5 * (F[q, q] ** 2 + log_det), (M, r, R, F[:q, q])
@@ -121,7 +122,7 @@ def condensed(model: Model, S, rows: LinearisedSegments, start_deviation) -> Con
 
     def strip(F, part):
         made = whiten(model, S, T, part, start_deviation)
-        return triangle(F, made.M, made.r), made.constant
+        return with_rows(F, made.M, made.r), made.constant
 
     parts = jax.tree.map(lambda a: a.reshape(count, -1, *a.shape[1:]), rows)
     F, constant = jax.lax.scan(strip, jnp.zeros((q + 1, q + 1), T.dtype), parts)
@@ -140,7 +141,7 @@ def conditional(known: Condensed, S, shift: Array | float = 0.0) -> ClosedForm:
     """
     q, scale = len(known.T), jnp.exp(-shift)
     there = scale * known.triangle
-    F = triangle(no_rows(q, there.dtype), there[:, :q], there[:, q])
+    F = with_rows(no_rows(q, there.dtype), there[:, :q], there[:, q])
     R = F[:q, :q]
     w = solve_triangular(R, F[:q, q])
     inverse = solve_triangular(R, jnp.eye(q, dtype=R.dtype))

@@ -26,7 +26,7 @@ from hamkernel import _require as require
 from hamkernel._closed_forms import Folds
 from hamkernel._features import is_of_parts
 from hamkernel._fields.base import AbstractField, Mean
-from hamkernel._machine import compiled, full_precision, one_blas_thread
+from hamkernel._machine import compiled, follow_data, full_precision, one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import observations
 from hamkernel._posterior import Posterior, posterior_of_problem
@@ -135,6 +135,7 @@ class Tuned(Shown, eqx.Module):
 _posterior = one_blas_thread(full_precision(posterior_of_problem))
 
 
+@follow_data
 @one_blas_thread
 @full_precision
 def tune(

@@ -7,6 +7,10 @@ in ball arithmetic (Arb); derivatives move the Gram by 1e-30 of its derivative. 
 largest error of the three losses, relative to the loss; `inf` means that the library said that it
 cannot tell. Asked for: at most 100 ε cond + 1e-10 up to a condition of 1e13, and beyond it a factor
 of 2 or inf.
+
+Before them stand least squares by the triangle of the columns, of reflections (QR) and of products
+(shifted Cholesky QR): the largest error of the weights, the residual and the log determinant. No
+bound is asked for; products have to be as good as reflections.
 """
 
 import argparse
@@ -30,6 +34,7 @@ from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of_states
 from hamkernel._solvers.landmarks import landmarks_of
 from hamkernel._solvers.low_rank import LandmarkBasis, WaveBasis
+from hamkernel._solvers.triangle import cholesky_triangle, householder_triangle
 from hamkernel._validation import (
     generalized_loss,
     log_likelihood,
@@ -232,6 +237,32 @@ def allowed(condition: float) -> float:
     return 100 * EPS * condition + 1e-10 if condition <= 1.01e13 else 1.0
 
 
+def triangle_error(S: np.ndarray, method: Callable[..., Any]) -> float:
+    """The largest relative error of what least squares in the columns of S = (Φ, y) needs."""
+    features, y = exact(S[:, :-1]), exact(S[:, -1])
+    w, log_det = solved(features.T @ features, (features.T @ y)[:, None])
+    misfit = y - features @ w[:, 0]
+    R = np.asarray(jax.jit(method)(jnp.asarray(S)))
+    made = np.linalg.solve(R[:-1, :-1], R[:-1, -1]), R[-1, -1] ** 2
+    w, square = w[:, 0].astype(float), float(misfit @ misfit)
+    log_det_error = abs(2 * np.log(np.abs(np.diagonal(R)[:-1])).sum() - float(log_det))
+    of_weights = np.linalg.norm(made[0] - w) / np.linalg.norm(w)
+    return max(of_weights, abs(made[1] / square - 1), log_det_error)
+
+
+def print_triangles(conditions: tuple[float, ...]) -> None:
+    rng = np.random.default_rng(0)
+    U, V = (np.linalg.qr(rng.normal(size=(rows, 11)))[0] for rows in (60, 11))
+    stacks = []
+    for condition in conditions:
+        features = U * np.logspace(0, -np.log10(condition), 11) @ V.T
+        y = features @ rng.normal(size=11) + 1e-3 * rng.normal(size=60)
+        stacks.append(np.column_stack([features, y]))
+    for name, method in (("reflections", householder_triangle), ("products", cholesky_triangle)):
+        line = "".join(f"{triangle_error(S, method):>10.1e}" for S in stacks)
+        print(f"{'triangle of ' + name:<32}{line}", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="three conditions only")
@@ -239,6 +270,7 @@ def main() -> None:
     conditions = (1e4, 1e10, 1e13) if quick else (1e2, 1e4, 1e6, 1e8, 1e10, 1e12, 1e13, 1e14, 1e15)
     print(f"{'condition':<32}" + "".join(f"{c:>10.0e}" for c in conditions))
     print(f"{'allowed':<32}" + "".join(f"{allowed(c):>10.1e}" for c in conditions))
+    print_triangles(conditions)
     missed = 0
     for problem in problems():
         for kind, basis in bases(problem, problem.make(jnp.zeros(()))).items():
