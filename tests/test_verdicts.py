@@ -1,5 +1,7 @@
 """Whether `learn` says of logs that it has not met before if the field may be used."""
 
+# pyright: reportArgumentType=false
+
 import warnings
 from types import SimpleNamespace
 
