@@ -15,7 +15,7 @@ import functools
 import math
 import os
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -267,7 +267,8 @@ def follow_data(function: Callable[P, T]) -> Callable[P, T]:
 
 def _device_of_data(tree: Any) -> Any:
     """A device of this process on which the first committed array of a PyTree lies, or None."""
-    for leaf in jax.tree.leaves(tree):
+    # JAX warns of generators, such as chunks of data, unless they are leaves by request.
+    for leaf in jax.tree.leaves(tree, is_leaf=lambda node: isinstance(node, Iterator)):
         if isinstance(leaf, jax.Array) and not isinstance(leaf, Tracer) and leaf.committed:
             return min(leaf.sharding.addressable_devices, key=lambda device: device.id)
     return None
