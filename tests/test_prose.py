@@ -71,6 +71,8 @@ def faults_of_text(text):
 
 def is_no_noun_or_verb(name):
     """Whether the name of a function is a participle, a pronoun or a preposition."""
+    if name[0].isupper():  # a structure, such as Odd, Even and Structured
+        return False
     tokens = name.strip("_").split("_")
     if tokens[0] in PREPOSITIONS | PRONOUNS:
         return True

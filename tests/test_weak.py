@@ -40,6 +40,7 @@ def test_the_conditioned_path_is_that_of_the_kalman_smoother():
     found, S = weak._posterior_path(PROCESS, t, x, variance, t)
     q, v = np.split(found[:, 0], 2)
     np.testing.assert_allclose(q - centre, wanted.value, atol=1e-9)
+    assert S is not None
     np.testing.assert_allclose(found[:, 1], 2 * found[:, 0], atol=1e-12)
     E = weak._root(S)
     np.testing.assert_allclose(E @ E.T, S, atol=1e-5 * S.max())

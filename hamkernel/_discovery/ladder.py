@@ -148,7 +148,7 @@ class Rung(AbstractMatrixKernel):
     def with_parity(self, parity: int) -> AbstractMatrixKernel:
         raise TypeError(self.no_potential)
 
-    def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
+    def average_over(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
         raise TypeError(self.no_potential)
 
     @property

@@ -154,7 +154,7 @@ class AbstractMatrixKernel(eqx.Module):
         """The kernel of the even (+1) or odd (−1) FIELDS with this structure."""
 
     @abc.abstractmethod
-    def averaged(self, maps: tuple[LinearMap, ...]) -> "AbstractMatrixKernel":
+    def average_over(self, maps: tuple[LinearMap, ...]) -> "AbstractMatrixKernel":
         """The kernel of the fields whose potential is invariant under these maps."""
 
     def bounds(self, name: str, X: Float[np.ndarray, "N d"], amplitude: float) -> Bounds:
@@ -302,8 +302,8 @@ class Sum(AbstractMatrixKernel):
         parts = tuple(K.with_parity(parity) for K in self.terms)
         return eqx.tree_at(lambda s: s.terms, self, parts)
 
-    def averaged(self, maps: tuple[LinearMap, ...]) -> "Sum":
-        return eqx.tree_at(lambda s: s.terms, self, tuple(K.averaged(maps) for K in self.terms))
+    def average_over(self, maps: tuple[LinearMap, ...]) -> "Sum":
+        return eqx.tree_at(lambda s: s.terms, self, tuple(K.average_over(maps) for K in self.terms))
 
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
@@ -398,7 +398,7 @@ def Reversible(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
             "Reversible(Symplectic(k)), and not with friction, magnetic fields or in rotating "
             "frames. In a sum say it of the part: Reversible(Symplectic(k)) + CurlFree(k)."
         )
-    return K.averaged((time_reversal,))
+    return K.average_over((time_reversal,))
 
 
 @overload
@@ -435,5 +435,5 @@ def Invariant(k: Any, maps: Any) -> Any:
     """
     generators = linear_maps(maps)
     if isinstance(k, AbstractMatrixKernel):
-        return k.averaged(generators)
+        return k.average_over(generators)
     return symmetrise(as_scalar_kernel(k), generators, (1.0,) * len(generators))

@@ -132,15 +132,15 @@ def Structured(kernel: Any, operator: Callable[..., Any]) -> AbstractStructure:
         field = hk.fit(hk.Structured(hk.Gaussian(1.0), flow), X, Y)
     """
     function = _operator_function(operator, "Structured", "operator")
-    of = StructuredByOperator if _takes_potential(operator) else StructuredByMatrix
-    return of(as_scalar_kernel(kernel), function)
+    made_by: Any = StructuredByOperator if _takes_potential(operator) else StructuredByMatrix
+    return made_by(as_scalar_kernel(kernel), function)
 
 
 def _takes_potential(operator: Callable[..., Any]) -> bool:
     """Whether a function has two arguments without defaults, (u, x), and not one, x."""
     try:
         arguments = inspect.signature(operator).parameters.values()
-    except (TypeError, ValueError):  # such as a function of C
+    except (TypeError, ValueError):  # functions of C
         return False
     needed = [a for a in arguments if a.default is a.empty and a.kind in _BY_POSITION]
     return len(needed) == 2

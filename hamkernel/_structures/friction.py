@@ -336,7 +336,7 @@ class Friction(AbstractMatrixKernel):
             raise TypeError("friction is odd, F(-v) = -F(v): add it to Even(K), Even(K) + Friction")
         return self
 
-    def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
+    def average_over(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
         raise TypeError(
             "friction has no potential to be averaged, and no motion with friction runs backwards: "
             "say the symmetry of the energy alone, Sum(energy=Invariant(K, maps), "

@@ -132,7 +132,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
     def with_parity(self, parity: int) -> AbstractMatrixKernel:
         raise TypeError(f"say the symmetry of {self.inner}(Odd(K), …).")
 
-    def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
+    def average_over(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
         raise TypeError(f"say the symmetry of {self.inner}(Invariant(K, maps), …).")
 
     @property

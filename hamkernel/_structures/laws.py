@@ -23,7 +23,7 @@ def undetermined_terms(K: Any, n: int) -> tuple[str, ...]:
     The linear function r_j as a law gives the potential Σ_p c_p φ_pj(x). Combinations of such
     functions, and of constants, are undetermined if their fields are zero at random states.
     """
-    terms = [t for t in (K.terms if isinstance(K, Sum) else (K,)) if _has_potential(t)]
+    terms: list[Any] = [t for t in (K.terms if isinstance(K, Sum) else (K,)) if _has_potential(t)]
     laws = [(term, law) for term in terms for law in shared_laws(term.kernel)]
     X, columns, names = np.random.default_rng(0).normal(size=(8, n)), [], []
     for i, (term, law) in enumerate(laws):

@@ -54,10 +54,10 @@ class StructuredByOperator(AbstractStructure):
         return u @ self.expansion(x, z[None], v[None])
 
     def potential(self, x: Point, Z: Points, A: Points) -> Float[Array, ""]:
-        def at(z, a):
+        def covariance(z, a):  # of u(x) and a·f(z)
             return a @ self._apply(lambda z: self.kernel(x, z), z)
 
-        return jax.vmap(at)(Z, A).sum()
+        return jax.vmap(covariance)(Z, A).sum()
 
     def potential_covariance(self, x: Point, z: Point) -> Float[Array, ""]:
         return self.kernel(x, z)
@@ -65,7 +65,7 @@ class StructuredByOperator(AbstractStructure):
     def expansion(self, x: Point, Z: Points, A: Points) -> Point:
         return self._apply(lambda x: self.potential(x, Z, A), x)
 
-    def averaged(self, maps: Any) -> AbstractStructure:
+    def average_over(self, maps: Any) -> AbstractStructure:
         raise TypeError(
             "the symmetry of an operator (u, x) is not known: average the kernel yourself, "
             "Structured(Invariant(k, maps), operator), if the operator allows it."
@@ -104,15 +104,15 @@ class StructuredByOperator(AbstractStructure):
 
 @compiled
 def _values(K: StructuredByOperator, X: Float[Array, "N n"]) -> tuple[Array, Array, Array, Array]:
-    """What the checks look at, for each point.
+    """The numbers that the checks need, for each point.
 
-    The error of linearity, the size of its terms, K(x, x), and how far K(x, x + h) is from it. h is
-    a ten-thousandth of the spread of the states: over that length a kernel with a lengthscale of a
-    hundredth of the spread changes by (h/l)² = 1e-4, and one that is too rough by all that it has.
+    They are the error of linearity, the size of its terms, K(x, x), and how far K(x, x + h) is from
+    K(x, x). h is a ten-thousandth of the spread of the states. Over that length a kernel changes by
+    (h/l)² = 1e-4 if its lengthscale is a hundredth of the spread, and by all if it is too rough.
     """
     h = 1e-4 * jnp.std(X, axis=0)
 
-    def at(x):
+    def values(x):
         u, w = (lambda y: K.kernel(X[0], y)), (lambda y: K.kernel(x + h, y))
         both = K._apply(lambda y: 2 * u(y) - 3 * w(y), x)
         terms = 2 * K._apply(u, x), -3 * K._apply(w, x)
@@ -125,4 +125,4 @@ def _values(K: StructuredByOperator, X: Float[Array, "N n"]) -> tuple[Array, Arr
         here = block(x)
         return jnp.abs(error).max(), size.max(), here, jnp.abs(block(x + h) - here).max()
 
-    return jax.lax.map(at, X)
+    return jax.lax.map(values, X)

@@ -159,7 +159,7 @@ class UnknownMasses(AbstractMatrixKernel):
     def with_parity(self, parity: int) -> "UnknownMasses":
         return eqx.tree_at(lambda K: K.kernel, self, self.kernel.with_parity(parity))
 
-    def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
+    def average_over(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
         raise TypeError("say the symmetry inside: UnknownMasses(Invariant(K, maps), masses).")
 
     def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:

@@ -90,7 +90,7 @@ class AbstractStructure(AbstractMatrixKernel):
                     "map that is smooth there."
                 )
 
-    def averaged(self, maps: tuple[LinearMap, ...]) -> "AbstractStructure":
+    def average_over(self, maps: tuple[LinearMap, ...]) -> "AbstractStructure":
         kernel = symmetrise(self.kernel, maps, (1.0,) * len(maps))
         return eqx.tree_at(lambda K: K.kernel, self, kernel)
 
@@ -421,9 +421,9 @@ class DivergenceFree(AbstractStructure):
 
     def __check_init__(self):
         if any(mean.parity is None for mean in symmetries(self.kernel)):
-            self.averaged(())
+            self.average_over(())
 
-    def averaged(self, maps: tuple[LinearMap, ...]) -> AbstractStructure:
+    def average_over(self, maps: tuple[LinearMap, ...]) -> AbstractStructure:
         raise ValueError(
             "a DivergenceFree field gets no symmetry from its matrix potential but Odd and Even: "
             "use Symplectic(Invariant(k, maps)) or CurlFree(Invariant(k, maps))."
@@ -452,7 +452,9 @@ def expand_group(
     group or a two-sided mean.
     """
     V, n = K.directions(Z, A), Z.shape[1]
-    mean = symmetry_removed(K.kernel) if isinstance(K, AbstractStructure) else None
+    if not isinstance(K, AbstractStructure):
+        return K, Z, V
+    mean = symmetry_removed(K.kernel)
     if mean is None or not mean.is_one_sided(n):
         return K, Z, V
     group = mean.group(n)

@@ -246,7 +246,7 @@ def degrees_of_freedom(fit: FitQuality) -> Diagnostic:
 def _chi_squared(fit: FitQuality) -> Diagnostic:
     """Whether the structure alone explains the runs at the noise."""
     passes = explains(fit.chi_squared, fit.free)
-    run, c = map(int, np.unravel_index(np.nanargmax(fit.misfit), fit.misfit.shape))
+    run, c = divmod(int(np.nanargmax(fit.misfit)), fit.misfit.shape[1])
     # Without a given noise, residuals that are as small as those of a settled field are exact.
     size = np.sqrt(fit.chi_squared) * np.nanmax(fit.noise / fit.scale)
     exact = not fit.is_noise_known and bool(size < SETTLED)

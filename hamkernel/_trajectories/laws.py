@@ -167,8 +167,9 @@ def _rows_over_noise(
     model: LawModel, rows: Rows, L
 ) -> tuple[Float[Array, "N m"], Float[Array, " N"]]:
     """Features and what the mean leaves, over their noise; zero for windows outside of the runs."""
-    both = rows.feature_rows(model.kernel), rows.known()
-    return tuple(whiten(L, a) * jnp.exp(-model.log_scatter) for a in both)
+    precision = jnp.exp(-model.log_scatter)
+    features = whiten(L, rows.feature_rows(model.kernel))
+    return features * precision, whiten(L, rows.known()) * precision
 
 
 @compiled
@@ -214,7 +215,7 @@ def _compress(model: LawModel, rows: Rows, L):
         return jnp.zeros((*on_rows.shape[:2], n)).at[:, :, rows.of_rows].set(on_rows)
 
     weights = jax.lax.map(back, (L, Q.reshape(*L.shape[:2], -1)))  # (B, m, P, n)
-    points = jax.vmap(rows.state)(p.path.reshape(-1, p.path.shape[2]))
+    points = jax.vmap(rows.state)(jnp.asarray(p.path).reshape(-1, p.path.shape[2]))
     return points, jnp.moveaxis(weights, 1, 0).reshape(Q.shape[1], -1, n), Q.T @ y
 
 

@@ -149,7 +149,8 @@ def _filtered(process: Process, steps, y, seen, slopes: Any = None):
         P = (P + P.T) / 2
         after, Q, S, error, loss = update(m, P, 0, one, value, there, process.log_noise)
         if slope:
-            after, Q, _, _, more = update(after, Q, 1, rate, *slope, slopes[2])
+            velocity, was_measured = slope
+            after, Q, _, _, more = update(after, Q, 1, rate, velocity, was_measured, slopes[2])
             loss = loss + more
         return (after, Q), (m, P, S, error, A, loss)
 
@@ -266,12 +267,13 @@ def processes(
     spacing = np.median(np.concatenate([np.diff(t) for t in pieces_t if len(t) > 1]))
     out: list[Any] = [None] * n
     for g in map(np.atleast_1d, range(n) if groups is None else groups):
-        arrays = [a[:, :, c] for c in (g, n + g) for a in (pieces.states, pieces.seen)]
+        arrays: list[Any] = [a[:, :, c] for c in (g, n + g) for a in (pieces.states, pieces.seen)]
         arrays = [a.swapaxes(1, 2).reshape(-1, a.shape[1]) for a in arrays]
         # As many as 64 pieces of eight coordinates say enough of a few numbers.
         part = np.unique(np.linspace(0, len(arrays[0]) - 1, 512).round().astype(int))
         arrays = [a[part] for a in (np.repeat(steps, len(g), 0), *arrays)]
-        coordinate = _process(*arrays, longest, spacing)
+        dt, x, seen, v, seen_slope = arrays
+        coordinate = _process(dt, x, seen, v, seen_slope, longest, spacing)
         for c in g:
             out[c] = coordinate._replace(seen=bool(pieces.seen[:, :, c].any()))
     return out
