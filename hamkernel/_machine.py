@@ -387,10 +387,13 @@ _UNOPTIMISED = {
 _MAX_UNOPTIMISED = 16_384  # numbers in the arguments; larger programs are optimised
 
 
-def compiled_by_size(function: Callable[P, T]) -> Callable[P, T]:
+def compiled_by_size(
+    function: Callable[P, T], platforms: tuple[str, ...] = ("cpu", "gpu")
+) -> Callable[P, T]:
     """`compiled` with options of XLA that shorten compilation; on a CPU by size of the arguments.
 
-    Inside another transformation the outer one chooses the options.
+    On other platforms than `platforms` XLA's own options are used. Inside another transformation
+    the outer one chooses them.
     """
     plain = compiled(function)
     fast, fastest = (
@@ -402,7 +405,8 @@ def compiled_by_size(function: Callable[P, T]) -> Callable[P, T]:
     def by_size(*args: P.args, **kwargs: P.kwargs) -> T:
         arrays = [a for a in jax.tree.leaves((args, kwargs)) if eqx.is_array(a)]
         platform = _sizes.platform()
-        if any(isinstance(a, Tracer) for a in arrays) or not _options_are_known(platform):
+        is_traced = any(isinstance(a, Tracer) for a in arrays)
+        if is_traced or platform not in platforms or not _options_are_known(platform):
             return plain(*args, **kwargs)
         small = sum(a.size for a in arrays) <= _MAX_UNOPTIMISED
         return (fastest if small else fast)[platform](*args, **kwargs)
