@@ -95,7 +95,7 @@ class JointWaves(eqx.Module):
     def slope(self, x: Float[Array, " n"], w: Float[Array, " w"]) -> Float[Array, " n"]:
         ends = np.cumsum([len(term.amplitudes) for term in self.terms])[:-1]
         pieces = zip(self.terms, jnp.split(w, ends), strict=True)
-        return sum((term.slope(x, own) for term, own in pieces), jnp.zeros_like(x))
+        return sum((term.slope(x, weights) for term, weights in pieces), jnp.zeros_like(x))
 
 
 class GroupWaves(eqx.Module):
@@ -283,7 +283,7 @@ class ControlledFeatures(AbstractFeatures):
 
     Attributes:
         drift: the features of the drift.
-        waves: those of the input matrix; None if it is known.
+        waves: the features of the input matrix; None if the matrix is known.
         acts_on: the coordinates that inputs change.
         count: m, the number of inputs; points are (x, u).
     """
@@ -367,10 +367,10 @@ def features(
 
     Args:
         K: a structure, or a sum of structures, on shift-invariant scalar kernels.
-        n: the number of coordinates of a point, those of inputs too.
-        count: frequencies for each term of each scalar kernel.
+        n: the number of coordinates of a point, inputs included.
+        count: the number of frequencies for each term of each scalar kernel.
         key: the random key.
-        dtype: of the features.
+        dtype: the dtype of the features.
 
     Raises:
         TypeError: a kernel without a known spectral density, or an unknown structure.

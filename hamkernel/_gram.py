@@ -26,7 +26,7 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import Descriptor, Invariance
-from hamkernel._kernels.symmetry import without_symmetry
+from hamkernel._kernels.symmetry import drop_symmetry
 from hamkernel._machine import (
     RowSharding,
     automatic,
@@ -455,7 +455,7 @@ def field_rounding(
     If the ridge is small, the terms are large and of both signs, and each rounds to ε of its size.
     The error is clipped at `limit`, since it grows without bound where f(x) tends to zero.
     """
-    K = without_symmetry(K)
+    K = drop_symmetry(K)
     terms = jax.vmap(lambda z, a: K.expansion(x, z[None], a[None]))(Z, A)
     size = jnp.linalg.norm(jnp.sum(jnp.abs(terms), axis=0))
     tiny = jnp.finfo(x.dtype).tiny

@@ -23,7 +23,7 @@ from hamkernel._fields.base import AbstractField, FieldSum, Mean, root
 from hamkernel._fields.joined import AbstractJoinedField, FamilyField, known_of, learned_field
 from hamkernel._gram import components
 from hamkernel._kernels.base import Invariance, Scaled
-from hamkernel._kernels.symmetry import without_symmetry
+from hamkernel._kernels.symmetry import drop_symmetry
 from hamkernel._machine import compiled, follow_data, full_precision, one_blas_thread
 from hamkernel._observations.blocks import AbstractBlock, Values
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
@@ -431,7 +431,7 @@ def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
         return
     with require.eager():
         x = X[0, : K.outputs(X.shape[1])]
-    for k in without_symmetry(K).scalar_kernels:
+    for k in drop_symmetry(K).scalar_kernels:
         with require.eager():
             one = Invariance.TRANSLATION in k.invariance and np.asarray(k(x, x)) == 1.0
         if one:

@@ -1,9 +1,9 @@
-"""`save` and `load`: a field or a result in one file, which is read without running anything in it.
+"""`save` and `load`: a field or a result in one file. Reading a file runs no code from it.
 
 A file is a line with the version of the format and the SHA-256 of the rest, a line of JSON that
 describes the object, and its arrays as Equinox writes the leaves of a PyTree, one after another in
-NumPy's `.npy` format. The digest finds a cut or changed file before anything is parsed. It does
-not authenticate: whoever rewrites a file can rewrite its digest, so what is parsed is checked too.
+NumPy's `.npy` format. The digest reveals a cut or changed file before anything is parsed. It does
+not authenticate: whoever changes a file can change its digest, so `load` checks all that it parses.
 
 The description has these nodes:
 
@@ -108,7 +108,7 @@ def save(
             "field from there, and save it outside."
         )
     spread = not all(map(_is_here, jax.tree.leaves(field)))
-    field = jax.tree.map(_whole, field)
+    field = jax.tree.map(_gather, field)
     described = description(field, [], "field")
     try:
         evaluable = _evaluable(field)
@@ -129,11 +129,11 @@ def save(
     content.write(json.dumps(header, ensure_ascii=False, allow_nan=False).encode() + b"\n")
     eqx.tree_serialise_leaves(content, field)
     if not spread:
-        _write_at_once(pathlib.Path(path), sealed(content.getvalue()))
+        _write_at_once(pathlib.Path(path), seal(content.getvalue()))
         return
     try:
         if jax.process_index() == 0:
-            _write_at_once(pathlib.Path(path), sealed(content.getvalue()))
+            _write_at_once(pathlib.Path(path), seal(content.getvalue()))
     finally:  # else the others would wait for ever for one that could not write
         multihost_utils.sync_global_devices("hamkernel.save")
 
@@ -171,7 +171,7 @@ def load(
             f"kernel must be the matrix-valued kernel that was given to fit; got {kernel!r}."
         )
     source = str(path)
-    content = io.BytesIO(_opened(pathlib.Path(path).read_bytes(), source))
+    content = io.BytesIO(_open(pathlib.Path(path).read_bytes(), source))
     try:
         header = json.loads(content.readline())
         node, probe, needs_x64 = header["field"], header["probe"], header["x64"]
@@ -184,28 +184,28 @@ def load(
             f"{source} has numbers of 64 bits, which JAX would cut to 32: run "
             "jax.config.update('jax_enable_x64', True) first."
         )
-    given = kernel is not None or mean is not None
+    is_supplied = kernel is not None or mean is not None
     try:
         results = Learned.__name__, LearnedLagrangian.__name__
         as_fitted = node["class"] not in results  # learn adds amplitudes and masses
-        like = skeleton(node, [], "field", _given(kernel, mean, as_fitted))
+        like = skeleton(node, [], "field", _supplied_parts(kernel, mean, as_fitted))
         with jax.ensure_compile_time_eval():  # a constant of what JAX traces around this call
             field = eqx.tree_deserialise_leaves(content, like)
         if content.read():
             raise ValueError("it has arrays that belong to nothing")
         evaluable = _evaluable(field)
-    except _NotGiven as error:
+    except _Mismatch as error:
         name = "mean" if ".mean" in str(error) else "kernel"
         raise ValueError(
             f"{source}: {error}. Pass the {name} that was given to fit, with any "
             f"hyperparameters: hk.load(path, {name}=...)."
         ) from error
     except Exception as error:  # a kernel of the caller's may raise anything
-        with_given = " with what was given" if given else ""
+        with_supplied = " with what was given" if is_supplied else ""
         raise ValueError(
-            f"{source} is not a valid file of hamkernel.save{with_given}: {error}"
+            f"{source} is not a valid file of hamkernel.save{with_supplied}: {error}"
         ) from error
-    if given:
+    if is_supplied:
         with jax.ensure_compile_time_eval():
             _check_probe(evaluable, probe, source)
     return field
@@ -217,8 +217,8 @@ def _is_saved(cls: Any) -> bool:
     return isinstance(cls, type) and issubclass(cls, kinds) and not inspect.isabstract(cls)
 
 
-def _of_state(field: Any) -> Callable[[Array], Array]:
-    """The field as a function of the state alone: where it has inputs or parameters, they are 1."""
+def _state_function(field: Any) -> Callable[[Array], Array]:
+    """The field as a function of the state alone; inputs and parameters are set to 1."""
     if isinstance(field, AbstractJoinedField):
         u = jnp.ones(field.kernel.input_count, field.offset.dtype)
         return lambda x: field(x, u)
@@ -228,23 +228,24 @@ def _of_state(field: Any) -> Callable[[Array], Array]:
 
 
 def _evaluable(saved: Any) -> AbstractField:
-    """The field of what was saved; that of a fit to chunks is the sum of its columns.
+    """The field of a saved object, with which `_probe` makes its check.
 
-    Raises unless the parts fit each other: as many lengthscales as coordinates, and the like.
+    For a fit to chunks we take the sum of its columns, which needs no data. An error is raised if
+    the parts do not fit each other, such as lengthscales and coordinates of different numbers.
     """
     is_stream = isinstance(saved, AbstractStreamingFit)  # whose columns need no data
     field = saved.sum_of_columns() if is_stream else getattr(saved, "field", saved)
     state = jax.ShapeDtypeStruct((field.dimension,), field.offset.dtype)
-    if field.offset.shape or jax.eval_shape(_of_state(field), state).shape != state.shape:
+    if field.offset.shape or jax.eval_shape(_state_function(field), state).shape != state.shape:
         raise ValueError("its arrays have an axis more than those of one field.")
     return field
 
 
 def _probe(field: AbstractField) -> list[list[float]]:
-    """A state and the velocity there, by which a kernel of the caller's code is known again."""
-    n = field.dimension  # of features, a state in which no two particles are in one place
+    """A state and the velocity there, by which `load` checks a kernel that the caller supplies."""
+    n = field.dimension  # without points, as for features: no two particles in one place
     points = np.asarray(getattr(field, "points", np.cos(1.0 + np.arange(n))[None]))[:64]
-    velocities = np.asarray(jax.vmap(_of_state(field))(jnp.asarray(points)))
+    velocities = np.asarray(jax.vmap(_state_function(field))(jnp.asarray(points)))
     if not np.isfinite(velocities).all():
         raise ValueError(
             "the field is NaN or infinite at its own points, as one is from a fit that failed with "
@@ -256,7 +257,7 @@ def _probe(field: AbstractField) -> list[list[float]]:
 
 def _check_probe(field: AbstractField, probe: Any, source: str) -> None:
     state, saved = np.asarray(probe, float)
-    velocity = np.asarray(_of_state(field)(jnp.asarray(state)))
+    velocity = np.asarray(_state_function(field)(jnp.asarray(state)))
     # Computed elsewhere, fields of large coefficients round at 1e-5.
     if not np.linalg.norm(velocity - saved) <= 1e-3 * np.linalg.norm(saved):
         raise ValueError(
@@ -272,8 +273,8 @@ def _is_here(leaf: Any) -> bool:
     return not is_array or leaf.is_fully_addressable or leaf.is_fully_replicated
 
 
-def _whole(leaf: Any) -> Any:
-    """The whole array, on this process, of one whose rows are spread over several processes."""
+def _gather(leaf: Any) -> Any:
+    """The whole array on this process, if its rows are spread over several processes."""
     return leaf if _is_here(leaf) else multihost_utils.process_allgather(leaf, tiled=True)
 
 
@@ -306,18 +307,18 @@ _RECORDS = (Diagnostic, Diagnostics, LinearisedSegments, Measurements, Model, Pr
 _MAPS = {function.__name__: function for function in (identity, reflection, time_reversal)}
 
 Node = Any
-Given = Mapping[str, tuple[Node, list[Any]]]
+Supplied = Mapping[str, tuple[Node, list[Any]]]
 
 
-class _NotGiven(ValueError):
-    """The caller gave another kernel or mean than the saved one, or code is missing in it."""
+class _Mismatch(ValueError):
+    """The caller's kernel or mean is not the saved one, or some of its code is missing."""
 
 
-def _given(kernel: Any, mean: Any, as_fitted: bool) -> Given:
-    """For each part of a field what the caller gave: its description or None, and its code.
+def _supplied_parts(kernel: Any, mean: Any, as_fitted: bool) -> Supplied:
+    """The parts of a field that the caller supplied: for each a description or None, and its code.
 
-    Where the kernel in the file is not `as_fitted` it differs from the caller's in more than
-    numbers: then only its code is taken, and the saved velocity tells a wrong one.
+    `learn` adds amplitudes and masses to the caller's kernel. Then `as_fitted` is false: we take
+    only the code of the caller's kernel, and the saved velocity reveals a wrong kernel.
     """
     of_kernel, of_mean = [], []
     node = None if kernel is None else description(kernel, of_kernel, "field.kernel")
@@ -342,13 +343,13 @@ def _fields(cls: type) -> list[str]:
 @functools.cache
 def _classes() -> dict[str, type]:
     """The classes that a file may name, by name."""
-    found: dict[str, type] = {cls.__name__: cls for cls in _RECORDS}
-    left = [eqx.Module]
-    for cls in left:  # which grows
-        left += cls.__subclasses__()
+    classes: dict[str, type] = {cls.__name__: cls for cls in _RECORDS}
+    queue = [eqx.Module]
+    for cls in queue:  # the queue grows by all subclasses
+        queue += cls.__subclasses__()
         if _ours(cls):
-            found[cls.__name__] = cls
-    return found
+            classes[cls.__name__] = cls
+    return classes
 
 
 def description(value: Any, codes: list[Any], where: str) -> Node:
@@ -388,17 +389,17 @@ def description(value: Any, codes: list[Any], where: str) -> Node:
     }
 
 
-def skeleton(node: Node, codes: list[Any], where: str, given: Given) -> Any:
+def skeleton(node: Node, codes: list[Any], where: str, supplied: Supplied) -> Any:
     """The object of a description, with shapes for arrays, and the caller's code in its places.
 
     Args:
         node: the description.
         codes: the code below, in order; it is used up.
         where: the name of the object.
-        given: what the caller gives for the parts of a field.
+        supplied: descriptions and code of the parts of a field that the caller has supplied.
 
     Raises:
-        _NotGiven: the caller has not given the same. ValueError: it is no description.
+        _Mismatch: the caller's kernel or mean is another. ValueError: `node` is no description.
     """
     match node:
         case {"class": str(name), **nodes}:
@@ -409,12 +410,12 @@ def skeleton(node: Node, codes: list[Any], where: str, given: Given) -> Any:
                 raise ValueError(f"{where} does not have the fields of {name}")
             parts = {}
             for key, child in nodes.items():
-                path, inside = f"{where}.{key}", (codes, given)
-                if key in given:
-                    differs = _difference(child, given[key][0], path)
+                path, inside = f"{where}.{key}", (codes, supplied)
+                if key in supplied:
+                    differs = _difference(child, supplied[key][0], path)
                     if differs:
-                        raise _NotGiven(differs)
-                    inside = list(given[key][1]), {}
+                        raise _Mismatch(differs)
+                    inside = list(supplied[key][1]), {}
                 parts[key] = skeleton(child, inside[0], path, inside[1])
             if issubclass(cls, tuple):
                 return cls(**parts)
@@ -428,24 +429,24 @@ def skeleton(node: Node, codes: list[Any], where: str, given: Given) -> Any:
             return jax.ShapeDtypeStruct(tuple(shape), np.dtype(dtype))
         case {"dict": dict(items)}:
             below = items.items()
-            return {k: skeleton(child, codes, f"{where}[{k!r}]", given) for k, child in below}
+            return {k: skeleton(child, codes, f"{where}[{k!r}]", supplied) for k, child in below}
         case {"function": str(name)} if name in _MAPS:
             return _MAPS[name]
         case {"code": str(name), "leaves": list()}:
             if not codes:
-                raise _NotGiven(f"{where} is {name[:80]!r}, code that is not in the file")
+                raise _Mismatch(f"{where} is {name[:80]!r}, code that is not in the file")
             return codes.pop(0)
         case list():
             below = enumerate(node)
-            return tuple(skeleton(child, codes, f"{where}[{i}]", given) for i, child in below)
+            return tuple(skeleton(child, codes, f"{where}[{i}]", supplied) for i, child in below)
         case None | bool() | int() | float() | str():
             return node
     raise ValueError(f"{where} is {str(node)[:80]}, which is no part of a field")
 
 
-def _difference(saved: Node, given: Node, where: str) -> str | None:
-    """The first difference of two descriptions, in words; what `given` leaves open may differ."""
-    match saved, given:
+def _difference(saved: Node, supplied: Node, where: str) -> str | None:
+    """The first difference of two descriptions, in words; parts that are None may differ."""
+    match saved, supplied:
         case {"class": name, **nodes}, {"class": other, **others} if name == other:
             pairs = [(nodes[key], others[key], f"{where}.{key}") for key in nodes]
         case [*nodes], [*others] if len(nodes) == len(others):
@@ -455,13 +456,13 @@ def _difference(saved: Node, given: Node, where: str) -> str | None:
             return None  # code of whatever name
         case {"array": _, "shape": _}, {"array": _, "shape": _}:
             keys = ("array", "shape")  # whether of NumPy or of JAX
-            if all(saved[key] == given[key] for key in keys):
+            if all(saved[key] == supplied[key] for key in keys):
                 return None
-            return _mismatch(saved, given, where)
-        case _ if given is None or (type(saved) is type(given) and saved == given):
+            return _mismatch(saved, supplied, where)
+        case _ if supplied is None or (type(saved) is type(supplied) and saved == supplied):
             return None
         case _:
-            return _mismatch(saved, given, where)
+            return _mismatch(saved, supplied, where)
     return next(filter(None, (_difference(*pair) for pair in pairs)), None)
 
 
@@ -482,29 +483,29 @@ def _summary(node: Node) -> str:
 # The file.
 
 
-def sealed(content: bytes) -> bytes:
-    """The file with this content."""
+def seal(content: bytes) -> bytes:
+    """The bytes of a file: its first line, with the version and the digest, and the content."""
     digest = hashlib.sha256(content).hexdigest()
     return _FIRST_LINE.format(_VERSION, digest).encode() + b"\n" + content
 
 
-def _opened(content: bytes, source: str) -> bytes:
-    """The content of a file of `save`.
+def _open(content: bytes, source: str) -> bytes:
+    """The content of a file that `save` wrote.
 
     Raises:
-        ValueError: the file is another one, or was cut or changed, or is of another version.
+        ValueError: `save` did not write the file, it was cut or changed, or it has another version.
     """
     first, _, rest = content.partition(b"\n")
-    known = re.fullmatch(_FIRST_LINE.format("([0-9]+)", "([0-9a-f]{64})").encode(), first)
-    if known is None:
+    match = re.fullmatch(_FIRST_LINE.format("([0-9]+)", "([0-9a-f]{64})").encode(), first)
+    if match is None:
         old = " It may be of a version before 0.1.0: fit again." * content.startswith(b"PK")
         raise ValueError(f"{source} was not written by hamkernel.save, or is cut off.{old}")
-    if int(known[1]) != _VERSION:
+    if int(match[1]) != _VERSION:
         raise ValueError(
-            f"{source} has version {int(known[1])} of the format and this library reads version "
+            f"{source} has version {int(match[1])} of the format and this library reads version "
             f"{_VERSION}: load it with the hamkernel that wrote it."
         )
-    if hashlib.sha256(rest).hexdigest().encode() != known[2]:
+    if hashlib.sha256(rest).hexdigest().encode() != match[2]:
         raise ValueError(
             f"{source} is cut off or was changed after hamkernel.save wrote it: its checksum does "
             "not fit. Take another copy, or save again."

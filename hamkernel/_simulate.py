@@ -17,7 +17,7 @@ from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import AbstractJoinedField
 from hamkernel._gram import field_rounding
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._machine import compiled, full_precision
+from hamkernel._machine import compiled, compiled_without_emitters, full_precision
 from hamkernel._structures.laws import outside
 from hamkernel._symplectic import AbstractSymplecticSolver, EqualSteps, step_counts
 
@@ -419,6 +419,8 @@ def _check_solver(solver: Any, dt: Any, rtol: Any, atol: Any, has_inputs: bool) 
 
 # The solve and its outcome.
 
+_solve = compiled_without_emitters(diffrax.diffeqsolve)
+
 
 def _integrate(
     rhs: RightHandSide,
@@ -431,7 +433,7 @@ def _integrate(
 ) -> diffrax.Solution:
     """The solution, complete or not."""
     try:
-        return diffrax.diffeqsolve(
+        return _solve(
             diffrax.ODETerm(rhs),
             steps.solver,
             ts[0],

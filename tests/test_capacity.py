@@ -85,6 +85,7 @@ def test_the_closed_form_in_strips_is_ridge_regression_on_all_rows():
     np.testing.assert_allclose(found.loss, loss + made.constant, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_noise_is_scaled_in_the_triangle_as_in_the_rows():
     rows = rows_of(*arrays(4, 12))
     rng = np.random.default_rng(3)
@@ -187,6 +188,7 @@ def test_four_windows_of_long_rows_are_as_long_as_the_samples_allow():
         assert windows(rows, samples).counts.shape[:2] == shape
 
 
+@pytest.mark.slow
 def test_a_window_says_what_its_part_of_the_path_says():
     given = arrays(1, 40)
     rows = rows_of(*given)
@@ -203,6 +205,7 @@ def test_a_window_says_what_its_part_of_the_path_says():
     np.testing.assert_allclose(*values, rtol=1e-8)
 
 
+@pytest.mark.slow
 def test_few_rows_are_all_searched_and_many_are_not():
     few, S = rows_of(*arrays(4, 12)), jnp.zeros((48, 2))
     same, part = search_sample(S, few)

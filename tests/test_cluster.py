@@ -98,6 +98,7 @@ def test_what_rounding_takes_from_the_sums_is_what_keeps_the_order_from_showing(
     assert float(abs(ours.compensation[0].square).max()) > 0
 
 
+@pytest.mark.slow
 def test_merged_features_are_those_of_a_qr_in_numpy():
     """At λ = 1e-13 in chunks in the order of q, where the normal equations lose four digits."""
     design: Any = hk.fit(K, X[:1], Y[:1], 1e-4, solver=WAVES).features
@@ -118,6 +119,7 @@ def test_parts_of_other_observations_add_up():
     np.testing.assert_array_equal(apart.trace, together.trace)
 
 
+@pytest.mark.slow
 def test_fits_that_differ_do_not_add_and_the_error_says_in_what():
     start, four = DENSE.start(K, X, 1e-4), hk.Nystrom(1e12, points=np.tile(X[::20], 2))
     for name, other in {

@@ -38,6 +38,7 @@ def kernels(n):
         yield rung, step.kernel(rung)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [2, 3, 4])
 @pytest.mark.few(1)
 def test_a_rung_of_the_ladder_is_the_kernel_that_is_shown_for_it(n):

@@ -56,6 +56,7 @@ def test_the_gram_of_a_warp_is_that_of_its_second_derivatives(inner, key):
         np.testing.assert_allclose(hk.gram(K, X)[1, :, 2], K(X[1], X[2]), atol=1e-13)
 
 
+@pytest.mark.slow
 def test_an_equivariant_warp_has_the_mean_over_both_arguments(molecules):
     """Against the mean over all pairs of permutations, written out."""
     inner = hk.Matern(2.5, 0.5)
@@ -119,6 +120,7 @@ def test_atoms_in_one_place_are_named_before_any_solve(molecules):
         hk.fit(roots, X - X[3], np.ones_like(X), 1e-3)
 
 
+@pytest.mark.slow
 def test_losses_through_a_descriptor_have_their_derivatives(molecules):
     forces = np.random.default_rng(1).normal(size=molecules.shape)
 
@@ -141,6 +143,7 @@ def test_an_equivariant_warp_comes_back_from_a_file(molecules, tmp_path):
     assert "equivariant=True" in repr(field.kernel)
 
 
+@pytest.mark.slow
 def test_directions_without_a_prior_do_not_enter_the_likelihood(molecules):
     """Against the density of the other components in NumPy, in a basis of the distances."""
     rng = np.random.default_rng(1)

@@ -457,7 +457,6 @@ print(json.dumps(result))
 
 
 @pytest.mark.slow
-@pytest.mark.ci
 def test_two_processes_give_the_fit_of_one(tmp_path):
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))

@@ -121,6 +121,7 @@ def test_derivatives_of_losses_are_those_of_jax(kind):
         np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_row_that_alone_knows_a_direction_is_held_out_with_its_digits():
     # Beside a weak direction of all rows. Off by 1.4e-5, and by 3.9 without the second pass of QR.
     rng = np.random.default_rng(0)

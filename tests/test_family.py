@@ -127,6 +127,7 @@ def test_it_is_the_poisson_kernel_on_states_and_parameters(fields):
     np.testing.assert_allclose(fields["one"](x, theta), other[:2], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_solvers_losses_and_observations_take_parameters(fields):
     dense = fields["one"](x, theta)
     for solver in (hk.ConjugateGradient(), hk.Nystrom(1e-6)):

@@ -62,6 +62,7 @@ def tuned(known):
     return hk.tune(K, X, Y, **options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.few(1)
 def test_the_curve_is_found_with_a_known_kinetic_energy_and_without(known):
@@ -90,6 +91,7 @@ def test_it_takes_energy_away_at_every_speed_where_a_gaussian_falls_to_zero():
     assert np.abs(others[outside]).max() < 1e-6
 
 
+@pytest.mark.slow
 def test_parts_are_saved_loaded_and_symmetrised(tmp_path):
     field = tuned(True).field
     hk.save(tmp_path / "f", field)
@@ -121,6 +123,7 @@ def test_a_rest_speed_that_was_not_given_has_the_units_of_the_momenta():
         jax.jit(lambda X: hk.fit(hk.Friction(), X, Y, regularization=1e-6)(x))(X)
 
 
+@pytest.mark.slow
 def test_steps_of_learn_are_short_enough_for_a_momentum_that_changes_its_sign():
     rest, ts = 0.005, np.linspace(0.0, 2.0, 101)
     K = hk.Friction(VISCOUS, COULOMB, rest_speed=rest)

@@ -107,6 +107,7 @@ def test_the_diagonal_is_right_far_from_the_origin():
     np.testing.assert_allclose(lx.diagonal(operator), diagonal, atol=1e-10)
 
 
+@pytest.mark.slow
 def test_lineax_knows_when_the_operator_is_positive():
     X = normal((FEW, n))
     K = KERNELS["odd_symplectic"]
@@ -195,6 +196,7 @@ def test_second_derivatives_of_a_matern_product_are_the_same_forward_and_backwar
     np.testing.assert_allclose(backward, forward, rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_value_and_gradient_need_memory_linear_in_the_points():
     K = hk.Symplectic(hk.Gaussian(1.0))
 

@@ -81,6 +81,7 @@ def test_digits_are_not_lost_far_from_the_origin():
     np.testing.assert_allclose(velocity(1000.0, np.float32), expected, atol=2e-3)
 
 
+@pytest.mark.slow
 def test_losses_and_solvers_take_inputs():
     K = kernel("state")
     blocks = [
@@ -207,6 +208,7 @@ def test_driven_trajectories_are_those_of_scipy(name, steps):
     np.testing.assert_allclose(ys, reference(force), atol=2e-8)
 
 
+@pytest.mark.slow
 def test_constant_steps_keep_their_order_across_held_inputs():
     """Were the last stage to see the next sample, Dopri5 would be of first order."""
     exact = reference(DRIVES["held"][2])[-1]

@@ -85,6 +85,7 @@ def agrees(posterior, exact, tolerance):
         np.testing.assert_allclose(own, theirs, rtol=tolerance, atol=tolerance)
 
 
+@pytest.mark.slow
 def test_the_posterior_is_that_of_gaussian_conditioning():
     posterior = hk.condition(K, X, Y, RIDGE, inputs=U)
     agrees(posterior, EXACT, 1e-9)

@@ -100,6 +100,7 @@ def test_the_features_of_torques_are_euler_and_lagrange_by_differences(arm):
         np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_saved_machine_is_the_same(arm, tmp_path):
     hk.save(tmp_path / "arm", arm)
     loaded = hk.load(tmp_path / "arm")
@@ -177,6 +178,7 @@ def test_bands_hold_the_truth():
     assert 0.85 < share <= 1
 
 
+@pytest.mark.slow
 def test_one_path_does_not_identify_a_mass_matrix():
     """At rest torques are gravity alone: M is unknown, and a motion is refused."""
     X, _, _ = data(40, 3)
@@ -192,6 +194,7 @@ def test_one_path_does_not_identify_a_mass_matrix():
     np.testing.assert_allclose(field.gravity(X[0, :2]), tau[0], atol=0.05)
 
 
+@pytest.mark.slow
 def test_one_known_entry_of_the_mass_matrix_fixes_the_scale_of_a_free_motion():
     X, _, _ = data(120, 4)
     free = [-torque(x[:2], x[2:], np.zeros(2)) for x in X]

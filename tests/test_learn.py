@@ -483,6 +483,7 @@ def with_a_gap(times, states):
     return [t[kept] for t in times], [x[kept] for x in states]
 
 
+@pytest.mark.slow
 def test_long_intervals_of_an_uneven_run_are_cut_and_an_even_run_is_left():
     times, states, _ = logs(samples=31)
     lost = np.zeros(31, bool)

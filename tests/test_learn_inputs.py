@@ -21,7 +21,12 @@ from hamkernel._trajectories.flow import NODES, Segments, jacobians, means, simu
 from hamkernel._trajectories.kalman import as_observations
 from hamkernel._trajectories.likelihood import Model
 from hamkernel._trajectories.preprocessing import _least
-from hamkernel._trajectories.runs import at_nodes, at_samples, in_intervals, values
+from hamkernel._trajectories.runs import (
+    inputs_at_nodes,
+    inputs_at_samples,
+    lines_in_intervals,
+    values,
+)
 from hamkernel._trajectories.segments import given_path, linearised, segments_of
 
 FRICTION, GAIN = 0.2, 1.5
@@ -59,7 +64,7 @@ def test_inputs_of_intervals_are_the_best_lines_in_the_mean_square(between):
     rng = np.random.default_rng(0)
     t, u = np.sort(rng.uniform(0, 1, 12)), rng.normal(size=12)
     at = np.array([t[0], 0.3, 0.55, t[-1]])
-    found = in_intervals(t, u[:, None], at, between)[..., 0]
+    found = lines_in_intervals(t, u[:, None], at, between)[..., 0]
     for (a, b), ends in zip(itertools.pairwise(at), found, strict=True):
         fine = np.linspace(a, b, 200_001)
         fine = (fine[1:] + fine[:-1]) / 2
@@ -70,15 +75,15 @@ def test_inputs_of_intervals_are_the_best_lines_in_the_mean_square(between):
 
 def test_inputs_between_the_samples_of_a_log_are_as_they_were_said():
     t, u = np.array([0.0, 0.3, 0.4, 1.0]), np.random.default_rng(0).normal(size=(4, 2))
-    lines = in_intervals(t, u, t, "linear")
+    lines = lines_in_intervals(t, u, t, "linear")
     np.testing.assert_allclose(lines, np.stack([u[:-1], u[1:]], axis=1), atol=1e-14)
-    np.testing.assert_allclose(at_samples(lines), u, atol=1e-14)
+    np.testing.assert_allclose(inputs_at_samples(lines), u, atol=1e-14)
     nodes = t[:-1, None] + np.diff(t)[:, None] * NODES
     expected = np.stack([np.interp(nodes, t, u[:, c]) for c in range(2)], axis=-1)
-    np.testing.assert_allclose(at_nodes(lines), expected, atol=1e-14)
-    steps = in_intervals(t, u, t, "held")
+    np.testing.assert_allclose(inputs_at_nodes(lines), expected, atol=1e-14)
+    steps = lines_in_intervals(t, u, t, "held")
     np.testing.assert_allclose(steps, np.repeat(u[:-1, None], 2, axis=1), atol=1e-14)
-    assert in_intervals(t, u[:, :0], t, "held").shape == (3, 2, 0)
+    assert lines_in_intervals(t, u[:, :0], t, "held").shape == (3, 2, 0)
 
 
 @pytest.mark.parametrize("count", [2, 3, 4, 5, 12])
@@ -100,7 +105,7 @@ def responses(per_period, between, periods=10):
     """
     stiffness, damping = 2.3, 0.2
     t = np.arange(periods * per_period + 1) * 2 * np.pi / per_period
-    lines = in_intervals(t, np.cos(t)[:, None], t, between)[..., 0]
+    lines = lines_in_intervals(t, np.cos(t)[:, None], t, between)[..., 0]
     steady = 1 / (stiffness - 1 + 1j * damping)  # ẍ + damping ẋ + stiffness x = cos t
     true = np.stack([(steady * np.exp(1j * t)).real, (1j * steady * np.exp(1j * t)).real], axis=1)
     h = t[1] - t[0]
@@ -131,7 +136,7 @@ def test_inputs_have_times_of_their_own_and_act_late():
     late = hk.Runs(ts, x, (own, np.sin(7 * own)[:, None]), between="linear", delay=0.05)
     assert repr(late) == "Runs(1 run, 9 samples, n=2, m=1 linear, delay=0.05)"
     nodes = ts[1:-1, None] + np.diff(ts[1:])[:, None] * NODES
-    found = at_nodes(late.applied(0, ts))[1:, :, 0]
+    found = inputs_at_nodes(late.applied(0, ts))[1:, :, 0]
     np.testing.assert_allclose(found, np.sin(7 * (nodes - 0.05)), atol=0.06)  # a line in each
     assert late.inputs[0].shape == (1000, 1)
 
@@ -178,6 +183,7 @@ def test_the_flow_is_driven_to_the_tolerance_of_the_integrator():
     np.testing.assert_allclose(path.nodes[0, ..., 2], u + slope * inner, atol=1e-12)
 
 
+@pytest.mark.slow
 def test_along_a_true_path_rows_are_exact_with_inputs():
     """Of ẋ = Ax + g(x, u): x(t) − exp(At) x(0) is the integral of exp(A(t − s)) g(x(s), u(s))."""
     A, ts, (u, slope) = np.array([[0.0, 1.0], [-2.0, -0.3]]), np.linspace(0.0, 0.8, 9), (0.7, -2.0)
@@ -193,7 +199,7 @@ def test_along_a_true_path_rows_are_exact_with_inputs():
 
     @jax.jit
     def rows(ends):
-        nodes = jnp.concatenate([states, at_nodes(ends)], axis=-1)
+        nodes = jnp.concatenate([states, inputs_at_nodes(ends)], axis=-1)
         path = given_path(x, nodes, segments.spans, jacobians(mean, nodes, 2))
         slopes = jax.vmap(jax.vmap(jax.vmap(joined)))(nodes)
         there = means(mean, nodes, slopes)

@@ -95,6 +95,7 @@ def test_ready_made_parts(parts, x, wanted):
         parts(jnp.zeros(7))
 
 
+@pytest.mark.slow
 def test_gradients_of_the_features_are_those_of_jax():
     shared = hk.Shared(hk.Gaussian(0.8), hk.pairs(4, 2), np.linspace(0.1, 4, 12))
     x = jnp.asarray(RNG.normal(size=16))

@@ -45,6 +45,7 @@ def heights(area, t):
     return there.min(), there.max()
 
 
+@pytest.mark.slow
 def test_a_smoothed_run_shows_samples_curve_and_two_standard_deviations(runs):
     panels = plot.smoothing(runs, 1, time_unit="s", units=("rad", None))
     band = runs.smoothing()
@@ -93,6 +94,7 @@ def learned_of(runs):
     )
 
 
+@pytest.mark.slow
 def test_a_fitted_run_shows_samples_curve_and_residuals(runs):
     learned = learned_of(runs)
     panels = plot.fitted(learned, names=("angle", "momentum"))

@@ -128,6 +128,7 @@ def test_energy_falls_along_the_flow_by_what_is_dissipated():
 # Sums: an operator of its own is a potential of its own.
 
 
+@pytest.mark.slow
 def test_terms_share_a_potential_only_where_they_share_the_operator():
     def first(x):
         return jnp.asarray([[0.0, 1.0], [-1.0, -1.0]])

@@ -106,6 +106,7 @@ def test_more_is_unknown_farther_away_up_to_the_prior():
     np.testing.assert_allclose(far, prior, rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_deviations_can_be_differentiated_mapped_and_compiled():
     x, h = jnp.asarray(INSIDE), 1e-6
     slope = jax.jit(jax.grad(lambda x: BOTH.deviation(x).sum()))(x)
@@ -375,6 +376,7 @@ def test_values_and_gradients_together_are_those_of_gpytorch():
     np.testing.assert_allclose(ours, theirs[:, 0, :, 1:], atol=1e-6)
 
 
+@pytest.mark.slow
 def test_evaluate_and_the_default_region_are_those_of_single_states_and_of_the_data():
     means, deviations = POSTERIOR.evaluate(X[:3])
     np.testing.assert_allclose(means[1], POSTERIOR.field(X[1]), atol=1e-12)
@@ -396,6 +398,7 @@ def test_the_score_of_a_field_is_one_minus_the_share_of_the_variance_it_leaves()
         POSTERIOR.field.score(at, there[:4])
 
 
+@pytest.mark.slow
 def test_the_posterior_of_tune_is_that_of_condition_with_what_was_tuned():
     tuned = hk.tune(K, X, Y, starts=1, max_steps=1, objective="marginal_likelihood")
     np.testing.assert_allclose(tuned.noise_variance, 12 * tuned.regularization)

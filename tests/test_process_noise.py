@@ -245,6 +245,7 @@ def test_bands_are_widened_as_much_as_correlated_noise_widens_least_squares():
     assert whiteness(white_or_not(rng, 0.0, runs=40, length=200), counts).widening == 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("noise", "friction"), [(0.0, 0.0), (1e-4, 0.0), (1e-5, 1e-4)])
 @pytest.mark.few(1)
 def test_good_sensors_are_not_exact_data(noise, friction):

@@ -22,6 +22,7 @@ def _close_figures():
     plt.close("all")
 
 
+@pytest.mark.slow
 def test_the_figure_has_the_fit_the_force_and_the_plane(learned):
     panels = learned.plot(run=1).axes
     assert len(panels) == 6
@@ -57,6 +58,7 @@ def test_a_page_has_all_of_it_inside(learned, tmp_path):
         hk.report(learned.field, tmp_path / "other.html")
 
 
+@pytest.mark.slow
 def test_the_ten_lines_load_and_simulate(learned, tmp_path, capsys):
     hk.save(tmp_path / "learned.hk", learned)
     text = script(str(tmp_path / "learned.hk"), learned)

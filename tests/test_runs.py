@@ -197,6 +197,7 @@ def dense(coordinate, t, s):
     return np.exp(2 * float(coordinate.process.log_amplitude)) * k
 
 
+@pytest.mark.slow
 def test_the_smoother_is_a_dense_gaussian_process_with_missing_entries():
     times, states = swings(missing=True)
     found = processes(times, states)

@@ -21,7 +21,7 @@ import pytest
 import hamkernel as hk
 from hamkernel import RandomFeatures, load, save
 from hamkernel._kernels.symmetry import Symmetrised, identity
-from hamkernel._save import _ours, description, sealed, skeleton
+from hamkernel._save import _ours, description, seal, skeleton
 
 RNG = np.random.default_rng(5)
 X = RNG.normal(size=(6, 2))
@@ -504,7 +504,7 @@ def parts(content):
 def forge(path, header, leaves):
     """Write a file with a right checksum, as a forger would who has read the source."""
     text = header if isinstance(header, bytes) else json.dumps(header).encode()
-    path.write_bytes(sealed(text + b"\n" + leaves))
+    path.write_bytes(seal(text + b"\n" + leaves))
 
 
 def test_a_forged_file_without_a_change_is_read(saved):

@@ -79,6 +79,7 @@ def test_the_linear_model_is_exact_for_an_oscillator():
     assert np.isnan(float(score.coverage))
 
 
+@pytest.mark.slow
 def test_a_score_without_runs_holds_out_the_last_fifth(learned):
     score = learned[0.0].score(draws=0)
     assert [len(t) for t in score.times] == [6] * 4

@@ -191,6 +191,7 @@ def test_the_subset_has_its_share_of_every_fold():
     assert abs(labels[rows].mean() - labels.mean()) < 1 / len(rows)
 
 
+@pytest.mark.slow
 def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free():
     few, states, ridge = jnp.asarray(Y[:6]), jnp.asarray(X[:6]), jnp.asarray(1e-3)
     waves = WaveBasis(jax.random.key(0), 3)

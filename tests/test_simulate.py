@@ -447,6 +447,7 @@ def test_a_state_that_overflows_in_constant_steps_is_no_success():
         run(throw=True)
 
 
+@pytest.mark.slow
 def test_the_reason_of_a_failure_is_the_one_that_is_said():
     with pytest.raises(RuntimeError, match="NaN or infinite at x0 already"):
         simulate(lambda x: x * jnp.nan, START, TIMES)

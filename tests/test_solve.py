@@ -376,6 +376,7 @@ def test_blocks_of_a_factorisation_are_shown(ask, capsys, monkeypatch):
     assert "factor" not in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_new_tolerance_of_conjugate_gradients_compiles_nothing():
     traces = []
 
@@ -390,6 +391,7 @@ def test_a_new_tolerance_of_conjugate_gradients_compiles_nothing():
         traces.clear()
 
 
+@pytest.mark.slow
 def test_landmarks_precondition():
     X, Y = swings(150, n=4)
     counts = [
@@ -413,6 +415,7 @@ def test_a_low_rank_gram_that_is_larger_than_the_gram_is_refused(structure, kern
     assert "check_kernel" in str(refused.value)
 
 
+@pytest.mark.slow
 def test_conjugate_gradients_that_do_not_converge_say_so():
     X, Y = swings(150)
     solver = ConjugateGradient(1e-12, max_iterations=2, preconditioner=Nystrom(1e5, 1))
@@ -498,6 +501,7 @@ def test_a_dense_fit_is_chosen_where_it_takes_half_of_the_memory(monkeypatch):
     assert info(hk.fit(K, X, Y, RIDGE, solver=hk.Cholesky())).solver == "Cholesky"
 
 
+@pytest.mark.slow
 def test_a_factor_made_in_place_is_that_of_lapack(monkeypatch):
     K, (X, Y) = hk.Symplectic(1.1 * hk.Gaussian(1.5)), swings(150)
     one = hk.condition(K, X, Y, RIDGE)

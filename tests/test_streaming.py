@@ -118,6 +118,7 @@ def test_digits_survive_a_small_ridge():
     assert relative(C @ alpha, values) > 10 * BASIS
 
 
+@pytest.mark.slow
 def test_sums_in_the_basis_of_a_sample_keep_the_digits_of_a_qr():
     """At λ = 1e-13 the same sums in the basis that they come in lose four digits more."""
     waves, regularization = hk.RandomFeatures(40, jax.random.key(0)), 1e-13

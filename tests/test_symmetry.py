@@ -156,6 +156,7 @@ def test_odd_and_even_are_the_group_of_two():
     )
 
 
+@pytest.mark.slow
 def test_reversible_and_odd_go_together_in_either_order():
     K = hk.Reversible(hk.Odd(hk.Symplectic(G)))
     other = hk.Odd(hk.Reversible(hk.Symplectic(G)))
@@ -178,6 +179,7 @@ def test_a_separable_hamiltonian_stays_one_when_it_is_made_reversible():
     assert off(alone, -REVERSAL, -1.0) > 1e-2
 
 
+@pytest.mark.slow
 def test_symmetry_helps_where_it_is_there():
     """The pendulum is odd and reversible: fewer points say as much."""
     pendulum = hk.systems.Pendulum(1.0, 1.0, 1.0)

@@ -951,6 +951,7 @@ def test_what_was_tuned_is_not_tuned_to_anything_worse():
     assert again.loss <= once.loss * (1 + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("lengthscale", "ridge"), [(2.0, 1e-6), (50.0, 1e-3), (1.0, 1.0)])
 def test_parts_that_mislead_do_not_make_it_worse_nor_hide_that_it_has_not_converged(
     lengthscale, ridge, monkeypatch

@@ -135,6 +135,7 @@ def of_every_kind():
 ENERGIES_TOGETHER = np.repeat([0, 1, 2, 3, 4], [6, 4, 10, 3, 2])  # of 14 + 6 + 4 + 1
 
 
+@pytest.mark.slow
 @pytest.mark.few(2)
 @pytest.mark.parametrize(
     ("waves", "folds"), [(4, 5), (30, ENERGIES_TOGETHER), (30, 5), (4, ENERGIES_TOGETHER)]
@@ -170,6 +171,7 @@ LOSSES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.few(1)
 @pytest.mark.parametrize("loss", LOSSES)
 def test_gradients_of_observations_are_those_of_finite_differences(loss):

@@ -1,6 +1,9 @@
 """Whether `learn` says of logs that it has not met before if the field may be used."""
 
+# pyright: reportArgumentType=false
+
 import warnings
+from types import SimpleNamespace
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,6 +11,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
+from hamkernel._trajectories.diagnostics import _noise_against_motion
 from hamkernel._trajectories.table import Diagnostic, Diagnostics
 
 K = hk.Symplectic(hk.Gaussian(1.0))
@@ -103,6 +107,7 @@ def test_a_run_at_rest_is_one_measurement_of_the_noise(step):
     np.testing.assert_allclose(learned.noise, noise, rtol=0.08)  # 13 % too small as 60 samples
 
 
+@pytest.mark.slow
 def test_animals_in_weather_are_no_hamiltonian_system():
     years, log = animals()
     learned, heard = learn_and_listen(K, hk.Runs([years], [log]))
@@ -123,6 +128,12 @@ def test_a_quantised_encoder_and_the_right_friction_are_silent():
     assert learned.converged, learned.diagnostics
     assert heard == [], learned.diagnostics
     np.testing.assert_allclose(learned.noise[0], step / np.sqrt(12), rtol=0.1)
+
+
+def test_a_sentence_of_the_table_has_the_name_of_the_column():
+    fit = SimpleNamespace(names=("angle", "speed"), noise=np.array([0.1, 0.9]), scale=np.ones(2))
+    row = _noise_against_motion(fit)
+    assert "the noise of coordinate speed is 0.9" in row.meaning
 
 
 def test_the_table_prints_in_ascii_and_in_html():

@@ -407,21 +407,21 @@ class MemberField(AbstractField):
 def at_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
     """A field or a mean of points (x, u) at one u, as a function of x.
 
-    Without u it is the drift of a `Controlled` kernel, at u = 0.
+    If u is None, the result is the drift of a `Controlled` kernel, at u = 0.
     """
     if isinstance(part, FieldSum):
         terms = [at_inputs(term, n, u) for term in part.terms]
-        known = tuple(term for term in terms if term is not None)
-        return FieldSum(known) if known else None
+        kept = tuple(term for term in terms if term is not None)
+        return FieldSum(kept) if kept else None
     if isinstance(part, KnownPart):
         if part.mean is None or not part.of_inputs:
             return part.mean
         if u is None:
-            # # The attribute `drift` of the mean may know a potential.
-            own = getattr(part.mean, "drift", None)
-            return AtInputs(part.mean, jnp.zeros(part.count)) if own is None else own
-        own = getattr(part.mean, "at", None)
-        return AtInputs(part.mean, u) if own is None else own(u)
+            # The attribute `drift` of the mean, if there is one, may have a potential.
+            drift = getattr(part.mean, "drift", None)
+            return AtInputs(part.mean, jnp.zeros(part.count)) if drift is None else drift
+        at = getattr(part.mean, "at", None)
+        return AtInputs(part.mean, u) if at is None else at(u)
     if isinstance(part, KernelField):
         K, points, values = part.kernel, part.points, part.value_points
         assert isinstance(K, AbstractJoinedKernel)
@@ -452,10 +452,10 @@ def at_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
     return part
 
 
-def learned_field(field: Any, known: Any) -> Any:
+def learned_field(field: Any, mean: Any) -> Any:
     """The field of a solver plus the known part, a function of (x, u) for a joined kernel."""
-    if known is not None:
-        field = dataclasses.replace(field, mean=known)
+    if mean is not None:
+        field = dataclasses.replace(field, mean=mean)
     if not isinstance(field.kernel, AbstractJoinedKernel):
         return field
     field_type = FamilyField if field.kernel.given == "parameters" else ControlledField

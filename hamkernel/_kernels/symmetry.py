@@ -73,17 +73,17 @@ def linear_maps(maps: Any) -> tuple[LinearMap, ...]:
             invertible.
     """
     single = callable(maps) or getattr(maps, "ndim", None) == 2
-    given: Any = [maps] if single else maps
-    if not isinstance(given, Sequence | np.ndarray | jax.Array) or len(given) == 0:
+    generators: Any = [maps] if single else maps
+    if not isinstance(generators, Sequence | np.ndarray | jax.Array) or len(generators) == 0:
         raise TypeError(
             "maps must be a list of linear maps of the state, (n, n) arrays or functions "
             f"x -> S @ x; got {maps!r}."
         )
-    rows: Any = tuple(each if callable(each) else _nested(each) for each in given)
+    rows: Any = tuple(g if callable(g) else _matrix_rows(g) for g in generators)
     return rows
 
 
-def _nested(matrix: Any) -> tuple[tuple[float, ...], ...]:
+def _matrix_rows(matrix: Any) -> tuple[tuple[float, ...], ...]:
     require.floating(matrix, "a map")
     array = np.asarray(matrix, float)  # all digits, also where JAX would keep those of float32
     if array.ndim != 2 or array.shape[0] != array.shape[1] or not np.isfinite(array).all():
@@ -95,24 +95,24 @@ def _nested(matrix: Any) -> tuple[tuple[float, ...], ...]:
 
 
 @functools.lru_cache(maxsize=1024)
-def matrix_of(given: LinearMap, n: int) -> Float[np.ndarray, "n n"]:
+def matrix_of(linear_map: LinearMap, n: int) -> Float[np.ndarray, "n n"]:
     """The matrix of a map on states of n coordinates.
 
     Raises:
-        ValueError: it is for states of another dimension, or a function is not linear.
+        ValueError: the map is for states of another dimension, or a function is not linear.
     """
-    if not callable(given):
-        if len(given) != n:
+    if not callable(linear_map):
+        if len(linear_map) != n:
             raise ValueError(
-                f"a map of the symmetry is a {len(given)} by {len(given)} matrix and the states "
-                f"have {n} coordinates."
+                f"a map of the symmetry is a {_name_of(linear_map)} and the states have {n} "
+                "coordinates."
             )
-        return np.asarray(given)
+        return np.asarray(linear_map)
     with jax.ensure_compile_time_eval():
         basis = np.eye(n)
-        columns = [np.asarray(given(jnp.asarray(e)), float) for e in basis]
-        probe = np.cos(1.0 + np.arange(n))  # no symmetry of its own
-        image = np.asarray(given(jnp.asarray(probe)), float)
+        columns = [np.asarray(linear_map(jnp.asarray(e)), float) for e in basis]
+        probe = np.cos(1.0 + np.arange(n))  # a state without symmetry
+        image = np.asarray(linear_map(jnp.asarray(probe)), float)
     if any(column.shape != (n,) for column in columns):
         raise ValueError(
             f"a map of the symmetry takes a state of shape ({n},) to shape {columns[0].shape}; a "
@@ -125,7 +125,7 @@ def matrix_of(given: LinearMap, n: int) -> Float[np.ndarray, "n n"]:
 
 
 @functools.lru_cache(maxsize=1024)
-def closed(
+def close_group(
     maps: tuple[LinearMap, ...], characters: tuple[float, ...], n: int
 ) -> tuple[Element, ...]:
     """The group that the maps generate on states of n coordinates, the identity first.
@@ -135,8 +135,7 @@ def closed(
             with both signs, so that zero is the only function with the symmetry.
     """
     generators = [
-        Element(_clean(matrix_of(each, n)), sign)
-        for each, sign in zip(maps, characters, strict=True)
+        Element(_clean(matrix_of(g, n)), sign) for g, sign in zip(maps, characters, strict=True)
     ]
     for g in generators:
         if abs(np.linalg.det(g.matrix)) < _SAME_MAP:
@@ -145,16 +144,16 @@ def closed(
                 f"S = {np.round(g.matrix, 3).tolist()}. To ignore a coordinate use Select(k, dims)."
             )
     group = [Element(np.eye(n), 1.0)]
-    for known in group:  # the list grows inside of the loop
+    for element in group:  # the list grows inside the loop
         for g in generators:
-            new = Element(_clean(g.matrix @ known.matrix), g.character * known.character)
-            found = [e for e in group if np.abs(e.matrix - new.matrix).max() < _SAME_MAP]
-            if found and found[0].character != new.character:
+            new = Element(_clean(g.matrix @ element.matrix), g.character * element.character)
+            equal = [e for e in group if np.abs(e.matrix - new.matrix).max() < _SAME_MAP]
+            if equal and equal[0].character != new.character:
                 raise ValueError(
                     "no function but zero has all these symmetries: a product of the maps is the "
                     "identity, or another product, and would change the sign. Choose fewer."
                 )
-            if not found:
+            if not equal:
                 group.append(new)
             if len(group) > 64:  # the largest point group of space, that of the cube, has 48
                 raise ValueError(
@@ -167,15 +166,15 @@ def closed(
 
 
 def _clean(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """The matrix with entries within rounding of a whole number replaced by it."""
-    whole = np.round(matrix)
-    return np.where(np.abs(matrix - whole) < 1e-14, whole, matrix) + 0.0
+    """The matrix, in which entries within rounding of an integer are replaced by the integer."""
+    integers = np.round(matrix)
+    return np.where(np.abs(matrix - integers) < 1e-14, integers, matrix) + 0.0
 
 
 def pairs(group: tuple[Element, ...], one_sided: bool) -> list[tuple[Element, Element, float]]:
     """The g, h and χ(g)χ(h) of the terms χ(g) χ(h) k(gx, hz) of a mean over the group."""
-    left = group[:1] if one_sided else group
-    return [(g, h, g.character * h.character) for g, h in itertools.product(left, group)]
+    first = group[:1] if one_sided else group
+    return [(g, h, g.character * h.character) for g, h in itertools.product(first, group)]
 
 
 def is_orthogonal(S: Float[np.ndarray, "n n"]) -> bool:
@@ -201,8 +200,8 @@ class Symmetrised(AbstractScalarKernel):
 
     k_G(x, z) is the mean over g and h of χ(g) χ(h) k(gx, hz), and its functions obey
     u(gx) = χ(g) u(x). This mean over both arguments is symmetric and positive for EVERY k. Where
-    k(gx, gz) = k(x, z) one side is enough, k_G(x, z) = mean over g of χ(g) k(x, gz); without that
-    property the one-sided mean is not even symmetric.
+    k(gx, gz) = k(x, z) one side is enough, k_G(x, z) = mean over g of χ(g) k(x, gz). For other k
+    the one-sided mean is not even symmetric.
 
     Args:
         kernel: the scalar kernel k.
@@ -221,39 +220,39 @@ class Symmetrised(AbstractScalarKernel):
     one_sided: bool | None = eqx.field(static=True, default=None)
 
     def __repr__(self) -> str:
-        names = [_name_of(each) for each in self.maps if each is not identity]
-        if self.parity is not None:  # a structure says Odd or Even of itself
+        names = [_name_of(g) for g in self.maps if g is not identity]
+        if self.parity is not None:  # a structure prints as Odd or Even
             return call("Symmetrised", [repr(self.kernel), f"parity={self.parity}"])
         return call("Invariant", [repr(self.kernel), f"[{', '.join(names)}]"])
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         x, z = one_point(x), one_point(z)
-        found = self.through_descriptor(len(x))
-        if found is not None:
-            return found.kernel(found.map(x), found.map(z))
+        descriptor = self.through_descriptor(len(x))
+        if descriptor is not None:
+            return descriptor.kernel(descriptor.map(x), descriptor.map(z))
         terms = pairs(self.group(len(x)), self.is_one_sided(len(x)))
         values = [sign * self.kernel(g(x), h(z)) for g, h, sign in terms]
         return sum(values[1:], start=values[0]) / len(values)
 
     def group(self, n: int) -> tuple[Element, ...]:
         """All maps of the group on states of n coordinates, the identity first."""
-        return closed(self.maps, self.characters, n)
+        return close_group(self.maps, self.characters, n)
 
     def through_descriptor(self, n: int) -> Descriptor | None:
         """The mean over the images of the maps, where these permute the entries of a warp."""
         if not isinstance(self.kernel, Warp):
             return None
-        images = [self.kernel.image(matrix_of(each, n)) for each in self.maps]
+        images = [self.kernel.image(matrix_of(g, n)) for g in self.maps]
         if any(image is None for image in images):
             return None
-        inner = Symmetrised(self.kernel.kernel, tuple(map(_nested, images)), self.characters)
+        inner = Symmetrised(self.kernel.kernel, tuple(map(_matrix_rows, images)), self.characters)
         return Descriptor(self.kernel.warped, inner)
 
     def is_one_sided(self, n: int) -> bool:
         """Whether k(gx, gz) = k(x, z) is known to hold for all g."""
         if self.one_sided is not None:
             return self.one_sided
-        return all(self.kernel.is_unchanged_by(matrix_of(each, n)) for each in self.maps)
+        return all(self.kernel.is_unchanged_by(matrix_of(g, n)) for g in self.maps)
 
     @property
     def parity(self) -> int | None:
@@ -293,11 +292,11 @@ class Symmetrised(AbstractScalarKernel):
         )
 
 
-def without_symmetry(tree: Tree) -> Tree:
+def drop_symmetry(tree: Tree) -> Tree:
     """The kernel, or any PyTree, in which each mean over a group is replaced by its scalar kernel.
 
-    Its values have the size of the terms that are added up and rounded: with a long lengthscale
-    (k(x, z) − k(−x, z))/2 is the small difference of two large numbers.
+    The values of the result have the size of the terms of the mean, which determines the rounding
+    errors: for a long lengthscale (k(x, z) − k(−x, z))/2 is the small difference of large numbers.
     """
 
     def is_mean(node: object) -> bool:
@@ -306,11 +305,15 @@ def without_symmetry(tree: Tree) -> Tree:
     return jax.tree.map(lambda node: node.kernel if is_mean(node) else node, tree, is_leaf=is_mean)
 
 
-def _name_of(given: LinearMap) -> str:
-    return text(given) if callable(given) else f"{len(given)} by {len(given)} matrix"
+def _name_of(linear_map: LinearMap) -> str:
+    return (
+        text(linear_map)
+        if callable(linear_map)
+        else f"{len(linear_map)} by {len(linear_map)} matrix"
+    )
 
 
-def symmetrised(
+def symmetrise(
     kernel: AbstractScalarKernel, maps: tuple[LinearMap, ...], characters: tuple[float, ...]
 ) -> AbstractScalarKernel:
     """The kernel of the functions u(gx) = χ(g) u(x) of the RKHS of `kernel`, g in the maps.
@@ -323,27 +326,30 @@ def symmetrised(
     """
     reflects = set(maps) <= {identity, reflection}
     if kernel.summands(reflects):
-        inner = tuple(symmetrised(k, maps, characters) for k in kernel.summands(reflects))
+        inner = tuple(symmetrise(k, maps, characters) for k in kernel.summands(reflects))
         return eqx.tree_at(lambda k: k.summands(reflects), kernel, inner)
     if isinstance(kernel, Symmetrised):
-        known = dict(zip(kernel.maps, kernel.characters, strict=True))
-        given = dict(zip(maps, characters, strict=True))
-        if any(known.get(each, sign) != sign for each, sign in given.items()):
+        signs = dict(zip(kernel.maps, kernel.characters, strict=True))
+        new = dict(zip(maps, characters, strict=True))
+        if any(signs.get(g, sign) != sign for g, sign in new.items()):
             raise ValueError("Odd(Even(K)) and Even(Odd(K)) have no fields but zero: choose one.")
-        if given.keys() <= known.keys():
+        if new.keys() <= signs.keys():
             return kernel
-        both = known | given
-        return _with_closed_group(Symmetrised(kernel.kernel, tuple(both), tuple(both.values())))
-    known = Invariance.REFLECTION in kernel.invariance if reflects else None
-    return _with_closed_group(Symmetrised(kernel, maps, characters, known))
+        all_signs = signs | new
+        return _with_closed_group(
+            Symmetrised(kernel.kernel, tuple(all_signs), tuple(all_signs.values()))
+        )
+    one_sided = Invariance.REFLECTION in kernel.invariance if reflects else None
+    return _with_closed_group(Symmetrised(kernel, maps, characters, one_sided))
 
 
 def _with_closed_group(kernel: Symmetrised) -> Symmetrised:
-    """The kernel, once its group is known to close.
+    """The kernel, after a check that its group is finite.
 
-    The dimension follows from a matrix; with functions alone the check waits for the first point.
+    The check needs the dimension, which a matrix has. If all maps are functions, the first point
+    makes the check.
     """
-    matrices = [each for each in kernel.maps if not callable(each)]
+    matrices = [g for g in kernel.maps if not callable(g)]
     if matrices:
         kernel.group(len(matrices[0]))
     return kernel
@@ -357,10 +363,10 @@ def with_parity(kernel: AbstractScalarKernel, parity: int) -> AbstractScalarKern
     Raises:
         ValueError: a term has the other parity already, so that only zero is left of it.
     """
-    return symmetrised(kernel, (identity, reflection), (1.0, float(parity)))
+    return symmetrise(kernel, (identity, reflection), (1.0, float(parity)))
 
 
-class Removed(NamedTuple):
+class Unsymmetrised(NamedTuple):
     """A scalar kernel k without its symmetry, and the means over a group from which it came."""
 
     kernel: AbstractScalarKernel
@@ -377,23 +383,26 @@ class Removed(NamedTuple):
         return all(mean.is_one_sided(n) for mean in self.means)
 
 
-def symmetry_removed(kernel: AbstractScalarKernel) -> Removed | None:
-    """The k and the group with `kernel` = `symmetrised(k, …)`, or None.
+def symmetry_removed(kernel: AbstractScalarKernel) -> Unsymmetrised | None:
+    """The k and the group with `kernel` = `symmetrise(k, …)`, or None.
 
     Where every mean is one-sided, `kernel` is the mean over h of χ(h) k(x, hz).
     """
     if isinstance(kernel, Symmetrised):
-        return Removed(kernel.kernel, (kernel,))
-    found = [symmetry_removed(k) for k in kernel.summands(True)]
-    known = [each for each in found if each is not None]
-    means = tuple(mean for each in known for mean in each.means)
-    if len(known) < len(found) or len({(mean.maps, mean.characters) for mean in means}) != 1:
+        return Unsymmetrised(kernel.kernel, (kernel,))
+    parts = [symmetry_removed(k) for k in kernel.summands(True)]
+    unsymmetrised = [part for part in parts if part is not None]
+    means = tuple(mean for part in unsymmetrised for mean in part.means)
+    if (
+        len(unsymmetrised) < len(parts)
+        or len({(mean.maps, mean.characters) for mean in means}) != 1
+    ):
         return None
     reflects = means[0].parity is not None
     if not kernel.summands(reflects):
         return None
-    inner = tuple(each.kernel for each in known)
-    return Removed(eqx.tree_at(lambda k: k.summands(reflects), kernel, inner), means)
+    inner = tuple(part.kernel for part in unsymmetrised)
+    return Unsymmetrised(eqx.tree_at(lambda k: k.summands(reflects), kernel, inner), means)
 
 
 def symmetries(kernel: AbstractScalarKernel) -> Iterator[Symmetrised]:

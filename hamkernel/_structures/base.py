@@ -31,7 +31,7 @@ from hamkernel._kernels.base import (
     common_invariance,
     one_point,
 )
-from hamkernel._kernels.symmetry import LinearMap, linear_maps, symmetrised, time_reversal
+from hamkernel._kernels.symmetry import LinearMap, linear_maps, symmetrise, time_reversal
 from hamkernel._machine import full_precision
 from hamkernel._show import call, described, joined
 
@@ -436,4 +436,4 @@ def Invariant(k: Any, maps: Any) -> Any:
     generators = linear_maps(maps)
     if isinstance(k, AbstractMatrixKernel):
         return k.averaged(generators)
-    return symmetrised(as_scalar_kernel(k), generators, (1.0,) * len(generators))
+    return symmetrise(as_scalar_kernel(k), generators, (1.0,) * len(generators))

@@ -34,12 +34,12 @@ from hamkernel._kernels.base import (
 )
 from hamkernel._kernels.symmetry import (
     LinearMap,
+    drop_symmetry,
     matrix_of,
     symmetries,
-    symmetrised,
+    symmetrise,
     symmetry_removed,
     with_parity,
-    without_symmetry,
 )
 from hamkernel._kernels.transforms import Warp
 from hamkernel._machine import compiled
@@ -76,7 +76,7 @@ class AbstractStructure(AbstractMatrixKernel):
 
     def check_points(self, X: Float[Array, "N d"]) -> None:
         super().check_points(X)
-        k = without_symmetry(self.kernel)
+        k = drop_symmetry(self.kernel)
         # No single process has all rows of a sharded X.
         if not (require.is_concrete(X, k) and jnp.asarray(X).is_fully_addressable):
             return
@@ -91,7 +91,7 @@ class AbstractStructure(AbstractMatrixKernel):
                 )
 
     def averaged(self, maps: tuple[LinearMap, ...]) -> "AbstractStructure":
-        kernel = symmetrised(self.kernel, maps, (1.0,) * len(maps))
+        kernel = symmetrise(self.kernel, maps, (1.0,) * len(maps))
         return eqx.tree_at(lambda K: K.kernel, self, kernel)
 
     def shares_potential(self, other: AbstractMatrixKernel) -> bool:

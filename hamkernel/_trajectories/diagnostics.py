@@ -265,8 +265,8 @@ def _chi_squared(fit: FitQuality) -> Diagnostic:
 
 
 def _chi_squared_limit(free: float) -> float:
-    # Its standard deviation is √(2/ν): five of them, and a tenth for the curvature that a
-    # linearisation misses.
+    # The standard deviation of χ²/ν is √(2/ν). We allow five of them, and a tenth for the curvature
+    # that a linearisation misses.
     return float(1.1 + 5 * np.sqrt(2 / max(free, 1.0)))
 
 
@@ -461,13 +461,13 @@ def _curve(fit: FitQuality) -> Diagnostic | None:
 def lengthscales(
     K: AbstractMatrixKernel, scale: Float[np.ndarray, " n"], names: Sequence[str]
 ) -> Diagnostic | None:
-    """Whether one lengthscale serves coordinates whose sizes differ by more than 300.
+    """Whether one lengthscale serves coordinates whose sizes differ by a factor of more than 300.
 
-    With noise of a hundredth, the field of a pendulum has an error of .004 where they differ by 3
-    to 100, and of .44 at 1000.
+    The field of a pendulum with noise of 1 % has an error of .004 for factors of 3 to 100, and of
+    .44 for a factor of 1000.
     """
-    least, most = float(np.nanmin(scale)), float(np.nanmax(scale))
-    if not most > 300 * least > 0:
+    least, largest = float(np.nanmin(scale)), float(np.nanmax(scale))
+    if not largest > 300 * least > 0:
         return None
 
     def is_on_some(node: object) -> bool:
@@ -483,7 +483,7 @@ def lengthscales(
         "sizes within 300",
         not single,
         f"the states vary by {least:.2g} in coordinate {names[np.nanargmin(scale)]} and by "
-        f"{most:.2g} in coordinate {names[np.nanargmax(scale)]}"
+        f"{largest:.2g} in coordinate {names[np.nanargmax(scale)]}"
         + (", and the kernel has one lengthscale for both" if single else ""),
         f"Give each coordinate its own, hk.Gaussian(np.ones({len(scale)})), or take units in which "
         "all are near one.",

@@ -1,4 +1,4 @@
-"""The evidence of learned runs: log p, and what another kernel beside the drift would add to it."""
+"""The evidence of learned runs: log p, and its gain by another kernel in the drift."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Evidence(eqx.Module):
         model: the kernel and both kinds of noise.
         points: the landmarks, shape (m, d).
         rows: the runs, linearised about their paths.
-        start_deviation: that of the prior of starts, shape (n,).
+        start_deviation: the prior standard deviation of starts, shape (n,).
         scale: the standard deviations of the coordinates, shape (n,).
         is_free: which kinds of noise were estimated, sensor noise first, shape (2n,).
     """
@@ -46,14 +46,14 @@ class Evidence(eqx.Module):
 
     @property
     def log_p(self) -> float:
-        """The log marginal likelihood of the rows, but for a constant of no kernel."""
+        """The log marginal likelihood of the rows, up to a constant that no kernel changes."""
         return -self._loss(self.model)
 
     def gain(self, part: AbstractMatrixKernel) -> float:
-        """By how much log p rises with `part` beside the kernel of the drift.
+        """The gain in log p from `part` as one more term of the drift.
 
-        All hyperparameters are searched again, from those found and from a tenth and a hundredth of
-        the noise, which had to explain what `part` does.
+        We search all hyperparameters again, from their learned values and from a tenth and a
+        hundredth of the noise, since the noise had to explain the effect of `part`.
         """
         n, K = len(self.scale), self.model.kernel
         part = completed(with_amplitude(part), self.points, n)
@@ -70,10 +70,10 @@ class Evidence(eqx.Module):
         values = losses(larger, jnp.asarray(design), points, rows, self.start_deviation)
         start = larger.at(jnp.asarray(design[int(np.argmin(np.asarray(values)))]))
         bounds = Bounds(low, high, free)
-        given = self.points, self.rows, self.start_deviation
-        found, _ = maximise_likelihood(start, *given, bounds, _STEPS)
+        args = self.points, self.rows, self.start_deviation
+        best, _ = maximise_likelihood(start, *args, bounds, _STEPS)
         # Learning ends within half a nat of its optimum, and so may this search.
-        return max(self._loss(self.model) - self._loss(found), 0.0)
+        return max(self._loss(self.model) - self._loss(best), 0.0)
 
     def _loss(self, model: Model) -> float:
         return float(closed_form(model, self.points, self.rows, self.start_deviation).loss)
@@ -83,7 +83,7 @@ class EvidenceOfRows(eqx.Module):
     """The evidence of weak rows, see `laws.py`.
 
     Attributes:
-        log_p: the log marginal likelihood of the rows, but for a constant of no kernel.
+        log_p: the log marginal likelihood of the rows, up to a constant that no kernel changes.
     """
 
     log_p: float

@@ -74,11 +74,11 @@ class Path(NamedTuple):
 
 @compiled_by_size
 def _with_norms(field: Expansion, X: Float[Array, "N d"], scale: Float[Array, " n"]):
-    def at(s):
+    def one(s):
         f, D = with_tangent(field, s, len(scale))
         return f, jnp.linalg.norm(D * scale[None] / scale[:, None])
 
-    return jax.vmap(at)(X)
+    return jax.vmap(one)(X)
 
 
 def stiffness(
@@ -86,11 +86,13 @@ def stiffness(
 ) -> float:
     """The .95 quantile of ‖∂f/∂x‖ at the points X, in standard deviations of the coordinates.
 
-    Dry friction is steep where a momentum changes its sign, and few points are there. Steps in
-    which that momentum moves by up to three rest speeds ε are those that `steps_for` makes of
-    .05 ‖ṗ‖/ε. Without them errors of the path bent the field: of a pendulum that sticks, q alone at
-    50 Hz, U′ was off by 1.8 and 1.1 % on two of eight logs, and is by .04 and .10 %, as with steps
-    that are a third (`tests/benchmarks/model_error.py friction`).
+    Dry friction is steep where a momentum changes its sign, but few points are there. So we add the
+    rate .05 ‖ṗ‖/ε for the rest speed ε of each friction: with this rate `steps_for` makes steps in
+    which the momentum changes by at most three ε.
+
+    Without the added rate errors of the path bent the field. For a pendulum that sticks, with q
+    alone at 50 Hz, the error of U′ was 1.8 and 1.1 % on two of eight logs. With it the error is .04
+    and .10 %, as with steps of a third (`tests/benchmarks/model_error.py friction`).
     """
     n = len(scale)
     f, norms = map(np.asarray, _with_norms(field, jnp.asarray(X), jnp.asarray(scale)))
@@ -105,18 +107,20 @@ def stiffness(
 
 def steps_for(spans: Float[np.ndarray, "S L"], stiffness: float) -> Int[np.ndarray, " L"]:
     """Runge-Kutta steps between two nodes, for intervals of these lengths and this ‖Df‖."""
-    return np.clip(np.nan_to_num(_needed(spans, stiffness), nan=1.0), 1, _MOST_STEPS).astype(int)
+    return np.clip(np.nan_to_num(_count_steps(spans, stiffness), nan=1.0), 1, _MOST_STEPS).astype(
+        int
+    )
 
 
 def is_too_stiff(spans: Float[np.ndarray, "S L"], stiffness: float) -> bool:
     """Whether a field needs more steps than `steps_for` allows in half of these intervals.
 
-    It moves by more than its range within a sample, and belongs to noise that was taken for motion.
+    Such a field moves by more than its range between two samples: it fits noise.
     """
-    return bool(np.median(_needed(spans[spans > 0][None], stiffness)) > _MOST_STEPS)
+    return bool(np.median(_count_steps(spans[spans > 0][None], stiffness)) > _MOST_STEPS)
 
 
-def _needed(spans: Float[np.ndarray, "S L"], stiffness: float) -> Float[np.ndarray, " L"]:
+def _count_steps(spans: Float[np.ndarray, "S L"], stiffness: float) -> Float[np.ndarray, " L"]:
     # A step of order four with ‖Df‖ dt = 0.15 is wrong by 0.15⁵/120 = 6e-7 of the change.
     return np.ceil(spans.max(axis=0) * _PIECES.max() * stiffness / 0.15)
 
@@ -131,8 +135,9 @@ def simulated(
 ) -> Path:
     """The path of each segment from its start, and its tangents.
 
-    The path is not finite from where the field is not. In shares of an interval of length h the
-    point (x, u) moves by (h f, u₁ − u₀), from the input u₀ at its beginning to u₁ at its end.
+    The path is not finite from the time at which the field is not. If the time runs from 0 to 1 in
+    an interval of length h, the point (x, u) has the velocity (h f, u₁ − u₀), where u₀ and u₁ are
+    the inputs at both ends.
     """
     n = starts.shape[1]
 
@@ -168,8 +173,8 @@ def simulated(
             to_end.append(to_end[-1] @ tangent)
         return end[:n], (end[:n], nodes[:3], jnp.stack(to_end[2::-1]), to_end[3])
 
-    def forward(x, given):
-        return jax.vmap(interval, in_axes=(0, 0, 0, None))(x, *given)
+    def forward(x, args):
+        return jax.vmap(interval, in_axes=(0, 0, 0, None))(x, *args)
 
     _, out = jax.lax.scan(forward, starts, (spans.T, jnp.moveaxis(inputs, 1, 0), steps))
     ends, nodes, to_end, across = (jnp.moveaxis(a, 0, 1) for a in out)
@@ -187,7 +192,7 @@ def jacobians(mean, nodes: Float[Array, "S L 3 d"], n: int) -> Float[Array, "S L
 def means(
     mean, nodes: Float[Array, "S L 3 d"], slopes: Float[Array, "S L 3 n"]
 ) -> Float[Array, "S L 3 n"]:
-    """The prior mean at the nodes, whose slopes have its shape."""
+    """The prior mean at the nodes, in the shape of their slopes."""
     if mean is None:
         return jnp.zeros_like(slopes)
     return jax.vmap(jax.vmap(jax.vmap(mean)))(nodes).astype(nodes.dtype)

@@ -1,4 +1,4 @@
-"""Free runs: what a field predicts from one state on, without another look at the samples."""
+"""Free runs: predictions of a field from one state, without use of later samples."""
 
 from typing import Any, NamedTuple
 
@@ -14,9 +14,9 @@ class Stretches(NamedTuple):
     """Stretches of runs over which a field runs freely, padded with intervals of no length.
 
     Attributes:
-        starts: the states at their beginnings, shape (S, n).
-        spans: the lengths of their intervals, shape (S, L).
-        inputs: at both ends of each interval, shape (S, L, 2, m).
+        starts: the states at the starts of the stretches, shape (S, n).
+        spans: the lengths of the intervals, shape (S, L).
+        inputs: the inputs at both ends of each interval, shape (S, L, 2, m).
         measured: the samples at the ends of the intervals, NaN where there are none, (S, L, n).
     """
 
@@ -26,7 +26,9 @@ class Stretches(NamedTuple):
     measured: Float[np.ndarray, "S L n"]
 
 
-def of_swings(runs: list, paths: list[np.ndarray], swing: float, count: float = 2.0) -> Stretches:
+def stretches_of_swings(
+    runs: list, paths: list[np.ndarray], swing: float, count: float = 2.0
+) -> Stretches:
     """Stretches over `count` swings, of 4 to 64 intervals, that cover the condensed runs."""
     spacing = np.median(np.concatenate([np.diff(run.times) for run in runs]))
     return stretches(runs, paths, int(np.clip(count * swing / spacing, 4, 64)))
@@ -60,7 +62,7 @@ def padded(parts: list[tuple]) -> Stretches:
 def predictions(
     field: Any, part: Stretches, scale: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "S L n"]:
-    """The states that the field predicts at the ends of the intervals; inf where it is lost.
+    """The states that the field predicts at the ends of the intervals; inf if they diverge.
 
     Args:
         field: a function of the points (x, u).
@@ -79,7 +81,8 @@ def error_over_constant(field: Any, part: Stretches, scale: Float[np.ndarray, " 
     """The RMS error of free runs over that of a constant, in standard deviations.
 
     The constant is the state at the start of the stretch or the mean of its samples, whichever is
-    nearer. Errors count up to three deviations, since one path that is lost says no more.
+    nearer. Each error counts as at most three standard deviations, so that one path that diverges
+    does not decide.
     """
     return relative_error(predictions(field, part, scale), part, scale)
 
@@ -89,13 +92,13 @@ def relative_error(
 ) -> float:
     """The RMS error of predicted states over that of a constant, as `error_over_constant`."""
     measured = part.measured / scale
-    seen = np.isfinite(measured)
-    if not seen.any():
+    finite = np.isfinite(measured)
+    if not finite.any():
         return 0.0
     predicted = predicted / scale
-    error = np.clip(np.where(seen, predicted - measured, 0.0), -3, 3)
-    count = np.maximum(seen.sum(axis=1, keepdims=True), 1)
-    mean = np.where(seen, measured, 0.0).sum(axis=1, keepdims=True) / count
+    error = np.clip(np.where(finite, predicted - measured, 0.0), -3, 3)
+    count = np.maximum(finite.sum(axis=1, keepdims=True), 1)
+    mean = np.where(finite, measured, 0.0).sum(axis=1, keepdims=True) / count
     constants = (part.starts[:, None] / scale, mean)
-    least = min(float((np.where(seen, measured - c, 0.0) ** 2).sum()) for c in constants)
+    least = min(float((np.where(finite, measured - c, 0.0) ** 2).sum()) for c in constants)
     return float(np.sqrt((error**2).sum() / max(least, np.finfo(float).tiny)))

@@ -20,7 +20,7 @@ from hamkernel._trajectories.flow import (
     steps_for,
     stiffness,
 )
-from hamkernel._trajectories.free_run import Stretches, error_over_constant, of_swings
+from hamkernel._trajectories.free_run import Stretches, error_over_constant, stretches_of_swings
 from hamkernel._trajectories.kalman import (
     SmoothedPath,
     innovations,
@@ -352,7 +352,7 @@ _landmark_whitening = compiled_by_size(landmark_whitening)
 
 def _stiffness(field: Expansion, data: Preprocessed, paths: list[np.ndarray]) -> float:
     """The stiffness of the field at 256 points along the paths."""
-    X = np.concatenate([run.joined(path) for run, path in zip(data.runs, paths, strict=True)])
+    X = np.concatenate([run.points(path) for run, path in zip(data.runs, paths, strict=True)])
     return stiffness(field, X[np.linspace(0, len(X) - 1, 256).round().astype(int)], data.scale)
 
 
@@ -454,7 +454,9 @@ def _split(data: Preprocessed, paths: list[np.ndarray]) -> tuple[Preprocessed, S
         for run, cut, path in zip(data.runs, cuts, paths, strict=True)
         if cut < len(run.times)
     ]
-    rest = of_swings([run for run, _ in last], [path for _, path in last], time_of_swing(data))
+    rest = stretches_of_swings(
+        [run for run, _ in last], [path for _, path in last], time_of_swing(data)
+    )
     return data._replace(runs=runs), rest
 
 

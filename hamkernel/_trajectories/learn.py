@@ -49,13 +49,19 @@ from hamkernel._trajectories.learned import Learned, empty, misfits
 from hamkernel._trajectories.model import Model, with_amplitude
 from hamkernel._trajectories.preprocessing import (
     Preprocessed,
-    decided,
+    decide,
     landmarks,
     preprocess,
-    sampled,
+    sample_points,
     seconds_of_iteration,
 )
-from hamkernel._trajectories.quality import by_run, chi_squared, disturbances, quality, with_causes
+from hamkernel._trajectories.quality import (
+    chi_squared,
+    disturbances,
+    join_runs,
+    quality,
+    with_causes,
+)
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.search import (
     LEAST_NOISE,
@@ -187,14 +193,14 @@ def learn(
     bar = _bar(progress, total=2 + max_steps)
     data = preprocess(runs, drift)
     bar.update()
-    K = completed(K, jnp.asarray(sampled(data)[0]), runs.dimension)
+    K = completed(K, jnp.asarray(sample_points(data)[0]), runs.dimension)
     most_landmarks = None if solver is None else solver.max_points
     start = _start(K, drift, data, sigma, landmarks(data, most_landmarks))
     seconds = seconds_of_iteration(data, start.landmarks[1])
     bar.set_description(f"learning, {seconds:.0f} s an iteration")
     task, now = start.begin(data)
     if not runs.is_decided:
-        runs, data = decided(runs, data, lambda d: initial_loss(task._replace(data=d), now.model))
+        runs, data = decide(runs, data, lambda d: initial_loss(task._replace(data=d), now.model))
         task, now = start.begin(data)
     q = start.floor if process is None else np.maximum(process, start.floor)
     end = first = iterate(*fix_process_noise(task, now, q), max_steps, bar)
@@ -274,7 +280,7 @@ class _Start(NamedTuple):
 
 def _start(K, mean, data: Preprocessed, sigma: np.ndarray | None, landmarks) -> _Start:
     """The first guesses from the smoothed runs; sigma is the noise if the caller gave one."""
-    X, Y = sampled(data)
+    X, Y = sample_points(data)
     if mean is not None:
         Y = Y - np.asarray(jax.vmap(mean)(jnp.asarray(X)))
     S, first = landmarks[:2]
@@ -355,7 +361,7 @@ def _result(
     fit = fit._replace(noise=noise, is_noise_known=is_noise_given)
     fit = fit._replace(process=process if given_process is None else None)
     fit = with_causes(fit, runs, end) if fit.kept.any() else fit
-    table = diagnostics(fit, field.kernel, sampled(data)[0])
+    table = diagnostics(fit, field.kernel, sample_points(data)[0])
     if table.warning:
         require.warn(table.warning)
     observations = as_observations(now.rows, now.model, task.mean, task.start_deviation)
@@ -373,7 +379,7 @@ def _result(
         pushed=fit.pushed,
         misfit=jnp.asarray(misfit),
         chi_squared=jnp.asarray(fit.chi_squared),
-        innovations=tuple(map(jnp.asarray, by_run(np.where(counts > 0, z, np.nan), end, np.nan))),
+        innovations=tuple(map(jnp.asarray, join_runs(np.where(counts > 0, z, np.nan), end))),
         whiteness=jnp.asarray(fit.white.probability),
         widening=jnp.asarray(fit.white.widening),
         disturbance=disturbances(end, times, bool(process.any())),
@@ -396,7 +402,7 @@ def _fitted_states(end: End, times: list[np.ndarray]) -> list[Float[np.ndarray, 
     out = []
     for t, run, path in zip(times, data.runs, now.paths, strict=True):
         if not np.array_equal(run.times, t - t[0]):
-            X, N = run.joined(path), len(path)
+            X, N = run.points(path), len(path)
             X = np.pad(X, ((0, power_of_two(N) - N), (0, 0)), "edge")  # one program for many logs
             slope = np.asarray(field_values(now.field, jnp.asarray(X)))[:N]
             path = interpolated(t - t[0], run.times, path, slope)

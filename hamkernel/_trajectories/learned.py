@@ -21,7 +21,7 @@ from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._trajectories.evidence import Evidence, EvidenceOfRows
 from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.score import Score, scored
+from hamkernel._trajectories.score import Score, compute_score
 from hamkernel._trajectories.table import Diagnostics
 
 
@@ -62,46 +62,46 @@ class Learned(Shown, eqx.Module):
             noise; the amplitude of the field is in `kernel`.
         noise: the standard deviation of the sensor noise of each coordinate, shape (n,); NaN where
             nothing was measured.
-        process_noise: the intensity q of w in ẋ = f + w, of each coordinate, in units of the states
-            over √time, shape (n,); 0 where the structure is the whole truth.
+        process_noise: the intensity q of the process noise w in ẋ = f + w, for each coordinate, in
+            units of the states over √time, shape (n,); 0 if there is none.
         states: the fitted path of each run at its times, missing coordinates filled in, (T, n).
-        kept: for each run the share of its samples that the field is learned from, shape (R,).
-        dropped: the parts of the runs that the field is not learned from, each as (run, first
-            sample, sample after the last).
-        pushed: the parts in which something that is neither in the log nor in the field pushed the
-            system, as those that were dropped. The field is hardly learned from them.
+        kept: the share of the samples of each run from which the field is learned, shape (R,).
+        dropped: the parts of the runs from which the field is not learned, each as (run, first
+            sample, last sample + 1).
+        pushed: the parts of the runs, in the same form, in which something pushed the system that
+            is neither in the log nor in the field. These parts have little weight.
         misfit: for each run and coordinate the root mean square of (measured − fitted)/σ, shape
-            (R, n); about one where the structure explains the run, NaN where nothing was measured.
-        chi_squared: the sum of squares of all of them over the degrees of freedom that the fit
-            leaves, shape (). It carries no information if σ was estimated from the same residuals.
-            Where process noise was found it is that of the field without; where it was given, that
-            of the innovations.
-        innovations: each sample less its prediction from all samples before it, in standard
-            deviations, for each run, (T, n); NaN where nothing was measured or it was dropped. If
-            model and noise are right they are independent and N(0, 1). Fast logs, whose samples
-            are averaged, have one for each mean.
+            (R, n). It is about 1 if the structure explains the run, NaN where nothing was measured.
+        chi_squared: the sum of all squares of (measured − fitted)/σ over the degrees of freedom
+            that the fit leaves, shape (). It carries no information if σ was estimated from the
+            same residuals. If process noise was found, `chi_squared` belongs to the field without
+            process noise; if it was given, to the innovations.
+        innovations: the error of predicting each sample from all earlier samples, in standard
+            deviations, for each run, (T, n); NaN where nothing was measured or the sample was
+            dropped. If model and noise are right, innovations are independent and N(0, 1). In fast
+            logs `learn` averages samples, and each mean has one innovation.
         whiteness: the probability that independent innovations are as correlated as these, by the
             test of Ljung and Box over ten lags, shape (). Below .05 the structure, or the timing
-            of inputs, leaves residuals that persist from sample to sample; this counts against
-            `converged` where it makes bands more than 1.2 times too narrow. Coordinates whose noise
-            is a millionth of the states or less are exact, and not judged.
-        widening: the factor on the variance of the noise in `posterior` where innovations are
-            correlated, the peak of their spectrum over ten lags, shape (); 1 where they are white.
-        disturbance: the mean of w from each sample to the next as far as the samples know it, for
-            each run, (T, n); 0 without process noise.
-        history: one entry an iteration.
+            of inputs, leaves residuals that persist from sample to sample. `converged` is then
+            False if bands are more than 1.2 times too narrow. Coordinates with a noise of less than
+            a millionth of the states are taken for exact and not judged.
+        widening: the factor on the variance of the noise in `posterior`, shape (): the peak of the
+            spectrum of the innovations over ten lags, 1 if they are white.
+        disturbance: the mean of w from each sample to the next, given all samples, for each run,
+            (T, n); 0 without process noise.
+        history: the iterations, one entry for each.
         converged: whether the field may be used: no row of `diagnostics` that decides falls short.
-        diagnostics: a table with one row for each question, such as whether the iterations settled,
-            whether the noise explains most of the motion, whether residuals are white, and whether
-            friction is missing; `.failing` has the names of the rows that fall short.
+        diagnostics: a table with one row for each question: do the iterations settle, does noise
+            explain most of the motion, are residuals white, is friction missing, and others;
+            `.failing` has the names of the rows that fall short.
         runs: the runs that were given.
-        observations: what the runs say of the field near the fitted paths, starts projected out:
-            linear functionals of it, with independent noise of variance one. `hk.fit(kernel,
-            observations, regularization=regularization)` is the exact fit of which `field`
-            is the approximation on landmarks. None where there were too few samples.
+        observations: linear functionals of the field with independent noise of variance one, which
+            contain all information of the runs near the fitted paths; unknown starts are projected
+            out. `hk.fit(kernel, observations, regularization=regularization)` is the exact fit, and
+            `field` its approximation on landmarks. None if there were too few samples.
         mean: the known part of the field, if one was given.
         evidence: the rows along the paths with their likeliest model; see `log_evidence`, `gain`.
-        again: `learn` with what was given besides the runs.
+        again: `learn` with its other arguments, a function of the runs.
     """
 
     field: Any
@@ -152,15 +152,15 @@ class Learned(Shown, eqx.Module):
     def posterior(self) -> Posterior:
         """The Gaussian process of the field given the runs: bands, samples, updates.
 
-        As `hk.condition` on the observations, exact up to 3000 rows and on the landmarks of the
-        field above; starts are integrated out, hyperparameters plugged in. Where innovations are
-        correlated the noise is larger by `widening`, and its mean somewhat smoother than `field`.
-        It is made anew with every call: keep it.
+        The posterior is `hk.condition` on the observations: exact up to 3000 rows, and on the
+        landmarks of the field above. Starts are integrated out, hyperparameters plugged in. If
+        innovations are correlated, the variance of the noise is multiplied by `widening`, and the
+        mean is somewhat smoother than `field`. Each call makes a new posterior: keep it.
 
-        Bands are those of a field of `kernel`. What no such field can be is not in them: a force
-        that repeats within less than a lengthscale, or a gain that a flexible part changes with the
-        frequency. Where you know of one, condition a kernel that has it on `observations`, at the
-        cost of a solve: `hk.condition(more, learned.observations,
+        Bands assume that the true field is a field of `kernel`. They do not include forces that
+        no such field has, such as a force that repeats within less than a lengthscale, or a gain
+        that a flexible part changes with the frequency. If you know of one, condition a kernel that
+        has it on `observations`, at the cost of a solve: `hk.condition(more, learned.observations,
         regularization=learned.regularization * learned.widening, mean=learned.mean)`.
 
         Raises:
@@ -172,9 +172,9 @@ class Learned(Shown, eqx.Module):
         return self._posterior(on_landmarks=rows > 3000)
 
     def _posterior(self, on_landmarks: bool) -> Posterior:
-        whole = getattr(self.field, "whole", self.field)  # of the points (x, u) with inputs
-        # A field in the features of laws has no points, and its posterior few unknowns.
-        points = getattr(whole, "points", None)
+        # With inputs, the field as a function of the points (x, u). A field in the features of laws
+        # has no points, and its posterior few unknowns.
+        points = getattr(getattr(self.field, "whole", self.field), "points", None)
         solver = None if points is None or not on_landmarks else Nystrom(points=points)
         assert self.observations is not None
         return condition(
@@ -279,7 +279,7 @@ class Learned(Shown, eqx.Module):
                 )
             cuts = [T - T // 5 if T >= 10 else T for T in lengths]
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # they are those of learning from all samples
+                warnings.simplefilter("ignore")  # learning from all samples gave the same warnings
                 rest = self.again(self.runs.part([slice(0, cut) for cut in cuts]))
             last = self.runs.part([slice(cut, None) for cut in cuts])
             return rest.score(last, first=first, draws=draws)
@@ -306,7 +306,7 @@ class Learned(Shown, eqx.Module):
                 # Whether the landmarks are enough is a row of `diagnostics`.
                 warnings.simplefilter("ignore")
                 posterior = self._posterior(on_landmarks=True)
-        return scored(self, runs, first, posterior, draws)
+        return compute_score(self, runs, first, posterior, draws)
 
     def plot(self, run: int = 0, held_out: Runs | None = None) -> Any:
         """One figure: fit, residuals in units of the noise, law with its band, free run.
@@ -332,7 +332,7 @@ class Learned(Shown, eqx.Module):
 
 
 def learned_from(learned: Any) -> str:
-    """The first line of a result: what was learned from, and whether to use it."""
+    """The first line of a result: the size of the data, and whether to use the field."""
     count, samples = len(learned.states), sum(len(x) for x in learned.states)
     of = f"{type(learned).__name__} from {count} run{'s' * (count != 1)}, {samples} samples"
     return f"{of}: {'usable' if learned.converged else 'do not use this field'}"
@@ -343,14 +343,12 @@ def misfits(runs: Runs, states: list[np.ndarray], noise: np.ndarray) -> np.ndarr
     out = []
     for x, fit in zip(runs.on_host()[1], states, strict=True):
         squares = ((x - fit) / noise[None]) ** 2
-        seen = np.isfinite(squares)
-        total = np.where(seen, squares, 0.0).sum(axis=0)
-        out.append(
-            np.where(seen.any(axis=0), np.sqrt(total / np.maximum(seen.sum(axis=0), 1)), np.nan)
-        )
+        measured = np.isfinite(squares)
+        total, count = np.where(measured, squares, 0.0).sum(axis=0), measured.sum(axis=0)
+        out.append(np.where(count > 0, np.sqrt(total / np.maximum(count, 1)), np.nan))
     return np.array(out)
 
 
 def empty(n: int) -> Float[Array, "0 n"]:
-    """Residuals of velocities, of which there are none."""
+    """No residuals: an empty array."""
     return jnp.zeros((0, n))

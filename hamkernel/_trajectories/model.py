@@ -1,4 +1,4 @@
-"""A kernel with both kinds of noise, and what rows of it are in the span of landmarks."""
+"""A kernel with both kinds of noise, and its rows in the span of landmarks."""
 
 import functools
 from typing import NamedTuple
@@ -34,7 +34,7 @@ def landmark_whitening(K: AbstractMatrixKernel, S: Float[Array, "m d"]) -> Float
     """T = L⁻ᵀ with L Lᵀ = K(S, S), q = m n."""
     G = forward_differentiated((K, S), KernelRows(S), rowwise=True)
     G = G.reshape(-1, G.shape[-1])
-    # For each component by itself, since units differ; some are zero, such as q̇ for a U(q).
+    # Each component has its own size, since units differ. Some are zero, such as q̇ for a U(q).
     d = jnp.diagonal(G)
     # A hundred times the rounding bounds how finely landmarks resolve, and biases nothing.
     rounding = 100 * jnp.finfo(G.dtype).eps * len(G) * jnp.where(d > 0, d, d.mean())
@@ -43,7 +43,7 @@ def landmark_whitening(K: AbstractMatrixKernel, S: Float[Array, "m d"]) -> Float
 
 
 def with_amplitude(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
-    """K, every structure and input matrix in it scaled; a likelihood needs amplitudes.
+    """K with an amplitude on every structure and input matrix, which a likelihood needs.
 
     `Symplectic(Gaussian(2.0))` becomes `Symplectic(1.0 * Gaussian(2.0))`.
     """
@@ -51,12 +51,12 @@ def with_amplitude(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
     def is_structure(node: object) -> bool:
         return isinstance(node, AbstractStructure | InputMatrix)
 
-    def scaled(node):
+    def scale(node):
         if not is_structure(node) or node.kernel.has_amplitude:
             return node
         return eqx.tree_at(lambda node: node.kernel, node, Scaled(node.kernel, 1.0))
 
-    return jax.tree.map(scaled, K, is_leaf=is_structure)
+    return jax.tree.map(scale, K, is_leaf=is_structure)
 
 
 class Model(NamedTuple):
@@ -65,7 +65,7 @@ class Model(NamedTuple):
     Attributes:
         kernel: the kernel.
         log_noise: log σ of each coordinate.
-        log_process: log q of each coordinate, −inf where the field is the whole truth.
+        log_process: log q of each coordinate, −inf if there is no process noise.
     """
 
     kernel: AbstractMatrixKernel
@@ -91,11 +91,11 @@ class Model(NamedTuple):
 
 
 class WhitenedRows(NamedTuple):
-    """Rows with independent noise of variance one, M̃ and r̃, in which no start is left.
+    """Rows r̃ = M̃ w + noise of variance one, independent, with unknown starts integrated out.
 
     Attributes:
-        M: what w adds to them, shape (D, q).
-        r: their values, shape (D,).
+        M: the matrix M̃, shape (D, q).
+        r: the values r̃, shape (D,).
         constant: the part of −log p that does not depend on M̃.
     """
 

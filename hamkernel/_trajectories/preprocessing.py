@@ -1,9 +1,9 @@
-"""The runs before the field is learned: condensed, smoothed, completed.
+"""Preprocessing of runs: they are condensed, smoothed and completed before a field is learned.
 
 Samples that are much closer in time than the motion needs are averaged in blocks. A block becomes
-one sample in its middle: the smoothed path there plus the mean of the block's residuals, whose
-noise is σ/√count. The bias of that sample is of second order in the error of the smoothed path. The
-scatter of the block about its mean is kept, since it determines σ.
+one sample in its middle: the smoothed path there plus the mean of the residuals in the block. Its
+noise is σ/√count, and its bias is of second order in the error of the smoothed path. We keep the
+scatter of the block about its mean, since the scatter determines σ.
 """
 
 import functools
@@ -18,14 +18,13 @@ from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled_by_size
 from hamkernel._trajectories.flow import NODES, with_tangent
-from hamkernel._trajectories.runs import Between, Runs, at_nodes, at_samples
+from hamkernel._trajectories.runs import Between, Runs, inputs_at_nodes, inputs_at_samples
 from hamkernel._trajectories.smoothing import Coordinate, interpolated, processes, smoothed
 
-# Rows times columns², 1 to 2 s for each solve, and up to ten where half of what is left is said to
-# be that of landmarks. 20 runs of 50 samples with n = 8 have 128 landmarks; with 256 a solve takes
-# 6.5 s, and the field's error would be .0105 for .0145; with 512 and 768 it is .0105 too. 400 runs
-# of a double pendulum have 640, and rollouts with an error of .0056; with 160 they have .033
-# (`tests/benchmarks/capacity.py`).
+# Rows times columns² of a solve: 1e10 take 1 to 2 s. If the residuals ask for more landmarks, a
+# solve may take 5e10, up to 10 s (`tests/benchmarks/capacity.py`):
+#     20 runs of 50 samples, n = 8:  128 landmarks, field error .0145; 256 (6.5 s), 512, 768: .0105
+#     400 runs, double pendulum:     160 landmarks, rollout error .033; 640: .0056
 _WORK, _MOST_WORK = 1e10, 5e10
 _POINTS = 1024  # from which boxes are taken, and landmarks if there are not more intervals
 
@@ -34,14 +33,14 @@ class PreprocessedRun(NamedTuple):
     """One run, condensed.
 
     Attributes:
-        times: since the first sample, shape (T,).
-        states: NaN where nothing was measured, shape (T, n).
-        counts: of the samples that an entry is the mean of, shape (T, n).
-        scatter: the sum of their squared distances from it, shape (T, n).
-        path: smoothed states at the times, no NaN, shape (T, n).
-        nodes: the same at the Gauss nodes between them, shape (T − 1, 3, n).
-        slopes: their velocities there.
-        inputs: at both ends of each interval, shape (T − 1, 2, m); m is 0 where there are none.
+        times: the times since the first sample, shape (T,).
+        states: means of samples, NaN where nothing was measured, shape (T, n).
+        counts: the number of samples in each mean, shape (T, n).
+        scatter: the sum of the squared distances of these samples from their mean, shape (T, n).
+        path: smoothed states at the times, without NaN, shape (T, n).
+        nodes: smoothed states at the Gauss nodes of each interval, shape (T − 1, 3, n).
+        slopes: smoothed velocities at the nodes, shape (T − 1, 3, n).
+        inputs: the inputs at both ends of each interval, shape (T − 1, 2, m); m = 0 without inputs.
     """
 
     times: np.ndarray
@@ -63,13 +62,13 @@ class PreprocessedRun(NamedTuple):
         at, between = slice(first, stop), slice(first, stop - 1)
         return PreprocessedRun(
             self.times[at] - self.times[first],
-            *(each[at] for each in (self.states, self.counts, self.scatter, self.path)),
-            *(each[between] for each in (self.nodes, self.slopes, self.inputs)),
+            *(array[at] for array in (self.states, self.counts, self.scatter, self.path)),
+            *(array[between] for array in (self.nodes, self.slopes, self.inputs)),
         )
 
-    def joined(self, path: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T d"]:
-        """Points (x, u) at the samples, for a path there."""
-        return np.concatenate([path, at_samples(self.inputs)], axis=1)
+    def points(self, path: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T d"]:
+        """Points (x, u) at the samples of a path."""
+        return np.concatenate([path, inputs_at_samples(self.inputs)], axis=1)
 
 
 class Preprocessed(NamedTuple):
@@ -77,7 +76,7 @@ class Preprocessed(NamedTuple):
 
     Attributes:
         runs: the condensed runs.
-        noise: that of each coordinate as smoothing finds it, NaN where never measured.
+        noise: the noise of each coordinate found by smoothing, NaN where nothing was measured.
         scale: the standard deviation of each coordinate, shape (n,).
         usable: which runs look like the others, shape (R,).
     """
@@ -89,51 +88,51 @@ class Preprocessed(NamedTuple):
 
 
 def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocessed:
-    """Condense, smooth and complete the runs; `mean` fills in what was never measured.
+    """Condense, smooth and complete the runs; `mean` fills in coordinates that no run measured.
 
-    With inputs it is a function of the points (x, u).
+    If there are inputs, `mean` is a function of the points (x, u).
     """
     times, states = runs.on_host()
     times, states = [t - t[0] for t in times], [_thin_rests(x) for x in states]
-    found, usable = _robust_processes(times, states)
+    fitted_processes, usable = _robust_processes(times, states)
     counts = [np.isfinite(x).astype(float) for x in states]
     scatter = [np.zeros_like(x) for x in states]
-    lengths = [c.lengthscale for c in found if np.isfinite(c.process.log_amplitude)]
+    lengths = [c.lengthscale for c in fitted_processes if np.isfinite(c.process.log_amplitude)]
     # A pendulum of frequency ω has a lengthscale near 2.7/ω, so a tenth of it is 23 samples a
     # swing; three Gauss nodes in such an interval are exact to 1e-8, and samples at 5 Hz of a
     # pendulum of period 2.6 are left as they are.
     block = 0.1 * min(lengths, default=np.inf)
     if any(2 * np.median(np.diff(t)) < block for t in times):
-        paths = smoothed(found, times, states)
+        paths = smoothed(fitted_processes, times, states)
         shortest = _shortest_block(sum(t[-1] for t in times), runs.dimension, runs.input_count)
-        averaged = 0.5 * averaging_time(found, times, paths.deviation)
+        averaged = 0.5 * averaging_time(fitted_processes, times, paths.deviation)
         block = min(block, max(averaged, shortest))
-        averages = [
-            condensed(t, x, paths.value[r, : len(t)], paths.slope[r, : len(t)], block)
+        condensed = [
+            condense(t, x, paths.value[r, : len(t)], paths.slope[r, : len(t)], block)
             for r, (t, x) in enumerate(zip(times, states, strict=True))
         ]
-        times, states, counts, scatter = (list(each) for each in zip(*averages, strict=True))
+        times, states, counts, scatter = (list(column) for column in zip(*condensed, strict=True))
     shortest = min(lengths, default=np.inf)
-    refined = [_refined(*run, shortest) for run in zip(times, states, counts, scatter, strict=True)]
-    times, states, counts, scatter = (list(each) for each in zip(*refined, strict=True))
+    refined = [_refine(*run, shortest) for run in zip(times, states, counts, scatter, strict=True)]
+    times, states, counts, scatter = (list(column) for column in zip(*refined, strict=True))
     inputs = [runs.applied(r, t + float(np.asarray(runs.times[r])[0])) for r, t in enumerate(times)]
-    path_runs = _with_paths(found, times, states, counts, scatter, inputs)
-    if not all(c.seen for c in found) or mean is not None:
-        path_runs = [_completed(run, mean) for run in path_runs]
-    noise = np.array([c.noise if c.seen else np.nan for c in found])
+    path_runs = _add_paths(fitted_processes, times, states, counts, scatter, inputs)
+    if not all(c.seen for c in fitted_processes) or mean is not None:
+        path_runs = [_complete(run, mean) for run in path_runs]
+    noise = np.array([c.noise if c.seen else np.nan for c in fitted_processes])
     good = [run.path for run, use in zip(path_runs, usable, strict=True) if use]
     scale = np.concatenate(good).std(axis=0)
     return Preprocessed(path_runs, noise, np.where(scale > 0, scale, 1.0), usable)
 
 
-_REST = 10  # equal states, from which a system is at rest
+_REST = 10  # more equal states than this are a rest
 
 
 def _thin_rests(x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T n"]:
-    """The states of a run, NaN inside of a stretch of equal ones.
+    """The states of a run, with NaN inside each stretch of equal states.
 
-    At rest a quantised sensor repeats one error, which is one measurement of the noise and not one
-    for each sample: with one run in four at rest σ was found as √(3/4) of what it is.
+    At rest a quantised sensor repeats one error. Such a stretch measures the noise once, and not
+    once a sample: with one run in four at rest, σ was estimated as √(3/4) of its true value.
     """
     same = (np.diff(x, axis=0) == 0) | np.isnan(x).all(axis=0)
     ends = np.flatnonzero(np.concatenate([[True], ~same.all(axis=1), [True]]))
@@ -144,37 +143,47 @@ def _thin_rests(x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T n"]:
     return kept
 
 
-def averaging_time(found: list[Coordinate], times, deviation: Float[np.ndarray, "R T n"]) -> float:
-    """The time of the σ²/Var x(t) samples that smoothing averages, the least of all coordinates.
+def averaging_time(
+    coordinates: list[Coordinate], times, deviation: Float[np.ndarray, "R T n"]
+) -> float:
+    """The averaging time of smoothing: the time of σ²/Var x(t) samples, least over coordinates.
 
-    In a longer block the path bends with the noise, and the block's sample is not as exact as
-    σ/√count says. On nine logs at 50 Hz of a driven pendulum the squares of the errors were 1.88,
-    1.20, 1.07 and 1.00 times that for blocks of 1.6, 1.1, 0.8 and 0.5 of this time, and with the
-    longest 10 of 20 clean logs were said to have process noise, or did not converge, for one.
+    In a longer block the smoothed path follows the noise, and the mean of the block is less exact
+    than σ/√count. We measured the ratio of the squared error to σ²/count on nine logs of a driven
+    pendulum at 50 Hz:
+
+        block / averaging time   1.6   1.1   0.8   0.5
+        ratio                    1.88  1.20  1.07  1.00
+
+    With the longest blocks, 10 of 20 clean logs instead of one seemed to have process noise or did
+    not converge.
 
     Args:
-        found: the processes of the coordinates.
-        times: those of each run.
+        coordinates: the processes of the coordinates.
+        times: the times of each run.
         deviation: √Var x(t) of each coordinate at the times of each run.
     """
     spacing = np.median(np.concatenate([np.diff(t) for t in times]))
     there = np.concatenate([deviation[r, : len(t)] for r, t in enumerate(times)])
     counts = [
         (c.noise / max(float(np.median(there[:, i])), np.finfo(float).tiny)) ** 2
-        for i, c in enumerate(found)
+        for i, c in enumerate(coordinates)
         if c.seen
     ]
     return float(spacing * min(counts, default=np.inf))
 
 
 def _shortest_block(duration: float, n: int, inputs: int) -> float:
-    """The shortest block whose rows can be afforded: without noise smoothing averages nothing."""
+    """The shortest block with an affordable number of rows.
+
+    Data without noise need this bound, since their averaging time is zero.
+    """
     columns = n * first_landmarks(n + inputs)
     return duration * n * columns**2 / _WORK
 
 
 def with_inputs(data: Preprocessed, runs: Runs) -> Preprocessed:
-    """The same runs with the inputs of `runs`, which may go on differently between samples."""
+    """The same runs with the inputs of `runs`, whose `between` or `delay` may differ."""
     return data._replace(
         runs=[
             run._replace(inputs=runs.applied(r, run.times + float(np.asarray(runs.times[r])[0])))
@@ -183,10 +192,10 @@ def with_inputs(data: Preprocessed, runs: Runs) -> Preprocessed:
     )
 
 
-def decided(
+def decide(
     runs: Runs, data: Preprocessed, loss: Callable[[Preprocessed], float]
 ) -> tuple[Runs, Preprocessed]:
-    """The likeliest way in which inputs go on between samples, and their likeliest delay.
+    """The runs with the likeliest `between` and `delay` of their inputs.
 
     Args:
         runs: runs with between="auto", delay="fit", or both.
@@ -194,64 +203,65 @@ def decided(
         loss: −log p of preprocessed runs.
     """
     kinds = get_args(Between) if runs.between == "auto" else (runs.between,)
-    found = []
+    candidates = []
 
     def judge(between, delay: float) -> float:
         chosen = runs.going_on(between, delay)
         there = with_inputs(data, chosen)
-        found.append((loss(there), chosen, there))
-        return found[-1][0]
+        candidates.append((loss(there), chosen, there))
+        return candidates[-1][0]
 
     for between in kinds:
         if runs.delay == "fit":
             _least(functools.partial(judge, between), _spacing(runs))
         else:
             judge(between, runs.delay)
-    _, chosen, there = min(found, key=lambda each: each[0])
+    _, chosen, there = min(candidates, key=lambda candidate: candidate[0])
     return chosen, there
 
 
 def _spacing(runs: Runs) -> float:
     """The median spacing of the inputs, or of the states where these are further apart."""
     assert runs.input_times is not None
-    both = [*runs.times], [*runs.input_times]
-    return max(float(np.median(np.concatenate([np.diff(t) for t in each]))) for each in both)
+    clocks = [*runs.times], [*runs.input_times]
+    return max(float(np.median(np.concatenate([np.diff(t) for t in ts]))) for ts in clocks)
 
 
 def _least(loss: Callable[[float], float], spacing: float) -> None:
     """Evaluate the loss near its minimum: downhill in whole spacings from 0, then by parabolas.
 
-    −log p is nearly quadratic in the delay, so that a parabola through three points finds its
-    minimum; a second and a third one through closer points settle it.
+    −log p is nearly quadratic in the delay, so a parabola through three points finds its minimum. A
+    second and a third parabola through closer points refine the minimum.
     """
-    known = {d: loss(d) for d in (-spacing, 0.0, spacing)}
-    while (best := min(known, key=known.__getitem__)) in (min(known), max(known)):
+    losses = {d: loss(d) for d in (-spacing, 0.0, spacing)}
+    while (best := min(losses, key=losses.__getitem__)) in (min(losses), max(losses)):
         if abs(best) > 20 * spacing:  # a delay of a whole swing is no delay
             return
-        known[best + np.sign(best) * spacing] = loss(best + np.sign(best) * spacing)
+        losses[best + np.sign(best) * spacing] = loss(best + np.sign(best) * spacing)
     for reach in (spacing, spacing / 4, spacing / 16):
-        best = min(known, key=known.__getitem__)
-        left, right = (known.setdefault(d, loss(d)) for d in (best - reach, best + reach))
-        bend = left - 2 * known[best] + right
+        best = min(losses, key=losses.__getitem__)
+        left, right = (losses.setdefault(d, loss(d)) for d in (best - reach, best + reach))
+        bend = left - 2 * losses[best] + right
         if not bend > 0:
             return
         vertex = best + reach * np.clip((left - right) / (2 * bend), -1, 1)
-        known[vertex] = loss(vertex)
+        losses[vertex] = loss(vertex)
 
 
 def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:
-    """The processes, without runs that are five times as far from them as the median run.
+    """The processes of the coordinates, and which runs resemble the others.
 
-    In standard deviations of the states; up to a thousandth of those no run is left out, since of
-    exact runs the smoother leaves that, most of it in the fastest one.
+    The distance of a run from its smoothed path is in standard deviations of the states. A run is
+    left out if its distance is more than five times the median and more than 1e-3: the smoother is
+    only that exact on runs without noise, and least so on the fastest run.
     """
-    found = processes(times, states)
+    coordinates = processes(times, states)
     if len(times) < 3:
-        return found, np.ones(len(times), bool)
-    paths = smoothed(found, times, states)
+        return coordinates, np.ones(len(times), bool)
+    paths = smoothed(coordinates, times, states)
     every = np.concatenate(states)
-    seen = np.isfinite(every).any(axis=0)
-    spread = np.where(seen, np.nanstd(np.where(seen, every, 0.0), axis=0), 1.0)
+    measured = np.isfinite(every).any(axis=0)
+    spread = np.where(measured, np.nanstd(np.where(measured, every, 0.0), axis=0), 1.0)
     unit = np.where(spread > 0, spread, 1.0)
     far = np.array(
         [
@@ -261,59 +271,61 @@ def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:
     )
     usable = ~(far > max(5 * np.nanmedian(far), 1e-3))
     if usable.all():
-        return found, usable
+        return coordinates, usable
     chosen = np.flatnonzero(usable)
     return processes([times[r] for r in chosen], [states[r] for r in chosen]), usable
 
 
-def condensed(t, x, path, slope, block: float):
-    """Times, means, counts and scatter of blocks of samples that span at most `block`."""
+def condense(t, x, path, slope, block: float):
+    """Times, means, counts and scatter of blocks of samples; a block spans at most `block`."""
     edges = [0]
     for i in range(1, len(t)):
         if t[i] - t[edges[-1]] >= block:
             edges.append(i)
     if len(edges) < 2:
         edges.append(len(t) // 2)
-    seen = np.isfinite(x)
-    residual = np.where(seen, x - path, 0.0)
-    counts = np.add.reduceat(seen.astype(float), edges, axis=0)
+    measured = np.isfinite(x)
+    residual = np.where(measured, x - path, 0.0)
+    counts = np.add.reduceat(measured.astype(float), edges, axis=0)
     sizes = np.diff([*edges, len(t)])
     middle = np.add.reduceat(t, edges) / sizes
     means = np.add.reduceat(residual, edges, axis=0) / np.maximum(counts, 1)
     there = interpolated(middle, t, path, slope)
-    about = np.where(seen, residual - np.repeat(means, sizes, axis=0), 0.0)
+    about = np.where(measured, residual - np.repeat(means, sizes, axis=0), 0.0)
     scatter = np.add.reduceat(about**2, edges, axis=0)
     return middle, np.where(counts > 0, there + means, np.nan), counts, scatter
 
 
-def _refined(t, x, counts, scatter, lengthscale: float):
-    """The run, its long intervals cut at times at which nothing was measured.
+def _refine(t, x, counts, scatter, lengthscale: float):
+    """The run with its long intervals cut by times at which nothing was measured.
 
-    Three Gauss nodes do not see how a field varies along a third of a swing, and Gauss-Newton steps
-    that trust them go uphill. Steps of Runge and Kutta are as many as the longest interval needs.
-    Even runs are left as they are. Of positions on three orbits, 60 uneven times each, up to half a
-    turn apart, process noise was found where there is none, and the field was off by 1.2 % along
-    the motion; with it and the steps of `likelier` by .3 % (`tests/test_learn.py`).
+    Three Gauss nodes do not resolve the field along a third of a swing, and Gauss-Newton steps then
+    increase the loss. The longest interval also sets the number of Runge-Kutta steps for all
+    intervals. Evenly sampled runs are not cut.
+
+    On positions of three orbits, each at 60 uneven times up to half a turn apart, `learn` found
+    process noise that is not there, and the field had an error of 1.2 % along the motion. With cuts
+    and the steps of `likelier` the error is .3 % (`tests/test_learn.py`).
     """
     spans = np.diff(t)
     usual = np.median(spans)
     # One radian: Gauss nodes, of order six, are exact to 1e-4/2⁶ there. Even runs are not cut.
     parts = np.ceil(spans / max(0.35 * lengthscale, 1.5 * usual))
-    parts = np.clip(parts, 1, 16).astype(int)  # of a pause nothing is known in its midst
+    parts = np.clip(parts, 1, 16).astype(int)  # inside a long pause nothing is known
     at = np.append(0, np.cumsum(parts))
     fine = np.interp(np.arange(at[-1] + 1), at, t)
     fine[at] = t
 
-    def placed(a: np.ndarray, empty: float) -> np.ndarray:
+    def place(a: np.ndarray, empty: float) -> np.ndarray:
         out = np.full((len(fine), a.shape[1]), empty)
         out[at] = a
         return out
 
-    return fine, placed(x, np.nan), placed(counts, 0.0), placed(scatter, 0.0)
+    return fine, place(x, np.nan), place(counts, 0.0), place(scatter, 0.0)
 
 
-def _with_paths(found, times, states, counts, scatter, inputs) -> list[PreprocessedRun]:
-    """The smoothed path at the samples and at the nodes between them."""
+def _add_paths(coordinates, times, states, counts, scatter, inputs) -> list[PreprocessedRun]:
+    """The runs with the smoothed path at the samples and at the nodes between them."""
     grids, filled = [], []
     for t, x in zip(times, states, strict=True):
         inside = t[:-1, None] + np.diff(t)[:, None] * NODES[None]
@@ -322,10 +334,10 @@ def _with_paths(found, times, states, counts, scatter, inputs) -> list[Preproces
         wide[::4] = x
         grids.append(grid)
         filled.append(wide)
-    paths = smoothed(found, grids, filled)
+    paths = smoothed(coordinates, grids, filled)
     out = []
-    each = zip(times, states, counts, scatter, inputs, strict=True)
-    for r, (t, x, count, about, ends) in enumerate(each):
+    columns = zip(times, states, counts, scatter, inputs, strict=True)
+    for r, (t, x, count, about, ends) in enumerate(columns):
         size = 4 * len(t) - 3
         value, slope = (a[r, :size] for a in (paths.value, paths.slope))
         nodes, slopes = (a[:-1].reshape(len(t) - 1, 4, -1)[:, 1:] for a in (value, slope))
@@ -333,16 +345,16 @@ def _with_paths(found, times, states, counts, scatter, inputs) -> list[Preproces
     return out
 
 
-def _completed(run: PreprocessedRun, mean: Callable[[Array], Array] | None) -> PreprocessedRun:
-    """The run with its unmeasured coordinates found from how they move the others.
+def _complete(run: PreprocessedRun, mean: Callable[[Array], Array] | None) -> PreprocessedRun:
+    """The run with values for unmeasured coordinates, found from the velocities of the others.
 
-    Given q̇ and a mean with q̇ = p/m, that is p = m q̇; in general Newton's method for the
-    coordinates that explain the slopes.
+    If the mean has q̇ = p/m, then p = m q̇. In general Newton's method finds the coordinates for
+    which the mean equals the measured velocities.
     """
     missing = ~np.isfinite(run.states).any(axis=0)
     if not missing.any():
         return run
-    if mean is None:  # known from other runs; the fit finds where this one started
+    if mean is None:  # other runs measured them, and the fit finds where this run started
         return run._replace(
             path=np.nan_to_num(run.path),
             nodes=np.nan_to_num(run.nodes),
@@ -350,7 +362,7 @@ def _completed(run: PreprocessedRun, mean: Callable[[Array], Array] | None) -> P
         )
     n = run.states.shape[1]
     nodes, slopes = run.nodes.reshape(-1, n), run.slopes.reshape(-1, n)
-    u = np.asarray(at_nodes(run.inputs)).reshape(len(nodes), -1)
+    u = np.asarray(inputs_at_nodes(run.inputs)).reshape(len(nodes), -1)
     there = np.array(_solved_for(mean, np.nan_to_num(nodes), u, np.nan_to_num(slopes), missing))
     span = np.diff(run.times)
     inner = (run.times[:-1, None] + span[:, None] * NODES[None]).ravel()
@@ -365,7 +377,7 @@ def _completed(run: PreprocessedRun, mean: Callable[[Array], Array] | None) -> P
 
 @compiled_by_size
 def _solved_for(mean, X, U, slopes, missing):
-    """X with its missing coordinates such that the mean equals the slopes of the others."""
+    """X with missing coordinates for which the mean equals the slopes of the other coordinates."""
     on = jnp.asarray(missing)
 
     def one(x, u, slope):
@@ -373,8 +385,8 @@ def _solved_for(mean, X, U, slopes, missing):
             f, D = with_tangent(mean, jnp.concatenate([x, u]), len(x))
             D = jnp.where(on[None, :] & ~on[:, None], D, 0.0)
             wrong = jnp.where(on, 0.0, slope - f)
-            # In units in which every coordinate moves the others equally; one that moves none of
-            # them stays where it is.
+            # We scale each coordinate so that all move the others equally. A coordinate that moves
+            # none of the others keeps its value.
             unit = jnp.linalg.norm(D, axis=0)
             unit = jnp.where(unit > 0, unit, jnp.ones_like(unit))
             D = D / unit[None]
@@ -383,20 +395,21 @@ def _solved_for(mean, X, U, slopes, missing):
 
         return jax.lax.scan(step, x, length=5)[0]
 
-    return jax.lax.map(lambda each: one(*each), (X, U, slopes))
+    return jax.lax.map(lambda point: one(*point), (X, U, slopes))
 
 
-def sampled(
+def sample_points(
     data: Preprocessed, count: int = _POINTS
 ) -> tuple[Float[np.ndarray, "N d"], Float[np.ndarray, "N n"]]:
-    """Points, (x, u) with inputs, and velocities of the smoothed runs at some of their nodes.
+    """`count` points x, or (x, u) with inputs, of the smoothed runs, and the velocities there.
 
-    Always as many, if need be some of them twice, so that other lengths do not compile anew.
+    The count does not depend on the length of the runs, so that other lengths do not compile anew;
+    short runs repeat some of their points.
     """
     n = len(data.scale)
     runs = [run for run, use in zip(data.runs, data.usable, strict=True) if use]
-    points = [np.concatenate([run.nodes, at_nodes(run.inputs)], axis=-1) for run in runs]
-    X = np.concatenate([each.reshape(-1, each.shape[-1]) for each in points])
+    points = [np.concatenate([run.nodes, inputs_at_nodes(run.inputs)], axis=-1) for run in runs]
+    X = np.concatenate([array.reshape(-1, array.shape[-1]) for array in points])
     Y = np.concatenate([run.slopes.reshape(-1, n) for run in runs])
     chosen = np.linspace(0, len(X) - 1, count).round().astype(int)
     return X[chosen], Y[chosen]
@@ -404,20 +417,20 @@ def sampled(
 
 def time_of_swing(data: Preprocessed) -> float:
     """2π times the median over coordinates of deviation over speed: the period of a sine."""
-    speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
+    speed = np.sqrt(np.mean(sample_points(data)[1] ** 2, axis=0))
     return float(2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)))
 
 
 def first_landmarks(d: int) -> int:
-    """With how many landmarks learning begins, for points of d coordinates."""
+    """The number of landmarks with which learning begins, for points of d coordinates."""
     # 45 for two coordinates and 80 for four were as good as all on ten runs of 10 s.
     return {1: 24, 2: 48, 3: 64, 4: 80}.get(d, 128)
 
 
 def seconds_of_iteration(data: Preprocessed, count: int) -> float:
-    """The time of an iteration with `count` landmarks: 2 rows · columns² operations.
+    """The seconds of an iteration with `count` landmarks: 2 rows · columns² operations.
 
-    One core of 2025 makes 1e10 of them in a second: 19 billion took 1.6 s.
+    One core of 2025 makes 1e10 operations a second: 19e9 took 1.6 s.
     """
     n = len(data.scale)
     rows = n * sum(len(run.times) for run in data.runs)
@@ -427,33 +440,35 @@ def seconds_of_iteration(data: Preprocessed, count: int) -> float:
 def landmarks(
     data: Preprocessed, count: int | None
 ) -> tuple[Float[np.ndarray, "m d"], int, int, bool]:
-    """Points of the paths, how many of them to begin with, how many are quick, and the cap.
+    """Landmarks: points of the paths, each farthest from the earlier ones in standard deviations.
 
-    The last is whether quick ones are fewer than intervals.
-
-    Each is the one farthest from those before, in standard deviations. They do not depend on
-    hyperparameters, which are not known yet. There are at most as many as intervals: of a field on
-    an interval its samples see the mean.
+    The choice does not depend on hyperparameters, which are not known yet. There are at most as
+    many landmarks as intervals, since the samples at the ends of an interval determine one mean of
+    the field.
 
     Args:
         data: the runs.
-        count: how many there are; if None, as many as are of use.
+        count: the number of landmarks; if None, as many as are useful and affordable.
+
+    Returns:
+        The landmarks, the number to begin with, the number for which a solve is quick, and whether
+        the latter is less than the number of intervals.
     """
     n, used = len(data.scale), zip(data.runs, data.usable, strict=True)
     intervals = max(sum(len(run.times) - 1 for run, use in used if use), 1)
     affordable = (np.array([_WORK, _MOST_WORK]) / (n * intervals)) ** 0.5 // n
-    X, _ = sampled(data, max(_POINTS, min(intervals, 2 * int(affordable[1]))))
+    X, _ = sample_points(data, max(_POINTS, min(intervals, 2 * int(affordable[1]))))
     first = first_landmarks(X.shape[1])
-    # They are doubled: a last step to a few more would cost a compilation and a solve.
+    # Learning doubles the number: a last step to a few more would cost a compilation and a solve.
     affordable = first * 2 ** np.log2(np.maximum(affordable / first, 1)).astype(int)
-    quick, most = np.maximum(first, np.minimum(intervals, affordable)).tolist()
+    quick, limit = np.maximum(first, np.minimum(intervals, affordable)).tolist()
     if count is not None:
-        first = quick = most = count
+        first = quick = limit = count
     spread = X[:, n:].std(axis=0)  # of the inputs
     points = X / np.concatenate([data.scale, np.where(spread > 0, spread, 1.0)])[None]
     chosen = [int(np.argmin(np.linalg.norm(points - points.mean(axis=0), axis=1)))]
     distance = np.full(len(points), np.inf)
-    while len(chosen) < min(most, len(points)):
+    while len(chosen) < min(limit, len(points)):
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
         if not distance.max() > 0:
             break

@@ -1,4 +1,4 @@
-"""How well learning ended: what the diagnostics are made of."""
+"""Quality of a fit: the numbers from which the diagnostics of `learn` are made."""
 
 from typing import Any
 
@@ -8,10 +8,10 @@ from jaxtyping import Array, Float
 
 from hamkernel._structures.friction import frictions
 from hamkernel._trajectories.diagnostics import FitQuality
-from hamkernel._trajectories.free_run import error_over_constant, of_swings
+from hamkernel._trajectories.free_run import error_over_constant, stretches_of_swings
 from hamkernel._trajectories.iteration import End, asks_for_landmarks, initial_loss, noisy_counts
 from hamkernel._trajectories.kalman import smoothed_path
-from hamkernel._trajectories.preprocessing import decided, sampled, time_of_swing
+from hamkernel._trajectories.preprocessing import decide, sample_points, time_of_swing
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.search import gain_of_friction, gain_of_inertia
 from hamkernel._trajectories.segments import Piece
@@ -27,19 +27,19 @@ def quality(
     process: Float[np.ndarray, " n"],
     states: list[np.ndarray],
 ) -> FitQuality:
-    """How well the field follows the runs; `z` are the innovations by segment."""
+    """The quality of the fit of a field to runs; `z` are the innovations by segment."""
     now, data = end.now, end.task.data
-    times, seen = runs.on_host()
+    times, samples = runs.on_host()
     noise = np.exp(np.asarray(now.model.log_noise))
     kept, pieces = np.zeros(len(data.runs)), list(zip(end.task.pieces, now.good, strict=True))
     for (r, start, stop), good in pieces:
         kept[r] += good * (stop - start) / len(data.runs[r].times)
-    speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
+    speed = np.sqrt(np.mean(sample_points(data)[1] ** 2, axis=0))
     spacing = np.median(np.concatenate([np.diff(t) for t in times]))
     swing = time_of_swing(data) / spacing
     period = np.maximum(swing, 1.0) * spacing
     dropped = _samples([piece for piece, good in pieces if not good], end, times)
-    residuals = [x - path for x, path in zip(seen, states, strict=True)]
+    residuals = [x - path for x, path in zip(samples, states, strict=True)]
     logged = [np.where(np.isfinite(r.states), r.states, r.path) for r in data.runs]
     timed = kept.any() and not (dropped or process.any())
     noisy = noisy_counts(end).any((0, 1))
@@ -53,7 +53,7 @@ def quality(
         core=_core(residuals, noise),
         share=float(np.max(process / np.sqrt(period) / np.maximum(speed, 1e-300))),
         impulse=_largest_push(end),
-        pushed=_samples(_pushed(end), end, times),
+        pushed=_samples(_push_intervals(end), end, times),
         is_curve=runs.inputs is None and is_on_a_curve(logged, noise),
         free_run=_free_run(end, kept, swing * spacing),
         timing=timing(times, [np.where(noisy, r, np.nan) for r in residuals], states)
@@ -76,7 +76,8 @@ def quality(
 def chi_squared(end: End, z: Float[np.ndarray, "S K n"]) -> dict[str, Any]:
     """χ² of the innovations z per degree of freedom, and the degrees of freedom.
 
-    A path with process noise follows the samples, so that only what was expected can be judged.
+    We judge the innovations and not the residuals, since a path with process noise follows the
+    samples.
     """
     free = float((np.asarray(end.now.rows.counts) > 0).sum())
     mean = float((z**2).sum()) / max(free, 1.0)
@@ -84,14 +85,14 @@ def chi_squared(end: End, z: Float[np.ndarray, "S K n"]) -> dict[str, Any]:
 
 
 def with_causes(fit: FitQuality, runs: Runs, end: End) -> FitQuality:
-    """The same with what would make the rows likelier: the causes that warnings name."""
+    """The quality with the gains in likelihood of possible causes, which warnings then name."""
     now, task, used = end.now, end.task, len(end.now.field.points)
-    given = now.model, now.field.points, now.rows, task.start_deviation
+    args = now.model, now.field.points, now.rows, task.start_deviation
     if (task.capped and used >= task.quick) or not fit.white.is_enough:
         fit = fit._replace(few=used * asks_for_landmarks(end))
     if fit.has_momenta and (fit.is_disturbed or not fit.white.is_enough):
-        bent = gain_of_inertia(*given, task.data, task.mean)
-        gain = gain_of_friction(*given, task.data)
+        bent = gain_of_inertia(*args, task.data, task.mean)
+        gain = gain_of_friction(*args, task.data)
         fit = fit._replace(friction_gain=gain, inertia_gain=bent)
     if fit.white.is_enough:
         return fit
@@ -99,12 +100,12 @@ def with_causes(fit: FitQuality, runs: Runs, end: End) -> FitQuality:
 
 
 def likelier_between(runs: Runs, end: End) -> str:
-    """The likeliest way in which inputs go on between samples; "" if it is that of the runs."""
+    """The likeliest `between` of the inputs; "" if the runs have it already."""
     if runs.inputs is None or isinstance(runs.delay, str):
         return ""
     task, model = end.task, end.now.model
     any_way = runs.going_on("auto", runs.delay)
-    chosen, _ = decided(
+    chosen, _ = decide(
         any_way, task.data, lambda data: initial_loss(task._replace(data=data), model)
     )
     return chosen.between if chosen.between != runs.between else ""
@@ -113,20 +114,20 @@ def likelier_between(runs: Runs, end: End) -> str:
 def disturbances(
     end: End, times: list[np.ndarray], is_disturbed: bool
 ) -> tuple[Float[Array, "T n"], ...]:
-    """The smoothed w of each run, from each of its times to the next."""
+    """The smoothed disturbance w of each run, from each time to the next."""
     task, now = end.task, end.now
     w = np.zeros(now.rows.drive.shape)
     if is_disturbed:
-        given = now.field.points, now.rows, task.start_deviation
-        w = np.asarray(smoothed_path(now.model, now.field.coefficients, *given).disturbance)
+        args = now.field.points, now.rows, task.start_deviation
+        w = np.asarray(smoothed_path(now.model, now.field.coefficients, *args).disturbance)
     out = []
-    for of_run, run, t in zip(by_run(w, end, 0.0), task.data.runs, times, strict=True):
+    for of_run, run, t in zip(join_runs(w, end, 0.0), task.data.runs, times, strict=True):
         i = np.searchsorted(run.times, t - t[0], "right") - 1
         out.append(jnp.asarray(of_run[np.clip(i, 0, len(of_run) - 1)]))
     return tuple(out)
 
 
-def _pushed(end: End) -> list[Piece]:
+def _push_intervals(end: End) -> list[Piece]:
     """The intervals in which something pushed the system, from one sample to the next."""
     sizes = np.asarray(end.now.rows.pushed)
     return [
@@ -137,24 +138,25 @@ def _pushed(end: End) -> list[Piece]:
 
 
 def _core(residuals: list[np.ndarray], noise: np.ndarray) -> Float[np.ndarray, " n"]:
-    """1.4826 times the median of |residual| over σ, by coordinate; NaN where nothing was measured.
+    """A robust standard deviation of residual/σ by coordinate; NaN where nothing was measured.
 
-    1.4826 is 1/Φ⁻¹(3/4), for which normal residuals have 1.
+    It is 1.4826 = 1/Φ⁻¹(3/4) times the median of |residual|/σ, which is 1 for normal residuals.
     """
     R = np.abs(np.concatenate(residuals))
-    seen = np.isfinite(R).any(axis=0)
+    measured = np.isfinite(R).any(axis=0)
     out = np.full(R.shape[1], np.nan)
-    out[seen] = 1.4826 * np.nanmedian(R[:, seen], axis=0) / noise[seen]
+    out[measured] = 1.4826 * np.nanmedian(R[:, measured], axis=0) / noise[measured]
     return out
 
 
 def _free_run(end: End, kept: Float[np.ndarray, " R"], swing: float) -> float:
-    """The error of free runs over two swings relative to that of a constant.
+    """The error of free runs over two swings, relative to the error of a constant.
 
-    Where it is not below one, the least of it and of those over one and half a swing: a pendulum
-    that is balanced upright is lost after a swing whatever the field. The field of a real one,
-    right to .05 rad after a second, has 2.5, 1.4 and .89. Three simulated logs of animals in
-    weather, which no field predicts, have 1.02 to 1.5 (`tests/test_verdicts.py`).
+    If this ratio is not below 1, we take the smallest ratio over two, one and half a swing: no
+    field predicts a pendulum that is balanced upright for a whole swing. For a real one, with a
+    field that is right to .05 rad after a second, the ratios are 2.5, 1.4 and .89. On three
+    simulated logs of animals in weather, which no field predicts, they are 1.02 to 1.5
+    (`tests/test_verdicts.py`).
     """
     data = end.task.data
     runs = [run for run, share in zip(data.runs, kept, strict=True) if share]
@@ -163,7 +165,7 @@ def _free_run(end: End, kept: Float[np.ndarray, " R"], swing: float) -> float:
         return np.inf
     least = np.inf
     for count in (2.0, 1.0, 0.5):
-        part = of_swings(runs, paths, swing, count)
+        part = stretches_of_swings(runs, paths, swing, count)
         least = min(least, error_over_constant(end.now.field, part, data.scale))
         if least < 1:
             break
@@ -176,8 +178,8 @@ def _largest_push(end: End) -> float:
     if not np.any(pushed):
         return 0.0
     task, now = end.task, end.now
-    given = now.field.points, now.rows, task.start_deviation
-    w = np.asarray(smoothed_path(now.model, now.field.coefficients, *given).disturbance)
+    args = now.field.points, now.rows, task.start_deviation
+    w = np.asarray(smoothed_path(now.model, now.field.coefficients, *args).disturbance)
     jump = np.abs(w[:, : pushed.shape[1]]) * np.asarray(now.rows.spans)[..., None]
     return float((jump / task.data.scale)[pushed].max())
 
@@ -185,7 +187,7 @@ def _largest_push(end: End) -> float:
 def _samples(
     pieces: list[Piece], end: End, times: list[np.ndarray]
 ) -> tuple[tuple[int, int, int], ...]:
-    """The run, the first sample and the one behind the last of pieces, joined where they touch."""
+    """(run, first sample, last sample + 1) of each piece; pieces that touch are joined."""
     out: list[tuple[int, int, int]] = []
     for r, start, stop in sorted(pieces):
         t, at = times[r] - times[r][0], end.task.data.runs[r].times
@@ -197,8 +199,10 @@ def _samples(
     return tuple(out)
 
 
-def by_run(values: np.ndarray, end: End, empty: float) -> list[Float[np.ndarray, "T n"]]:
-    """Values by segment put together to runs."""
+def join_runs(
+    values: np.ndarray, end: End, empty: float = np.nan
+) -> list[Float[np.ndarray, "T n"]]:
+    """Values by segment, joined to runs; `empty` where no segment is."""
     out = [np.full(run.path.shape, empty) for run in end.task.data.runs]
     for s, ((r, start, stop), good) in enumerate(zip(end.task.pieces, end.now.good, strict=True)):
         if good:

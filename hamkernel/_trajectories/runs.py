@@ -5,11 +5,16 @@ constant one. Where samples were averaged an interval spans many samples of the 
 inputs bend within it: the line is then the best one in the mean square, which keeps the impulse
 ∫u dt and its first moment exactly.
 
-"smooth" is the natural quintic spline through the samples. Of a sinusoid it misses 2e-3 at four
-samples a period, 1.3e-4 at six and 1.5e-6 at twelve, where the cubic one misses .08, .016 and .001,
-lines .31, .14 and .03. The band-limited interpolation Σ u_j sinc(t/h − j) misses nothing of a
-sinusoid without end; it needs even times, and the error that the unknown inputs before the first
-sample and after the last one cause falls as 1/k over k samples, that of this spline as .43ᵏ.
+"smooth" is the natural quintic spline through the samples. Its error for a sinusoid is
+
+    samples a period    4      6       12
+    quintic spline      2e-3   1.3e-4  1.5e-6
+    cubic spline        .08    .016    .001
+    lines               .31    .14     .03
+
+Band-limited interpolation Σ u_j sinc(t/h − j) is exact for an infinite sinusoid, but it needs even
+times. The inputs before the first sample and after the last one are unknown. The error from them
+falls over k samples as 1/k for band-limited interpolation, and as .43ᵏ for the quintic spline.
 """
 
 from __future__ import annotations
@@ -43,10 +48,10 @@ Between = Literal["held", "linear", "smooth"]
 def spline(
     t: Float[np.ndarray, " T"], u: Float[np.ndarray, "T m"], at: Float[np.ndarray, " P"]
 ) -> Float[np.ndarray, "P m"]:
-    """The natural quintic spline through the samples, of all functions that of least ∫(u‴)² dt.
+    """The natural quintic spline through the samples, the interpolant with the least ∫(u‴)² dt.
 
-    Of two samples it is a line. Times are counted in spacings: its fourth derivatives have a place
-    in the same matrix as its values.
+    Through two samples the spline is a line. The unit of time is the median spacing, so that values
+    and fourth derivatives have similar sizes in the matrix of the spline.
     """
     from scipy.interpolate import make_interp_spline  # so that importing does not load it
 
@@ -66,7 +71,7 @@ def values(
     at = np.clip(at, t[0], t[-1])
     if between == "smooth":
         return spline(t, u, at)
-    # Held inputs change at a sample, and a value that is held ends at the next one.
+    # A held input changes at a sample and keeps its value until the next one.
     i = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 1 - (between == "linear"))
     if between == "held":
         return u[i]
@@ -74,16 +79,17 @@ def values(
     return u[i] + share[:, None] * (u[i + 1] - u[i])
 
 
-def in_intervals(
+def lines_in_intervals(
     t: Float[np.ndarray, " T"],
     u: Float[np.ndarray, "T m"],
     at: Float[np.ndarray, " R"],
     between: Between,
 ) -> Float[np.ndarray, "R-1 2 m"]:
-    """The best line in each interval of the times `at`.
+    """The line that fits the input best in each interval of the times `at`, by its two ends.
 
-    Of u(σ) with σ from −1 to 1 it is m₀ + 3 m₁ σ, the moments m₀ = ½∫u dσ and m₁ = ½∫uσ dσ. Both
-    are sums over the pieces between all times; four Gauss nodes are exact for a quintic times σ.
+    For u(σ) with −1 ≤ σ ≤ 1 the line is m₀ + 3 m₁ σ, with the moments m₀ = ½∫u dσ and m₁ = ½∫uσ dσ.
+    We integrate over the pieces between all times; four Gauss nodes are exact for a quintic
+    times σ.
     """
     grid = np.union1d(t, at)
     grid = grid[(grid >= at[0]) & (grid <= at[-1])]
@@ -103,8 +109,8 @@ def in_intervals(
     return np.stack([m0 - 3 * m1, m0 + 3 * m1], axis=1)
 
 
-def at_samples(ends: Float[np.ndarray, "intervals 2 m"]) -> Float[np.ndarray, "R m"]:
-    """U at the ends of the intervals; where it jumps, the mean of both sides."""
+def inputs_at_samples(ends: Float[np.ndarray, "intervals 2 m"]) -> Float[np.ndarray, "R m"]:
+    """The inputs at the ends of the intervals; the mean of both sides where they jump."""
     before, after = (
         np.concatenate([ends[:1, 0], ends[:, 1]]),
         np.concatenate([ends[:, 0], ends[-1:, 1]]),
@@ -112,8 +118,10 @@ def at_samples(ends: Float[np.ndarray, "intervals 2 m"]) -> Float[np.ndarray, "R
     return (before + after) / 2
 
 
-def at_nodes(ends: Float[Array | np.ndarray, "*S 2 m"]) -> Float[Array | np.ndarray, "*S 3 m"]:
-    """U at the Gauss nodes."""
+def inputs_at_nodes(
+    ends: Float[Array | np.ndarray, "*S 2 m"],
+) -> Float[Array | np.ndarray, "*S 3 m"]:
+    """The inputs at the Gauss nodes."""
     shares = NODES.reshape((1,) * (ends.ndim - 2) + (3, 1))
     first, last = ends[..., :1, :], ends[..., 1:, :]
     return first + shares * (last - first)
@@ -134,15 +142,15 @@ class Runs(eqx.Module):
             (R, T, n) are those of all R runs.
         states: for each run the states, shape (T, n), or (T,) for one coordinate. Angles must be
             continuous: `np.unwrap`.
-        inputs: for each run what was applied, for `learn` with a `Controlled` kernel: u at the
-            times of the states, shape (T, m), or (T,) for one input; or a pair (times, u) of shapes
-            (P,) and (P, m) that spans them, such as a command at 1 kHz beside a camera at 50 Hz;
-            None if nothing.
-        between: how inputs go on from a sample: "held" until the next, as a digital controller
-            holds its command; "linear", for a measured force; "smooth", the quintic spline through
-            the samples, for one that is sampled 4 to 20 times a period; or "auto", with which
-            `learn` takes the likeliest of the three, see `learned.runs`. Inputs that were held and
-            are taken for linear come half a sample early.
+        inputs: for each run the inputs u, for `learn` with a `Controlled` kernel. An array has the
+            inputs at the times of the states, shape (T, m), or (T,) for one input. A pair (times,
+            u), shapes (P,) and (P, m), has times of its own that span the run, such as a command at
+            1 kHz beside a camera at 50 Hz. None if there are no inputs.
+        between: the inputs between two samples. "held": constant until the next sample, as the
+            command of a digital controller. "linear": for a measured force. "smooth": the quintic
+            spline, for an input with 4 to 20 samples a period. "auto": `learn` takes the likeliest
+            of the three, see `learned.runs`. If held inputs are taken for linear, they come half a
+            sample early.
         parameters: for each run the θ of its system, shape (p,), for `learn` with a `Family`; None
             if all runs are of one system.
         delay: by how much later than logged an input acts, in the unit of the times: at time t it
@@ -156,10 +164,10 @@ class Runs(eqx.Module):
             TypeError: something is not an array of real numbers.
 
     Warns:
-        UserWarning: samples that are impossible beside their neighbours, a jump of 2π, 360, 4096
-            or 65536, a long gap, a coordinate that never moves or stops while others
-            go on, a sensor that was clipped, samples that were repeated or interpolated, inputs
-            that never change, depend on one another or are a function of the states: once each.
+        UserWarning: once for each kind of fault. Faults of states are impossible samples, jumps of
+            2π, 360, 4096 or 65536, long gaps, constant coordinates, and sensors that are clipped,
+            dead, repeated or interpolated. Faults of inputs are constant or dependent inputs, and
+            inputs that are a function of the states.
     """
 
     times: tuple[Float[np.ndarray, " T"], ...]
@@ -194,7 +202,7 @@ class Runs(eqx.Module):
         inside = "Make it outside; the losses and hk.simulate work inside."
         require.untraced("hk.Runs", inside, times, states, inputs)
         _check_counts(times, states, inputs)
-        times = [_at_interval(t, x) for t, x in zip(times, states, strict=True)]
+        times = [_sample_times(t, x) for t, x in zip(times, states, strict=True)]
         self.times = tuple(_times(t, r) for r, t in enumerate(times))
         self.states = tuple(
             _rows(x, t, r, "states")
@@ -211,7 +219,7 @@ class Runs(eqx.Module):
         if inputs is not None:
             pairs = zip(inputs, self.times, strict=True)
             signals = [_signal(u, t, r) for r, (u, t) in enumerate(pairs)]
-            self.input_times, self.inputs = (tuple(each) for each in zip(*signals, strict=True))
+            self.input_times, self.inputs = (tuple(part) for part in zip(*signals, strict=True))
             _check_inputs(self.inputs)
             of_values = [
                 u[1] if _is_pair(u, t) else u for u, t in zip(inputs, self.times, strict=True)
@@ -245,11 +253,11 @@ class Runs(eqx.Module):
     def check(self) -> Diagnostics:
         """A table of the faults that sensors and controllers may have left in the log.
 
-        One row for each kind of fault: samples that are no measurements, wrapped angles, gaps,
+        Each kind of fault has a row: samples that are no measurements, wrapped angles, gaps,
         coordinates that never move, clipped and dead sensors, repeated and interpolated samples.
-        With inputs also: constant inputs, dependent ones, and feedback. Each row has a value, its
-        limit, its meaning and advice; `.failing` names the rows that fall short. `Runs` has warned
-        of them.
+        With inputs there are rows for constant inputs, dependent inputs and feedback. A row has a
+        value, its limit, its meaning and advice; `.failing` names the rows that fall short. `Runs`
+        has warned of these.
         """
         times, states = self.on_host()
         inputs = [np.asarray(u, float) for u in self.inputs or ()]
@@ -280,9 +288,9 @@ class Runs(eqx.Module):
     ) -> tuple[Float[Array, "N n"], Float[Array, "N n"], Int[Array, " N"]]:
         """Smoothed states X, their velocities Y and run labels, for `hk.fit` and `hk.tune`.
 
-        Every coordinate is a Gaussian process in time (Matérn-7/2), whose lengthscale, amplitude
-        and noise come from the marginal likelihood of all runs. Linear in the number of samples.
-        `hk.learn` does better: it needs no velocities.
+        Every coordinate is a Gaussian process in time (Matérn-7/2). Its lengthscale, amplitude and
+        noise maximise the marginal likelihood of all runs. The cost is linear in the number of
+        samples. `hk.learn` is more accurate, since it needs no velocities.
 
         Returns:
             X and Y, shape (N, n), N all samples of all runs, and labels (N,), 0, 1, … by run.
@@ -301,12 +309,12 @@ class Runs(eqx.Module):
         return X, Y, jnp.asarray(np.repeat(np.arange(len(times)), lengths))
 
     def smoothing(self, between: int = 0) -> Smoothing:
-        """The smoothed states with their standard deviations: what `hk.plot.smoothing` draws.
+        """The smoothed states with their standard deviations, as `hk.plot.smoothing` draws them.
 
         The processes in time are those of `velocities`.
 
         Args:
-            between: at how many times between each two samples the states are smoothed, too.
+            between: the number of additional times between two samples.
 
         Raises:
             ValueError: `between` is negative. TypeError: it is no integer.
@@ -330,8 +338,8 @@ class Runs(eqx.Module):
     @property
     def input_count(self) -> int:
         """The number m of inputs or parameters; 0 where there are none."""
-        given = self.inputs or self.parameters
-        return given[0].shape[-1] if given else 0
+        arrays = self.inputs or self.parameters
+        return arrays[0].shape[-1] if arrays else 0
 
     @property
     def is_decided(self) -> bool:
@@ -339,10 +347,10 @@ class Runs(eqx.Module):
         return self.inputs is None or (self.between != "auto" and self.delay != "fit")
 
     def applied(self, run: int, at: Float[np.ndarray, " R"]) -> Float[np.ndarray, "R-1 2 m"]:
-        """The best line of the inputs in each interval of the times `at`, by its ends.
+        """The line that fits the inputs best in each interval of the times `at`, by its two ends.
 
-        The parameters of a run are its inputs at all times. While `between` or `delay` is not
-        decided yet, inputs are linear, or without delay.
+        The parameters of a run are its inputs at all times. Inputs with between="auto" are taken
+        for linear, and inputs with delay="fit" have no delay.
         """
         if self.parameters is not None:
             return np.tile(np.asarray(self.parameters[run], float), (len(at) - 1, 2, 1))
@@ -351,16 +359,16 @@ class Runs(eqx.Module):
         between = "linear" if self.between == "auto" else self.between
         delay = 0.0 if isinstance(self.delay, str) else self.delay
         t, u = (np.asarray(a[run], float) for a in (self.input_times, self.inputs))
-        return in_intervals(t, u, np.asarray(at) - delay, between)
+        return lines_in_intervals(t, u, np.asarray(at) - delay, between)
 
     def going_on(self, between: Between | Literal["auto"], delay: float) -> "Runs":
-        """The same runs with inputs that go on in this way; nothing is checked again."""
+        """The same runs with another `between` and `delay` of the inputs, without new checks."""
         return self._with(between=between, delay=delay)
 
     def part(self, of_runs: Sequence[slice]) -> "Runs":
-        """The samples of each run in its slice, without runs of which none are left.
+        """The samples of each run in its slice; runs without samples there are dropped.
 
-        Inputs stay whole, so that they go on between samples as before.
+        All samples of the inputs stay, so that the inputs between samples do not change.
         """
         kept = [
             r
@@ -387,10 +395,10 @@ class Runs(eqx.Module):
         names = self.names and (*self.names, *(f"p of {name}" for name in self.names))
         return self._with(states=states, names=names)
 
-    def _with(self, **given: Any) -> "Runs":
+    def _with(self, **changes: Any) -> "Runs":
         new = object.__new__(Runs)
         for field in dataclasses.fields(self):
-            object.__setattr__(new, field.name, given.get(field.name, getattr(self, field.name)))
+            object.__setattr__(new, field.name, changes.get(field.name, getattr(self, field.name)))
         return new
 
     def _check_measured(self) -> None:
@@ -482,7 +490,7 @@ def _name_list(names: tuple[str, ...] | None) -> str:
     return f" ({', '.join(names)})" if names else ""
 
 
-def _at_interval(times: Any, states: Any) -> Any:
+def _sample_times(times: Any, states: Any) -> Any:
     """The times of samples at a sampling interval, from 0 on; other times as they are."""
     if _depth(times) != 0:
         return times
@@ -495,10 +503,10 @@ def _at_interval(times: Any, states: Any) -> Any:
 def _check_counts(times: Sequence[Any], states: Sequence[Any], inputs: Any) -> None:
     if not times:
         raise ValueError("there are no runs: pass lists of arrays, one entry a run.")
-    for name, other in (("states", states), ("inputs", inputs)):
-        if other is not None and len(other) != len(times):
+    for name, entries in (("states", states), ("inputs", inputs)):
+        if entries is not None and len(entries) != len(times):
             raise ValueError(
-                f"times has {len(times)} runs and {name} has {len(other)}: pass lists of equal "
+                f"times has {len(times)} runs and {name} has {len(entries)}: pass lists of equal "
                 "length, one entry a run, times (T,) and states (T, n)."
             )
 
@@ -533,7 +541,7 @@ def _members(parameters: Any, count: int, inputs: Any) -> tuple[Float[Array, " p
 
 def _times(t: Any, run: int, of: str = "states") -> Float[np.ndarray, " T"]:
     name = f"times[{run}]" if of == "states" else f"the times of {of}[{run}]"
-    given, t = getattr(t, "dtype", None), require.doubles(t, name)
+    dtype, t = getattr(t, "dtype", None), require.doubles(t, name)
     t = t[:, 0] if t.ndim == 2 and t.shape[1] == 1 else t  # a frame of one column
     if t.ndim != 1:
         raise ValueError(f"{name} has shape {t.shape}; times of shape (T,) are needed.")
@@ -548,7 +556,7 @@ def _times(t: Any, run: int, of: str = "states") -> Float[np.ndarray, " T"]:
     if back.size:
         i = int(back[0])
         cure = "Sort by time and drop repeats; where a log starts anew, start a new run."
-        if given == np.float32 and (np.diff(t) >= 0).all() and abs(t[i]) > 1e5:
+        if dtype == np.float32 and (np.diff(t) >= 0).all() and abs(t[i]) > 1e5:
             step = np.spacing(np.float32(t[i]))
             cure = (
                 f"They are float32, which tells times near {t[i]:g} apart by {step:g} only: pass "
@@ -610,13 +618,13 @@ def _signal(
         raise ValueError(
             f"inputs[{run}] is a tuple of {len(u)}: give an array (T, m), or (times, u)."
         )
-    own = _times(u[0], run, "inputs")
-    values = _rows(u[1], own, run, "inputs")
-    spacing = float(np.median(np.diff(np.asarray(own))))
+    input_times = _times(u[0], run, "inputs")
+    values = _rows(u[1], input_times, run, "inputs")
+    spacing = float(np.median(np.diff(np.asarray(input_times))))
     # A held command lasts until the next one, which comes a spacing after the last that was logged.
     for name, missing, end in (
-        ("begin", own[0] - t[0], (own[0], t[0])),
-        ("end", t[-1] - own[-1], (own[-1], t[-1])),
+        ("begin", input_times[0] - t[0], (input_times[0], t[0])),
+        ("end", t[-1] - input_times[-1], (input_times[-1], t[-1])),
     ):
         if missing > 1.001 * spacing:
             raise ValueError(
@@ -624,7 +632,7 @@ def _signal(
                 f"{float(end[1]):g}: what was applied must be known over the whole run. Cut the "
                 "states, or repeat the command that was held."
             )
-    return own, values
+    return input_times, values
 
 
 def _check_coordinates(states: tuple[np.ndarray, ...]) -> None:

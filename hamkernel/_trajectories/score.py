@@ -18,26 +18,26 @@ from hamkernel._show import Shown
 from hamkernel._show import text as number
 from hamkernel._trajectories.flow import simulated, steps_for, stiffness
 from hamkernel._trajectories.free_run import Stretches, padded, predictions
-from hamkernel._trajectories.preprocessing import preprocess, sampled
+from hamkernel._trajectories.preprocessing import preprocess, sample_points
 from hamkernel._trajectories.runs import Runs
 
-_STEPS = 12  # of Levenberg and Marquardt; from smoothed states 4 are the rule
+_STEPS = 12  # of Levenberg and Marquardt; starts at smoothed states usually need 4
 
 
 class Score(Shown, eqx.Module):
     """How well free runs of a learned field follow runs, with two baselines.
 
-    A free run begins at the state that fits the first few samples best, and sees no sample after
-    them; the root mean squares are over those that it does not see. A baseline knows the same
-    samples: with `persistence` the last of them stays, and `linear` is a free run of a linear model
-    ẋ = A x + B u + c by least squares on the runs that the field was learned from. Free runs that
-    leave every bound have infinite errors.
+    A free run begins at the state that fits the first few samples best, and uses no later sample.
+    The root mean squares are over the later samples. Both baselines use the same first samples:
+    `persistence` repeats the last of them, and `linear` is a free run of the linear model
+    ẋ = A x + B u + c, fitted by least squares to the runs from which the field was learned. Free
+    runs that leave every bound have infinite errors.
 
     Attributes:
         rmse: the root mean square of predicted − measured, in units of the states, shape (n,); NaN
             where nothing was measured.
-        persistence: the same where the last known sample stays, shape (n,).
-        linear: the same of the linear model, shape (n,).
+        persistence: the root mean square if the last known sample stays, shape (n,).
+        linear: the root mean square of the linear model, shape (n,).
         coverage: the share of samples inside the 95 % band of the posterior, with both kinds of
             noise, shape (); NaN where no band was asked for. Honest bands hold about .95.
         predictions: the free run of each run at its times, shape (T, n).
@@ -60,28 +60,30 @@ class Score(Shown, eqx.Module):
     @property
     def text(self) -> str:
         """The verdict in one sentence."""
-        own, still, linear = (
-            float(jnp.sqrt(jnp.nanmean((each / self.scale) ** 2)))
-            for each in (self.rmse, self.persistence, self.linear)
+        error, still, linear = (
+            float(jnp.sqrt(jnp.nanmean((rmse / self.scale) ** 2)))
+            for rmse in (self.rmse, self.persistence, self.linear)
         )
-        if not own < still:
+        if not error < still:
             return (
                 f"is worse than saying that nothing moves: off by {number(self.rmse)}, where the "
                 f"last known sample is off by {number(self.persistence)}"
             )
-        if not own < linear:
+        if not error < linear:
             return f"is worse than a linear model ({number(self.rmse)} for {number(self.linear)})"
         if not np.isfinite(linear):
             return f"follows the runs to {number(self.rmse)}; a linear model leaves every bound"
-        return f"follows the runs {linear / max(own, 1e-300):.2g} times better than a linear model"
+        return (
+            f"follows the runs {linear / max(error, 1e-300):.2g} times better than a linear model"
+        )
 
     def horizon(self, error: ArrayLike) -> Float[Array, " R"]:
         """The time for which the free run of each run stays within `error`, shape (R,).
 
-        From its first sample to the last before any coordinate is off by more.
+        The time runs from the first sample to the last sample before any error is larger.
 
         Args:
-            error: in units of the states, a number or one for each coordinate, shape (n,).
+            error: a bound in units of the states, one number or shape (n,).
 
         Raises:
             ValueError: the error is not positive.
@@ -117,35 +119,38 @@ class _Linear(eqx.Module):
 
 
 class _Disturbed(eqx.Module):
-    """f(x, u) + w, of points (x, u, w)."""
+    """The disturbed field f(x, u) + w as a function of (x, u, w)."""
 
     field: Any
-    count: int = eqx.field(static=True)  # of the coordinates of (x, u)
+    count: int = eqx.field(static=True)  # the number of coordinates of (x, u)
 
     def __call__(self, s: Float[Array, " k"]) -> Float[Array, " n"]:
         return self.field(s[: self.count]) + s[self.count :]
 
 
-def scored(learned: Any, runs: Runs, first: int, posterior: Posterior | None, draws: int) -> Score:
+def compute_score(
+    learned: Any, runs: Runs, first: int, posterior: Posterior | None, draws: int
+) -> Score:
     """The score of a learned field on `runs`; see `Learned.score`."""
-    known = known_part(learned.kernel, learned.mean, runs.dimension, jnp.float64)
-    training = preprocess(learned.runs, known)
+    mean = known_part(learned.kernel, learned.mean, runs.dimension, jnp.float64)
+    training = preprocess(learned.runs, mean)
     scale = training.scale
     noise = np.asarray(learned.noise)
     deviation = np.maximum(np.where(np.isfinite(noise), noise, scale), 1e-6 * scale)
-    part = _whole_runs(runs, [run.path[0] for run in preprocess(runs, known).runs])
-    seen = [min(first, max(len(t) // 2, 1)) for t in runs.on_host()[0]]
+    part = _as_stretches(runs, [run.path[0] for run in preprocess(runs, mean).runs])
+    known_counts = [min(first, max(len(t) // 2, 1)) for t in runs.on_host()[0]]
     field = getattr(learned.field, "whole", learned.field)  # of the points (x, u) with inputs
 
     def free(field: Any) -> tuple[_Starts, np.ndarray]:
-        starts = _fitted(field, part, seen, deviation, scale)
+        starts = _fit_starts(field, part, known_counts, deviation, scale)
         return starts, predictions(field, part._replace(starts=starts.states), scale)
 
     starts, predicted = free(field)
-    _, linear = free(_linear(*sampled(training)))
-    measured, later = part.measured, np.arange(part.spans.shape[1]) >= np.array(seen)[:, None]
+    _, linear = free(_linear(*sample_points(training)))
+    measured = part.measured
+    later = np.arange(part.spans.shape[1]) >= np.array(known_counts)[:, None]
     judged = np.where(later[..., None], measured, np.nan)
-    last = np.stack([_last(y[:k]) for y, k in zip(measured, seen, strict=True)])[:, None]
+    last = np.stack([_last(y[:k]) for y, k in zip(measured, known_counts, strict=True)])[:, None]
     coverage = np.nan
     if posterior is not None:
         bands = _draws(learned, posterior, part, starts, scale, draws)
@@ -168,8 +173,8 @@ def scored(learned: Any, runs: Runs, first: int, posterior: Posterior | None, dr
     )
 
 
-def _whole_runs(runs: Runs, starts: list[np.ndarray]) -> Stretches:
-    """The runs as stretches; an interval of no length before the first sample measures it too."""
+def _as_stretches(runs: Runs, starts: list[np.ndarray]) -> Stretches:
+    """The runs as stretches, each with an interval of no length before its first sample."""
     parts = []
     for r, (t, x) in enumerate(zip(*runs.on_host(), strict=True)):
         inputs = runs.applied(r, t)
@@ -206,22 +211,23 @@ class _Starts(NamedTuple):
     roots: Float[np.ndarray, "S n n"]
 
 
-def _fitted(field: Any, part: Stretches, seen: list[int], deviation, scale) -> _Starts:
+def _fit_starts(field: Any, part: Stretches, known_counts: list[int], deviation, scale) -> _Starts:
     """The starts from which the field passes the first samples most closely.
 
-    Steps of Levenberg and Marquardt, from starts that are known to three standard deviations of the
-    coordinates: a momentum that was never measured may be unknown otherwise.
+    We minimise by steps of Levenberg and Marquardt. The prior standard deviation of a start is
+    three times the scale of its coordinate: without a prior, a momentum that was never measured may
+    be undetermined.
     """
-    L = max(seen)
+    L = max(known_counts)
     judged = np.where(
-        np.arange(L)[:, None] < np.array(seen)[:, None, None], part.measured[:, :L], np.nan
+        np.arange(L)[:, None] < np.array(known_counts)[:, None, None], part.measured[:, :L], np.nan
     )
     steps = jnp.asarray(steps_for(part.spans[:, :L], _stiffness(field, part, scale)))
     rest = jnp.asarray(part.spans[:, :L]), steps, jnp.asarray(part.inputs[:, :L])
     S, n = part.starts.shape
     prior = np.eye(n) / 9  # in units of `scale`, as all below
 
-    def at(y):
+    def linearise(y):
         path = simulated(field, jnp.asarray(part.starts + scale * y), *rest)
         tangents, J = np.asarray(path.across), []
         for i in range(L):
@@ -229,23 +235,24 @@ def _fitted(field: Any, part: Stretches, seen: list[int], deviation, scale) -> _
         r = np.where(np.isfinite(judged), judged - np.asarray(path.x)[:, 1:], 0.0) / deviation
         J = np.where(np.isfinite(judged)[..., None], np.stack(J, 1), 0.0) / deviation[:, None]
         squares = (r**2).sum((1, 2)) + (y**2).sum(1) / 9
-        # A path that is lost says nothing of its start.
-        found = np.isfinite(squares) & (np.abs(J).max((1, 2, 3)) < 1e100)
-        r, J = np.where(found[:, None, None], r, 0.0), np.where(found[:, None, None, None], J, 0.0)
+        # A path that is not finite does not constrain its start.
+        finite = np.isfinite(squares) & (np.abs(J).max((1, 2, 3)) < 1e100)
+        r = np.where(finite[:, None, None], r, 0.0)
+        J = np.where(finite[:, None, None, None], J, 0.0)
         H, gradient = np.einsum("slki,slkj->sij", J, J), np.einsum("slki,slk->si", J, r)
-        return np.where(found, squares, np.inf), H + prior, gradient - y / 9
+        return np.where(finite, squares, np.inf), H + prior, gradient - y / 9
 
     y, damping = np.zeros((S, n)), np.full(S, 1e-3)
-    least, H, gradient = at(y)
+    least, H, gradient = linearise(y)
     for _ in range(_STEPS):
         D = np.einsum("s,sii->si", damping, H)[:, :, None] * np.eye(n)
         there = y + np.linalg.solve(H + D, gradient[..., None])[..., 0]
-        found = at(there)
-        better = found[0] < least
+        trial = linearise(there)
+        better = trial[0] < least
         y = np.where(better[:, None], there, y)
-        least = np.where(better, found[0], least)
-        H = np.where(better[:, None, None], found[1], H)
-        gradient = np.where(better[:, None], found[2], gradient)
+        least = np.where(better, trial[0], least)
+        H = np.where(better[:, None, None], trial[1], H)
+        gradient = np.where(better[:, None], trial[2], gradient)
         damping = np.where(better, damping / 10, damping * 10)
     values, vectors = np.linalg.eigh(H)
     roots = vectors / np.sqrt(np.maximum(values, 1 / 9))[:, None]
@@ -286,8 +293,8 @@ def _draws(
     @compiled
     @jax.vmap
     def run(field, x, inputs):
-        whole = getattr(field, "whole", field)
-        return simulated(_Disturbed(whole, d), x, spans, steps, inputs).x[:, 1:]
+        joint_field = getattr(field, "whole", field)
+        return simulated(_Disturbed(joint_field, d), x, spans, steps, inputs).x[:, 1:]
 
     out = np.asarray(run(fields, jnp.asarray(x), jnp.asarray(inputs)))
     noise = np.nan_to_num(np.asarray(learned.noise))

@@ -26,7 +26,7 @@ from hamkernel._trajectories.likelihood import (
     regression_loss,
 )
 from hamkernel._trajectories.model import KernelRows, Model, landmark_whitening
-from hamkernel._trajectories.preprocessing import Preprocessed, sampled
+from hamkernel._trajectories.preprocessing import Preprocessed, sample_points
 from hamkernel._trajectories.segments import LinearisedSegments, windows
 from hamkernel._tuning.minimiser import most_likely_in_box
 from hamkernel._tuning.space import gram_trace, hyperparameters
@@ -278,7 +278,7 @@ def gain_of_friction(
     Of four runs of positions of a pendulum, 80 samples each, with viscous friction of .1 and .03 it
     is 75 and 33 beside the process noise found; with white pushes and no friction −9 to −6.
     """
-    K, (X, Y) = model.kernel, sampled(data)
+    K, (X, Y) = model.kernel, sample_points(data)
     n = Y.shape[1]
     force, fastest = np.sqrt(np.mean(Y[:, n // 2 :] ** 2)), np.abs(X[:, n // 2 : n]).max()
     if frictions(K) or K.given == "parameters" or not fastest > 0:
@@ -306,7 +306,7 @@ def gain_of_inertia(
     55, and that of friction −7 to −5; of coupled pendula with friction 96 to 139, and 140 to 239.
     So three times the gain of friction tells them apart (`tests/test_process_noise.py`).
     """
-    K, (X, Y) = model.kernel, sampled(data)
+    K, (X, Y) = model.kernel, sample_points(data)
     n = Y.shape[1]
     force, fastest = np.sqrt(np.mean(Y[:, n // 2 :] ** 2)), np.abs(X[:, n // 2 : n]).max()
     if n < 4 or n % 2 or K.given == "parameters" or not (force > 0 and fastest > 0):
@@ -470,7 +470,7 @@ def impulses(K: AbstractMatrixKernel, S, Y, data: Preprocessed) -> Float[np.ndar
     """
     prior = np.asarray(KernelRows(S).rows(K, S)).reshape(len(S), len(data.scale), -1)
     velocity = np.sqrt(np.mean(Y**2, axis=0))
-    speed = np.sqrt(np.mean(sampled(data)[1] ** 2, axis=0))
+    speed = np.sqrt(np.mean(sample_points(data)[1] ** 2, axis=0))
     time = np.median(data.scale / np.maximum(speed, np.finfo(float).tiny))
     with np.errstate(divide="ignore"):
         return np.where((prior != 0).any((0, 2)), np.log(velocity * np.sqrt(time)), -np.inf)

@@ -1,16 +1,17 @@
 """Measured states as linear functionals of the field, linearised about a path.
 
-With x̂ the path, Φ its tangent, m the mean and τ_k Gauss nodes with weights w_k, a sample is
+Let x̂ be the path, Φ its tangent, m the mean, and τ_k Gauss nodes with weights w_k. A sample is
 
     x(tᵢ) ≈ x̂(tᵢ) + Φᵢ δz + Σ_{τ_k < tᵢ} w_k Φᵢ Φ_k⁻¹ (f(x̂(τ_k)) − d x̂/dt(τ_k)),
 
-so with g = f − m, and ô the same sum of d x̂/dt − m, xᵢ − x̂ᵢ + ôᵢ = Φᵢ δz + (B g)ᵢ. The sums run
-from interval to interval, sᵢ₊₁ = Ψᵢ sᵢ + Σ_k Γ_ik (…)_k, and no matrix B is stored. Each
-interval adds its `drive` to ô; where the path solves no equation, `missed` is the rest of its
-increment.
+where δz is the change of the start. Let g = f − m, and let ô be the same sum of d x̂/dt − m. Then
+xᵢ − x̂ᵢ + ôᵢ = Φᵢ δz + (B g)ᵢ. We compute the sums from interval to interval, as
+sᵢ₊₁ = Ψᵢ sᵢ + Σ_k Γ_ik (…)_k, and store no matrix B. Each interval adds its `drive` to ô. If the
+path is no solution of an equation, `missed` is the part of its increment that the Gauss rule
+misses.
 
-The path is that of the current field, or any other, such as a smoothed one: then Φ is the tangent
-of the mean alone, the identity where there is none.
+The path is a solution of the current field, or any other path, such as a smoothed one. For a
+smoothed path Φ is the tangent of the mean alone, the identity if there is no mean.
 """
 
 import itertools
@@ -31,7 +32,7 @@ from hamkernel._trajectories.flow import (
     means,
 )
 from hamkernel._trajectories.preprocessing import Preprocessed, PreprocessedRun
-from hamkernel._trajectories.runs import at_nodes
+from hamkernel._trajectories.runs import inputs_at_nodes
 from hamkernel._trajectories.smoothing import power_of_two
 
 
@@ -51,10 +52,10 @@ class LinearisedSegments(NamedTuple):
         across: Ψ, shape (S, L, n, n).
         weights: Γ, shape (S, L, 3, n, n).
         spans: the lengths of the intervals, shape (S, L).
-        pushed: by how much larger the deviation of w is in an interval, shape (S, L).
+        pushed: the factor on the standard deviation of w in an interval, shape (S, L).
         drive: Σ_k Γ_k (d x̂/dt − m)_k, shape (S, L, n).
-        missed: the increment of x̂ less that of the Gauss rule for d x̂/dt, 0 for a solution, the
-            same shape.
+        missed: the increment of x̂ minus the Gauss rule for ∫ d x̂/dt, 0 for a solution of an
+            equation, shape (S, L, n).
         residual: x − x̂, shape (S, L + 1, n).
         counts: the counts of the segments, zero on samples that were dropped.
         scatter: the scatter of the segments, zero on samples that were dropped.
@@ -94,7 +95,7 @@ def linearised(
     keep = good[:, None, None]
     x, nodes, to_end, across = (_where(good, a) for a in path)
     n = x.shape[-1]
-    # Where nothing is kept the field is still asked: at the starts, which are states of the runs.
+    # Dropped segments are evaluated too: we put their nodes at the starts, states of the runs.
     still = jnp.pad(segments.starts, ((0, 0), (0, nodes.shape[-1] - n)))
     nodes = jnp.where(keep[..., None], nodes, still[:, None, None])
     eye = jnp.broadcast_to(jnp.eye(n, dtype=x.dtype), across.shape)
@@ -121,18 +122,23 @@ def linearised(
 def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
     """The rows, or windows of them, evenly from all segments, with at most `samples` samples.
 
-    The start of a window is unknown, as that of a segment is, and what adds up along a path is seen
-    in long windows only; four at least keep some variety. Of six runs of 240 samples of a pendulum
-    with friction .2, four seeds, windows of 12 samples gave .222, .191, .206 and .217, windows of
-    192 .197, .199, .197 and .197 in the same time, and all rows .199, .199, .198 and .200 (those of
-    `logs(seed, samples=240, step=6)` in `tests/test_learn_inputs.py`, a known matrix of inputs).
+    The start of a window is unknown, like the start of a segment, so only long windows contain the
+    effects that add up along a path. We take at least four windows for variety. The table has the
+    friction found for a pendulum with friction .2 from six runs of 240 samples, for four seeds:
+
+        windows of 12 samples     .222  .191  .206  .217
+        windows of 192 samples    .197  .199  .197  .197   (in the same time)
+        all rows                  .199  .199  .198  .200
+
+    The runs are `logs(seed, samples=240, step=6)` in `tests/test_learn_inputs.py`.
     """
-    seen: Any = np.asarray(rows.counts).any(axis=2)
-    if seen.size <= samples or not seen[:, 1:].any():
+    measured: Any = np.asarray(rows.counts).any(axis=2)
+    if measured.size <= samples or not measured[:, 1:].any():
         return rows
-    ends = np.where(seen.any(axis=1), seen.shape[1] - np.argmax(seen[:, ::-1], axis=1), 0)
-    # Of few lengths, so that few programs are compiled.
-    length = int(ends.max()) if seen.shape[1] < SHORT else SHORT
+    lengths = measured.shape[1] - np.argmax(measured[:, ::-1], axis=1)
+    ends = np.where(measured.any(axis=1), lengths, 0)
+    # There are few possible lengths, so that few programs are compiled.
+    length = int(ends.max()) if measured.shape[1] < SHORT else SHORT
     while 2 * length <= min(int(ends.max()), samples // 4):
         length *= 2
     firsts = [
@@ -140,9 +146,9 @@ def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
         for s, end in enumerate(ends)
         for i in range(0, end - 1, max(length - 1, 1))
     ]
-    most = max(samples // length, 1)
-    if len(firsts) > most:
-        chosen = np.linspace(0, len(firsts) - 1, most).round().astype(int)
+    limit = max(samples // length, 1)
+    if len(firsts) > limit:
+        chosen = np.linspace(0, len(firsts) - 1, limit).round().astype(int)
         firsts = [firsts[i] for i in chosen]
     s, first = np.array(firsts).T
     return _windows(rows, jnp.asarray(s), jnp.asarray(first[:, None] + np.arange(length)[None]))
@@ -192,16 +198,16 @@ def segments_of(
     n, m = pieces[0][1].shape[1], pieces[0][5].shape[2]
     spans = np.zeros((size, length - 1))
     measured, counts, scatter = np.zeros((3, size, length, n))
-    # Segments that are padding stay at a state of the runs: another one may be where none is
-    # possible, as a population of zero in a kernel of its logarithm.
+    # Padding stays at a state of the runs. Other states may be impossible, such as a population of
+    # zero for a kernel of its logarithm.
     starts, inputs = np.tile(pieces[0][4], (size, 1)), np.zeros((size, length - 1, 2, m))
     for s, (t, x, count, squares, start, ends) in enumerate(pieces):
         T = len(t)
         spans[s, : T - 1] = np.diff(t)
-        seen = np.isfinite(x)
-        measured[s, :T] = np.where(seen, x, 0.0)
-        counts[s, :T] = np.where(seen, count, 0.0)
-        scatter[s, :T] = np.where(seen, squares, 0.0)
+        finite = np.isfinite(x)
+        measured[s, :T] = np.where(finite, x, 0.0)
+        counts[s, :T] = np.where(finite, count, 0.0)
+        scatter[s, :T] = np.where(finite, squares, 0.0)
         starts[s], inputs[s, : T - 1] = start, ends
     arrays = spans, measured, counts, scatter, starts, inputs
     return Segments(*(jnp.asarray(a) for a in arrays))
@@ -210,7 +216,7 @@ def segments_of(
 def linearised_along_smoothed(
     data: Preprocessed, pieces: list[Piece], segments: Segments, mean, good: np.ndarray
 ) -> LinearisedSegments:
-    """The rows along the smoothed runs, whose tangent is that of the mean."""
+    """The rows along the smoothed runs, with the tangent of the mean."""
     S, L = segments.spans.shape
     n = len(data.scale)
     first = data.runs[pieces[0][0]].path[pieces[0][1]]  # where padding stays
@@ -223,7 +229,7 @@ def linearised_along_smoothed(
         x[s, :T] = run.path[start:stop]
         nodes[s, : T - 1] = run.nodes[start : stop - 1]
         slopes[s, : T - 1] = run.slopes[start : stop - 1]
-    points = np.concatenate([nodes, at_nodes(np.asarray(segments.inputs))], axis=-1)
+    points = np.concatenate([nodes, inputs_at_nodes(np.asarray(segments.inputs))], axis=-1)
     along = jnp.asarray(x), jnp.asarray(points), jnp.asarray(slopes)
     return _linearised_along_smoothed(mean, along, jnp.asarray(good), segments)
 
@@ -234,32 +240,32 @@ def _linearised_along_smoothed(mean, along, good, segments: Segments) -> Lineari
     path = given_path(x, points, segments.spans, jacobians(mean, points, x.shape[-1]))
     there = means(mean, points, slopes)
     rows = linearised(path, slopes, there, segments, good)
-    # What the Gauss rule misses of the increments of a path that solves no equation is put back.
+    # The smoothed path solves no equation, so the Gauss rule misses a part of its increments.
     shares = segments.spans[:, :, None, None] * jnp.asarray(WEIGHTS, x.dtype)[None, None, :, None]
     missed = jnp.diff(x, axis=1) - (shares * slopes).sum(axis=2)
     return rows._replace(missed=jnp.where(good[:, None, None], missed, 0.0))
 
 
-SHORT = 12  # samples at most in a segment while the field is rough; 10 gave the same errors
-LONG = 256  # at most: longer segments add little information, and arrays stay small
+SHORT = 12  # samples, the longest segment while the field is rough; 10 gave the same errors
+LONG = 256  # samples, the longest segment: longer ones add little information
 
 
-def equal_pieces(runs: list[PreprocessedRun], most: int) -> list[Piece]:
-    """Every run in pieces of at most `most` samples, of nearly equal lengths."""
-    return [piece for r, run in enumerate(runs) for piece in _equal(r, 0, len(run.times), most)]
+def equal_pieces(runs: list[PreprocessedRun], limit: int) -> list[Piece]:
+    """Every run in pieces of at most `limit` samples, of nearly equal lengths."""
+    return [piece for r, run in enumerate(runs) for piece in _equal(r, 0, len(run.times), limit)]
 
 
-def _equal(run: int, start: int, stop: int, most: int) -> list[Piece]:
-    # As many as the next power of two needs: runs of other lengths then have as many pieces.
-    count = -(-power_of_two(stop - start) // most)
+def _equal(run: int, start: int, stop: int, limit: int) -> list[Piece]:
+    # The count is that of the next power of two, so that runs of similar lengths have equal counts.
+    count = -(-power_of_two(stop - start) // limit)
     ends = np.linspace(start, stop, count + 1).round().astype(int)
     return [Piece(run, int(a), int(b)) for a, b in itertools.pairwise(ends)]
 
 
 def padded_count(count: int, large: bool) -> int:
-    """The least power of two that is not below `count`; of a large log an eighth finer."""
-    most = power_of_two(count)
-    step = max(most // 8, 1) if large else most
+    """The least power of two that is not below `count`; for a large log a multiple of an eighth."""
+    power = power_of_two(count)
+    step = max(power // 8, 1) if large else power
     return -(-count // step) * step
 
 
@@ -268,24 +274,24 @@ def segmented(
 ) -> Segments:
     """The pieces as arrays of a few shapes; they start on `paths`."""
     longest = max(piece.stop - piece.start for piece in pieces)
-    # Padding costs as much as samples: in each direction half of a large log may be padding, and
-    # above some thousand entries that costs more than to compile anew, some 15 s.
+    # Padding costs as much as samples, and half of each axis may be padding. For more than some
+    # thousand entries this costs more than compiling a new program, some 15 s.
     large = len(pieces) * longest * len(runs[0].path[0]) > 4096
     size, length = (padded_count(count, large) for count in (len(pieces), longest))
-    # As the windows of longer pieces have, so that one program does for both; of a large log of
-    # short runs there are none, and 400 runs of 5 samples took 11 s a solve for 7.
+    # Windows of longer pieces have this length too, so that one program serves both. A large log of
+    # short runs has no windows: with this padding 400 runs of 5 samples took 11 s a solve, not 7.
     if longest <= SHORT and not (large and longest == max(len(run.times) for run in runs)):
         length = min(power_of_two(longest), SHORT)
     filled = []
     for r, start, stop in pieces:
         run, part = runs[r], slice(start, stop)
-        own = run.times, run.states, run.counts, run.scatter
-        filled.append((*(a[part] for a in own), paths[r][start], run.inputs[start : stop - 1]))
+        arrays = run.times, run.states, run.counts, run.scatter
+        filled.append((*(a[part] for a in arrays), paths[r][start], run.inputs[start : stop - 1]))
     return segments_of(filled, size, length)
 
 
 def updated(paths, pieces: list[Piece], good, x: np.ndarray) -> list[np.ndarray]:
-    """The paths, with those of the pieces that were kept replaced by x."""
+    """The paths, in which x replaces the pieces that were kept."""
     new = [path.copy() for path in paths]
     for s, (r, start, stop) in enumerate(pieces):
         if good[s] and np.isfinite(x[s]).all():

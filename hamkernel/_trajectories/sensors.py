@@ -42,10 +42,10 @@ def faults(log: Log) -> Diagnostics:
 def _row(
     name: str, faults_found: Sequence[str], limit: str, meaning: str, advice: str
 ) -> Diagnostic:
-    """A row that passes where nothing was faults_found."""
+    """A row of the table, which passes if no faults were found."""
     if not faults_found:
         return Diagnostic(name, "none", limit, True, "nothing of it in this log")
-    return Diagnostic(name, _some(faults_found), limit, False, meaning, advice)
+    return Diagnostic(name, _list(faults_found), limit, False, meaning, advice)
 
 
 def _impossible(log: Log) -> Diagnostic:
@@ -82,7 +82,7 @@ def _wraps(log: Log) -> Diagnostic:
         f" of the samples that were measured alone, ok = np.isfinite(q); q[ok] = "
         f"np.unwrap(q[ok]{option}), since after a NaN it leaves NaN"
     )
-    jumps = "; ".join(f"{_some(places)} jumps by about {full[p]}" for p, places in where.items())
+    jumps = "; ".join(f"{_list(places)} jumps by about {full[p]}" for p, places in where.items())
     return _row(
         "wrapped angles",
         [place for places in where.values() for place in places],
@@ -106,7 +106,7 @@ def _gaps(log: Log) -> Diagnostic:
         "gaps",
         faults_found,
         "10 spacings",
-        f"a gap of {_some(faults_found)}",
+        f"a gap of {_list(faults_found)}",
         "The path inside a gap is known from the field alone; cut the run in two there if the "
         "system was moved meanwhile.",
     )
@@ -123,12 +123,12 @@ def _constant(log: Log) -> Diagnostic:
         "constant",
         faults_found,
         "some motion",
-        f"constant in all runs: coordinate {_some(faults_found)}",
+        f"constant in all runs: coordinate {_list(faults_found)}",
         "Leave it out of the states.",
     )
 
 
-_QUANTA = 4.0  # the steps of a log, above which a repeat is no rounding of a sensor at work
+_QUANTA = 4.0  # if a coordinate moves by more resolution steps than this, a repeat is no rounding
 
 
 def _sensors(log: Log) -> list[Diagnostic]:
@@ -175,7 +175,7 @@ def _sensor_rows(
             "clipped sensors",
             clipped,
             "two plateaus",
-            f"a sensor seems clipped: coordinate {_some(clipped)} stays at its outermost value and "
+            f"a sensor seems clipped: coordinate {_list(clipped)} stays at its outermost value and "
             "arrives there at speed",
             "Write NaN for these samples; the field then says where it went.",
         ),
@@ -183,7 +183,7 @@ def _sensor_rows(
             "dead sensors",
             dead,
             "one deviation of the others",
-            f"a sensor seems dead: coordinate {_some(dead)} keeps one value while others move by "
+            f"a sensor seems dead: coordinate {_list(dead)} keeps one value while others move by "
             "more than a standard deviation",
             "Write NaN for these samples.",
         ),
@@ -191,7 +191,7 @@ def _sensor_rows(
             "repeated samples",
             repeated,
             "30%",
-            f"repeated samples: coordinate {_some(repeated)} is often exactly the sample before, "
+            f"repeated samples: coordinate {_list(repeated)} is often exactly the sample before, "
             "and else goes on by many steps of its resolution. The log was written faster than the "
             "sensor measures, so times are late and the noise looks smaller than it is",
             "Keep the first of equal samples and write NaN for the others.",
@@ -200,7 +200,7 @@ def _sensor_rows(
             "interpolated samples",
             drawn,
             "40%",
-            f"interpolated samples: coordinate {_some(drawn)} lies on straight lines between some "
+            f"interpolated samples: coordinate {_list(drawn)} lies on straight lines between some "
             "of its samples. What was interpolated is no measurement, and the noise looks smaller "
             "than it is",
             "Give the samples at their own times, hk.Runs does not need equal ones.",
@@ -211,8 +211,8 @@ def _sensor_rows(
 def _repeats(steps: Sequence[Float[np.ndarray, " _"]]) -> float:
     """The share of samples that repeat the one before, without stretches at rest.
 
-    A stretch of equal values is a rest where it is a whole run, or ten times longer than half of
-    all stretches are.
+    A stretch of equal values is a rest if it is a whole run, or more than ten times as long as the
+    median stretch.
     """
     lengths, is_run = [], []
     for step in steps:
@@ -227,8 +227,8 @@ def _repeats(steps: Sequence[Float[np.ndarray, " _"]]) -> float:
 def _straight(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> float:
     """The share of samples on the line of their neighbours, among those whose neighbours differ.
 
-    Zero where fewer than ten samples lie off their line, as in free motion with a few collisions,
-    and where the angle was wrapped.
+    The share is zero if fewer than ten samples lie off their line, as in free motion with a few
+    collisions, and if the angle was wrapped.
     """
     off = [np.zeros(0)]
     for t, x in zip(times, columns, strict=True):
@@ -243,28 +243,28 @@ def _straight(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> flo
 
 
 def _plateaus(x: Float[np.ndarray, " T"], value: float, quantum: float) -> int:
-    """The number of times x stays at this outermost value for three samples, and comes at speed.
+    """The number of plateaus: x arrives at speed at this outermost value and stays three samples.
 
-    A smooth maximum that rounds to one value k times is a parabola that falls by less than
-    ((k + 2)/k)² of a step of the resolution one sample further on, 2.8 for k = 3.
+    A smooth maximum can also round to one value k times. Such a parabola falls by less than
+    ((k + 2)/k)² resolution steps at the next sample, 2.8 for k = 3.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], x == value, [False]]).astype(int)))
-    found = 0
+    count = 0
     for first, stop in edges.reshape(-1, 2):
         if stop - first < 3 or first == 0 or stop == len(x):
             continue
         step = min(abs(x[first - 1] - value), abs(x[stop] - value))
-        found += 1 if step > _QUANTA * quantum else 0
-    return found
+        count += 1 if step > _QUANTA * quantum else 0
+    return count
 
 
-def _stuck(x: Float[np.ndarray, " T"], others: Float[np.ndarray, "T others"]):
+def _stuck(x: Float[np.ndarray, " T"], rest: Float[np.ndarray, "T rest"]):
     """The longest stretch of equal values in which another coordinate moves by more than one."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], x[1:] == x[:-1], [False]]).astype(int)))
-    if not edges.size or not others.size:
+    if not edges.size or not rest.size:
         return None
     first, stop = max(edges.reshape(-1, 2), key=lambda pair: pair[1] - pair[0])
-    part = others[first : stop + 1]
+    part = rest[first : stop + 1]
     part = part[:, np.isfinite(part).all(axis=0)]
     if stop - first < 5 or not part.size or np.ptp(part, axis=0).max() < 1.0:
         return None
@@ -272,10 +272,10 @@ def _stuck(x: Float[np.ndarray, " T"], others: Float[np.ndarray, "T others"]):
 
 
 def _inputs(log: Log) -> list[Diagnostic]:
-    """Inputs that never change, or a combination of which hardly does.
+    """Inputs that never change, and inputs with a combination that hardly changes.
 
-    Of inputs of variance one it has a variance below .01: the errors of its gain are ten times
-    those under independent inputs.
+    The inputs are scaled to variance one. A combination with a variance below .01 has a gain whose
+    error is ten times as large as with independent inputs.
     """
     U = np.concatenate(log.inputs)
     none = np.ptp(U, axis=0) == 0
@@ -291,7 +291,7 @@ def _inputs(log: Log) -> list[Diagnostic]:
             "constant inputs",
             still,
             "some change",
-            f"constant in all runs: input {_some(still)}. What it does cannot be told from the "
+            f"constant in all runs: input {_list(still)}. What it does cannot be told from the "
             f"drift, {unless}",
             "Leave it out, or log runs in which it varies.",
         ),
@@ -299,7 +299,7 @@ def _inputs(log: Log) -> list[Diagnostic]:
             "dependent inputs",
             alike,
             "1% of the variance",
-            f"inputs {_some(alike)} depend on one another: a combination of them has less than 1 % "
+            f"inputs {_list(alike)} depend on one another: a combination of them has less than 1 % "
             f"of their variance. Their gains cannot be told apart, {unless}",
             "Leave out inputs that repeat others, or vary each on its own.",
         ),
@@ -328,9 +328,9 @@ def _feedback(log: Log) -> Diagnostic:
 
 
 def _free_of_states(X: Float[np.ndarray, "N n"], U: Float[np.ndarray, "N m"]) -> float:
-    """The share of the variance of U, of its least free combination, that no cubic of X leaves.
+    """The share of the variance of U that no cubic polynomial of X explains.
 
-    1 where nothing can be said.
+    Of all combinations of the inputs we return the smallest share; 1 if there are too few data.
     """
     X = X[:, np.isfinite(X).any(axis=0)]
     use = np.isfinite(X).all(axis=1)
@@ -341,7 +341,7 @@ def _free_of_states(X: Float[np.ndarray, "N n"], U: Float[np.ndarray, "N m"]) ->
     powers = [np.ones(len(Z))]
     for degree in range(1, 4):
         more = itertools.combinations_with_replacement(Z.T, degree)
-        new = [np.prod(each, axis=0) for each in more]
+        new = [np.prod(factors, axis=0) for factors in more]
         if 10 * (len(powers) + len(new)) > len(Z):
             break
         powers += new
@@ -349,18 +349,18 @@ def _free_of_states(X: Float[np.ndarray, "N n"], U: Float[np.ndarray, "N m"]) ->
     varied = U.std(axis=0) > 0
     if A.shape[1] == 1 or not varied.any():
         return 1.0
-    left = U - A @ np.linalg.lstsq(A, U, rcond=None)[0]
+    residual = U - A @ np.linalg.lstsq(A, U, rcond=None)[0]
     R = np.linalg.qr(U[:, varied], mode="r")
     if np.abs(np.diag(R)).min() <= 1e-9 * np.abs(R).max():
         return 1.0  # inputs that depend on one another are refused by `learn`
-    return float(np.linalg.svd(left[:, varied] @ np.linalg.inv(R), compute_uv=False)[-1] ** 2)
+    return float(np.linalg.svd(residual[:, varied] @ np.linalg.inv(R), compute_uv=False)[-1] ** 2)
 
 
 class Timing(NamedTuple):
-    """How residuals r grow with the speed v, as those of times that are off do.
+    """The growth of residuals r with the speed v, which wrong times cause: E r² = σ² + τ²v².
 
     Attributes:
-        score: of no growth in E r² = σ² + τ²v², N(0, 1) if there is none.
+        score: the score test of τ = 0, N(0, 1) if the times are right.
         off: τ, the standard deviation of the times.
         share: the largest share of τ²v² in the variance of a coordinate.
     """
@@ -371,16 +371,16 @@ class Timing(NamedTuple):
 
     @property
     def is_off(self) -> bool:
-        """Whether they do, and by a fifth of a variance, a tenth of a deviation.
+        """Whether the times are wrong, and cause a fifth of the variance of a coordinate.
 
-        Ten clean logs of a pendulum, 4 runs of 80 samples, have scores of −1 to .6. Three with
-        noise of .02 and times off by .02 have 12 to 16, and τ from .018 to .024 by coordinate.
+        Ten clean logs of a pendulum, 4 runs of 80 samples each, have scores of −1 to .6. Three logs
+        with noise of .02 and times off by .02 have scores of 12 to 16 and τ of .018 to .024.
         """
         return self.score > 3 and self.share > 0.2
 
 
 def timing(times: list[np.ndarray], residuals: list[np.ndarray], paths: list[np.ndarray]) -> Timing:
-    """Whether residuals grow with the speed along the paths; a coordinate without any is NaN.
+    """The growth of residuals with the speed along the paths; NaN where nothing was measured.
 
     Speeds are compared within each run, since the noise may be larger in a run that is faster.
     """
@@ -394,7 +394,7 @@ def timing(times: list[np.ndarray], residuals: list[np.ndarray], paths: list[np.
                 parts.append((r, r / r.mean(), v, v - v.mean()))
         if sum(len(part[0]) for part in parts) < 20:
             continue
-        r, relative, v, d = (np.concatenate(each) for each in zip(*parts, strict=True))
+        r, relative, v, d = (np.concatenate(column) for column in zip(*parts, strict=True))
         if not d.any():
             continue
         scores.append(relative @ d / np.sqrt(2 * d @ d))
@@ -414,8 +414,8 @@ _PERIODS = (2 * np.pi, 360.0, 4096.0, 65536.0)
 def wrapped_period(t: Float[np.ndarray, " T"], x: Float[np.ndarray, " T"]) -> float:
     """The period at which x is wrapped; 0.0 if it is not.
 
-    Its steps are then about the period, and no others are more than a third of the period. In units
-    other than radians x must also fill the period and no more.
+    A wrapped x has steps of about the period, and all its other steps are less than a third of the
+    period. In units other than radians x must also fill the period and no more.
     """
     t, x = t[np.isfinite(x)], x[np.isfinite(x)]
     near = np.diff(t) <= 3 * np.median(np.diff(t)) if len(t) > 1 else slice(0)
@@ -425,22 +425,22 @@ def wrapped_period(t: Float[np.ndarray, " T"], x: Float[np.ndarray, " T"]) -> fl
         full = beyond < 1 / 3
         if not full.any() or (period > 7 and not 0.8 < np.ptp(x) / period <= 1.0):
             continue
-        others = 0.0 if full.all() else step[~full].max()
-        if others < 1 / 3 and beyond[full].max() < 0.111 + others:
+        largest = 0.0 if full.all() else step[~full].max()
+        if largest < 1 / 3 and beyond[full].max() < 0.111 + largest:
             return period
     return 0.0
 
 
 def impossible_samples(x: Float[np.ndarray, "T n"]) -> Bool[np.ndarray, " T"]:
-    """Rows of one run that no motion of the others passes through.
+    """The rows of one run that cannot belong to the motion of the other rows.
 
-    With d the distance of a sample from the mean of its two neighbours and σ the deviation of all
-    d, by their median so that one row in eight may be wrong, a row is impossible if in one of its
-    coordinates the neighbours agree to a fifth of d, and
-    - d > 20 σ, and the row lies outside the range of the others by twice that range, as −9999,
-      65535 and 1e30 do, or
-    - d > 6 σ, and the row is all zeros, which loggers write for a lost packet; then all rows of
-      zeros between others are.
+    Let d be the distance of a sample from the mean of its two neighbours, and σ the standard
+    deviation of d, estimated by the median so that one row in eight may be wrong. A row is
+    impossible if in one coordinate the neighbours agree to d/5 and one of two conditions holds.
+    - d > 20 σ, and the row is outside the range of the others by twice that range, such as −9999,
+      65535 or 1e30.
+    - d > 6 σ, and the row is all zeros, which loggers write for a lost packet. Then all rows of
+      zeros are impossible whose neighbours are not.
     """
     bad = np.zeros(len(x), bool)
     if len(x) < 5:
@@ -463,12 +463,12 @@ def impossible_samples(x: Float[np.ndarray, "T n"]) -> Bool[np.ndarray, " T"]:
 
 
 def is_on_a_curve(states: Sequence[Float[np.ndarray, "T n"]], noise: np.ndarray) -> bool:
-    """Whether the momentum is one function of the position in the data of all runs, with n = 2.
+    """Whether the momentum is one function of the position in the data of all runs, for n = 2.
 
-    Of the variance of the momenta a cubic leaves 0 for a capacitor that discharges and 1.6e-3 for
-    a tank; 9e-3 for a pendulum on a quarter of a swing, and all for one that turns over quickly,
-    whose momenta vary by a tenth about their mean (`tests/test_process_noise.py`). The noise of the
-    sensors comes on top, of the position by the slope of the curve.
+    We fit a cubic to the momenta and test the share of their variance that remains, after we
+    subtract the noise of both sensors. The share is 0 for a capacitor that discharges, 1.6e-3 for a
+    tank, and 9e-3 for a pendulum on a quarter of a swing. It is 1 for a pendulum that turns over
+    quickly, whose momenta vary by a tenth (`tests/test_process_noise.py`).
     """
     X = np.concatenate(states)
     X = X[np.isfinite(X).all(axis=1)]
@@ -481,11 +481,11 @@ def is_on_a_curve(states: Sequence[Float[np.ndarray, "T n"]], noise: np.ndarray)
     rest = p - cubic @ np.linalg.lstsq(cubic, p, rcond=None)[0]
     slope = (q @ p) / max(q @ q, 1e-300)
     sensors = noise[1] ** 2 + (slope * noise[0]) ** 2
-    # Noise as large as a tenth of the momenta hides what a curve would be.
+    # Noise of more than a tenth of the momenta would hide a curve, so we do not subtract it.
     sensors = sensors if sensors < 0.01 * p.var() else 0.0
     return bool(rest @ rest < 2e-3 * (p @ p) + 1.5 * len(X) * sensors)
 
 
-def _some(names: Sequence[str]) -> str:
+def _list(names: Sequence[str]) -> str:
     more = f" and {len(names) - 3} more" if len(names) > 3 else ""
     return ", ".join(names[:3]) + more

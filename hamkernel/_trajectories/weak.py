@@ -23,7 +23,7 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
-from hamkernel._trajectories.preprocessing import condensed
+from hamkernel._trajectories.preprocessing import condense
 from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.smoothing import Coordinate, Process, power_of_two, processes, smoothed
 
@@ -223,7 +223,7 @@ def _samples(times: list[np.ndarray], channels: Channels) -> _Samples:
         for r, (t, x) in enumerate(zip(times, both, strict=True)):
             z = np.concatenate([paths.value[r, : len(t)], paths.slope[r, : len(t)]], axis=1)
             slopes = np.gradient(z, t, axis=0)
-            means.append(condensed(t, x.reshape(len(t), -1), z, slopes, block)[:3])
+            means.append(condense(t, x.reshape(len(t), -1), z, slopes, block)[:3])
         times, both, counts = (list(column) for column in zip(*means, strict=True))
         both, counts = ([x.reshape(-1, 2, C) for x in runs] for runs in (both, counts))
     sets = list(channels.groups)

@@ -19,7 +19,7 @@ from jaxtyping import Array, ArrayLike, Float
 from hamkernel._gram import forward_differentiated, gram_of_rows, gram_rounding, trace
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, bounds_by_value
 from hamkernel._kernels.functions import Bound
-from hamkernel._kernels.symmetry import without_symmetry
+from hamkernel._kernels.symmetry import drop_symmetry
 from hamkernel._machine import compiled
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import Measurements
@@ -103,7 +103,7 @@ gram_trace = compiled(trace)
 
 def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
     """The trace of the Gram before terms of odd and even kernels cancel, for its rounding."""
-    terms = without_symmetry(K)
+    terms = drop_symmetry(K)
     trace = gram_trace(terms, X)
     if Invariance.REFLECTION in terms.invariance:
         return trace  # the trace of the Gram is no larger

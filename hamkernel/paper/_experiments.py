@@ -155,9 +155,9 @@ def _pendulum(mass: float) -> Experiment:
     )
 
 
-def _models(**found: tuple[float, float]) -> dict[str, Model]:
-    found["symplectic"] = found["odd_symplectic"]
-    return {structure: Model(structure, *found[structure]) for structure in STRUCTURES}
+def _models(**published: tuple[float, float]) -> dict[str, Model]:
+    published["symplectic"] = published["odd_symplectic"]
+    return {structure: Model(structure, *published[structure]) for structure in STRUCTURES}
 
 
 _TIMES = 100  # steps of the test trajectory
@@ -222,11 +222,11 @@ def evaluate(
 
     The quantities are:
 
-    - the mean and maximum of the trajectory error over the test horizon;
-    - the mean and variance of the odd error ‖f(x) + f(−x)‖ over the sampled points;
-    - the mean and variance of the learned Hamiltonian on the learned test trajectory, if there is a
-      Hamiltonian, with the constant of the representer, and of the true Hamiltonian on the true
-      trajectory.
+    - The mean and maximum of the trajectory error over the test horizon.
+    - The mean and variance of the odd error ‖f(x) + f(−x)‖ over the sampled points.
+    - The mean and variance of the true Hamiltonian on the true test trajectory. If the field has a
+      Hamiltonian, also its mean and variance on the learned trajectory, with the constant of the
+      representer.
 
     Args:
         experiment: the system and its test.
@@ -254,8 +254,8 @@ def evaluate(
     ridge = jnp.asarray(regularization, X.dtype)
     if not ridge.ndim:  # the same hyperparameters for all data sets
         kernel, ridge = jax.tree.map(lambda a: jnp.stack([a] * len(X)), (kernel, ridge))
-    fields = _in_batches(_batch_of_fits, (kernel, X, Y, ridge))
-    learned, error, quantities = _in_batches(
+    fields = _map_batches(_batch_of_fits, (kernel, X, Y, ridge))
+    learned, error, quantities = _map_batches(
         lambda batch: _tests(batch, ts, true, points, accuracy), _pad(fields)
     )
     test = slice(_TIMES + 1)
@@ -287,8 +287,8 @@ def _pad(fields: KernelField) -> KernelField:
     return eqx.tree_at(lambda f: (f.points, f.coefficients, f.residual), fields, parts)
 
 
-def _in_batches(fn: Callable, seeds):
-    """fn(seeds), a PyTree with the leading axis S of that argument, 20 of them at a time."""
+def _map_batches(fn: Callable, seeds):
+    """The PyTree fn(seeds), with 20 of the S seeds on the leading axis at a time."""
     S = len(jax.tree.leaves(seeds)[0])
     batch = min(20, S)
     parts = []
@@ -411,20 +411,20 @@ def compare(
     """
     make = STRUCTURES[structure]
 
-    def chosen(found: list[_SearchEnd], seconds: np.ndarray) -> Choice:
-        kernels = [make(Gaussian(each.lengthscale)) for each in found]
+    def choice(ends: list[_SearchEnd], seconds: np.ndarray) -> Choice:
+        kernels = [make(Gaussian(end.lengthscale)) for end in ends]
         kernels = jax.tree.map(lambda *leaves: jnp.stack(leaves), *kernels)
-        lengthscale, regularization, loss = np.array(found).T
-        # Where the data asks for the flat limit (σ -> ∞, λ -> 0), a field rounds at about 1e-9,
-        # and with a smaller tolerance 100 times as many steps were measured.
+        lengthscale, regularization, loss = np.array(ends).T
+        # In the flat limit (σ -> ∞, λ -> 0) a field has rounding errors of about 1e-9, and the
+        # integrator took 100 times as many steps with a smaller tolerance.
         outcome = evaluate(experiment, kernels, X, Y, regularization, tolerance=1e-6)
         return Choice(lengthscale, regularization, loss, seconds, outcome.quantities)
 
     surfaces, grid_seconds = _time(lambda x, y: _surface(make, x, y), X, Y)
-    tuned, gradient_seconds = _time(lambda x, y: _by_gradient(make, x, y), X, Y)
+    tuned, gradient_seconds = _time(lambda x, y: _search_by_gradient(make, x, y), X, Y)
     return Comparison(
-        chosen([_least_loss(surface) for surface in surfaces], grid_seconds),
-        chosen(tuned, gradient_seconds),
+        choice([_least_loss(surface) for surface in surfaces], grid_seconds),
+        choice(tuned, gradient_seconds),
         surfaces[0],
     )
 
@@ -458,7 +458,7 @@ def _least_loss(surface: np.ndarray) -> _SearchEnd:
     return _SearchEnd(GRID[0][i], GRID[1][j], surface[i, j])
 
 
-def _by_gradient(make, x, y) -> _SearchEnd:
+def _search_by_gradient(make, x, y) -> _SearchEnd:
     tuned = tune(make(Gaussian(1.0)), x, y, 1e-3, FOLDS)
     # The only hyperparameter of these kernels, which is stored as a logarithm.
     (leaf,) = jax.tree.leaves(eqx.filter(tuned.kernel, eqx.is_inexact_array))
@@ -493,10 +493,10 @@ def grid_losses(
 
         def loss(regularization):
             ridge = (N - N / len(points)) * regularization
-            return jnp.mean(jnp.stack([fold_loss(G, ridge, each) for each in points]))
+            return jnp.mean(jnp.stack([fold_loss(G, ridge, fold) for fold in points]))
 
-        # One after the other: jaxlib 0.10.2 stalls forever on two cores where several batches of
-        # factorisations that do not depend on each other, here those of the folds, run at once.
+        # One ridge after the other: on two cores jaxlib 0.10.2 stalls forever if several
+        # independent batches of factorisations, such as those of the folds, run at once.
         return jax.lax.map(loss, ridges)
 
     return jax.lax.map(row, lengthscales)

@@ -105,11 +105,11 @@ def tracking(experiment: Experiment, reading: str, models: Models) -> Figure:
     figure = Figure(figsize=(8, 3.7), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1, 1.45))
     first = next(iter(models.values()))
-    curves = {"true": first.true, **{name: each.learned[0] for name, each in models.items()}}
+    curves = {"true": first.true, **{name: model.learned[0] for name, model in models.items()}}
     plot.trajectories(
         curves, left, units=experiment.units, title="Test trajectory, seed 0", show_legend=False
     )
-    errors = {name: np.asarray(each.error) for name, each in models.items()}
+    errors = {name: np.asarray(model.error) for name, model in models.items()}
     seeds = len(first.error)
     plot.trajectory_error(
         first.ts,

@@ -110,7 +110,7 @@ def _tuned_verdict(results: Results) -> str:
     cases = [values for readings in results.values() for values in readings["tuned"].values()]
 
     def ratios(of: str, above: str, below: str) -> np.ndarray:
-        return np.array([each[of][above]["median"] / each[of][below]["median"] for each in cases])
+        return np.array([case[of][above]["median"] / case[of][below]["median"] for case in cases])
 
     loss, speed = ratios("loss", "gradient", "grid"), ratios("seconds", "grid", "gradient")
     text = (
@@ -221,11 +221,11 @@ def _median(values: Mapping[str, dict[str, float]], quantity: str) -> float:
 
 
 def _cell(spread: Mapping[str, float]) -> str:
-    median, p10, p90 = (_rounded(spread[key]) for key in ("median", "p10", "p90"))
+    median, p10, p90 = (_format(spread[key]) for key in ("median", "p10", "p90"))
     return f"{median} [{p10}, {p90}]"
 
 
-def _rounded(x: float) -> str:
+def _format(x: float) -> str:
     if x == 0 or 1e-3 <= abs(x) < 1e4:
         return f"{x:.4g}" if abs(x) >= 100 else f"{x:.3g}"
     return f"{x:.1e}"
@@ -265,10 +265,10 @@ def _closest(
             systems.setdefault(system, []).append((float(deviation), label))
     clauses = []
     for system, fits in systems.items():
-        (best, label), (second, other), *_ = sorted(fits)
+        (best, label), (second, next_label), *_ = sorted(fits)
         clauses.append(
             f"{label} for the {system.lower()} ({best:.1%} off on average, "
-            f"next {other} {second:.1%})"
+            f"next {next_label} {second:.1%})"
         )
     return f"{table} is closest to " + ",\nand to ".join(clauses) + "."
 
@@ -352,7 +352,7 @@ def retune(
     comparisons = _comparisons(_datasets_of_seeds(seeds), progress)
     results = json.loads(path.read_text())
     for name, models in comparisons.items():
-        results[name]["tuned"] = {model: _tuned_quantities(each) for model, each in models.items()}
+        results[name]["tuned"] = {model: _tuned_quantities(c) for model, c in models.items()}
     _write(results, path)
     text = tuning_report(results, experiments(), seeds)
     if show is not None:
@@ -397,12 +397,12 @@ def _outcomes(data: Data, progress: bool) -> Outcomes:
 
 
 def _comparisons(data: Data, progress: bool) -> Comparisons:
-    known = experiments()
-    runs = [(name, model) for name, each in known.items() for model in each.models]
+    by_name = experiments()
+    runs = [(name, model) for name, experiment in by_name.items() for model in experiment.models]
     comparisons: Comparisons = {}
     for name, model in tqdm(runs, desc="tuning", disable=None if progress else True):
-        structure = known[name].models[model].structure
-        comparisons.setdefault(name, {})[model] = compare(known[name], structure, *data[name])
+        structure = by_name[name].models[model].structure
+        comparisons.setdefault(name, {})[model] = compare(by_name[name], structure, *data[name])
     return comparisons
 
 

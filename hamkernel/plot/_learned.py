@@ -19,22 +19,22 @@ from hamkernel.plot._style import (
     STREAM,
     Limits,
     Texts,
+    as_pair,
     axes,
     dots,
-    drawn,
+    evaluate_in_plane,
     grid,
-    in_plane,
     legend,
     plane_data,
     plane_labels,
-    two,
+    refuse_tracers,
     with_unit,
 )
 
 ScalarField = Callable[[Float[Array, "2"]], Float[Array, ""]]
 
 
-@drawn
+@refuse_tracers
 def hamiltonian(
     learned: ScalarField,
     true: ScalarField,
@@ -51,9 +51,9 @@ def hamiltonian(
 ) -> tuple[Axes, Axes]:
     """Draw the true and the learned Hamiltonian side by side, on the same contours.
 
-    Velocities determine H up to a constant, so the learned one is shifted by the mean difference
-    over the grid; both are drawn relative to the minimum of the true one. Where a function is not
-    finite the picture stays white. To draw a learned H alone, use
+    Velocities determine H up to a constant, so the learned H is shifted by the mean difference of
+    both over the grid. Both are drawn relative to the minimum of the true H. The picture stays
+    white where a function is not finite. To draw a learned H alone, use
     `plane_slice(field.hamiltonian, jnp.zeros(2), (0, 1), xlim, ylim)`.
 
     Args:
@@ -62,10 +62,10 @@ def hamiltonian(
         xlim: limits of q.
         ylim: limits of p.
         ax: two axes, for the true and the learned one; new ones if None.
-        titles: of the two axes.
-        units: of q and p.
-        names: of the coordinates; q and p if None.
-        energy_unit: of H.
+        titles: the titles of the two axes.
+        units: the units of q and p.
+        names: the names of the coordinates; q and p if None.
+        energy_unit: the unit of H.
         levels: the largest number of contours, or the levels themselves.
         resolution: points on each axis of the grid.
 
@@ -76,11 +76,13 @@ def hamiltonian(
         ValueError: a function is not scalar or not one of the plane, nowhere on the grid are both
             finite, or an argument is not a pair.
     """
-    titles, labels = two("titles", titles), plane_labels((0, 1), 2, units, names)
-    panels = None if ax is None else two("ax", ax)
+    titles, labels = as_pair("titles", titles), plane_labels((0, 1), 2, units, names)
+    panels = None if ax is None else as_pair("ax", ax)
     q, p, points = grid(xlim, ylim, resolution)
     need = "a scalar function, such as field.hamiltonian,"
-    H, H_learned = (in_plane(fn, points, (), need).reshape(len(p), -1) for fn in (true, learned))
+    H, H_learned = (
+        evaluate_in_plane(fn, points, (), need).reshape(len(p), -1) for fn in (true, learned)
+    )
     H, H_learned = np.ma.masked_invalid(H), np.ma.masked_invalid(H_learned)
     if (H + H_learned).count() == 0:
         raise ValueError("nowhere on the grid are both functions finite.")
@@ -108,7 +110,7 @@ def _pair() -> tuple[Axes, Axes]:
     return left, right
 
 
-@drawn
+@refuse_tracers
 def loss_surface(
     first: Float[ArrayLike, " A"],
     second: Float[ArrayLike, " B"],
@@ -129,20 +131,20 @@ def loss_surface(
     Args:
         first: values of the first hyperparameter, shape (A,).
         second: values of the second, shape (B,).
-        losses: shape (A, B).
+        losses: the loss at each pair of values, shape (A, B).
         path: the optimiser's steps (first, second), shape (K, 2), from start to end; one row to
             show only the end.
         ax: axes to draw on; new ones if None.
-        names: of the hyperparameters.
-        label: of the loss.
-        title: of the axes.
+        names: the names of the hyperparameters.
+        label: the name of the loss, beside its colours.
+        title: the title of the axes.
         levels: number of contours.
 
     Raises:
         ValueError: the shapes do not fit, a hyperparameter is not positive, no loss is finite and
             positive, or `names` is not a pair.
     """
-    names = two("names", names)
+    names = as_pair("names", names)
     first, second, losses = np.asarray(first), np.asarray(second), np.asarray(losses)
     if losses.shape != (len(first), len(second)):
         raise ValueError(
@@ -163,7 +165,7 @@ def loss_surface(
     ax.contour(first, second, shown.T, steps, colors="white", linewidths=0.4)
     bar = ax.figure.colorbar(filled, ax=ax, label=label)
     ticks = steps[:: max(1, levels // 5)].tolist()
-    bar.set_ticks(ticks, labels=_in_one_format(ticks))
+    bar.set_ticks(ticks, labels=_number_labels(ticks))
     bar.ax.minorticks_off()
     i, j = np.unravel_index(np.ma.argmin(shown), shown.shape)
     best = {"ms": 13, "mec": "black", "mfc": "white", "mew": 0.8, "linestyle": "none"}
@@ -183,7 +185,7 @@ def loss_surface(
     return ax
 
 
-def _in_one_format(values: list[float]) -> list[str]:
+def _number_labels(values: list[float]) -> list[str]:
     """Numbers all with or all without an exponent, with enough digits to distinguish them."""
     plain = 1e-3 <= values[0] and values[-1] < 1e5
     for digits in range(2, 8):
@@ -195,7 +197,7 @@ def _in_one_format(values: list[float]) -> list[str]:
     return texts
 
 
-@drawn
+@refuse_tracers
 def ensemble(
     ys: Float[ArrayLike, "S T n"],
     true: Float[ArrayLike, "T n"] | None = None,
@@ -216,11 +218,11 @@ def ensemble(
         true: the true orbit, shape (T, n), drawn on top.
         ax: axes to draw on; new ones if None.
         dims: the two coordinates, counted from 0.
-        color: of the ensemble.
-        title: of the axes.
-        units: of the two coordinates.
-        names: of the two coordinates, if they are not q and p.
-        label: of the ensemble, in the legend.
+        color: the colour of the ensemble.
+        title: the title of the axes.
+        units: the units of the two coordinates.
+        names: the names of the two coordinates, if not q and p.
+        label: the name of the ensemble in the legend.
 
     Raises:
         ValueError: an array is of another shape, `dims` are not two of the coordinates, or an
@@ -249,7 +251,7 @@ def ensemble(
     return ax
 
 
-@drawn
+@refuse_tracers
 def band(
     ts: Float[ArrayLike, " T"],
     mean: Float[ArrayLike, " T"],
@@ -267,23 +269,23 @@ def band(
 
     Args:
         ts: times, or another abscissa, shape (T,).
-        mean: shape (T,).
+        mean: the mean at each time, shape (T,).
         deviation: standard deviations, shape (T,), such as those of `posterior.energy_deviation`.
-        true: the truth, shape (T,).
+        true: the true values, shape (T,).
         ax: axes to draw on; new ones if None.
-        color: of the mean and the bands.
-        xlabel: of the abscissa.
-        ylabel: of the mean.
-        unit: of the mean.
-        title: of the axes.
+        color: the colour of the mean and of the bands.
+        xlabel: the name of the abscissa.
+        ylabel: the name of the mean.
+        unit: the unit of the mean.
+        title: the title of the axes.
 
     Raises:
         ValueError: shapes are not all (T,), or a deviation is negative.
     """
-    given = [ts, mean, deviation] + ([] if true is None else [true])
-    ts, mean, deviation, *rest = (np.asarray(each) for each in given)
-    if ts.ndim != 1 or any(each.shape != ts.shape for each in (mean, deviation, *rest)):
-        shapes = ", ".join(str(np.shape(each)) for each in given)
+    arrays = [np.asarray(a) for a in (ts, mean, deviation, *([] if true is None else [true]))]
+    ts, mean, deviation, *rest = arrays
+    if ts.ndim != 1 or any(array.shape != ts.shape for array in arrays):
+        shapes = ", ".join(str(array.shape) for array in arrays)
         raise ValueError(f"the arrays have shapes {shapes}; all must be (T,).")
     if (deviation < 0).any():
         raise ValueError("deviation is negative somewhere: standard deviations are needed.")
@@ -304,7 +306,7 @@ def band(
     return ax
 
 
-@drawn
+@refuse_tracers
 def deviation(
     fn: Callable[[Float[Array, "2"]], Array],
     xlim: Limits,
@@ -327,10 +329,10 @@ def deviation(
         ylim: limits of p.
         data: measured states, shape (N, 2).
         ax: axes to draw on; new ones if None.
-        label: of the colours.
-        title: of the axes.
-        units: of q and p.
-        names: of the coordinates; q and p if None.
+        label: the name of the colours.
+        title: the title of the axes.
+        units: the units of q and p.
+        names: the names of the coordinates; q and p if None.
         resolution: points on each axis of the grid.
 
     Raises:
@@ -341,13 +343,13 @@ def deviation(
     q, p, points = grid(xlim, ylim, resolution)
     X = plane_data(data)
     length = jax.tree_util.Partial(_length, fn)
-    values = in_plane(length, points, (), "a deviation")
+    values = evaluate_in_plane(length, points, (), "a deviation")
     ax = axes(ax, figsize=(5.4, 4.4))
     filled = ax.contourf(q, p, values.reshape(len(p), -1), 14, cmap="cividis")
     ax.figure.colorbar(filled, ax=ax, label=label)
     dots(ax, X, clip_on=False)
-    most = {"color": "white", "mec": "black", "mew": 0.8, "ms": 13, "linestyle": "none"}
-    ax.plot(*points[values.argmax()], "*", label="largest", zorder=6, clip_on=False, **most)
+    star = {"color": "white", "mec": "black", "mew": 0.8, "ms": 13, "linestyle": "none"}
+    ax.plot(*points[values.argmax()], "*", label="largest", zorder=6, clip_on=False, **star)
     ax.set(title=title or "", xlim=xlim, ylim=ylim, **labels)
     legend(ax)
     return ax
@@ -357,12 +359,12 @@ def _length(fn: Callable[[Array], Array], x: Float[Array, "2"]) -> Float[Array, 
     return jnp.linalg.norm(jnp.atleast_1d(fn(x)))
 
 
-@drawn
+@refuse_tracers
 def comparison(compared: Comparison, ax: Axes | None = None) -> Axes:
     """Draw how far the score of each candidate is below the best, and the answers as the title.
 
-    The best is on top. The data do not decide between candidates within the threshold, the dashed
-    line. Bars longer than 60 end at the edge and carry their number.
+    The best candidate is on top. The dashed line is the threshold: the data do not decide between
+    the candidates on its left. A bar longer than 60 ends at the edge; its number is beside it.
 
     Args:
         compared: the result of `hk.compare`.
@@ -373,17 +375,17 @@ def comparison(compared: Comparison, ax: Axes | None = None) -> Axes:
     """
     count = len(compared.table)
     ax = axes(ax, figsize=(7.0, 0.8 + 0.27 * count))
-    most = 60.0  # e⁶⁰ to one needs no comparing
+    longest = 60.0  # e⁶⁰ to one needs no comparing
     for place, row in enumerate(compared.table):
         behind = -row.difference
         near = behind <= THRESHOLD
         color = COLORS["symplectic"] if near else STREAM
-        ax.barh(place, min(behind, most), color=color, height=0.7)
-        ax.text(min(behind, most) + 0.6, place, f"{behind:.1f}", va="center", fontsize="small")
+        ax.barh(place, min(behind, longest), color=color, height=0.7)
+        ax.text(min(behind, longest) + 0.6, place, f"{behind:.1f}", va="center", fontsize="small")
     ax.axvline(THRESHOLD, color=COLORS["true"], linestyle="--", linewidth=1)
     ax.set_yticks(range(count), [row.name for row in compared.table])
     ax.invert_yaxis()
-    ax.set_xlim(0.0, 1.12 * most)
+    ax.set_xlim(0.0, 1.12 * longest)
     ax.set_xlabel("score below the best (log evidence)")
     pairs = QUESTIONS.items()
     answers = [f"{question.rstrip('?')}: {compared.answers[key]}" for key, question in pairs]

@@ -16,23 +16,23 @@ from hamkernel.plot._style import (
     Limits,
     Texts,
     axes,
+    curves_by_name,
     dots,
-    drawn,
+    evaluate_at,
+    evaluate_in_plane,
     grid,
-    in_plane,
     legend,
     line_styles,
-    named,
-    on_points,
     plane_data,
     plane_labels,
+    refuse_tracers,
 )
 
 # Each (T, n), or (B, T, n) for trajectories under one name.
 Curves = ArrayLike | Mapping[str, ArrayLike]
 
 
-@drawn
+@refuse_tracers
 def phase_portrait(
     field: Callable[[Float[Array, "2"]], Float[Array, "2"]],
     xlim: Limits,
@@ -58,10 +58,10 @@ def phase_portrait(
         trajectories: shape (T, 2) or (B, T, 2), or a mapping from names to such arrays, as in
             `trajectories`.
         ax: axes to draw on; new ones if None.
-        title: of the axes.
-        units: of q and p.
-        names: of the coordinates; q and p if None.
-        density: of the stream lines.
+        title: the title of the axes.
+        units: the units of q and p.
+        names: the names of the coordinates; q and p if None.
+        density: the density of the stream lines, as in Matplotlib.
         resolution: points on each axis of the grid where the field is evaluated.
         show_legend: whether named trajectories and data get a legend.
 
@@ -71,7 +71,7 @@ def phase_portrait(
     """
     labels = plane_labels((0, 1), 2, units, names)
     q, p, points = grid(xlim, ylim, resolution)
-    velocities = in_plane(field, points, (2,), "a field")
+    velocities = evaluate_in_plane(field, points, (2,), "a field")
     X = plane_data(data)
     curves = {} if trajectories is None else _checked_curves(trajectories, 2)
     ax = axes(ax, figsize=(5.2, 4.6))
@@ -84,7 +84,7 @@ def phase_portrait(
     return ax
 
 
-@drawn
+@refuse_tracers
 def trajectories(
     ys: Curves,
     ax: Axes | None = None,
@@ -102,9 +102,9 @@ def trajectories(
             each starts. "true", or else the first name, is drawn wide, beneath the others.
         ax: axes to draw on; new ones if None.
         dims: the two coordinates, counted from 0.
-        title: of the axes.
-        units: of the two coordinates.
-        names: of the two coordinates, if they are not q and p.
+        title: the title of the axes.
+        units: the units of the two coordinates.
+        names: the names of the two coordinates, if not q and p.
         show_legend: whether named trajectories get a legend.
 
     Raises:
@@ -121,7 +121,7 @@ def trajectories(
     return _finish(ax, labels, title)
 
 
-@drawn
+@refuse_tracers
 def plane_slice(
     fn: Callable[[Float[Array, " n"]], Array],
     point: Float[ArrayLike, " n"],
@@ -148,13 +148,13 @@ def plane_slice(
         fn: x (n,) -> () or (n,).
         point: values of the other coordinates, shape (n,).
         dims: the two coordinates that vary, counted from 0.
-        xlim: limits of the first.
-        ylim: limits of the second.
+        xlim: limits of the first coordinate.
+        ylim: limits of the second coordinate.
         ax: axes to draw on; new ones if None.
-        title: of the axes.
-        units: of the two coordinates.
-        names: of the two coordinates, if they are not q and p.
-        label: of the colours; H − min H, or the speed out of the plane, if None.
+        title: the title of the axes.
+        units: the units of the two coordinates.
+        names: the names of the two coordinates, if not q and p.
+        label: the name of the colours; H − min H, or the speed out of the plane, if None.
         levels: number of contours, or the levels themselves; colours continue beyond them.
         resolution: points on each axis of the grid.
 
@@ -168,7 +168,7 @@ def plane_slice(
     x, y, plane = grid(xlim, ylim, resolution)
     states = np.tile(point, (len(plane), 1))
     states[:, list(dims)] = plane
-    values = on_points(fn, states)
+    values = evaluate_at(fn, states)
     if values.shape not in {(len(plane),), states.shape}:
         raise ValueError(
             f"plane_slice needs a function ({len(point)},) -> () or ({len(point)},), this one "
@@ -207,7 +207,7 @@ def _stream(
 def _checked_curves(curves: Curves, n: int | None = None) -> dict[str | None, np.ndarray]:
     """The curves by name, if all of them are trajectories of n coordinates, those of the first."""
     try:
-        arrays = named(curves)
+        arrays = curves_by_name(curves)
     except ValueError as error:  # rows of unequal length
         raise ValueError(
             "trajectories of unequal length are not one array: name them, {name: (T, n), ...}."
@@ -266,7 +266,7 @@ def _widest_corner(ax: Axes) -> str:
     return max(("upper right", "upper left", "lower left", "lower right"), key=width)
 
 
-@drawn
+@refuse_tracers
 def crossings(
     ys: Float[ArrayLike, "T n"], coordinate: int, value: float = 0.0, direction: int = 1
 ) -> Float[np.ndarray, "M n"]:
@@ -277,8 +277,8 @@ def crossings(
 
     Args:
         ys: states along one trajectory, shape (T, n).
-        coordinate: which coordinate has the value on the section, counted from 0.
-        value: of that coordinate.
+        coordinate: the number of the coordinate that is fixed on the section, counted from 0.
+        value: the value of this coordinate on the section.
         direction: +1 for crossings from below, −1 from above, 0 for both.
 
     Returns:
@@ -301,7 +301,7 @@ def crossings(
     return (1 - weight) * ys[index] + weight * ys[index + 1]
 
 
-@drawn
+@refuse_tracers
 def poincare_section(
     points: ArrayLike | Sequence[ArrayLike] | Mapping[str, ArrayLike],
     dims: tuple[int, int],
@@ -315,14 +315,14 @@ def poincare_section(
     """Draw the points of a Poincaré section in the plane of two coordinates.
 
     Args:
-        points: of one trajectory, shape (M, n); a list of such arrays, each in its own colour; or
-            a mapping from names to arrays, which adds a legend.
+        points: crossings of one trajectory, shape (M, n); a list of such arrays, each drawn in
+            its own colour; or a mapping from names to arrays, which adds a legend.
         dims: the two coordinates, counted from 0.
         ax: axes to draw on; new ones if None.
-        title: of the axes.
-        units: of the two coordinates.
-        names: of the two coordinates, if they are not q and p.
-        size: of the dots, in points.
+        title: the title of the axes.
+        units: the units of the two coordinates.
+        names: the names of the two coordinates, if not q and p.
+        size: the size of the dots, in points.
 
     Raises:
         ValueError: there is no trajectory to draw, `dims` are not two of the coordinates, or an
@@ -334,7 +334,7 @@ def poincare_section(
         shades = colormaps["viridis"](np.linspace(0, 0.9, len(arrays)))
         styles = [{"color": shade} for shade in shades]
     else:
-        groups = named(points)
+        groups = curves_by_name(points)
         styles = [{k: s[k] for k in ("color", "label")} for s in line_styles(groups)]
         arrays = list(groups.values())
     if not arrays:

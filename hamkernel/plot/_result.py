@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
 
 from hamkernel import _require as require
 from hamkernel.plot._learned import band
@@ -217,12 +218,15 @@ def _uncertainty(ax: Axes, learned: Learned, posterior: Any) -> None:
     states = states[np.linspace(0, len(states) - 1, min(_PATH, len(states))).astype(int)]
     means, deviations = map(np.asarray, posterior.evaluate(states, *_inputs(learned, len(states))))
     speeds = np.sqrt((means**2).mean(axis=0))
-    shares = deviations / np.where(speeds > 0, speeds, 1.0)
+    shares = 100 * deviations / np.where(speeds > 0, speeds, 1.0)
     ax.boxplot(shares, whis=(5, 95), showfliers=False, medianprops={"color": BLUE})
     ax.set_xticks(range(1, n + 1), _labels(learned))
     ax.set(
         ylabel="deviation / speed", yscale="log", title="uncertainty of the field along the runs"
     )
+    ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    ax.yaxis.set_major_formatter("{x:g} %")
+    ax.yaxis.set_minor_locator(NullLocator())
     ax.title.set_fontsize("small")
 
 

@@ -36,7 +36,7 @@ Limits = tuple[float, float]
 Texts = tuple[str | None, str | None]  # the units, or the names, of two coordinates
 
 
-def two(name: str, values: Any) -> tuple[Any, Any]:
+def as_pair(name: str, values: Any) -> tuple[Any, Any]:
     """The entries of an argument that must be a pair; a string of two letters is not one."""
     entries = () if isinstance(values, str) or not np.iterable(values) else tuple(values)
     if len(entries) != 2:
@@ -53,19 +53,19 @@ def axes(ax: Axes | None, **options: Any) -> Axes:
     return plt.subplots(layout="constrained", **options)[1]
 
 
-def drawn(plot: Callable[Arguments, R]) -> Callable[Arguments, R]:
+def refuse_tracers(plot: Callable[Arguments, R]) -> Callable[Arguments, R]:
     """The function `plot`, with a TypeError where JAX traces an argument."""
 
     @functools.wraps(plot)
-    def checked(*args: Arguments.args, **options: Arguments.kwargs) -> R:
+    def wrapper(*args: Arguments.args, **options: Arguments.kwargs) -> R:
         name = f"hk.plot.{plot.__name__}"
         require.untraced(name, "Return the arrays and draw them outside.", args, options)
         return plot(*args, **options)
 
-    return checked
+    return wrapper
 
 
-def named(series: Any) -> dict[str | None, np.ndarray]:
+def curves_by_name(series: Any) -> dict[str | None, np.ndarray]:
     """Curves by name; a bare array has none."""
     pairs = series.items() if isinstance(series, Mapping) else [(None, series)]
     return {name: np.asarray(values) for name, values in pairs}
@@ -76,10 +76,10 @@ def line_styles(series: Mapping[str | None, Any]) -> Iterator[dict[str, Any]]:
     keys = [(name or "").lower().replace(" ", "_") for name in series]
     taken = {COLORS[key] for key in keys if key in COLORS}
     palette = (BLUE, "#D55E00", "#009E73", "#CC79A7", "#56B4E9", "#E69F00")
-    others = itertools.cycle([color for color in palette if color not in taken])
+    free_colors = itertools.cycle([color for color in palette if color not in taken])
     dashes: dict[str, Any] = {"separable": (0, (5, 1.5)), "symplectic": (0, (1, 1))}
     for name, key in zip(series, keys, strict=True):
-        color = COLORS[key] if key in COLORS else next(others)
+        color = COLORS[key] if key in COLORS else next(free_colors)
         yield {
             "color": color,
             "linestyle": dashes.get(key, "-"),
@@ -106,10 +106,10 @@ def plane_labels(
     dims: tuple[int, int], n: int, units: Texts | None, names: Texts | None
 ) -> dict[str, str]:
     """Axis labels of a plane of two of n coordinates, for `ax.set`."""
-    if len({range(n)[i] for i in two("dims", dims) if -n <= i < n}) != 2:
+    if len({range(n)[i] for i in as_pair("dims", dims) if -n <= i < n}) != 2:
         raise ValueError(f"dims must be two different coordinates of {n}, got {dims}.")
-    units = (None, None) if units is None else two("units", units)
-    names = (None, None) if names is None else two("names", names)
+    units = (None, None) if units is None else as_pair("units", units)
+    names = (None, None) if names is None else as_pair("names", names)
     symbols = [name or coordinate(i, n) for name, i in zip(names, dims, strict=True)]
     return {
         "xlabel": with_unit(symbols[0], units[0]),
@@ -144,7 +144,7 @@ def grid(
 ) -> tuple[np.ndarray, np.ndarray, Float[np.ndarray, "P 2"]]:
     """Ticks on both axes and all points of their grid, y by y, P = resolution²."""
     for name, limits in (("xlim", xlim), ("ylim", ylim)):
-        low, high = two(name, limits)
+        low, high = as_pair(name, limits)
         if not -np.inf < low < high < np.inf:
             raise ValueError(f"{name} must be finite limits (low, high), low < high; got {limits}.")
     x, y = np.linspace(*xlim, resolution), np.linspace(*ylim, resolution)
@@ -152,16 +152,16 @@ def grid(
 
 
 @eqx.filter_jit
-def _at_each(fn: Callable[[Array], Array], points: Float[Array, "P n"]) -> Array:
+def _map_points(fn: Callable[[Array], Array], points: Float[Array, "P n"]) -> Array:
     return jax.vmap(fn)(points)
 
 
-def on_points(fn: Callable[[Array], Array], points: np.ndarray) -> np.ndarray:
+def evaluate_at(fn: Callable[[Array], Array], points: np.ndarray) -> np.ndarray:
     """The values of fn at each row of `points`, in JAX's default float."""
-    return np.asarray(_at_each(fn, jnp.asarray(points, float)))
+    return np.asarray(_map_points(fn, jnp.asarray(points, float)))
 
 
-def in_plane(
+def evaluate_in_plane(
     fn: Callable[[Array], Array],
     points: Float[np.ndarray, "P 2"],
     shape: tuple[int, ...],
@@ -171,7 +171,7 @@ def in_plane(
     need = f"{need} (2,) -> {shape} is needed"
     hint = "plane_slice draws functions of more coordinates."
     try:
-        values = on_points(fn, points)
+        values = evaluate_at(fn, points)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{need}; {hint} This one says: {error}") from error
     if values.shape[1:] != shape:

@@ -16,13 +16,13 @@ from hamkernel.plot._style import (
     BLUE,
     COLORS,
     DATA,
+    as_pair,
     axes,
     coordinate,
-    drawn,
+    curves_by_name,
     legend,
     line_styles,
-    named,
-    two,
+    refuse_tracers,
     with_unit,
 )
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 Series = ArrayLike | Mapping[str, ArrayLike]
 
 
-@drawn
+@refuse_tracers
 def trajectory_error(
     ts: Float[ArrayLike, " T"],
     errors: Series,
@@ -57,9 +57,9 @@ def trajectory_error(
         ax: axes to draw on; new ones if None.
         log: whether the axis of the error is logarithmic. Zeros, as at the start, are omitted.
         quantiles: the band over seeds.
-        unit: of the error.
-        time_unit: of `ts`.
-        title: of the axes.
+        unit: the unit of the error.
+        time_unit: the unit of `ts`.
+        title: the title of the axes.
         show_legend: whether named curves get a legend.
 
     Raises:
@@ -69,10 +69,10 @@ def trajectory_error(
     ax = axes(ax, figsize=(5.6, 3.8))
     _bands(ax, ts, curves, quantiles, log)
     ax.set_ylabel(with_unit("trajectory error", unit))
-    return _with_time_axis(ax, ts, time_unit, title, show_legend)
+    return _finish_time_axes(ax, ts, time_unit, title, show_legend)
 
 
-@drawn
+@refuse_tracers
 def energy_drift(
     ts: Float[ArrayLike, " T"],
     energies: Series,
@@ -95,9 +95,9 @@ def energy_drift(
         relative: divide by |H(x(0))|.
         log: draw the absolute change on a logarithmic axis. Zeros are omitted.
         quantiles: the band over seeds.
-        unit: of the energy; unused if `relative`.
-        time_unit: of `ts`.
-        title: of the axes.
+        unit: the unit of the energy; unused if `relative`.
+        time_unit: the unit of `ts`.
+        title: the title of the axes.
         show_legend: whether named curves get a legend.
 
     Raises:
@@ -116,12 +116,12 @@ def energy_drift(
     change = r"|\Delta H|" if log else r"\Delta H"
     symbol = rf"${change} / |H(0)|$" if relative else f"${change}$"
     ax.set_ylabel(with_unit(f"energy drift {symbol}", None if relative else unit))
-    return _with_time_axis(ax, ts, time_unit, title, show_legend)
+    return _finish_time_axes(ax, ts, time_unit, title, show_legend)
 
 
 def _curves_over_time(ts: ArrayLike, series: Series) -> dict[str | None, np.ndarray]:
     """The curves by name, if each has one value for each time."""
-    shape, curves = np.shape(ts), named(series)
+    shape, curves = np.shape(ts), curves_by_name(series)
     if len(shape) != 1:
         raise ValueError(f"ts has shape {shape}; times (T,) are needed.")
     for name, values in curves.items():
@@ -142,7 +142,7 @@ def _bands(
     log: bool,
 ) -> None:
     ts, counts = np.asarray(ts), set()
-    first, last = two("quantiles", quantiles)
+    first, last = as_pair("quantiles", quantiles)
     for style, values in zip(line_styles(series), series.values(), strict=True):
         seeds = np.atleast_2d(values)  # (S, T)
         if len(seeds) > 1:
@@ -175,7 +175,7 @@ def _finite_seeds(seeds: np.ndarray, of_name: str) -> np.ndarray:
     return seeds[finite]
 
 
-def _with_time_axis(
+def _finish_time_axes(
     ax: Axes, ts: ArrayLike, time_unit: str | None, title: str | None, show_legend: bool
 ) -> Axes:
     ts = np.asarray(ts)
@@ -194,7 +194,7 @@ _SIGMAS = 2.0  # standard deviations on either side, which hold 95 % of a normal
 _BETWEEN = 9  # points a sample, between which a curve looks smooth
 
 
-@drawn
+@refuse_tracers
 def smoothing(
     runs: Runs,
     run: int = 0,
@@ -207,16 +207,17 @@ def smoothing(
 ) -> tuple[Axes, ...]:
     """Draw one logged run: the samples, and the smoothed states within two standard deviations.
 
-    One panel per coordinate, stacked. The band is that of the state, not of a new sample, which
-    has noise on top. The panel of a coordinate that was never measured stays empty.
+    Each coordinate has one panel. The band is for the state; a new sample has noise on top of it.
+    The panel of a coordinate that was never measured stays empty.
 
     Args:
         runs: the logged runs.
         run: the position of the run, counted from 0, or from the end if negative.
         ax: n axes, one for each coordinate; new ones if None.
-        units: of the coordinates.
-        names: of the coordinates; those of the columns of the log, else q and p, if None.
-        time_unit: of the times.
+        units: the unit of each coordinate.
+        names: the name of each coordinate; if None, the name of its column in the log, else q
+            or p.
+        time_unit: the unit of the times.
         title: above the first panel; the number of the run if None.
 
     Returns:
@@ -227,7 +228,7 @@ def smoothing(
     """
     run, n = index_of_run(run, len(runs)), runs.dimension
     labels = _coordinate_labels(n, units, names or runs.names)
-    panels = _column(n, 1, ax)[:, 0]
+    panels = _panels(n, 1, ax)[:, 0]
     curves = runs.smoothing(_BETWEEN - 1)
     ts, mean = np.asarray(curves.times[run]), np.asarray(curves.states[run])
     reach = _SIGMAS * np.asarray(curves.deviation[run])
@@ -237,11 +238,11 @@ def smoothing(
         panel.fill_between(ts, low, high, color=BLUE, alpha=0.25, linewidth=0, label=name)
         panel.plot(ts, mean[:, c], color=BLUE, linewidth=1.4, label="smoothed")
         _draw_samples(panel, runs, run, c)
-        _over_time(panel, ts, labels[c])
-    return _titled(panels, f"run {run}" if title is None else title, time_unit)
+        _set_time_axis(panel, ts, labels[c])
+    return _set_titles(panels, f"run {run}" if title is None else title, time_unit)
 
 
-@drawn
+@refuse_tracers
 def fitted(
     learned: Learned,
     run: int = 0,
@@ -254,19 +255,20 @@ def fitted(
 ) -> tuple[tuple[Axes, Axes], ...]:
     """Draw one run as measured and as the learned field explains it, with the residuals.
 
-    One row of panels per coordinate: on the left the samples and the fitted states, joined by the
-    flow of the field, across gaps too; on the right (measured − fitted)/σ, of which about one in
-    twenty lies outside the grey band of ±2. A wave in the residuals means that the structure misses
-    part of the motion; a single outlier means that the sample is wrong. A coordinate that was never
-    measured has no residuals.
+    Each coordinate has one row of panels. On the left are the samples and the fitted states; the
+    flow of the field joins the states, also across gaps. On the right are the residuals
+    (measured − fitted)/σ; about one in twenty lies outside the grey band of ±2. A wave in the
+    residuals means that the structure misses part of the motion; a single outlier means that the
+    sample is wrong. A coordinate that was never measured has no residuals.
 
     Args:
         learned: the result of `hk.learn`.
         run: which run, counted from 0, or from the end if negative.
         ax: n pairs of axes; new ones if None.
-        units: of the coordinates.
-        names: of the coordinates; those of the columns of the log, else q and p, if None.
-        time_unit: of the times.
+        units: the unit of each coordinate.
+        names: the name of each coordinate; if None, the name of its column in the log, else q
+            or p.
+        time_unit: the unit of the times.
         title: above the first panel; if None, the number of the run and the share of it from which
             the field was learned.
 
@@ -278,7 +280,7 @@ def fitted(
     """
     run, n = index_of_run(run, len(learned.runs)), learned.runs.dimension
     labels = _coordinate_labels(n, units, names or learned.runs.names)
-    panels = _column(n, 2, ax)
+    panels = _panels(n, 2, ax)
     ts, fit = np.asarray(learned.runs.times[run]), np.asarray(learned.states[run])
     grid = np.interp(np.arange(_BETWEEN * (len(ts) - 1) + 1) / _BETWEEN, np.arange(len(ts)), ts)
     spans = np.repeat(np.diff(ts)[:, None] / _BETWEEN, _BETWEEN, axis=1)
@@ -292,11 +294,11 @@ def fitted(
     for c, (left, right) in enumerate(panels):
         left.plot(grid, path[:, c], color=BLUE, linewidth=1.4, label="fitted")
         _draw_samples(left, learned.runs, run, c)
-        _over_time(left, ts, labels[c])
+        _set_time_axis(left, ts, labels[c])
         right.axhspan(-_SIGMAS, _SIGMAS, color="0.9", linewidth=0)
         right.axhline(0.0, color="0.6", linewidth=0.8)
         right.plot(ts, residuals[:, c], "o", color=COLORS["true"], ms=3, clip_on=False)
-        _over_time(right, ts, r"residual / $\sigma$")
+        _set_time_axis(right, ts, r"residual / $\sigma$")
         said = f"root mean square {misfit[c]:.2f}" if np.isfinite(misfit[c]) else "never measured"
         right.set_title(said, fontsize="small")
         if np.isfinite(misfit[c]):
@@ -304,7 +306,7 @@ def fitted(
             right.set_ylim(-far, far)
     if title is None:
         title = f"run {run}, {float(learned.kept[run]):.0%} kept"
-    _titled(panels[:, 0], title, time_unit)
+    _set_titles(panels[:, 0], title, time_unit)
     panels[-1, 1].set_xlabel(with_unit("time $t$", time_unit))
     return tuple((left, right) for left, right in panels)
 
@@ -329,8 +331,8 @@ def _coordinate_labels(
     ]
 
 
-def _column(n: int, width: int, ax: object) -> np.ndarray:
-    """Panels, shape (n, width), those that were given or new ones."""
+def _panels(n: int, width: int, ax: object) -> np.ndarray:
+    """The caller's axes, or new ones, as an array of panels of shape (n, width)."""
     if ax is None:
         import matplotlib.pyplot as plt  # starts a backend, so only where a figure must be made
 
@@ -340,8 +342,8 @@ def _column(n: int, width: int, ax: object) -> np.ndarray:
         return plt.subplots(n, width, sharex=True, width_ratios=ratios, **options)[1]
     panels = np.asarray(ax, object)
     if panels.size != n * width:
-        each = "axes, one" if width == 1 else "pairs of axes, one"
-        raise ValueError(f"ax has {panels.size} axes; {n} {each} for each coordinate, are needed.")
+        need = "axes, one" if width == 1 else "pairs of axes, one"
+        raise ValueError(f"ax has {panels.size} axes; {n} {need} for each coordinate, are needed.")
     return panels.reshape(n, width)
 
 
@@ -358,14 +360,14 @@ def _draw_samples(panel: Axes, runs: Runs, run: int, c: int) -> None:
     panel.plot(ts, x, "o", color=DATA, label="measured", **style)
 
 
-def _over_time(panel: Axes, ts: np.ndarray, label: str) -> None:
+def _set_time_axis(panel: Axes, ts: np.ndarray, label: str) -> None:
     panel.set_ylabel(label)
     panel.set_xlim(ts[0], ts[-1])
     panel.grid(True, color="0.9", linewidth=0.6)
     panel.set_axisbelow(True)
 
 
-def _titled(panels: np.ndarray, title: str, time_unit: str | None) -> tuple[Axes, ...]:
+def _set_titles(panels: np.ndarray, title: str, time_unit: str | None) -> tuple[Axes, ...]:
     panels[0].set_title(title)
     panels[-1].set_xlabel(with_unit("time $t$", time_unit))
     legend(panels[0])

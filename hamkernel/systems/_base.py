@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._machine import compiled_by_size, compiled_without_emitters
 from hamkernel._show import described
 
 Numbers = ArrayLike | Sequence[ArrayLike]
@@ -345,12 +346,19 @@ def sample(
     failed = (require.not_finite(X) | require.not_finite(Y)).any(axis=(1, 2))  # (B,)
     X = require.value(X, failed, lambda: _failure(failed), RuntimeError)
     if key is not None:
-        noises = (jax.random.normal(k, X.shape, X.dtype) for k in jax.random.split(key))
-        X, Y = (
-            clean + jnp.broadcast_to(level, X.shape) * noise
-            for clean, level, noise in zip((X, Y), levels, noises, strict=True)
-        )
+        X, Y = _noisy((X, Y), levels, key)
     return (X[0], Y[0]) if x0.ndim == 1 else (X, Y)
+
+
+@compiled_by_size
+def _noisy(
+    clean: Sequence[Float[Array, "B T n"]], levels: Sequence[Array], key: Key[Array, ""]
+) -> tuple[Float[Array, "B T n"], ...]:
+    keys = jax.random.split(key, len(clean))
+    return tuple(
+        A + jnp.broadcast_to(level, A.shape) * jax.random.normal(k, A.shape, A.dtype)
+        for A, level, k in zip(clean, levels, keys, strict=True)
+    )
 
 
 def _noise_level(level: ArrayLike, name: str, states: Float[Array, "B n"], key: Any) -> Array:
@@ -379,7 +387,7 @@ def _failure(failed: Array) -> str:
     )
 
 
-@eqx.filter_jit
+@compiled_without_emitters
 def _trajectories(
     field: Callable[[Array], Array], states: Float[Array, "B n"], ts: Float[Array, " T"]
 ) -> tuple[Float[Array, "B T n"], Float[Array, "B T n"]]:
