@@ -5,7 +5,7 @@ from __future__ import annotations
 import html
 import os
 import pathlib
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from hamkernel import _require as require
 from hamkernel._trajectories.lagrangian import LearnedLagrangian
@@ -112,7 +112,7 @@ def _picture(learned: Learned | LearnedLagrangian, held_out: Runs | None) -> str
 
     from hamkernel.plot._result import image
 
-    options = {} if held_out is None else {"held_out": held_out}
+    options: dict[str, Any] = {} if held_out is None else {"held_out": held_out}
     figure = learned.plot(**options)
     try:
         return image(figure, "fit, residuals, law")

@@ -206,7 +206,8 @@ class AbstractGauss(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
     root_find_max_steps: AbstractVar[int]
 
     def __repr__(self) -> str:
-        usual, names = type(self)(), [field.name for field in dataclasses.fields(self)]
+        integrator: Any = type(self)
+        usual, names = integrator(), [field.name for field in dataclasses.fields(self)]
         values = [(name, getattr(self, name), getattr(usual, name)) for name in names]
         # Equal rather than identical, which a default is no longer after pickling.
         changed = [f"{name}={v!r}" for name, v, u in values if eqx.tree_equal(v, u) is not True]

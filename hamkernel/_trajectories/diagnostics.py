@@ -246,7 +246,7 @@ def degrees_of_freedom(fit: FitQuality) -> Diagnostic:
 def _chi_squared(fit: FitQuality) -> Diagnostic:
     """Whether the structure alone explains the runs at the noise."""
     passes = explains(fit.chi_squared, fit.free)
-    run, c = np.unravel_index(np.nanargmax(fit.misfit), fit.misfit.shape)
+    run, c = map(int, np.unravel_index(np.nanargmax(fit.misfit), fit.misfit.shape))
     # Without a given noise, residuals that are as small as those of a settled field are exact.
     size = np.sqrt(fit.chi_squared) * np.nanmax(fit.noise / fit.scale)
     exact = not fit.is_noise_known and bool(size < SETTLED)
@@ -482,8 +482,8 @@ def lengthscales(
         "one" if single else "one for each coordinate",
         "sizes within 300",
         not single,
-        f"the states vary by {least:.2g} in coordinate {names[np.nanargmin(scale)]} and by "
-        f"{largest:.2g} in coordinate {names[np.nanargmax(scale)]}"
+        f"the states vary by {least:.2g} in coordinate {names[int(np.nanargmin(scale))]} and by "
+        f"{largest:.2g} in coordinate {names[int(np.nanargmax(scale))]}"
         + (", and the kernel has one lengthscale for both" if single else ""),
         f"Give each coordinate its own, hk.Gaussian(np.ones({len(scale)})), or take units in which "
         "all are near one.",
