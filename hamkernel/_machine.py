@@ -389,12 +389,15 @@ _MAX_UNOPTIMISED = 16_384  # numbers in the arguments; larger programs are optim
 
 
 def compiled_by_size(
-    function: Callable[P, T], unoptimised_up_to: int = _MAX_UNOPTIMISED
+    function: Callable[P, T],
+    unoptimised_up_to: int = _MAX_UNOPTIMISED,
+    platforms: tuple[str, ...] = ("cpu", "gpu"),
 ) -> Callable[P, T]:
     """`compiled` with options of XLA that shorten compilation; on a CPU by size of the arguments.
 
     Programs with at most `unoptimised_up_to` numbers in their arguments skip LLVM's optimisation.
-    Inside another transformation the outer one chooses the options.
+    On other platforms than `platforms` XLA's own options are used. Inside another transformation
+    the outer one chooses them.
     """
     plain = compiled(function)
     fast, fastest = (
@@ -406,7 +409,8 @@ def compiled_by_size(
     def by_size(*args: P.args, **kwargs: P.kwargs) -> T:
         arrays = [a for a in jax.tree.leaves((args, kwargs)) if eqx.is_array(a)]
         platform = _sizes.platform()
-        if any(isinstance(a, Tracer) for a in arrays) or not _options_are_known(platform):
+        is_traced = any(isinstance(a, Tracer) for a in arrays)
+        if is_traced or platform not in platforms or not _options_are_known(platform):
             return plain(*args, **kwargs)
         small = sum(a.size for a in arrays) <= unoptimised_up_to
         return (fastest if small else fast)[platform](*args, **kwargs)

@@ -62,12 +62,13 @@ _CPU = Sizes(
 
 # Measured on an NVIDIA H200, jax 0.11. tile: a product of 100 000 states with n = 4 in float64 took
 # 337 ms with tiles of 1000, 184 with 4000 and 175 with 10 000. states: evaluating 24 data points at
-# a million states took 14.1 ms in batches of 1024 and .92 ms at once. triangle_entries: 250 random
-# features of 100 000 points took 391 ms with QR and three times as many rows as columns, and 53 ms
-# with products and 2²⁴ entries. rows_in_place: 16 000 rows took 107 ms in place and 54 ms not, so
-# only memory decides. Not measured, but derived: trace_points as states; design_entries are 134 MB,
-# products of 33 GFLOP with 1000 features, .6 ms at 57 TFLOP/s, beside 5 µs to start a kernel;
-# strip_entries with 40 numbers each take 1.3 GB.
+# a million states took 14.1 ms in batches of 1024 and .92 ms at once; 2²⁰ at once are no faster.
+# triangle_entries: 250 random features of 100 000 points took 391 ms with QR and three times as
+# many rows as columns, and 53 ms with products and 2²⁴ entries. strip_entries: a fit of 8000 rows
+# took 15.5 ms with 500 000, 13.8 with 2²² and 12.8 with 2²⁴, where 40 numbers each would take 5 GB.
+# rows_in_place: 16 000 rows took 107 ms in place and 54 ms not, so only memory decides. Not
+# measured, but derived: trace_points as states; design_entries are 134 MB, products of 33 GFLOP
+# with 1000 features, .6 ms at 57 TFLOP/s, beside 5 µs to start a kernel.
 _GPU = Sizes(
     tile=4000,
     states=2**17,

@@ -8,7 +8,7 @@ import pytest
 from data import swings
 
 import hamkernel as hk
-from hamkernel._machine import follow_data
+from hamkernel._machine import compiled_by_size, follow_data
 from hamkernel._sizes import platform, sizes
 from hamkernel._solvers import dense
 from hamkernel._solvers.problem import make_problem
@@ -67,6 +67,13 @@ def test_sizes_follow_the_device_of_the_data(monkeypatch):
     monkeypatch.setattr("hamkernel._sizes._GPU", None)  # no one may ask for these now
     field = hk.fit(K, on_cpu, Y, 1e-3)  # asks for the memory too
     assert field.evaluate(on_cpu).shape == hk.gram_operator(K, on_cpu).mv(Y).shape == X.shape
+
+
+def test_a_program_can_be_compiled_with_options_on_a_gpu_alone(monkeypatch):
+    monkeypatch.setattr("hamkernel._machine._options_are_known", None)  # nobody may ask
+    assert compiled_by_size(lambda x: 2 * x, platforms=("gpu",))(jnp.ones(2)).sum() == 4
+    with pytest.raises(TypeError):
+        compiled_by_size(lambda x: 2 * x)(jnp.ones(2))
 
 
 def test_on_a_gpu_memory_decides_what_is_factored_in_place(monkeypatch):

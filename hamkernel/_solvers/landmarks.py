@@ -39,6 +39,10 @@ from hamkernel._structures.base import AbstractMatrixKernel
 # The number of candidates drawn at once. The number of landmarks is rounded up to a multiple of
 # BLOCK, so that similar fits share their compiled programs.
 BLOCK = 16
+# The number of columns that `_independent` eliminates at once. One by one, 32 and 64 at once took
+# 200, 600 and 800 columns on an NVIDIA H200 5.0, 2.2, 2.2 ms; 5.4, 2.5, 2.7 ms; 23, 8.7, 8.8 ms,
+# and on one core of a CPU 1.3, 1.5, 1.8 ms; 28, 19, 12 ms; 411, 256, 196 ms.
+PANEL = 32
 
 
 class Landmarks(eqx.Module):
@@ -259,23 +263,31 @@ def _independent(matrix, rounding):
     """A mask of independent columns of a Gram: pivoted Cholesky down to pivots of rounding size.
 
     Without pivoting, columns with pivots above rounding may still be dependent. Only pivoting
-    makes a small eigenvalue show as a small pivot.
+    makes a small eigenvalue show as a small pivot. Inside a panel only the diagonal is updated; one
+    product then subtracts the panel from the matrix A that remains, as in LAPACK's `pstrf`.
     """
 
     def more(carry):
-        rank, _, diagonal, _ = carry
-        return (rank < len(matrix)) & (diagonal.max() > rounding)
+        return carry[1].max() > rounding
 
-    def column(carry):
-        rank, factor, diagonal, kept = carry
-        c = jnp.argmax(diagonal)
-        v = (matrix[c] - factor[:, c] @ factor) / jnp.sqrt(diagonal[c])
-        diagonal = (diagonal - v**2).at[c].set(0.0)
-        return rank + 1, factor.at[rank].set(v), diagonal, kept.at[c].set(True)
+    def panel(carry):
+        A, diagonal, kept = carry
+
+        def column(i, carry):
+            rows, diagonal, kept = carry
+            c = jnp.argmax(diagonal)
+            is_new = diagonal[c] > rounding
+            v = (A[c] - rows[:, c] @ rows) / jnp.sqrt(diagonal[c])
+            v = jnp.where(is_new, v, jnp.zeros_like(v))
+            diagonal = (diagonal - v**2).at[c].set(0.0)
+            return rows.at[i].set(v), diagonal, kept.at[c].max(is_new)
+
+        rows = jnp.zeros((PANEL, len(A)), A.dtype)
+        rows, diagonal, kept = jax.lax.fori_loop(0, PANEL, column, (rows, diagonal, kept))
+        return A - rows.T @ rows, diagonal, kept
 
     none = jnp.zeros(len(matrix), bool)
-    start = (jnp.zeros((), int), jnp.zeros_like(matrix), jnp.diagonal(matrix), none)
-    return jax.lax.while_loop(more, column, start)[3]
+    return jax.lax.while_loop(more, panel, (matrix, jnp.diagonal(matrix), none))[2]
 
 
 def _rounding(traces: Float[Array, " P"], columns: int) -> Float[Array, " P"]:
@@ -457,23 +469,33 @@ def _masked_cholesky(block, thresholds, n, rounding):
     """Block Cholesky that skips points of small trace.
 
     A point is skipped if its trace, after elimination of the points before it, is below its
-    threshold.
+    threshold. The n rows of a point are eliminated before one product subtracts them from all
+    others: of 16 points with n = 4, .23 ms for .74 column by column on one core of a CPU, .41 for
+    .78 on an NVIDIA H200.
     """
-
-    def column(c, carry):
-        block, L, kept, chosen = carry
-        now = jax.lax.dynamic_slice(jnp.diagonal(block), ((c // n) * n,), (n,)).sum()
-        chosen = jnp.where(c % n == 0, now > thresholds[c // n], chosen)
-        pivot = block[c, c]
-        keep = chosen & (pivot > rounding[c // n])
-        scale = jnp.sqrt(jnp.where(keep, pivot, jnp.ones_like(pivot)))
-        v = jnp.where(keep, block[:, c] / scale, jnp.zeros_like(scale))
-        block = block - v[:, None] * v[None, :]
-        return block, L.at[:, c].set(v), kept.at[c].set(keep), chosen
-
     size = len(block)
-    start = (block, jnp.zeros_like(block), jnp.zeros(size, bool), jnp.zeros((), bool))
-    _, L, kept, _ = jax.lax.fori_loop(0, size, column, start)
+
+    def point(j, carry):
+        block, L, kept = carry
+        first = j * n
+        rows = jax.lax.dynamic_slice(block, (first, 0), (n, size))
+        diagonal = jax.lax.dynamic_slice(rows, (0, first), (n, n))
+        chosen = jnp.trace(diagonal) > thresholds[j]
+        columns, keeps = [], []
+        for c in range(n):
+            pivot = diagonal[c, c]
+            keep = chosen & (pivot > rounding[j])
+            scale = jnp.sqrt(jnp.where(keep, pivot, jnp.ones_like(pivot)))
+            v, d = (jnp.where(keep, a[c] / scale, jnp.zeros_like(a[c])) for a in (rows, diagonal))
+            rows, diagonal = rows - d[:, None] * v[None], diagonal - d[:, None] * d[None]
+            columns.append(v)
+            keeps.append(keep)
+        V = jnp.stack(columns)
+        L = jax.lax.dynamic_update_slice(L, V.T, (0, first))
+        return block - V.T @ V, L, jax.lax.dynamic_update_slice(kept, jnp.stack(keeps), (first,))
+
+    start = (block, jnp.zeros_like(block), jnp.zeros(size, bool))
+    _, L, kept = jax.lax.fori_loop(0, size // n, point, start)
     return mask_columns(jnp.tril(L), kept), kept
 
 
