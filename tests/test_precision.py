@@ -197,11 +197,7 @@ STRUCTURES = {
         {"inputs": X[:, :1]},
     ),
     "family": (hk.Family(hk.Symplectic(G), G), X, Y, {"parameters": X[:, :1]}),
-<<<<<<< HEAD
-    "masses": (hk.UnknownMasses(hk.Symplectic(G), jnp.array([2.0, 1.0])), X4, Y4, {}),
-=======
     "masses": (hk.UnknownMasses(hk.Symplectic(G), np.array([2.0, 1.0])), X4, Y4, {}),
->>>>>>> main
     "shared": (
         hk.Symplectic(hk.Shared(G, hk.sites(2), centres=jnp.linspace(-2.0, 2.0, 5)[:, None])),
         X4,
