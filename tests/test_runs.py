@@ -16,7 +16,7 @@ import hamkernel as hk
 from hamkernel._trajectories.smoothing import (
     Process,
     negative_log_likelihood,
-    padded,
+    pad,
     power_of_two,
     processes,
     smoothed,
@@ -262,7 +262,7 @@ def test_velocities_of_what_was_never_measured_are_refused():
 
 def test_runs_are_padded_to_few_shapes():
     assert [power_of_two(n) for n in (1, 2, 3, 33, 64)] == [1, 2, 4, 64, 64]
-    runs = padded(TIMES, STATES)
+    runs = pad(TIMES, STATES)
     assert runs.states.shape == (4, 32, 2)
     assert not runs.seen[0, 25:].any()
 

@@ -52,7 +52,7 @@ def power_of_two(count: int) -> int:
     return 1 << max(count - 1, 0).bit_length()
 
 
-def padded(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> Padded:
+def pad(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> Padded:
     """Runs of any lengths as arrays; T is a power of two, at least 8."""
     R = power_of_two(len(times))
     T = max(power_of_two(max(len(t) for t in times)), 8)
@@ -122,7 +122,7 @@ def _stationary(process: Process) -> Float[Array, "4 4"]:
     return jnp.exp(2 * process.log_amplitude) * jnp.asarray(_STATIONARY, dtype)
 
 
-def _filtered(process: Process, steps, y, seen, slopes: Any = None):
+def _filter(process: Process, steps, y, measured, slopes: Any = None):
     """The forward pass: what the backward pass needs at each time, and the log likelihood.
 
     `steps` are the times since the sample before, and 0 for the first. `slopes` are samples of the
@@ -155,7 +155,7 @@ def _filtered(process: Process, steps, y, seen, slopes: Any = None):
         return (after, Q), (m, P, S, error, A, loss)
 
     start = jnp.zeros(4, y.dtype), stationary
-    _, out = jax.lax.scan(step, start, (steps, y, seen, *(slopes or ())[:2]))
+    _, out = jax.lax.scan(step, start, (steps, y, measured, *(slopes or ())[:2]))
     return out
 
 
@@ -163,20 +163,20 @@ def negative_log_likelihood(
     process: Process,
     steps: Float[Array, "R T"],
     y: Float[Array, "R T"],
-    seen: Bool[Array, "R T"],
+    measured: Bool[Array, "R T"],
     slopes: Any = None,
 ) -> Float[Array, ""]:
     """−log p(y) of several independent runs; `steps` as in `smooth`, `slopes` as in `_filtered`."""
 
     def one(dt, value, there, *slope):
         rates = (*slope, slopes[2]) if slope else None
-        return _filtered(process, dt, value, there, rates)[-1].sum()
+        return _filter(process, dt, value, there, rates)[-1].sum()
 
-    return 0.5 * jax.vmap(one)(steps, y, seen, *(slopes or ())[:2]).sum()
+    return 0.5 * jax.vmap(one)(steps, y, measured, *(slopes or ())[:2]).sum()
 
 
 def smooth(
-    process: Process, steps: Float[Array, " T"], y: Float[Array, " T"], seen: Bool[Array, " T"]
+    process: Process, steps: Float[Array, " T"], y: Float[Array, " T"], measured: Bool[Array, " T"]
 ) -> Smoothed:
     """The process given one run: values and derivatives at all its times, measured or not.
 
@@ -184,9 +184,9 @@ def smooth(
         process: the hyperparameters.
         steps: the time since the sample before, 0 for the first.
         y: the samples.
-        seen: which of them were measured.
+        measured: which of them were measured.
     """
-    m, P, S, error, A, _ = _filtered(process, steps, y, seen)
+    m, P, S, error, A, _ = _filter(process, steps, y, measured)
 
     def step(carry, at):
         l, L = carry  # noqa: E741 - the adjoint, after the sample
@@ -202,7 +202,7 @@ def smooth(
         return (A.T @ l, A.T @ L @ A), (value[:2], jnp.diagonal(covariance)[:2])
 
     none = jnp.zeros(4, y.dtype), jnp.zeros((4, 4), y.dtype)
-    _, (mean, variance) = jax.lax.scan(step, none, (m, P, S, error, A, seen), reverse=True)
+    _, (mean, variance) = jax.lax.scan(step, none, (m, P, S, error, A, measured), reverse=True)
     rate = jnp.exp(process.log_rate)
     deviation = jnp.sqrt(jnp.maximum(variance, jnp.zeros_like(variance)))
     return Smoothed(mean[:, 0], rate * mean[:, 1], deviation[:, 0], rate * deviation[:, 1])
@@ -236,8 +236,8 @@ def without_means(states: Sequence[np.ndarray]) -> tuple[list[np.ndarray], np.nd
 
 
 def _mean(x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, " n"]:
-    seen = np.isfinite(x)
-    return np.where(seen, x, 0.0).sum(axis=0) / np.maximum(seen.sum(axis=0), 1)
+    measured = np.isfinite(x)
+    return np.where(measured, x, 0.0).sum(axis=0) / np.maximum(measured.sum(axis=0), 1)
 
 
 @in_doubles
@@ -261,7 +261,7 @@ def processes(
     if len(pieces_t) > 64:
         chosen = np.linspace(0, len(pieces_t) - 1, 64).round().astype(int)
         pieces_t, pieces_x = [pieces_t[i] for i in chosen], [pieces_x[i] for i in chosen]
-    pieces = padded(pieces_t, pieces_x)
+    pieces = pad(pieces_t, pieces_x)
     steps = np.diff(pieces.times, axis=1, prepend=0.0)
     longest = max(t[-1] - t[0] for t in times)
     spacing = np.median(np.concatenate([np.diff(t) for t in pieces_t if len(t) > 1]))
@@ -272,27 +272,27 @@ def processes(
         # As many as 64 pieces of eight coordinates say enough of a few numbers.
         part = np.unique(np.linspace(0, len(arrays[0]) - 1, 512).round().astype(int))
         arrays = [a[part] for a in (np.repeat(steps, len(g), 0), *arrays)]
-        dt, x, seen, v, seen_slope = arrays
-        coordinate = _process(dt, x, seen, v, seen_slope, longest, spacing)
+        dt, x, measured, v, measured_slope = arrays
+        coordinate = _process(dt, x, measured, v, measured_slope, longest, spacing)
         for c in g:
             out[c] = coordinate._replace(seen=bool(pieces.seen[:, :, c].any()))
     return out
 
 
-def _process(steps, y, seen, v, seen_slope, longest: float, spacing: float) -> Coordinate:
-    scale = y[seen].std() if seen.any() else 0.0
+def _process(steps, y, measured, v, measured_slope, longest: float, spacing: float) -> Coordinate:
+    scale = y[measured].std() if measured.any() else 0.0
     if not scale > 0:  # never measured, or constant
         nothing = Process(*(jnp.asarray(v) for v in (-np.inf, -np.log(longest), -np.inf)))
-        return Coordinate(nothing, bool(seen.any()))
+        return Coordinate(nothing, bool(measured.any()))
     # A swing a hundred times as long as the data looks like a line; one faster than half a sample,
     # like noise. The noise is at least the rounding of the states.
     low, high = [0.3, 0.03 / longest, 1e-7], [1e3, 3.0 / spacing, 2.0]
     slopes = None
-    if seen_slope.any():
-        speed = (v[seen_slope].std() or 1.0) / scale
+    if measured_slope.any():
+        speed = (v[measured_slope].std() or 1.0) / scale
         low, high = [*low, 1e-7 * speed], [*high, 2.0 * speed]
-        slopes = jnp.asarray(v / scale), jnp.asarray(seen_slope)
-    data = jnp.asarray(steps), jnp.asarray(y / scale), jnp.asarray(seen), slopes
+        slopes = jnp.asarray(v / scale), jnp.asarray(measured_slope)
+    data = jnp.asarray(steps), jnp.asarray(y / scale), jnp.asarray(measured), slopes
     log_amplitude, log_rate, *log_noise = np.asarray(_found(*data, np.log(low), np.log(high)))
     shift = np.log(scale)
     logs = log_amplitude + shift, log_rate, log_noise[0] + shift
@@ -301,13 +301,13 @@ def _process(steps, y, seen, v, seen_slope, longest: float, spacing: float) -> C
 
 
 @compiled_by_size
-def _found(steps, y, seen, slopes, low, high) -> Float[Array, " h"]:
+def _found(steps, y, measured, slopes, low, high) -> Float[Array, " h"]:
     """(log amplitude, log rate, log noise, and that of slopes) by BFGS from the best of a grid."""
     low, high = jnp.asarray(low, y.dtype), jnp.asarray(high, y.dtype)
 
     def loss(h):
         rates = None if slopes is None else (*slopes, h[3])
-        return negative_log_likelihood(Process(*h[:3]), steps, y, seen, rates)
+        return negative_log_likelihood(Process(*h[:3]), steps, y, measured, rates)
 
     rates = np.linspace(0.1, 0.95, 12)
     noises = np.log([1e-5, 1e-3, 1e-2, 0.1, 0.5])
@@ -317,7 +317,7 @@ def _found(steps, y, seen, slopes, low, high) -> Float[Array, " h"]:
         low[1] + (high[1] - low[1]) * jnp.asarray(rate, y.dtype),
         jnp.asarray(noise, y.dtype),
     ]
-    count = jnp.maximum(seen.sum(), 1).astype(y.dtype)
+    count = jnp.maximum(measured.sum(), 1).astype(y.dtype)
     sizes = [jnp.full_like(count, 0.2), jnp.full_like(count, 0.1), 1 / jnp.sqrt(2 * count)]
     if slopes is not None:  # as large a share of them
         columns, sizes = [*columns, columns[2] + high[3] - high[2]], [*sizes, sizes[2]]
@@ -328,7 +328,7 @@ def _found(steps, y, seen, slopes, low, high) -> Float[Array, " h"]:
 
 @compiled_by_size
 def _smooth_each(process: Process, steps, y, seen: Bool[Array, "R T"]) -> Smoothed:
-    return jax.vmap(lambda dt, value, there: smooth(process, dt, value, there))(steps, y, seen)
+    return jax.vmap(lambda dt, value, there: smooth(process, dt, value, there))(steps, y, measured)
 
 
 class Paths(NamedTuple):
@@ -349,7 +349,7 @@ def smoothed(
     A coordinate that was never measured is NaN; one that is constant stays so.
     """
     states, means = without_means(states)
-    runs = padded(times, states)
+    runs = pad(times, states)
     steps = np.diff(runs.times, axis=1, prepend=0.0)
     paths = Paths(*(np.zeros(runs.states.shape) for _ in Paths._fields))
     for c, coordinate in enumerate(found):
