@@ -327,7 +327,7 @@ def _found(steps, y, measured, slopes, low, high) -> Float[Array, " h"]:
 
 
 @compiled_by_size
-def _smooth_each(process: Process, steps, y, seen: Bool[Array, "R T"]) -> Smoothed:
+def _smooth_each(process: Process, steps, y, measured: Bool[Array, "R T"]) -> Smoothed:
     return jax.vmap(lambda dt, value, there: smooth(process, dt, value, there))(steps, y, measured)
 
 
