@@ -168,10 +168,14 @@ def _settling(fit: FitQuality) -> Diagnostic:
 
 
 def _noise_against_motion(fit: FitQuality) -> Diagnostic:
-    """Whether the field explains most of the motion: where learning failed, .9 to 1.1 are found."""
+    """Whether the field explains most of the motion: where learning failed, .9 to 1.1 are found.
+
+    From ten coordinates on a tenth of them may hardly move: in one film of 30 particles one of 120
+    coordinates moved by less than the noise, and the law was right to some thousandths.
+    """
     share = np.nan_to_num(fit.noise / fit.scale)
-    c = int(np.argmax(share))
     n = len(share)
+    c = int(np.argsort(share)[n - 1 - n // 10])
     return Diagnostic(
         "noise",
         f"{share[c]:.2g} of the motion",
