@@ -89,14 +89,14 @@ def test_the_features_of_torques_are_euler_and_lagrange_by_differences(arm):
 
     def slope(x, i):
         step = h * jnp.eye(4)[i]
-        L = lambda x: features.of_lagrangian(x) @ w  # noqa: E731
+        L = lambda x: features.features_at(x) @ w  # noqa: E731
         return (L(x + step) - L(x - step)) / (2 * h)
 
     d = jnp.concatenate([x[2:], a])
     for i in range(2):
         along = (slope(x + 1e-4 * d, 2 + i) - slope(x - 1e-4 * d, 2 + i)) / 2e-4
         wanted = along - slope(x, i)
-        found = (features.of_torques(x, a) @ w)[i]
+        found = (features.torque_features(x, a) @ w)[i]
         np.testing.assert_allclose(found, wanted, rtol=1e-3, atol=1e-3)
 
 

@@ -104,20 +104,20 @@ class LagrangianField(Shown, eqx.Module):
     @full_precision
     def mass_matrix(self, q: Num[ArrayLike, " m"]) -> Float[Array, "m m"]:
         """M(q), symmetric, shape (m, m)."""
-        return self.features.of_mass_matrix(self._position(q)) @ self.coefficients
+        return self.features.mass_matrix_features(self._position(q)) @ self.coefficients
 
     @full_precision
     def mass_matrix_deviation(self, q: Num[ArrayLike, " m"]) -> Float[Array, "m m"]:
         """The standard deviation of each entry of M(q), shape (m, m)."""
         q = self._position(q)
-        rows = self.features.of_mass_matrix(q)
+        rows = self.features.mass_matrix_features(q)
         missing = self._missing(self.kernel.inertia, q, q)
         return jnp.sqrt(self._variance(rows) + missing * (2 + 2 * jnp.eye(len(q), dtype=q.dtype)))
 
     @full_precision
     def potential(self, q: Num[ArrayLike, " m"]) -> Float[Array, ""]:
         """V(q), known up to a constant, shape ()."""
-        return self.features.of_potential(self._position(q)) @ self.coefficients
+        return self.features.potential_features(self._position(q)) @ self.coefficients
 
     @full_precision
     def gravity(self, q: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
@@ -128,7 +128,7 @@ class LagrangianField(Shown, eqx.Module):
     def gravity_deviation(self, q: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
         """The standard deviation of each entry of the gravity, shape (m,)."""
         q, k = self._position(q), self.kernel.potential
-        rows = jax.jacfwd(self.features.of_potential)(q).T
+        rows = jax.jacfwd(self.features.potential_features)(q).T
         mixed = jax.jacfwd(jax.jacrev(lambda a, b: self._missing(k, a, b)), argnums=1)(q, q)
         return jnp.sqrt(self._variance(rows) + jnp.maximum(jnp.diagonal(mixed), 0.0))
 
@@ -140,8 +140,8 @@ class LagrangianField(Shown, eqx.Module):
 
         def row(x):
             q, v = jnp.split(self._state(x), 2)
-            kinetic = jnp.einsum("i,j,ijr->r", v, v, self.features.of_mass_matrix(q)) / 2
-            return kinetic + self.features.of_potential(q)
+            kinetic = jnp.einsum("i,j,ijr->r", v, v, self.features.mass_matrix_features(q)) / 2
+            return kinetic + self.features.potential_features(q)
 
         return jnp.sqrt(self._variance(row(x) - row(x0)))
 
@@ -151,12 +151,12 @@ class LagrangianField(Shown, eqx.Module):
     ) -> Float[Array, " m"]:
         """The standard deviation of each torque of `inverse_dynamics`, without noise, (m,)."""
         x = jnp.concatenate([self._position(q), self._position(v, "v")])
-        return jnp.sqrt(self._variance(self.features.of_torques(x, self._position(a, "a"))))
+        return jnp.sqrt(self._variance(self.features.torque_features(x, self._position(a, "a"))))
 
     @full_precision
     def friction(self, v: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
         """The friction of the joints at the velocities v, shape (m,)."""
-        return self.features.of_friction(self._position(v, "v")) @ self.coefficients
+        return self.features.friction_features(self._position(v, "v")) @ self.coefficients
 
     @full_precision
     def momentum(self, x: Num[ArrayLike, " n"]) -> Float[Array, " m"]:
@@ -182,7 +182,7 @@ class LagrangianField(Shown, eqx.Module):
     ) -> Float[Array, " m"]:
         """The torques τ = M(q) a + Coriolis forces + ∂V/∂q + friction, shape (m,)."""
         x = jnp.concatenate([self._position(q), self._position(v, "v")])
-        return self.features.of_torques(x, self._position(a, "a")) @ self.coefficients
+        return self.features.torque_features(x, self._position(a, "a")) @ self.coefficients
 
     @full_precision
     def rest_torques(self, x: Num[ArrayLike, " n"]) -> Float[Array, " m"]:
@@ -197,16 +197,17 @@ class LagrangianField(Shown, eqx.Module):
 
     def _variance(self, rows: Float[Array, "*k r"]) -> Float[Array, "*k"]:
         """The variance of rows in kernels, carried by the centres."""
-        done = self.features.finished(rows).reshape(-1, rows.shape[-1])
+        done = self.features.whiten(rows).reshape(-1, rows.shape[-1])
         whitened = solve_triangular(self.triangle, done.T, trans="T")
         return jnp.sum(whitened**2, axis=0).reshape(rows.shape[:-1])
 
     def _missing(self, k, q, other) -> Float[Array, ""]:
         """The prior covariance of k at two positions that the centres do not carry."""
-        whole = k(self.kernel.placed(q), self.kernel.placed(other))
+        whole = k(self.kernel.embed(q), self.kernel.embed(other))
         root = self.features.roots[0 if k is self.kernel.potential else 1]
         mine, others = (
-            solve_triangular(root, self.features.of_kernel(k, at), lower=True) for at in (q, other)
+            solve_triangular(root, self.features.kernel_values(k, at), lower=True)
+            for at in (q, other)
         )
         return jnp.maximum(whole - mine @ others, 0.0) if q is other else whole - mine @ others
 
@@ -227,7 +228,7 @@ def lagrangian_field(
 ) -> LagrangianField:
     """The field of these weights, with the smallest eigenvalue of M over the states X."""
     zero = jnp.zeros((), weights.dtype)
-    coefficients = features.on_kernels(weights)
+    coefficients = features.kernel_coefficients(weights)
     field = LagrangianField(features, coefficients, triangle, noise, residual, zero, zero)
     both = lambda f: (f.least_inertia, f.least_inertia_deviation)  # noqa: E731
     return eqx.tree_at(both, field, _least_inertia(field, X[:, : features.count]))
@@ -238,6 +239,6 @@ def _least_inertia(field: LagrangianField, Q: Float[Array, "N m"]) -> tuple[Arra
     values, vectors = jax.lax.map(lambda q: jnp.linalg.eigh(field.mass_matrix(q)), Q)
     at = jnp.argmin(values[:, 0])
     e = vectors[at, :, 0]
-    row = jnp.einsum("i,j,ijr->r", e, e, field.features.of_mass_matrix(Q[at]))
+    row = jnp.einsum("i,j,ijr->r", e, e, field.features.mass_matrix_features(Q[at]))
     missing = 4 * field._missing(field.kernel.inertia, Q[at], Q[at])
     return values[at, 0], jnp.sqrt(field._variance(row) + jnp.maximum(missing, 0.0))

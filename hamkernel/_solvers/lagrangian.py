@@ -132,10 +132,10 @@ def strong_rows(
 
     @jax.checkpoint
     def at(point):
-        return features.of_torques(*point)
+        return features.torque_features(*point)
 
     rows = jax.lax.map(at, (data.states, data.accelerations), batch_size=64)
-    rows = features.finished(rows).reshape(-1, features.columns)
+    rows = features.whiten(rows).reshape(-1, features.columns)
     return rows / deviation, data.torques.reshape(-1) / deviation
 
 
@@ -149,7 +149,7 @@ def with_anchor(
     q, M = np.asarray(known[0]), np.asarray(known[1], float)  # None is NaN
     i, j = np.nonzero(np.triu(np.isfinite(M)))
     size = _ANCHOR * np.abs(M[i, j]).max()
-    rows = features.finished(features.of_mass_matrix(jnp.asarray(q, B.dtype))[i, j])
+    rows = features.whiten(features.mass_matrix_features(jnp.asarray(q, B.dtype))[i, j])
     values = jnp.asarray(M[i, j] / size, B.dtype)
     return jnp.concatenate([B, rows / size]), jnp.concatenate([y, values])
 

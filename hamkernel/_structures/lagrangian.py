@@ -80,7 +80,7 @@ class Lagrangian(eqx.Module):
         said += ["known_mass_matrix=…"] if self.known_mass_matrix else []
         return call("Lagrangian", said)
 
-    def placed(self, q: Float[Array, " m"]) -> Float[Array, " d"]:
+    def embed(self, q: Float[Array, " m"]) -> Float[Array, " d"]:
         """The coordinates that the kernels see: (cos, sin) of angles, all others as they are."""
         parts = [
             jnp.stack([jnp.cos(q[i]), jnp.sin(q[i])]) if i in self.angles else q[i : i + 1]
@@ -126,7 +126,7 @@ class LagrangianFeatures(eqx.Module):
 
     Those of V are −R⁻¹k_V(C, q). Those of Mᵢⱼ are R⁻¹k_M(C, q) times vᵢ² or √2 vᵢvⱼ, i < j, since
     (v·v′)² is the sum of their products. R is a root of a Gram, R Rᵀ = k(C, C). Rows "in kernels"
-    are without R⁻¹, which `finished` applies to rows that were differentiated and integrated.
+    are without R⁻¹, which `whiten` applies to rows that were differentiated and integrated.
 
     Attributes:
         kernel: the Lagrangian kernel.
@@ -159,11 +159,11 @@ class LagrangianFeatures(eqx.Module):
         roots = root_at(kernel.potential, C), root_at(kernel.inertia, C)
         return LagrangianFeatures(kernel, C, roots, self.rest_speed, self.count)
 
-    def of_kernel(self, k: AbstractScalarKernel, q: Float[Array, " m"]) -> Float[Array, " c"]:
+    def kernel_values(self, k: AbstractScalarKernel, q: Float[Array, " m"]) -> Float[Array, " c"]:
         """k(C, q)."""
-        return jax.vmap(k, (None, 0))(self.kernel.placed(q), self.centres)
+        return jax.vmap(k, (None, 0))(self.kernel.embed(q), self.centres)
 
-    def finished(self, rows: Float[Array, "*k r"]) -> Float[Array, "*k r"]:
+    def whiten(self, rows: Float[Array, "*k r"]) -> Float[Array, "*k r"]:
         """Rows in kernels as rows in features: R⁻¹ on each block of centres."""
         c, shape = len(self.centres), rows.shape[:-1]
         rows = rows.reshape(-1, self.columns)
@@ -174,29 +174,29 @@ class LagrangianFeatures(eqx.Module):
         done = jnp.concatenate([V, M.reshape(len(rows), -1), rows[:, last:]], axis=1)
         return done.reshape(*shape, self.columns)
 
-    def on_kernels(self, weights: Float[Array, " r"]) -> Float[Array, " r"]:
-        """The coefficients c with `finished(rows) @ weights` = rows @ c."""
-        return jax.linear_transpose(self.finished, weights)(weights)[0]
+    def kernel_coefficients(self, weights: Float[Array, " r"]) -> Float[Array, " r"]:
+        """The coefficients c with `whiten(rows) @ weights` = rows @ c."""
+        return jax.linear_transpose(self.whiten, weights)(weights)[0]
 
-    def of_lagrangian(self, x: Float[Array, " n"]) -> Float[Array, " r"]:
+    def features_at(self, x: Float[Array, " n"]) -> Float[Array, " r"]:
         """L(q, v), in kernels."""
         q, v = jnp.split(x, 2)
         i, j = np.triu_indices(self.count)
         squares = v[i] * v[j] * np.where(i == j, 1.0, np.sqrt(2.0))
-        inertia = squares[:, None] * self.of_kernel(self.kernel.inertia, q)[None]
-        V, none = -self.of_kernel(self.kernel.potential, q), jnp.zeros(self.friction_columns)
+        inertia = squares[:, None] * self.kernel_values(self.kernel.inertia, q)[None]
+        V, none = -self.kernel_values(self.kernel.potential, q), jnp.zeros(self.friction_columns)
         return jnp.concatenate([V, inertia.reshape(-1), none.astype(V.dtype)])
 
-    def of_potential(self, q: Float[Array, " m"]) -> Float[Array, " r"]:
+    def potential_features(self, q: Float[Array, " m"]) -> Float[Array, " r"]:
         """V(q), in kernels."""
-        phi = self.of_kernel(self.kernel.potential, q)
+        phi = self.kernel_values(self.kernel.potential, q)
         return jnp.pad(phi, (0, self.columns - len(phi)))
 
-    def of_mass_matrix(self, q: Float[Array, " m"]) -> Float[Array, "m m r"]:
+    def mass_matrix_features(self, q: Float[Array, " m"]) -> Float[Array, "m m r"]:
         """M(q) = ∂²L/∂v², in kernels."""
         m, c = self.count, len(self.centres)
         i, j = np.triu_indices(m)
-        phi = self.of_kernel(self.kernel.inertia, q)
+        phi = self.kernel_values(self.kernel.inertia, q)
         shares = np.zeros((m, m, len(i)))
         shares[i, j, np.arange(len(i))] = shares[j, i, np.arange(len(i))] = np.where(
             i == j, 2.0, np.sqrt(2.0)
@@ -204,7 +204,7 @@ class LagrangianFeatures(eqx.Module):
         found = jnp.einsum("ijp,c->ijpc", jnp.asarray(shares, phi.dtype), phi).reshape(m, m, -1)
         return jnp.pad(found, ((0, 0), (0, 0), (c, self.friction_columns)))
 
-    def of_friction(self, v: Float[Array, " m"]) -> Float[Array, "m r"]:
+    def friction_features(self, v: Float[Array, " m"]) -> Float[Array, "m r"]:
         """The friction of each joint, in kernels."""
         friction, m = self.kernel.friction, self.count
         if friction is None:
@@ -213,17 +213,19 @@ class LagrangianFeatures(eqx.Module):
             friction_of_joints(friction, v, self.rest_speed), ((0, 0), (self.columns - 2 * m, 0))
         )
 
-    def of_motion(self, x: Float[Array, " n"]) -> tuple[Float[Array, "m r"], Float[Array, "m r"]]:
+    def motion_features(
+        self, x: Float[Array, " n"]
+    ) -> tuple[Float[Array, "m r"], Float[Array, "m r"]]:
         """The momentum p = ∂L/∂v and the force b = friction − ∂L/∂q of ṗ + b = τ, in kernels."""
         m = self.count
-        slopes = jax.jacfwd(self.of_lagrangian)(x).T
-        return slopes[m:], self.of_friction(x[m:]) - slopes[:m]
+        slopes = jax.jacfwd(self.features_at)(x).T
+        return slopes[m:], self.friction_features(x[m:]) - slopes[:m]
 
-    def of_torques(self, x: Float[Array, " n"], a: Float[Array, " m"]) -> Float[Array, "m r"]:
+    def torque_features(self, x: Float[Array, " n"], a: Float[Array, " m"]) -> Float[Array, "m r"]:
         """τ = D_(v,a) ∂L/∂v − ∂L/∂q + friction, in kernels."""
-        momentum = lambda x: self.of_motion(x)[0]  # noqa: E731
+        momentum = lambda x: self.motion_features(x)[0]  # noqa: E731
         rate = jax.jvp(momentum, (x,), (jnp.concatenate([x[self.count :], a]),))[1]
-        return rate + self.of_motion(x)[1]
+        return rate + self.motion_features(x)[1]
 
 
 def friction_of_joints(
@@ -238,16 +240,16 @@ def friction_of_joints(
 def lagrangian_features(K: Lagrangian, X: Float[Array, "N n"]) -> LagrangianFeatures:
     """The features of K with centres among the positions of the states X, far from one another."""
     m = X.shape[1] // 2
-    placed = np.asarray(_placed(K, X[:, :m]))
-    unit = placed / np.where(np.ptp(placed, axis=0) > 0, np.ptp(placed, axis=0), 1.0)
+    embedded = np.asarray(_embed(K, X[:, :m]))
+    unit = embedded / np.where(np.ptp(embedded, axis=0) > 0, np.ptp(embedded, axis=0), 1.0)
     given = None if K.friction is None else K.friction.rest_speed
     # Dry friction changes its sign within a tenth of the speed of the slowest joint.
     rest = 0.1 * jnp.sqrt(jnp.mean(X[:, m:] ** 2, axis=0)).min() if given is None else given
-    centres = jnp.asarray(placed[far_apart(unit, _CENTRES)])
+    centres = jnp.asarray(embedded[far_apart(unit, _CENTRES)])
     none = jnp.zeros((0, 0), X.dtype)
     start = LagrangianFeatures(K, centres, (none, none), jnp.asarray(rest, X.dtype), m)
     return _with_kernel(start, K)
 
 
 _with_kernel = compiled(lambda features, K: features.with_kernel(K))
-_placed = compiled(lambda K, Q: jax.vmap(K.placed)(Q))
+_embed = compiled(lambda K, Q: jax.vmap(K.embed)(Q))

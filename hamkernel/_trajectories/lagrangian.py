@@ -209,7 +209,7 @@ class _WeakRows(eqx.Module):
     covariance: Float[Array, "B R R"]
 
     def __call__(self, features: LagrangianFeatures, deviation: Float[Array, " m"]):
-        rows = features.finished(weak_rows(features.of_motion, self.pieces))
+        rows = features.whiten(weak_rows(features.motion_features, self.pieces))
         L = factors(self.pieces, self.covariance, deviation)
         return whiten(L, rows), whiten(L, jnp.asarray(self.pieces.targets)), log_scale(L)
 
@@ -225,15 +225,15 @@ def _solve(features, pieces, covariance, deviation) -> tuple[Array, ...]:
 
 @compiled_by_size
 def _rows(features, pieces) -> Float[Array, "B W m r"]:
-    return features.finished(weak_rows(features.of_motion, pieces))
+    return features.whiten(weak_rows(features.motion_features, pieces))
 
 
 @compiled_by_size
 def _covariance(features, weights, pieces) -> Float[Array, "B R R"]:
-    coefficients = features.on_kernels(weights)
+    coefficients = features.kernel_coefficients(weights)
 
     def law(x):
-        a, b = features.of_motion(x)
+        a, b = features.motion_features(x)
         return a @ coefficients, b @ coefficients
 
     return path_covariance(law, pieces)
