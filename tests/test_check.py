@@ -316,6 +316,7 @@ def test_a_small_number_under_the_root_does_not_make_laplace_smooth(jitter):
             assert "too rough" in refusal(k, cloud(seed, n=n))
 
 
+@pytest.mark.slow
 def test_a_kernel_with_a_second_smaller_scale_is_sound():
     small = [
         1e-4 * hk.Gaussian(1e-3),
@@ -366,6 +367,7 @@ def test_bad_points_and_tracers_are_refused():
 # Kernels of other libraries, as their users get them
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_tinygp_matern_has_a_rank_one_block_and_its_smooth_kernels_pass():
     kernels = pytest.importorskip("tinygp").kernels

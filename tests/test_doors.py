@@ -284,6 +284,7 @@ def controlled():
     return hk.fit(K, X, np.gradient(X, T, axis=0), 1e-3, inputs=U)
 
 
+@pytest.mark.slow
 def test_one_input_is_one_column_everywhere(controlled):
     np.testing.assert_array_equal(hk.Velocities(X, X, inputs=U).inputs, U[:, None])
     np.testing.assert_array_equal(hk.Velocities(X, X, parameters=U).inputs, U[:, None])
@@ -425,6 +426,7 @@ def test_the_table_of_a_log_says_what_was_found_and_what_to_do():
     assert "! impossible samples" in repr(found)
 
 
+@pytest.mark.slow
 def test_what_is_printed_degrades_on_a_terminal_of_ascii():
     code = (
         "from hamkernel._trajectories.table import Diagnostic, Diagnostics\n"

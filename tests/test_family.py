@@ -155,6 +155,7 @@ def test_a_mean_may_depend_on_the_member():
         field.at(theta).hamiltonian(x)
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:the amplitude")
 def test_the_deviation_is_that_of_the_gaussian_process_and_grows_outside_of_the_range():
     posterior = hk.condition(K, X, Y, LAMBDA, parameters=THETA)

@@ -255,6 +255,7 @@ def test_other_solvers_find_the_field_of_the_dense_one(name):
     np.testing.assert_allclose(*changes, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_conjugate_gradients_of_rows_are_preconditioned():
     X = np.random.default_rng(0).uniform(-2, 2, size=(40, 2))
     data = hk.Velocities(X, np.sin(X[:, ::-1]), noise=np.array([1.0, 0.5]))
@@ -265,6 +266,7 @@ def test_conjugate_gradients_of_rows_are_preconditioned():
     assert int(field.info.iterations or 0) in range(1, 17)  # 8, and more than 100 without
 
 
+@pytest.mark.slow
 def test_random_features_learn_from_every_kind_what_their_own_kernel_learns(key):
     solver = hk.RandomFeatures(40, key)
     field = hk.fit(K, EVERYTHING, regularization=RIDGE, solver=solver)
@@ -423,6 +425,7 @@ def test_energies_with_a_mean_are_the_closed_form():
     np.testing.assert_allclose(field.evaluate(ASKED), expected, atol=SOLVE)
 
 
+@pytest.mark.slow
 def test_separability_needs_that_of_the_mean():
     k = 2.0 * (hk.Select(hk.Gaussian(1.0), (0,)) + hk.Select(hk.Gaussian(1.0), (1,)))
     X, Y = pendulum_data(8, 0)

@@ -237,6 +237,7 @@ def test_verdict_is_computed_from_the_results(results):
     assert "Table II is closest to N*lambda for the harmonic oscillator" in text
 
 
+@pytest.mark.slow
 def test_data_has_the_noise_of_the_paper_and_keys_decide_it():
     oscillator = paper.experiments()["harmonic_oscillator"]
     keys = jax.vmap(jax.random.key)(np.arange(400))

@@ -128,6 +128,7 @@ def same(one, other, rtol=SOLVE):
 MEAN = hk.systems.HarmonicOscillator()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mean", [MEAN, pytest.param(None, marks=pytest.mark.slow)])
 @pytest.mark.few(1)
 def test_an_update_is_a_refit_with_the_same_noise(mean):

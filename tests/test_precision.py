@@ -121,6 +121,10 @@ SLOW = (
     "learn",
     "tune low rank",
     "other answers",
+    "posterior",
+    "fields",
+    "observations",
+    "streams",
 )  # 37 s and 18 s: they are traced and compiled anew
 CALLS = {
     "fields": field_answers,

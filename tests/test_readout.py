@@ -196,6 +196,7 @@ def test_a_mean_is_taken_off_and_inputs_do_not_enter_the_drift():
         np.testing.assert_allclose(found(x), [0.4, -math.sin(0.3)], atol=0.02)
 
 
+@pytest.mark.slow
 def test_masses_and_poisson_tensors_bring_their_own_operator():
     rng = np.random.default_rng(2)
     Z = rng.uniform(-1, 1, (40, 4))

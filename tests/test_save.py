@@ -186,6 +186,7 @@ def test_every_symmetry_of_every_scalar_kernel_is_stored_hashed_and_added(struct
                 assert more.terms[-1] == hk.Matern()
 
 
+@pytest.mark.slow
 def test_a_symmetry_over_a_sum_of_scalar_kernels_is_saved(tmp_path):
     K = hk.Odd(hk.Symplectic(hk.Gaussian(1.0) + hk.Matern(2.5, 1.0)))
     for field in (fitted(K), hk.tune(K, X, Y, starts=1, max_steps=1, solver=hk.Cholesky()).field):

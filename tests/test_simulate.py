@@ -93,6 +93,7 @@ def test_states_at_times_that_are_no_multiples_of_the_step(solver, error):
     assert solution.stats["num_steps"] == 8 + 13 + 1 + 35 + 9 + 38
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
 def test_multiples_of_the_step_need_no_extra_step_for_rounding(dtype):
     ts = jnp.linspace(0, 30, 301).astype(dtype)  # intervals of 0.1, give or take rounding
@@ -103,6 +104,7 @@ def test_multiples_of_the_step_need_no_extra_step_for_rounding(dtype):
         assert solution.stats["num_steps"] == 300 * steps
 
 
+@pytest.mark.slow
 def test_saved_states_are_steps_and_not_interpolations():
     field, solver, energy = Pendulum(), GaussLegendre6(), Pendulum().hamiltonian(START)
     ts = np.linspace(0, 10, 11)
@@ -171,6 +173,7 @@ def test_batch_by_vmap_is_the_loop(options):
     np.testing.assert_allclose(jax.jit(jax.vmap(run))(starts), loop, atol=1e-13)
 
 
+@pytest.mark.slow
 def test_jit_with_traced_times_and_step_changes_nothing():
     def run(x, ts, dt):
         return states(Pendulum(), x, ts, GaussLegendre4(), dt)
@@ -181,6 +184,7 @@ def test_jit_with_traced_times_and_step_changes_nothing():
     )
 
 
+@pytest.mark.slow
 def test_a_new_start_field_or_step_does_not_compile_again():
     @eqx.filter_jit
     @eqx.debug.assert_max_traces(max_traces=1)
@@ -234,6 +238,7 @@ def test_gradient_of_a_rollout_is_the_central_difference(options):
     np.testing.assert_allclose(by_start[0], difference, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_flow_map_by_forward_mode_is_symplectic():
     def end(x):
         adjoint = diffrax.ForwardMode()
@@ -285,6 +290,7 @@ def test_a_solver_without_error_estimate_needs_a_step():
         simulate(Pendulum(), START, TIMES, diffrax.Euler())
 
 
+@pytest.mark.slow
 def test_splitting_of_a_bare_function_is_refused():
     field = Pendulum()
 
@@ -385,6 +391,7 @@ def test_bad_times_are_refused_under_jit_too():
         jax.jit(lambda ts: states(Pendulum(), START, ts))(jnp.array([0.0, 2.0, 1.0]))
 
 
+@pytest.mark.slow
 def test_failed_solves_raise_unless_told_not_to():
     ts = np.array([0.0, 5.0])
     with pytest.raises(RuntimeError, match="maximum number of solver steps"):

@@ -149,6 +149,7 @@ def observed():
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "solver",
     [

@@ -558,6 +558,7 @@ def test_seeds_are_vmapped_and_jitted_alike(key):
     assert np.abs(X[0] - X[1]).max() > 0.1
 
 
+@pytest.mark.slow
 def test_everything_may_be_traced(key):
     @jax.jit
     def draw(mass, x0, ts, noise):
@@ -588,6 +589,7 @@ def test_gradients_through_a_trajectory_match_differences():
         np.testing.assert_allclose(slope, (ahead - behind) / (2 * h), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_single_precision_stays_single_and_is_looser():
     X, Y = systems.sample(systems.Pendulum(), START.astype(np.float32), TS)
     assert X.dtype == Y.dtype == jnp.float32
@@ -661,6 +663,7 @@ def test_trajectories_without_an_end_are_errors_that_name_the_row():
         jitted(lambda x: x**2, np.array([1.0]), np.array([0.0, 2.0]))
 
 
+@pytest.mark.slow
 def test_diffrax_loads_only_when_a_trajectory_is_integrated():
     program = """
 import sys, jax, numpy as np

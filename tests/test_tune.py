@@ -231,6 +231,7 @@ def test_frozen_hyperparameters_keep_their_values_to_the_last_bit():
         hk.tune(SIMPLE, X, Y, starts=1, bounds=low)
 
 
+@pytest.mark.slow
 def test_a_part_of_a_named_sum_is_frozen_by_its_name_and_its_hyperparameters_are_called_by_it():
     X, Y = scattered()
     K = hk.Sum(energy=hk.Symplectic(2.0 * hk.Gaussian(1.0)), rest=hk.CurlFree(hk.Gaussian(3.0)))
@@ -507,6 +508,7 @@ def test_a_search_that_will_take_long_says_so_and_how_to_shorten_it(monkeypatch,
     assert "of 3 runs, best loss 0.0" in lines[-1]
 
 
+@pytest.mark.slow
 def test_any_optimistix_minimiser_and_any_objective_will_do(simple):
     X, Y = scattered()
 
