@@ -197,8 +197,7 @@ def learn(
     most_landmarks = None if solver is None else solver.max_points
     start = _start(K, drift, data, sigma, landmarks(data, most_landmarks))
     seconds = seconds_of_iteration(data, start.landmarks[1])
-    if seconds >= 1:  # else compilation takes longer than the iterations
-        bar.set_description(f"learning, {seconds:.0f} s an iteration")
+    bar.set_description("learning" + (f", {seconds:.0f} s an iteration" if seconds >= 1 else ""))
     task, now = start.begin(data)
     if not runs.is_decided:
         runs, data = decide(runs, data, lambda d: initial_loss(task._replace(data=d), now.model))
