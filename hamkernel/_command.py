@@ -126,9 +126,10 @@ def run(arguments: list[str], show: Callable[[str], None]) -> None:
         learned = learn(K, runs, noise=_number(asked.noise), mass=_number(asked.mass))
         save(out / "learned.hk", learned)
         (out / "simulate.py").write_text(script("learned.hk", learned), encoding="utf-8")
+        report(learned, out / "report.html")
         show(f"{learned!r}\nScoring on the last fifth of each run, which learns once more.")
-        score = _score(learned, show)
-        report(learned, out / "report.html", score)
+        if (score := _score(learned, show)) is not None:
+            report(learned, out / "report.html", score)
     except (ValueError, TypeError, OSError) as error:
         options.error(str(error))
     show(f"Written: report.html, learned.hk and simulate.py in {out}/.")
