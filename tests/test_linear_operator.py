@@ -39,6 +39,13 @@ def test_of_first_order_it_is_the_kernel_of_the_matrix():
     np.testing.assert_allclose(*grams, rtol=0, atol=1e-13 * np.abs(grams[0]).max())
 
 
+def test_a_symmetric_kernel_is_that_of_the_matrix_in_products_too():
+    k = hk.Invariant(hk.Gaussian(1.0), [np.diag([-1.0, 1.0])])
+    kernels = hk.CurlFree(k), hk.Structured(k, lambda u, x: jax.grad(u)(x))
+    wanted, product = (np.asarray(hk.gram_operator(K, X[:9]).mv(X[:9])) for K in kernels)
+    np.testing.assert_allclose(product, wanted, rtol=0, atol=1e-13 * np.abs(wanted).max())
+
+
 def test_a_field_of_third_order_and_its_potential_are_found(field):
     new = jnp.asarray(np.random.default_rng(1).uniform(-1, 1, (50, 2)))
     assert np.abs(np.asarray(field.evaluate(new)) - truth(new)).max() < 1e-3

@@ -31,7 +31,7 @@ class StructuredByOperator(AbstractStructure):
     kernel: AbstractScalarKernel
     operator: Callable[[Potential, Float[Array, " n"]], Any]
 
-    field_parity: ClassVar[int] = 1
+    field_parity: ClassVar[int] = 0
     operator_invariance: ClassVar[Invariance] = Invariance.NONE
     symplectic: ClassVar[bool] = False
     no_potential: ClassVar[str | None] = None

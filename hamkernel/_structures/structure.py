@@ -51,7 +51,8 @@ class AbstractStructure(AbstractMatrixKernel):
     """A structure made from one scalar kernel k."""
 
     kernel: AbstractScalarKernel = eqx.field(converter=as_scalar_kernel)
-    # 1 if the fields have the parity of the functions of k, −1 if a derivative changes it.
+    # 1 if the fields have the parity of the functions of k, −1 if a derivative changes it, 0 if the
+    # operator is a function of the caller's, which may do either.
     field_parity: eqx.AbstractClassVar[int]
     # The symmetry of the operator: TRANSLATION if B is constant, REFLECTION if B(−x) = B(x).
     operator_invariance: eqx.AbstractClassVar[Invariance]
@@ -449,10 +450,10 @@ def expand_group(
     functionals of u are functionals of the u without symmetry at the images, divided by |G| once (a
     two-sided mean would be divided by |G|²). In a sum over many pairs this is cheaper than adding
     all terms for each pair, which fills the registers. K and Z are returned unchanged if K has no
-    group or a two-sided mean.
+    group or a two-sided mean, or is made by an unknown operator.
     """
     V, n = K.directions(Z, A), Z.shape[1]
-    if not isinstance(K, AbstractStructure):
+    if not isinstance(K, AbstractStructure) or K.field_parity == 0:
         return K, Z, V
     mean = symmetry_removed(K.kernel)
     if mean is None or not mean.is_one_sided(n):
