@@ -14,7 +14,7 @@ from hamkernel._gram import gram_of_rows
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of, measurements_of_states
 from hamkernel._solvers.low_rank import WaveBasis
-from hamkernel._tuning.minimiser import BoxBFGS, init, minimise, most_likely_in_box
+from hamkernel._tuning.minimiser import BoxBFGS, init, inside_box, minimise, run_in_box
 from hamkernel._tuning.objective import SearchObjective, criterion_of, parts_of
 from hamkernel._tuning.search import box_distance, choose_starts, design
 from hamkernel._tuning.space import SearchSpace, full_trace, hyperparameters
@@ -354,7 +354,8 @@ def test_a_likelihood_is_followed_in_the_units_of_its_deviations_and_inside_its_
     def minus_log(h):
         return 0.5 * jnp.sum(((h - jnp.array([0.2, 5.0])) / deviations) ** 2)
 
-    h, value = most_likely_in_box(minus_log, jnp.array([0.21, 1.0]), low, high, deviations, 30)
+    run = run_in_box(minus_log, jnp.array([0.21, 1.0]), low, high, deviations, 30)
+    h, value = inside_box(run.best.u, low, high), run.best.value
     np.testing.assert_allclose(h, [0.2, 3.0], atol=2e-4)
     np.testing.assert_allclose(value, minus_log(h))
 

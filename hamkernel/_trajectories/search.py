@@ -28,7 +28,7 @@ from hamkernel._trajectories.likelihood import (
 from hamkernel._trajectories.model import KernelRows, Model, landmark_whitening
 from hamkernel._trajectories.preprocessing import Preprocessed, sample_points
 from hamkernel._trajectories.segments import LinearisedSegments, windows
-from hamkernel._tuning.minimiser import most_likely_in_box
+from hamkernel._tuning.minimiser import inside_box, run_in_box
 from hamkernel._tuning.space import gram_trace, hyperparameters
 
 
@@ -128,7 +128,8 @@ def _best(model: Model, S, rows: LinearisedSegments, start_deviation, low, high,
     kernel = jnp.full(start.size - 2 * count.size, 0.2, start.dtype)
     noise = 1 / jnp.sqrt(2 * count)
     deviations = jnp.concatenate([kernel, noise, noise])
-    end, value = most_likely_in_box(loss, start, low, high, deviations, steps)
+    run = run_in_box(loss, start, low, high, deviations, steps)
+    end, value = inside_box(run.best.u, low, high), run.best.value
     return jnp.where(free & (value < jnp.inf), end, start), value
 
 

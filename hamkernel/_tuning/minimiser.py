@@ -204,23 +204,6 @@ def minimise(
     return eqx.combine(jax.lax.while_loop(active, step, arrays), static)
 
 
-def most_likely_in_box(
-    fn: Callable[[Float[Array, " P"]], Float[Array, ""]],
-    start: Float[Array, " P"],
-    low: Float[Array, " P"],
-    high: Float[Array, " P"],
-    deviations: Float[Array, " P"],
-    steps: Any,
-) -> tuple[Float[Array, " P"], Float[Array, ""]]:
-    """The minimiser h of fn(h) = −log p in the box low ≤ h ≤ high, from `start`, and fn(h).
-
-    `deviations` are rough standard deviations σ of h under the likelihood. With
-    dh/du = (high − low) cos(u)/2 they give the first inverse Hessian of BFGS, (σ / (dh/du))².
-    """
-    run = run_in_box(fn, start, low, high, deviations, steps)
-    return inside_box(run.best.u, low, high), run.best.value
-
-
 def run_in_box(
     fn: Callable[[Float[Array, " P"]], Float[Array, ""]],
     start: Float[Array, " P"],
@@ -229,7 +212,12 @@ def run_in_box(
     deviations: Float[Array, " P"],
     steps: Any,
 ) -> MinimiserRun:
-    """The run that ends at the point of `most_likely_in_box`."""
+    """The run to the minimum of fn(h) = −log p in the box low ≤ h ≤ high, from h = `start`.
+
+    `deviations` are rough standard deviations σ of h under the likelihood. With
+    dh/du = (high − low) cos(u)/2 they give the first inverse Hessian of BFGS, (σ / (dh/du))². The
+    minimiser is `inside_box(run.best.u, low, high)`, and `run.best.value` the value there.
+    """
     # A hyperparameter within a tenth of its standard deviation of the best value is good enough;
     # there the quadratic −log p is ½ .1² = .005 above its minimum.
     bfgs = BoxBFGS(atol=jnp.asarray(0.005, start.dtype))
