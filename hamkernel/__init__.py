@@ -58,6 +58,7 @@ from hamkernel._kernels.transforms import Select, Warp
 from hamkernel._observations.kinds import Energies, Equilibria, Functionals, Velocities
 from hamkernel._posterior import Posterior, condition
 from hamkernel._report import report
+from hamkernel._runs.runs import Runs
 from hamkernel._save import load, save
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.dense import Cholesky
@@ -75,7 +76,6 @@ from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable,
 from hamkernel._trajectories.lagrangian import LearnedLagrangian
 from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.learned import Learned
-from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.score import Score
 from hamkernel._tuning.tune import Tuned, tune
 from hamkernel._validation import (

@@ -14,6 +14,7 @@ from numpy.lib.recfunctions import unstructured_to_structured
 from hamkernel._kernels.built_in import Gaussian
 from hamkernel._kernels.transforms import Select
 from hamkernel._report import report, script
+from hamkernel._runs.runs import Runs
 from hamkernel._save import save
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.friction import Friction
@@ -21,7 +22,6 @@ from hamkernel._structures.joined import Controlled, InputMatrix
 from hamkernel._structures.structure import Symplectic
 from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.learned import Learned
-from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.score import Score
 
 

@@ -12,7 +12,7 @@ from hamkernel._trajectories.lagrangian import LearnedLagrangian
 from hamkernel._trajectories.learned import Learned
 
 if TYPE_CHECKING:
-    from hamkernel._trajectories.runs import Runs
+    from hamkernel._runs.runs import Runs
     from hamkernel._trajectories.score import Score
 
 _STYLE = """

@@ -49,6 +49,7 @@ from hamkernel._kernels.functions import Bound, Closure, as_pytree
 from hamkernel._kernels.symmetry import identity, reflection, time_reversal
 from hamkernel._observations.measurements import Measurements
 from hamkernel._posterior import Posterior
+from hamkernel._runs.table import Diagnostic, Diagnostics
 from hamkernel._solvers.problem import Problem
 from hamkernel._solvers.stream import AbstractStreamingFit
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -56,7 +57,6 @@ from hamkernel._trajectories.lagrangian import LearnedLagrangian
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.model import Model
 from hamkernel._trajectories.segments import LinearisedSegments
-from hamkernel._trajectories.table import Diagnostic, Diagnostics
 from hamkernel._tuning.tune import Tuned
 
 _VERSION = 2  # of the format; 1 was an archive of NumPy's, before the first release
@@ -298,6 +298,7 @@ _ROOMS = tuple(
         "_solvers.",
         "_posterior",
         "_tuning.tune",
+        "_runs.",
         "_trajectories.",
         "systems.",
     )

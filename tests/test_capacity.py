@@ -16,8 +16,8 @@ from test_learn import with_missed
 
 import hamkernel as hk
 from hamkernel import _machine
-from hamkernel._trajectories import preprocessing
-from hamkernel._trajectories.flow import Segments
+from hamkernel._runs import preprocessing
+from hamkernel._runs.flow import Segments
 from hamkernel._trajectories.kalman import whiten
 from hamkernel._trajectories.likelihood import (
     closed_form,

@@ -429,7 +429,7 @@ def test_the_table_of_a_log_says_what_was_found_and_what_to_do():
 @pytest.mark.slow
 def test_what_is_printed_degrades_on_a_terminal_of_ascii():
     code = (
-        "from hamkernel._trajectories.table import Diagnostic, Diagnostics\n"
+        "from hamkernel._runs.table import Diagnostic, Diagnostics\n"
         "row = Diagnostic('chi', 'χ² is 2', '≤ 1', False, 'λ ≤ χ … ∂ q̇', 'Ж')\n"
         "print(Diagnostics((row,)))"
     )

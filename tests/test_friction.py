@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._trajectories.flow import Expansion, simulated, steps_for, stiffness
+from hamkernel._runs.flow import Expansion, simulated, steps_for, stiffness
 
 VISCOUS, COULOMB, REST = 0.2, 0.6, 0.2
 

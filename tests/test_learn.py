@@ -20,8 +20,7 @@ import scipy.stats
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._trajectories.diagnostics import degrees_of_freedom
-from hamkernel._trajectories.flow import (
+from hamkernel._runs.flow import (
     NODES,
     WEIGHTS,
     Segments,
@@ -29,6 +28,8 @@ from hamkernel._trajectories.flow import (
     means,
     simulated,
 )
+from hamkernel._runs.preprocessing import preprocess
+from hamkernel._trajectories.diagnostics import degrees_of_freedom
 from hamkernel._trajectories.kalman import as_observations
 from hamkernel._trajectories.likelihood import (
     closed_form,
@@ -36,7 +37,6 @@ from hamkernel._trajectories.likelihood import (
     conditional,
 )
 from hamkernel._trajectories.model import Model, landmark_whitening
-from hamkernel._trajectories.preprocessing import preprocess
 from hamkernel._trajectories.search import _loss, losses
 from hamkernel._trajectories.segments import given_path, linearised
 

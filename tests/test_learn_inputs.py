@@ -17,16 +17,16 @@ from scipy.integrate import solve_ivp
 from test_learn import integrals
 
 import hamkernel as hk
-from hamkernel._trajectories.flow import NODES, Segments, jacobians, means, simulated
-from hamkernel._trajectories.kalman import as_observations
-from hamkernel._trajectories.likelihood import Model
-from hamkernel._trajectories.preprocessing import _least
-from hamkernel._trajectories.runs import (
+from hamkernel._runs.flow import NODES, Segments, jacobians, means, simulated
+from hamkernel._runs.preprocessing import _least
+from hamkernel._runs.runs import (
     inputs_at_nodes,
     inputs_at_samples,
     lines_in_intervals,
     values,
 )
+from hamkernel._trajectories.kalman import as_observations
+from hamkernel._trajectories.likelihood import Model
 from hamkernel._trajectories.segments import given_path, linearised, segments_of
 
 FRICTION, GAIN = 0.2, 1.5

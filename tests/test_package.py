@@ -32,6 +32,7 @@ ROOMS = [
     {"_closed_forms"},
     {"_validation"},
     {"_tuning"},
+    {"_runs"},
     {"_trajectories"},
     {"_discovery"},
     {"_symplectic"},

@@ -20,15 +20,15 @@ from scipy.integrate import solve_ivp
 from test_learn import PENDULUM, damped, field_error, logs, moved_by_momenta, moved_by_momentum
 
 import hamkernel as hk
+from hamkernel._runs.flow import WEIGHTS
+from hamkernel._runs.sensors import is_on_a_curve, timing
 from hamkernel._trajectories.diagnostics import lengthscales, missing_force
 from hamkernel._trajectories.diagnostics import rest_speed as rest_speed_row
-from hamkernel._trajectories.flow import WEIGHTS
 from hamkernel._trajectories.iteration import iterate, likelier
 from hamkernel._trajectories.kalman import as_observations, innovations, smoothed_path, whiten
 from hamkernel._trajectories.model import Model, WhitenedRows, landmark_whitening
 from hamkernel._trajectories.search import gain_of_friction, gain_of_inertia, losses
 from hamkernel._trajectories.segments import LinearisedSegments
-from hamkernel._trajectories.sensors import is_on_a_curve, timing
 from hamkernel._trajectories.whiteness import autocorrelations, ljung_box, whiteness
 
 # The filter.

@@ -13,7 +13,7 @@ import pytest
 import scipy.stats
 
 import hamkernel as hk
-from hamkernel._trajectories.smoothing import (
+from hamkernel._runs.smoothing import (
     Process,
     negative_log_likelihood,
     pad,

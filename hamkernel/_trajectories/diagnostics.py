@@ -14,11 +14,11 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.transforms import Select, Warp
+from hamkernel._runs.runs import Runs
+from hamkernel._runs.sensors import Timing
+from hamkernel._runs.table import Diagnostic, Diagnostics
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.friction import damped_coordinates, frictions
-from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.sensors import Timing
-from hamkernel._trajectories.table import Diagnostic, Diagnostics
 from hamkernel._trajectories.whiteness import Whiteness
 
 # The change of a field, relative to its size, at which iterations end. It may leave residuals of as

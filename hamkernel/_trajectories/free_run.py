@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from hamkernel._trajectories.flow import simulated, steps_for, stiffness
-from hamkernel._trajectories.smoothing import power_of_two
+from hamkernel._runs.flow import simulated, steps_for, stiffness
+from hamkernel._runs.smoothing import power_of_two
 
 
 class Stretches(NamedTuple):

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled_by_size
-from hamkernel._trajectories.diagnostics import SETTLED
-from hamkernel._trajectories.flow import (
+from hamkernel._runs.flow import (
     Expansion,
     Segments,
     field_values,
@@ -20,6 +19,8 @@ from hamkernel._trajectories.flow import (
     steps_for,
     stiffness,
 )
+from hamkernel._runs.preprocessing import Preprocessed, time_of_swing
+from hamkernel._trajectories.diagnostics import SETTLED
 from hamkernel._trajectories.free_run import Stretches, error_over_constant, stretches_of_swings
 from hamkernel._trajectories.kalman import (
     SmoothedPath,
@@ -32,7 +33,6 @@ from hamkernel._trajectories.kalman import (
 from hamkernel._trajectories.learned import Iteration
 from hamkernel._trajectories.likelihood import ClosedForm, closed_form
 from hamkernel._trajectories.model import Model, landmark_whitening
-from hamkernel._trajectories.preprocessing import Preprocessed, time_of_swing
 from hamkernel._trajectories.search import (
     Bounds,
     choose_start,

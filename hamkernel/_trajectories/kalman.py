@@ -32,7 +32,7 @@ from jaxtyping import Array, Float
 
 from hamkernel._machine import compiled_by_size, orthonormal
 from hamkernel._observations.kinds import Functionals, Together
-from hamkernel._trajectories.flow import WEIGHTS, Expansion, Path, Segments, means, simulated
+from hamkernel._runs.flow import WEIGHTS, Expansion, Path, Segments, means, simulated
 from hamkernel._trajectories.model import Model, WhitenedRows, columns, landmark_whitening
 from hamkernel._trajectories.segments import LinearisedSegments, linearised
 

@@ -23,15 +23,8 @@ from hamkernel._fields.kinetic import Kinetic
 from hamkernel._machine import compiled
 from hamkernel._observations.kinds import Functionals
 from hamkernel._posterior import condition
-from hamkernel._solvers.lagrangian import negative_log_likelihood, solved
-from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.completed import completed, shared_laws
-from hamkernel._trajectories.diagnostics import FitQuality, diagnostics_of_rows
-from hamkernel._trajectories.evidence import EvidenceOfRows
-from hamkernel._trajectories.free_run import Stretches, relative_error, stretches
-from hamkernel._trajectories.learned import Iteration, Learned, misfits
-from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.weak import (
+from hamkernel._runs.runs import Runs
+from hamkernel._runs.weak import (
     Channels,
     Pieces,
     factors,
@@ -40,6 +33,13 @@ from hamkernel._trajectories.weak import (
     weak_rows,
     whiten,
 )
+from hamkernel._solvers.lagrangian import negative_log_likelihood, solved
+from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.completed import completed, shared_laws
+from hamkernel._trajectories.diagnostics import FitQuality, diagnostics_of_rows
+from hamkernel._trajectories.evidence import EvidenceOfRows
+from hamkernel._trajectories.free_run import Stretches, relative_error, stretches
+from hamkernel._trajectories.learned import Iteration, Learned, misfits
 from hamkernel._trajectories.whiteness import Whiteness
 from hamkernel._tuning.minimiser import best_in_box, inside_box
 from hamkernel._tuning.space import hyperparameters

@@ -22,6 +22,17 @@ from hamkernel._kernels.functions import as_pytree
 from hamkernel._machine import follow_data, full_precision, one_blas_thread
 from hamkernel._observations.kinds import inputs_or_parameters
 from hamkernel._observations.measurements import sampled_points
+from hamkernel._runs.flow import Expansion, field_values
+from hamkernel._runs.preprocessing import (
+    Preprocessed,
+    decide,
+    landmarks,
+    preprocess,
+    sample_points,
+    seconds_of_iteration,
+)
+from hamkernel._runs.runs import Runs
+from hamkernel._runs.smoothing import interpolated, power_of_two
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.completed import completed
@@ -29,7 +40,6 @@ from hamkernel._structures.lagrangian import Lagrangian
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._trajectories.diagnostics import check_identifiable, diagnostics
 from hamkernel._trajectories.evidence import Evidence
-from hamkernel._trajectories.flow import Expansion, field_values
 from hamkernel._trajectories.iteration import (
     Current,
     End,
@@ -47,14 +57,6 @@ from hamkernel._trajectories.lagrangian import LearnedLagrangian, learn_lagrangi
 from hamkernel._trajectories.laws import are_learned_from_rows, learn_laws
 from hamkernel._trajectories.learned import Learned, empty, misfits
 from hamkernel._trajectories.model import Model, with_amplitude
-from hamkernel._trajectories.preprocessing import (
-    Preprocessed,
-    decide,
-    landmarks,
-    preprocess,
-    sample_points,
-    seconds_of_iteration,
-)
 from hamkernel._trajectories.quality import (
     chi_squared,
     disturbances,
@@ -62,7 +64,6 @@ from hamkernel._trajectories.quality import (
     quality,
     with_causes,
 )
-from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.search import (
     LEAST_NOISE,
     bounds_and_design,
@@ -70,7 +71,6 @@ from hamkernel._trajectories.search import (
     landmark_spacing,
 )
 from hamkernel._trajectories.segments import LONG, equal_pieces
-from hamkernel._trajectories.smoothing import interpolated, power_of_two
 
 
 @overload

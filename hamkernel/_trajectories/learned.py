@@ -16,13 +16,13 @@ from hamkernel import _require as require
 from hamkernel._machine import full_precision
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._posterior import Posterior, condition
+from hamkernel._runs.runs import Runs
+from hamkernel._runs.table import Diagnostics
 from hamkernel._show import Shown, described, text
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._trajectories.evidence import Evidence, EvidenceOfRows
-from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.score import Score, compute_score
-from hamkernel._trajectories.table import Diagnostics
 
 
 class Iteration(eqx.Module):

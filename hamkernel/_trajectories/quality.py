@@ -6,16 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hamkernel._runs.preprocessing import decide, sample_points, time_of_swing
+from hamkernel._runs.runs import Runs
+from hamkernel._runs.sensors import is_on_a_curve, timing
 from hamkernel._structures.friction import frictions
 from hamkernel._trajectories.diagnostics import FitQuality
 from hamkernel._trajectories.free_run import error_over_constant, stretches_of_swings
 from hamkernel._trajectories.iteration import End, asks_for_landmarks, initial_loss, noisy_counts
 from hamkernel._trajectories.kalman import smoothed_path
-from hamkernel._trajectories.preprocessing import decide, sample_points, time_of_swing
-from hamkernel._trajectories.runs import Runs
 from hamkernel._trajectories.search import gain_of_friction, gain_of_inertia
 from hamkernel._trajectories.segments import Piece
-from hamkernel._trajectories.sensors import is_on_a_curve, timing
 from hamkernel._trajectories.whiteness import whiteness
 
 

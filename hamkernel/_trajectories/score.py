@@ -14,12 +14,12 @@ from hamkernel import _require as require
 from hamkernel._fields.base import known_part
 from hamkernel._machine import compiled
 from hamkernel._posterior import Posterior
+from hamkernel._runs.flow import simulated, steps_for, stiffness
+from hamkernel._runs.preprocessing import preprocess, sample_points
+from hamkernel._runs.runs import Runs
 from hamkernel._show import Shown
 from hamkernel._show import text as number
-from hamkernel._trajectories.flow import simulated, steps_for, stiffness
 from hamkernel._trajectories.free_run import Stretches, padded, predictions
-from hamkernel._trajectories.preprocessing import preprocess, sample_points
-from hamkernel._trajectories.runs import Runs
 
 _STEPS = 12  # of Levenberg and Marquardt; starts at smoothed states usually need 4
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from hamkernel._kernels.built_in import Gaussian
 from hamkernel._kernels.transforms import Select
 from hamkernel._machine import compiled_by_size
+from hamkernel._runs.preprocessing import Preprocessed, sample_points
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.custom_operator import Structured
 from hamkernel._structures.friction import Friction, frictions, with_rest_speed
@@ -26,7 +27,6 @@ from hamkernel._trajectories.likelihood import (
     regression_loss,
 )
 from hamkernel._trajectories.model import KernelRows, Model, landmark_whitening
-from hamkernel._trajectories.preprocessing import Preprocessed, sample_points
 from hamkernel._trajectories.segments import LinearisedSegments, windows
 from hamkernel._tuning.minimiser import inside_box, run_in_box
 from hamkernel._tuning.space import gram_trace, hyperparameters

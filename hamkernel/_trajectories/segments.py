@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled, compiled_by_size
-from hamkernel._trajectories.flow import (
+from hamkernel._runs.flow import (
     NODES,
     WEIGHTS,
     Path,
@@ -31,9 +31,9 @@ from hamkernel._trajectories.flow import (
     jacobians,
     means,
 )
-from hamkernel._trajectories.preprocessing import Preprocessed, PreprocessedRun
-from hamkernel._trajectories.runs import inputs_at_nodes
-from hamkernel._trajectories.smoothing import power_of_two
+from hamkernel._runs.preprocessing import Preprocessed, PreprocessedRun
+from hamkernel._runs.runs import inputs_at_nodes
+from hamkernel._runs.smoothing import power_of_two
 
 
 class Piece(NamedTuple):

@@ -19,9 +19,9 @@ from hamkernel.plot._style import BLUE, COLORS, DATA, coordinate, legend
 from hamkernel.plot._time import fitted, index_of_run
 
 if TYPE_CHECKING:
+    from hamkernel._runs.runs import Runs
     from hamkernel._trajectories.lagrangian import LearnedLagrangian
     from hamkernel._trajectories.learned import Learned
-    from hamkernel._trajectories.runs import Runs
 
 _STATES = 120  # at which a law is drawn
 _PATH = 400  # states of a path at which deviations are drawn

@@ -11,7 +11,7 @@ from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
 
 from hamkernel import _require as require
-from hamkernel._trajectories.flow import simulated
+from hamkernel._runs.flow import simulated
 from hamkernel.plot._style import (
     BLUE,
     COLORS,
@@ -27,8 +27,8 @@ from hamkernel.plot._style import (
 )
 
 if TYPE_CHECKING:
+    from hamkernel._runs.runs import Runs
     from hamkernel._trajectories.learned import Learned
-    from hamkernel._trajectories.runs import Runs
 
 # Each (T,), or (S, T) for several seeds.
 Series = ArrayLike | Mapping[str, ArrayLike]

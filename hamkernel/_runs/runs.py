@@ -31,16 +31,16 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
-from hamkernel._show import described, has_arrays
-from hamkernel._trajectories.flow import NODES
-from hamkernel._trajectories.sensors import Log, faults, impossible_samples
-from hamkernel._trajectories.smoothing import (
+from hamkernel._runs.flow import NODES
+from hamkernel._runs.sensors import Log, faults, impossible_samples
+from hamkernel._runs.smoothing import (
     Smoothing,
     processes,
     smoothed,
     smoothing,
 )
-from hamkernel._trajectories.table import Diagnostics
+from hamkernel._runs.table import Diagnostics
+from hamkernel._show import described, has_arrays
 
 Between = Literal["held", "linear", "smooth"]
 

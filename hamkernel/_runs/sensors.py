@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hamkernel._trajectories.table import Diagnostic, Diagnostics
+from hamkernel._runs.table import Diagnostic, Diagnostics
 
 
 class Log(NamedTuple):

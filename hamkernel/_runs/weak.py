@@ -23,9 +23,9 @@ import numpy as np
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Bool, Float, Int
 
-from hamkernel._trajectories.preprocessing import condense
-from hamkernel._trajectories.runs import Runs
-from hamkernel._trajectories.smoothing import Coordinate, Process, power_of_two, processes, smoothed
+from hamkernel._runs.preprocessing import condense
+from hamkernel._runs.runs import Runs
+from hamkernel._runs.smoothing import Coordinate, Process, power_of_two, processes, smoothed
 
 # In a window. By the trapezoidal rule ∫ (φ b − φ̇ a) dt of a sinusoid with b = ȧ and 2.2 rad in a
 # window is then wrong by 2e-6 of its size, and with (1 − s²)³ by 7e-5.

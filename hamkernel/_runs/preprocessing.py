@@ -17,9 +17,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._machine import compiled_by_size
-from hamkernel._trajectories.flow import NODES, with_tangent
-from hamkernel._trajectories.runs import Between, Runs, inputs_at_nodes, inputs_at_samples
-from hamkernel._trajectories.smoothing import Coordinate, interpolated, processes, smoothed
+from hamkernel._runs.flow import NODES, with_tangent
+from hamkernel._runs.runs import Between, Runs, inputs_at_nodes, inputs_at_samples
+from hamkernel._runs.smoothing import Coordinate, interpolated, processes, smoothed
 
 # Rows times columns² of a solve: 1e10 take 1 to 2 s. If the residuals ask for more landmarks, a
 # solve may take 5e10, up to 10 s (`tests/benchmarks/capacity.py`):

@@ -1,0 +1,1 @@
+"""Logged runs: states at times, their checks, their smoothed paths, and rows of both."""
