@@ -26,6 +26,8 @@ from hamkernel._trajectories.whiteness import Whiteness
 # the noise found.
 SETTLED = 1e-4
 _SWING = 5.0  # samples in a swing: with fewer noise and motion cannot be told apart
+# Bands are wider below p = .05, which one good log in twenty has. One in a thousand may be refused.
+_FALSE_ALARMS = 1e-3
 _FEW = 10  # degrees of freedom, from which σ is known to a fifth
 
 
@@ -41,8 +43,8 @@ class FitQuality(NamedTuple):
         dropped: the parts that the field was not learned from, each as run, first sample, and the
             sample after the last.
         misfit: the misfit of each run and coordinate, in units of the noise, shape (R, n).
-        core: the noise of the middle half of the residuals over σ, by coordinate, shape (n,); one
-            for normal residuals, NaN where there are none.
+        core: the deviation of the middle half of the residuals over that of all, by coordinate,
+            shape (n,); one for normal residuals, NaN where there are none.
         chi_squared: χ² per degree of freedom, of the fit without process noise if q was estimated.
         free: the degrees of freedom of that fit.
         remaining: the degrees of freedom that the fit leaves, process noise included.
@@ -182,7 +184,7 @@ def _noise_against_motion(fit: FitQuality) -> Diagnostic:
         "0.5",
         bool(share[c] < 0.5),
         f"the field explains {'the runs' if share[c] < 0.5 else 'little of the runs'}: the noise "
-        f"of coordinate {fit.names[c]} is {fit.noise[c]:.3g}, and its states vary by "
+        f"of coordinate {fit.names[c]} is {fit.noise[c]:.3g}, and its smoothed path varies by "
         f"{fit.scale[c]:.3g}",
         "Look for a sample that is no measurement, a jump, a structure that the motion does not "
         f"have, or one lengthscale for coordinates of different sizes (hk.Gaussian(np.ones({n})) "
@@ -282,6 +284,7 @@ def explains(chi_squared: float, free: float) -> bool:
 def _whiteness(fit: FitQuality) -> Diagnostic:
     """Whether the residuals of the prediction are independent from sample to sample."""
     white, c = fit.white, int(np.argmax(np.abs(fit.white.neighbours)))
+    passes = white.is_enough or white.probability > _FALSE_ALARMS
     causes = "what the process noise stands for, which is a force and not white"
     if not fit.is_disturbed:
         causes = missing_force(fit)
@@ -292,9 +295,9 @@ def _whiteness(fit: FitQuality) -> Diagnostic:
     return Diagnostic(
         "whiteness",
         f"p = {white.probability:.2g}, bands wider by {white.widening**0.5:.2g}",
-        "p = 0.05, or 1.2",
-        white.is_enough,
-        f"the innovations are {'' if white.is_enough else 'not '}white: the correlation of "
+        f"p = {_FALSE_ALARMS}, or 1.2",
+        passes,
+        f"the innovations are {'' if passes else 'not '}white: the correlation of "
         f"neighbours is {white.neighbours[c]:.2f} in coordinate {fit.names[c]}",
         f"Likely causes: {causes}; sensors that are filtered or resampled.",
         decides=True,
