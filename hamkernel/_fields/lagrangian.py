@@ -9,12 +9,12 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._machine import compiled, full_precision
+from hamkernel._machine import EqualToItself, compiled, full_precision
 from hamkernel._show import Shown, has_arrays, text
 from hamkernel._structures.lagrangian import Lagrangian, LagrangianFeatures
 
 
-class LagrangianField(Shown, eqx.Module):
+class LagrangianField(Shown, EqualToItself, eqx.Module):
     """The machine that torques tell of; made by `fit` and `learn` with a `Lagrangian`.
 
     `field(x, u)` is ẋ = (v, a) of the state x = (q, v) under the torques u, so that
