@@ -116,7 +116,10 @@ def _gram_of_descriptor(
     Source: Chmiela, Sauceda, Müller & Tkatchenko (2018), Nature Communications 9, 3887.
     """
     # (N, m) and (N, m, n), (M, m) and (M, m, n)
-    (D, J), (E, L) = jax.vmap(descriptor.at)(X), jax.vmap(descriptor.at)(Z)
+    (D, J), (E, L) = (
+        jax.vmap(descriptor.value_and_jacobian)(X),
+        jax.vmap(descriptor.value_and_jacobian)(Z),
+    )
 
     def slope(d, v, e):
         """The gradient in e of the derivative of κ(d, e) along v, (m,)."""
@@ -144,15 +147,15 @@ def block_traces(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array
     """The traces of the diagonal blocks of the Gram, tr K(xᵢ, xᵢ)."""
     if isinstance(K, Sum):
         return total([block_traces(term, X) for term in K.terms])
-    traces = K.through_descriptor(X.shape[1])
-    if traces is None:
+    descriptor = K.through_descriptor(X.shape[1])
+    if descriptor is None:
         return diagonals(K, X, X).sum(axis=1)
 
-    def of_point(x):
-        d, J = traces.at(x)
-        return jax.vmap(lambda v: mixed(traces.kernel, d, v, d, v))(J.T).sum()
+    def block_trace(x):
+        d, J = descriptor.value_and_jacobian(x)
+        return jax.vmap(lambda v: mixed(descriptor.kernel, d, v, d, v))(J.T).sum()
 
-    return jax.lax.map(of_point, X)
+    return jax.lax.map(block_trace, X)
 
 
 def trace(

@@ -338,7 +338,8 @@ def project_silent_directions(
 
     def project(pair):
         x, v = pair
-        J = jax.jacfwd(descriptor.seen or descriptor.map)(x) @ descriptor.directions(x)  # (m, n)
+        J = jax.jacfwd(descriptor.point_data or descriptor.map)(x)  # (m, n)
+        J = J @ descriptor.directions(x)
         J = jax.lax.stop_gradient(J)  # constant, for a map of constant rank
         squares, V = jnp.linalg.eigh(J.T @ J)
         # Zero eigenvalues are ε of the largest after rounding; a descriptor resolves more than

@@ -51,7 +51,7 @@ def _linear_fields(K: Any, law: Shared, X: Float[Array, "N n"]) -> Float[Array, 
     """The fields of a constant and of the coordinates as laws."""
 
     def potentials(x):
-        points, weights = law.of(x)
+        points, weights = law.parts_at(x)
         return jnp.append(weights.sum(), weights @ points)
 
     return jax.lax.map(lambda x: K.apply(x, jax.jacrev(potentials)(x).T), X)
@@ -109,7 +109,7 @@ def _range(law: Shared, X: Float[Array, "T n"]) -> tuple[Float[Array, " d"], Flo
     """The lowest and highest coordinates of the parts of the states."""
 
     def extremes(x):
-        points = law.of(x).points
+        points = law.parts_at(x).points
         return points.min(axis=0), points.max(axis=0)
 
     low, high = jax.lax.map(extremes, X)

@@ -137,7 +137,7 @@ def _is_smooth(warp: Warp, X: Float[Array, "N n"]) -> Bool[Array, " N"]:
     """Whether the map and its Jacobian are finite at each point."""
 
     def is_finite(x):
-        return jnp.isfinite(warp.warped(x)).all() & jnp.isfinite(jax.jacfwd(warp.warped)(x)).all()
+        return jnp.isfinite(warp.warp(x)).all() & jnp.isfinite(jax.jacfwd(warp.warp)(x)).all()
 
     return jax.lax.map(is_finite, X)
 

@@ -293,7 +293,7 @@ def _part(K: AbstractMatrixKernel, rows: Rows) -> np.ndarray:
     B, P = rows.pieces.path.shape[:2]
     x = jax.eval_shape(rows.state, rows.pieces.path[0, 0])
     parts = sum(
-        jax.eval_shape(law.of, x).weights.shape[0] * len(law.centres or ())
+        jax.eval_shape(law.parts_at, x).weights.shape[0] * len(law.centres or ())
         for law in shared_laws(K)
     )
     count = int(np.clip(_SEARCHED // max(parts * P, 1), 1, B))
