@@ -356,6 +356,20 @@ def full_precision(function: Callable[P, T]) -> Callable[P, T]:
     return precise
 
 
+class EqualToItself:
+    """A base of PyTrees with arrays that may be jitted, andso may their methods.
+
+    `jax.jit(field)` looks up the compiled function by hash and equality. Arrays have no hash and
+    traced arrays no equality, so such an object equals only itself.
+    """
+
+    def __hash__(self) -> int:
+        return id(self)
+
+    def __eq__(self, other: object) -> bool:
+        return self is other
+
+
 def precise_jit(function: Any = None, **options: Any) -> Any:
     """`function` under `eqx.filter_jit` with products in full precision; `options` are of the jit.
 

@@ -24,7 +24,13 @@ from hamkernel._fields.joined import AbstractJoinedField, FamilyField, known_of,
 from hamkernel._gram import components
 from hamkernel._kernels.base import Invariance, Scaled
 from hamkernel._kernels.symmetry import drop_symmetry
-from hamkernel._machine import follow_data, full_precision, one_blas_thread, precise_jit
+from hamkernel._machine import (
+    EqualToItself,
+    follow_data,
+    full_precision,
+    one_blas_thread,
+    precise_jit,
+)
 from hamkernel._observations.blocks import AbstractBlock, Values
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import inputs_of, observations
@@ -113,7 +119,7 @@ def posterior_of_problem(
     return Posterior(conditional, learned_field(conditional.field, problem.known))
 
 
-class Posterior(Shown, eqx.Module):
+class Posterior(Shown, EqualToItself, eqx.Module):
     """A field learned from data, with its uncertainty; made by `condition`.
 
     A PyTree. Its methods take one state and work under jit, vmap and, with respect to states, grad.
@@ -131,13 +137,6 @@ class Posterior(Shown, eqx.Module):
         """The old name of `conditional`, until version 0.2."""
         return self.conditional
 
-    # For jax.jit of the methods; see AbstractField.
-    def __hash__(self) -> int:
-        return id(self)
-
-    def __eq__(self, other: object) -> bool:
-        return self is other
-
     def _summary(self) -> tuple[str, list[tuple[str, str]]]:
         rows = self.conditional.rows
         has_sizes = has_arrays((rows.targets, rows.energies))
@@ -148,8 +147,37 @@ class Posterior(Shown, eqx.Module):
             ("field", text(self.field)),
             ("kernel", text(self.conditional.field.kernel)),
             ("lambda", text(self.conditional.field.regularization)),
+            *self._misfit(),
             ("next", f".field, .deviation(x{u}), .evaluate(X{U}), .sample(key, 5), .updated(X, Y)"),
         ]
+
+    def _misfit(self) -> list[tuple[str, str]]:
+        """χ², with a warning if deviations are too small; empty if the numbers are not known."""
+        arrays = self.conditional.field.residual, self.conditional.ridge
+        if not has_arrays(arrays) or not require.is_concrete(arrays):
+            return []
+        chi_squared = float(self.chi_squared)
+        if not np.isfinite(chi_squared):
+            return []
+        said = f"{chi_squared:.3g} a row"
+        # D rows scatter by √(2/D) about 1; .3 is three deviations of 200 rows.
+        if chi_squared > 1.3:
+            said += ": deviations are too small by its root or more, see .chi_squared"
+        return [("chi squared", said)]
+
+    @property
+    def chi_squared(self) -> Float[Array, ""]:
+        """χ² = yᵀA⁻¹y/D, y the D rows minus the prior mean, A = G + NλI, shape ().
+
+        χ² is near 1 if Nλ is the variance of the noise and the kernel has the right amplitude and
+        lengthscales. Deviations of the posterior do not depend on y: if χ² is much larger than 1,
+        they are too small, and if χ² is much smaller, too large. Then pass the kernel and λ of
+        `hk.tune(…, objective="marginal_likelihood")`.
+        """
+        conditional, rows = self.conditional, self.conditional.rows
+        field = conditional.field
+        residual = field.residual.ravel() / rows.scale
+        return (field.norm**2 + residual @ residual / conditional.ridge) / rows.size
 
     @full_precision
     def covariance(

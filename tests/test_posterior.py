@@ -59,6 +59,18 @@ def test_the_covariance_of_two_states_is_the_recipe_of_the_readme(solver):
     np.testing.assert_allclose(posterior.covariance(OUTSIDE, x2=INSIDE), found.T, atol=1e-12)
 
 
+def test_chi_squared_is_the_quadratic_form_of_the_rows():
+    A = np.asarray(hk.gram(K, X)).reshape(24, 24) + 12 * RIDGE * np.eye(24)
+    y = Y.ravel()
+    np.testing.assert_allclose(POSTERIOR.chi_squared, y @ np.linalg.solve(A, y) / 24, rtol=1e-8)
+    noisy = hk.condition(K, hk.Velocities(X, Y, noise=2.0), regularization=RIDGE / 4)
+    np.testing.assert_allclose(noisy.chi_squared, POSTERIOR.chi_squared, rtol=1e-8)
+    # An amplitude that is a hundred times too small in variance.
+    weak = hk.condition(hk.Symplectic(0.03 * hk.Gaussian(1.5)), X, Y, 1e-6)
+    assert weak.chi_squared > 10
+    assert "deviations are too small" in repr(weak)
+
+
 def test_a_second_state_in_the_place_of_inputs_is_refused_with_the_keyword():
     with pytest.raises(TypeError, match=r"has no inputs.*posterior\.covariance\(x, x2=z\)"):
         POSTERIOR.covariance(INSIDE, OUTSIDE)

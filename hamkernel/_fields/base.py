@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._machine import follow_data, full_precision
+from hamkernel._machine import EqualToItself, follow_data, full_precision, precise_jit
 from hamkernel._show import Shown, describe, has_arrays, text
 from hamkernel._sizes import sizes
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
@@ -24,7 +24,7 @@ Mean = Callable[..., Float[Array, " n"]]
 Scalar = Callable[[Num[ArrayLike, " n"]], Float[Array, ""]]
 
 
-class AbstractField(Shown, eqx.Module):
+class AbstractField(Shown, EqualToItself, eqx.Module):
     """A learned vector field x -> f(x), one state of shape (n,) per call.
 
     A field is a PyTree and a pure function, so `jax.jit(field)`, `jax.vmap(field)(X)`,
@@ -63,14 +63,6 @@ class AbstractField(Shown, eqx.Module):
     def _next(self) -> str:
         potential = ", .hamiltonian(x)" if self.kernel.has_hamiltonian else ""
         return f"field(x), .evaluate(X){potential}, hk.simulate(field, x0, ts)"
-
-    # jax.jit(field) looks up the compiled function by hash and equality. Arrays have no hash and
-    # traced arrays no equality, so a field equals only itself.
-    def __hash__(self) -> int:
-        return id(self)
-
-    def __eq__(self, other: object) -> bool:
-        return self is other
 
     @property
     @abc.abstractmethod
@@ -237,11 +229,9 @@ class AbstractField(Shown, eqx.Module):
                 "the field has no law: no term of its kernel is hk.Shared(k, parts). For the "
                 "potential of the whole field use field.potential(x)."
             )
-        waves, weights = laws[which]
-        waves_at_r = (
-            waves.law_values(r) if r0 is None else waves.law_values(r) - waves.law_values(r0)
-        )
-        return waves_at_r.astype(weights.dtype) @ weights
+        # Compiled, since JAX would compile each operation of jax.vmap(field.law)(r) by itself.
+        zero = None if r0 is None else require.floating(r0, "r0")
+        return _law_at(*laws[which], require.floating(r, "r"), zero)
 
     @property
     def undetermined(self) -> tuple[str, ...]:
@@ -320,6 +310,12 @@ class AbstractField(Shown, eqx.Module):
             for k in self.kernel.scalar_kernels
             for support in k.supports(n)
         )
+
+
+@precise_jit
+def _law_at(waves: Any, weights: Float[Array, " m"], r: Array, r0: Array | None) -> Array:
+    waves_at_r = waves.law_values(r) if r0 is None else waves.law_values(r) - waves.law_values(r0)
+    return waves_at_r.astype(weights.dtype) @ weights
 
 
 class FieldSum(eqx.Module):

@@ -9,12 +9,12 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._machine import full_precision, precise_jit
+from hamkernel._machine import EqualToItself, full_precision, precise_jit
 from hamkernel._show import Shown, has_arrays, text
 from hamkernel._structures.lagrangian import Lagrangian, LagrangianFeatures
 
 
-class LagrangianField(Shown, eqx.Module):
+class LagrangianField(Shown, EqualToItself, eqx.Module):
     """Learned Lagrangian mechanics, M(q) a + C(q, v) v + ∂V/∂q + friction(v) = τ.
 
     Made by `fit` and `learn` with a `Lagrangian`. `field(x, u)` is ẋ = (v, a) for the state

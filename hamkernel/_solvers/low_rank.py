@@ -435,14 +435,8 @@ class LowRankConditional(AbstractConditional):
         if not laws:
             raise AttributeError("the posterior has no law: its kernel is no hk.Shared(k, parts).")
         waves, place = laws[which]
-        dtype = self.R.dtype
-        difference = jnp.zeros(len(self.R), dtype)
-        difference = difference.at[place].set(
-            (waves.law_values(r) - waves.law_values(r0)).astype(dtype)
-        )
-        rest = waves.kernel.missing(waves.kernel.point(r), waves.kernel.point(r0)).astype(dtype)
-        whitened = solve_triangular(self.R, difference, trans="T")
-        return self.ridge * whitened @ whitened + waves.scale.astype(dtype) * rest
+        r, r0 = require.floating(r, "r"), require.floating(r0, "r0")
+        return _law_variance(self.R, self.ridge, waves, place.start, r, r0)
 
     def updated(self, new: Measurements) -> "LowRankConditional":
         rows = self.rows.append(new)
@@ -456,6 +450,15 @@ class LowRankConditional(AbstractConditional):
         z = jax.random.normal(weight_key, (len(self.R), count), self.R.dtype)
         w = solve_triangular(self.R, self.rotated[:, None] + jnp.sqrt(self.ridge) * z)
         return self.span.draws(w.T, self.rows, rest, region)
+
+
+@precise_jit
+def _law_variance(R, ridge, waves, start: int, r, r0) -> Float[Array, ""]:
+    features = (waves.law_values(r) - waves.law_values(r0)).astype(R.dtype)
+    difference = jnp.zeros_like(R[0]).at[start : start + len(features)].set(features)
+    rest = waves.kernel.missing(waves.kernel.point(r), waves.kernel.point(r0)).astype(R.dtype)
+    whitened = solve_triangular(R, difference, trans="T")
+    return ridge * whitened @ whitened + waves.scale.astype(R.dtype) * rest
 
 
 def low_rank_conditional(
