@@ -357,7 +357,7 @@ def full_precision(function: Callable[P, T]) -> Callable[P, T]:
 
 
 class EqualToItself:
-    """A base of PyTrees with arrays that may be jitted, andso may their methods.
+    """A base of PyTrees with arrays, so that `jax.jit` takes the object and its methods.
 
     `jax.jit(field)` looks up the compiled function by hash and equality. Arrays have no hash and
     traced arrays no equality, so such an object equals only itself.
