@@ -456,7 +456,7 @@ def _range_of(U: Float[Array, "N m"], centre: float | None) -> Float[Array, "2 m
     return jnp.array([[-1.0], [1.0]], U.dtype) * jnp.where(largest > 0, largest, 1)[None]
 
 
-_at = compiled(lambda k, x: k(x, x))
+_at = precise_jit(lambda k, x: k(x, x))
 
 
 def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:

@@ -300,23 +300,23 @@ def _whiteness(fit: FitQuality) -> Diagnostic:
         f"the innovations are {'' if passes else 'not '}white: the correlation of "
         f"neighbours is {white.neighbours[c]:.2f} in coordinate {fit.names[c]}",
         f"Likely causes: {causes}; sensors that are filtered or resampled.",
-        decides=True,
+        decides=not (fit.few and np.nanmax(fit.noise / fit.scale) < NEGLIGIBLE),
     )
 
 
 # Process noise and pushes below this share of the motion change no rollout that anyone would draw.
-_NEGLIGIBLE = 0.01
+NEGLIGIBLE = 0.01
 
 
 def _process_noise(fit: FitQuality) -> Diagnostic | None:
     """Whether w in ẋ = f + w stands for much of the motion."""
     if fit.process is None:
         return None
-    silent = not fit.is_disturbed or fit.share < _NEGLIGIBLE
+    silent = not fit.is_disturbed or fit.share < NEGLIGIBLE
     return Diagnostic(
         "process noise",
         f"{fit.share:.2g} of the speed",
-        f"{_NEGLIGIBLE}",
+        f"{NEGLIGIBLE}",
         silent,
         "the structure alone explains the runs"
         if not fit.is_disturbed
@@ -333,8 +333,8 @@ def _pushes(fit: FitQuality) -> Diagnostic:
     return Diagnostic(
         "pushes",
         f"{len(fit.pushed)}, of {fit.impulse:.2g} of the motion",
-        f"{_NEGLIGIBLE}",
-        not fit.pushed or fit.impulse < _NEGLIGIBLE,
+        f"{NEGLIGIBLE}",
+        not fit.pushed or fit.impulse < NEGLIGIBLE,
         f"something pushed the system in {len(fit.pushed)} parts of the runs",
         "learned.pushed names the samples. Look there for a hand, a stop, a cable, inputs that "
         "were not applied, or a force that the kernel cannot have.",
@@ -381,7 +381,7 @@ def _force(fit: FitQuality) -> Diagnostic:
         "missing force",
         f"log p + {gain:.0f}",
         f"{_FEW}",
-        gain <= _FEW or (fit.share < _NEGLIGIBLE and fit.white.is_enough),
+        gain <= _FEW or (fit.share < NEGLIGIBLE and fit.white.is_enough),
         f"the runs are likelier with {missing_force(fit)}"
         if gain > _FEW
         else "no force is missing",

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hamkernel._machine import compiled, compiled_by_size
+from hamkernel._machine import compiled_by_size, precise_jit
 from hamkernel._runs.flow import (
     Expansion,
     Segments,
@@ -21,7 +21,7 @@ from hamkernel._runs.flow import (
     stiffness,
 )
 from hamkernel._runs.preprocessing import Preprocessed, sample_points, time_of_swing
-from hamkernel._trajectories.diagnostics import SETTLED
+from hamkernel._trajectories.diagnostics import NEGLIGIBLE, SETTLED
 from hamkernel._trajectories.free_run import Stretches, error_over_constant, stretches_of_swings
 from hamkernel._trajectories.kalman import (
     SmoothedPath,
@@ -401,7 +401,7 @@ def _weights_of(field: Expansion, S: Float[Array, "m d"], T: Float[Array, "q q"]
     return T.T @ jax.vmap(field)(S).reshape(-1)
 
 
-@compiled
+@precise_jit
 def _weights_between(old, new, share, S: Float[Array, "m d"], T: Float[Array, "q q"]):
     """The weights at a share of the way from the old ones to the new, and their coefficients."""
     weights = (1 - share) * old + share * new
@@ -441,9 +441,13 @@ def noisy_counts(end: End) -> Float[np.ndarray, "S L+1 n"]:
 def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     """Whether iterations with next to no process noise say that it is not enough.
 
-    They did not settle, innovations are not white, or rows are likelier with more of it.
+    They did not settle, innovations are not white, or rows are likelier with more of it. If the
+    landmarks are the limit and leave next to nothing, process noise would only stand for them.
     """
     now, task = end.now, end.task
+    share = float(np.max(np.exp(np.asarray(now.model.log_noise)) / task.data.scale))
+    if end.settled and share < NEGLIGIBLE and task.capped and asks_for_landmarks(end):
+        return False
     if not (end.settled and is_white(end)):
         return True
     levels = [
