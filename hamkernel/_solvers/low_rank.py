@@ -46,10 +46,11 @@ from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import AbstractField, SolverInfo, root
 from hamkernel._fields.expansions import FeatureField, KernelField, feature_field, kernel_field
 from hamkernel._gram import between, block_traces, components, plus_ridge, trace_of_rows
-from hamkernel._machine import compiled
+from hamkernel._machine import RowSharding, compiled
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks, whitening
+from hamkernel._solvers.least_squares import Normal, normal
 from hamkernel._solvers.problem import AbstractConditional
 from hamkernel._structures.base import AbstractMatrixKernel
 
@@ -176,17 +177,6 @@ def _draw_prior(K, landmarks: Landmarks, key, count: int) -> Prior:
 Arrays = TypeVar("Arrays")
 
 
-class Columns(eqx.Module):
-    """The design of landmarks: their columns of the Gram at points, (t, d) -> (t, n, r)."""
-
-    kernel: AbstractMatrixKernel
-    landmarks: Landmarks
-
-    def __call__(self, X: Float[Array, "t d"]) -> Float[Array, "t n r"]:
-        columns = self.landmarks.columns(self.kernel, components(self.kernel, X))
-        return columns.reshape(len(X), -1, columns.shape[1])
-
-
 def factor(square: Float[Array, "r r"], ridge: Float[Array, ""]) -> Float[Array, "r r"]:
     """The lower Cholesky factor of FᵀF + ridge I; NaN where the ridge is below rounding."""
     return jnp.linalg.cholesky(plus_ridge(square, ridge))
@@ -238,14 +228,45 @@ def singular(dtype: jnp.dtype) -> str:
     )
 
 
-class AbstractSpan(eqx.Module):
-    """Functions φ_1 … φ_r with Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z)."""
+class AbstractFunctions(eqx.Module):
+    """Functions φ_1 … φ_r and the rows of observations of them."""
 
     kernel: eqx.AbstractVar[AbstractMatrixKernel]
 
     @abc.abstractmethod
     def rows_of(self, block: AbstractBlock) -> Float[Array, "d r"]:
         """The rows of a block, for each of the r functions."""
+
+    def __call__(self, X: Float[Array, "t d"]) -> Float[Array, "t n r"]:
+        """The values at points, a design of `least_squares.py`."""
+        rows = self.rows_of(components(self.kernel, X))
+        return rows.reshape(len(X), -1, rows.shape[1])
+
+    def all_rows(self, rows: Measurements) -> Float[Array, "M r"]:
+        """The rows of all observations for each function, before the contrast of the energies."""
+        return jnp.concatenate([self.rows_of(block) for block in rows.blocks])
+
+    def normal_equations(
+        self, rows: Measurements, basis: Float[Array, "r r"], spread: RowSharding | None = None
+    ) -> Normal:
+        """The normal equations of the rows times `basis`; velocities are seen tile by tile."""
+        if rows.states is not None:
+            return normal(self, basis, *rows.states, spread)
+        return Normal.from_rows(self.all_rows(rows) @ basis, rows.targets)
+
+
+class Columns(AbstractFunctions):
+    """The columns K(·, s) of landmarks."""
+
+    kernel: AbstractMatrixKernel
+    landmarks: Landmarks
+
+    def rows_of(self, block: AbstractBlock) -> Float[Array, "d r"]:
+        return self.landmarks.columns(self.kernel, block)
+
+
+class AbstractSpan(AbstractFunctions):
+    """Functions φ_1 … φ_r with Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z)."""
 
     @abc.abstractmethod
     def missing(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
@@ -277,10 +298,6 @@ class AbstractSpan(eqx.Module):
         region: Float[Array, "2 n"],
     ) -> AbstractField:
         """A batch of fields: Σ_r w_r φ_r plus draws of the remainder of the prior."""
-
-    def all_rows(self, rows: Measurements) -> Float[Array, "M r"]:
-        """The rows of all observations for each function, before the contrast of the energies."""
-        return jnp.concatenate([self.rows_of(block) for block in rows.blocks])
 
 
 def landmark_field(
