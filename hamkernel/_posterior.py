@@ -341,8 +341,8 @@ class Posterior(Shown, eqx.Module):
                 f"the new data is {new.targets.dtype} and the posterior {old.targets.dtype}: cast "
                 "one of them."
             )
-        data_inputs = self.conditional.updated(new)
-        return Posterior(data_inputs, learned_field(data_inputs.field, known))
+        conditional = self.conditional.updated(new)
+        return Posterior(conditional, learned_field(conditional.field, known))
 
     @follow_data
     @one_blas_thread

@@ -52,6 +52,7 @@ from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks, whitening
 from hamkernel._solvers.least_squares import Normal, normal
 from hamkernel._solvers.problem import AbstractConditional
+from hamkernel._solvers.triangle import append_rows, no_rows
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -463,8 +464,9 @@ class LowRankConditional(AbstractConditional):
         rows = self.rows.append(new)
         extended_rows, new_count = self.rows.with_previous(new), rows.size - self.rows.size
         new_rows = extended_rows.contrast(self.span.all_rows(extended_rows))[-new_count:]
-        R, rotated = _append_rows(self.R, self.rotated, new_rows, rows.y[-new_count:])
-        return _conditional(self.span, rows, self.ridge, R, rotated)
+        above = jnp.column_stack([self.R, self.rotated])
+        F = append_rows(above, new_rows, rows.y[-new_count:])
+        return _conditional(self.span, rows, self.ridge, F)
 
     def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> AbstractField:
         weight_key, rest = jax.random.split(key)
@@ -497,20 +499,12 @@ def low_rank_conditional(
 @compiled
 def _low_rank_conditional(span, rows, ridge):
     F = rows.contrast(span.all_rows(rows))
-    start = jnp.sqrt(ridge) * jnp.eye(F.shape[1], dtype=F.dtype)
-    return _conditional(span, rows, ridge, *_append_rows(start, jnp.zeros_like(F[0]), F, rows.y))
+    start = no_rows(F.shape[1], F.dtype, ridge)
+    return _conditional(span, rows, ridge, append_rows(start, F, rows.y))
 
 
-def _append_rows(R, rotated, F, y):
-    """The QR update of (R, Qᵀy) by the rows F with targets y."""
-    both = jnp.concatenate(
-        [jnp.column_stack([R, rotated]), jnp.column_stack([F, y])],
-    )
-    Q = jnp.linalg.qr(both, mode="r")
-    return Q[: len(R), :-1], Q[: len(R), -1]
-
-
-def _conditional(span, rows, ridge, R, rotated):
+def _conditional(span, rows, ridge, triangle):
+    R, rotated = triangle[:-1, :-1], triangle[:-1, -1]
     w, F = solve_triangular(R, rotated), span.all_rows(rows)
     residual = rows.y - rows.contrast(F @ w)
     truncation = span.truncation(rows, F, ridge)

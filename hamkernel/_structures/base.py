@@ -42,7 +42,7 @@ class AbstractMatrixKernel(eqx.Module):
     matrix_valued: ClassVar[bool] = True
     takes_inputs: ClassVar[bool] = False  # whether its points are (x, u)
     given: ClassVar[str] = "inputs"  # the name of u in `fit`; "parameters" for a family
-    # # Whether derivatives of the Gram are cheaper in reverse mode, as for some closed forms.
+    # Whether derivatives of the Gram are cheaper in reverse mode, as for some closed forms.
     differentiated_backward: ClassVar[bool] = False
     symplectic: eqx.AbstractVar[bool]  # whether flows keep dq ∧ dp, as those of J∇H do
     no_potential: eqx.AbstractVar[str | None]  # why fields have no potential; None if they have one
