@@ -92,7 +92,7 @@ def test_a_map_that_is_not_equivariant_is_refused(molecules):
         return inverse_distances(x) * jnp.arange(1.0, 7.0)
 
     K = hk.Invariant(hk.CurlFree(hk.Warp(hk.Gaussian(1.0), weighted, equivariant=True)), GENERATORS)
-    with pytest.raises(ValueError, match=r"no permutation of them\. Leave equivariant=True away"):
+    with pytest.raises(ValueError, match=r"no permutation of them\. Leave out equivariant=True"):
         hk.gram(K, molecules)
 
 

@@ -81,6 +81,7 @@ def test_mass_matrix_gravity_and_torques_are_those_of_the_arm(arm):
     zero = np.zeros(4)
     wanted = energy(x) - energy(zero)
     np.testing.assert_allclose(arm.hamiltonian(x) - arm.hamiltonian(zero), wanted, rtol=1e-3)
+    np.testing.assert_allclose(jax.jit(arm.gravity)(q), gravity(q), rtol=1e-3)
 
 
 def test_the_features_of_torques_are_euler_and_lagrange_by_differences(arm):

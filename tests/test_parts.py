@@ -255,7 +255,7 @@ def test_what_is_no_part_is_refused():
         hk.Shared(hk.Gaussian(1.0), lambda x: x)(jnp.ones(3), jnp.ones(3))
     with pytest.raises(ValueError, match="of must be"):
         hk.pairs(3, 2, of="square")
-    with pytest.raises(ValueError, match="there is no pair"):
+    with pytest.raises(ValueError, match="contains no pair"):
         hk.pairs(1, 2)
     with pytest.raises(AttributeError, match="the field has no law"):
         hk.fit(hk.CurlFree(hk.Gaussian(1.0)), np.eye(2), np.eye(2), 1e-3).law(1.0)

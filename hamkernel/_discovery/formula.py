@@ -15,13 +15,13 @@ from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
 from hamkernel._fields.base import potential_of
-from hamkernel._machine import full_precision
+from hamkernel._machine import EqualToItself, full_precision
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import AbstractPotentialKernel
 
 
-class Formula(eqx.Module):
+class Formula(EqualToItself, eqx.Module):
     """u(x) = Σ θ_k φ_k(x), the potential as a formula; made by `readout`.
 
     A formula is a field: `formula(x)` is the velocity B∇u at one state, so `hk.simulate(formula,
@@ -52,13 +52,6 @@ class Formula(eqx.Module):
     functions: tuple[Callable[..., Any], ...]
     kernel: AbstractMatrixKernel
     mean: Any
-
-    # For jax.jit(formula), as of fields.
-    def __hash__(self) -> int:
-        return id(self)
-
-    def __eq__(self, other: object) -> bool:
-        return self is other
 
     def __repr__(self) -> str:
         signed = [

@@ -22,7 +22,7 @@ from jaxtyping import Array, ArrayLike, Float, Key
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._show import described, exponential, in_brackets, joined, text
+from hamkernel._show import describe, exponential, join_terms, put_in_brackets, text
 
 Point = Float[Array, " n"]
 Points = Float[Array, "M n"]
@@ -40,7 +40,7 @@ def one_point(x: ArrayLike) -> Float[Array, " n"]:
     return x
 
 
-def divided(x: Point, scale: Float[Array, "..."], name: str = "lengthscale") -> Point:
+def divide(x: Point, scale: Float[Array, "..."], name: str = "lengthscale") -> Point:
     """x/scale in the dtype of x, for one point; the scale is a number, or one per coordinate."""
     x = one_point(x)
     if scale.ndim and scale.shape != x.shape:
@@ -69,16 +69,18 @@ def bounds_by_value(name: str, leaf: Any) -> Bounds:
     return value - reach, value + reach
 
 
-def bounds_of_length(leaf: Any, X: Float[np.ndarray, "N n"], least: float, most: float) -> Bounds:
-    """Bounds of the logarithm of a length, from `least` spacings to `most` extents of the data.
+def bounds_of_length(
+    leaf: Any, X: Float[np.ndarray, "N n"], spacings: float, extents: float
+) -> Bounds:
+    """Bounds of the logarithm of a length, `spacings` spacings and `extents` extents of the data.
 
-    The spacing of N points in an extent L is taken as L / N: a fair lower bound in any dimension,
-    since points on a few trajectories lie close together along them. An extent of 0 counts as 1.
+    The spacing of N points in an extent L counts as L / N, a fair lower bound in any dimension:
+    points on a few trajectories lie close together along them. An extent of 0 counts as 1.
     """
     ranges = np.ptp(X, axis=0)
     extent = ranges if leaf.ndim > 0 else np.asarray(np.linalg.norm(ranges))
     extent = np.where(extent > 0, extent, 1.0)
-    return np.log(least * extent / max(len(X), 2)), np.log(most * extent)
+    return np.log(spacings * extent / max(len(X), 2)), np.log(extents * extent)
 
 
 class Invariance(enum.Flag):
@@ -100,24 +102,27 @@ def _identity(x: Float[Array, " n"]) -> Float[Array, "n n"]:
 class Descriptor(NamedTuple):
     """A map d of points and a kernel κ of its values, k(x, z) = κ(d(x), d(z)).
 
-    The derivatives of k follow from those of κ and the Jacobian of d, which each point needs once.
-    It is taken in forward mode, unless there is a better `jacobian`.
+    The derivatives of k follow from the derivatives of κ and the Jacobian of d, which is computed
+    once for each point.
 
     Attributes:
         map: d.
         kernel: κ.
         directions: the directions along which a field differentiates at a point, side by side.
         jacobian: the Jacobian of d; None for automatic differentiation in forward mode.
-        seen: what k knows of a point for every κ; None for d itself.
+        point_data: a function c(x) such that k, for every κ, depends on x through c(x) alone; None
+            if c is d.
     """
 
     map: Callable[[Float[Array, " n"]], Float[Array, " m"]]
     kernel: "AbstractScalarKernel"
     directions: Callable[[Float[Array, " n"]], Float[Array, "n n"]] = _identity
     jacobian: Callable[[Float[Array, " n"]], Float[Array, "m n"]] | None = None
-    seen: Callable[[Float[Array, " n"]], Float[Array, " s"]] | None = None
+    point_data: Callable[[Float[Array, " n"]], Float[Array, " s"]] | None = None
 
-    def at(self, x: Float[Array, " n"]) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
+    def value_and_jacobian(
+        self, x: Float[Array, " n"]
+    ) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
         """d(x), and its derivatives along the directions."""
         jacobian = self.jacobian or jax.jacfwd(self.map)
         return self.map(x), jacobian(x) @ self.directions(x)
@@ -126,14 +131,13 @@ class Descriptor(NamedTuple):
 class Spectrum(eqx.Module):
     """Draws from a spectral measure: k(x, z) ≈ Σ_r c_r cos(ω_r·(x − z)), or its even or odd part.
 
-    Bochner: k(x, z) = κ(x − z) is the mean of cos(ω·(x − z)) over its spectral measure, so that
-    with F frequencies drawn from it the sum is right to F^(−1/2).
+    Bochner: k(x, z) = κ(x − z) is the mean of cos(ω·(x − z)) over the spectral measure of k. The
+    sum over F frequencies drawn from the measure has a relative error of order F^(−1/2).
 
     Frequencies are smooth functions of the hyperparameters and of base samples that depend on the
-    key alone, so fits are differentiable and losses comparable between steps. α of a rational
-    quadratic kernel and the lengthscale of a periodic one change the law of the base samples: there
-    the derivative is that of the measure, right in the mean over keys but not the exact slope for
-    one key.
+    key alone, so fits are differentiable and losses comparable between steps. Two hyperparameters
+    change the law of the base samples: α of a rational quadratic kernel, and the lengthscale of a
+    periodic one. Their derivatives are right in the mean over keys, but not for one key.
 
     Attributes:
         frequencies: ω_r in radians per unit of the states, shape (F, n).
@@ -159,7 +163,7 @@ class AbstractScalarKernel(eqx.Module):
     """
 
     def __repr__(self) -> str:
-        return described(self, positional=("kernel",))
+        return describe(self, positional=("kernel",))
 
     def __hash__(self) -> int:
         # Arrays have no hash. Equal kernels have equal structure, so this one fits `==`.
@@ -189,9 +193,9 @@ class AbstractScalarKernel(eqx.Module):
         return np.array_equal(S, -identity) and Invariance.REFLECTION in self.invariance
 
     def summands(self, reflection: bool) -> "tuple[AbstractScalarKernel, ...]":
-        """The inner kernels that may be averaged over linear maps in place of this kernel.
+        """The inner kernels in which k is linear; a mean over linear maps may act on them instead.
 
-        They are those in which k is linear; `reflection` says that x -> −x is the only map.
+        `reflection` says that x -> −x is the only map.
         """
         return ()
 
@@ -211,8 +215,8 @@ class AbstractScalarKernel(eqx.Module):
         name = getattr(getattr(fn, "func", fn), "__name__", "")
         raise TypeError(
             f"RandomFeatures cannot draw frequencies for {type(self).__name__}"
-            f"{name and f' ({name})'}: that takes a shift-invariant kernel with a known spectral "
-            "density. Use Gaussian, Matern, RationalQuadratic or Periodic, their sums, products, "
+            f"{name and f' ({name})'}: a shift-invariant kernel with a known spectral density is "
+            "needed. Use Gaussian, Matern, RationalQuadratic or Periodic, their sums, products, "
             "multiples and Select, or another solver, hk.Cholesky() or hk.Nystrom()."
         )
 
@@ -268,7 +272,7 @@ class ScalarSum(AbstractScalarKernel):
     terms: tuple[AbstractScalarKernel, ...]
 
     def __repr__(self) -> str:
-        return joined("+", [repr(k) for k in self.terms])
+        return join_terms("+", [repr(k) for k in self.terms])
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         return sum((k(x, z) for k in self.terms[1:]), start=self.terms[0](x, z))
@@ -288,25 +292,29 @@ class ScalarSum(AbstractScalarKernel):
 
     def through_descriptor(self, n: int) -> Descriptor | None:
         """All descriptors side by side, and the point itself for terms that have none."""
-        found = [k.through_descriptor(n) for k in self.terms]
-        if not any(found):
+        descriptors = [k.through_descriptor(n) for k in self.terms]
+        if not any(descriptors):
             return None
-        each = [d or Descriptor(lambda x: x, k) for d, k in zip(found, self.terms, strict=True)]
+        completed = [
+            d or Descriptor(lambda x: x, k) for d, k in zip(descriptors, self.terms, strict=True)
+        ]
         point = jax.ShapeDtypeStruct((n,), jnp.result_type(float))
-        lengths = tuple(jax.eval_shape(d.map, point).size for d in each)
+        lengths = tuple(jax.eval_shape(d.map, point).size for d in completed)
 
         def jacobian(x):
-            return jnp.concatenate([d._replace(directions=_identity).at(x)[1] for d in each])
+            return jnp.concatenate(
+                [d._replace(directions=_identity).value_and_jacobian(x)[1] for d in completed]
+            )
 
         return Descriptor(
-            lambda x: jnp.concatenate([d.map(x) for d in each]),
-            _SideBySide(tuple(d.kernel for d in each), lengths),
+            lambda x: jnp.concatenate([d.map(x) for d in completed]),
+            _SideBySide(tuple(d.kernel for d in completed), lengths),
             jacobian=jacobian,
-            seen=lambda x: jnp.concatenate([(d.seen or d.map)(x) for d in each]),
+            point_data=lambda x: jnp.concatenate([(d.point_data or d.map)(x) for d in completed]),
         )
 
     def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
-        return tuple(itertools.chain.from_iterable(_of_terms(self, n, count, key, dtype)))
+        return tuple(itertools.chain.from_iterable(_term_spectra(self, n, count, key, dtype)))
 
     @property
     def has_amplitude(self) -> bool:
@@ -331,7 +339,7 @@ class ScalarProduct(AbstractScalarKernel):
     terms: tuple[AbstractScalarKernel, ...]
 
     def __repr__(self) -> str:
-        return joined("*", [_as_factor(k) for k in self.terms])
+        return join_terms("*", [_as_factor(k) for k in self.terms])
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         return math.prod((k(x, z) for k in self.terms[1:]), start=self.terms[0](x, z))
@@ -351,25 +359,25 @@ class ScalarProduct(AbstractScalarKernel):
 
     def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
         """The measure of a product is the convolution: frequencies add."""
-        factors = _of_terms(self, n, count, key, dtype)
+        factors = _term_spectra(self, n, count, key, dtype)
         if any(s.parity for factor in factors for s in factor):
             raise TypeError(
-                "RandomFeatures cannot take a product with an even or odd kernel inside. Give the "
-                "parity to the whole, for example hk.Odd(hk.Symplectic(k1 * k2))."
+                "RandomFeatures cannot take a product with an even or odd kernel inside. Put the "
+                "parity around the structure, for example hk.Odd(hk.Symplectic(k1 * k2))."
             )
 
-        def convolved(a: Spectrum, b: Spectrum) -> Spectrum:
+        def convolve(a: Spectrum, b: Spectrum) -> Spectrum:
             weights = len(a.weights) * a.weights * b.weights
             return Spectrum(a.frequencies + b.frequencies, weights)
 
-        return tuple(functools.reduce(convolved, term) for term in itertools.product(*factors))
+        return tuple(functools.reduce(convolve, term) for term in itertools.product(*factors))
 
     @property
     def has_amplitude(self) -> bool:
         return any(k.has_amplitude for k in self.terms)
 
 
-def _of_terms(
+def _term_spectra(
     kernel: ScalarSum | ScalarProduct, n: int, count: int, key: Key[Array, ""], dtype: Any
 ) -> list[Spectra]:
     """The spectra of the terms, drawn independently."""
@@ -423,10 +431,10 @@ class Scaled(AbstractScalarKernel):
         return (self.kernel,)
 
     def through_descriptor(self, n: int) -> Descriptor | None:
-        found = self.kernel.through_descriptor(n)
-        if found is None:
+        inner = self.kernel.through_descriptor(n)
+        if inner is None:
             return None
-        return found._replace(kernel=eqx.tree_at(lambda k: k.kernel, self, found.kernel))
+        return inner._replace(kernel=eqx.tree_at(lambda k: k.kernel, self, inner.kernel))
 
     def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
         inner, scale = self.kernel.spectra(n, count, key, dtype), self.scale.astype(dtype)
@@ -438,25 +446,25 @@ class Scaled(AbstractScalarKernel):
 
 
 def _as_factor(kernel: AbstractScalarKernel) -> str:
-    return in_brackets(repr(kernel)) if isinstance(kernel, ScalarSum) else repr(kernel)
+    return put_in_brackets(repr(kernel)) if isinstance(kernel, ScalarSum) else repr(kernel)
 
 
 class UserKernel(AbstractScalarKernel):
     """Any callable (x, z) -> scalar: a function, an Equinox module, another library's kernel.
 
-    Array leaves of a module are trained like those of the built-in kernels. Nothing is assumed
-    of the callable: it is taken to depend on every coordinate and to have no invariance.
+    Array leaves of a module are trained like hyperparameters of the built-in kernels. We assume
+    that the callable depends on every coordinate and has no invariance.
     """
 
     fn: Callable[..., Any]
 
     def __init__(self, fn: Callable[..., Any]):
-        self.fn = as_pytree(of_one_pair(fn))
+        self.fn = as_pytree(pair_function(fn))
 
     def __repr__(self) -> str:
         fn = getattr(self.fn, "__self__", self.fn)  # the kernel of tinygp that has the method
-        bare = type(fn).__repr__ is eqx.Module.__repr__  # it says nothing of values
-        return described(fn) if bare else text(fn)
+        bare = type(fn).__repr__ is eqx.Module.__repr__  # which shows no values
+        return describe(fn) if bare else text(fn)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         value = self.fn(x, z)
@@ -467,11 +475,11 @@ class UserKernel(AbstractScalarKernel):
                 "one pair of points, k(x, z) -> (): the library adds the vmap."
             )
         value = require.floating(value, f"the value of the kernel {_name(self.fn)}")
-        # Its parameters may be more precise than the data.
+        # Parameters of the kernel may be more precise than the data.
         return value.astype(require.floating(x, "the point").dtype)
 
 
-def of_one_pair(fn: Callable[..., Any]) -> Callable[..., Any]:
+def pair_function(fn: Callable[..., Any]) -> Callable[..., Any]:
     """The function of one pair of points: `fn`, or the method `evaluate` of a tinygp kernel.
 
     A call of a tinygp kernel returns a Gram.

@@ -1,9 +1,9 @@
 """The built-in kernels: of the scaled distance, k = φ(s) with s = ‖(x − z)/ℓ‖², and of products.
 
-A structured kernel meets every point with itself, so the second derivatives of k at x = z must
-be exact. They are when φ is differentiated with respect to s, the SQUARED distance, in which a
-smooth kernel is smooth: ∂x ∂zᵀ k = −2φ′(s) I/ℓ² − 4φ″(s) ddᵀ with d = (x − z)/ℓ². A kernel
-written with the distance √s gives NaN there, or, after the usual repairs, a wrong block.
+The diagonal of a Gram pairs every point with itself, so the second derivatives of k at x = z must
+be exact. They are exact if φ is a function of s, the SQUARED distance, in which a smooth kernel is
+smooth: ∂x ∂zᵀ k = −2φ′(s) I/ℓ² − 4φ″(s) ddᵀ with d = (x − z)/ℓ². A kernel written with the
+distance √s gives NaN at x = z, or, after the usual repairs, a wrong block.
 """
 
 import abc
@@ -24,7 +24,7 @@ from hamkernel._kernels.base import (
     Invariance,
     Spectrum,
     bounds_of_length,
-    divided,
+    divide,
     log_per_coordinate,
     one_point,
 )
@@ -35,12 +35,12 @@ from hamkernel._machine import orthonormal
 def squared_distance(x: Float[Array, " n"], z: Float[Array, " n"], cut: bool) -> Float[Array, ""]:
     """‖x − z‖² as x·x + z·z − 2 x·z, which under two vmaps is one matrix product.
 
-    The factor −2 stands outside, so that the derivative of exp(−s/2) needs no pass over all pairs
-    for it.
+    The factor −2 stands outside, so that the derivative of exp(−s/2) needs no extra pass over all
+    pairs.
 
-    With `cut`, a value below the rounding error of the product form is set to zero: on the diagonal
+    With `cut`, a value below the rounding error of the product form is set to zero. On the diagonal
     of the Gram one unit in the last place would be a distance of 1e-8, to which Matérn-3/2 is
-    sensitive. Only the value is cut; the derivatives are those of the exact expression.
+    sensitive. The derivatives are not cut.
     """
     halves = x @ x / 2 + z @ z / 2
     s = -2 * (x @ z - halves)
@@ -55,8 +55,10 @@ def orthogonal_normal(
 ) -> Float[Array, "count n"]:
     """Standard normal vectors in blocks of n with orthogonal directions, otherwise independent.
 
-    The mean over a block then has less variance (Yu et al. (2016), "Orthogonal random features"):
-    the error on the pendulum of the paper is smaller by a quarter.
+    Orthogonality reduces the variance of means over a block; the error on the paper's pendulum is
+    smaller by a quarter.
+
+    Source: Yu et al. (2016), "Orthogonal random features".
     """
     directions, lengths = jax.random.split(key)
     blocks = -(-count // n)
@@ -100,7 +102,7 @@ class AbstractRadialKernel(AbstractScalarKernel):
         widths = self.widths(mixture, count, dtype)
         base = orthogonal_normal(key if widths is None else normal, count, n, dtype)
         base = base if widths is None else base * widths
-        frequencies = jax.vmap(divided, in_axes=(0, None))(base, self.lengthscale)
+        frequencies = jax.vmap(divide, in_axes=(0, None))(base, self.lengthscale)
         return (Spectrum(frequencies, jnp.full(count, 1 / count, dtype)),)
 
     @property
@@ -108,7 +110,7 @@ class AbstractRadialKernel(AbstractScalarKernel):
         return jnp.exp(self.log_lengthscale)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
-        x, z = divided(x, self.lengthscale), divided(z, self.lengthscale)
+        x, z = divide(x, self.lengthscale), divide(z, self.lengthscale)
         return self.profile(squared_distance(x, z, cut=self.cuts_rounding))
 
     def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
@@ -166,9 +168,9 @@ class Matern(AbstractRadialKernel):
         ValueError: `nu` is 1/2, whose second derivative at x = z does not exist, or no
             half-integer; a lengthscale is not positive and finite.
 
-    Where more than 1000 points are multiplied, as in `field.evaluate` and `gram_operator`, second
-    derivatives at points that coincide are NaN once one of the two is in reverse mode, as in
-    `jax.hessian`; `jax.jacfwd(jax.jacfwd(f))` is right.
+    Products with more than 1000 points, as in `field.evaluate` and `gram_operator`, have NaN second
+    derivatives in reverse mode, as in `jax.hessian`, at points that coincide. Forward mode,
+    `jax.jacfwd(jax.jacfwd(f))`, is right.
 
     Source: Rasmussen & Williams (2006), eq. 4.16.
     """
@@ -198,12 +200,12 @@ class Matern(AbstractRadialKernel):
         return jnp.sqrt(self.nu / half_square)
 
 
-# With ψ_p(t) the Matérn function of order p + 1/2 at r = √t, the identity
-# d/dr [r^ν K_ν(r)] = −r^ν K_{ν−1}(r) (DLMF 10.29.4) gives  ψ_p′(t) = −ψ_{p−1}(t) / (4p − 2):
-# the derivative of a Matérn function is a smoother multiple of the next rougher one, so a
-# custom_jvp that calls itself is exact to every order and never divides by the distance. Only
-# the last, ψ_0 = e^(−r), has a derivative that grows like 1/r. It multiplies components of
-# x − z that vanish faster, so the value 0 at r = 0 gives the limit of the whole expression.
+# Let ψ_p(t) be the Matérn function of order p + 1/2 at r = √t. The identity
+# d/dr [r^ν K_ν(r)] = −r^ν K_{ν−1}(r) (DLMF 10.29.4) gives
+#     ψ_p′(t) = −ψ_{p−1}(t) / (4p − 2).
+# So a custom_jvp that calls itself is exact to every order and never divides by the distance. Only
+# ψ_0 = e^(−r) has a derivative that grows like 1/r. This derivative multiplies components of x − z,
+# which vanish faster, so the value 0 at r = 0 gives the limit of the product.
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _matern(p: int, t: Float[Array, ""]) -> Float[Array, ""]:
     far = -1.2 * math.log(float(jnp.finfo(t.dtype).tiny))  # e^(−r) is zero, the polynomial finite
@@ -263,7 +265,7 @@ class RationalQuadratic(AbstractRadialKernel):
         return jnp.exp(-alpha * jnp.log1p(s / (2 * alpha)))
 
     def widths(self, key: Key[Array, ""], count: int, dtype: Any) -> Float[Array, "count 1"]:
-        """√(g/α) with g ~ Gamma(α), over which φ(s) is the mean of exp(−(g/α) s/2)."""
+        """√(g/α) with g ~ Gamma(α): φ(s) is the mean of exp(−(g/α) s/2)."""
         alpha = self.alpha.astype(dtype)
         # The logarithm is drawn: for small α the sample itself underflows, and √ has no derivative
         # at 0.
@@ -274,8 +276,8 @@ class RationalQuadratic(AbstractRadialKernel):
 class Polynomial(AbstractScalarKernel):
     """The polynomial kernel, k(x, z) = (x·z + c)^d.
 
-    Its potentials are the polynomials of degree ≤ d, so a Hamiltonian of degree d is learned
-    exactly. Not shift-invariant: state the data in coordinates whose origin means something.
+    The potentials are the polynomials of degree ≤ d, so a Hamiltonian of degree d is learned
+    exactly. The kernel is not shift-invariant: choose coordinates with a meaningful origin.
 
     Args:
         degree: d ≥ 1, an integer; fixed, not trained.
@@ -283,7 +285,7 @@ class Polynomial(AbstractScalarKernel):
 
     Raises:
         ValueError: `degree` or `offset` is not positive, or `offset` not finite. TypeError:
-            `degree` is not whole.
+            `degree` is no integer.
 
     Source: Rasmussen & Williams (2006), section 4.2.2.
     """
@@ -318,12 +320,12 @@ class Polynomial(AbstractScalarKernel):
 class Periodic(AbstractScalarKernel):
     """The periodic kernel, k(x, z) = exp(−2 Σₐ sin²(π(xₐ − zₐ)/Tₐ)/ℓₐ²).
 
-    It is the Gaussian kernel on the circle: sin² of half an angle is a quarter of the squared
+    This is the Gaussian kernel on the circle: sin² of half an angle is a quarter of the squared
     chord between (cos, sin) pairs, so the sum is a dot product of features.
 
     Args:
-        period: T > 0 in the units of the states; a number, or an array (n,). It is trained like
-            every hyperparameter: where it is known, such as 2π, say `tune(..., frozen="period")`.
+        period: T > 0 in the units of the states; a number, or an array (n,). `tune` trains T like
+            every hyperparameter. If T is known, such as 2π, pass `tune(..., frozen="period")`.
         lengthscale: ℓ > 0, dimensionless; a number, or an array (n,).
 
     Raises:
@@ -349,12 +351,12 @@ class Periodic(AbstractScalarKernel):
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         x, z = one_point(x), one_point(z)
-        weight = divided(divided(jnp.ones_like(x), self.lengthscale), self.lengthscale)
+        weight = divide(divide(jnp.ones_like(x), self.lengthscale), self.lengthscale)
         # Σ 2 sin²(θ/2)/ℓ² = Σ (1 − cos θ)/ℓ², and cos(a − b) is a product of features.
         return jnp.exp(self._features(x) @ (jnp.tile(weight, 2) * self._features(z)) - weight.sum())
 
     def _features(self, x: Float[Array, " n"]) -> Float[Array, " 2*n"]:
-        angle = divided(2 * jnp.pi * x, self.period, "period")
+        angle = divide(2 * jnp.pi * x, self.period, "period")
         return jnp.concatenate([jnp.cos(angle), jnp.sin(angle)])
 
     @property
@@ -367,38 +369,38 @@ class Periodic(AbstractScalarKernel):
 
     def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
         if name == "log_lengthscale":
-            # On a circle of radius 1; below 1/64 random features need too long a Fourier series.
+            # On a circle of radius 1. Below 1/64 random features need too long a Fourier series.
             return np.log(max(0.6 / len(X), 1 / 64)), np.log(60.0)
         return bounds_of_length(self.log_period, X, 2.0, 10.0)
 
     def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
         """Harmonics 2πj/T with the probabilities of the Fourier series of the kernel.
 
-        exp((cos θ − 1)/ℓ²) = Σ_j p_j cos jθ with p_j = exp(−1/ℓ²) I_j(1/ℓ²), here by a discrete
-        Fourier transform of M = 1024 samples, whose aliasing is below rounding for ℓ ≥ 1/64. An
-        integer j has no derivative in ℓ; the weights p_j(ℓ)/p_j have the value 1 and the derivative
-        of the measure.
+        exp((cos θ − 1)/ℓ²) = Σ_j p_j cos jθ with p_j = exp(−1/ℓ²) I_j(1/ℓ²). We compute the p_j by
+        a discrete Fourier transform of M = 1024 samples, whose aliasing is below rounding for
+        ℓ ≥ 1/64. An integer j has no derivative in ℓ; the weights p_j(ℓ)/p_j have the value 1 and
+        the derivative of the measure.
         """
         lengthscale, M = self.lengthscale.astype(dtype), 1024
         lengthscale = require.value(
             lengthscale,
-            require.on_host(lengthscale) < 1 / 64,
+            require.host_array(lengthscale) < 1 / 64,
             "RandomFeatures of a Periodic kernel needs a lengthscale (dimensionless) of at least "
             "1/64.",
         )
-        concentration = divided(divided(jnp.ones(n, dtype), lengthscale), lengthscale)  # (n,)
+        concentration = divide(divide(jnp.ones(n, dtype), lengthscale), lengthscale)  # (n,)
         circle = jnp.cos(2 * jnp.pi * jnp.arange(M, dtype=dtype) / M) - 1
         samples = jnp.exp(concentration[:, None] * circle[None])
         probability = jnp.fft.fftshift(jnp.fft.fft(samples).real, axes=1) / M  # j ≥ −M/2
         fixed = jax.lax.stop_gradient(probability)
         cumulative = jnp.cumsum(fixed, axis=1)
-        # The least value is not zero, which would draw a harmonic whose probability underflows and
-        # lead to 0/0.
+        # The smallest sample is not zero: zero would draw a harmonic whose probability underflows,
+        # and lead to 0/0.
         uniform = jax.random.uniform(key, (n, count), dtype, minval=jnp.finfo(dtype).tiny)
         index = jax.vmap(jnp.searchsorted)(cumulative, uniform * cumulative[:, -1:])  # (n, F)
         ratio = jnp.take_along_axis(probability, index, 1) / jnp.take_along_axis(fixed, index, 1)
         harmonic = (index - M // 2).astype(dtype).T  # (F, n)
-        frequencies = jax.vmap(lambda j: divided(2 * jnp.pi * j, self.period, "period"))(harmonic)
+        frequencies = jax.vmap(lambda j: divide(2 * jnp.pi * j, self.period, "period"))(harmonic)
         return (Spectrum(frequencies, jnp.prod(ratio, axis=0) / count),)
 
 

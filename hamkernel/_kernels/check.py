@@ -1,11 +1,11 @@
 """`check_kernel`: whether a scalar kernel can be differentiated once in each argument.
 
 Structured kernels are made of blocks M(x, z) = ∂x ∂zᵀ k(x, z), and every point meets itself on the
-diagonal of the Gram. A kernel written with the distance ‖x − z‖ has a removable singularity there
-that automatic differentiation does not remove: M(x, x) comes out as NaN, as zero or of rank one,
-and nothing raises. So M(x, x) is compared with M(x, x + h) at steps h that halve from the spread
-of the data down to rounding. A sound kernel agrees with one of those near enough to x that k has
-hardly changed, and far enough that it has changed by more than rounding.
+diagonal of the Gram. A kernel written with the distance ‖x − z‖ has a removable singularity there,
+which automatic differentiation does not remove: M(x, x) comes out as NaN, as zero or of rank one,
+and no error is raised. So we compare M(x, x) with M(x, x + h) at steps h that halve from the spread
+of the data down to rounding. For a sound kernel M(x, x) agrees with M(x, x + h) at one step or
+more, among the steps at which k changes by more than rounding and M by little.
 """
 
 from __future__ import annotations
@@ -41,16 +41,22 @@ class _Pairs(NamedTuple):
 def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     """Raise if the scalar kernel `k` is unfit for the structured kernels; return None if sound.
 
-    The faults, in the order of the checks: a result that is not one differentiable real number; a k
-    that is not finite; a block M(x, x) = ∂x ∂zᵀ k that is not the limit of M(x, x + h), or has no
-    limit because the kernel is too rough; derivatives that are not finite; k(x, z) ≠ k(z, x); a
-    negative eigenvalue of the Gram of k or of M. A kernel that passes is sound at these points.
+    The faults, in the order of the checks:
+
+    1. k(x, z) is not one differentiable real number, or is not finite.
+    2. The block M(x, x) = ∂x ∂zᵀ k is not the limit of M(x, x + h), or has no limit because the
+       kernel is too rough.
+    3. A derivative is not finite.
+    4. k(x, z) ≠ k(z, x).
+    5. The Gram of k or of M has a negative eigenvalue.
+
+    A kernel that passes is sound at these points.
 
     Args:
-        k: a kernel of this library or any callable (x, z) → scalar on two points of shape (n,);
-            of a kernel object of tinygp, its method `evaluate`.
-        points: representative states, shape (N, n). Their spread sets the largest h, their dtype
-            the tolerances: an eigenvalue is negative below −ε^(2/3) of the trace.
+        k: a kernel of this library or any callable (x, z) → scalar on two points of shape (n,). For
+            a tinygp kernel the method `evaluate` is checked.
+        points: representative states, shape (N, n). Their spread sets the largest h. Their dtype
+            sets the tolerances: an eigenvalue counts as negative below −ε^(2/3) of the trace.
 
     Raises:
         ValueError: the first fault found, with its cause, its numbers and its cure.
@@ -64,8 +70,8 @@ def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     eps = _check_signature(k, X)
     X = np.asarray(X)
     N, n = X.shape
-    subset = _spaced(N, min(64, max(8, 256 // n)))  # the Gram of blocks has some 256 rows
-    near = _spaced(len(subset), 8)  # the points that are compared with their neighbours
+    subset = _even_indices(N, min(64, max(8, 256 // n)))  # the Gram of blocks has some 256 rows
+    near = _even_indices(len(subset), 8)  # the points that are compared with their neighbours
     spread, size = np.ptp(X.astype(float), axis=0), np.abs(X.astype(float)).max(axis=0)
     unit = np.where(spread > 0, spread, np.where(size > 0, size, 1.0))
     here, Z = X[subset], _neighbours(X[subset[near]], unit, size, eps)
@@ -77,8 +83,8 @@ def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     )
     _refuse_infinite(gram.k, subset, f"k is {gram.k.sum()}")
     with np.errstate(all="ignore"):
-        own = _Pairs(*(values[near, near] for values in gram))
-        _check_limits(own, between, beyond, subset[near], unit, eps)
+        diagonal = _Pairs(*(values[near, near] for values in gram))
+        _check_limits(diagonal, between, beyond, subset[near], unit, eps)
     _refuse_infinite(
         gram.block.sum(axis=(2, 3)) + gram.gradient.sum(axis=2),
         subset,
@@ -97,7 +103,7 @@ def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
 
 
 def _check_signature(k: Callable, X: Array) -> float:
-    """Machine epsilon of `k` at `X`, once it is known to be one differentiable real number."""
+    """The machine epsilon of `k` at `X`; ValueError unless k is one differentiable real number."""
     x = X[0]
     try:
         out = jax.eval_shape(k, x, x)
@@ -107,12 +113,12 @@ def _check_signature(k: Callable, X: Array) -> float:
             "kernel takes one pair of points and is written with jax.numpy."
         ) from error
     if getattr(out, "shape", None) != () or not jnp.issubdtype(out.dtype, jnp.floating):
-        found = f"{out.dtype}{out.shape}" if hasattr(out, "shape") else type(out).__name__
+        got = f"{out.dtype}{out.shape}" if hasattr(out, "shape") else type(out).__name__
         raise ValueError(
-            f"k(x, z) must return one real number, shape (), for two points; got {found}."
+            f"k(x, z) must return one real number, shape (), for two points; got {got}."
         )
     try:
-        jax.eval_shape(_mixed(k), x, x)
+        jax.eval_shape(_mixed_derivative(k), x, x)
     except Exception as error:
         raise ValueError(
             f"k(x, z) cannot be differentiated once in x and once in z: {error} Write it with "
@@ -121,11 +127,11 @@ def _check_signature(k: Callable, X: Array) -> float:
     return float(max(jnp.finfo(out.dtype).eps, jnp.finfo(X.dtype).eps))
 
 
-def _mixed(k: Callable) -> Callable:
+def _mixed_derivative(k: Callable) -> Callable:
     return jax.jacfwd(jax.grad(k), argnums=1)
 
 
-def _spaced(size: int, count: int) -> np.ndarray:
+def _even_indices(size: int, count: int) -> np.ndarray:
     return np.unique(np.linspace(0, size - 1, min(size, count)).round().astype(int))
 
 
@@ -148,7 +154,9 @@ def _derivatives_of_pairs(k: Callable, unit: np.ndarray, *pairs) -> list[_Pairs]
     # the distance.
     values = jax.jit(
         lambda X, Z: jax.lax.map(
-            lambda p: (k(*p), jax.grad(k)(*p), _mixed(k)(*p)), (X, Z), batch_size=8192 // n**2 or 1
+            lambda p: (k(*p), jax.grad(k)(*p), _mixed_derivative(k)(*p)),
+            (X, Z),
+            batch_size=8192 // n**2 or 1,
         ),
         compiler_options={
             "xla_backend_optimization_level": 0,
@@ -176,42 +184,44 @@ def _lowest(matrix: np.ndarray) -> float:
     return float(np.linalg.eigvalsh((matrix + matrix.T) / 2)[0])
 
 
-def _check_limits(own: _Pairs, between: _Pairs, beyond: _Pairs, index, unit, eps) -> None:
+def _check_limits(diagonal: _Pairs, between: _Pairs, beyond: _Pairs, index, unit, eps) -> None:
     """Raise a ValueError for the first M(x, x) that is not the limit of M(x, x + h)."""
-    total = np.abs(own.k[:, None, None]) + np.abs(beyond.k)
-    moved = own.k[:, None, None] + beyond.k - 2 * between.k
+    total = np.abs(diagonal.k[:, None, None]) + np.abs(beyond.k)
+    moved = diagonal.k[:, None, None] + beyond.k - 2 * between.k
     moved = np.abs(moved) / np.where(total > 0, total, 1.0)  # (P, 2, J)
     finite: Any = np.isfinite(between.block).all(axis=(-2, -1))
     size = _size(between.block)
-    # Near are neighbours at which k has changed by more than rounding and M by little; that of
+    # `near`: neighbours at which k changes by more than rounding and M by little. The M of
     # Matérn-3/2 changes by 3 √moved.
     near = finite & (moved > 8 * eps) & (moved <= eps**0.5 / 8)
     larger = np.maximum.accumulate(np.where(finite & (moved <= 0.01), size, 0.0), axis=2)
-    scale = np.maximum(np.maximum(size, larger), _size(own.block)[:, None, None])
+    scale = np.maximum(np.maximum(size, larger), _size(diagonal.block)[:, None, None])
     scale = np.maximum(scale, 0.1 * scale.max(axis=(0, 1)))  # blocks may vanish at some points
     # The limit may lie beyond the smallest step. Matérn-3/2 tends to it linearly, so two successive
     # steps are extrapolated too.
     before = np.concatenate([between.block[:, :, :1], between.block[:, :, :-1]], axis=2)
-    here: Any = own.block[:, None, None]
+    here: Any = diagonal.block[:, None, None]
     misses = [_size(tends - here) for tends in (between.block, 2 * between.block - before)]
     differs = np.minimum(*misses) / np.where(scale > 0, scale, 1.0)
-    whole: Any = np.isfinite(own.block).all(axis=(-2, -1))
-    differs = np.where(whole[:, None, None], differs, np.inf)
+    is_finite: Any = np.isfinite(diagonal.block).all(axis=(-2, -1))
+    differs = np.where(is_finite[:, None, None], differs, np.inf)
     grows: Any = (size[..., 1:] > 1.2 * size[..., :-1]) & finite[..., 1:] & finite[..., :-1]
     grows &= (moved <= 0.1 * np.where(finite, moved, 0).max(axis=2, keepdims=True))[..., :-1]
     for p, i in enumerate(index):
         # Only the blocks of a kernel of the distance keep growing over 10 halvings of h, a factor
-        # of 1000; those of a sound kernel with a second, smaller scale grow over two or three. And
-        # the blocks of a sound kernel at near neighbours differ from M(x, x) by 3 √(√ε/8) = .02 in
-        # float32, while an M(x, x) that is twice too large differs from them by .5.
+        # of 1000. Blocks of a sound kernel with a second, smaller scale grow over two or three.
+        # Blocks of a sound kernel at near neighbours differ from M(x, x) by 3 √(√ε/8) = .02 in
+        # float32; an M(x, x) that is twice too large differs from its neighbours by .5.
         steady = max(_longest(row) for row in grows[p]) >= 10
         rows = zip(near[p], differs[p], strict=True)
         wrong = any(row.any() and off[row].min() > 0.3 for row, off in rows)
-        if not (steady or wrong or not np.isfinite(own.block[p]).all()):
+        if not (steady or wrong or not np.isfinite(diagonal.block[p]).all()):
             continue
         last = [np.flatnonzero(row)[-1] for row in near[p] if row.any()]
         limits = [between.block[p, d, j] for d, j in enumerate(last)]
-        raise ValueError(_diagnosis(own.block[p], limits, steady, f"at x = z = points[{i}]", unit))
+        raise ValueError(
+            _diagnosis(diagonal.block[p], limits, steady, f"at x = z = points[{i}]", unit)
+        )
 
 
 def _longest(row: np.ndarray) -> int:
@@ -220,8 +230,8 @@ def _longest(row: np.ndarray) -> int:
     return int(np.diff(breaks).max()) - 1
 
 
-def _diagnosis(own, limits, steady: bool, where: str, unit) -> str:
-    got, *shown = (_block_text(b / unit[:, None] / unit) for b in (own, *limits))
+def _diagnosis(block, limits, steady: bool, where: str, unit) -> str:
+    got, *shown = (_block_text(b / unit[:, None] / unit) for b in (block, *limits))
     scale = max(map(_size, limits), default=0.0)
     tends = f" The neighbours M(x, x + h) tend to {shown[0]} as h → 0." if limits else ""
     said = f"{where} autodiff returns M(x, x) = {got}.{tends}"
@@ -237,11 +247,11 @@ def _diagnosis(own, limits, steady: bool, where: str, unit) -> str:
             f"direction of h, {shown[0]} and {shown[1]}; a kink, as in the L1 distance "
             f"Σ|x_a - z_a|. {_CURE}"
         )
-    if not np.isfinite(own).all():
+    if not np.isfinite(block).all():
         return f"NaN or inf in the derivatives of k {said} Likely the square root of zero. {_CURE}"
-    if _size(own) <= 0.05 * scale:
+    if _size(block) <= 0.05 * scale:
         return f"zero block: {said} Likely a 'safe' norm, jnp.where around the root. {_CURE}"
-    if _rank_one(own) and not _rank_one(limits[0]):
+    if _rank_one(block) and not _rank_one(limits[0]):
         return f"rank-one block: {said} Likely a distance that changes its kind at zero. {_CURE}"
     return f"wrong block: {said} A branch at small distances, or a wrong derivative rule. {_CURE}"
 

@@ -58,7 +58,7 @@ class Bound(eqx.Module):
 
     @property
     def floats(self) -> dict[str, float]:
-        """The Python floats that it binds, by keyword or position."""
+        """The Python floats among the bound arguments, by keyword or position."""
         args, keywords = self._bound()
         bound = {f"argument {i}": value for i, value in enumerate(args)} | keywords
         return {name: value for name, value in bound.items() if isinstance(value, float)}
@@ -70,9 +70,9 @@ class Bound(eqx.Module):
 
 
 class Closure(eqx.Module):
-    """A function with the traced values that it closes over as leaves.
+    """A function with the traced values of its closure as leaves.
 
-    A custom derivative rule sees its arguments only, so they must be among them.
+    A custom derivative rule sees its arguments only, so the traced values must be leaves of one.
     """
 
     func: Any = eqx.field(static=True)  # with nothing in the cells of `traced`
@@ -102,7 +102,7 @@ class Closure(eqx.Module):
 def _holds_traced(value: Any, outer: tuple[Any, ...] = ()) -> bool:
     """Whether a PyTree has traced leaves, or a function closes over such a PyTree or function.
 
-    A function that closes over itself cannot be taken apart, and does not count.
+    A function that closes over itself does not count, since its cells cannot be copied.
     """
     if isinstance(value, functools.partial):
         return any(
@@ -112,7 +112,7 @@ def _holds_traced(value: Any, outer: tuple[Any, ...] = ()) -> bool:
         return not require.is_concrete(value)
     inner = (*outer, value)
     contents = [_content(cell) for cell in value.__closure__ or ()]
-    if any(content is each for content in contents for each in inner):
+    if any(content is enclosing for content in contents for enclosing in inner):
         return False
     return any(_holds_traced(content, inner) for content in contents)
 

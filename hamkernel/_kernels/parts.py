@@ -1,7 +1,7 @@
 """Laws that many parts share: u(x) = Σ_p c_p w(φ_p(x)) with one unknown function w.
 
-A functional of u is the sum of the same functionals of w at the points φ_p(x), along Dφ_p(x) v. So
-one Gaussian process w ~ GP(0, k) of the parts gives u the kernel
+The value of u at x is the sum of values of w at the points φ_p(x), and a derivative of u along v
+the sum of derivatives of w along Dφ_p(x) v. If w ~ GP(0, k), then u has the kernel
 
     k_S(x, z) = Σ_pq c_p c_q k(φ_p(x), φ_q(z)).
 
@@ -10,7 +10,7 @@ and a ~ N(0, I), so that u(x) = Φ(x)·a with
 
     Φ(x) = L⁻¹ Σ_p c_p k(C, φ_p(x)),   ∂Φ_j/∂x = Σ_p c_p Dφ_p(x)ᵀ ∇k(φ_p(x), ·),
 
-and a system of any size has m unknowns. One reverse derivative of the parts serves each of the m.
+and a system of any size has m unknowns.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,7 +33,7 @@ from hamkernel._kernels.base import (
     one_point,
 )
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._show import call, described, text
+from hamkernel._show import call, describe, text
 
 _AT_ONCE = 2**16  # parts times centres that are computed at once: arrays of 512 KB
 _CENTRES = 64  # a law of one variable: lengthscales from a thirtieth of the range on
@@ -46,16 +46,16 @@ class Shared(AbstractScalarKernel):
         field = hk.fit(K, X, Y, 1e-6, mean=hk.kinetic(mass=1.0))
         V = jax.vmap(field.law)(r)  # the pair potential, up to a constant
 
-    A constant in w moves nothing, so `field.law` is known up to one; of several laws a linear term
-    in one may be carried by another. Where φ takes no values in the data the law is unknown, and
-    `posterior.law_deviation` says so.
+    A constant in w moves nothing, so `field.law` is known up to a constant. With several laws, a
+    linear term may move from one law to another (see `field.undetermined`). Outside the values of φ
+    in the data the law is unknown, and `posterior.law_deviation` is large.
 
     Args:
         kernel: the kernel k of w, on points of the parts, (d,).
         parts: x (n,) -> points (P, d), or (points, weights c) with weights (P,); `hk.pairs`,
             `hk.neighbours`, `hk.sites`, or a function of your own.
-        centres: points of the parts, (m, d), that carry w. If None, up to 64 are spread over the
-            parts of the data when a fit begins.
+        centres: points of the parts, (m, d), whose k(·, c) span w. If None, a fit takes up to 64
+            points spread over the parts of the data.
 
     Raises:
         TypeError: `kernel` is no scalar kernel or `parts` no function. ValueError, when called:
@@ -77,9 +77,9 @@ class Shared(AbstractScalarKernel):
         self.parts = as_pytree(parts)
         self.centres = None
         if centres is not None:
-            given = np.asarray(centres, float)
-            given = given[:, None] if given.ndim == 1 else given
-            self.centres = tuple(tuple(map(float, point)) for point in given)
+            points = np.asarray(centres, float)
+            points = points[:, None] if points.ndim == 1 else points
+            self.centres = tuple(tuple(map(float, point)) for point in points)
 
     def __repr__(self) -> str:
         said = [] if self.centres is None else [f"centres={len(self.centres)}"]
@@ -88,15 +88,15 @@ class Shared(AbstractScalarKernel):
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         if self.centres is not None:
             return self.features(x) @ self.features(z)
-        (X, a), (Z, b) = self.of(x), self.of(z)
+        (X, a), (Z, b) = self.parts_at(x), self.parts_at(z)
         rows = jax.vmap(jax.vmap(self.kernel, (None, 0)), (0, None))(X, Z)
         return a @ rows @ b
 
-    def of(self, x: Float[Array, " n"]) -> "Parts":
+    def parts_at(self, x: Float[Array, " n"]) -> "Parts":
         """The points and the weights of the parts of one state."""
         x = one_point(x)
-        found = self.parts(x)
-        points, weights = found if isinstance(found, tuple) else (found, 1.0)
+        result = self.parts(x)
+        points, weights = result if isinstance(result, tuple) else (result, 1.0)
         if jnp.ndim(points) != 2 or jnp.shape(weights) not in ((), jnp.shape(points)[:1]):
             raise ValueError(
                 f"the parts of Shared are of shape {jnp.shape(points)}, with weights "
@@ -109,31 +109,31 @@ class Shared(AbstractScalarKernel):
 
     def features(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """Φ(x), with k_S(x, z) = Φ(x)·Φ(z)."""
-        points, weights = self.of(x)
+        points, weights = self.parts_at(x)
 
-        def of_centre(c):
+        def feature(c):
             return weights @ jax.vmap(self.kernel, (0, None))(points, c)
 
-        return self._whitened(self._over_centres(of_centre, len(points), x.dtype))
+        return self._whiten(self._over_centres(feature, len(points), x.dtype))
 
     def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n m"]:
         """The gradients of the features, by one reverse derivative of the parts for each."""
-        (points, weights), back = jax.vjp(self.of, x)
+        (points, weights), back = jax.vjp(self.parts_at, x)
 
-        def of_centre(c):
+        def gradient(c):
             value, slope = jax.vmap(jax.value_and_grad(self.kernel), (0, None))(points, c)
             return back(Parts(weights[:, None] * slope, value))[0]
 
-        return self._whitened(self._over_centres(of_centre, len(points), x.dtype)).T
+        return self._whiten(self._over_centres(gradient, len(points), x.dtype)).T
 
     def slope(self, x: Float[Array, " n"], w: Float[Array, " m"]) -> Float[Array, " n"]:
         """`gradients(x) @ w`, by one reverse derivative of the parts."""
-        (points, weights), back = jax.vjp(self.of, x)
+        (points, weights), back = jax.vjp(self.parts_at, x)
         C = self._points(x.dtype)
-        of_centres = solve_triangular(self._factor(x.dtype), w, lower=True, trans="T")
+        coefficients = solve_triangular(self._factor(x.dtype), w, lower=True, trans="T")
 
         def law(r):
-            return jax.vmap(self.kernel, (None, 0))(r, C) @ of_centres
+            return jax.vmap(self.kernel, (None, 0))(r, C) @ coefficients
 
         at_once = max(1, _AT_ONCE // len(C))
         value, slope = jax.lax.map(jax.value_and_grad(law), points, batch_size=at_once)
@@ -141,7 +141,7 @@ class Shared(AbstractScalarKernel):
 
     def _over_centres(self, fn: Callable[..., Array], parts: int, dtype: Any) -> Array:
         """`fn` at each centre, so many at once that memory does not grow with parts × centres."""
-        # A checkpoint keeps the reverse derivative as small.
+        # A checkpoint keeps the memory of the reverse derivative as small.
         at_once = int(np.clip(_AT_ONCE // parts, 1, len(self.centres or ())))
         return jax.lax.map(jax.checkpoint(fn), self._points(dtype), batch_size=at_once)
 
@@ -159,14 +159,14 @@ class Shared(AbstractScalarKernel):
 
     def law(self, point: Float[Array, " d"]) -> Float[Array, " m"]:
         """L⁻¹ k(C, point), the features of w at one point of the parts."""
-        return self._whitened(self._columns(point[None])[0])
+        return self._whiten(self._columns(point[None])[0])
 
-    def missing(self, point: Float[Array, " d"], other: Float[Array, " d"]) -> Float[Array, ""]:
-        """The prior variance of w(point) − w(other) that the centres do not carry."""
+    def missing(self, point: Float[Array, " d"], origin: Float[Array, " d"]) -> Float[Array, ""]:
+        """The prior variance of w(point) − w(origin) outside the span of the centres."""
         k = self.kernel
-        whole = k(point, point) - 2 * k(point, other) + k(other, other)
-        known = self.law(point) - self.law(other)
-        return jnp.maximum(whole - known @ known, 0.0)
+        prior = k(point, point) - 2 * k(point, origin) + k(origin, origin)
+        carried = self.law(point) - self.law(origin)
+        return jnp.maximum(prior - carried @ carried, 0.0)
 
     def _points(self, dtype: Any) -> Float[Array, "m d"]:
         assert self.centres is not None
@@ -176,7 +176,7 @@ class Shared(AbstractScalarKernel):
         C = self._points(points.dtype)
         return jax.vmap(jax.vmap(self.kernel, (None, 0)), (0, None))(points, C)
 
-    def _whitened(self, rows: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
+    def _whiten(self, rows: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
         return solve_triangular(self._factor(rows.dtype), rows, lower=True)
 
     def _factor(self, dtype: Any) -> Float[Array, "m m"]:
@@ -189,7 +189,7 @@ class Shared(AbstractScalarKernel):
             self.features,
             InnerProduct(),
             jacobian=lambda x: self.gradients(x).T,
-            seen=lambda x: ravel_pytree(self.of(x))[0],
+            point_data=lambda x: ravel_pytree(self.parts_at(x))[0],
         )
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
@@ -202,11 +202,11 @@ class Shared(AbstractScalarKernel):
     def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N d"]:
         return self.spread(X, 16 * _CENTRES)
 
-    def spread(self, X: Float[np.ndarray, "N n"], most: int) -> Float[np.ndarray, "m d"]:
-        """Up to `most` points of the parts of the states X, each the farthest from those before."""
+    def spread(self, X: Float[np.ndarray, "N n"], limit: int) -> Float[np.ndarray, "m d"]:
+        """Up to `limit` points of the parts of X, each the farthest from all before it."""
         rows = jnp.asarray(X[np.linspace(0, len(X) - 1, min(len(X), 256)).astype(int)])
-        found = np.asarray(jax.lax.map(lambda x: self.of(x).points, rows))
-        points = found.reshape(-1, found.shape[-1])
+        parts = np.asarray(jax.lax.map(lambda x: self.parts_at(x).points, rows))
+        points = parts.reshape(-1, parts.shape[-1])
         low, high = points.min(axis=0), points.max(axis=0)
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
             raise ValueError(
@@ -214,29 +214,30 @@ class Shared(AbstractScalarKernel):
                 "no distance to take a logarithm of. Leave such states out."
             )
         unit = points / np.where(high > low, high - low, 1.0)
-        if points.shape[1] == 1 and len(points) > most:
-            # On a line: evenly over the range, each the nearest of the data.
+        if points.shape[1] == 1 and len(points) > limit:
+            # On a line: the points nearest to an even grid over the range.
             order = np.argsort(points[:, 0])
-            wanted = np.linspace(low[0], high[0], most)
+            wanted = np.linspace(low[0], high[0], limit)
             at = np.searchsorted(points[order, 0], wanted).clip(0, len(points) - 1)
             return np.unique(points[order[at]], axis=0)
-        return points[far_apart(unit, most)]
+        return points[far_apart(unit, limit)]
 
     def with_centres(self, X: Float[np.ndarray, "N n"]) -> "Shared":
-        """The same with centres over the parts of the states X."""
+        """This kernel with centres over the parts of the states X."""
         return Shared(self.kernel, self.parts, self.spread(X, _CENTRES))
 
 
 def root_at(k: AbstractScalarKernel, C: Float[Array, "m d"]) -> Float[Array, "m m"]:
     """L with L Lᵀ = k(C, C)."""
     G = jax.vmap(jax.vmap(k, (None, 0)), (0, None))(C, C)
-    # A hundred times the rounding bounds how finely centres resolve, and biases nothing.
+    # A hundred times the rounding error keeps the Cholesky factor finite if centres nearly
+    # coincide. For 64 centres it is 1e-12 of the mean of the diagonal.
     rounding = 100 * jnp.finfo(G.dtype).eps * len(G) * jnp.diagonal(G).mean()
     return jnp.linalg.cholesky(G + rounding * jnp.eye(len(G), dtype=G.dtype))
 
 
 def far_apart(points: Float[np.ndarray, "N d"], count: int) -> list[int]:
-    """Up to `count` points, as indices, each the farthest from those before; none twice."""
+    """The indices of up to `count` distinct points, each the farthest from all before it."""
     chosen, distance = [int(np.argmin(points[:, 0]))], np.full(len(points), np.inf)
     while len(chosen) < count:
         distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
@@ -312,13 +313,14 @@ def pairs(
     States are (q, p), or q alone, with q the positions of the first particle, of the second, ….
 
     Args:
-        particles: how many there are.
+        particles: the number of particles.
         dim: the dimension of space.
         box: the side of a periodic box, with the nearest image; None without one.
         of: the coordinate of the law: "distance" r; "log" or "inverse" for laws that vary by
-            many orders, as of Lennard-Jones or gravity.
-        among: particles between which the law acts, or two groups of them, one against the other;
-            all if None. A sum of `Shared` has a law for each pair of species.
+            many orders of magnitude, such as Lennard-Jones or gravity.
+        among: particles between which the law acts; or two groups, and the law acts between a
+            particle of one and a particle of the other; all if None. For species, add one `Shared`
+            for each pair of species.
 
     Raises:
         ValueError: a number is not positive, `of` is unknown, or a particle is not there.
@@ -333,7 +335,8 @@ def pairs(
     two = sorted({(min(i, j), max(i, j)) for i in left for j in right if i != j})
     if not two or min(i for i, _ in two) < 0 or max(j for _, j in two) >= particles:
         raise ValueError(
-            f"there is no pair, or one of a particle that is not among 0 to {particles - 1}."
+            f"`among` contains no pair, or a particle that is not among 0 to {particles - 1}: "
+            "particles are counted from 0."
         )
     first, second = zip(*two, strict=True)
     return _Pairs(tuple(map(int, first)), tuple(map(int, second)), particles, dim, box, of)
@@ -347,7 +350,7 @@ class _Sites(eqx.Module):
     periodic: bool = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        return described(self)
+        return describe(self)
 
     @property
     def positions(self) -> int:
@@ -370,7 +373,7 @@ def neighbours(sites: int, periodic: bool = False) -> Callable[..., Array]:
     """The differences qᵢ₊₁ − qᵢ along a chain, x -> (P, 1), for `hk.Shared`.
 
     Args:
-        sites: how many there are; states are (q, p), or q alone.
+        sites: the number of sites; states are (q, p), or q alone.
         periodic: whether the first follows the last.
 
     Raises:
@@ -385,9 +388,9 @@ def sites(count: int) -> Callable[..., Array]:
     """The positions qᵢ of sites, x -> (P, 1), for a law of each site, for `hk.Shared`.
 
     Args:
-        count: how many there are; states are (q, p), or q alone.
+        count: the number of sites; states are (q, p), or q alone.
 
     Raises:
-        ValueError: there is none.
+        ValueError: count is not positive.
     """
     return _Sites(require.count(count, "count"), neighbours=False, periodic=False)

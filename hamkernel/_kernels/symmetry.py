@@ -239,14 +239,14 @@ class Symmetrised(AbstractScalarKernel):
         return close_group(self.maps, self.characters, n)
 
     def through_descriptor(self, n: int) -> Descriptor | None:
-        """The mean over the images of the maps, where these permute the entries of a warp."""
+        """The mean over permutations of the entries of a warp; None if the maps do not permute."""
         if not isinstance(self.kernel, Warp):
             return None
         images = [self.kernel.image(matrix_of(g, n)) for g in self.maps]
         if any(image is None for image in images):
             return None
         inner = Symmetrised(self.kernel.kernel, tuple(map(_matrix_rows, images)), self.characters)
-        return Descriptor(self.kernel.warped, inner)
+        return Descriptor(self.kernel.warp, inner)
 
     def is_one_sided(self, n: int) -> bool:
         """Whether k(gx, gz) = k(x, z) is known to hold for all g."""
@@ -386,7 +386,7 @@ class Unsymmetrised(NamedTuple):
 def symmetry_removed(kernel: AbstractScalarKernel) -> Unsymmetrised | None:
     """The k and the group with `kernel` = `symmetrise(k, …)`, or None.
 
-    Where every mean is one-sided, `kernel` is the mean over h of χ(h) k(x, hz).
+    If every mean is one-sided, `kernel` is the mean over h of χ(h) k(x, hz).
     """
     if isinstance(kernel, Symmetrised):
         return Unsymmetrised(kernel.kernel, (kernel,))

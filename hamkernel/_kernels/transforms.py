@@ -28,12 +28,12 @@ class Warp(AbstractScalarKernel):
     Args:
         kernel: a scalar kernel on the warped coordinates, shape (m,).
         fn: a smooth map (n,) -> (m,), written with jax.numpy; the array leaves of an Equinox
-            module are trained. Define it once: JAX treats a new lambda as a new function and
-            compiles again. Data at which it or its derivative is not finite are refused, and a
-            field is NaN at such states: inverse distances know nothing of two atoms in one place.
+            module are trained. Define `fn` once: JAX treats a new lambda as a new function and
+            compiles again. A fit refuses data at which `fn` or its derivative is not finite, such
+            as inverse distances of two atoms in one place; a field is NaN at such states.
         equivariant: whether the maps of a symmetry only permute the entries of `fn`, as a
             permutation of like atoms permutes the distances between atoms. `Invariant` then takes
-            its mean in the warped coordinates, over |G| terms in place of |G|².
+            its mean in the warped coordinates, over |G| terms instead of |G|².
 
     Raises:
         TypeError: `kernel` is not a scalar kernel, or `fn` not a function. ValueError, when called:
@@ -68,12 +68,12 @@ class Warp(AbstractScalarKernel):
         return call("Warp", [repr(self.kernel), f"fn={text(self.fn)}", *said])
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
-        return self.kernel(self.warped(x), self.warped(z))
+        return self.kernel(self.warp(x), self.warp(z))
 
     def through_descriptor(self, n: int) -> Descriptor:
-        return Descriptor(self.warped, self.kernel)
+        return Descriptor(self.warp, self.kernel)
 
-    def warped(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+    def warp(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """fn(x), as a vector."""
         x = one_point(x)
         warped = self.fn(x)
@@ -97,7 +97,7 @@ class Warp(AbstractScalarKernel):
         # Entries of an analytic map that agree at four points of no symmetry agree everywhere.
         probes = np.cos(1.0 + np.arange(4.0 * len(S))).reshape(4, -1)
         with jax.ensure_compile_time_eval():
-            here, there = (self.transform_inputs(each).T for each in (probes, probes @ S.T))
+            here, there = (self.transform_inputs(points).T for points in (probes, probes @ S.T))
         apart = np.abs(there[:, None] - here[None]).max(axis=2)  # (m, m)
         P = np.eye(len(here))[apart.argmin(axis=1)]
         close = apart.min(axis=1).max() <= 1e-5 * np.abs(here).max()  # float32 without x64
@@ -105,22 +105,22 @@ class Warp(AbstractScalarKernel):
             raise ValueError(
                 "Warp(..., equivariant=True) says that the maps of a symmetry permute the entries "
                 f"of fn(x), and with S = {np.round(S, 3).tolist()} the entries of fn(Sx) are no "
-                "permutation of them. Leave equivariant=True away: the mean is then taken over "
-                "both arguments, which is right for every map."
+                "permutation of them. Leave out equivariant=True: Invariant then takes the mean "
+                "over both arguments, which is right for every map."
             )
         return P
 
     def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
         image = self.image(S)
-        known = image is not None and self.kernel.is_unchanged_by(image)
-        return known or super().is_unchanged_by(S)
+        is_symmetric = image is not None and self.kernel.is_unchanged_by(image)
+        return is_symmetric or super().is_unchanged_by(S)
 
     @property
     def has_amplitude(self) -> bool:
         return self.kernel.has_amplitude
 
     def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
-        return np.asarray(jax.vmap(self.warped)(jnp.asarray(X)))
+        return np.asarray(jax.vmap(self.warp)(jnp.asarray(X)))
 
 
 class Select(AbstractScalarKernel):
@@ -134,8 +134,8 @@ class Select(AbstractScalarKernel):
         dims: distinct coordinates, integers ≥ 0.
 
     Raises:
-        TypeError: `kernel` is not a scalar kernel. ValueError: `dims` are not such coordinates, or,
-            when called, not those of the points.
+        TypeError: `kernel` is not a scalar kernel. ValueError: `dims` are no distinct integers ≥ 0;
+            or, when called, the points have fewer coordinates.
     """
 
     kernel: AbstractScalarKernel
@@ -146,9 +146,9 @@ class Select(AbstractScalarKernel):
         self.dims = require.coordinates(dims, "dims, the second argument of Select,")
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
-        return self.kernel(self._selected(x), self._selected(z))
+        return self.kernel(self._select(x), self._select(z))
 
-    def _selected(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+    def _select(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         x = one_point(x)
         if max(self.dims) >= len(x):
             raise ValueError(
@@ -176,17 +176,17 @@ class Select(AbstractScalarKernel):
         return apart and self.kernel.is_unchanged_by(S[np.ix_(inside, inside)])
 
     def summands(self, reflection: bool) -> tuple[AbstractScalarKernel, ...]:
-        return (self.kernel,) if reflection else ()  # which the selected coordinates do, too
+        return (self.kernel,) if reflection else ()  # −x selected is −(x selected)
 
     def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
         if max(self.dims) >= n:
             raise ValueError(f"Select has coordinates {self.dims} and the points have {n}, from 0.")
         inner, columns = self.kernel.spectra(len(self.dims), count, key, dtype), list(self.dims)
 
-        def placed(frequencies):
+        def embed(frequencies):
             return jnp.zeros((len(frequencies), n), dtype).at[:, columns].set(frequencies)
 
-        return tuple(Spectrum(placed(s.frequencies), s.weights, s.parity) for s in inner)
+        return tuple(Spectrum(embed(s.frequencies), s.weights, s.parity) for s in inner)
 
     @property
     def has_amplitude(self) -> bool:

@@ -31,9 +31,9 @@ from hamkernel._gram import (
     components,
     gram_of_rows,
     gram_rounding,
-    without_gradient,
+    stop_gradients,
 )
-from hamkernel._machine import compiled, full_precision, row_sharding, shard
+from hamkernel._machine import full_precision, precise_jit, row_sharding, shard
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -119,7 +119,7 @@ def choose_landmarks(
     Source: Chen, Epperly, Tropp & Webber (2023), arXiv 2207.06503; in blocks, Epperly, Tropp &
         Webber (2024), arXiv 2410.03969.
     """
-    K, X, target_trace = without_gradient((K, X, target_trace))
+    K, X, target_trace = stop_gradients((K, X, target_trace))
     rows = row_sharding(X)
     X = shard(rows, X)
     if len(X) > candidates:
@@ -156,7 +156,7 @@ def choose_rows(
     Returns:
         The landmarks. O(P² + P r²) time and O(P²) memory for P candidates and r landmarks.
     """
-    K, rows, target_trace = without_gradient((K, rows, target_trace))
+    K, rows, target_trace = stop_gradients((K, rows, target_trace))
     blocks = rows.blocks
     size = sum(block.size for block in blocks)
     if size > candidates:
@@ -185,7 +185,7 @@ def _choose(
     return _first_candidates(drawn, min(size, blocks * BLOCK))
 
 
-_gram = compiled(Landmarks.gram)
+_gram = precise_jit(Landmarks.gram)
 
 
 def _stratified_sample(key, N: int, count: int) -> Int[Array, " count"]:
@@ -239,13 +239,13 @@ def _prune(
     return Landmarks(tuple(parts), jnp.asarray(places), kept, count)
 
 
-@compiled
+@precise_jit
 def given_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Landmarks:
     """Keep the columns of the landmarks that pivoted Cholesky finds independent.
 
     O(r³) time for r columns. Nothing is differentiated, as in `choose_landmarks`.
     """
-    K, landmarks = without_gradient((K, landmarks))
+    K, landmarks = stop_gradients((K, landmarks))
     G = landmarks.gram(K)
     # Scaled to a unit diagonal, since the rounding errors of Cholesky are relative to the
     # diagonal.
@@ -475,7 +475,7 @@ def mask_columns(matrix: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[
     return jnp.where(both, matrix, jnp.diag(~kept).astype(matrix.dtype))
 
 
-@compiled
+@precise_jit
 def _first_candidates(drawn, size):
     """The first `size` chosen candidates: index, kept columns, and the number of candidates."""
     used = jnp.arange(size) < drawn.count

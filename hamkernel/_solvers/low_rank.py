@@ -147,7 +147,7 @@ def prior_draws(
     return _draw_prior(K, landmarks, draw_key, count)
 
 
-@compiled
+@precise_jit
 def _draw_prior(K, landmarks: Landmarks, key, count: int) -> Prior:
     S, T = landmarks.points, whitening(K, landmarks)
     m, d = S.shape
@@ -209,8 +209,8 @@ def check_solution(
     """
     if truncation is None:
         return require.value(learned, failed, message, RuntimeError, throw)
-    none = require.on_host(landmarks.count) == 0
-    failed = failed | (none & (require.on_host(truncation) != 0))
+    none = require.host_array(landmarks.count) == 0
+    failed = failed | (none & (require.host_array(truncation) != 0))
     learned = require.value(learned, failed, message, RuntimeError, throw)
     indefinite = (
         "the low-rank Gram of the landmarks is larger than the Gram itself, so the kernel is not "
@@ -348,7 +348,7 @@ class LandmarkSpan(AbstractSpan):
         return _landmark_draws(self, weights, prior)
 
 
-@compiled
+@precise_jit
 def _landmark_draws(span: LandmarkSpan, weights, prior: Prior) -> KernelField:
     landmarks = span.landmarks
     # f = Φw̃ + f₀ − K(·, L)TTᵀ L f₀: weights w̃ in the span plus the draw f₀ minus its projection
@@ -453,12 +453,8 @@ class LowRankConditional(AbstractConditional):
         if not laws:
             raise AttributeError("the posterior has no law: its kernel is no hk.Shared(k, parts).")
         waves, place = laws[which]
-        dtype = self.R.dtype
-        difference = jnp.zeros(len(self.R), dtype)
-        difference = difference.at[place].set((waves.of_law(r) - waves.of_law(r0)).astype(dtype))
-        rest = waves.kernel.missing(waves.kernel.point(r), waves.kernel.point(r0)).astype(dtype)
-        whitened = solve_triangular(self.R, difference, trans="T")
-        return self.ridge * whitened @ whitened + waves.scale.astype(dtype) * rest
+        r, r0 = require.floating(r, "r"), require.floating(r0, "r0")
+        return _law_variance(self.R, self.ridge, waves, place.start, r, r0)
 
     def updated(self, new: Measurements) -> "LowRankConditional":
         rows = self.rows.append(new)
@@ -473,6 +469,15 @@ class LowRankConditional(AbstractConditional):
         z = jax.random.normal(weight_key, (len(self.R), count), self.R.dtype)
         w = solve_triangular(self.R, self.rotated[:, None] + jnp.sqrt(self.ridge) * z)
         return self.span.draws(w.T, self.rows, rest, region)
+
+
+@precise_jit
+def _law_variance(R, ridge, waves, start: int, r, r0) -> Float[Array, ""]:
+    features = (waves.law_values(r) - waves.law_values(r0)).astype(R.dtype)
+    difference = jnp.zeros_like(R[0]).at[start : start + len(features)].set(features)
+    rest = waves.kernel.missing(waves.kernel.point(r), waves.kernel.point(r0)).astype(R.dtype)
+    whitened = solve_triangular(R, difference, trans="T")
+    return ridge * whitened @ whitened + waves.scale.astype(R.dtype) * rest
 
 
 def low_rank_conditional(
@@ -496,7 +501,7 @@ def low_rank_conditional(
     return eqx.tree_at(lambda c: c.field, conditional, eqx.combine(arrays, rest))
 
 
-@compiled
+@precise_jit
 def _low_rank_conditional(span, rows, ridge):
     F = rows.contrast(span.all_rows(rows))
     start = no_rows(F.shape[1], F.dtype, ridge)

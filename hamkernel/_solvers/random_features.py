@@ -115,7 +115,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
         return _start(K, basis, thin(K, sample, 4096), regularization)
 
 
-@compiled
+@precise_jit
 def _feature_fit(K, solver, X, Y, regularization, spread):
     basis = solver._features(K, X.shape[1], X.dtype)
     ridge = len(X) * regularization
@@ -187,7 +187,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
         return _check_field(_feature_solution(self, count, regularization))
 
 
-@compiled
+@precise_jit
 def _start(K, basis, sample, regularization):
     identity = jnp.eye(basis.columns, dtype=sample.targets.dtype)
     span = FeatureSpan(K, basis, sample.dimension)
@@ -203,7 +203,7 @@ def _start(K, basis, sample, regularization):
     )
 
 
-@compiled
+@precise_jit
 def _feature_solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, _, residual_norm = solve_sums(fit.sums, ridge)

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel._kernels.parts import Shared
-from hamkernel._machine import compiled
+from hamkernel._machine import precise_jit
 from hamkernel._structures.base import Sum
 from hamkernel._structures.completed import shared_laws
 from hamkernel._structures.structure import AbstractPotentialKernel
@@ -46,12 +46,12 @@ def _has_potential(K: Any) -> bool:
     return isinstance(K, AbstractPotentialKernel)
 
 
-@compiled
+@precise_jit
 def _linear_fields(K: Any, law: Shared, X: Float[Array, "N n"]) -> Float[Array, "N n k"]:
     """The fields of a constant and of the coordinates as laws."""
 
     def potentials(x):
-        points, weights = law.of(x)
+        points, weights = law.parts_at(x)
         return jnp.append(weights.sum(), weights @ points)
 
     return jax.lax.map(lambda x: K.apply(x, jax.jacrev(potentials)(x).T), X)
@@ -104,12 +104,12 @@ def outside(K: Any, X: Float[Array, "T n"]) -> str:
     return ""
 
 
-@compiled
+@precise_jit
 def _range(law: Shared, X: Float[Array, "T n"]) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
     """The lowest and highest coordinates of the parts of the states."""
 
     def extremes(x):
-        points = law.of(x).points
+        points = law.parts_at(x).points
         return points.min(axis=0), points.max(axis=0)
 
     low, high = jax.lax.map(extremes, X)
