@@ -373,7 +373,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
                 "the new data."
             )
         conditional = self.conditional.updated(new)
-        return Posterior(conditional, learned_field(conditional.field, known))
+        return Posterior(conditional, learned_field(conditional.field, mean))
 
     @follow_data
     @one_blas_thread

@@ -283,7 +283,7 @@ def _next(products: AbstractProducts, y, ridge, state: _Iterate) -> _Iterate:
     )
 
 
-@compiled
+@precise_jit
 def _solve(prepare, args, y, ridge, tolerance, max_iterations) -> _Solution:
     """The solution of (I + G/ridge) c = y; its derivatives solve with the same system."""
     products, truncation = prepare(*args)
@@ -316,7 +316,7 @@ def _solve_with_bar(prepared, y, ridge, tolerance, max_iterations) -> _Solution:
     return _solution_of(products, truncation, y, ridge, state.c, state.steps)
 
 
-@compiled
+@precise_jit
 def _solution_of(products: AbstractProducts, truncation, y, ridge, c, steps) -> _Solution:
     # c = ρa, so f(X) = Ga = Gc/ρ and ‖f‖² = aᵀGa = c·f(X)/ρ. With the residual r = y − c − f(X) of
     # the system, aᵀr = cᵀr/ρ estimates the error of ‖f‖², as in `norm_of`.

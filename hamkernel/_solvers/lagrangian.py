@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._fields.lagrangian import LagrangianField, lagrangian_field
-from hamkernel._machine import compiled
+from hamkernel._machine import precise_jit
 from hamkernel._solvers.triangle import append_rows, no_rows, regression_loss
 from hamkernel._structures.friction import Friction
 from hamkernel._structures.lagrangian import (

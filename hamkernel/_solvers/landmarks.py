@@ -338,7 +338,7 @@ class _Drawing(NamedTuple):
     rounds: Int[Array, ""]
 
 
-@compiled
+@precise_jit
 def _begin(candidates: Candidates, target_trace, key, size):
     """The state after the first call of `_draw`."""
     traces, n = candidates.traces(), candidates.outputs
@@ -366,7 +366,7 @@ def _enlarge(drawn: _Drawing, size: int) -> _Drawing:
     )
 
 
-@compiled
+@precise_jit
 def _draw(candidates: Candidates, target_trace, drawn, size):
     """Draw blocks until the mean trace is at most `target_trace` or `size` points are chosen."""
     goal = jnp.maximum(target_trace, drawn.rounding).sum()

@@ -46,7 +46,7 @@ from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import AbstractField, SolverInfo, root
 from hamkernel._fields.expansions import FeatureField, KernelField, feature_field, kernel_field
 from hamkernel._gram import between, block_traces, components, plus_ridge, trace_of_rows
-from hamkernel._machine import RowSharding, compiled
+from hamkernel._machine import RowSharding, precise_jit
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks, whitening

@@ -187,7 +187,7 @@ def start_fit(K, sample, regularization, landmarks, tolerance):
     )
 
 
-@compiled
+@precise_jit
 def _landmark_solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, norm, residual_norm = solve_sums(fit.sums, ridge)

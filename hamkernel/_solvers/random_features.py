@@ -11,7 +11,7 @@ from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import FeatureField, feature_field
 from hamkernel._machine import (
-    compiled,
+    precise_jit,
     refuse_beyond_memory,
     row_sharding,
     shard,

@@ -259,7 +259,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         return learned_field(self._solve(count, regularization), self._known_part)
 
 
-@compiled
+@precise_jit
 def _with_rows(fit, rows, spread):
     return _plus(fit, fit._totals_of(rows, spread), None, rows.count)
 
