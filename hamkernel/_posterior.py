@@ -372,8 +372,8 @@ class Posterior(Shown, EqualToItself, eqx.Module):
                 f"the new data are {new.targets.dtype} and the posterior {old.targets.dtype}: cast "
                 "the new data."
             )
-        data_inputs = self.conditional.updated(new)
-        return Posterior(data_inputs, learned_field(data_inputs.field, mean))
+        conditional = self.conditional.updated(new)
+        return Posterior(conditional, learned_field(conditional.field, mean))
 
     @follow_data
     @one_blas_thread
