@@ -95,10 +95,9 @@ class Task(NamedTuple):
     def bounds_for(self, count: int) -> Bounds:
         """The box for `count` landmarks: the closer they lie, the shorter lengthscales may be.
 
-        With the box for the first 80 landmarks, both lengthscales of the angles of a double
-        pendulum ended at their bounds, also on 640 landmarks, and noise took up what the kernel
-        could not follow: 400 runs without noise ended with noise of 4e-4
-        (`tests/benchmarks/capacity.py double 400`).
+        400 runs of a double pendulum without noise used 640 landmarks. In the box of the first 80,
+        two lengthscales ended at their bounds, and noise took up the rest: −log p was 4e5, and it
+        is −3e4 in the box for 640 (`tests/benchmarks/capacity.py double 400`).
         """
         X, scale = sample_points(self.data)[0], self.data.scale
         at_first, now = (landmark_spacing(X, self.S[:m], scale) for m in (self.first, count))
