@@ -344,8 +344,8 @@ def test_kinetic_energy_is_that_of_numpy(mass):
     ("mass", "said"),
     [
         (-1.0, "mass must be positive"),
-        ([[1.0, 2.0], [2.0, 1.0]], "symmetric and positive definite"),
-        ([[1.0, 0.5], [0.0, 1.0]], "symmetric and positive definite"),
+        ([[1.0, 2.0], [2.0, 1.0]], "symmetric positive definite"),
+        ([[1.0, 0.5], [0.0, 1.0]], "symmetric positive definite"),
         (np.ones((2, 3)), r"\(\), \(m,\) or \(m, m\)"),
     ],
 )
