@@ -459,8 +459,8 @@ def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
         design.append(np.asarray(less.flat))
     S, rows = search_sample(now.field.points, now.rows)
     values = losses(model, np.stack(design), S, rows, task.start_deviation)
-    whole = np.asarray(now.rows.counts).sum() / np.asarray(rows.counts).sum()
-    return bool(whole * (values[0] - values.min()) > price(end))
+    factor = np.asarray(now.rows.counts).sum() / np.asarray(rows.counts).sum()
+    return bool(factor * (values[0] - values.min()) > price(end))
 
 
 def price(end: End) -> float:
