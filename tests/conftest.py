@@ -13,8 +13,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # LLVM's optimiser is a third of it, and a pipeline of MLIR for each fusion half of the rest
 # (test_observations.py: 86 s with that pipeline, 43 without).
 # `.ci/run` compiles as for a user for its slow tests and those of rounding, with empty XLA_FLAGS.
-FAST_COMPILATION = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
-os.environ.setdefault("XLA_FLAGS", FAST_COMPILATION)
+os.environ["FAST_XLA_FLAGS"] = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+)
+os.environ.setdefault("XLA_FLAGS", os.environ["FAST_XLA_FLAGS"])
 
 import jax
 import numpy as np
@@ -53,7 +55,7 @@ def pytest_collection_finish():
 @pytest.fixture
 def fast_compilation() -> dict[str, str]:
     """The environment of a process whose programs run once, also where CI sets no XLA_FLAGS."""
-    return os.environ | {"XLA_FLAGS": FAST_COMPILATION}
+    return os.environ | {"XLA_FLAGS": os.environ["FAST_XLA_FLAGS"]}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -70,7 +72,7 @@ def key() -> jax.Array:
 
 @pytest.fixture(scope="session")
 def learned():
-    """What `learn` finds in positions of a pendulum of known mass, q̈ = −sin q, in two short runs."""
+    """What `learn` finds in two short logs of the angle of a pendulum, q̈ = −sin q, mass 1."""
     import hamkernel as hk  # after the settings above
 
     rng, ts, positions = np.random.default_rng(0), np.linspace(0.0, 5.7, 20), []

@@ -21,7 +21,6 @@ The number of devices is set before JAX starts, so each test here asks a fresh i
 
 import itertools
 import json
-import os
 import socket
 import subprocess
 import sys

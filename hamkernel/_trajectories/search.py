@@ -4,7 +4,7 @@ Each gradient in the hyperparameters evaluates K anew. Of many rows the search t
 sample of windows, and the first of the landmarks.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,11 +33,16 @@ from hamkernel._tuning.space import gram_trace, hyperparameters
 
 
 class Bounds(NamedTuple):
-    """The box of the hyperparameters, and which of them are free."""
+    """The box of the hyperparameters, which of them are free, and which are lengthscales."""
 
     low: Float[np.ndarray, " P"]
     high: Float[np.ndarray, " P"]
     free: Bool[np.ndarray, " P"]
+    lengths: Bool[np.ndarray, " P"] | Literal[False] = False
+
+    def with_shorter_lengths(self, share: float) -> "Bounds":
+        """The box whose least lengthscales are `share` times as long."""
+        return self._replace(low=np.where(self.lengths, self.low + np.log(share), self.low))
 
 
 # Entries of K at nodes in the search of hyperparameters: with n = 8 it takes 4 to 10 s.
@@ -85,8 +90,11 @@ def losses(
     start_deviation,
 ) -> Float[np.ndarray, " count"]:
     """−log p(rows) at some points h, one after another: designs of all sizes share a program."""
-    points = jnp.asarray(design)
-    return np.array([_compiled_loss(model, h, S, rows, start_deviation) for h in points])
+    values = [
+        _compiled_loss(model, jax.device_put(h), S, rows, start_deviation)
+        for h in np.asarray(design)
+    ]
+    return np.array(values)
 
 
 def search_sample(
@@ -113,7 +121,8 @@ def exact(rows: LinearisedSegments) -> tuple[Float[Array, "k d"], LinearisedSegm
     Intervals of padding repeat one point, which adds nothing to the span. Without the padding XLA
     would compile for rows of every length.
     """
-    return rows.nodes[:, :, 1].reshape(-1, rows.nodes.shape[-1]), rows
+    middles = np.asarray(rows.nodes)[:, :, 1].reshape(-1, rows.nodes.shape[-1])
+    return jax.device_put(middles), rows
 
 
 @compiled_by_size
@@ -147,9 +156,9 @@ def maximise_likelihood(
     """
     S, rows = search_sample(jnp.asarray(S), rows)
     if not bounds.free.any():
-        flat = model.flat[None]
+        flat = np.asarray(model.flat)[None]
         return model, float(losses(model, flat, S, rows, start_deviation)[0])
-    sides = jnp.asarray(bounds.low), jnp.asarray(bounds.high), jnp.asarray(bounds.free)
+    sides = jax.device_put((bounds.low, bounds.high, bounds.free))
     h, value = _best(model, S, rows, start_deviation, *sides, steps)
     return model.at(h), float(value)
 
@@ -169,7 +178,7 @@ def choose_start(
     landmarks the best point is a smooth field with much noise, where more landmarks do not help.
     """
     n, width = rows.residual.shape[-1], (_ENTRIES / 3) ** 0.5
-    part = windows(rows, int(width / n))
+    part = limiting_windows(rows)
     middles = exact(part)[0]
     sets = {first: jnp.asarray(S[:first]) if n * first <= width else middles}
     if len(middles) > first < len(S):
@@ -179,7 +188,7 @@ def choose_start(
         values = losses(model, design, points, part, start_deviation)
         if values.min() < best - (n * len(points) / 2) ** 0.5:
             best, count, start = values.min(), size, design[int(np.argmin(values))]
-    return model.at(jnp.asarray(start)), count
+    return model.at(start), count
 
 
 def solve(
@@ -195,41 +204,55 @@ def solve(
 
     The number of landmarks is doubled while −log p falls by more than √(q/2), the uncertainty of
     −log p with q weights. Beyond `quick` landmarks it is doubled only where windows predict half
-    of the remaining variance. If the search used a sample of the rows, both kinds of noise are
-    scaled to the residuals of all rows.
+    of the remaining variance. Of a short log all rows are in one window, and are asked before a
+    larger solve compiles. If the search used a sample of the rows, both kinds of noise are scaled
+    to the residuals of all rows.
     """
     free, size = np.array(bounds.free), len(model.flat) - 2 * len(model.log_noise)
     free[:size] = False  # the kernel stays, both kinds of noise are scaled
 
     def solution(count: int) -> tuple[Condensed, ClosedForm]:
-        points = jnp.asarray(S[:count])
+        points = jax.device_put(S[:count])
         triangle = condensed(model, points, rows, start_deviation)
         return triangle, conditional(triangle, points)
 
     triangle, closed = solution(count)
+    is_short = limiting_windows(rows) is rows
     while count < len(S):
-        if count <= quick < min(2 * count, len(S)):
+        is_slow = count <= quick < min(2 * count, len(S))
+        if is_slow or is_short:
             args = model, jnp.asarray(S[:count]), rows, start_deviation
-            if not limited_by_landmarks(*args, bool(free.any()), least=np.log(2) / 2):
+            least = np.log(2) / 2 if is_slow else 0.0
+            if not limited_by_landmarks(*args, is_slow and bool(free.any()), least=least):
                 break
         more = solution(2 * count)
-        if not more[1].loss < closed.loss - (more[1].weights.size / 2) ** 0.5:
+        if not float(more[1].loss) < float(closed.loss) - (more[1].weights.size / 2) ** 0.5:
             break
         (triangle, closed), count = more, 2 * count
-    is_held = np.isfinite(np.asarray(model.log_process)) & ~free[-len(model.log_process) :]
+    # The floor of process noise stands for none, and may be scaled with the noise; q may not.
+    log_q, n = np.asarray(model.log_process), len(model.log_process)
+    is_held = (log_q > np.asarray(bounds.low)[-n:] + 0.1) & ~free[-n:]
     is_sample = search_sample(jnp.asarray(S[:count]), rows)[1] is not rows
     scales = is_sample and free.any() and not is_held.any()
     if scales and closed.free > closed.used and closed.squares > 0:
-        shift = jnp.log(closed.squares / closed.free) / 2
+        shift = _excess(closed)
         if abs(shift) > 0.01:  # residuals depend on the noise: a secant step, a half to twice it
-            there = conditional(triangle, closed.points, shift)
-            again = jnp.log(there.squares / there.free) / 2
-            shift = shift / (1 - jnp.clip(again / shift, -1.0, 0.5))
-        there = jnp.where(jnp.asarray(free), model.flat + shift, model.flat)
-        there = jnp.clip(there, jnp.asarray(bounds.low), jnp.asarray(bounds.high))
-        model = model.at(jnp.where(jnp.asarray(free), there, model.flat))
+            again = _excess(conditional(triangle, closed.points, shift))
+            shift = shift / (1 - np.clip(again / shift, -1.0, 0.5))
+        h = np.asarray(model.flat)
+        model = model.at(np.where(free, np.clip(h + shift, bounds.low, bounds.high), h))
         closed = conditional(triangle, closed.points, shift)
     return model, closed
+
+
+def _excess(closed: ClosedForm) -> float:
+    """The logarithm of the deviation of the residuals, in units of the noise."""
+    return float(np.log(closed.squares / closed.free) / 2)
+
+
+def limiting_windows(rows: LinearisedSegments) -> LinearisedSegments:
+    """As many samples as a search can take with a landmark in each of their intervals."""
+    return windows(rows, int((_ENTRIES / 3) ** 0.5 / rows.residual.shape[-1]))
 
 
 def limited_by_landmarks(
@@ -250,8 +273,7 @@ def limited_by_landmarks(
     and a third or a hundredth of the noise.
     """
     shares = np.array([1.0, 0.3, 0.1, 0.03] if with_less_noise else [1.0])
-    width = (_ENTRIES / 3) ** 0.5
-    part = windows(rows, int(width / rows.residual.shape[-1]))
+    part = limiting_windows(rows)
     middles, n = exact(part)[0], rows.residual.shape[-1]
     less = np.tile(np.asarray(model.flat), (len(shares), 1))
     less[:, -2 * n :] += np.log(shares)[:, None]
@@ -418,7 +440,7 @@ def bounds_and_design(
         np.where(looked, impulse + np.log(share), 0.0) for share in (1e-6, 0.01, 3.0)
     )
     some = np.where(looked, some, -np.inf)
-    pairs = (low, least), (high, limit), (free, looked)
+    pairs = (low, least), (high, limit), (free, looked), (lengths, none)
     design = [np.append(np.clip(h, low, high), some) for h in [start, *noisy]]
     return Bounds(*map(np.concatenate, pairs)), np.array(design)
 
@@ -455,7 +477,7 @@ def _scale_amplitudes(model: Model, h, scales, X, Y):
     """The point h with amplitudes at which velocities of the prior are twice those observed."""
     if not scales.any():
         return h
-    full = jnp.concatenate([jnp.asarray(h), model.log_process])
+    full = np.concatenate([h, np.asarray(model.log_process)])
     trace = float(gram_trace(model.at(full).kernel, jnp.asarray(X))) / len(X)
     target = 4 * np.mean(np.sum(Y**2, axis=1))
     out = h.copy()
