@@ -111,7 +111,7 @@ def cross_validation_residuals(
     """
     K, rows, regularization = _check_problem(K, X, Y, regularization, inputs, parameters)
     residuals = held_out_rows(K, rows, regularization, partition_of_rows(rows, folds))[0]
-    return rows.in_units(residuals)
+    return rows.to_units(residuals)
 
 
 @follow_data

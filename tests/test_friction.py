@@ -223,7 +223,7 @@ def test_it_is_found_in_metres_and_seconds_of_a_cantilever():
         (
             lambda: hk.Invariant(hk.Friction(), [-np.eye(2)]),
             TypeError,
-            "no potential to be averaged",
+            "no potential that could have a symmetry",
         ),
         (lambda: hk.gram(hk.Friction(), X[:, :1]), ValueError, "say which have friction"),
         (lambda: hk.gram(hk.Friction(damped=2), X), ValueError, "does not exist"),

@@ -502,9 +502,9 @@ def test_energies_of_what_has_no_potential_are_refused():
 
 
 def test_arguments_that_do_not_belong_together_are_refused():
-    with pytest.raises(TypeError, match="Say the regularization by name"):
+    with pytest.raises(TypeError, match="pass λ by name"):
         hk.fit(K, GOOD, 1e-3)
-    with pytest.raises(TypeError, match="the velocities Y are needed"):
+    with pytest.raises(TypeError, match="Y is missing"):
         hk.fit(K, GOOD.X)
     with pytest.raises(ValueError, match=r"mean maps a state of shape \(2,\) to shape \(\)"):
         hk.fit(K, GOOD, regularization=RIDGE, mean=lambda x: x.sum())

@@ -132,7 +132,7 @@ class Formula(EqualToItself, eqx.Module):
 
 def operator_of(K: AbstractMatrixKernel) -> Callable[[Array, Array], Array]:
     """(x, v) -> B(x) v."""
-    K = K.of_states
+    K = K.state_kernel
     if isinstance(K, Sum):  # its terms share one operator, or it would have no potential
         return operator_of(K.terms[0])
     if isinstance(K, UnknownMasses):  # S⁻¹ B S⁻ᵀ in the coordinates y = S⁻¹x

@@ -142,7 +142,7 @@ class Rung(AbstractMatrixKernel):
             return value, value
         return PortHamiltonian(Gaussian(1.0)).bounds(name, X, amplitude)
 
-    def shares_potential(self, other: AbstractMatrixKernel) -> bool:
+    def shares_potential(self, kernel: AbstractMatrixKernel) -> bool:
         return False
 
     def with_parity(self, parity: int) -> AbstractMatrixKernel:

@@ -149,7 +149,7 @@ def _data_of(learned: Any) -> tuple[AbstractMatrixKernel, Any, Float[Array, ""],
             "readout takes what hk.learn or hk.condition returns, for the measurements in it; got "
             f"a {type(learned).__name__}. A field alone has none: hk.condition(K, X, Y, λ)."
         )
-    if kernel.given == "parameters":
+    if kernel.input_name == "parameters":
         raise TypeError(
             "readout is of one system and this is a family: condition on the data of one member, "
             "without parameters."
@@ -186,7 +186,7 @@ def _check_terms(terms: Any, rows: Any) -> tuple[list[str], list[Callable[..., A
 
 def _check_symmetry(K: Any, names: list[str], functions: list[Any], rows: Any) -> None:
     """ValueError if the symmetry of the kernel forbids a term."""
-    K = K.of_states
+    K = K.state_kernel
     symmetry_means = [symmetry_removed(k) for k in K.scalar_kernels]
     n = rows.dimension
     if any(mean is None for mean in symmetry_means) or isinstance(K, UnknownMasses):

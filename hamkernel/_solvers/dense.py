@@ -243,7 +243,7 @@ def gram_product(
     zero = jnp.zeros((), c.dtype)
     field = field_of_rows(K, rows, c, c, zero, zero, SolverInfo("none"))
     potential = jax.tree_util.Partial(map_states, field._learned_potential)
-    return rows.contrast(rows.of(field._velocities, potential))
+    return rows.contrast(rows.evaluate(field._velocities, potential))
 
 
 def _refuse_failure(

@@ -79,7 +79,7 @@ class Prior(eqx.Module):
 
         def rows_of_features(basis, w):
             field = jax.vmap(lambda x: basis.field(x, w))
-            return rows.of(field, jax.vmap(lambda x: basis.potential(x, w)))
+            return rows.evaluate(field, jax.vmap(lambda x: basis.potential(x, w)))
 
         return landmark_rows + jax.vmap(rows_of_features, out_axes=1)(self.features, self.weights)
 

@@ -26,7 +26,7 @@ from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import Measurements, measurements, measurements_of
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.completed import completed
+from hamkernel._structures.completed import complete
 from hamkernel._structures.joined import AbstractJoinedKernel
 
 
@@ -87,7 +87,7 @@ def make_problem(
     spread = row_sharding(X) if isinstance(X, jax.Array) else None
     K, rows = measurements(matrix_kernel(K), X, Y, inputs_or_parameters(inputs, parameters, K))
     K.check_points(rows.points)
-    K = completed(K, rows.points, rows.dimension)
+    K = complete(K, rows.points, rows.dimension)
     if len(rows.energies) and K.no_potential:
         raise AttributeError(f"energies were given, and {K.no_potential}")
     regularization = require.ridge(regularization, rows.targets.dtype)
@@ -133,7 +133,7 @@ def without_known(
         return rows
     potential = _known_potential(K, known) if len(rows.energies) else known
     field, potential = (jax.tree_util.Partial(map_states, part) for part in (known, potential))
-    values = rows.of(field, potential)
+    values = rows.evaluate(field, potential)
     if throw:
         bad = require.not_finite(values)
         values = require.value(values, bad, lambda: _not_finite(rows, bad))
@@ -162,7 +162,7 @@ def _known_potential(K: AbstractMatrixKernel, known: Any):
     drift = fix_inputs(known, 0, None)
     if drift is None:  # G u, which is no part of the drift
         return lambda s: 0 * s[0]
-    of_drift = potential_of(drift, K.of_states)
+    of_drift = potential_of(drift, K.state_kernel)
     return lambda s: of_drift(s[: -known.count])
 
 

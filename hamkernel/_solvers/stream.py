@@ -48,7 +48,7 @@ from hamkernel._show import call, text
 from hamkernel._solvers.least_squares import Sums
 from hamkernel._solvers.problem import AbstractSolver, LearnedField, without_known
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.completed import completed
+from hamkernel._structures.completed import complete
 
 Fit = TypeVar("Fit", bound="AbstractStreamingFit")
 
@@ -365,7 +365,7 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
             K, points = sampled_points(K, sample, inputs_or_parameters(inputs, parameters))
             rows = rows_at(K, points)
         K.check_dimension(rows.points.shape[1])
-        K = completed(K, rows.points, rows.dimension)
+        K = complete(K, rows.points, rows.dimension)
         require.warn_of_float32(rows.targets)
         return self._start_fit(K, rows, require.ridge(regularization, rows.targets.dtype))
 

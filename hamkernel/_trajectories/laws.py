@@ -35,7 +35,7 @@ from hamkernel._runs.weak import (
 )
 from hamkernel._solvers.lagrangian import negative_log_likelihood, solved
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.completed import completed, shared_laws
+from hamkernel._structures.completed import complete, shared_laws
 from hamkernel._trajectories.diagnostics import FitQuality, diagnostics_of_rows
 from hamkernel._trajectories.evidence import EvidenceOfRows
 from hamkernel._trajectories.free_run import Stretches, relative_error, stretches
@@ -247,7 +247,7 @@ def find_laws(K: AbstractMatrixKernel, runs: Runs, mean: Any, noise: Any) -> Fou
     unit = np.ones(n) if state.mass is None else np.append(np.ones(n // 2), state.mass)
     states, sigma = [x[:, :n] * unit[None] for x in smooth.states], smooth.noise.ravel()[:n] * unit
     X = np.concatenate(states)
-    K = completed(K, jnp.asarray(X), n)
+    K = complete(K, jnp.asarray(X), n)
     depends = sorted(set().union(*(s for k in K.scalar_kernels for s in k.supports(n))))
     if state.mass is not None and depends[-1] >= n // 2:
         raise ValueError(

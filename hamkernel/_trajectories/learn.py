@@ -35,7 +35,7 @@ from hamkernel._runs.runs import Runs
 from hamkernel._runs.smoothing import interpolated, power_of_two
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.completed import completed
+from hamkernel._structures.completed import complete
 from hamkernel._structures.lagrangian import Lagrangian
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._trajectories.diagnostics import check_identifiable, diagnostics
@@ -193,7 +193,7 @@ def learn(
     bar = _bar(progress, total=2 + max_steps)
     data = preprocess(runs, drift)
     bar.update()
-    K = completed(K, jnp.asarray(sample_points(data)[0]), runs.dimension)
+    K = complete(K, jnp.asarray(sample_points(data)[0]), runs.dimension)
     most_landmarks = None if solver is None else solver.max_points
     start = _start(K, drift, data, sigma, landmarks(data, most_landmarks))
     seconds = seconds_of_iteration(data, start.landmarks[1])
@@ -451,7 +451,7 @@ def _check(
             "parameters": "to know of which system each run is: hk.Runs(times, states, "
             "parameters=[(0.5,), (0.8,), …]), for each run θ of shape (p,).",
         }
-        raise TypeError(f"a {type(K).__name__} kernel needs {needed[K.given]}")
+        raise TypeError(f"a {type(K).__name__} kernel needs {needed[K.input_name]}")
     if runs.parameters is not None and not K.takes_inputs:
         raise TypeError(
             f"the runs have parameters and {type(K).__name__} takes none: say how systems are "
@@ -514,7 +514,7 @@ def _unknown_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
             "only a unit of the energy, so there is nothing to find. Leave it out; (q, q̇) is "
             "(q, p) of a mass of one."
         )
-    inner = K.of_states
+    inner = K.state_kernel
     return K.with_states(
         inner if isinstance(inner, UnknownMasses) else UnknownMasses(inner, jnp.ones(n // 2))
     )

@@ -282,7 +282,7 @@ def gain_of_friction(
     K, (X, Y) = model.kernel, sample_points(data)
     n = Y.shape[1]
     force, fastest = np.sqrt(np.mean(Y[:, n // 2 :] ** 2)), np.abs(X[:, n // 2 : n]).max()
-    if frictions(K) or K.given == "parameters" or not fastest > 0:
+    if frictions(K) or K.input_name == "parameters" or not fastest > 0:
         return 0.0
     both = Friction(force / fastest, 1e-6 * force) + Friction(1e-6 * force / fastest, force)
     more = with_rest_speed(both, jnp.asarray(X), n)
@@ -310,7 +310,7 @@ def gain_of_inertia(
     K, (X, Y) = model.kernel, sample_points(data)
     n = Y.shape[1]
     force, fastest = np.sqrt(np.mean(Y[:, n // 2 :] ** 2)), np.abs(X[:, n // 2 : n]).max()
-    if n < 4 or n % 2 or K.given == "parameters" or not (force > 0 and fastest > 0):
+    if n < 4 or n % 2 or K.input_name == "parameters" or not (force > 0 and fastest > 0):
         return 0.0
     v = slice(n // 2, n)
     if mean is not None and jax.vmap(jax.hessian(mean))(jnp.asarray(X[::99]))[:, v, v, v].any():
@@ -350,7 +350,7 @@ def _gain(
         design[:, explains] += np.log([[1.0], [0.1], [0.01]])
         return float(losses(model, design, S, rows, start_deviation).min())
 
-    return least(model) - least(model._replace(kernel=K.with_states(K.of_states + more)))
+    return least(model) - least(model._replace(kernel=K.with_states(K.state_kernel + more)))
 
 
 def bounds_and_design(

@@ -117,7 +117,7 @@ def velocity_rms(K: AbstractMatrixKernel, rows: Measurements) -> float:
     diagonals: of the Gram of velocities at the points, and of the Gram of the rows.
     """
     if isinstance(rows.blocks[0], Components) and len(rows.blocks) == 1:
-        return float(np.sqrt(np.mean(np.asarray(rows.measured()) ** 2)))
+        return float(np.sqrt(np.mean(np.asarray(rows.measured_values()) ** 2)))
     ratio = np.sum(np.asarray(rows.y) ** 2) / np.trace(np.asarray(_gram_of_rows(K, rows)))
     components = len(rows.points) * rows.dimension
     return float(np.sqrt(ratio * float(gram_trace(K, rows.points)) / components))
@@ -148,7 +148,7 @@ def _amplitudes(
         for term, of_middle in zip(K.terms, middle.terms, strict=True):
             amplitudes |= _amplitudes(term, of_middle, X, rms)
     elif isinstance(K, AbstractJoinedKernel):
-        amplitudes |= _amplitudes(K.of_states, middle.of_states, K.split(X)[0], rms)
+        amplitudes |= _amplitudes(K.state_kernel, middle.state_kernel, K.split(X)[0], rms)
         if isinstance(K, Controlled):
             both, drift = amplitudes[id(K)], amplitudes[id(K.drift)]  # as 1/(a + b) and 1/a
             amplitudes[id(K.inputs)] = 1 / (1 / both - 1 / drift) if both < drift else both
