@@ -372,7 +372,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
                 f"the new data are {new.targets.dtype} and the posterior {old.targets.dtype}: cast "
                 "the new data."
             )
-        data_inputs = self.conditional.updated(new)
+        data_inputs = self.conditional.update(new)
         return Posterior(data_inputs, learned_field(data_inputs.field, mean))
 
     @follow_data

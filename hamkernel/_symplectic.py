@@ -281,8 +281,8 @@ class ImplicitMidpoint(AbstractGauss):
 class GaussLegendre4(AbstractGauss):
     """Gauss collocation with two stages, c = 1/2 ∓ √3/6.
 
-    Order 4; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. The
-    formula is that of `AbstractGauss`; arguments and errors are those of `ImplicitMidpoint`.
+    Order 4; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. For
+    the formula see `AbstractGauss`, for arguments and errors `ImplicitMidpoint`.
 
     Source: HLW, II.1.3 (table 1.1) and VI.4.
     """
@@ -296,8 +296,8 @@ class GaussLegendre4(AbstractGauss):
 class GaussLegendre6(AbstractGauss):
     """Gauss collocation with three stages, c = 1/2, 1/2 ∓ √15/10.
 
-    Order 6; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. The
-    formula is that of `AbstractGauss`; arguments and errors are those of `ImplicitMidpoint`.
+    Order 6; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. For
+    the formula see `AbstractGauss`, for arguments and errors `ImplicitMidpoint`.
 
     Source: HLW, II.1.3 (table 1.1) and VI.4.
     """

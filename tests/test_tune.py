@@ -443,8 +443,8 @@ def test_of_a_vector_the_coordinate_at_a_bound_is_named():
     )
     np.testing.assert_allclose(np.exp(space.high[1]), 1.0)
     assert np.exp(space.high[0]) > 10
-    assert space.at_bounds(np.array([0.1, np.pi / 2, 0.0])) == ("kernel.lengthscale[1]",)
-    assert space.at_bounds(np.array([-np.pi / 2, 0.0, np.pi / 2])) == (
+    assert space.active_bounds(np.array([0.1, np.pi / 2, 0.0])) == ("kernel.lengthscale[1]",)
+    assert space.active_bounds(np.array([-np.pi / 2, 0.0, np.pi / 2])) == (
         "kernel.lengthscale[0]",
         "regularization",
     )

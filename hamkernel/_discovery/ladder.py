@@ -111,8 +111,8 @@ class Rung(AbstractMatrixKernel):
             return jax.tree.map(jnp.add, sums, term(*one_term)), None
 
         nothing = [[jnp.zeros((len(X), len(Z)), dtype)] * n] * n
-        found, _ = jax.lax.scan(add, nothing, (weights, D, S, C))
-        return jnp.stack([jnp.stack(row, axis=-1) for row in found], axis=1)
+        sums_of_entries, _ = jax.lax.scan(add, nothing, (weights, D, S, C))
+        return jnp.stack([jnp.stack(row, axis=-1) for row in sums_of_entries], axis=1)
 
     def _hamiltonian_operator(self, n: int) -> Float[Array, "n n"]:
         """The operator J − R; zero if n is odd."""

@@ -63,7 +63,7 @@ class DenseConditional(AbstractConditional):
         """R⁻ᵀ c."""
         return self.factor.whiten(rows_between(self.field.kernel, self.rows, block))
 
-    def updated(self, new: Measurements) -> "DenseConditional":
+    def update(self, new: Measurements) -> "DenseConditional":
         factor, c, field = _extend(self, new)
         rows = self.rows.append(new)
         return DenseConditional(

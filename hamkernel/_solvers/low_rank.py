@@ -438,7 +438,7 @@ class LowRankConditional(AbstractConditional):
         r, r0 = require.floating(r, "r"), require.floating(r0, "r0")
         return _law_variance(self.R, self.ridge, waves, place.start, r, r0)
 
-    def updated(self, new: Measurements) -> "LowRankConditional":
+    def update(self, new: Measurements) -> "LowRankConditional":
         rows = self.rows.append(new)
         extended_rows, new_count = self.rows.with_previous(new), rows.size - self.rows.size
         new_rows = extended_rows.contrast(self.span.all_rows(extended_rows))[-new_count:]

@@ -102,15 +102,15 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
     def _features(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> AbstractFeatures:
         """The features of K for points of n coordinates; ValueError if a fit exceeds the memory."""
 
-        def of_kernel(K, key):
+        def features_of(K, key):
             return features(K, n, self.count, key, dtype)
 
-        r = eqx.filter_eval_shape(of_kernel, K, self.key).columns
+        r = eqx.filter_eval_shape(features_of, K, self.key).columns
         what, cure = f"a fit with count = {self.count}", "Take fewer features."
         # Eight matrices of r² numbers: the triangle (1), the tile of 3r rows below it (3), and
         # their QR factorisation (4).
         refuse_beyond_memory(what, r, r, dtype, 8, cure)
-        return of_kernel(K, self.key)
+        return features_of(K, self.key)
 
     def _start_fit(self, K, sample, regularization) -> "FeatureFit":
         basis = self._features(K, sample.points.shape[1], sample.targets.dtype)

@@ -46,7 +46,7 @@ from hamkernel._observations.measurements import (
 )
 from hamkernel._show import call, text
 from hamkernel._solvers.least_squares import Sums
-from hamkernel._solvers.problem import AbstractSolver, LearnedField, without_known
+from hamkernel._solvers.problem import AbstractSolver, LearnedField, subtract_known
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.completed import complete
 
@@ -209,7 +209,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         _, rows = measurements_of(self.kernel, data, previous=nothing)
         self._check(rows.targets.dtype, rows.dimension)
         _refuse_energies(rows)
-        return without_known(self.kernel, rows, self._known_part)
+        return subtract_known(self.kernel, rows, self._known_part)
 
     def _check(self, dtype: jnp.dtype | None, dimension: int) -> None:
         """ValueError for another number of coordinates, TypeError for a dtype of more digits."""

@@ -68,7 +68,7 @@ class Evidence(eqx.Module):
         design = np.maximum(design, low)
         points, rows = search_sample(self.points, self.rows)
         values = losses(larger, jnp.asarray(design), points, rows, self.start_deviation)
-        start = larger.at(jnp.asarray(design[int(np.argmin(np.asarray(values)))]))
+        start = larger.unflatten(jnp.asarray(design[int(np.argmin(np.asarray(values)))]))
         bounds = Bounds(low, high, free)
         args = self.points, self.rows, self.start_deviation
         best, _ = maximise_likelihood(start, *args, bounds, _STEPS)

@@ -47,8 +47,8 @@ from hamkernel._trajectories.segments import (
     LinearisedSegments,
     Piece,
     linearised_along_smoothed,
-    segmented,
-    updated,
+    make_segments,
+    replace_pieces,
 )
 from hamkernel._trajectories.whiteness import whiteness
 
@@ -195,7 +195,7 @@ def fix_process_noise(task: Task, now: Current, q: Float[np.ndarray, " n"]) -> t
     noises = [np.where(moves, np.maximum(noise, floor), noise) for floor in floors]
     design = np.stack([model._replace(log_noise=jnp.asarray(sigma)).flat for sigma in noises])
     values = losses(model, design, *search_sample(now.field.points, rows), task.start_deviation)
-    model = model.at(jnp.asarray(design[int(np.argmin(values))]))
+    model = model.unflatten(jnp.asarray(design[int(np.argmin(values))]))
     return task, _full_step(task, model, len(now.field.points), rows, now.paths)
 
 
@@ -216,8 +216,8 @@ def _full_step(
     model, closed = solve(model, task.S, task.first, task.quick, *args, task.bounds)
     field = Expansion(model.kernel, closed.points, closed.coefficients, task.mean)
     moves, _, pushed = _smooth(model, closed, rows, task)
-    x = _segment_paths(paths, task.pieces, segmented(task.data.runs, task.pieces, paths))
-    paths = updated(paths, task.pieces, task.good, x + np.asarray(moves))
+    x = _segment_paths(paths, task.pieces, make_segments(task.data.runs, task.pieces, paths))
+    paths = replace_pieces(paths, task.pieces, task.good, x + np.asarray(moves))
     used = len(closed.points)
     S = task.S if used > task.first else task.S[:used]
     return Current(model, field, S, rows, paths, task.good, np.inf, float(closed.free), pushed)
@@ -225,7 +225,7 @@ def _full_step(
 
 def _along_smoothed(task: Task) -> LinearisedSegments:
     runs = task.data.runs
-    segments = segmented(runs, task.pieces, [run.path for run in runs])
+    segments = make_segments(runs, task.pieces, [run.path for run in runs])
     return linearised_along_smoothed(
         task.data, task.pieces, segments, task.mean, task.usable(len(segments.starts))
     )
@@ -310,7 +310,7 @@ def take_step(task: Task, now: Current) -> tuple[Current, Iteration]:
 
     gain, taken, best = _line_search(trial, bool(good.any()))
     good = np.asarray(good)[: len(task.pieces)]
-    paths = updated(now.paths, task.pieces, good, best.x)
+    paths = replace_pieces(now.paths, task.pieces, good, best.x)
     step = _history_entry(task, good, best, gain, taken, model, closed.loss)
     free = float(closed.free)
     return Current(model, best.field, S, rows, paths, good, best.squares, free, pushed), step
@@ -320,7 +320,7 @@ def _linearise(
     task: Task, now: Current
 ) -> tuple[Segments, Float[Array, "S L+1 n"], Array, LinearisedSegments]:
     """The segments, the path on them, Runge-Kutta steps, and the rows along it."""
-    segments = segmented(task.data.runs, task.pieces, now.paths)
+    segments = make_segments(task.data.runs, task.pieces, now.paths)
     spans = np.asarray(segments.spans).reshape(-1, 1)
     steps = jnp.asarray(steps_for(spans, _stiffness(now.field, task.data, now.paths)))
     x = jnp.asarray(_segment_paths(now.paths, task.pieces, segments))

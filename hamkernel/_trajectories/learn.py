@@ -347,7 +347,7 @@ def _result(
     mean = None if mean is None else as_pytree(mean)
     task, now, history = end.task, end.now, end.history
     field, data = now.field, task.data
-    times = runs.on_host()[0]
+    times = runs.host_arrays()[0]
     states = _fitted_states(end, times)
     noise = np.where(np.isfinite(data.noise), np.exp(np.asarray(now.model.log_noise)), np.nan)
     # Without process noise q stands at the floor of the integrator, and is none.

@@ -83,7 +83,7 @@ class Model(NamedTuple):
         leaves = leaves.astype(self.log_noise.dtype)
         return jnp.concatenate([leaves, self.log_noise, self.log_process])
 
-    def at(self, h: Float[Array, " P"]) -> "Model":
+    def unflatten(self, h: Float[Array, " P"]) -> "Model":
         params, static = eqx.partition(self.kernel, eqx.is_inexact_array)
         flat, unravel = ravel_pytree(params)
         leaves, noise, process = jnp.split(h, [flat.size, flat.size + len(self.log_noise)])

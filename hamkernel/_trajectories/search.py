@@ -22,7 +22,7 @@ from hamkernel._trajectories.kalman import whiten
 from hamkernel._trajectories.likelihood import (
     ClosedForm,
     Condensed,
-    condensed,
+    condense,
     conditional,
     regression_loss,
 )
@@ -67,7 +67,7 @@ def noise_free_coordinates(
 
 
 def _loss(model: Model, h, S, rows, start_deviation):
-    there = model.at(h)
+    there = model.unflatten(h)
     T = landmark_whitening(there.kernel, S)
     made = whiten(there, S, T, rows, start_deviation)
     value = regression_loss(made.M, made.r) + made.constant
@@ -151,7 +151,7 @@ def maximise_likelihood(
         return model, float(losses(model, flat, S, rows, start_deviation)[0])
     sides = jnp.asarray(bounds.low), jnp.asarray(bounds.high), jnp.asarray(bounds.free)
     h, value = _best(model, S, rows, start_deviation, *sides, steps)
-    return model.at(h), float(value)
+    return model.unflatten(h), float(value)
 
 
 def choose_start(
@@ -179,7 +179,7 @@ def choose_start(
         values = losses(model, design, points, part, start_deviation)
         if values.min() < best - (n * len(points) / 2) ** 0.5:
             best, count, start = values.min(), size, design[int(np.argmin(values))]
-    return model.at(jnp.asarray(start)), count
+    return model.unflatten(jnp.asarray(start)), count
 
 
 def solve(
@@ -203,7 +203,7 @@ def solve(
 
     def solution(count: int) -> tuple[Condensed, ClosedForm]:
         points = jnp.asarray(S[:count])
-        triangle = condensed(model, points, rows, start_deviation)
+        triangle = condense(model, points, rows, start_deviation)
         return triangle, conditional(triangle, points)
 
     triangle, closed = solution(count)
@@ -227,7 +227,7 @@ def solve(
             shift = shift / (1 - jnp.clip(again / shift, -1.0, 0.5))
         there = jnp.where(jnp.asarray(free), model.flat + shift, model.flat)
         there = jnp.clip(there, jnp.asarray(bounds.low), jnp.asarray(bounds.high))
-        model = model.at(jnp.where(jnp.asarray(free), there, model.flat))
+        model = model.unflatten(jnp.where(jnp.asarray(free), there, model.flat))
         closed = conditional(triangle, closed.points, shift)
     return model, closed
 
@@ -456,7 +456,7 @@ def _scale_amplitudes(model: Model, h, scales, X, Y):
     if not scales.any():
         return h
     full = jnp.concatenate([jnp.asarray(h), model.log_process])
-    trace = float(gram_trace(model.at(full).kernel, jnp.asarray(X))) / len(X)
+    trace = float(gram_trace(model.unflatten(full).kernel, jnp.asarray(X))) / len(X)
     target = 4 * np.mean(np.sum(Y**2, axis=1))
     out = h.copy()
     if np.isfinite(trace) and trace > 0 and target > 0:

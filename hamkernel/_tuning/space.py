@@ -346,7 +346,7 @@ class SearchSpace(eqx.Module):
         keys = [self.names[i] if self.logarithmic[i] else i for i in self.free]
         return tuple(list(dict.fromkeys(keys)).index(key) for key in keys)
 
-    def at_bounds(self, u: Float[np.ndarray, " P"]) -> tuple[str, ...]:
+    def active_bounds(self, u: Float[np.ndarray, " P"]) -> tuple[str, ...]:
         """The hyperparameters that rest on a bound; entries of arrays by name and coordinate."""
         at_edge = np.abs(np.sin(u)) > 1 - 2 * _EDGE
         return tuple(self.entries[i] for i in np.array(self.free)[at_edge])
