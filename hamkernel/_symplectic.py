@@ -282,7 +282,7 @@ class GaussLegendre4(AbstractGauss):
     """Gauss collocation with two stages, c = 1/2 ∓ √3/6.
 
     Order 4; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. For
-    the formula see `AbstractGauss`, for arguments and errors `ImplicitMidpoint`.
+    the formula see `AbstractGauss`, for arguments and errors see `ImplicitMidpoint`.
 
     Source: HLW, II.1.3 (table 1.1) and VI.4.
     """
@@ -297,7 +297,7 @@ class GaussLegendre6(AbstractGauss):
     """Gauss collocation with three stages, c = 1/2, 1/2 ∓ √15/10.
 
     Order 6; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. For
-    the formula see `AbstractGauss`, for arguments and errors `ImplicitMidpoint`.
+    the formula see `AbstractGauss`, for arguments and errors see `ImplicitMidpoint`.
 
     Source: HLW, II.1.3 (table 1.1) and VI.4.
     """

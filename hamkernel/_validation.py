@@ -102,8 +102,8 @@ def cross_validation_residuals(
 ) -> Float[Array, "N n"]:
     """The held-out residuals yᵢ − f₋S(xᵢ), with f₋S the fit without the fold S of the point i.
 
-    `cross_validation_loss` is the mean over folds of their mean square, and has the same arguments
-    and errors.
+    The mean over folds of their mean square is the cross-validation loss. For arguments and errors
+    see `cross_validation_loss`.
 
     Returns:
         Shape (N, n), in units of Y; for observations one residual for each row, shape (M,), in the
