@@ -403,8 +403,8 @@ class Yoshida4(AbstractSplitting):
     """Yoshida's triple jump: three `StormerVerlet` steps of sizes γh, (1 − 2γ)h, γh.
 
     γ = 1/(2 − 2^{1/3}) ≈ 1.35, so the middle step runs backwards. Order 4; symplectic if
-    H = T(p) + U(q); symmetric; explicit, six evaluations per step. Arguments and errors are those
-    of `StormerVerlet`.
+    H = T(p) + U(q); symmetric; explicit, six evaluations per step. For arguments and errors see
+    `StormerVerlet`.
 
     Source: Yoshida (1990), Phys. Lett. A 150, 262–268; HLW, II.4 (example 4.2).
     """
