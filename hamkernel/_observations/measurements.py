@@ -386,7 +386,7 @@ def with_input_count(
     if not isinstance(K, AbstractJoinedKernel):
         if all_inputs:
             raise TypeError(
-                f"inputs came and {type(K).__name__} takes none: use hk.Controlled(K, "
+                f"{type(K).__name__} takes no inputs: use hk.Controlled(K, "
                 "inputs=hk.InputMatrix(k, acts_on=(1,))) for inputs, and hk.Family(K, k) for the "
                 "parameters of a family."
             )
