@@ -260,7 +260,7 @@ TWICE = np.repeat(THETA[:1], N, axis=0)
         (
             lambda: hk.fit(hk.Symplectic(SMOOTH), X, Y, parameters=THETA),
             TypeError,
-            r"for the parameters of a family hk.Family\(K, k\)",
+            r"hk.Family\(K, k\) for the parameters of a family",
         ),
         (
             lambda: hk.fit(K, X, Y, parameters=THETA, inputs=THETA),

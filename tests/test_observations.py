@@ -473,7 +473,7 @@ REFUSED = {
     "targets": (lambda: hk.Functionals(SIX, SIX + 1, np.ones(2)), "must be .R, Q, n"),
     "zero weights": (
         lambda: hk.Functionals(SIX, SIX + np.array([1, 0, 1])[:, None, None], np.ones(3)),
-        "all zero says nothing of the field: leave it out, row 1",
+        "all zero contains no information: leave it out, row 1",
     ),
     "another n": (lambda: GOOD + hk.Equilibria(np.zeros((1, 4))), r"\[2, 4\] coordinates"),
     "one energy": (

@@ -194,7 +194,7 @@ def test_what_is_no_poisson_system_is_refused():
     with pytest.raises(TypeError, match="call it with the magnetic field"):
         hk.Poisson(G, hk.poisson.charged_particle)
     for given in ((), (1.0, 2.0), (1.0,)):
-        with pytest.raises(TypeError, match=r"lotka_volterra is a tensor itself.*without brackets"):
+        with pytest.raises(TypeError, match=r"lotka_volterra is a tensor.*without brackets"):
             hk.Poisson(G, hk.poisson.lotka_volterra(*given))
     with pytest.raises(ValueError, match="one finite number for motion in a plane"):
         hk.poisson.charged_particle([1.0, 2.0])

@@ -936,7 +936,7 @@ def test_an_objective_that_jax_cannot_trace_is_told_to_use_jax_numpy():
         return float(hk.log_marginal_likelihood(K, X, Y, regularization))
 
     X, Y = scattered()
-    with pytest.raises(TypeError, match=r"the objective asks for numbers.*jax\.numpy"):
+    with pytest.raises(TypeError, match=r"the objective needs numbers.*jax\.numpy"):
         hk.tune(hk.Symplectic(hk.Gaussian()), X, Y, objective=objective)  # pyright: ignore
 
 
