@@ -469,4 +469,4 @@ def test_two_processes_give_the_fit_of_one(tmp_path):
         assert result["saved"] < ORDER
         assert "landmarks=20" in result["printed"]
         assert "rank=40" in result["printed"]
-        assert "the data is spread over several processes" in result["refused"]
+        assert "the data is sharded over several processes" in result["refused"]

@@ -677,7 +677,7 @@ def test_kernels_without_a_spectral_density_are_refused(k, what, key):
                 .add(*data())
             ),
             ValueError,
-            "the data has 4 coordinates and the fit 3",
+            "the data have 4 coordinates and the fit 3",
         ),
         (
             lambda key: of_any(10, key).start(

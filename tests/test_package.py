@@ -193,7 +193,7 @@ def test_every_public_name_is_documented(name):
     assert text
     # A dataclass without a docstring gets its signature for one.
     assert not text.startswith(f"{name}(")
-    elsewhere = re.search(r"(As|those\s+of)\s+`", text)  # "Args and errors are those of `fit`."
+    elsewhere = re.search(r"arguments\s+and\s+errors\s+see\s+`", text)  # "… see `fit`."
     made_by_library = name in ("KernelField", "FeatureField", "SolverInfo", "Tuned")
     made_by_library |= name in ("LandmarkFit", "FeatureFit", "ControlledField", "Posterior")
     if callable(thing) and not elsewhere and not made_by_library:
