@@ -1,9 +1,9 @@
 """Random Fourier features of structured kernels.
 
-Any structure is an operator on a potential u made of waves, f = B∇u, so the structure is exact for
-every number of frequencies; only the kernel is approximate.
+The potential u is a sum of waves and f = B∇u, so the structure is exact for every number of
+frequencies. Only the kernel is approximate.
 
-Source: the odd symplectic case: Smith & Egeland (2024), arXiv 2404.07703.
+Source: Smith & Egeland (2024), arXiv 2404.07703, for the odd symplectic case.
 """
 
 import abc
@@ -65,7 +65,7 @@ class PartWaves(eqx.Module):
     def values(self, x: Float[Array, " n"]) -> Float[Array, " w"]:
         return jnp.sqrt(self.scale).astype(x.dtype) * self.kernel.features(x)
 
-    def of_law(self, r: Float[Array, "..."]) -> Float[Array, " w"]:
+    def law_values(self, r: Float[Array, "..."]) -> Float[Array, " w"]:
         """The features of the law itself at r."""
         r = self.kernel.point(r)
         return jnp.sqrt(self.scale).astype(r.dtype) * self.kernel.law(r)
@@ -133,19 +133,19 @@ def waves_of(
     shared = part_waves(k)
     if shared is not None:
         return shared
-    found = symmetry_removed(k)
-    if found is None or found.parity is not None:  # which a `Spectrum` knows
+    unsymmetrised = symmetry_removed(k)
+    if unsymmetrised is None or unsymmetrised.parity is not None:  # a `Spectrum` has the parity
         return Waves(k.spectra(n, count, key, dtype))
-    group = found.group(n)
+    group = unsymmetrised.group(n)
     return GroupWaves(
-        Waves(found.kernel.spectra(n, count, key, dtype)),
+        Waves(unsymmetrised.kernel.spectra(n, count, key, dtype)),
         jnp.asarray(np.stack([g.matrix for g in group]), dtype),
         jnp.asarray([g.character for g in group], dtype),
     )
 
 
 def part_waves(k: AbstractScalarKernel, scale: Any = 1.0) -> PartWaves | JointWaves | None:
-    """The features of `Shared` kernels, their multiples and sums; None of any other kernel."""
+    """The features of `Shared` kernels, their multiples and sums; None for any other kernel."""
     if isinstance(k, Shared):
         return PartWaves(k, jnp.asarray(scale))
     if isinstance(k, Scaled):
@@ -168,7 +168,7 @@ def laws_of(waves: Any) -> list[tuple[PartWaves, slice]]:
 
 
 def is_of_parts(K: AbstractMatrixKernel) -> bool:
-    """Whether all of K is made from laws that many parts share, so that its features are exact."""
+    """Whether all of K is made from `Shared` laws, so that its features are exact."""
     if isinstance(K, Controlled):
         return is_of_parts(K.drift) and isinstance(K.inputs, KnownMatrix)
     if isinstance(K, Sum):
@@ -207,7 +207,7 @@ class AbstractFeatures(eqx.Module):
         return []
 
     def __call__(self, X: Float[Array, "t n"]) -> Float[Array, "t n r"]:
-        # Of laws that many parts share one state at a time: it has all their parts and centres.
+        # One state at a time for `Shared` laws: a state has many parts, and the laws many centres.
         return jax.lax.map(self.rows, X) if self.laws() else jax.vmap(self.rows)(X)
 
 
@@ -375,9 +375,9 @@ def features(
     Raises:
         TypeError: a kernel without a known spectral density, or an unknown structure.
     """
-    # Asked by name as every structure is here: a structure need not know of random features.
+    # We dispatch on the type of K, so that a structure need not know of random features.
     if isinstance(K, Controlled):
-        return _controlled(K, n, count, key, dtype)
+        return _controlled_features(K, n, count, key, dtype)
     if isinstance(K, Sum):
         keys = jax.random.split(key, len(K.terms))
         pairs = zip(K.terms, keys, strict=True)
@@ -395,7 +395,7 @@ def features(
     )
 
 
-def _controlled(K: Controlled, n: int, count: int, key: Key[Array, ""], dtype: Any):
+def _controlled_features(K: Controlled, n: int, count: int, key: Key[Array, ""], dtype: Any):
     n, inputs = K.outputs(n), K.input_count
     of_drift, of_matrix = jax.random.split(key)
     drift, G = features(K.drift, n, count, of_drift, dtype), K.inputs

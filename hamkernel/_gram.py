@@ -8,10 +8,10 @@ combinations of three kinds,
 with none, one and two derivatives of k. The second is the potential of the representer K(·, z)v,
 and the third is `K.form`. A block of observations maps the covariances at its points to rows.
 
-A kernel has few hyperparameters, so their derivatives are taken in forward mode: each costs about
-one assembly of the Gram. Reverse mode through the pairs of points took 6 to 60 assemblies, and
-several times as long to compile. A kernel with a closed form of its Gram may choose reverse mode:
-the one of `hk.compare` takes four assemblies for all derivatives.
+A kernel has few hyperparameters, so we take derivatives with respect to them in forward mode. Each
+derivative costs about one assembly of the Gram. Reverse mode through the pairs of points cost 6 to
+60 assemblies, and several times as long to compile. A kernel with a closed form of its Gram may
+choose reverse mode: the kernel of `hk.compare` needs four assemblies for all derivatives.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from hamkernel._kernels.symmetry import drop_symmetry
 from hamkernel._machine import (
     RowSharding,
     automatic,
-    compiled,
     full_precision,
-    on_each,
+    map_devices,
+    precise_jit,
     refuse_beyond_memory,
 )
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components
@@ -48,8 +48,8 @@ def gram(
 ) -> Float[Array, "N n M n"]:
     """The Gram G[i, a, j, b] = K(xᵢ, zⱼ)[a, b].
 
-    `gram(K, X).reshape(N * n, N * n)` is the symmetric positive semidefinite matrix of the
-    representer system. Compiled once for each kernel type and shape, not for each value.
+    `gram(K, X).reshape(N * n, N * n)` is symmetric and positive semidefinite. JAX compiles once for
+    each type of kernel and shape of the data, not for each value.
 
     Args:
         K: a matrix-valued kernel.
@@ -65,10 +65,10 @@ def gram(
     """
     K = matrix_kernel(K)
     X = require.points(X, "X")
-    X, Z = require.same_space(X, X if Z is None else require.points(Z, "Z"))
+    X, Z = require.one_space(X, X if Z is None else require.points(Z, "Z"))
     K.check_points(X)
     X, Z = automatic(X), automatic(Z)
-    cure = "hk.gram_operator(K, X, Z) multiplies with it and never forms it."
+    cure = "hk.gram_operator(K, X, Z) multiplies with the Gram and never forms it."
     refuse_beyond_memory("the Gram", X.size, Z.size, X.dtype, 1, cure)
     return _assemble(K, X, Z)
 
@@ -86,7 +86,7 @@ def assemble(
     closed = K.blocks(X, Z)
     if closed is not None:
         return closed
-    X, Z = centred(K, X, Z)
+    X, Z = subtract_centre(K, X, Z)
     basis = jnp.eye(K.outputs(X.shape[1]), dtype=X.dtype)
     # Entries are computed in the order of memory. Computing blocks of K and transposing them took
     # two to four times as long, most of it for a copy of the Gram.
@@ -96,7 +96,7 @@ def assemble(
     return form(X, basis, Z, basis)  # (N, n, M, n)
 
 
-_assemble = compiled(assemble)
+_assemble = precise_jit(assemble)
 
 
 def _gram_of_descriptor(
@@ -109,17 +109,14 @@ def _gram_of_descriptor(
 
         K(x, z) = (J_d(x) D(x))ᵀ [∂_d ∂_eᵀ κ(d, e)] (J_d(z) D(z)),    d = d(x), e = d(z).
 
-    Each Jacobian is computed once per point and not per pair. A row of blocks then costs n
-    gradients of κ per pair and a product with the Jacobians of Z; entries one by one would cost n²
-    second derivatives.
+    We compute each Jacobian once per point. A row of blocks then costs n gradients of κ per pair
+    and a product with the Jacobians of Z, instead of n² second derivatives per pair.
 
     Source: Chmiela, Sauceda, Müller & Tkatchenko (2018), Nature Communications 9, 3887.
     """
     # (N, m) and (N, m, n), (M, m) and (M, m, n)
-    (D, J), (E, L) = (
-        jax.vmap(descriptor.value_and_jacobian)(X),
-        jax.vmap(descriptor.value_and_jacobian)(Z),
-    )
+    values_and_jacobians = jax.vmap(descriptor.value_and_jacobian)
+    (D, J), (E, L) = values_and_jacobians(X), values_and_jacobians(Z)
 
     def slope(d, v, e):
         """The gradient in e of the derivative of κ(d, e) along v, (m,)."""
@@ -137,7 +134,7 @@ def diagonals(
     K: AbstractMatrixKernel, X: Float[Array, "N n"], Z: Float[Array, "N n"]
 ) -> Float[Array, "N n"]:
     """The diagonals of the blocks K(xᵢ, zᵢ)."""
-    X, Z = centred(K, X, Z)
+    X, Z = subtract_centre(K, X, Z)
     basis = jnp.eye(K.outputs(X.shape[1]), dtype=X.dtype)
     over_basis = jax.vmap(K.form, in_axes=(None, 0, None, 0))
     return jax.vmap(over_basis, in_axes=(0, None, 0, None))(X, basis, Z, basis)
@@ -169,10 +166,12 @@ def trace(
         trace_of_point = jax.checkpoint(lambda x: block_traces(K, x[None])[0])
         return jax.lax.map(trace_of_point, X, batch_size=sizes().trace_points).sum()
 
-    return on_each(spread, trace_of_points, K, X, joined=False)
+    return map_devices(spread, trace_of_points, K, X, joined=False)
 
 
-def centred(K: AbstractMatrixKernel, x: Array, Z: Float[Array, "M n"]) -> tuple[Array, Array]:
+def subtract_centre(
+    K: AbstractMatrixKernel, x: Array, Z: Float[Array, "M n"]
+) -> tuple[Array, Array]:
     """Both arguments relative to the mean of Z, if K is invariant under translations.
 
     The product form x·x + z·z − 2x·z has a relative error of ε (‖x‖/ℓ)²; far from the origin, in
@@ -222,7 +221,7 @@ def regularized_gram(
 
 
 def strips_of_gram(args: tuple, A: Float[Array, "D D"]) -> Float[Array, "D D"]:
-    """The matrix A after the rows of some points are overwritten by those of the Gram plus ridge I.
+    """The matrix A, with the rows of some points replaced by rows of the Gram plus ridge I.
 
     The rows are computed in strips, so that the intermediate arrays stay small.
 
@@ -230,7 +229,7 @@ def strips_of_gram(args: tuple, A: Float[Array, "D D"]) -> Float[Array, "D D"]:
         args: (kernel, points, ridge, first, count), packed into one tuple because everything else
             is donated. Rows of the points first, …, first + count − 1 are computed; count is
             static.
-        A: the matrix (D, D); its other rows are kept.
+        A: the matrix (D, D); the other rows do not change.
     """
     K, X, ridge, first, count = args
     D, n = len(A), len(A) // len(X)
@@ -267,7 +266,7 @@ def trace_of_rows(K: AbstractMatrixKernel, rows: Measurements) -> Float[Array, "
 def _trace(K: AbstractMatrixKernel, block: AbstractBlock) -> Float[Array, ""]:
     X = block.points
     if block.of_values:
-        variances = jax.vmap(K.potential_covariance)(*centred(K, X, X))
+        variances = jax.vmap(K.potential_covariance)(*subtract_centre(K, X, X))
         return jnp.sum(block.rows(variances) / block.scale)
     if not isinstance(block, Combinations):
         return jnp.sum(block.rows(diagonals(K, X, X)) / block.scale)
@@ -321,7 +320,7 @@ def _covariances_at_points(
         return assemble(K, X, Z)  # (P, n, P′, n)
     if not left.of_values:
         return jnp.moveaxis(_covariances_at_points(K, right, left), 0, -1)  # (P, n, P′)
-    X, Z = centred(K, X, Z)
+    X, Z = subtract_centre(K, X, Z)
     if right.of_values:
         pair = jax.vmap(K.potential_covariance, in_axes=(None, 0))
         return jax.vmap(pair, in_axes=(0, None))(X, Z)  # (P, P′)
@@ -339,13 +338,13 @@ def _covariances_at_points(
 def forward_differentiated(kernel_and_data, make, rowwise: bool = False):
     """The array make(K, data); derivatives with respect to K use forward mode.
 
-    For a cotangent Ḡ of the array G and a hyperparameter h_p, h̄_p = ⟨Ḡ, ∂G/∂h_p⟩: one JVP for each
-    hyperparameter, at the price of about one assembly of G each. Reverse mode would go backward
-    through N² pairs of points. For few hyperparameters forward mode is therefore cheaper.
+    For a cotangent Ḡ of the array G and a hyperparameter h_p, h̄_p = ⟨Ḡ, ∂G/∂h_p⟩. This is one JVP
+    for each hyperparameter, and costs about one assembly of G. Reverse mode would go backward
+    through N² pairs of points, so forward mode is cheaper for few hyperparameters.
 
-    With `rowwise` the value of make(K, data) is a pair (rows, X) of a function g and points, and
-    the array is G = g(X), with one row for each point. The pairing is then summed strip by strip,
-    h̄_p = Σ_i ⟨Ḡ_i, ∂g(x_i)/∂h_p⟩, and takes the memory of one strip.
+    With `rowwise`, make(K, data) is a pair (rows, X) of a function g and points, and the array is
+    G = g(X), with one row for each point. The pairing is then summed strip by strip,
+    h̄_p = Σ_i ⟨Ḡ_i, ∂g(x_i)/∂h_p⟩, in the memory of one strip.
     """
     return _array(make, rowwise, *kernel_and_data)
 
@@ -376,8 +375,7 @@ def _(saved, bar, perturbed, kernel_and_data, make, rowwise=False):
 
     def slope(direction):
         # The barrier makes every intermediate depend on the direction. Otherwise XLA would move
-        # the intermediates that do not out of the loop and keep several arrays of the size of the
-        # Gram.
+        # intermediates out of the loop and keep several arrays of the size of the Gram.
         here, direction = jax.lax.optimization_barrier((flat, direction))
         at = lambda h: pair(eqx.combine(unravel(h), static), data, bar)  # noqa: E731
         return jax.jvp(at, (here,), (direction,))[1]
@@ -429,7 +427,7 @@ def _pair_by_strips(rows, X: Float[Array, "N n"], bar: Float[Array, "N ..."]) ->
     return total.sum() + (strip(N - remainder, remainder).sum() if remainder else 0.0)
 
 
-def without_gradient(tree):
+def stop_gradients(tree):
     """A copy of the PyTree whose arrays are constants for JAX's derivatives (`stop_gradient`)."""
     arrays, rest = eqx.partition(tree, eqx.is_inexact_array)
     return eqx.combine(jax.tree.map(jax.lax.stop_gradient, arrays), rest)
@@ -444,7 +442,7 @@ def gram_rounding(trace: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.finfo(trace.dtype).eps * trace
 
 
-@compiled
+@precise_jit
 def field_rounding(
     K: AbstractMatrixKernel,
     x: Float[Array, " n"],

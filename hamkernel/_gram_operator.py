@@ -17,18 +17,18 @@ import lineax as lx
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._gram import centred, diagonals, gram
+from hamkernel._gram import diagonals, gram, subtract_centre
 from hamkernel._machine import (
     RowSharding,
-    compiled,
     follow_data,
     full_precision,
+    precise_jit,
     row_sharding,
     shard,
     sum_of_columns,
     to_caller_sharding,
 )
-from hamkernel._show import described
+from hamkernel._show import describe
 from hamkernel._sizes import sizes
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.structure import expand_group
@@ -39,20 +39,20 @@ def gram_operator(
 ) -> GramOperator:
     """The Gram of K as a linear operator that maps coefficients (M, n) to fields (N, n).
 
-    `gram_operator(K, X, Z).mv(A)[i] = Σⱼ K(xᵢ, zⱼ) aⱼ`, any kernel by automatic differentiation.
-    It is a `lineax` operator: `.mv`, `.T`, `.as_matrix()` (which forms the Gram), algebra with
-    other operators, and `lineax.linear_solve`. It works under jit, vmap and grad, with respect to
-    the kernel, the points and the coefficients; derivatives need no more memory than values.
+    `gram_operator(K, X, Z).mv(A)[i] = Σⱼ K(xᵢ, zⱼ) aⱼ`, for any kernel, by automatic
+    differentiation. The result is a `lineax` operator: `.mv`, `.T`, `.as_matrix()` (which forms the
+    Gram), algebra with other operators, and `lineax.linear_solve`. Products work under jit, vmap
+    and grad, with respect to the kernel, the points and the coefficients. Derivatives need no more
+    memory than values. For a learned field at many points use `field.evaluate(X)`, the same
+    product.
 
-    A learned field at many points is the same product: `field.evaluate(X)`.
-
-    If the rows of X or Z are sharded over a mesh of devices, each device keeps its own, and the
-    result is sharded like X.
+    If the rows of X or Z are sharded over a mesh of devices, each device keeps its own rows, and
+    the result is sharded like X.
 
     Args:
         K: a matrix-valued kernel.
         X: states, shape (N, n).
-        Z: states, shape (M, n); X if None, and then the operator is tagged positive semidefinite.
+        Z: states, shape (M, n). If None, Z = X, and the operator is tagged positive semidefinite.
 
     Returns:
         The operator. A product takes O(N M n) time and O((N + M) n) memory.
@@ -67,7 +67,7 @@ def gram_operator(
     K = matrix_kernel(K)
     X = require.points(X, "X")
     if Z is not None:
-        X, Z = require.same_space(X, require.points(Z, "Z"))
+        X, Z = require.one_space(X, require.points(Z, "Z"))
     K.check_points(X)
     X_rows = row_sharding(X)
     Z_rows = X_rows if Z is None else row_sharding(Z)
@@ -85,7 +85,7 @@ class GramOperator(lx.AbstractLinearOperator):
     Z_rows: RowSharding | None = eqx.field(static=True, default=None)
 
     def __repr__(self) -> str:
-        return described(self)
+        return describe(self)
 
     @property
     def columns(self) -> Float[Array, "M n"]:
@@ -106,7 +106,7 @@ class GramOperator(lx.AbstractLinearOperator):
                 f"the Gram, shape {columns}, is needed."
             )
         vector = require.floating(vector, "the vector")
-        return _compiled(self.kernel, self.X, self.columns, vector, self.X_rows, self.Z_rows)
+        return _sharded_product(self.kernel, self.X, self.columns, vector, self.X_rows, self.Z_rows)
 
     @full_precision
     def as_matrix(self) -> Float[Array, "Nn Mn"]:
@@ -152,21 +152,21 @@ def placed_product(
     """`product` for arrays that carry their sharding."""
     X_rows, Z_rows = row_sharding(X), row_sharding(Z)
     X, Z = shard(X_rows, X), shard(Z_rows, Z)
-    return _compiled(K, X, Z, A, X_rows, Z_rows)
+    return _sharded_product(K, X, Z, A, X_rows, Z_rows)
 
 
-def _compiled(K, X, Z, A, X_rows, Z_rows):
+def _sharded_product(K, X, Z, A, X_rows, Z_rows):
     """`product` for X and Z that are already sharded over the devices."""
     return to_caller_sharding(X_rows, _product(K, X, Z, shard(Z_rows, A), X_rows, Z_rows))
 
 
-_product = compiled(product)
+_product = precise_jit(product)
 
 
 def _product_by_tiles(K, X, Z, A):
     """`product` on one device."""
     K, Z, A = expand_group(K, Z, A.astype(X.dtype))
-    X, Z = centred(K, X, Z)
+    X, Z = subtract_centre(K, X, Z)
     side = sizes().tile
     rows = tiles(X, X[:1], side)
     columns = (tiles(Z, Z[:1], side), tiles(A, jnp.zeros_like(A[:1]), side))

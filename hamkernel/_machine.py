@@ -36,7 +36,7 @@ T = TypeVar("T")
 
 @dataclasses.dataclass(frozen=True)
 class RowSharding:
-    """The axes of a mesh of devices over which the rows of an array are spread."""
+    """The axes of a mesh of devices over which the rows of an array are sharded."""
 
     mesh: Mesh
     axes: tuple[str, ...]
@@ -66,7 +66,7 @@ def row_sharding(array: Array) -> RowSharding | None:
     The devices of a traced array are unknown, so inside `jax.jit` the compiler shards the loops:
     the results are right, but every device holds all rows.
     """
-    sharding = _on_mesh(array)
+    sharding = _mesh_sharding(array)
     if sharding is None or not sharding.spec:
         return None
     first = sharding.spec[0]
@@ -84,7 +84,7 @@ def shard(rows: RowSharding | None, array: Array) -> Array:
 
 def automatic(array: Array) -> Array:
     """The array on the same devices, on automatic axes of its mesh."""
-    sharding = _on_mesh(array)
+    sharding = _mesh_sharding(array)
     if sharding is None:
         return array
     mesh = _automatic(sharding.mesh)
@@ -93,8 +93,8 @@ def automatic(array: Array) -> Array:
     return jax.device_put(array, NamedSharding(mesh, sharding.spec))
 
 
-def _on_mesh(array: Array) -> Any:
-    """The sharding of an array on a mesh of devices; None of others, and under tracing."""
+def _mesh_sharding(array: Array) -> Any:
+    """The sharding of an array on a mesh of devices; None for other arrays, and under tracing."""
     sharding = None if isinstance(array, Tracer) else getattr(array, "sharding", None)
     is_named = isinstance(sharding, NamedSharding)
     return sharding if is_named and isinstance(sharding.mesh, Mesh) else None  # no abstract mesh
@@ -106,7 +106,7 @@ def _automatic(mesh: Mesh) -> Mesh:
 
 
 def is_on_one_device(array: Array) -> bool:
-    """Whether `array` lies on one device and on no mesh; a traced one is left to the compiler."""
+    """Whether `array` lies on one device and on no mesh; True if traced."""
     return isinstance(array, Tracer) or isinstance(array.sharding, SingleDeviceSharding)
 
 
@@ -118,9 +118,9 @@ def to_one_device(name: str, array: Array) -> Array:
         return automatic(array)
     if not array.is_fully_addressable:
         raise ValueError(
-            f"{name} is spread over several processes, and only one can work on it here: gather it "
-            "with jax.experimental.multihost_utils.process_allgather(..., tiled=True), or pass a "
-            "part of it."
+            f"{name} is sharded over several processes, and one process must hold all of it here: "
+            "gather it with jax.experimental.multihost_utils.process_allgather(..., tiled=True), "
+            "or pass a part."
         )
     return jnp.asarray(np.asarray(array))  # by the host: bound to no device
 
@@ -132,7 +132,7 @@ def to_caller_sharding(rows: RowSharding | None, array: Array) -> Array:
     return jax.device_put(array, rows.caller)
 
 
-def on_each(
+def map_devices(
     rows: RowSharding | None,
     function: Callable[..., Any],
     replicated: Any,
@@ -143,12 +143,13 @@ def on_each(
     """`function(replicated, *parts)`, evaluated by each device for its own rows of the parts.
 
     Args:
-        rows: how the parts are spread; None if they are not, and the function is called once.
+        rows: the sharding of the parts; None if one device holds them: one call on all rows.
         function: (replicated, *parts) -> a PyTree of arrays.
         replicated: a PyTree, the same on all devices.
         parts: arrays with rows.
-        joined: whether the results are rows to be put one after the other. Else they are reduced.
-        reduce: the results of all devices -> one result, the same on all of them; their sum.
+        joined: whether the results are rows, which are concatenated; otherwise they are reduced.
+        reduce: maps the results of all devices to one result, the same on all of them; the default
+            is the sum.
     """
     if rows is None:
         return function(replicated, *parts)
@@ -179,18 +180,18 @@ def sum_of_columns(
     X_rows: RowSharding | None,
     Z_rows: RowSharding | None,
 ) -> Float[Array, "N n"]:
-    """`product(K, X, Z, A)`, a sum over Z and A, where the rows of X, Z or both are spread.
+    """`product(K, X, Z, A)`, a sum over the rows of Z and A, for sharded rows of X, Z or both.
 
     Raises:
-        ValueError: X and Z are spread differently.
+        ValueError: X and Z are sharded differently.
     """
     if Z_rows is None:
-        return on_each(X_rows, lambda w, x: product(w[0], x, *w[1:]), (K, Z, A), X, joined=True)
+        return map_devices(X_rows, lambda w, x: product(w[0], x, *w[1:]), (K, Z, A), X, joined=True)
     if X_rows is None:
-        return on_each(Z_rows, lambda w, z, a: product(*w, z, a), (K, X), Z, A, joined=False)
+        return map_devices(Z_rows, lambda w, z, a: product(*w, z, a), (K, X), Z, A, joined=False)
     if (X_rows.mesh, X_rows.axes) != (Z_rows.mesh, Z_rows.axes):
         raise ValueError(
-            f"X and Z are spread over devices differently: {X_rows.caller} and {Z_rows.caller}. "
+            f"X and Z are sharded over devices differently: {X_rows.caller} and {Z_rows.caller}. "
             "Put both on one mesh and the same axes, or one of them on every device."
         )
     ring = [(i, (i + 1) % X_rows.count) for i in range(X_rows.count)]
@@ -204,7 +205,7 @@ def sum_of_columns(
         start = jnp.zeros_like(x), (z, a)
         return jax.lax.scan(step, start, length=X_rows.count)[0][0]
 
-    return on_each(X_rows, around, K, X, Z, A, joined=True)
+    return map_devices(X_rows, around, K, X, Z, A, joined=True)
 
 
 _CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
@@ -236,7 +237,7 @@ def _memory_of(platform: str) -> int | None:
 def refuse_beyond_memory(
     what: str, rows: int, columns: int, dtype: jnp.dtype, copies: int, cure: str
 ) -> None:
-    """Raise a ValueError where so many dense matrices cannot fit, with the size and a cure."""
+    """ValueError if `copies` dense matrices do not fit in memory, with their size and a cure."""
     needed, memory = dense_bytes(rows, columns, dtype, copies), memory_bytes()
     if memory is not None and needed > memory:
         matrices = "one matrix" if copies == 1 else f"{copies} matrices"
@@ -249,9 +250,9 @@ def refuse_beyond_memory(
 def follow_data(function: Callable[P, T]) -> Callable[P, T]:
     """`function` with the device of its arguments as JAX's default device.
 
-    Data put on a CPU beside a GPU are computed on the CPU. Sizes, memory and options of the
-    compiler are those of the default device (`_sizes`), so they have to be asked for there. Arrays
-    that no one put on a device, and traced ones, leave the default as it is.
+    If the caller put the data on a CPU of a machine with a GPU, the CPU computes. Sizes, memory and
+    compiler options belong to the default device (`_sizes`), so we change the default. Arrays that
+    no one put on a device, and traced arrays, do not change it.
     """
 
     @functools.wraps(function)
@@ -285,10 +286,10 @@ _limit: Any = None  # restores the number of threads after the last call
 
 
 def one_blas_thread(function: Callable[P, T]) -> Callable[P, T]:
-    """`function`, and its result computed, with one thread of BLAS; restored afterwards.
+    """`function` with one thread of BLAS until its result is computed; then the limit is lifted.
 
     Inside the caller's own `jax.jit` nothing is computed while `function` runs, so this decorator
-    has no effect; set OPENBLAS_NUM_THREADS=1 in the environment instead.
+    has no effect. Set OPENBLAS_NUM_THREADS=1 in the environment instead.
     """
 
     @functools.wraps(function)
@@ -323,7 +324,7 @@ def _controller():
     return ThreadpoolController()
 
 
-def in_doubles(function: Callable[P, T]) -> Callable[P, T]:
+def double_precision(function: Callable[P, T]) -> Callable[P, T]:
     """`function` of NumPy arrays, computed in float64 whatever the configuration of JAX."""
     if hasattr(jax, "enable_x64"):
         context = jax.enable_x64
@@ -331,11 +332,11 @@ def in_doubles(function: Callable[P, T]) -> Callable[P, T]:
         from jax.experimental import enable_x64 as context  # pyright: ignore
 
     @functools.wraps(function)
-    def in_double_precision(*args: P.args, **kwargs: P.kwargs) -> T:
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
         with context(True):
             return function(*args, **kwargs)
 
-    return in_double_precision
+    return call
 
 
 def full_precision(function: Callable[P, T]) -> Callable[P, T]:
@@ -356,7 +357,7 @@ def full_precision(function: Callable[P, T]) -> Callable[P, T]:
 
 
 class EqualToItself:
-    """A base of PyTrees with arrays that may be jitted, and so may their methods.
+    """A base of PyTrees with arrays, so that `jax.jit` takes the object and its methods.
 
     `jax.jit(field)` looks up the compiled function by hash and equality. Arrays have no hash and
     traced arrays no equality, so such an object equals only itself.
@@ -369,13 +370,13 @@ class EqualToItself:
         return self is other
 
 
-def compiled(function: Any = None, **options: Any) -> Any:
+def precise_jit(function: Any = None, **options: Any) -> Any:
     """`function` under `eqx.filter_jit` with products in full precision; `options` are of the jit.
 
-    The precision is set while JAX traces, and costs nothing in a call of the compiled program.
+    The precision is set while JAX traces, so a call of the compiled program costs nothing extra.
     """
     if function is None:
-        return functools.partial(compiled, **options)
+        return functools.partial(precise_jit, **options)
     return eqx.filter_jit(full_precision(function), **options)
 
 
@@ -384,13 +385,13 @@ def compiled(function: Any = None, **options: Any) -> Any:
 #     XLA's own options             4.5 s / .11 s    10.6 s / 4 s
 #     without fusion emitters       2.5 s / .11 s     7.4 s / 4 s
 #     nor optimisation by LLVM       .8 s / .25 s     1.7 s / 7 s
-# So only small programs skip LLVM's optimisation. Learning from two runs of 61 samples, with 7000
-# numbers in the arguments, takes 24 s by this rule, 18 s without LLVM and 55 s with XLA's own
-# options. Learning from 20 runs of 50 samples with n = 8, with 20 000 to 400 000 numbers, takes 44
-# s by this rule and 73 s without LLVM.
-# On a GPU XLA times several versions of each product while it compiles: the first `tune` of 300
-# points took 78 s, and 15.5 s without, and `learn` 185 s and 60 s; later calls are as fast
-# (NVIDIA H200, jax 0.11). Products of large Grams are not compiled by size, and keep the choice.
+# So only small programs skip LLVM's optimisation. The first `learn` takes
+#                                  this rule    no LLVM    XLA's own options
+#     2 runs of 61 samples           24 s        18 s           55 s          (7000 numbers)
+#     20 runs of 50, n = 8           44 s        73 s                         (20 000 to 400 000)
+# On a GPU XLA times several versions of each product while it compiles. Without these timings the
+# first `tune` of 300 points took 15.5 s instead of 78 s, and the first `learn` 60 s instead of
+# 185 s; later calls are as fast (NVIDIA H200, jax 0.11). Products of large Grams keep the timings.
 _BY_PLATFORM = {
     "cpu": {"xla_cpu_use_fusion_emitters": False},
     "gpu": {"xla_gpu_autotune_level": 0},
@@ -407,20 +408,20 @@ def compiled_by_size(
     unoptimised_up_to: int = _MAX_UNOPTIMISED,
     platforms: tuple[str, ...] = ("cpu", "gpu"),
 ) -> Callable[P, T]:
-    """`compiled` with options of XLA that shorten compilation; on a CPU by size of the arguments.
+    """`precise_jit` with options of XLA that shorten compilation.
 
-    Programs with at most `unoptimised_up_to` numbers in their arguments skip LLVM's optimisation.
-    On other platforms than `platforms` XLA's own options are used. Inside another transformation
-    the outer one chooses them.
+    On a CPU, programs with at most `unoptimised_up_to` numbers in their arguments also skip LLVM's
+    optimisation. Platforms that are not in `platforms` use XLA's own options. Inside another JAX
+    transformation the outer transformation chooses the options.
     """
-    plain = compiled(function)
+    plain = precise_jit(function)
     fast, fastest = (
-        {name: compiled(function, compiler_options=options) for name, options in table.items()}
+        {name: precise_jit(function, compiler_options=options) for name, options in table.items()}
         for table in (_BY_PLATFORM, _UNOPTIMISED)
     )
 
     @functools.wraps(function)
-    def by_size(*args: P.args, **kwargs: P.kwargs) -> T:
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
         arrays = [a for a in jax.tree.leaves((args, kwargs)) if eqx.is_array(a)]
         platform = _sizes.platform()
         is_traced = any(isinstance(a, Tracer) for a in arrays)
@@ -429,14 +430,16 @@ def compiled_by_size(
         small = sum(a.size for a in arrays) <= unoptimised_up_to
         return (fastest if small else fast)[platform](*args, **kwargs)
 
-    return by_size
+    return call
 
 
 def compiled_without_emitters(function: Callable[P, T]) -> Callable[P, T]:
-    """`compiled` without XLA's fusion emitters, of integrations, which have few large fusions.
+    """`precise_jit` without XLA's fusion emitters, for integrations, which have few large fusions.
 
-    `hk.simulate` of a field of 24 points over 1000 saved times takes 2.7 s to compile for 4.4, and
-    114 ms to run for 136. A Gram of 500 states takes 12 ms without emitters, and 3.5 ms with them.
+    Compile and run times of two programs on a CPU, with and without emitters:
+
+        `hk.simulate`, field of 24 points, 1000 saved times   4.4 s / 136 ms   2.7 s / 114 ms
+        Gram of 500 states, run time                          3.5 ms           12 ms
     """
     return compiled_by_size(function, unoptimised_up_to=0)
 

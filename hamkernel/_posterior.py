@@ -26,10 +26,10 @@ from hamkernel._kernels.base import Invariance, Scaled
 from hamkernel._kernels.symmetry import drop_symmetry
 from hamkernel._machine import (
     EqualToItself,
-    compiled,
     follow_data,
     full_precision,
     one_blas_thread,
+    precise_jit,
 )
 from hamkernel._observations.blocks import AbstractBlock, Values
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
@@ -65,8 +65,8 @@ def condition(
 ) -> Posterior:
     """Condition the Gaussian process GP(mean, K) on data: `fit` with error bars.
 
-    The posterior mean is the field of `fit`. Its uncertainty is only as good as the amplitude of K
-    and λ, so tune both by the marginal likelihood first:
+    The posterior mean is the field of `fit`. Deviations are proportional to the amplitude of K and
+    depend on λ, so tune both by the marginal likelihood first:
 
         tuned = hk.tune(hk.Symplectic(1.0 * k), X, Y, objective="marginal_likelihood")
         posterior = hk.condition(tuned.kernel, X, Y, tuned.regularization)
@@ -79,25 +79,25 @@ def condition(
         X: states, shape (N, n); or observations, and then there is no Y.
         Y: velocities, shape (N, n).
         regularization: λ > 0; Nλ is the variance of the noise of a row of relative noise 1.
-        solver: `Cholesky()` if None, which is exact; or a low-rank solver. With `Nystrom(…)` the
-            field is approximate if there are few landmarks, and the deviation far from them is
-            that of the prior. With `RandomFeatures(…)` the prior is that of the features.
+        solver: `Cholesky()` if None, which is exact; or a low-rank solver. With `Nystrom(…)` and
+            few landmarks the field is approximate, and far from the landmarks the deviation is
+            the prior deviation. With `RandomFeatures(…)` the features define the prior.
         mean: the known part of the field, x (n,) -> (n,), as in `fit`.
         inputs: u at each state, for a `Controlled` kernel, shape (N, m). Predictions then need the
             inputs as well, `posterior.deviation(x, u)`.
         parameters: θ at each state, for a `Family`, shape (N, p): `posterior.deviation(x, θ)`. The
-            deviation grows to that of the prior outside of the range of θ.
+            deviation grows to the prior deviation outside the range of θ.
         progress: show a progress bar of the blocks of `Cholesky`, as in `fit`.
 
     Returns:
         The posterior. O(D³) time and O(D²) memory for D rows, with a solver of rank r O(D r²).
 
     Raises:
-        TypeError: conjugate gradients, which keep no factor; else as in `fit`.
+        TypeError: the solver is `ConjugateGradient`, which keeps no factor; or as in `fit`.
         ValueError, AttributeError, RuntimeError: as in `fit`.
 
     Warns:
-        UserWarning: the amplitude of K is exactly 1, as that of built-in kernels is before tuning.
+        UserWarning: the amplitude of K is exactly 1, the value of built-in kernels before tuning.
     """
     problem = make_problem(K, X, Y, regularization, mean, inputs, parameters)
     return posterior_of_problem(problem, solver, progress)
@@ -152,7 +152,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         ]
 
     def _misfit(self) -> list[tuple[str, str]]:
-        """How far λ and the kernel are from what the data say of them, if that is known."""
+        """χ², with a warning if deviations are too small; empty if the numbers are not known."""
         arrays = self.conditional.field.residual, self.conditional.ridge
         if not has_arrays(arrays) or not require.is_concrete(arrays):
             return []
@@ -167,12 +167,12 @@ class Posterior(Shown, EqualToItself, eqx.Module):
 
     @property
     def chi_squared(self) -> Float[Array, ""]:
-        """χ² = yᵀA⁻¹y/D of the D rows y less the mean, A = G + NλI, shape ().
+        """χ² = yᵀA⁻¹y/D, y the D rows minus the prior mean, A = G + NλI, shape ().
 
-        It is near 1 if Nλ is the variance of the noise and the kernel has the right amplitude and
-        lengthscales. If it is much larger, all deviations of the posterior are too small, since
-        they do not depend on y: pass the kernel and λ of
-        `hk.tune(…, objective="marginal_likelihood")`. If it is much smaller, they are too large.
+        χ² is near 1 if Nλ is the variance of the noise and the kernel has the right amplitude and
+        lengthscales. Deviations of the posterior do not depend on y: if χ² is much larger than 1,
+        they are too small, and if χ² is much smaller, too large. Then pass the kernel and λ of
+        `hk.tune(…, objective="marginal_likelihood")`.
         """
         conditional, rows = self.conditional, self.conditional.rows
         field = conditional.field
@@ -205,7 +205,9 @@ class Posterior(Shown, EqualToItself, eqx.Module):
                 field has no inputs, or u2 comes without x2.
         """
         if x2 is None and u2 is not None:
-            raise TypeError("u2 came without x2: posterior.covariance(x, u, x2=z, u2=v).")
+            raise TypeError(
+                "u2 came without x2: give both, posterior.covariance(x, u, x2=z, u2=v)."
+            )
         K = self.conditional.field.kernel
         here = components(K, self._point(x, u)[None])
         there = None if x2 is None else components(K, self._point(x2, u2)[None])
@@ -213,11 +215,11 @@ class Posterior(Shown, EqualToItself, eqx.Module):
 
     def _point(self, x: Any, u: Any) -> Float[Array, " d"]:
         if isinstance(self.field, AbstractJoinedField):
-            return self.field.joined(x, u)
+            return self.field.join(x, u)
         if u is not None:
             raise TypeError(
-                "the second argument is u, and this field has no inputs: leave it out. The "
-                "covariance of f at two states is posterior.covariance(x, x2=z)."
+                "the second argument is u, and this field has no inputs: leave u out. For the "
+                "covariance of f at two states write posterior.covariance(x, x2=z)."
             )
         return self.field._state(x)
 
@@ -263,7 +265,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         elif U is None:
             means = self.field.evaluate(X)
         else:
-            raise TypeError("the field has no inputs: posterior.evaluate(X).")
+            raise TypeError("U came and the field has no inputs: write posterior.evaluate(X).")
         states = (jnp.asarray(X, means.dtype), *(() if U is None else (jnp.asarray(U),)))
         # A state takes D n numbers for D rows: of 64 states and 3000 rows, 3 MB for n = 2.
         return means, jax.lax.map(lambda s: self.deviation(*s), states, batch_size=64)
@@ -274,17 +276,18 @@ class Posterior(Shown, EqualToItself, eqx.Module):
     ) -> Float[Array, ""]:
         """The standard deviation of w(r) − w(r₀) for a law w of `hk.Shared`, shape ().
 
-        The deviation includes the prior outside the span of the centres of the law. If no part of
-        the data came near r, it is the deviation of the prior.
+        The deviation includes the prior outside the span of the centres of the law. Far from all
+        values of r in the data it is the prior deviation.
 
         Args:
             r: an argument of the law, as in `field.law`.
-            r0: another.
-            which: which of several laws.
+            r0: another argument.
+            which: the position of the law, if there are several.
 
         Raises:
-            AttributeError: no part of the kernel is `Shared`. TypeError: the posterior is not one
-                in features, as it is where all of the kernel is `Shared`.
+            AttributeError: no part of the kernel is `Shared`. TypeError: the posterior is not
+                expressed in features: not all terms of the kernel are `Shared`, and the solver was
+                not `RandomFeatures`.
         """
         conditional = self.conditional
         if not isinstance(conditional, LowRankConditional):
@@ -317,7 +320,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         field, K = self.field, self.conditional.field.kernel
         if isinstance(field, FamilyField):
             n = field.dimension
-            points = jnp.stack([field.joined(x, theta), field.joined(x0, theta)])
+            points = jnp.stack([field.join(x, theta), field.join(x0, theta)])
             _ = field.at(points[0, n:]).potential
             both = Values(points, outputs=n)
         else:
@@ -352,25 +355,25 @@ class Posterior(Shown, EqualToItself, eqx.Module):
             parameters: θ at each state, for a `Family`, shape (M, p).
 
         Raises:
-            ValueError: the new data has another n, or does not fit itself. RuntimeError: the new
-                rows are so close to the old ones that the factor fails.
+            ValueError: the new data have another n, or their shapes do not fit. RuntimeError: the
+                new rows are so close to the old rows that the factorisation fails.
         """
         data_inputs = inputs_or_parameters(inputs, parameters, self.conditional.field.kernel)
         data, old = observations(X, Y, data_inputs, part=True), self.conditional.rows
         if data.dimension != old.dimension:
             raise ValueError(
-                f"the new data has {data.dimension} coordinates and the posterior {old.dimension}: "
-                "both must be of one system."
+                f"the new data have {data.dimension} coordinates and the posterior "
+                f"{old.dimension}: both must be of one system."
             )
-        known = known_of(self.field)
-        new = new_rows(self.conditional.field.kernel, data, old, known)
+        mean = known_of(self.field)
+        new = new_rows(self.conditional.field.kernel, data, old, mean)
         if new.targets.dtype != old.targets.dtype:
             raise TypeError(
-                f"the new data is {new.targets.dtype} and the posterior {old.targets.dtype}: cast "
-                "one of them."
+                f"the new data are {new.targets.dtype} and the posterior {old.targets.dtype}: cast "
+                "the new data."
             )
         data_inputs = self.conditional.updated(new)
-        return Posterior(data_inputs, learned_field(data_inputs.field, known))
+        return Posterior(data_inputs, learned_field(data_inputs.field, mean))
 
     @follow_data
     @one_blas_thread
@@ -388,17 +391,17 @@ class Posterior(Shown, EqualToItself, eqx.Module):
             fields = posterior.sample(jax.random.key(0), 64)
             orbits = jax.vmap(lambda f: hk.simulate(f, x0, ts).ys)(fields)
 
-        In the region and at the data, the mean and covariance of the draws are those of the
-        posterior. Far outside, draws have errors of a few per cent for kernels with a known
-        spectrum (those of `RandomFeatures`), and too little spread for other kernels. Choose a
-        region that the orbits do not leave. Draws of fields with inputs contain the drift and G and
-        are affine in u; the region is a region of states, and u may be any.
+        In the region and at the data, the draws have the mean and covariance of the posterior. Far
+        outside, draws have errors of a few per cent for the kernels that `RandomFeatures` takes,
+        and too little spread for other kernels. Choose a region that the orbits do not leave. Draws
+        of fields with inputs contain the drift and G and are affine in u; the region bounds the
+        states, not u.
 
         Args:
             key: the random key.
-            count: how many fields.
+            count: the number of fields.
             region: the lowest and the highest corner of a box of states, shape (2, n); if None, the
-                smallest box that holds the states of the data.
+                smallest box that contains the states of the data.
 
         Returns:
             Fields of the type of `field`. The norm of a draw is not finite.
@@ -418,24 +421,24 @@ class Posterior(Shown, EqualToItself, eqx.Module):
                 f"region has shape {corners.shape}; the lowest and the highest corner of a box, "
                 f"shape (2, {n}), are needed."
             )
-        low, high = require.on_host(corners)
+        low, high = require.host_array(corners)
         bad = ~((high > low) & (abs(low) < np.inf) & (abs(high) < np.inf))
         message = "region must be finite, its first row the lower corner in every coordinate."
         corners = require.value(corners, bad, message)
         around = None if isinstance(self.field, FamilyField) else 0.0
         corners = jnp.concatenate([corners, _range_of(rows.points[:, n:], around)], axis=1)
-        draws, known = self.conditional.draws(key, count, corners), known_of(self.field)
+        draws, mean = self.conditional.draws(key, count, corners), known_of(self.field)
 
         def one(draw):
-            if draw.mean is None or known is None:
-                return learned_field(draw, known if draw.mean is None else draw.mean)
-            return learned_field(draw, FieldSum((known, draw.mean)))
+            if draw.mean is None or mean is None:
+                return learned_field(draw, mean if draw.mean is None else draw.mean)
+            return learned_field(draw, FieldSum((mean, draw.mean)))
 
         return jax.vmap(one)(draws)
 
 
 # Without jit the operations are hundreds of small programs, which took 4 s to compile.
-@compiled
+@precise_jit
 def _covariance(
     conditional: AbstractConditional, left: AbstractBlock, right: AbstractBlock | None = None
 ) -> Float[Array, "d e"]:
@@ -445,7 +448,7 @@ def _covariance(
 def _range_of(U: Float[Array, "N m"], centre: float | None) -> Float[Array, "2 m"]:
     """The corners of the smallest box that contains the parameters, or a box around a centre.
 
-    The box around zero contains the inputs, and has the half-width 1 if all inputs are 0.
+    A box around zero contains all inputs, and has the half-width 1 if all inputs are 0.
     """
     if centre is None:
         return jnp.stack([U.min(axis=0), U.max(axis=0)])
@@ -463,10 +466,10 @@ def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
         with require.eager():
             one = Invariance.TRANSLATION in k.invariance and np.asarray(k(x, x)) == 1.0
         if one:
-            scaled = "it" if isinstance(k, Scaled) else f"that of 1.0 * {k!r}"
+            scaled = "the amplitude" if isinstance(k, Scaled) else f"1.0 * {k!r}"
             require.warn(
-                f"the amplitude of {k!r} is exactly 1, as it is before tuning, and deviations are "
-                f"proportional to it. Tune {scaled} by "
+                f"the amplitude of {k!r} is exactly 1, its value before tuning, and deviations are "
+                f"proportional to the amplitude. Tune {scaled} by "
                 "hk.tune(..., objective='marginal_likelihood')."
             )
             return

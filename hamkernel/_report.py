@@ -77,7 +77,7 @@ def report(
     """
     if not isinstance(learned, Learned | LearnedLagrangian):
         raise TypeError(f"report takes the result of hk.learn; got a {type(learned).__name__}.")
-    require.untraced("hk.report", "Call it outside.", learned)
+    require.no_tracers("hk.report", "Call it outside.", learned)
     verdict = "may be used" if learned.converged else "must not be used as it is"
     short = learned.diagnostics.warning or "No diagnostic falls short."
     parts = [

@@ -36,16 +36,16 @@ def eager(*values: object) -> AbstractContextManager[None]:
     return jax.ensure_compile_time_eval() if is_concrete(*values) else nullcontext()
 
 
-def untraced(name: str, instead: str, *values: object) -> None:
-    """TypeError if JAX traces one of `values`, on whose numbers the function `name` branches."""
+def no_tracers(name: str, instead: str, *values: object) -> None:
+    """TypeError if JAX traces one of `values`; the function `name` branches on their numbers."""
     if not is_concrete(*values):
         raise TypeError(
-            f"{name} cannot run under jax.jit, jax.vmap or jax.grad: it decides in Python by the "
-            f"numbers that it is given. {instead}"
+            f"{name} cannot run under jax.jit, jax.vmap or jax.grad: it branches in Python on the "
+            f"numbers of its arguments. {instead}"
         )
 
 
-def on_host(x: Array) -> Any:
+def host_array(x: Array) -> Any:
     """`x` as a NumPy array if it is concrete and on one device; else `x` itself."""
     if is_concrete(x) and len(x.sharding.device_set) == 1:
         return np.asarray(x)
@@ -54,7 +54,7 @@ def on_host(x: Array) -> Any:
 
 def not_finite(x: Array) -> Any:
     """A mask of the entries of `x` that are NaN or infinite, as `value` takes it."""
-    return ~(abs(on_host(x)) < np.inf)
+    return ~(abs(host_array(x)) < np.inf)
 
 
 def value(
@@ -64,11 +64,11 @@ def value(
     error: type[Exception] = ValueError,
     throw: bool = True,
 ) -> Any:
-    """Return `x`, or fail if `bad` holds anywhere, at run time under jit and else at once.
+    """Return `x`, or raise `error` if `bad` holds anywhere: at once, or at run time under jit.
 
     Without `throw`, a failure makes `x` NaN. Pass as `x` all arrays that would be wrong, as one
     array or a PyTree: under jit the check is dropped if the caller does not use `x`. Compute `bad`
-    with `on_host`, so that it is concrete whenever possible, also for constants under jit.
+    with `host_array`, so that `bad` is concrete whenever possible, also for constants under jit.
     """
     bad = bad.any()  # type: ignore[union-attr]
     if not throw:
@@ -102,7 +102,7 @@ def traceable(name: str) -> Iterator[None]:
         yield
     except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
         raise TypeError(
-            f"{name} asks for numbers while JAX traces it, when only shapes are known: write it "
+            f"{name} needs numbers while JAX traces it, and then only shapes are known: write it "
             "with jax.numpy in place of numpy and math, and with jnp.where in place of if."
         ) from error
 
@@ -171,15 +171,15 @@ def doubles(x: Any, name: str) -> np.ndarray:
 
     The caller's log keeps all its digits, whatever the precision of JAX.
     """
-    plain = _plain(x, name)  # arrays of JAX stay as they are, and are looked at here
+    plain = _plain(x, name)  # which does not change arrays of JAX; the next line does
     return _plain(np.asarray(plain), name).astype(float)
 
 
 def _plain(x: Any, name: str) -> Any:
-    """`x` as an array of real numbers of NumPy; what holds arrays of JAX, as it is.
+    """`x` as a NumPy array of real numbers; arrays of JAX, and lists of them, unchanged.
 
-    An iterator is read, entries that are masked or missing are NaN, columns with names form a
-    matrix, and a tensor of PyTorch leaves its graph. JAX takes none of these by itself.
+    We read iterators, write NaN for masked or missing entries, make a matrix of named columns, and
+    detach tensors of PyTorch. JAX converts none of these.
     """
     if isinstance(x, jax.Array):
         return x
@@ -243,7 +243,7 @@ def _no_numbers(x: Any, name: str) -> TypeError:
     if hasattr(x, "columns") and hasattr(x, "select_dtypes"):
         text = ", ".join(map(str, x.select_dtypes(exclude="number").columns))
         return TypeError(
-            f"{name} has columns that hold no numbers: {text}. Choose those of the state, "
+            f"{name} has columns that hold no numbers: {text}. Choose the columns of the state, "
             "frame[['q', 'p']]."
         )
     return TypeError(
@@ -268,7 +268,7 @@ def single_or_double(dtype: Any, whose: str) -> None:
 def positive(x: Any, name: str, cure: str = "") -> Array:
     """`x` as a float array whose every entry is finite and larger than zero."""
     array = floating(x, name)
-    values = on_host(array)
+    values = host_array(array)
     return value(
         array,
         ~((values > 0) & (values < np.inf)),
@@ -289,8 +289,8 @@ def positive_scalar(x: ArrayLike, name: str, cure: str = "") -> Float[Array, ""]
 
 
 def ridge(x: ArrayLike, dtype: jnp.dtype) -> Float[Array, ""]:
-    """The λ of a fit, positive in the dtype of the data too: 1e-50 is zero in float32."""
-    cure = "Data without noise still need a small one, such as 1e-8; hk.tune finds a good one."
+    """The λ of a fit, positive also in the dtype of the data: 1e-50 is zero in float32."""
+    cure = "Data without noise still need a small λ, such as 1e-8; hk.tune finds a good one."
     return positive_scalar(floating(x, "regularization").astype(dtype), "regularization", cure)
 
 
@@ -318,8 +318,8 @@ def key(key: Any) -> Key[Array, ""]:
         raise TypeError(f"key must be a key of JAX, such as jax.random.key(0); got {key!r}.")
     if key.shape:
         raise ValueError(
-            f"key is an array of keys of shape {key.shape}; one is needed. For many seeds map over "
-            "them, jax.vmap(lambda key: ...)(keys)."
+            f"key is an array of keys of shape {key.shape}; one key is needed. For many seeds use "
+            "jax.vmap(lambda key: ...)(keys)."
         )
     return key
 
@@ -331,7 +331,7 @@ def one_dtype(X: Array, Z: Array) -> tuple[Array, Array]:
         return X.astype(dtype), Z.astype(dtype)
 
 
-def same_space(X: Array, Z: Array) -> tuple[Array, Array]:
+def one_space(X: Array, Z: Array) -> tuple[Array, Array]:
     """Both arrays in one dtype; ValueError if their numbers of coordinates differ."""
     if X.shape[1] != Z.shape[1]:
         raise ValueError(
@@ -401,32 +401,32 @@ def data(
     return finite(X, "X"), finite(Y, "Y", cure)
 
 
-def measured(X: ArrayLike, Y: ArrayLike) -> tuple[Array, Array, np.ndarray | None]:
+def velocity_data(X: ArrayLike, Y: ArrayLike) -> tuple[Array, Array, np.ndarray | None]:
     """States, velocities with NaN where a component was not measured, and the measured indices.
 
     The indices count the components of all points, and are None if all were measured. If Y is
     traced, NaN is refused, since the measured components are then unknown.
     """
     X, Y = points(X, "X"), points(Y, "Y")
-    values = on_host(Y)
+    values = host_array(Y)
     if not is_concrete(Y):
         cure = (
-            " Where NaN means that a component was not measured, make hk.Velocities(X, Y) outside "
-            "of jax.jit: inside, it is not known which they are."
+            " If NaN means that a component was not measured, make hk.Velocities(X, Y) outside "
+            "of jax.jit: inside, the positions of NaN are unknown."
         )
         return *data(X, Y, part=True, cure=cure), None
     if not (values != values).any():
         return *data(X, Y, part=True), None
     if not Y.is_fully_addressable:
         raise ValueError(
-            "Y contains NaN and is spread over several processes, where components that were not "
-            "measured cannot be left out: remove those points."
+            "Y contains NaN and is sharded over several processes, where components that were not "
+            "measured cannot be left out: remove the points with NaN."
         )
     missing = np.isnan(np.asarray(Y))
     if missing.all():
         raise ValueError(
-            f"all {missing.size} components of Y are NaN, which says not measured: there is "
-            "nothing to learn from."
+            f"all {missing.size} components of Y are NaN, which means not measured: there is "
+            "nothing to learn from. Look at how Y was read or computed."
         )
     X, filled = data(X, jnp.where(missing, jnp.zeros_like(Y), Y), part=True)
     return X, jnp.where(missing, jnp.nan, filled), np.flatnonzero(~missing.reshape(-1))
@@ -447,21 +447,21 @@ def times(ts: ArrayLike, least: int) -> Float[Array, " T"]:
     array = floating(ts, "ts")
     if array.ndim != 1 or array.size < least:
         raise ValueError(
-            f"ts has shape {array.shape}; times of shape (T,), T ≥ {least}, are needed, the first "
-            "that of x0."
+            f"ts has shape {array.shape}; times of shape (T,), T ≥ {least}, are needed. The first "
+            "is the time of x0."
         )
     return finite(array, "ts")
 
 
-def elapsed(ts: Float[Array, " T"], dtype: Any) -> Float[Array, " T"]:
+def elapsed_times(ts: Float[Array, " T"], dtype: Any) -> Float[Array, " T"]:
     """The times since the first one, which must increase, in the dtype of the states.
 
     A field does not depend on time, so we may subtract the first time. We subtract in the dtype of
     `ts`: late times in float64 then keep their differences if the states are in float32.
     """
-    ts = on_host(ts)
+    ts = host_array(ts)
     since = jnp.asarray((ts - ts[0]).astype(dtype))
-    values = on_host(since)
+    values = host_array(since)
     return value(
         since,
         values[1:] <= values[:-1],
@@ -478,11 +478,11 @@ def velocity(field: Any, x: Float[Array, " n"], name: str = "field") -> jax.Shap
         raise TypeError(
             f"{name} is a {type(field).__name__}; a callable x (n,) -> (n,) is needed.{hint}"
         )
-    other_names = other_arguments(field, x)
-    if other_names is not None:
+    mismatch = signature_mismatch(field, x)
+    if mismatch is not None:
         raise TypeError(
-            f"{name} takes ({other_names}); it is called with one argument, the state x of shape "
-            "(n,). Bind the others, as in `lambda x: f(0.0, x)` where time does not enter. A "
+            f"{name} takes ({mismatch}); it is called with one argument, the state x of shape "
+            "(n,). Bind the others, as in `lambda x: f(0.0, x)` if f does not depend on time. A "
             "kernel becomes a field by hk.fit."
         )
     with traceable(name):
@@ -495,13 +495,13 @@ def velocity(field: Any, x: Float[Array, " n"], name: str = "field") -> jax.Shap
     if out.shape != x.shape:
         raise ValueError(
             f"{name} maps a state of shape {x.shape} to shape {out.shape}; one velocity for each "
-            "coordinate is needed. Is x0 of the dimension it was made for?"
+            "coordinate is needed. Was it made for states of another dimension?"
         )
     return out
 
 
-def other_arguments(function: Any, *arguments: Any) -> str | None:
-    """The names of the parameters of `function` if it cannot take these arguments; else None."""
+def signature_mismatch(function: Any, *arguments: Any) -> str | None:
+    """The parameters of `function`, as text, if it cannot take these arguments; else None."""
     with suppress(ValueError):  # raised for a builtin without a signature
         signature = inspect.signature(function)
         try:

@@ -14,7 +14,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
-# # Replacements for terminals of ASCII and for code pages of Windows.
+# Replacements for terminals of ASCII and for code pages of Windows.
 _ASCII = str.maketrans(
     {
         "λ": "lambda",
@@ -69,7 +69,7 @@ def printable(text: str) -> str:
 
 
 class Shown:
-    """Prints as one head and a line for each finding; a notebook shows the lines as a table."""
+    """An object that prints a head and a line for each finding; a notebook shows a table."""
 
     def _summary(self) -> tuple[str, list[tuple[str, str]]]:
         """The head, and the findings, each a name and a text of one or more lines."""
@@ -101,7 +101,7 @@ def html_table(rows: Iterable[Sequence[str]], head: Sequence[str] = ()) -> str:
     return f"<table>{f'<thead><tr>{top}</tr></thead>' if head else ''}<tbody>{body}</tbody></table>"
 
 
-def described(module: Any, positional: tuple[str, ...] = ()) -> str:
+def describe(module: Any, positional: tuple[str, ...] = ()) -> str:
     """`Gaussian(lengthscale=3.28)`: the attributes as they are read, few numbers as values.
 
     Attributes in `positional` are shown without their names. Attributes that are None, since they
@@ -122,35 +122,35 @@ def call(function: str, arguments: list[str]) -> str:
     line = f"{function}({', '.join(arguments)})"
     if _fits(line):
         return line
-    lines = _indented(",\n".join(arguments))
+    lines = _indent(",\n".join(arguments))
     return f"{function}(\n{lines}\n)"
 
 
-def joined(sign: str, terms: list[str]) -> str:
+def join_terms(sign: str, terms: list[str]) -> str:
     """`a + b`, in one line if it fits."""
     line = f" {sign} ".join(terms)
     return line if _fits(line) else f"\n{sign} ".join(terms)
 
 
-def shortened(items: list[str]) -> list[str]:
-    """The items, or the first, how many there are between, and the last, if all take a page."""
+def shorten(items: list[str]) -> list[str]:
+    """The items; if they are many and long, the first, the number of omitted ones, and the last."""
     if len(items) <= 3 or sum(map(len, items)) <= 300:
         return items
     return [items[0], f"… {len(items) - 2} more", items[-1]]
 
 
-def in_brackets(sum_of_terms: str) -> str:
+def put_in_brackets(sum_of_terms: str) -> str:
     """The sum in brackets, to stand as a factor of a product."""
     if _fits(sum_of_terms):
         return f"({sum_of_terms})"
-    return f"(\n{_indented(sum_of_terms)}\n)"
+    return f"(\n{_indent(sum_of_terms)}\n)"
 
 
 def _fits(line: str) -> bool:
     return len(line) <= 88 and "\n" not in line
 
 
-def _indented(lines: str) -> str:
+def _indent(lines: str) -> str:
     return textwrap.indent(lines, "  ")
 
 
@@ -162,7 +162,7 @@ def _attribute(module: Any, name: str) -> str:
 
 
 def exponential(log_value: Array) -> str:
-    """exp(log_value) as text; its shape where it has no value, as while JAX traces."""
+    """exp(log_value) as text; the shape instead while JAX traces, or for many numbers."""
     short = _is_short(log_value)
     with np.errstate(over="ignore"):  # a gradient, in the place of the hyperparameter
         return text(np.asarray(np.exp(np.asarray(log_value))) if short else log_value)
@@ -180,7 +180,7 @@ def _is_short(value: Any) -> bool:
 
 
 def text(value: Any) -> str:
-    """A value as it would be written; arrays of many numbers by their shape."""
+    """A value as code would write it; an array of many numbers as its dtype and shape."""
     if isinstance(value, Shown):
         return value._summary()[0]
     if _is_short(value):
@@ -191,7 +191,7 @@ def text(value: Any) -> str:
     if isinstance(value, float):
         return _number(value)
     if type(value) is tuple:
-        items = shortened([text(item) for item in value])
+        items = shorten([text(item) for item in value])
         return f"({', '.join(items)}{',' if len(items) == 1 else ''})"
     if isinstance(value, dict):
         return "{" + ", ".join(f"{key!r}: {text(item)}" for key, item in value.items()) + "}"
@@ -207,8 +207,8 @@ def has_arrays(tree: Any) -> bool:
 
 
 def _module(module: eqx.Module) -> str:
-    """A module that does not print itself, such as a network: one line, however deep it is."""
-    line = described(module)
+    """One line for a module without a `__repr__` of its own, such as a network of any depth."""
+    line = describe(module)
     if _fits(line):
         return line
     arrays = [leaf for leaf in jax.tree.leaves(module) if eqx.is_array(leaf)]

@@ -17,7 +17,7 @@ from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import AbstractJoinedField
 from hamkernel._gram import field_rounding
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._machine import compiled, compiled_without_emitters, full_precision
+from hamkernel._machine import compiled_without_emitters, full_precision, precise_jit
 from hamkernel._structures.laws import outside
 from hamkernel._symplectic import AbstractSymplecticSolver, EqualSteps, step_counts
 
@@ -97,7 +97,7 @@ def simulate(
         x0 = _initial_state(x0)
     with require.eager(ts):
         caller_times = require.times(ts, least=2)
-        ts = require.elapsed(caller_times, x0.dtype)
+        ts = require.elapsed_times(caller_times, x0.dtype)
     solver = diffrax.Dopri8() if solver is None else solver
     _check_solver(solver, dt, rtol, atol, inputs is not None)
     rhs, start = _right_hand_side(field, inputs, ts, caller_times[0], between, dt is not None)
@@ -119,7 +119,7 @@ def simulate(
     solution = _integrate(rhs, steps, ts, x0, start, adjoint, progress)
     solution, failed = _restore_times(solution, caller_times.astype(x0.dtype))
     if steps.counts is not None:  # Diffrax counted the intervals around the equal steps
-        total = jnp.asarray(require.on_host(steps.counts).sum())
+        total = jnp.asarray(require.host_array(steps.counts).sum())
         stats = {**solution.stats, "num_steps": total, "num_accepted_steps": total}
         solution = eqx.tree_at(lambda s: s.stats, solution, stats)
     if require.is_concrete(field, solution.ys):
@@ -129,7 +129,7 @@ def simulate(
     if not throw:
         return solution
     message = jax.tree_util.Partial(_reason_of_failure, solution, at_start, x0, dt is None)
-    ys = require.value(solution.ys, require.on_host(failed), message, RuntimeError)
+    ys = require.value(solution.ys, require.host_array(failed), message, RuntimeError)
     return eqx.tree_at(lambda s: s.ys, solution, ys)
 
 
@@ -233,10 +233,10 @@ def _right_hand_side(
                 f"function t -> (m,) or samples (T, m) at ts. {alone}"
             )
         return RightHandSide(field, None, held=False), None
-    other_names = require.other_arguments(field, ts, ts)
-    if other_names is not None:
+    mismatch = require.signature_mismatch(field, ts, ts)
+    if mismatch is not None:
         raise TypeError(
-            f"field takes ({other_names}); with inputs it is called with two arguments, the state "
+            f"field takes ({mismatch}); with inputs it is called with two arguments, the state "
             "x and its inputs u: a field of a Controlled kernel, hk.systems.Driven(system, G), or "
             "a function of yours. To simulate it without inputs, leave them out."
         )
@@ -251,10 +251,10 @@ def _inputs(inputs: Any, ts: Float[Array, " T"], between: Interpolation) -> Call
     if between not in ("held", "linear"):
         raise ValueError(f"between must be 'held' or 'linear'; got {between!r}.")
     if callable(inputs):
-        other_names = require.other_arguments(inputs, ts[0])
-        if other_names is not None:
+        mismatch = require.signature_mismatch(inputs, ts[0])
+        if mismatch is not None:
             raise TypeError(
-                f"inputs takes ({other_names}); it is called with one argument, the time. Feedback "
+                f"inputs takes ({mismatch}); it is called with one argument, the time. Feedback "
                 "closes the loop instead: hk.simulate(lambda x: field(x, law(x)), x0, ts)."
             )
         out = jax.eval_shape(inputs, jax.ShapeDtypeStruct((), ts.dtype))
@@ -328,7 +328,7 @@ def _tolerances(
     if rtol is None or atol is None:
         learned, point = rhs.field, x0
         if isinstance(learned, AbstractJoinedField) and rhs.inputs is not None:
-            learned, point = learned.whole, learned.joined(x0, rhs.inputs(start))
+            learned, point = learned.whole, learned.join(x0, rhs.inputs(start))
         if isinstance(learned, KernelField):
             Z, A = learned.points, learned.coefficients
             # At an equilibrium f is zero and has no digits; the limit 1e-6 still gives states a
@@ -458,7 +458,7 @@ def _integrate(
         ) from error
 
 
-@compiled
+@precise_jit
 def _restore_times(solution: Any, ts: Float[Array, " T"]) -> tuple[Any, Bool[Array, ""]]:
     """The solution at the caller's times, and whether it failed.
 

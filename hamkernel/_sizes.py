@@ -1,9 +1,9 @@
-"""How much is computed at once, for the kind of device that computes it.
+"""The sizes of the pieces in which data are computed, for a CPU and for a GPU.
 
-A CPU wants pieces that stay in its cache, a GPU pieces that fill it. JAX decides on a device when
-it lowers a program, later than Python cuts the data into pieces, so `sizes` asks for the default
-device: of the process, or of `with jax.default_device(…)` around the call. Public functions make
-the device of their data the default one (`_machine.follow_data`).
+A CPU needs pieces that stay in its cache, a GPU needs pieces that fill it. JAX chooses the device
+when it lowers a program, after Python has cut the data into pieces. So `sizes` asks for the default
+device, of the process or of `with jax.default_device(…)` around the call. Public functions make the
+device of their data the default device (`_machine.follow_data`).
 """
 
 from typing import NamedTuple
@@ -30,8 +30,8 @@ class Sizes(NamedTuple):
         triangle_entries: entries of a tile of features that is appended to a triangle; a tile has
             at least three times as many rows as columns.
         strip_entries: entries of a strip of rows of the Gram.
-        rows_in_place: rows from which the Gram is factored in its own memory; None if it is where
-            a fit outside of it would not fit in memory.
+        rows_in_place: the number of rows from which the Gram is factored in its own memory; None
+            to do so only if a separate factor would not fit in memory.
     """
 
     tile: int
@@ -43,13 +43,17 @@ class Sizes(NamedTuple):
     rows_in_place: int | None
 
 
-# tile: 1000 × 1000 doubles are 8 MB; measured on two cores between 125 × 4000 and 2000 × 1000, with
-# n = 4 and 20, half and twice cost up to 15 % more. states: with 1000 random features the waves of
-# 1024 states take 8 MB. trace_points: the blocks of 1024 points of a Gaussian stay in the cache,
-# 16 ms for a million points, and 90 ms with 4096 at once. design_entries: 2²⁰ numbers, 8 MB, stay
-# in the cache. triangle_entries: with 2²⁰ a fit of 100, 250 and 500 random features took 28, 14 and
-# 12 % longer than with three times as many rows as columns. strip_entries: some kernels hold 40
-# numbers for each entry, 160 MB. rows_in_place: 6000 rows are 288 MB.
+# Measured on two cores, or derived:
+# - tile: 1000 × 1000 doubles are 8 MB. Tiles half and twice as large cost up to 15 % more, between
+#   125 × 4000 and 2000 × 1000, n = 4 and 20.
+# - states: with 1000 random features the waves of 1024 states take 8 MB.
+# - trace_points: the blocks of 1024 points of a Gaussian stay in the cache. A million points take
+#   16 ms, and 90 ms with 4096 points at once.
+# - design_entries: 2²⁰ numbers, 8 MB, stay in the cache.
+# - triangle_entries: 0, so a tile has three times as many rows as columns. With 2²⁰ a fit of 100,
+#   250 and 500 random features took 28, 14 and 12 % longer.
+# - strip_entries: some kernels hold 40 numbers for each entry, 160 MB.
+# - rows_in_place: the Gram of 6000 rows takes 288 MB.
 _CPU = Sizes(
     tile=1000,
     states=1024,
@@ -60,15 +64,18 @@ _CPU = Sizes(
     rows_in_place=6000,
 )
 
-# Measured on an NVIDIA H200, jax 0.11. tile: a product of 100 000 states with n = 4 in float64 took
-# 337 ms with tiles of 1000, 184 with 4000 and 175 with 10 000. states: evaluating 24 data points at
-# a million states took 14.1 ms in batches of 1024 and .92 ms at once; 2²⁰ at once are no faster.
-# triangle_entries: 250 random features of 100 000 points took 391 ms with QR and three times as
-# many rows as columns, and 53 ms with products and 2²⁴ entries. strip_entries: a fit of 8000 rows
-# took 15.5 ms with 500 000, 13.8 with 2²² and 12.8 with 2²⁴, where 40 numbers each would take 5 GB.
-# rows_in_place: 16 000 rows took 107 ms in place and 54 ms not, so only memory decides. Not
-# measured, but derived: trace_points as states; design_entries are 134 MB, products of 33 GFLOP
-# with 1000 features, .6 ms at 57 TFLOP/s, beside 5 µs to start a kernel.
+# Measured on an NVIDIA H200, jax 0.11:
+# - tile: a product of 100 000 states with n = 4 in float64 took 337 ms with tiles of 1000, 184 ms
+#   with 4000 and 175 ms with 10 000.
+# - states: evaluating a field of 24 points at a million states took 14.1 ms in batches of 1024, and
+#   .92 ms with 2¹⁷ at once; 2²⁰ at once are no faster.
+# - triangle_entries: 250 random features of 100 000 points took 391 ms with QR and three times as
+#   many rows as columns, and 53 ms with products and 2²⁴ entries.
+# - strip_entries: a fit of 8000 rows took 15.5 ms with 500 000, 13.8 ms with 2²² and 12.8 ms with
+#   2²⁴; with 40 numbers for each entry, 2²⁴ entries would take 5 GB.
+# - rows_in_place: 16 000 rows took 107 ms in place and 54 ms otherwise, so only memory decides.
+# Derived: trace_points as states; design_entries are 134 MB, products of 33 GFLOP with 1000
+# features, .6 ms at 57 TFLOP/s, against 5 µs to start a kernel.
 _GPU = Sizes(
     tile=4000,
     states=2**17,

@@ -30,7 +30,7 @@ import optimistix as optx
 from equinox import AbstractClassVar, AbstractVar
 from jaxtyping import Array, Bool, Float, Int, Scalar
 
-from hamkernel._machine import compiled
+from hamkernel._machine import precise_jit
 
 
 class Step(eqx.Module):
@@ -468,7 +468,7 @@ class EqualSteps(diffrax.AbstractSolver):
         return y1, None, {"y0": y0, "y1": y1}, None, solution.result
 
 
-@compiled
+@precise_jit
 def step_counts(ts: Float[Array, " T"], dt: Float[Array, ""]) -> Int[Array, " T-1"]:
     """The number of equal steps in each interval of ts."""
     return equal_steps(ts[1:] - ts[:-1], dt).astype(int)

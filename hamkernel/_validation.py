@@ -24,10 +24,10 @@ from hamkernel._closed_forms import (
 )
 from hamkernel._gram import between_all, forward_differentiated, gram_of_rows, plus_ridge
 from hamkernel._machine import (
-    compiled,
     follow_data,
     full_precision,
     one_blas_thread,
+    precise_jit,
     refuse_beyond_memory,
 )
 from hamkernel._observations.blocks import AbstractBlock, Combinations
@@ -232,7 +232,7 @@ def partition_loss(K, rows: Measurements, regularization, partition: Partition, 
     return partition_loss_and_square(K, rows, regularization, partition, basis)[0]
 
 
-@compiled
+@precise_jit
 def partition_loss_and_square(
     K, rows: Measurements, regularization, partition: Partition, basis=None
 ):
@@ -240,7 +240,7 @@ def partition_loss_and_square(
     return jnp.asarray(partition.weights, residuals.dtype) @ residuals**2, a @ a
 
 
-@compiled
+@precise_jit
 def held_out_rows(K, rows: Measurements, regularization, partition: Partition, basis=None):
     """The residual of each row under the fit without its fold, in units of its noise, and A⁻¹y.
 
@@ -286,7 +286,7 @@ def generalized_loss(K, rows: Measurements, regularization, basis=None, least_fr
     return generalized_loss_and_square(K, rows, regularization, basis, least_free)[0]
 
 
-@compiled
+@precise_jit
 def generalized_loss_and_square(K, rows: Measurements, regularization, basis=None, least_free=0.0):
     # The loss is infinite if the share of free residuals, tr(I − S)/D, is below `least_free`.
     ridge = rows.count * regularization
@@ -295,7 +295,7 @@ def generalized_loss_and_square(K, rows: Measurements, regularization, basis=Non
     return jnp.where(enough, squares * rows.size / trace**2, jnp.inf), squares
 
 
-@compiled
+@precise_jit
 def log_likelihood(K, rows: Measurements, regularization, basis=None, projected=None):
     """The log marginal likelihood of rows, with a flat prior for the constant of energies.
 

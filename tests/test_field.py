@@ -196,7 +196,7 @@ def test_named_sums_of_one_structure_have_a_hamiltonian_as_a_whole():
 
 @pytest.mark.parametrize(("x0", "value"), [([np.nan, 0.0], 0.0), ([0.0, 0.0], np.inf)])
 def test_an_anchor_that_is_not_finite_is_refused(x0, value):
-    with pytest.raises(ValueError, match="x0 and value must be finite"):
+    with pytest.raises(ValueError, match="x0, value and the field must be finite"):
         fitted(hk.Symplectic).anchored(np.array(x0), value)
 
 

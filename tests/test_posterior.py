@@ -79,9 +79,9 @@ def test_a_second_state_in_the_place_of_inputs_is_refused_with_the_keyword():
 
 
 def test_the_warning_of_an_amplitude_of_one_is_told_to_scale_only_what_is_not_scaled():
-    with pytest.warns(UserWarning, match=r"Tune that of 1\.0 \* Gaussian"):
+    with pytest.warns(UserWarning, match=r"Tune 1\.0 \* Gaussian"):
         hk.condition(hk.Symplectic(hk.Gaussian(1.5)), X, Y, RIDGE)
-    with pytest.warns(UserWarning, match=r"1 \* Gaussian.* is exactly 1.*Tune it by"):
+    with pytest.warns(UserWarning, match=r"1 \* Gaussian.* is exactly 1.*Tune the amplitude by"):
         hk.condition(hk.Symplectic(1.0 * hk.Gaussian(1.5)), X, Y, RIDGE)
 
 
@@ -325,7 +325,7 @@ def test_what_cannot_be_said_is_refused():
     kinetic = hk.condition(K, X, Y, RIDGE, mean=lambda x: x * jnp.array([0.0, 1.0]))
     with pytest.raises(AttributeError, match="the mean"):
         kinetic.energy_deviation(INSIDE, X0)
-    with pytest.raises(ValueError, match="new data has 4 coordinates and the posterior 2"):
+    with pytest.raises(ValueError, match="new data have 4 coordinates and the posterior 2"):
         POSTERIOR.updated(np.zeros((3, 4)), np.zeros((3, 4)))
     with pytest.raises(ValueError, match=r"shape \(3,\); one state of shape \(2,\)"):
         POSTERIOR.deviation(np.zeros(3))

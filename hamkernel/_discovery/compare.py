@@ -38,7 +38,7 @@ from hamkernel._tuning.space import RIDGE, SearchSpace, named_values, velocity_r
 from hamkernel._tuning.tune import SEARCH_COPIES, check_finite_loss, decode, warn_of_constants
 from hamkernel._validation import check_memory
 
-# # A factor of e⁵ = 148 in the evidence. In the prototype no confident answer was wrong at 5, and
+# A factor of e⁵ = 148 in the evidence. In the prototype no confident answer was wrong at 5, and
 # up to 5 % at 3; see `tests/benchmarks/comparison.py`.
 THRESHOLD = 5.0
 
@@ -178,7 +178,7 @@ def compare(
     """
     from tqdm import tqdm  # so that importing the package does not load it
 
-    require.untraced("hk.compare", "Call it outside.", X, Y, candidates)
+    require.no_tracers("hk.compare", "Call it outside.", X, Y, candidates)
     data, ridge = _data(X, Y)
     rows = make_problem(Separable(Gaussian(1.0)), data, None, 1.0).rows
     points, n, D = np.asarray(rows.points), rows.dimension, rows.size
@@ -213,7 +213,7 @@ def _maximise_evidence(
     rms = velocity_rms(K, rows)
     space = SearchSpace(K, rows.points, rms, ridge, (), {})
     criterion = criterion_of("marginal_likelihood", rows.count, 2)
-    # # The search of `tune`, with a design of 32 points instead of up to 256, since the first point
+    # The search of `tune`, with a design of 32 points instead of up to 256, since the first point
     # already has the size of the data.
     search = Search(
         space,

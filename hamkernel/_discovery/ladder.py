@@ -74,7 +74,7 @@ class Rung(AbstractMatrixKernel):
         S = jnp.tile(jnp.asarray(_signs(n, images), dtype), (parts, 1))
         one = jnp.eye(n, dtype=dtype)
         B = c * one + h * self._hamiltonian_operator(n).astype(dtype)
-        # # Let k = w exp(−½(x − Sz)ᵀD(x − Sz)), D and S diagonal, and a = D(x − Sz). Then ∂x k = −k
+        # Let k = w exp(−½(x − Sz)ᵀD(x − Sz)), D and S diagonal, and a = D(x − Sz). Then ∂x k = −k
         # a, ∂z k = k Sa and ∂x_i a_j = D_ij, ∂z_j a_i = −(DS)_ij, so
         #     M = ∂x ∂zᵀ k = k (DS − a(Sa)ᵀ),     B M Bᵀ = k (B DS Bᵀ − (Ba)(BSa)ᵀ),
         #     tr(M) I − Mᵀ = k ((tr DS − a·Sa) I − DS + (Sa)aᵀ).
@@ -84,7 +84,7 @@ class Rung(AbstractMatrixKernel):
         if n > 2:
             C = C + d * ((D * S).sum(axis=1)[:, None, None] - (D * S)[..., None]) * one[None]
 
-        # # The components of Ba and BSa are separate arrays (N, M), computed once and kept. If XLA
+        # The components of Ba and BSa are separate arrays (N, M), computed once and kept. If XLA
         # fused them into each entry of the blocks, they took eight times as long.
         @jax.checkpoint
         def term(w, D, S, C):

@@ -36,7 +36,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._discovery.formula import Formula, operator_of
-from hamkernel._fields.joined import at_inputs, known_of
+from hamkernel._fields.joined import fix_inputs, known_of
 from hamkernel._gram import gram_of_rows
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._kernels.symmetry import symmetry_removed
@@ -99,7 +99,7 @@ def readout(
     Source: Brunton, Proctor & Kutz (2016) for the dictionary; Chen & Chen (2008), Biometrika 95,
         for the criterion; Hoeting et al. (1999), Statistical Science 14, for the deviations.
     """
-    require.untraced("hk.readout", "Call it outside, on what was learned.", learned)
+    require.no_tracers("hk.readout", "Call it outside, on what was learned.", learned)
     kernel, rows, ridge, mean = _data_of(learned)
     most = require.count(most, "most")
     if kernel.no_potential:
@@ -155,7 +155,7 @@ def _data_of(learned: Any) -> tuple[AbstractMatrixKernel, Any, Float[Array, ""],
             "without parameters."
         )
     if kernel.takes_inputs and mean is not None:
-        mean = at_inputs(mean, 0, None)  # the mean of the drift
+        mean = fix_inputs(mean, 0, None)  # the mean of the drift
     return kernel, rows, ridge, mean
 
 
@@ -265,11 +265,11 @@ def _of_dictionary(operator: Any, functions: tuple[Any, ...], n: int) -> tuple[A
         return values, abs(values)
 
     def evaluate_at_points(fn):
-        def at_points(points):
+        def values_and_sizes(points):
             values, typical = jax.vmap(fn)(points[:, :n])
             return values, typical.max(axis=0)
 
-        return eqx.filter_jit(at_points)
+        return eqx.filter_jit(values_and_sizes)
 
     return evaluate_at_points(field), evaluate_at_points(value)
 
@@ -346,13 +346,13 @@ def _select(columns: np.ndarray, y: np.ndarray, most: int) -> _Selection:
         )
     sizes = np.linalg.norm(columns, axis=0)
     T = np.asarray(np.linalg.qr(np.column_stack([columns / sizes, y]), mode="r"))
-    # # Residuals below the rounding of y cannot be compared.
+    # Residuals below the rounding of y cannot be compared.
     floor = (np.finfo(float).eps * np.linalg.norm(y)) ** 2 * R
     scores, batches = [], []
     for k in range(1, most + 1):
         prior = k * math.log(R) + 2 * math.log(math.comb(D, k))
         subsets = itertools.combinations(range(D), k)
-        # # 20 000 subsets in one stack of QR factorisations.
+        # 20 000 subsets in one stack of QR factorisations.
         while len(batch := np.array(list(itertools.islice(subsets, 20_000)), int)):
             theta, inverse, squares = _least_squares(T, batch)
             squares = np.maximum(squares, floor)

@@ -12,8 +12,8 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._machine import EqualToItself, compiled, follow_data, full_precision
-from hamkernel._show import Shown, described, has_arrays, text
+from hamkernel._machine import EqualToItself, follow_data, full_precision, precise_jit
+from hamkernel._show import Shown, describe, has_arrays, text
 from hamkernel._sizes import sizes
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.joined import AbstractJoinedKernel, KnownMatrix
@@ -27,8 +27,8 @@ Scalar = Callable[[Num[ArrayLike, " n"]], Float[Array, ""]]
 class AbstractField(Shown, EqualToItself, eqx.Module):
     """A learned vector field x -> f(x), one state of shape (n,) per call.
 
-    It is a PyTree and a pure function: `jax.jit(field)`, `jax.vmap(field)(X)`, `jax.jacfwd(field)`
-    and `jax.export` work on it.
+    A field is a PyTree and a pure function, so `jax.jit(field)`, `jax.vmap(field)(X)`,
+    `jax.jacfwd(field)` and `jax.export` work.
     """
 
     kernel: eqx.AbstractVar[AbstractMatrixKernel]
@@ -73,7 +73,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
     def residual_norm(self) -> Float[Array, ""]:
         """‖y − f(X)‖ over all the training data, in units of Y, shape ().
 
-        Known after a fit to a stream too, which keeps no residuals.
+        The norm is known also after a fit to a stream, which keeps no residuals.
         """
         norm_of_stream = self.info.residual_norm
         return jnp.linalg.norm(self.residual) if norm_of_stream is None else norm_of_stream
@@ -81,18 +81,18 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
     def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
         """The velocity f(x), including the mean."""
         x = self._state(x)
-        learned = self._learned(x)
+        learned = self._velocity(x)
         if self.mean is None:
             return learned
         return learned + full_precision(self.mean)(x).astype(learned.dtype)
 
     @abc.abstractmethod
-    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    def _velocity(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """The velocity without the mean."""
 
     @full_precision
     def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """The potential, with the constant that the representer and the mean happen to have."""
+        """The potential without `offset`: its constant is arbitrary."""
         self.kernel.check_potential()
         x = self._state(x)
         learned = self._learned_potential(x)
@@ -117,9 +117,12 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         self._check_single()
         X = require.points(X, "X").astype(self.offset.dtype)
         if X.shape[1] != self.dimension:
-            raise ValueError(f"X has {X.shape[1]} coordinates and the field {self.dimension}.")
+            raise ValueError(
+                f"X has {X.shape[1]} coordinates and the field {self.dimension}: states of shape "
+                f"(N, {self.dimension}) are needed."
+            )
         learned = self._velocities(X)
-        return learned if self.mean is None else learned + at_points(self.mean, X)
+        return learned if self.mean is None else learned + map_states(self.mean, X)
 
     @abc.abstractmethod
     def _velocities(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
@@ -131,9 +134,9 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         Y: Num[ArrayLike, "N n"],
         U: Num[ArrayLike, "N m"] | None = None,
     ) -> Float[Array, ""]:
-        """R² = 1 − Σ‖yᵢ − f(xᵢ)‖²/Σ‖yᵢ − ȳ‖² of velocities that were not learned from, shape ().
+        """R² = 1 − Σ‖yᵢ − f(xᵢ)‖²/Σ‖yᵢ − ȳ‖² on held-out velocities yᵢ, shape ().
 
-        One for a perfect field, zero for the mean ȳ, negative for a worse one.
+        R² is 1 for a perfect field, 0 for the mean ȳ, and negative for a field worse than ȳ.
 
         Args:
             X: states, shape (N, n).
@@ -146,7 +149,10 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         velocities = self.evaluate(*(X,) if U is None else (X, U))
         measured = require.points(Y, "Y").astype(velocities.dtype)
         if measured.shape != velocities.shape:
-            raise ValueError(f"Y has shape {measured.shape} and X needs {velocities.shape}.")
+            raise ValueError(
+                f"Y has shape {measured.shape}; one velocity for each state in X, shape "
+                f"{velocities.shape}, is needed."
+            )
         spread = measured - jnp.nanmean(measured, axis=0, keepdims=True)
         return 1 - jnp.nansum((measured - velocities) ** 2) / jnp.nansum(spread**2)
 
@@ -196,9 +202,9 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         if not self.kernel.has_hamiltonian:
             raise AttributeError(
                 f"a field of the kernel {type(self.kernel).__name__} is not Hamiltonian by "
-                "construction, so it has no learned Hamiltonian. Use Symplectic(k); for a sum "
-                "that contains one ask that part, by position or name, such as "
-                "field.part(0).hamiltonian(x); for CurlFree see field.potential(x)."
+                "construction, so it has no learned Hamiltonian. Use Symplectic(k). If the kernel "
+                "is a sum with a Symplectic term, ask the part, by position or name, such as "
+                "field.part(0).hamiltonian(x). For CurlFree use field.potential(x)."
             )
         return self.potential
 
@@ -206,13 +212,13 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
     def law(self, r: Num[ArrayLike, "..."], r0: Any = None, which: int = 0) -> Float[Array, ""]:
         """The law w of `hk.Shared` at r, such as a pair potential at a distance, shape ().
 
-        Fields say nothing of its constant: w(r) − w(r₀) with `r0`.
+        The data do not determine the constant of w: with `r0` the result is w(r) − w(r₀).
 
         Args:
-            r: a distance or difference as `hk.pairs` and `hk.neighbours` measure it, or one point
-                of your own parts, shape (d,); `jax.vmap(field.law)(r)` for many.
-            r0: where the law is zero; None for the constant of the smallest norm.
-            which: which of several laws, in the order of the kernel.
+            r: a distance as `hk.pairs` measures it, a difference as `hk.neighbours` does, or one
+                point of your own parts, shape (d,); `jax.vmap(field.law)(r)` for many.
+            r0: an argument at which the law is zero; None for the constant of the smallest norm.
+            which: the position of the law in the kernel, if there are several.
 
         Raises:
             AttributeError: no part of the kernel is `Shared`. IndexError: there is no such law.
@@ -220,7 +226,8 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         laws = self._laws()
         if not laws:
             raise AttributeError(
-                "the field has no law: no part of its kernel is hk.Shared(k, parts)."
+                "the field has no law: no term of its kernel is hk.Shared(k, parts). For the "
+                "potential of the whole field use field.potential(x)."
             )
         # Compiled, since JAX would compile each operation of jax.vmap(field.law)(r) by itself.
         zero = None if r0 is None else require.floating(r0, "r0")
@@ -228,10 +235,10 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
 
     @property
     def undetermined(self) -> tuple[str, ...]:
-        """The changes of the laws of `hk.Shared` that no data tell, a sentence for each.
+        """The changes of the laws of `hk.Shared` that change no velocity, a sentence for each.
 
-        A constant in a law changes no velocity. Nor does a linear term, if the sum of its parts is
-        constant or if another law has the same sum.
+        A constant in a law changes no velocity. Nor does a linear term if the sum over its parts is
+        constant, or equals the sum over the parts of another law.
         """
         return undetermined_terms(self.kernel, self.dimension)
 
@@ -242,7 +249,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
     def dissipation(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """The dissipated power at x, −dH/dt = ∇HᵀR∇H along the field, shape ().
 
-        It is not negative with `PortHamiltonian`, zero if H is conserved, and of any sign with an
+        The power is ≥ 0 for `PortHamiltonian`, zero if H is conserved, and of any sign for an
         operator of your own.
 
         Raises:
@@ -254,7 +261,8 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
     def _check_single(self) -> None:
         if self.offset.shape:
             raise ValueError(
-                f"this is a batch of {self.offset.size} fields: jax.vmap(lambda f: f(x))(fields)."
+                f"this is a batch of {self.offset.size} fields, and a method needs one: "
+                "jax.vmap(lambda f: f(x))(fields)."
             )
 
     def _state(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
@@ -281,8 +289,8 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         offset = require.value(
             offset,
             require.not_finite(offset),
-            "x0 and value must be finite, and the field, which is NaN where a fit with throw=False "
-            "failed: one of them is not.",
+            "x0, value and the field must be finite, and one of them is not. A field is NaN if a "
+            "fit with throw=False failed.",
         )
         return eqx.tree_at(lambda field: field.offset, self, offset)
 
@@ -291,7 +299,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         """Whether H(q, p) = T(p) + U(q) follows from the kernel, as explicit integrators need.
 
         True for a symplectic kernel whose scalar kernels are sums of `Select`s, each on q alone
-        or on p alone, and a mean that says it of itself.
+        or on p alone, if the mean is zero or has an attribute `is_separable` that is true.
         """
         if self.mean is not None and not getattr(self.mean, "is_separable", False):
             return False
@@ -304,9 +312,9 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         )
 
 
-@compiled
+@precise_jit
 def _law_at(waves: Any, weights: Float[Array, " m"], r: Array, r0: Array | None) -> Array:
-    waves_at_r = waves.of_law(r) if r0 is None else waves.of_law(r) - waves.of_law(r0)
+    waves_at_r = waves.law_values(r) if r0 is None else waves.law_values(r) - waves.law_values(r0)
     return waves_at_r.astype(weights.dtype) @ weights
 
 
@@ -390,7 +398,7 @@ def _takes_inputs(mean: Any, x: Float[Array, " n"]) -> bool:
     """Whether the mean takes x and u; a second argument with a default does not count."""
     if getattr(mean, "takes_inputs", False):
         return True
-    alone, both = (require.other_arguments(mean, *args) for args in ((x,), (x, x)))
+    alone, both = (require.signature_mismatch(mean, *args) for args in ((x,), (x, x)))
     return callable(mean) and alone is not None and both is None
 
 
@@ -410,8 +418,8 @@ def potential_of(field: Callable[..., Any], kernel: AbstractMatrixKernel) -> Sca
         why = f"was learned with {type(field.kernel).__name__}: learn both with one structure."
     elif hasattr(field, "hamiltonian"):
         why = (
-            f"has a Hamiltonian H with f = J∇H, and {structure} makes fields B∇u of another B: "
-            "take Symplectic(k), or use velocities alone."
+            f"has a Hamiltonian H with f = J∇H, and {structure} makes fields B∇u with another B: "
+            "use Symplectic(k), or learn from velocities alone."
         )
     else:
         why = (
@@ -424,13 +432,13 @@ def potential_of(field: Callable[..., Any], kernel: AbstractMatrixKernel) -> Sca
     )
 
 
-def at_points(fn: Callable[..., Any], X: Float[Array, "N n"]) -> Float[Array, "N *out"]:
+def map_states(fn: Callable[..., Any], X: Float[Array, "N n"]) -> Float[Array, "N *out"]:
     """fn(x) at many states, in bounded memory, in their dtype."""
     return jax.lax.map(lambda x: jnp.asarray(fn(x)).astype(X.dtype), X, batch_size=sizes().states)
 
 
 def root(square: Float[Array, ""]) -> Float[Array, ""]:
-    """√square; zero, with a zero derivative, if rounding or data of zeros make `square` ≤ 0."""
+    """√square; zero, with zero derivative, for `square` ≤ 0, from rounding or data of zeros."""
     nothing = square <= 0
     return jnp.where(nothing, 0.0, jnp.sqrt(jnp.where(nothing, jnp.ones_like(square), square)))
 
@@ -465,11 +473,11 @@ class SolverInfo(eqx.Module):
     relative_residual: Float[Array, ""] | None = None
 
     def __repr__(self) -> str:
-        return described(self)
+        return describe(self)
 
     @property
     def words(self) -> str:
-        """The same as words: `Cholesky, relative residual 8.9e-16`."""
+        """The attributes in words: `Cholesky, relative residual 8.9e-16`."""
         numbers = {name: v for name, v in vars(self).items() if v is not None and name != "solver"}
         return ", ".join(
             [self.solver, *(f"{k.replace('_', ' ')} {text(v)}" for k, v in numbers.items())]

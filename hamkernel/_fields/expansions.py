@@ -9,10 +9,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hamkernel._features import AbstractFeatures, SumFeatures, laws_of, part_waves
-from hamkernel._fields.base import AbstractField, SolverInfo, at_points, root
-from hamkernel._gram import centred
+from hamkernel._fields.base import AbstractField, SolverInfo, map_states, root
+from hamkernel._gram import subtract_centre
 from hamkernel._gram_operator import placed_product
-from hamkernel._machine import compiled, on_each, row_sharding, shard, to_caller_sharding
+from hamkernel._machine import map_devices, precise_jit, row_sharding, shard, to_caller_sharding
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.structure import AbstractPotentialKernel
 
@@ -27,9 +27,9 @@ class KernelField(AbstractField):
         kernel: K.
         points: zⱼ, shape (M, n): the data, or the landmarks of a low-rank solver.
         coefficients: aⱼ, shape (M, n).
-        residual: yᵢ − f(xᵢ) at the training data, shape (N, n); for other observations one residual
-            for each row, in the units of the row, shape (M,); of shape (0, n) after a fit to a
-            stream, whose data are not kept.
+        residual: yᵢ − f(xᵢ) at the training data, shape (N, n). For other observations than
+            complete velocities one residual for each row, in the units of the row, shape (M,).
+            After a fit to a stream, whose data are not kept, empty, shape (0, n).
         norm: the norm of f minus its mean in the RKHS of K, shape ().
         regularization: the λ of the fit, shape ().
         offset: the constant in the potential, shape ().
@@ -55,7 +55,7 @@ class KernelField(AbstractField):
     def dimension(self) -> int:
         return self.points.shape[-1]
 
-    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    def _velocity(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         field = _expansion(self.kernel, x, self.points, self.coefficients)
         return self._add_values(field, _value_field, x)
 
@@ -68,7 +68,7 @@ class KernelField(AbstractField):
         return self._add_values(potential, _value_potential, x)
 
     def _add_values(self, field: Array, contribution: Callable[..., Array], x: Array) -> Array:
-        """`of_field`, plus the contribution `of_values(K, x, s, b)` of the energies if any."""
+        """`field`, plus `contribution(K, x, s, b)` if there are energies."""
         S, b = self.value_points, self.value_coefficients
         return field if S is None or b is None else field + contribution(self.kernel, x, S, b)
 
@@ -86,55 +86,55 @@ class KernelField(AbstractField):
 
     def _term(self, kernel: Sum, position: int) -> "KernelField":
         term, Z, A = kernel.terms[position], self.points, self.coefficients
-        # ‖f‖² = aᵀG_aa a + 2aᵀG_ab b + bᵀG_bb b, where a are the coefficients of K(·, z) and b
-        # those of k(·, s). With doubled coefficients 2a the potential at the points S of the values
-        # is u(S) = 2G_ba a + G_bb b, so b·u(S) is the sum of the last two terms.
+        # ‖f‖² = aᵀG_aa a + 2aᵀG_ab b + bᵀG_bb b, a the coefficients of K(·, z), b of k(·, s). With
+        # coefficients 2a the potential at the points S is u(S) = 2G_ba a + G_bb b, so b·u(S) is the
+        # sum of the last two terms.
         square = jnp.sum(A * placed_product(term, Z, Z, A))
         bare = dataclasses.replace(self, kernel=term, offset=jnp.zeros_like(self.offset), mean=None)
         S, b = self.value_points, self.value_coefficients
         if S is not None and b is not None:
             doubled = dataclasses.replace(bare, coefficients=2 * A)
-            square = square + b @ at_points(doubled._learned_potential, S)
+            square = square + b @ map_states(doubled._learned_potential, S)
         return dataclasses.replace(bare, norm=root(square))
 
 
-@compiled
+@precise_jit
 def _expansion(
     K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
 ) -> Float[Array, " n"]:
     """f(x) = Σⱼ K(x, zⱼ) aⱼ through the potential, without (n, n) blocks."""
-    x, Z = centred(K, x, Z)
+    x, Z = subtract_centre(K, x, Z)
     return K.expansion(x, Z, A)
 
 
-@compiled
+@precise_jit
 def _potential(
     K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
 ) -> Float[Array, ""]:
     """The potential of `_expansion`."""
-    x, Z = centred(K, x, Z)
+    x, Z = subtract_centre(K, x, Z)
     return K.potential(x, Z, A)
 
 
-@compiled
+@precise_jit
 def _value_potential(
     K: AbstractMatrixKernel, x: Float[Array, " n"], S: Float[Array, "E n"], b: Float[Array, " E"]
 ) -> Float[Array, ""]:
     """Σₑ bₑ k(x, sₑ)."""
-    x, S = centred(K, x, S)
+    x, S = subtract_centre(K, x, S)
     return b @ jax.vmap(K.potential_covariance, in_axes=(None, 0))(x, S)
 
 
-@compiled
+@precise_jit
 def _value_field(
     K: AbstractMatrixKernel, x: Float[Array, " n"], S: Float[Array, "E n"], b: Float[Array, " E"]
 ) -> Float[Array, " n"]:
     """The field of `_value_potential`.
 
-    The component along v is Cov(vᵀf(x), Σ bₑ u(sₑ)) = Σ bₑ (potential of K(·, x)v at sₑ). This
-    number is linear in v, so its gradient with respect to v is the field, and B need not be known.
+    The component along v is Cov(vᵀf(x), Σ bₑ u(sₑ)) = Σ bₑ (potential of K(·, x)v at sₑ). The
+    component is linear in v, so its gradient with respect to v is the field, without use of B.
     """
-    x, S = centred(K, x, S)
+    x, S = subtract_centre(K, x, S)
 
     def component(v):
         return b @ jax.vmap(lambda s: K.potential(s, x[None], v[None]))(S)
@@ -142,9 +142,9 @@ def _value_field(
     return jax.grad(component)(jnp.zeros(K.outputs(len(x)), x.dtype))
 
 
-@compiled
+@precise_jit
 def _value_fields(K, X, S, b):
-    return at_points(lambda x: _value_field(K, x, S, b), X)
+    return map_states(lambda x: _value_field(K, x, S, b), X)
 
 
 def kernel_field(
@@ -182,8 +182,8 @@ class FeatureField(AbstractField):
         features: φ, with frequencies and amplitudes; `F = field.features(X)`, shape (N, n, r),
             holds φ_r(xᵢ), so `jnp.einsum("iar,jbr->iajb", F, F)` is the Gram of the approximation.
         weights: w, shape (r,).
-        residual: yᵢ − f(xᵢ) at the training data, shape (N, n); of shape (0, n) after a fit to a
-            stream, which is not kept.
+        residual: yᵢ − f(xᵢ) at the training data, shape (N, n). After a fit to a stream, whose data
+            are not kept, empty, shape (0, n).
         norm: ‖w‖, the norm of f in the RKHS of the approximate kernel, shape ().
         regularization: the λ of the fit, shape ().
         offset: the constant in the potential, shape ().
@@ -205,7 +205,7 @@ class FeatureField(AbstractField):
     def dimension(self) -> int:
         return self.residual.shape[-1]
 
-    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    def _velocity(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         return _field_at(self.features, x, self.weights)
 
     def _velocities(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
@@ -254,16 +254,18 @@ def feature_field(
     )
 
 
-@compiled
+@precise_jit
 def _field_at(features, x, weights):
     return features.field(x, weights)
 
 
-@compiled
+@precise_jit
 def _potential_at(features, x, weights):
     return features.potential(x, weights)
 
 
-@compiled
+@precise_jit
 def _evaluate(field, X, spread):
-    return on_each(spread, lambda field, X: at_points(field._learned, X), field, X, joined=True)
+    return map_devices(
+        spread, lambda field, X: map_states(field._velocity, X), field, X, joined=True
+    )

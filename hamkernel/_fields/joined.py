@@ -19,7 +19,7 @@ from hamkernel._fields.base import (
     KnownPart,
     Scalar,
     SolverInfo,
-    at_points,
+    map_states,
     root,
 )
 from hamkernel._fields.expansions import FeatureField, KernelField
@@ -30,7 +30,7 @@ from hamkernel._structures.joined import AbstractJoinedKernel
 
 
 def _column(u: Array, ndim: int, m: int) -> Array:
-    """Numbers as inputs of shape (…, 1), where there is one for each of the states."""
+    """U in the shape (…, 1), if m = 1 and there is one number for each state."""
     return u[..., None] if u.ndim == ndim and m == 1 else u
 
 
@@ -127,11 +127,11 @@ class AbstractJoinedField(AbstractField):
         Raises:
             ValueError: u is missing, or x or u has another shape.
         """
-        s = self.joined(x, u)
-        learned, mean = self.whole._learned(s), self.whole.mean
+        s = self.join(x, u)
+        learned, mean = self.whole._velocity(s), self.whole.mean
         return learned if mean is None else learned + mean(s).astype(learned.dtype)
 
-    def joined(self, x: Any, u: Any) -> Float[Array, " d"]:
+    def join(self, x: Any, u: Any) -> Float[Array, " d"]:
         """The point (x, u).
 
         Raises:
@@ -180,7 +180,7 @@ class AbstractJoinedField(AbstractField):
             )
         S, mean = jnp.concatenate([X, inputs], axis=1), self.whole.mean
         learned = self.whole._velocities(S)
-        return learned if mean is None else learned + at_points(mean, S).reshape(len(S), n)
+        return learned if mean is None else learned + map_states(mean, S).reshape(len(S), n)
 
     def part(self, which: int | str) -> "AbstractJoinedField":
         """KeyError: a field of x alone has parts, a joint field has none."""
@@ -193,9 +193,9 @@ class AbstractJoinedField(AbstractField):
 class ControlledField(AbstractJoinedField):
     """f(x, u) = f(x) + G(x) u, one state (n,) and its inputs (m,) per call.
 
-    The potential, the Hamiltonian and the dissipation are those of the drift; `residual`, `norm`,
-    `regularization` and `info` belong to the whole. A mean of x and u may be any function of u; the
-    drift is then f(x, 0), and the input matrix ∂f/∂u there.
+    The potential, the Hamiltonian and the dissipation belong to the drift f(x); `residual`, `norm`,
+    `regularization` and `info` belong to f(x, u). A prior mean may be any function of x and u; the
+    drift is then f(x, 0), and the input matrix ∂f/∂u at u = 0.
 
     Attributes:
         whole: the field of the points (x, u), of dimension n + m.
@@ -228,12 +228,12 @@ class ControlledField(AbstractJoinedField):
     @property
     def drift(self) -> KernelField | FeatureField:
         """f, a field of its own: `field.drift(x)`, `field.drift.hamiltonian(x)`."""
-        return at_inputs(self.whole, self.dimension, None)
+        return fix_inputs(self.whole, self.dimension, None)
 
     def input_matrix(self, x: Num[ArrayLike, " n"]) -> Float[Array, "n m"]:
         """The input matrix G(x), shape (n, m)."""
         x = self._state(x)
-        # Forward mode drops all terms that do not depend on u: this costs as much as G(x) alone.
+        # Forward mode drops all terms without u, so this costs as much as G(x) alone.
         return jax.jacfwd(lambda u: self(x, u))(jnp.zeros(self.kernel.input_count, x.dtype))
 
     @property
@@ -252,8 +252,8 @@ class ControlledField(AbstractJoinedField):
     def _velocities(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         return self.drift._velocities(X)
 
-    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self.drift._learned(x)
+    def _velocity(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return self.drift._velocity(x)
 
     def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         return self.drift._learned_potential(x)
@@ -262,7 +262,7 @@ class ControlledField(AbstractJoinedField):
 class FamilyField(AbstractJoinedField):
     """f(x; θ), one state (n,) and the parameters θ (p,) of a member per call.
 
-    `field.at(θ)` is a member: an ordinary field of K, with its Hamiltonian and everything else.
+    `field.at(θ)` is a member: an ordinary field of K, with a Hamiltonian if K has one.
 
     Attributes:
         whole: the field of the points (x, θ), of dimension n + p.
@@ -307,38 +307,38 @@ class FamilyField(AbstractJoinedField):
             )
         theta = require.finite(theta, "θ").astype(self.offset.dtype)
         terms = tuple(
-            at_inputs(
+            fix_inputs(
                 dataclasses.replace(self._expansion, kernel=t, mean=None), self.dimension, theta
             )
             for t in K.terms
         )
-        mean = at_inputs(self.whole.mean, self.dimension, theta)
+        mean = fix_inputs(self.whole.mean, self.dimension, theta)
         if len(terms) == 1:
             return dataclasses.replace(terms[0], mean=mean)
         return MemberField(K.of_states, terms, self.offset, mean)  # pyright: ignore
 
     @property
     def potential(self) -> Scalar:
-        """Refused: each member has its own, `field.at(θ).potential`."""
+        """AttributeError: each member has a potential of its own, `field.at(θ).potential`."""
         raise AttributeError(
             "a family has no one potential: each member has its own, field.at(θ).potential, and "
             "field.at(θ).hamiltonian where the structure has one."
         )
 
     def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """Refused, as `potential`."""
+        """AttributeError, as `potential`."""
         return self.potential(x)
 
     @property
     def hamiltonian(self) -> Scalar:
-        """Refused: each member has its own, `field.at(θ).hamiltonian`."""
+        """AttributeError: each member has its own Hamiltonian, `field.at(θ).hamiltonian`."""
         return self.potential
 
     def _velocities(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
-        raise AttributeError("a family is evaluated at states and parameters.")
+        raise AttributeError("a family needs states and parameters: field.evaluate(X, Θ).")
 
-    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        raise AttributeError("a family is evaluated at a state and parameters.")
+    def _velocity(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        raise AttributeError("a family needs a state and parameters: field(x, θ).")
 
     def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
         return self.potential(x)
@@ -347,12 +347,11 @@ class FamilyField(AbstractJoinedField):
 class MemberField(AbstractField):
     """The member of a family with several terms, Σᵢ Σⱼ kᵢ(θ, θⱼ) Kᵢ(x, zⱼ) aⱼ.
 
-    The terms share their points, and each has coefficients of its own. The square of `norm` is the
-    sum of the squares of their norms.
+    The terms share their points; each term has its own coefficients. `norm` is (Σᵢ ‖fᵢ‖²)^½.
 
     Attributes:
         kernel: the sum of the Kᵢ.
-        terms: the field of each.
+        terms: the field of each Kᵢ.
         offset: the constant in the potential, shape ().
         mean: the prior mean at θ, x (n,) -> (n,), which is added; None if it is zero.
     """
@@ -391,8 +390,8 @@ class MemberField(AbstractField):
         """The outcome of the solver."""
         return self.terms[0].info
 
-    def _learned(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        return sum((t._learned(x) for t in self.terms), jnp.zeros_like(x))
+    def _velocity(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        return sum((t._velocity(x) for t in self.terms), jnp.zeros_like(x))
 
     def _velocities(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
         return sum((t._velocities(X) for t in self.terms), jnp.zeros_like(X))
@@ -404,13 +403,13 @@ class MemberField(AbstractField):
         return self.terms[position]
 
 
-def at_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
+def fix_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
     """A field or a mean of points (x, u) at one u, as a function of x.
 
     If u is None, the result is the drift of a `Controlled` kernel, at u = 0.
     """
     if isinstance(part, FieldSum):
-        terms = [at_inputs(term, n, u) for term in part.terms]
+        terms = [fix_inputs(term, n, u) for term in part.terms]
         kept = tuple(term for term in terms if term is not None)
         return FieldSum(kept) if kept else None
     if isinstance(part, KnownPart):
@@ -430,7 +429,7 @@ def at_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
             kernel=K.of_states,
             points=points[..., :n],
             value_points=None if values is None else values[..., :n],
-            mean=at_inputs(part.mean, n, u),
+            mean=fix_inputs(part.mean, n, u),
         )
         if u is None:
             return member
@@ -447,7 +446,7 @@ def at_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
             features=features,
             weights=part.weights[..., : features.columns],
             residual=part.residual[..., :n],
-            mean=at_inputs(part.mean, n, u),
+            mean=fix_inputs(part.mean, n, u),
         )
     return part
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._show import described
+from hamkernel._show import describe
 
 
 class Kinetic(eqx.Module):
@@ -56,30 +56,36 @@ class Kinetic(eqx.Module):
         return jnp.linalg.solve(mass, p) if mass.ndim == 2 else p / mass
 
     def __repr__(self) -> str:
-        return described(self)
+        return describe(self)
 
 
 def kinetic(mass: ArrayLike) -> Kinetic:
-    """The prior mean (M⁻¹p, 0) for known masses: K then learns the forces.
+    """The prior mean (M⁻¹p, 0) of a system with known masses M; the kernel then learns the forces.
 
         hk.learn(K, hk.Runs(times, states), mean=hk.kinetic(mass=1.0))
 
-    It is saved with a field, so that `load` needs no `mean`, and its energy ½ pᵀM⁻¹p is part of
-    `field.hamiltonian`.
+    The energy ½ pᵀM⁻¹p of the mean is part of `field.hamiltonian`. `save` stores the mean with the
+    field, so `load` needs no `mean`.
 
     Args:
-        mass: one mass for all positions, one for each, shape (m,), or a symmetric positive definite
-            matrix (m, m).
+        mass: M, in the units p/q̇: one mass for all positions, one for each, shape (m,), or a
+            symmetric positive definite matrix (m, m).
+
+    Returns:
+        A function x (n,) -> (n,) with the method `hamiltonian(x)`, n = 2m.
 
     Raises:
-        ValueError: the shape is another; a mass is not positive, or the matrix not symmetric
-            positive definite. TypeError: these are no real numbers.
+        ValueError: the shape is none of these; a mass is not positive; or the matrix is not
+            symmetric positive definite. TypeError: `mass` holds no real numbers.
     """
     mass_array = require.floating(mass, "mass")
     if mass_array.ndim == 2 and mass_array.shape[0] == mass_array.shape[1]:
         matrix = np.asarray(mass_array)
         if not np.allclose(matrix, matrix.T) or not (np.linalg.eigvalsh(matrix) > 0).all():
-            raise ValueError("a mass matrix must be symmetric and positive definite.")
+            raise ValueError(
+                "mass must be a symmetric positive definite matrix; got one that is not. Check its "
+                "entries, or give one mass for each position, shape (m,)."
+            )
         return Kinetic(mass_array)
     if mass_array.ndim > 1:
         raise ValueError(f"mass has shape {mass_array.shape}; (), (m,) or (m, m) is needed.")

@@ -10,26 +10,26 @@ from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._machine import EqualToItself, compiled, full_precision
+from hamkernel._machine import EqualToItself, full_precision, precise_jit
 from hamkernel._show import Shown, has_arrays, text
 from hamkernel._structures.lagrangian import Lagrangian, LagrangianFeatures
 
 
 class LagrangianField(Shown, EqualToItself, eqx.Module):
-    """The machine that torques tell of; made by `fit` and `learn` with a `Lagrangian`.
+    """Learned Lagrangian mechanics, M(q) a + C(q, v) v + ∂V/∂q + friction(v) = τ.
 
-    `field(x, u)` is ẋ = (v, a) of the state x = (q, v) under the torques u, so that
-    `hk.simulate(field, x0, ts, inputs=u)` runs it. Where M(q) is not positive definite there is no
-    acceleration, and it refuses.
+    Made by `fit` and `learn` with a `Lagrangian`. `field(x, u)` is ẋ = (v, a) for the state
+    x = (q, v) and the torques u, so `hk.simulate(field, x0, ts, inputs=u)` simulates the machine. A
+    call raises a RuntimeError if M(q) is not positive definite.
 
-    It is its own posterior: the methods that end in `_deviation` are standard deviations.
+    The field contains its posterior: methods that end in `_deviation` return standard deviations.
 
     Attributes:
         features: the features of L and of friction, with the kernel.
-        coefficients: those of the kernels at the centres, and of friction, shape (r,).
-        triangle: R with RᵀR = BᵀB + I of the torques' rows B, over their noise, shape (r, r).
+        coefficients: the coefficients of the kernels at the centres, then of friction, shape (r,).
+        triangle: R with RᵀR = BᵀB + I, B the rows of the torques over their noise, shape (r, r).
         noise: the standard deviation of the torque of each joint, shape (m,).
-        residual: measured less learned torques, shape (N, m); of `learn`, their means over windows.
+        residual: measured minus learned torques, shape (N, m); after `learn`, means over windows.
         least_inertia: the smallest eigenvalue of M at the state of the data where it is least
             certain to be positive: λ − 2σ is smallest there, with σ its standard deviation.
         least_inertia_deviation: σ there, shape ().
@@ -81,8 +81,8 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
             "the mass matrix is not identified: its smallest eigenvalue at the data is "
             f"{float(self.least_inertia):.3g}, with a standard deviation of "
             f"{float(self.least_inertia_deviation):.3g}, mostly of joint {joint}. Motions along "
-            "one path do not tell inertia from gravity and friction: add others, or "
-            "hk.Lagrangian(…, friction=True) where joints have friction. A joint without a torque "
+            "one path do not tell inertia from gravity and friction: add other motions, or "
+            "hk.Lagrangian(…, friction=True) if the joints have friction. A joint without a torque "
             "that is not coupled to the others needs a torque or an entry of known_mass_matrix."
         )
 
@@ -104,9 +104,9 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
         a = require.value(
             jnp.linalg.solve(M, torques - rest),
             ~positive,
-            "the mass matrix is not positive definite at this state, so it has no acceleration: "
-            "the data do not identify M there. field.least_inertia and its deviation say so of the "
-            "data; more motions, a friction that is missing, or a longer lengthscale may help.",
+            "the mass matrix is not positive definite at this state, so there is no acceleration: "
+            "the data do not identify M there. Compare field.least_inertia with "
+            "field.least_inertia_deviation. Add motions, friction=True, or a longer lengthscale.",
             RuntimeError,
         )
         return jnp.concatenate([v, a])
@@ -184,7 +184,7 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
 
     @full_precision
     def momentum(self, x: Num[ArrayLike, " n"]) -> Float[Array, " m"]:
-        """P = ∂L/∂v = M(q) v of the state x = (q, v), shape (m,)."""
+        """The momentum p = ∂L/∂v = M(q) v of the state x = (q, v), shape (m,)."""
         q, v = jnp.split(self._state(x), 2)
         return self.mass_matrix(q) @ v
 
@@ -223,20 +223,19 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
         return jnp.zeros_like(self.least_inertia)
 
     def _variance(self, rows: Float[Array, "*k r"]) -> Float[Array, "*k"]:
-        """The variance of rows in kernels, carried by the centres."""
+        """The posterior variance of rows in kernels, in the span of the centres."""
         done = self.features.whiten(rows).reshape(-1, rows.shape[-1])
         whitened = solve_triangular(self.triangle, done.T, trans="T")
         return jnp.sum(whitened**2, axis=0).reshape(rows.shape[:-1])
 
-    def _missing(self, k, q, other) -> Float[Array, ""]:
-        """The prior covariance of k at two positions that the centres do not carry."""
-        whole = k(self.kernel.embed(q), self.kernel.embed(other))
+    def _missing(self, k, q, q2) -> Float[Array, ""]:
+        """The prior covariance k(q, q₂) outside the span of the centres."""
         root = self.features.roots[0 if k is self.kernel.potential else 1]
-        mine, others = (
-            solve_triangular(root, self.features.kernel_values(k, at), lower=True)
-            for at in (q, other)
+        whitened, whitened2 = (
+            solve_triangular(root, self.features.kernel_values(k, at), lower=True) for at in (q, q2)
         )
-        return jnp.maximum(whole - mine @ others, 0.0) if q is other else whole - mine @ others
+        missing = k(self.kernel.embed(q), self.kernel.embed(q2)) - whitened @ whitened2
+        return jnp.maximum(missing, 0.0) if q is q2 else missing
 
     def _state(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
         return require.point(x, self.dimension).astype(self.coefficients.dtype)
@@ -261,7 +260,7 @@ def lagrangian_field(
     return eqx.tree_at(least, field, _least_inertia(field, X[:, : features.count]))
 
 
-@compiled
+@precise_jit
 def _least_inertia(field: LagrangianField, Q: Float[Array, "N m"]) -> tuple[Array, Array, Array]:
     def at_position(q):
         values, vectors = jnp.linalg.eigh(field.mass_matrix(q))

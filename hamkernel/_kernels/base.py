@@ -22,7 +22,7 @@ from jaxtyping import Array, ArrayLike, Float, Key
 
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._show import described, exponential, in_brackets, joined, text
+from hamkernel._show import describe, exponential, join_terms, put_in_brackets, text
 
 Point = Float[Array, " n"]
 Points = Float[Array, "M n"]
@@ -163,7 +163,7 @@ class AbstractScalarKernel(eqx.Module):
     """
 
     def __repr__(self) -> str:
-        return described(self, positional=("kernel",))
+        return describe(self, positional=("kernel",))
 
     def __hash__(self) -> int:
         # Arrays have no hash. Equal kernels have equal structure, so this one fits `==`.
@@ -272,7 +272,7 @@ class ScalarSum(AbstractScalarKernel):
     terms: tuple[AbstractScalarKernel, ...]
 
     def __repr__(self) -> str:
-        return joined("+", [repr(k) for k in self.terms])
+        return join_terms("+", [repr(k) for k in self.terms])
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         return sum((k(x, z) for k in self.terms[1:]), start=self.terms[0](x, z))
@@ -339,7 +339,7 @@ class ScalarProduct(AbstractScalarKernel):
     terms: tuple[AbstractScalarKernel, ...]
 
     def __repr__(self) -> str:
-        return joined("*", [_as_factor(k) for k in self.terms])
+        return join_terms("*", [_as_factor(k) for k in self.terms])
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         return math.prod((k(x, z) for k in self.terms[1:]), start=self.terms[0](x, z))
@@ -446,7 +446,7 @@ class Scaled(AbstractScalarKernel):
 
 
 def _as_factor(kernel: AbstractScalarKernel) -> str:
-    return in_brackets(repr(kernel)) if isinstance(kernel, ScalarSum) else repr(kernel)
+    return put_in_brackets(repr(kernel)) if isinstance(kernel, ScalarSum) else repr(kernel)
 
 
 class UserKernel(AbstractScalarKernel):
@@ -464,7 +464,7 @@ class UserKernel(AbstractScalarKernel):
     def __repr__(self) -> str:
         fn = getattr(self.fn, "__self__", self.fn)  # the kernel of tinygp that has the method
         bare = type(fn).__repr__ is eqx.Module.__repr__  # which shows no values
-        return described(fn) if bare else text(fn)
+        return describe(fn) if bare else text(fn)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         value = self.fn(x, z)

@@ -379,7 +379,7 @@ class Periodic(AbstractScalarKernel):
         lengthscale, M = self.lengthscale.astype(dtype), 1024
         lengthscale = require.value(
             lengthscale,
-            require.on_host(lengthscale) < 1 / 64,
+            require.host_array(lengthscale) < 1 / 64,
             "RandomFeatures of a Periodic kernel needs a lengthscale (dimensionless) of at least "
             "1/64.",
         )

@@ -33,7 +33,7 @@ from hamkernel._kernels.base import (
     one_point,
 )
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._show import call, described, text
+from hamkernel._show import call, describe, text
 
 _AT_ONCE = 2**16  # parts times centres that are computed at once: arrays of 512 KB
 _CENTRES = 64  # a law of one variable: lengthscales from a thirtieth of the range on
@@ -350,7 +350,7 @@ class _Sites(eqx.Module):
     periodic: bool = eqx.field(static=True)
 
     def __repr__(self) -> str:
-        return described(self)
+        return describe(self)
 
     @property
     def positions(self) -> int:

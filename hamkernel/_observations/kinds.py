@@ -25,14 +25,14 @@ from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components, Values
-from hamkernel._show import described, joined, shortened
+from hamkernel._show import describe, join_terms, shorten
 
 
 class AbstractObservations(eqx.Module):
     """Measured values of linear functionals of a field; a + b are the observations of both."""
 
     def __repr__(self) -> str:
-        return described(self)
+        return describe(self)
 
     @property
     @abc.abstractmethod
@@ -93,7 +93,7 @@ class Together(AbstractObservations):
             )
 
     def __repr__(self) -> str:
-        return joined("+", shortened([repr(term) for term in self.terms]))
+        return join_terms("+", shorten([repr(term) for term in self.terms]))
 
     @property
     def dimension(self) -> int:
@@ -217,7 +217,7 @@ class Velocities(AbstractObservations):
         parameters: Num[ArrayLike, "N p"] | None = None,
     ):
         refuse_swapped(X, Y, inputs)
-        self.X, self.Y, kept = require.measured(X, Y)
+        self.X, self.Y, kept = require.velocity_data(X, Y)
         self.inputs = inputs_at(self.X, inputs, parameters)
         self.kept = None if kept is None else jnp.asarray(kept)
         N, n = self.X.shape
@@ -398,7 +398,7 @@ class Functionals(AbstractObservations):
             require.finite(array, name)
             for name, array in zip(named, (points, weights, targets), strict=True)
         )
-        zero = (require.on_host(weights) == 0).all(axis=(2, 3)).reshape(-1)
+        zero = (require.host_array(weights) == 0).all(axis=(2, 3)).reshape(-1)
         self.weights = require.value(
             weights,
             zero,

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hamkernel._gram import centred
+from hamkernel._gram import subtract_centre
 from hamkernel._machine import compiled_by_size
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.friction import damped_coordinates, frictions
@@ -32,7 +32,9 @@ class Expansion(eqx.Module):
     mean: Callable[[Array], Array] | None
 
     def __call__(self, x: Float[Array, " d"]) -> Float[Array, " n"]:
-        learned = self.kernel.expansion(*centred(self.kernel, x, self.points), self.coefficients)
+        learned = self.kernel.expansion(
+            *subtract_centre(self.kernel, x, self.points), self.coefficients
+        )
         return learned if self.mean is None else self.mean(x).astype(x.dtype) + learned
 
 

@@ -40,7 +40,7 @@ from hamkernel._runs.smoothing import (
     smoothing,
 )
 from hamkernel._runs.table import Diagnostics
-from hamkernel._show import described, has_arrays
+from hamkernel._show import describe, has_arrays
 
 Between = Literal["held", "linear", "smooth"]
 
@@ -200,7 +200,7 @@ class Runs(eqx.Module):
         times = _entries(times, "times")
         inputs = None if inputs is None else _entries(inputs, "inputs")
         inside = "Make it outside; the losses and hk.simulate work inside."
-        require.untraced("hk.Runs", inside, times, states, inputs)
+        require.no_tracers("hk.Runs", inside, times, states, inputs)
         _check_counts(times, states, inputs)
         times = [_sample_times(t, x) for t, x in zip(times, states, strict=True)]
         self.times = tuple(_times(t, r) for r, t in enumerate(times))
@@ -236,7 +236,7 @@ class Runs(eqx.Module):
 
     def __repr__(self) -> str:
         if not has_arrays((self.times, self.states, self.inputs or ())):
-            return described(self)
+            return describe(self)
         samples = sum(len(t) for t in self.times)
         said = [
             f"{len(self)} run{'s' * (len(self) != 1)}",

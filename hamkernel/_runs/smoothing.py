@@ -26,8 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hamkernel._machine import compiled_by_size, in_doubles
-from hamkernel._show import described
+from hamkernel._machine import compiled_by_size, double_precision
+from hamkernel._show import describe
 from hamkernel._tuning.minimiser import best_in_box, inside_box
 
 
@@ -240,7 +240,7 @@ def _mean(x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, " n"]:
     return np.where(measured, x, 0.0).sum(axis=0) / np.maximum(measured.sum(axis=0), 1)
 
 
-@in_doubles
+@double_precision
 def processes(
     times: Sequence[np.ndarray],
     states: Sequence[np.ndarray],
@@ -340,7 +340,7 @@ class Paths(NamedTuple):
     slope_deviation: Float[np.ndarray, "R T n"]
 
 
-@in_doubles
+@double_precision
 def smoothed(
     found: list[Coordinate], times: Sequence[np.ndarray], states: Sequence[np.ndarray]
 ) -> Paths:
@@ -382,7 +382,7 @@ class Smoothing(eqx.Module):
     noise: Float[Array, " n"]
 
     def __repr__(self) -> str:
-        return described(self)
+        return describe(self)
 
 
 def smoothing(times: Sequence[np.ndarray], states: Sequence[np.ndarray], between: int) -> Smoothing:

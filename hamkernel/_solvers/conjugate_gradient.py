@@ -23,9 +23,9 @@ from jaxtyping import Array, Float, Int
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import KernelField
-from hamkernel._gram import gram_rounding, trace, without_gradient
+from hamkernel._gram import gram_rounding, stop_gradients, trace
 from hamkernel._gram_operator import product
-from hamkernel._machine import RowSharding, compiled, row_sharding, shard, to_caller_sharding
+from hamkernel._machine import RowSharding, precise_jit, row_sharding, shard, to_caller_sharding
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.dense import field_of_rows, gram_product, norm_of, relative_error
 from hamkernel._solvers.landmarks import whitening
@@ -163,7 +163,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                 "residual that is NaN the kernel is at fault: hk.check_kernel(k, X) finds out."
             )
 
-        failed = ~(require.on_host(relative_residual) <= require.on_host(tolerance))
+        failed = ~(require.host_array(relative_residual) <= require.host_array(tolerance))
         info = SolverInfo(
             "ConjugateGradient",
             landmarks=landmarks.count,
@@ -224,7 +224,7 @@ class _RowProducts(AbstractProducts):
 
 def _prepare_velocities(K, X, ridge, landmarks, spread):
     """The products for velocities alone, and the truncation of the preconditioner."""
-    K_, X_, ridge_, marks = without_gradient((K, X, ridge, landmarks))
+    K_, X_, ridge_, marks = stop_gradients((K, X, ridge, landmarks))
     T, nothing = whitening(K_, marks), jnp.zeros((len(X), K.outputs(X.shape[1])), X.dtype)
     square = normal(Columns(K_, marks), T, X_, nothing, spread).square
     products = _VelocityProducts(K, X, T, factor(square, ridge_), (K_, X_, marks.points), spread)
@@ -233,7 +233,7 @@ def _prepare_velocities(K, X, ridge, landmarks, spread):
 
 def _prepare_rows(K, rows, ridge, landmarks):
     """The products for rows of any observations, and the truncation of the preconditioner."""
-    K_, rows_, ridge_, marks = without_gradient((K, rows, ridge, landmarks))
+    K_, rows_, ridge_, marks = stop_gradients((K, rows, ridge, landmarks))
     span = landmark_span(K_, marks)
     all_rows = span.all_rows(rows_)
     F = rows_.contrast(all_rows)
@@ -241,12 +241,12 @@ def _prepare_rows(K, rows, ridge, landmarks):
     return _RowProducts(K, rows, F, factor(F.T @ F, ridge_)), truncation
 
 
-@compiled
+@precise_jit
 def _prepare(prepare, args):
     return prepare(*args)
 
 
-@compiled
+@precise_jit
 def _solve(prepare, args, y, ridge, tolerance, max_iterations):
     products, truncation = prepare(*args)
     return _iterate(products, truncation, y, ridge, tolerance, max_iterations)
@@ -311,13 +311,13 @@ def _iterate_with_bar(prepared, y, ridge, tolerance, max_iterations) -> _Solutio
     return last._replace(iterations=last.iterations + done)
 
 
-@compiled
+@precise_jit
 def _first_iterate(products: AbstractProducts, y) -> _Iterate:
     z = products.precondition(y)
     return _Iterate(jnp.zeros_like(y), y, z, jnp.sum(y * z), relative_error(y, y))
 
 
-@compiled
+@precise_jit
 def _next(products: AbstractProducts, y, ridge, state: _Iterate) -> _Iterate:
     p = state.direction
     image = p + products.gram(p) / ridge
@@ -329,6 +329,6 @@ def _next(products: AbstractProducts, y, ridge, state: _Iterate) -> _Iterate:
     return _Iterate(c, residual, z + square / state.square * p, square, relative_error(residual, y))
 
 
-@compiled
+@precise_jit
 def _finish(products: AbstractProducts, truncation, y, ridge, tolerance, start) -> _Solution:
     return _iterate(products, truncation, y, ridge, tolerance, 2, start)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from hamkernel import _require as require
-from hamkernel._fields.base import SolverInfo, at_points, root
+from hamkernel._fields.base import SolverInfo, map_states, root
 from hamkernel._fields.expansions import KernelField, kernel_field
 from hamkernel._gram import (
     between,
@@ -27,7 +27,7 @@ from hamkernel._gram import (
     rows_between,
     strips_of_gram,
 )
-from hamkernel._machine import compiled, dense_bytes, memory_bytes, refuse_beyond_memory
+from hamkernel._machine import dense_bytes, memory_bytes, precise_jit, refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._sizes import sizes
@@ -129,17 +129,17 @@ def _assemble(K, rows: Measurements, ridge, progress: bool):
     return A, lambda blocks: tqdm(blocks, "factor", disable=off)
 
 
-_slab = compiled(strips_of_gram, donate="all-except-first")
+_slab = precise_jit(strips_of_gram, donate="all-except-first")
 
 
-@compiled
+@precise_jit
 def _solve_in_memory(K, rows: Measurements, regularization, keep: bool):
     ridge = rows.count * regularization
     factor, c = solution(regularized_gram(K, rows, ridge), rows.y)
     return factor if keep else None, *_field_and_residual(K, rows, regularization, c)
 
 
-@compiled
+@precise_jit
 def _solve_with_factor(K, rows: Measurements, regularization, factor: DenseFactor):
     return _field_and_residual(K, rows, regularization, factor.solve(rows.y))
 
@@ -179,7 +179,7 @@ def relative_error(error: Array, reference: Array) -> Float[Array, ""]:
     return jnp.linalg.norm(error) / jnp.where(scale > 0, scale, jnp.ones_like(scale))
 
 
-@compiled
+@precise_jit
 def _extend(old: DenseConditional, new: Measurements):
     K, R, rows = old.field.kernel, old.factor.R, old.rows.append(new)
     # A contrast of a new energy is a difference with the old energies, so their rows are needed
@@ -212,7 +212,7 @@ def _extend(old: DenseConditional, new: Measurements):
     return factor, c, field_of_rows(K, rows, c, residual, norm, regularization, info)
 
 
-@compiled
+@precise_jit
 def _condition_draws(conditional: DenseConditional, prior: Prior, key) -> KernelField:
     """The draws of the posterior, from draws of the prior by Matheron's rule (`low_rank.py`)."""
     rows = conditional.rows
@@ -242,7 +242,7 @@ def gram_product(
     """G c, computed as the rows of the field with coefficients c, without forming G."""
     zero = jnp.zeros((), c.dtype)
     field = field_of_rows(K, rows, c, c, zero, zero, SolverInfo("none"))
-    potential = jax.tree_util.Partial(at_points, field._learned_potential)
+    potential = jax.tree_util.Partial(map_states, field._learned_potential)
     return rows.contrast(rows.of(field._velocities, potential))
 
 
@@ -275,7 +275,7 @@ def _refuse_failure(
 
     # The relative error of the fitted values was 1 to 10 times ‖y − (G + σ²I)c‖/‖y‖, at every
     # accuracy.
-    failed = ~(require.on_host(relative_residual) <= 1e-2)
+    failed = ~(require.host_array(relative_residual) <= 1e-2)
     if throw and require.is_concrete(failed):  # the field need not be taken apart
         return require.value(field, failed, message, RuntimeError)
     values = require.value(learned_arrays(field), failed, message, RuntimeError, throw)

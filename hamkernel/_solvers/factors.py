@@ -39,7 +39,7 @@ import numpy as np
 from jax.custom_batching import sequential_vmap
 from jaxtyping import Array, Bool, Float, Int
 
-from hamkernel._machine import compiled, full_precision
+from hamkernel._machine import full_precision, precise_jit
 
 
 class Group:
@@ -350,10 +350,10 @@ def factor_in_place(A: Float[Array, "D D"], steps: Callable[[Iterable], Iterable
     return DenseFactor(A, size)
 
 
-_norm = compiled(jnp.linalg.norm)
+_norm = precise_jit(jnp.linalg.norm)
 
 
-@compiled(donate="all-except-first")
+@precise_jit(donate="all-except-first")
 def _rows_of_factor(position: tuple[int], A: Float[Array, "D D"]) -> Float[Array, "D D"]:
     start, D = position[0], len(A)
     b = min(ROWS_IN_PLACE, D - start)

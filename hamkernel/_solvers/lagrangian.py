@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._fields.lagrangian import LagrangianField, lagrangian_field
-from hamkernel._machine import compiled
+from hamkernel._machine import precise_jit
 from hamkernel._structures.friction import Friction
 from hamkernel._structures.lagrangian import (
     Lagrangian,
@@ -53,7 +53,7 @@ def torque_data(K: Lagrangian, X: Any, torques: Any, accelerations: Any) -> Torq
             "states (q, v) of shape (N, 2m), and torques and accelerations (N, m), are needed."
         )
     check_machine(K, torques, m)
-    require.untraced("hk.fit of a Lagrangian", "Call it outside.", K, X, torques, A)
+    require.no_tracers("hk.fit of a Lagrangian", "Call it outside.", K, X, torques, A)
     X, torques = require.one_dtype(X, torques)
     X, A = require.one_dtype(X, A)
     X, torques = require.finite(X, "X"), require.finite(torques, "the torques")
@@ -128,7 +128,7 @@ def verdicts(field: LagrangianField, joints: tuple[int, ...]) -> list[str]:
     return said
 
 
-@compiled
+@precise_jit
 def strong_rows(
     features: LagrangianFeatures, data: TorqueData, deviation: Float[Array, ""]
 ) -> tuple[Float[Array, "R r"], Float[Array, " R"]]:
@@ -174,7 +174,7 @@ def solved(
     return Q[:r, :r], solve_triangular(Q[:r, :r], Q[:r, r])
 
 
-@compiled
+@precise_jit
 def _solved(features, B, y) -> tuple[Array, Array]:
     return solved(*with_anchor(features, B, y))
 
@@ -213,7 +213,7 @@ def missing_friction(
 _FRICTION_GAIN = 10.0
 
 
-@compiled
+@precise_jit
 def _friction_gains(B, y, columns) -> Float[Array, " m"]:
     def profile(B):
         R, w = solved(B, y)
@@ -232,7 +232,7 @@ def _friction_gains(B, y, columns) -> Float[Array, " m"]:
     return jax.lax.map(of_joint, jnp.arange(m))
 
 
-@compiled
+@precise_jit
 def plain_friction(features: LagrangianFeatures, V: Float[Array, "N m"]) -> Float[Array, "N m k"]:
     """The columns v and tanh(v/ε) of each joint at the velocities V, k = 2m."""
     return jax.vmap(lambda v: friction_of_joints(Friction(1.0, 1.0), v, features.rest_speed))(V)

@@ -29,9 +29,9 @@ from hamkernel._gram import (
     components,
     gram_of_rows,
     gram_rounding,
-    without_gradient,
+    stop_gradients,
 )
-from hamkernel._machine import compiled, full_precision, row_sharding, shard
+from hamkernel._machine import full_precision, precise_jit, row_sharding, shard
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -117,7 +117,7 @@ def choose_landmarks(
     Source: Chen, Epperly, Tropp & Webber (2023), arXiv 2207.06503; in blocks, Epperly, Tropp &
         Webber (2024), arXiv 2410.03969.
     """
-    K, X, target_trace = without_gradient((K, X, target_trace))
+    K, X, target_trace = stop_gradients((K, X, target_trace))
     rows = row_sharding(X)
     X = shard(rows, X)
     if len(X) > candidates:
@@ -152,7 +152,7 @@ def choose_rows(
     Returns:
         The landmarks. O(P² + P r²) time and O(P²) memory for P candidates and r landmarks.
     """
-    K, rows, target_trace = without_gradient((K, rows, target_trace))
+    K, rows, target_trace = stop_gradients((K, rows, target_trace))
     blocks = rows.blocks
     size = sum(block.size for block in blocks)
     if size > candidates:
@@ -180,7 +180,7 @@ def _choose(
     return _first_candidates(drawn, min(size, blocks * BLOCK))
 
 
-_gram = compiled(Landmarks.gram)
+_gram = precise_jit(Landmarks.gram)
 
 
 def _stratified_sample(key, N: int, count: int) -> Int[Array, " count"]:
@@ -234,13 +234,13 @@ def _prune(
     return Landmarks(tuple(parts), jnp.asarray(places), kept, count)
 
 
-@compiled
+@precise_jit
 def given_landmarks(K: AbstractMatrixKernel, landmarks: Landmarks) -> Landmarks:
     """Keep the columns of the landmarks that pivoted Cholesky finds independent.
 
     O(r³) time for r columns. Nothing is differentiated, as in `choose_landmarks`.
     """
-    K, landmarks = without_gradient((K, landmarks))
+    K, landmarks = stop_gradients((K, landmarks))
     G = landmarks.gram(K)
     # Scaled to a unit diagonal, since the rounding errors of Cholesky are relative to the
     # diagonal.
@@ -368,7 +368,7 @@ class _Drawing(NamedTuple):
     rounds: Int[Array, ""]
 
 
-@compiled
+@precise_jit
 def _begin(candidates: AbstractCandidates, target_trace, key, size):
     """The state after the first call of `_draw`."""
     traces, n = candidates.traces, candidates.outputs
@@ -396,7 +396,7 @@ def _enlarge(drawn: _Drawing, size: int) -> _Drawing:
     )
 
 
-@compiled
+@precise_jit
 def _draw(candidates: AbstractCandidates, target_trace, drawn, size):
     """Draw blocks until the mean trace is at most `target_trace` or `size` points are chosen."""
     goal = jnp.maximum(target_trace, drawn.rounding).sum()
@@ -505,7 +505,7 @@ def mask_columns(matrix: Float[Array, "r r"], kept: Bool[Array, " r"]) -> Float[
     return jnp.where(both, matrix, jnp.diag(~kept).astype(matrix.dtype))
 
 
-@compiled
+@precise_jit
 def _first_candidates(drawn, size):
     """The first `size` chosen candidates: index, kept columns, and the number of candidates."""
     used = jnp.arange(size) < drawn.count

@@ -26,8 +26,8 @@ import jax.numpy as jnp
 from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
-from hamkernel._gram import plus_ridge, without_gradient
-from hamkernel._machine import RowSharding, on_each
+from hamkernel._gram import plus_ridge, stop_gradients
+from hamkernel._machine import RowSharding, map_devices
 from hamkernel._sizes import sizes
 from hamkernel._solvers.triangle import triangle
 
@@ -64,7 +64,7 @@ def triangle_of_design(
         return over_tiles(step, jnp.diag(on_diagonal), (X, Y), _rows_of_tile(columns))[0]
 
     ridge = ridge if spread is None else ridge / spread.count
-    return on_each(
+    return map_devices(
         spread, triangle_of_device, (design, ridge), X, Y, joined=False, reduce=_merge_triangles
     )
 
@@ -107,8 +107,8 @@ def ridge_regression(
         ridge: δ > 0.
         spread: the sharding of points and targets; None if they lie on one device.
     """
-    fixed, fixed_X, fixed_Y, fixed_ridge = without_gradient((design, X, Y, ridge))
-    R = without_gradient(triangle_of_design(fixed, columns, fixed_X, fixed_Y, fixed_ridge, spread))
+    fixed, fixed_X, fixed_Y, fixed_ridge = stop_gradients((design, X, Y, ridge))
+    R = stop_gradients(triangle_of_design(fixed, columns, fixed_X, fixed_Y, fixed_ridge, spread))
     R, rotated = R[:-1, :-1], R[:-1, -1]
     w = solve_triangular(R, rotated)
 
@@ -143,7 +143,7 @@ def residual(
 
         return over_tiles(step, None, (X, Y), _rows_of_tile(len(w)))[1]
 
-    return on_each(spread, residual_of_device, (design, w), X, Y, joined=True)
+    return map_devices(spread, residual_of_device, (design, w), X, Y, joined=True)
 
 
 def _correlations(design, X, Y, w, spread: RowSharding | None) -> Float[Array, " r"]:
@@ -158,7 +158,7 @@ def _correlations(design, X, Y, w, spread: RowSharding | None) -> Float[Array, "
 
         return over_tiles(step, jnp.zeros_like(w), (X, Y), _rows_of_tile(len(w)))[0]
 
-    return on_each(spread, correlations_of_device, (design, w), X, Y, joined=False)
+    return map_devices(spread, correlations_of_device, (design, w), X, Y, joined=False)
 
 
 def over_tiles(step, carry, data: tuple[Array, Array], rows: int):
@@ -259,7 +259,7 @@ def normal(
         at_once = max(1024, sizes().design_entries // len(basis))
         return over_tiles(step, nothing, (X, Y), at_once)[0]
 
-    return on_each(spread, sums_of_device, (design, basis), X, Y, joined=False)
+    return map_devices(spread, sums_of_device, (design, basis), X, Y, joined=False)
 
 
 def solve_sums(

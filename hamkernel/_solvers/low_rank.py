@@ -46,7 +46,7 @@ from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import AbstractField, SolverInfo, root
 from hamkernel._fields.expansions import FeatureField, KernelField, feature_field, kernel_field
 from hamkernel._gram import between, block_traces, components, plus_ridge, trace_of_rows
-from hamkernel._machine import compiled
+from hamkernel._machine import precise_jit
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks, whitening
@@ -145,7 +145,7 @@ def prior_draws(
     return _draw_prior(K, landmarks, draw_key, count)
 
 
-@compiled
+@precise_jit
 def _draw_prior(K, landmarks: Landmarks, key, count: int) -> Prior:
     S, T = landmarks.points, whitening(K, landmarks)
     m, d = S.shape
@@ -218,8 +218,8 @@ def check_solution(
     """
     if truncation is None:
         return require.value(learned, failed, message, RuntimeError, throw)
-    none = require.on_host(landmarks.count) == 0
-    failed = failed | (none & (require.on_host(truncation) != 0))
+    none = require.host_array(landmarks.count) == 0
+    failed = failed | (none & (require.host_array(truncation) != 0))
     learned = require.value(learned, failed, message, RuntimeError, throw)
     indefinite = (
         "the low-rank Gram of the landmarks is larger than the Gram itself, so the kernel is not "
@@ -330,7 +330,7 @@ class LandmarkSpan(AbstractSpan):
         return _landmark_draws(self, weights, prior)
 
 
-@compiled
+@precise_jit
 def _landmark_draws(span: LandmarkSpan, weights, prior: Prior) -> KernelField:
     landmarks = span.landmarks
     # f = Φw̃ + f₀ − K(·, L)TTᵀ L f₀: weights w̃ in the span plus the draw f₀ minus its projection
@@ -452,9 +452,9 @@ class LowRankConditional(AbstractConditional):
         return self.span.draws(w.T, self.rows, rest, region)
 
 
-@compiled
+@precise_jit
 def _law_variance(R, ridge, waves, start: int, r, r0) -> Float[Array, ""]:
-    features = (waves.of_law(r) - waves.of_law(r0)).astype(R.dtype)
+    features = (waves.law_values(r) - waves.law_values(r0)).astype(R.dtype)
     difference = jnp.zeros_like(R[0]).at[start : start + len(features)].set(features)
     rest = waves.kernel.missing(waves.kernel.point(r), waves.kernel.point(r0)).astype(R.dtype)
     whitened = solve_triangular(R, difference, trans="T")
@@ -482,7 +482,7 @@ def low_rank_conditional(
     return eqx.tree_at(lambda c: c.field, conditional, eqx.combine(arrays, rest))
 
 
-@compiled
+@precise_jit
 def _low_rank_conditional(span, rows, ridge):
     F = rows.contrast(span.all_rows(rows))
     start = jnp.sqrt(ridge) * jnp.eye(F.shape[1], dtype=F.dtype)

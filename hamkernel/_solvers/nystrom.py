@@ -25,7 +25,7 @@ from hamkernel._fields.base import root
 from hamkernel._fields.expansions import KernelField
 from hamkernel._gram import components, trace, trace_of_rows
 from hamkernel._gram_operator import product
-from hamkernel._machine import RowSharding, compiled, row_sharding, shard, to_caller_sharding
+from hamkernel._machine import RowSharding, precise_jit, row_sharding, shard, to_caller_sharding
 from hamkernel._observations.measurements import Measurements
 from hamkernel._show import text
 from hamkernel._solvers.landmarks import (
@@ -175,7 +175,7 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         )
 
 
-@compiled
+@precise_jit
 def start_fit(K, sample, regularization, landmarks, tolerance):
     T = whitening(K, landmarks)
     if sample.states is None:
@@ -203,7 +203,7 @@ def _design(K, landmarks, rows):
     return jnp.concatenate([landmarks.columns(K, block) for block in rows.blocks])
 
 
-@compiled
+@precise_jit
 def _landmark_solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, norm, residual_norm = solve_sums(fit.sums, ridge)
@@ -335,7 +335,7 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
         return start_fit(K, subset, regularization, landmarks, self.tolerance)
 
 
-@compiled
+@precise_jit
 def _landmark_fit(K, X, Y, regularization, landmarks, spread):
     S, ridge = landmarks.points, len(X) * regularization
     T = whitening(K, landmarks)

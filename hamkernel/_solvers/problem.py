@@ -19,8 +19,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
 from hamkernel import _require as require
-from hamkernel._fields.base import AbstractField, KnownPart, at_points, known_part, potential_of
-from hamkernel._fields.joined import at_inputs
+from hamkernel._fields.base import AbstractField, KnownPart, known_part, map_states, potential_of
+from hamkernel._fields.joined import fix_inputs
 from hamkernel._machine import RowSharding, is_on_one_device, row_sharding, to_one_device
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
@@ -102,7 +102,7 @@ def _refuse_overflow(rows: Measurements, regularization: Float[Array, ""]) -> No
     """ValueError where ‖y‖² or ‖f‖² ≤ ‖y‖²/(Nλ) is larger than the dtype can hold."""
     if not require.is_concrete(rows.targets, regularization):
         return
-    y = require.on_host(rows.targets)
+    y = require.host_array(rows.targets)
     size, limit = float(abs(y).max()), float(jnp.finfo(y.dtype).max)
     smallest = min(1.0, rows.count * float(regularization))
     if size > (limit * smallest / len(y)) ** 0.5:
@@ -132,7 +132,7 @@ def without_known(
     if known is None:
         return rows
     potential = _known_potential(K, known) if len(rows.energies) else known
-    field, potential = (jax.tree_util.Partial(at_points, part) for part in (known, potential))
+    field, potential = (jax.tree_util.Partial(map_states, part) for part in (known, potential))
     values = rows.of(field, potential)
     if throw:
         bad = require.not_finite(values)
@@ -159,7 +159,7 @@ def _known_potential(K: AbstractMatrixKernel, known: Any):
     """The potential of the known part, as a function of the points of K."""
     if not isinstance(known, KnownPart) or not isinstance(K, AbstractJoinedKernel):
         return potential_of(known, K)
-    drift = at_inputs(known, 0, None)
+    drift = fix_inputs(known, 0, None)
     if drift is None:  # G u, which is no part of the drift
         return lambda s: 0 * s[0]
     of_drift = potential_of(drift, K.of_states)

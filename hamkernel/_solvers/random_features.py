@@ -12,7 +12,7 @@ from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import FeatureField, feature_field
 from hamkernel._machine import (
     RowSharding,
-    compiled,
+    precise_jit,
     refuse_beyond_memory,
     row_sharding,
     shard,
@@ -118,7 +118,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
         return _start(K, basis, thin(K, sample, 4096), regularization)
 
 
-@compiled
+@precise_jit
 def _feature_fit(K, solver, X, Y, regularization, spread):
     basis = solver._features(K, X.shape[1], X.dtype)
     ridge = len(X) * regularization
@@ -195,7 +195,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
         return _check_field(_feature_solution(self, count, regularization))
 
 
-@compiled
+@precise_jit
 def _start(K, basis, sample, regularization):
     identity = jnp.eye(basis.columns, dtype=sample.targets.dtype)
     if sample.states is None:
@@ -215,7 +215,7 @@ def _start(K, basis, sample, regularization):
     )
 
 
-@compiled
+@precise_jit
 def _feature_solution(fit, count, regularization):
     ridge = count.astype(regularization.dtype) * regularization
     weights, _, residual_norm = solve_sums(fit.sums, ridge)

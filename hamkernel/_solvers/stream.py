@@ -29,10 +29,10 @@ from hamkernel._fields.joined import learned_field
 from hamkernel._gram import components
 from hamkernel._machine import (
     RowSharding,
-    compiled,
     follow_data,
     full_precision,
     one_blas_thread,
+    precise_jit,
     row_sharding,
     shard,
 )
@@ -253,19 +253,19 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         if regularization is None:
             regularization = self.regularization
         regularization = require.ridge(regularization, self.dtype)
-        none = require.on_host(self.count) == 0
+        none = require.host_array(self.count) == 0
         count = require.value(
             self.count, none, "no data yet: add(X, Y) before asking for the field."
         )
         return learned_field(self._solve(count, regularization), self._known_part)
 
 
-@compiled
+@precise_jit
 def _with_velocities(fit, X, Y, spread):
     return _plus(fit, fit._totals_of_velocities(X, Y, spread), None, len(X))
 
 
-@compiled
+@precise_jit
 def _with_rows(fit, rows):
     return _plus(fit, fit._totals_of_rows(rows), None, rows.count)
 
@@ -285,7 +285,7 @@ def _differ(first: Any, second: Any) -> Bool[ArrayLike, ""]:
     return ~xp.asarray(same, bool).all()
 
 
-@compiled
+@precise_jit
 def _plus(fit: Fit, more: Any, more_compensation: Any, count: Int[ArrayLike, ""]) -> Fit:
     def add_compensated(a, b, a_error, b_error):
         s, error = _two_sum(a, b)

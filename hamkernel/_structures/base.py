@@ -33,7 +33,7 @@ from hamkernel._kernels.base import (
 )
 from hamkernel._kernels.symmetry import LinearMap, linear_maps, symmetrise, time_reversal
 from hamkernel._machine import full_precision
-from hamkernel._show import call, described, joined
+from hamkernel._show import call, describe, join_terms
 
 
 class AbstractMatrixKernel(eqx.Module):
@@ -42,7 +42,7 @@ class AbstractMatrixKernel(eqx.Module):
     matrix_valued: ClassVar[bool] = True
     takes_inputs: ClassVar[bool] = False  # whether its points are (x, u)
     given: ClassVar[str] = "inputs"  # the name of u in `fit`; "parameters" for a family
-    # # Whether derivatives of the Gram are cheaper in reverse mode, as for some closed forms.
+    # Whether derivatives of the Gram are cheaper in reverse mode, as for some closed forms.
     differentiated_backward: ClassVar[bool] = False
     symplectic: eqx.AbstractVar[bool]  # whether flows keep dq ∧ dp, as those of J∇H do
     no_potential: eqx.AbstractVar[str | None]  # why fields have no potential; None if they have one
@@ -58,7 +58,7 @@ class AbstractMatrixKernel(eqx.Module):
         return self.symplectic
 
     def __repr__(self) -> str:
-        return described(self)
+        return describe(self)
 
     def __hash__(self) -> int:
         # Arrays have no hash. Equal kernels have equal structure, so this one fits `==`.
@@ -75,7 +75,7 @@ class AbstractMatrixKernel(eqx.Module):
         Raises:
             ValueError: x or z is no single point, or n is not one that the structure allows.
         """
-        x, z = require.same_space(one_point(x)[None], one_point(z)[None])
+        x, z = require.one_space(one_point(x)[None], one_point(z)[None])
         x, z = x[0], z[0]
         self.check_dimension(len(x))
         basis = jnp.eye(self.outputs(len(x)), dtype=x.dtype)
@@ -237,7 +237,7 @@ class Sum(AbstractMatrixKernel):
 
     def __repr__(self) -> str:
         if not any(self.names):
-            return joined("+", [repr(K) for K in self.terms])
+            return join_terms("+", [repr(K) for K in self.terms])
         pairs = zip(self.names, self.terms, strict=True)
         return call("Sum", [f"{name}={K!r}" if name else repr(K) for name, K in pairs])
 

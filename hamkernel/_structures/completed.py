@@ -18,7 +18,7 @@ def completed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> Any:
     K = with_rest_speed(K, X, n)
     if all(shared.centres is not None for shared in shared_laws(K)):
         return K
-    require.untraced("hk.Shared() without centres", "Name them: hk.Shared(k, parts, centres).", X)
+    require.no_tracers("hk.Shared() without centres", "Name them: hk.Shared(k, parts, centres).", X)
     with require.eager():
         states = np.asarray(X)[:, :n]
 

@@ -24,7 +24,7 @@ from hamkernel._kernels.base import (
     as_scalar_kernel,
 )
 from hamkernel._kernels.built_in import Constant
-from hamkernel._show import call, joined
+from hamkernel._show import call, join_terms
 from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel, total
 from hamkernel._structures.joined import AbstractJoinedKernel
 
@@ -219,7 +219,7 @@ class FamilySum(AbstractFamily):
         self.terms = tuple(Family(t.member, t.parameters, self.count) for t in terms)
 
     def __repr__(self) -> str:
-        return joined("+", [repr(t) for t in self.terms])
+        return join_terms("+", [repr(t) for t in self.terms])
 
     def child_inputs(
         self, child: Any, X: Float[np.ndarray, "N d"], amplitude: float

@@ -368,7 +368,9 @@ def with_rest_speed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> 
     """
     if all(part.rest_speed is not None for part in frictions(K)):
         return K
-    require.untraced("hk.Friction() without a rest speed", "Name it: hk.Friction(rest_speed=…).", X)
+    require.no_tracers(
+        "hk.Friction() without a rest speed", "Name it: hk.Friction(rest_speed=…).", X
+    )
     with require.eager():
         speeds = np.asarray(jnp.sqrt(jnp.mean(jnp.square(X[:, :n]), axis=0)))
 

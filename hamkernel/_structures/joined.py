@@ -30,7 +30,7 @@ from hamkernel._kernels.base import (
 )
 from hamkernel._kernels.built_in import Constant
 from hamkernel._kernels.symmetry import LinearMap
-from hamkernel._show import described
+from hamkernel._show import describe
 from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel
 
 
@@ -175,7 +175,7 @@ class InputMatrix(eqx.Module):
         self.acts_on = None if acts_on is None else require.coordinates(acts_on, "acts_on")
 
     def __repr__(self) -> str:
-        return described(self, positional=("kernel",))
+        return describe(self, positional=("kernel",))
 
     def rows(self, n: int, dtype: Any) -> Float[Array, " n"]:
         """A vector with 1 for the nonzero rows of G and 0 for the others."""

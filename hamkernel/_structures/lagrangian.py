@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Scaled, as_scalar_kernel
 from hamkernel._kernels.parts import far_apart, root_at
-from hamkernel._machine import compiled
+from hamkernel._machine import precise_jit
 from hamkernel._show import call
 from hamkernel._structures.friction import Friction
 
@@ -292,5 +292,5 @@ def lagrangian_features(K: Lagrangian, X: Float[Array, "N n"]) -> LagrangianFeat
     return _with_kernel(start, K)
 
 
-_with_kernel = compiled(lambda features, K: features.with_kernel(K))
-_embed = compiled(lambda K, Q: jax.vmap(K.embed)(Q))
+_with_kernel = precise_jit(lambda features, K: features.with_kernel(K))
+_embed = precise_jit(lambda K, Q: jax.vmap(K.embed)(Q))

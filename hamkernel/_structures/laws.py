@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel._kernels.parts import Shared
-from hamkernel._machine import compiled
+from hamkernel._machine import precise_jit
 from hamkernel._structures.base import Sum
 from hamkernel._structures.completed import shared_laws
 from hamkernel._structures.structure import AbstractPotentialKernel
@@ -46,7 +46,7 @@ def _has_potential(K: Any) -> bool:
     return isinstance(K, AbstractPotentialKernel)
 
 
-@compiled
+@precise_jit
 def _linear_fields(K: Any, law: Shared, X: Float[Array, "N n"]) -> Float[Array, "N n k"]:
     """The fields of a constant and of the coordinates as laws."""
 
@@ -104,7 +104,7 @@ def outside(K: Any, X: Float[Array, "T n"]) -> str:
     return ""
 
 
-@compiled
+@precise_jit
 def _range(law: Shared, X: Float[Array, "T n"]) -> tuple[Float[Array, " d"], Float[Array, " d"]]:
     """The lowest and highest coordinates of the parts of the states."""
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, Point, Points
-from hamkernel._machine import compiled
+from hamkernel._machine import precise_jit
 from hamkernel._show import call, text
 from hamkernel._structures.structure import AbstractStructure
 
@@ -102,7 +102,7 @@ class StructuredByOperator(AbstractStructure):
             )
 
 
-@compiled
+@precise_jit
 def _values(K: StructuredByOperator, X: Float[Array, "N n"]) -> tuple[Array, Array, Array, Array]:
     """The numbers that the checks need, for each point.
 

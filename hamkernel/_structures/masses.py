@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 from hamkernel import _require as require
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, Point, Points
 from hamkernel._kernels.symmetry import LinearMap
-from hamkernel._show import described
+from hamkernel._show import describe
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 
@@ -72,7 +72,7 @@ class UnknownMasses(AbstractMatrixKernel):
         self.log_masses = jnp.log(guess[1:] / guess[0])
 
     def __repr__(self) -> str:
-        return described(self, positional=("kernel",))
+        return describe(self, positional=("kernel",))
 
     @property
     def masses(self) -> Float[Array, " m"] | Float[Array, "m m"]:

@@ -42,8 +42,8 @@ from hamkernel._kernels.symmetry import (
     with_parity,
 )
 from hamkernel._kernels.transforms import Warp
-from hamkernel._machine import compiled
-from hamkernel._show import call, described
+from hamkernel._machine import precise_jit
+from hamkernel._show import call, describe
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -60,7 +60,7 @@ class AbstractStructure(AbstractMatrixKernel):
     def __repr__(self) -> str:
         symmetry_of_kernel = symmetry_removed(self.kernel)
         if symmetry_of_kernel is None or symmetry_of_kernel.parity is None:
-            return described(self, positional=("kernel",))
+            return describe(self, positional=("kernel",))
         symmetry = "Odd" if self.field_parity * symmetry_of_kernel.parity < 0 else "Even"
         return call(
             symmetry, [repr(eqx.tree_at(lambda K: K.kernel, self, symmetry_of_kernel.kernel))]
@@ -132,7 +132,7 @@ def _is_warp(node: object) -> bool:
     return isinstance(node, Warp)
 
 
-@compiled
+@precise_jit
 def _is_smooth(warp: Warp, X: Float[Array, "N n"]) -> Bool[Array, " N"]:
     """Whether the map and its Jacobian are finite at each point."""
 
@@ -177,7 +177,7 @@ def _operators_at(K: Any, X: Float[Array, "N n"]) -> Float[Array, "N n n"]:
     return jax.vmap(K.operator_at)(X)
 
 
-_compiled_operators_at = compiled(_operators_at)
+_compiled_operators_at = precise_jit(_operators_at)
 
 
 def check_symmetries(K: Any, X: Float[Array | np.ndarray, "N n"]) -> None:

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._fields.lagrangian import LagrangianField, lagrangian_field
-from hamkernel._machine import compiled, compiled_by_size
+from hamkernel._machine import compiled_by_size, precise_jit
 from hamkernel._runs.runs import Runs
 from hamkernel._runs.weak import (
     Channels,
@@ -213,7 +213,7 @@ class _WeakRows(eqx.Module):
         return whiten(L, rows), whiten(L, targets), log_scale(L)
 
 
-_with_kernel = compiled(lambda features, K: features.with_kernel(K))
+_with_kernel = precise_jit(lambda features, K: features.with_kernel(K))
 
 
 @compiled_by_size

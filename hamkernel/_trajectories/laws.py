@@ -20,7 +20,7 @@ from jaxtyping import Array, Float, Int
 from hamkernel import _require as require
 from hamkernel._features import AbstractFeatures, features, is_of_parts
 from hamkernel._fields.kinetic import Kinetic
-from hamkernel._machine import compiled
+from hamkernel._machine import precise_jit
 from hamkernel._observations.kinds import Functionals
 from hamkernel._posterior import condition
 from hamkernel._runs.runs import Runs
@@ -162,7 +162,7 @@ class Rows(NamedTuple):
         return self._replace(pieces=p._replace(**by_piece))
 
 
-@compiled
+@precise_jit
 def _rows_over_noise(
     model: LawModel, rows: Rows, L
 ) -> tuple[Float[Array, "N m"], Float[Array, " N"]]:
@@ -172,7 +172,7 @@ def _rows_over_noise(
     return features * precision, whiten(L, rows.known()) * precision
 
 
-@compiled
+@precise_jit
 def _search(model: LawModel, design, low, high, rows: Rows, L):
     count = jnp.sum(rows.pieces.inside, dtype=low.dtype) * len(rows.of_rows)
 
@@ -186,19 +186,19 @@ def _search(model: LawModel, design, low, high, rows: Rows, L):
     return inside_box(run.best.u, low, high), run.best.value
 
 
-@compiled
+@precise_jit
 def _factors(rows: Rows, field: Any, deviation):
     """The factors of the covariance of the rows with this field in the laws."""
     return factors(rows.pieces, path_covariance(rows.law(field), rows.pieces), deviation)
 
 
-@compiled
+@precise_jit
 def _weights_of(model: LawModel, rows: Rows, L) -> Float[Array, " m"]:
     """The mean of the weights of the features."""
     return solved(*_rows_over_noise(model, rows, L))[1]
 
 
-@compiled
+@precise_jit
 def _compress(model: LawModel, rows: Rows, L):
     """All rows as m orthonormal combinations: weights (m, Q, n) at points (Q, n), targets (m,)."""
     p, n = rows.pieces, rows.state(rows.pieces.path[0, 0]).shape[0]
@@ -432,7 +432,7 @@ def _quality(
     )
 
 
-@compiled
+@precise_jit
 def _run_freely(field: Any, part: Stretches) -> Float[Array, "S L n"]:
     """The states at the ends of all intervals, by four steps of Runge and Kutta in each."""
 

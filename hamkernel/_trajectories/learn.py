@@ -167,7 +167,7 @@ def learn(
     Warns:
         UserWarning: once, where a row of `learned.diagnostics` falls short, with its meaning.
     """
-    require.untraced("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
+    require.no_tracers("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
     if isinstance(K, Lagrangian):
         unused = {"mean": mean, "solver": solver, "process_noise": process_noise, "mass": mass}
         return learn_lagrangian(K, runs, noise, unused | {"masses": masses})

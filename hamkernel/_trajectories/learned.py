@@ -18,7 +18,7 @@ from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._posterior import Posterior, condition
 from hamkernel._runs.runs import Runs
 from hamkernel._runs.table import Diagnostics
-from hamkernel._show import Shown, described, text
+from hamkernel._show import Shown, describe, text
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._trajectories.evidence import Evidence, EvidenceOfRows
@@ -49,7 +49,7 @@ class Iteration(eqx.Module):
     loss: Float[Array, ""]
 
     def __repr__(self) -> str:
-        return described(self)
+        return describe(self)
 
 
 class Learned(Shown, eqx.Module):

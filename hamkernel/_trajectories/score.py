@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._fields.base import known_part
-from hamkernel._machine import compiled
+from hamkernel._machine import precise_jit
 from hamkernel._posterior import Posterior
 from hamkernel._runs.flow import simulated, steps_for, stiffness
 from hamkernel._runs.preprocessing import preprocess, sample_points
@@ -290,7 +290,7 @@ def _draws(
     steps = jnp.asarray(steps_for(part.spans, _stiffness(field, part, scale)))
     spans, d = jnp.asarray(part.spans), n + part.inputs.shape[-1]
 
-    @compiled
+    @precise_jit
     @jax.vmap
     def run(field, x, inputs):
         joint_field = getattr(field, "whole", field)

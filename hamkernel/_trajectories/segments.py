@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from hamkernel._machine import compiled, compiled_by_size
+from hamkernel._machine import compiled_by_size, precise_jit
 from hamkernel._runs.flow import (
     NODES,
     WEIGHTS,
@@ -154,7 +154,7 @@ def windows(rows: LinearisedSegments, samples: int) -> LinearisedSegments:
     return _windows(rows, jnp.asarray(s), jnp.asarray(first[:, None] + np.arange(length)[None]))
 
 
-@compiled
+@precise_jit
 def _windows(rows: LinearisedSegments, s, at) -> LinearisedSegments:
     inner, s = at[:, :-1], s[:, None]
     cut = {name: getattr(rows, name)[s, at] for name in ("residual", "counts", "scatter")}

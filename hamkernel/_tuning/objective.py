@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int
 from hamkernel import _require as require
 from hamkernel._closed_forms import Folds, Partition
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._machine import compiled
+from hamkernel._machine import precise_jit
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -219,11 +219,11 @@ def criterion_of(
             "'marginal_likelihood' or a function (K, X, Y, regularization) -> (); "
             f"got {objective!r}."
         )
-    other_arguments = require.other_arguments(objective, "K", "X", "Y", "regularization")
-    if other_arguments is not None:
+    mismatch = require.signature_mismatch(objective, "K", "X", "Y", "regularization")
+    if mismatch is not None:
         raise TypeError(
             "an objective is called with (K, X, Y, regularization), by position, and returns one "
-            f"number; this one takes ({other_arguments})."
+            f"number; this one takes ({mismatch})."
         )
     fn = partial(_custom_of_data, as_pytree(objective), data)
     return SearchCriterion(fn, None, logarithmic=False, custom=True)
@@ -233,7 +233,7 @@ def _custom_of_data(fn, data, K, rows, regularization):
     return fn(K, *data, regularization)
 
 
-_project = compiled(project_silent_directions)
+_project = precise_jit(project_silent_directions)
 
 
 def _negative_log_likelihood(K, rows, regularization, basis=None, projected=None):

@@ -20,7 +20,7 @@ from hamkernel._gram import forward_differentiated, gram_of_rows, gram_rounding,
 from hamkernel._kernels.base import AbstractScalarKernel, Invariance, bounds_by_value
 from hamkernel._kernels.functions import Bound
 from hamkernel._kernels.symmetry import drop_symmetry
-from hamkernel._machine import compiled
+from hamkernel._machine import precise_jit
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import Measurements
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
@@ -98,7 +98,7 @@ def constants(K: AbstractMatrixKernel) -> dict[str, float]:
     return values
 
 
-gram_trace = compiled(trace)
+gram_trace = precise_jit(trace)
 
 
 def full_trace(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array, ""]:
@@ -123,7 +123,7 @@ def velocity_rms(K: AbstractMatrixKernel, rows: Measurements) -> float:
     return float(np.sqrt(ratio * float(gram_trace(K, rows.points)) / components))
 
 
-_gram_of_rows = compiled(gram_of_rows)
+_gram_of_rows = precise_jit(gram_of_rows)
 
 
 def _amplitude(K: AbstractMatrixKernel, X: Array, rms: float) -> float:
@@ -328,7 +328,7 @@ class SearchSpace(eqx.Module):
             high = jnp.maximum(self.ridge_interval[1], low)
         return jnp.log(low), jnp.log(high)
 
-    @compiled
+    @precise_jit
     def encode_start(self) -> Float[Array, " P"]:
         """The u of the caller's values, moved into the box by a margin if they are outside."""
         ridge_low, ridge_high = self.ridge_bounds(self.size_of_gram(self.kernel))

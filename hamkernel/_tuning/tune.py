@@ -26,7 +26,7 @@ from hamkernel import _require as require
 from hamkernel._closed_forms import Folds
 from hamkernel._features import is_of_parts
 from hamkernel._fields.base import AbstractField, Mean
-from hamkernel._machine import compiled, follow_data, full_precision, one_blas_thread
+from hamkernel._machine import follow_data, full_precision, one_blas_thread, precise_jit
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import observations
 from hamkernel._posterior import Posterior, posterior_of_problem
@@ -390,7 +390,7 @@ def _tuned_lagrangian(K: Any, X: Any, Y: Any, accelerations: Any, max_steps: int
     )
 
 
-decode = compiled(lambda space, u: space.decode(u))
+decode = precise_jit(lambda space, u: space.decode(u))
 
 
 def _check_optimiser(optimiser: optx.AbstractMinimiser | None) -> None:

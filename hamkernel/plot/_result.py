@@ -50,7 +50,7 @@ def result(learned: Learned, run: int = 0, held_out: Runs | None = None) -> Figu
     """
     import matplotlib.pyplot as plt  # starts a backend, so only where a figure must be made
 
-    require.untraced("hk.plot.result", "Draw outside.", learned)
+    require.no_tracers("hk.plot.result", "Draw outside.", learned)
     n = learned.runs.dimension
     heights = [0.8 + (1.7 if n <= 4 else 1.2) * n, 3.4]
     figure = plt.figure(figsize=(9.2, sum(heights)), layout="constrained")
@@ -90,7 +90,7 @@ def machine(learned: LearnedLagrangian, run: int = 0) -> Figure:
     """
     import matplotlib.pyplot as plt  # starts a backend, so only where a figure must be made
 
-    require.untraced("hk.plot.machine", "Draw outside.", learned)
+    require.no_tracers("hk.plot.machine", "Draw outside.", learned)
     run = index_of_run(run, len(learned.runs))
     field, path, m = learned.field, np.asarray(learned.states[run]), learned.field.features.count
     t, q = learned.runs.times[run], path[:, :m]

@@ -59,7 +59,7 @@ def refuse_tracers(plot: Callable[Arguments, R]) -> Callable[Arguments, R]:
     @functools.wraps(plot)
     def wrapper(*args: Arguments.args, **options: Arguments.kwargs) -> R:
         name = f"hk.plot.{plot.__name__}"
-        require.untraced(name, "Return the arrays and draw them outside.", args, options)
+        require.no_tracers(name, "Return the arrays and draw them outside.", args, options)
         return plot(*args, **options)
 
     return wrapper

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 from hamkernel import _require as require
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._machine import compiled_by_size, compiled_without_emitters
-from hamkernel._show import described
+from hamkernel._show import describe
 
 Numbers = ArrayLike | Sequence[ArrayLike]
 Function = TypeVar("Function", bound=Callable[[Array], Array])
@@ -55,7 +55,7 @@ class AbstractHamiltonianSystem(eqx.Module):
         return _velocity(self, x)
 
     def __repr__(self) -> str:
-        return described(self)
+        return describe(self)
 
 
 @eqx.filter_jit
@@ -192,7 +192,7 @@ class Damped(eqx.Module):
         return jnp.zeros_like(x).at[np.asarray(which)].set(self.damping.astype(x.dtype))
 
     def __repr__(self) -> str:
-        return described(self, positional=("system",))
+        return describe(self, positional=("system",))
 
 
 @eqx.filter_jit
@@ -286,7 +286,7 @@ class Driven(eqx.Module):
         return drift + G @ u.astype(x.dtype)
 
     def __repr__(self) -> str:
-        return described(self, positional=("system",))
+        return describe(self, positional=("system",))
 
 
 def sample(
@@ -334,7 +334,7 @@ def sample(
     x0 = require.floating(x0, "x0")
     require.single_or_double(x0.dtype, "x0 has")
     states = require.finite(require.points(x0[None] if x0.ndim == 1 else x0, "x0"), "x0")
-    ts = require.elapsed(require.times(ts, least=1), states.dtype)
+    ts = require.elapsed_times(require.times(ts, least=1), states.dtype)
     system = in_precision(system, states.dtype)
     require.velocity(system, states[0], "system")
     levels = [
@@ -366,7 +366,7 @@ def _noise_level(level: ArrayLike, name: str, states: Float[Array, "B n"], key: 
     if key is None and not (require.is_concrete(level) and np.all(np.asarray(level) == 0)):
         raise ValueError(f"{name} needs randomness: pass `key=jax.random.key(...)`.")
     array = require_shape(require.floating(level, name), name, (), states.shape[1:])
-    level_on_host = require.on_host(array)
+    level_on_host = require.host_array(array)
     array = require.value(
         array,
         ~((level_on_host >= 0) & (level_on_host < np.inf)),

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Num
 
 from hamkernel import _require as require
-from hamkernel._show import described
+from hamkernel._show import describe
 from hamkernel.poisson import charged_particle, lotka_volterra, rigid_body
 from hamkernel.systems._base import (
     AbstractHamiltonianSystem,
@@ -153,7 +153,7 @@ class PointVortices(AbstractHamiltonianSystem):
         )
         self.circulations = require.value(
             array,
-            require.on_host(array) == 0,
+            require.host_array(array) == 0,
             lambda: f"circulations must not be zero, got {array}: leave out vortices without one.",
         )
 
@@ -223,7 +223,7 @@ class AbstractPoissonSystem(eqx.Module):
         return _poisson_velocity(self, x)
 
     def __repr__(self) -> str:
-        return described(self)
+        return describe(self)
 
 
 @eqx.filter_jit
