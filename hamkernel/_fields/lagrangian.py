@@ -167,15 +167,32 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
             kinetic = jnp.einsum("i,j,ijr->r", v, v, self.features.mass_matrix_features(q)) / 2
             return kinetic + self.features.potential_features(q)
 
-        return jnp.sqrt(self._variance(row(x) - row(x0)))
+        missing = self._missing_lagrangian  # which T + V has as well, since T and V are independent
+        here, there = self._state(x), self._state(x0)
+        rest = missing(here, here) + missing(there, there) - 2 * missing(here, there)
+        return jnp.sqrt(self._variance(row(x) - row(x0)) + jnp.maximum(rest, 0.0))
 
     @full_precision
     def torque_deviation(
         self, q: Num[ArrayLike, " m"], v: Num[ArrayLike, " m"], a: Num[ArrayLike, " m"]
     ) -> Float[Array, " m"]:
         """The standard deviation of each torque of `inverse_dynamics`, without noise, (m,)."""
+        m, a = self.features.count, self._position(a, "a")
         x = jnp.concatenate([self._position(q), self._position(v, "v")])
-        return jnp.sqrt(self._variance(self.features.torque_features(x, self._position(a, "a"))))
+
+        def torques(u):
+            """D ∂u/∂v − ∂u/∂q, linear in u."""
+            momentum = lambda x: jax.grad(lambda v: u(jnp.append(x[:m], v)))(x[m:])  # noqa: E731
+            rate = jax.jvp(momentum, (x,), (jnp.append(x[m:], a),))[1]
+            return rate - jax.grad(lambda q: u(jnp.append(q, x[m:])))(x[:m])
+
+        def rest(e):
+            missing = self._missing_lagrangian
+            return e @ torques(lambda z: e @ torques(lambda x: missing(x, z)))
+
+        rests = jax.vmap(rest)(jnp.eye(m, dtype=x.dtype))
+        rows = self.features.torque_features(x, a)
+        return jnp.sqrt(self._variance(rows) + jnp.maximum(rests, 0.0))
 
     @full_precision
     def friction(self, v: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
@@ -236,6 +253,12 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
         )
         missing = k(self.kernel.embed(q), self.kernel.embed(q2)) - whitened @ whitened2
         return jnp.maximum(missing, 0.0) if q is q2 else missing
+
+    def _missing_lagrangian(self, x: Array, z: Array) -> Float[Array, ""]:
+        """The prior covariance of L at two states that the centres do not carry."""
+        (q, v), (other, w) = jnp.split(x, 2), jnp.split(z, 2)
+        K, missing = self.kernel, self._missing
+        return missing(K.potential, q, other) + (v @ w) ** 2 * missing(K.inertia, q, other)
 
     def _state(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
         return require.point(x, self.dimension).astype(self.coefficients.dtype)
