@@ -115,6 +115,7 @@ class GroupWaves(eqx.Module):
 
     def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n w"]:
         matrices, characters = self._constants()
+        # ∂/∂x wave(gx) = gᵀ(∇wave)(gx)
         slopes = jax.vmap(self.waves.gradients)(matrices @ x)  # (G, n, w) at g x
         return jnp.einsum("g,gba,gbw->aw", characters, matrices, slopes) / len(characters)
 
@@ -245,6 +246,8 @@ class DivergenceFreeFeatures(AbstractFeatures):
         return len(self.waves.amplitudes) * self.dimension * (self.dimension - 1) // 2
 
     def _pairs(self) -> Float[Array, "n P n"]:
+        # Σ_{a<b} φφᵀ has M_bb at (a, a) for every b ≠ a, that is tr M − M_aa, and −M_ba at (a, b),
+        # with M = ∂x ∂zᵀ k of the waves: tr(M) I − Mᵀ, the kernel of `DivergenceFree`.
         a, b = np.triu_indices(self.dimension, 1)
         pairs = np.zeros((self.dimension, len(a), self.dimension))
         pairs[a, np.arange(len(a)), b] = 1.0

@@ -372,8 +372,8 @@ class Posterior(Shown, EqualToItself, eqx.Module):
                 f"the new data are {new.targets.dtype} and the posterior {old.targets.dtype}: cast "
                 "the new data."
             )
-        data_inputs = self.conditional.updated(new)
-        return Posterior(data_inputs, learned_field(data_inputs.field, mean))
+        conditional = self.conditional.updated(new)
+        return Posterior(conditional, learned_field(conditional.field, mean))
 
     @follow_data
     @one_blas_thread
@@ -456,15 +456,17 @@ def _range_of(U: Float[Array, "N m"], centre: float | None) -> Float[Array, "2 m
     return jnp.array([[-1.0], [1.0]], U.dtype) * jnp.where(largest > 0, largest, 1)[None]
 
 
+_at = precise_jit(lambda k, x: k(x, x))
+
+
 def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
     """Warn if k(x, x) = 1 to the last digit, as in built-in kernels without an amplitude."""
     if not require.is_concrete(K, X):
         return
-    with require.eager():
-        x = X[0, : K.outputs(X.shape[1])]
+    origin = np.zeros(K.outputs(X.shape[1]), X.dtype)
     for k in drop_symmetry(K).scalar_kernels:
         with require.eager():
-            one = Invariance.TRANSLATION in k.invariance and np.asarray(k(x, x)) == 1.0
+            one = Invariance.TRANSLATION in k.invariance and float(_at(k, origin)) == 1.0
         if one:
             scaled = "the amplitude" if isinstance(k, Scaled) else f"1.0 * {k!r}"
             require.warn(

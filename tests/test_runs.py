@@ -164,6 +164,12 @@ def test_clean_noisy_and_digital_logs_are_taken_without_a_word():
     hk.Runs(np.arange(450.0), held)
 
 
+def test_a_coarse_encoder_at_a_turning_point_is_not_called_dead():
+    t = np.linspace(0, 6, 121)
+    swing = np.stack([2.2 * np.cos(2 * t), -4.4 * np.sin(2 * t)], axis=1)
+    hk.Runs(t, np.round(swing / 0.5) * 0.5)  # warnings are errors
+
+
 def test_clipped_dead_repeated_and_interpolated_samples_are_named():
     clipped = np.column_stack([NOISY[:, 0], np.clip(NOISY[:, 1], -9, 1.5)])
     with pytest.warns(UserWarning, match=r"seems clipped: coordinate 1 at 1\.5 stays"):

@@ -27,7 +27,7 @@ from hamkernel._structures.structure import (
     canonical,
 )
 
-NO_FRICTION = -200.0  # # the logarithm of zero friction: e⁻²⁰⁰ vanishes in every sum
+NO_FRICTION = -200.0  # the logarithm of zero friction: e⁻²⁰⁰ vanishes in every sum
 
 
 class Rung(AbstractMatrixKernel):

@@ -95,6 +95,9 @@ class AbstractRadialKernel(AbstractScalarKernel):
 
     def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
         """Normal vectors divided by ℓ, each multiplied by a random width √w."""
+        # φ(s) is the mean of exp(−w s/2) over w with s = ‖(x − z)/ℓ‖², and exp(−w s/2) the mean of
+        # cos(ω·(x − z)) over ω = √w ζ/ℓ with ζ ~ N(0, I): Bochner's theorem for a mixture of
+        # Gaussians.
         normal, mixture = jax.random.split(key)
         widths = self.widths(mixture, count, dtype)
         base = orthogonal_normal(key if widths is None else normal, count, n, dtype)
@@ -208,6 +211,8 @@ def _matern(p: int, t: Float[Array, ""]) -> Float[Array, ""]:
     far = -1.2 * math.log(float(jnp.finfo(t.dtype).tiny))  # e^(−r) is zero, the polynomial finite
     r = jnp.sqrt(jnp.clip(t, 0.0, far**2))
     polynomial = jnp.zeros_like(t)
+    # p!/(2p)! Σᵢ (p + i)!/(i! (p − i)!) (2r)^(p − i), Rasmussen & Williams (2006), eq. 4.16, where
+    # (p + i)!/(i! (p − i)!) p! = C(p, i) · (p + i)!/p! · p!.
     for i in range(p + 1):  # Horner's scheme in 2r, the highest power first
         ways = math.comb(p, i) * math.perm(p + i, i) * math.factorial(p)
         polynomial = polynomial * (2 * r) + ways / math.factorial(2 * p)

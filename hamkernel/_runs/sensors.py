@@ -259,7 +259,11 @@ def _plateaus(x: Float[np.ndarray, " T"], value: float, quantum: float) -> int:
 
 
 def _stuck(x: Float[np.ndarray, " T"], rest: Float[np.ndarray, "T rest"]):
-    """The longest stretch of equal values in which another coordinate moves by more than one."""
+    """The longest stretch of equal values in which another coordinate moves by more than one.
+
+    A sensor that was stuck jumps to where the system is. A coarse encoder at a turning point moves
+    on by one step, the least difference of its values, and is not stuck.
+    """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], x[1:] == x[:-1], [False]]).astype(int)))
     if not edges.size or not rest.size:
         return None
@@ -267,6 +271,10 @@ def _stuck(x: Float[np.ndarray, " T"], rest: Float[np.ndarray, "T rest"]):
     part = rest[first : stop + 1]
     part = part[:, np.isfinite(part).all(axis=0)]
     if stop - first < 5 or not part.size or np.ptp(part, axis=0).max() < 1.0:
+        return None
+    changes = np.abs(np.diff(x))
+    at_ends = np.concatenate([changes[first - 1 : first], changes[stop : stop + 1]])
+    if not (at_ends > 1.5 * changes[changes > 0].min(initial=np.inf)).any():
         return None
     return first, stop
 

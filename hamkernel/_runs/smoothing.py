@@ -226,7 +226,7 @@ class Coordinate(NamedTuple):
     @property
     def lengthscale(self) -> float:
         """ℓ in units of time, that of a Matérn kernel."""
-        return float(np.sqrt(7.0) * np.exp(-self.process.log_rate))
+        return float(np.sqrt(7.0) * np.exp(-float(self.process.log_rate)))
 
 
 def without_means(states: Sequence[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
@@ -291,13 +291,13 @@ def _process(steps, y, measured, v, measured_slope, longest: float, spacing: flo
     if measured_slope.any():
         speed = (v[measured_slope].std() or 1.0) / scale
         low, high = [*low, 1e-7 * speed], [*high, 2.0 * speed]
-        slopes = jnp.asarray(v / scale), jnp.asarray(measured_slope)
-    data = jnp.asarray(steps), jnp.asarray(y / scale), jnp.asarray(measured), slopes
+        slopes = v / scale, measured_slope
+    data = jax.device_put((steps, y / scale, measured, slopes))
     log_amplitude, log_rate, *log_noise = np.asarray(_found(*data, np.log(low), np.log(high)))
     shift = np.log(scale)
     logs = log_amplitude + shift, log_rate, log_noise[0] + shift
     slope_noise = float(np.exp(log_noise[1] + shift)) if slopes else np.nan
-    return Coordinate(Process(*map(jnp.asarray, logs)), True, slope_noise)
+    return Coordinate(Process(*jax.device_put(logs)), True, slope_noise)
 
 
 @compiled_by_size
@@ -358,7 +358,7 @@ def smoothed(
                 path[:, :, c] = 0.0 if coordinate.seen else np.nan
         else:
             one = _smooth_each(
-                coordinate.process, steps, runs.states[:, :, c], jnp.asarray(runs.seen[:, :, c])
+                coordinate.process, steps, runs.states[:, :, c], jax.device_put(runs.seen[:, :, c])
             )
             for path, values in zip(paths, one, strict=True):
                 path[:, :, c] = np.asarray(values)

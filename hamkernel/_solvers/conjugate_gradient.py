@@ -17,8 +17,7 @@ from typing import ClassVar, NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import lineax as lx
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo
@@ -113,7 +112,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
             X, y = (shard(spread, array) for array in problem.states)
             prepare, args = _prepare_velocities, (K, X, ridge, landmarks, spread)
         if progress and require.is_concrete(K, rows, ridge):
-            result = _iterate_with_bar(_prepare(prepare, args), y, ridge, *limits)
+            result = _solve_with_bar(_prepare(prepare, args), y, ridge, *limits)
         else:
             result = _solve(prepare, args, y, ridge, *limits)
         (c, residual, norm), info = self._check_convergence(K, X, ridge, landmarks, result, throw)
@@ -246,75 +245,24 @@ def _prepare(prepare, args):
     return prepare(*args)
 
 
-@precise_jit
-def _solve(prepare, args, y, ridge, tolerance, max_iterations):
-    products, truncation = prepare(*args)
-    return _iterate(products, truncation, y, ridge, tolerance, max_iterations)
-
-
-def _iterate(
-    products: AbstractProducts, truncation, y, ridge, tolerance, max_iterations, start=None
-) -> _Solution:
-    """The solution of (I + G/ridge) c = y by preconditioned conjugate gradients."""
-    structure = jax.ShapeDtypeStruct(y.shape, y.dtype)
-    positive = lx.positive_semidefinite_tag
-    gram = products.gram
-    system = lx.FunctionLinearOperator(lambda c: c + gram(c) / ridge, structure, positive)
-    preconditioner = lx.FunctionLinearOperator(products.precondition, structure, positive)
-    # lineax has one bound for the residual and for the change of c, both in units of y. Half of
-    # the tolerance allows for the rounding errors of the recursion for the residual.
-    scale = jnp.linalg.norm(jax.lax.stop_gradient(y))
-    solver = lx.CG(
-        rtol=0.0,
-        atol=0.5 * tolerance * scale,
-        norm=jnp.linalg.norm,
-        stabilise_every=None,
-        max_steps=max_iterations,
-    )
-    options = {"preconditioner": preconditioner} | ({} if start is None else {"y0": start})
-    solution = lx.linear_solve(system, y, solver, options=options, throw=False)
-    c = solution.value
-    # c = ρa, so f(X) = Ga = Gc/ρ and ‖f‖² = aᵀGa = c·f(X)/ρ. With the residual r = y − c − f(X) of
-    # the system, aᵀr = cᵀr/ρ estimates the error of ‖f‖², as in `norm_of`.
-    values = gram(c) / ridge
-    norm = norm_of(jnp.sum(c * values) / ridge, jnp.sum(c * (y - c - values)) / ridge)
-    learned = c / ridge, y - values, norm
-    return _Solution(
-        learned, solution.stats["num_steps"], relative_error(y - c - values, y), truncation
-    )
-
-
-# The same iterations one at a time, for the progress bar; Ctrl-C stops between two of them.
-
-
 class _Iterate(NamedTuple):
     c: Array
     residual: Array
     direction: Array
     square: Float[Array, ""]  # rᵀM r of the residual, M the preconditioner
     relative_residual: Float[Array, ""]  # ‖r‖/‖y‖
+    steps: Int[Array, ""]
 
-
-def _iterate_with_bar(prepared, y, ridge, tolerance, max_iterations) -> _Solution:
-    """`_iterate` with a progress bar, outside any trace."""
-    from tqdm import tqdm  # so that importing the package does not load it
-
-    products, truncation = prepared
-    state, done = _first_iterate(products, y), 0
-    with tqdm(total=max_iterations, desc="conjugate gradients", disable=None) as bar:
-        while float(state.relative_residual) > 0.5 * float(tolerance) and done < max_iterations:
-            state = _next(products, y, ridge, state)
-            done += 1
-            bar.set_postfix_str(f"residual {float(state.relative_residual):.1e}", refresh=False)
-            bar.update()
-    last = _finish(products, truncation, y, ridge, tolerance, state.c)
-    return last._replace(iterations=last.iterations + done)
+    def goes_on(self, tolerance, max_iterations) -> Bool[Array, ""]:
+        # Half of the tolerance allows for the rounding errors of the recursion for the residual.
+        return (self.relative_residual > 0.5 * tolerance) & (self.steps < max_iterations)
 
 
 @precise_jit
 def _first_iterate(products: AbstractProducts, y) -> _Iterate:
     z = products.precondition(y)
-    return _Iterate(jnp.zeros_like(y), y, z, jnp.sum(y * z), relative_error(y, y))
+    start, none = jnp.zeros_like(y), jnp.zeros((), int)
+    return _Iterate(start, y, z, jnp.sum(y * z), relative_error(y, y), none)
 
 
 @precise_jit
@@ -325,10 +273,54 @@ def _next(products: AbstractProducts, y, ridge, state: _Iterate) -> _Iterate:
     residual = state.residual - step * image
     z = products.precondition(residual)
     square = jnp.sum(residual * z)
-    c = state.c + step * p
-    return _Iterate(c, residual, z + square / state.square * p, square, relative_error(residual, y))
+    return _Iterate(
+        c=state.c + step * p,
+        residual=residual,
+        direction=z + square / state.square * p,
+        square=square,
+        relative_residual=relative_error(residual, y),
+        steps=state.steps + 1,
+    )
 
 
 @precise_jit
-def _finish(products: AbstractProducts, truncation, y, ridge, tolerance, start) -> _Solution:
-    return _iterate(products, truncation, y, ridge, tolerance, 2, start)
+def _solve(prepare, args, y, ridge, tolerance, max_iterations) -> _Solution:
+    """The solution of (I + G/ridge) c = y; its derivatives solve with the same system."""
+    products, truncation = prepare(*args)
+
+    def solve(_, y):
+        last = jax.lax.while_loop(
+            lambda state: state.goes_on(tolerance, max_iterations),
+            lambda state: _next(products, y, ridge, state),
+            _first_iterate(products, y),
+        )
+        return last.c, last.steps
+
+    c, steps = jax.lax.custom_linear_solve(
+        lambda c: c + products.gram(c) / ridge, y, solve, symmetric=True, has_aux=True
+    )
+    return _solution_of(products, truncation, y, ridge, c, steps)
+
+
+def _solve_with_bar(prepared, y, ridge, tolerance, max_iterations) -> _Solution:
+    """`_solve` outside any trace, with a progress bar; Ctrl-C stops between two iterations."""
+    from tqdm import tqdm  # so that importing the package does not load it
+
+    products, truncation = prepared
+    state = _first_iterate(products, y)
+    with tqdm(total=max_iterations, desc="conjugate gradients", disable=None) as bar:
+        while state.goes_on(tolerance, max_iterations):
+            state = _next(products, y, ridge, state)
+            bar.set_postfix_str(f"residual {float(state.relative_residual):.1e}", refresh=False)
+            bar.update()
+    return _solution_of(products, truncation, y, ridge, state.c, state.steps)
+
+
+@precise_jit
+def _solution_of(products: AbstractProducts, truncation, y, ridge, c, steps) -> _Solution:
+    # c = ρa, so f(X) = Ga = Gc/ρ and ‖f‖² = aᵀGa = c·f(X)/ρ. With the residual r = y − c − f(X) of
+    # the system, aᵀr = cᵀr/ρ estimates the error of ‖f‖², as in `norm_of`.
+    values = products.gram(c) / ridge
+    norm = norm_of(jnp.sum(c * values) / ridge, jnp.sum(c * (y - c - values)) / ridge)
+    learned = c / ridge, y - values, norm
+    return _Solution(learned, steps, relative_error(y - c - values, y), truncation)

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._fields.lagrangian import LagrangianField, lagrangian_field
 from hamkernel._machine import precise_jit
+from hamkernel._solvers.triangle import append_rows, no_rows, regression_loss
 from hamkernel._structures.friction import Friction
 from hamkernel._structures.lagrangian import (
     Lagrangian,
@@ -169,9 +170,8 @@ def solved(
 ) -> tuple[Float[Array, "r r"], Float[Array, " r"]]:
     """R with RᵀR = BᵀB + I, and w = (RᵀR)⁻¹Bᵀy, by orthogonal triangularisation."""
     r = B.shape[1]
-    above = jnp.eye(r, r + 1, dtype=B.dtype)
-    Q = jnp.linalg.qr(jnp.concatenate([above, jnp.column_stack([B, y])]), mode="r")
-    return Q[:r, :r], solve_triangular(Q[:r, :r], Q[:r, r])
+    F = append_rows(no_rows(r, B.dtype), B, y)
+    return F[:r, :r], solve_triangular(F[:r, :r], F[:r, r])
 
 
 @precise_jit
@@ -179,19 +179,7 @@ def _solved(features, B, y) -> tuple[Array, Array]:
     return solved(*with_anchor(features, B, y))
 
 
-def negative_log_likelihood(B: Float[Array, "R r"], y: Float[Array, " R"]) -> Float[Array, ""]:
-    """−log p(y) of y ~ N(0, BBᵀ + I), but for a constant: ½(‖y − Bw‖² + ‖w‖² + log|BᵀB + I|).
-
-    Its derivatives are (B(BᵀB + I)⁻¹ − (y − Bw)wᵀ) and y − Bw, for w is where the square is least:
-    they come from a function with both held, and not from those of the triangularisation.
-    """
-    R, w = jax.lax.stop_gradient(solved(*jax.lax.stop_gradient((B, y))))
-    residual = y - B @ w
-    square = 0.5 * (residual @ residual + w @ w)
-    inverse = solve_triangular(R, jax.lax.stop_gradient(B).T, trans="T")
-    slope = jnp.sum(solve_triangular(R, inverse).T * B)
-    log_determinant = jnp.log(jnp.abs(jnp.diagonal(R))).sum()
-    return square + slope + jax.lax.stop_gradient(log_determinant - slope)
+negative_log_likelihood = regression_loss
 
 
 def missing_friction(

@@ -11,7 +11,8 @@ Candidates are drawn in blocks. Rejection inside a block makes the distribution 
 draws one by one (Epperly, Tropp & Webber), so blocks only change the speed.
 """
 
-import abc
+import operator
+from collections.abc import Callable
 from typing import NamedTuple
 
 import equinox as eqx
@@ -19,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from hamkernel import _require as require
@@ -124,7 +126,9 @@ def choose_landmarks(
         X = X[_stratified_sample(jax.random.split(key)[0], len(X), candidates)]
     if rows is not None:
         X = rows.replicate(X)
-    index, kept, count = _choose(PointCandidates(K, X), target_trace, min(max_count, len(X)), key)
+    traces, gram = Partial(block_traces, K, X), Partial(_gram_of_points, K, X)
+    points = Candidates(traces, gram, K.outputs(X.shape[1]))
+    index, kept, count = _choose(points, target_trace, min(max_count, len(X)), key)
     return Landmarks((components(K, X[index]),), None, kept.reshape(-1), count)
 
 
@@ -158,12 +162,13 @@ def choose_rows(
     if size > candidates:
         blocks = _part(blocks, candidates / size, jax.random.split(key)[0])
     G = _gram(landmarks_of(*blocks), K)
-    index, kept, count = _choose(RowCandidates(G), target_trace, min(max_count, len(G)), key)
+    single = Candidates(Partial(jnp.diagonal, G), Partial(operator.getitem, G), 1)
+    index, kept, count = _choose(single, target_trace, min(max_count, len(G)), key)
     return _prune(blocks, index, kept.reshape(-1), count)
 
 
 def _choose(
-    candidates: "AbstractCandidates",
+    candidates: "Candidates",
     target_trace: Float[Array, ""],
     max_count: int,
     key: Key[Array, ""],
@@ -301,58 +306,23 @@ def _rounding(traces: Float[Array, " P"], columns: int) -> Float[Array, " P"]:
     return (10 * columns * gram_rounding(jnp.abs(traces))).astype(traces.dtype)
 
 
-class AbstractCandidates(eqx.Module):
-    """P candidates of n rows each, and their Gram."""
+class Candidates(NamedTuple):
+    """P candidates of n rows each.
 
-    @property
-    @abc.abstractmethod
-    def traces(self) -> Float[Array, " P"]:
-        """The traces of the diagonal blocks of the Gram."""
+    Attributes:
+        traces: () -> the traces of the diagonal blocks of the Gram, shape (P,).
+        gram: (B,) indices -> the rows of the Gram of these candidates, shape (B n, P n).
+        outputs: n.
+    """
 
-    @property
-    @abc.abstractmethod
-    def outputs(self) -> int:
-        """The number n of rows of a candidate."""
-
-    @abc.abstractmethod
-    def gram(self, index: Int[Array, " B"]) -> Float[Array, "Bn Pn"]:
-        """The rows of the Gram that belong to some of the candidates."""
+    traces: Callable[[], Float[Array, " P"]]
+    gram: Callable[[Int[Array, " B"]], Float[Array, "Bn Pn"]]
+    outputs: int
 
 
-class PointCandidates(AbstractCandidates):
-    """All components of the field at points."""
-
-    kernel: AbstractMatrixKernel
-    points: Float[Array, "P d"]
-
-    @property
-    def traces(self) -> Float[Array, " P"]:
-        return block_traces(self.kernel, self.points)
-
-    @property
-    def outputs(self) -> int:
-        return self.kernel.outputs(self.points.shape[1])
-
-    def gram(self, index: Int[Array, " B"]) -> Float[Array, "Bn Pn"]:
-        G = assemble(self.kernel, self.points[index], self.points)
-        return G.reshape(G.shape[0] * G.shape[1], -1)
-
-
-class RowCandidates(AbstractCandidates):
-    """Single rows, whose Gram is a matrix."""
-
-    matrix: Float[Array, "P P"]
-
-    @property
-    def traces(self) -> Float[Array, " P"]:
-        return jnp.diagonal(self.matrix)
-
-    @property
-    def outputs(self) -> int:
-        return 1
-
-    def gram(self, index: Int[Array, " B"]) -> Float[Array, "B P"]:
-        return self.matrix[index]
+def _gram_of_points(K: AbstractMatrixKernel, X: Float[Array, "P d"], index: Int[Array, " B"]):
+    G = assemble(K, X[index], X)
+    return G.reshape(G.shape[0] * G.shape[1], -1)
 
 
 class _Drawing(NamedTuple):
@@ -369,9 +339,9 @@ class _Drawing(NamedTuple):
 
 
 @precise_jit
-def _begin(candidates: AbstractCandidates, target_trace, key, size):
+def _begin(candidates: Candidates, target_trace, key, size):
     """The state after the first call of `_draw`."""
-    traces, n = candidates.traces, candidates.outputs
+    traces, n = candidates.traces(), candidates.outputs
     P, buffer = len(traces), size + BLOCK
     zero = jnp.zeros((), int)
     drawn = _Drawing(
@@ -397,7 +367,7 @@ def _enlarge(drawn: _Drawing, size: int) -> _Drawing:
 
 
 @precise_jit
-def _draw(candidates: AbstractCandidates, target_trace, drawn, size):
+def _draw(candidates: Candidates, target_trace, drawn, size):
     """Draw blocks until the mean trace is at most `target_trace` or `size` points are chosen."""
     goal = jnp.maximum(target_trace, drawn.rounding).sum()
 
@@ -410,7 +380,7 @@ def _draw(candidates: AbstractCandidates, target_trace, drawn, size):
     return jax.lax.while_loop(more, lambda drawn: _draw_block(candidates, drawn), drawn)
 
 
-def _draw_block(candidates: AbstractCandidates, drawn: _Drawing) -> _Drawing:
+def _draw_block(candidates: Candidates, drawn: _Drawing) -> _Drawing:
     P, n = len(drawn.traces), drawn.kept.shape[1]
     key, draw, accept = jax.random.split(drawn.key, 3)
     index = jax.random.choice(draw, P, (BLOCK,), p=drawn.traces / drawn.traces.sum())

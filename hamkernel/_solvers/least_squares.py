@@ -29,7 +29,7 @@ from jaxtyping import Array, Float
 from hamkernel._gram import plus_ridge, stop_gradients
 from hamkernel._machine import RowSharding, map_devices
 from hamkernel._sizes import sizes
-from hamkernel._solvers.triangle import triangle
+from hamkernel._solvers.triangle import append_rows, no_rows, triangle
 
 # A design maps t points to their rows, (t, n) -> (t, n, r); row (i, a) is component a of each of
 # the r fields at point i.
@@ -55,13 +55,11 @@ def triangle_of_design(
         design, ridge = replicated
 
         def step(factor, tile):
-            rows = design(tile[0])  # (t, n, r)
-            below = jnp.concatenate([rows, tile[1][..., None]], axis=2)  # (t, n, r + 1)
-            below = below.reshape(-1, columns + 1)  # (t n, r + 1)
-            return triangle(jnp.concatenate([factor, below])), None
+            rows = design(tile[0]).reshape(-1, columns)  # (t, n, r) -> (t n, r)
+            return append_rows(factor, rows, tile[1].reshape(-1)), None
 
-        on_diagonal = jnp.append(jnp.full(columns, jnp.sqrt(ridge)), jnp.zeros((), Y.dtype))
-        return over_tiles(step, jnp.diag(on_diagonal), (X, Y), _rows_of_tile(columns))[0]
+        start = no_rows(columns, Y.dtype, ridge)
+        return over_tiles(step, start, (X, Y), _rows_of_tile(columns))[0]
 
     ridge = ridge if spread is None else ridge / spread.count
     return map_devices(

@@ -46,11 +46,13 @@ from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import AbstractField, SolverInfo, root
 from hamkernel._fields.expansions import FeatureField, KernelField, feature_field, kernel_field
 from hamkernel._gram import between, block_traces, components, plus_ridge, trace_of_rows
-from hamkernel._machine import precise_jit
+from hamkernel._machine import RowSharding, precise_jit
 from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks, whitening
+from hamkernel._solvers.least_squares import Normal, normal
 from hamkernel._solvers.problem import AbstractConditional
+from hamkernel._solvers.triangle import append_rows, no_rows
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -176,17 +178,6 @@ def _draw_prior(K, landmarks: Landmarks, key, count: int) -> Prior:
 Arrays = TypeVar("Arrays")
 
 
-class Columns(eqx.Module):
-    """The design of landmarks: their columns of the Gram at points, (t, d) -> (t, n, r)."""
-
-    kernel: AbstractMatrixKernel
-    landmarks: Landmarks
-
-    def __call__(self, X: Float[Array, "t d"]) -> Float[Array, "t n r"]:
-        columns = self.landmarks.columns(self.kernel, components(self.kernel, X))
-        return columns.reshape(len(X), -1, columns.shape[1])
-
-
 def factor(square: Float[Array, "r r"], ridge: Float[Array, ""]) -> Float[Array, "r r"]:
     """The lower Cholesky factor of FᵀF + ridge I; NaN where the ridge is below rounding."""
     return jnp.linalg.cholesky(plus_ridge(square, ridge))
@@ -238,14 +229,45 @@ def singular(dtype: jnp.dtype) -> str:
     )
 
 
-class AbstractSpan(eqx.Module):
-    """Functions φ_1 … φ_r with Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z)."""
+class AbstractFunctions(eqx.Module):
+    """Functions φ_1 … φ_r and the rows of observations of them."""
 
     kernel: eqx.AbstractVar[AbstractMatrixKernel]
 
     @abc.abstractmethod
     def rows_of(self, block: AbstractBlock) -> Float[Array, "d r"]:
         """The rows of a block, for each of the r functions."""
+
+    def __call__(self, X: Float[Array, "t d"]) -> Float[Array, "t n r"]:
+        """The values at points, a design of `least_squares.py`."""
+        rows = self.rows_of(components(self.kernel, X))
+        return rows.reshape(len(X), -1, rows.shape[1])
+
+    def all_rows(self, rows: Measurements) -> Float[Array, "M r"]:
+        """The rows of all observations for each function, before the contrast of the energies."""
+        return jnp.concatenate([self.rows_of(block) for block in rows.blocks])
+
+    def normal_equations(
+        self, rows: Measurements, basis: Float[Array, "r r"], spread: RowSharding | None = None
+    ) -> Normal:
+        """The normal equations of the rows times `basis`; velocities are seen tile by tile."""
+        if rows.states is not None:
+            return normal(self, basis, *rows.states, spread)
+        return Normal.from_rows(self.all_rows(rows) @ basis, rows.targets)
+
+
+class Columns(AbstractFunctions):
+    """The columns K(·, s) of landmarks."""
+
+    kernel: AbstractMatrixKernel
+    landmarks: Landmarks
+
+    def rows_of(self, block: AbstractBlock) -> Float[Array, "d r"]:
+        return self.landmarks.columns(self.kernel, block)
+
+
+class AbstractSpan(AbstractFunctions):
+    """Functions φ_1 … φ_r with Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z)."""
 
     @abc.abstractmethod
     def missing(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
@@ -277,10 +299,6 @@ class AbstractSpan(eqx.Module):
         region: Float[Array, "2 n"],
     ) -> AbstractField:
         """A batch of fields: Σ_r w_r φ_r plus draws of the remainder of the prior."""
-
-    def all_rows(self, rows: Measurements) -> Float[Array, "M r"]:
-        """The rows of all observations for each function, before the contrast of the energies."""
-        return jnp.concatenate([self.rows_of(block) for block in rows.blocks])
 
 
 def landmark_field(
@@ -442,8 +460,9 @@ class LowRankConditional(AbstractConditional):
         rows = self.rows.append(new)
         extended_rows, new_count = self.rows.with_previous(new), rows.size - self.rows.size
         new_rows = extended_rows.contrast(self.span.all_rows(extended_rows))[-new_count:]
-        R, rotated = _append_rows(self.R, self.rotated, new_rows, rows.y[-new_count:])
-        return _conditional(self.span, rows, self.ridge, R, rotated)
+        above = jnp.column_stack([self.R, self.rotated])
+        F = append_rows(above, new_rows, rows.y[-new_count:])
+        return _conditional(self.span, rows, self.ridge, F)
 
     def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> AbstractField:
         weight_key, rest = jax.random.split(key)
@@ -485,20 +504,12 @@ def low_rank_conditional(
 @precise_jit
 def _low_rank_conditional(span, rows, ridge):
     F = rows.contrast(span.all_rows(rows))
-    start = jnp.sqrt(ridge) * jnp.eye(F.shape[1], dtype=F.dtype)
-    return _conditional(span, rows, ridge, *_append_rows(start, jnp.zeros_like(F[0]), F, rows.y))
+    start = no_rows(F.shape[1], F.dtype, ridge)
+    return _conditional(span, rows, ridge, append_rows(start, F, rows.y))
 
 
-def _append_rows(R, rotated, F, y):
-    """The QR update of (R, Qᵀy) by the rows F with targets y."""
-    both = jnp.concatenate(
-        [jnp.column_stack([R, rotated]), jnp.column_stack([F, y])],
-    )
-    Q = jnp.linalg.qr(both, mode="r")
-    return Q[: len(R), :-1], Q[: len(R), -1]
-
-
-def _conditional(span, rows, ridge, R, rotated):
+def _conditional(span, rows, ridge, triangle):
+    R, rotated = triangle[:-1, :-1], triangle[:-1, -1]
     w, F = solve_triangular(R, rotated), span.all_rows(rows)
     residual = rows.y - rows.contrast(F @ w)
     truncation = span.truncation(rows, F, ridge)

@@ -36,14 +36,7 @@ from hamkernel._solvers.landmarks import (
     landmarks_of,
     whitening,
 )
-from hamkernel._solvers.least_squares import (
-    Normal,
-    Sums,
-    first_sums,
-    normal,
-    solve_sums,
-    trace_of_sums,
-)
+from hamkernel._solvers.least_squares import Normal, Sums, normal, solve_sums, trace_of_sums
 from hamkernel._solvers.low_rank import (
     Columns,
     LandmarkBasis,
@@ -56,7 +49,12 @@ from hamkernel._solvers.low_rank import (
     singular,
     truncation_of,
 )
-from hamkernel._solvers.stream import AbstractStreamingFit, AbstractStreamingSolver, thin
+from hamkernel._solvers.stream import (
+    AbstractStreamingFit,
+    AbstractStreamingSolver,
+    first_sums_of,
+    thin,
+)
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -124,7 +122,7 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         landmarks: the points that carry the field.
         sums: the normal equations of the rows added.
         trace: the trace of the Gram of these rows, shape ().
-        lost: the rounding errors of the sums and the trace.
+        compensation: the rounding errors of the sums and the trace.
         count: N, the number of points added, shape ().
         regularization: the λ of `start`, shape ().
         dimension: n, the number of coordinates of a state.
@@ -148,21 +146,17 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         return "landmarks", self.landmarks
 
     @property
+    def _functions(self) -> Columns:
+        return Columns(self.kernel, self.landmarks)
+
+    @property
     def _totals(self) -> tuple[Any, ...]:
         return self.sums.normal_equations, self.trace
 
-    def _totals_of_velocities(
-        self, X: Float[Array, "N n"], Y: Float[Array, "N n"], spread: RowSharding | None
-    ) -> tuple[Any, ...]:
-        normal_equations = normal(
-            Columns(self.kernel, self.landmarks), self.sums.basis, X, Y, spread
-        )
-        return normal_equations, trace(self.kernel, X, spread)
-
-    def _totals_of_rows(self, rows: Measurements) -> tuple[Any, ...]:
-        design = _design(self.kernel, self.landmarks, rows)
-        normal_equations = Normal.from_rows(design @ self.sums.basis, rows.targets)
-        return normal_equations, trace_of_rows(self.kernel, rows)
+    def _totals_of(self, rows: Measurements, spread: RowSharding | None) -> tuple[Any, ...]:
+        K, states = self.kernel, rows.states
+        new_trace = trace_of_rows(K, rows) if states is None else trace(K, states[0], spread)
+        return *super()._totals_of(rows, spread), new_trace
 
     def _solve(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
         solution = _landmark_solution(self, count, regularization)
@@ -178,14 +172,8 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 @precise_jit
 def start_fit(K, sample, regularization, landmarks, tolerance):
     T = whitening(K, landmarks)
-    if sample.states is None:
-        normal_equations = Normal.from_rows(_design(K, landmarks, sample) @ T, sample.targets)
-    else:
-        normal_equations = normal(Columns(K, landmarks), T, *sample.states)
-    sums, nothing = (
-        first_sums(normal_equations, T, sample.count, regularization),
-        jnp.zeros((), T.dtype),
-    )
+    sums = first_sums_of(Columns(K, landmarks), T, sample, regularization)
+    nothing = jnp.zeros((), T.dtype)
     return LandmarkFit(
         kernel=K,
         landmarks=landmarks,
@@ -197,10 +185,6 @@ def start_fit(K, sample, regularization, landmarks, tolerance):
         dimension=sample.dimension,
         tolerance=tolerance,
     )
-
-
-def _design(K, landmarks, rows):
-    return jnp.concatenate([landmarks.columns(K, block) for block in rows.blocks])
 
 
 @precise_jit

@@ -11,7 +11,6 @@ from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import FeatureField, feature_field
 from hamkernel._machine import (
-    RowSharding,
     precise_jit,
     refuse_beyond_memory,
     row_sharding,
@@ -19,14 +18,7 @@ from hamkernel._machine import (
     to_caller_sharding,
 )
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.least_squares import (
-    Normal,
-    Sums,
-    first_sums,
-    normal,
-    ridge_regression,
-    solve_sums,
-)
+from hamkernel._solvers.least_squares import Normal, Sums, ridge_regression, solve_sums
 from hamkernel._solvers.low_rank import (
     FeatureSpan,
     LowRankConditional,
@@ -34,7 +26,12 @@ from hamkernel._solvers.low_rank import (
     low_rank_conditional,
     singular,
 )
-from hamkernel._solvers.stream import AbstractStreamingFit, AbstractStreamingSolver, thin
+from hamkernel._solvers.stream import (
+    AbstractStreamingFit,
+    AbstractStreamingSolver,
+    first_sums_of,
+    thin,
+)
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -158,7 +155,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
         kernel: K.
         features: the features of K.
         sums: the normal equations of the rows added.
-        lost: the rounding errors of the sums.
+        compensation: the rounding errors of the sums.
         count: N, the number of points added, shape ().
         regularization: the λ of `start`, shape ().
         dimension: n, the number of coordinates of a state.
@@ -179,17 +176,12 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
         return "features", self.features
 
     @property
+    def _functions(self) -> FeatureSpan:
+        return FeatureSpan(self.kernel, self.features, self.dimension)
+
+    @property
     def _totals(self) -> tuple[Any, ...]:
         return (self.sums.normal_equations,)
-
-    def _totals_of_velocities(
-        self, X: Float[Array, "N n"], Y: Float[Array, "N n"], spread: RowSharding | None
-    ) -> tuple[Any, ...]:
-        return (normal(self.features, self.sums.basis, X, Y, spread),)
-
-    def _totals_of_rows(self, rows: Measurements) -> tuple[Any, ...]:
-        design = FeatureSpan(self.kernel, self.features, self.dimension).all_rows(rows)
-        return (Normal.from_rows(design @ self.sums.basis, rows.targets),)
 
     def _solve(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
         return _check_field(_feature_solution(self, count, regularization))
@@ -198,12 +190,8 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
 @precise_jit
 def _start(K, basis, sample, regularization):
     identity = jnp.eye(basis.columns, dtype=sample.targets.dtype)
-    if sample.states is None:
-        design = FeatureSpan(K, basis, sample.dimension).all_rows(sample)
-        normal_equations = Normal.from_rows(design, sample.targets)
-    else:
-        normal_equations = normal(basis, identity, *sample.states)
-    sums = first_sums(normal_equations, identity, sample.count, regularization)
+    span = FeatureSpan(K, basis, sample.dimension)
+    sums = first_sums_of(span, identity, sample, regularization)
     return FeatureFit(
         kernel=K,
         features=basis,

@@ -45,7 +45,8 @@ from hamkernel._observations.measurements import (
     sampled_points,
 )
 from hamkernel._show import call, text
-from hamkernel._solvers.least_squares import Sums
+from hamkernel._solvers.least_squares import Sums, first_sums
+from hamkernel._solvers.low_rank import AbstractFunctions
 from hamkernel._solvers.problem import AbstractSolver, LearnedField, without_known
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.completed import completed
@@ -131,15 +132,14 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
             "samples, or functions in their kernels": (self.sums.triangle, self.sums.basis),
         }
 
+    @property
     @abc.abstractmethod
-    def _totals_of_velocities(
-        self, X: Float[Array, "N n"], Y: Float[Array, "N n"], spread: RowSharding | None
-    ) -> tuple[Any, ...]:
-        """The totals of velocities; their rows may be sharded over devices."""
+    def _functions(self) -> AbstractFunctions:
+        """The functions that, times `sums.basis`, make the rows of the sums."""
 
-    @abc.abstractmethod
-    def _totals_of_rows(self, rows: Measurements) -> tuple[Any, ...]:
-        """The totals of observations of any kind."""
+    def _totals_of(self, rows: Measurements, spread: RowSharding | None) -> tuple[Any, ...]:
+        """The totals of new rows; velocities may be sharded over devices."""
+        return (self._functions.normal_equations(rows, self.sums.basis, spread),)
 
     @abc.abstractmethod
     def _solve(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> LearnedField:
@@ -172,11 +172,10 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         rows = self._checked_rows(
             observations(X, Y, inputs_or_parameters(inputs, parameters), part=True)
         )
-        if rows.states is None:
-            return _with_rows(self, rows)
-        X, Y = (array.astype(self.dtype) for array in rows.states)
-        spread = row_sharding(X)
-        return _with_velocities(self, shard(spread, X), shard(spread, Y), spread)
+        spread = None if rows.states is None else row_sharding(rows.points)
+        arrays, rest = eqx.partition(rows, eqx.is_inexact_array)
+        arrays = jax.tree.map(lambda a: shard(spread, a.astype(self.dtype)), arrays)
+        return _with_rows(self, eqx.combine(arrays, rest), spread)
 
     def __add__(self: Fit, other: Any) -> Fit:
         """The fit to the data of both, the same bits in any order of the parts of the data.
@@ -261,13 +260,8 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
 
 
 @precise_jit
-def _with_velocities(fit, X, Y, spread):
-    return _plus(fit, fit._totals_of_velocities(X, Y, spread), None, len(X))
-
-
-@precise_jit
-def _with_rows(fit, rows):
-    return _plus(fit, fit._totals_of_rows(rows), None, rows.count)
+def _with_rows(fit, rows, spread):
+    return _plus(fit, fit._totals_of(rows, spread), None, rows.count)
 
 
 def _to_jax(leaf: Any) -> Any:
@@ -463,6 +457,16 @@ def _refuse_energies(rows: Measurements) -> None:
         )
 
 
+def first_sums_of(
+    functions: AbstractFunctions,
+    W: Float[Array, "r r"],
+    sample: Measurements,
+    regularization: Float[Array, ""],
+) -> Sums:
+    """`first_sums` of functions times W on a sample."""
+    return first_sums(functions.normal_equations(sample, W), W, sample.count, regularization)
+
+
 def rows_at(K: AbstractMatrixKernel, points: Float[Array, "N d"]) -> Measurements:
     """The rows of velocities at points, with targets of zero."""
     block = components(K, points)
@@ -470,7 +474,7 @@ def rows_at(K: AbstractMatrixKernel, points: Float[Array, "N d"]) -> Measurement
 
 
 def thin(K: AbstractMatrixKernel, sample: Measurements, count: int) -> Measurements:
-    """Every k-th point, at most `most` of them, replicated; all rows if there are other rows."""
+    """Every k-th point, at most `count` of them, replicated; all rows if there are other rows."""
     if sample.states is None:
         return sample
     points = sample.points

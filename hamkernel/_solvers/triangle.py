@@ -18,16 +18,38 @@ Source: Fukaya, Kannan, Nakatsukasa, Yamamoto & Yanagisawa (2020), SIAM J. Sci. 
 Cholesky QR".
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, ArrayLike, Float
 
+from hamkernel._machine import full_precision
 from hamkernel._solvers.factors import cholesky, forward
 
 
 def triangle(S: Float[Array, "m k"]) -> Float[Array, "k k"]:
     """R, upper triangular with RᵀR = SᵀS, for m ≥ k. The signs of its rows depend on the device."""
     return jax.lax.platform_dependent(S, cpu=householder_triangle, default=cholesky_triangle)
+
+
+def no_rows(columns: int, dtype: Any, ridge: ArrayLike = 1.0) -> Float[Array, "k k"]:
+    """The triangle of √ridge [I 0], to which rows are appended, k = columns + 1."""
+    root = jnp.sqrt(jnp.asarray(ridge, dtype))
+    return jnp.diag(jnp.append(jnp.full(columns, root), jnp.zeros((), dtype)))
+
+
+def append_rows(
+    above: Float[Array, "j k"], rows: Float[Array, "D r"], y: Float[Array, " D"]
+) -> Float[Array, "k k"]:
+    """The triangle of `above` over new rows with their targets, k = r + 1.
+
+    From `no_rows` on it is [R, b; 0, ρ] with RᵀR = ΦᵀΦ + δI for all rows Φ so far. Orthogonal
+    transformations change no norm, so ‖Φw − y‖² + δ‖w‖² = ‖Rw − b‖² + ρ², which is least, ρ², at
+    w = R⁻¹b.
+    """
+    return triangle(jnp.concatenate([above, jnp.column_stack([rows, y])]))
 
 
 def householder_triangle(S: Float[Array, "m k"]) -> Float[Array, "k k"]:
@@ -52,3 +74,36 @@ def cholesky_triangle(S: Float[Array, "m k"]) -> Float[Array, "k k"]:
     # G = S₂ᵀS₂. The condition of S₂ is then below √3, and the last factor is exact to rounding.
     is_orthonormal = jnp.linalg.norm(G - one) <= 0.5
     return jax.lax.cond(is_orthonormal, lambda S, R: R, lambda S, R: householder_triangle(S), S, R)
+
+
+@jax.custom_vjp
+def regression_loss(M: Float[Array, "D q"], r: Float[Array, " D"]) -> Float[Array, ""]:
+    """−log p(r) of r ~ N(0, MMᵀ + I) but for a constant: ½(‖r − Mw‖² + ‖w‖² + log det(I + MᵀM)).
+
+    The squares are taken where they are least, so their derivatives hold w constant:
+    M(I + MᵀM)⁻¹ − (r − Mw)wᵀ in M, with the one of ½ log det, and r − Mw in r. The first term is
+    computed as (MR⁻¹)R⁻ᵀ, since MR⁻¹ is bounded by one however small the noise is. For reverse
+    mode only.
+    """
+    return _regression_forward(M, r)[0]
+
+
+@full_precision
+def _regression_forward(M, r):
+    q = M.shape[1]
+    F = append_rows(no_rows(q, M.dtype), M, r)
+    R = F[:q, :q]
+    log_det = 2 * jnp.log(jnp.abs(jnp.diagonal(R))).sum()
+    return 0.5 * (F[q, q] ** 2 + log_det), (M, r, R, F[:q, q])
+
+
+@full_precision
+def _regression_backward(saved, bar):
+    M, r, R, z = saved
+    w = solve_triangular(R, z)
+    misfit = r - M @ w
+    inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype))
+    return bar * ((M @ inverse) @ inverse.T - misfit[:, None] * w[None, :]), bar * misfit
+
+
+regression_loss.defvjp(_regression_forward, _regression_backward)

@@ -39,7 +39,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
 
     Attributes:
         count: m; None until the data determines it.
-            inner: the name, in error messages, of the part that may have a symmetry.
+        inner: the name, in error messages, of the part that may have a symmetry.
     """
 
     count: eqx.AbstractVar[int | None]

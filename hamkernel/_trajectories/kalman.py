@@ -270,7 +270,7 @@ def as_observations(
     mean m. None if no segment has more samples than are needed to fix its start.
     """
     n = rows.residual.shape[-1]
-    least = rows.counts.astype(bool).sum((1, 2)) > n
+    least = np.asarray(rows.counts, bool).sum((1, 2)) > n
     there = _means(mean, rows.nodes, rows.nodes[..., :n])
     # On the host: one segment of a JAX array compiles.
     every = jax.tree.map(np.asarray, (rows, there))

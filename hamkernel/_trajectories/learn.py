@@ -193,7 +193,7 @@ def learn(
     bar = _bar(progress, total=2 + max_steps)
     data = preprocess(runs, drift)
     bar.update()
-    K = completed(K, jnp.asarray(sample_points(data)[0]), runs.dimension)
+    K = completed(K, jax.device_put(sample_points(data)[0]), runs.dimension)
     most_landmarks = None if solver is None else solver.max_points
     start = _start(K, drift, data, sigma, landmarks(data, most_landmarks))
     seconds = seconds_of_iteration(data, start.landmarks[1])
@@ -284,11 +284,11 @@ def _start(K, mean, data: Preprocessed, sigma: np.ndarray | None, landmarks) -> 
     if mean is not None:
         Y = Y - np.asarray(jax.vmap(mean)(jnp.asarray(X)))
     S, first = landmarks[:2]
-    impulse = impulses(K, jnp.asarray(S[:first]), Y, data)
+    impulse = impulses(K, jax.device_put(S[:first]), Y, data)
     return _Start(
         kernel=K,
         mean=mean,
-        log_noise=jnp.log(jnp.asarray(_first_noise(data) if sigma is None else sigma)),
+        log_noise=jax.device_put(np.log(_first_noise(data) if sigma is None else sigma)),
         free=np.isfinite(data.noise) & (sigma is None),
         X=X,
         Y=Y,
@@ -373,7 +373,7 @@ def _result(
         regularization=regularization,
         noise=jnp.asarray(noise),
         process_noise=jnp.asarray(process),
-        states=tuple(map(jnp.asarray, states)),
+        states=tuple(jax.device_put(states)),
         kept=jnp.asarray(fit.kept),
         dropped=fit.dropped,
         pushed=fit.pushed,
@@ -413,16 +413,16 @@ def _fitted_states(end: End, times: list[np.ndarray]) -> list[Float[np.ndarray, 
 def _field(expansion: Expansion, regularization: Float[Array, ""]) -> Any:
     """The field as one of the library."""
     S, A = expansion.points, expansion.coefficients
-    square = jnp.sum(A * placed_product(expansion.kernel, S, S, A))  # ‖f‖² = aᵀGa
+    square = np.vdot(A, placed_product(expansion.kernel, S, S, A))  # ‖f‖² = aᵀGa
     field = KernelField(
         kernel=expansion.kernel,
         points=S,
         coefficients=A,
         residual=empty(A.shape[1]),
-        norm=jnp.sqrt(jnp.maximum(square, 0.0)),
+        norm=jax.device_put(np.sqrt(max(square, 0.0))),
         regularization=regularization,
         offset=jnp.zeros((), S.dtype),
-        info=SolverInfo("learn", landmarks=jnp.asarray(len(S))),
+        info=SolverInfo("learn", landmarks=jax.device_put(len(S))),
         mean=None,
     )
     return learned_field(field, expansion.mean)
@@ -468,7 +468,7 @@ def _check(
     else:
         U = jnp.concatenate([jnp.atleast_2d(u) for u in extra])
         K, _ = sampled_points(K, jnp.zeros((len(U), n), U.dtype), U)
-    if jnp.zeros(()).dtype != jnp.float64:
+    if jax.dtypes.canonicalize_dtype(float) != jnp.float64:
         raise ValueError(
             "learn needs doubles, since paths and their tangents are compared over many steps: "
             "jax.config.update('jax_enable_x64', True) first."

@@ -18,54 +18,12 @@ import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, Float
 
-from hamkernel._machine import compiled_by_size, full_precision
-from hamkernel._solvers.triangle import triangle
+from hamkernel._machine import compiled_by_size
+from hamkernel._solvers.triangle import append_rows, no_rows
+from hamkernel._solvers.triangle import regression_loss as regression_loss
 from hamkernel._trajectories.kalman import whiten
 from hamkernel._trajectories.model import Model, landmark_whitening
 from hamkernel._trajectories.segments import LinearisedSegments
-
-
-def with_rows(
-    above: Float[Array, "k k"], M: Float[Array, "D q"], r: Float[Array, " D"]
-) -> Float[Array, "k k"]:
-    """The triangle of the QR factorisation of `above` over (M, r), k = q + 1."""
-    return triangle(jnp.concatenate([above, jnp.column_stack([M, r])]))
-
-
-def no_rows(q: int, dtype) -> Float[Array, "k k"]:
-    """The triangle before there are rows: that of the prior w ~ N(0, I)."""
-    return jnp.diag(jnp.append(jnp.ones(q, dtype), 0))
-
-
-@jax.custom_vjp
-def regression_loss(M: Float[Array, "D q"], r: Float[Array, " D"]) -> Float[Array, ""]:
-    """½(‖r − Mw‖² + ‖w‖² + log det(I + MᵀM)) at its least w.
-
-    Its derivatives are M(I + MᵀM)⁻¹ − (r − Mw)wᵀ in M and r − Mw in r. The first term is computed
-    as (MR⁻¹)R⁻ᵀ, since MR⁻¹ is bounded by one however small the noise is.
-    """
-    return _regression_forward(M, r)[0]
-
-
-@full_precision
-def _regression_forward(M, r):
-    q = M.shape[1]
-    F = with_rows(no_rows(q, M.dtype), M, r)
-    R = F[:q, :q]
-    log_det = 2 * jnp.log(jnp.abs(jnp.diagonal(R))).sum()
-    return 0.5 * (F[q, q] ** 2 + log_det), (M, r, R, F[:q, q])
-
-
-@full_precision
-def _regression_backward(saved, bar):
-    M, r, R, z = saved
-    w = solve_triangular(R, z)
-    misfit = r - M @ w
-    inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype))
-    return bar * ((M @ inverse) @ inverse.T - misfit[:, None] * w[None, :]), bar * misfit
-
-
-regression_loss.defvjp(_regression_forward, _regression_backward)
 
 
 class Condensed(NamedTuple):
@@ -122,7 +80,7 @@ def condensed(model: Model, S, rows: LinearisedSegments, start_deviation) -> Con
 
     def strip(F, part):
         made = whiten(model, S, T, part, start_deviation)
-        return with_rows(F, made.M, made.r), made.constant
+        return append_rows(F, made.M, made.r), made.constant
 
     parts = jax.tree.map(lambda a: a.reshape(count, -1, *a.shape[1:]), rows)
     F, constant = jax.lax.scan(strip, jnp.zeros((q + 1, q + 1), T.dtype), parts)
@@ -141,7 +99,7 @@ def conditional(known: Condensed, S, shift: Array | float = 0.0) -> ClosedForm:
     """
     q, scale = len(known.T), jnp.exp(-shift)
     there = scale * known.triangle
-    F = with_rows(no_rows(q, there.dtype), there[:, :q], there[:, q])
+    F = append_rows(no_rows(q, there.dtype), there[:, :q], there[:, q])
     R = F[:q, :q]
     w = solve_triangular(R, F[:q, q])
     inverse = solve_triangular(R, jnp.eye(q, dtype=R.dtype))

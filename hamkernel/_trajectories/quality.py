@@ -50,7 +50,7 @@ def quality(
         is_noise_known=False,
         kept=kept,
         dropped=dropped,
-        core=_core(residuals, noise),
+        core=_core(residuals),
         share=float(np.max(process / np.sqrt(period) / np.maximum(speed, 1e-300))),
         impulse=_largest_push(end),
         pushed=_samples(_push_intervals(end), end, times),
@@ -137,15 +137,17 @@ def _push_intervals(end: End) -> list[Piece]:
     ]
 
 
-def _core(residuals: list[np.ndarray], noise: np.ndarray) -> Float[np.ndarray, " n"]:
-    """A robust standard deviation of residual/σ by coordinate; NaN where nothing was measured.
+def _core(residuals: list[np.ndarray]) -> Float[np.ndarray, " n"]:
+    """A robust standard deviation of the residuals over their RMS; NaN where nothing was measured.
 
-    It is 1.4826 = 1/Φ⁻¹(3/4) times the median of |residual|/σ, which is 1 for normal residuals.
+    The robust one is 1.4826 = 1/Φ⁻¹(3/4) times the median of |residual|, so the ratio is 1 for
+    normal residuals. The RMS stands in place of σ, since process noise makes residuals smaller.
     """
-    R = np.abs(np.concatenate(residuals))
+    R = np.concatenate(residuals)
     measured = np.isfinite(R).any(axis=0)
-    out = np.full(R.shape[1], np.nan)
-    out[measured] = 1.4826 * np.nanmedian(R[:, measured], axis=0) / noise[measured]
+    R, out = R[:, measured], np.full(R.shape[1], np.nan)
+    rms = np.sqrt(np.nanmean(R**2, axis=0))
+    out[measured] = 1.4826 * np.nanmedian(np.abs(R), axis=0) / np.where(rms > 0, rms, 1.0)
     return out
 
 

@@ -4,7 +4,7 @@ Each gradient in the hyperparameters evaluates K anew. Of many rows the search t
 sample of windows, and the first of the landmarks.
 """
 
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -33,11 +33,16 @@ from hamkernel._tuning.space import gram_trace, hyperparameters
 
 
 class Bounds(NamedTuple):
-    """The box of the hyperparameters, and which of them are free."""
+    """The box of the hyperparameters, which of them are free, and which are lengthscales."""
 
     low: Float[np.ndarray, " P"]
     high: Float[np.ndarray, " P"]
     free: Bool[np.ndarray, " P"]
+    lengths: Bool[np.ndarray, " P"] | Literal[False] = False
+
+    def with_shorter_lengths(self, share: float) -> "Bounds":
+        """The box whose least lengthscales are `share` times as long."""
+        return self._replace(low=np.where(self.lengths, self.low + np.log(share), self.low))
 
 
 # Entries of K at nodes in the search of hyperparameters: with n = 8 it takes 4 to 10 s.
@@ -85,8 +90,11 @@ def losses(
     start_deviation,
 ) -> Float[np.ndarray, " count"]:
     """−log p(rows) at some points h, one after another: designs of all sizes share a program."""
-    points = jnp.asarray(design)
-    return np.array([_compiled_loss(model, h, S, rows, start_deviation) for h in points])
+    values = [
+        _compiled_loss(model, jax.device_put(h), S, rows, start_deviation)
+        for h in np.asarray(design)
+    ]
+    return np.array(values)
 
 
 def search_sample(
@@ -113,7 +121,8 @@ def exact(rows: LinearisedSegments) -> tuple[Float[Array, "k d"], LinearisedSegm
     Intervals of padding repeat one point, which adds nothing to the span. Without the padding XLA
     would compile for rows of every length.
     """
-    return rows.nodes[:, :, 1].reshape(-1, rows.nodes.shape[-1]), rows
+    middles = np.asarray(rows.nodes)[:, :, 1].reshape(-1, rows.nodes.shape[-1])
+    return jax.device_put(middles), rows
 
 
 @compiled_by_size
@@ -147,9 +156,9 @@ def maximise_likelihood(
     """
     S, rows = search_sample(jnp.asarray(S), rows)
     if not bounds.free.any():
-        flat = model.flat[None]
+        flat = np.asarray(model.flat)[None]
         return model, float(losses(model, flat, S, rows, start_deviation)[0])
-    sides = jnp.asarray(bounds.low), jnp.asarray(bounds.high), jnp.asarray(bounds.free)
+    sides = jax.device_put((bounds.low, bounds.high, bounds.free))
     h, value = _best(model, S, rows, start_deviation, *sides, steps)
     return model.at(h), float(value)
 
@@ -179,7 +188,7 @@ def choose_start(
         values = losses(model, design, points, part, start_deviation)
         if values.min() < best - (n * len(points) / 2) ** 0.5:
             best, count, start = values.min(), size, design[int(np.argmin(values))]
-    return model.at(jnp.asarray(start)), count
+    return model.at(start), count
 
 
 def solve(
@@ -202,7 +211,7 @@ def solve(
     free[:size] = False  # the kernel stays, both kinds of noise are scaled
 
     def solution(count: int) -> tuple[Condensed, ClosedForm]:
-        points = jnp.asarray(S[:count])
+        points = jax.device_put(S[:count])
         triangle = condensed(model, points, rows, start_deviation)
         return triangle, conditional(triangle, points)
 
@@ -213,10 +222,12 @@ def solve(
             if not limited_by_landmarks(*args, bool(free.any()), least=np.log(2) / 2):
                 break
         more = solution(2 * count)
-        if not more[1].loss < closed.loss - (more[1].weights.size / 2) ** 0.5:
+        if not float(more[1].loss) < float(closed.loss) - (more[1].weights.size / 2) ** 0.5:
             break
         (triangle, closed), count = more, 2 * count
-    is_held = np.isfinite(np.asarray(model.log_process)) & ~free[-len(model.log_process) :]
+    # The floor of process noise stands for none, and may be scaled with the noise; q may not.
+    log_q, n = np.asarray(model.log_process), len(model.log_process)
+    is_held = (log_q > np.asarray(bounds.low)[-n:] + 0.1) & ~free[-n:]
     is_sample = search_sample(jnp.asarray(S[:count]), rows)[1] is not rows
     scales = is_sample and free.any() and not is_held.any()
     if scales and closed.free > closed.used and closed.squares > 0:
@@ -418,7 +429,7 @@ def bounds_and_design(
         np.where(looked, impulse + np.log(share), 0.0) for share in (1e-6, 0.01, 3.0)
     )
     some = np.where(looked, some, -np.inf)
-    pairs = (low, least), (high, limit), (free, looked)
+    pairs = (low, least), (high, limit), (free, looked), (lengths, none)
     design = [np.append(np.clip(h, low, high), some) for h in [start, *noisy]]
     return Bounds(*map(np.concatenate, pairs)), np.array(design)
 
@@ -455,7 +466,7 @@ def _scale_amplitudes(model: Model, h, scales, X, Y):
     """The point h with amplitudes at which velocities of the prior are twice those observed."""
     if not scales.any():
         return h
-    full = jnp.concatenate([jnp.asarray(h), model.log_process])
+    full = np.concatenate([h, np.asarray(model.log_process)])
     trace = float(gram_trace(model.at(full).kernel, jnp.asarray(X))) / len(X)
     target = 4 * np.mean(np.sum(Y**2, axis=1))
     out = h.copy()

@@ -17,6 +17,7 @@ smoothed path Φ is the tangent of the mean alone, the identity if there is no m
 import itertools
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -210,7 +211,7 @@ def segments_of(
         scatter[s, :T] = np.where(finite, squares, 0.0)
         starts[s], inputs[s, : T - 1] = start, ends
     arrays = spans, measured, counts, scatter, starts, inputs
-    return Segments(*(jnp.asarray(a) for a in arrays))
+    return Segments(*jax.device_put(arrays))
 
 
 def linearised_along_smoothed(
@@ -230,8 +231,8 @@ def linearised_along_smoothed(
         nodes[s, : T - 1] = run.nodes[start : stop - 1]
         slopes[s, : T - 1] = run.slopes[start : stop - 1]
     points = np.concatenate([nodes, inputs_at_nodes(np.asarray(segments.inputs))], axis=-1)
-    along = jnp.asarray(x), jnp.asarray(points), jnp.asarray(slopes)
-    return _linearised_along_smoothed(mean, along, jnp.asarray(good), segments)
+    along, good = jax.device_put(((x, points, slopes), good))
+    return _linearised_along_smoothed(mean, along, good, segments)
 
 
 @compiled_by_size

@@ -11,13 +11,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel._machine import compiled_by_size
-from hamkernel._solvers.lagrangian import (
-    TorqueData,
-    known_entries,
-    negative_log_likelihood,
-    strong_rows,
-    with_anchor,
-)
+from hamkernel._solvers.lagrangian import TorqueData, known_entries, strong_rows, with_anchor
+from hamkernel._solvers.triangle import regression_loss
 from hamkernel._structures.lagrangian import Lagrangian, LagrangianFeatures
 from hamkernel._tuning.minimiser import best_in_box, inside_box
 from hamkernel._tuning.space import Hyperparameter, boxes_of
@@ -133,7 +128,7 @@ def _search(features, rows, space, steps):
     def loss(h):
         shown = features.with_kernel(_with_leaves(features.kernel, h[:-m]))
         B, y, lost = rows(shown, jnp.exp(h[-m:]))
-        return negative_log_likelihood(*with_anchor(shown, B, y)) + lost
+        return regression_loss(*with_anchor(shown, B, y)) + lost
 
     run = best_in_box(loss, design, low, high, jnp.full_like(low, 0.3), steps)
     return inside_box(run.best.u, low, high), run.best.value, run.converged, run.steps

@@ -336,7 +336,7 @@ def sample(
     states = require.finite(require.points(x0[None] if x0.ndim == 1 else x0, "x0"), "x0")
     ts = require.elapsed_times(require.times(ts, least=1), states.dtype)
     system = in_precision(system, states.dtype)
-    require.velocity(system, states[0], "system")
+    require.velocity(system, jax.ShapeDtypeStruct(states.shape[1:], states.dtype), "system")
     levels = [
         _noise_level(level, name, states, key)
         for level, name in [(state_noise, "state_noise"), (velocity_noise, "velocity_noise")]
