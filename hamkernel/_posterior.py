@@ -36,12 +36,13 @@ from hamkernel._observations.kinds import AbstractObservations, inputs_or_parame
 from hamkernel._observations.measurements import inputs_of, observations
 from hamkernel._show import Shown, has_arrays, text
 from hamkernel._solvers.dense import Cholesky
-from hamkernel._solvers.fit import check_solver, features_of_parts
+from hamkernel._solvers.fit import features_of_parts
 from hamkernel._solvers.low_rank import LowRankConditional
 from hamkernel._solvers.problem import (
     AbstractConditional,
     AbstractSolver,
     Problem,
+    check_solver,
     make_problem,
     new_rows,
 )
@@ -59,6 +60,7 @@ def condition(
     *,
     solver: AbstractSolver | None = None,
     mean: Mean | None = None,
+    throw: bool = True,
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
     progress: bool = False,
@@ -83,6 +85,7 @@ def condition(
             few landmarks the field is approximate, and far from the landmarks the deviation is
             the prior deviation. With `RandomFeatures(…)` the features define the prior.
         mean: the known part of the field, x (n,) -> (n,), as in `fit`.
+        throw: whether a failed solve raises; if False, the numbers of the field are NaN.
         inputs: u at each state, for a `Controlled` kernel, shape (N, m). Predictions then need the
             inputs as well, `posterior.deviation(x, u)`.
         parameters: θ at each state, for a `Family`, shape (N, p): `posterior.deviation(x, θ)`. The
@@ -99,12 +102,12 @@ def condition(
     Warns:
         UserWarning: the amplitude of K is exactly 1, the value of built-in kernels before tuning.
     """
-    problem = make_problem(K, X, Y, regularization, mean, inputs, parameters)
-    return posterior_of_problem(problem, solver, progress)
+    problem = make_problem(K, X, Y, regularization, mean, inputs, parameters, throw)
+    return posterior_of_problem(problem, solver, throw, progress)
 
 
 def posterior_of_problem(
-    problem: Problem, solver: AbstractSolver | None, progress: bool = False
+    problem: Problem, solver: AbstractSolver | None, throw: bool = True, progress: bool = False
 ) -> Posterior:
     """`condition` on a problem."""
     check_solver(solver)
@@ -115,7 +118,7 @@ def posterior_of_problem(
         solver = features_of_parts() if is_of_parts(problem.kernel) else Cholesky()
     require.warn_of_float32(problem.rows.targets)
     _warn_of_amplitude(problem.kernel, problem.rows.points)
-    conditional = solver.condition(problem, progress=progress)
+    conditional = solver.condition(problem, throw, progress)
     return Posterior(conditional, learned_field(conditional.field, problem.known))
 
 

@@ -320,6 +320,12 @@ def _adaptive_steps(
     return _Steps(solver, controller, diffrax.SaveAt(ts=ts), limit)
 
 
+@precise_jit
+def _rounding(field: KernelField, x: Float[Array, " n"]) -> Float[Array, ""]:
+    """The relative rounding error of f(x), at most 1e-6."""
+    return field_rounding(field.kernel, x, field.points, field.coefficients, field(x), 1e-6)
+
+
 def _tolerances(
     rhs: RightHandSide, start: Any, x0: Float[Array, " n"], rtol: Any, atol: Any
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -330,10 +336,9 @@ def _tolerances(
         if isinstance(learned, AbstractJoinedField) and rhs.inputs is not None:
             learned, point = learned.whole, learned.join(x0, rhs.inputs(start))
         if isinstance(learned, KernelField):
-            Z, A = learned.points, learned.coefficients
             # At an equilibrium f is zero and has no digits; the limit 1e-6 still gives states a
             # few digits.
-            share = field_rounding(learned.kernel, point, Z, A, learned(point), 1e-6)
+            share = _rounding(learned, point)
             default = jnp.maximum(default, share)
 
     def tolerance(name: str, value: Any) -> Float[Array, ""]:

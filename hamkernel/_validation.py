@@ -22,6 +22,7 @@ from hamkernel._closed_forms import (
     held_out,
     log_density,
 )
+from hamkernel._fields.base import Mean
 from hamkernel._gram import between_all, forward_differentiated, gram_of_rows, plus_ridge
 from hamkernel._machine import (
     follow_data,
@@ -36,7 +37,7 @@ from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.factors import AbstractSystem, ContrastedSystem, DenseSystem
 from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._solvers.low_rank_factor import LowRankSystem
-from hamkernel._solvers.problem import make_problem
+from hamkernel._solvers.problem import AbstractSolver, check_solver, make_problem
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -50,6 +51,8 @@ def cross_validation_loss(
     regularization: ArrayLike = 1e-4,
     folds: Folds = 5,
     *,
+    mean: Mean | None = None,
+    solver: AbstractSolver | None = None,
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Float[Array, ""]:
@@ -70,6 +73,8 @@ def cross_validation_loss(
             single components would leak their siblings. Labels must be concrete under jit. Of
             observations N is the number of all: points, energies, functionals, in their order. A
             fold with all energies is compared up to their constant.
+        mean: the known part of the field, as in `fit`.
+        solver: a low-rank solver, for the loss of its fit as `tune` minimises it; exact if None.
         inputs: u at each state for a `Controlled` kernel, shape (N, m).
         parameters: θ at each state for a `Family`, shape (N, p).
 
@@ -83,8 +88,8 @@ def cross_validation_loss(
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
             matrices that do not fit in memory.
     """
-    K, rows, regularization = _check_problem(K, X, Y, regularization, inputs, parameters)
-    return partition_loss(K, rows, regularization, partition_of_rows(rows, folds))
+    *checked, basis = _check_problem(K, X, Y, regularization, mean, solver, inputs, parameters)
+    return partition_loss(*checked, partition_of_rows(checked[1], folds), basis)
 
 
 @follow_data
@@ -97,6 +102,8 @@ def cross_validation_residuals(
     regularization: ArrayLike = 1e-4,
     folds: Folds = 5,
     *,
+    mean: Mean | None = None,
+    solver: AbstractSolver | None = None,
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Float[Array, "N n"]:
@@ -109,8 +116,9 @@ def cross_validation_residuals(
         Shape (N, n), in units of Y; for observations one residual for each row, in the units of the
         row. inf if the matrix is not positive definite to rounding.
     """
-    K, rows, regularization = _check_problem(K, X, Y, regularization, inputs, parameters)
-    residuals = held_out_rows(K, rows, regularization, partition_of_rows(rows, folds))[0]
+    *checked, basis = _check_problem(K, X, Y, regularization, mean, solver, inputs, parameters)
+    rows = checked[1]
+    residuals = held_out_rows(*checked, partition_of_rows(rows, folds), basis)[0]
     return rows.in_units(residuals)
 
 
@@ -123,6 +131,8 @@ def generalized_cross_validation(
     Y: Num[ArrayLike, "N n"] | None = None,
     regularization: ArrayLike = 1e-4,
     *,
+    mean: Mean | None = None,
+    solver: AbstractSolver | None = None,
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Float[Array, ""]:
@@ -137,6 +147,8 @@ def generalized_cross_validation(
         X: states, shape (N, n); or observations, and then there is no Y.
         Y: measured velocities, shape (N, n).
         regularization: λ > 0.
+        mean: the known part of the field, as in `fit`.
+        solver: a low-rank solver, for the loss of its fit as `tune` minimises it; exact if None.
         inputs: u at each state, for a `Controlled` kernel, shape (N, m).
         parameters: θ at each state, for a `Family`, shape (N, p).
 
@@ -150,7 +162,9 @@ def generalized_cross_validation(
 
     Source: Golub, Heath & Wahba (1979), Technometrics 21.
     """
-    return generalized_loss(*_check_problem(K, X, Y, regularization, inputs, parameters))
+    return generalized_loss(
+        *_check_problem(K, X, Y, regularization, mean, solver, inputs, parameters)
+    )
 
 
 @follow_data
@@ -162,6 +176,8 @@ def log_marginal_likelihood(
     Y: Num[ArrayLike, "N n"] | None = None,
     regularization: ArrayLike = 1e-4,
     *,
+    mean: Mean | None = None,
+    solver: AbstractSolver | None = None,
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Float[Array, ""]:
@@ -177,6 +193,8 @@ def log_marginal_likelihood(
         X: states, shape (N, n); or observations, and then there is no Y.
         Y: measured velocities, shape (N, n).
         regularization: λ > 0; the noise variance is Nλ.
+        mean: the known part of the field, as in `fit`.
+        solver: a low-rank solver, for the loss of its fit as `tune` minimises it; exact if None.
         inputs: u at each state, for a `Controlled` kernel, shape (N, m).
         parameters: θ at each state, for a `Family`, shape (N, p).
 
@@ -190,19 +208,23 @@ def log_marginal_likelihood(
 
     Source: Rasmussen & Williams (2006), eq. 2.30.
     """
-    return log_likelihood(*_check_problem(K, X, Y, regularization, inputs, parameters))
+    return log_likelihood(
+        *_check_problem(K, X, Y, regularization, mean, solver, inputs, parameters)
+    )
 
 
 def _check_problem(
-    K, X, Y, regularization, inputs, parameters
-) -> tuple[Any, Measurements, Float[Array, ""]]:
-    """The checked kernel, rows and λ."""
+    K, X, Y, regularization, mean, solver, inputs, parameters
+) -> tuple[Any, Measurements, Float[Array, ""], AbstractBasis | None]:
+    """The checked kernel, rows and λ, and the basis of a low-rank solver."""
+    check_solver(solver)
     # LAPACK calls on several devices at once can deadlock, see `_solvers/factors.py`.
-    checked = make_problem(
-        K, X, Y, regularization, inputs=inputs, parameters=parameters
-    ).to_one_device()
-    check_memory(checked.rows, 3)  # matrices of the size of the Gram, with the gradient
-    return checked.kernel, checked.rows, checked.regularization
+    problem = make_problem(K, X, Y, regularization, mean, inputs, parameters).to_one_device()
+    checked = problem.kernel, problem.rows, problem.regularization
+    basis = None if solver is None else solver.low_rank_basis(*checked)
+    if basis is None:
+        check_memory(problem.rows, 3)  # matrices of the size of the Gram, with the gradient
+    return *checked, basis
 
 
 def check_memory(rows: Measurements, copies: int) -> None:

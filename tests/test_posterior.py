@@ -345,6 +345,14 @@ def test_a_region_that_is_none_is_refused(region, message, key):
         POSTERIOR.sample(key, 2, region)
 
 
+def test_a_failed_solve_is_nan_if_it_is_not_to_raise():
+    one_place = np.tile(X[:1], (12, 1))
+    failed = hk.condition(K, one_place, Y, 1e-30, throw=False)
+    assert np.isnan(failed.field(INSIDE)).all()
+    with pytest.raises(RuntimeError, match="raise it"):
+        hk.condition(K, one_place, Y, 1e-30)
+
+
 @pytest.mark.parametrize(
     "k", [hk.Gaussian(1.0), 1.0 * hk.Gaussian(1.0), hk.Matern(2.5) * hk.Gaussian(1.0)]
 )

@@ -27,7 +27,13 @@ from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._solvers.conjugate_gradient import ConjugateGradient
 from hamkernel._solvers.dense import Cholesky, copies
 from hamkernel._solvers.lagrangian import fit_lagrangian
-from hamkernel._solvers.problem import AbstractSolver, LearnedField, Problem, make_problem
+from hamkernel._solvers.problem import (
+    AbstractSolver,
+    LearnedField,
+    Problem,
+    check_solver,
+    make_problem,
+)
 from hamkernel._solvers.random_features import RandomFeatures
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.family import AbstractFamily
@@ -193,12 +199,6 @@ def field_of_problem(
             field, residual=to_caller_sharding(problem.spread, field.residual)
         )
     return learned_field(field, problem.known)
-
-
-def check_solver(solver: Any) -> None:
-    """TypeError unless `solver` is a solver or None."""
-    if not (solver is None or isinstance(solver, AbstractSolver)):
-        raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")
 
 
 def features_of_parts() -> RandomFeatures:

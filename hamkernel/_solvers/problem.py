@@ -241,3 +241,9 @@ class AbstractSolver(eqx.Module, Generic[LearnedField]):
             TypeError: the solver keeps no factor.
         """
         raise TypeError(self.no_factor)
+
+
+def check_solver(solver: Any) -> None:
+    """TypeError unless `solver` is a solver or None."""
+    if not (solver is None or isinstance(solver, AbstractSolver)):
+        raise TypeError(f"solver must be an instance, for example hk.Cholesky(); got {solver!r}.")

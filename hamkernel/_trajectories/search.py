@@ -178,7 +178,7 @@ def choose_start(
     landmarks the best point is a smooth field with much noise, where more landmarks do not help.
     """
     n, width = rows.residual.shape[-1], (_ENTRIES / 3) ** 0.5
-    part = windows(rows, int(width / n))
+    part = limiting_windows(rows)
     middles = exact(part)[0]
     sets = {first: jnp.asarray(S[:first]) if n * first <= width else middles}
     if len(middles) > first < len(S):
@@ -204,8 +204,9 @@ def solve(
 
     The number of landmarks is doubled while −log p falls by more than √(q/2), the uncertainty of
     −log p with q weights. Beyond `quick` landmarks it is doubled only where windows predict half
-    of the remaining variance. If the search used a sample of the rows, both kinds of noise are
-    scaled to the residuals of all rows.
+    of the remaining variance. Of a short log all rows are in one window, and are asked before a
+    larger solve compiles. If the search used a sample of the rows, both kinds of noise are scaled
+    to the residuals of all rows.
     """
     free, size = np.array(bounds.free), len(model.flat) - 2 * len(model.log_noise)
     free[:size] = False  # the kernel stays, both kinds of noise are scaled
@@ -216,10 +217,13 @@ def solve(
         return triangle, conditional(triangle, points)
 
     triangle, closed = solution(count)
+    is_short = limiting_windows(rows) is rows
     while count < len(S):
-        if count <= quick < min(2 * count, len(S)):
+        is_slow = count <= quick < min(2 * count, len(S))
+        if is_slow or is_short:
             args = model, jnp.asarray(S[:count]), rows, start_deviation
-            if not limited_by_landmarks(*args, bool(free.any()), least=np.log(2) / 2):
+            least = np.log(2) / 2 if is_slow else 0.0
+            if not limited_by_landmarks(*args, is_slow and bool(free.any()), least=least):
                 break
         more = solution(2 * count)
         if not float(more[1].loss) < float(closed.loss) - (more[1].weights.size / 2) ** 0.5:
@@ -231,16 +235,24 @@ def solve(
     is_sample = search_sample(jnp.asarray(S[:count]), rows)[1] is not rows
     scales = is_sample and free.any() and not is_held.any()
     if scales and closed.free > closed.used and closed.squares > 0:
-        shift = jnp.log(closed.squares / closed.free) / 2
+        shift = _excess(closed)
         if abs(shift) > 0.01:  # residuals depend on the noise: a secant step, a half to twice it
-            there = conditional(triangle, closed.points, shift)
-            again = jnp.log(there.squares / there.free) / 2
-            shift = shift / (1 - jnp.clip(again / shift, -1.0, 0.5))
-        there = jnp.where(jnp.asarray(free), model.flat + shift, model.flat)
-        there = jnp.clip(there, jnp.asarray(bounds.low), jnp.asarray(bounds.high))
-        model = model.at(jnp.where(jnp.asarray(free), there, model.flat))
+            again = _excess(conditional(triangle, closed.points, shift))
+            shift = shift / (1 - np.clip(again / shift, -1.0, 0.5))
+        h = np.asarray(model.flat)
+        model = model.at(np.where(free, np.clip(h + shift, bounds.low, bounds.high), h))
         closed = conditional(triangle, closed.points, shift)
     return model, closed
+
+
+def _excess(closed: ClosedForm) -> float:
+    """The logarithm of the deviation of the residuals, in units of the noise."""
+    return float(np.log(closed.squares / closed.free) / 2)
+
+
+def limiting_windows(rows: LinearisedSegments) -> LinearisedSegments:
+    """As many samples as a search can take with a landmark in each of their intervals."""
+    return windows(rows, int((_ENTRIES / 3) ** 0.5 / rows.residual.shape[-1]))
 
 
 def limited_by_landmarks(
@@ -261,8 +273,7 @@ def limited_by_landmarks(
     and a third or a hundredth of the noise.
     """
     shares = np.array([1.0, 0.3, 0.1, 0.03] if with_less_noise else [1.0])
-    width = (_ENTRIES / 3) ** 0.5
-    part = windows(rows, int(width / rows.residual.shape[-1]))
+    part = limiting_windows(rows)
     middles, n = exact(part)[0], rows.residual.shape[-1]
     less = np.tile(np.asarray(model.flat), (len(shares), 1))
     less[:, -2 * n :] += np.log(shares)[:, None]

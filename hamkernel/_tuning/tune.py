@@ -31,9 +31,9 @@ from hamkernel._observations.kinds import AbstractObservations, inputs_or_parame
 from hamkernel._observations.measurements import observations
 from hamkernel._posterior import Posterior, posterior_of_problem
 from hamkernel._show import Shown, text
-from hamkernel._solvers.fit import check_solver, features_of_parts, field_of_problem
+from hamkernel._solvers.fit import features_of_parts, field_of_problem
 from hamkernel._solvers.lagrangian import field_of_torques, torque_data
-from hamkernel._solvers.problem import AbstractSolver, Problem, make_problem
+from hamkernel._solvers.problem import AbstractSolver, Problem, check_solver, make_problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.lagrangian import Lagrangian, lagrangian_features
 from hamkernel._tuning.lagrangian import StrongRows, likeliest, sizes_of_torques
