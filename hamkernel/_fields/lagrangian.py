@@ -114,16 +114,16 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
     @property
     def gains(self) -> Float[Array, " m"]:
         """The torques over the inputs, found for `unknown_gains` and 1 for other joints, (m,)."""
-        return self._of_joints(1.0, self.features.gain_features() @ self.coefficients)
+        return self._fill_joints(1.0, self.features.gain_features() @ self.coefficients)
 
     @property
     def gains_deviation(self) -> Float[Array, " m"]:
         """The standard deviation of each gain, 0 where it is known, shape (m,)."""
-        return self._of_joints(0.0, jnp.sqrt(self._variance(self.features.gain_features())))
+        return self._fill_joints(0.0, jnp.sqrt(self._variance(self.features.gain_features())))
 
-    def _of_joints(self, known: float, found: Float[Array, " g"]) -> Float[Array, " m"]:
+    def _fill_joints(self, value: float, unknown: Float[Array, " g"]) -> Float[Array, " m"]:
         joints = np.asarray(self.kernel.unknown_gains, int)
-        return jnp.full(self.features.count, known, found.dtype).at[joints].set(found)
+        return jnp.full(self.features.count, value, unknown.dtype).at[joints].set(unknown)
 
     @full_precision
     def mass_matrix(self, q: Num[ArrayLike, " m"]) -> Float[Array, "m m"]:
@@ -256,9 +256,9 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
 
     def _missing_lagrangian(self, x: Array, z: Array) -> Float[Array, ""]:
         """The prior covariance of L at two states that the centres do not carry."""
-        (q, v), (other, w) = jnp.split(x, 2), jnp.split(z, 2)
+        (q, v), (q2, w) = jnp.split(x, 2), jnp.split(z, 2)
         K, missing = self.kernel, self._missing
-        return missing(K.potential, q, other) + (v @ w) ** 2 * missing(K.inertia, q, other)
+        return missing(K.potential, q, q2) + (v @ w) ** 2 * missing(K.inertia, q, q2)
 
     def _state(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
         return require.point(x, self.dimension).astype(self.coefficients.dtype)
@@ -285,7 +285,7 @@ def lagrangian_field(
 
 @precise_jit
 def _least_inertia(field: LagrangianField, Q: Float[Array, "N m"]) -> tuple[Array, Array, Array]:
-    def at_position(q):
+    def least_eigenvalue(q):
         values, vectors = jnp.linalg.eigh(field.mass_matrix(q))
         e = vectors[:, 0]
         row = jnp.einsum("i,j,ijr->r", e, e, field.features.mass_matrix_features(q))
@@ -293,6 +293,6 @@ def _least_inertia(field: LagrangianField, Q: Float[Array, "N m"]) -> tuple[Arra
         return values[0], jnp.sqrt(field._variance(row) + missing), e
 
     # Of 64 positions and 400 features, arrays of 200 KB.
-    value, deviation, e = jax.lax.map(at_position, Q, batch_size=64)
+    value, deviation, e = jax.lax.map(least_eigenvalue, Q, batch_size=64)
     at = jnp.argmin(value - 2 * deviation)
     return value[at], deviation[at], e[at]

@@ -174,11 +174,11 @@ class LagrangianFeatures(eqx.Module):
     def columns(self) -> int:
         """How many features there are: those on centres, of friction, and of gains last."""
         m = self.count
-        return len(self.centres) * (1 + m * (m + 1) // 2) + self.other_columns
+        return len(self.centres) * (1 + m * (m + 1) // 2) + self.global_columns
 
     @property
-    def other_columns(self) -> int:
-        """How many of the features are of friction and of gains."""
+    def global_columns(self) -> int:
+        """How many of the features are numbers of the whole machine: friction and gains."""
         friction = self.kernel.friction
         terms = 0 if friction is None else 2 + (friction.stribeck is not None)
         return terms * self.count + len(self.kernel.unknown_gains)
@@ -197,7 +197,7 @@ class LagrangianFeatures(eqx.Module):
         """Rows in kernels as rows in features: R⁻¹ on each block of centres."""
         c, shape = len(self.centres), rows.shape[:-1]
         rows = rows.reshape(-1, self.columns)
-        last = self.columns - self.other_columns
+        last = self.columns - self.global_columns
         blocks = rows[:, :last].reshape(len(rows), -1, c)
         V = solve_triangular(self.roots[0], blocks[:, 0].T, lower=True).T
         M = solve_triangular(self.roots[1], blocks[:, 1:].reshape(-1, c).T, lower=True).T
@@ -214,7 +214,7 @@ class LagrangianFeatures(eqx.Module):
         i, j = np.triu_indices(self.count)
         squares = v[i] * v[j] * np.where(i == j, 1.0, np.sqrt(2.0))
         inertia = squares[:, None] * self.kernel_values(self.kernel.inertia, q)[None]
-        V, none = -self.kernel_values(self.kernel.potential, q), jnp.zeros(self.other_columns)
+        V, none = -self.kernel_values(self.kernel.potential, q), jnp.zeros(self.global_columns)
         return jnp.concatenate([V, inertia.reshape(-1), none.astype(V.dtype)])
 
     def potential_features(self, q: Float[Array, " m"]) -> Float[Array, " r"]:
@@ -232,15 +232,15 @@ class LagrangianFeatures(eqx.Module):
             i == j, 2.0, np.sqrt(2.0)
         )
         found = jnp.einsum("ijp,c->ijpc", jnp.asarray(shares, phi.dtype), phi).reshape(m, m, -1)
-        return jnp.pad(found, ((0, 0), (0, 0), (c, self.other_columns)))
+        return jnp.pad(found, ((0, 0), (0, 0), (c, self.global_columns)))
 
     def friction_features(self, v: Float[Array, " m"]) -> Float[Array, "m r"]:
         """The friction of each joint, in kernels."""
         if self.kernel.friction is None:
             return jnp.zeros((self.count, self.columns), v.dtype)
-        found = friction_of_joints(self.kernel.friction, v, self.rest_speed)
-        before = self.columns - self.other_columns
-        return jnp.pad(found, ((0, 0), (before, len(self.kernel.unknown_gains))))
+        terms = friction_of_joints(self.kernel.friction, v, self.rest_speed)
+        before = self.columns - self.global_columns
+        return jnp.pad(terms, ((0, 0), (before, len(self.kernel.unknown_gains))))
 
     def with_gains(
         self, rows: Float[Array, "*k m r"], inputs: Float[Array, "*k m"]

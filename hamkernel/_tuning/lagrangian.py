@@ -190,7 +190,7 @@ def sizes_of_torques(K: Lagrangian, data: TorqueData) -> Sizes:
 def torque_size(K: Lagrangian, torques: ArrayLike, acceleration: float) -> float:
     """The root mean square of the torques of known gains; of motions without, that of M q̈."""
     torques = np.asarray(torques)
-    known = np.delete(torques, np.asarray(K.unknown_gains, int), axis=-1)
-    size = float(np.sqrt(np.mean(np.square(known)))) if known.any() else 0.0
+    forces = np.delete(torques, np.asarray(K.unknown_gains, int), axis=-1)
+    size = float(np.sqrt(np.mean(np.square(forces)))) if forces.any() else 0.0
     anchor = 1.0 if K.known_mass_matrix is None else np.nanmax(np.abs(known_entries(K)))
     return size or float(anchor) * acceleration
