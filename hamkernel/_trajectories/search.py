@@ -22,7 +22,7 @@ from hamkernel._trajectories.kalman import whiten
 from hamkernel._trajectories.likelihood import (
     ClosedForm,
     Condensed,
-    condensed,
+    condense,
     conditional,
     regression_loss,
 )
@@ -72,7 +72,7 @@ def noise_free_coordinates(
 
 
 def _loss(model: Model, h, S, rows, start_deviation):
-    there = model.at(h)
+    there = model.unflatten(h)
     T = landmark_whitening(there.kernel, S)
     made = whiten(there, S, T, rows, start_deviation)
     value = regression_loss(made.M, made.r) + made.constant
@@ -160,7 +160,7 @@ def maximise_likelihood(
         return model, float(losses(model, flat, S, rows, start_deviation)[0])
     sides = jax.device_put((bounds.low, bounds.high, bounds.free))
     h, value = _best(model, S, rows, start_deviation, *sides, steps)
-    return model.at(h), float(value)
+    return model.unflatten(h), float(value)
 
 
 def choose_start(
@@ -188,7 +188,7 @@ def choose_start(
         values = losses(model, design, points, part, start_deviation)
         if values.min() < best - (n * len(points) / 2) ** 0.5:
             best, count, start = values.min(), size, design[int(np.argmin(values))]
-    return model.at(start), count
+    return model.unflatten(start), count
 
 
 def solve(
@@ -213,7 +213,7 @@ def solve(
 
     def solution(count: int) -> tuple[Condensed, ClosedForm]:
         points = jax.device_put(S[:count])
-        triangle = condensed(model, points, rows, start_deviation)
+        triangle = condense(model, points, rows, start_deviation)
         return triangle, conditional(triangle, points)
 
     triangle, closed = solution(count)
@@ -240,7 +240,7 @@ def solve(
             again = _excess(conditional(triangle, closed.points, shift))
             shift = shift / (1 - np.clip(again / shift, -1.0, 0.5))
         h = np.asarray(model.flat)
-        model = model.at(np.where(free, np.clip(h + shift, bounds.low, bounds.high), h))
+        model = model.unflatten(np.where(free, np.clip(h + shift, bounds.low, bounds.high), h))
         closed = conditional(triangle, closed.points, shift)
     return model, closed
 
@@ -304,7 +304,7 @@ def gain_of_friction(
     K, (X, Y) = model.kernel, sample_points(data)
     n = Y.shape[1]
     force, fastest = np.sqrt(np.mean(Y[:, n // 2 :] ** 2)), np.abs(X[:, n // 2 : n]).max()
-    if frictions(K) or K.given == "parameters" or not fastest > 0:
+    if frictions(K) or K.input_name == "parameters" or not fastest > 0:
         return 0.0
     both = Friction(force / fastest, 1e-6 * force) + Friction(1e-6 * force / fastest, force)
     more = with_rest_speed(both, jnp.asarray(X), n)
@@ -332,7 +332,7 @@ def gain_of_inertia(
     K, (X, Y) = model.kernel, sample_points(data)
     n = Y.shape[1]
     force, fastest = np.sqrt(np.mean(Y[:, n // 2 :] ** 2)), np.abs(X[:, n // 2 : n]).max()
-    if n < 4 or n % 2 or K.given == "parameters" or not (force > 0 and fastest > 0):
+    if n < 4 or n % 2 or K.input_name == "parameters" or not (force > 0 and fastest > 0):
         return 0.0
     v = slice(n // 2, n)
     if mean is not None and jax.vmap(jax.hessian(mean))(jnp.asarray(X[::99]))[:, v, v, v].any():
@@ -372,7 +372,7 @@ def _gain(
         design[:, explains] += np.log([[1.0], [0.1], [0.01]])
         return float(losses(model, design, S, rows, start_deviation).min())
 
-    return least(model) - least(model._replace(kernel=K.with_states(K.of_states + more)))
+    return least(model) - least(model._replace(kernel=K.with_states(K.state_kernel + more)))
 
 
 def bounds_and_design(
@@ -478,7 +478,7 @@ def _scale_amplitudes(model: Model, h, scales, X, Y):
     if not scales.any():
         return h
     full = np.concatenate([h, np.asarray(model.log_process)])
-    trace = float(gram_trace(model.at(full).kernel, jnp.asarray(X))) / len(X)
+    trace = float(gram_trace(model.unflatten(full).kernel, jnp.asarray(X))) / len(X)
     target = 4 * np.mean(np.sum(Y**2, axis=1))
     out = h.copy()
     if np.isfinite(trace) and trace > 0 and target > 0:
