@@ -6,35 +6,34 @@
     posterior = hk.condition(K, X, Y, 1e-4)                  # with error bars
     orbit = hk.simulate(field, x0, ts).ys
 
-Data flows from kernels to fields through these folders and files; each imports only from itself and
-those above it:
+Data flows from kernels to fields through these folders and files. Each imports only from itself and
+from the ones above:
 
     _kernels      scalar kernels k(x, z), and any callable as one
     _structures   matrix-valued kernels B [∂x ∂zᵀ k] Bᵀ, sums, symmetries; tensors in `poisson`
-    _observations what is measured, as rows of linear functionals
+    _observations measurements, as rows of linear functionals
     _gram         the Gram as a matrix, its parts, and its derivatives
     _gram_operator
                   products with the Gram, tile by tile
     _features     random Fourier features
-    _fields       what is learned: f and its potential
-    _solvers      how it is solved: dense, by conjugate gradients, of low rank, from streams;
-                  factors of G + ridge I
+    _fields       learned fields f with their potentials
+    _solvers      solvers: dense, conjugate gradients, low rank, streams; factors of G + ridge I
     _posterior    a field with its uncertainty
     _closed_forms held-out residuals and the likelihood, from any factor of G + ridge I
     _validation   validation losses, each by one factorisation
     _tuning       hyperparameters, by gradients
     _trajectories from logged runs to a field
-    _discovery    a formula read off the data, and which physics they obey
+    _discovery    a formula for the potential, and tests of which physics the data obey
     _symplectic, _simulate
                   symplectic integrators, and trajectories of any field
     _save         fields and results in files
     systems, plot, paper
                   example systems, pictures, the paper's experiments
     _report, _command
-                  a result as a page, and from CSV files to one
+                  a result as a page of HTML, and a program from CSV files to such a page
 
-`_require` checks arguments, `_show` prints objects, `_machine` knows devices, memory, precision,
-threads, and what stalls, and `_sizes` how much is computed at once.
+`_require` checks arguments, `_show` prints objects, `_machine` handles devices, memory, precision
+and threads, and `_sizes` sets the sizes of tiles and batches.
 """
 
 import importlib
@@ -130,7 +129,7 @@ __all__ = [  # noqa: RUF022 - in reading order
     "UnknownMasses",
     "Lagrangian",
     "Sum",
-    # What was measured.
+    # Observations.
     "Velocities",
     "Energies",
     "Equilibria",
@@ -171,7 +170,7 @@ __all__ = [  # noqa: RUF022 - in reading order
     "LearnedLagrangian",
     "Score",
     "report",
-    # What the data say beyond the field.
+    # Discovery.
     "compare",
     "readout",
     "Formula",
@@ -195,7 +194,7 @@ def __getattr__(name: str) -> Any:
     # Loaded when first asked for, so that `import hamkernel` loads neither diffrax nor matplotlib.
     if name in ("plot", "paper"):
         return importlib.import_module(f"hamkernel.{name}")
-    if name in __all__:  # what is not loaded yet: `simulate` and the integrators
+    if name in __all__:  # `simulate` and the integrators, which are not loaded yet
         file = "_simulate" if name == "simulate" else "_symplectic"
         return getattr(importlib.import_module(f"hamkernel.{file}"), name)
     raise AttributeError(f"module 'hamkernel' has no attribute {name!r}")

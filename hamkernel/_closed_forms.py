@@ -6,15 +6,15 @@ a fit WITHOUT S would have on S,
 
     r_S = y_S − f₋S(X_S) = (C_SS)⁻¹ a_S,    C = A⁻¹,                                   (1)
 
-    without a refit for any fold.
+without a refit for any fold.
 
-Their derivatives are written by hand, since differentiating through the factorisation costs
+The derivatives are written by hand, since differentiating through the factorisation costs
 several times as much as the factorisation. From dC = −C dA C, and with v_S = (C_SS)⁻¹ r̄_S for a
 cotangent r̄,
 
     r̄·dr = Σ_S v_Sᵀ[(dC y)_S − dC_SS r_S]   so   Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − (C v) aᵀ,
 
-    where v has the entries v_S. With a cotangent ā of a, da = −C dA a adds −(C ā) aᵀ, so that
+where v has the entries v_S. With a cotangent ā of a, da = −C dA a adds −(C ā) aᵀ, so that
 
         Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − w aᵀ,   w = C(v + ā),   ȳ = w.                          (2)
 
@@ -139,7 +139,7 @@ def _integers(N: int, labels: Any) -> Int[np.ndarray, " N"]:
 
 
 def _factor_and_solve(system: AbstractSystem, y: Float[Array, " D"]):
-    """The factor of A, a = A⁻¹y, yᵀa, and whether A is well-conditioned enough for them.
+    """The factor of A, a = A⁻¹y, yᵀa, and whether A is well-conditioned enough to use these.
 
     Barriers keep calls of LAPACK from running side by side.
     """

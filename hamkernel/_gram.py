@@ -39,7 +39,7 @@ from hamkernel._observations.blocks import AbstractBlock, Combinations, Componen
 from hamkernel._observations.measurements import Measurements
 from hamkernel._sizes import sizes
 from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel, total
-from hamkernel._structures.structure import mixed
+from hamkernel._structures.structure import mixed_derivative
 
 
 @full_precision
@@ -150,7 +150,7 @@ def block_traces(K: AbstractMatrixKernel, X: Float[Array, "N n"]) -> Float[Array
 
     def block_trace(x):
         d, J = descriptor.value_and_jacobian(x)
-        return jax.vmap(lambda v: mixed(descriptor.kernel, d, v, d, v))(J.T).sum()
+        return jax.vmap(lambda v: mixed_derivative(descriptor.kernel, d, v, d, v))(J.T).sum()
 
     return jax.lax.map(block_trace, X)
 

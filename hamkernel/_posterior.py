@@ -375,7 +375,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
                 f"the new data are {new.targets.dtype} and the posterior {old.targets.dtype}: cast "
                 "the new data."
             )
-        conditional = self.conditional.updated(new)
+        conditional = self.conditional.update(new)
         return Posterior(conditional, learned_field(conditional.field, mean))
 
     @follow_data

@@ -48,50 +48,49 @@ def simulate(
     """Integrate ẋ = f(x) from x0 at time ts[0], and return the states at the times ts.
 
     Without `dt` the step adapts to the tolerances. With `dt` every interval [ts[i], ts[i+1]] is cut
-    into the fewest equal steps of at most `dt` (to √ε of it), so that each saved state is the end
-    of a step and none is interpolated. Symplectic solvers need this: they keep the energy error
-    bounded because every step is the same map, and a step chosen from the state is a different map
-    each time. With equally spaced `ts` all steps have one size. With unequal spacing the size
-    changes from interval to interval (relatively by at most dt over the spacing), but never with
-    the state.
+    into the fewest equal steps of at most `dt`, so each saved state is the end of a step and none
+    is interpolated. Symplectic solvers need `dt`: their energy error stays bounded because every
+    step is the same map, and an adaptive step changes the map. With equally spaced `ts` all steps
+    have one size. With unequal spacing the size changes between intervals, by at most dt over the
+    spacing, but never with the state.
 
     Args:
         field: x (n,) ↦ ẋ (n,), a function or a PyTree such as a fitted field or a system.
-        x0: initial state, shape (n,); for a batch, `jax.vmap` over it. It sets the dtype.
+        x0: initial state, shape (n,), which sets the dtype; for a batch of states use `jax.vmap`.
         ts: times, shape (T,), T ≥ 2, strictly increasing, in the unit of time of the field.
         solver: any Diffrax solver; `diffrax.Dopri8()` if None. Symplectic: `ImplicitMidpoint`,
             `GaussLegendre4`, `GaussLegendre6` for every H; `StormerVerlet`, `Yoshida4` for
             H = T(p) + U(q).
         dt: the largest step; required by a symplectic solver.
-        rtol: relative tolerance of the adaptive step. If None, 1e-10, and 1e-5 in float32; for a
-            learned field at least its rounding at x0, ε ‖Σⱼ |K(x0, xⱼ) aⱼ|‖ / ‖f(x0)‖, and at most
-            1e-6: with a tolerance below the rounding every step would be rejected.
-        atol: absolute tolerance, likewise, in the units of x.
+        rtol: relative tolerance of the adaptive step. If None, 1e-10, and 1e-5 in float32. For a
+            learned field the default is at least the rounding of f(x0),
+            ε ‖Σⱼ |K(x0, xⱼ) aⱼ|‖ / ‖f(x0)‖ up to 1e-6, since a tolerance below rounding would
+            reject every step.
+        atol: absolute tolerance in the units of x; the default is as for `rtol`.
         max_steps: the largest number of steps of the solve, or between two saved times if `dt` is
             given and `dt` or `ts` is traced. If None, the number of steps if it is known, else 2²⁰.
-            The memory of gradients grows with its square root.
+            The memory of gradients grows with the square root of `max_steps`.
         progress: show a progress bar (tqdm); with `dt` it moves at every saved time.
-        adjoint: how Diffrax differentiates; None is its default, for reverse mode alone.
-            For `jax.jvp` and `jax.jacfwd` pass `diffrax.ForwardMode()`, for `jax.hessian`
-            `diffrax.DirectAdjoint()`.
+        adjoint: the method by which Diffrax differentiates. None is reverse mode. For `jax.jvp` and
+            `jax.jacfwd` pass `diffrax.ForwardMode()`, for `jax.hessian` `diffrax.DirectAdjoint()`.
         throw: raise if the solve fails. If False, look at `.result`.
         inputs: u of a field (x, u) ↦ ẋ: a function t ↦ (m,) of the time of ts, or samples (T, m) at
             ts. For explicit time pass `inputs=lambda t: jnp.array([t])`.
-        between: samples are "held" until the next one, or "linear" in between.
+        between: whether samples of inputs are "held" until the next sample, or "linear".
 
     Returns:
         A `diffrax.Solution`: `.ts` (T,), `.ys` (T, n), `.stats["num_steps"]`.
 
     Raises:
-        ValueError: a shape, time or value does not fit; a symplectic solver without `dt`; a solver
-            that cannot estimate its error without `dt`; a splitting of a field that is not known to
-            be separable; more steps of `dt` than `max_steps`; inputs that are missing, of another
-            shape, or together with a symplectic solver.
-        TypeError: `field` does not map one JAX array to another of the same dtype; `solver` or
-            `adjoint` is not one of Diffrax; x0 has less precision than float32; forward mode
-            through the default adjoint.
+        ValueError: a shape, time or value does not fit. `dt` is missing for a symplectic solver, or
+            for a solver without an error estimate, or needs more than `max_steps` steps. The field
+            is not known to be separable, and the solver splits H. Inputs are missing, have another
+            shape, or come with a symplectic solver.
+        TypeError: `field` does not map a JAX array to another of the same dtype; `solver` or
+            `adjoint` is no object of Diffrax; x0 has less precision than float32; or JAX takes
+            forward mode through the default adjoint.
         RuntimeError: the solve failed: too many steps, the implicit equations of a step did not
-            converge, or the state overflowed. Usually the remedy is a smaller `dt`.
+            converge, or the state overflowed. Usually a smaller `dt` helps.
     """
     with require.eager(x0):
         x0 = _initial_state(x0)
@@ -320,6 +319,12 @@ def _adaptive_steps(
     return _Steps(solver, controller, diffrax.SaveAt(ts=ts), limit)
 
 
+@precise_jit
+def _rounding(field: KernelField, x: Float[Array, " n"]) -> Float[Array, ""]:
+    """The relative rounding error of f(x), at most 1e-6."""
+    return field_rounding(field.kernel, x, field.points, field.coefficients, field(x), 1e-6)
+
+
 def _tolerances(
     rhs: RightHandSide, start: Any, x0: Float[Array, " n"], rtol: Any, atol: Any
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
@@ -330,10 +335,9 @@ def _tolerances(
         if isinstance(learned, AbstractJoinedField) and rhs.inputs is not None:
             learned, point = learned.whole, learned.join(x0, rhs.inputs(start))
         if isinstance(learned, KernelField):
-            Z, A = learned.points, learned.coefficients
             # At an equilibrium f is zero and has no digits; the limit 1e-6 still gives states a
             # few digits.
-            share = field_rounding(learned.kernel, point, Z, A, learned(point), 1e-6)
+            share = _rounding(learned, point)
             default = jnp.maximum(default, share)
 
     def tolerance(name: str, value: Any) -> Float[Array, ""]:

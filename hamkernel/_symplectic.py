@@ -281,8 +281,8 @@ class ImplicitMidpoint(AbstractGauss):
 class GaussLegendre4(AbstractGauss):
     """Gauss collocation with two stages, c = 1/2 ∓ √3/6.
 
-    Order 4; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. The
-    formula is that of `AbstractGauss`; arguments and errors are those of `ImplicitMidpoint`.
+    Order 4; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. For
+    the formula see `AbstractGauss`, for arguments and errors see `ImplicitMidpoint`.
 
     Source: HLW, II.1.3 (table 1.1) and VI.4.
     """
@@ -296,8 +296,8 @@ class GaussLegendre4(AbstractGauss):
 class GaussLegendre6(AbstractGauss):
     """Gauss collocation with three stages, c = 1/2, 1/2 ∓ √15/10.
 
-    Order 6; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. The
-    formula is that of `AbstractGauss`; arguments and errors are those of `ImplicitMidpoint`.
+    Order 6; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. For
+    the formula see `AbstractGauss`, for arguments and errors see `ImplicitMidpoint`.
 
     Source: HLW, II.1.3 (table 1.1) and VI.4.
     """
@@ -403,8 +403,8 @@ class Yoshida4(AbstractSplitting):
     """Yoshida's triple jump: three `StormerVerlet` steps of sizes γh, (1 − 2γ)h, γh.
 
     γ = 1/(2 − 2^{1/3}) ≈ 1.35, so the middle step runs backwards. Order 4; symplectic if
-    H = T(p) + U(q); symmetric; explicit, six evaluations per step. Arguments and errors are those
-    of `StormerVerlet`.
+    H = T(p) + U(q); symmetric; explicit, six evaluations per step. For arguments and errors see
+    `StormerVerlet`.
 
     Source: Yoshida (1990), Phys. Lett. A 150, 262–268; HLW, II.4 (example 4.2).
     """

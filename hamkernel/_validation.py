@@ -1,9 +1,8 @@
-"""Validation losses in closed form, each at the price of one factorisation.
+"""Validation losses in closed form, each for the cost of one factorisation.
 
 The public functions check their arguments and make the rows of the observations. The functions of
-rows, below, are the same losses, for the dense fit or, with a `basis`, for the low-rank fit. They
-measure residuals in units of the relative noise of a row. Completely measured velocities X, Y are
-one block of rows and need no copy.
+rows, below, are the same losses, for the dense fit or, with a `basis`, for the low-rank fit. Their
+residuals are in units of the relative noise of a row.
 """
 
 from __future__ import annotations
@@ -56,33 +55,34 @@ def cross_validation_loss(
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Float[Array, ""]:
-    """The mean over folds of the mean squared error of a fit that has not seen the fold.
+    """The cross-validation loss: the mean over folds of the mean squared error of a held-out fold.
 
-    The mean squared error is itself the mean over the fold's points and components. Exact: equal
-    to refitting without each fold, with the ridge that such a fit has, (N − N/F) λ for F folds.
-    With folds of unequal size every refit has this same ridge, that of the average fold.
+    (1/F) Σ_S (1/(|S| n)) Σ_{i ∈ S} ‖yᵢ − f₋S(xᵢ)‖², with f₋S the fit without the fold S. The loss
+    is exact: equal to a refit without each of the F folds, with the ridge (N − N/F) λ, the same for
+    all folds.
 
     Args:
         K: a matrix-valued kernel.
         X: states, shape (N, n); or observations, and then there is no Y.
         Y: measured velocities, shape (N, n).
         regularization: λ > 0.
-        folds: a number of folds, made of consecutive points as equal in size as possible; "loo"
-            for one point per fold; or a label for each point, shape (N,), such as the name of its
-            run, to hold out one run at a time. A fold always holds out whole points: leaving out
-            single components would leak their siblings. Labels must be concrete under jit. Of
-            observations N is the number of all: points, energies, functionals, in their order. A
-            fold with all energies is compared up to their constant.
+        folds: a number of folds, made of consecutive points and of nearly equal size; "loo" for one
+            point per fold; or a label for each point, shape (N,), such as the name of its run, to
+            hold out one run at a time. A fold contains complete points, since the other components
+            of a point would reveal a held-out component. Labels must be concrete under jit. For
+            observations N counts all points, energies and functionals, in their order. A fold with
+            all energies is compared up to their constant.
         mean: the known part of the field, as in `fit`.
-        solver: a low-rank solver, for the loss of its fit as `tune` minimises it; exact if None.
+        solver: a low-rank solver, for the loss of its fit as in `tune`; None for the exact loss.
         inputs: u at each state for a `Controlled` kernel, shape (N, m).
         parameters: θ at each state for a `Family`, shape (N, p).
 
     Returns:
-        The loss, in squared units of Y, or of the rows of observations over their relative noise;
-        inf if the matrix is not positive definite to rounding. Differentiable in reverse mode only:
-        `jax.jacrev(jax.grad(loss))` is the Hessian. Vmappable, compiled once per shape and
-        partition. O((N n)³) time and three matrices of (N n)² numbers, also for the gradient.
+        The loss, shape (), in squared units of Y, or of rows over their relative noise; inf if
+        G + NλI is not positive definite to rounding. O((N n)³) time and three matrices of (N n)²
+        numbers, also for the gradient. The loss is differentiable in reverse mode only:
+        `jax.jacrev(jax.grad(loss))` is the Hessian. It works under vmap, and compiles once for each
+        shape and partition.
 
     Raises:
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
@@ -108,19 +108,19 @@ def cross_validation_residuals(
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Float[Array, "N n"]:
-    """The residual yᵢ − f(xᵢ) of each point under the fit that has not seen its fold.
+    """The held-out residuals yᵢ − f₋S(xᵢ), with f₋S the fit without the fold S of the point i.
 
-    Args and errors are those of `cross_validation_loss`, the mean over folds of the mean square of
-    these residuals. With unequal folds this is not the mean of all squares.
+    The mean over folds of their mean square is the cross-validation loss. For arguments and errors
+    see `cross_validation_loss`.
 
     Returns:
-        Shape (N, n), in units of Y; for observations one residual for each row, in the units of the
-        row. inf if the matrix is not positive definite to rounding.
+        Shape (N, n), in units of Y; for observations one residual for each row, shape (M,), in the
+        units of the row. inf if G + NλI is not positive definite to rounding.
     """
     checked = _check_problem(K, X, Y, regularization, mean, solver, inputs, parameters)
     K, rows, regularization, basis = checked
     residuals = held_out_rows(K, rows, regularization, partition_of_rows(rows, folds), basis)[0]
-    return rows.in_units(residuals)
+    return rows.to_units(residuals)
 
 
 @follow_data
@@ -137,11 +137,11 @@ def generalized_cross_validation(
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Float[Array, ""]:
-    """Generalised cross-validation: the training error over the squared share of free residuals.
+    """The generalised cross-validation loss, (‖y − Sy‖²/D) / (tr(I − S)/D)² = D ‖a‖² / (tr A⁻¹)².
 
-    With the smoother y -> Sy, S = G A⁻¹, and D = N n rows, it is (‖y − Sy‖²/D) / (tr(I − S)/D)²
-    = D ‖a‖² / (tr A⁻¹)². This loss needs no folds, does not depend on the order of the data, and is
-    leave-one-out with every leverage replaced by their mean. It assumes independent noise.
+    S = G A⁻¹ is the smoother of the fit, A = G + NλI, a = A⁻¹y, and D = N n the number of rows. The
+    loss is the leave-one-out loss with every leverage replaced by their mean. It needs no folds,
+    does not depend on the order of the data, and assumes independent noise.
 
     Args:
         K: a matrix-valued kernel.
@@ -154,8 +154,8 @@ def generalized_cross_validation(
         parameters: θ at each state, for a `Family`, shape (N, p).
 
     Returns:
-        The loss, in squared units of Y; inf where the factorisation fails. Differentiable as
-        `cross_validation_loss` is.
+        The loss, shape (), in squared units of Y; inf if the factorisation fails. Derivatives are
+        available as for `cross_validation_loss`.
 
     Raises:
         TypeError: K is not matrix-valued. ValueError: bad data or regularization, or a matrix
@@ -184,10 +184,10 @@ def log_marginal_likelihood(
 ) -> Float[Array, ""]:
     """The log density of Y under f ~ GP(0, K) and independent noise of variance Nλ.
 
-    −½ yᵀA⁻¹y − ½ log det A − ½ N n log 2π with A = G + NλI. This is the best objective if the truth
-    resembles a draw of the prior; cross-validation relies less on that. For a kernel of a
-    descriptor, `Warp(k, fn)`, no field may point along some directions, such as translations of a
-    molecule. The density is then the density of the components of Y along all other directions.
+    log p(Y) = −½ yᵀA⁻¹y − ½ log det A − ½ N n log 2π with A = G + NλI. This is the best objective
+    of `tune` if the true field resembles a draw of the prior; otherwise cross-validation is safer.
+    With `Warp(k, fn)` fields may have no component along some directions, such as translations of a
+    molecule. The result is then the density of the components of Y along all other directions.
 
     Args:
         K: a matrix-valued kernel.
@@ -200,8 +200,8 @@ def log_marginal_likelihood(
         parameters: θ at each state, for a `Family`, shape (N, p).
 
     Returns:
-        The log density; −inf where the factorisation fails. Differentiable as
-        `cross_validation_loss` is.
+        The log density, shape (); −inf if the factorisation fails. Derivatives are available as for
+        `cross_validation_loss`.
 
     Raises:
         TypeError: K is not matrix-valued. ValueError: bad data or regularization, or a matrix

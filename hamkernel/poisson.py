@@ -4,8 +4,8 @@
     hk.Poisson(k, hk.poisson.lotka_volterra)        # two populations, n = 2
     hk.Poisson(k, hk.poisson.charged_particle(B))   # in a magnetic field, n = 4 or 6
 
-Each is a function x (n,) -> (n, n), which a saved field stores by name. Any such function of your
-own will do.
+A tensor is a function x (n,) -> (n, n); `Poisson` also takes functions of your own. `save` stores
+the tensors of this module by name.
 """
 
 from hamkernel._structures.custom_operator import charged_particle, lotka_volterra, rigid_body

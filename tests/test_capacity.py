@@ -21,7 +21,7 @@ from hamkernel._runs.flow import Segments
 from hamkernel._trajectories.kalman import whiten
 from hamkernel._trajectories.likelihood import (
     closed_form,
-    condensed,
+    condense,
     conditional,
     regression_loss,
 )
@@ -39,9 +39,9 @@ from hamkernel._trajectories.segments import (
     LinearisedSegments,
     equal_pieces,
     given_path,
-    linearised,
+    linearise,
+    make_segments,
     padded_count,
-    segmented,
     windows,
 )
 
@@ -57,7 +57,7 @@ def rows_of(spans, path, nodes, slopes, measured) -> LinearisedSegments:
     segments = Segments(spans, measured, ones, zeros, path[:, 0], inputs)
     along = given_path(path, nodes, spans, none)
     good = jnp.ones(size, bool)
-    rows = linearised(along, slopes, jnp.zeros_like(slopes), segments, good)
+    rows = linearise(along, slopes, jnp.zeros_like(slopes), segments, good)
     return with_missed(rows, path, slopes, spans)
 
 
@@ -93,7 +93,7 @@ def test_noise_is_scaled_in_the_triangle_as_in_the_rows():
     scatter = jnp.where(counts > 1, jnp.asarray(rng.uniform(0, 1, counts.shape)), 0.0)
     rows = rows._replace(counts=counts, scatter=scatter)
     S, given = rows.nodes[:, 0, 0], (rows, WIDE)
-    found = conditional(condensed(MODEL, S, *given), S, jnp.asarray(0.7))
+    found = conditional(condense(MODEL, S, *given), S, jnp.asarray(0.7))
     expected = closed_form(MODEL._replace(log_noise=MODEL.log_noise + 0.7), S, *given)
     for name in ("weights", "coefficients", "free", "used", "squares"):
         a, b = getattr(found, name), getattr(expected, name)
@@ -111,9 +111,9 @@ def test_many_short_runs_are_not_padded_in_length():
     t = np.linspace(0.0, 1.0, 5)
     states = [np.column_stack([np.cos(t + i), -np.sin(t + i)]) for i in range(450)]
     runs = preprocessing.preprocess(hk.Runs([t] * 450, states), None).runs
-    segments = segmented(runs, equal_pieces(runs, LONG), [run.path for run in runs])
+    segments = make_segments(runs, equal_pieces(runs, LONG), [run.path for run in runs])
     assert segments.counts.shape == (512, 5, 2)
-    few = segmented(runs[:9], equal_pieces(runs[:9], LONG), [run.path for run in runs[:9]])
+    few = make_segments(runs[:9], equal_pieces(runs[:9], LONG), [run.path for run in runs[:9]])
     assert few.counts.shape == (16, 8, 2)
 
 

@@ -78,6 +78,7 @@ def test_the_fit_is_the_regression_with_k_times_K(fields, name):
     assert found == pytest.approx(likelihood, rel=1e-10)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", FORMULAS)
 def test_a_member_is_an_ordinary_field_with_its_structure(fields, name):
     field = fields[name]
@@ -260,7 +261,7 @@ TWICE = np.repeat(THETA[:1], N, axis=0)
         (
             lambda: hk.fit(hk.Symplectic(SMOOTH), X, Y, parameters=THETA),
             TypeError,
-            r"for the parameters of a family hk.Family\(K, k\)",
+            r"hk.Family\(K, k\) for the parameters of a family",
         ),
         (
             lambda: hk.fit(K, X, Y, parameters=THETA, inputs=THETA),
@@ -283,13 +284,13 @@ TWICE = np.repeat(THETA[:1], N, axis=0)
                 regularization=1e-2,
             ),
             ValueError,
-            "each member of a family has one of its own",
+            "each member of a family has another constant",
         ),
         (lambda: hk.Family(SMOOTH, ALIKE), TypeError, "must be a matrix-valued kernel"),
-        (lambda: hk.Family(K, ALIKE), TypeError, "takes inputs or parameters already"),
-        (lambda: hk.Controlled(K, hk.InputMatrix(1.0)), TypeError, "parameters already"),
+        (lambda: hk.Family(K, ALIKE), TypeError, "takes inputs or parameters: put"),
+        (lambda: hk.Controlled(K, hk.InputMatrix(1.0)), TypeError, "parameters itself"),
         (lambda: hk.Family(hk.Symplectic(SMOOTH), 2), TypeError, "a scalar kernel is needed"),
-        (lambda: hk.Odd(K), TypeError, "say the symmetry of the members"),
+        (lambda: hk.Odd(K), TypeError, "give them to the members"),
         (lambda: hk.fit(K, X[:, :1], Y[:, :1], parameters=THETA), ValueError, "even"),
         (lambda: hk.Runs(*RUNS, parameters=[0.5]), ValueError, "there are 2 runs"),
         (lambda: hk.Runs(*RUNS, parameters=[(0.5,), (1.0, 2.0)]), ValueError, "with one p"),

@@ -13,7 +13,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
-from hamkernel._runs.flow import Expansion, simulated, steps_for, stiffness
+from hamkernel._runs.flow import Expansion, integrate, steps_for, stiffness
 
 VISCOUS, COULOMB, REST = 0.2, 0.6, 0.2
 
@@ -140,7 +140,7 @@ def test_steps_of_learn_are_short_enough_for_a_momentum_that_changes_its_sign():
     spans = np.diff(ts)[None]
     steps = jnp.asarray(steps_for(spans, stiffness(field, true, true.std(axis=0))))
     inputs = jnp.zeros((1, len(ts) - 1, 2, 0))
-    path = simulated(field, jnp.asarray(true[:1]), jnp.asarray(spans), steps, inputs).x[0]
+    path = integrate(field, jnp.asarray(true[:1]), jnp.asarray(spans), steps, inputs).x[0]
     assert np.abs(path - true).max() < 2e-4  # 1e-3 with steps for the usual ‖∂f/∂x‖
 
 
@@ -223,7 +223,7 @@ def test_it_is_found_in_metres_and_seconds_of_a_cantilever():
         (
             lambda: hk.Invariant(hk.Friction(), [-np.eye(2)]),
             TypeError,
-            "no potential to be averaged",
+            "no potential that could have a symmetry",
         ),
         (lambda: hk.gram(hk.Friction(), X[:, :1]), ValueError, "say which have friction"),
         (lambda: hk.gram(hk.Friction(damped=2), X), ValueError, "does not exist"),

@@ -283,7 +283,7 @@ K = kernel("state")
         (lambda: hk.Controlled(hk.Symplectic(G), [1.0, 2.0]), ValueError, "one column"),
         (lambda: hk.Controlled(G, hk.InputMatrix(V)), TypeError, "drift of Controlled"),
         (lambda: hk.InputMatrix(-1.0), ValueError, "variance .* must be positive"),
-        (lambda: hk.Odd(K), TypeError, "symmetry of the drift"),
+        (lambda: hk.Odd(K), TypeError, "give them to the drift"),
         (lambda: hk.simulate(DRIVEN, START, TS), ValueError, "inputs=u"),
         (
             lambda: hk.simulate(DRIVEN, START, TS, inputs=SAMPLES[:4]),

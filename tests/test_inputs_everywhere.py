@@ -319,7 +319,7 @@ DATA = hk.Velocities(X, Y, inputs=U)
     [
         (lambda: hk.condition(K, X, Y, RIDGE), ValueError, "inputs of Velocities are missing"),
         (lambda: hk.fit(K, hk.Equilibria(X) + DATA), ValueError, "of Equilibria are missing"),
-        (lambda: hk.fit(K, DATA, inputs=U), TypeError, "hold their inputs themselves"),
+        (lambda: hk.fit(K, DATA, inputs=U), TypeError, "observations contain their inputs"),
         (lambda: hk.fit(hk.Symplectic(hk.Gaussian()), DATA), TypeError, "takes no inputs"),
         (lambda: hk.Velocities(X, Y, inputs=U[:3]), ValueError, r"shape \(3, 2\)"),
         (lambda: hk.Equilibria(X[0], inputs=[1.0, np.inf]), ValueError, "NaN or inf"),

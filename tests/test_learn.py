@@ -24,21 +24,21 @@ from hamkernel._runs.flow import (
     NODES,
     WEIGHTS,
     Segments,
+    integrate,
     jacobians,
     means,
-    simulated,
 )
 from hamkernel._runs.preprocessing import preprocess
 from hamkernel._trajectories.diagnostics import degrees_of_freedom
 from hamkernel._trajectories.kalman import as_observations
 from hamkernel._trajectories.likelihood import (
     closed_form,
-    condensed,
+    condense,
     conditional,
 )
 from hamkernel._trajectories.model import Model, landmark_whitening
 from hamkernel._trajectories.search import _loss, losses
-from hamkernel._trajectories.segments import given_path, linearised
+from hamkernel._trajectories.segments import given_path, linearise
 
 K = hk.Symplectic(hk.Gaussian(1.0))
 NO_PROCESS = jnp.full(2, -jnp.inf)
@@ -96,7 +96,7 @@ def one_segment(seed=0, T=7):
     segments = Segments(*arrays)
     none = jnp.zeros((1, T - 1, 2, 2))
     as_path = given_path(jnp.asarray(path), jnp.asarray(nodes), segments.spans, none)
-    rows = linearised(
+    rows = linearise(
         as_path, jnp.asarray(slopes), jnp.zeros_like(slopes), segments, jnp.array([True])
     )
     rows = with_missed(rows, path, slopes, segments.spans)
@@ -143,7 +143,7 @@ def test_along_a_true_path_rows_and_functionals_are_the_variation_of_constants()
     segments = Segments(jnp.diff(ts)[None], x, counts, jnp.zeros_like(x), x[:, 0], none)
     path = given_path(x, nodes, segments.spans, jacobians(mean, nodes, n))
     slopes = jax.vmap(jax.vmap(jax.vmap(PENDULUM)))(nodes)
-    rows = linearised(path, slopes, means(mean, nodes, slopes), segments, jnp.array([True]))
+    rows = linearise(path, slopes, means(mean, nodes, slopes), segments, jnp.array([True]))
     expected = [x[0, i] - scipy.linalg.expm(A * t) @ x[0, 0] for i, t in enumerate(ts)]
     np.testing.assert_allclose(integrals(rows), expected, atol=1e-8)
     assert np.abs(expected).max() > 0.1
@@ -183,7 +183,7 @@ def test_the_likelihood_at_another_noise_is_that_of_every_sample_in_a_mean():
     rows = rows._replace(counts=jnp.full_like(rows.counts, count), scatter=scatter)
     S, spread = jnp.asarray(nodes), jnp.full(2, 1e4)
     model = Model(kernel, jnp.full(2, np.log(sigma)), NO_PROCESS)
-    known = condensed(model, S, rows, spread)
+    known = condense(model, S, rows, spread)
     # Differences of successive samples, of which `count` have one time.
     G, weights = differences(kernel, sigma, spans, nodes, measured)[:2]
     from_start = np.kron(np.tri(len(measured), len(spans), -1), np.eye(2)) @ weights
@@ -233,7 +233,7 @@ def test_landmarks_closer_than_rounding_resolves_span_what_they_span():
 def test_the_flow_and_its_tangent_are_exact_to_the_tolerance_of_the_integrator():
     starts = jnp.array([[1.0, 0.5], [-0.3, 1.2]])
     spans = np.full((2, 4), 0.2)
-    path = simulated(PENDULUM, starts, jnp.asarray(spans), jnp.full(4, 8), jnp.zeros((2, 4, 2, 0)))
+    path = integrate(PENDULUM, starts, jnp.asarray(spans), jnp.full(4, 8), jnp.zeros((2, 4, 2, 0)))
     ts = jnp.linspace(0, 0.8, 5)
 
     def flow(x):
@@ -246,7 +246,7 @@ def test_the_flow_and_its_tangent_are_exact_to_the_tolerance_of_the_integrator()
         ends = [(flow(starts[s] + h)[1] - flow(starts[s] - h)[1]) / 2e-5 for h in steps]
         np.testing.assert_allclose(path.across[s, 0], np.stack(ends, axis=1), atol=1e-7)
         # From a node to the end: the tangent over what is left of the interval.
-        left = simulated(
+        left = integrate(
             PENDULUM,
             path.nodes[s, 0, 1][None],
             jnp.array([[0.2 * (1 - NODES[1])]]),
@@ -301,6 +301,7 @@ def learned():
 def test_a_pendulum_is_learned_from_noisy_states(learned):
     found, true = learned
     assert found.converged
+    assert found.diagnostics.failing == ()  # and no warning, which is an error here
     assert field_error(found.field, true) < 0.05  # .043, .028 and .029 for three seeds
     np.testing.assert_allclose(found.noise, 0.05, rtol=0.15)
     assert np.asarray(found.kept).tolist() == [1.0] * 6
@@ -326,6 +327,20 @@ def test_runs_of_other_lengths_do_not_compile_anew(learned, caplog):
     programs = re.findall(r"XLA compilation of jit\((\w+)\)", caplog.text)
     assert set(programs) <= {"stage", "reshape"}  # data on its way to the device
     assert field_error(found.field, true) < 0.06
+
+
+def test_one_row_that_is_no_measurement_spoils_no_field():
+    times, states, true = logs()
+    states[1][20] = -9999.0
+    with pytest.warns(UserWarning, match="Write NaN"):
+        runs = hk.Runs(times, states)
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        found = hk.learn(K, runs)
+    # The run with that row is left out, or the field must not be used.
+    assert not found.converged or field_error(found.field, true) < 0.1
+    assert len(heard) == 1
+    assert "one curve" not in found.diagnostics.failing
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from scipy.integrate import solve_ivp
 from test_learn import integrals
 
 import hamkernel as hk
-from hamkernel._runs.flow import NODES, Segments, jacobians, means, simulated
+from hamkernel._runs.flow import NODES, Segments, integrate, jacobians, means
 from hamkernel._runs.preprocessing import _least
 from hamkernel._runs.runs import (
     inputs_at_nodes,
@@ -27,7 +27,7 @@ from hamkernel._runs.runs import (
 )
 from hamkernel._trajectories.kalman import as_observations
 from hamkernel._trajectories.likelihood import Model
-from hamkernel._trajectories.segments import given_path, linearised, segments_of
+from hamkernel._trajectories.segments import given_path, linearise, segments_of
 
 FRICTION, GAIN = 0.2, 1.5
 PENDULUM = hk.systems.Damped(hk.systems.Pendulum(1.0, 1.0, 6.0), FRICTION)
@@ -136,7 +136,7 @@ def test_inputs_have_times_of_their_own_and_act_late():
     late = hk.Runs(ts, x, (own, np.sin(7 * own)[:, None]), between="linear", delay=0.05)
     assert repr(late) == "Runs(1 run, 9 samples, n=2, m=1 linear, delay=0.05)"
     nodes = ts[1:-1, None] + np.diff(ts[1:])[:, None] * NODES
-    found = inputs_at_nodes(late.applied(0, ts))[1:, :, 0]
+    found = inputs_at_nodes(late.input_lines(0, ts))[1:, :, 0]
     np.testing.assert_allclose(found, np.sin(7 * (nodes - 0.05)), atol=0.06)  # a line in each
     assert late.inputs[0].shape == (1000, 1)
 
@@ -174,7 +174,7 @@ def test_the_flow_is_driven_to_the_tolerance_of_the_integrator():
     true = driven_path(ts, u, slope)
     ends = u + slope * np.column_stack([ts[:-1], ts[1:]])[None, ..., None]
     spans, steps = jnp.diff(ts)[None], jnp.full(4, 8)
-    path = simulated(joined, jnp.array([[1.0, 0.5]]), spans, steps, jnp.asarray(ends))
+    path = integrate(joined, jnp.array([[1.0, 0.5]]), spans, steps, jnp.asarray(ends))
     np.testing.assert_allclose(path.x[0], true(ts), atol=1e-8)
     inner = ts[:-1, None] + np.diff(ts)[:, None] * NODES
     np.testing.assert_allclose(
@@ -203,7 +203,7 @@ def test_along_a_true_path_rows_are_exact_with_inputs():
         path = given_path(x, nodes, segments.spans, jacobians(mean, nodes, 2))
         slopes = jax.vmap(jax.vmap(jax.vmap(joined)))(nodes)
         there = means(mean, nodes, slopes)
-        return linearised(path, slopes, there, segments, jnp.array([True]))
+        return linearise(path, slopes, there, segments, jnp.array([True]))
 
     expected = [
         at - scipy.linalg.expm(A * t) @ true(0.0) for t, at in zip(ts, true(ts), strict=True)
@@ -230,7 +230,7 @@ def test_segments_that_are_not_kept_stay_at_states_of_the_runs():
     nodes = jnp.full((2, 3, 3, 3), jnp.nan)
     path = given_path(jnp.full((2, 4, 2), 2.0), nodes, segments.spans, jnp.zeros((2, 3, 2, 2)))
     zero, none = jnp.zeros((2, 3, 3, 2)), jnp.zeros(2, bool)
-    rows = linearised(path, zero, zero, segments, none)
+    rows = linearise(path, zero, zero, segments, none)
     np.testing.assert_array_equal(rows.nodes[..., :2], 2.0)
     np.testing.assert_array_equal(rows.counts, 0.0)
 

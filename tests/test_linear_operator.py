@@ -81,7 +81,7 @@ def test_what_cannot_be_is_refused():
         fit(hk.Gaussian(1.0), lambda u, x: u(x))
     with pytest.raises(ValueError, match=r"too few derivatives|too rough"):
         fit(hk.Matern(1.5), lambda u, x: jax.hessian(u)(x) @ jnp.ones(2))
-    with pytest.raises(TypeError, match="have no parity"):
+    with pytest.raises(TypeError, match="cannot be odd or even"):
         hk.Odd(hk.Structured(hk.Gaussian(1.0), flow))
 
 

@@ -121,7 +121,7 @@ def test_masses_are_those_of_a_drift_as_well():
     np.testing.assert_allclose(slope @ field(x, u), slope @ field.input_matrix(x) @ u, atol=1e-9)
     wrong = hk.fit(hk.Controlled(kernel, GAIN), X, Y, 1e-8, inputs=U)
     assert float(jnp.linalg.norm(wrong.residual)) > 10 * float(jnp.linalg.norm(field.residual))
-    with pytest.raises(TypeError, match="those of the drift"):
+    with pytest.raises(TypeError, match="takes no kernel with inputs"):
         hk.UnknownMasses(hk.Controlled(kernel, GAIN), [1.0, RATIO])
 
 
@@ -147,11 +147,11 @@ def test_tuning_finds_a_full_matrix():
 
 
 def test_what_has_no_masses_to_find_is_refused():
-    with pytest.raises(ValueError, match="one degree of freedom there is nothing to find"):
+    with pytest.raises(ValueError, match="one degree of freedom every mass explains"):
         hk.UnknownMasses(hk.Symplectic(G), [1.0])
     with pytest.raises(ValueError, match="masses must be positive"):
         hk.UnknownMasses(hk.Symplectic(G), [1.0, -1.0])
-    with pytest.raises(ValueError, match="must be symmetric"):
+    with pytest.raises(ValueError, match="not symmetric"):
         hk.UnknownMasses(hk.Symplectic(G), [[1.0, 0.5], [0.0, 1.0]])
     with pytest.raises(ValueError, match=r"positive definite.* lowest eigenvalue is -1"):
         hk.UnknownMasses(hk.Symplectic(G), [[1.0, 2.0], [2.0, 1.0]])

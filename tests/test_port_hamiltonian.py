@@ -147,7 +147,7 @@ def test_terms_share_a_potential_only_where_they_share_the_operator():
     ]
     data = X[:, :2], Y[:, :2]
     for K in different:
-        assert "an operator of its own" in str(K.no_potential)
+        assert "each has another operator" in str(K.no_potential)
         assert not K.has_hamiltonian
     field = hk.fit(different[0], *data, 1e-2)
     with pytest.raises(AttributeError):
@@ -252,5 +252,5 @@ def test_what_cannot_be_is_refused(make, match):
 def test_an_operator_must_be_a_function():
     with pytest.raises(TypeError, match="constant matrix"):
         hk.Structured(G, np.eye(2))
-    with pytest.raises(TypeError, match="have no parity"):
+    with pytest.raises(TypeError, match="cannot be odd or even"):
         hk.Odd(structured())

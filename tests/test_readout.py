@@ -162,6 +162,7 @@ def test_data_without_noise_gives_the_formula_to_rounding_and_no_term_more():
     assert (np.asarray(found.deviations) < 1e-12).all()
 
 
+@pytest.mark.slow
 def test_friction_is_that_of_the_kernel():
     X, Y = pendulum(friction=0.3)
     damped = hk.PortHamiltonian(2.0 * hk.Gaussian(1.5), friction=0.3)
@@ -225,7 +226,7 @@ def test_masses_and_poisson_tensors_bring_their_own_operator():
     found = hk.readout(hk.condition(K, Z, V, 1e-8), two)
     np.testing.assert_allclose(jax.vmap(found)(Z), V, atol=1e-12)
     casimir = {"x1**2": squares["x1**2"], "C": lambda x: x @ x}
-    with pytest.raises(ValueError, match="leaves no trace in the data"):
+    with pytest.raises(ValueError, match="has no effect on the data"):
         hk.readout(hk.condition(K, Z, V, 1e-8), casimir)
 
 
@@ -265,7 +266,7 @@ def test_a_symmetric_kernel_takes_terms_with_its_symmetry():
         ),
         ({"q": lambda x: math.sin(x[0])}, TypeError, "jax.numpy in place of numpy and math"),
         ({"log": lambda x: jnp.log(x[0])}, ValueError, "'log' is not finite at some"),
-        (TERMS | {"one": lambda x: 0 * x[0] + 1}, ValueError, "'one' leaves no trace"),
+        (TERMS | {"one": lambda x: 0 * x[0] + 1}, ValueError, "'one' has no effect"),
         (
             TERMS | {"sin2": lambda x: jnp.sin(x[0]) ** 2, "cos2": lambda x: jnp.cos(x[0]) ** 2},
             ValueError,
@@ -284,14 +285,14 @@ def test_a_dictionary_that_cannot_be_read_off_is_refused(posterior, terms, error
 
 
 def test_what_has_no_measurements_no_potential_or_too_many_subsets_is_refused():
-    with pytest.raises(TypeError, match="A field alone has none"):
+    with pytest.raises(TypeError, match="which contains the measurements"):
         hk.readout(hk.fit(KERNEL, X, Y, LAMBDA), TERMS)  # type: ignore[arg-type]
     free = hk.condition(hk.Separable(2.0 * hk.Gaussian(1.0)), X, Y, LAMBDA)
     with pytest.raises(AttributeError, match="there is no potential to read a formula of"):
         hk.readout(free, TERMS)
     theta = np.linspace(0.5, 1.0, len(X))[:, None]
     family = hk.condition(hk.Family(KERNEL), X, Y, LAMBDA, parameters=theta)
-    with pytest.raises(TypeError, match="of one system and this is a family"):
+    with pytest.raises(TypeError, match="takes one system and this is a family"):
         hk.readout(family, TERMS)
     with pytest.raises(ValueError, match="all are compared: give fewer terms"):
         _select(np.random.default_rng(0).normal(size=(90, 57)), np.ones(90), 6)

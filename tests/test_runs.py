@@ -19,8 +19,8 @@ from hamkernel._runs.smoothing import (
     pad,
     power_of_two,
     processes,
-    smoothed,
-    without_means,
+    smooth_runs,
+    subtract_means,
 )
 
 
@@ -207,8 +207,8 @@ def dense(coordinate, t, s):
 def test_the_smoother_is_a_dense_gaussian_process_with_missing_entries():
     times, states = swings(missing=True)
     found = processes(times, states)
-    paths = smoothed(found, times, states)
-    inside, means = without_means(states)
+    paths = smooth_runs(found, times, states)
+    inside, means = subtract_means(states)
     for r, t in enumerate(times):
         for c, coordinate in enumerate(found):
             seen = np.isfinite(states[r][:, c])
@@ -270,7 +270,7 @@ def test_runs_are_padded_to_few_shapes():
     assert [power_of_two(n) for n in (1, 2, 3, 33, 64)] == [1, 2, 4, 64, 64]
     runs = pad(TIMES, STATES)
     assert runs.states.shape == (4, 32, 2)
-    assert not runs.seen[0, 25:].any()
+    assert not runs.measured[0, 25:].any()
 
 
 @pytest.mark.slow

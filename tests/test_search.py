@@ -364,7 +364,7 @@ def whole(kernel, Y, bounds=None):
     """The objective of the search on all of X."""
     rows, typical = measurements_of_states(jnp.asarray(X), jnp.asarray(Y)), speed(Y)
     given = SearchSpace(kernel, rows.points, typical, jnp.asarray(1e-3), (), bounds or {})
-    criterion = criterion_of("cross_validation", N, 5).for_subset(rows, np.arange(N))
+    criterion = criterion_of("cross_validation", N, 5).restrict(rows, np.arange(N))
     return SearchObjective(given, criterion, rows, *map(jnp.asarray, (1.0, typical, 1.0)))
 
 

@@ -324,9 +324,9 @@ def test_what_makes_no_sense_is_refused():
         solver.fit_chunks(K, [])
     with pytest.raises(ValueError, match="no data yet"):
         solver.start(K, X).field()
-    with pytest.raises(ValueError, match="the data has 4 coordinates and the fit 2"):
+    with pytest.raises(ValueError, match="the data have 4 coordinates and the fit 2"):
         solver.start(K, X).add(*swings(10, n=4))
-    with pytest.raises(ValueError, match="the landmarks have 2 coordinates and X 4"):
+    with pytest.raises(ValueError, match="have 2 coordinates and X 4"):
         hk.fit(K, *swings(10, n=4), RIDGE, solver=solver)
     with pytest.raises(ValueError, match="NaN or inf in row 3"):
         solver.start(K, np.where(np.arange(600)[:, None] == 3, np.nan, X))
@@ -345,7 +345,7 @@ def test_an_error_in_a_stream_says_in_which_chunk_it_is():
     good, hole = (X[:9], Y[:9]), (X[:9], np.where(np.arange(9)[:, None] == 7, np.nan, Y[:9]))
     with pytest.raises(ValueError, match="chunk 2, counted from 0: Y contains NaN or inf in row 7"):
         given(S).fit_chunks(K, [good, good, hole])
-    with pytest.raises(ValueError, match=r"chunk 1, .* the data has 4 coordinates"):
+    with pytest.raises(ValueError, match=r"chunk 1, .* the data have 4 coordinates"):
         given(S).fit_chunks(K, [good, swings(10, n=4)])
     with pytest.raises(TypeError, match=r"chunk 0, .* a pair \(X, Y\) is needed.* \[\(X, Y\)\]"):
         given(S).fit_chunks(K, (X, Y))  # type: ignore[arg-type]

@@ -63,7 +63,7 @@ def off(field, S, sign=1.0):
     return np.abs(there - sign * here @ S.T).max() / np.abs(here).max()
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @every_group
 def test_fields_have_the_symmetry_to_rounding_and_plain_ones_have_not(name):
     k, maps, same, reversed_, order, one_sided = GROUPS[name]
@@ -253,7 +253,7 @@ def test_works_under_jit_vmap_and_grad():
     ("make", "match"),
     [
         (lambda: hk.Invariant(G, [turn(1.0)]), "more than 64"),
-        (lambda: hk.Invariant(G, [np.diag([1.0, -1.0, 1.0, 1.0])]), "symplectic or antisymplectic"),
+        (lambda: hk.Invariant(G, [np.diag([1.0, -1.0, 1.0, 1.0])]), "must satisfy SᵀJS = ±J"),
         (lambda: hk.Invariant(G, [np.eye(3)]), "3 by 3 matrix and the states have 4"),
         (lambda: hk.Invariant(G, [lambda x: x + 1.0]), "not linear"),
         (lambda: hk.Invariant(G, [lambda x: x[:2]]), r"to shape \(2,\)"),
@@ -290,7 +290,7 @@ def test_other_refusals():
         lambda: hk.Invariant(hk.DivergenceFree(G), [C3]),
         lambda: hk.Invariant(hk.DivergenceFree(G) + hk.CurlFree(G), [C3]),
     ):
-        with pytest.raises(ValueError, match="no symmetry from its matrix potential"):
+        with pytest.raises(ValueError, match="takes no symmetry but Odd and Even"):
             make()
     with pytest.raises(ValueError, match="no function but zero"):
         hk.Invariant(hk.Even(hk.Symplectic(G)), [-np.eye(4)])  # H odd and even

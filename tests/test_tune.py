@@ -443,8 +443,8 @@ def test_of_a_vector_the_coordinate_at_a_bound_is_named():
     )
     np.testing.assert_allclose(np.exp(space.high[1]), 1.0)
     assert np.exp(space.high[0]) > 10
-    assert space.at_bounds(np.array([0.1, np.pi / 2, 0.0])) == ("kernel.lengthscale[1]",)
-    assert space.at_bounds(np.array([-np.pi / 2, 0.0, np.pi / 2])) == (
+    assert space.active_bounds(np.array([0.1, np.pi / 2, 0.0])) == ("kernel.lengthscale[1]",)
+    assert space.active_bounds(np.array([-np.pi / 2, 0.0, np.pi / 2])) == (
         "kernel.lengthscale[0]",
         "regularization",
     )
@@ -936,7 +936,7 @@ def test_an_objective_that_jax_cannot_trace_is_told_to_use_jax_numpy():
         return float(hk.log_marginal_likelihood(K, X, Y, regularization))
 
     X, Y = scattered()
-    with pytest.raises(TypeError, match=r"the objective asks for numbers.*jax\.numpy"):
+    with pytest.raises(TypeError, match=r"the objective needs numbers.*jax\.numpy"):
         hk.tune(hk.Symplectic(hk.Gaussian()), X, Y, objective=objective)  # pyright: ignore
 
 

@@ -333,7 +333,7 @@ def _answer(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D: i
             for claimed in (True, False)
         )
         if key == "friction" and yes is not None:
-            no = _without_friction(yes, among) or no
+            no = _frictionless_rival(yes, among) or no
         if yes is None or no is None:
             return say(key, "not tested", "no candidate for the other answer")
         change = yes.score - no.score
@@ -369,7 +369,7 @@ def _answer(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D: i
     return Comparison(table, _sort_answers(answers), reasons, differences, D)
 
 
-def _without_friction(damped: Candidate, among: list[Candidate]) -> Candidate | None:
+def _frictionless_rival(damped: Candidate, among: list[Candidate]) -> Candidate | None:
     """The candidate that lacks only the friction; None if there is none.
 
     No candidate has friction and an H that is even in p. A candidate without friction may thus be

@@ -24,18 +24,18 @@ from hamkernel._structures.structure import AbstractPotentialKernel
 class Formula(EqualToItself, eqx.Module):
     """u(x) = Σ θ_k φ_k(x), the potential as a formula; made by `readout`.
 
-    A formula is a field: `formula(x)` is the velocity B∇u at one state, so `hk.simulate(formula,
-    x0, ts)` works. `formula.potential(x)` is u, and so is `formula.hamiltonian(x)` for structures
-    with an energy. A PyTree.
+    A formula is a field and a PyTree: `formula(x)` is the velocity B∇u at one state, so
+    `hk.simulate(formula, x0, ts)` works. `formula.potential(x)` is u, and for structures with an
+    energy so is `formula.hamiltonian(x)`.
 
     Attributes:
-        terms: the names of the functions that were selected, in the order of the dictionary.
+        terms: the names of the selected functions, in the order of the dictionary.
         coefficients: θ, shape (k,).
-        deviations: the standard deviations of θ, shape (k,). They include the noise and the
-            selection of the terms; hyperparameters of the kernel, such as friction, count as known.
-        misfit: the root mean square of the residuals over the standard deviation √(Nλ) of the noise
-            that the fit assumed, shape (): about one where the formula explains the data as well as
-            the kernel does, larger where a term is missing.
+        deviations: the standard deviations of θ, shape (k,), which include the noise and the
+            selection of the terms. Hyperparameters of the kernel, such as friction, count as known.
+        misfit: the root mean square of the residuals over √(Nλ), the standard deviation of the
+            noise, shape (). It is about one if the formula explains the data as well as the kernel,
+            and larger if a term is missing.
         probability: the posterior probability of these terms among all subsets, shape ().
         rows: the number of rows.
         functions: the φ_k of the terms.
@@ -132,15 +132,18 @@ class Formula(EqualToItself, eqx.Module):
 
 def operator_of(K: AbstractMatrixKernel) -> Callable[[Array, Array], Array]:
     """(x, v) -> B(x) v."""
-    K = K.of_states
-    if isinstance(K, Sum):  # its terms share one operator, or it would have no potential
+    K = K.state_kernel
+    if isinstance(K, Sum):  # a sum with a potential has one operator for all terms
         return operator_of(K.terms[0])
     if isinstance(K, UnknownMasses):  # S⁻¹ B S⁻ᵀ in the coordinates y = S⁻¹x
         inner = operator_of(K.kernel)
         return lambda y, v: K.to_velocities(inner(K.to_momenta(y), K.to_velocities(v)))
     if isinstance(K, AbstractPotentialKernel):
         return K.apply
-    raise TypeError(f"{type(K).__name__} does not say by which operator its fields are made.")
+    raise TypeError(
+        f"{type(K).__name__} has no operator B with f = B∇u that the library knows: learn with "
+        "Symplectic, PortHamiltonian, Poisson, CurlFree or Structured(k, operator)."
+    )
 
 
 def _with_deviation(value: float, deviation: float) -> str:

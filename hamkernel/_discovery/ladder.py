@@ -111,8 +111,8 @@ class Rung(AbstractMatrixKernel):
             return jax.tree.map(jnp.add, sums, term(*one_term)), None
 
         nothing = [[jnp.zeros((len(X), len(Z)), dtype)] * n] * n
-        found, _ = jax.lax.scan(add, nothing, (weights, D, S, C))
-        return jnp.stack([jnp.stack(row, axis=-1) for row in found], axis=1)
+        sums_of_entries, _ = jax.lax.scan(add, nothing, (weights, D, S, C))
+        return jnp.stack([jnp.stack(row, axis=-1) for row in sums_of_entries], axis=1)
 
     def _hamiltonian_operator(self, n: int) -> Float[Array, "n n"]:
         """The operator J − R; zero if n is odd."""
@@ -142,7 +142,7 @@ class Rung(AbstractMatrixKernel):
             return value, value
         return PortHamiltonian(Gaussian(1.0)).bounds(name, X, amplitude)
 
-    def shares_potential(self, other: AbstractMatrixKernel) -> bool:
+    def shares_potential(self, kernel: AbstractMatrixKernel) -> bool:
         return False
 
     def with_parity(self, parity: int) -> AbstractMatrixKernel:

@@ -82,49 +82,49 @@ def readout(
         most: the largest number of terms in the formula.
 
     Returns:
-        A `Formula`, with `.terms`, `.coefficients`, `.deviations`, `.misfit`, and `.latex()`.
-        C(D, 1) + … + C(D, most) small least squares for D terms: 17 terms take 0.1 s.
-
-    Raises:
-        TypeError: `learned` is neither, `terms` no dictionary of functions, or a function is not
-            traceable.
-        AttributeError: the structure has no scalar potential (with the reason).
-        ValueError: a function does not map one state to one number, is not finite on the data,
-            leaves no trace in the rows, or does not have the symmetry of the kernel; functions are
-            linearly dependent on the data; there are as many terms as rows, or too many subsets.
+        A `Formula`, with `.terms`, `.coefficients`, `.deviations`, `.misfit`, and `.latex()`. D
+        terms need C(D, 1) + … + C(D, most) small least squares: 17 terms take 0.1 s.
 
     Warns:
-        UserWarning: the formula leaves more than twice the noise.
+        UserWarning: the residuals of the formula are more than twice the noise.
+
+    Raises:
+        TypeError: `learned` is neither a posterior nor a result of `learn`, `terms` is no
+            dictionary of functions, or a function is not traceable.
+        AttributeError: the structure has no scalar potential (with the reason).
+        ValueError: a function does not map one state to one number, is not finite on the data, has
+            a zero field B∇φ, or lacks the symmetry of the kernel. ValueError also if functions are
+            linearly dependent on the data, or there are as many terms as rows, or too many subsets.
 
     Source: Brunton, Proctor & Kutz (2016) for the dictionary; Chen & Chen (2008), Biometrika 95,
         for the criterion; Hoeting et al. (1999), Statistical Science 14, for the deviations.
     """
     require.no_tracers("hk.readout", "Call it outside, on what was learned.", learned)
     kernel, rows, ridge, mean = _data_of(learned)
-    most = require.count(most, "most")
+    limit = require.count(most, "most")
     if kernel.no_potential:
         raise AttributeError(f"there is no potential to read a formula of: {kernel.no_potential}")
     names, functions = _check_terms(terms, rows)
     _check_symmetry(kernel, names, functions, rows)
     y, columns, typical = _regression(kernel, rows, ridge, functions)
     _check_columns(names, columns, typical, y, float(jnp.finfo(rows.targets.dtype).eps))
-    found = _select(columns, y, min(most, len(names)))
-    misfit = math.sqrt(found.variance / float(ridge))
+    selection = _select(columns, y, min(limit, len(names)))
+    misfit = math.sqrt(selection.variance / float(ridge))
     if misfit > 2.0:  # three quarters of the residuals are then not noise
         require.warn(
-            f"the formula leaves {misfit:.3g} times the noise of the fit: a term is missing from "
-            "the dictionary or more than `most` are needed; or the regularization, whose Nλ is "
-            "the variance of the noise, was not tuned and is too small."
+            f"the residuals of the formula are {misfit:.3g} times the noise of the fit. Add terms "
+            "to the dictionary, or raise `most`. Or the regularization is too small: tune it, "
+            "since Nλ is the variance of the noise."
         )
     dtype = rows.targets.dtype
     return Formula(
-        terms=tuple(names[i] for i in found.subset),
-        coefficients=jnp.asarray(found.coefficients, dtype),
-        deviations=jnp.asarray(found.deviations, dtype),
+        terms=tuple(names[i] for i in selection.subset),
+        coefficients=jnp.asarray(selection.coefficients, dtype),
+        deviations=jnp.asarray(selection.deviations, dtype),
         misfit=jnp.asarray(misfit, dtype),
-        probability=jnp.asarray(found.probability, dtype),
+        probability=jnp.asarray(selection.probability, dtype),
         rows=len(y),
-        functions=tuple(functions[i] for i in found.subset),
+        functions=tuple(functions[i] for i in selection.subset),
         kernel=kernel,
         mean=mean,
     )
@@ -139,19 +139,22 @@ def _data_of(learned: Any) -> tuple[AbstractMatrixKernel, Any, Float[Array, ""],
         mean = known_of(learned.field)
     elif isinstance(learned, Learned):
         if learned.observations is None:
-            raise ValueError("no run had enough samples to say anything of the field.")
+            raise ValueError(
+                "no run had enough samples for `learn`, so there are no rows for a formula: add "
+                "longer runs."
+            )
         asked = make_problem(
             learned.kernel, learned.observations, None, learned.regularization, learned.mean
         )
         kernel, rows, ridge, mean = asked.kernel, asked.rows, asked.ridge, asked.known
     else:
         raise TypeError(
-            "readout takes what hk.learn or hk.condition returns, for the measurements in it; got "
-            f"a {type(learned).__name__}. A field alone has none: hk.condition(K, X, Y, λ)."
+            "readout takes the result of hk.learn or hk.condition, which contains the "
+            f"measurements; got a {type(learned).__name__}. Use hk.condition(K, X, Y, λ)."
         )
-    if kernel.given == "parameters":
+    if kernel.input_name == "parameters":
         raise TypeError(
-            "readout is of one system and this is a family: condition on the data of one member, "
+            "readout takes one system and this is a family: condition on the data of one member, "
             "without parameters."
         )
     if kernel.takes_inputs and mean is not None:
@@ -186,7 +189,7 @@ def _check_terms(terms: Any, rows: Any) -> tuple[list[str], list[Callable[..., A
 
 def _check_symmetry(K: Any, names: list[str], functions: list[Any], rows: Any) -> None:
     """ValueError if the symmetry of the kernel forbids a term."""
-    K = K.of_states
+    K = K.state_kernel
     symmetry_means = [symmetry_removed(k) for k in K.scalar_kernels]
     n = rows.dimension
     if any(mean is None for mean in symmetry_means) or isinstance(K, UnknownMasses):
@@ -209,7 +212,7 @@ def _check_symmetry(K: Any, names: list[str], functions: list[Any], rows: Any) -
     if bad:
         do, them = ("does", "it") if len(bad) == 1 else ("do", "them")
         raise ValueError(
-            "the kernel believes in a symmetry of the potential that "
+            "the kernel has a symmetry of the potential that "
             f"{_join_names(bad)} {do} not have: leave {them} out, or learn without the symmetry."
         )
 
@@ -227,10 +230,10 @@ def _regression(
     have the covariance C, and we multiply the rows by L⁻¹ with LLᵀ = I + C/ridge: generalised least
     squares, with G integrated out.
     """
-    of_fields, of_values = _of_dictionary(operator_of(K), tuple(functions), rows.dimension)
+    fields, potentials = _dictionary_functions(operator_of(K), tuple(functions), rows.dimension)
     columns, typical = [], []
     for block in rows.blocks:
-        values = (of_values if block.of_values else of_fields)(block.points)
+        values = (potentials if block.of_values else fields)(block.points)
         columns.append(block.rows(values[0]))
         typical.append(np.broadcast_to(np.asarray(values[1]), (block.size, len(functions))))
     columns = rows.contrast(jnp.concatenate(columns))
@@ -244,7 +247,7 @@ def _regression(
     return y, columns, np.concatenate(typical).max(axis=0)
 
 
-def _of_dictionary(operator: Any, functions: tuple[Any, ...], n: int) -> tuple[Any, Any]:
+def _dictionary_functions(operator: Any, functions: tuple[Any, ...], n: int) -> tuple[Any, Any]:
     """Functions of points: the fields (P, n, D) or potentials (P, D), and the sizes of their terms.
 
     The sizes (D,) are the maxima of Σ_b |B_ab| |∂_b φ|. If a field B∇φ consists of rounding errors
@@ -295,19 +298,22 @@ def _check_columns(
     bad = [name for name, a, b in zip(names, sizes, typical, strict=True) if a <= rounding * b]
     if bad:
         raise ValueError(
-            f"{_join_names(bad)} leaves no trace in the data: its field B∇φ is zero, as that of a "
-            "constant or of a Casimir. Leave it out."
+            f"{_join_names(bad)} has no effect on the data: the field B∇φ is zero, as for a "
+            "constant or a Casimir φ. Leave it out."
         )
     _, singular, V = np.linalg.svd(np.linalg.qr(columns / sizes, mode="r"))
     if singular[-1] <= rounding * singular[0]:
         shares = np.abs(V[-1])
         bad = [name for name, share in zip(names, shares, strict=True) if share > 1e-3]
         raise ValueError(
-            f"{_join_names(bad)} are linearly dependent on the data: a combination of them moves "
-            "nothing, so no data like these can tell them apart. Leave one of them out."
+            f"{_join_names(bad)} are linearly dependent on the data: a combination has a zero "
+            "field, so such data do not determine the coefficients. Leave one of them out."
         )
     if not np.abs(y).max() > 0:
-        raise ValueError("all targets are zero, less what the mean explains: nothing is left.")
+        raise ValueError(
+            "all targets are zero after the mean is subtracted, so there is nothing to explain: "
+            "check the data and the mean."
+        )
 
 
 def _finite(column: np.ndarray) -> bool:
@@ -329,19 +335,19 @@ class _Selection(NamedTuple):
     probability: float
 
 
-def _select(columns: np.ndarray, y: np.ndarray, most: int) -> _Selection:
-    """The best of all subsets of up to `most` columns.
+def _select(columns: np.ndarray, y: np.ndarray, limit: int) -> _Selection:
+    """The best of all subsets of up to `limit` columns.
 
     [Φ, y] = QT is computed once, and for each subset a QR of the D + 1 rows of T, whose last
     diagonal entry is the norm of the residual. Without normal equations, nearly dependent columns
     lose digits like their condition number and not like its square.
     """
     R, D = columns.shape
-    most = min(most, R - 1)
-    count = sum(math.comb(D, k) for k in range(1, most + 1))
+    limit = min(limit, R - 1)
+    count = sum(math.comb(D, k) for k in range(1, limit + 1))
     if count > 1_000_000:  # one million take 4 s of CPU time and 150 MB
         raise ValueError(
-            f"{D} terms have {count} subsets of up to {most}, and all are compared: give fewer "
+            f"{D} terms have {count} subsets of up to {limit}, and all are compared: give fewer "
             f"terms or a smaller `most`, for at most 1000000 subsets."
         )
     sizes = np.linalg.norm(columns, axis=0)
@@ -349,7 +355,7 @@ def _select(columns: np.ndarray, y: np.ndarray, most: int) -> _Selection:
     # Residuals below the rounding of y cannot be compared.
     floor = (np.finfo(float).eps * np.linalg.norm(y)) ** 2 * R
     scores, batches = [], []
-    for k in range(1, most + 1):
+    for k in range(1, limit + 1):
         prior = k * math.log(R) + 2 * math.log(math.comb(D, k))
         subsets = itertools.combinations(range(D), k)
         # 20 000 subsets in one stack of QR factorisations.

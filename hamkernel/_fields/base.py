@@ -256,7 +256,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
             AttributeError: the field has no Hamiltonian. ValueError: x is no state (n,).
         """
         slope = jax.grad(self.hamiltonian)(self._state(x))
-        return self.kernel.dissipated(self._state(x), slope)
+        return self.kernel.dissipated_power(self._state(x), slope)
 
     def _check_single(self) -> None:
         if self.offset.shape:

@@ -138,7 +138,7 @@ class AbstractJoinedField(AbstractField):
             ValueError: u is missing, or x or u has another shape.
         """
         self._check_single()
-        name = self.kernel.given
+        name = self.kernel.input_name
         if u is None:
             raise ValueError(
                 f"a {type(self).__name__} needs its {name}: field(x, u), and hk.simulate(field, "
@@ -175,7 +175,7 @@ class AbstractJoinedField(AbstractField):
         inputs = None if U is None else _column(require.floating(U, "U"), 1, m).astype(X.dtype)
         if inputs is None or inputs.shape != (len(X), m):
             raise ValueError(
-                f"field.evaluate(X, U) needs the {self.kernel.given} of every state, shape "
+                f"field.evaluate(X, U) needs the {self.kernel.input_name} of every state, shape "
                 f"({len(X)}, {m}); got {None if inputs is None else inputs.shape}."
             )
         S, mean = jnp.concatenate([X, inputs], axis=1), self.whole.mean
@@ -315,7 +315,7 @@ class FamilyField(AbstractJoinedField):
         mean = fix_inputs(self.whole.mean, self.dimension, theta)
         if len(terms) == 1:
             return dataclasses.replace(terms[0], mean=mean)
-        return MemberField(K.of_states, terms, self.offset, mean)  # pyright: ignore
+        return MemberField(K.state_kernel, terms, self.offset, mean)  # pyright: ignore
 
     @property
     def potential(self) -> Scalar:
@@ -426,7 +426,7 @@ def fix_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
         assert isinstance(K, AbstractJoinedKernel)
         member = dataclasses.replace(
             part,
-            kernel=K.of_states,
+            kernel=K.state_kernel,
             points=points[..., :n],
             value_points=None if values is None else values[..., :n],
             mean=fix_inputs(part.mean, n, u),
@@ -435,14 +435,14 @@ def fix_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
             return member
         A = K.coefficients_at(u, points[..., n:], part.coefficients)
         bare = dataclasses.replace(member, coefficients=A, residual=jnp.zeros((0, n), A.dtype))
-        square = jnp.sum(A * placed_product(K.of_states, bare.points, bare.points, A))  # aᵀGa
+        square = jnp.sum(A * placed_product(K.state_kernel, bare.points, bare.points, A))  # aᵀGa
         return dataclasses.replace(bare, norm=root(square))
     if isinstance(part, FeatureField):
         assert isinstance(part.features, ControlledFeatures)
         features = part.features.drift
         return dataclasses.replace(
             part,
-            kernel=part.kernel.of_states,
+            kernel=part.kernel.state_kernel,
             features=features,
             weights=part.weights[..., : features.columns],
             residual=part.residual[..., :n],
@@ -457,7 +457,7 @@ def learned_field(field: Any, mean: Any) -> Any:
         field = dataclasses.replace(field, mean=mean)
     if not isinstance(field.kernel, AbstractJoinedKernel):
         return field
-    field_type = FamilyField if field.kernel.given == "parameters" else ControlledField
+    field_type = FamilyField if field.kernel.input_name == "parameters" else ControlledField
     return field_type(whole=field)  # pyright: ignore[reportCallIssue]
 
 

@@ -65,7 +65,7 @@ class AbstractBlock(eqx.Module):
 
     @abc.abstractmethod
     def merge(self, following: "AbstractBlock") -> "AbstractBlock | None":
-        """One block of these rows followed by the rows of `other`; None if its kind differs."""
+        """One block of the rows here, then the rows of `following`; None if the kinds differ."""
 
     @abc.abstractmethod
     def with_points(self, points: Float[Array, "P d"]) -> "AbstractBlock":

@@ -39,7 +39,7 @@ class AbstractObservations(eqx.Module):
     def dimension(self) -> int:
         """n, the number of coordinates of a state."""
 
-    def given_inputs(self) -> Iterator[Float[Array, "*points m"]]:
+    def all_inputs(self) -> Iterator[Float[Array, "*points m"]]:
         """The inputs of each kind of observation with inputs."""
         inputs = getattr(self, "inputs", None)  # energies have none
         if inputs is not None:
@@ -47,13 +47,13 @@ class AbstractObservations(eqx.Module):
 
     @abc.abstractmethod
     def parts(
-        self, count: int = 0, given: str = "inputs"
+        self, count: int = 0, input_name: str = "inputs"
     ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
-        """The blocks of rows, one for each kind, and the measured values.
+        """The blocks of rows, one for each kind, with their measured values.
 
         Args:
-            count: m, the number of inputs of the kernel. If it is not 0 the points are (x, u).
-            given: "inputs", or "parameters" for a family: the name of u in errors.
+            count: m, the number of inputs of the kernel. If m > 0 the points are (x, u).
+            input_name: "inputs", or "parameters" for a family: the name of u in errors.
 
         Raises:
             ValueError: u is missing, or there are energies of a family.
@@ -61,20 +61,20 @@ class AbstractObservations(eqx.Module):
 
     def __add__(self, other: Any) -> AbstractObservations:
         if not isinstance(other, AbstractObservations):
-            raise TypeError(_not_observations(self, other))
+            raise TypeError(_addition_error(self, other))
         return Together(_summands(self) + _summands(other))
 
     def __radd__(self, other: Any) -> AbstractObservations:
         if isinstance(other, int) and other == 0:  # so that sum(data) works
             return self
-        raise TypeError(_not_observations(self, other))
+        raise TypeError(_addition_error(self, other))
 
     __array_ufunc__ = None  # so that NumPy leaves array + observations to __radd__
 
 
-def _not_observations(data: AbstractObservations, other: Any) -> str:
+def _addition_error(data: AbstractObservations, operand: Any) -> str:
     return (
-        f"{type(data).__name__} was added to {type(other).__name__}: only observations add up. "
+        f"{type(data).__name__} was added to {type(operand).__name__}: only observations add up. "
         "Give an array its meaning first, for example hk.Velocities(X, Y) + hk.Energies(Z, E)."
     )
 
@@ -88,8 +88,8 @@ class Together(AbstractObservations):
         dimensions = [term.dimension for term in self.terms]
         if len(set(dimensions)) > 1:
             raise ValueError(
-                f"the observations in a sum are of states of {dimensions} coordinates: all must be "
-                "of one system, with the same n."
+                f"the observations in a sum have states of {dimensions} coordinates: all must "
+                "belong to one system, with the same n."
             )
 
     def __repr__(self) -> str:
@@ -99,15 +99,15 @@ class Together(AbstractObservations):
     def dimension(self) -> int:
         return self.terms[0].dimension
 
-    def given_inputs(self) -> Iterator[Float[Array, "*points m"]]:
+    def all_inputs(self) -> Iterator[Float[Array, "*points m"]]:
         for term in self.terms:
-            yield from term.given_inputs()
+            yield from term.all_inputs()
 
     def parts(
-        self, count: int = 0, given: str = "inputs"
+        self, count: int = 0, input_name: str = "inputs"
     ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
         for term in self.terms:
-            yield from term.parts(count, given)
+            yield from term.parts(count, input_name)
 
 
 def _summands(data: AbstractObservations) -> tuple[AbstractObservations, ...]:
@@ -127,15 +127,15 @@ def inputs_or_parameters(inputs: Any, parameters: Any, K: Any = None) -> Any:
     """The caller's inputs or parameters; None without both.
 
     Raises:
-        TypeError: both are given, or K takes inputs and parameters are given, or the reverse.
+        TypeError: the caller gives both, or inputs where K takes parameters, or the reverse.
     """
     if inputs is not None and parameters is not None:
         raise TypeError(
-            "inputs and parameters were both given: a Controlled kernel takes inputs, which act "
-            "linearly, and a Family parameters, on which its members depend in any way. An input "
-            "of a family may be one of its parameters."
+            "inputs and parameters were both given, and one is needed: a Controlled kernel takes "
+            "inputs, which act linearly; a Family takes parameters, on which its members depend "
+            "in any way. For a family with inputs, pass the inputs as further parameters."
         )
-    name = K.given if K is not None and K.takes_inputs else None
+    name = K.input_name if K is not None and K.takes_inputs else None
     passed = "inputs" if inputs is not None else "parameters" if parameters is not None else name
     if name is not None and passed != name:
         raise TypeError(f"{type(K).__name__} takes {name}, and {passed} were given: {name}=….")
@@ -161,7 +161,7 @@ def inputs_at(
         if U.ndim == X.ndim == 2 and U.shape[1] == len(X):
             hint = f" They seem to be transposed: {letter}.T."
         elif U.ndim == 1:
-            hint = f" Where all have the same: np.tile({letter}, ({len(X)}, 1))."
+            hint = f" If all states have the same: np.tile({letter}, ({len(X)}, 1))."
         raise ValueError(
             f"{name} has shape {U.shape}; one row of {name} for each of the states is needed, "
             f"which have shape {X.shape}.{hint}"
@@ -170,16 +170,16 @@ def inputs_at(
 
 
 def joined_points(
-    data: Any, X: Float[Array, "*points n"], count: int, given: str
+    data: Any, X: Float[Array, "*points n"], count: int, input_name: str
 ) -> tuple[Float[Array, "*points d"], int | None]:
     """The points (x, u) and the dimension n of x; X and None for a kernel of states alone."""
     if not count:
         return X, None
     if data.inputs is None:
+        name = "Controlled" if input_name == "inputs" else "Family"
         raise ValueError(
-            f"the {given} of {type(data).__name__} are missing: a "
-            f"{'Controlled' if given == 'inputs' else 'Family'} kernel needs {given}=…, one row of "
-            "shape (m,) for each state."
+            f"the {input_name} of {type(data).__name__} are missing: a {name} kernel needs "
+            f"{input_name}=…, one row of shape (m,) for each state."
         )
     return jnp.concatenate([X, data.inputs], axis=-1), X.shape[-1]
 
@@ -192,14 +192,14 @@ class Velocities(AbstractObservations):
         Y: velocities, shape (N, n), in units of X per unit of time. NaN marks a component that was
             not measured; it adds no row.
         noise: relative standard deviations, positive: one number, one for each coordinate, shape
-            (n,), or one for each component, shape (N, n); 1 if None. The noise of unmeasured
-            components has no effect.
+            (n,), or one for each component, shape (N, n); 1 if None. A row of relative noise s has
+            the variance s² Nλ. The noise of unmeasured components has no effect.
         inputs: u at each state, shape (N, m), for a `Controlled` kernel.
         parameters: θ at each state, shape (N, p), for a `Family`.
 
     Raises:
         ValueError: shapes do not fit, no component was measured, X or a noise is not finite, or a
-            noise is not positive. TypeError: the data is complex or in half precision.
+            noise is not positive. TypeError: the data are complex or in half precision.
     """
 
     X: Float[Array, "N n"]
@@ -228,7 +228,7 @@ class Velocities(AbstractObservations):
         return self.X.shape[1]
 
     def parts(
-        self, count: int = 0, given: str = "inputs"
+        self, count: int = 0, input_name: str = "inputs"
     ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
         y, noise = self.Y.reshape(-1), self.noise
         if noise is not None:
@@ -236,28 +236,28 @@ class Velocities(AbstractObservations):
             noise = jnp.broadcast_to(noise, self.X.shape).reshape(-1)
         if self.kept is not None:
             y, noise = y[self.kept], None if noise is None else noise[self.kept]
-        points, outputs = joined_points(self, self.X, count, given)
+        points, outputs = joined_points(self, self.X, count, input_name)
         yield Components(points, self.kept, noise, outputs), y
 
 
 class Energies(AbstractObservations):
     """Values of the potential, Eᵢ = H(xᵢ) + c + noise, with one unknown constant c.
 
-    A fit estimates the constant together with the field (generalised least squares). The constant
-    is the same for all energies in a sum of observations, and uses up one row. With a `Controlled`
-    kernel H belongs to the drift, whatever the inputs are.
+    A fit estimates the constant together with the field (generalised least squares). All energies
+    in a sum of observations share the constant, which uses up one row. With a `Controlled` kernel H
+    is the energy of the drift.
 
     Args:
         X: states, shape (N, n).
         E: energies there, shape (N,): of H for `Symplectic`, of the potential for `CurlFree`.
-        noise: relative standard deviations, one number or shape (N,); 1 if None. A row has the
-            variance noise² Nλ in the squared units of E, which sets the weight of energies against
-            velocities.
+        noise: relative standard deviations, one number or shape (N,); 1 if None. An energy has the
+            variance noise² Nλ, in squared units of E, so `noise` sets the weight of energies
+            against velocities.
 
     Raises:
-        ValueError: shapes do not fit, a value is not finite, or a noise is not positive; from what
-            takes the data, there is one energy alone. AttributeError, from there: the structure
-            has no potential.
+        ValueError: shapes do not fit, a value is not finite, or a noise is not positive. `fit` and
+            the other functions of data raise ValueError for a single energy, and AttributeError if
+            the structure has no potential.
     """
 
     X: Float[Array, "N n"]
@@ -286,13 +286,13 @@ class Energies(AbstractObservations):
         return self.X.shape[1]
 
     def parts(
-        self, count: int = 0, given: str = "inputs"
+        self, count: int = 0, input_name: str = "inputs"
     ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
         noise = None if self.noise is None else jnp.broadcast_to(self.noise, self.E.shape)
-        if given == "parameters":
+        if input_name == "parameters":
             raise ValueError(
-                "hk.Energies have one unknown constant, and each member of a family has one of its "
-                "own: learn a family from velocities, equilibria and functionals."
+                "hk.Energies have one unknown constant, and each member of a family has another "
+                "constant: learn a family from velocities, equilibria and functionals."
             )
         if not count:
             yield Values(self.X, noise), self.E
@@ -336,28 +336,28 @@ class Equilibria(AbstractObservations):
         return self.X.shape[1]
 
     def parts(
-        self, count: int = 0, given: str = "inputs"
+        self, count: int = 0, input_name: str = "inputs"
     ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
-        points, outputs = joined_points(self, self.X, count, given)
+        points, outputs = joined_points(self, self.X, count, input_name)
         yield Components(points, outputs=outputs), jnp.zeros(self.X.size, self.X.dtype)
 
 
 class Functionals(AbstractObservations):
     """Σ_q weights[r, q] · f(points[r, q]) = targets[r] + noise: increments, integrals, averages.
 
-    An increment x(t₁) − x(t₀) in coordinate a is the integral of f_a along the path: Q nodes of a
-    quadrature rule in time, weights[r, q] = w_q e_a. A row of relative noise s is given as
-    weights/s and targets/s. Rows of fewer points than Q are padded with any finite points of
+    An increment x(t₁) − x(t₀) in coordinate a is the integral of f_a along the path: take the Q
+    nodes of a quadrature rule in time and weights[r, q] = w_q e_a. For a row of relative noise s
+    divide its weights and its target by s. Pad rows of fewer points with any finite points of
     weight zero.
 
-    Rows that share their points may say so, and then cost less: `points` (S, Q, n), `weights`
-    (S, R, Q, n) and `targets` (S, R) are R rows for each of S groups of points,
+    R rows that share their points cost less in one group: for S groups pass `points` (S, Q, n),
+    `weights` (S, R, Q, n) and `targets` (S, R),
     Σ_q weights[s, r, q] · f(points[s, q]) = targets[s, r].
 
     Args:
-        points: shape (R, Q, n): the Q points of each of R rows.
-        weights: shape (R, Q, n): a vector for each of them, which multiplies f there.
-        targets: shape (R,).
+        points: the Q points of each of R rows, shape (R, Q, n).
+        weights: the vector that multiplies f at each point, shape (R, Q, n).
+        targets: the measured values of the sums, shape (R,).
         inputs: u at each point, for a `Controlled` kernel, shape (R, Q, m) or (S, Q, m).
         parameters: θ at each point, for a `Family`, shape (R, Q, p) or (S, Q, p).
 
@@ -391,8 +391,8 @@ class Functionals(AbstractObservations):
             raise ValueError(
                 "points, weights and targets have shapes "
                 + f"{', '.join(str(array.shape) for array in arrays)}; they must be (R, Q, n), "
-                "(R, Q, n) and (R,): Q points and as many vectors for each of R rows. Pad shorter "
-                "rows with weights of zero."
+                "(R, Q, n) and (R,): Q points and Q vectors for each of R rows. Pad shorter rows "
+                "with weights of zero."
             )
         points, weights, targets = (
             require.finite(array, name)
@@ -403,7 +403,7 @@ class Functionals(AbstractObservations):
             weights,
             zero,
             lambda: (
-                "a row of weights that are all zero says nothing of the field: leave it out"
+                "a row with weights that are all zero contains no information: leave it out"
                 + (f", row {np.flatnonzero(zero)[0]}." if require.is_concrete(zero) else ".")
             ),
         )
@@ -415,9 +415,9 @@ class Functionals(AbstractObservations):
         return self.points.shape[2]
 
     def parts(
-        self, count: int = 0, given: str = "inputs"
+        self, count: int = 0, input_name: str = "inputs"
     ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
-        points, _ = joined_points(self, self.points, count, given)
+        points, _ = joined_points(self, self.points, count, input_name)
         rows = Combinations(groups=points, weights=self.weights)  # pyright: ignore[reportCallIssue]
         yield rows, self.targets
 
@@ -432,5 +432,5 @@ def _noise(noise: Any, shapes: list[tuple[int, ...]], needed: str, X: Array) -> 
             f"noise has shape {array.shape}; relative standard deviations of shape {needed} are "
             f"needed, here {' or '.join(map(str, shapes))}."
         )
-    cure = "It is a standard deviation; what was measured without noise has a small one, as 1e-3."
+    cure = "It is a standard deviation; for exact measurements take a small one, such as 1e-3."
     return require.positive(array, "noise", cure).astype(X.dtype)

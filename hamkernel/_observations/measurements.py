@@ -127,7 +127,7 @@ class Measurements:
         """The points of all blocks; (x, u) if there are inputs."""
         return jnp.concatenate([block.points for block in self.blocks])
 
-    def of(
+    def evaluate(
         self,
         field: Callable[[Float[Array, "P n"]], Float[Array, "P n"]],
         potential: Callable[[Float[Array, "E n"]], Float[Array, " E"]],
@@ -142,12 +142,12 @@ class Measurements:
         """The measurements of f − g, given the M rows of a known field g."""
         return dataclasses.replace(self, targets=self.targets - known_rows)
 
-    def measured(self) -> Float[Array, " M"]:
-        """The targets in the units of the data, energies minus their weighted mean."""
+    def measured_values(self) -> Float[Array, " M"]:
+        """The targets in the units of the data; energies minus their weighted mean."""
         return self.scale * self.contrast_transpose(self.y)
 
     def append(self, new: Measurements) -> Measurements:
-        """These measurements followed by new rows."""
+        """The measurements with new rows at the end."""
         blocks = merge(self.blocks + new.blocks)
         return Measurements(blocks, jnp.concatenate([self.targets, new.targets]))
 
@@ -191,9 +191,9 @@ class Measurements:
 
         The shape is (N, n) for completely measured velocities, else (M,).
         """
-        return self.in_units(self.contrast_transpose(contrasts))
+        return self.to_units(self.contrast_transpose(contrasts))
 
-    def in_units(self, values: Float[Array, " M"]) -> Float[Array, "..."]:
+    def to_units(self, values: Float[Array, " M"]) -> Float[Array, "..."]:
         """M rows in the units of the data; shape (N, n) for completely measured velocities."""
         block = self.blocks[0]
         is_complete = len(self.blocks) == 1 and isinstance(block, Components) and block.kept is None
@@ -222,9 +222,8 @@ class Measurements:
         rows = rows.at[np.delete(np.arange(len(rows)), where[0])].set(c)
         p, sizes = self._constant(rows)
         energies = rows[where][1:] / sizes[1:]
-        # The transpose has the entries Σ_i T_ij c_i = n_{j−1} c_j/n_j − p_j Σ_{i>j} p_i
-        # c_i/(n_{i−1} n_i) in the column j; the sums over i > j are accumulated from the last
-        # contrast backward.
+        # Σ_i T_ij c_i = n_{j−1} c_j/n_j − p_j Σ_{i>j} p_i c_i/(n_{i−1} n_i) for the column j. The
+        # sums over i > j are accumulated from the last contrast backward.
         after = jnp.cumsum((p[1:] / sizes[:-1] * energies)[::-1], axis=0)[::-1]
         none = jnp.zeros_like(after[:1])
         direct = jnp.concatenate([none, sizes[:-1] * energies])
@@ -242,7 +241,7 @@ class Measurements:
     ) -> tuple[Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]]:
         """The representer Lᵀc: points z and coefficients a of the field, s and b of the values.
 
-        Energies alone give one point of the field, with a = 0.
+        If all rows are energies, the field has one point, with a = 0.
         """
         return self.representer(self.contrast_transpose(c))
 
@@ -275,10 +274,10 @@ def measurements(
     Raises:
         TypeError, ValueError: as `fit` says.
     """
-    many = bool(shared_laws(K))  # parts in a state: a few states of many coordinates are enough
+    many = bool(shared_laws(K))  # a state has many parts, so few states are enough
     if inputs is None and not isinstance(X, AbstractObservations) and not K.takes_inputs:
         return K, measurements_of_states(*place(velocities_at(X, Y, part=many)))
-    return measurements_of(K, place(observations(X, Y, inputs, many, K.given)))
+    return measurements_of(K, place(observations(X, Y, inputs, many, K.input_name)))
 
 
 def observations(
@@ -292,13 +291,13 @@ def observations(
         return Velocities(*velocities_at(X, Y, inputs, part), **{name: inputs})
     if Y is not None:
         raise TypeError(
-            f"{type(X).__name__} is all of the data, and Y is not needed. Say the regularization "
-            "by name: hk.fit(K, data, regularization=1e-4)."
+            f"X is {type(X).__name__}, which contains all the data, and a third argument Y came: "
+            "leave Y out, and pass λ by name, hk.fit(K, data, regularization=1e-4)."
         )
     if inputs is not None:
         raise TypeError(
-            "observations hold their inputs themselves: hk.Velocities(X, Y, inputs=U), and "
-            "likewise hk.Equilibria and hk.Functionals."
+            "observations contain their inputs: pass them there, hk.Velocities(X, Y, inputs=U), "
+            "and likewise to hk.Equilibria and hk.Functionals."
         )
     return X
 
@@ -309,8 +308,8 @@ def velocities_at(
     """States and velocities, finite and of one shape and dtype."""
     if Y is None:
         raise TypeError(
-            "with states X the velocities Y are needed, of the same shape (N, n); or observations "
-            f"in the place of both, hk.Velocities(X, Y); got {type(X).__name__} and nothing."
+            f"X is {type(X).__name__} and Y is missing: give the velocities Y, of the same shape "
+            "(N, n) as X, or observations in place of both, hk.Velocities(X, Y)."
         )
     refuse_swapped(X, Y, inputs)
     return require.data(X, Y, part=part)
@@ -340,11 +339,11 @@ def measurements_of(
         previous: the rows to which `data` is added, if any.
 
     Raises:
-        ValueError: inputs are missing, or cannot be told from the drift; there is one energy.
-            TypeError: K takes no inputs.
+        ValueError: inputs are missing, or the data cannot distinguish their effect from the drift;
+            or there is a single energy. TypeError: K takes no inputs.
     """
     K = with_input_count(K, data, part=previous is not None)
-    blocks, targets = zip(*data.parts(inputs_of(K), K.given), strict=True)
+    blocks, targets = zip(*data.parts(inputs_of(K), K.input_name), strict=True)
     dtype = np.result_type(*[block.points.dtype for block in blocks])
     blocks = tuple(_cast(block, dtype) for block in blocks)
     divided = [
@@ -355,8 +354,7 @@ def measurements_of(
     before = 0 if previous is None else len(previous.energies)
     if before + len(rows.energies) == 1:
         raise ValueError(
-            "there is one energy, and energies are known up to a constant: two are needed to say "
-            "something."
+            "there is one energy, and energies are known up to a constant: give two or more."
         )
     return K, rows
 
@@ -367,7 +365,7 @@ def sampled_points(
     """The kernel with its number of inputs, and points (x, u) without measurements."""
     data = Equilibria(X, inputs)
     K = with_input_count(K, data)
-    (block, _), *_ = data.parts(inputs_of(K), K.given)
+    (block, _), *_ = data.parts(inputs_of(K), K.input_name)
     return K, block.points
 
 
@@ -384,24 +382,28 @@ def with_input_count(
     The inputs or parameters of complete data must vary. For a `part` of the data they may be
     constant.
     """
-    all_inputs = list(data.given_inputs())
+    all_inputs = list(data.all_inputs())
     if not isinstance(K, AbstractJoinedKernel):
         if all_inputs:
             raise TypeError(
-                f"{type(K).__name__} takes no inputs: say how they act, hk.Controlled(K, "
-                "inputs=hk.InputMatrix(k, acts_on=(1,))), and for the parameters of a family "
-                "hk.Family(K, k)."
+                f"{type(K).__name__} takes no inputs: use hk.Controlled(K, "
+                "inputs=hk.InputMatrix(k, acts_on=(1,))) for inputs, and hk.Family(K, k) for the "
+                "parameters of a family."
             )
         return K
     counts = {u.shape[-1] for u in all_inputs}
     if len(counts) > 1:
-        raise ValueError(f"the observations have {sorted(counts)} {K.given}: all need as many.")
+        raise ValueError(
+            f"the observations have {sorted(counts)} {K.input_name}: all need as many."
+        )
     if not counts:
-        list(data.parts(1, K.given))  # raises where they are needed
+        list(data.parts(1, K.input_name))  # raises where they are needed
         return K
     count = counts.pop()
     if K.count is not None and K.count != count:
-        raise ValueError(f"{K.given} has {count} columns and the kernel {K.count} {K.given}.")
+        raise ValueError(
+            f"{K.input_name} has {count} columns and the kernel {K.count} {K.input_name}."
+        )
     K = K.with_count(count)
     K.check_dimension(data.dimension + count)
     if not part and require.is_concrete(all_inputs):

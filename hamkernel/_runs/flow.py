@@ -131,7 +131,7 @@ def _count_steps(spans: Float[np.ndarray, "S L"], stiffness: float) -> Float[np.
 
 
 @compiled_by_size
-def simulated(
+def integrate(
     field: Any,
     starts: Float[Array, "S n"],
     spans: Float[Array, "S L"],

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float
 from hamkernel._machine import compiled_by_size
 from hamkernel._runs.flow import NODES, with_tangent
 from hamkernel._runs.runs import Between, Runs, inputs_at_nodes, inputs_at_samples
-from hamkernel._runs.smoothing import Coordinate, interpolated, processes, smoothed
+from hamkernel._runs.smoothing import Coordinate, interpolate, processes, smooth_runs
 
 # Rows times columns² of a solve: 1e10 take 1 to 2 s. If the residuals ask for more landmarks, a
 # solve may take 5e10, up to 10 s (`tests/benchmarks/capacity.py`):
@@ -92,7 +92,7 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
 
     If there are inputs, `mean` is a function of the points (x, u).
     """
-    times, states = runs.on_host()
+    times, states = runs.host_arrays()
     times, states = [t - t[0] for t in times], [_thin_rests(x) for x in states]
     fitted_processes, usable = _robust_processes(times, states)
     counts = [np.isfinite(x).astype(float) for x in states]
@@ -103,7 +103,7 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
     # pendulum of period 2.6 are left as they are.
     block = 0.1 * min(lengths, default=np.inf)
     if any(2 * np.median(np.diff(t)) < block for t in times):
-        paths = smoothed(fitted_processes, times, states)
+        paths = smooth_runs(fitted_processes, times, states)
         shortest = _shortest_block(sum(t[-1] for t in times), runs.dimension, runs.input_count)
         averaged = 0.5 * averaging_time(fitted_processes, times, paths.deviation)
         block = min(block, max(averaged, shortest))
@@ -115,11 +115,13 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
     shortest = min(lengths, default=np.inf)
     refined = [_refine(*run, shortest) for run in zip(times, states, counts, scatter, strict=True)]
     times, states, counts, scatter = (list(column) for column in zip(*refined, strict=True))
-    inputs = [runs.applied(r, t + float(np.asarray(runs.times[r])[0])) for r, t in enumerate(times)]
+    inputs = [
+        runs.input_lines(r, t + float(np.asarray(runs.times[r])[0])) for r, t in enumerate(times)
+    ]
     path_runs = _add_paths(fitted_processes, times, states, counts, scatter, inputs)
-    if not all(c.seen for c in fitted_processes) or mean is not None:
+    if not all(c.measured for c in fitted_processes) or mean is not None:
         path_runs = [_complete(run, mean) for run in path_runs]
-    noise = np.array([c.noise if c.seen else np.nan for c in fitted_processes])
+    noise = np.array([c.noise if c.measured else np.nan for c in fitted_processes])
     good = [run.path for run, use in zip(path_runs, usable, strict=True) if use]
     scale = np.concatenate(good).std(axis=0)
     return Preprocessed(path_runs, noise, np.where(scale > 0, scale, 1.0), usable)
@@ -168,7 +170,7 @@ def averaging_time(
     counts = [
         (c.noise / max(float(np.median(there[:, i])), np.finfo(float).tiny)) ** 2
         for i, c in enumerate(coordinates)
-        if c.seen
+        if c.measured
     ]
     return float(spacing * min(counts, default=np.inf))
 
@@ -186,7 +188,9 @@ def with_inputs(data: Preprocessed, runs: Runs) -> Preprocessed:
     """The same runs with the inputs of `runs`, whose `between` or `delay` may differ."""
     return data._replace(
         runs=[
-            run._replace(inputs=runs.applied(r, run.times + float(np.asarray(runs.times[r])[0])))
+            run._replace(
+                inputs=runs.input_lines(r, run.times + float(np.asarray(runs.times[r])[0]))
+            )
             for r, run in enumerate(data.runs)
         ]
     )
@@ -258,7 +262,7 @@ def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:
     coordinates = processes(times, states)
     if len(times) < 3:
         return coordinates, np.ones(len(times), bool)
-    paths = smoothed(coordinates, times, states)
+    paths = smooth_runs(coordinates, times, states)
     every = np.concatenate(states)
     measured = np.isfinite(every).any(axis=0)
     spread = np.where(measured, np.nanstd(np.where(measured, every, 0.0), axis=0), 1.0)
@@ -290,7 +294,7 @@ def condense(t, x, path, slope, block: float):
     sizes = np.diff([*edges, len(t)])
     middle = np.add.reduceat(t, edges) / sizes
     means = np.add.reduceat(residual, edges, axis=0) / np.maximum(counts, 1)
-    there = interpolated(middle, t, path, slope)
+    there = interpolate(middle, t, path, slope)
     about = np.where(measured, residual - np.repeat(means, sizes, axis=0), 0.0)
     scatter = np.add.reduceat(about**2, edges, axis=0)
     return middle, np.where(counts > 0, there + means, np.nan), counts, scatter
@@ -334,7 +338,7 @@ def _add_paths(coordinates, times, states, counts, scatter, inputs) -> list[Prep
         wide[::4] = x
         grids.append(grid)
         filled.append(wide)
-    paths = smoothed(coordinates, grids, filled)
+    paths = smooth_runs(coordinates, grids, filled)
     out = []
     columns = zip(times, states, counts, scatter, inputs, strict=True)
     for r, (t, x, count, about, ends) in enumerate(columns):

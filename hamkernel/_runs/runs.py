@@ -36,7 +36,7 @@ from hamkernel._runs.sensors import Log, faults, impossible_samples
 from hamkernel._runs.smoothing import (
     Smoothing,
     processes,
-    smoothed,
+    smooth_runs,
     smoothing,
 )
 from hamkernel._runs.table import Diagnostics
@@ -259,9 +259,9 @@ class Runs(eqx.Module):
         value, its limit, its meaning and advice; `.failing` names the rows that fall short. `Runs`
         has warned of these.
         """
-        times, states = self.on_host()
+        times, states = self.host_arrays()
         inputs = [np.asarray(u, float) for u in self.inputs or ()]
-        lines = [self.applied(r, t) for r, t in enumerate(times)] if inputs else []
+        lines = [self.input_lines(r, t) for r, t in enumerate(times)] if inputs else []
         return faults(
             Log(
                 times,
@@ -276,7 +276,7 @@ class Runs(eqx.Module):
     @property
     def impossible(self) -> tuple[Int[np.ndarray, " k"], ...]:
         """The samples of each run that are no measurements, such as −9999 or a row of zeros."""
-        return tuple(np.flatnonzero(impossible_samples(x)) for x in self.on_host()[1])
+        return tuple(np.flatnonzero(impossible_samples(x)) for x in self.host_arrays()[1])
 
     @property
     def dimension(self) -> int:
@@ -298,9 +298,9 @@ class Runs(eqx.Module):
         Raises:
             ValueError: a coordinate was never measured.
         """
-        times, states = self.on_host()
+        times, states = self.host_arrays()
         self._check_measured()
-        paths = smoothed(processes(times, states), times, states)
+        paths = smooth_runs(processes(times, states), times, states)
         lengths = [len(t) for t in times]
         X, Y = (
             jnp.asarray(np.concatenate([a[r, :T] for r, T in enumerate(lengths)]))
@@ -322,9 +322,9 @@ class Runs(eqx.Module):
         between = operator.index(between)
         if between < 0:
             raise ValueError(f"between must be 0 or more, got {between}.")
-        return smoothing(*self.on_host(), between)
+        return smoothing(*self.host_arrays(), between)
 
-    def on_host(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    def host_arrays(self) -> tuple[list[np.ndarray], list[np.ndarray]]:
         """Times and states as NumPy arrays of doubles."""
         return [np.asarray(t, float) for t in self.times], [
             np.asarray(x, float) for x in self.states
@@ -346,7 +346,7 @@ class Runs(eqx.Module):
         """Whether `between` and `delay` are both given rather than left to `learn`."""
         return self.inputs is None or (self.between != "auto" and self.delay != "fit")
 
-    def applied(self, run: int, at: Float[np.ndarray, " R"]) -> Float[np.ndarray, "R-1 2 m"]:
+    def input_lines(self, run: int, at: Float[np.ndarray, " R"]) -> Float[np.ndarray, "R-1 2 m"]:
         """The line that fits the inputs best in each interval of the times `at`, by its two ends.
 
         The parameters of a run are its inputs at all times. Inputs with between="auto" are taken

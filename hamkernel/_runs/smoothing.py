@@ -1,6 +1,6 @@
 """Every coordinate of the runs as a Gaussian process in time, with its own hyperparameters.
 
-A Gaussian process in time with the Matérn-7/2 kernel, by Kalman filtering: linear in time.
+The kernel is Matérn-7/2, and a Kalman filter makes the cost linear in the number of samples.
 
 With u = λ t and λ = √7/ℓ the process and its first three derivatives in u obey a linear equation
 driven by white noise, (d/du + 1)⁴ x = w. Between two samples
@@ -9,9 +9,9 @@ driven by white noise, (d/du + 1)⁴ x = w. Between two samples
 
 N the companion matrix plus the identity, which is nilpotent: both are exact for any spacing.
 
-The smoother is that of Bryson & Frazier, backward in the adjoint (l, L): x = m − P l and
-Cov = P − P L P. It inverts no predicted covariance, which is singular to rounding where samples
-are close, and it takes padding, no time and no measurement, without a special case.
+We smooth by Bryson & Frazier's recursion, backward in the adjoint (l, L): x = m − P l and
+Cov = P − P L P. The recursion inverts no predicted covariance, which is singular to rounding if
+samples are close, and needs no special case for padding, zero time steps or missing measurements.
 
 Source: Hartikainen & Särkkä (2010), "Kalman filtering and smoothing solutions to temporal Gaussian
 process regression models"; Bierman (1973) for the smoother.
@@ -32,18 +32,18 @@ from hamkernel._tuning.minimiser import best_in_box, inside_box
 
 
 class Padded(NamedTuple):
-    """Runs side by side. After the end of a run its last time is repeated, with nothing measured.
+    """Runs padded to one length: the last time is repeated, with nothing measured.
 
     Attributes:
-        times: since the first sample of the run, shape (R, T).
-        states: zero where nothing was measured, shape (R, T, n).
-        seen: what was measured.
-        lengths: how many samples each run has; 0 for a run that is padding.
+        times: the times since the first sample of each run, shape (R, T).
+        states: the samples; zero where nothing was measured, shape (R, T, n).
+        measured: whether each entry of a state was measured, shape (R, T, n).
+        lengths: the number of samples of each run; 0 for a run that is padding.
     """
 
     times: Float[np.ndarray, "R T"]
     states: Float[np.ndarray, "R T n"]
-    seen: Bool[np.ndarray, "R T n"]
+    measured: Bool[np.ndarray, "R T n"]
     lengths: Int[np.ndarray, " R"]
 
 
@@ -63,18 +63,18 @@ def pad(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> Padded:
         out.times[r, : len(t)] = t - t[0]
         there = np.isfinite(x)
         out.states[r, : len(t)] = np.where(there, x, 0.0)
-        out.seen[r, : len(t)] = there
+        out.measured[r, : len(t)] = there
         out.lengths[r] = len(t)
     return out
 
 
 def cut(
-    times: Sequence[np.ndarray], states: Sequence[np.ndarray], most: int
+    times: Sequence[np.ndarray], states: Sequence[np.ndarray], limit: int
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
-    """The runs in pieces of at most `most` samples, of nearly equal lengths."""
+    """The runs in pieces of at most `limit` samples, of nearly equal lengths."""
     pieces_t, pieces_x = [], []
     for t, x in zip(times, states, strict=True):
-        count = -(-len(t) // most)
+        count = -(-len(t) // limit)
         pieces_t += np.array_split(t, count)
         pieces_x += np.array_split(x, count)
     return pieces_t, pieces_x
@@ -89,7 +89,7 @@ _powers = np.stack([np.linalg.matrix_power(_nilpotent, j) / f for j, f in enumer
 
 
 class Process(NamedTuple):
-    """Hyperparameters: standard deviation of the signal, rate λ per time, that of the noise."""
+    """The logs of the standard deviation of the signal, of the rate λ, and of the noise."""
 
     log_amplitude: Float[Array, ""]
     log_rate: Float[Array, ""]
@@ -103,7 +103,7 @@ class Smoothed(NamedTuple):
         value: x(t), shape (T,).
         slope: ẋ(t).
         deviation: the standard deviation of x(t).
-        slope_deviation: that of ẋ(t).
+        slope_deviation: the standard deviation of ẋ(t).
     """
 
     value: Float[Array, " T"]
@@ -123,11 +123,11 @@ def _stationary(process: Process) -> Float[Array, "4 4"]:
 
 
 def _filter(process: Process, steps, y, measured, slopes: Any = None):
-    """The forward pass: what the backward pass needs at each time, and the log likelihood.
+    """The forward pass: arrays for the backward pass at each time, and the log likelihood.
 
-    `steps` are the times since the sample before, and 0 for the first. `slopes` are samples of the
-    derivative, which of them were measured, and the logarithm of their noise; the backward pass
-    knows of none.
+    `steps` are the times since the sample before, 0 for the first. `slopes` are samples of the
+    derivative, a mask of the measured ones, and the logarithm of their noise. The backward pass
+    does not use `slopes`.
     """
     stationary = _stationary(process)
     rate, one = jnp.exp(process.log_rate), jnp.ones_like(process.log_rate)
@@ -166,7 +166,7 @@ def negative_log_likelihood(
     measured: Bool[Array, "R T"],
     slopes: Any = None,
 ) -> Float[Array, ""]:
-    """−log p(y) of several independent runs; `steps` as in `smooth`, `slopes` as in `_filtered`."""
+    """−log p(y) of several independent runs; `steps` as in `smooth`, `slopes` as in `_filter`."""
 
     def one(dt, value, there, *slope):
         rates = (*slope, slopes[2]) if slope else None
@@ -214,12 +214,12 @@ def smooth(
 class Coordinate(NamedTuple):
     """A process of one coordinate in the units of the states.
 
-    `seen` is False where the coordinate was never measured; the rest is NaN then. `slope_noise` is
-    that of samples of its derivative, NaN without any.
+    `measured` is False if the coordinate was never measured. `slope_noise` is the noise of samples
+    of its derivative, NaN if there are none.
     """
 
     process: Process
-    seen: bool
+    measured: bool
     slope_noise: float = np.nan
 
     @property
@@ -228,12 +228,12 @@ class Coordinate(NamedTuple):
 
     @property
     def lengthscale(self) -> float:
-        """ℓ in units of time, that of a Matérn kernel."""
+        """The lengthscale ℓ of the Matérn kernel, in units of time."""
         return float(np.sqrt(7.0) * np.exp(-float(self.process.log_rate)))
 
 
-def without_means(states: Sequence[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
-    """The states less the mean of each run, and those means, shape (R, n)."""
+def subtract_means(states: Sequence[np.ndarray]) -> tuple[list[np.ndarray], np.ndarray]:
+    """The states minus the mean of each run, and the means, shape (R, n)."""
     means = np.array([_mean(x) for x in states])
     return [x - mean[None] for x, mean in zip(states, means, strict=True)], means
 
@@ -252,14 +252,14 @@ def processes(
 ) -> list[Coordinate]:
     """The hyperparameters of each coordinate, by the marginal likelihood of all runs.
 
-    Coordinates of one of the `groups`, as indices, have one process; if None, each has its own.
-    `slopes` are samples of their derivatives.
+    Coordinates of one of the `groups`, as indices, share one process; if None, each coordinate has
+    its own. `slopes` are samples of the derivatives.
     """
-    states, n = without_means(states)[0], states[0].shape[1]
+    states, n = subtract_means(states)[0], states[0].shape[1]
     slopes = [np.full(x.shape, np.nan) for x in states] if slopes is None else slopes
     both = [np.concatenate(pair, axis=1) for pair in zip(states, slopes, strict=True)]
-    # Pieces are filtered side by side, and of many some are taken: 100 000 samples then cost as
-    # much as 16 000.
+    # Pieces of 256 samples are filtered in parallel, at most 64 of them: 100 000 samples then cost
+    # as much as 16 000.
     pieces_t, pieces_x = cut(times, both, 256)
     if len(pieces_t) > 64:
         chosen = np.linspace(0, len(pieces_t) - 1, 64).round().astype(int)
@@ -270,15 +270,17 @@ def processes(
     spacing = np.median(np.concatenate([np.diff(t) for t in pieces_t if len(t) > 1]))
     out: list[Any] = [None] * n
     for g in map(np.atleast_1d, range(n) if groups is None else groups):
-        arrays: list[Any] = [a[:, :, c] for c in (g, n + g) for a in (pieces.states, pieces.seen)]
+        arrays: list[Any] = [
+            a[:, :, c] for c in (g, n + g) for a in (pieces.states, pieces.measured)
+        ]
         arrays = [a.swapaxes(1, 2).reshape(-1, a.shape[1]) for a in arrays]
-        # As many as 64 pieces of eight coordinates say enough of a few numbers.
+        # At most 512 rows, 64 pieces of eight coordinates, are enough for a few numbers.
         part = np.unique(np.linspace(0, len(arrays[0]) - 1, 512).round().astype(int))
         arrays = [a[part] for a in (np.repeat(steps, len(g), 0), *arrays)]
         dt, x, measured, v, measured_slope = arrays
         coordinate = _process(dt, x, measured, v, measured_slope, longest, spacing)
         for c in g:
-            out[c] = coordinate._replace(seen=bool(pieces.seen[:, :, c].any()))
+            out[c] = coordinate._replace(measured=bool(pieces.measured[:, :, c].any()))
     return out
 
 
@@ -296,7 +298,7 @@ def _process(steps, y, measured, v, measured_slope, longest: float, spacing: flo
         low, high = [*low, 1e-7 * speed], [*high, 2.0 * speed]
         slopes = v / scale, measured_slope
     data = jax.device_put((steps, y / scale, measured, slopes))
-    log_amplitude, log_rate, *log_noise = np.asarray(_found(*data, np.log(low), np.log(high)))
+    log_amplitude, log_rate, *log_noise = np.asarray(_fit_process(*data, np.log(low), np.log(high)))
     shift = np.log(scale)
     logs = log_amplitude + shift, log_rate, log_noise[0] + shift
     slope_noise = float(np.exp(log_noise[1] + shift)) if slopes else np.nan
@@ -304,8 +306,8 @@ def _process(steps, y, measured, v, measured_slope, longest: float, spacing: flo
 
 
 @compiled_by_size
-def _found(steps, y, measured, slopes, low, high) -> Float[Array, " h"]:
-    """(log amplitude, log rate, log noise, and that of slopes) by BFGS from the best of a grid."""
+def _fit_process(steps, y, measured, slopes, low, high) -> Float[Array, " h"]:
+    """The logs of amplitude, rate, noise and noise of slopes, by BFGS from the best of a grid."""
     low, high = jnp.asarray(low, y.dtype), jnp.asarray(high, y.dtype)
 
     def loss(h):
@@ -314,7 +316,7 @@ def _found(steps, y, measured, slopes, low, high) -> Float[Array, " h"]:
 
     rates = np.linspace(0.1, 0.95, 12)
     noises = np.log([1e-5, 1e-3, 1e-2, 0.1, 0.5])
-    rate, noise = (each.ravel() for each in np.meshgrid(rates, noises))
+    rate, noise = (grid.ravel() for grid in np.meshgrid(rates, noises))
     columns = [
         jnp.full(rate.shape, np.log(1.5), y.dtype),
         low[1] + (high[1] - low[1]) * jnp.asarray(rate, y.dtype),
@@ -322,7 +324,7 @@ def _found(steps, y, measured, slopes, low, high) -> Float[Array, " h"]:
     ]
     count = jnp.maximum(measured.sum(), 1).astype(y.dtype)
     sizes = [jnp.full_like(count, 0.2), jnp.full_like(count, 0.1), 1 / jnp.sqrt(2 * count)]
-    if slopes is not None:  # as large a share of them
+    if slopes is not None:  # the same share of the slopes
         columns, sizes = [*columns, columns[2] + high[3] - high[2]], [*sizes, sizes[2]]
     design, sizes = jnp.stack(columns, axis=1), jnp.stack(sizes)
     run = best_in_box(loss, design, low, high, sizes, 40, batch_size=12)
@@ -344,24 +346,27 @@ class Paths(NamedTuple):
 
 
 @double_precision
-def smoothed(
-    found: list[Coordinate], times: Sequence[np.ndarray], states: Sequence[np.ndarray]
+def smooth_runs(
+    coordinates: list[Coordinate], times: Sequence[np.ndarray], states: Sequence[np.ndarray]
 ) -> Paths:
-    """All runs at all their times, padded; times without a measurement too.
+    """The smoothed paths of all runs at all their times, padded; also where nothing was measured.
 
-    A coordinate that was never measured is NaN; one that is constant stays so.
+    A coordinate that was never measured is NaN; a constant coordinate stays constant.
     """
-    states, means = without_means(states)
+    states, means = subtract_means(states)
     runs = pad(times, states)
     steps = np.diff(runs.times, axis=1, prepend=0.0)
     paths = Paths(*(np.zeros(runs.states.shape) for _ in Paths._fields))
-    for c, coordinate in enumerate(found):
+    for c, coordinate in enumerate(coordinates):
         if not np.isfinite(coordinate.process.log_amplitude):
             for path in paths:
-                path[:, :, c] = 0.0 if coordinate.seen else np.nan
+                path[:, :, c] = 0.0 if coordinate.measured else np.nan
         else:
             one = _smooth_each(
-                coordinate.process, steps, runs.states[:, :, c], jax.device_put(runs.seen[:, :, c])
+                coordinate.process,
+                steps,
+                runs.states[:, :, c],
+                jax.device_put(runs.measured[:, :, c]),
             )
             for path, values in zip(paths, one, strict=True):
                 path[:, :, c] = np.asarray(values)
@@ -370,7 +375,7 @@ def smoothed(
 
 
 class Smoothing(eqx.Module):
-    """Runs smoothed one coordinate at a time, to be looked at; no field is involved.
+    """Runs smoothed one coordinate at a time, without a field, for inspection.
 
     Attributes:
         times: the times of each run, shape (P,): its samples, and times between them.
@@ -390,7 +395,7 @@ class Smoothing(eqx.Module):
 
 def smoothing(times: Sequence[np.ndarray], states: Sequence[np.ndarray], between: int) -> Smoothing:
     """The smoothed runs at their samples and at `between` times between each two."""
-    found = processes(times, states)
+    coordinates = processes(times, states)
     grids, wide = [], []
     for t, x in zip(times, states, strict=True):
         shares = np.arange(between + 1) / (between + 1)
@@ -399,16 +404,16 @@ def smoothing(times: Sequence[np.ndarray], states: Sequence[np.ndarray], between
         spread = np.full((len(grids[-1]), x.shape[1]), np.nan)
         spread[:: between + 1] = x
         wide.append(spread)
-    paths = smoothed(found, grids, wide)
+    paths = smooth_runs(coordinates, grids, wide)
     values, deviations = (
         tuple(jnp.asarray(a[r, : len(t)]) for r, t in enumerate(grids))
         for a in (paths.value, paths.deviation)
     )
-    noise = jnp.asarray([c.noise if c.seen else np.nan for c in found])
+    noise = jnp.asarray([c.noise if c.measured else np.nan for c in coordinates])
     return Smoothing(tuple(jnp.asarray(t) for t in grids), values, deviations, noise)
 
 
-def interpolated(
+def interpolate(
     times: np.ndarray, at: np.ndarray, x: np.ndarray, slopes: np.ndarray
 ) -> Float[np.ndarray, "T n"]:
     """Hermite's cubic through the states x at the times `at`, with their velocities `slopes`."""

@@ -25,7 +25,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hamkernel._runs.preprocessing import condense
 from hamkernel._runs.runs import Runs
-from hamkernel._runs.smoothing import Coordinate, Process, power_of_two, processes, smoothed
+from hamkernel._runs.smoothing import Coordinate, Process, power_of_two, processes, smooth_runs
 
 # In a window. By the trapezoidal rule ∫ (φ b − φ̇ a) dt of a sinusoid with b = ȧ and 2.2 rad in a
 # window is then wrong by 2e-6 of its size, and with (1 − s²)³ by 7e-5.
@@ -124,7 +124,7 @@ def smoothed_pieces(runs: Runs, channels: Channels) -> Smoothed:
     Raises:
         ValueError: no run has 13 samples, or a channel does not move.
     """
-    times, C = runs.on_host()[0], channels.values[0].shape[1]
+    times, C = runs.host_arrays()[0], channels.values[0].shape[1]
     if max(map(len, times)) < _FEWEST:
         raise ValueError(
             f"no run has the {_FEWEST} samples that weak rows need: log more of them, or pass "
@@ -218,7 +218,7 @@ def _samples(times: list[np.ndarray], channels: Channels) -> _Samples:
     counts = [np.isfinite(x).astype(float) for x in both]
     C, block = len(coordinates), length / _SAMPLES
     if any(2 * np.median(np.diff(t)) < block for t in times):
-        paths = smoothed(coordinates, times, channels.values)
+        paths = smooth_runs(coordinates, times, channels.values)
         means = []
         for r, (t, x) in enumerate(zip(times, both, strict=True)):
             z = np.concatenate([paths.value[r, : len(t)], paths.slope[r, : len(t)]], axis=1)
@@ -237,7 +237,7 @@ def _processes(times, channels: Channels) -> tuple[list[Coordinate], Float[np.nd
     coordinates = processes(times, channels.values, channels.groups, channels.slopes)
     for c, coordinate in enumerate(coordinates):
         if not np.isfinite(coordinate.process.log_amplitude):
-            said = "does not move" if coordinate.seen else "is missing"
+            said = "does not move" if coordinate.measured else "is missing"
             raise ValueError(f"position {c} {said}.")
     noise = np.array([[c.noise for c in coordinates], [c.slope_noise for c in coordinates]])
     if channels.noise is not None:
@@ -257,7 +257,7 @@ def _bump(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _integrals(runs, r: int, at, centres, half_width: float, m: int) -> Float[np.ndarray, "W m"]:
     """∫ φ u dt of the inputs u of run r, exactly for inputs that are lines between nodes."""
-    lines = runs.applied(r, at)
+    lines = runs.input_lines(r, at)
     if lines.shape[2] == 0:
         return np.zeros((len(centres), m))
     x, weights = np.polynomial.legendre.leggauss(4)

@@ -49,22 +49,22 @@ class _Solution(NamedTuple):
 
 
 class ConjugateGradient(AbstractSolver[KernelField]):
-    """The exact fit without the Gram: preconditioned conjugate gradients on its products.
+    """The solver of the exact fit by preconditioned conjugate gradients, without a stored Gram.
 
     Use this solver if the dense Gram does not fit in memory and `Nystrom` alone is not exact
-    enough. Each iteration costs one product with the Gram, O(N² n). `field.info` has the number of
-    `iterations` and the `relative_residual`, computed anew at the end.
+    enough. Each iteration takes one product with the Gram, O(N² n) time. `field.info` has the
+    number of `iterations` and the `relative_residual`, which is computed at the end.
 
     Args:
         tolerance: the largest ‖y − (G + NλI)a‖/‖y‖, dimensionless; 1e-8 if None, and 1e-5 for data
             in float32.
-        max_iterations: the largest number of iterations; the solve fails beyond it.
-        preconditioner: the `Nystrom` solver whose low-rank Gram preconditions. Its tolerance may be
-            large, since the condition number is at most 1 + truncation; more landmarks mean fewer
-            iterations.
+        max_iterations: the largest number of iterations, after which the solve fails.
+        preconditioner: the `Nystrom` solver whose low-rank Gram is the preconditioner. The
+            condition number is at most 1 + truncation, so its tolerance may be large; more
+            landmarks mean fewer iterations.
 
     Raises:
-        ValueError: an argument is not positive. TypeError: `max_iterations` is not whole, or the
+        ValueError: an argument is not positive. TypeError: `max_iterations` is no integer, or the
             preconditioner no `Nystrom`. RuntimeError, from `fit`: no convergence (the text says
             what to do).
 
@@ -140,8 +140,8 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                     f"{float(truncation):.1e})"
                 )
                 rounding = float(gram_rounding(trace(K, X, row_sharding(X))))
-                # On 87 points of an orbit the iterations converged with a ridge of 3e4 times the
-                # rounding and not with 3e2, where Cholesky left a residual of 4e-12.
+                # On 87 points of an orbit the iterations converged for a ridge of 3e4 times the
+                # rounding, not for 3e2, where Cholesky left a residual of 4e-12.
                 if ridge < 1e4 * rounding:
                     return (
                         f"conjugate gradients did not converge{reached}: the ridge N λ = "
@@ -177,8 +177,8 @@ class ConjugateGradient(AbstractSolver[KernelField]):
 class AbstractProducts(eqx.Module):
     """Products with the Gram and with the inverse of the low-rank Gram that preconditions.
 
-    The preconditioner changes the number of iterations and not the solution, so it is not
-    differentiated.
+    The preconditioner changes the number of iterations, not the solution, so we do not
+    differentiate the preconditioner.
     """
 
     @abc.abstractmethod

@@ -63,7 +63,7 @@ class DenseConditional(AbstractConditional):
         """R⁻ᵀ c."""
         return self.factor.whiten(rows_between(self.field.kernel, self.rows, block))
 
-    def updated(self, new: Measurements) -> "DenseConditional":
+    def update(self, new: Measurements) -> "DenseConditional":
         factor, c, field = _extend(self, new)
         rows = self.rows.append(new)
         return DenseConditional(
@@ -157,9 +157,8 @@ def _field_and_residual(K, rows: Measurements, regularization, c):
 def norm_of(square: Float[Array, ""], error: Float[Array, ""]) -> Float[Array, ""]:
     """The norm √(cᵀGc) of the field; NaN if rounding may be a tenth of cᵀGc or more.
 
-    If the field is small compared to the velocities, cᵀGc is a small difference of large numbers.
-
-    With Ac = y − r, cᵀGc = cᵀ(y − σ²c) − cᵀr, so the residual r changes the form by cᵀr.
+    cᵀGc may be a small difference of large numbers. With the residual r = y − Ac,
+    cᵀGc = cᵀ(y − σ²c) − cᵀr, so the residual changes the form by cᵀr.
 
     Args:
         square: cᵀGc, as computed.
@@ -243,7 +242,7 @@ def gram_product(
     zero = jnp.zeros((), c.dtype)
     field = field_of_rows(K, rows, c, c, zero, zero, SolverInfo("none"))
     potential = jax.tree_util.Partial(map_states, field._learned_potential)
-    return rows.contrast(rows.of(field._velocities, potential))
+    return rows.contrast(rows.evaluate(field._velocities, potential))
 
 
 def _refuse_failure(
@@ -283,10 +282,10 @@ def _refuse_failure(
 
 
 class Cholesky(AbstractSolver[KernelField]):
-    """The dense Gram and its Cholesky factor: exact, O((N n)³) time and O((N n)²) memory.
+    """The solver by a Cholesky factor of the dense Gram: exact, O((N n)³) time, O((N n)²) memory.
 
-    `field.info.relative_residual` is the relative residual ‖y − (G + NλI)a‖/‖y‖ that rounding
-    leaves. A fit with a relative residual above one per cent is refused.
+    `field.info.relative_residual` is ‖y − (G + NλI)a‖/‖y‖, which is not zero because of rounding. A
+    fit with a relative residual above one per cent raises a RuntimeError.
 
     Raises:
         ValueError, from `fit`: the matrices do not fit in memory. RuntimeError, from `fit`: the

@@ -129,29 +129,29 @@ def fit(
     """Learn the field f in the RKHS of K that minimises (1/N) Σᵢ‖f(xᵢ) − yᵢ‖² + λ‖f‖².
 
     By the representer theorem f(x) = Σⱼ K(x, xⱼ) aⱼ with (G + NλI) a = y. Nothing else is added
-    to the diagonal. Read as a Gaussian process, Nλ is the variance of the noise on Y.
+    to the diagonal. For the Gaussian process f ~ GP(0, K), Nλ is the variance of the noise on Y.
 
     Args:
         K: a matrix-valued kernel, for example `Odd(Symplectic(Gaussian(3.0)))`.
         X: states, shape (N, n); or observations of any kind, without Y:
-            `hk.fit(K, hk.Velocities(X, Y) + hk.Energies(Z, E), regularization=1e-4)`. With X and Y
-            they are `hk.Velocities(X, Y)`.
+            `hk.fit(K, hk.Velocities(X, Y) + hk.Energies(Z, E), regularization=1e-4)`. X and Y mean
+            `hk.Velocities(X, Y)`.
         Y: measured velocities, shape (N, n), in units of X per unit of time.
         regularization: λ > 0, in squared units of Y over those of the kernel. With other
             observations Nλ is the variance of a row of relative noise 1, and N counts points of
             velocities and equilibria, energies and functionals.
         solver: if None, `Cholesky()` as long as its matrices take at most half of the memory, and
             `ConjugateGradient()` otherwise. (There are four matrices of (N n)² numbers, or two for
-            velocities from 6000 rows on.) Both solvers are exact; `field.info.solver` names the one
-            used. `Nystrom()` is faster, and approximate to a stated tolerance. If the rows of X are
-            sharded over a mesh of devices, None means `ConjugateGradient()`, and the rows stay
-            there; only `Cholesky()` gathers them on one device.
-        mean: the known part of the field, x (n,) -> (n,): a learned field, one of `hk.systems`, any
-            function of one state. The kernel learns the rest, and the field is the sum; it has a
-            Hamiltonian if both parts have one.
+            velocities from 6000 rows on.) Both solvers are exact; `field.info.solver` names the
+            solver used. `Nystrom()` is faster, and approximate to a stated tolerance. If the rows
+            of X are sharded over devices, None means `ConjugateGradient()`, which keeps the rows
+            sharded; `Cholesky()` gathers the rows on one device.
+        mean: the known part of the field, x (n,) -> (n,): a learned field, one of `hk.systems`, or
+            any function of one state. The kernel learns the difference, and the result is the sum,
+            which has a Hamiltonian if both parts have one.
         throw: whether a failed solve raises. If False, the numbers of the field and `field.norm`
-            are NaN. Use this under `jax.vmap` over many hyperparameters, where one failure would
-            end all of them, and in your own objectives of `tune`, which avoids NaN.
+            are NaN. Pass False under `jax.vmap` over many hyperparameters, where one failure would
+            end all fits, and in your own objectives of `tune`, which avoids NaN.
         inputs: for a `Controlled` kernel, u at each state, shape (N, m). The result is a
             `ControlledField`, field(x, u).
         parameters: for a `Family`, θ at each state, shape (N, p). The result is a `FamilyField`,
@@ -159,8 +159,8 @@ def fit(
         progress: show a progress bar if the standard error is a terminal: for the iterations of
             `ConjugateGradient`, with their residuals, and for the blocks of `Cholesky` from 6000
             rows on. Ctrl-C stops the fit between two iterations or blocks.
-        accelerations: for a `Lagrangian`, the accelerations, shape (N, m); X are then states
-            (q, v), and Y torques.
+        accelerations: for a `Lagrangian`, the accelerations, shape (N, m). X holds the states
+            (q, v), shape (N, 2m), and Y the torques, shape (N, m).
 
     Returns:
         The learned field. Works under jit, vmap and grad, with respect to every argument; new
@@ -168,11 +168,12 @@ def fit(
         number of landmarks.
 
     Raises:
-        TypeError: K is not matrix-valued, `solver` is no solver, or the data is complex or in half
-            precision. ValueError: a shape does not fit, the data is empty or not finite, n is not
-            allowed by the structure, λ is not positive, or a dense problem does not fit in memory.
-            AttributeError: energies, of a structure or a mean that has no potential. RuntimeError:
-            the ridge is too small for this Gram (the text says what to do).
+        TypeError: K is not matrix-valued, `solver` is no solver, or the data are complex or in half
+            precision. ValueError: a shape does not fit, the data are empty or not finite, the
+            structure does not allow this n, λ is not positive, or a dense problem does not fit in
+            memory. AttributeError: there are energies, and the structure or the mean has no
+            potential. RuntimeError: the ridge is too small for this Gram (the text says what to
+            do).
 
     Source: Smith & Egeland (2023), section 3, where "Nλ a_j" should read "Nλ a_i".
     """
@@ -180,7 +181,10 @@ def fit(
     if isinstance(K, Lagrangian):
         return fit_lagrangian(K, X, Y, regularization, accelerations)
     if accelerations is not None:
-        raise TypeError("accelerations= belongs to hk.Lagrangian(potential=…, inertia=…).")
+        raise TypeError(
+            f"accelerations came with a {type(K).__name__}: they belong to "
+            "hk.Lagrangian(potential=…, inertia=…). For another kernel leave them out."
+        )
     problem = make_problem(K, X, Y, regularization, mean, inputs, parameters, throw)
     return field_of_problem(problem, solver, throw, progress)
 
@@ -202,14 +206,15 @@ def field_of_problem(
 
 
 def features_of_parts() -> RandomFeatures:
-    """The solver in the features of shared laws, which has no random draws."""
+    """The solver in the features of `Shared` laws, which draws nothing."""
     return RandomFeatures(1, jax.random.key(0))
 
 
 def default_solver(problem: Problem) -> AbstractSolver[Any]:
     """The solver for data on one device: Cholesky if it takes at most half of the memory.
 
-    Otherwise conjugate gradients; for shared laws their features, which are exact and few.
+    Otherwise conjugate gradients. For `Shared` laws the solver uses their features, which are exact
+    and few.
     """
     if is_of_parts(problem.kernel):
         return features_of_parts()

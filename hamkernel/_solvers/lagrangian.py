@@ -25,7 +25,7 @@ from hamkernel._structures.lagrangian import (
     lagrangian_features,
 )
 
-# Of a known entry of M: its error, as a share of the entry.
+# The error of a known entry of M, as a share of the entry.
 _ANCHOR = 1e-4
 
 
@@ -38,7 +38,7 @@ class TorqueData(NamedTuple):
 
 
 def torque_data(K: Lagrangian, X: Any, torques: Any, accelerations: Any) -> TorqueData:
-    """The data of a strong form, checked."""
+    """States, torques and accelerations, checked."""
     if accelerations is None or torques is None:
         raise TypeError(
             "a Lagrangian is learned from states (q, v), torques and accelerations, "
@@ -75,8 +75,8 @@ def check_machine(K: Lagrangian, torques: Any, m: int) -> None:
     elif not np.asarray(torques).any():
         raise ValueError(
             "all torques are zero: without a force the scale of L is not determined, and L = 0 "
-            "fits everything. Add motions with a torque or a known load, or give an entry of M "
-            "that is known, hk.Lagrangian(…, known_mass_matrix=(q, M)), with NaN for the others."
+            "fits everything. Add motions with a torque or a known load, or give a known entry of "
+            "M, hk.Lagrangian(…, known_mass_matrix=(q, M)), with NaN for unknown entries."
         )
 
 
@@ -85,7 +85,7 @@ def fit_lagrangian(
 ) -> LagrangianField:
     """The field of a `Lagrangian` from states (q, v), torques and accelerations; see `fit`.
 
-    It warns where the mass matrix is not positive definite at the data by two deviations, and where
+    A warning says if the mass matrix is not positive definite at the data by two deviations, or if
     friction of the joints is missing.
     """
     data = torque_data(K, X, torques, accelerations)
@@ -100,7 +100,7 @@ def field_of_torques(
     features = lagrangian_features(K, data.states)
     B, y = strong_rows(features, data, deviation)
     m = features.count
-    R, weights = _solved(features, B, y)
+    R, weights = _anchored_solution(features, B, y)
     residual = deviation * (y - B @ weights).reshape(-1, m)
     noise = jnp.broadcast_to(deviation, (m,))
     field = lagrangian_field(features, weights, R, noise, residual, data.states)
@@ -115,7 +115,7 @@ def field_of_torques(
 
 
 def verdicts(field: LagrangianField, joints: tuple[int, ...]) -> list[str]:
-    """What is wrong with a learned machine, in words."""
+    """Sentences about the faults of a learned machine, to be issued as a warning."""
     said = [field.refusal] if field.refusal else []
     if joints:
         said.append(
@@ -132,10 +132,10 @@ def strong_rows(
     """The rows of torques at known accelerations, over their standard deviation."""
 
     @jax.checkpoint
-    def at(point):
+    def torque_rows(point):
         return features.torque_features(*point)
 
-    rows = jax.lax.map(at, (data.states, data.accelerations), batch_size=64)
+    rows = jax.lax.map(torque_rows, (data.states, data.accelerations), batch_size=64)
     rows = features.whiten(rows).reshape(-1, features.columns)
     return rows / deviation, data.torques.reshape(-1) / deviation
 
@@ -143,11 +143,11 @@ def strong_rows(
 def with_anchor(
     features: LagrangianFeatures, B: Float[Array, "R r"], y: Float[Array, " R"]
 ) -> tuple[Float[Array, "S r"], Float[Array, " S"]]:
-    """The rows with one more for each known entry of the mass matrix."""
-    known = features.kernel.known_mass_matrix
-    if known is None:
+    """The rows B, y with one more row for each known entry of the mass matrix."""
+    known_matrix = features.kernel.known_mass_matrix
+    if known_matrix is None:
         return B, y
-    q, M = np.asarray(known[0]), np.asarray(known[1], float)  # None is NaN
+    q, M = np.asarray(known_matrix[0]), np.asarray(known_matrix[1], float)  # None is NaN
     i, j = np.nonzero(np.triu(np.isfinite(M)))
     size = _ANCHOR * np.abs(M[i, j]).max()
     rows = features.whiten(features.mass_matrix_features(jnp.asarray(q, B.dtype))[i, j])
@@ -155,7 +155,7 @@ def with_anchor(
     return jnp.concatenate([B, rows / size]), jnp.concatenate([y, values])
 
 
-def solved(
+def ridge_solution(
     B: Float[Array, "R r"], y: Float[Array, " R"]
 ) -> tuple[Float[Array, "r r"], Float[Array, " r"]]:
     """R with RᵀR = BᵀB + I, and w = (RᵀR)⁻¹Bᵀy, by orthogonal triangularisation."""
@@ -165,8 +165,8 @@ def solved(
 
 
 @precise_jit
-def _solved(features, B, y) -> tuple[Array, Array]:
-    return solved(*with_anchor(features, B, y))
+def _anchored_solution(features, B, y) -> tuple[Array, Array]:
+    return ridge_solution(*with_anchor(features, B, y))
 
 
 negative_log_likelihood = regression_loss
@@ -177,8 +177,8 @@ def missing_friction(
 ) -> tuple[int, ...]:
     """The joints whose friction makes the torques much likelier; `columns` are v and tanh(v/ε).
 
-    The size of the noise is that which is likeliest, with and without friction, so that a ridge
-    that is too small or a kernel that is too stiff do not look like friction.
+    The size of the noise maximises the likelihood, both with and without friction. Otherwise a
+    ridge that is too small, or a kernel that is too stiff, would look like friction.
     """
     unit = columns / jnp.maximum(jnp.linalg.norm(columns, axis=0), 1e-300)[None]
     unit = unit * jnp.linalg.norm(y)  # a priori friction may be as large as the torques
@@ -186,15 +186,16 @@ def missing_friction(
     return tuple(int(i) for i in np.flatnonzero(np.asarray(gains) > _FRICTION_GAIN))
 
 
-# log p that friction must gain to be named: 10 is the limit of "missing force" in `learn`. With it
-# the residual also must fall by a twentieth, which exact data with any small misfit would not show.
+# The gain of log p for which friction is reported: 10 is the limit of "missing force" in `learn`.
+# The squared residual must also fall by a twentieth, so that tiny misfits of exact data do not
+# count.
 _FRICTION_GAIN = 10.0
 
 
 @precise_jit
 def _friction_gains(B, y, columns) -> Float[Array, " m"]:
     def profile(B):
-        R, w = solved(B, y)
+        R, w = ridge_solution(B, y)
         square = jnp.sum((y - B @ w) ** 2) + w @ w
         value = 0.5 * len(y) * jnp.log(square) + jnp.log(jnp.abs(jnp.diagonal(R))).sum()
         return value, square
@@ -202,12 +203,12 @@ def _friction_gains(B, y, columns) -> Float[Array, " m"]:
     before, square = profile(B)
     m = columns.shape[1] // 2
 
-    def of_joint(i):
+    def gain(i):
         pair = columns[:, jnp.stack([i, m + i])]
-        after, left = profile(jnp.concatenate([B, pair], axis=1))
-        return jnp.where(left < 0.95 * square, before - after, 0.0)
+        after, square_after = profile(jnp.concatenate([B, pair], axis=1))
+        return jnp.where(square_after < 0.95 * square, before - after, 0.0)
 
-    return jax.lax.map(of_joint, jnp.arange(m))
+    return jax.lax.map(gain, jnp.arange(m))
 
 
 @precise_jit

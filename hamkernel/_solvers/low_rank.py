@@ -81,7 +81,7 @@ class Prior(eqx.Module):
 
         def rows_of_features(basis, w):
             field = jax.vmap(lambda x: basis.field(x, w))
-            return rows.of(field, jax.vmap(lambda x: basis.potential(x, w)))
+            return rows.evaluate(field, jax.vmap(lambda x: basis.potential(x, w)))
 
         return landmark_rows + jax.vmap(rows_of_features, out_axes=1)(self.features, self.weights)
 
@@ -456,7 +456,7 @@ class LowRankConditional(AbstractConditional):
         r, r0 = require.floating(r, "r"), require.floating(r0, "r0")
         return _law_variance(self.R, self.ridge, waves, place.start, r, r0)
 
-    def updated(self, new: Measurements) -> "LowRankConditional":
+    def update(self, new: Measurements) -> "LowRankConditional":
         rows = self.rows.append(new)
         extended_rows, new_count = self.rows.with_previous(new), rows.size - self.rows.size
         new_rows = extended_rows.contrast(self.span.all_rows(extended_rows))[-new_count:]

@@ -4,12 +4,12 @@ Let S be the landmarks, T Tᵀ = G_SS⁻¹, and F = G_XS T. The Gram is approxim
 field Σⱼ K(x, sⱼ) αⱼ with α = T w minimises ‖y − F w‖² + Nλ‖w‖². F is computed tile by tile, and
 only the sums FᵀF and Fᵀy are kept.
 
-The condition number of FᵀF + NλI is that of G + NλI. (The normal equations in α would square it and
+FᵀF + NλI has the condition number of G + NλI. (The normal equations in α would have its square, and
 lose twice the digits.) One step of refinement with the residual of the data recovers the digits
 that the sums round off (Björck's corrected seminormal equations).
 
-A stream has no second pass and therefore no residual; `least_squares.py` explains how its sums keep
-their digits.
+A stream has no second pass and therefore no residual; for the accuracy of its sums see
+`least_squares.py`.
 """
 
 import numbers
@@ -88,8 +88,8 @@ CHOOSE = (
 def warn_if_truncated(truncation, count, tolerance, cure):
     if not require.is_concrete(truncation, count):
         return
-    # The landmarks reach the tolerance on their candidates, a random part of the data; on all of
-    # the data the truncation may be larger.
+    # The landmarks reach the tolerance on the candidates, a random part of the data. On all the
+    # data the truncation may be larger.
     if truncation > 2 * tolerance:
         if truncation.dtype == jnp.float32:
             cure = (
@@ -107,7 +107,7 @@ def warn_if_truncated(truncation, count, tolerance, cure):
 class LandmarkFit(AbstractStreamingFit[KernelField]):
     """A fit on landmarks to the data added so far, made by `Nystrom.start`.
 
-    It has a fixed size, 4r² numbers for r columns. `add` returns a new one, and `field` solves
+    The fit has a fixed size, 4r² numbers for r columns. `add` returns a new fit, and `field` solves
     for any λ:
 
         model = hk.Nystrom().start(K, X, 1e-4).add(X, Y)
@@ -119,9 +119,9 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 
     Attributes:
         kernel: K.
-        landmarks: the points that carry the field.
+        landmarks: the points whose kernels span the field.
         sums: the normal equations of the rows added.
-        trace: the trace of the Gram of these rows, shape ().
+        trace: the trace of the Gram of the rows added, shape ().
         compensation: the rounding errors of the sums and the trace.
         count: N, the number of points added, shape ().
         regularization: the λ of `start`, shape ().
@@ -201,32 +201,33 @@ def _landmark_solution(fit, count, regularization):
 
 
 class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
-    """A low-rank fit: the field lives on a few landmarks, chosen from the data.
+    """The solver of a low-rank fit, in the span of a few landmarks chosen from the data.
 
-    Randomly pivoted Cholesky draws landmarks until trace(G − Ĝ) ≤ tolerance · Nλ. The fitted values
-    ŷ then differ from the exact ones by at most tolerance · ‖y − ŷ‖, since the difference is Nλ (G
-    + NλI)⁻¹ (G − Ĝ) (Ĝ + NλI)⁻¹ y. More noise and a larger λ therefore need fewer landmarks, and N
-    does not matter. Smooth kernels in few dimensions need tens to hundreds. `field.info` has the
-    number of `landmarks`, the `rank`, and the `truncation` that was reached.
+    Randomly pivoted Cholesky draws landmarks until trace(G − Ĝ) ≤ tolerance · Nλ, with Ĝ the
+    Nyström approximation of the Gram G. The fitted values ŷ then differ from the exact values by at
+    most tolerance · ‖y − ŷ‖, since the difference is Nλ (G + NλI)⁻¹ (G − Ĝ) (Ĝ + NλI)⁻¹ y. A larger
+    λ therefore needs fewer landmarks, and their number hardly depends on N. Smooth kernels in few
+    dimensions need tens to hundreds. `field.info` has the number of `landmarks`, the `rank`, and
+    the `truncation` trace(G − Ĝ)/(Nλ).
 
     Under jit, vmap and grad the number of landmarks cannot depend on values, and buffers have the
-    size of `max_points`. Otherwise the number is rounded up to a multiple of 16, and each such
-    number compiles a new program: pass `points` for a sweep over hyperparameters. Derivatives hold
-    the landmarks fixed.
+    size of `max_points`. Otherwise the number is rounded up to a multiple of 16, and each multiple
+    compiles a new program: pass `points` for a sweep over hyperparameters. Derivatives hold the
+    landmarks fixed.
 
     Args:
         tolerance: the bound on trace(G − Ĝ)/(Nλ), dimensionless.
-        max_points: the largest number of landmarks m. In float64 at most 8 m n² `candidates` bytes
-            while they are chosen, and 16 (m n)² after that.
-        candidates: landmarks are chosen from the data, or from a random part of this size.
-        key: for the draws; `jax.random.key(0)` if None, so that a fit can be repeated.
+        max_points: the largest number of landmarks m. In float64 the choice takes at most
+            8 m n² `candidates` bytes, and the fit 16 (m n)² bytes.
+        candidates: the number of points from which landmarks are chosen, a random part of the data.
+        key: the random key; `jax.random.key(0)` if None, so that a fit can be repeated.
         points: landmarks to use instead of choosing them, shape (m, n). Linearly dependent columns
             are dropped. `max_points`, `candidates` and `key` then have no effect.
 
     Raises:
         ValueError: an argument is not positive, `points` is not of shape (m, n), or the tolerance
-            is a whole number above 1, which looks like `max_points`; write 10.0 if it is meant.
-            TypeError: a number of points is not whole, or `key` no key.
+            is a Python integer above 1, which looks like `max_points` (write 10.0 for a tolerance).
+            TypeError: a number of points is no integer, or `key` no key.
 
     Warns:
         UserWarning: the landmarks do not reach the tolerance.
@@ -253,7 +254,7 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
         if isinstance(tolerance, numbers.Integral) and tolerance > 1:
             raise ValueError(
                 f"got the whole number {tolerance} as the tolerance on trace(G - Ĝ)/(N λ). For at "
-                f"most {tolerance} landmarks say hk.Nystrom(max_points={tolerance}); for that "
+                f"most {tolerance} landmarks write hk.Nystrom(max_points={tolerance}); for this "
                 f"tolerance write {tolerance}.0."
             )
         self.max_points = require.count(max_points, "max_points")
@@ -264,15 +265,18 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
     def landmarks(
         self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
     ) -> Landmarks:
-        """The caller's `points`, if any; otherwise landmarks chosen from the data.
+        """The caller's `points`, or landmarks chosen from the data.
 
-        They are chosen until the tolerance is met or `max_points` is reached.
+        The choice stops when the tolerance is met or `max_points` is reached.
         """
         if self.points is not None:
             d = rows.blocks[0].points.shape[1]
             if self.points.shape[1] != d:
                 m = self.points.shape[1]
-                raise ValueError(f"the landmarks have {m} coordinates and X {d}.")
+                raise ValueError(
+                    f"the landmarks, `points` of Nystrom, have {m} coordinates and X {d}: both "
+                    "must be states of one system."
+                )
             points = self.points.astype(rows.targets.dtype)
             return given_landmarks(K, landmarks_of(components(K, points)))
         key = jax.random.key(0) if self.key is None else self.key

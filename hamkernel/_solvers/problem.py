@@ -26,7 +26,7 @@ from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import Measurements, measurements, measurements_of
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.completed import completed
+from hamkernel._structures.completed import complete
 from hamkernel._structures.joined import AbstractJoinedKernel
 
 
@@ -77,25 +77,25 @@ def make_problem(
     parameters: Any = None,
     throw: bool = True,
 ) -> Problem:
-    """The problem that the checked data pose; X and Y mean `Velocities(X, Y)`.
+    """The regularised least-squares problem of checked data; X and Y mean `Velocities(X, Y)`.
 
     Raises:
-        TypeError, ValueError: as `fit` says. A mean that is not finite at the data, and data whose
-            squares overflow, are refused only with `throw`. AttributeError: there are energies and
-            K has no potential.
+        TypeError, ValueError: as in `fit`. Only with `throw`, ValueError for a mean that is not
+            finite at the data, or data whose squares overflow. AttributeError: there are energies
+            and K has no potential.
     """
     spread = row_sharding(X) if isinstance(X, jax.Array) else None
     K, rows = measurements(matrix_kernel(K), X, Y, inputs_or_parameters(inputs, parameters, K))
     K.check_points(rows.points)
-    K = completed(K, rows.points, rows.dimension)
+    K = complete(K, rows.points, rows.dimension)
     if len(rows.energies) and K.no_potential:
         raise AttributeError(f"energies were given, and {K.no_potential}")
     regularization = require.ridge(regularization, rows.targets.dtype)
-    known = known_part(K, mean, rows.dimension, rows.targets.dtype)
-    remaining = without_known(K, rows, known, throw)
+    known_field = known_part(K, mean, rows.dimension, rows.targets.dtype)
+    remaining = subtract_known(K, rows, known_field, throw)
     if throw:
         _refuse_overflow(remaining, regularization)
-    return Problem(K, remaining, regularization, known, spread)
+    return Problem(K, remaining, regularization, known_field, spread)
 
 
 def _refuse_overflow(rows: Measurements, regularization: Float[Array, ""]) -> None:
@@ -107,33 +107,35 @@ def _refuse_overflow(rows: Measurements, regularization: Float[Array, ""]) -> No
     smallest = min(1.0, rows.count * float(regularization))
     if size > (limit * smallest / len(y)) ** 0.5:
         raise ValueError(
-            f"the data are as large as {size:.2g}, and their squares, or these over N λ, overflow "
-            f"in {y.dtype}, whose largest number is {limit:.2g}. Change the units, so that the "
-            "data are of the order of 1."
+            f"the data are as large as {size:.2g}, and their squares, or squares over N λ, "
+            f"overflow in {y.dtype}, whose largest number is {limit:.2g}. Change the units, so "
+            "that the data are of the order of 1."
         )
 
 
 def new_rows(
-    K: AbstractMatrixKernel, data: AbstractObservations, old: Measurements, known: Any
+    K: AbstractMatrixKernel, data: AbstractObservations, old: Measurements, known_field: Any
 ) -> Measurements:
-    """The measurements of additional data, minus those of the known part."""
-    return without_known(K, measurements_of(K, data, previous=old)[1], known)
+    """The measurements of additional data, minus the measurements of the known part."""
+    return subtract_known(K, measurements_of(K, data, previous=old)[1], known_field)
 
 
-def without_known(
-    K: AbstractMatrixKernel, rows: Measurements, known: Any, throw: bool = True
+def subtract_known(
+    K: AbstractMatrixKernel, rows: Measurements, known_field: Any, throw: bool = True
 ) -> Measurements:
-    """The rows of observations minus those of the known part of the field.
+    """The rows of observations minus the rows of the known part of the field.
 
     Raises:
         AttributeError: there are energies and the known part has no potential.
         ValueError: `throw`, and the known part is not finite at the data.
     """
-    if known is None:
+    if known_field is None:
         return rows
-    potential = _known_potential(K, known) if len(rows.energies) else known
-    field, potential = (jax.tree_util.Partial(map_states, part) for part in (known, potential))
-    values = rows.of(field, potential)
+    potential = _known_potential(K, known_field) if len(rows.energies) else known_field
+    field, potential = (
+        jax.tree_util.Partial(map_states, part) for part in (known_field, potential)
+    )
+    values = rows.evaluate(field, potential)
     if throw:
         bad = require.not_finite(values)
         values = require.value(values, bad, lambda: _not_finite(rows, bad))
@@ -149,21 +151,21 @@ def _not_finite(rows: Measurements, bad: Any) -> str:
         if local < block.count == len(block.points):
             where += f" at x = {np.asarray(block.points[local])}"
     return (
-        f"mean is NaN or infinite at the data{where}. The kernel learns what mean leaves of the "
-        "data, so mean must be finite there: look at what it divides by, and at the logarithms and "
-        "roots in it, or leave those observations out."
+        f"mean is NaN or infinite at the data{where}. The kernel learns the data minus the mean, "
+        "so mean must be finite there: look at its divisions, logarithms and roots, or leave "
+        "these observations out."
     )
 
 
-def _known_potential(K: AbstractMatrixKernel, known: Any):
+def _known_potential(K: AbstractMatrixKernel, known_field: Any):
     """The potential of the known part, as a function of the points of K."""
-    if not isinstance(known, KnownPart) or not isinstance(K, AbstractJoinedKernel):
-        return potential_of(known, K)
-    drift = fix_inputs(known, 0, None)
-    if drift is None:  # G u, which is no part of the drift
+    if not isinstance(known_field, KnownPart) or not isinstance(K, AbstractJoinedKernel):
+        return potential_of(known_field, K)
+    drift = fix_inputs(known_field, 0, None)
+    if drift is None:  # the known part is G u alone
         return lambda s: 0 * s[0]
-    of_drift = potential_of(drift, K.of_states)
-    return lambda s: of_drift(s[: -known.count])
+    of_drift = potential_of(drift, K.state_kernel)
+    return lambda s: of_drift(s[: -known_field.count])
 
 
 Own = TypeVar("Own", bound="AbstractConditional")
@@ -187,7 +189,7 @@ class AbstractConditional(eqx.Module):
         """The covariance of the rows of two blocks, given the data."""
 
     @abc.abstractmethod
-    def updated(self: Own, new: Measurements) -> Own:
+    def update(self: Own, new: Measurements) -> Own:
         """This process conditioned on new rows as well, with the same σ²."""
 
     @abc.abstractmethod

@@ -36,29 +36,29 @@ from hamkernel._structures.base import AbstractMatrixKernel
 
 
 class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
-    """Ridge regression in random Fourier features: O(N n r²) time, O(r²) memory beside the data.
+    """The solver of ridge regression in r random Fourier features.
 
-    The weights of r features come from a QR, tile by tile, and not from the normal equations. The
-    structure of the field is exact for every count. The kernel is approximate, with an error of
-    order count^(−1/2), or smaller for fields that the features can represent. For shift-invariant
-    kernels: Gaussian, Matern, RationalQuadratic and Periodic, their sums, products, multiples and
-    Select, in every structure and parity.
+    The structure of the field is exact for every count. The kernel is approximate, with an error of
+    order count^(−1/2), or smaller for fields that the features can represent. A fit takes O(N n r²)
+    time and O(r²) memory beside the data, by a QR of tiles of rows. The scalar kernels must be
+    shift-invariant: Gaussian, Matern, RationalQuadratic and Periodic, and their sums, products,
+    multiples and Select. Every structure and parity is allowed.
 
     How to choose: start with 500 frequencies in the plane. Short lengthscales and rough kernels
-    need more; the frequencies of a field of Matern(1.5) have an infinite fourth moment, so the
-    error falls slowly. If N n is a few thousands, `Cholesky()` is exact and as fast. `Nystrom()`
-    needs fewer columns for the same accuracy, and places them on the data.
+    need more: with Matern(1.5) the error falls slowly, since the fourth moment of the frequencies
+    is infinite. If N n is a few thousands, `Cholesky()` is exact and as fast. `Nystrom()` needs
+    fewer columns for the same accuracy.
 
     Args:
         count: the number of frequencies for each term of each scalar kernel. A frequency has a
-            cosine and a sine, or one of them for an odd or even kernel. A divergence-free field has
-            a set of frequencies for each of the n(n − 1)/2 planes, a separable field one for each
-            component.
+            cosine and a sine, or one of these for an odd or even kernel. A divergence-free field
+            has a set of frequencies for each of the n(n − 1)/2 planes, a separable field a set for
+            each component.
         key: the random key, `jax.random.key(0)`. The same key draws the same features.
 
     Raises:
-        ValueError: count is not positive, or, from `fit` and `start`, so large that its matrices do
-            not fit in memory. TypeError: count is no integer, or key is no key.
+        ValueError: count is not positive; or, from `fit` and `start`, the matrices do not fit in
+            memory. TypeError: count is no integer, or key is no key.
 
     Source: Rahimi & Recht (2007).
     """
@@ -99,15 +99,15 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
     def _features(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> AbstractFeatures:
         """The features of K for points of n coordinates; ValueError if a fit exceeds the memory."""
 
-        def of_kernel(K, key):
+        def features_of(K, key):
             return features(K, n, self.count, key, dtype)
 
-        r = eqx.filter_eval_shape(of_kernel, K, self.key).columns
+        r = eqx.filter_eval_shape(features_of, K, self.key).columns
         what, cure = f"a fit with count = {self.count}", "Take fewer features."
         # Eight matrices of r² numbers: the triangle (1), the tile of 3r rows below it (3), and
         # their QR factorisation (4).
         refuse_beyond_memory(what, r, r, dtype, 8, cure)
-        return of_kernel(K, self.key)
+        return features_of(K, self.key)
 
     def _start_fit(self, K, sample, regularization) -> "FeatureFit":
         basis = self._features(K, sample.points.shape[1], sample.targets.dtype)
@@ -130,7 +130,7 @@ def _field_of_weights(K, basis, w, residual, regularization, residual_norm=None)
 
 
 def _check_field(field: FeatureField, throw: bool = True) -> FeatureField:
-    """The field; RuntimeError, or NaN without `throw`, if the least squares had no solution."""
+    """The field; RuntimeError, or NaN without `throw`, if the least squares have no solution."""
 
     def learned_arrays(f: FeatureField):
         return f.weights, f.residual, f.norm
@@ -144,7 +144,7 @@ def _check_field(field: FeatureField, throw: bool = True) -> FeatureField:
 class FeatureFit(AbstractStreamingFit[FeatureField]):
     """A fit in random features to the data added so far, made by `RandomFeatures.start`.
 
-    It has a fixed size, 4r² numbers for r columns. `add` returns a new one, and `field` solves
+    The fit has a fixed size, 4r² numbers for r columns. `add` returns a new fit, and `field` solves
     for any λ:
 
         model = hk.RandomFeatures(500, key).start(K, X, 1e-4).add(X, Y)

@@ -1,8 +1,8 @@
-"""Fits to data that comes in chunks: one pass, and memory that ignores the number of points.
+"""Fits to data in chunks: one pass, in memory that does not depend on the number of points.
 
 A low-rank solver with r columns compresses all rows into r² sums, in a basis that `start` chose.
-More data adds to these sums. The sums of two parts of the data add up to the sums of both, and the
-field for any λ follows from them.
+The sums of two parts of the data add up to the sums of all the data, and the field for any λ
+follows from the sums.
 
 Plain sums are exact to rounding, but nearly dependent landmarks amplify rounding errors in the
 coefficients: 600 points on 160 landmarks at λ = 1e-13, added in another order, changed the field by
@@ -47,9 +47,9 @@ from hamkernel._observations.measurements import (
 from hamkernel._show import call, text
 from hamkernel._solvers.least_squares import Sums, first_sums
 from hamkernel._solvers.low_rank import AbstractFunctions
-from hamkernel._solvers.problem import AbstractSolver, LearnedField, without_known
+from hamkernel._solvers.problem import AbstractSolver, LearnedField, subtract_known
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.completed import completed
+from hamkernel._structures.completed import complete
 
 Fit = TypeVar("Fit", bound="AbstractStreamingFit")
 
@@ -63,14 +63,14 @@ _START_ONCE = (
 class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
     """A fit to the data added so far, made by `solver.start`.
 
-    It has a fixed size. `add` returns a new one, and `field` solves for any λ:
+    The fit has a fixed size. `add` returns a new fit, and `field` solves for any λ:
 
         model = solver.start(K, X, 1e-4).add(X, Y)
         field = model.field()
         better = model.add(X_new, Y_new).field()
 
-    Fits to parts of the data add up to the fit to all of them, `a + b` or `sum(parts)`, where all
-    parts are copies of one `start`. `hk.save` and `hk.load` keep it for later.
+    Fits to parts of the data add up to the fit to all the data, `a + b` or `sum(parts)`, if all
+    parts begin with copies of one `start`. `hk.save` and `hk.load` store a fit.
     """
 
     kernel: eqx.AbstractVar[AbstractMatrixKernel]
@@ -158,16 +158,16 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
 
         Args:
             X: states, shape (N, n); or observations, and then there is no Y. The D rows of
-                observations take O(D r) memory, where velocities are seen tile by tile.
+                observations take O(D r) memory; velocities are read in tiles and take less.
             Y: measured velocities, shape (N, n).
             inputs: u at each state, for a `Controlled` kernel, shape (N, m).
             parameters: θ at each state, for a `Family`, shape (N, p).
 
         Raises:
-            ValueError: a shape does not fit, the data is not finite, or there are energies, whose
+            ValueError: a shape does not fit, the data are not finite, or there are energies, whose
                 constant all chunks would share: give differences of H as `hk.Functionals`, or fit
-                all data at once. TypeError: the dtype, or it has more digits than the fit. The fit
-                is then as it was before.
+                all data at once. TypeError: the data hold no real numbers, or have more digits than
+                the fit. After an error the fit has not changed.
         """
         rows = self._checked_rows(
             observations(X, Y, inputs_or_parameters(inputs, parameters), part=True)
@@ -178,14 +178,15 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         return _with_rows(self, eqx.combine(arrays, rest), spread)
 
     def __add__(self: Fit, other: Any) -> Fit:
-        """The fit to the data of both, the same bits in any order of the parts of the data.
+        """The fit to the data of both fits, bit by bit the same in any order of the parts.
 
-        Both must come from one `start`, so that their sums are in one basis: start once and give
-        every worker a copy. Also `sum(parts)`.
+        Both fits must come from one `start`, so that their sums are in one basis: start once and
+        give every worker a copy. `sum(parts)` works, too.
 
         Raises:
-            TypeError: the other is no such fit, or of another dtype. ValueError: it has another
-                kernel, other landmarks or features, another λ, or was started from another sample.
+            TypeError: the other object is no such fit, or has another dtype. ValueError: it has
+                another kernel, other landmarks or features, another λ, or another sample in
+                `start`.
         """
         if isinstance(other, int) and other == 0:  # the start of `sum`
             return self
@@ -208,16 +209,19 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         _, rows = measurements_of(self.kernel, data, previous=nothing)
         self._check(rows.targets.dtype, rows.dimension)
         _refuse_energies(rows)
-        return without_known(self.kernel, rows, self._known_part)
+        return subtract_known(self.kernel, rows, self._known_part)
 
     def _check(self, dtype: jnp.dtype | None, dimension: int) -> None:
         """ValueError for another number of coordinates, TypeError for a dtype of more digits."""
         if dimension != self.dimension:
-            raise ValueError(f"the data has {dimension} coordinates and the fit {self.dimension}.")
+            raise ValueError(
+                f"the data have {dimension} coordinates and the fit {self.dimension}: both must be "
+                "states of one system."
+            )
         if dtype is not None and np.promote_types(dtype, self.dtype) != self.dtype:
             raise TypeError(
-                f"the data is {dtype} and the fit {self.dtype}, the dtype of the sample that it "
-                f"was started with: start it with a sample in {dtype}, or cast the data."
+                f"the data are {dtype} and the fit {self.dtype}, the dtype of the sample of "
+                f"`start`: start with a sample in {dtype}, or cast the data."
             )
 
     @property
@@ -240,14 +244,14 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
     @one_blas_thread
     @full_precision
     def field(self, regularization: ArrayLike | None = None) -> Any:
-        """The field learned from all data added so far; O(r³), and no pass over the data.
+        """The field learned from all data added so far, in O(r³) time without the data.
 
         Args:
             regularization: λ > 0, as in `hk.fit`, with N the number of points added so far; the λ
                 of `start` if None.
 
         Raises:
-            ValueError: λ is not positive, or no data was added.
+            ValueError: λ is not positive, or no data were added.
         """
         if regularization is None:
             regularization = self.regularization
@@ -308,7 +312,7 @@ def _two_sum(a: Array, b: Array) -> tuple[Array, Array]:
 
 
 class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField, Fit]):
-    """A solver whose fit to all the data can be made from chunks of it."""
+    """A solver that can fit to data in chunks."""
 
     @abc.abstractmethod
     def _start_fit(
@@ -326,25 +330,25 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
         inputs: Num[ArrayLike, "N m"] | None = None,
         parameters: Num[ArrayLike, "N p"] | None = None,
     ) -> Fit:
-        """An empty fit, to which chunks are added: a `LandmarkFit` or a `FeatureFit`.
+        """A fit without data, to which chunks are added: a `LandmarkFit` or a `FeatureFit`.
 
         Args:
             K: a matrix-valued kernel.
-            sample: states that look like all of the data, shape (N, n), or observations that do,
-                where the data are not velocities. They are not added to the fit. The landmarks of
-                `Nystrom` are chosen from them now, and later data does not move them: the first
-                chunk is enough if all chunks look alike, one trajectory out of many is not. Of
-                `RandomFeatures` only the rounding of the sums depends on them.
-            regularization: the smallest λ that will be asked for, since the tolerance of `Nystrom`
-                is relative to it, and so are the digits that are kept: a smaller one loses some.
+            sample: states that represent all the data, shape (N, n); if the data are not
+                velocities, representative observations. The sample is not added to the fit.
+                `Nystrom` chooses its landmarks from the sample, and later data do not change them.
+                The first chunk is enough if all chunks look alike; one trajectory out of many is
+                not. For `RandomFeatures` only the rounding of the sums depends on the sample.
+            regularization: the smallest λ that `field` will need. The tolerance of `Nystrom` is
+                relative to this λ; fields for a smaller λ lose digits.
             inputs: u at each point of the sample, for a `Controlled` kernel, shape (N, m).
             parameters: θ at each point of the sample, for a `Family`, shape (N, p).
 
-        Where `field.info.truncation` of the data added exceeds the tolerance of `Nystrom`, start
-        anew with a sample that looks like the data so far.
+        If `field.info.truncation` exceeds the tolerance of `Nystrom`, start again with a sample
+        that represents the data so far.
 
         Raises:
-            ValueError: a shape does not fit, n is not allowed by the structure, the sample is not
+            ValueError: a shape does not fit, the structure does not allow this n, the sample is not
                 finite, or λ is not positive. TypeError: K is not matrix-valued, or, for
                 `RandomFeatures`, has no known spectral density.
         """
@@ -359,7 +363,7 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
             K, points = sampled_points(K, sample, inputs_or_parameters(inputs, parameters))
             rows = rows_at(K, points)
         K.check_dimension(rows.points.shape[1])
-        K = completed(K, rows.points, rows.dimension)
+        K = complete(K, rows.points, rows.dimension)
         require.warn_of_float32(rows.targets)
         return self._start_fit(K, rows, require.ridge(regularization, rows.targets.dtype))
 
@@ -376,30 +380,30 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
         inputs: Num[ArrayLike, "S m"] | None = None,
         parameters: Num[ArrayLike, "S p"] | None = None,
     ) -> Any:
-        """`hk.fit` to data that comes in chunks, in one pass and with memory for two chunks.
+        """The field of `hk.fit`, from chunks of data, in one pass and with memory for two chunks.
 
-        The field is that of one fit to all the data: to rounding for `RandomFeatures`, and for
-        `Nystrom` where the landmarks are the same (`sample=X`, or its `points`), else within the
-        tolerance. The sums of a stream need a larger λ than one fit, in float32 most of all, and
-        fail where it is too small. If `Nystrom` warns of the truncation, start anew with a
-        `sample` that looks like all of the data. To add data later, or to keep what was added when
-        a later chunk is refused, add to the fit of `start` instead.
+        The result equals one fit to all the data: to rounding for `RandomFeatures`, and for
+        `Nystrom` if the landmarks are the same (`sample=X`, or `points`), else within the
+        tolerance. The sums of a stream need a larger λ than one fit, above all in float32; a λ that
+        is too small raises a RuntimeError. If `Nystrom` warns of the truncation, pass a `sample`
+        that represents all the data. To add data later, or to keep the data so far if a later chunk
+        is refused, add to the fit of `start` instead.
 
         Args:
             K: a matrix-valued kernel.
             chunks: pairs (X, Y) of states and velocities, shape (Nᵢ, n) each: a generator, or
-                slices of memory-mapped files. Every new Nᵢ compiles anew: equal ones are fast. Of a
-                `Controlled` kernel (X, Y, U), with inputs of shape (Nᵢ, m), and of a `Family`
-                with its parameters in their place.
+                slices of memory-mapped files. Every new Nᵢ compiles a program, so use equal sizes.
+                For a `Controlled` kernel triples (X, Y, U) with inputs of shape (Nᵢ, m), for a
+                `Family` (X, Y, Θ).
             regularization: λ > 0, as in `hk.fit`, with N the number of all points.
-            sample: states that look like all of the data, for `start`; the first chunk if None.
-            progress: show a progress bar where the standard error is a terminal.
+            sample: states that represent all the data, for `start`; the first chunk if None.
+            progress: show a progress bar if the standard error is a terminal.
             inputs: u at each point of the sample, for a `Controlled` kernel, shape (S, m).
             parameters: θ at each point of the sample, for a `Family`, shape (S, p).
 
         Raises:
-            ValueError: there is no chunk, or as `hk.fit` for one of them. TypeError: as `hk.fit`.
-                Whatever reading a chunk raises goes on with a note which chunk it was.
+            ValueError: there is no chunk, or a chunk is refused as in `hk.fit`. TypeError: as in
+                `hk.fit`. Errors while a chunk is read propagate, with a note of its number.
         """
         from tqdm import tqdm  # so that importing the package does not load it
 
@@ -474,7 +478,7 @@ def rows_at(K: AbstractMatrixKernel, points: Float[Array, "N d"]) -> Measurement
 
 
 def thin(K: AbstractMatrixKernel, sample: Measurements, count: int) -> Measurements:
-    """Every k-th point, at most `count` of them, replicated; all rows if there are other rows."""
+    """Every k-th point, at most `count` points, replicated; all rows if not all are velocities."""
     if sample.states is None:
         return sample
     points = sample.points

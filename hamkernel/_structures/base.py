@@ -1,8 +1,7 @@
 """The base of matrix-valued kernels, their sums, and their symmetries: odd, even, reversible, any.
 
-A symmetry is imposed on the SCALAR kernel inside a structure, which is averaged over the group. The
-potential then has the symmetry, and so has the field: where B(Sx) = ± S B(x) Sᵀ, a potential with
-u(Sx) = u(x) gives f(Sx) = ± S f(x).
+A symmetry is imposed on the SCALAR kernel inside a structure, which is averaged over the group. If
+B(Sx) = ± S B(x) Sᵀ, a potential with u(Sx) = u(x) gives a field with f(Sx) = ± S f(x).
 """
 
 import abc
@@ -41,7 +40,7 @@ class AbstractMatrixKernel(eqx.Module):
 
     matrix_valued: ClassVar[bool] = True
     takes_inputs: ClassVar[bool] = False  # whether its points are (x, u)
-    given: ClassVar[str] = "inputs"  # the name of u in `fit`; "parameters" for a family
+    input_name: ClassVar[str] = "inputs"  # the name of u in `fit`; "parameters" for a family
     # Whether derivatives of the Gram are cheaper in reverse mode, as for some closed forms.
     differentiated_backward: ClassVar[bool] = False
     symplectic: eqx.AbstractVar[bool]  # whether flows keep dq ∧ dp, as those of J∇H do
@@ -107,7 +106,9 @@ class AbstractMatrixKernel(eqx.Module):
         if self.no_potential:
             raise AttributeError(self.no_potential)
 
-    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
+    def dissipated_power(
+        self, x: Float[Array, " n"], slope: Float[Array, " n"]
+    ) -> Float[Array, ""]:
         """The power −dH/dt at x for ∇H = `slope`, shape (); for structures with a Hamiltonian."""
         raise AttributeError(self.no_potential)
 
@@ -133,19 +134,19 @@ class AbstractMatrixKernel(eqx.Module):
         return None
 
     @property
-    def of_states(self) -> "AbstractMatrixKernel":
+    def state_kernel(self) -> "AbstractMatrixKernel":
         """The kernel of fields of x alone: this one, unless its points are (x, u)."""
         return self
 
     def with_states(self, K: "AbstractMatrixKernel") -> "AbstractMatrixKernel":
-        """This kernel with `of_states` replaced by K."""
+        """This kernel with `state_kernel` replaced by K."""
         return K
 
     def outputs(self, inputs: int) -> int:
         """The number of components of a field at points with `inputs` coordinates."""
         return inputs
 
-    def shares_potential(self, other: "AbstractMatrixKernel") -> bool:
+    def shares_potential(self, kernel: "AbstractMatrixKernel") -> bool:
         """Whether the fields of both kernels are made from a potential by the same operator."""
         return False
 
@@ -182,8 +183,8 @@ class AbstractMatrixKernel(eqx.Module):
 
     def __mul__(self, other: Any) -> Any:
         raise TypeError(
-            f"a structured kernel is scaled inside: {type(self).__name__}(2.0 * k), and so it is "
-            f"with products, {type(self).__name__}(k1 * k2)."
+            "a structured kernel cannot be multiplied: scale or multiply the scalar kernel inside, "
+            f"{type(self).__name__}(2.0 * k) or {type(self).__name__}(k1 * k2)."
         )
 
     __rmul__ = __mul__
@@ -229,7 +230,9 @@ class Sum(AbstractMatrixKernel):
                 )
         names = [name for name, _ in flat if name is not None]
         if "regularization" in names:
-            raise ValueError("a part cannot be called regularization: tune calls λ so.")
+            raise ValueError(
+                "a part is called regularization, the name of λ in tune: choose another name."
+            )
         if not flat or len(set(names)) < len(names):
             raise ValueError(f"Sum needs at least one kernel and distinct names, got {names}.")
         self.terms = tuple(term for _, term in flat)
@@ -262,8 +265,8 @@ class Sum(AbstractMatrixKernel):
             return first.no_potential
         names = " + ".join(type(K).__name__ for K in (first, *rest))
         return (
-            f"the sum of structures {names} has no single potential: each has an operator of its "
-            "own. Ask one part for its own: field.part(0).potential(x)."
+            f"the sum of structures {names} has no single potential: each has another operator. "
+            "Ask one part, by position or name: field.part(0).potential(x)."
         )
 
     def _structures(self) -> Iterator[AbstractMatrixKernel]:
@@ -271,8 +274,8 @@ class Sum(AbstractMatrixKernel):
         for K in self.terms:
             yield from K._structures() if isinstance(K, Sum) else (K,)
 
-    def shares_potential(self, other: AbstractMatrixKernel) -> bool:
-        return all(K.shares_potential(other) for K in self._structures())
+    def shares_potential(self, kernel: AbstractMatrixKernel) -> bool:
+        return all(K.shares_potential(kernel) for K in self._structures())
 
     @property
     def symplectic(self) -> bool:
@@ -286,9 +289,11 @@ class Sum(AbstractMatrixKernel):
     def conserves(self) -> bool:
         return self.has_hamiltonian and all(K.conserves for K in self.terms)
 
-    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
+    def dissipated_power(
+        self, x: Float[Array, " n"], slope: Float[Array, " n"]
+    ) -> Float[Array, ""]:
         self.check_potential()
-        return self.terms[0].dissipated(x, slope)
+        return self.terms[0].dissipated_power(x, slope)
 
     def check_points(self, X: Float[Array, "N d"]) -> None:
         for K in self.terms:
@@ -342,22 +347,22 @@ def matrix_kernel(
         return K
     cure = f"Give a scalar kernel its structure first: {example}."
     if isinstance(K, type) and issubclass(K, AbstractMatrixKernel):
-        cure = f"That is a class; make a kernel of it, such as hk.{K.__name__}(hk.Gaussian(1.0))."
+        cure = f"This is a class; make a kernel, such as hk.{K.__name__}(hk.Gaussian(1.0))."
     raise TypeError(f"{what} must be a matrix-valued kernel; got {reprlib.repr(K)}. {cure}")
 
 
 def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
     """The kernel of the odd fields with the structure of K, f(−x) = −f(x).
 
-    The SCALAR kernel inside is symmetrised: a field B∇u is odd when u is even. Exact for every
-    kernel; twice the cost of K if k(−x, −z) = k(x, z) is known, else four times. A sum is
-    symmetrised part by part.
+    A field B∇u is odd if u is even, so the SCALAR kernel k inside is replaced by its even part. The
+    symmetry is exact for every k. Evaluating costs twice as much as K if the library knows that
+    k(−x, −z) = k(x, z), else four times. A sum is symmetrised term by term.
 
     Args:
         K: a structured kernel whose B does not depend on x.
 
     Raises:
-        TypeError: K is not matrix-valued.
+        TypeError: K is not matrix-valued, or its B depends on x.
 
     Source: Smith & Egeland (2023), section 4, there for k(x, z) = g(x − z).
     """
@@ -367,24 +372,27 @@ def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
 def Even(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
     """The kernel of the even fields with the structure of K, f(−x) = f(x).
 
-    As `Odd`, with an odd potential: H(−x) = −H(x).
+    A field B∇u is even if u is odd, u(−x) = −u(x). Costs and arguments are those of `Odd`.
+
+    Args:
+        K: a structured kernel whose B does not depend on x.
 
     Raises:
-        TypeError: K is not matrix-valued.
+        TypeError: K is not matrix-valued, or its B depends on x.
     """
     return matrix_kernel(K, "the argument of Even", "Even(Symplectic(k))").with_parity(+1)
 
 
 def Reversible(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
-    """The kernel of the reversible fields J∇H: H(q, −p) = H(q, p), whose motions may run backwards.
+    """The kernel of the reversible fields J∇H, H(q, −p) = H(q, p), whose motions may run backwards.
 
-    With S = diag(I, −I) they obey f(Sx) = −S f(x). True for every H = T(p) + U(q) with an even T;
-    false with friction, in magnetic fields and in rotating frames. Twice the cost of K if
-    k(Sx, Sz) = k(x, z) is known, else four times. `Reversible(Odd(K))` is both, with a group of
-    four.
+    With S = diag(I, −I), f(Sx) = −S f(x). Every H = T(p) + U(q) with an even T is reversible;
+    systems with friction, in magnetic fields and in rotating frames are not. Evaluating costs twice
+    as much as K if the library knows that k(Sx, Sz) = k(x, z), else four times.
+    `Reversible(Odd(K))` has both symmetries, a group of four maps.
 
     Args:
-        K: `Symplectic(k)`, an odd or even one, or a sum of them.
+        K: `Symplectic(k)`, `Odd(Symplectic(k))`, `Even(Symplectic(k))`, or a sum of these.
 
     Raises:
         TypeError: K is not matrix-valued, or its fields are not J∇H.
@@ -396,7 +404,7 @@ def Reversible(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
         raise TypeError(
             f"the fields of {type(K).__name__} are not reversible: time reversal holds for J∇H, "
             "Reversible(Symplectic(k)), and not with friction, magnetic fields or in rotating "
-            "frames. In a sum say it of the part: Reversible(Symplectic(k)) + CurlFree(k)."
+            "frames. In a sum make one part reversible: Reversible(Symplectic(k)) + CurlFree(k)."
         )
     return K.average_over((time_reversal,))
 
@@ -408,28 +416,28 @@ def Invariant(k: Any, maps: Any) -> AbstractScalarKernel: ...
 
 
 def Invariant(k: Any, maps: Any) -> Any:
-    """The kernel of the functions that a finite group of linear maps leaves unchanged.
+    """The kernel of the functions with H(Sx) = H(x) for a finite group G of linear maps S.
 
-    H(Sx) = H(x) for every S that the maps generate: the mean (1/|G|²) Σ k(gx, hz) over both
-    arguments, right for every k. Where k(Sx, Sz) = k(x, z) is known one side is enough, at |G|
-    times the cost of k in place of |G|²: an orthogonal S and one lengthscale for all coordinates,
-    or an S that only changes signs.
+    The kernel is the mean (1/|G|²) Σ k(gx, hz) over both arguments, which is right for every k. If
+    the library knows that k(Sx, Sz) = k(x, z), the mean over one argument is enough, and costs |G|
+    times as much as k instead of |G|² times. This holds for orthogonal S with one lengthscale for
+    all coordinates, and for S that only change signs.
 
-    Inside `Symplectic` a map with SᵀJS = J gives fields f(Sx) = S f(x), one with SᵀJS = −J
-    reversible ones, f(Sx) = −S f(x); another one is an error there.
+    Inside `Symplectic`, a map with SᵀJS = J gives fields f(Sx) = S f(x), and a map with SᵀJS = −J
+    reversible fields, f(Sx) = −S f(x). Other maps raise a ValueError.
 
     Args:
         k: a scalar kernel, or a structure, inside which the scalar kernels are averaged.
-        maps: generators of the group, (n, n) arrays or linear functions x -> S x. The group is
-            closed from them, and may have up to 64 elements.
+        maps: generators of the group, (n, n) arrays or linear functions x -> S x. The group may
+            have up to 64 elements.
 
     Returns:
-        A scalar kernel, or a structure where one was given.
+        A scalar kernel; a structure if `k` is a structure.
 
     Raises:
         TypeError: `k` is no kernel, or `maps` no list of maps. ValueError: a matrix is not square;
-            when called: a map is not linear or of another dimension, the group does not close, or
-            a structure does not allow the map.
+            or, when called, a map is not linear or of another dimension, the group does not close,
+            or the structure does not allow the map.
 
     Example: `hk.Symplectic(hk.Invariant(hk.Gaussian(1.0), [rotation, mirror]))`.
     """

@@ -1,4 +1,4 @@
-"""Kernels with what only the data can tell: rest speeds of friction, centres of shared laws."""
+"""Attributes of kernels that come from the data: rest speeds of `Friction`, centres of `Shared`."""
 
 from typing import Any
 
@@ -13,7 +13,7 @@ from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.friction import with_rest_speed
 
 
-def completed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> Any:
+def complete(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> Any:
     """K with a rest speed in every `Friction`, and centres in every `Shared`, from the states X."""
     K = with_rest_speed(K, X, n)
     if all(shared.centres is not None for shared in shared_laws(K)):
@@ -22,21 +22,21 @@ def completed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> Any:
     with require.eager():
         states = np.asarray(X)[:, :n]
 
-    def carried(node: Any) -> Any:
+    def add_centres(node: Any) -> Any:
         return node.with_centres(states) if _lacks_centres(node) else node
 
-    return jax.tree.map(carried, K, is_leaf=_lacks_centres)
+    return jax.tree.map(add_centres, K, is_leaf=_lacks_centres)
 
 
 def shared_laws(K: Any) -> list[Shared]:
-    """The laws within K that many parts share."""
+    """The `Shared` kernels within K."""
     return [node for node in jax.tree.leaves(K, is_leaf=_is_shared) if _is_shared(node)]
 
 
 def has_constant_parts(K: AbstractMatrixKernel) -> bool:
-    """Whether K is made of laws that many parts share, and no map to the parts is trained."""
+    """Whether every scalar kernel of K has `Shared` laws, and no map to the parts is trained."""
     laws = [shared_laws(k) for k in K.scalar_kernels]
-    parts = [shared.parts for each in laws for shared in each]
+    parts = [shared.parts for laws_of_kernel in laws for shared in laws_of_kernel]
     return all(laws) and not any(map(eqx.is_inexact_array, jax.tree.leaves(parts)))
 
 

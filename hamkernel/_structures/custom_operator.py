@@ -1,4 +1,4 @@
-"""Fields B(x)∇H with an operator of the caller's; where it is antisymmetric, Poisson systems."""
+"""Fields B(x)∇H with the caller's operator B, and Poisson systems, whose B is antisymmetric."""
 
 import abc
 import inspect
@@ -27,7 +27,7 @@ Operator = Callable[[Float[Array, " n"]], Any]
 
 
 class AbstractCustomOperator(AbstractPotentialKernel):
-    """A structure whose B(x) is a function of the caller's, the attribute named by `role`."""
+    """A structure whose B(x) is the caller's function, stored in the attribute named by `role`."""
 
     role: AbstractClassVar[str]
     name: AbstractClassVar[str]  # by which users know the structure
@@ -37,7 +37,7 @@ class AbstractCustomOperator(AbstractPotentialKernel):
     has_hamiltonian: ClassVar[bool] = True
 
     def _check_values(self, matrices: Float[np.ndarray, "N n n"], X: Float[Array, "N n"]) -> None:
-        """ValueError unless B(x) is what the structure asks for at these points."""
+        """ValueError unless B(x) has the property that the structure needs, at these points."""
 
     def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         return self._matrix(x) @ v
@@ -52,8 +52,8 @@ class AbstractCustomOperator(AbstractPotentialKernel):
         if jnp.shape(value) != (n, n):
             raise ValueError(
                 f"the {name} returned shape {jnp.shape(value)} for a state of shape ({n},); an "
-                f"array of shape ({n}, {n}) is needed, such as jnp.array([[...], [...]]). It was "
-                "written for states of another dimension, or for many at once."
+                f"array of shape ({n}, {n}) is needed, such as jnp.array([[...], [...]]). Write it "
+                f"for one state of {n} coordinates."
             )
         return require.floating(value, f"the {name}").astype(x.dtype)
 
@@ -97,22 +97,22 @@ def Structured(kernel: Any, operator: Callable[..., Any]) -> AbstractStructure:
         operator(x) -> (n, n)        f(x) = B(x)∇u(x),    K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ
         operator(u, x) -> (n,)       f(x) = (L u)(x),     K(x, z) = L_x L_z k(x, z)
 
-    The rest of the library works with both: `tune` tunes the arrays in the operator, and `save`
-    keeps the arrays. As with kernels of your own, `load` needs the kernel again, since the file
-    does not contain its code. A field of B(x) has its `.hamiltonian(x)` and its `.dissipation(x)` =
-    −∇HᵀB∇H and is the fast case; one of L has its `.potential(x)`.
+    The rest of the library works with both forms: `tune` tunes the arrays in the operator, and
+    `save` stores them. `load` needs the kernel again, since the file does not contain its code.
+    Fields B(x)∇u have `.hamiltonian(x)` and `.dissipation(x)` = −∇HᵀB∇H, and are faster. Fields L u
+    have `.potential(x)`.
 
     Args:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
-        operator: a function written with jax.numpy. Of one argument it is B. Of two it is L: u is a
-            function (n,) -> () that `jax.grad`, `jax.hessian` and so on differentiate, to any
-            order p for which k has 2p derivatives, and the value must be linear in u. The array
-            leaves of an Equinox module are trained; store what is positive as `log_…`.
+        operator: a function written with jax.numpy. With one argument it is B, with two L. In L, u
+            is a function (n,) -> () that `jax.grad`, `jax.hessian` and so on differentiate, to any
+            order p for which k has 2p derivatives; the value must be linear in u. The array leaves
+            of an Equinox module are trained; store positive numbers as `log_…`.
 
     Raises:
         TypeError: `kernel` is not a scalar kernel, or `operator` not a function. ValueError, with
-            data: the value has another shape, or is not finite there; L is not linear in u, or k is
-            too rough for it.
+            data: the operator returns another shape, or is not finite at the data; L is not linear
+            in u; or k is too rough for L.
 
     Example: friction that grows with the height of a pendulum, and the flow of a vorticity,
 
@@ -152,13 +152,13 @@ _BY_POSITION = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_
 class Poisson(AbstractCustomOperator):
     """K(x, z) = Π(x) [∂x ∂zᵀ k(x, z)] Π(z)ᵀ: Poisson systems f = Π(x)∇H, Π antisymmetric.
 
-    Any n, even or odd: dH/dt = ∇HᵀΠ∇H = 0, and every field conserves the Casimirs C, Π(x)∇C = 0.
-    `field.hamiltonian(x)` is H, known up to functions of the Casimirs. Π need not satisfy the
-    Jacobi identity.
+    n may be even or odd. Every field conserves H, dH/dt = ∇HᵀΠ∇H = 0, and the Casimirs C with
+    Π(x)∇C = 0. `field.hamiltonian(x)` is H, known up to functions of the Casimirs. Π need not
+    satisfy the Jacobi identity.
 
-    Ready-made tensors in `hk.poisson`: `rigid_body` (n = 3), `lotka_volterra` (n = 2), and
-    `charged_particle(B)` (n = 4 or 6). Where H is harder than f, structure loses: Lotka-Volterra in
-    populations is easier for `Separable`, since H has their logarithms.
+    `hk.poisson` has the tensors `rigid_body` (n = 3), `lotka_volterra` (n = 2), and
+    `charged_particle(B)` (n = 4 or 6). If H is harder to learn than f, `Separable` is better: the H
+    of Lotka-Volterra contains logarithms of the populations, its f does not.
 
     Args:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
@@ -167,7 +167,7 @@ class Poisson(AbstractCustomOperator):
 
     Raises:
         TypeError: `kernel` is not a scalar kernel, or `tensor` not a function. ValueError, with
-            data: Π is not an (n, n) array, or not antisymmetric there.
+            data: Π is not an (n, n) array, or not antisymmetric at the data.
 
     Source: Hu, Ortega & Yin (2024), arXiv 2403.10070 and 2504.13396.
     """
@@ -186,7 +186,7 @@ class Poisson(AbstractCustomOperator):
     def _check_values(self, matrices, X) -> None:
         size = np.abs(matrices).max(axis=(1, 2))
         symmetric = np.abs(matrices + np.swapaxes(matrices, 1, 2)).max(axis=(1, 2)) / 2
-        # Rounding in float32 leaves 1e-7 of Π, a wrong sign 1.
+        # The symmetric part is 1e-7 of Π by rounding in float32, and 1 if a sign is wrong.
         worst = int(np.argmax(symmetric - 1e-6 * size))
         if symmetric[worst] > 1e-6 * size[worst]:
             raise ValueError(
@@ -209,7 +209,7 @@ def _operator_function(fn: Any, whose: str, name: str) -> Operator:
 
 
 _NO_TENSOR = (
-    "charged_particle makes a tensor and is not one itself: give it the magnetic field, "
+    "charged_particle is a function that makes a tensor: call it with the magnetic field, "
     "hk.Poisson(k, hk.poisson.charged_particle(1.0))."
 )
 
@@ -218,16 +218,16 @@ class _AbstractTensor(eqx.Module):
     """A tensor Π of this library."""
 
     @abc.abstractmethod
-    def _at(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+    def _value(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
         """Π(x) at one state."""
 
     def __call__(self, *x: Float[Array, " n"]) -> Float[Array, "n n"]:
         if len(x) != 1 or jnp.ndim(x[0]) == 0:
             raise TypeError(
-                f"{self!r} is a tensor itself, a function of one state (n,), and makes none: write "
-                f"hk.Poisson(k, hk.poisson.{self!r}), without brackets or parameters after it."
+                f"{self!r} is a tensor, a function of one state (n,), and takes no parameters: "
+                f"write hk.Poisson(k, hk.poisson.{self!r}), without brackets after the name."
             )
-        return self._at(x[0])
+        return self._value(x[0])
 
 
 class RigidBodyTensor(_AbstractTensor):
@@ -239,21 +239,21 @@ class RigidBodyTensor(_AbstractTensor):
     def __repr__(self) -> str:
         return "rigid_body"
 
-    def _at(self, x: Float[Array, "3"]) -> Float[Array, "3 3"]:
+    def _value(self, x: Float[Array, "3"]) -> Float[Array, "3 3"]:
         return _cross(require.point(x, 3, "the state of rigid_body"))
 
 
 class LotkaVolterraTensor(_AbstractTensor):
     """Π(x, y) = [[0, −xy], [xy, 0]]: prey x and predators y, n = 2.
 
-    With H = δx − γ log x + βy − α log y it gives ẋ = αx − βxy and ẏ = δxy − γy. In the logarithms
-    of the populations Π is J, up to its sign, and H is far easier to learn.
+    H = δx − γ log x + βy − α log y gives ẋ = αx − βxy and ẏ = δxy − γy. In the logarithms of the
+    populations Π is −J, and H is far easier to learn.
     """
 
     def __repr__(self) -> str:
         return "lotka_volterra"
 
-    def _at(self, x: Float[Array, "2"]) -> Float[Array, "2 2"]:
+    def _value(self, x: Float[Array, "2"]) -> Float[Array, "2 2"]:
         prey, predators = require.point(x, 2, "the state of lotka_volterra")
         product = prey * predators
         zero = jnp.zeros_like(product)
@@ -274,7 +274,7 @@ class ChargedParticleTensor(_AbstractTensor):
             "charged_particle", [text(self.field if self.constant is None else self.constant)]
         )
 
-    def _at(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+    def _value(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
         n = len(x)
         if n not in (4, 6):
             raise ValueError(
@@ -318,15 +318,16 @@ def charged_particle(
 
     Args:
         magnetic_field: e·B, the charge times the field: one number for motion in a plane normal to
-            the field, n = 4; three for motion in space, n = 6; or a function of the position q that
-            returns as many. Numbers are fixed; the arrays of an Equinox module are tuned.
+            the field, n = 4; three numbers for motion in space, n = 6; or a function of the
+            position q that returns these. Numbers are fixed; `tune` tunes the arrays of an Equinox
+            module.
 
     Returns:
         Π, for `hk.Poisson(k, hk.poisson.charged_particle(2.0))`. p is the KINETIC momentum mq̇.
 
     Raises:
-        ValueError: the field has another number of components, or is not finite. TypeError: it is
-            traced by JAX, as a state is where `charged_particle` itself is given as the tensor.
+        ValueError: the field has another number of components, or is not finite. TypeError: JAX
+            traces the field, as in `hk.Poisson(k, charged_particle)` without a call.
 
     Source: Littlejohn (1979), J. Math. Phys. 20, 2445, eq. (5).
     """

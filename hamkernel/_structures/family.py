@@ -32,13 +32,13 @@ from hamkernel._structures.joined import AbstractJoinedKernel
 class AbstractFamily(AbstractJoinedKernel):
     """Σᵢ kᵢ(θ, ϑ) Kᵢ(x, z), with one term or several."""
 
-    given: ClassVar[str] = "parameters"
+    input_name: ClassVar[str] = "parameters"
     inner: ClassVar[str] = "the members: Family"
 
     terms: eqx.AbstractVar[tuple["Family", ...]]
 
     @property
-    def of_states(self) -> AbstractMatrixKernel:
+    def state_kernel(self) -> AbstractMatrixKernel:
         """The kernel K of the members; for several terms the sum of their kernels."""
         first, *rest = (term.member for term in self.terms)
         return Sum(first, *rest) if rest else first
@@ -46,29 +46,29 @@ class AbstractFamily(AbstractJoinedKernel):
     def with_states(self, K: AbstractMatrixKernel) -> "AbstractFamily":
         """ValueError: a family has a kernel of states in each of its terms."""
         raise ValueError(
-            "each term of a family has a kernel of its members, which is named there: for unknown "
-            "masses hk.Family(hk.UnknownMasses(K, masses), k)."
+            "the kernel of the members cannot be replaced in a family: name it inside, as in "
+            "hk.Family(hk.UnknownMasses(K, masses), k)."
         )
 
     @property
     def conserves(self) -> bool:
         """Whether every member conserves its H."""
-        return self.of_states.conserves
+        return self.state_kernel.conserves
 
     def check_identified(self, U: Float[np.ndarray, "N p"]) -> None:
         """ValueError for a coordinate of θ that is the same at all points."""
         fixed = np.flatnonzero((U == U[:1]).all(axis=0))
         if fixed.size == U.shape[1]:
             raise ValueError(
-                f"all {len(U)} points have the parameters {U[0].tolist()}: that is one system and "
-                "no family, and nothing says how the field depends on them. Give data of other "
-                "members too, or fit without parameters, with the kernel inside of Family."
+                f"all {len(U)} points have the parameters {U[0].tolist()}, so the data contain one "
+                "system and no family. Add data of other members, or fit without parameters, with "
+                "the kernel inside of Family."
             )
         if fixed.size:
             i = int(fixed[0])
             raise ValueError(
-                f"parameters[:, {i}] is {U[0, i]:g} at all points, so nothing says how the field "
-                "depends on it: leave it out, or give data of other members too."
+                f"parameters[:, {i}] is {U[0, i]:g} at all points, so the data do not show how the "
+                "field depends on it: leave it out, or add data of other members."
             )
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
@@ -102,7 +102,7 @@ class AbstractFamily(AbstractJoinedKernel):
 
     def centre(self, Z: Float[Array, "M d"]) -> Float[Array, " d"] | None:
         states, T = self.split(Z)
-        centre = self.of_states.centre(states)
+        centre = self.state_kernel.centre(states)
         if centre is None:
             return None
         shifts = all(Invariance.TRANSLATION in t.parameters.invariance for t in self.terms)
@@ -111,7 +111,7 @@ class AbstractFamily(AbstractJoinedKernel):
     @property
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
         """The scalar kernels of the members, functions of states."""
-        return self.of_states.scalar_kernels
+        return self.state_kernel.scalar_kernels
 
     def __add__(self, other: Any) -> Any:
         if not isinstance(other, AbstractMatrixKernel):
@@ -129,40 +129,38 @@ class Family(AbstractFamily):
 
     The parameters θ, shape (p,), distinguish the members: a length, a load, the coefficients of a
     potential, the time. Pass the θ of each point: `hk.fit(hk.Family(K, k), X, Y, λ, parameters=Θ)`
-    with Θ of shape (N, p). The field is `field(x, θ)`; `field.at(θ)` is one member, an ordinary
-    field of K, which can be simulated, plotted and saved.
+    with Θ of shape (N, p). The result is `field(x, θ)`; `field.at(θ)` is one member, an ordinary
+    field of K.
 
-    The parts of a sum may depend on θ in different ways, H = T(p) + U(q; θ):
+    The terms of a sum may depend on θ in different ways, H = T(p) + U(q; θ):
 
         T, U = hk.Symplectic(hk.Select(k, (1,))), hk.Symplectic(hk.Select(k, (0,)))
         K = hk.Family(T) + hk.Family(U, hk.Gaussian(1.0))
 
-    If both parts change, give each part its own k, since T and U may have different lengthscales in
-    θ. With one short run of each of eight pendulums and an even H, the error of an unmeasured
-    pendulum was .0051 with one k for T + U, and .0039 with two (`tests/benchmarks/families.py`).
+    If both terms depend on θ, give each its own k. With one k for T + U the error of an unmeasured
+    pendulum was .0051, with two .0039 (`tests/benchmarks/families.py`).
 
     Between measured members a family interpolates, and is better than a separate model for each
-    member. Outside the range of measured θ it extrapolates, no better than separate models, and the
-    deviation of `hk.condition` grows to that of the prior over a lengthscale of k. The deviation is
-    too small if the field changes faster with θ there than among the measured members, as 1/θ² does
-    towards zero: built-in kernels depend on θ − ϑ alone. Choose a θ in which the field changes
-    evenly.
+    member. Outside the range of measured θ it is no better than separate models, and the deviation
+    of `hk.condition` grows to the prior deviation over a lengthscale of k. The deviation is too
+    small if the field changes faster with θ there than among the measured members, as 1/θ² does
+    towards zero. Choose a θ in which the field changes evenly.
 
-    For a drive of known frequency use `Controlled` with u = (cos ωt, sin ωt) instead, in which the
-    drive enters linearly.
+    For a drive of known frequency use `Controlled` with u = (cos ωt, sin ωt) instead, since the
+    drive is linear in u.
 
     Args:
         member: K, the structured kernel of each member.
         parameters: k, a scalar kernel of θ, without an amplitude, since K has one. The range of θ
             is a good first lengthscale. If None, all members are the same.
-        count: p. `fit` takes it from the data.
+        count: p; if None, `fit` takes p from the data.
 
     Raises:
-        TypeError: `member` is not matrix-valued, or takes inputs or parameters already; or
-            `parameters` is no scalar kernel.
+        TypeError: `member` is not matrix-valued, or takes inputs or parameters; or `parameters` is
+            no scalar kernel.
 
-    Source: the intrinsic model of coregionalisation, k(θ, ϑ) in the place of its matrix: Bonilla,
-        Chai & Williams (2008); Álvarez, Rosasco & Lawrence (2012).
+    Source: Bonilla, Chai & Williams (2008); Álvarez, Rosasco & Lawrence (2012): the intrinsic model
+        of coregionalisation, with k(θ, ϑ) instead of a matrix.
     """
 
     member: AbstractMatrixKernel
@@ -174,7 +172,7 @@ class Family(AbstractFamily):
         if self.member.takes_inputs:
             raise TypeError(
                 f"the members of a family are fields of states alone, and {type(member).__name__} "
-                "takes inputs or parameters already: give all θ to one Family."
+                "takes inputs or parameters: put all of them into the θ of one Family."
             )
         self.parameters = Constant() if parameters is None else as_scalar_kernel(parameters)
         self.count = count
@@ -214,7 +212,9 @@ class FamilySum(AbstractFamily):
     def __init__(self, terms: tuple["Family", ...], count: int | None = None):
         counts = {t.count for t in terms if t.count is not None}
         if len(counts) > 1:
-            raise ValueError(f"the families have {sorted(counts)} parameters: all need the same θ.")
+            raise ValueError(
+                f"the families in a sum have {sorted(counts)} parameters: all need the same θ."
+            )
         self.count = counts.pop() if counts and count is None else count
         self.terms = tuple(Family(t.member, t.parameters, self.count) for t in terms)
 

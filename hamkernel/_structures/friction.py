@@ -1,8 +1,4 @@
-"""Friction, of two kinds.
-
-`PortHamiltonian` has friction in its operator, J − R. `Friction` is the kernel of one force curve
-with a few unknown numbers.
-"""
+"""Friction: in the operator J − R (`PortHamiltonian`), and as a force curve (`Friction`)."""
 
 import copy
 from collections.abc import Sequence
@@ -26,12 +22,22 @@ from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.structure import AbstractPotentialKernel, canonical, check_even
 
-# The default rest speed, over the root mean square of the momenta. Measured at .03, .006, .003
-# and .001 for a real pendulum (`tests/benchmarks/real_logs.py`): log p 6892, 6911, 6917, 6917;
-# errors of rollouts under a controller that lets the pendulum rest .16, .11, .11, .12 rad. At .03,
-# .01 and .003 for a drive (`tests/benchmarks/machines.py`): log p 13 586, 13 770, 13 858; errors of
-# free runs 3.3, 3.2, 2.3 mm. A simulated minute of a sticking pendulum takes 17 ms, and 6 ms with
-# .01.
+# The default rest speed, over the root mean square of the momenta. Measured for a real pendulum
+# (`tests/benchmarks/real_logs.py`), with the error of rollouts in which the pendulum comes to rest.
+#
+#     fraction     .03      .006     .003     .001
+#     log p       6892     6911     6917     6917
+#     error        .16      .11      .11      .12 rad
+#
+# Measured for a drive (`tests/benchmarks/machines.py`), with the error of free runs.
+#
+#     fraction     .03      .01      .003
+#     log p     13 586   13 770   13 858
+#     error        3.3      3.2      2.3 mm
+#
+# A simulated minute of a sticking pendulum takes 17 ms with .003, and 6 ms with .01. A trained rest
+# speed absorbs other effects than friction: on the real pendulum it rose from a hundredth to a
+# fifth of the largest speed, and the error of rollouts under another controller from .13 to .5 rad.
 REST_SPEED_FRACTION = 0.003
 DEFAULT_REST_SPEED = 0.1  # without data
 
@@ -53,14 +59,14 @@ def damped_coordinates(damped: tuple[int, ...] | None, n: int) -> tuple[int, ...
 class PortHamiltonian(AbstractPotentialKernel):
     """K(x, z) = (J − R) [∂x ∂zᵀ k(x, z)] (J − R)ᵀ: fields f = (J − R)∇H with friction R ≥ 0.
 
-    R is diagonal, constant and positive on the damped coordinates, zero on the others. With the
-    momenta damped q̇ = ∂H/∂p and ṗ = −∂H/∂q − r ∂H/∂p = −∂H/∂q − r q̇: viscous friction. Along the
-    flow dH/dt = −∇HᵀR∇H, `field.dissipation(x)`.
+    R is diagonal and constant, positive on the damped coordinates and zero on the others. With
+    damped momenta, q̇ = ∂H/∂p and ṗ = −∂H/∂q − r ∂H/∂p = −∂H/∂q − r q̇, viscous friction. Along the
+    flow dH/dt = −∇HᵀR∇H = −`field.dissipation(x)`.
 
-    The friction is a hyperparameter: every objective of `tune` finds it, and `frozen="friction"`
-    keeps it. Friction on p is unique if ∂²H/∂p² is invertible. In a (nearly) linear system only the
-    sum of the frictions on q and p can be identified. If the friction rests on the lower end of its
-    box, see `tuned.at_bounds`, the data show none.
+    The friction r is a hyperparameter: every objective of `tune` finds r, and `frozen="friction"`
+    keeps r fixed. Friction on p is unique if ∂²H/∂p² is invertible. In a nearly linear system only
+    the sum of the frictions on q and p can be identified. If r rests on the lower end of its
+    box (`tuned.at_bounds`), the data show no friction.
 
     Args:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
@@ -69,9 +75,9 @@ class PortHamiltonian(AbstractPotentialKernel):
         damped: the coordinates with friction, counted from 0; the momenta if None.
 
     Raises:
-        TypeError: `kernel` is not a scalar kernel. ValueError: the friction is not positive, or not
-            one number or one per damped coordinate; `damped` are no coordinates. With data: n is
-            odd, or there is no such coordinate.
+        TypeError: `kernel` is not a scalar kernel. ValueError: the friction is not positive, or has
+            another shape; `damped` are no coordinates; or, with data, n is odd, or `damped` names a
+            coordinate that does not exist.
 
     Example: `hk.tune(hk.PortHamiltonian(1.0 * hk.Gaussian(1.0), friction=0.1), X, Y,
         objective="marginal_likelihood").kernel.friction`.
@@ -94,8 +100,8 @@ class PortHamiltonian(AbstractPotentialKernel):
     ):
         self.kernel = as_scalar_kernel(kernel)
         cure = (
-            "Energy that grows is no friction; for a system without friction use Symplectic(k), "
-            "and for other damping Structured(k, operator)."
+            "For a system without friction use Symplectic(k), and for other damping, or energy "
+            "that grows, Structured(k, operator)."
         )
         array = require.positive(friction, "friction", cure)
         self.damped = None if damped is None else require.coordinates(damped, "damped")
@@ -118,7 +124,9 @@ class PortHamiltonian(AbstractPotentialKernel):
     def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
         return -canonical(v) - self._damping(v)
 
-    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
+    def dissipated_power(
+        self, x: Float[Array, " n"], slope: Float[Array, " n"]
+    ) -> Float[Array, ""]:
         """The dissipated power ∇HᵀR∇H, a sum of squares."""
         return jnp.sum(self.resistance(len(x)).astype(x.dtype) * slope**2)
 
@@ -164,8 +172,8 @@ class PortHamiltonian(AbstractPotentialKernel):
         unused = sorted(set(coordinates) - frozenset().union(*self.kernel.supports(n)))
         if unused:
             raise ValueError(
-                f"friction on coordinate {unused[0]} is -r ∂H/∂x there, and the kernel of H does "
-                "not depend on that coordinate, so there would be none. Where the kinetic energy is"
+                f"the friction on coordinate {unused[0]} is -r ∂H/∂x, and the kernel of H does not "
+                "depend on this coordinate, so the friction would be zero. If the kinetic energy is"
                 " known as a mean, q̇ = p/m, add hk.Friction() to hk.Symplectic(k) instead."
             )
         super().check_dimension(n)
@@ -175,21 +183,20 @@ class Friction(AbstractMatrixKernel):
     """K_ii(x, z) = F(xᵢ) F(zᵢ): forces −a F(v) on the momenta, a ~ N(0, 1), for a sum of kernels.
 
     F(v) = d v + c tanh(v/ε) + s exp(−(v/w)²) tanh(v/ε): viscous, dry (Coulomb) and Stribeck
-    friction, with d, c, s and w > 0 as hyperparameters. F is odd and has the sign of v. With a > 0
-    the force therefore removes energy at every speed, measured or not; the fit finds a, which is
-    negative only if friction drives the motion. (With a Gaussian kernel of the momentum the
-    friction would fall to zero outside the data.)
+    friction, with d, c, s and w > 0 as hyperparameters. F is odd and has the sign of v, so a force
+    with a > 0 removes energy at every speed, inside and outside the data. The fit finds a; a < 0
+    means that the force drives the motion.
 
     Add this kernel to the kernel of the energy, `Sum(energy=Symplectic(k), friction=Friction())`.
-    The energy need not depend on the momenta: with q̇ = p/m known and `Symplectic(Select(k, 0))`
-    for the rest, friction is found from positions alone, where R ∂H/∂p of `PortHamiltonian` is
-    zero. If the curve is too simple, add a smooth term such as `Odd(CurlFree(Select(k, 1)))`. It
-    vanishes away from the data. The energy is `field.part("energy").hamiltonian`.
+    The energy is then `field.part("energy").hamiltonian`. Its kernel need not depend on the
+    momenta: if q̇ = p/m is the prior mean, `Symplectic(Select(k, 0))` is enough. If the curve is too
+    simple, add a smooth term such as `Odd(CurlFree(Select(k, 1)))`, which vanishes away from the
+    data.
 
-    The friction of a joint between links depends on the velocity of the joint, (M(q)⁻¹p)ᵢ or the
-    difference of two such velocities, and not on a momentum. It is −∂D/∂v = −M(q) ∂D/∂p with
-    Rayleigh's function D(v) = ½ d v² + c ε log cosh v/ε: a structure with the operator −M(q), and a
-    kernel with one product for each term.
+    The friction of a joint between links depends on the velocity of the joint, not on one momentum:
+    (M(q)⁻¹p)ᵢ, or the difference of two such velocities. The friction is −∂D/∂v = −M(q) ∂D/∂p with
+    Rayleigh's function D(v) = ½ d v² + c ε log cosh v/ε. Use a structure with the operator −M(q)
+    and one product kernel for each term of D:
 
         def terms(x):  # v: the velocities of the joints at x = (q, p)
             v = velocities(x)
@@ -205,25 +212,21 @@ class Friction(AbstractMatrixKernel):
         viscous: the first guess of d, in units of the momentum's rate over the momentum.
         coulomb: the first guess of c, a force.
         stribeck: the first guess of s, the force by which sticking exceeds sliding; None for none.
-        rest_speed: ε > 0, the momentum below which dry friction fades to zero. It makes the force
-            smooth and is not trained. If None, three thousandths of the root mean square of the
-            momenta when a field is learned from states (the kernel of the result has the number),
-            and .1 otherwise, as in `hk.gram`. Under `jax.jit` it must be given. A smaller ε costs a
-            simulation more steps. A system that should stick creeps at a speed of about ε, and the
-            error bars do not account for it: for a pendulum with position noise 1e-3, 89 % of the
-            true U′ lies within two standard deviations (14 logs; `tests/benchmarks/model_error.py
-            friction`). If ε were trained, it would absorb other effects than friction: on a real
-            pendulum ε rose from a hundredth to a fifth of the largest speed, and the error of
-            rollouts under another controller from .13 to .5 rad.
+        rest_speed: ε > 0, the momentum below which dry friction fades to zero, so that the force is
+            smooth; not trained. If None, fits and `learn` take .003 of the root mean square of the
+            momenta (the kernel of the result has the number), and other functions .1. Under
+            `jax.jit` a number is needed. A smaller ε costs a simulation more steps. A system that
+            should stick creeps at a speed of about ε, and error bars do not account for the creep
+            (`tests/benchmarks/model_error.py friction`).
         stribeck_speed: the first guess of w, the momentum above which the joint slides.
         damped: the coordinates with friction, counted from 0; the momenta if None.
 
     Each guess is a number for all damped coordinates, or an array with one for each.
 
     Raises:
-        ValueError: a guess is not positive and finite, or `damped` are no coordinates. With data: n
-            is odd and `damped` is None, or there is no such coordinate. TypeError: a guess is no
-            number.
+        ValueError: a guess is not positive and finite; `damped` are no coordinates; or, with data,
+            n is odd and `damped` is None, or `damped` names a coordinate that does not exist.
+            TypeError: a guess is no number.
 
     Example: `hk.Sum(energy=hk.Symplectic(hk.Select(k, 0)), friction=hk.Friction(0.1, 1.0))`.
 
@@ -239,7 +242,7 @@ class Friction(AbstractMatrixKernel):
 
     symplectic: ClassVar[bool] = False
     no_potential: ClassVar[str | None] = (
-        "friction has no potential: the energy is that of another part of the sum, "
+        "friction has no potential: ask the part of the sum with the energy, "
         "field.part(…).hamiltonian."
     )
 
@@ -308,8 +311,7 @@ class Friction(AbstractMatrixKernel):
             fastest = fastest.max()
         if name == "log_stribeck_speed":
             # Near the turning points of a swing of n samples the speed changes by 2π/n of the
-            # largest speed per sample, so with fewer than 300 samples a log does not resolve 2 % of
-            # it.
+            # largest speed per sample: 2 % of the largest speed needs 300 samples.
             return np.log(0.02 * fastest), np.log(fastest)
         force = 0.5 * np.log(amplitude)
         if name == "log_viscous":
@@ -338,9 +340,8 @@ class Friction(AbstractMatrixKernel):
 
     def average_over(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
         raise TypeError(
-            "friction has no potential to be averaged, and no motion with friction runs backwards: "
-            "say the symmetry of the energy alone, Sum(energy=Invariant(K, maps), "
-            "friction=Friction())."
+            "friction has no potential that could have a symmetry: give the symmetry to the energy "
+            "alone, Sum(energy=Invariant(K, maps), friction=Friction())."
         )
 
     @property
@@ -360,7 +361,7 @@ def frictions(K: AbstractMatrixKernel) -> list[Friction]:
 def with_rest_speed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> Any:
     """K with a rest speed in every `Friction`, from the states X[:, :n].
 
-    With several momenta, the slowest one sets the rest speed. Systems at rest get .1.
+    The slowest momentum that moves sets the rest speed. Systems at rest get .1.
     """
     if all(part.rest_speed is not None for part in frictions(K)):
         return K

@@ -38,7 +38,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
     """A kernel of points (x, u), u of shape (m,).
 
     Attributes:
-        count: m; None until the data determines it.
+        count: m; None until the data determine m.
         inner: the name, in error messages, of the part that may have a symmetry.
     """
 
@@ -50,12 +50,12 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
 
     @property
     @abc.abstractmethod
-    def of_states(self) -> AbstractMatrixKernel:
+    def state_kernel(self) -> AbstractMatrixKernel:
         """The kernel of fields of x alone: of the drift, or of a member."""
 
     @abc.abstractmethod
     def with_states(self, K: AbstractMatrixKernel) -> "AbstractJoinedKernel":
-        """This kernel with `of_states` replaced by K."""
+        """This kernel with `state_kernel` replaced by K."""
 
     @abc.abstractmethod
     def check_identified(self, U: Float[np.ndarray, "N m"]) -> None:
@@ -79,15 +79,17 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
 
     @property
     def no_potential(self) -> str | None:
-        return self.of_states.no_potential
+        return self.state_kernel.no_potential
 
     @property
     def has_hamiltonian(self) -> bool:
         """Whether the fields of x alone have a Hamiltonian."""
-        return self.of_states.has_hamiltonian
+        return self.state_kernel.has_hamiltonian
 
-    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
-        return self.of_states.dissipated(x, slope)
+    def dissipated_power(
+        self, x: Float[Array, " n"], slope: Float[Array, " n"]
+    ) -> Float[Array, ""]:
+        return self.state_kernel.dissipated_power(x, slope)
 
     def outputs(self, inputs: int) -> int:
         return inputs - self.input_count
@@ -97,8 +99,9 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
         """The number m; ValueError as long as it is unknown."""
         if self.count is None:
             raise ValueError(
-                f"this {type(self).__name__} kernel does not know how many {self.given} there are: "
-                f"give them, hk.fit(K, X, Y, {self.given}=U), or say count=1 when it is made."
+                f"the number of {self.input_name} of this {type(self).__name__} kernel is not "
+                f"known: pass them, hk.fit(K, X, Y, {self.input_name}=U), or make the kernel with "
+                "count=1."
             )
         return self.count
 
@@ -121,19 +124,21 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
         """`n` counts the coordinates of u, too."""
         if self.outputs(n) < 1:
             raise ValueError(
-                f"points (x, u) with {self.input_count} {self.given} have no coordinates left."
+                f"points (x, u) with {self.input_count} {self.input_name} have no coordinates left."
             )
-        self.of_states.check_dimension(self.outputs(n))
+        self.state_kernel.check_dimension(self.outputs(n))
 
     def check_points(self, X: Float[Array, "N d"]) -> None:
         self.check_dimension(X.shape[1])
-        self.of_states.check_points(self.split(X)[0])
+        self.state_kernel.check_points(self.split(X)[0])
 
     def with_parity(self, parity: int) -> AbstractMatrixKernel:
-        raise TypeError(f"say the symmetry of {self.inner}(Odd(K), …).")
+        raise TypeError(f"Odd and Even belong inside: give them to {self.inner}(Odd(K), …).")
 
     def average_over(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
-        raise TypeError(f"say the symmetry of {self.inner}(Invariant(K, maps), …).")
+        raise TypeError(
+            f"a symmetry belongs inside: give it to {self.inner}(Invariant(K, maps), …)."
+        )
 
     @property
     def invariance(self) -> Invariance:
@@ -146,19 +151,19 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
 
 
 class InputMatrix(eqx.Module):
-    """The prior of an unknown input matrix G(x), shape (n, m).
+    """The prior of an unknown input matrix G(x), shape (n, m), for `Controlled`.
 
-    Its entries are independent functions in the RKHS of one scalar kernel, in the rows `acts_on`;
-    the other rows are zero: a torque changes momenta and not positions.
+    The entries in the rows `acts_on` are independent functions in the RKHS of one scalar kernel.
+    The other rows are zero: a torque, for example, changes momenta and not positions.
 
     Args:
         kernel: a scalar kernel, for a G that depends on the state; or a positive number, the prior
-            variance of the entries of an unknown constant G.
-        acts_on: the coordinates that inputs change, counted from 0; all of them if None.
+            variance of the entries of a constant G, in squared units of velocity per input.
+        acts_on: the coordinates that inputs change, counted from 0; all if None.
 
     Raises:
-        TypeError: `kernel` is neither. ValueError: the variance is not positive, or `acts_on` are
-            no coordinates.
+        TypeError: `kernel` is neither a kernel nor a number. ValueError: the variance is not
+            positive, or `acts_on` are no coordinates.
 
     Example: `hk.Controlled(K, inputs=hk.InputMatrix(hk.Gaussian(2.0), acts_on=(1,)))`.
     """
@@ -185,7 +190,7 @@ class InputMatrix(eqx.Module):
 
 
 class KnownMatrix(eqx.Module):
-    """A known constant input matrix G, kept as Python numbers, which are not trained."""
+    """A known constant input matrix G, stored as Python numbers, which `tune` does not train."""
 
     entries: tuple[tuple[float, ...], ...] = eqx.field(static=True)
 
@@ -202,35 +207,35 @@ class Controlled(AbstractJoinedKernel):
     """Fields with inputs: f(x, u) = f(x) + G(x) u, f in the RKHS of K.
 
     Pass the inputs of each point to `fit`, `tune` and the losses: `hk.fit(K, X, Y, λ, inputs=U)`
-    with U of shape (N, m). The field is `field(x, u)`. `field.drift(x)` is f, an ordinary field of
+    with U of shape (N, m). The result is `field(x, u)`. `field.drift(x)` is f, an ordinary field of
     K with its Hamiltonian, and `field.input_matrix(x)` is G.
 
-    Time is an input like any other: with U the values of t, or of cos ωt and sin ωt, the field is
-    f(x) + G(x) u(t), and `hk.simulate(field, x0, ts, inputs=lambda t: jnp.array([t]))` follows it.
+    For a field that depends on time, take u = t, or u = (cos ωt, sin ωt): the field is then
+    f(x) + G(x) u(t), and `hk.simulate(field, x0, ts, inputs=lambda t: jnp.array([t]))` simulates.
 
-    An input that is constant over all data cannot be distinguished from the drift, and is refused
-    unless G is known. Vary every input.
+    Vary every input: the data cannot distinguish a constant input from the drift, and `fit` refuses
+    a constant input unless G is known.
 
     Args:
         drift: K, the structured kernel of f.
-        inputs: an `InputMatrix`, for an unknown G; or G itself, an array (n, m), where it is known.
-        count: m, the number of inputs. `fit` takes it from the data.
+        inputs: an `InputMatrix`, if G is unknown; or a known constant G, an array (n, m).
+        count: m, the number of inputs; if None, `fit` takes m from the data.
 
     Raises:
-        TypeError: `drift` is not matrix-valued, or `inputs` is neither. ValueError: a known G is no
-            finite matrix.
+        TypeError: `drift` is not matrix-valued, or `inputs` is neither an `InputMatrix` nor an
+            array. ValueError: a known G is no finite matrix.
 
     Example: `hk.Controlled(hk.PortHamiltonian(k), inputs=hk.InputMatrix(1.0, acts_on=(1,)))`.
 
-    Source: Beckers et al. (2022) for the process; the kernel of a function that is affine in u is
-        that of Castañeda et al. (2021).
+    Source: Beckers et al. (2022) for the process; Castañeda et al. (2021) for the kernel of a
+        function that is affine in u.
     """
 
     drift: AbstractMatrixKernel
     inputs: InputMatrix | KnownMatrix
     count: int | None = eqx.field(static=True)
 
-    given: ClassVar[str] = "inputs"
+    input_name: ClassVar[str] = "inputs"
     inner: ClassVar[str] = "the drift: Controlled"
 
     def __init__(self, drift: AbstractMatrixKernel, inputs: Any, count: int | None = None):
@@ -238,15 +243,15 @@ class Controlled(AbstractJoinedKernel):
         if self.drift.takes_inputs:
             raise TypeError(
                 f"the drift of Controlled is a {type(self.drift).__name__}, which takes inputs or "
-                "parameters already: give all inputs to one Controlled."
+                "parameters itself: give all inputs to one Controlled."
             )
         if isinstance(inputs, InputMatrix | KnownMatrix):
             self.inputs = inputs
         elif callable(inputs) or isinstance(inputs, str):
             raise TypeError(
                 "inputs must be hk.InputMatrix(k, acts_on=(1,)), for an unknown input matrix, or a "
-                f"known one as an array (n, m); got {inputs!r}. Where G(x) is a known function, fit"
-                " with mean=lambda x, u: G(x) @ u, and an array of zeros here."
+                f"known one as an array (n, m); got {inputs!r}. If G(x) is a known function, fit"
+                " with mean=lambda x, u: G(x) @ u, and pass an array of zeros here."
             )
         else:
             self.inputs = KnownMatrix(_entries(inputs))
@@ -254,7 +259,7 @@ class Controlled(AbstractJoinedKernel):
         self.count = G.matrix.shape[1] if isinstance(G, KnownMatrix) else count
 
     @property
-    def of_states(self) -> AbstractMatrixKernel:
+    def state_kernel(self) -> AbstractMatrixKernel:
         """The kernel of the drift."""
         return self.drift
 
@@ -278,9 +283,9 @@ class Controlled(AbstractJoinedKernel):
         if rank < U.shape[1]:
             raise ValueError(
                 f"the inputs, less their means, have rank {rank} and there are {U.shape[1]}: a "
-                "combination of them is the same at all points, and cannot be told from the drift. "
-                "Vary every input on its own, leave out those that repeat others, or give the "
-                "matrix that is known, Controlled(K, inputs=G)."
+                "combination of inputs is the same at all points, so the data cannot distinguish "
+                "its effect from the drift. Vary every input on its own, leave out inputs that "
+                "repeat others, or give a known matrix, Controlled(K, inputs=G)."
             )
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:

@@ -27,29 +27,29 @@ class Lagrangian(eqx.Module):
         field = hk.fit(K, X, torques, 1e-6, accelerations=A)  # X = (q, v), where q̈ is known
         field.mass_matrix(q), field.gravity(q), field.inverse_dynamics(q, v, a)
 
-    The equation of Euler and Lagrange, τ = d/dt ∂L/∂v − ∂L/∂q + friction(v), is linear in L, so
-    torques are linear functionals of L ~ GP(0, k_V(q, q′) + k_M(q, q′) (v·v′)²) and one least
-    squares finds V, M and the friction together. Both kernels are carried by 64 positions of the
-    data. A joint without a motor has the torque zero.
+    The Euler-Lagrange equation τ = d/dt ∂L/∂v − ∂L/∂q + friction(v) is linear in L, so torques are
+    linear functionals of L ~ GP(0, k_V(q, q′) + k_M(q, q′) (v·v′)²), and one least squares finds V,
+    M and the friction together. V and M lie in the span of kernels at 64 positions of the data. A
+    joint without a motor has zero torque.
 
-    A constant in V is not determined. Without any torque the scale of L is not either, and L = 0
-    would fit everything: such data are refused, unless an entry of M is known. Friction of the
-    joints that is there and not asked for spoils M.
+    Torques determine V up to a constant. If all torques are zero, L = 0 fits, so `fit` and `learn`
+    need an entry of M. If the joints have friction, pass `friction=True`: otherwise M is wrong.
 
     Args:
         potential: the kernel k_V of V, on positions. A kernel without an amplitude gets one.
-        inertia: the kernel k_M of the entries of ½M, on positions; likewise.
-        angles: the coordinates that are angles, for which kernels see (cos, sin).
-        friction: whether joints have friction d v + c tanh(v/ε) with unknown d and c, one pair
-            each; its standard deviations are `viscous` and `coulomb` of a `Friction`. True is
-            `Friction(1.0, 1.0)`.
+        inertia: the kernel k_M of the entries of ½M, on positions. A kernel without an amplitude
+            gets one.
+        angles: the coordinates that are angles; the kernels take (cos q, sin q) for them.
+        friction: whether joints have friction d v + c tanh(v/ε), with unknown d and c for each
+            joint. A `Friction` gives the prior standard deviations `viscous` of d and `coulomb` of
+            c; True means `Friction(1.0, 1.0)`.
         known_mass_matrix: a pair (q, M) of one position, shape (m,), and the mass matrix there,
-            shape (m, m), with NaN for entries that are not known. One entry fixes the scale of L,
-            as a known load or a link that was weighed gives it.
+            shape (m, m), with NaN for unknown entries. One known entry, from a known load or a
+            weighed link, fixes the scale of L.
 
     Raises:
         TypeError: a kernel is no scalar kernel. ValueError: `angles` are no coordinates;
-            `known_mass_matrix` has other shapes, or no entry of it is known.
+            `known_mass_matrix` has other shapes, or no known entry.
     """
 
     potential: AbstractScalarKernel
@@ -81,7 +81,7 @@ class Lagrangian(eqx.Module):
         return call("Lagrangian", said)
 
     def embed(self, q: Float[Array, " m"]) -> Float[Array, " d"]:
-        """The coordinates that the kernels see: (cos, sin) of angles, all others as they are."""
+        """The arguments of the kernels: (cos q, sin q) for angles, q for other coordinates."""
         parts = [
             jnp.stack([jnp.cos(q[i]), jnp.sin(q[i])]) if i in self.angles else q[i : i + 1]
             for i in range(len(q))
@@ -99,12 +99,12 @@ def _is_scaled(node: Any) -> bool:
     return isinstance(node, Scaled)
 
 
-def _known(given: Any) -> tuple[tuple[float, ...], tuple[tuple[float | None, ...], ...]]:
-    """The position and the mass matrix there, symmetric, checked; None is not known."""
-    if not isinstance(given, tuple | list) or len(given) != 2:
+def _known(pair: Any) -> tuple[tuple[float, ...], tuple[tuple[float | None, ...], ...]]:
+    """A position and the mass matrix there, checked and symmetric; None for unknown entries."""
+    if not isinstance(pair, tuple | list) or len(pair) != 2:
         raise ValueError("known_mass_matrix must be a pair (q, M) of a position and M there.")
-    q = require.doubles(given[0], "the position of known_mass_matrix")
-    M = require.doubles(given[1], "known_mass_matrix")
+    q = require.doubles(pair[0], "the position of known_mass_matrix")
+    M = require.doubles(pair[1], "known_mass_matrix")
     if q.ndim != 1 or M.shape != (len(q), len(q)):
         raise ValueError(
             f"known_mass_matrix has a position of shape {q.shape} and a matrix of shape {M.shape}; "
@@ -124,13 +124,14 @@ def _known(given: Any) -> tuple[tuple[float, ...], tuple[tuple[float | None, ...
 class LagrangianFeatures(eqx.Module):
     """Features Φ of L and of friction, with L = Φ(x)·w and w ~ N(0, I).
 
-    Those of V are −R⁻¹k_V(C, q). Those of Mᵢⱼ are R⁻¹k_M(C, q) times vᵢ² or √2 vᵢvⱼ, i < j, since
-    (v·v′)² is the sum of their products. R is a root of a Gram, R Rᵀ = k(C, C). Rows "in kernels"
-    are without R⁻¹, which `whiten` applies to rows that were differentiated and integrated.
+    The features of V are −R⁻¹k_V(C, q). The features of Mᵢⱼ are R⁻¹k_M(C, q) times vᵢ² or
+    √2 vᵢvⱼ, i < j, since (v·v′)² is the sum of the products of vᵢ² and √2 vᵢvⱼ with the same terms
+    of v′. R is a root of a Gram, R Rᵀ = k(C, C). Rows "in kernels" are rows before the
+    multiplication by R⁻¹; `whiten` multiplies after rows were differentiated and integrated.
 
     Attributes:
         kernel: the Lagrangian kernel.
-        centres: what the kernels see of the positions that carry V and M, shape (c, d).
+        centres: C, the embedded positions whose kernels span V and M, shape (c, d).
         roots: the roots of k_V and k_M at the centres, each of shape (c, c).
         rest_speed: ε of dry friction.
         count: m, the number of positions.
@@ -144,13 +145,13 @@ class LagrangianFeatures(eqx.Module):
 
     @property
     def columns(self) -> int:
-        """How many features there are, those of friction last."""
+        """The number r of features; the features of friction are the last."""
         m = self.count
         return len(self.centres) * (1 + m * (m + 1) // 2) + self.friction_columns
 
     @property
     def friction_columns(self) -> int:
-        """How many of the features are of friction."""
+        """The number of features of friction."""
         return 2 * self.count * (self.kernel.friction is not None)
 
     def with_kernel(self, kernel: Lagrangian) -> "LagrangianFeatures":
@@ -201,8 +202,8 @@ class LagrangianFeatures(eqx.Module):
         shares[i, j, np.arange(len(i))] = shares[j, i, np.arange(len(i))] = np.where(
             i == j, 2.0, np.sqrt(2.0)
         )
-        found = jnp.einsum("ijp,c->ijpc", jnp.asarray(shares, phi.dtype), phi).reshape(m, m, -1)
-        return jnp.pad(found, ((0, 0), (0, 0), (c, self.friction_columns)))
+        rows = jnp.einsum("ijp,c->ijpc", jnp.asarray(shares, phi.dtype), phi).reshape(m, m, -1)
+        return jnp.pad(rows, ((0, 0), (0, 0), (c, self.friction_columns)))
 
     def friction_features(self, v: Float[Array, " m"]) -> Float[Array, "m r"]:
         """The friction of each joint, in kernels."""
@@ -238,16 +239,18 @@ def friction_of_joints(
 
 
 def lagrangian_features(K: Lagrangian, X: Float[Array, "N n"]) -> LagrangianFeatures:
-    """The features of K with centres among the positions of the states X, far from one another."""
+    """The features of K, with centres chosen far apart among the positions of the states X."""
     m = X.shape[1] // 2
     embedded = np.asarray(_embed(K, X[:, :m]))
     unit = embedded / np.where(np.ptp(embedded, axis=0) > 0, np.ptp(embedded, axis=0), 1.0)
-    given = None if K.friction is None else K.friction.rest_speed
+    rest_speed = None if K.friction is None else K.friction.rest_speed
     # Dry friction changes its sign within a tenth of the speed of the slowest joint.
-    rest = 0.1 * jnp.sqrt(jnp.mean(X[:, m:] ** 2, axis=0)).min() if given is None else given
+    speed = (
+        0.1 * jnp.sqrt(jnp.mean(X[:, m:] ** 2, axis=0)).min() if rest_speed is None else rest_speed
+    )
     centres = jnp.asarray(embedded[far_apart(unit, _CENTRES)])
     none = jnp.zeros((0, 0), X.dtype)
-    start = LagrangianFeatures(K, centres, (none, none), jnp.asarray(rest, X.dtype), m)
+    start = LagrangianFeatures(K, centres, (none, none), jnp.asarray(speed, X.dtype), m)
     return _with_kernel(start, K)
 
 

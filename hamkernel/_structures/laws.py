@@ -1,4 +1,4 @@
-"""Limits of what data say of laws that many parts share: in words, for fields and simulations."""
+"""Sentences about `Shared` laws: which changes no data determine, and which states are new."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from hamkernel._structures.completed import shared_laws
 from hamkernel._structures.structure import AbstractPotentialKernel
 
 _ZERO = 1e-5  # of the largest singular value, above the rounding of float32
-_CLOSER = 0.05  # of the range of the data, which is known from 256 of their states
+_CLOSER = 0.05  # of the range of the data, which is estimated from 256 states
 
 
 def undetermined_terms(K: Any, n: int) -> tuple[str, ...]:
@@ -58,7 +58,7 @@ def _linear_fields(K: Any, law: Shared, X: Float[Array, "N n"]) -> Float[Array, 
 
 
 def _null_vectors(M: Float[np.ndarray, "R Q"]) -> Float[np.ndarray, "d Q"]:
-    """The space of v with M v = 0, by vectors with as many zeros as elimination finds."""
+    """A basis of the null space of M; Gaussian elimination makes many entries zero."""
     _, sizes, V = np.linalg.svd(M)
     sizes = np.append(sizes, np.zeros(len(V) - len(sizes)))
     space, first = V[sizes <= _ZERO * max(sizes.max(), 1.0)], 0
@@ -76,9 +76,9 @@ def _null_vectors(M: Float[np.ndarray, "R Q"]) -> Float[np.ndarray, "d Q"]:
 
 
 def outside(K: Any, X: Float[Array, "T n"]) -> str:
-    """A sentence if parts of the states X are not among those of the data, else "".
+    """A sentence if parts of the states X lie outside the range of the data, else "".
 
-    For distances only those are meant that are smaller than all of the data.
+    For distances the check concerns only distances below the smallest in the data.
     """
     for law in shared_laws(K) if K is not None else ():
         if law.centres is None:

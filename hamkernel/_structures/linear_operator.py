@@ -1,4 +1,4 @@
-"""Fields L u with any linear operator L of the caller's, of any order of differentiation."""
+"""Fields L u with the caller's linear operator L, of any order of differentiation."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -20,12 +20,11 @@ Potential = Callable[[Float[Array, " n"]], Float[Array, ""]]
 class StructuredByOperator(AbstractStructure):
     """K(x, z) = L_x L_z k(x, z): fields f = L u, L a linear operator on functions u.
 
-    With L_z k(x, ·) as a function of x, and L applied to it once more,
+    The operator is applied to k twice, in z and then in x:
 
-        vᵀ(L_z k)(x) = v · operator(z ↦ k(x, z), z),    K(x, z) v = operator(x ↦ vᵀ(L_z k)(x), x),
+        vᵀ(L_z k)(x) = v · operator(z ↦ k(x, z), z),    K(x, z) v = operator(x ↦ vᵀ(L_z k)(x), x).
 
-    so an operator of order p takes derivatives of k of order 2p. Nesting costs the m × m entries of
-    the block, and no n × n block of second derivatives in between.
+    So an operator of order p takes derivatives of k of order 2p.
     """
 
     kernel: AbstractScalarKernel
@@ -67,8 +66,8 @@ class StructuredByOperator(AbstractStructure):
 
     def average_over(self, maps: Any) -> AbstractStructure:
         raise TypeError(
-            "the symmetry of an operator (u, x) is not known: average the kernel yourself, "
-            "Structured(Invariant(k, maps), operator), if the operator allows it."
+            "the symmetry of an operator (u, x) is not known: if the operator has the symmetry, "
+            "put Invariant inside, Structured(Invariant(k, maps), operator)."
         )
 
     def check_dimension(self, n: int) -> None:
@@ -104,11 +103,11 @@ class StructuredByOperator(AbstractStructure):
 
 @precise_jit
 def _values(K: StructuredByOperator, X: Float[Array, "N n"]) -> tuple[Array, Array, Array, Array]:
-    """The numbers that the checks need, for each point.
+    """For each point: the error of linearity, its scale, K(x, x), and |K(x, x + h) − K(x, x)|.
 
-    They are the error of linearity, the size of its terms, K(x, x), and how far K(x, x + h) is from
-    K(x, x). h is a ten-thousandth of the spread of the states. Over that length a kernel changes by
-    (h/l)² = 1e-4 if its lengthscale is a hundredth of the spread, and by all if it is too rough.
+    h is a ten-thousandth of the spread of the states. Over the length h a kernel changes by
+    (h/l)² = 1e-4 if its lengthscale is a hundredth of the spread, and by its size if it is too
+    rough.
     """
     h = 1e-4 * jnp.std(X, axis=0)
 

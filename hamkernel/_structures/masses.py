@@ -1,4 +1,4 @@
-"""States (q, q̇) in the place of (q, p), with unknown masses."""
+"""States (q, q̇) instead of (q, p), with unknown masses."""
 
 from typing import Any, ClassVar
 
@@ -16,30 +16,30 @@ from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 
 
 class UnknownMasses(AbstractMatrixKernel):
-    """K′(y, z) = S⁻¹ K(Sy, Sz) S⁻ᵀ: states y = (q, q̇) of a structure for x = Sy = (q, p).
+    """K′(y, z) = S⁻¹ K(Sy, Sz) S⁻ᵀ: the structure K of (q, p) = Sy, for states y = (q, q̇).
 
-    S = diag(I, M) with a constant mass matrix M, so p = M q̇, and a field f of K for (q, p) is
-    S⁻¹f(Sy) for (q, q̇). M is a hyperparameter: diagonal, or a full matrix that stays symmetric and
-    positive, M = L D Lᵀ with a unit lower triangle L. Its first entry is 1, since scaling H and M
-    together changes no motion; `field.hamiltonian(y)` is H in that unit.
+    S = diag(I, M) with a constant mass matrix M, so p = M q̇. A field f for (q, p) becomes S⁻¹f(Sy)
+    for (q, q̇). M is a hyperparameter: diagonal, or a full symmetric positive definite matrix
+    M = L D Lᵀ with a unit lower triangle L. The first entry of M is 1, since scaling H and M
+    together changes no motion; `field.hamiltonian(y)` is H in this unit.
 
-    What can be identified: with q̈ = −M⁻¹∇U(q), every M that makes M ∂q̈/∂q symmetric at all q
-    explains the motion. The ratio of two masses is seen only where the motion of one depends on the
-    other. A full matrix needs nonlinear forces: for linear oscillations every M under which their
-    modes are orthogonal explains the motion.
+    Let q̈ = −M⁻¹∇U(q). Every M that makes M ∂q̈/∂q symmetric at all q explains the motion, so the
+    ratio of two masses is identified only if the motion of one depends on the other. A full matrix
+    needs nonlinear forces: a linear oscillation is explained by every M for which its modes are
+    orthogonal.
 
-    As the drift of `Controlled` it leaves the inputs in (q, q̇): G holds accelerations, M⁻¹ times
-    the forces, so a force on one coordinate moves several where M is full.
+    As the drift of `Controlled`, G contains accelerations, M⁻¹ times the forces. If M is full, a
+    force on one coordinate therefore accelerates several.
 
     Args:
         kernel: K, a matrix-valued kernel, such as `Symplectic(k)`.
-        masses: the first guess, m ≥ 2 degrees of freedom: shape (m,) for a diagonal M, (m, m) for a
-            full one, symmetric and positive definite. Its unit does not matter.
+        masses: the first guess of M, for m ≥ 2 degrees of freedom: shape (m,) for a diagonal M,
+            (m, m) for a full symmetric positive definite M. The unit does not matter.
 
     Raises:
-        TypeError: K is not matrix-valued, or it is `Controlled`. ValueError: a mass is not positive
-            and finite, a matrix is not symmetric and positive definite, or there is one degree of
-            freedom only.
+        TypeError: K is not matrix-valued, or is `Controlled`. ValueError: a mass is not positive
+            and finite; a matrix is not symmetric and positive definite; or there is only one degree
+            of freedom.
 
     Example: `hk.tune(hk.UnknownMasses(hk.Symplectic(k), [1.0, 1.0]), X, Y)`, or
     `hk.learn(hk.UnknownMasses(hk.Symplectic(k), np.eye(2)), runs)`.
@@ -55,20 +55,21 @@ class UnknownMasses(AbstractMatrixKernel):
         self.kernel = matrix_kernel(kernel, "the kernel of UnknownMasses", "Symplectic(k)")
         if self.kernel.takes_inputs:
             raise TypeError(
-                "the masses are those of the drift: Controlled(UnknownMasses(K, masses), …)."
+                "UnknownMasses takes no kernel with inputs: put it inside, "
+                "Controlled(UnknownMasses(K, masses), …)."
             )
         guess = require.floating(masses, "masses")
         if guess.shape not in ((len(guess),) * k for k in (1, 2)) or len(guess) < 2:
             raise ValueError(
-                f"masses has shape {guess.shape}; two or more, shape (m,), or a matrix (m, m) are "
-                "needed. With one degree of freedom there is nothing to find: every mass explains "
-                "the same motion, and is only a unit of the energy. Leave UnknownMasses out."
+                f"masses has shape {guess.shape}; two or more masses, shape (m,), or a matrix "
+                "(m, m), are needed. With one degree of freedom every mass explains the same "
+                "motion, and is only a unit of the energy: leave UnknownMasses out."
             )
         self.coupling = None
         if guess.ndim == 2:
             guess, self.coupling = _factors(guess)
         else:
-            guess = require.positive(guess, "masses", "One for each degree of freedom.")
+            guess = require.positive(guess, "masses", "Give one for each degree of freedom.")
         self.log_masses = jnp.log(guess[1:] / guess[0])
 
     def __repr__(self) -> str:
@@ -102,7 +103,7 @@ class UnknownMasses(AbstractMatrixKernel):
         return jnp.concatenate([q, p], axis=-1)
 
     def to_velocities(self, x: Float[Array, "... n"]) -> Float[Array, "... n"]:
-        """S⁻¹ x, and S⁻ᵀ x, which is the same; for one state or many."""
+        """S⁻¹ x = S⁻ᵀ x, for one state or many."""
         q, p = jnp.split(x, 2, axis=-1)
         M = self.masses.astype(x.dtype)
         if M.ndim == 1:
@@ -127,9 +128,11 @@ class UnknownMasses(AbstractMatrixKernel):
     def potential_covariance(self, x: Point, z: Point) -> Float[Array, ""]:
         return self.kernel.potential_covariance(self.to_momenta(x), self.to_momenta(z))
 
-    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
+    def dissipated_power(
+        self, x: Float[Array, " n"], slope: Float[Array, " n"]
+    ) -> Float[Array, ""]:
         # ∂H/∂x = S⁻ᵀ ∂H/∂y
-        return self.kernel.dissipated(self.to_momenta(x), self.to_velocities(slope))
+        return self.kernel.dissipated_power(self.to_momenta(x), self.to_velocities(slope))
 
     @property
     def no_potential(self) -> str | None:
@@ -160,7 +163,9 @@ class UnknownMasses(AbstractMatrixKernel):
         return eqx.tree_at(lambda K: K.kernel, self, self.kernel.with_parity(parity))
 
     def average_over(self, maps: tuple[LinearMap, ...]) -> AbstractMatrixKernel:
-        raise TypeError("say the symmetry inside: UnknownMasses(Invariant(K, maps), masses).")
+        raise TypeError(
+            "a symmetry belongs inside: give it to K, UnknownMasses(Invariant(K, maps), masses)."
+        )
 
     def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N n"]:
         return np.asarray(self.to_momenta(jnp.asarray(X)))
@@ -176,10 +181,13 @@ class UnknownMasses(AbstractMatrixKernel):
 
 
 def _factors(M: Array) -> tuple[Float[Array, " m"], Float[Array, " c"]]:
-    """D and L below its diagonal, of M = L D Lᵀ."""
+    """D, and the entries of L below its diagonal, with M = L D Lᵀ."""
     guess = np.asarray(M)
     if not np.isfinite(guess).all() or np.abs(guess - guess.T).max() > 1e-6 * np.abs(guess).max():
-        raise ValueError("masses, as a matrix, must be symmetric and finite.")
+        raise ValueError(
+            "masses is a matrix that is not symmetric or not finite: give a symmetric positive "
+            "definite matrix (m, m), or one mass for each degree of freedom, shape (m,)."
+        )
     try:
         C = np.linalg.cholesky(guess)
     except np.linalg.LinAlgError:

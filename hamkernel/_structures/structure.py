@@ -5,11 +5,11 @@ RKHS of k, then f lives in the RKHS of
 
     K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ          shape (n, n),
 
-and automatic differentiation builds it from any k: uᵀK(x, z)v is the derivative of k along B(x)ᵀu
-in its first argument and B(z)ᵀv in its second. With representer coefficients aⱼ at points zⱼ
-the potential is u(x) = Σⱼ ∂z k(x, zⱼ)·B(zⱼ)ᵀaⱼ: one forward derivative of a row of scalars. The
-field is its gradient, so evaluating it never forms an (n, n) block. The paper's −∇∇ᵀg(x − z) is
-the case k(x, z) = g(x − z); the mixed derivative is the one that is positive for every k.
+and automatic differentiation builds K from any k: uᵀK(x, z)v is the derivative of k along B(x)ᵀu in
+the first argument and along B(z)ᵀv in the second. With representer coefficients aⱼ at points zⱼ
+the potential is u(x) = Σⱼ ∂z k(x, zⱼ)·B(zⱼ)ᵀaⱼ, one forward derivative of a row of scalars. The
+field is B times the gradient of u, so no (n, n) block is formed. The paper's −∇∇ᵀg(x − z) is the
+case k(x, z) = g(x − z); the mixed derivative is positive for every k.
 """
 
 import abc
@@ -51,8 +51,8 @@ class AbstractStructure(AbstractMatrixKernel):
     """A structure made from one scalar kernel k."""
 
     kernel: AbstractScalarKernel = eqx.field(converter=as_scalar_kernel)
-    # 1 if the fields have the parity of the functions of k, −1 if a derivative changes it, 0 if the
-    # operator is a function of the caller's, which may do either.
+    # 1 if the fields have the parity of the potential, −1 if they have the opposite parity, 0 if
+    # unknown, for an operator of the caller.
     field_parity: eqx.AbstractClassVar[int]
     # The symmetry of the operator: TRANSLATION if B is constant, REFLECTION if B(−x) = B(x).
     operator_invariance: eqx.AbstractClassVar[Invariance]
@@ -69,8 +69,8 @@ class AbstractStructure(AbstractMatrixKernel):
     def with_parity(self, parity: int) -> "AbstractStructure":
         if Invariance.REFLECTION not in self.operator_invariance:
             raise TypeError(
-                f"the fields of {type(self).__name__} have no parity with any potential: its "
-                "operator B(x) is another one at -x."
+                f"the fields of {type(self).__name__} cannot be odd or even: its operator B(x) "
+                "depends on x. Use Invariant(k, maps) inside, with maps that B allows."
             )
         kernel = with_parity(self.kernel, self.field_parity * parity)
         return eqx.tree_at(lambda K: K.kernel, self, kernel)
@@ -95,12 +95,12 @@ class AbstractStructure(AbstractMatrixKernel):
         kernel = symmetrise(self.kernel, maps, (1.0,) * len(maps))
         return eqx.tree_at(lambda K: K.kernel, self, kernel)
 
-    def shares_potential(self, other: AbstractMatrixKernel) -> bool:
+    def shares_potential(self, kernel: AbstractMatrixKernel) -> bool:
         """Whether both have the same operator; operators with trained arrays count as unequal."""
-        if type(self) is not type(other):
+        if type(self) is not type(kernel):
             return False
         (arrays, tree), (other_arrays, other_tree) = (
-            jax.tree.flatten(_operator(K)) for K in (self, other)
+            jax.tree.flatten(_operator(K)) for K in (self, kernel)
         )
         return tree == other_tree and not any(map(eqx.is_array, arrays)) and arrays == other_arrays
 
@@ -153,7 +153,7 @@ def row(k: AbstractScalarKernel, x: Point, Z: Points) -> Float[Array, " M"]:
     return jax.vmap(k, in_axes=(None, 0))(x, Z)
 
 
-def mixed(k: AbstractScalarKernel, x, u, z, v) -> Float[Array, ""]:
+def mixed_derivative(k: AbstractScalarKernel, x, u, z, v) -> Float[Array, ""]:
     """The mixed derivative uᵀ [∂x ∂zᵀ k(x, z)] v, in forward mode for both arguments.
 
     For k(x, z) = φ(s) it is φ″(s) ds(u) ds(v) + φ′(s) dds(u, v). Factors that depend on one point,
@@ -205,9 +205,9 @@ def check_symmetries(K: Any, X: Float[Array | np.ndarray, "N n"]) -> None:
                 raise ValueError(
                     f"a map of the symmetry is not one of the fields of {type(K).__name__}: with "
                     f"S = {np.round(S, 3).tolist()} neither B(Sx) = S B(x) Sᵀ nor -S B(x) Sᵀ holds."
-                    " For J∇H it must be symplectic or antisymplectic, SᵀJS = ±J, so momenta move "
-                    "with their positions; for gradients orthogonal; with all its digits, not 0.866"
-                    " for √3/2. With friction time reversal is false."
+                    " For J∇H the map must satisfy SᵀJS = ±J, so momenta move with their positions;"
+                    " for gradients it must be orthogonal. Give all digits, not 0.866 for √3/2. "
+                    "With friction time reversal is no symmetry."
                 )
 
 
@@ -229,7 +229,9 @@ class AbstractPotentialKernel(AbstractStructure):
         """B(x)ᵀ v."""
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
-        return mixed(self.kernel, x, self.apply_transpose(x, u), z, self.apply_transpose(z, v))
+        return mixed_derivative(
+            self.kernel, x, self.apply_transpose(x, u), z, self.apply_transpose(z, v)
+        )
 
     def through_descriptor(self, n: int) -> Descriptor | None:
         descriptor = self.kernel.through_descriptor(n)
@@ -259,7 +261,9 @@ class AbstractPotentialKernel(AbstractStructure):
     def along(self, x: Point, Z: Points, V: Points) -> Point:
         return self.apply(x, jax.grad(self._slope)(x, Z, V))
 
-    def dissipated(self, x: Float[Array, " n"], slope: Float[Array, " n"]) -> Float[Array, ""]:
+    def dissipated_power(
+        self, x: Float[Array, " n"], slope: Float[Array, " n"]
+    ) -> Float[Array, ""]:
         if self.conserves:
             return jnp.zeros((), x.dtype)
         return -slope @ self.apply(x, slope)
@@ -277,9 +281,9 @@ class AbstractPotentialKernel(AbstractStructure):
 
 
 class CurlFree(AbstractPotentialKernel):
-    """K(x, z) = ∂x ∂zᵀ k(x, z): gradient fields f = ∇u, so Df is symmetric.
+    """K(x, z) = ∂x ∂zᵀ k(x, z): gradient fields f = ∇u, with a symmetric Jacobian.
 
-    Works in every dimension n ≥ 1. `field.potential(x)` is u.
+    n ≥ 1. `field.potential(x)` is u.
 
     Args:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
@@ -305,10 +309,10 @@ def check_even(n: int, whose: str) -> None:
     if n % 2:
         raise ValueError(
             f"{whose} needs states x = (q, p) of even dimension, got n = {n}. "
-            "Add the missing coordinate, or drop a column that is no state, such as time; of "
-            "positions alone hk.learn(K, runs, mass=m) finds the momenta; for "
-            "conservative systems of any dimension use Poisson(k, tensor), for others CurlFree, "
-            "DivergenceFree or Separable."
+            "Add the missing coordinate, or drop a column that is no state, such as time. For "
+            "positions alone, hk.learn(K, runs, mass=m) finds the momenta. For conservative "
+            "systems of any dimension use Poisson(k, tensor), for others CurlFree, DivergenceFree "
+            "or Separable."
         )
 
 
@@ -347,9 +351,9 @@ class Symplectic(AbstractPotentialKernel):
 
 
 class Separable(AbstractStructure):
-    """K(x, z) = k(x, z) I: the components share a kernel and no structure.
+    """K(x, z) = k(x, z) I: independent components with one kernel, the paper's baseline.
 
-    The baseline of the paper. Works in every dimension; fields have no potential.
+    n ≥ 1. The fields have no potential.
 
     Args:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
@@ -376,10 +380,11 @@ class Separable(AbstractStructure):
 
 
 class DivergenceFree(AbstractStructure):
-    """K(x, z) = tr(M) I − Mᵀ with M = ∂x ∂zᵀ k(x, z): fields with div f = 0, any n ≥ 2.
+    """K(x, z) = tr(M) I − Mᵀ with M = ∂x ∂zᵀ k(x, z): fields with div f = 0, n ≥ 2.
 
-    The fields are f_a = Σ_b ∂_b Ψ_ab of an antisymmetric matrix Ψ whose entries above the
-    diagonal are independent functions in the RKHS of k. For n = 2, K = J M Jᵀ.
+    The fields are f_a = Σ_b ∂_b Ψ_ab with an antisymmetric matrix potential Ψ, whose entries above
+    the diagonal are independent functions in the RKHS of k. For n = 2, K = J M Jᵀ, the kernel of
+    `Symplectic`.
 
     Args:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
@@ -387,7 +392,7 @@ class DivergenceFree(AbstractStructure):
     Raises:
         TypeError: `kernel` is not a scalar kernel. ValueError, with data: n is 1.
 
-    Source: Fuselier (2006); for n = 3 it is the curl of a vector potential.
+    Source: Fuselier (2006). For n = 3, f is the curl of a vector potential.
     """
 
     field_parity: ClassVar[int] = -1
@@ -400,9 +405,9 @@ class DivergenceFree(AbstractStructure):
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
         # uᵀ(tr(M) I − Mᵀ)v = tr(M) u·v − vᵀMu with M_ab = ∂x_a ∂z_b k
-        along_both = jax.vmap(lambda e: mixed(self.kernel, x, e, z, e))
+        along_both = jax.vmap(lambda e: mixed_derivative(self.kernel, x, e, z, e))
         trace = along_both(jnp.eye(len(x), dtype=x.dtype)).sum()
-        return trace * (u @ v) - mixed(self.kernel, x, v, z, u)
+        return trace * (u @ v) - mixed_derivative(self.kernel, x, v, z, u)
 
     def expansion(self, x: Point, Z: Points, A: Points) -> Point:
         # W_ba(x) = Σⱼ ∂_{z_b} k(x, zⱼ) a_ja, Ψ = Wᵀ − W, and f_a = Σ_b ∂_b Ψ_ab. The slopes
@@ -426,8 +431,8 @@ class DivergenceFree(AbstractStructure):
 
     def average_over(self, maps: tuple[LinearMap, ...]) -> AbstractStructure:
         raise ValueError(
-            "a DivergenceFree field gets no symmetry from its matrix potential but Odd and Even: "
-            "use Symplectic(Invariant(k, maps)) or CurlFree(Invariant(k, maps))."
+            "DivergenceFree has a matrix potential, and takes no symmetry but Odd and Even: use "
+            "Symplectic(Invariant(k, maps)) or CurlFree(Invariant(k, maps))."
         )
 
     def check_dimension(self, n: int) -> None:
@@ -443,14 +448,13 @@ def expand_group(
 ) -> tuple[AbstractMatrixKernel, Float[Array, "L n"], Float[Array, "L n"]]:
     """The kernel without its group, with the images of the points and of their directions.
 
-    So that Σⱼ K(x, zⱼ) aⱼ stays the same in `along`. With a one-sided mean of k,
+    The result has the same sum Σⱼ K(x, zⱼ) aⱼ in `along`. For a one-sided mean k_G of k,
 
-        Σⱼ ∂_vⱼ k_G(x, zⱼ) = Σⱼ Σ_h χ(h)/|G| ∂_(h vⱼ) k(x, h zⱼ),
+        Σⱼ ∂_vⱼ k_G(x, zⱼ) = Σⱼ Σ_h χ(h)/|G| ∂_(h vⱼ) k(x, h zⱼ).
 
-    functionals of u are functionals of the u without symmetry at the images, divided by |G| once (a
-    two-sided mean would be divided by |G|²). In a sum over many pairs this is cheaper than adding
-    all terms for each pair, which fills the registers. K and Z are returned unchanged if K has no
-    group or a two-sided mean, or is made by an unknown operator.
+    In a sum over many pairs more points are cheaper than more terms for each pair, which fill the
+    registers. K and Z are returned unchanged if K has no group or a two-sided mean, or if its
+    operator belongs to the caller.
     """
     V, n = K.directions(Z, A), Z.shape[1]
     if not isinstance(K, AbstractStructure) or K.field_parity == 0:

@@ -489,7 +489,7 @@ def lengthscales(
     def is_on_some(node: object) -> bool:
         return isinstance(node, Select | Warp)
 
-    paths, _ = tree_flatten_with_path(K.of_states, is_leaf=is_on_some)
+    paths, _ = tree_flatten_with_path(K.state_kernel, is_leaf=is_on_some)
     single = any(
         keystr(path).endswith(".log_lengthscale") and not leaf.shape for path, leaf in paths
     )

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.completed import completed
+from hamkernel._structures.completed import complete
 from hamkernel._trajectories.likelihood import closed_form
 from hamkernel._trajectories.model import Model, with_amplitude
 from hamkernel._trajectories.search import (
@@ -56,9 +56,9 @@ class Evidence(eqx.Module):
         hundredth of the noise, since the noise had to explain the effect of `part`.
         """
         n, K = len(self.scale), self.model.kernel
-        part = completed(with_amplitude(part), self.points, n)
+        part = complete(with_amplitude(part), self.points, n)
         part.check_dimension(n)
-        larger = self.model._replace(kernel=K.with_states(K.of_states + part))
+        larger = self.model._replace(kernel=K.with_states(K.state_kernel + part))
         flat = np.asarray(larger.flat)
         free = np.concatenate([np.ones(len(flat) - 2 * n, bool), self.is_free])
         low, high = flat - _RANGE, flat + _RANGE
@@ -68,7 +68,7 @@ class Evidence(eqx.Module):
         design = np.maximum(design, low)
         points, rows = search_sample(self.points, self.rows)
         values = losses(larger, jnp.asarray(design), points, rows, self.start_deviation)
-        start = larger.at(jnp.asarray(design[int(np.argmin(np.asarray(values)))]))
+        start = larger.unflatten(jnp.asarray(design[int(np.argmin(np.asarray(values)))]))
         bounds = Bounds(low, high, free)
         args = self.points, self.rows, self.start_deviation
         best, _ = maximise_likelihood(start, *args, bounds, _STEPS)

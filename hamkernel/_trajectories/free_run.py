@@ -6,7 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from hamkernel._runs.flow import simulated, steps_for, stiffness
+from hamkernel._runs.flow import integrate, steps_for, stiffness
 from hamkernel._runs.smoothing import power_of_two
 
 
@@ -43,10 +43,10 @@ def stretches(runs: list, paths: list[np.ndarray], length: int) -> Stretches:
             spans = np.diff(run.times[first : stop + 1])
             measured = run.states[first + 1 : stop + 1]
             parts.append((path[first], spans, run.inputs[first:stop], measured))
-    return padded(parts)
+    return pad_stretches(parts)
 
 
-def padded(parts: list[tuple]) -> Stretches:
+def pad_stretches(parts: list[tuple]) -> Stretches:
     """Stretches (start, spans, inputs, measured) of different lengths in arrays of one shape."""
     L = power_of_two(max(len(spans) for _, spans, _, _ in parts))
     starts, spans, inputs, measured = [], [], [], []
@@ -71,7 +71,7 @@ def predictions(
     """
     ends = np.concatenate([part.starts, part.inputs[:, 0, 0]], axis=1)
     steps = steps_for(part.spans, stiffness(field, ends, scale))
-    path = simulated(field, *jax.device_put((part.starts, part.spans, steps, part.inputs)))
+    path = integrate(field, *jax.device_put((part.starts, part.spans, steps, part.inputs)))
     x = np.asarray(path.x)[:, 1:]
     return np.where(np.isfinite(x), x, np.inf)
 

@@ -49,8 +49,8 @@ from hamkernel._trajectories.segments import (
     LinearisedSegments,
     Piece,
     linearised_along_smoothed,
-    segmented,
-    updated,
+    make_segments,
+    replace_pieces,
 )
 from hamkernel._trajectories.whiteness import whiteness
 
@@ -211,7 +211,7 @@ def fix_process_noise(task: Task, now: Current, q: Float[np.ndarray, " n"]) -> t
     noises = [np.where(moves, np.maximum(noise, floor), noise) for floor in floors]
     design = np.stack([model._replace(log_noise=sigma).flat for sigma in noises])
     values = losses(model, design, *search_sample(now.field.points, rows), task.start_deviation)
-    model = model.at(design[int(np.argmin(values))])
+    model = model.unflatten(design[int(np.argmin(values))])
     count = len(now.field.points)
     return task, _full_step(task, model, count, count, rows, now.paths)
 
@@ -239,8 +239,8 @@ def _full_step(
     model, closed = solve(model, task.S, least, task.quick, *args, bounds)
     field = Expansion(model.kernel, closed.points, closed.coefficients, task.mean)
     moves, _, pushed = _smooth(model, closed, rows, task)
-    x = _segment_paths(paths, task.pieces, segmented(task.data.runs, task.pieces, paths))
-    paths = updated(paths, task.pieces, task.good, x + np.asarray(moves))
+    x = _segment_paths(paths, task.pieces, make_segments(task.data.runs, task.pieces, paths))
+    paths = replace_pieces(paths, task.pieces, task.good, x + np.asarray(moves))
     used = len(closed.points)
     S = task.S if used > task.first else task.S[:used]
     return Current(model, field, S, rows, paths, task.good, np.inf, float(closed.free), pushed)
@@ -248,7 +248,7 @@ def _full_step(
 
 def _along_smoothed(task: Task) -> LinearisedSegments:
     runs = task.data.runs
-    segments = segmented(runs, task.pieces, [run.path for run in runs])
+    segments = make_segments(runs, task.pieces, [run.path for run in runs])
     return linearised_along_smoothed(
         task.data, task.pieces, segments, task.mean, task.usable(len(segments.starts))
     )
@@ -335,7 +335,7 @@ def take_step(task: Task, now: Current) -> tuple[Current, Iteration]:
 
     gain, taken, best = _line_search(trial, bool(good.any()))
     good = np.asarray(good)[: len(task.pieces)]
-    paths = updated(now.paths, task.pieces, good, best.x)
+    paths = replace_pieces(now.paths, task.pieces, good, best.x)
     step = _history_entry(task, good, best, gain, taken, model, closed.loss)
     free = float(closed.free)
     tuned = now.is_tuned or _is_tuned(now, model, closed, rows)
@@ -362,7 +362,7 @@ def _linearise(
     task: Task, now: Current
 ) -> tuple[Segments, Float[Array, "S L+1 n"], Array, LinearisedSegments]:
     """The segments, the path on them, Runge-Kutta steps, and the rows along it."""
-    segments = segmented(task.data.runs, task.pieces, now.paths)
+    segments = make_segments(task.data.runs, task.pieces, now.paths)
     spans = np.asarray(segments.spans).reshape(-1, 1)
     steps = steps_for(spans, _stiffness(now.field, task.data, now.paths))
     x = jax.device_put(_segment_paths(now.paths, task.pieces, segments))

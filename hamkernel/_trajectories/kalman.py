@@ -33,9 +33,9 @@ from jaxtyping import Array, Float
 
 from hamkernel._machine import compiled_by_size, orthonormal
 from hamkernel._observations.kinds import Functionals, Together
-from hamkernel._runs.flow import WEIGHTS, Expansion, Path, Segments, means, simulated
+from hamkernel._runs.flow import WEIGHTS, Expansion, Path, Segments, integrate, means
 from hamkernel._trajectories.model import Model, WhitenedRows, columns, landmark_whitening
-from hamkernel._trajectories.segments import LinearisedSegments, linearised
+from hamkernel._trajectories.segments import LinearisedSegments, linearise
 
 
 class Filtered(NamedTuple):
@@ -199,7 +199,7 @@ def linearised_by_interval(
     Segments that are not finite are dropped.
     """
     (S, L), n, m = segments.spans.shape, x.shape[-1], segments.inputs.shape[-1]
-    there = simulated(
+    there = integrate(
         field,
         x[:, :-1].reshape(-1, n),
         segments.spans.reshape(-1, 1),
@@ -212,7 +212,7 @@ def linearised_by_interval(
     good = good & finite
     nodes = jnp.where(good[:, None, None, None], nodes, 0.0)
     slopes = jax.vmap(jax.vmap(jax.vmap(field)))(nodes)
-    rows = linearised(
+    rows = linearise(
         Path(x, nodes, to_end, across),
         slopes,
         means(field.mean, nodes, slopes),

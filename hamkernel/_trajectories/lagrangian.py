@@ -28,7 +28,7 @@ from hamkernel._solvers.lagrangian import (
     check_machine,
     missing_friction,
     plain_friction,
-    solved,
+    ridge_solution,
     with_anchor,
 )
 from hamkernel._structures.lagrangian import (
@@ -110,7 +110,7 @@ def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, unused: dict[str, An
         unused: arguments of `learn` that say nothing of a Lagrangian.
     """
     m, noise = _check(K, runs, noise, unused)
-    states = runs.on_host()[1]
+    states = runs.host_arrays()[1]
     q, v = ([x[:, part] for x in states] for part in (slice(m), slice(m, None)))
     if not v[0].shape[1]:
         v = [np.full(x.shape, np.nan) for x in q]
@@ -220,7 +220,7 @@ _with_kernel = precise_jit(lambda features, K: features.with_kernel(K))
 @compiled_by_size
 def _solve(features, pieces, covariance, deviation) -> tuple[Array, ...]:
     A, y, _ = _WeakRows(pieces, covariance)(features, deviation)
-    return *solved(*with_anchor(features, A, y)), A, y
+    return *ridge_solution(*with_anchor(features, A, y)), A, y
 
 
 @compiled_by_size

@@ -33,9 +33,9 @@ from hamkernel._runs.weak import (
     weak_rows,
     whiten,
 )
-from hamkernel._solvers.lagrangian import negative_log_likelihood, solved
+from hamkernel._solvers.lagrangian import negative_log_likelihood, ridge_solution
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._structures.completed import completed, shared_laws
+from hamkernel._structures.completed import complete, shared_laws
 from hamkernel._trajectories.diagnostics import FitQuality, diagnostics_of_rows
 from hamkernel._trajectories.evidence import EvidenceOfRows
 from hamkernel._trajectories.free_run import Stretches, relative_error, stretches
@@ -68,7 +68,7 @@ class States(eqx.Module):
 
 def _channels(runs: Runs, mean: Any, noise: Any, is_canonical: bool) -> tuple[Channels, States]:
     """The channels: q with p/m as its slope where masses are known, else all coordinates."""
-    X, n = runs.on_host()[1], runs.dimension
+    X, n = runs.host_arrays()[1], runs.dimension
     m = n // 2
     if isinstance(mean, Kinetic) and mean.mass.ndim < 2:
         mass = np.broadcast_to(np.asarray(mean.mass, float), (m,))
@@ -195,7 +195,7 @@ def _factors(rows: Rows, field: Any, deviation):
 @precise_jit
 def _weights_of(model: LawModel, rows: Rows, L) -> Float[Array, " m"]:
     """The mean of the weights of the features."""
-    return solved(*_rows_over_noise(model, rows, L))[1]
+    return ridge_solution(*_rows_over_noise(model, rows, L))[1]
 
 
 @precise_jit
@@ -247,7 +247,7 @@ def find_laws(K: AbstractMatrixKernel, runs: Runs, mean: Any, noise: Any) -> Fou
     unit = np.ones(n) if state.mass is None else np.append(np.ones(n // 2), state.mass)
     states, sigma = [x[:, :n] * unit[None] for x in smooth.states], smooth.noise.ravel()[:n] * unit
     X = np.concatenate(states)
-    K = completed(K, jnp.asarray(X), n)
+    K = complete(K, jnp.asarray(X), n)
     depends = sorted(set().union(*(s for k in K.scalar_kernels for s in k.supports(n))))
     if state.mass is not None and depends[-1] >= n // 2:
         raise ValueError(
@@ -344,7 +344,7 @@ def learn_laws(
     posterior = condition(
         solution.model.kernel, solution.observations, regularization=scatter**2 / count, mean=mean
     )
-    states, measured = solution.states, runs.on_host()[1]
+    states, measured = solution.states, runs.host_arrays()[1]
     sigma = solution.noise if noise is None else np.asarray(noise)
     quality = _quality(runs, solution, posterior.field, states, sigma, noise is not None)
     table = diagnostics_of_rows(quality, scatter)
@@ -395,7 +395,7 @@ class _Log(NamedTuple):
 def _quality(
     runs: Runs, solution: Found, field: Any, states, sigma, is_noise_known: bool
 ) -> FitQuality:
-    times, measured = runs.on_host()
+    times, measured = runs.host_arrays()
     every = np.concatenate(states)
     scale = np.where((size := every.std(axis=0)) > 0, size, 1.0)
     slopes = [np.gradient(x, t, axis=0) for t, x in zip(times, states, strict=True)]

@@ -32,10 +32,10 @@ from hamkernel._runs.preprocessing import (
     seconds_of_iteration,
 )
 from hamkernel._runs.runs import Runs
-from hamkernel._runs.smoothing import interpolated, power_of_two
+from hamkernel._runs.smoothing import interpolate, power_of_two
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
-from hamkernel._structures.completed import completed
+from hamkernel._structures.completed import complete
 from hamkernel._structures.lagrangian import Lagrangian
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._trajectories.diagnostics import check_identifiable, diagnostics
@@ -193,7 +193,7 @@ def learn(
     bar = _bar(progress, total=2 + max_steps)
     data = preprocess(runs, drift)
     bar.update()
-    K = completed(K, jax.device_put(sample_points(data)[0]), runs.dimension)
+    K = complete(K, jax.device_put(sample_points(data)[0]), runs.dimension)
     most_landmarks = None if solver is None else solver.max_points
     start = _start(K, drift, data, sigma, landmarks(data, most_landmarks))
     seconds = seconds_of_iteration(data, start.landmarks[1])
@@ -347,7 +347,7 @@ def _result(
     mean = None if mean is None else as_pytree(mean)
     task, now, history = end.task, end.now, end.history
     field, data = now.field, task.data
-    times = runs.on_host()[0]
+    times = runs.host_arrays()[0]
     states = _fitted_states(end, times)
     noise = np.where(np.isfinite(data.noise), np.exp(np.asarray(now.model.log_noise)), np.nan)
     # Without process noise q stands at the floor of the integrator, and is none.
@@ -405,7 +405,7 @@ def _fitted_states(end: End, times: list[np.ndarray]) -> list[Float[np.ndarray, 
             X, N = run.points(path), len(path)
             X = np.pad(X, ((0, power_of_two(N) - N), (0, 0)), "edge")  # one program for many logs
             slope = np.asarray(field_values(now.field, jnp.asarray(X)))[:N]
-            path = interpolated(t - t[0], run.times, path, slope)
+            path = interpolate(t - t[0], run.times, path, slope)
         out.append(path)
     return out
 
@@ -451,7 +451,7 @@ def _check(
             "parameters": "to know of which system each run is: hk.Runs(times, states, "
             "parameters=[(0.5,), (0.8,), …]), for each run θ of shape (p,).",
         }
-        raise TypeError(f"a {type(K).__name__} kernel needs {needed[K.given]}")
+        raise TypeError(f"a {type(K).__name__} kernel needs {needed[K.input_name]}")
     if runs.parameters is not None and not K.takes_inputs:
         raise TypeError(
             f"the runs have parameters and {type(K).__name__} takes none: say how systems are "
@@ -514,7 +514,7 @@ def _unknown_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
             "only a unit of the energy, so there is nothing to find. Leave it out; (q, q̇) is "
             "(q, p) of a mass of one."
         )
-    inner = K.of_states
+    inner = K.state_kernel
     return K.with_states(
         inner if isinstance(inner, UnknownMasses) else UnknownMasses(inner, jnp.ones(n // 2))
     )

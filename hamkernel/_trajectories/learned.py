@@ -341,7 +341,7 @@ def learned_from(learned: Any) -> str:
 def misfits(runs: Runs, states: list[np.ndarray], noise: np.ndarray) -> np.ndarray:
     """Root mean squares of the normalised residuals, by run and coordinate."""
     out = []
-    for x, fit in zip(runs.on_host()[1], states, strict=True):
+    for x, fit in zip(runs.host_arrays()[1], states, strict=True):
         squares = ((x - fit) / noise[None]) ** 2
         measured = np.isfinite(squares)
         total, count = np.where(measured, squares, 0.0).sum(axis=0), measured.sum(axis=0)

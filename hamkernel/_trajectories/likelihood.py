@@ -6,9 +6,9 @@ Whitened rows M w + ε = r, ε ~ N(0, I), give
     (I + MᵀM) w = Mᵀ r,
     −2 log p = ‖r − Mw‖² + ‖w‖² + log det(I + MᵀM) + Σ log s,
 
-but for a constant. All of it is in the triangle of the QR factorisation of (I, 0) above (M, r),
-which keeps the digits that I + MᵀM loses where there is next to no noise, and which takes rows a
-strip at a time.
+up to a constant. We compute all terms from the triangle of the QR factorisation of (I, 0) above
+(M, r). For small noise the triangle keeps digits that I + MᵀM loses. Rows are added to the triangle
+a strip at a time.
 """
 
 from typing import NamedTuple
@@ -31,10 +31,10 @@ class Condensed(NamedTuple):
 
     Attributes:
         T: the whitening of the landmarks, shape (q, q).
-        triangle: of the QR factorisation of (M̃, r̃), shape (q + 1, q + 1).
+        triangle: the triangle of the QR factorisation of (M̃, r̃), shape (q + 1, q + 1).
         constant: the part of −log p that does not depend on M̃.
-        scatter: the sum of squares of samples about the rows that are their means, in units of σ².
-        samples: how many samples there are, less n for each start.
+        scatter: the sum of squares of samples about their means, the rows, in units of σ².
+        samples: the number of samples, less n for each start.
         rows: the number of rows, less n for each start.
     """
 
@@ -47,16 +47,16 @@ class Condensed(NamedTuple):
 
 
 class ClosedForm(NamedTuple):
-    """The closed form.
+    """The field given the rows, and the marginal likelihood of the rows.
 
     Attributes:
         weights: w, shape (q,); ‖f‖² = ‖w‖².
         points: the landmarks, shape (m, d).
         coefficients: T w, shape (m, n).
         free: the number of rows less the number of parameters that they determine, shape ().
-        used: that number of parameters.
+        used: the number of parameters that the rows determine, tr M̃ (I + M̃ᵀM̃)⁻¹ M̃ᵀ.
         squares: ‖r̃ − M̃w‖².
-        loss: −log p(rows), but for a constant.
+        loss: −log p(rows), up to a constant.
     """
 
     weights: Float[Array, " q"]
@@ -69,11 +69,11 @@ class ClosedForm(NamedTuple):
 
 
 @compiled_by_size
-def condensed(model: Model, S, rows: LinearisedSegments, start_deviation) -> Condensed:
+def condense(model: Model, S, rows: LinearisedSegments, start_deviation) -> Condensed:
     """The rows in the triangle of their QR factorisation, a strip at a time."""
     T = landmark_whitening(model.kernel, S)
     (size, samples, n), q = rows.counts.shape, len(T)
-    # Strips have twice as many rows as columns: with fewer, most of the work is the triangle's.
+    # Strips have twice as many rows as columns: in smaller strips the triangle is most of the work.
     count = 1
     while size % (2 * count) == 0 and size // (2 * count) * samples * n >= 2 * q:
         count *= 2
@@ -92,26 +92,26 @@ def condensed(model: Model, S, rows: LinearisedSegments, start_deviation) -> Con
 
 
 @compiled_by_size
-def conditional(known: Condensed, S, shift: Array | float = 0.0) -> ClosedForm:
+def conditional(information: Condensed, S, shift: Array | float = 0.0) -> ClosedForm:
     """The field for rows whose noise is exp(shift) times what it was.
 
-    The prior of the starts does not scale with the rows; it is too wide for that to matter.
+    The prior of the starts does not scale with the rows; it is so wide that this does not matter.
     """
-    q, scale = len(known.T), jnp.exp(-shift)
-    there = scale * known.triangle
+    q, scale = len(information.T), jnp.exp(-shift)
+    there = scale * information.triangle
     F = append_rows(no_rows(q, there.dtype), there[:, :q], there[:, q])
     R = F[:q, :q]
     w = solve_triangular(R, F[:q, q])
     inverse = solve_triangular(R, jnp.eye(q, dtype=R.dtype))
     # tr M̃(I + M̃ᵀM̃)⁻¹M̃ᵀ = q − tr (I + M̃ᵀM̃)⁻¹ = q − ‖R⁻¹‖²
     used = q - jnp.sum(inverse**2)
-    loss = 0.5 * F[q, q] ** 2 + jnp.log(jnp.abs(jnp.diagonal(R))).sum() + known.constant
-    loss = loss + shift * known.samples + 0.5 * (scale**2 - 1) * known.scatter
+    loss = 0.5 * F[q, q] ** 2 + jnp.log(jnp.abs(jnp.diagonal(R))).sum() + information.constant
+    loss = loss + shift * information.samples + 0.5 * (scale**2 - 1) * information.scatter
     squares = F[q, q] ** 2 - w @ w
-    coefficients = (known.T @ w).reshape(len(S), -1)
-    return ClosedForm(w, S, coefficients, known.rows - used, used, squares, loss)
+    coefficients = (information.T @ w).reshape(len(S), -1)
+    return ClosedForm(w, S, coefficients, information.rows - used, used, squares, loss)
 
 
 def closed_form(model: Model, S, rows: LinearisedSegments, start_deviation) -> ClosedForm:
     """The field given the rows."""
-    return conditional(condensed(model, S, rows, start_deviation), S)
+    return conditional(condense(model, S, rows, start_deviation), S)

@@ -86,7 +86,7 @@ class Model(NamedTuple):
         return jnp.concatenate([leaves, self.log_noise, self.log_process])
 
     @precise_jit
-    def at(self, h: Float[ArrayLike, " P"]) -> "Model":
+    def unflatten(self, h: Float[ArrayLike, " P"]) -> "Model":
         h = jnp.asarray(h)
         params, static = eqx.partition(self.kernel, eqx.is_inexact_array)
         flat, unravel = ravel_pytree(params)

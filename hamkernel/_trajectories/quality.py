@@ -29,7 +29,7 @@ def quality(
 ) -> FitQuality:
     """The quality of the fit of a field to runs; `z` are the innovations by segment."""
     now, data = end.now, end.task.data
-    times, samples = runs.on_host()
+    times, samples = runs.host_arrays()
     noise = np.exp(np.asarray(now.model.log_noise))
     kept, pieces = np.zeros(len(data.runs)), list(zip(end.task.pieces, now.good, strict=True))
     for (r, start, stop), good in pieces:

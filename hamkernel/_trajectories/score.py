@@ -14,12 +14,12 @@ from hamkernel import _require as require
 from hamkernel._fields.base import known_part
 from hamkernel._machine import precise_jit
 from hamkernel._posterior import Posterior
-from hamkernel._runs.flow import simulated, steps_for, stiffness
+from hamkernel._runs.flow import integrate, steps_for, stiffness
 from hamkernel._runs.preprocessing import preprocess, sample_points
 from hamkernel._runs.runs import Runs
 from hamkernel._show import Shown
 from hamkernel._show import text as number
-from hamkernel._trajectories.free_run import Stretches, padded, predictions
+from hamkernel._trajectories.free_run import Stretches, pad_stretches, predictions
 
 _STEPS = 12  # of Levenberg and Marquardt; starts at smoothed states usually need 4
 
@@ -138,7 +138,7 @@ def compute_score(
     noise = np.asarray(learned.noise)
     deviation = np.maximum(np.where(np.isfinite(noise), noise, scale), 1e-6 * scale)
     part = _as_stretches(runs, [run.path[0] for run in preprocess(runs, mean).runs])
-    known_counts = [min(first, max(len(t) // 2, 1)) for t in runs.on_host()[0]]
+    known_counts = [min(first, max(len(t) // 2, 1)) for t in runs.host_arrays()[0]]
     field = getattr(learned.field, "whole", learned.field)  # of the points (x, u) with inputs
 
     def free(field: Any) -> tuple[_Starts, np.ndarray]:
@@ -157,7 +157,7 @@ def compute_score(
         low, high = np.quantile(bands, [0.025, 0.975], axis=0)
         inside = (low <= judged) & (judged <= high)
         coverage = float(inside[np.isfinite(judged)].mean())
-    times = runs.on_host()[0]
+    times = runs.host_arrays()[0]
     return Score(
         rmse=_root_mean_square(predicted - judged),
         persistence=_root_mean_square(last - judged),
@@ -176,12 +176,12 @@ def compute_score(
 def _as_stretches(runs: Runs, starts: list[np.ndarray]) -> Stretches:
     """The runs as stretches, each with an interval of no length before its first sample."""
     parts = []
-    for r, (t, x) in enumerate(zip(*runs.on_host(), strict=True)):
-        inputs = runs.applied(r, t)
+    for r, (t, x) in enumerate(zip(*runs.host_arrays(), strict=True)):
+        inputs = runs.input_lines(r, t)
         before = np.repeat(inputs[:1, :1], 2, axis=1)
         spans = np.concatenate([[0.0], np.diff(t)])
         parts.append((starts[r], spans, np.concatenate([before, inputs]), x))
-    return padded(parts)
+    return pad_stretches(parts)
 
 
 def _last(measured: Float[np.ndarray, "k n"]) -> Float[np.ndarray, " n"]:
@@ -228,7 +228,7 @@ def _fit_starts(field: Any, part: Stretches, known_counts: list[int], deviation,
     prior = np.eye(n) / 9  # in units of `scale`, as all below
 
     def linearise(y):
-        path = simulated(field, jnp.asarray(part.starts + scale * y), *rest)
+        path = integrate(field, jnp.asarray(part.starts + scale * y), *rest)
         tangents, J = np.asarray(path.across), []
         for i in range(L):
             J.append(tangents[:, i] @ (J[-1] if J else np.diag(scale)))
@@ -294,7 +294,7 @@ def _draws(
     @jax.vmap
     def run(field, x, inputs):
         joint_field = getattr(field, "whole", field)
-        return simulated(_Disturbed(joint_field, d), x, spans, steps, inputs).x[:, 1:]
+        return integrate(_Disturbed(joint_field, d), x, spans, steps, inputs).x[:, 1:]
 
     out = np.asarray(run(fields, jnp.asarray(x), jnp.asarray(inputs)))
     noise = np.nan_to_num(np.asarray(learned.noise))

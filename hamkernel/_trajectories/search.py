@@ -22,7 +22,7 @@ from hamkernel._trajectories.kalman import whiten
 from hamkernel._trajectories.likelihood import (
     ClosedForm,
     Condensed,
-    condensed,
+    condense,
     conditional,
     regression_loss,
 )
@@ -72,7 +72,7 @@ def noise_free_coordinates(
 
 
 def _loss(model: Model, h, S, rows, start_deviation):
-    there = model.at(h)
+    there = model.unflatten(h)
     T = landmark_whitening(there.kernel, S)
     made = whiten(there, S, T, rows, start_deviation)
     value = regression_loss(made.M, made.r) + made.constant
@@ -160,7 +160,7 @@ def maximise_likelihood(
         return model, float(losses(model, flat, S, rows, start_deviation)[0])
     sides = jax.device_put((bounds.low, bounds.high, bounds.free))
     h, value = _best(model, S, rows, start_deviation, *sides, steps)
-    return model.at(h), float(value)
+    return model.unflatten(h), float(value)
 
 
 def choose_start(
@@ -178,7 +178,7 @@ def choose_start(
     landmarks the best point is a smooth field with much noise, where more landmarks do not help.
     """
     n, width = rows.residual.shape[-1], (_ENTRIES / 3) ** 0.5
-    part = windows(rows, int(width / n))
+    part = limiting_windows(rows)
     middles = exact(part)[0]
     sets = {first: jnp.asarray(S[:first]) if n * first <= width else middles}
     if len(middles) > first < len(S):
@@ -188,7 +188,7 @@ def choose_start(
         values = losses(model, design, points, part, start_deviation)
         if values.min() < best - (n * len(points) / 2) ** 0.5:
             best, count, start = values.min(), size, design[int(np.argmin(values))]
-    return model.at(start), count
+    return model.unflatten(start), count
 
 
 def solve(
@@ -204,22 +204,26 @@ def solve(
 
     The number of landmarks is doubled while −log p falls by more than √(q/2), the uncertainty of
     −log p with q weights. Beyond `quick` landmarks it is doubled only where windows predict half
-    of the remaining variance. If the search used a sample of the rows, both kinds of noise are
-    scaled to the residuals of all rows.
+    of the remaining variance. Of a short log all rows are in one window, and are asked before a
+    larger solve compiles. If the search used a sample of the rows, both kinds of noise are scaled
+    to the residuals of all rows.
     """
     free, size = np.array(bounds.free), len(model.flat) - 2 * len(model.log_noise)
     free[:size] = False  # the kernel stays, both kinds of noise are scaled
 
     def solution(count: int) -> tuple[Condensed, ClosedForm]:
         points = jax.device_put(S[:count])
-        triangle = condensed(model, points, rows, start_deviation)
+        triangle = condense(model, points, rows, start_deviation)
         return triangle, conditional(triangle, points)
 
     triangle, closed = solution(count)
+    is_short = limiting_windows(rows) is rows
     while count < len(S):
-        if count <= quick < min(2 * count, len(S)):
+        is_slow = count <= quick < min(2 * count, len(S))
+        if is_slow or is_short:
             args = model, jnp.asarray(S[:count]), rows, start_deviation
-            if not limited_by_landmarks(*args, bool(free.any()), least=np.log(2) / 2):
+            least = np.log(2) / 2 if is_slow else 0.0
+            if not limited_by_landmarks(*args, is_slow and bool(free.any()), least=least):
                 break
         more = solution(2 * count)
         if not float(more[1].loss) < float(closed.loss) - (more[1].weights.size / 2) ** 0.5:
@@ -231,16 +235,24 @@ def solve(
     is_sample = search_sample(jnp.asarray(S[:count]), rows)[1] is not rows
     scales = is_sample and free.any() and not is_held.any()
     if scales and closed.free > closed.used and closed.squares > 0:
-        shift = jnp.log(closed.squares / closed.free) / 2
+        shift = _excess(closed)
         if abs(shift) > 0.01:  # residuals depend on the noise: a secant step, a half to twice it
-            there = conditional(triangle, closed.points, shift)
-            again = jnp.log(there.squares / there.free) / 2
-            shift = shift / (1 - jnp.clip(again / shift, -1.0, 0.5))
-        there = jnp.where(jnp.asarray(free), model.flat + shift, model.flat)
-        there = jnp.clip(there, jnp.asarray(bounds.low), jnp.asarray(bounds.high))
-        model = model.at(jnp.where(jnp.asarray(free), there, model.flat))
+            again = _excess(conditional(triangle, closed.points, shift))
+            shift = shift / (1 - np.clip(again / shift, -1.0, 0.5))
+        h = np.asarray(model.flat)
+        model = model.unflatten(np.where(free, np.clip(h + shift, bounds.low, bounds.high), h))
         closed = conditional(triangle, closed.points, shift)
     return model, closed
+
+
+def _excess(closed: ClosedForm) -> float:
+    """The logarithm of the deviation of the residuals, in units of the noise."""
+    return float(np.log(closed.squares / closed.free) / 2)
+
+
+def limiting_windows(rows: LinearisedSegments) -> LinearisedSegments:
+    """As many samples as a search can take with a landmark in each of their intervals."""
+    return windows(rows, int((_ENTRIES / 3) ** 0.5 / rows.residual.shape[-1]))
 
 
 def limited_by_landmarks(
@@ -261,8 +273,7 @@ def limited_by_landmarks(
     and a third or a hundredth of the noise.
     """
     shares = np.array([1.0, 0.3, 0.1, 0.03] if with_less_noise else [1.0])
-    width = (_ENTRIES / 3) ** 0.5
-    part = windows(rows, int(width / rows.residual.shape[-1]))
+    part = limiting_windows(rows)
     middles, n = exact(part)[0], rows.residual.shape[-1]
     less = np.tile(np.asarray(model.flat), (len(shares), 1))
     less[:, -2 * n :] += np.log(shares)[:, None]
@@ -293,7 +304,7 @@ def gain_of_friction(
     K, (X, Y) = model.kernel, sample_points(data)
     n = Y.shape[1]
     force, fastest = np.sqrt(np.mean(Y[:, n // 2 :] ** 2)), np.abs(X[:, n // 2 : n]).max()
-    if frictions(K) or K.given == "parameters" or not fastest > 0:
+    if frictions(K) or K.input_name == "parameters" or not fastest > 0:
         return 0.0
     both = Friction(force / fastest, 1e-6 * force) + Friction(1e-6 * force / fastest, force)
     more = with_rest_speed(both, jnp.asarray(X), n)
@@ -321,7 +332,7 @@ def gain_of_inertia(
     K, (X, Y) = model.kernel, sample_points(data)
     n = Y.shape[1]
     force, fastest = np.sqrt(np.mean(Y[:, n // 2 :] ** 2)), np.abs(X[:, n // 2 : n]).max()
-    if n < 4 or n % 2 or K.given == "parameters" or not (force > 0 and fastest > 0):
+    if n < 4 or n % 2 or K.input_name == "parameters" or not (force > 0 and fastest > 0):
         return 0.0
     v = slice(n // 2, n)
     if mean is not None and jax.vmap(jax.hessian(mean))(jnp.asarray(X[::99]))[:, v, v, v].any():
@@ -361,7 +372,7 @@ def _gain(
         design[:, explains] += np.log([[1.0], [0.1], [0.01]])
         return float(losses(model, design, S, rows, start_deviation).min())
 
-    return least(model) - least(model._replace(kernel=K.with_states(K.of_states + more)))
+    return least(model) - least(model._replace(kernel=K.with_states(K.state_kernel + more)))
 
 
 def bounds_and_design(
@@ -467,7 +478,7 @@ def _scale_amplitudes(model: Model, h, scales, X, Y):
     if not scales.any():
         return h
     full = np.concatenate([h, np.asarray(model.log_process)])
-    trace = float(gram_trace(model.at(full).kernel, jnp.asarray(X))) / len(X)
+    trace = float(gram_trace(model.unflatten(full).kernel, jnp.asarray(X))) / len(X)
     target = 4 * np.mean(np.sum(Y**2, axis=1))
     out = h.copy()
     if np.isfinite(trace) and trace > 0 and target > 0:

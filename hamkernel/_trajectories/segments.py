@@ -77,7 +77,7 @@ class LinearisedSegments(NamedTuple):
 
 
 @compiled_by_size
-def linearised(
+def linearise(
     path: Path,
     slopes: Float[Array, "S L 3 n"],
     mean: Float[Array, "S L 3 n"],
@@ -240,7 +240,7 @@ def _linearised_along_smoothed(mean, along, good, segments: Segments) -> Lineari
     x, points, slopes = along
     path = given_path(x, points, segments.spans, jacobians(mean, points, x.shape[-1]))
     there = means(mean, points, slopes)
-    rows = linearised(path, slopes, there, segments, good)
+    rows = linearise(path, slopes, there, segments, good)
     # The smoothed path solves no equation, so the Gauss rule misses a part of its increments.
     shares = segments.spans[:, :, None, None] * jnp.asarray(WEIGHTS, x.dtype)[None, None, :, None]
     missed = jnp.diff(x, axis=1) - (shares * slopes).sum(axis=2)
@@ -270,7 +270,7 @@ def padded_count(count: int, large: bool) -> int:
     return -(-count // step) * step
 
 
-def segmented(
+def make_segments(
     runs: list[PreprocessedRun], pieces: list[Piece], paths: list[np.ndarray]
 ) -> Segments:
     """The pieces as arrays of a few shapes; they start on `paths`."""
@@ -291,7 +291,7 @@ def segmented(
     return segments_of(filled, size, length)
 
 
-def updated(paths, pieces: list[Piece], good, x: np.ndarray) -> list[np.ndarray]:
+def replace_pieces(paths, pieces: list[Piece], good, x: np.ndarray) -> list[np.ndarray]:
     """The paths, in which x replaces the pieces that were kept."""
     new = [path.copy() for path in paths]
     for s, (r, start, stop) in enumerate(pieces):

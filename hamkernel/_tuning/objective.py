@@ -89,7 +89,7 @@ class SearchCriterion(eqx.Module):
         # An eigenvalue problem of n × n for each point.
         return self._with(projected=_project(K, rows))
 
-    def for_subset(self, rows: Measurements, chosen: np.ndarray) -> "SearchCriterion":
+    def restrict(self, rows: Measurements, chosen: np.ndarray) -> "SearchCriterion":
         """This criterion for the rows of a subset of the observations."""
         if self.partition is None:
             return self

@@ -105,7 +105,7 @@ class Search:
             part = self._part(self.criterion, more)
             runs, ends = self._finish(part, ends, steps)
         if last is not None:
-            runs = self._at_least_as_good_as_start(part, runs)
+            runs = self._add_caller_run(part, runs)
         if low_rank is not None and runs.best.value.min() < np.inf:
             part = self._part(low_rank(best(runs)), np.arange(self.rows.count))
             runs, _ = self._finish(part, ends, self.max_steps)
@@ -156,7 +156,7 @@ class Search:
         runs = _take(runs, slice(self.starts))
         return runs, _concatenate(_take(runs, [0]), self._caller_run(part))
 
-    def _at_least_as_good_as_start(self, part: "Part", runs: MinimiserRun) -> MinimiserRun:
+    def _add_caller_run(self, part: "Part", runs: MinimiserRun) -> MinimiserRun:
         """The runs, with one more from the caller's point if its loss on all the data is smaller.
 
         A subset of the data can mislead. The check evaluates the loss once on all the data. For a
@@ -273,7 +273,7 @@ class Part:
             rows, chosen = rows.subset(chosen)
         self.count = rows.count
         numbers = (jnp.asarray(number, rows.targets.dtype) for number in (N / self.count, rms, 1.0))
-        criterion = criterion.for_subset(rows, chosen).with_silent_directions(space.kernel, rows)
+        criterion = criterion.restrict(rows, chosen).with_silent_directions(space.kernel, rows)
         self.objective = SearchObjective(space, criterion, rows, *numbers)
 
     def set_unit(self, unit: float) -> None:

@@ -117,7 +117,7 @@ def velocity_rms(K: AbstractMatrixKernel, rows: Measurements) -> float:
     diagonals: of the Gram of velocities at the points, and of the Gram of the rows.
     """
     if isinstance(rows.blocks[0], Components) and len(rows.blocks) == 1:
-        return float(np.sqrt(np.mean(np.asarray(rows.measured()) ** 2)))
+        return float(np.sqrt(np.mean(np.asarray(rows.measured_values()) ** 2)))
     ratio = np.sum(np.asarray(rows.y) ** 2) / np.trace(np.asarray(_gram_of_rows(K, rows)))
     components = len(rows.points) * rows.dimension
     return float(np.sqrt(ratio * float(gram_trace(K, rows.points)) / components))
@@ -148,7 +148,7 @@ def _amplitudes(
         for term, of_middle in zip(K.terms, middle.terms, strict=True):
             amplitudes |= _amplitudes(term, of_middle, X, rms)
     elif isinstance(K, AbstractJoinedKernel):
-        amplitudes |= _amplitudes(K.of_states, middle.of_states, K.split(X)[0], rms)
+        amplitudes |= _amplitudes(K.state_kernel, middle.state_kernel, K.split(X)[0], rms)
         if isinstance(K, Controlled):
             both, drift = amplitudes[id(K)], amplitudes[id(K.drift)]  # as 1/(a + b) and 1/a
             amplitudes[id(K.inputs)] = 1 / (1 / both - 1 / drift) if both < drift else both
@@ -346,7 +346,7 @@ class SearchSpace(eqx.Module):
         keys = [self.names[i] if self.logarithmic[i] else i for i in self.free]
         return tuple(list(dict.fromkeys(keys)).index(key) for key in keys)
 
-    def at_bounds(self, u: Float[np.ndarray, " P"]) -> tuple[str, ...]:
+    def active_bounds(self, u: Float[np.ndarray, " P"]) -> tuple[str, ...]:
         """The hyperparameters that rest on a bound; entries of arrays by name and coordinate."""
         at_edge = np.abs(np.sin(u)) > 1 - 2 * _EDGE
         return tuple(self.entries[i] for i in np.array(self.free)[at_edge])

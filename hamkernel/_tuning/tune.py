@@ -357,7 +357,7 @@ def _result(
         converged=jnp.asarray(best_run.converged),
         steps=jnp.asarray(best_run.steps),
         start_losses=jnp.asarray(losses, dtype),
-        at_bounds=space.at_bounds(best_run.best.u),
+        at_bounds=space.active_bounds(best_run.best.u),
         bounds=space.bounds(size),
         problem=dataclasses.replace(problem, spread=None),
     )

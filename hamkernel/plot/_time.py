@@ -11,7 +11,7 @@ from jaxtyping import ArrayLike, Float
 from matplotlib.axes import Axes
 
 from hamkernel import _require as require
-from hamkernel._runs.flow import simulated
+from hamkernel._runs.flow import integrate
 from hamkernel.plot._style import (
     BLUE,
     COLORS,
@@ -284,11 +284,11 @@ def fitted(
     ts, fit = np.asarray(learned.runs.times[run]), np.asarray(learned.states[run])
     grid = np.interp(np.arange(_BETWEEN * (len(ts) - 1) + 1) / _BETWEEN, np.arange(len(ts)), ts)
     spans = np.repeat(np.diff(ts)[:, None] / _BETWEEN, _BETWEEN, axis=1)
-    ends = learned.runs.applied(run, grid)
+    ends = learned.runs.input_lines(run, grid)
     ends = ends.reshape(*spans.shape, 2, ends.shape[2])
     field = getattr(learned.field, "whole", learned.field)  # of the points (x, u) with inputs
     steps, starts = jnp.ones(_BETWEEN, int), jnp.asarray(fit[:-1])
-    between = simulated(field, starts, jnp.asarray(spans), steps, jnp.asarray(ends)).x
+    between = integrate(field, starts, jnp.asarray(spans), steps, jnp.asarray(ends)).x
     path = np.concatenate([np.asarray(between[:, :-1]).reshape(-1, n), fit[-1:]])
     residuals, misfit = np.asarray(learned.residuals[run]), np.asarray(learned.misfit[run])
     for c, (left, right) in enumerate(panels):

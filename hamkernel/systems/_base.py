@@ -60,11 +60,11 @@ class AbstractHamiltonianSystem(eqx.Module):
 
 @eqx.filter_jit
 def _velocity(system: AbstractHamiltonianSystem, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    dq, dp = jnp.split(jax.grad(in_precision(system, x.dtype).hamiltonian)(x), 2)
+    dq, dp = jnp.split(jax.grad(cast_arrays(system, x.dtype).hamiltonian)(x), 2)
     return jnp.concatenate([dp, -dq])
 
 
-def in_precision(field: Function, dtype: jnp.dtype) -> Function:
+def cast_arrays(field: Function, dtype: jnp.dtype) -> Function:
     """`field` with its real arrays in the dtype of the states; a plain function has none."""
 
     def cast_leaf(leaf):
@@ -79,7 +79,7 @@ def cast_state(
 ) -> tuple[Function, Float[Array, " n"]]:
     """`system` in the dtype of x, and x, which must be one state of n coordinates."""
     x = require.point(x, n)
-    return in_precision(system, x.dtype), x
+    return cast_arrays(system, x.dtype), x
 
 
 def require_shape(x: Array, name: str, *shapes: tuple[int, ...]) -> Array:
@@ -173,7 +173,7 @@ class Damped(eqx.Module):
     def dissipation(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """Return the power lost, ∇HᵀR∇H ≥ 0, shape ()."""
         x = require.floating(x, "x")
-        slope = jax.grad(in_precision(self, x.dtype).hamiltonian)(x)
+        slope = jax.grad(cast_arrays(self, x.dtype).hamiltonian)(x)
         return self._resistance(x) @ slope**2
 
     def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
@@ -197,7 +197,7 @@ class Damped(eqx.Module):
 
 @eqx.filter_jit
 def _damped_velocity(system: Damped, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    system = in_precision(system, x.dtype)
+    system = cast_arrays(system, x.dtype)
     return system.system(x) - system._resistance(x) * jax.grad(system.system.hamiltonian)(x)
 
 
@@ -335,7 +335,7 @@ def sample(
     require.single_or_double(x0.dtype, "x0 has")
     states = require.finite(require.points(x0[None] if x0.ndim == 1 else x0, "x0"), "x0")
     ts = require.elapsed_times(require.times(ts, least=1), states.dtype)
-    system = in_precision(system, states.dtype)
+    system = cast_arrays(system, states.dtype)
     require.velocity(system, jax.ShapeDtypeStruct(states.shape[1:], states.dtype), "system")
     levels = [
         _noise_level(level, name, states, key)

@@ -14,9 +14,9 @@ from hamkernel.poisson import charged_particle, lotka_volterra, rigid_body
 from hamkernel.systems._base import (
     AbstractHamiltonianSystem,
     Numbers,
+    cast_arrays,
     cast_state,
     count_of,
-    in_precision,
     log_parameter,
     positive_parameter,
     require_shape,
@@ -171,7 +171,7 @@ class PointVortices(AbstractHamiltonianSystem):
         """
         positions = require.floating(positions, "positions")
         x, y = require_shape(positions, "positions", (self.circulations.size, 2)).T
-        self = in_precision(self, x.dtype)
+        self = cast_arrays(self, x.dtype)
         scale = jnp.sqrt(jnp.abs(self.circulations))
         return jnp.concatenate([scale * x, jnp.sign(self.circulations) * scale * y])
 
@@ -228,7 +228,7 @@ class AbstractPoissonSystem(eqx.Module):
 
 @eqx.filter_jit
 def _poisson_velocity(system: AbstractPoissonSystem, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    system = in_precision(system, x.dtype)
+    system = cast_arrays(system, x.dtype)
     return system.tensor(x) @ jax.grad(system.hamiltonian)(x)
 
 

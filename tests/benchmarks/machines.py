@@ -127,7 +127,9 @@ def judged(case, logs, test, kernel, between, force, gain, count, unit):
     t, true, u = (a[: count + 1] for a in test[:3])
     held = hk.Runs(t, true, u, between=between if between != "auto" else found.runs.between)
     fine = 16
-    ends = held.applied(0, np.interp(np.arange(count * fine + 1) / fine, np.arange(count + 1), t))
+    ends = held.input_lines(
+        0, np.interp(np.arange(count * fine + 1) / fine, np.arange(count + 1), t)
+    )
     grid = jnp.asarray(np.linspace(t[0], t[-1], count * fine + 1))
     middle = jnp.asarray(np.append(ends.mean(axis=1), ends[-1:, 1], axis=0))
     free = hk.simulate(found.field, jnp.asarray(true[0]), grid, inputs=middle, dt=grid[1]).ys
