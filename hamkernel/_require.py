@@ -471,8 +471,11 @@ def elapsed_times(ts: Float[Array, " T"], dtype: Any) -> Float[Array, " T"]:
     )
 
 
-def velocity(field: Any, x: Float[Array, " n"], name: str = "field") -> jax.ShapeDtypeStruct:
-    """The shape and dtype of `field(x)`, one velocity; errors inside `field` propagate."""
+def velocity(field: Any, x: Any, name: str = "field") -> jax.ShapeDtypeStruct:
+    """The shape and dtype of `field(x)`, one velocity, for a state x or a struct of its shape.
+
+    Errors inside `field` propagate.
+    """
     if not callable(field):
         hint = " Pass its .field." if hasattr(field, "field") else ""
         raise TypeError(

@@ -297,8 +297,9 @@ def _process(steps, y, measured, v, measured_slope, longest: float, spacing: flo
         speed = (v[measured_slope].std() or 1.0) / scale
         low, high = [*low, 1e-7 * speed], [*high, 2.0 * speed]
         slopes = v / scale, measured_slope
-    data = jax.device_put((steps, y / scale, measured, slopes))
-    log_amplitude, log_rate, *log_noise = np.asarray(_fit_process(*data, np.log(low), np.log(high)))
+    box = np.log(low), np.log(high)
+    data = jax.device_put((steps, y / scale, measured, slopes, *box))
+    log_amplitude, log_rate, *log_noise = np.asarray(_fit_process(*data))
     shift = np.log(scale)
     logs = log_amplitude + shift, log_rate, log_noise[0] + shift
     slope_noise = float(np.exp(log_noise[1] + shift)) if slopes else np.nan

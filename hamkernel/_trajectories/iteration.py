@@ -363,7 +363,7 @@ def _is_tuned(now: Current, model: Model, closed: ClosedForm, rows: LinearisedSe
 
 def _linearise(
     task: Task, now: Current
-) -> tuple[Segments, Float[Array, "S L+1 n"], Array, LinearisedSegments]:
+) -> tuple[Segments, Float[Array, "S L+1 n"], np.ndarray, LinearisedSegments]:
     """The segments, the path on them, Runge-Kutta steps, and the rows along it."""
     segments = make_segments(task.data.runs, task.pieces, now.paths)
     spans = np.asarray(segments.spans).reshape(-1, 1)

@@ -29,7 +29,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel._machine import compiled_by_size, orthonormal
 from hamkernel._observations.kinds import Functionals, Together
@@ -192,7 +192,7 @@ def smoothed_path(
 
 @compiled_by_size
 def linearised_by_interval(
-    field: Expansion, x: Float[Array, "S L+1 n"], segments: Segments, steps, good
+    field: Expansion, x: Float[Any, "S L+1 n"], segments: Segments, steps, good
 ) -> LinearisedSegments:
     """The rows along a path that the field need not follow; `missed` is the defect by interval.
 
@@ -224,7 +224,7 @@ def linearised_by_interval(
 
 @compiled_by_size
 def process_covariance(
-    model: Model, rows: LinearisedSegments, least: Float[Array, " n"]
+    model: Model, rows: LinearisedSegments, least: Float[ArrayLike, " n"]
 ) -> Float[Array, "S L n n"]:
     """Cov η of each interval, plus the squares of `least` on its diagonal."""
     roots = process_roots(model.log_process, rows)

@@ -158,8 +158,8 @@ def maximise_likelihood(
     if not bounds.free.any():
         flat = np.asarray(model.flat)[None]
         return model, float(losses(model, flat, S, rows, start_deviation)[0])
-    sides = jax.device_put((bounds.low, bounds.high, bounds.free))
-    h, value = _best(model, S, rows, start_deviation, *sides, steps)
+    low, high, free = jax.device_put((bounds.low, bounds.high, bounds.free))
+    h, value = _best(model, S, rows, start_deviation, low, high, free, steps)
     return model.unflatten(h), float(value)
 
 

@@ -336,7 +336,8 @@ def sample(
     states = require.finite(require.points(x0[None] if x0.ndim == 1 else x0, "x0"), "x0")
     ts = require.elapsed_times(require.times(ts, least=1), states.dtype)
     system = cast_arrays(system, states.dtype)
-    require.velocity(system, jax.ShapeDtypeStruct(states.shape[1:], states.dtype), "system")
+    one = jax.ShapeDtypeStruct(states.shape[1:], states.dtype)  # indexing would compile
+    require.velocity(system, one, "system")
     levels = [
         _noise_level(level, name, states, key)
         for level, name in [(state_noise, "state_noise"), (velocity_noise, "velocity_noise")]
