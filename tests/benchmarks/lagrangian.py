@@ -16,6 +16,10 @@ All machines are the two-link arm of `tests/test_lagrangian.py`.
 Printed over all seeds, at states that were not learned from: the rms errors of M, gravity, energy
 and torques relative to their rms, the mean square error of the torques, the shares inside one and
 two deviations of the bands (.68 and .95 are right), and CPU seconds with compilation.
+
+Measured, seed 0: the mean square error of the torques is 2.1e-11 in `letters`, 37 s, and 7e-27 in
+`trigonometric`, 25 s. `bands`, eight seeds, 39 s: .85, .82, .91 and .85 of M, gravity, energy and
+torques are inside one deviation, and all inside two: with these guessed kernels bands are too wide.
 """
 
 import argparse
