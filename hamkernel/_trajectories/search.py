@@ -217,20 +217,22 @@ def solve(
         return triangle, conditional(triangle, points)
 
     triangle, closed = solution(count)
+    n = len(model.log_noise)
     is_short = limiting_windows(rows) is rows
     while count < len(S):
         is_slow = count <= quick < min(2 * count, len(S))
-        if is_slow or is_short:
-            args = model, jnp.asarray(S[:count]), rows, start_deviation
-            least = np.log(2) / 2 if is_slow else 0.0
-            if not limited_by_landmarks(*args, is_slow and bool(free.any()), least=least):
-                break
+        args = model, jnp.asarray(S[:count]), rows, start_deviation
+        if is_slow and not limited_by_landmarks(*args, bool(free.any()), least=np.log(2) / 2):
+            break
+        # All landmarks gain at least as much as twice as many, which must gain √(q/2).
+        if is_short and landmark_gain(*args)[0] <= (n * count) ** 0.5:
+            break
         more = solution(2 * count)
         if not float(more[1].loss) < float(closed.loss) - (more[1].weights.size / 2) ** 0.5:
             break
         (triangle, closed), count = more, 2 * count
     # The floor of process noise stands for none, and may be scaled with the noise; q may not.
-    log_q, n = np.asarray(model.log_process), len(model.log_process)
+    log_q = np.asarray(model.log_process)
     is_held = (log_q > np.asarray(bounds.low)[-n:] + 0.1) & ~free[-n:]
     is_sample = search_sample(jnp.asarray(S[:count]), rows)[1] is not rows
     scales = is_sample and free.any() and not is_held.any()
@@ -272,17 +274,25 @@ def limited_by_landmarks(
     them have a log p of 1733, of 1732 with more landmarks, and of 2002 and 2454 with more landmarks
     and a third or a hundredth of the noise.
     """
+    gain, part = landmark_gain(model, S, rows, start_deviation, with_less_noise)
+    counts, n = np.asarray(part.counts), rows.residual.shape[-1]
+    q, freedom = n * len(exact(part)[0]), (counts > 0).sum() - n * len(counts)
+    return bool(gain > max((q / 2) ** 0.5, least * freedom))
+
+
+def landmark_gain(
+    model: Model, S, rows: LinearisedSegments, start_deviation, with_less_noise: bool = False
+) -> tuple[float, LinearisedSegments]:
+    """The gain of log p of windows from a landmark in each of their intervals, and the windows."""
     shares = np.array([1.0, 0.3, 0.1, 0.03] if with_less_noise else [1.0])
     part = limiting_windows(rows)
-    middles, n = exact(part)[0], rows.residual.shape[-1]
     less = np.tile(np.asarray(model.flat), (len(shares), 1))
-    less[:, -2 * n :] += np.log(shares)[:, None]
+    less[:, -2 * len(model.log_noise) :] += np.log(shares)[:, None]
     few, many = (
         losses(model, flat, points, part, start_deviation).min()
-        for points, flat in ((S, less[:1]), (middles, less))
+        for points, flat in ((S, less[:1]), (exact(part)[0], less))
     )
-    freedom = float((part.counts > 0).sum()) - n * len(part.counts)
-    return bool(few - many > max((n * len(middles) / 2) ** 0.5, least * freedom))
+    return float(few - many), part
 
 
 def gain_of_friction(
