@@ -1,6 +1,7 @@
 """Every test runs in float64 with strict promotion: a silent change of dtype is an error."""
 
 import collections
+import gc
 import os
 import warnings
 import zlib
@@ -12,9 +13,10 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # LLVM's optimiser is a third of it, and a pipeline of MLIR for each fusion half of the rest
 # (test_observations.py: 86 s with that pipeline, 43 without).
 # `.ci/run` compiles as for a user for its slow tests and those of rounding, with empty XLA_FLAGS.
-os.environ.setdefault(
-    "XLA_FLAGS", "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+os.environ["FAST_XLA_FLAGS"] = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
 )
+os.environ.setdefault("XLA_FLAGS", os.environ["FAST_XLA_FLAGS"])
 
 import jax
 import numpy as np
@@ -41,6 +43,21 @@ def pytest_collection_modifyitems(items):
             item.add_marker(pytest.mark.slow)
 
 
+def pytest_collection_finish():
+    """Collect garbage less often: with Python's thresholds that is 6 % of test_linear_operator.py.
+
+    Tracing allocates many small objects that live, so most collections free nothing.
+    """
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 50)
+
+
+@pytest.fixture
+def fast_compilation() -> dict[str, str]:
+    """The environment of a process whose programs run once, also where CI sets no XLA_FLAGS."""
+    return os.environ | {"XLA_FLAGS": os.environ["FAST_XLA_FLAGS"]}
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _few_compiled_programs():
     """Each module compiles thousands of programs, and each program maps memory: drop them."""
@@ -55,20 +72,21 @@ def key() -> jax.Array:
 
 @pytest.fixture(scope="session")
 def learned():
-    """What `learn` finds in two short runs of a pendulum of known mass, q̈ = −sin q."""
+    """What `learn` finds in two short logs of the angle of a pendulum, q̈ = −sin q, mass 1."""
     import hamkernel as hk  # after the settings above
 
-    rng, ts, states = np.random.default_rng(0), np.linspace(0.0, 5.7, 20), []
+    rng, ts, positions = np.random.default_rng(0), np.linspace(0.0, 5.7, 20), []
     for q, p in [(1.2, 0.0), (0.4, 1.0)]:
         rows = []
         for i in range(5701):  # leaps of a millisecond
             if i % 300 == 0:
-                rows.append([q, p])
+                rows.append(q)
             half = p - 0.0005 * np.sin(q)
             q += 0.001 * half
             p = half - 0.0005 * np.sin(q)
-        states.append(np.array(rows) + 0.01 * rng.normal(size=(20, 2)))
+        positions.append(np.array(rows) + 0.01 * rng.normal(size=20))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the log is short
-        K, runs = hk.Symplectic(hk.Gaussian(2.0)), hk.Runs([ts] * 2, states)
+        K = hk.Symplectic(hk.Select(hk.Gaussian(2.0), 0))
+        runs = hk.Runs([ts] * 2, positions)
         return hk.learn(K, runs, mass=1.0, iterations=2, progress=False)

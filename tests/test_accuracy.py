@@ -40,6 +40,7 @@ K = hk.Symplectic(1.0 * hk.Gaussian(0.5))
 G = np.asarray(hk.gram(K, X)).reshape(X.size, X.size)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("regularization", [1e-8, 1e-10, 1e-12, 1e-13])
 def test_losses_of_a_kepler_orbit_are_those_of_refits(regularization):
     N, y = len(X), Y.ravel()
@@ -87,6 +88,7 @@ def test_conjugate_gradients_name_cholesky_where_the_ridge_is_rounding():
     assert "rounding" not in str(failure.value).split("float32")[0]  # another cause
 
 
+@pytest.mark.few(1)
 @pytest.mark.filterwarnings("ignore:.*landmarks leave")
 @pytest.mark.parametrize("regularization", [1e-2, 1e-5, 1e-8])
 def test_the_truncation_bounds_the_distance_to_the_exact_fit(regularization):
@@ -113,6 +115,7 @@ def test_the_relative_residual_is_that_of_the_coefficients(regularization):
     assert expected < 1e-9
 
 
+@pytest.mark.few(3)
 @pytest.mark.parametrize("solver", [None, hk.Nystrom(max_points=40), hk.ConjugateGradient()])
 @pytest.mark.parametrize("regularization", [1e-3, 1e-7])
 def test_energy_differences_are_line_integrals_of_the_field(solver, regularization):

@@ -46,7 +46,7 @@ QUANTITIES = {
 SLOW = {("Nystrom", "nested"), ("Nystrom", "in a warp"), ("CG", "in a warp")}
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     ("quantity", "kernel"),
     [

@@ -122,7 +122,7 @@ def test_sound_kernels_pass_at_every_lengthscale_amplitude_and_dimension(name, d
             assert check_kernel(k, cloud(seed, n=n).astype(dtype)) is None
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", NOT_STATIONARY)
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_kernels_that_are_not_stationary_pass(name, dtype):
@@ -305,6 +305,7 @@ reverse_only.defvjp(
 )
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("jitter", [1e-9, 1e-12, 1e-36, 1e-300])
 def test_a_small_number_under_the_root_does_not_make_laplace_smooth(jitter):
     for seed, n in ((0, 2), (1, 4)):

@@ -21,7 +21,6 @@ The number of devices is set before JAX starts, so each test here asks a fresh i
 
 import itertools
 import json
-import os
 import socket
 import subprocess
 import sys
@@ -117,13 +116,11 @@ jax.distributed.initialize(sys.argv[1], num_processes=2, process_id=int(sys.argv
 
 def started(program, setup, *arguments):
     code = PRELUDE.replace("SETUP", setup) + program
-    environment = {k: v for k, v in os.environ.items() if k != "XLA_FLAGS"}
     return subprocess.Popen(
         [sys.executable, "-c", code, *arguments],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=environment,
     )
 
 

@@ -7,7 +7,6 @@ import os
 import re
 import subprocess
 import sys
-import warnings
 from pathlib import Path
 
 import jax
@@ -344,8 +343,8 @@ def test_kinetic_energy_is_that_of_numpy(mass):
     ("mass", "said"),
     [
         (-1.0, "mass must be positive"),
-        ([[1.0, 2.0], [2.0, 1.0]], "symmetric and positive definite"),
-        ([[1.0, 0.5], [0.0, 1.0]], "symmetric and positive definite"),
+        ([[1.0, 2.0], [2.0, 1.0]], "symmetric positive definite"),
+        ([[1.0, 0.5], [0.0, 1.0]], "symmetric positive definite"),
         (np.ones((2, 3)), r"\(\), \(m,\) or \(m, m\)"),
     ],
 )
@@ -359,31 +358,21 @@ def test_a_state_of_other_masses_is_refused():
         hk.kinetic([1.0, 2.0])(np.ones(2))
 
 
-def test_positions_and_a_mass_are_enough(tmp_path):
-    """A pendulum of mass 2: the field of (q, p), saved and loaded without a mean."""
-    dice = np.random.default_rng(0)
-    t, runs = np.linspace(0, 6, 60), []
-    system = hk.systems.Pendulum(2.0, 1.0, 6.0)
-    for start in ([1.0, 0.0], [0.3, 1.0], [-1.8, 2.0]):
-        q = np.asarray(hk.simulate(system, jnp.asarray(start), jnp.asarray(t)).ys)[:, 0]
-        runs.append(q + 1e-3 * dice.standard_normal(q.shape))
-    K = hk.Symplectic(hk.Select(hk.Gaussian(1.0), 0))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        learned = hk.learn(K, hk.Runs([t] * 3, runs), mass=2.0, progress=False)
-    x = jnp.array([0.7, 1.3])
-    np.testing.assert_allclose(learned.field(x), system(x), rtol=0.01)
+def test_positions_and_a_mass_are_enough(learned, tmp_path):
+    """A pendulum, H = p²/2 − cos q: the field of (q, p), saved and loaded without a mean."""
+    assert learned.runs.states[0].shape == (20, 2)
+    assert np.isnan(learned.runs.states[0][:, 1]).all()
+    x, H = jnp.array([0.7, 0.4]), learned.field.hamiltonian
+    np.testing.assert_allclose(learned.field(x), [0.4, -np.sin(0.7)], rtol=0.05)
+    np.testing.assert_allclose(H(x) - H(x * 0), 0.4**2 / 2 + 1 - np.cos(0.7), rtol=0.05)
     assert learned.field.is_separable
-    H = learned.field.hamiltonian
-    np.testing.assert_allclose(
-        H(x) - H(x * 0), system.hamiltonian(x) - system.hamiltonian(x * 0), rtol=0.01
-    )
     hk.save(tmp_path / "field", learned.field)
     np.testing.assert_array_equal(hk.load(tmp_path / "field")(x), learned.field(x))
+    K = learned.kernel
     with pytest.raises(TypeError, match="give one of mass and mean"):
         hk.learn(K, learned.runs, mean=hk.kinetic(1.0), mass=1.0)
     with pytest.raises(ValueError, match=r"positions alone hk\.learn\(K, runs, mass=m\)"):
-        hk.learn(K, hk.Runs(t, runs[0]))
+        hk.learn(K, hk.Runs(T, X[:, 0]))
 
 
 def test_the_line_of_the_readme_reads_a_csv_with_a_header(tmp_path, monkeypatch):

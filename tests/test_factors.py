@@ -19,7 +19,9 @@ def tall(D: int, r: int) -> tuple[jax.Array, jax.Array]:
     return jnp.asarray(np.random.default_rng(D).normal(size=(D, r))), jnp.asarray(0.3)
 
 
-@pytest.mark.parametrize("D", [1, 31, 129, 601, 1500])  # one block, two, of unequal size, all
+@pytest.mark.parametrize(
+    "D", [1, 31, 129, 601, pytest.param(1500, marks=pytest.mark.slow)]
+)  # one block, two, of unequal size, all
 def test_the_dense_inverse_and_factor_are_those_of_numpy(D):
     A = positive(D)
     factor, C = jax.jit(lambda A: (dense_factor(A), dense_factor(A).inverse().C))(A)
@@ -89,6 +91,7 @@ def test_derivatives_of_the_primitives_are_those_of_jax(mode):
     np.testing.assert_allclose(found, expected, rtol=1e-9)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("kind", ["dense", "low rank"])
 def test_derivatives_of_losses_are_those_of_jax(kind):
     # Of all of them at once, each with a weight of its own. One fold has more rows than features.

@@ -78,6 +78,7 @@ def test_the_fit_is_the_regression_with_k_times_K(fields, name):
     assert found == pytest.approx(likelihood, rel=1e-10)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", FORMULAS)
 def test_a_member_is_an_ordinary_field_with_its_structure(fields, name):
     field = fields[name]

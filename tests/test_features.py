@@ -474,9 +474,10 @@ def test_gradients_with_respect_to_hyperparameters_are_differences(make, key):
     ("make", "formula"),
     [
         (lambda ell: hk.Periodic(3.0, ell), lambda ell: periodic(3.0, ell)),
-        (
+        pytest.param(
             lambda alpha: hk.RationalQuadratic(alpha, 1.1),
             lambda alpha: radial(rational_profile(alpha), 1.1)[0],
+            marks=pytest.mark.slow,
         ),
     ],
     ids=["periodic_lengthscale", "rational_quadratic_alpha"],

@@ -359,7 +359,7 @@ def test_a_kernel_that_is_not_finite_is_refused():
         hk.fit(hk.Symplectic(plain), *data(), RIDGE)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "solver",
     [hk.Cholesky(), hk.ConjugateGradient(), hk.Nystrom(), hk.RandomFeatures(9, jax.random.key(0))],

@@ -78,7 +78,7 @@ KERNELS = {
 }
 
 
-@pytest.mark.few(6)
+@pytest.mark.few(4)
 @pytest.mark.parametrize("name", KERNELS)
 def test_products_are_those_of_the_dense_gram(name):
     K, X, Z = KERNELS[name], normal((FEW, n)), normal((FEW + 5, n), 1)

@@ -316,7 +316,7 @@ def rollout(solver, coupling, x0):
         pytest.param(ImplicitMidpoint(), marks=pytest.mark.slow),
         GaussLegendre4(),
         pytest.param(GaussLegendre6(), marks=pytest.mark.slow),
-        StormerVerlet(),
+        pytest.param(StormerVerlet(), marks=pytest.mark.slow),
         pytest.param(Yoshida4(), marks=pytest.mark.slow),
     ],
     ids=name,

@@ -140,6 +140,7 @@ def test_a_free_motion_is_scipys(arm):
     np.testing.assert_allclose(run.ys, true, atol=0.02)
 
 
+@pytest.mark.slow
 def test_friction_is_found_and_spoils_the_mass_matrix_where_it_is_ignored():
     X, tau, A = data(120, 1, viscous=0.8, dry=0.5)
     with_friction = hk.Lagrangian(

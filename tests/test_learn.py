@@ -301,6 +301,7 @@ def learned():
 def test_a_pendulum_is_learned_from_noisy_states(learned):
     found, true = learned
     assert found.converged
+    assert found.diagnostics.failing == ()  # and no warning, which is an error here
     assert field_error(found.field, true) < 0.05  # .043, .028 and .029 for three seeds
     np.testing.assert_allclose(found.noise, 0.05, rtol=0.15)
     assert np.asarray(found.kept).tolist() == [1.0] * 6
@@ -326,6 +327,20 @@ def test_runs_of_other_lengths_do_not_compile_anew(learned, caplog):
     programs = re.findall(r"XLA compilation of jit\((\w+)\)", caplog.text)
     assert set(programs) <= {"stage", "reshape"}  # data on its way to the device
     assert field_error(found.field, true) < 0.06
+
+
+def test_one_row_that_is_no_measurement_spoils_no_field():
+    times, states, true = logs()
+    states[1][20] = -9999.0
+    with pytest.warns(UserWarning, match="Write NaN"):
+        runs = hk.Runs(times, states)
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        found = hk.learn(K, runs)
+    # The run with that row is left out, or the field must not be used.
+    assert not found.converged or field_error(found.field, true) < 0.1
+    assert len(heard) == 1
+    assert "one curve" not in found.diagnostics.failing
 
 
 @pytest.mark.slow

@@ -128,7 +128,7 @@ FIELD_ASKED = [[(0.0, e, x)] for x in ASKED for e in np.eye(2)]
 ENERGY_ASKED = [[(1.0, ZERO, ASKED[0]), (-1.0, ZERO, ASKED[1])]]
 
 
-@pytest.mark.few(5)
+@pytest.mark.few(3)
 @pytest.mark.parametrize(("first", "second"), PAIRS, ids=lambda name: name)
 def test_fit_and_posterior_of_each_pair_of_kinds_are_the_closed_form(first, second):
     (a, rows_a, n_a), (b, rows_b, n_b) = KINDS[first](1), KINDS[second](2)
@@ -375,7 +375,7 @@ MEANS = {
 }
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", MEANS)
 @pytest.mark.parametrize("solver", [None, hk.ConjugateGradient(1e-12), hk.Nystrom(1e-8)])
 def test_a_mean_is_taken_off_the_data_and_added_to_the_field(name, solver):

@@ -279,10 +279,8 @@ print(json.dumps([refused(lambda: k(X, X)), refused(lambda: K(x, jnp.zeros(3)))]
 
 @pytest.mark.slow
 @pytest.mark.ci
-def test_annotations_hold_when_they_are_executed(tmp_path):
-    here, file = str(Path(__file__).parent), str(tmp_path / "field.npz")
-    done = subprocess.run(
-        [sys.executable, "-c", ANNOTATED, here, file], capture_output=True, text=True, check=False
-    )
+def test_annotations_hold_when_they_are_executed(tmp_path, fast_compilation):
+    program = [sys.executable, "-c", ANNOTATED, Path(__file__).parent, tmp_path / "field.npz"]
+    done = subprocess.run(program, capture_output=True, text=True, env=fast_compilation)
     assert done.returncode == 0, done.stderr[-2000:]
     assert json.loads(done.stdout) == [True, True]  # wrong shapes, the control

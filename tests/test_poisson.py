@@ -56,6 +56,7 @@ def test_energy_and_casimir_are_conserved_by_every_field_and_not_by_a_separable_
     assert not field.is_separable
 
 
+@pytest.mark.slow
 def test_the_flow_keeps_the_sphere():
     ys = hk.simulate(field_of_body(), X[0], np.linspace(0, 2, 5)).ys
     np.testing.assert_allclose(np.sum(np.asarray(ys) ** 2, axis=1), X[0] @ X[0], rtol=1e-8)

@@ -37,6 +37,7 @@ POSTERIOR = hk.condition(K, X, Y, RIDGE)
 BOTH = hk.condition(K, hk.Velocities(X, Y) + ENERGIES, regularization=RIDGE)
 
 
+@pytest.mark.slow
 def test_the_variance_is_the_recipe_of_the_readme():
     """K(x, x) − K(x, X)(G + NλI)⁻¹K(X, x), by the Gram and NumPy."""
     G, across = hk.gram(K, X), hk.gram(K, INSIDE[None], X)[0].reshape(2, -1)
@@ -353,6 +354,7 @@ def test_a_failed_solve_is_nan_if_it_is_not_to_raise():
         hk.condition(K, one_place, Y, 1e-30)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "k", [hk.Gaussian(1.0), 1.0 * hk.Gaussian(1.0), hk.Matern(2.5) * hk.Gaussian(1.0)]
 )

@@ -162,6 +162,7 @@ def test_data_without_noise_gives_the_formula_to_rounding_and_no_term_more():
     assert (np.asarray(found.deviations) < 1e-12).all()
 
 
+@pytest.mark.slow
 def test_friction_is_that_of_the_kernel():
     X, Y = pendulum(friction=0.3)
     damped = hk.PortHamiltonian(2.0 * hk.Gaussian(1.5), friction=0.3)

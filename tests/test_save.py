@@ -679,7 +679,7 @@ def test_a_header_with_any_value_exchanged_gives_a_field_or_a_value_error(tmp_pa
     content = (tmp_path / "f").read_bytes()
     junk = [None, -1, 3, 1e300, "reflection", [], {}, [[]], {"array": "float64", "shape": []}]
     refused = 0
-    for _ in range(150):
+    for _ in range(60):
         header, leaves = parts(content)
         inner = [node for node in nodes(header["field"]) if node]
         node = inner[RNG.integers(len(inner))]
@@ -690,7 +690,7 @@ def test_a_header_with_any_value_exchanged_gives_a_field_or_a_value_error(tmp_pa
             load(tmp_path / "f")
         except ValueError:
             refused += 1
-    assert refused > 75
+    assert refused > 30
 
 
 def test_a_field_that_is_nan_is_not_saved(tmp_path):

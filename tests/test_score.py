@@ -2,6 +2,7 @@
 
 # pyright: reportArgumentType=false
 
+import functools
 import warnings
 
 import jax
@@ -29,20 +30,17 @@ def logs(friction, seed, count=4, noise=0.01):
     return hk.Runs([ts] * count, [x + noise * rng.standard_normal(x.shape) for x in true])
 
 
-@pytest.fixture(scope="module")
-def learned():
-    """A field without friction, of runs without and with it."""
-    out = {}
-    for friction in (0.0, 0.1):
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            out[friction] = hk.learn(K, logs(friction, 0), progress=False)
-    return out
+@functools.cache
+def learned(friction=0.0):
+    """A field without friction, of runs without or with it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return hk.learn(K, logs(friction, 0), progress=False)
 
 
-def test_a_free_run_is_scipys_from_scipys_start(learned):
-    field, runs, first = learned[0.0].field, logs(0.0, 1, count=1), 8
-    score = learned[0.0].score(runs, first=first)
+def test_a_free_run_is_scipys_from_scipys_start():
+    field, runs, first = learned().field, logs(0.0, 1, count=1), 8
+    score = learned().score(runs, first=first)
     t, x = np.asarray(runs.times[0]), np.asarray(runs.states[0])
     compiled = jax.jit(field)
 
@@ -80,10 +78,10 @@ def test_the_linear_model_is_exact_for_an_oscillator():
 
 
 @pytest.mark.slow
-def test_a_score_without_runs_holds_out_the_last_fifth(learned):
-    score = learned[0.0].score(draws=0)
+def test_a_score_without_runs_holds_out_the_last_fifth():
+    score = learned().score(draws=0)
     assert [len(t) for t in score.times] == [6] * 4
-    np.testing.assert_array_equal(score.times[0], learned[0.0].runs.times[0][-6:])
+    np.testing.assert_array_equal(score.times[0], learned().runs.times[0][-6:])
     assert float(jnp.max(score.rmse / score.scale)) < 0.05
 
 
@@ -129,28 +127,28 @@ def test_the_horizon_ends_before_the_first_larger_error():
 
 
 @pytest.mark.slow
-def test_friction_raises_log_p_where_there_is_some_and_only_there(learned):
+def test_friction_raises_log_p_where_there_is_some_and_only_there():
     price = 0.5 * np.log(4 * 32 * 2)
-    assert learned[0.0].gain(hk.Friction()) < 2 * price
-    assert learned[0.1].gain(hk.Friction()) > 20
+    assert learned().gain(hk.Friction()) < 2 * price
+    assert learned(0.1).gain(hk.Friction()) > 20
 
 
 @pytest.mark.slow
-def test_the_evidence_of_a_wrong_structure_is_lower(learned):
+def test_the_evidence_of_a_wrong_structure_is_lower():
     """A curl-free field cannot turn in circles."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        wrong = hk.learn(hk.CurlFree(hk.Gaussian(1.0)), learned[0.0].runs, progress=False)
-    assert wrong.log_evidence < learned[0.0].log_evidence - 20
+        wrong = hk.learn(hk.CurlFree(hk.Gaussian(1.0)), learned().runs, progress=False)
+    assert wrong.log_evidence < learned().log_evidence - 20
 
 
-def test_what_cannot_be_scored_is_refused(learned):
+def test_what_cannot_be_scored_is_refused():
     with pytest.raises(TypeError, match=r"score takes hk\.Runs"):
-        learned[0.0].score(np.zeros((5, 2)))
+        learned().score(np.zeros((5, 2)))
     t = np.arange(12.0)
     with pytest.raises(TypeError, match="these runs have inputs and the learned have none"):
-        learned[0.0].score(hk.Runs(t, np.sin(np.outer(t, [1, 2])), np.cos(t)[:, None]))
+        learned().score(hk.Runs(t, np.sin(np.outer(t, [1, 2])), np.cos(t)[:, None]))
     with pytest.raises(ValueError, match="4 coordinates"):
-        learned[0.0].score(hk.Runs(t, np.sin(np.outer(t, [1, 2, 3, 4]))))
+        learned().score(hk.Runs(t, np.sin(np.outer(t, [1, 2, 3, 4]))))
     with pytest.raises(ValueError, match="first must be"):
-        learned[0.0].score(first=0)
+        learned().score(first=0)

@@ -217,10 +217,14 @@ def test_a_tolerance_must_be_positive():
         states(Pendulum(jnp.array(1.0)), START, TIMES, rtol=0.0)
 
 
-@pytest.mark.few(1)
 @pytest.mark.parametrize(
     "options",
-    [{}, {"solver": ImplicitMidpoint(), "dt": 0.1}, {"solver": StormerVerlet(), "dt": 0.1}],
+    [
+        {},
+        # As those of test_integrators.py.
+        pytest.param({"solver": ImplicitMidpoint(), "dt": 0.1}, marks=pytest.mark.slow),
+        pytest.param({"solver": StormerVerlet(), "dt": 0.1}, marks=pytest.mark.slow),
+    ],
     ids=["adaptive", "ImplicitMidpoint", "StormerVerlet"],
 )
 def test_gradient_of_a_rollout_is_the_central_difference(options):
@@ -248,6 +252,7 @@ def test_flow_map_by_forward_mode_is_symplectic():
     np.testing.assert_allclose(np.linalg.det(jax.jit(jax.jacfwd(end))(START)), 1.0, atol=1e-12)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("options", [{}, {"solver": diffrax.Heun(), "dt": 0.1}])
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.hessian])
 def test_forward_mode_through_the_default_adjoint_says_which_to_pass(derivative, options):

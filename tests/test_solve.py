@@ -718,6 +718,7 @@ def test_landmarks_depend_on_the_key():
     assert default.shape != other.shape or (default != other).any()
 
 
+@pytest.mark.slow
 def test_the_warning_of_few_landmarks_comes_at_twice_the_tolerance():
     X, Y = swings(60)
     few = hk.fit(K, X, Y, 1e-3, solver=Nystrom(1e9, points=X[:4]))

@@ -63,7 +63,7 @@ def off(field, S, sign=1.0):
     return np.abs(there - sign * here @ S.T).max() / np.abs(here).max()
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @every_group
 def test_fields_have_the_symmetry_to_rounding_and_plain_ones_have_not(name):
     k, maps, same, reversed_, order, one_sided = GROUPS[name]

@@ -130,7 +130,7 @@ def test_the_tables_have_each_case_that_is_tested_and_no_other():
     assert [row[0] for row in refused] == list(REFUSED)
 
 
-@pytest.mark.few(3)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", WORKS)
 def test_works_under_jit_vmap_and_grad(name):
     def number(s):

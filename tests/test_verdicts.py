@@ -59,6 +59,7 @@ def learn_and_listen(K, runs, **options):
     return learned, [str(each.message) for each in heard]
 
 
+@pytest.mark.slow  # and the fields of test_learn.py
 def test_a_good_log_is_silent_and_usable():
     learned, heard = learn_and_listen(K, hk.Runs(*pendulum()))
     assert learned.converged
@@ -67,8 +68,8 @@ def test_a_good_log_is_silent_and_usable():
     np.testing.assert_allclose(learned.noise, 0.02, rtol=0.2)
 
 
+@pytest.mark.slow  # but for one like it in test_learn.py
 @pytest.mark.parametrize("value", [-9999.0, 1e6])
-@pytest.mark.few(1)
 def test_one_row_that_is_no_measurement_is_named_and_spoils_no_field(value):
     times, states = pendulum()
     states[1][20] = value
