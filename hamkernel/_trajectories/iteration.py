@@ -206,7 +206,9 @@ def fix_process_noise(task: Task, now: Current, q: Float[np.ndarray, " n"]) -> t
     task = task._replace(bounds=task.bounds._replace(free=free))
     with np.errstate(divide="ignore"):
         model = model._replace(log_process=jax.device_put(np.log(q)))
-    rows = _linearise(task, now._replace(pushed=1.0))[3]
+    # A push is one beside the process noise of the caller, which the beginning had too.
+    was_given = bool((np.asarray(model.log_process) > task.bounds.low[-n:] + 0.1).any())
+    rows = _linearise(task, now if was_given else now._replace(pushed=1.0))[3]
     noise = np.asarray(model.log_noise)
     floors = (np.log(share * task.data.scale) for share in (1e-300, 0.01, 0.1))
     noises = [np.where(moves, np.maximum(noise, floor), noise) for floor in floors]
