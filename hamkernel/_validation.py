@@ -88,8 +88,9 @@ def cross_validation_loss(
         TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
             matrices that do not fit in memory.
     """
-    *checked, basis = _check_problem(K, X, Y, regularization, mean, solver, inputs, parameters)
-    return partition_loss(*checked, partition_of_rows(checked[1], folds), basis)
+    checked = _check_problem(K, X, Y, regularization, mean, solver, inputs, parameters)
+    K, rows, regularization, basis = checked
+    return partition_loss(K, rows, regularization, partition_of_rows(rows, folds), basis)
 
 
 @follow_data
@@ -116,9 +117,9 @@ def cross_validation_residuals(
         Shape (N, n), in units of Y; for observations one residual for each row, shape (M,), in the
         units of the row. inf if G + NλI is not positive definite to rounding.
     """
-    *checked, basis = _check_problem(K, X, Y, regularization, mean, solver, inputs, parameters)
-    rows = checked[1]
-    residuals = held_out_rows(*checked, partition_of_rows(rows, folds), basis)[0]
+    checked = _check_problem(K, X, Y, regularization, mean, solver, inputs, parameters)
+    K, rows, regularization, basis = checked
+    residuals = held_out_rows(K, rows, regularization, partition_of_rows(rows, folds), basis)[0]
     return rows.to_units(residuals)
 
 

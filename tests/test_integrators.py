@@ -394,6 +394,16 @@ def test_splitting_refuses_a_field_that_is_not_known_to_be_separable(solver):
     np.testing.assert_array_equal(a, b)
 
 
+def test_after_a_jump_of_the_field_the_force_is_computed_anew():
+    solver, term = StormerVerlet(), diffrax.ODETerm(Term(HenonHeiles()))
+    t0, t1 = jnp.zeros(()), jnp.array(0.1)
+    stale = jnp.full(2, 9.0)
+    fresh = solver.step(term, t0, t1, START, None, stale, True)[0]
+    np.testing.assert_array_equal(fresh, one_step(solver, term, START, 0.1))
+    kept = solver.step(term, t0, t1, START, None, stale, False)[0]
+    assert np.abs(kept - fresh).max() > 0.1
+
+
 def test_splitting_refuses_an_odd_number_of_coordinates():
     with pytest.raises(ValueError, match="got 3 coordinates"):
         one_step(StormerVerlet(assume_separable=True), bare_term(jnp.sin), jnp.ones(3), 0.1)

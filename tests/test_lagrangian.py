@@ -197,6 +197,72 @@ def test_one_path_does_not_identify_a_mass_matrix():
 
 
 @pytest.mark.slow
+def test_a_joint_without_a_torque_that_is_not_coupled_is_refused_by_its_number():
+    """Two pendulums side by side, and a motor in the first: the other half of L stays zero."""
+    X, _, A = data(80, 8)
+    tau = np.column_stack([2.0 * A[:, 0] + 3.0 * np.sin(X[:, 0]), np.zeros(80)])
+    A[:, 1] = -5.0 * np.sin(X[:, 1])
+    with pytest.warns(UserWarning, match=r"not identified.*mostly of joint 1.*needs a torque"):
+        field = hk.fit(K, X, tau, 1e-8, accelerations=A)
+    assert abs(field.least_direction[1]) > 0.9
+    with pytest.raises(RuntimeError, match="mostly of joint 1"):
+        hk.simulate(field, X[0], np.linspace(0, 1, 5), inputs=lambda t: jnp.zeros(2))
+
+
+@pytest.mark.slow
+def test_gains_of_motors_are_found_with_a_known_inertia_or_beside_a_known_motor():
+    X, tau, A = data(120, 6)
+    gains = np.array([2.5, 0.4])
+    known = np.zeros(2), np.array([[A1 + 2 * A3, np.nan], [np.nan, np.nan]])
+    both = hk.Lagrangian(
+        K.potential, K.inertia, (0, 1), known_mass_matrix=known, unknown_gains=(0, 1)
+    )
+    field = hk.fit(both, X, tau / gains, 1e-12, accelerations=A)
+    assert field.is_identified
+    np.testing.assert_allclose(field.gains, gains, rtol=1e-3)
+    assert (abs(field.gains - gains) < 4 * field.gains_deviation + 1e-4 * gains).all()
+    assert max(errors(field)) < 5e-3  # torques in newton metres
+    x, u = X[0], np.array([1.0, -2.0])
+    expected = np.linalg.solve(mass(x[:2]), gains * u - torque(x[:2], x[2:], np.zeros(2)))
+    np.testing.assert_allclose(field(x, u)[2:], expected, rtol=0.02, atol=0.02)
+    one = hk.Lagrangian(K.potential, K.inertia, (0, 1), unknown_gains=1)
+    field = hk.fit(one, X, tau / np.array([1.0, 0.4]), 1e-12, accelerations=A)
+    np.testing.assert_allclose(field.gains, [1.0, 0.4], rtol=1e-3)
+    with pytest.raises(ValueError, match="all torques of known gains are zero"):
+        hk.fit(
+            hk.Lagrangian(K.potential, K.inertia, unknown_gains=(0, 1)),
+            X,
+            tau,
+            1e-12,
+            accelerations=A,
+        )
+
+
+@pytest.mark.slow
+def test_stribeck_friction_of_joints_is_found():
+    X, tau, A = data(160, 9)
+    X[::2, 2:] *= 0.1  # slow enough to show it
+    tau = np.array([torque(x[:2], x[2:], a) for x, a in zip(X, A, strict=True)])
+
+    def friction(v):
+        return 0.5 * v + (0.8 + 0.6 * np.exp(-((v / 0.4) ** 2))) * np.tanh(v / 0.05)
+
+    rough = hk.Friction(1.0, 1.0, stribeck=1.0, rest_speed=0.05, stribeck_speed=0.4)
+    field = hk.fit(
+        hk.Lagrangian(K.potential, K.inertia, (0, 1), friction=rough),
+        X,
+        tau + friction(X[:, 2:]),
+        1e-10,
+        accelerations=A,
+    )
+    assert max(errors(field)[:2]) < 5e-3
+    v = np.array([0.3, -2.0])
+    np.testing.assert_allclose(field.friction(v), friction(v), rtol=0.01)
+    with pytest.raises(ValueError, match="leave out damped="):
+        hk.Lagrangian(SMOOTH, SMOOTH, friction=hk.Friction(damped=(1,)))
+
+
+@pytest.mark.slow
 def test_one_known_entry_of_the_mass_matrix_fixes_the_scale_of_a_free_motion():
     X, _, _ = data(120, 4)
     free = [-torque(x[:2], x[2:], np.zeros(2)) for x in X]
@@ -230,6 +296,11 @@ def test_a_known_mass_matrix_is_checked(known, said):
             {"K": hk.Lagrangian(hk.Gaussian(1.0), hk.Gaussian(1.0), angles=(5,))},
             ValueError,
             "from 0",
+        ),
+        (
+            {"K": hk.Lagrangian(hk.Gaussian(1.0), hk.Gaussian(1.0), unknown_gains=(5,))},
+            ValueError,
+            "unknown_gains are .5,. and there are 2 positions",
         ),
         ({"K": hk.CurlFree(hk.Gaussian(1.0))}, TypeError, "belongs to hk.Lagrangian"),
     ],

@@ -201,13 +201,12 @@ def test_log_marginal_likelihood_is_the_density_of_scipy_with_noise_variance_n_l
 def test_losses_take_the_mean_and_the_solver_of_tune():
     X, Y = data()
     K = hk.Symplectic(hk.Gaussian(1.5))
-    known = {"mean": lambda x: jnp.array([x[1], -x[0]])}
     less = Y - np.column_stack([X[:, 1], -X[:, 0]])
     for loss, solver in (
         (hk.log_marginal_likelihood, hk.Nystrom(points=X)),  # all points: the Gram itself
         (hk.cross_validation_loss, hk.ConjugateGradient()),  # whose fit is exact
     ):
-        found = loss(K, X, Y, RIDGE, solver=solver, **known)
+        found = loss(K, X, Y, RIDGE, mean=lambda x: jnp.array([x[1], -x[0]]), solver=solver)
         np.testing.assert_allclose(found, loss(K, X, less, RIDGE), rtol=1e-8)
     with pytest.raises(TypeError, match="solver must be an instance"):
         hk.generalized_cross_validation(K, X, Y, RIDGE, solver=cast(Any, hk.Nystrom))

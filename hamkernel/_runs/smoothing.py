@@ -188,6 +188,9 @@ def smooth(
     """
     m, P, S, error, A, _ = _filter(process, steps, y, measured)
 
+    # Let J be −log p(this sample and the later ones | m), l = ∂J/∂m and L = ∂²J/∂m². A sample maps
+    # m to C m + … and adds error²/(2S) to J, an interval maps m to A m, and the chain rule gives l
+    # and L backward in time. E[x | y] = m − P l and Cov[x | y] = P − P L P, as in `kalman.py`.
     def step(carry, at):
         l, L = carry  # noqa: E741 - the adjoint, after the sample
         m, P, S, error, A, there = at

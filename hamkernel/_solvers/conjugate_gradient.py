@@ -251,18 +251,20 @@ class _Iterate(NamedTuple):
     direction: Array
     square: Float[Array, ""]  # rᵀM r of the residual, M the preconditioner
     relative_residual: Float[Array, ""]  # ‖r‖/‖y‖
+    relative_change: Float[Array, ""]  # of c in the last step, over ‖y‖
     steps: Int[Array, ""]
 
     def goes_on(self, tolerance, max_iterations) -> Bool[Array, ""]:
         # Half of the tolerance allows for the rounding errors of the recursion for the residual.
-        return (self.relative_residual > 0.5 * tolerance) & (self.steps < max_iterations)
+        error = jnp.maximum(self.relative_residual, self.relative_change)
+        return (error > 0.5 * tolerance) & (self.steps < max_iterations)
 
 
 @precise_jit
 def _first_iterate(products: AbstractProducts, y) -> _Iterate:
     z = products.precondition(y)
-    start, none = jnp.zeros_like(y), jnp.zeros((), int)
-    return _Iterate(start, y, z, jnp.sum(y * z), relative_error(y, y), none)
+    start, none, size = jnp.zeros_like(y), jnp.zeros((), int), relative_error(y, y)
+    return _Iterate(start, y, z, jnp.sum(y * z), size, jnp.zeros_like(size), none)
 
 
 @precise_jit
@@ -279,6 +281,7 @@ def _next(products: AbstractProducts, y, ridge, state: _Iterate) -> _Iterate:
         direction=z + square / state.square * p,
         square=square,
         relative_residual=relative_error(residual, y),
+        relative_change=relative_error(step * p, y),
         steps=state.steps + 1,
     )
 

@@ -64,17 +64,21 @@ def torque_data(K: Lagrangian, X: Any, torques: Any, accelerations: Any) -> Torq
 
 def check_machine(K: Lagrangian, torques: Any, m: int) -> None:
     """Raise unless K is of m positions, and there is a torque or a known entry of M."""
-    if K.angles and max(K.angles) >= m:
-        raise ValueError(f"angles are {K.angles} and there are {m} positions, counted from 0.")
+    for name in ("angles", "unknown_gains"):
+        if max(getattr(K, name), default=0) >= m:
+            raise ValueError(
+                f"{name} are {getattr(K, name)} and there are {m} positions, counted from 0."
+            )
     if K.known_mass_matrix is not None:
         if len(K.known_mass_matrix[0]) != m:
             raise ValueError(
                 f"known_mass_matrix is of {len(K.known_mass_matrix[0])} positions and the data of "
                 f"{m}."
             )
-    elif not np.asarray(torques).any():
+    elif not np.delete(np.asarray(torques), np.asarray(K.unknown_gains, int), axis=-1).any():
+        which = "all torques" if not K.unknown_gains else "all torques of known gains"
         raise ValueError(
-            "all torques are zero: without a force the scale of L is not determined, and L = 0 "
+            f"{which} are zero: without a force the scale of L is not determined, and L = 0 "
             "fits everything. Add motions with a torque or a known load, or give a known entry of "
             "M, hk.Lagrangian(…, known_mass_matrix=(q, M)), with NaN for unknown entries."
         )
@@ -136,8 +140,14 @@ def strong_rows(
         return features.torque_features(*point)
 
     rows = jax.lax.map(torque_rows, (data.states, data.accelerations), batch_size=64)
-    rows = features.whiten(rows).reshape(-1, features.columns)
-    return rows / deviation, data.torques.reshape(-1) / deviation
+    rows, torques = features.with_gains(features.whiten(rows), data.torques)
+    return rows.reshape(-1, features.columns) / deviation, torques.reshape(-1) / deviation
+
+
+def known_entries(K: Lagrangian) -> Float[np.ndarray, "m m"]:
+    """The known mass matrix, NaN where it is not known."""
+    assert K.known_mass_matrix is not None
+    return np.asarray(K.known_mass_matrix[1], float)  # None is NaN
 
 
 def with_anchor(
@@ -147,7 +157,7 @@ def with_anchor(
     known_matrix = features.kernel.known_mass_matrix
     if known_matrix is None:
         return B, y
-    q, M = np.asarray(known_matrix[0]), np.asarray(known_matrix[1], float)  # None is NaN
+    q, M = np.asarray(known_matrix[0]), known_entries(features.kernel)
     i, j = np.nonzero(np.triu(np.isfinite(M)))
     size = _ANCHOR * np.abs(M[i, j]).max()
     rows = features.whiten(features.mass_matrix_features(jnp.asarray(q, B.dtype))[i, j])

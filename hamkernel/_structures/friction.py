@@ -284,13 +284,17 @@ class Friction(AbstractMatrixKernel):
     def curve(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """The force F for the damped coordinates of a state, zero for the others."""
         damped = np.asarray(damped_coordinates(self.damped, len(x)))
-        v = x[damped]
-        stick = jnp.tanh(v / (DEFAULT_REST_SPEED if self.rest_speed is None else self.rest_speed))
-        force = self.viscous.astype(x.dtype) * v + self.coulomb.astype(x.dtype) * stick
+        rest_speed = DEFAULT_REST_SPEED if self.rest_speed is None else self.rest_speed
+        return jnp.zeros_like(x).at[damped].set(sum(self.terms(x[damped], rest_speed)))
+
+    def terms(self, v: Float[Array, " m"], rest_speed: ArrayLike) -> list[Float[Array, " m"]]:
+        """The viscous, the dry and, if there is one, the Stribeck force at the speeds v."""
+        stick = jnp.tanh(v / rest_speed)
+        forces = [self.viscous.astype(v.dtype) * v, self.coulomb.astype(v.dtype) * stick]
         if self.stribeck is not None and self.stribeck_speed is not None:
-            fades = jnp.exp(-((v / self.stribeck_speed.astype(x.dtype)) ** 2))
-            force = force + self.stribeck.astype(x.dtype) * fades * stick
-        return jnp.zeros_like(x).at[damped].set(force)
+            fades = jnp.exp(-((v / self.stribeck_speed.astype(v.dtype)) ** 2))
+            forces.append(self.stribeck.astype(v.dtype) * fades * stick)
+        return forces
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
         return (self.curve(x) * u) @ (self.curve(z) * v)

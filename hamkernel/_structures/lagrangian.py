@@ -33,7 +33,17 @@ class Lagrangian(eqx.Module):
     joint without a motor has zero torque.
 
     Torques determine V up to a constant. If all torques are zero, L = 0 fits, so `fit` and `learn`
-    need an entry of M. If the joints have friction, pass `friction=True`: otherwise M is wrong.
+    need an entry of M. If a joint has no torque and is not coupled to the others, its inertia stays
+    near zero, and the field refuses to move. If the joints have friction, pass `friction=True`:
+    otherwise M is wrong.
+
+    If inputs uᵢ are currents or voltages and not torques, name their joints in `unknown_gains`: the
+    torque is gᵢ uᵢ, and gᵢ is found together with L. The data determine the gains and the scale of
+    L if one joint has a known gain, or if an entry of M is known.
+
+        K = hk.Lagrangian(k, k, unknown_gains=(0, 1), known_mass_matrix=(q, M))
+        learned = hk.learn(K, hk.Runs(times, q, inputs=currents))
+        learned.field.gains, learned.field.gains_deviation
 
     Args:
         potential: the kernel k_V of V, on positions. A kernel without an amplitude gets one.
@@ -42,14 +52,17 @@ class Lagrangian(eqx.Module):
         angles: the coordinates that are angles; the kernels take (cos q, sin q) for them.
         friction: whether joints have friction d v + c tanh(v/ε), with unknown d and c for each
             joint. A `Friction` gives the prior standard deviations `viscous` of d and `coulomb` of
-            c; True means `Friction(1.0, 1.0)`.
+            c; True means `Friction(1.0, 1.0)`. `Friction(1.0, 1.0, stribeck=1.0)` adds the term
+            s exp(−(v/w)²) tanh(v/ε), with an unknown s for each joint; `tune` and `learn` find w.
         known_mass_matrix: a pair (q, M) of one position, shape (m,), and the mass matrix there,
             shape (m, m), with NaN for unknown entries. One known entry, from a known load or a
             weighed link, fixes the scale of L.
+        unknown_gains: the joints whose inputs are proportional to their torques.
 
     Raises:
-        TypeError: a kernel is no scalar kernel. ValueError: `angles` are no coordinates;
-            `known_mass_matrix` has other shapes, or no known entry.
+        TypeError: a kernel is no scalar kernel. ValueError: `angles` or `unknown_gains` are no
+            coordinates; `known_mass_matrix` has other shapes, or no known entry; the friction is
+            one of some joints only.
     """
 
     potential: AbstractScalarKernel
@@ -59,6 +72,7 @@ class Lagrangian(eqx.Module):
     known_mass_matrix: tuple[tuple[float, ...], tuple[tuple[float | None, ...], ...]] | None = (
         eqx.field(static=True)
     )
+    unknown_gains: tuple[int, ...] = eqx.field(static=True)
 
     def __init__(
         self,
@@ -67,10 +81,18 @@ class Lagrangian(eqx.Module):
         angles: Any = (),
         friction: Friction | bool = False,
         known_mass_matrix: tuple[Any, Any] | None = None,
+        unknown_gains: Any = (),
     ):
         self.potential, self.inertia = map(_with_amplitude, (potential, inertia))
         self.angles = require.coordinates(angles, "angles") if np.size(angles) else ()
+        joints = unknown_gains
+        self.unknown_gains = require.coordinates(joints, "unknown_gains") if np.size(joints) else ()
         self.friction = Friction(1.0, 1.0) if friction is True else (friction or None)
+        if self.friction is not None and self.friction.damped is not None:
+            raise ValueError(
+                "the friction of a Lagrangian is one of all joints, each with its own numbers: "
+                "leave out damped=. That of a joint without friction is found near zero."
+            )
         self.known_mass_matrix = None if known_mass_matrix is None else _known(known_mass_matrix)
 
     def __repr__(self) -> str:
@@ -78,6 +100,7 @@ class Lagrangian(eqx.Module):
         said += [f"angles={self.angles}"] if self.angles else []
         said += [f"friction={self.friction!r}"] if self.friction else []
         said += ["known_mass_matrix=…"] if self.known_mass_matrix else []
+        said += [f"unknown_gains={self.unknown_gains}"] if self.unknown_gains else []
         return call("Lagrangian", said)
 
     def embed(self, q: Float[Array, " m"]) -> Float[Array, " d"]:
@@ -121,8 +144,13 @@ def _known(pair: Any) -> tuple[tuple[float, ...], tuple[tuple[float | None, ...]
     return tuple(q.tolist()), tuple(rows)
 
 
+# The prior deviation of a gain, in torque over input: with a gain of 1 of 1e4 rows with noise of a
+# tenth of the torques it moves the result by 1e-18.
+_GAIN = 1e6
+
+
 class LagrangianFeatures(eqx.Module):
-    """Features Φ of L and of friction, with L = Φ(x)·w and w ~ N(0, I).
+    """Features Φ of L, of friction and of gains, with L = Φ(x)·w and w ~ N(0, I).
 
     The features of V are −R⁻¹k_V(C, q). The features of Mᵢⱼ are R⁻¹k_M(C, q) times vᵢ² or
     √2 vᵢvⱼ, i < j, since (v·v′)² is the sum of the products of vᵢ² and √2 vᵢvⱼ with the same terms
@@ -145,14 +173,16 @@ class LagrangianFeatures(eqx.Module):
 
     @property
     def columns(self) -> int:
-        """The number r of features; the features of friction are the last."""
+        """The number r of features: on centres, then of friction, then of gains."""
         m = self.count
-        return len(self.centres) * (1 + m * (m + 1) // 2) + self.friction_columns
+        return len(self.centres) * (1 + m * (m + 1) // 2) + self.global_columns
 
     @property
-    def friction_columns(self) -> int:
-        """The number of features of friction."""
-        return 2 * self.count * (self.kernel.friction is not None)
+    def global_columns(self) -> int:
+        """The number of features of friction and of gains, which have no centres."""
+        friction = self.kernel.friction
+        terms = 0 if friction is None else 2 + (friction.stribeck is not None)
+        return terms * self.count + len(self.kernel.unknown_gains)
 
     def with_kernel(self, kernel: Lagrangian) -> "LagrangianFeatures":
         """The features of another kernel on the same centres."""
@@ -168,7 +198,7 @@ class LagrangianFeatures(eqx.Module):
         """Rows in kernels as rows in features: R⁻¹ on each block of centres."""
         c, shape = len(self.centres), rows.shape[:-1]
         rows = rows.reshape(-1, self.columns)
-        last = self.columns - self.friction_columns
+        last = self.columns - self.global_columns
         blocks = rows[:, :last].reshape(len(rows), -1, c)
         V = solve_triangular(self.roots[0], blocks[:, 0].T, lower=True).T
         M = solve_triangular(self.roots[1], blocks[:, 1:].reshape(-1, c).T, lower=True).T
@@ -185,7 +215,7 @@ class LagrangianFeatures(eqx.Module):
         i, j = np.triu_indices(self.count)
         squares = v[i] * v[j] * np.where(i == j, 1.0, np.sqrt(2.0))
         inertia = squares[:, None] * self.kernel_values(self.kernel.inertia, q)[None]
-        V, none = -self.kernel_values(self.kernel.potential, q), jnp.zeros(self.friction_columns)
+        V, none = -self.kernel_values(self.kernel.potential, q), jnp.zeros(self.global_columns)
         return jnp.concatenate([V, inertia.reshape(-1), none.astype(V.dtype)])
 
     def potential_features(self, q: Float[Array, " m"]) -> Float[Array, " r"]:
@@ -203,16 +233,29 @@ class LagrangianFeatures(eqx.Module):
             i == j, 2.0, np.sqrt(2.0)
         )
         rows = jnp.einsum("ijp,c->ijpc", jnp.asarray(shares, phi.dtype), phi).reshape(m, m, -1)
-        return jnp.pad(rows, ((0, 0), (0, 0), (c, self.friction_columns)))
+        return jnp.pad(rows, ((0, 0), (0, 0), (c, self.global_columns)))
 
     def friction_features(self, v: Float[Array, " m"]) -> Float[Array, "m r"]:
         """The friction of each joint, in kernels."""
-        friction, m = self.kernel.friction, self.count
-        if friction is None:
-            return jnp.zeros((m, self.columns), v.dtype)
-        return jnp.pad(
-            friction_of_joints(friction, v, self.rest_speed), ((0, 0), (self.columns - 2 * m, 0))
-        )
+        if self.kernel.friction is None:
+            return jnp.zeros((self.count, self.columns), v.dtype)
+        terms = friction_of_joints(self.kernel.friction, v, self.rest_speed)
+        before = self.columns - self.global_columns
+        return jnp.pad(terms, ((0, 0), (before, len(self.kernel.unknown_gains))))
+
+    def with_gains(
+        self, rows: Float[Array, "*k m r"], inputs: Float[Array, "*k m"]
+    ) -> tuple[Float[Array, "*k m r"], Float[Array, "*k m"]]:
+        """Rows and their torques: where a gain is unknown, the rows less g u have the torque 0."""
+        joints = np.asarray(self.kernel.unknown_gains, int)
+        columns = self.columns - len(joints) + np.arange(len(joints))
+        rows = rows.at[..., joints, columns].set(-_GAIN * inputs[..., joints])
+        return rows, inputs.at[..., joints].set(0.0)
+
+    def gain_features(self) -> Float[Array, "g r"]:
+        """The unknown gains, in kernels."""
+        g = len(self.kernel.unknown_gains)
+        return _GAIN * jnp.eye(g, self.columns, k=self.columns - g, dtype=self.centres.dtype)
 
     def motion_features(
         self, x: Float[Array, " n"]
@@ -232,10 +275,8 @@ class LagrangianFeatures(eqx.Module):
 def friction_of_joints(
     friction: Friction, v: Float[Array, " m"], rest_speed: Float[Array, ""]
 ) -> Float[Array, "m k"]:
-    """The columns v and tanh(v/ε) of each joint, times their standard deviations, k = 2m."""
-    slide = jnp.diag(jnp.broadcast_to(friction.viscous.astype(v.dtype), v.shape) * v)
-    dry = jnp.broadcast_to(friction.coulomb.astype(v.dtype), v.shape)
-    return jnp.concatenate([slide, jnp.diag(dry * jnp.tanh(v / rest_speed))], axis=1)
+    """The terms of friction of each joint, times their standard deviations, k = 2m or 3m."""
+    return jnp.concatenate([jnp.diag(term) for term in friction.terms(v, rest_speed)], axis=1)
 
 
 def lagrangian_features(K: Lagrangian, X: Float[Array, "N n"]) -> LagrangianFeatures:

@@ -3,6 +3,7 @@
 The path is moved by the field and by process noise; rows are whitened by a Kalman filter.
 """
 
+import itertools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -205,7 +206,9 @@ def fix_process_noise(task: Task, now: Current, q: Float[np.ndarray, " n"]) -> t
     task = task._replace(bounds=task.bounds._replace(free=free))
     with np.errstate(divide="ignore"):
         model = model._replace(log_process=jax.device_put(np.log(q)))
-    rows = _linearise(task, now._replace(pushed=1.0))[3]
+    # A push is one beside the process noise of the caller, which the beginning had too.
+    was_given = bool((np.asarray(model.log_process) > task.bounds.low[-n:] + 0.1).any())
+    rows = _linearise(task, now if was_given else now._replace(pushed=1.0))[3]
     noise = np.asarray(model.log_noise)
     floors = (np.log(share * task.data.scale) for share in (1e-300, 0.01, 0.1))
     noises = [np.where(moves, np.maximum(noise, floor), noise) for floor in floors]
@@ -440,23 +443,26 @@ def noisy_counts(end: End) -> Float[np.ndarray, "S L+1 n"]:
 def asks_for_process(end: End, impulse: Float[np.ndarray, " n"]) -> bool:
     """Whether iterations with next to no process noise say that it is not enough.
 
-    They did not settle, innovations are not white, or rows are likelier with more of it. If the
-    landmarks are the limit and leave next to nothing, process noise would only stand for them.
+    They did not settle, or log p would gain more than the price of process noise, with less sensor
+    noise too. If the landmarks are the limit and leave next to nothing, process noise would only
+    stand for them.
     """
-    now, task = end.now, end.task
-    share = float(np.max(np.exp(np.asarray(now.model.log_noise)) / task.data.scale))
-    if end.settled and share < NEGLIGIBLE and task.capped and asks_for_landmarks(end):
-        return False
-    if not (end.settled and is_white(end)):
+    now, task, model = end.now, end.task, end.now.model
+    if not end.settled:
         return True
-    levels = [
-        np.asarray(now.model.log_process),
-        *(impulse + np.log(share) for share in (1e-3, 1e-2, 1e-1)),
-    ]
-    flat = np.stack([now.model._replace(log_process=q).flat for q in levels])
-    sample = search_sample(now.field.points, now.rows)
-    values = losses(now.model, flat, *sample, task.start_deviation)
-    return bool(values[0] - values.min() > price(end))
+    noise = np.asarray(model.log_noise)
+    if np.max(np.exp(noise) / task.data.scale) < NEGLIGIBLE:
+        if task.capped and asks_for_landmarks(end):
+            return False
+    free = task.bounds.free[-2 * len(noise) : -len(noise)]
+    design = [np.asarray(model.flat)]
+    for q, sigma in itertools.product(np.log([1e-3, 1e-2, 1e-1]), np.log([1.0, 0.3, 0.1])):
+        less = model._replace(log_noise=noise + sigma * free, log_process=impulse + q)
+        design.append(np.asarray(less.flat))
+    S, rows = search_sample(now.field.points, now.rows)
+    values = losses(model, np.stack(design), S, rows, task.start_deviation)
+    factor = np.asarray(now.rows.counts).sum() / np.asarray(rows.counts).sum()
+    return bool(factor * (values[0] - values.min()) > price(end))
 
 
 def price(end: End) -> float:

@@ -17,7 +17,8 @@ changes L by Potter's update, and an interval by an orthonormal factor of ((Ψ L
 
 The smoothed d and η are gradients. Let J = ½ Σ e²/s, let u be a push of the state between two
 samples, and m the expectation of d given the samples before it. Then E[η | y] = −Cov η ∂J/∂u, and
-E[d | y] = m − L Lᵀ ∂J/∂m.
+E[d | y] = m − P ∂J/∂m with P = L Lᵀ. The reason: −J is log p(y | m) but for a constant, and the
+derivative of p(y | m) = ∫ N(d; m, P) p(y | d) dd is P⁻¹(E[d | y] − m) p(y | m).
 
 Source: Potter (1963), in Bierman (1977), "Factorization methods for discrete sequential
 estimation"; Bryson & Frazier (1963) for the smoother.
@@ -82,6 +83,8 @@ def run_filter(
             s = phi @ phi + r
             k = jnp.where(there, L @ phi / s, 0.0)
             e = E[c].at[-1].add(y[c])
+            # P − s k kᵀ = L (I − φφᵀ/s) Lᵀ, and I − φφᵀ/s = (I − β φφᵀ)² for β = 1/(s + √(r s)):
+            # with φ·φ = s − r, 2β − β²(s − r) = 1/s. So L ← L (I − β φφᵀ), βLφ = k/(1 + √(r/s)).
             out.append((jnp.where(there, e / jnp.sqrt(s), 0.0), jnp.where(there, jnp.log(s), 0.0)))
             L = L - jnp.outer(k / (1 + jnp.sqrt(r / s)), phi)
             E = E - jnp.outer(k, e)
@@ -172,12 +175,14 @@ def smoothed_path(
         return 0.5 * jnp.sum(out.rows**2), out
 
     slopes, out = jax.grad(half_chi_squared, (0, 1), has_aux=True)(push, rows.prior_offset)
+    # m at the first sample is the offset of the start, and later the push adds to it, so these
+    # slopes are ∂J/∂m at all samples. E is −m.
     adjoint = jnp.concatenate([slopes[1][:, None], slopes[0]], axis=1)
     back = jnp.einsum("slba,slb->sla", out.roots, adjoint)
     moves = -out.expected[..., 0] - jnp.einsum("slab,slb->sla", out.roots, back)
     # E[w | y] at node k is −diag(q²) Γ_kᵀ ∂J/∂u / (h w_k); we return its weighted mean over k.
     h = jnp.where(rows.spans > 0, rows.spans, 1.0)[..., None]
-    w = jnp.einsum("slkab,sla->slb", rows.weights, slopes[0])
+    w = jnp.einsum("slkab,sla->slb", rows.weights, slopes[0])  # Σ_k h w_k Γ_kᵀ∂J/∂u / (h w_k)
     variance = jnp.exp(2 * model.log_process)[None, None] * rows.pushed[..., None] ** 2
     w = -variance * w / h
     unit = jnp.where(model.log_process > -jnp.inf, jnp.exp(model.log_process), jnp.inf)

@@ -38,7 +38,7 @@ from hamkernel._structures.lagrangian import (
 )
 from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics
 from hamkernel._trajectories.learned import learned_from
-from hamkernel._tuning.lagrangian import Sizes, likeliest
+from hamkernel._tuning.lagrangian import Sizes, likeliest, torque_size
 
 
 class LearnedLagrangian(Shown, eqx.Module):
@@ -121,7 +121,7 @@ def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, unused: dict[str, An
     pieces = smoothing.pieces
     X = jnp.asarray(pieces.states())
     features = lagrangian_features(K, X)
-    sizes = _sizes(pieces, m, smoothing.lengthscale)
+    sizes = _sizes(K, pieces, m, smoothing.lengthscale)
     R = pieces.targets[0].size
     none = jnp.zeros((len(pieces.targets), R, R))
     first = likeliest(features, _WeakRows(pieces, none), sizes)
@@ -132,8 +132,8 @@ def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, unused: dict[str, An
     end = likeliest(_with_kernel(features, first.kernel), rows, sizes, np.asarray(first.deviation))
     shown = _with_kernel(features, end.kernel)
     triangle, weights, A, y = _solve(shown, pieces, covariance, end.deviation)
-    raw = np.asarray(_rows(shown, pieces))
-    residual = (pieces.targets - raw @ np.asarray(weights)) / pieces.values[0].sum()
+    raw, targets = map(np.asarray, _rows(shown, pieces))
+    residual = (targets - raw @ np.asarray(weights)) / pieces.values[0].sum()
     residual = jnp.asarray(residual[pieces.inside])
     field = lagrangian_field(shown, weights, triangle, end.deviation, residual, X)
     joints = ()
@@ -191,13 +191,12 @@ def _check(K: Lagrangian, runs: Any, noise: Any, unused: dict[str, Any]) -> tupl
     return m, noise
 
 
-def _sizes(pieces: Pieces, m: int, lengthscale: float) -> Sizes:
+def _sizes(K: Lagrangian, pieces: Pieces, m: int, lengthscale: float) -> Sizes:
     """Torques as means over windows; a sinusoid has the lengthscale 2.7/ω, see `preprocess`."""
     speed = float(np.sqrt(np.mean(pieces.states()[:, m:] ** 2)))
     acceleration = 2.7 * speed / lengthscale
-    torque = np.sqrt(np.mean(pieces.targets[pieces.inside] ** 2)) / pieces.values[0].sum()
-    # Free motions have no torques: any scale that the anchor sets is within the boxes.
-    torque = float(torque) or acceleration
+    means = pieces.targets[pieces.inside] / pieces.values[0].sum()
+    torque = torque_size(K, means, acceleration)
     white = np.sqrt(pieces.overlap[0, 0] * pieces.spacing) / pieces.values[0].sum()
     return Sizes(torque, speed, acceleration, torque / float(white))
 
@@ -209,9 +208,9 @@ class _WeakRows(eqx.Module):
     covariance: Float[Array, "B R R"]
 
     def __call__(self, features: LagrangianFeatures, deviation: Float[Array, " m"]):
-        rows = features.whiten(weak_rows(features.motion_features, self.pieces))
+        rows, targets = _rows_and_targets(features, self.pieces)
         L = factors(self.pieces, self.covariance, deviation)
-        return whiten(L, rows), whiten(L, jnp.asarray(self.pieces.targets)), log_scale(L)
+        return whiten(L, rows), whiten(L, targets), log_scale(L)
 
 
 _with_kernel = precise_jit(lambda features, K: features.with_kernel(K))
@@ -223,9 +222,12 @@ def _solve(features, pieces, covariance, deviation) -> tuple[Array, ...]:
     return *ridge_solution(*with_anchor(features, A, y)), A, y
 
 
-@compiled_by_size
-def _rows(features, pieces) -> Float[Array, "B W m r"]:
-    return features.whiten(weak_rows(features.motion_features, pieces))
+def _rows_and_targets(features, pieces) -> tuple[Float[Array, "B W m r"], Float[Array, "B W m"]]:
+    rows = features.whiten(weak_rows(features.motion_features, pieces))
+    return features.with_gains(rows, jnp.asarray(pieces.targets))
+
+
+_rows = compiled_by_size(_rows_and_targets)
 
 
 @compiled_by_size

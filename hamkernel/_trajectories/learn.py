@@ -195,7 +195,7 @@ def learn(
     bar.update()
     K = complete(K, jax.device_put(sample_points(data)[0]), runs.dimension)
     most_landmarks = None if solver is None else solver.max_points
-    start = _start(K, drift, data, sigma, landmarks(data, most_landmarks))
+    start = _start(K, drift, data, sigma, process, landmarks(data, most_landmarks))
     seconds = seconds_of_iteration(data, start.landmarks[1])
     bar.set_description("learning" + (f", {seconds:.0f} s an iteration" if seconds >= 1 else ""))
     task, now = start.begin(data)
@@ -248,6 +248,7 @@ class _Start(NamedTuple):
         spacing: the least lengthscale.
         impulse: log of the process noise that would explain all of the motion.
         floor: the process noise that stands for none.
+        process: the process noise of the caller, None if it is looked for.
     """
 
     kernel: AbstractMatrixKernel
@@ -260,6 +261,7 @@ class _Start(NamedTuple):
     spacing: float
     impulse: np.ndarray
     floor: np.ndarray
+    process: np.ndarray | None
 
     def begin(self, data: Preprocessed) -> tuple[Task, Current]:
         """The task and its first path.
@@ -272,14 +274,19 @@ class _Start(NamedTuple):
         model = Model(self.kernel, self.log_noise, jnp.asarray(self.impulse))
         log = self.X, self.Y, data.scale, self.free, self.impulse, self.spacing
         bounds, design = bounds_and_design(model, *log)
+        if self.process is not None:  # pushes stand out beside it from the beginning
+            n, is_given = len(self.process), self.process > self.floor
+            bounds.free[-n:] &= ~is_given
+            with np.errstate(divide="ignore"):
+                design[:, -n:] = np.where(is_given, np.log(self.process), design[:, -n:])
         wide = jnp.asarray(100 * data.scale)  # a prior of starts that says next to nothing
         pieces = equal_pieces(data.runs, LONG)
         task = Task(data, self.mean, *self.landmarks, bounds, wide, pieces)
         return task, begin(task, model, design)
 
 
-def _start(K, mean, data: Preprocessed, sigma: np.ndarray | None, landmarks) -> _Start:
-    """The first guesses from the smoothed runs; sigma is the noise if the caller gave one."""
+def _start(K, mean, data: Preprocessed, sigma: Any, process: Any, landmarks) -> _Start:
+    """The first guesses from the smoothed runs; sigma and process are the caller's, or None."""
     X, Y = sample_points(data)
     if mean is not None:
         Y = Y - np.asarray(jax.vmap(mean)(jnp.asarray(X)))
@@ -296,6 +303,7 @@ def _start(K, mean, data: Preprocessed, sigma: np.ndarray | None, landmarks) -> 
         spacing=landmark_spacing(X, S[:first], data.scale),
         impulse=impulse,
         floor=LEAST_NOISE * np.exp(impulse),
+        process=process,
     )
 
 

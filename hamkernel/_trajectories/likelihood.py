@@ -103,7 +103,8 @@ def conditional(information: Condensed, S, shift: Array | float = 0.0) -> Closed
     R = F[:q, :q]
     w = solve_triangular(R, F[:q, q])
     inverse = solve_triangular(R, jnp.eye(q, dtype=R.dtype))
-    used = q - jnp.sum(inverse**2)  # tr M̃ (I + M̃ᵀM̃)⁻¹ M̃ᵀ
+    # tr M̃(I + M̃ᵀM̃)⁻¹M̃ᵀ = q − tr (I + M̃ᵀM̃)⁻¹ = q − ‖R⁻¹‖²
+    used = q - jnp.sum(inverse**2)
     loss = 0.5 * F[q, q] ** 2 + jnp.log(jnp.abs(jnp.diagonal(R))).sum() + information.constant
     loss = loss + shift * information.samples + 0.5 * (scale**2 - 1) * information.scatter
     squares = F[q, q] ** 2 - w @ w

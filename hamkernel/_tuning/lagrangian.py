@@ -8,10 +8,10 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel._machine import compiled_by_size
-from hamkernel._solvers.lagrangian import TorqueData, strong_rows, with_anchor
+from hamkernel._solvers.lagrangian import TorqueData, known_entries, strong_rows, with_anchor
 from hamkernel._solvers.triangle import regression_loss
 from hamkernel._structures.lagrangian import Lagrangian, LagrangianFeatures
 from hamkernel._tuning.minimiser import best_in_box, inside_box
@@ -153,11 +153,14 @@ def _boxes(K: Lagrangian, centres: np.ndarray, sizes: Sizes) -> list[Hyperparame
     boxes = []
     for name, amplitude in amplitudes.items():
         boxes += boxes_of(getattr(K, name), name, centres, amplitude)
-    for name in () if K.friction is None else ("log_viscous", "log_coulomb"):
-        leaf = np.asarray(getattr(K.friction, name))
-        size = np.log(sizes.torque / (sizes.speed if name == "log_viscous" else 1.0))
-        side = (np.full(leaf.shape, size + s * np.log(1e3)) for s in (-1, 1))
-        boxes.append(Hyperparameter(f"friction.{name[4:]}", True, *side))
+    # A joint is up to three times as fast as its root mean square.
+    fastest = np.full((1, 2), 3 * sizes.speed)
+    for name in ("log_viscous", "log_coulomb", "log_stribeck", "log_stribeck_speed"):
+        leaf = getattr(K.friction, name, None)
+        if K.friction is not None and leaf is not None:
+            bounds = K.friction.bounds(name, fastest, sizes.torque**2)
+            sides = (np.broadcast_to(np.asarray(b, float), leaf.shape) for b in bounds)
+            boxes.append(Hyperparameter(f"friction.{name[4:]}", True, *sides))
     return boxes
 
 
@@ -175,9 +178,19 @@ class StrongRows(eqx.Module):
         return *rows, self.data.torques.size * log_deviation
 
 
-def sizes_of_torques(data: TorqueData) -> Sizes:
+def sizes_of_torques(K: Lagrangian, data: TorqueData) -> Sizes:
     """The root mean squares of states, torques and accelerations."""
     m = data.torques.shape[1]
-    arrays = data.torques, data.states[:, m:], data.accelerations
-    torque, speed, acceleration = (float(np.sqrt(np.mean(np.square(a)))) or 1.0 for a in arrays)
+    arrays = data.states[:, m:], data.accelerations
+    speed, acceleration = (float(np.sqrt(np.mean(np.square(a)))) or 1.0 for a in arrays)
+    torque = torque_size(K, data.torques, acceleration)
     return Sizes(torque, speed, acceleration, torque)
+
+
+def torque_size(K: Lagrangian, torques: ArrayLike, acceleration: float) -> float:
+    """The root mean square of the torques of known gains; of motions without, that of M q̈."""
+    torques = np.asarray(torques)
+    forces = np.delete(torques, np.asarray(K.unknown_gains, int), axis=-1)
+    size = float(np.sqrt(np.mean(np.square(forces)))) if forces.any() else 0.0
+    anchor = 1.0 if K.known_mass_matrix is None else np.nanmax(np.abs(known_entries(K)))
+    return size or float(anchor) * acceleration

@@ -369,7 +369,9 @@ def _tuned_lagrangian(K: Any, X: Any, Y: Any, accelerations: Any, max_steps: int
         raise TypeError("accelerations= belongs to hk.Lagrangian(potential=…, inertia=…).")
     data = torque_data(K, X, Y, accelerations)
     features = lagrangian_features(K, data.states)
-    end = likeliest(features, StrongRows(data), sizes_of_torques(data), steps=max_steps)
+    end = likeliest(
+        features, StrongRows(data), sizes_of_torques(features.kernel, data), steps=max_steps
+    )
     deviation = jnp.exp(jnp.log(end.deviation).mean())
     field = field_of_torques(end.kernel, data, deviation)
     regularization = deviation**2 / len(data.states)
