@@ -112,9 +112,9 @@ def readout(
     misfit = math.sqrt(selection.variance / float(ridge))
     if misfit > 2.0:  # three quarters of the residuals are then not noise
         require.warn(
-            f"the residuals of the formula are {misfit:.3g} times the noise of the fit. Add terms "
-            "to the dictionary, or raise `most`. Or the regularization is too small: tune it, "
-            "since Nλ is the variance of the noise."
+            f"the formula leaves {misfit:.3g} times the noise of the fit: a term is missing from "
+            "the dictionary or more than `most` are needed; or the regularization, whose Nλ is "
+            "the variance of the noise, was not tuned and is too small."
         )
     dtype = rows.targets.dtype
     return Formula(
