@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import csv
 import pathlib
+import warnings
 from collections.abc import Callable
+from typing import get_args
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +16,7 @@ from numpy.lib.recfunctions import unstructured_to_structured
 from hamkernel._kernels.built_in import Gaussian
 from hamkernel._kernels.transforms import Select
 from hamkernel._report import report, script
-from hamkernel._runs.runs import Runs
+from hamkernel._runs.runs import Between, Runs
 from hamkernel._save import save
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.friction import Friction
@@ -42,6 +44,12 @@ def parser() -> argparse.ArgumentParser:
         "with --mass and one mass for each",
     )
     options.add_argument("--inputs", nargs="+", default=[], help="the columns of what was applied")
+    options.add_argument(
+        "--between",
+        choices=[*get_args(Between), "auto"],
+        default="held",
+        help="the inputs between two samples; auto takes the likeliest (%(default)s)",
+    )
     options.add_argument("--friction", action="store_true", help="there is friction")
     options.add_argument(
         "--mass",
@@ -102,11 +110,19 @@ def kernel(
 
 
 def run(arguments: list[str], show: Callable[[str], None]) -> None:
-    """Learn, score and write the files; what happens is shown in words.
+    """Learn, score and write the files; what happens is shown in words, warnings too.
 
     Raises:
         SystemExit: an option or a file does not fit, with a sentence.
     """
+    with warnings.catch_warnings():
+        warnings.simplefilter("always", UserWarning)
+        warnings.showwarning = lambda message, *place, **more: show(f"Warning: {message}")
+        _run(arguments, show)
+
+
+def _run(arguments: list[str], show: Callable[[str], None]) -> None:
+    """Learn, score and write the files."""
     options = parser()
     asked = options.parse_args(arguments)
     try:
@@ -125,7 +141,7 @@ def run(arguments: list[str], show: Callable[[str], None]) -> None:
         show(f"Learning from {runs!r}.")
         learned = learn(K, runs, noise=_number(asked.noise), mass=_number(asked.mass))
         save(out / "learned.hk", learned)
-        (out / "simulate.py").write_text(script("learned.hk", learned), encoding="utf-8")
+        (out / "simulate.py").write_text(script("learned.hk", learned, True), encoding="utf-8")
         report(learned, out / "report.html")
         show(f"{learned!r}\nScoring on the last fifth of each run, which learns once more.")
         if (score := _score(learned, show)) is not None:
@@ -154,7 +170,7 @@ def _runs(asked: argparse.Namespace) -> Runs:
     inputs = None
     if asked.inputs:
         inputs = [unstructured_to_structured(x[:, k:], names=asked.inputs) for x in tables]
-    return Runs([table[:, 0] for table in tables], states, inputs)
+    return Runs([table[:, 0] for table in tables], states, inputs, between=asked.between)
 
 
 def _number(values: list[float] | None) -> float | np.ndarray | None:

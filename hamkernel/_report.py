@@ -30,15 +30,21 @@ img { max-width: 100%; }
 """
 
 
-def script(file: str, learned: Learned | LearnedLagrangian) -> str:
-    """Ten lines that load the result in `file` and simulate its field."""
+def script(file: str, learned: Learned | LearnedLagrangian, is_beside: bool = False) -> str:
+    """Ten lines that load the result in `file` and simulate its field.
+
+    Args:
+        file: the file, or its name where `is_beside`.
+        learned: the result.
+        is_beside: whether the lines are a script that lies in the folder of the file.
+    """
     lines = [
+        *["from pathlib import Path"] * is_beside,
         "import jax",
         'jax.config.update("jax_enable_x64", True)  # before any array',
         "import jax.numpy as jnp",
         "import hamkernel as hk",
-        "",
-        f"learned = hk.load({file!r})",
+        f"learned = hk.load({f'Path(__file__).with_name({file!r})' if is_beside else repr(file)})",
         "x0 = learned.states[0][0]  # the start of the first run; any state will do",
         "ts = jnp.linspace(0.0, learned.runs.times[0][-1] - learned.runs.times[0][0], 401)",
     ]
@@ -79,11 +85,14 @@ def report(
         raise TypeError(f"report takes the result of hk.learn; got a {type(learned).__name__}.")
     require.no_tracers("hk.report", "Call it outside.", learned)
     verdict = "may be used" if learned.converged else "must not be used as it is"
-    short = learned.diagnostics.warning or "No diagnostic falls short."
+    short = [row.meaning.rstrip(".") for row in learned.diagnostics if not row.passes]
+    said = "No diagnostic falls short."
+    if short:
+        said = f"Falls short: {'; '.join(short)}. The diagnostics below say what to do."
     parts = [
         f"<h1>A field learned from {len(learned.runs)} run{'s' * (len(learned.runs) != 1)}</h1>",
         f'<p class="verdict {"yes" if learned.converged else "no"}"><b>The field {verdict}.</b> '
-        f"{html.escape(short)}</p>",
+        f"{html.escape(said)}</p>",
         f"<pre>{html.escape(repr(learned))}</pre>",
     ]
     if score is not None:

@@ -225,6 +225,15 @@ def _frame_values(x: Any) -> Any:
     return array
 
 
+def _holds_numbers(column: Any) -> bool:
+    """Whether a column of a frame becomes an array of floats."""
+    try:
+        np.asarray(column, dtype=float)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
 def _no_numbers(x: Any, name: str) -> TypeError:
     """The error for an argument that does not hold real numbers."""
     dtype = getattr(x, "dtype", None)
@@ -240,8 +249,8 @@ def _no_numbers(x: Any, name: str) -> TypeError:
     }.get(kind)
     if cure is not None:
         return TypeError(f"{name} has dtype {dtype}; real numbers are needed.{cure}")
-    if hasattr(x, "columns") and hasattr(x, "select_dtypes"):
-        text = ", ".join(map(str, x.select_dtypes(exclude="number").columns))
+    if hasattr(x, "columns") and hasattr(x, "__getitem__"):  # a frame of pandas or polars
+        text = ", ".join(str(column) for column in x.columns if not _holds_numbers(x[column]))
         return TypeError(
             f"{name} has columns that hold no numbers: {text}. Choose the columns of the state, "
             "frame[['q', 'p']]."

@@ -35,6 +35,9 @@ class Polars:
     def __iter__(self):
         return iter(self.values.T)
 
+    def __getitem__(self, column):
+        return self.values[:, self.columns.index(column)]
+
 
 class Tensor:
     """A tensor like that of PyTorch that requires a gradient."""
@@ -173,8 +176,11 @@ def test_what_is_no_log_is_refused_in_a_sentence(arguments, said):
         hk.Runs(*arguments)
 
 
-def test_columns_of_text_are_named():
-    frame = pytest.importorskip("pandas").DataFrame({"q": T, "tag": ["a"] * 40})
+@pytest.mark.parametrize("kind", ["polars", "pandas"])
+def test_columns_of_text_are_named(kind):
+    frame = Polars(np.array([[0.5, "a"]] * 40, dtype=object), ["q", "tag"])
+    if kind == "pandas":
+        frame = pytest.importorskip("pandas").DataFrame({"q": T, "tag": ["a"] * 40})
     with pytest.raises(TypeError, match=r"states\[0\] has columns that hold no numbers: tag\. Ch"):
         hk.Runs(T, frame)
 

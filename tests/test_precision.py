@@ -250,6 +250,39 @@ def test_products_of_a_machine_are_in_full_precision():
     assert not places, "\n".join(map(str, places[:5]))
 
 
+PENDULUM = hk.systems.Pendulum()
+SYSTEMS = [
+    (hk.systems.Acrobot(), 4),
+    (hk.systems.CartPole(), 4),
+    (hk.systems.ChargedParticle(), 4),
+    (hk.systems.Damped(PENDULUM, 0.1), 2),
+    (hk.systems.DoublePendulum(), 4),
+    (hk.systems.Duffing(), 2),
+    (hk.systems.HarmonicOscillator(), 2),
+    (hk.systems.HenonHeiles(), 4),
+    (hk.systems.Kepler(), 4),
+    (hk.systems.LotkaVolterra(), 2),
+    (hk.systems.NBody(), 8),
+    (PENDULUM, 2),
+    (hk.systems.PointVortices(), 4),
+    (hk.systems.RigidBody(), 3),
+    (hk.systems.SpringChain(4), 8),
+]
+
+
+def test_products_of_systems_are_in_full_precision():
+    jax.clear_caches()
+    driven = hk.systems.Driven(PENDULUM, [[0.0], [1.0]])
+    with imprecise_products() as places:
+        jax.eval_shape(driven, jnp.ones(2), jnp.ones(1))
+        for system, n in SYSTEMS:
+            jax.eval_shape(system, jnp.arange(1.0, n + 1))
+            jax.eval_shape(system.hamiltonian, jnp.arange(1.0, n + 1))
+        jax.eval_shape(hk.systems.RigidBody().casimir, jnp.ones(3))
+        jax.eval_shape(hk.systems.Damped(PENDULUM, 0.1).dissipation, jnp.ones(2))
+    assert not places, "\n".join(map(str, places[:5]))
+
+
 def test_the_spy_sees_a_product_at_default_precision():
     with imprecise_products() as places:
         jax.jit(lambda x: x @ x)(X[0])

@@ -5,6 +5,8 @@
 import base64
 import html
 import re
+import warnings
+from types import SimpleNamespace
 
 import equinox as eqx
 import matplotlib.pyplot as plt
@@ -52,6 +54,7 @@ def test_a_page_has_all_of_it_inside(learned, tmp_path):
     (picture,) = re.findall('src="data:image/png;base64,([^"]*)"', page)
     assert base64.b64decode(picture).startswith(b"\x89PNG")
     assert "http" not in page  # nothing is fetched
+    assert "learned.diagnostics" not in page  # which a reader without Python does not have
     for row in learned.diagnostics:
         assert html.escape(row.name) in page
     with pytest.raises(TypeError, match=r"report takes the result of hk\.learn"):
@@ -65,6 +68,16 @@ def test_the_ten_lines_load_and_simulate(learned, tmp_path, capsys):
     assert len(text.splitlines()) <= 10
     exec(compile(text, "simulate.py", "exec"), {})
     assert "[" in capsys.readouterr().out
+
+
+def test_the_script_loads_the_file_beside_it(learned, tmp_path, monkeypatch):
+    """Whatever the folder is from which it is run."""
+    text, loaded = script("learned.hk", learned, is_beside=True), []
+    assert len(text.splitlines()) <= 11
+    monkeypatch.setattr(hk, "load", lambda file: loaded.append(file) or learned)
+    monkeypatch.setattr(hk, "simulate", lambda *args, **options: SimpleNamespace(ys=0.0))
+    exec(compile(text, "simulate.py", "exec"), {"__file__": str(tmp_path / "simulate.py")})
+    assert loaded == [tmp_path / "learned.hk"]
 
 
 def test_columns_are_read_by_name_and_what_is_wrong_is_named(tmp_path):
@@ -96,7 +109,11 @@ def test_the_command_refuses_with_a_sentence(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "momenta", "given"),
     [
-        (["--states", "q", "p", "--inputs", "u", "--friction"], (1,), (None, None)),
+        (
+            ["--states", "q", "p", "--inputs", "u", "--friction", "--between", "smooth"],
+            (1,),
+            (None, None),
+        ),
         (["--states", "q", "--mass", "2", "--noise", "0.1"], None, (2.0, 0.1)),
         (["--states", "q", "p", "--mass", "1", "2", "--noise", "1", "3"], None, ([1, 2], [1, 3])),
         (["--states", "q", "--inputs", "u", "v", "--mass", "2"], (1,), (2.0, None)),
@@ -121,6 +138,7 @@ def test_options_of_the_command_reach_the_kernel_and_learn(
     count = runs.dimension
     assert runs.names == tuple(names[:count])
     assert runs.input_names == (tuple(names[count:]) or None)
+    assert runs.between == ("smooth" if "smooth" in options else "held")
     np.testing.assert_array_equal(runs.states[0][:, 0], rows[:, 1])
     if momenta is None:
         assert isinstance(K, hk.Symplectic)
@@ -142,13 +160,19 @@ def test_the_command_writes_a_page_a_field_and_a_script(learned, tmp_path, monke
     np.savetxt(file, rows, delimiter=",", header="t,q,p", comments="")
     score = hk.Score(*(np.ones(2),) * 3, np.array(np.nan), (), (), (), np.ones(2), first=1)
     stub = eqx.tree_at(lambda of: of.again.iterations, learned, 2)
-    monkeypatch.setattr("hamkernel._command.learn", lambda K, runs, **options: stub)
+
+    def learn(K, runs, **options):
+        warnings.warn("do not use it", stacklevel=1)
+        return stub
+
+    monkeypatch.setattr("hamkernel._command.learn", learn)
     monkeypatch.setattr(type(learned), "score", lambda self: score)
     options = ["--time", "t", "--states", "q", "p", "--out", str(tmp_path / "out")]
     run([str(file), *options], said.append)
     names = {path.name for path in (tmp_path / "out").iterdir()}
     assert names == {"report.html", "learned.hk", "simulate.py"}
     assert said[-1].startswith("Written:")
+    assert "Warning: do not use it" in said
 
     def too_short(self):
         raise ValueError("no run has ten samples")

@@ -174,7 +174,7 @@ class Damped(eqx.Module):
         """Return the power lost, ∇HᵀR∇H ≥ 0, shape ()."""
         x = require.floating(x, "x")
         slope = jax.grad(cast_arrays(self, x.dtype).hamiltonian)(x)
-        return self._resistance(x) @ slope**2
+        return jnp.sum(self._resistance(x) * slope**2)
 
     def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
         """Return the velocity of one state, shape (n,)."""
@@ -283,7 +283,7 @@ class Driven(eqx.Module):
                 f"u has shape {u.shape}; the inputs have shape {G.shape[1:]}. Is it system(x, u)?"
             )
         drift = cast(Array, self.system(x))
-        return drift + G @ u.astype(x.dtype)
+        return drift + jnp.matmul(G, u.astype(x.dtype), precision="highest")
 
     def __repr__(self) -> str:
         return describe(self, positional=("system",))

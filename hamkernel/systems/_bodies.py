@@ -61,8 +61,8 @@ class Kepler(AbstractHamiltonianSystem):
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
         self, x = cast_state(self, x, 4)
         q, p = jnp.split(x, 2)
-        potential = -self.gravitational_parameter * self.reduced_mass / jnp.sqrt(q @ q)
-        return p @ p / (2 * self.reduced_mass) + potential
+        potential = -self.gravitational_parameter * self.reduced_mass / jnp.sqrt(jnp.sum(q**2))
+        return jnp.sum(p**2) / (2 * self.reduced_mass) + potential
 
 
 class NBody(AbstractHamiltonianSystem):
@@ -229,7 +229,7 @@ class AbstractPoissonSystem(eqx.Module):
 @eqx.filter_jit
 def _poisson_velocity(system: AbstractPoissonSystem, x: Float[Array, " n"]) -> Float[Array, " n"]:
     system = cast_arrays(system, x.dtype)
-    return system.tensor(x) @ jax.grad(system.hamiltonian)(x)
+    return jnp.matmul(system.tensor(x), jax.grad(system.hamiltonian)(x), precision="highest")
 
 
 class RigidBody(AbstractPoissonSystem):
@@ -265,7 +265,7 @@ class RigidBody(AbstractPoissonSystem):
     def casimir(self, x: Num[ArrayLike, "3"]) -> Float[Array, ""]:
         """Return |L|², which every field Π∇H conserves, shape ()."""
         L = require.point(x, 3)
-        return L @ L
+        return jnp.sum(L**2)
 
 
 class LotkaVolterra(AbstractPoissonSystem):
@@ -350,7 +350,7 @@ class ChargedParticle(AbstractPoissonSystem):
         """Return H(q, p), shape (); ValueError unless x has shape (4,)."""
         self, x = cast_state(self, x, 4)
         q, p = jnp.split(x, 2)
-        return p @ p / (2 * self.mass) + self.stiffness * q @ q / 2
+        return jnp.sum(p**2) / (2 * self.mass) + self.stiffness * jnp.sum(q**2) / 2
 
     def tensor(self, x: Num[ArrayLike, "4"]) -> Float[Array, "4 4"]:
         """Return Π = [[0, I], [−I, F]], F v = v × B."""

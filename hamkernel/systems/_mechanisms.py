@@ -155,7 +155,7 @@ class HenonHeiles(AbstractHamiltonianSystem):
     def hamiltonian(self, x: Num[ArrayLike, "4"]) -> Float[Array, ""]:
         """Return H(x), shape (); ValueError unless x has shape (4,)."""
         self, x = cast_state(self, x, 4)
-        return x @ x / 2 + self.coupling * (x[0] ** 2 * x[1] - x[1] ** 3 / 3)
+        return jnp.sum(x**2) / 2 + self.coupling * (x[0] ** 2 * x[1] - x[1] ** 3 / 3)
 
 
 class SpringChain(AbstractHamiltonianSystem):
