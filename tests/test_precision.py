@@ -272,7 +272,7 @@ SYSTEMS = [
 
 def test_products_of_systems_are_in_full_precision():
     jax.clear_caches()
-    driven = hk.systems.Driven(PENDULUM, [[0.0], [1.0]])
+    driven = hk.systems.Driven(PENDULUM, jnp.array([[0.0], [1.0]]))
     with imprecise_products() as places:
         jax.eval_shape(driven, jnp.ones(2), jnp.ones(1))
         for system, n in SYSTEMS:
