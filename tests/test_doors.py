@@ -377,7 +377,7 @@ def test_positions_and_a_mass_are_enough(learned, tmp_path):
     K = learned.kernel
     with pytest.raises(TypeError, match="give one of mass and mean"):
         hk.learn(K, learned.runs, mean=hk.kinetic(1.0), mass=1.0)
-    with pytest.raises(ValueError, match=r"positions alone hk\.learn\(K, runs, mass=m\)"):
+    with pytest.raises(ValueError, match=r"positions alone, hk\.learn\(K, runs, mass=m\)"):
         hk.learn(K, hk.Runs(T, X[:, 0]))
 
 

@@ -329,7 +329,7 @@ DATA = hk.Velocities(X, Y, inputs=U)
             r"have \[1, 2\] inputs",
         ),
         (lambda: hk.fit(K, hk.Velocities(X, Y, inputs=0 * U)), ValueError, "have rank 0"),
-        (lambda: hk.fit(K, hk.Energies(X, X[:, 0])), ValueError, "how many inputs"),
+        (lambda: hk.fit(K, hk.Energies(X, X[:, 0])), ValueError, "number of inputs"),
         (lambda: K + hk.Separable(hk.Gaussian()), TypeError, "add the drifts"),
         (
             lambda: hk.fit(K, X, Y, inputs=U, mean=lambda x, u: u[:1]),

@@ -302,7 +302,7 @@ def test_a_known_mass_matrix_is_checked(known, said):
             ValueError,
             "unknown_gains are .5,. and there are 2 positions",
         ),
-        ({"K": hk.CurlFree(hk.Gaussian(1.0))}, TypeError, "belongs to hk.Lagrangian"),
+        ({"K": hk.CurlFree(hk.Gaussian(1.0))}, TypeError, "belong to hk.Lagrangian"),
     ],
 )
 def test_what_cannot_be_learned_is_refused(change, error, said):

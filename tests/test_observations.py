@@ -407,7 +407,7 @@ def test_a_mean_with_a_hamiltonian_is_in_that_of_the_field():
 def test_a_system_of_another_structure_is_not_told_to_be_a_system():
     X, Y = pendulum_data(8, 0)
     field = hk.fit(hk.CurlFree(hk.Gaussian(1.5)), X, Y, RIDGE, mean=MEANS["system"])
-    with pytest.raises(AttributeError, match=r"f = J∇H, and CurlFree.*take Symplectic\(k\)"):
+    with pytest.raises(AttributeError, match=r"f = J∇H, and CurlFree.*use Symplectic\(k\)"):
         _ = field.potential
     learned = hk.fit(MODEL, X, Y, RIDGE)
     field = hk.fit(hk.CurlFree(hk.Gaussian(1.5)), X, Y, RIDGE, mean=learned)

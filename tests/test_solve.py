@@ -291,7 +291,7 @@ def test_nystrom_refuses_what_makes_no_sense():
         Nystrom(tolerance=0.0)
     with pytest.raises(ValueError, match="at least 1"):
         Nystrom(max_points=0)
-    with pytest.raises(ValueError, match=r"most 100 landmarks say hk.Nystrom\(max_points=100\)"):
+    with pytest.raises(ValueError, match=r"most 100 landmarks write hk.Nystrom\(max_points=100\)"):
         Nystrom(100)
     with pytest.raises(ValueError, match=r"hk.Nystrom\(max_points=100\)"):
         Nystrom(np.int64(100))  # pyright: ignore[reportArgumentType]

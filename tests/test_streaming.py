@@ -360,7 +360,7 @@ def test_a_stream_in_float32_warns_and_takes_no_data_with_more_digits(solver):
     with pytest.warns(UserWarning, match="fitting in float32"):
         model = solver.start(K, few[0], 1e-2)
     assert model.add(*few).field(1e-2).norm.dtype == jnp.float32
-    with pytest.raises(TypeError, match="the data is float64 and the fit float32"):
+    with pytest.raises(TypeError, match="the data are float64 and the fit float32"):
         model.add(X[:20], Y[:20])
     with pytest.raises(ValueError, match="regularization must be positive"):
         model.add(*few).field(1e-50)  # zero in float32
