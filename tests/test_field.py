@@ -474,7 +474,10 @@ def test_a_batch_of_fields_says_how_it_is_called():
     fields = jax.vmap(lambda ridge: hk.fit(hk.Symplectic(hk.Gaussian()), X, Y, ridge))(
         jnp.array([1e-1, 1e-2])
     )
-    with pytest.raises(ValueError, match=r"a batch of 2 fields, and a method needs one: jax\.vmap\(lambda f: f\(x\)\)"):
+    with pytest.raises(
+        ValueError,
+        match=r"a batch of 2 fields, and a method needs one: jax\.vmap\(lambda f: f\(x\)\)",
+    ):
         fields(x)
     for ask in (lambda: fields.evaluate(X), lambda: fields.part(0), lambda: fields.anchored(x)):
         with pytest.raises(ValueError, match="a batch of 2 fields"):

@@ -42,9 +42,7 @@ from hamkernel._structures.completed import shared_laws
 from hamkernel._structures.joined import AbstractJoinedKernel
 
 
-@jax.tree_util.register_dataclass
-@dataclasses.dataclass(frozen=True)
-class Measurements:
+class Measurements(eqx.Module):
     """The rows of observations: the map L in blocks, and the targets y.
 
     There are M rows before the contrast of the energies and D ≤ M after it.
