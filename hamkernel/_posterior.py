@@ -459,7 +459,7 @@ def _range_of(U: Float[Array, "N m"], centre: float | None) -> Float[Array, "2 m
     return jnp.array([[-1.0], [1.0]], U.dtype) * jnp.where(largest > 0, largest, 1)[None]
 
 
-_at = precise_jit(lambda k, x: k(x, x))
+_variance_at = precise_jit(lambda k, x: k(x, x))
 
 
 def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
@@ -469,7 +469,7 @@ def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
     origin = np.zeros(K.outputs(X.shape[1]), X.dtype)
     for k in drop_symmetry(K).scalar_kernels:
         with require.eager():
-            one = Invariance.TRANSLATION in k.invariance and float(_at(k, origin)) == 1.0
+            one = Invariance.TRANSLATION in k.invariance and float(_variance_at(k, origin)) == 1.0
         if one:
             scaled = "the amplitude" if isinstance(k, Scaled) else f"1.0 * {k!r}"
             require.warn(

@@ -18,12 +18,12 @@ import hamkernel as hk
 from hamkernel import _machine
 from hamkernel._runs import preprocessing
 from hamkernel._runs.flow import Segments
+from hamkernel._solvers.triangle import regression_loss
 from hamkernel._trajectories.kalman import whiten
 from hamkernel._trajectories.likelihood import (
     closed_form,
     condense,
     conditional,
-    regression_loss,
 )
 from hamkernel._trajectories.model import Model, landmark_whitening
 from hamkernel._trajectories.search import (

@@ -26,7 +26,7 @@ from hamkernel._runs.runs import (
     values,
 )
 from hamkernel._trajectories.kalman import as_observations
-from hamkernel._trajectories.likelihood import Model
+from hamkernel._trajectories.model import Model
 from hamkernel._trajectories.segments import given_path, linearise, segments_of
 
 FRICTION, GAIN = 0.2, 1.5

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from hamkernel import _require as require
 from hamkernel._fields.lagrangian import LagrangianField, lagrangian_field
 from hamkernel._machine import precise_jit
-from hamkernel._solvers.triangle import append_rows, no_rows, regression_loss
+from hamkernel._solvers.triangle import append_rows, no_rows
 from hamkernel._structures.friction import Friction
 from hamkernel._structures.lagrangian import (
     Lagrangian,
@@ -177,9 +177,6 @@ def ridge_solution(
 @precise_jit
 def _anchored_solution(features, B, y) -> tuple[Array, Array]:
     return ridge_solution(*with_anchor(features, B, y))
-
-
-negative_log_likelihood = regression_loss
 
 
 def missing_friction(

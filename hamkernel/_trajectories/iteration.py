@@ -38,6 +38,7 @@ from hamkernel._trajectories.model import Model, landmark_whitening
 from hamkernel._trajectories.search import (
     Bounds,
     choose_start,
+    has_process_noise,
     landmark_spacing,
     limited_by_landmarks,
     losses,
@@ -207,7 +208,7 @@ def fix_process_noise(task: Task, now: Current, q: Float[np.ndarray, " n"]) -> t
     with np.errstate(divide="ignore"):
         model = model._replace(log_process=jax.device_put(np.log(q)))
     # A push is one beside the process noise of the caller, which the beginning had too.
-    was_given = bool((np.asarray(model.log_process) > task.bounds.low[-n:] + 0.1).any())
+    was_given = has_process_noise(model, task.bounds).any()
     rows = _linearise(task, now if was_given else now._replace(pushed=1.0))[3]
     noise = np.asarray(model.log_noise)
     floors = (np.log(share * task.data.scale) for share in (1e-300, 0.01, 0.1))

@@ -33,7 +33,8 @@ from hamkernel._runs.weak import (
     weak_rows,
     whiten,
 )
-from hamkernel._solvers.lagrangian import negative_log_likelihood, ridge_solution
+from hamkernel._solvers.lagrangian import ridge_solution
+from hamkernel._solvers.triangle import regression_loss
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import complete, shared_laws
 from hamkernel._trajectories.diagnostics import FitQuality, diagnostics_of_rows
@@ -178,9 +179,7 @@ def _search(model: LawModel, design, low, high, rows: Rows, L):
 
     def loss(h):
         shown = model.with_flat(h)
-        return (
-            negative_log_likelihood(*_rows_over_noise(shown, rows, L)) + count * shown.log_scatter
-        )
+        return regression_loss(*_rows_over_noise(shown, rows, L)) + count * shown.log_scatter
 
     run = best_in_box(loss, design, low, high, jnp.full_like(low, 0.2), _STEPS)
     return inside_box(run.best.u, low, high), run.best.value

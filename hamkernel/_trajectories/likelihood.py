@@ -20,7 +20,6 @@ from jaxtyping import Array, Float
 
 from hamkernel._machine import compiled_by_size
 from hamkernel._solvers.triangle import append_rows, no_rows
-from hamkernel._solvers.triangle import regression_loss as regression_loss
 from hamkernel._trajectories.kalman import whiten
 from hamkernel._trajectories.model import Model, landmark_whitening
 from hamkernel._trajectories.segments import LinearisedSegments

@@ -15,6 +15,7 @@ from hamkernel._kernels.built_in import Gaussian
 from hamkernel._kernels.transforms import Select
 from hamkernel._machine import compiled_by_size
 from hamkernel._runs.preprocessing import Preprocessed, sample_points
+from hamkernel._solvers.triangle import regression_loss
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.custom_operator import Structured
 from hamkernel._structures.friction import Friction, frictions, with_rest_speed
@@ -24,7 +25,6 @@ from hamkernel._trajectories.likelihood import (
     Condensed,
     condense,
     conditional,
-    regression_loss,
 )
 from hamkernel._trajectories.model import KernelRows, Model, landmark_whitening
 from hamkernel._trajectories.segments import LinearisedSegments, windows
@@ -112,7 +112,7 @@ def search_sample(
     width = (_ENTRIES / 3) ** 0.5  # columns, and rows, if there are as many of both
     if n * len(S) <= width:
         return S, windows(rows, int(width**2 / (n**2 * len(S))))
-    return exact(windows(rows, int(width / n)))
+    return exact(limiting_windows(rows))
 
 
 def exact(rows: LinearisedSegments) -> tuple[Float[Array, "k d"], LinearisedSegments]:
@@ -221,7 +221,7 @@ def solve(
     is_short = limiting_windows(rows) is rows
     while count < len(S):
         is_slow = count <= quick < min(2 * count, len(S))
-        args = model, jnp.asarray(S[:count]), rows, start_deviation
+        args = model, closed.points, rows, start_deviation
         if is_slow and not limited_by_landmarks(*args, bool(free.any()), least=np.log(2) / 2):
             break
         # All landmarks gain at least as much as twice as many, which must gain √(q/2).
@@ -231,9 +231,8 @@ def solve(
         if not float(more[1].loss) < float(closed.loss) - (more[1].weights.size / 2) ** 0.5:
             break
         (triangle, closed), count = more, 2 * count
-    # The floor of process noise stands for none, and may be scaled with the noise; q may not.
-    log_q = np.asarray(model.log_process)
-    is_held = (log_q > np.asarray(bounds.low)[-n:] + 0.1) & ~free[-n:]
+    # The floor of process noise may be scaled with the sensor noise; q of the caller may not.
+    is_held = has_process_noise(model, bounds) & ~free[-n:]
     is_sample = search_sample(jnp.asarray(S[:count]), rows)[1] is not rows
     scales = is_sample and free.any() and not is_held.any()
     if scales and closed.free > closed.used and closed.squares > 0:
@@ -245,6 +244,12 @@ def solve(
         model = model.unflatten(np.where(free, np.clip(h + shift, bounds.low, bounds.high), h))
         closed = conditional(triangle, closed.points, shift)
     return model, closed
+
+
+def has_process_noise(model: Model, bounds: Bounds) -> Bool[np.ndarray, " n"]:
+    """The coordinates whose process noise is above its floor, which stands for none."""
+    floor = np.asarray(bounds.low)[-len(model.log_process) :]
+    return np.asarray(model.log_process) > floor + 0.1  # more than the rounding of a logarithm
 
 
 def _excess(closed: ClosedForm) -> float:

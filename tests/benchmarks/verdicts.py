@@ -4,8 +4,9 @@
     python tests/benchmarks/verdicts.py --good 30
 
 Each line has the verdict, the error of a free run from an unseen start over the deviation of the
-motion, and the rows of the diagnostics that fall short. SciPy simulates the logs. `--good` counts
-refusals among that many short logs of pendula and double wells, which a field describes.
+motion, the row of free runs of the diagnostics, and the rows that fall short. SciPy simulates the
+logs. `--good` counts refusals among that many short logs of pendula and double wells, which a field
+describes.
 """
 
 import argparse
@@ -123,7 +124,7 @@ def learned(K, ts, states):
 
 
 def table(names, seed):
-    print("| log | usable | free run | falls short | CPU s |\n|---|---|---|---|---|")
+    print("| log | usable | unseen | free run | falls short | CPU s |\n|---|---|---|---|---|---|")
     for name, K, ts, states, truth, start, unit in logs(np.random.default_rng(seed)):
         if names and not any(part in name for part in names):
             continue
@@ -132,7 +133,8 @@ def table(names, seed):
         cpu = time.process_time() - cpu
         error = "" if truth is None else f"{free_run(found.field, truth, start, unit):.3f}"
         short = ", ".join(found.diagnostics.failing)
-        print(f"| {name} | {found.converged} | {error} | {short} | {cpu:.0f} |", flush=True)
+        own = found.diagnostics["free run"].value
+        print(f"| {name} | {found.converged} | {error} | {own} | {short} | {cpu:.0f} |", flush=True)
 
 
 def count_refusals(count):
