@@ -29,9 +29,10 @@ _SWING = 5.0  # samples in a swing: with fewer noise and motion cannot be told a
 # Bands are wider below p = .05, which one good log in twenty has. One in a thousand may be refused.
 _FALSE_ALARMS = 1e-3
 # The error of free runs over that of a constant, below which correlated residuals do not decide.
-# Where friction is missing it is .33 to .5 and of a Van der Pol oscillator .68 to 1
+# Where viscous friction is missing it is .56, of a spiral that grows .57, of a limit cycle .91 to 1
 # (`tests/benchmarks/verdicts.py`). It is .01 where few landmarks leave a field of eight coordinates
-# 1.3 % off (`tests/benchmarks/capacity.py chain`).
+# 1.3 % off (`tests/benchmarks/capacity.py chain`). Three runs that lose energy and never cross can
+# be followed without friction: dry friction that is missing left .006, and is a missing force.
 _CLOSE = 0.1
 _FEW = 10  # degrees of freedom, from which σ is known to a fifth
 
