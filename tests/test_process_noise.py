@@ -27,7 +27,12 @@ from hamkernel._trajectories.diagnostics import rest_speed as rest_speed_row
 from hamkernel._trajectories.iteration import iterate, likelier
 from hamkernel._trajectories.kalman import as_observations, innovations, smoothed_path, whiten
 from hamkernel._trajectories.model import Model, WhitenedRows, landmark_whitening
-from hamkernel._trajectories.search import gain_of_friction, gain_of_inertia, losses
+from hamkernel._trajectories.search import (
+    MissingForce,
+    losses,
+    missing_friction,
+    missing_inertia,
+)
 from hamkernel._trajectories.segments import LinearisedSegments
 from hamkernel._trajectories.whiteness import autocorrelations, ljung_box, whiteness
 
@@ -515,8 +520,8 @@ def test_friction_of_joints_is_spoken_of_where_there_may_be_links(n, said, gaine
         process=np.ones(n),
         misfit=np.ones((1, n)),
         driven=False,
-        friction_gain=gained,
-        inertia_gain=0.0,
+        friction=MissingForce(gained),
+        inertia=MissingForce(),
         has_momenta=True,
         has_friction=has_friction,
     )
@@ -545,8 +550,9 @@ def test_a_mass_matrix_that_depends_on_the_positions_is_told_from_friction(
     def first_rows(task, now, most, bar):
         rows = now.rows, task.start_deviation, task.data
         given = now.model, now.field.points, *rows
-        gains.extend([gain_of_friction(*given), gain_of_inertia(*given, task.mean)])
-        assert gain_of_inertia(*given, with_centrifugal_forces) == 0
+        inertia = missing_inertia(*given, task.mean)
+        gains.extend([missing_friction(*given).gain, inertia.gain])
+        assert missing_inertia(*given, with_centrifugal_forces) == MissingForce()
         raise StopIteration
 
     monkeypatch.setattr("hamkernel._trajectories.learn.iterate", first_rows)

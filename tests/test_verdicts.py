@@ -131,6 +131,26 @@ def test_a_quantised_encoder_and_the_right_friction_are_silent():
     np.testing.assert_allclose(learned.noise[0], step / np.sqrt(12), rtol=0.1)
 
 
+def rubbing(x0, t, rng):
+    """Noisy (q, p) of an oscillator with dry friction of .5, by SciPy."""
+    path = solve_ivp(
+        lambda _, x: [x[1], -x[0] - 0.5 * np.tanh(20 * x[1])], (0, t[-1]), x0, t_eval=t, rtol=1e-8
+    ).y.T
+    return path + 0.01 * path.std(axis=0) * rng.standard_normal(path.shape)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kernel", "usable"), [(K, False), (FRICTION, True)])
+def test_runs_that_can_be_followed_without_their_friction_ask_for_it(kernel, usable):
+    # The three runs never cross, so some field without friction follows them within the noise.
+    t, rng = np.linspace(0, 6, 61), np.random.default_rng(0)
+    runs = hk.Runs([t] * 3, [rubbing(x0, t, rng) for x0 in ([2.0, 0.0], [3.0, 1.0], [-4.0, 0.0])])
+    learned, heard = learn_and_listen(kernel, runs)
+    assert learned.converged == usable
+    assert ("missing force" in learned.diagnostics.failing) != usable
+    assert ["hk.Friction()" in said for said in heard] == [True] * (not usable), heard
+
+
 def test_a_sentence_of_the_table_has_the_name_of_the_column():
     fit = SimpleNamespace(names=("angle", "speed"), noise=np.array([0.1, 0.9]), scale=np.ones(2))
     row = _noise_against_motion(fit)

@@ -19,6 +19,7 @@ from hamkernel._runs.sensors import Timing
 from hamkernel._runs.table import Diagnostic, Diagnostics
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.friction import damped_coordinates, frictions
+from hamkernel._trajectories.search import MissingForce
 from hamkernel._trajectories.whiteness import Whiteness
 
 # The change of a field, relative to its size, at which iterations end. It may leave residuals of as
@@ -32,9 +33,12 @@ _FALSE_ALARMS = 1e-3
 # Where viscous friction is missing it is .56, of a spiral that grows .57, of a limit cycle .91 to 1
 # (`tests/benchmarks/verdicts.py`). It is .01 where few landmarks leave a field of eight coordinates
 # 1.3 % off (`tests/benchmarks/capacity.py chain`). Three runs that lose energy and never cross can
-# be followed without friction: dry friction that is missing left .006, and is a missing force.
+# be followed without friction: dry friction that is missing left .006, see `_LOSSY`.
 _CLOSE = 0.1
 _FEW = 10  # degrees of freedom, from which σ is known to a fifth
+# The share of the forces above which a missing one decides. Friction of the share s takes 2πs of
+# the energy of an oscillator in each swing: a tenth.
+_LOSSY = 0.1 / (2 * np.pi)
 
 
 class FitQuality(NamedTuple):
@@ -67,8 +71,8 @@ class FitQuality(NamedTuple):
         few: the number of landmarks if more would help but were not taken, because a number was
             given or more would take too long; else 0.
         between: how inputs go on in a likelier way than was said; "" if they do not.
-        friction_gain: by how much friction in the kernel raises log p; 0 where nothing asked.
-        inertia_gain: the same of forces that are quadratic in the velocities.
+        friction: viscous and dry friction that the kernel lacks.
+        inertia: forces that are quadratic in the velocities and that the kernel lacks.
         has_momenta: whether half of the coordinates are momenta, on which friction can act.
         has_friction: whether the kernel has a `Friction`.
         is_curve: whether the momentum is one function of the position in the data.
@@ -98,8 +102,8 @@ class FitQuality(NamedTuple):
     driven: bool
     few: int = 0
     between: str = ""
-    friction_gain: float = 0.0
-    inertia_gain: float = 0.0
+    friction: MissingForce = MissingForce()
+    inertia: MissingForce = MissingForce()
     has_momenta: bool = False
     has_friction: bool = False
     is_curve: bool = False
@@ -391,37 +395,40 @@ def _landmarks(fit: FitQuality) -> Diagnostic:
 
 def _force(fit: FitQuality) -> Diagnostic:
     """Whether a force that the kernel lacks would make the runs likelier."""
-    gain = max(fit.friction_gain, fit.inertia_gain)
+    missing = max(fit.friction, fit.inertia, key=lambda force: force.gain)
+    shown = f", {missing.share:.0%} of the forces" if missing.is_there else ""
     return Diagnostic(
         "missing force",
-        f"log p + {gain:.0f}",
-        f"{_FEW}",
-        gain <= _FEW or (fit.share < NEGLIGIBLE and fit.white.is_enough),
+        f"log p + {missing.gain:.0f}{shown}",
+        "log p + 10",
+        not missing.is_there or (fit.share < NEGLIGIBLE and fit.white.is_enough),
         f"the runs are likelier with {missing_force(fit)}"
-        if gain > _FEW
+        if missing.is_there
         else "no force is missing",
         "Add the term; until then gains and the rest of the field may be wrong by more than their "
         "bands.",
+        decides=missing.share > _LOSSY,
     )
 
 
 def missing_force(fit: FitQuality) -> str:
     """The force that the kernel lacks, or may lack, with the kernel to add."""
-    if fit.inertia_gain > max(_FEW, 3 * fit.friction_gain):  # see `gain_of_inertia`
+    friction, inertia = fit.friction.gain, fit.inertia.gain
+    if fit.inertia.is_there and inertia > 3 * friction:  # see `missing_inertia`
         return (
             "a mass matrix that depends on the positions, as that of links (log p + "
-            f"{fit.inertia_gain:.0f}): velocities are no momenta there; give the kinetic energy in "
+            f"{inertia:.0f}): velocities are no momenta there; give the kinetic energy in "
             "mean, with p = M(q) v"
         )
     # `Friction` acts on each momentum by itself.
     joints = "; joints between links have a kernel of their own, in the docstring of hk.Friction"
     joints = joints if fit.misfit.shape[1] > 2 else ""
-    if fit.friction_gain > _FEW:
+    if fit.friction.is_there:
         return (
-            f"friction (log p + {fit.friction_gain:.0f}): add hk.Friction() to the drift, "
+            f"friction (log p + {friction:.0f}): add hk.Friction() to the drift, "
             f"hk.Sum(energy=…, friction=hk.Friction()){joints}"
         )
-    if fit.friction_gain < 0:  # which was looked for
+    if friction < 0:  # which was looked for
         return "another force, or too few landmarks (more: solver=hk.Nystrom(max_points=…))"
     if fit.has_friction:
         return f"friction of another form (hk.Friction(stribeck=…), another rest_speed{joints})"

@@ -14,7 +14,7 @@ from hamkernel._trajectories.diagnostics import FitQuality
 from hamkernel._trajectories.free_run import error_over_constant, stretches_of_swings
 from hamkernel._trajectories.iteration import End, asks_for_landmarks, initial_loss, noisy_counts
 from hamkernel._trajectories.kalman import smoothed_path
-from hamkernel._trajectories.search import gain_of_friction, gain_of_inertia
+from hamkernel._trajectories.search import missing_friction, missing_inertia
 from hamkernel._trajectories.segments import Piece
 from hamkernel._trajectories.whiteness import whiteness
 
@@ -85,15 +85,16 @@ def chi_squared(end: End, z: Float[np.ndarray, "S K n"]) -> dict[str, Any]:
 
 
 def with_causes(fit: FitQuality, runs: Runs, end: End) -> FitQuality:
-    """The quality with the gains in likelihood of possible causes, which warnings then name."""
+    """The quality with the forces that the kernel may lack, which warnings then name."""
     now, task, used = end.now, end.task, len(end.now.field.points)
     args = now.model, now.field.points, now.rows, task.start_deviation
     if (task.capped and used >= task.quick) or not fit.white.is_enough:
         fit = fit._replace(few=used * asks_for_landmarks(end))
     if fit.has_momenta and (fit.is_disturbed or not fit.white.is_enough):
-        bent = gain_of_inertia(*args, task.data, task.mean)
-        gain = gain_of_friction(*args, task.data)
-        fit = fit._replace(friction_gain=gain, inertia_gain=bent)
+        fit = fit._replace(
+            friction=missing_friction(*args, task.data),
+            inertia=missing_inertia(*args, task.data, task.mean),
+        )
     if fit.white.is_enough:
         return fit
     return fit._replace(between=likelier_between(runs, end))

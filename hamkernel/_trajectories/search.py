@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from hamkernel._gram_operator import placed_product
 from hamkernel._kernels.built_in import Gaussian
 from hamkernel._kernels.transforms import Select
 from hamkernel._machine import compiled_by_size
@@ -23,6 +24,7 @@ from hamkernel._trajectories.kalman import whiten
 from hamkernel._trajectories.likelihood import (
     ClosedForm,
     Condensed,
+    closed_form,
     condense,
     conditional,
 )
@@ -300,63 +302,82 @@ def landmark_gain(
     return float(few - many), part
 
 
-def gain_of_friction(
+class MissingForce(NamedTuple):
+    """A force that the kernel lacks, or may lack.
+
+    Attributes:
+        gain: by how much the force raises log p; 0 where nothing asked.
+        share: the RMS of the force over that of the rates of the momenta, along the runs; 0 where
+            the gain is small.
+    """
+
+    gain: float = 0.0
+    share: float = 0.0
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the runs are e¹⁰ times as likely with the force."""
+        return self.gain > 10
+
+
+def missing_friction(
     model: Model,
     S,
     rows: LinearisedSegments,
     start_deviation,
     data: Preprocessed,
-) -> float:
-    """The gain of log p from viscous and dry friction of the momenta beside the drift.
+) -> MissingForce:
+    """Viscous and dry friction of the momenta beside the drift.
 
     Kernels stay. Process noise, or without it sensor noise, had to explain what friction would, and
     may be a tenth or a hundredth with either. Forces as large as all of the motion are as good as
-    free in the closed form. 0 where the kernel has friction, or is that of a family.
+    free in the closed form. None is missing where the kernel has friction, or is that of a family.
 
-    Of four runs of positions of a pendulum, 80 samples each, with viscous friction of .1 and .03 it
-    is 75 and 33 beside the process noise found; with white pushes and no friction −9 to −6.
+    The gain of four runs of positions of a pendulum, 80 samples each, with viscous friction of .1
+    and .03 is 75 and 33 beside the process noise found; with white pushes and no friction −9 to −6.
     """
     K, (X, Y) = model.kernel, sample_points(data)
     n = Y.shape[1]
     force, fastest = np.sqrt(np.mean(Y[:, n // 2 :] ** 2)), np.abs(X[:, n // 2 : n]).max()
     if frictions(K) or K.input_name == "parameters" or not fastest > 0:
-        return 0.0
+        return MissingForce()
     both = Friction(force / fastest, 1e-6 * force) + Friction(1e-6 * force / fastest, force)
     more = with_rest_speed(both, jnp.asarray(X), n)
-    return _gain(model, more, S, rows, start_deviation)
+    return _missing(model, more, S, rows, start_deviation, X, force)
 
 
-def gain_of_inertia(
+def missing_inertia(
     model: Model,
     S,
     rows: LinearisedSegments,
     start_deviation,
     data: Preprocessed,
     mean: Any,
-) -> float:
-    """The gain of log p from forces that are quadratic in the velocities, beside the drift.
+) -> MissingForce:
+    """Forces that are quadratic in the velocities, beside the drift.
 
     Velocities are no momenta where a mass matrix depends on the positions, and ½ vᵀ∂M/∂q v is such
-    a force. They are the gradient in v of g(q, v), of degree three in v. It is 0 where the mean has
-    such forces, for families, and with one degree of freedom, where (q, v) is (q, p) of another q.
+    a force. They are the gradient in v of g(q, v), of degree three in v. None is missing where the
+    mean has such forces, for families, and with one degree of freedom, where (q, v) is (q, p) of
+    another q.
 
-    At the first step, of four runs of 80 positions of a double pendulum, three seeds, it is 43 to
-    55, and that of friction −7 to −5; of coupled pendula with friction 96 to 139, and 140 to 239.
-    So three times the gain of friction tells them apart (`tests/test_process_noise.py`).
+    At the first step, of four runs of 80 positions of a double pendulum, three seeds, the gain is
+    43 to 55, and that of friction −7 to −5; of coupled pendula with friction 96 to 139, and 140 to
+    239. So three times the gain of friction tells them apart (`tests/test_process_noise.py`).
     """
     K, (X, Y) = model.kernel, sample_points(data)
     n = Y.shape[1]
     force, fastest = np.sqrt(np.mean(Y[:, n // 2 :] ** 2)), np.abs(X[:, n // 2 : n]).max()
     if n < 4 or n % 2 or K.input_name == "parameters" or not (force > 0 and fastest > 0):
-        return 0.0
+        return MissingForce()
     v = slice(n // 2, n)
     if mean is not None and jax.vmap(jax.hessian(mean))(jnp.asarray(X[::99]))[:, v, v, v].any():
-        return 0.0
+        return MissingForce()
     size, positions = force / (3 * fastest**2), tuple(range(n // 2))
     lengths = Gaussian(np.maximum(data.scale[: n // 2], 1e-3 * data.scale[: n // 2].max()))
     cubic = Select(_cubic, tuple(range(n // 2, n)))
     more = Structured(size**2 * (Select(lengths, positions) * cubic), _momentum_projection)
-    return _gain(model, more, S, rows, start_deviation)
+    return _missing(model, more, S, rows, start_deviation, X, force)
 
 
 def _cubic(v: Float[Array, " m"], w: Float[Array, " m"]) -> Float[Array, ""]:
@@ -367,27 +388,39 @@ def _momentum_projection(x: Float[Array, " n"]) -> Float[Array, "n n"]:
     return jnp.diag((jnp.arange(len(x)) >= len(x) // 2).astype(x.dtype))
 
 
-def _gain(
+def _missing(
     model: Model,
     more: AbstractMatrixKernel,
     S,
     rows: LinearisedSegments,
     start_deviation,
-) -> float:
-    """The gain of log p from `more` beside the kernel of states, at less noise if that is likelier.
+    X: Float[np.ndarray, "N d"],
+    rate: float,
+) -> MissingForce:
+    """The force of `more` beside the kernel of states, with less noise if that is likelier.
 
-    Process noise, or without it sensor noise, had to explain what `more` would.
+    Process noise, or without it sensor noise, had to explain what `more` would. X are points along
+    the runs, and `rate` is the RMS rate of the momenta there.
     """
     K, n = model.kernel, rows.residual.shape[-1]
     S, rows = search_sample(jnp.asarray(S), rows)
     explains = slice(-2 * n, None)
 
-    def least(model: Model) -> float:
+    def likeliest(model: Model) -> tuple[float, Model]:
         design = np.tile(np.asarray(model.flat), (3, 1))
         design[:, explains] += np.log([[1.0], [0.1], [0.01]])
-        return float(losses(model, design, S, rows, start_deviation).min())
+        values = losses(model, design, S, rows, start_deviation)
+        return float(values.min()), model.unflatten(design[int(np.argmin(values))])
 
-    return least(model) - least(model._replace(kernel=K.with_states(K.state_kernel + more)))
+    loss, _ = likeliest(model)
+    least, larger = likeliest(model._replace(kernel=K.with_states(K.state_kernel + more)))
+    missing = MissingForce(loss - least)
+    if not missing.is_there:
+        return missing
+    A = closed_form(larger, S, rows, start_deviation).coefficients
+    # Inputs are columns of the points, and do not change the force.
+    force = placed_product(more, jnp.asarray(X[:, :n]), S[:, :n], A)[:, n // 2 :]
+    return missing._replace(share=float(np.sqrt(np.mean(np.asarray(force) ** 2)) / rate))
 
 
 def bounds_and_design(
