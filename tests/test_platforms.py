@@ -13,6 +13,7 @@ from hamkernel._sizes import platform, sizes
 from hamkernel._solvers import dense
 from hamkernel._solvers.problem import make_problem
 from hamkernel._solvers.triangle import cholesky_triangle, triangle
+from hamkernel._tuning import search
 
 X, Y = map(jnp.asarray, swings(8))
 K = hk.Symplectic(hk.Gaussian(1.0))
@@ -118,3 +119,23 @@ def test_where_columns_are_dependent_reflections_take_over(S):
 def test_a_triangle_is_made_of_products_on_a_gpu_alone():
     assert "dot_general" in lowered(triangle, jnp.ones((6, 3)), platform="cuda")
     assert "dot_general" not in lowered(triangle, jnp.ones((6, 3)), platform="cpu")
+
+
+@pytest.mark.slow
+def test_runs_side_by_side_are_computed_without_those_that_have_finished(monkeypatch):
+    def tuned():
+        return hk.tune(K, X, Y, starts=3)
+
+    alone, widths = tuned(), []
+    minimise = search._minimise
+
+    def minimise_and_look(objective, minimiser, runs, *args):
+        widths.append((len(runs.u), int(np.sum(runs.active))))
+        return minimise(objective, minimiser, runs, *args)
+
+    monkeypatch.setattr(search, "platform", lambda: "gpu")
+    monkeypatch.setattr(search, "_minimise", minimise_and_look)
+    np.testing.assert_allclose(tuned().loss, alone.loss, rtol=1e-3)
+    design = max(width for width, _ in widths)
+    assert {width for width, _ in widths} == {4, design}
+    assert all(width == 4 for width, active in widths if active <= 3)

@@ -112,7 +112,8 @@ class Search:
         return runs
 
     def _part(self, criterion: SearchCriterion, chosen: np.ndarray) -> "Part":
-        return Part(self.space, criterion, self.rows, self.rms, chosen, len(self._points))
+        widths = self.starts + 1, len(self._points) + 1
+        return Part(self.space, criterion, self.rows, self.rms, chosen, widths)
 
     def _caller_run(self, part: "Part") -> MinimiserRun:
         return part.init(self._minimiser(_TOLERANCE), self._points[:1])
@@ -190,10 +191,9 @@ class Search:
         last_step = runs.steps.max() + steps
         while (active := runs.active & (runs.steps < last_step)).any():
             # A call makes one step, or as many as take a second, so that Ctrl-C works.
-            steps_at_once = 1 if self.progress else max(1, int(1 / (part.seconds * active.sum())))
-            runs = part.minimise(
-                minimiser, runs, min(steps_at_once, int(last_step - runs.steps[active].max()))
-            )
+            steps = 1 if self.progress else max(1, int(1 / (part.seconds * active.sum())))
+            steps = min(steps, int(last_step - runs.steps[active].max()))
+            runs = _put(runs, active, part.minimise(minimiser, _take(runs, active), steps))
             if self.progress:
                 self._say(part, runs, active.sum())
         return runs
@@ -236,6 +236,17 @@ def _take(runs: MinimiserRun, which: Any) -> MinimiserRun:
     return eqx.combine(jax.tree.map(lambda a: a[which], arrays), static)
 
 
+def _put(runs: MinimiserRun, which: Any, moved: MinimiserRun) -> MinimiserRun:
+    """The runs with `moved` in the places `which`."""
+    arrays, static = eqx.partition(runs, eqx.is_array)
+    arrays = jax.tree.map(np.array, arrays)
+    for array, part in zip(
+        *map(jax.tree.leaves, (arrays, eqx.filter(moved, eqx.is_array))), strict=True
+    ):
+        array[which] = part
+    return eqx.combine(arrays, static)
+
+
 def _concatenate(first: MinimiserRun, second: MinimiserRun) -> MinimiserRun:
     arrays, static = eqx.partition(first, eqx.is_array)
     second_arrays = eqx.filter(second, eqx.is_array)
@@ -249,7 +260,7 @@ class Part:
 
     Attributes:
         count: the number of these observations.
-            seconds: the shortest time of one step, without the first call, which compiles.
+        seconds: the shortest time of one step, without the first call, which compiles.
         objective: the function of u.
     """
 
@@ -260,14 +271,16 @@ class Part:
         rows: Measurements,
         rms: float,
         chosen: np.ndarray,
-        max_runs: int,
+        widths: tuple[int, int],
     ):
         """Restrict the criterion and the rows to the observations `chosen`.
 
-        The arrays of runs are padded to `max_runs` + 1, so that one program serves all calls.
+        The arrays of runs are padded to the larger of `widths`, so that one program serves all
+        calls. Side by side the padding is computed too: there the runs that go on are padded to the
+        smaller one, and have a program of their own.
         """
         self.seconds, self._compiled = np.inf, False
-        self._max_runs = max_runs + 1
+        self._widths = widths
         N = rows.count
         if len(chosen) < N:
             rows, chosen = rows.subset(chosen)
@@ -285,7 +298,7 @@ class Part:
         self, minimiser: optx.AbstractMinimiser, us: Float[np.ndarray, "count P"]
     ) -> MinimiserRun:
         """Runs at points where the function has not been evaluated yet."""
-        padded = np.resize(us, (self._max_runs, us.shape[1])).astype(jnp.result_type(float))
+        padded = np.resize(us, (self._widths[1], us.shape[1])).astype(jnp.result_type(float))
         runs = _init(self.objective, minimiser, padded)
         return _take(jax.tree.map(_as_numpy, runs), slice(len(us)))
 
@@ -295,11 +308,11 @@ class Part:
         """The runs after up to `steps` more steps."""
         count, before = len(runs.u), runs.steps.sum()
         # On a CPU, runs one after the other took two thirds of the time of batched runs. On a GPU
-        # a few hundred rows do not fill the device, so runs are batched, although a `while_loop`
-        # under `vmap` also computes the runs that have finished.
+        # a few hundred rows do not fill the device, so runs are batched.
         side_by_side = platform() != "cpu" and len(self.objective.rows.targets) <= 256
-        padded = _take(runs, np.resize(np.arange(count), self._max_runs))
-        padded = padded._replace(active=padded.active & (np.arange(self._max_runs) < count))
+        width = self._widths[0 if side_by_side and count <= self._widths[0] else 1]
+        padded = _take(runs, np.resize(np.arange(count), width))
+        padded = padded._replace(active=padded.active & (np.arange(width) < count))
         began = time.perf_counter()
         moved = _minimise(self.objective, minimiser, padded, padded.steps + steps, side_by_side)
         moved = _take(jax.tree.map(_as_numpy, moved), slice(count))
