@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import codecs
 import csv
+import io
 import pathlib
 import warnings
 from collections.abc import Callable
@@ -34,7 +36,7 @@ def parser() -> argparse.ArgumentParser:
         description="Learn a field from logged runs in CSV files with a header row, score it on "
         "the last fifth of each run, and write report.html, learned.hk and simulate.py.",
     )
-    options.add_argument("files", nargs="+", help="one CSV file a run, with a header row")
+    options.add_argument("files", nargs="+", help="one CSV file a run, with a row of names")
     options.add_argument("--time", required=True, help="the column of times")
     options.add_argument(
         "--states",
@@ -65,28 +67,58 @@ def parser() -> argparse.ArgumentParser:
 def columns(path: str, names: list[str]) -> Float[np.ndarray, "T k"]:
     """The named columns of a CSV file; an empty cell is NaN.
 
+    The header is the first row that has all the names, with commas, semicolons or tabs between
+    cells. We skip the lines above it, which oscilloscopes write, and rows without a number below
+    it, such as one of units. Between semicolons a comma is a decimal point.
+
     Raises:
         ValueError: the file has no such column, no rows, or a cell that is no number. OSError: the
             file cannot be read.
     """
-    with pathlib.Path(path).open(newline="", encoding="utf-8-sig") as file:
-        header, *rows = [*csv.reader(file)] or [[]]
-    header = [name.strip() for name in header]
-    for name in names:
-        if name not in header:
-            raise ValueError(f"{path} has no column {name!r}; its columns are {', '.join(header)}.")
+    text, widest = _text(path), []
+    for mark in ",;\t":
+        rows = [*csv.reader(io.StringIO(text, newline=""), delimiter=mark)]
+        headers = [[name.strip() for name in row] for row in rows]
+        first = next((i for i, row in enumerate(headers) if {*names} <= {*row}), None)
+        if first is not None:
+            break
+        widest = max(widest, *headers, [], key=lambda row: sum(x[:1].isalpha() for x in row))
+    else:
+        missing = next((name for name in names if name not in widest), names[0])
+        raise ValueError(f"{path} has no column {missing!r}; its columns are {', '.join(widest)}.")
+    header = headers[first]
     places, table = [header.index(name) for name in names], []
-    for number, row in enumerate(rows, start=2):
-        if not row:
-            continue
+    for number, row in enumerate(rows[first + 1 :], start=first + 2):
         cells = [row[place].strip() if place < len(row) else "" for place in places]
+        cells = [cell.replace(",", ".") if mark == ";" else cell for cell in cells]
+        if not any(row) or (not table and not any(map(_is_number, cells))):
+            continue
         try:
             table.append([float(cell) if cell else np.nan for cell in cells])
         except ValueError as error:
             raise ValueError(f"{path}, line {number}: {error}.") from error
     if not table:
-        raise ValueError(f"{path} has a header and no rows.")
+        raise ValueError(f"{path} has a header and no rows of numbers.")
     return np.array(table)
+
+
+def _text(path: str) -> str:
+    """The text of a file in UTF-8, in UTF-16 with its mark, or in the Latin-1 of older programs."""
+    content = pathlib.Path(path).read_bytes()
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return content.decode("utf-16")
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("latin-1")
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def kernel(

@@ -88,10 +88,30 @@ def test_columns_are_read_by_name_and_what_is_wrong_is_named(tmp_path):
         columns(file, ["v"])
     file.write_text("t,q\n0,a\n", encoding="utf-8")
     with pytest.raises(ValueError, match=r"line 2: could not convert string to float: 'a'"):
+        columns(file, ["t", "q"])
+    file.write_text("t,q\n0,1\n1,b\n", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"line 3: could not convert string to float: 'b'"):
         columns(file, ["q"])
-    file.write_text("t,q\n", encoding="utf-8")
-    with pytest.raises(ValueError, match="no rows"):
-        columns(file, ["q"])
+    for rows in ("t,q\n", "t,q\ns,V\n"):
+        file.write_text(rows, encoding="utf-8")
+        with pytest.raises(ValueError, match="no rows"):
+            columns(file, ["q"])
+
+
+@pytest.mark.parametrize(
+    ("text", "encoding"),
+    [
+        ("Model TDS2024B\nRecord Length,2,,\n\nt,q °\ns,V\n0,1.5\n1e-6,2\n", "utf-8"),
+        ("t;q °\n0;1,5\n1e-6;2,0\n", "latin-1"),
+        ("t\tq °\n0\t1.5\n1e-6\t2\n", "utf-16"),
+    ],
+)
+def test_columns_of_oscilloscopes_and_spreadsheets_are_read(tmp_path, text, encoding):
+    file = tmp_path / "scope.csv"
+    file.write_text(text, encoding=encoding)
+    np.testing.assert_array_equal(columns(file, ["t", "q °"]), [[0, 1.5], [1e-6, 2]])
+    with pytest.raises(ValueError, match=r"no column 'p'; its columns are t, q °"):
+        columns(file, ["t", "p"])
 
 
 def test_the_command_refuses_with_a_sentence(tmp_path, capsys):
@@ -158,7 +178,9 @@ def test_the_command_writes_a_page_a_field_and_a_script(learned, tmp_path, monke
     file, said = tmp_path / "run.csv", []
     rows = np.column_stack([learned.runs.times[0], learned.runs.states[0]])
     np.savetxt(file, rows, delimiter=",", header="t,q,p", comments="")
-    score = hk.Score(*(np.ones(2),) * 3, np.array(np.nan), (), (), (), np.ones(2), first=1)
+    score = hk.Score(
+        *(np.ones(2),) * 3, np.array(9.0), np.array(np.nan), (), (), (), np.ones(2), first=1
+    )
     stub = eqx.tree_at(lambda of: of.again.iterations, learned, 2)
 
     def learn(K, runs, **options):

@@ -13,7 +13,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import hamkernel as hk
-from hamkernel._trajectories.score import Score
+from hamkernel._trajectories.score import Score, _lead
 
 K = hk.Symplectic(hk.Gaussian(1.0))
 
@@ -85,7 +85,7 @@ def test_a_score_without_runs_holds_out_the_last_fifth():
     assert float(jnp.max(score.rmse / score.scale)) < 0.05
 
 
-def of_errors(own, still, linear, scale=1.0):
+def of_errors(own, still, linear, lead=9.0):
     t = jnp.arange(4.0)
     errors = jnp.array([[np.nan], [0.1], [0.2], [0.4]])
     own, still, linear = (jnp.array([each]) for each in (own, still, linear))
@@ -93,11 +93,12 @@ def of_errors(own, still, linear, scale=1.0):
         rmse=own,
         persistence=still,
         linear=linear,
+        lead=jnp.array(lead),
         coverage=jnp.array(np.nan),
         predictions=(errors,),
         times=(t,),
         errors=(errors,),
-        scale=jnp.array([scale]),
+        scale=jnp.ones(1),
         first=1,
     )
 
@@ -116,6 +117,14 @@ def test_the_verdict_is_one_sentence(own, still, linear, said):
     score = of_errors(own, still, linear)
     assert said in score.text
     assert "last sample stays" in repr(score)
+
+
+def test_a_difference_within_its_error_is_no_verdict():
+    rng = np.random.default_rng(0)
+    noise, shift = rng.normal(size=(3, 40, 2)), 0.1 * rng.normal(size=(3, 40, 2))
+    assert abs(_lead(noise**2, (noise + 0.1 * shift) ** 2)) < 2
+    assert _lead(noise**2, (noise + 2.0) ** 2) > 2
+    assert "as closely as a linear model ([0.9] for [0.7])" in of_errors(0.9, 2.0, 0.7, 1.0).text
 
 
 def test_the_horizon_ends_before_the_first_larger_error():

@@ -38,6 +38,8 @@ class Score(Shown, eqx.Module):
             where nothing was measured.
         persistence: the root mean square if the last known sample stays, shape (n,).
         linear: the root mean square of the linear model, shape (n,).
+        lead: by how many of its standard errors the mean of (error/scale)² of the linear model is
+            above that of the field, shape (). Below 2 the samples do not tell the two apart.
         coverage: the share of samples inside the 95 % band of the posterior, with both kinds of
             noise, shape (); NaN where no band was asked for. Honest bands hold about .95.
         predictions: the free run of each run at its times, shape (T, n).
@@ -50,6 +52,7 @@ class Score(Shown, eqx.Module):
     rmse: Float[Array, " n"]
     persistence: Float[Array, " n"]
     linear: Float[Array, " n"]
+    lead: Float[Array, ""]
     coverage: Float[Array, ""]
     predictions: tuple[Float[Array, "T n"], ...]
     times: tuple[Float[Array, " T"], ...]
@@ -69,12 +72,17 @@ class Score(Shown, eqx.Module):
                 f"is worse than saying that nothing moves: off by {number(self.rmse)}, where the "
                 f"last known sample is off by {number(self.persistence)}"
             )
+        if abs(float(self.lead)) < 2:
+            return (
+                f"follows the runs as closely as a linear model ({number(self.rmse)} for "
+                f"{number(self.linear)})"
+            )
         if not error < linear:
             return f"is worse than a linear model ({number(self.rmse)} for {number(self.linear)})"
         if not np.isfinite(linear):
             return f"follows the runs to {number(self.rmse)}; a linear model leaves every bound"
         return (
-            f"follows the runs {linear / max(error, 1e-300):.2g} times better than a linear model"
+            f"follows the runs {linear / max(error, 1e-300):.3g} times better than a linear model"
         )
 
     def horizon(self, error: ArrayLike) -> Float[Array, " R"]:
@@ -162,6 +170,7 @@ def compute_score(
         rmse=_root_mean_square(predicted - judged),
         persistence=_root_mean_square(last - judged),
         linear=_root_mean_square(linear - judged),
+        lead=_lead(((predicted - judged) / scale) ** 2, ((linear - judged) / scale) ** 2),
         coverage=jnp.asarray(coverage),
         predictions=tuple(jnp.asarray(x[: len(t)]) for x, t in zip(predicted, times, strict=True)),
         times=tuple(map(jnp.asarray, times)),
@@ -197,6 +206,20 @@ def _root_mean_square(error: Float[np.ndarray, "S L n"]) -> Float[Array, " n"]:
     total = np.where(counts, error, 0.0) ** 2
     count = counts.sum((0, 1))
     return jnp.asarray(np.where(count, np.sqrt(total.sum((0, 1)) / np.maximum(count, 1)), np.nan))
+
+
+def _lead(own: Float[np.ndarray, "S L n"], other: Float[np.ndarray, "S L n"]) -> Float[Array, ""]:
+    """By how many of its standard errors the mean of `other` − `own` is above 0.
+
+    Where two predictions are close, the difference of their squared errors is twice the noise times
+    the distance of the predictions, and the noise of samples is independent.
+    """
+    with np.errstate(invalid="ignore"):  # of inf − inf
+        gains = other - own
+        gains = gains[~np.isnan(gains)]
+        deviation = gains.std() / np.sqrt(gains.size) if gains.size else np.nan
+        mean = gains.mean() if gains.size else np.nan
+        return jnp.asarray(mean / np.maximum(deviation, np.finfo(float).tiny))
 
 
 def _linear(X: Float[np.ndarray, "N d"], Y: Float[np.ndarray, "N n"]) -> _Linear:

@@ -363,6 +363,7 @@ def _draw_samples(panel: Axes, runs: Runs, run: int, c: int) -> None:
 def _set_time_axis(panel: Axes, ts: np.ndarray, label: str) -> None:
     panel.set_ylabel(label)
     panel.set_xlim(ts[0], ts[-1])
+    panel.ticklabel_format(axis="x", scilimits=(-2, 5))  # microseconds would overlap
     panel.grid(True, color="0.9", linewidth=0.6)
     panel.set_axisbelow(True)
 
