@@ -208,14 +208,16 @@ def _root_mean_square(error: Float[np.ndarray, "S L n"]) -> Float[Array, " n"]:
     return jnp.asarray(np.where(count, np.sqrt(total.sum((0, 1)) / np.maximum(count, 1)), np.nan))
 
 
-def _lead(own: Float[np.ndarray, "S L n"], other: Float[np.ndarray, "S L n"]) -> Float[Array, ""]:
-    """By how many of its standard errors the mean of `other` − `own` is above 0.
+def _lead(
+    field: Float[np.ndarray, "S L n"], linear: Float[np.ndarray, "S L n"]
+) -> Float[Array, ""]:
+    """By how many of its standard errors the mean of `linear` − `field`, squared errors, is above 0.
 
     Where two predictions are close, the difference of their squared errors is twice the noise times
     the distance of the predictions, and the noise of samples is independent.
     """
     with np.errstate(invalid="ignore"):  # of inf − inf
-        gains = other - own
+        gains = linear - field
         gains = gains[~np.isnan(gains)]
         deviation = gains.std() / np.sqrt(gains.size) if gains.size else np.nan
         mean = gains.mean() if gains.size else np.nan
