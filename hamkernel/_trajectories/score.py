@@ -211,7 +211,7 @@ def _root_mean_square(error: Float[np.ndarray, "S L n"]) -> Float[Array, " n"]:
 def _lead(
     field: Float[np.ndarray, "S L n"], linear: Float[np.ndarray, "S L n"]
 ) -> Float[Array, ""]:
-    """By how many of its standard errors the mean of `linear` − `field`, squared errors, is above 0.
+    """The mean difference of the squared errors `linear` − `field` in units of its standard error.
 
     Where two predictions are close, the difference of their squared errors is twice the noise times
     the distance of the predictions, and the noise of samples is independent.
