@@ -256,7 +256,8 @@ def _inputs(inputs: Any, ts: Float[Array, " T"], between: Interpolation) -> Call
                 f"inputs takes ({mismatch}); it is called with one argument, the time. Feedback "
                 "closes the loop instead: hk.simulate(lambda x: field(x, law(x)), x0, ts)."
             )
-        out = jax.eval_shape(inputs, jax.ShapeDtypeStruct((), ts.dtype))
+        with require.traceable("inputs"):
+            out = jax.eval_shape(inputs, jax.ShapeDtypeStruct((), ts.dtype))
         shape = getattr(out, "shape", type(out).__name__)
         if shape == ():
             return OneInput(as_pytree(inputs))

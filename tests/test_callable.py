@@ -2,6 +2,7 @@
 
 import functools
 import itertools
+import math
 
 import equinox as eqx
 import jax
@@ -159,6 +160,30 @@ def test_a_function_may_name_what_has_no_value_yet():
     K = hk.Separable(lambda x, z: width + x @ z)
     width = 0.5
     np.testing.assert_allclose(hk.gram(K, X)[:, 0, :, 0], 0.5 + X @ X.T, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "kernel",
+    [
+        lambda x, z: np.exp(-np.sum((x - z) ** 2)),
+        lambda x, z: math.exp(-jnp.sum((x - z) ** 2)),
+        lambda x, z: jnp.exp(-x @ z) if x @ z > 0 else 1.0,
+        hk.Warp(hk.Gaussian(), lambda x: np.array([np.cos(x[0]), x[1]])),
+        hk.Shared(hk.Gaussian(), lambda x: np.array([[x[0]], [x[1]]])),
+    ],
+)
+def test_functions_of_a_kernel_that_jax_cannot_trace_are_told_to_use_jax_numpy(kernel):
+    with pytest.raises(TypeError, match=r"jax\.numpy in place of numpy.*jnp\.where"):
+        hk.fit(hk.Symplectic(kernel), np.eye(2), np.eye(2), 1e-4)
+
+
+def test_a_matrix_of_lists_is_a_matrix():
+    K = [
+        hk.Structured(hk.Gaussian(), lambda x, wrap=wrap: wrap([[0, x[0]], [-x[0], 0]]))
+        for wrap in (list, jnp.array)
+    ]
+    X = np.eye(2) + 0.1
+    np.testing.assert_array_equal(*(hk.gram(each, X) for each in K))
 
 
 def test_one_function_makes_the_same_kernel_again():

@@ -467,14 +467,15 @@ class UserKernel(AbstractScalarKernel):
         return describe(fn) if bare else text(fn)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
-        value = self.fn(x, z)
-        if jnp.shape(value) != ():
+        with require.traceable(f"the kernel {_name(self.fn)}"):
+            value = self.fn(x, z)
+        value = require.floating(value, f"the value of the kernel {_name(self.fn)}")
+        if value.shape:
             raise ValueError(
-                f"the kernel {_name(self.fn)} returned an array of shape {jnp.shape(value)} for "
+                f"the kernel {_name(self.fn)} returned an array of shape {value.shape} for "
                 f"two points of shape {jnp.shape(x)}; a scalar is needed. Write the kernel for "
                 "one pair of points, k(x, z) -> (): the library adds the vmap."
             )
-        value = require.floating(value, f"the value of the kernel {_name(self.fn)}")
         # Parameters of the kernel may be more precise than the data.
         return value.astype(require.floating(x, "the point").dtype)
 

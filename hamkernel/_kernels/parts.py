@@ -95,7 +95,8 @@ class Shared(AbstractScalarKernel):
     def parts_at(self, x: Float[Array, " n"]) -> "Parts":
         """The points and the weights of the parts of one state."""
         x = one_point(x)
-        result = self.parts(x)
+        with require.traceable("the parts function of Shared"):
+            result = self.parts(x)
         points, weights = result if isinstance(result, tuple) else (result, 1.0)
         if jnp.ndim(points) != 2 or jnp.shape(weights) not in ((), jnp.shape(points)[:1]):
             raise ValueError(

@@ -76,7 +76,8 @@ class Warp(AbstractScalarKernel):
     def warp(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         """fn(x), as a vector."""
         x = one_point(x)
-        warped = self.fn(x)
+        with require.traceable("the map of Warp"):
+            warped = self.fn(x)
         warped = jnp.stack(warped) if isinstance(warped, list | tuple) else warped
         if jnp.ndim(warped) != 1:
             raise ValueError(

@@ -49,13 +49,14 @@ class AbstractCustomOperator(AbstractPotentialKernel):
         """B(x), in the dtype of x."""
         value, n = getattr(self, self.role)(x), len(x)
         name = f"{self.role} of {self.name}"
-        if jnp.shape(value) != (n, n):
+        value = require.floating(value, f"the value of the {name}")
+        if value.shape != (n, n):
             raise ValueError(
-                f"the {name} returned shape {jnp.shape(value)} for a state of shape ({n},); an "
+                f"the {name} returned shape {value.shape} for a state of shape ({n},); an "
                 f"array of shape ({n}, {n}) is needed, such as jnp.array([[...], [...]]). Write it "
                 f"for one state of {n} coordinates."
             )
-        return require.floating(value, f"the {name}").astype(x.dtype)
+        return value.astype(x.dtype)
 
     def check_dimension(self, n: int) -> None:
         with require.traceable(f"the {self.role} of {self.name}"):
