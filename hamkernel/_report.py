@@ -82,7 +82,10 @@ def report(
         TypeError: `learned` is no result of `hk.learn`. OSError: the file cannot be written.
     """
     if not isinstance(learned, Learned | LearnedLagrangian):
-        raise TypeError(f"report takes the result of hk.learn; got a {type(learned).__name__}.")
+        raise TypeError(
+            "report takes the result of hk.learn and then a path; got a "
+            f"{type(learned).__name__} and a {type(path).__name__}."
+        )
     require.no_tracers("hk.report", "Call it outside.", learned)
     verdict = "may be used" if learned.converged else "must not be used as it is"
     short = [row.meaning.rstrip(".") for row in learned.diagnostics if not row.passes]

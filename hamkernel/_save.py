@@ -96,6 +96,8 @@ def save(
             finite.
         OSError: the file cannot be written; an older one at `path` is left as it was.
     """
+    if isinstance(field, str | os.PathLike):
+        raise TypeError("save takes the path first, hk.save(path, field).")
     if not _is_saved(type(field)):
         names = sorted(name for name, cls in _classes().items() if _is_saved(cls))
         raise TypeError(

@@ -168,7 +168,7 @@ def test_a_function_may_name_what_has_no_value_yet():
         lambda x, z: np.exp(-np.sum((x - z) ** 2)),
         lambda x, z: math.exp(-jnp.sum((x - z) ** 2)),
         lambda x, z: jnp.exp(-x @ z) if x @ z > 0 else 1.0,
-        hk.Warp(hk.Gaussian(), lambda x: np.array([np.cos(x[0]), x[1]])),
+        hk.Warp(hk.Gaussian(), lambda x: jnp.array([math.cos(x[0]), x[1]])),
         hk.Shared(hk.Gaussian(), lambda x: np.array([[x[0]], [x[1]]])),
     ],
 )
@@ -183,7 +183,8 @@ def test_a_matrix_of_lists_is_a_matrix():
         for wrap in (list, jnp.array)
     ]
     X = np.eye(2) + 0.1
-    np.testing.assert_array_equal(*(hk.gram(each, X) for each in K))
+    of_lists, of_arrays = (hk.gram(each, X) for each in K)
+    np.testing.assert_array_equal(of_lists, of_arrays)
 
 
 def test_one_function_makes_the_same_kernel_again():

@@ -8,6 +8,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import jax
 import jax.numpy as jnp
@@ -21,6 +22,7 @@ from hamkernel._closed_forms import Partition
 T = np.linspace(0, 3, 40)
 X = np.stack([np.sin(2 * T), 2 * np.cos(2 * T)], 1)
 U = np.cos(3 * T) + 0.3 * np.sin(7 * T)
+K = hk.Symplectic(1.0 * hk.Gaussian(1.0))
 
 
 class Polars:
@@ -159,6 +161,40 @@ def test_names_of_pandas_and_xarray_are_kept_and_used():
     xarray = pytest.importorskip("xarray")
     array = xarray.DataArray(X, dims=("time", "c"), coords={"time": T, "c": ["q", "p"]})
     assert hk.Runs(array.time, array).names == ("q", "p")
+    log = xarray.Dataset({"q": ("t", X[:, 0]), "p": ("t", X[:, 1])}, {"t": T})
+    assert hk.Runs(log.t, log).names == ("q", "p")
+
+
+def test_a_mapping_of_columns_is_a_table_with_names():
+    columns = {"q": X[:, 0], "p": list(X[:, 1])}
+    runs = hk.Runs([T, T], [columns, columns], [{"u": U}, {"u": U}])
+    assert repr(runs) == "Runs(2 runs, 80 samples, n=2 (q, p), m=1 (u) held)"
+    np.testing.assert_array_equal(runs.states[1], X)
+    assert hk.Runs(T, columns, {"u": U}).names == ("q", "p")
+    with pytest.raises(ValueError, match=r"of one length.*; got q \(40,\), p \(3,\)"):
+        hk.Runs(T, {"q": X[:, 0], "p": X[:3, 1]})
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda hk: hk.learn(K, T, X), r"got Symplectic and ndarray\. For states with velocities"),
+        (lambda hk: hk.learn(hk.Runs(T, X), K), "after the kernel, .*; got Runs and Symplectic"),
+        (lambda hk: hk.learn(K, hk.Runs(T, X), X), "mean is a ndarray; a callable"),
+        (lambda hk: hk.fit(K, hk.Runs(T, X)), r"hk\.learn\(K, runs\) needs no velocities"),
+        (lambda hk: hk.compare(hk.Runs(T, X)), r"hk\.learn\(K, runs\) needs no velocities"),
+        (lambda hk: hk.save(K, "field.hk"), r"hk\.save\(path, field\)"),
+        (lambda hk: hk.report("page.html", K), "a str and a Symplectic"),
+        (lambda hk: hk.plot.comparison(K), r"result of hk\.compare"),
+        (
+            lambda hk: hk.plot.phase_portrait(SimpleNamespace(field=K), (-1, 1), (-1, 1)),
+            r"got a SimpleNamespace\. Pass its \.field",
+        ),
+    ],
+)
+def test_arguments_in_another_order_are_told_the_right_one(call, said):
+    with pytest.raises(TypeError, match=said):
+        call(hk)
 
 
 @pytest.mark.parametrize(

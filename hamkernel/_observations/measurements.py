@@ -305,10 +305,16 @@ def velocities_at(
 ) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
     """States and velocities, finite and of one shape and dtype."""
     if Y is None:
-        raise TypeError(
-            f"X is {type(X).__name__} and Y is missing: give the velocities Y, of the same shape "
-            "(N, n) as X, or observations in place of both, hk.Velocities(X, Y)."
+        cure = (
+            "give the velocities Y, of the same shape (N, n) as X, or observations in place of "
+            "both, hk.Velocities(X, Y)."
         )
+        if hasattr(X, "velocities"):
+            cure = (
+                "hk.learn(K, runs) needs no velocities; smoothed ones are X, Y, labels = "
+                "runs.velocities()."
+            )
+        raise TypeError(f"X is {type(X).__name__} and Y is missing: {cure}")
     refuse_swapped(X, Y, inputs)
     return require.data(X, Y, part=part)
 

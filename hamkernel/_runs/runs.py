@@ -22,13 +22,14 @@ from __future__ import annotations
 import dataclasses
 import operator
 import reprlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, get_args
 
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
+from numpy.lib.recfunctions import unstructured_to_structured
 
 from hamkernel import _require as require
 from hamkernel._runs.flow import NODES
@@ -156,7 +157,9 @@ class Runs(eqx.Module):
         delay: by how much later than logged an input acts, in the unit of the times: at time t it
             is u(t − delay). Or "fit", with which `learn` finds it.
 
-    A single run may be given as bare arrays or lists of numbers, (T,) and (T, n).
+    A single run may be given as bare arrays or lists of numbers, (T,) and (T, n). In the place of
+    an array (T, n) there may be a mapping of names to columns (T,), such as a dictionary or a
+    Dataset of xarray.
 
     Raises:
         ValueError: shapes do not fit, a run has one sample only, times do not increase, an entry is
@@ -190,6 +193,7 @@ class Runs(eqx.Module):
         delay: float | Literal["fit"] = 0.0,
     ):
         times, states, inputs, parameters = map(_as_list, (times, states, inputs, parameters))
+        states, inputs = _named_columns(states), _named_columns(inputs)
         if _is_one_run(times, states):
             times, states = [times], [states]
             inputs = None if inputs is None else [inputs]  # an array, or a pair (times, u)
@@ -414,6 +418,21 @@ class Runs(eqx.Module):
 def _as_list(values: Any) -> Any:
     """The values of an iterator as a list; anything else as it is."""
     return list(values) if isinstance(values, Iterator) else values
+
+
+def _named_columns(values: Any) -> Any:
+    """A structured array for a mapping of columns, also inside of a list; else `values`."""
+    if isinstance(values, list | tuple) and any(isinstance(entry, Mapping) for entry in values):
+        return type(values)(map(_named_columns, values))
+    if not isinstance(values, Mapping) or not values:
+        return values
+    names = [str(name) for name in values]
+    columns = [require.doubles(values[name], f"column {name!r}") for name in values]
+    shapes = {column.shape for column in columns}
+    if len(shapes) > 1 or columns[0].ndim != 1:
+        said = ", ".join(f"{name} {c.shape}" for name, c in zip(names, columns, strict=True))
+        raise ValueError(f"columns of one length, shape (T,), are needed; got {said}.")
+    return unstructured_to_structured(np.stack(columns, axis=1), names=names)
 
 
 def _depth(values: Any) -> int | None:

@@ -156,8 +156,6 @@ def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, unused: dict[str, An
 
 
 def _check(K: Lagrangian, runs: Any, noise: Any, unused: dict[str, Any]) -> tuple[int, Any]:
-    if not isinstance(runs, Runs):
-        raise TypeError(f"learn takes hk.Runs(times, states); got a {type(runs).__name__}.")
     extra = [name for name, value in unused.items() if value is not None and value is not False]
     if extra:
         raise TypeError(f"{extra[0]}= does not belong to learning a Lagrangian: leave it out.")

@@ -168,6 +168,7 @@ def learn(
         UserWarning: once, where a row of `learned.diagnostics` falls short, with its meaning.
     """
     require.no_tracers("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
+    _check_types(K, runs, mean)
     if isinstance(K, Lagrangian):
         unused = {"mean": mean, "solver": solver, "process_noise": process_noise, "mass": mass}
         return learn_lagrangian(K, runs, noise, unused | {"masses": masses})
@@ -436,15 +437,25 @@ def _field(expansion: Expansion, regularization: Float[Array, ""]) -> Any:
     return learned_field(field, expansion.mean)
 
 
+def _check_types(K: Any, runs: Any, mean: Any) -> None:
+    """Refuse arrays in place of runs, and arguments in another order."""
+    if not isinstance(runs, Runs):
+        raise TypeError(
+            "learn takes hk.Runs(times, states) after the kernel, hk.learn(K, runs); got "
+            f"{type(K).__name__} and {type(runs).__name__}. For states with velocities take hk.fit "
+            "or hk.tune."
+        )
+    if mean is not None and not callable(mean):
+        raise TypeError(
+            f"mean is a {type(mean).__name__}; a callable x (n,) -> (n,) is needed, such as "
+            "hk.kinetic(mass)."
+        )
+
+
 def _check(
     K: AbstractMatrixKernel, runs: Any, noise: Any, process_noise: Any, solver: Any
 ) -> tuple[AbstractMatrixKernel, np.ndarray | None, np.ndarray | None]:
     """The kernel with its number of inputs, and both noises of the caller, (n,) or None."""
-    if not isinstance(runs, Runs):
-        raise TypeError(
-            f"learn takes hk.Runs(times, states), lists of arrays, one entry a run; got a "
-            f"{type(runs).__name__}. For states with velocities take hk.fit or hk.tune."
-        )
     if not (solver is None or isinstance(solver, Nystrom)):
         raise TypeError(f"the solver of learn is hk.Nystrom(max_points=…) or None; got {solver!r}.")
     n = runs.dimension

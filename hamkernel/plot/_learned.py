@@ -373,6 +373,10 @@ def comparison(compared: Comparison, ax: Axes | None = None) -> Axes:
     Returns:
         The axes.
     """
+    if not isinstance(compared, Comparison):
+        raise TypeError(
+            f"the result of hk.compare is needed, a Comparison; got a {type(compared).__name__}."
+        )
     count = len(compared.table)
     ax = axes(ax, figsize=(7.0, 0.8 + 0.27 * count))
     longest = 60.0  # e⁶⁰ to one needs no comparing

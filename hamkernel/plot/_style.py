@@ -169,6 +169,9 @@ def evaluate_in_plane(
 ) -> np.ndarray:
     """The values of fn on a plane, (P, *shape); a function of more coordinates is refused."""
     need = f"{need} (2,) -> {shape} is needed"
+    if not callable(fn):
+        hint = " Pass its .field." if hasattr(fn, "field") else ""
+        raise TypeError(f"{need}; got a {type(fn).__name__}.{hint}")
     hint = "plane_slice draws functions of more coordinates."
     try:
         values = evaluate_at(fn, points)
