@@ -193,7 +193,6 @@ class Runs(eqx.Module):
         delay: float | Literal["fit"] = 0.0,
     ):
         times, states, inputs, parameters = map(_as_list, (times, states, inputs, parameters))
-        states, inputs = _named_columns(states), _named_columns(inputs)
         if _is_one_run(times, states):
             times, states = [times], [states]
             inputs = None if inputs is None else [inputs]  # an array, or a pair (times, u)
@@ -416,8 +415,8 @@ class Runs(eqx.Module):
 
 
 def _as_list(values: Any) -> Any:
-    """The values of an iterator as a list; anything else as it is."""
-    return list(values) if isinstance(values, Iterator) else values
+    """The values of an iterator as a list, tables of mappings of columns; else `values`."""
+    return _named_columns(list(values) if isinstance(values, Iterator) else values)
 
 
 def _named_columns(values: Any) -> Any:

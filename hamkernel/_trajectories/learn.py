@@ -167,8 +167,7 @@ def learn(
     Warns:
         UserWarning: once, where a row of `learned.diagnostics` falls short, with its meaning.
     """
-    require.no_tracers("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
-    _check_types(K, runs, mean)
+    _check_types(K, runs, mean, noise)
     if isinstance(K, Lagrangian):
         unused = {"mean": mean, "solver": solver, "process_noise": process_noise, "mass": mass}
         return learn_lagrangian(K, runs, noise, unused | {"masses": masses})
@@ -437,8 +436,9 @@ def _field(expansion: Expansion, regularization: Float[Array, ""]) -> Any:
     return learned_field(field, expansion.mean)
 
 
-def _check_types(K: Any, runs: Any, mean: Any) -> None:
-    """Refuse arrays in place of runs, and arguments in another order."""
+def _check_types(K: Any, runs: Any, mean: Any, noise: Any) -> None:
+    """Refuse traced arguments, arrays in place of runs, and arguments in another order."""
+    require.no_tracers("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
     if not isinstance(runs, Runs):
         raise TypeError(
             "learn takes hk.Runs(times, states) after the kernel, hk.learn(K, runs); got "
