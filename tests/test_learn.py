@@ -577,6 +577,10 @@ def test_what_cannot_be_known_or_meant_is_refused():
     unseen = [np.column_stack([x[:, 0], np.full(len(x), np.nan)]) for x in states]
     with pytest.raises(ValueError, match=r"coordinate 1 was measured in no run.*q̇ = p/m"):
         hk.learn(K, hk.Runs(times, unseen))
+    with pytest.raises(
+        ValueError, match=r"up to any change .* hk\.Symplectic\(hk\.Select\(k, \(0,\)"
+    ):
+        hk.learn(K, hk.Runs(times, [x[:, 0] for x in states]), mass=1.0)
     with pytest.raises(ValueError, match="do not depend on it"):
         hk.learn(K, hk.Runs(times, unseen), mean=lambda x: jnp.array([x[0], 0.0]))
     with pytest.raises(TypeError, match=r"learn takes hk.Runs.*hk.fit or hk.tune"):
