@@ -345,8 +345,8 @@ def _coefficients(field: Any, names: tuple[str, ...]) -> list[tuple[str, str]]:
         if isinstance(term, Friction):
             damped = list(damped_coordinates(term.damped, len(x)))
             share = (-drift.part(i)(x) / term.curve(x))[np.array(damped)]
-            found = {"viscous": term.viscous, "dry": term.coulomb, "Stribeck": term.stribeck}
-            said = [f"{k} {text(share * c)}" for k, c in found.items() if c is not None]
+            scales = {"viscous": term.viscous, "dry": term.coulomb, "Stribeck": term.stribeck}
+            said = [f"{k} {text(share * c)}" for k, c in scales.items() if c is not None]
             places = ", ".join(names[c] for c in damped)
             rows.append(("friction", f"{', '.join(said)} on coordinate {places}"))
     G = getattr(getattr(field, "kernel", None), "inputs", None)
