@@ -16,6 +16,7 @@ import pytest
 import hamkernel as hk
 from hamkernel._command import columns, kernel, run
 from hamkernel._report import script
+from hamkernel._trajectories.learned import _coefficients
 
 
 @pytest.fixture(autouse=True)
@@ -46,6 +47,22 @@ def test_a_summary_has_a_line_for_each_finding(learned):
     assert "<table>" in shown
     (picture,) = re.findall('src="data:image/png;base64,([^"]*)"', shown)
     assert base64.b64decode(picture).startswith(b"\x89PNG")
+
+
+def test_friction_and_gain_are_said_in_units_of_the_states():
+    """Not as the standard deviations of their priors, which the kernel has."""
+    rng = np.random.default_rng(0)
+    X, U = rng.normal(size=(60, 2)), rng.normal(size=(60, 1))
+    q, p = X.T
+    Y = np.stack([p, -q - 0.3 * p - 0.4 * np.tanh(p / 0.1) + 2.5 * U[:, 0]], axis=1)
+    friction = hk.Friction(0.6, 0.8, rest_speed=0.1)
+    K = hk.Symplectic(hk.Polynomial(2)) + friction
+    K = hk.Controlled(K, inputs=hk.InputMatrix(9.0, acts_on=(1,)))
+    field = hk.fit(K, X, Y, 1e-8, inputs=U)
+    assert _coefficients(field, ("q", "p")) == [
+        ("friction", "viscous [0.3], dry [0.4] on coordinate p"),
+        ("input matrix", "[2.5] on coordinate p"),
+    ]
 
 
 def test_a_page_has_all_of_it_inside(learned, tmp_path):

@@ -20,7 +20,9 @@ from hamkernel._runs.runs import Runs
 from hamkernel._runs.table import Diagnostics
 from hamkernel._show import Shown, describe, text
 from hamkernel._solvers.nystrom import Nystrom
-from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel
+from hamkernel._structures.friction import Friction, damped_coordinates
+from hamkernel._structures.joined import InputMatrix
 from hamkernel._trajectories.evidence import Evidence, EvidenceOfRows
 from hamkernel._trajectories.score import Score, compute_score
 
@@ -133,6 +135,7 @@ class Learned(Shown, eqx.Module):
         table = {row.name: row for row in self.diagnostics}
         rows = [
             ("kernel", text(self.kernel)),
+            *_coefficients(self.field, self.runs.coordinate_names),
             ("noise", text(self.noise)),
             ("process noise", text(self.process_noise) if noisy else "none"),
         ]
@@ -329,6 +332,29 @@ class Learned(Shown, eqx.Module):
         """(measured − fitted)/σ for each run, NaN where nothing was measured."""
         pairs = zip(self.runs.states, self.states, strict=True)
         return tuple((jnp.asarray(x) - fit) / self.noise[None] for x, fit in pairs)
+
+
+def _coefficients(field: Any, names: tuple[str, ...]) -> list[tuple[str, str]]:
+    """The friction and the constant input matrix that were found.
+
+    The numbers of the kernel are prior standard deviations and variances, not coefficients.
+    """
+    drift, rows = getattr(field, "drift", field), []
+    x = jnp.ones(len(names))
+    for i, term in enumerate(drift.kernel.terms if isinstance(drift.kernel, Sum) else ()):
+        if isinstance(term, Friction):
+            damped = list(damped_coordinates(term.damped, len(x)))
+            share = (-drift.part(i)(x) / term.curve(x))[np.array(damped)]
+            scales = {"viscous": term.viscous, "dry": term.coulomb, "Stribeck": term.stribeck}
+            said = [f"{k} {text(share * c)}" for k, c in scales.items() if c is not None]
+            places = ", ".join(names[c] for c in damped)
+            rows.append(("friction", f"{', '.join(said)} on coordinate {places}"))
+    G = getattr(getattr(field, "kernel", None), "inputs", None)
+    if isinstance(G, InputMatrix) and not frozenset().union(*G.kernel.supports(len(x))):
+        lines = zip(np.asarray(field.input_matrix(x)), names, strict=True)
+        said = [f"{text(line)} on coordinate {name}" for line, name in lines if line.any()]
+        rows.append(("input matrix", ", ".join(said)))
+    return rows
 
 
 def learned_from(learned: Any) -> str:
