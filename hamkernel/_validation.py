@@ -14,13 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Num
 
-from hamkernel._closed_forms import (
-    Folds,
-    Partition,
-    free_residuals,
-    held_out,
-    log_density,
-)
+from hamkernel._closed_forms import Folds, Partition, free_residuals, held_out, log_density
 from hamkernel._fields.base import Mean
 from hamkernel._gram import between_all, forward_differentiated, gram_of_rows, plus_ridge
 from hamkernel._machine import (
@@ -33,7 +27,7 @@ from hamkernel._machine import (
 from hamkernel._observations.blocks import AbstractBlock, Combinations
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.factors import AbstractSystem, ContrastedSystem, DenseSystem
+from hamkernel._solvers.factors import AbstractSystem, DenseSystem
 from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._solvers.low_rank_factor import LowRankSystem
 from hamkernel._solvers.problem import AbstractSolver, check_solver, make_problem
@@ -299,7 +293,7 @@ def _dense_held_out(G, ridge, y, p, rows: Measurements, partition: Partition):
     # energies, p ∝ 1/s and U = diag(s), so Up does not depend on the noise and needs no derivative.
     units = jnp.where(p == 0, jnp.ones_like(p), rows.scale)
     equal = jnp.where(p == 0, p, len(rows.energies) ** -0.5)
-    system = ContrastedSystem(units[:, None] * A * units[None], equal)
+    system = DenseSystem(units[:, None] * A * units[None], equal)
     result: Any = held_out(system, units * y, partition)
     return result[0] / units, units * result[1]
 

@@ -96,9 +96,9 @@ def test_derivatives_of_the_primitives_are_those_of_jax(mode):
 def test_derivatives_of_losses_are_those_of_jax(kind):
     # Of all of them at once, each with a weight of its own. One fold has more rows than features.
     rows, ridge = tall(12, 3)
-    y, labels = jnp.cos(jnp.arange(12.0) ** 2), np.array([0, 0, 0, 0, 1, 2])
-    partition, weights = Partition(6, labels), np.sqrt([2, 3, 5, 7, 11])
-    folds = [np.flatnonzero(np.repeat(labels == each, 2)) for each in range(3)]
+    y, labels = jnp.cos(jnp.arange(12.0) ** 2), np.repeat([0, 0, 0, 0, 1, 2], 2)
+    partition, weights = Partition(12, labels), np.sqrt([2, 3, 5, 7, 11])
+    folds = [np.flatnonzero(labels == each) for each in range(3)]
 
     def ours(rows, ridge, y):
         A = rows @ rows.T + ridge * jnp.eye(12)

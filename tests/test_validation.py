@@ -462,7 +462,7 @@ def test_every_lapack_call_of_a_loss_and_its_gradient_waits_for_the_one_before()
         r, pull = jax.vjp(lambda A, y: held_out(DenseSystem(A), y, partition)[0], A, y)  # pyright: ignore
         return r, pull(r)
 
-    program = jax.make_jaxpr(loss_and_gradient)(jnp.eye(5 * N), jnp.ones(5 * N)).jaxpr
+    program = jax.make_jaxpr(loss_and_gradient)(jnp.eye(N), jnp.ones(N)).jaxpr
     upstream, calls = {}, []  # the calls that each variable depends on
     for i, equation in enumerate(program.eqns):
         variables = [v for v in equation.invars if isinstance(v, jax.extend.core.Var)]

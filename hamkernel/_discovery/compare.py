@@ -320,18 +320,17 @@ def _reversal(n: int) -> Float[np.ndarray, " n"]:
 
 
 def _answer(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D: int) -> Comparison:
-    """The answers to all questions, from the table of candidates."""
+    """The answers to all questions, from the table of candidates in descending order."""
     n = points.shape[1]
-    answers, reasons, differences = {}, {}, {}
+    answers = dict.fromkeys(QUESTIONS, "")  # in this order
+    reasons, differences = {}, {}
 
     def say(key: str, answer: str, reason: str, difference: float = math.nan) -> None:
         answers[key], reasons[key], differences[key] = answer, reason, difference
 
     def ask(key: str, among: list[Candidate]) -> None:
-        yes, no = (
-            max((row for row in among if (key in row.claims) == claimed), default=None, key=_score)
-            for claimed in (True, False)
-        )
+        yes = next((row for row in among if key in row.claims), None)  # the best row is first
+        no = next((row for row in among if key not in row.claims), None)
         if key == "friction" and yes is not None:
             no = _frictionless_rival(yes, among) or no
         if yes is None or no is None:
@@ -356,7 +355,7 @@ def _answer(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D: i
     if answers["energy"] != "yes":
         for key in ("friction", "reversible", "T + U"):
             say(key, "not tested", "it asks about an energy, and none was established")
-        return Comparison(table, _sort_answers(answers), reasons, differences, D)
+        return Comparison(table, answers, reasons, differences, D)
     having = [row for row in table if "energy" in row.claims]
     ask("friction", having)
     ask("T + U", having)
@@ -366,7 +365,7 @@ def _answer(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D: i
         ask("reversible", [row for row in having if "friction" not in row.claims])
     else:
         say("reversible", "not tested", "no data near those of backward motion")
-    return Comparison(table, _sort_answers(answers), reasons, differences, D)
+    return Comparison(table, answers, reasons, differences, D)
 
 
 def _frictionless_rival(damped: Candidate, among: list[Candidate]) -> Candidate | None:
@@ -377,14 +376,6 @@ def _frictionless_rival(damped: Candidate, among: list[Candidate]) -> Candidate 
     """
     same = [row for row in among if row.claims - {"reversible"} == damped.claims - {"friction"}]
     return min(same, key=lambda row: len(row.claims), default=None)
-
-
-def _score(row: Candidate) -> float:
-    return row.score
-
-
-def _sort_answers(answers: dict[str, str]) -> dict[str, str]:
-    return {key: answers[key] for key in QUESTIONS}
 
 
 def _is_seen(points: Float[np.ndarray, "P n"], signs: Float[np.ndarray, " n"]) -> bool:

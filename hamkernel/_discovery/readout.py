@@ -281,7 +281,7 @@ def _check_columns(
     names: list[str], columns: np.ndarray, typical: np.ndarray, y: np.ndarray, eps: float
 ) -> None:
     """ValueError if the functions are not linearly independent on these rows."""
-    bad = [name for name, column in zip(names, columns.T, strict=True) if not _finite(column)]
+    bad = [names[i] for i in np.flatnonzero(~np.isfinite(columns).all(axis=0))]
     if bad:
         raise ValueError(
             f"{_join_names(bad)} is not finite at some of the states, or has no derivative there: "
@@ -314,10 +314,6 @@ def _check_columns(
             "all targets are zero after the mean is subtracted, so there is nothing to explain: "
             "check the data and the mean."
         )
-
-
-def _finite(column: np.ndarray) -> bool:
-    return bool(np.isfinite(column).all())
 
 
 def _join_names(names: list[str]) -> str:

@@ -12,6 +12,7 @@ from hamkernel._features import AbstractFeatures, SumFeatures, laws_of, part_wav
 from hamkernel._fields.base import AbstractField, SolverInfo, map_states, root
 from hamkernel._gram import subtract_centre
 from hamkernel._gram_operator import placed_product
+from hamkernel._kernels.base import Point, Points
 from hamkernel._machine import map_devices, precise_jit, row_sharding, shard, to_caller_sharding
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.structure import AbstractPotentialKernel
@@ -99,18 +100,14 @@ class KernelField(AbstractField):
 
 
 @precise_jit
-def _expansion(
-    K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-) -> Float[Array, " n"]:
+def _expansion(K: AbstractMatrixKernel, x: Point, Z: Points, A: Points) -> Point:
     """f(x) = Σⱼ K(x, zⱼ) aⱼ through the potential, without (n, n) blocks."""
     x, Z = subtract_centre(K, x, Z)
     return K.expansion(x, Z, A)
 
 
 @precise_jit
-def _potential(
-    K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-) -> Float[Array, ""]:
+def _potential(K: AbstractMatrixKernel, x: Point, Z: Points, A: Points) -> Float[Array, ""]:
     """The potential of `_expansion`."""
     x, Z = subtract_centre(K, x, Z)
     return K.potential(x, Z, A)

@@ -27,6 +27,9 @@ from hamkernel import _require as require
 from hamkernel._observations.blocks import AbstractBlock, Combinations, Components, Values
 from hamkernel._show import describe, join_terms, shorten
 
+# Blocks of rows, each with its measured values.
+Parts = Iterator[tuple[AbstractBlock, Float[Array, " D"]]]
+
 
 class AbstractObservations(eqx.Module):
     """Measured values of linear functionals of a field; a + b are the observations of both."""
@@ -46,9 +49,7 @@ class AbstractObservations(eqx.Module):
             yield inputs
 
     @abc.abstractmethod
-    def parts(
-        self, count: int = 0, input_name: str = "inputs"
-    ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+    def parts(self, count: int = 0, input_name: str = "inputs") -> Parts:
         """The blocks of rows, one for each kind, with their measured values.
 
         Args:
@@ -103,9 +104,7 @@ class Together(AbstractObservations):
         for term in self.terms:
             yield from term.all_inputs()
 
-    def parts(
-        self, count: int = 0, input_name: str = "inputs"
-    ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+    def parts(self, count: int = 0, input_name: str = "inputs") -> Parts:
         for term in self.terms:
             yield from term.parts(count, input_name)
 
@@ -227,9 +226,7 @@ class Velocities(AbstractObservations):
     def dimension(self) -> int:
         return self.X.shape[1]
 
-    def parts(
-        self, count: int = 0, input_name: str = "inputs"
-    ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+    def parts(self, count: int = 0, input_name: str = "inputs") -> Parts:
         y, noise = self.Y.reshape(-1), self.noise
         if noise is not None:
             noise = noise.reshape((1,) * (2 - noise.ndim) + noise.shape)
@@ -285,9 +282,7 @@ class Energies(AbstractObservations):
     def dimension(self) -> int:
         return self.X.shape[1]
 
-    def parts(
-        self, count: int = 0, input_name: str = "inputs"
-    ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+    def parts(self, count: int = 0, input_name: str = "inputs") -> Parts:
         noise = None if self.noise is None else jnp.broadcast_to(self.noise, self.E.shape)
         if input_name == "parameters":
             raise ValueError(
@@ -335,9 +330,7 @@ class Equilibria(AbstractObservations):
     def dimension(self) -> int:
         return self.X.shape[1]
 
-    def parts(
-        self, count: int = 0, input_name: str = "inputs"
-    ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+    def parts(self, count: int = 0, input_name: str = "inputs") -> Parts:
         points, outputs = joined_points(self, self.X, count, input_name)
         yield Components(points, outputs=outputs), jnp.zeros(self.X.size, self.X.dtype)
 
@@ -414,9 +407,7 @@ class Functionals(AbstractObservations):
     def dimension(self) -> int:
         return self.points.shape[2]
 
-    def parts(
-        self, count: int = 0, input_name: str = "inputs"
-    ) -> Iterator[tuple[AbstractBlock, Float[Array, " D"]]]:
+    def parts(self, count: int = 0, input_name: str = "inputs") -> Parts:
         points, _ = joined_points(self, self.points, count, input_name)
         rows = Combinations(groups=points, weights=self.weights)  # pyright: ignore[reportCallIssue]
         yield rows, self.targets

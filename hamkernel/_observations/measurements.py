@@ -41,6 +41,11 @@ from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import shared_laws
 from hamkernel._structures.joined import AbstractJoinedKernel
 
+# Points and coefficients of the field, then of the values.
+Representer = tuple[
+    Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]
+]
+
 
 class Measurements(eqx.Module):
     """The rows of observations: the map L in blocks, and the targets y.
@@ -234,18 +239,14 @@ class Measurements(eqx.Module):
         shape = (-1, *[1] * (rows.ndim - 1))
         return p.reshape(shape), sizes.reshape(shape)
 
-    def coefficients(
-        self, c: Float[Array, " D"]
-    ) -> tuple[Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]]:
+    def coefficients(self, c: Float[Array, " D"]) -> Representer:
         """The representer Lᵀc: points z and coefficients a of the field, s and b of the values.
 
         If all rows are energies, the field has one point, with a = 0.
         """
         return self.representer(self.contrast_transpose(c))
 
-    def representer(
-        self, raw: Float[Array, " M"]
-    ) -> tuple[Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]]:
+    def representer(self, raw: Float[Array, " M"]) -> Representer:
         """The representer of the M rows before the contrast, as `coefficients` of the D rows."""
         pairs = [(b, b.coefficients(raw[s])) for b, s in zip(self.blocks, self.slices, strict=True)]
         none = self.blocks[0].points[:1]

@@ -21,12 +21,12 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo
-from hamkernel._fields.expansions import KernelField
+from hamkernel._fields.expansions import KernelField, kernel_field
 from hamkernel._gram import gram_rounding, stop_gradients, trace
 from hamkernel._gram_operator import product
 from hamkernel._machine import RowSharding, precise_jit, row_sharding, shard, to_caller_sharding
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.dense import field_of_rows, gram_product, norm_of, relative_error
+from hamkernel._solvers.dense import gram_product, norm_of, relative_error
 from hamkernel._solvers.landmarks import whitening
 from hamkernel._solvers.least_squares import normal
 from hamkernel._solvers.low_rank import (
@@ -117,7 +117,8 @@ class ConjugateGradient(AbstractSolver[KernelField]):
             result = _solve(prepare, args, y, ridge, *limits)
         (c, residual, norm), info = self._check_convergence(K, X, ridge, landmarks, result, throw)
         residual = to_caller_sharding(spread, rows.residual(residual.reshape(-1)))
-        return field_of_rows(K, rows, c.reshape(-1), residual, norm, problem.regularization, info)
+        representer = rows.coefficients(c.reshape(-1))
+        return kernel_field(K, representer, residual, norm, problem.regularization, info)
 
     def _tolerance(self, dtype: jnp.dtype) -> Float[Array, ""]:
         tolerance = self.tolerance

@@ -151,7 +151,8 @@ def _field_and_residual(K, rows: Measurements, regularization, c):
     relative_residual = relative_error(y - values - ridge * c, y)
     residual, norm = rows.residual(ridge * c), norm_of(c @ values, c @ (y - values - ridge * c))
     info = SolverInfo("Cholesky", relative_residual=relative_residual)
-    return c, field_of_rows(K, rows, c, residual, norm, regularization, info), relative_residual
+    field = kernel_field(K, rows.coefficients(c), residual, norm, regularization, info)
+    return c, field, relative_residual
 
 
 def norm_of(square: Float[Array, ""], error: Float[Array, ""]) -> Float[Array, ""]:
@@ -208,7 +209,7 @@ def _extend(old: DenseConditional, new: Measurements):
     residual = rows.residual(old.ridge * c)
     norm = norm_of(c @ (y - old.ridge * c), rounding.astype(c.dtype))
     info = SolverInfo("Cholesky")
-    return factor, c, field_of_rows(K, rows, c, residual, norm, regularization, info)
+    return factor, c, kernel_field(K, rows.coefficients(c), residual, norm, regularization, info)
 
 
 @precise_jit
@@ -222,25 +223,12 @@ def _condition_draws(conditional: DenseConditional, prior: Prior, key) -> Kernel
     return prior.plus(Z, A, S, b) if len(S) else prior.plus(Z, A)
 
 
-def field_of_rows(
-    K: AbstractMatrixKernel,
-    rows: Measurements,
-    c: Float[Array, " D"],
-    residual: Float[Array, "..."],
-    norm: Float[Array, ""],
-    regularization: Float[Array, ""],
-    info: SolverInfo,
-) -> KernelField:
-    """The field Σ c_r L_r K, at the points of the rows."""
-    return kernel_field(K, rows.coefficients(c), residual, norm, regularization, info)
-
-
 def gram_product(
     K: AbstractMatrixKernel, rows: Measurements, c: Float[Array, " D"]
 ) -> Float[Array, " D"]:
     """G c, computed as the rows of the field with coefficients c, without forming G."""
     zero = jnp.zeros((), c.dtype)
-    field = field_of_rows(K, rows, c, c, zero, zero, SolverInfo("none"))
+    field = kernel_field(K, rows.coefficients(c), c, zero, zero, SolverInfo("none"))
     potential = jax.tree_util.Partial(map_states, field._learned_potential)
     return rows.contrast(rows.evaluate(field._velocities, potential))
 

@@ -43,10 +43,10 @@ from hamkernel._machine import full_precision, precise_jit
 
 
 class Group:
-    """F folds of similar size, padded to S points each so that one batched operation serves all.
+    """F folds of similar size, padded to S rows each so that one batched operation serves all.
 
     Attributes:
-        members: the points of each fold, shape (F, S), padded with N, which is no point.
+        members: the rows of each fold, shape (F, S), padded with N, which is no row.
     """
 
     def __init__(self, N: int, folds: list[Int[np.ndarray, " _"]]):
@@ -55,29 +55,23 @@ class Group:
         for row, fold in zip(self.members, folds, strict=True):
             row[: len(fold)] = fold
 
-    def gather(self, array: Float[Array, "Nn *r"]) -> Float[Array, "F Sn *r"]:
+    def gather(self, array: Float[Array, "N *r"]) -> Float[Array, "F S *r"]:
         """The rows of each fold; zeros in the padding."""
-        by_point, points = array.reshape(self.N, -1, *array.shape[1:]), self.members.reshape(-1)
-        if not np.array_equal(points, np.arange(self.N)):
-            by_point = jnp.take(by_point, points, axis=0, mode="fill", fill_value=0)
-        return by_point.reshape(len(self.members), -1, *array.shape[1:])
+        members = self.members.reshape(-1)
+        if not np.array_equal(members, np.arange(self.N)):
+            array = jnp.take(array, members, axis=0, mode="fill", fill_value=0)
+        return array.reshape(*self.members.shape, *array.shape[1:])
 
-    def scatter(
-        self, values: Float[Array, "F Sn *r"], into: Float[Array, "Nn *r"]
-    ) -> Float[Array, "Nn *r"]:
+    def scatter(self, values: Float[Array, "F S *r"], into: Float[Array, "N *r"]) -> Array:
         """`into` with the rows of these folds replaced; the padding is dropped."""
-        by_point = values.reshape(*self.members.shape, -1)
-        rows = into.reshape(self.N, -1).at[self.members].set(by_point, mode="drop")
-        return rows.reshape(into.shape)
+        return into.at[self.members].set(values, mode="drop")
 
-    def diagonal_blocks(self, C: Float[Array, "Nn Nn"]) -> Float[Array, "F Sn Sn"]:
+    def diagonal_blocks(self, C: Float[Array, "N N"]) -> Float[Array, "F S S"]:
         """The block of C that belongs to each fold, and the identity in the padding."""
-        n = len(C) // self.N
-        rows = (n * self.members[:, :, None] + np.arange(n)).reshape(len(self.members), -1)
+        rows = self.members
         blocks = C.at[rows[:, :, None], rows[:, None, :]].get(mode="fill", fill_value=0)
-        in_padding = jnp.asarray(rows >= len(C), C.dtype)
         diagonal = np.arange(rows.shape[1])
-        return blocks.at[:, diagonal, diagonal].add(in_padding)
+        return blocks.at[:, diagonal, diagonal].add(jnp.asarray(rows == self.N, C.dtype))
 
 
 System = TypeVar("System", bound="AbstractSystem")
@@ -268,12 +262,23 @@ def _(primals, tangents):
 
 
 class DenseSystem(AbstractSystem):
-    """A as a matrix."""
+    """A as a matrix.
+
+    Attributes:
+        matrix: A; if the rows contain an unknown constant, A before the contrast.
+        constant: the direction p of the unknown constant, without negative entries and not
+            differentiated; None if there is none.
+    """
 
     matrix: Float[Array, "D D"]
+    constant: Float[Array, " D"] | None = None
 
-    def factor(self) -> "DenseFactor":
-        return dense_factor(self.matrix)
+    def factor(self) -> "AbstractFactor[DenseSystem]":
+        if self.constant is None:
+            return dense_factor(self.matrix)
+        p = jax.lax.stop_gradient(self.constant)
+        inner = dense_factor(_contrast(p, _contrast(p, self.matrix).T))
+        return ContrastedFactor(inner=inner, constant=p, size=inner.size)
 
 
 class DenseFactor(AbstractFactor[DenseSystem]):
@@ -378,9 +383,10 @@ def solution(
 
 
 class DenseInverse(AbstractInverse[DenseSystem]):
-    """C = A⁻¹ as a matrix."""
+    """C = A⁻¹ as a matrix, or Tᵀ(T A Tᵀ)⁻¹T if there is an unknown constant along p."""
 
     C: Float[Array, "D D"]
+    constant: Float[Array, " D"] | None = None
 
     def blocks(self, group: Group) -> CholeskyBlocks:
         return CholeskyBlocks(group.diagonal_blocks(self.C))
@@ -391,7 +397,7 @@ class DenseInverse(AbstractInverse[DenseSystem]):
             A_bar = A_bar + inverse * self.C
         if square is not None:
             A_bar = A_bar + square * (self.C @ self.C)
-        return DenseSystem(A_bar)
+        return self._cotangent(A_bar)
 
     def vjp_of_folds(self, a, groups, V, R, bars) -> tuple[DenseSystem, Float[Array, " D"]]:
         # Ā = Σ_S (C_:S v_S)(C_:S r_S)ᵀ − w aᵀ = [P, −w][Q, a]ᵀ, equation (2) of `_closed_forms.py`;
@@ -406,7 +412,11 @@ class DenseInverse(AbstractInverse[DenseSystem]):
         # Without the barrier XLA fuses these sums into the product and computes them again for
         # every entry, which takes 10 times as long.
         left, right, w = jax.lax.optimization_barrier((left, right, w))
-        return DenseSystem(left @ right.T), w
+        return self._cotangent(left @ right.T), w
+
+    def _cotangent(self, A_bar: Float[Array, "D D"]) -> DenseSystem:
+        p = self.constant
+        return DenseSystem(A_bar, None if p is None else jnp.zeros_like(p))
 
 
 def _outer_square(U: Float[Array, "D D"]) -> Float[Array, "D D"]:
@@ -432,22 +442,7 @@ def _blocks(D: int) -> list[slice]:
     return [slice(start, stop) for start, stop in itertools.pairwise(starts)]
 
 
-class ContrastedSystem(AbstractSystem):
-    """The matrix A before the contrast, and the direction p of the unknown constant.
-
-    The entries of p are not negative, and p is not differentiated.
-    """
-
-    matrix: Float[Array, "M M"]
-    constant: Float[Array, " M"]
-
-    def factor(self) -> "ContrastedFactor":
-        p = jax.lax.stop_gradient(self.constant)
-        inner = dense_factor(_contrast(p, _contrast(p, self.matrix).T))
-        return ContrastedFactor(inner=inner, constant=p, size=inner.size)
-
-
-class ContrastedFactor(AbstractFactor[ContrastedSystem]):
+class ContrastedFactor(AbstractFactor[DenseSystem]):
     """The factor of T A Tᵀ; `solve` applies C = Tᵀ(T A Tᵀ)⁻¹T instead of A⁻¹."""
 
     inner: DenseFactor
@@ -469,34 +464,12 @@ class ContrastedFactor(AbstractFactor[ContrastedSystem]):
     def inverse_trace(self) -> Float[Array, ""]:
         return self.inner.inverse_trace
 
-    def inverse(self) -> "ContrastedInverse":
+    def inverse(self) -> DenseInverse:
         p = self.constant
-        return ContrastedInverse(
-            DenseInverse(_uncontrast(p, _uncontrast(p, self.inner.inverse().C).T))
-        )
+        return DenseInverse(_uncontrast(p, _uncontrast(p, self.inner.inverse().C).T), p)
 
     def is_well_conditioned(self, y: Float[Array, " M"]) -> Bool[Array, ""]:
         return self.inner.is_well_conditioned(_contrast(self.constant, y))
-
-
-class ContrastedInverse(AbstractInverse[ContrastedSystem]):
-    """C = Tᵀ(T A Tᵀ)⁻¹T as a matrix."""
-
-    dense: DenseInverse
-
-    def blocks(self, group: Group) -> AbstractBlocks:
-        return self.dense.blocks(group)
-
-    def vjp(self, u, w, inverse=None, square=None) -> ContrastedSystem:
-        return _cotangent(self.dense.vjp(u, w, inverse, square))
-
-    def vjp_of_folds(self, a, groups, V, R, bars) -> tuple[ContrastedSystem, Float[Array, " M"]]:
-        dense, w = self.dense.vjp_of_folds(a, groups, V, R, bars)
-        return _cotangent(dense), w
-
-
-def _cotangent(dense: DenseSystem) -> ContrastedSystem:
-    return ContrastedSystem(dense.matrix, jnp.zeros_like(dense.matrix[0]))
 
 
 def _contrast(p: Float[Array, " M"], b: Float[Array, "M *m"]) -> Float[Array, "D *m"]:

@@ -35,7 +35,7 @@ from hamkernel._gram import (
 )
 from hamkernel._machine import full_precision, precise_jit, row_sharding, shard
 from hamkernel._observations.blocks import AbstractBlock
-from hamkernel._observations.measurements import Measurements
+from hamkernel._observations.measurements import Measurements, Representer
 from hamkernel._structures.base import AbstractMatrixKernel
 
 # The number of candidates drawn at once. The number of landmarks is rounded up to a multiple of
@@ -83,9 +83,7 @@ class Landmarks(eqx.Module):
         G = gram_of_rows(K, self.rows, contrasted=False)
         return G if self.index is None else G[self.index][:, self.index]
 
-    def representer(
-        self, c: Float[Array, " r"]
-    ) -> tuple[Float[Array, "P d"], Float[Array, "P n"], Float[Array, "E d"], Float[Array, " E"]]:
+    def representer(self, c: Float[Array, " r"]) -> Representer:
         """The points and coefficients of the function Σ c_r L_r K, of velocities and of values."""
         if self.index is not None:
             c = jnp.zeros(self.rows.targets.shape, c.dtype).at[self.index].add(c)

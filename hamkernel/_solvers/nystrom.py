@@ -27,7 +27,6 @@ from hamkernel._gram import components, trace, trace_of_rows
 from hamkernel._gram_operator import product
 from hamkernel._machine import RowSharding, precise_jit, row_sharding, shard, to_caller_sharding
 from hamkernel._observations.measurements import Measurements
-from hamkernel._show import text
 from hamkernel._solvers.landmarks import (
     Landmarks,
     choose_landmarks,
@@ -36,7 +35,14 @@ from hamkernel._solvers.landmarks import (
     landmarks_of,
     whitening,
 )
-from hamkernel._solvers.least_squares import Normal, Sums, normal, solve_sums, trace_of_sums
+from hamkernel._solvers.least_squares import (
+    Normal,
+    Sums,
+    first_sums,
+    normal,
+    solve_sums,
+    trace_of_sums,
+)
 from hamkernel._solvers.low_rank import (
     Columns,
     LandmarkBasis,
@@ -52,7 +58,6 @@ from hamkernel._solvers.low_rank import (
 from hamkernel._solvers.stream import (
     AbstractStreamingFit,
     AbstractStreamingSolver,
-    first_sums_of,
     thin,
 )
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -139,11 +144,8 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
     dimension: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
 
-    def _size(self) -> str:
-        return f"landmarks={text(self.landmarks.count)}"
-
-    def _columns(self) -> tuple[str, Any]:
-        return "landmarks", self.landmarks
+    def _columns(self) -> tuple[str, Any, Any]:
+        return "landmarks", self.landmarks.count, self.landmarks
 
     @property
     def _functions(self) -> Columns:
@@ -172,7 +174,8 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 @precise_jit
 def start_fit(K, sample, regularization, landmarks, tolerance):
     T = whitening(K, landmarks)
-    sums = first_sums_of(Columns(K, landmarks), T, sample, regularization)
+    equations = Columns(K, landmarks).normal_equations(sample, T)
+    sums = first_sums(equations, T, sample.count, regularization)
     nothing = jnp.zeros((), T.dtype)
     return LandmarkFit(
         kernel=K,

@@ -208,7 +208,8 @@ class AbstractSolver(eqx.Module, Generic[LearnedField]):
         class Mine(AbstractSolver[KernelField]):
             def fit(self, problem, throw=True, progress=False):
                 rows, ridge = problem.rows, problem.ridge
-                ...  # (G + ridge I) c = rows.y, then `field_of_rows(problem.kernel, rows, c, …)`
+                ...  # (G + ridge I) c = rows.y
+                return kernel_field(problem.kernel, rows.coefficients(c), …)
     """
 
     no_factor: ClassVar[str | None] = None  # why `condition` is not available; None if it is

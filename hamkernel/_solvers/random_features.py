@@ -18,7 +18,7 @@ from hamkernel._machine import (
     to_caller_sharding,
 )
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.least_squares import Normal, Sums, ridge_regression, solve_sums
+from hamkernel._solvers.least_squares import Normal, Sums, first_sums, ridge_regression, solve_sums
 from hamkernel._solvers.low_rank import (
     FeatureSpan,
     LowRankConditional,
@@ -29,7 +29,6 @@ from hamkernel._solvers.low_rank import (
 from hamkernel._solvers.stream import (
     AbstractStreamingFit,
     AbstractStreamingSolver,
-    first_sums_of,
     thin,
 )
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -169,11 +168,8 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     regularization: Float[Array, ""]
     dimension: int = eqx.field(static=True)
 
-    def _size(self) -> str:
-        return f"features={len(self.sums.basis)}"
-
-    def _columns(self) -> tuple[str, Any]:
-        return "features", self.features
+    def _columns(self) -> tuple[str, Any, Any]:
+        return "features", len(self.sums.basis), self.features
 
     @property
     def _functions(self) -> FeatureSpan:
@@ -189,9 +185,9 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
 
 @precise_jit
 def _start(K, basis, sample, regularization):
-    identity = jnp.eye(basis.columns, dtype=sample.targets.dtype)
+    one = jnp.eye(basis.columns, dtype=sample.targets.dtype)
     span = FeatureSpan(K, basis, sample.dimension)
-    sums = first_sums_of(span, identity, sample, regularization)
+    sums = first_sums(span.normal_equations(sample, one), one, sample.count, regularization)
     return FeatureFit(
         kernel=K,
         features=basis,

@@ -45,7 +45,7 @@ from hamkernel._observations.measurements import (
     sampled_points,
 )
 from hamkernel._show import call, text
-from hamkernel._solvers.least_squares import Sums, first_sums
+from hamkernel._solvers.least_squares import Sums
 from hamkernel._solvers.low_rank import AbstractFunctions
 from hamkernel._solvers.problem import AbstractSolver, LearnedField, subtract_known
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
@@ -81,8 +81,9 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
     dimension: eqx.AbstractVar[int]
 
     def __repr__(self) -> str:
-        name, kernel = type(self).__name__, text(self.kernel)
-        return call(name, [f"kernel={kernel}", self._size(), f"added={text(self.count)}"])
+        name, size, _ = self._columns()
+        numbers = [f"{name}={text(size)}", f"added={text(self.count)}"]
+        return call(type(self).__name__, [f"kernel={text(self.kernel)}", *numbers])
 
     def __getstate__(self) -> dict[str, Any]:
         # Arrays of JAX would lose digits, in silence, in a process that has not enabled float64.
@@ -104,18 +105,14 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         """The dtype of the fit, and of its fields."""
         return self.regularization.dtype
 
-    @abc.abstractmethod
-    def _size(self) -> str:
-        """The number of landmarks or features, as text."""
-
     @property
     @abc.abstractmethod
     def _totals(self) -> tuple[Any, ...]:
         """The accumulated sums. `add` changes these leaves and `count`, nothing else."""
 
     @abc.abstractmethod
-    def _columns(self) -> tuple[str, Any]:
-        """The word "landmarks" or "features", and the arrays."""
+    def _columns(self) -> tuple[str, Any, Any]:
+        """The word "landmarks" or "features", their number, and the arrays."""
 
     def _from_start(self) -> dict[str, Any]:
         """The arrays, by name, that must agree bit by bit in two fits that are added.
@@ -123,7 +120,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         Functions in kernels cannot be compared. The basis depends on the kernel and on the sample,
         so two fits with different functions also differ in their basis.
         """
-        name, columns = self._columns()
+        name, _, columns = self._columns()
         return {
             "numbers of coordinates": self.dimension,
             "kernels": self.kernel,
@@ -459,16 +456,6 @@ def _refuse_energies(rows: Measurements) -> None:
             "a stream takes no energies: they are known up to a constant that all chunks would "
             "share. Give differences of H as hk.Functionals, or fit all of the data at once."
         )
-
-
-def first_sums_of(
-    functions: AbstractFunctions,
-    W: Float[Array, "r r"],
-    sample: Measurements,
-    regularization: Float[Array, ""],
-) -> Sums:
-    """`first_sums` of functions times W on a sample."""
-    return first_sums(functions.normal_equations(sample, W), W, sample.count, regularization)
 
 
 def rows_at(K: AbstractMatrixKernel, points: Float[Array, "N d"]) -> Measurements:

@@ -106,9 +106,7 @@ class AbstractMatrixKernel(eqx.Module):
         if self.no_potential:
             raise AttributeError(self.no_potential)
 
-    def dissipated_power(
-        self, x: Float[Array, " n"], slope: Float[Array, " n"]
-    ) -> Float[Array, ""]:
+    def dissipated_power(self, x: Point, slope: Point) -> Float[Array, ""]:
         """The power −dH/dt at x for ∇H = `slope`, shape (); for structures with a Hamiltonian."""
         raise AttributeError(self.no_potential)
 
@@ -289,9 +287,7 @@ class Sum(AbstractMatrixKernel):
     def conserves(self) -> bool:
         return self.has_hamiltonian and all(K.conserves for K in self.terms)
 
-    def dissipated_power(
-        self, x: Float[Array, " n"], slope: Float[Array, " n"]
-    ) -> Float[Array, ""]:
+    def dissipated_power(self, x: Point, slope: Point) -> Float[Array, ""]:
         self.check_potential()
         return self.terms[0].dissipated_power(x, slope)
 

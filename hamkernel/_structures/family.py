@@ -26,7 +26,7 @@ from hamkernel._kernels.base import (
 from hamkernel._kernels.built_in import Constant
 from hamkernel._show import call, join_terms
 from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel, total
-from hamkernel._structures.joined import AbstractJoinedKernel
+from hamkernel._structures.joined import AbstractJoinedKernel, JointPoint, JointPoints
 
 
 class AbstractFamily(AbstractJoinedKernel):
@@ -77,20 +77,16 @@ class AbstractFamily(AbstractJoinedKernel):
             [t.parameters(theta, other_theta) * t.member.form(x, u, z, v) for t in self.terms]
         )
 
-    def expansion(self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Points) -> Point:
+    def expansion(self, x: JointPoint, Z: JointPoints, A: Points) -> Point:
         (x, theta), (Z, T) = self.split(x), self.split(Z)
         return total([t.member.expansion(x, Z, t.coefficients_at(theta, T, A)) for t in self.terms])
 
-    def potential(
-        self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Float[Array, "M n"]
-    ) -> Float[Array, ""]:
+    def potential(self, x: JointPoint, Z: JointPoints, A: Points) -> Float[Array, ""]:
         self.check_potential()
         (x, theta), (Z, T) = self.split(x), self.split(Z)
         return total([t.member.potential(x, Z, t.coefficients_at(theta, T, A)) for t in self.terms])
 
-    def potential_covariance(
-        self, x: Float[Array, " d"], z: Float[Array, " d"]
-    ) -> Float[Array, ""]:
+    def potential_covariance(self, x: JointPoint, z: JointPoint) -> Float[Array, ""]:
         self.check_potential()
         (x, theta), (z, other_theta) = self.split(x), self.split(z)
         return total(

@@ -15,6 +15,8 @@ from hamkernel._kernels.base import (
     AbstractScalarKernel,
     Bounds,
     Invariance,
+    Point,
+    Points,
     as_scalar_kernel,
     log_per_coordinate,
 )
@@ -124,9 +126,7 @@ class PortHamiltonian(AbstractPotentialKernel):
     def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
         return -canonical(v) - self._damping(v)
 
-    def dissipated_power(
-        self, x: Float[Array, " n"], slope: Float[Array, " n"]
-    ) -> Float[Array, ""]:
+    def dissipated_power(self, x: Point, slope: Point) -> Float[Array, ""]:
         """The dissipated power ∇HᵀR∇H, a sum of squares."""
         return jnp.sum(self.resistance(len(x)).astype(x.dtype) * slope**2)
 
@@ -299,14 +299,10 @@ class Friction(AbstractMatrixKernel):
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
         return (self.curve(x) * u) @ (self.curve(z) * v)
 
-    def expansion(
-        self, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
-    ) -> Float[Array, " n"]:
+    def expansion(self, x: Point, Z: Points, A: Points) -> Point:
         return self.curve(x) * jnp.sum(jax.vmap(self.curve)(Z) * A, axis=0)
 
-    def bounds(
-        self, name: str, X: Float[np.ndarray, "N n"], amplitude: float
-    ) -> tuple[ArrayLike, ArrayLike]:
+    def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
         """Bounds of forces around √amplitude, and of speeds up to the largest in X."""
         damped = list(damped_coordinates(self.damped, X.shape[1]))
         fastest = np.abs(X[:, damped]).max(axis=0)

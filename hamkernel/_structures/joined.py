@@ -33,6 +33,9 @@ from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._show import describe
 from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel
 
+JointPoint = Float[Array, " d"]  # (x, u), d = n + m
+JointPoints = Float[Array, "M d"]
+
 
 class AbstractJoinedKernel(AbstractMatrixKernel):
     """A kernel of points (x, u), u of shape (m,).
@@ -86,9 +89,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
         """Whether the fields of x alone have a Hamiltonian."""
         return self.state_kernel.has_hamiltonian
 
-    def dissipated_power(
-        self, x: Float[Array, " n"], slope: Float[Array, " n"]
-    ) -> Float[Array, ""]:
+    def dissipated_power(self, x: Point, slope: Point) -> Float[Array, ""]:
         return self.state_kernel.dissipated_power(x, slope)
 
     def outputs(self, inputs: int) -> int:
@@ -296,7 +297,7 @@ class Controlled(AbstractJoinedKernel):
         rows = self.inputs.rows(len(x), x.dtype)
         return drift + (inputs @ other_inputs) * self.inputs.kernel(x, z) * ((u * rows) @ v)
 
-    def expansion(self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Points) -> Point:
+    def expansion(self, x: JointPoint, Z: JointPoints, A: Points) -> Point:
         (x, u), (Z, U) = self.split(x), self.split(Z)
         drift = self.drift.expansion(x, Z, A)
         if isinstance(self.inputs, KnownMatrix):
@@ -305,14 +306,10 @@ class Controlled(AbstractJoinedKernel):
         G = A.T @ (row[:, None] * U)  # (n, m)
         return drift + self.inputs.rows(len(x), x.dtype) * (G @ u)
 
-    def potential(
-        self, x: Float[Array, " d"], Z: Float[Array, "M d"], A: Float[Array, "M n"]
-    ) -> Float[Array, ""]:
+    def potential(self, x: JointPoint, Z: JointPoints, A: Points) -> Float[Array, ""]:
         return self.drift.potential(self.split(x)[0], self.split(Z)[0], A)
 
-    def potential_covariance(
-        self, x: Float[Array, " d"], z: Float[Array, " d"]
-    ) -> Float[Array, ""]:
+    def potential_covariance(self, x: JointPoint, z: JointPoint) -> Float[Array, ""]:
         return self.drift.potential_covariance(self.split(x)[0], self.split(z)[0])
 
     def centre(self, Z: Float[Array, "M d"]) -> Float[Array, " d"] | None:

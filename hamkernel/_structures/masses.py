@@ -128,9 +128,7 @@ class UnknownMasses(AbstractMatrixKernel):
     def potential_covariance(self, x: Point, z: Point) -> Float[Array, ""]:
         return self.kernel.potential_covariance(self.to_momenta(x), self.to_momenta(z))
 
-    def dissipated_power(
-        self, x: Float[Array, " n"], slope: Float[Array, " n"]
-    ) -> Float[Array, ""]:
+    def dissipated_power(self, x: Point, slope: Point) -> Float[Array, ""]:
         # ∂H/∂x = S⁻ᵀ ∂H/∂y
         return self.kernel.dissipated_power(self.to_momenta(x), self.to_velocities(slope))
 

@@ -261,9 +261,7 @@ class AbstractPotentialKernel(AbstractStructure):
     def along(self, x: Point, Z: Points, V: Points) -> Point:
         return self.apply(x, jax.grad(self._slope)(x, Z, V))
 
-    def dissipated_power(
-        self, x: Float[Array, " n"], slope: Float[Array, " n"]
-    ) -> Float[Array, ""]:
+    def dissipated_power(self, x: Point, slope: Point) -> Float[Array, ""]:
         if self.conserves:
             return jnp.zeros((), x.dtype)
         return -slope @ self.apply(x, slope)
