@@ -169,8 +169,8 @@ class Runs(eqx.Module):
     Warns:
         UserWarning: once for each kind of fault. Faults of states are impossible samples, outages,
             jumps of 2π, 360, 4096 or 65536, long gaps, constant coordinates, and sensors that are
-            clipped, dead, repeated or interpolated. Faults of inputs are constant or dependent inputs, and
-            inputs that are a function of the states.
+            clipped, dead, repeated or interpolated. Faults of inputs are constant or dependent
+            inputs, and inputs that are a function of the states.
     """
 
     times: tuple[Float[np.ndarray, " T"], ...]
