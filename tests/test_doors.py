@@ -451,8 +451,9 @@ def test_the_table_of_a_log_says_what_was_found_and_what_to_do():
     row = found["impossible samples"]
     assert row.value == "1, the first of them sample 20 of run 0"
     assert "Write NaN there" in row.advice
-    names = "impossible samples, wrapped angles, gaps, constant, clipped sensors, dead sensors, "
-    names += "repeated samples, interpolated samples, constant inputs, dependent inputs, feedback"
+    names = "impossible samples, outages, wrapped angles, gaps, constant, clipped sensors, "
+    names += "dead sensors, repeated samples, interpolated samples, constant inputs, "
+    names += "dependent inputs, feedback"
     assert [each.name for each in found] == names.split(", ")
     assert "! impossible samples" in repr(found)
 

@@ -170,6 +170,18 @@ def test_a_coarse_encoder_at_a_turning_point_is_not_called_dead():
     hk.Runs(t, np.round(swing / 0.5) * 0.5)  # warnings are errors
 
 
+def test_an_outage_is_named_and_a_body_that_is_struck_is_not():
+    for value in (0.0, NOISY[200]):
+        lost = NOISY.copy()
+        lost[200:205] = value
+        with pytest.warns(UserWarning, match=r"stand still in run 0 from 5\.013 to 5\.113: all"):
+            hk.Runs(EVEN, lost)
+    t = np.linspace(0, 3, 61)
+    speed = np.maximum(1 - t, 0) + np.where(t > 2, 8.0, 0.0)
+    position = np.cumsum(speed) * 0.05
+    hk.Runs(t, np.round(np.stack([position, speed], axis=1), 2))  # warnings are errors
+
+
 def test_clipped_dead_repeated_and_interpolated_samples_are_named():
     clipped = np.column_stack([NOISY[:, 0], np.clip(NOISY[:, 1], -9, 1.5)])
     with pytest.warns(UserWarning, match=r"seems clipped: coordinate 1 at 1\.5 stays"):

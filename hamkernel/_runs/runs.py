@@ -167,10 +167,10 @@ class Runs(eqx.Module):
             TypeError: something is not an array of real numbers.
 
     Warns:
-        UserWarning: once for each kind of fault. Faults of states are impossible samples, jumps of
-            2π, 360, 4096 or 65536, long gaps, constant coordinates, and sensors that are clipped,
-            dead, repeated or interpolated. Faults of inputs are constant or dependent inputs, and
-            inputs that are a function of the states.
+        UserWarning: once for each kind of fault. Faults of states are impossible samples, outages,
+            jumps of 2π, 360, 4096 or 65536, long gaps, constant coordinates, and sensors that are
+            clipped, dead, repeated or interpolated. Faults of inputs are constant or dependent
+            inputs, and inputs that are a function of the states.
     """
 
     times: tuple[Float[np.ndarray, " T"], ...]

@@ -33,7 +33,8 @@ class Log(NamedTuple):
 
 def faults(log: Log) -> Diagnostics:
     """The table of a log: one row for each kind of fault."""
-    rows = [_impossible(log), _wraps(log), _gaps(log), _constant(log), *_sensors(log)]
+    rows = [_impossible(log), _outages(log), _wraps(log), _gaps(log), _constant(log)]
+    rows += _sensors(log)
     if log.inputs:
         rows += [*_inputs(log), _feedback(log)]
     return Diagnostics(tuple(rows))
@@ -165,6 +166,50 @@ def _sensors(log: Log) -> list[Diagnostic]:
                 a, b = (float(log.times[r][i]) for i in stretch)
                 dead.append(f"{name} of run {r} from {a:.4g} to {b:.4g}")
     return _sensor_rows(clipped, dead, repeated, drawn)
+
+
+def _outages(log: Log) -> Diagnostic:
+    """Stretches in which all coordinates keep one value, between motions."""
+    places = []
+    for r, (t, x) in enumerate(zip(log.times, log.states, strict=True)):
+        for first, stop in _outages_of(x[:, np.isfinite(x).any(axis=0)]):
+            places.append(f"run {r} from {float(t[first]):.4g} to {float(t[stop]):.4g}")
+    return _row(
+        "outages",
+        places,
+        "twice the largest step",
+        f"the log seems to stand still in {_list(places)}: all coordinates keep one value there, "
+        "and then jump by more than twice of what they move in a step elsewhere",
+        "Write NaN for these samples.",
+    )
+
+
+def _outages_of(x: Float[np.ndarray, "T n"]) -> list[tuple[int, int]]:
+    """The first and last rows of outages: three equal rows or more, from motion to a jump.
+
+    If the largest speed was held for three samples, the next step is three times the largest. A
+    body that comes to rest and is then struck arrives by steps of its resolution.
+    """
+    steps = np.abs(np.diff(x, axis=0))
+    equal = (steps == 0).all(axis=1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], equal, [False]]).astype(int)))
+    pairs = edges.reshape(-1, 2)
+    beside = np.zeros(len(steps), bool)
+    for first, stop in pairs:
+        beside[max(first - 1, 0) : stop + 1] = True
+    ordinary = steps[~beside]
+    if not (steps > 0).any() or not np.isfinite(ordinary).any(axis=0).all():
+        return []
+    largest = np.nanmax(ordinary, axis=0)
+    quantum = np.nanmin(np.where(steps > 0, steps, np.inf), axis=0)
+    outages = []
+    for first, stop in pairs:
+        if stop - first < 2 or first == 0 or stop == len(steps):
+            continue
+        ends = steps[[first - 1, stop]]
+        if (ends[0] > _QUANTA * quantum).any() and (ends > 2 * largest).any():
+            outages.append((int(first), int(stop)))
+    return outages
 
 
 def _sensor_rows(
