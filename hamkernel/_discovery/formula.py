@@ -82,8 +82,7 @@ class Formula(EqualToItself, eqx.Module):
             sign = "-" if value < 0 else "+" if total else ""
             term = rf"{_with_deviation(abs(value), deviation)}\,{_latex(name)}"
             total += f" {sign} {term}" if total else f"{sign}{term}"
-        mean = r"H_\mathrm{mean} + " if self.mean is not None and self._symbol == "H" else ""
-        mean = r"u_\mathrm{mean} + " if self.mean is not None and not mean else mean
+        mean = rf"{self._symbol}_\mathrm{{mean}} + " if self.mean is not None else ""
         return f"{self._symbol} = {mean}{total}".replace("+ -", "- ")
 
     def _triples(self) -> Iterator[tuple[str, float, float]]:

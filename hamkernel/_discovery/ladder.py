@@ -206,15 +206,11 @@ class LadderStep(NamedTuple):
         momenta = np.repeat([0, 1], [n // 2, n - n // 2])
         even = int(self.mirror) * (-1 if self.structure is Separable else 1)
         if self.apart:  # T(p) and U(q); seen from T backward motion is the mirror image
-            masks, weights = (
-                [momenta, 1 - momenta],
-                [[1, self.mirror or self.reversible], [1, even]],
-            )
+            masks = [momenta, 1 - momenta]
+            weights = [[1, self.mirror or self.reversible], [1, even]]
         else:
-            masks, weights = (
-                [momenta * 0 + 1],
-                [[1, even, 1, even] if self.reversible else [1, even]],
-            )
+            masks = [momenta * 0 + 1]
+            weights = [[1, even, 1, even] if self.reversible else [1, even]]
         length = np.log(2 * np.where(scale > 0, scale, 1.0))
         structures = Separable, DivergenceFree, CurlFree, Symplectic
         return Rung(

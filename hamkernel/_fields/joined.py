@@ -100,13 +100,9 @@ class AbstractJoinedField(AbstractField):
 
     @property
     def dimension(self) -> int:
-        joint_field = self.whole
-        shape = (
-            joint_field.coefficients
-            if isinstance(joint_field, KernelField)
-            else joint_field.residual
-        )
-        return shape.shape[-1]
+        if isinstance(self.whole, KernelField):  # whose points are (x, u)
+            return self.whole.coefficients.shape[-1]
+        return self.whole.dimension
 
     @property
     def _next(self) -> str:

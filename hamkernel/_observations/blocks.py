@@ -206,10 +206,8 @@ class Combinations(AbstractBlock):
         return jnp.einsum("srqa,sr->sqa", self.weights, c.reshape(S, R)).reshape(S * Q, n)
 
     def merge(self, following: AbstractBlock) -> "Combinations | None":
-        if (
-            not isinstance(following, Combinations)
-            or self.weights.shape[1:] != following.weights.shape[1:]
-        ):
+        shape = self.weights.shape[1:]
+        if not isinstance(following, Combinations) or following.weights.shape[1:] != shape:
             return None
         pairs = (self.groups, following.groups), (self.weights, following.weights)
         return Combinations(*map(jnp.concatenate, pairs))

@@ -186,14 +186,11 @@ def _extend(old: DenseConditional, new: Measurements):
     # too.
     extended_rows, new_count = old.rows.with_previous(new), rows.size - old.rows.size
     across = [rows_between(K, old.rows, block) for block in extended_rows.blocks]
-    across = extended_rows.contrast(jnp.concatenate(across, axis=1).T)[
-        -new_count:
-    ].T  # (D, new_count)
+    across = extended_rows.contrast(jnp.concatenate(across, axis=1).T)[-new_count:]
+    across = across.T  # (D, new_count)
     B = old.factor.whiten(across)
-    complement = (
-        plus_ridge(gram_of_rows(K, extended_rows)[-new_count:, -new_count:], old.ridge) - B.T @ B
-    )
-    D, S = len(R), cholesky(complement)
+    G = gram_of_rows(K, extended_rows)[-new_count:, -new_count:]
+    D, S = len(R), cholesky(plus_ridge(G, old.ridge) - B.T @ B)
     # Writing the blocks into zeros takes a quarter of the time of `jnp.block`.
     above = jnp.zeros((D + new_count,) * 2, R.dtype).at[:D, :D].set(R).at[:D, D:].set(B)
     R = above.at[D:, D:].set(S)
@@ -242,12 +239,9 @@ def _refuse_failure(
     def message() -> str:
         is_known = require.is_concrete(regularization, relative_residual)
         number = f" = {N * float(regularization):.3g}" if is_known else ""
-        solved = is_known and jnp.isfinite(relative_residual)
-        share = (
-            f" (its solution leaves a relative residual of {relative_residual:.2g})"
-            if solved
-            else ""
-        )
+        share = ""
+        if is_known and jnp.isfinite(relative_residual):
+            share = f" (its solution leaves a relative residual of {relative_residual:.2g})"
         return (
             f"the Gram plus the ridge N * regularization{number} is not positive definite to "
             f"rounding in {relative_residual.dtype}{share}. Likely causes, in order: the "

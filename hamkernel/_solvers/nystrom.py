@@ -288,11 +288,8 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
             return choose_landmarks(
                 K, rows.states[0], target_trace, max_count, self.candidates, key
             )
-        target_trace, max_count = (
-            target_trace * (rows.count / len(rows.targets)),
-            max_count * rows.dimension,
-        )
-        return choose_rows(K, rows, target_trace, max_count, self.candidates, key)
+        trace_of_row = target_trace * (rows.count / len(rows.targets))
+        return choose_rows(K, rows, trace_of_row, max_count * rows.dimension, self.candidates, key)
 
     def low_rank_basis(
         self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]

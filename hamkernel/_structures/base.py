@@ -191,6 +191,15 @@ class AbstractMatrixKernel(eqx.Module):
         return self if isinstance(other, int) and other == 0 else NotImplemented
 
 
+def nodes_of(kind: type, tree: Any) -> list[Any]:
+    """The objects of a type within a PyTree."""
+
+    def is_node(node: Any) -> bool:
+        return isinstance(node, kind)
+
+    return [node for node in jax.tree.leaves(tree, is_leaf=is_node) if is_node(node)]
+
+
 def total(values: list[Array]) -> Array:
     """The sum of the values of the terms of a kernel, of which there is at least one."""
     return functools.reduce(operator.add, values)

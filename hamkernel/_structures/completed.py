@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from hamkernel import _require as require
 from hamkernel._kernels.parts import Shared
-from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.base import AbstractMatrixKernel, nodes_of
 from hamkernel._structures.friction import with_rest_speed
 
 
@@ -22,15 +22,18 @@ def complete(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> Any:
     with require.eager():
         states = np.asarray(X)[:, :n]
 
-    def add_centres(node: Any) -> Any:
-        return node.with_centres(states) if _lacks_centres(node) else node
+    def lacks_centres(node: Any) -> bool:
+        return isinstance(node, Shared) and node.centres is None
 
-    return jax.tree.map(add_centres, K, is_leaf=_lacks_centres)
+    def add_centres(node: Any) -> Any:
+        return node.with_centres(states) if lacks_centres(node) else node
+
+    return jax.tree.map(add_centres, K, is_leaf=lacks_centres)
 
 
 def shared_laws(K: Any) -> list[Shared]:
     """The `Shared` kernels within K."""
-    return [node for node in jax.tree.leaves(K, is_leaf=_is_shared) if _is_shared(node)]
+    return nodes_of(Shared, K)
 
 
 def has_constant_parts(K: AbstractMatrixKernel) -> bool:
@@ -38,11 +41,3 @@ def has_constant_parts(K: AbstractMatrixKernel) -> bool:
     laws = [shared_laws(k) for k in K.scalar_kernels]
     parts = [shared.parts for laws_of_kernel in laws for shared in laws_of_kernel]
     return all(laws) and not any(map(eqx.is_inexact_array, jax.tree.leaves(parts)))
-
-
-def _is_shared(node: Any) -> bool:
-    return isinstance(node, Shared)
-
-
-def _lacks_centres(node: Any) -> bool:
-    return isinstance(node, Shared) and node.centres is None

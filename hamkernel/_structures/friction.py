@@ -21,7 +21,7 @@ from hamkernel._kernels.base import (
     log_per_coordinate,
 )
 from hamkernel._kernels.symmetry import LinearMap
-from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.base import AbstractMatrixKernel, nodes_of
 from hamkernel._structures.structure import AbstractPotentialKernel, canonical, check_even
 
 # The default rest speed, over the root mean square of the momenta. Measured for a real pendulum
@@ -355,7 +355,7 @@ class Friction(AbstractMatrixKernel):
 
 def frictions(K: AbstractMatrixKernel) -> list[Friction]:
     """The `Friction` kernels inside K."""
-    return [node for node in jax.tree.leaves(K, is_leaf=_is_friction) if _is_friction(node)]
+    return nodes_of(Friction, K)
 
 
 def with_rest_speed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> Any:
@@ -372,7 +372,7 @@ def with_rest_speed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> 
         speeds = np.asarray(jnp.sqrt(jnp.mean(jnp.square(X[:, :n]), axis=0)))
 
     def set_speed(node: Any) -> Any:
-        if not _is_friction(node) or node.rest_speed is not None:
+        if not isinstance(node, Friction) or node.rest_speed is not None:
             return node
         moving = [v for v in speeds[list(damped_coordinates(node.damped, n))] if v > 0]
         out = copy.copy(node)
@@ -383,8 +383,4 @@ def with_rest_speed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> 
         )
         return out
 
-    return jax.tree.map(set_speed, K, is_leaf=_is_friction)
-
-
-def _is_friction(node: Any) -> bool:
-    return isinstance(node, Friction)
+    return jax.tree.map(set_speed, K, is_leaf=lambda node: isinstance(node, Friction))

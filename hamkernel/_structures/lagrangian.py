@@ -14,6 +14,7 @@ from hamkernel._kernels.base import AbstractScalarKernel, Scaled, as_scalar_kern
 from hamkernel._kernels.parts import far_apart, root_at
 from hamkernel._machine import precise_jit
 from hamkernel._show import call
+from hamkernel._structures.base import nodes_of
 from hamkernel._structures.friction import Friction
 
 _CENTRES = 64  # positions that carry V and each entry of M
@@ -114,12 +115,7 @@ class Lagrangian(eqx.Module):
 
 def _with_amplitude(k: Any) -> AbstractScalarKernel:
     k = as_scalar_kernel(k)
-    scaled = any(isinstance(node, Scaled) for node in jax.tree.leaves(k, is_leaf=_is_scaled))
-    return k if scaled else 1.0 * k
-
-
-def _is_scaled(node: Any) -> bool:
-    return isinstance(node, Scaled)
+    return k if nodes_of(Scaled, k) else 1.0 * k
 
 
 def _known(pair: Any) -> tuple[tuple[float, ...], tuple[tuple[float | None, ...], ...]]:

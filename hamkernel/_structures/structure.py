@@ -44,7 +44,7 @@ from hamkernel._kernels.symmetry import (
 from hamkernel._kernels.transforms import Warp
 from hamkernel._machine import precise_jit
 from hamkernel._show import call, describe
-from hamkernel._structures.base import AbstractMatrixKernel
+from hamkernel._structures.base import AbstractMatrixKernel, nodes_of
 
 
 class AbstractStructure(AbstractMatrixKernel):
@@ -124,12 +124,8 @@ def _warps(
         return node is not k and isinstance(node, AbstractScalarKernel)
 
     for inner in filter(is_inside, jax.tree.leaves(k, is_leaf=is_inside)):
-        if any(map(_is_warp, jax.tree.leaves(inner, is_leaf=_is_warp))):
+        if nodes_of(Warp, inner):
             yield from _warps(inner, k.transform_inputs(X))
-
-
-def _is_warp(node: object) -> bool:
-    return isinstance(node, Warp)
 
 
 @precise_jit
@@ -198,10 +194,7 @@ def check_symmetries(K: Any, X: Float[Array | np.ndarray, "N n"]) -> None:
             moved_operators = operators if constant else _operators(K, moved)
             image = S @ operators @ S.T
             tolerance = 1e-5 * np.abs(operators).max()  # maps may come in float32
-            if (
-                min(np.abs(moved_operators - image).max(), np.abs(moved_operators + image).max())
-                > tolerance
-            ):
+            if min(np.abs(moved_operators + sign * image).max() for sign in (1, -1)) > tolerance:
                 raise ValueError(
                     f"a map of the symmetry is not one of the fields of {type(K).__name__}: with "
                     f"S = {np.round(S, 3).tolist()} neither B(Sx) = S B(x) Sᵀ nor -S B(x) Sᵀ holds."

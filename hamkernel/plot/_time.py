@@ -349,14 +349,7 @@ def _panels(n: int, width: int, ax: object) -> np.ndarray:
 
 def _draw_samples(panel: Axes, runs: Runs, run: int, c: int) -> None:
     ts, x = np.asarray(runs.times[run]), np.asarray(runs.states[run])[:, c]
-    style = {
-        "mec": "black",
-        "mew": 0.4,
-        "ms": 4,
-        "linestyle": "none",
-        "zorder": 4,
-        "clip_on": False,
-    }
+    style = {"mec": "black", "mew": 0.4, "ms": 4, "zorder": 4, "clip_on": False}
     panel.plot(ts, x, "o", color=DATA, label="measured", **style)
 
 

@@ -338,16 +338,14 @@ def sample(
     system = cast_arrays(system, states.dtype)
     one = jax.ShapeDtypeStruct(states.shape[1:], states.dtype)  # indexing would compile
     require.velocity(system, one, "system")
-    levels = [
-        _noise_level(level, name, states, key)
-        for level, name in [(state_noise, "state_noise"), (velocity_noise, "velocity_noise")]
-    ]
+    state_level = _noise_level(state_noise, "state_noise", states, key)
+    velocity_level = _noise_level(velocity_noise, "velocity_noise", states, key)
     key = None if key is None else require.key(key)
     X, Y = _trajectories(system, states, ts)
     failed = (require.not_finite(X) | require.not_finite(Y)).any(axis=(1, 2))  # (B,)
     X = require.value(X, failed, lambda: _failure(failed), RuntimeError)
     if key is not None:
-        X, Y = _noisy((X, Y), levels, key)
+        X, Y = _noisy((X, Y), (state_level, velocity_level), key)
     return (X[0], Y[0]) if x0.ndim == 1 else (X, Y)
 
 
