@@ -191,6 +191,24 @@ def test_friction_that_is_missing_is_named_and_found():
     np.testing.assert_allclose(field.friction(np.ones(1)), 0.8 + 0.6, rtol=0.05)
 
 
+@pytest.mark.slow
+def test_the_gain_of_a_motor_is_found_from_the_angle_and_a_known_inertia():
+    runs, gain = swings(seed=2), 2.5
+    currents = [u / gain for u in runs.inputs]
+    runs = hk.Runs(runs.times, runs.states, inputs=currents, between="linear")
+    known = np.zeros(1), np.array([[2.0]])
+    K = hk.Lagrangian(ONE.potential, ONE.inertia, (0,), known_mass_matrix=known, unknown_gains=0)
+    learned = hk.learn(K, runs)
+    assert learned.converged
+    field = learned.field
+    np.testing.assert_allclose(field.gains, gain, rtol=0.01)
+    assert abs(field.gains[0] - gain) < 4 * field.gains_deviation[0]
+    Q = np.linspace(-1.2, 1.2, 20)[:, None]
+    M, G = (jax.vmap(f)(Q).ravel() for f in (field.mass_matrix, field.gravity))
+    np.testing.assert_allclose(M, 2.0, rtol=0.01)
+    np.testing.assert_allclose(G, 20 * np.sin(Q[:, 0]), atol=0.1)
+
+
 @pytest.mark.parametrize(
     ("change", "error", "said"),
     [
