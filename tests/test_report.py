@@ -9,6 +9,7 @@ import warnings
 from types import SimpleNamespace
 
 import equinox as eqx
+import jax
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -43,6 +44,7 @@ def test_a_summary_has_a_line_for_each_finding(learned):
     assert len(lines) < 10
     assert lines[0].startswith("Learned from 2 runs, 40 samples: ")
     assert ".plot()" in lines[-1]
+    assert "usable" in repr(jax.tree.map(lambda leaf: None, learned))
     shown = learned._repr_html_()
     assert "<table>" in shown
     (picture,) = re.findall('src="data:image/png;base64,([^"]*)"', shown)

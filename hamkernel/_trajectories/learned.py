@@ -18,7 +18,7 @@ from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._posterior import Posterior, condition
 from hamkernel._runs.runs import Runs
 from hamkernel._runs.table import Diagnostics
-from hamkernel._show import Shown, describe, text
+from hamkernel._show import Shown, describe, has_arrays, text
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel
 from hamkernel._structures.friction import Friction, damped_coordinates
@@ -133,9 +133,10 @@ class Learned(Shown, eqx.Module):
     def _summary(self) -> tuple[str, list[tuple[str, str]]]:
         noisy = bool(np.any(np.asarray(self.process_noise)))
         table = {row.name: row for row in self.diagnostics}
+        is_known = has_arrays((self.noise, self.runs.states)) and require.is_concrete(self.field)
         rows = [
             ("kernel", text(self.kernel)),
-            *_coefficients(self.field, self.runs.coordinate_names),
+            *(_coefficients(self.field, self.runs.coordinate_names) if is_known else ()),
             ("noise", text(self.noise)),
             ("process noise", text(self.process_noise) if noisy else "none"),
         ]
@@ -359,7 +360,8 @@ def _coefficients(field: Any, names: tuple[str, ...]) -> list[tuple[str, str]]:
 
 def learned_from(learned: Any) -> str:
     """The first line of a result: the size of the data, and whether to use the field."""
-    count, samples = len(learned.states), sum(len(x) for x in learned.states)
+    count, is_known = len(learned.states), has_arrays(learned.states)
+    samples = sum(len(x) for x in learned.states) if is_known else "unknown"
     of = f"{type(learned).__name__} from {count} run{'s' * (count != 1)}, {samples} samples"
     return f"{of}: {'usable' if learned.converged else 'do not use this field'}"
 
