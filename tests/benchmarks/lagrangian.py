@@ -21,7 +21,7 @@ Measured, seed 0: the mean square error of the torques is 2.1e-11 in `letters`, 
 `trigonometric`, 25 s. `bands`, eight seeds, 39 s: .85, .82, .91 and .85 of M, gravity, energy and
 torques are inside one deviation, and all inside two: with these guessed kernels bands are too wide.
 `noisy`, eight seeds, 47 s: .73, .69, .75 and .71 inside one deviation, .97, .96, .96 and .97 inside
-two, with errors of .41, .63, .24 and .57 %: bands of a kernel found by `tune` are calibrated to 7 points.
+two, with errors of .41, .63, .24 and .57 %. With a kernel from `tune` bands are right to 7 points.
 """
 
 import argparse
