@@ -399,16 +399,17 @@ def _missing(
 ) -> MissingForce:
     """The force of `more` beside the kernel of states, with less noise if that is likelier.
 
-    Process noise, or without it sensor noise, had to explain what `more` would. X are points along
-    the runs, and `rate` is the RMS rate of the momenta there.
+    Process noise, or without it sensor noise, had to explain what `more` would, and process noise
+    alone may be a tenth or a hundredth. X are points along the runs, and `rate` is the RMS rate of
+    the momenta there.
     """
     K, n = model.kernel, rows.residual.shape[-1]
     S, rows = search_sample(jnp.asarray(S), rows)
-    explains = slice(-2 * n, None)
+    shares = np.array([[1.0, 1.0], [1.0, 0.1], [1.0, 0.01], [0.1, 0.1], [0.01, 0.01]])
 
     def likeliest(model: Model) -> tuple[float, Model]:
-        design = np.tile(np.asarray(model.flat), (3, 1))
-        design[:, explains] += np.log([[1.0], [0.1], [0.01]])
+        design = np.tile(np.asarray(model.flat), (len(shares), 1))
+        design[:, -2 * n :] += np.repeat(np.log(shares), n, axis=1)  # sensor noise first
         values = losses(model, design, S, rows, start_deviation)
         return float(values.min()), model.unflatten(design[int(np.argmin(values))])
 
