@@ -85,7 +85,8 @@ def columns(path: str, names: list[str]) -> Float[np.ndarray, "T k"]:
         widest = max(widest, *headers, [], key=lambda row: sum(x[:1].isalpha() for x in row))
     else:
         missing = next((name for name in names if name not in widest), names[0])
-        raise ValueError(f"{path} has no column {missing!r}; its columns are {', '.join(widest)}.")
+        said = f"its columns are {', '.join(widest)}" if widest else "it is empty"
+        raise ValueError(f"{path} has no column {missing!r}; {said}.")
     header = headers[first]
     places, table = [header.index(name) for name in names], []
     for number, row in enumerate(rows[first + 1 :], start=first + 2):
@@ -96,7 +97,8 @@ def columns(path: str, names: list[str]) -> Float[np.ndarray, "T k"]:
         try:
             table.append([float(cell) if cell else np.nan for cell in cells])
         except ValueError as error:
-            raise ValueError(f"{path}, line {number}: {error}.") from error
+            said = f"{error}; numbers are needed, such as seconds in place of dates"
+            raise ValueError(f"{path}, line {number}: {said}.") from error
     if not table:
         raise ValueError(f"{path} has a header and no rows of numbers.")
     return np.array(table)
@@ -166,6 +168,8 @@ def _run(arguments: list[str], show: Callable[[str], None]) -> None:
                 "or the positions alone with --mass."
             )
         masses = len(asked.mass or [])
+        if masses not in (0, 1, count, count / 2):
+            raise ValueError(f"--mass names {masses} masses and --states {count} columns.")
         is_position = masses == count or (masses == 1 and count % 2 == 1)
         state_count = 2 * count if is_position else count
         K = kernel(state_count, runs.input_count, asked.friction, bool(masses))
