@@ -333,8 +333,7 @@ def _tolerances(
         if isinstance(learned, KernelField):
             # At an equilibrium f is zero and has no digits; the limit 1e-6 still gives states a
             # few digits.
-            share = _rounding(learned, point)
-            default = jnp.maximum(default, share)
+            default = jnp.maximum(default, _rounding(learned, point))
 
     def tolerance(name: str, value: Any) -> Float[Array, ""]:
         if value is None:
