@@ -100,7 +100,7 @@ def simulate(
     solver = diffrax.Dopri8() if solver is None else solver
     _check_solver(solver, dt, rtol, atol, inputs is not None)
     rhs, start = _right_hand_side(field, inputs, ts, caller_times[0], between, dt is not None)
-    at_start = rhs.field if inputs is None else _AtStart(rhs, start)
+    at_start = rhs.field if inputs is None else jax.tree_util.Partial(_at_start, rhs, start)
     _check_field(at_start, x0)
     if max_steps is not None:
         max_steps = require.count(max_steps, "max_steps")
@@ -193,14 +193,9 @@ class RightHandSide(eqx.Module):
         return self.field(x, require.floating(u, "the value of inputs").astype(x.dtype))
 
 
-class _AtStart(eqx.Module):
-    """x -> f(x, u) with the inputs u of the first time."""
-
-    rhs: RightHandSide
-    start: Any  # (), the time of the inputs
-
-    def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        return self.rhs(jnp.zeros_like(self.start), x, self.start)
+def _at_start(rhs: RightHandSide, start: Any, x: Float[Array, " n"]) -> Float[Array, " n"]:
+    """f(x, u) with the inputs u of the first time, `start`."""
+    return rhs(jnp.zeros_like(start), x, start)
 
 
 _FilterJit: Any = type(eqx.filter_jit(abs))  # Equinox does not name it
@@ -338,8 +333,7 @@ def _tolerances(
         if isinstance(learned, KernelField):
             # At an equilibrium f is zero and has no digits; the limit 1e-6 still gives states a
             # few digits.
-            share = _rounding(learned, point)
-            default = jnp.maximum(default, share)
+            default = jnp.maximum(default, _rounding(learned, point))
 
     def tolerance(name: str, value: Any) -> Float[Array, ""]:
         if value is None:

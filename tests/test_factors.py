@@ -94,9 +94,10 @@ def test_derivatives_of_the_primitives_are_those_of_jax(mode):
 @pytest.mark.few(1)
 @pytest.mark.parametrize("kind", ["dense", "low rank"])
 def test_derivatives_of_losses_are_those_of_jax(kind):
-    # Of all of them at once, each with a weight of its own. One fold has more rows than features.
+    # Of all of them at once, each with a weight of its own. One fold has more rows than features;
+    # the other two are of similar size, so the smaller one is padded.
     rows, ridge = tall(12, 3)
-    y, labels = jnp.cos(jnp.arange(12.0) ** 2), np.repeat([0, 0, 0, 0, 1, 2], 2)
+    y, labels = jnp.cos(jnp.arange(12.0) ** 2), np.repeat([0, 1, 2], [7, 3, 2])
     partition, weights = Partition(12, labels), np.sqrt([2, 3, 5, 7, 11])
     folds = [np.flatnonzero(labels == each) for each in range(3)]
 

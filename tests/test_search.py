@@ -208,7 +208,7 @@ def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free
         assert judged(generalized_loss(K, rows, ridge, None, dense + more))
     criterion = criterion_of("generalized_cross_validation", 6, 5)
     assert criterion.loss(K, rows, jnp.asarray(1e-12))[0] == np.inf
-    assert criterion.with_basis(waves).loss(K, rows, jnp.asarray(1.0))[0] < np.inf
+    assert criterion.with_options(basis=waves).loss(K, rows, jnp.asarray(1.0))[0] < np.inf
 
 
 def test_the_ridge_of_a_subset_is_that_of_all_points():

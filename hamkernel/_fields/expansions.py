@@ -139,9 +139,7 @@ def _value_field(
     return jax.grad(component)(jnp.zeros(K.outputs(len(x)), x.dtype))
 
 
-@precise_jit
-def _value_fields(K, X, S, b):
-    return map_states(lambda x: _value_field(K, x, S, b), X)
+_value_fields = precise_jit(lambda K, X, S, b: map_states(lambda x: _value_field(K, x, S, b), X))
 
 
 def kernel_field(
@@ -251,14 +249,8 @@ def feature_field(
     )
 
 
-@precise_jit
-def _field_at(features, x, weights):
-    return features.field(x, weights)
-
-
-@precise_jit
-def _potential_at(features, x, weights):
-    return features.potential(x, weights)
+_field_at = precise_jit(lambda features, x, weights: features.field(x, weights))
+_potential_at = precise_jit(lambda features, x, weights: features.potential(x, weights))
 
 
 @precise_jit

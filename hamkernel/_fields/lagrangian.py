@@ -167,7 +167,8 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
             kinetic = jnp.einsum("i,j,ijr->r", v, v, self.features.mass_matrix_features(q)) / 2
             return kinetic + self.features.potential_features(q)
 
-        missing = self._missing_lagrangian  # which T + V has as well, since T and V are independent
+        # T + V has the prior covariance of L = T − V, since T and V are independent.
+        missing = self._missing_lagrangian
         here, there = self._state(x), self._state(x0)
         rest = missing(here, here) + missing(there, there) - 2 * missing(here, there)
         return jnp.sqrt(self._variance(row(x) - row(x0)) + jnp.maximum(rest, 0.0))
@@ -292,7 +293,7 @@ def _least_inertia(field: LagrangianField, Q: Float[Array, "N m"]) -> tuple[Arra
         missing = 4 * field._missing(field.kernel.inertia, q, q)  # ½M has the covariance k_M
         return values[0], jnp.sqrt(field._variance(row) + missing), e
 
-    # Of 64 positions and 400 features, arrays of 200 KB.
+    # 64 positions at a time: with 400 features, the arrays take 200 KB.
     value, deviation, e = jax.lax.map(least_eigenvalue, Q, batch_size=64)
     at = jnp.argmin(value - 2 * deviation)
     return value[at], deviation[at], e[at]

@@ -241,9 +241,7 @@ def _prepare_rows(K, rows, ridge, landmarks):
     return _RowProducts(K, rows, F, factor(F.T @ F, ridge_)), truncation
 
 
-@precise_jit
-def _prepare(prepare, args):
-    return prepare(*args)
+_prepare = precise_jit(lambda prepare, args: prepare(*args))
 
 
 class _Iterate(NamedTuple):

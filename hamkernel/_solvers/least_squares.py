@@ -70,7 +70,7 @@ def triangle_of_design(
 def _merge_triangles(
     spread: RowSharding, device_triangle: Float[Array, "k k"]
 ) -> Float[Array, "k k"]:
-    """The triangular factor of the rows of all devices, from the factor `own` of each device.
+    """The triangular factor of the rows of all devices, from the factor of each device.
 
     The factors are merged one after the other: no device holds more than two of them, and all
     devices get the same result.

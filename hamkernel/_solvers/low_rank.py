@@ -219,7 +219,7 @@ def check_solution(
     return require.value(learned, require.not_finite(truncation), indefinite, RuntimeError, throw)
 
 
-def singular(dtype: jnp.dtype) -> str:
+def singular_message(dtype: jnp.dtype) -> str:
     """The error text of a failed factorisation of the low-rank system."""
     return (
         f"the low-rank system plus the ridge N * regularization is not positive definite to "
@@ -490,7 +490,7 @@ def low_rank_conditional(
     """
     conditional = _low_rank_conditional(span, rows, rows.count * regularization)
     field = conditional.field
-    cause = singular(field.offset.dtype)
+    cause = singular_message(field.offset.dtype)
     arrays, rest = eqx.partition(field, eqx.is_inexact_array)
     failed = require.not_finite(field.norm)
     if isinstance(span, LandmarkSpan):

@@ -52,7 +52,7 @@ from hamkernel._solvers.low_rank import (
     landmark_field,
     landmark_span,
     low_rank_conditional,
-    singular,
+    singular_message,
     truncation_of,
 )
 from hamkernel._solvers.stream import (
@@ -78,13 +78,13 @@ def _check_field(
     dtype = landmarks.points.dtype
     failed = require.not_finite(solution.coefficients).any()
     solution = check_solution(
-        solution, landmarks, solution.truncation, failed, singular(dtype), throw
+        solution, landmarks, solution.truncation, failed, singular_message(dtype), throw
     )
     warn_if_truncated(solution.truncation, landmarks.count, tolerance, cure)
     return landmark_field(K, landmarks, regularization, *solution)
 
 
-CHOOSE = (
+REMEDY = (
     "Raise max_points, the tolerance or the regularization; let landmarks be chosen from more "
     "candidates;"
 )
@@ -306,7 +306,7 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
         X, Y = shard(spread, X), shard(spread, Y)
         solution = _landmark_fit(K, X, Y, regularization, landmarks, spread)
         solution = solution._replace(residual=to_caller_sharding(spread, solution.residual))
-        return _check_field(K, landmarks, solution, regularization, self.tolerance, CHOOSE, throw)
+        return _check_field(K, landmarks, solution, regularization, self.tolerance, REMEDY, throw)
 
     def condition(self, problem, throw=True, progress=False) -> LowRankConditional:
         problem = problem.to_one_device()
@@ -314,7 +314,7 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
         landmarks = self.landmarks(K, rows, regularization)
         conditional = low_rank_conditional(landmark_span(K, landmarks), rows, regularization, throw)
         truncation = conditional.field.info.truncation
-        warn_if_truncated(truncation, landmarks.count, self.tolerance, CHOOSE)
+        warn_if_truncated(truncation, landmarks.count, self.tolerance, REMEDY)
         return conditional
 
     def _start_fit(self, K, sample, regularization) -> LandmarkFit:

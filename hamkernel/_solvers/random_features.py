@@ -24,7 +24,7 @@ from hamkernel._solvers.low_rank import (
     LowRankConditional,
     WaveBasis,
     low_rank_conditional,
-    singular,
+    singular_message,
 )
 from hamkernel._solvers.stream import (
     AbstractStreamingFit,
@@ -135,7 +135,7 @@ def _check_field(field: FeatureField, throw: bool = True) -> FeatureField:
         return f.weights, f.residual, f.norm
 
     failed = require.not_finite(field.weights)
-    cause = singular(field.weights.dtype)
+    cause = singular_message(field.weights.dtype)
     values = require.value(learned_arrays(field), failed, cause, RuntimeError, throw)
     return eqx.tree_at(learned_arrays, field, values)
 

@@ -220,7 +220,7 @@ class FamilySum(AbstractFamily):
     def child_inputs(
         self, child: Any, X: Float[np.ndarray, "N d"], amplitude: float
     ) -> tuple[Float[np.ndarray, "N d"], float]:
-        """The terms are kernels of joined points."""
+        """The joined points themselves, since the terms are kernels of joined points."""
         return X, amplitude
 
 

@@ -92,7 +92,7 @@ class Lagrangian(eqx.Module):
         if self.friction is not None and self.friction.damped is not None:
             raise ValueError(
                 "the friction of a Lagrangian is one of all joints, each with its own numbers: "
-                "leave out damped=. That of a joint without friction is found near zero."
+                "leave out damped=. A joint without friction gets numbers near zero."
             )
         self.known_mass_matrix = None if known_mass_matrix is None else _known(known_mass_matrix)
 
@@ -140,8 +140,8 @@ def _known(pair: Any) -> tuple[tuple[float, ...], tuple[tuple[float | None, ...]
     return tuple(q.tolist()), tuple(rows)
 
 
-# The prior deviation of a gain, in torque over input: with a gain of 1 of 1e4 rows with noise of a
-# tenth of the torques it moves the result by 1e-18.
+# The prior standard deviation of a gain, in torque over input. This prior moves a gain of 1 by
+# 1e-18 if there are 1e4 rows and their noise is a tenth of the torques.
 _GAIN = 1e6
 
 

@@ -13,8 +13,8 @@ from hamkernel._structures.base import Sum
 from hamkernel._structures.completed import shared_laws
 from hamkernel._structures.structure import AbstractPotentialKernel
 
-_ZERO = 1e-5  # of the largest singular value, above the rounding of float32
-_CLOSER = 0.05  # of the range of the data, which is estimated from 256 states
+_NULL_TOLERANCE = 1e-5  # of the largest singular value, above the rounding of float32
+_RANGE_MARGIN = 0.05  # of the range of the data, which is estimated from 256 states
 
 
 def undetermined_terms(K: Any, n: int) -> tuple[str, ...]:
@@ -61,18 +61,18 @@ def _null_vectors(M: Float[np.ndarray, "R Q"]) -> Float[np.ndarray, "d Q"]:
     """A basis of the null space of M; Gaussian elimination makes many entries zero."""
     _, sizes, V = np.linalg.svd(M)
     sizes = np.append(sizes, np.zeros(len(V) - len(sizes)))
-    space, first = V[sizes <= _ZERO * max(sizes.max(), 1.0)], 0
+    space, first = V[sizes <= _NULL_TOLERANCE * max(sizes.max(), 1.0)], 0
     for column in range(space.shape[1]):
         if first == len(space):
             break
         pivot = first + int(np.argmax(np.abs(space[first:, column])))
-        if abs(space[pivot, column]) > _ZERO:
+        if abs(space[pivot, column]) > _NULL_TOLERANCE:
             space[[first, pivot]] = space[[pivot, first]]
             space[first] /= space[first, column]
             rest = np.arange(len(space)) != first
             space[rest] -= space[rest, column][:, None] * space[first][None]
             first += 1
-    return np.where(np.abs(space) > 10 * _ZERO, space, 0.0)
+    return np.where(np.abs(space) > 10 * _NULL_TOLERANCE, space, 0.0)
 
 
 def outside(K: Any, X: Float[Array, "T n"]) -> str:
@@ -86,12 +86,12 @@ def outside(K: Any, X: Float[Array, "T n"]) -> str:
         lowest, highest = (np.asarray(a) for a in _range(law, X))
         C = np.asarray(law.centres)
         low, high = C.min(axis=0), C.max(axis=0)
-        reach = _CLOSER * (high - low)
+        reach = _RANGE_MARGIN * (high - low)
         distance = getattr(law.parts, "distance", None)
         if distance is not None:
             closest = min(float(distance(low[0])), float(distance(high[0])))
             now = min(float(distance(lowest[0])), float(distance(highest[0])))
-            if now < (1 - _CLOSER) * closest:
+            if now < (1 - _RANGE_MARGIN) * closest:
                 return (
                     f"two particles come as close as {now:.3g}, and in the data no closer than "
                     f"{closest:.3g}: there the law is not known, see posterior.law_deviation."

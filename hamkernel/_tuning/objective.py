@@ -18,7 +18,6 @@ from hamkernel._closed_forms import Folds, Partition
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._machine import precise_jit
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import has_constant_parts
 from hamkernel._tuning.space import SearchSpace
@@ -71,11 +70,8 @@ class SearchCriterion(eqx.Module):
             )
         return value, square
 
-    def with_basis(self, basis: AbstractBasis) -> "SearchCriterion":
-        """This criterion, for the low-rank fit in a basis."""
-        return self._with(basis=basis)
-
-    def _with(self, **keywords: Any) -> "SearchCriterion":
+    def with_options(self, **keywords: Any) -> "SearchCriterion":
+        """This criterion with arguments of its loss, such as the `basis` of a low-rank fit."""
         # A Partial of a Partial would be a new function, and compile anew, in each call of `tune`.
         fn = jax.tree_util.Partial(self.fn.func, **(self.fn.keywords | keywords))
         return dataclasses.replace(self, fn=fn)
@@ -87,7 +83,7 @@ class SearchCriterion(eqx.Module):
         if self.fn.func is not _negative_log_likelihood or not has_constant_parts(K):
             return self
         # An eigenvalue problem of n × n for each point.
-        return self._with(projected=_project(K, rows))
+        return self.with_options(projected=_project(K, rows))
 
     def restrict(self, rows: Measurements, chosen: np.ndarray) -> "SearchCriterion":
         """This criterion for the rows of a subset of the observations."""

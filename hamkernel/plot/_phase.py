@@ -343,8 +343,5 @@ def poincare_section(
     ax = axes(ax, figsize=(5.0, 4.6))
     for style, array in zip(styles, arrays, strict=True):
         ax.plot(array[:, dims[0]], array[:, dims[1]], **dots, **style)
-    ax.set(**labels)
-    if title is not None:
-        ax.set_title(title)
     legend(ax, markerscale=4)
-    return ax
+    return _finish(ax, labels, title)

@@ -146,6 +146,7 @@ class Damped(eqx.Module):
     system: Any
     log_damping: Float[Array, "..."]
     damped: tuple[int, ...] | None = eqx.field(static=True)
+    damping = positive_parameter("damping", "The friction r.")
 
     def __init__(
         self, system: Any, damping: ArrayLike = 0.1, damped: int | Sequence[int] | None = None
@@ -160,11 +161,6 @@ class Damped(eqx.Module):
         self.damped = None if damped is None else require.coordinates(damped, "damped")
         if self.log_damping.ndim > 1:
             raise ValueError(f"damping has shape {self.log_damping.shape}; () or (m,) is needed.")
-
-    @property
-    def damping(self) -> Float[Array, "..."]:
-        """The friction r."""
-        return jnp.exp(self.log_damping)
 
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """Return the energy H(x), which decreases, shape ()."""

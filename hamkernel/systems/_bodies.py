@@ -264,8 +264,7 @@ class RigidBody(AbstractPoissonSystem):
 
     def casimir(self, x: Num[ArrayLike, "3"]) -> Float[Array, ""]:
         """Return |L|², which every field Π∇H conserves, shape ()."""
-        L = require.point(x, 3)
-        return jnp.sum(L**2)
+        return jnp.sum(require.point(x, 3) ** 2)
 
 
 class LotkaVolterra(AbstractPoissonSystem):
