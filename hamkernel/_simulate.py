@@ -100,7 +100,7 @@ def simulate(
     solver = diffrax.Dopri8() if solver is None else solver
     _check_solver(solver, dt, rtol, atol, inputs is not None)
     rhs, start = _right_hand_side(field, inputs, ts, caller_times[0], between, dt is not None)
-    at_start = rhs.field if inputs is None else jax.tree_util.Partial(_at_start, rhs, start)
+    at_start = rhs.field if inputs is None else jax.tree_util.Partial(_initial_velocity, rhs, start)
     _check_field(at_start, x0)
     if max_steps is not None:
         max_steps = require.count(max_steps, "max_steps")
@@ -193,7 +193,7 @@ class RightHandSide(eqx.Module):
         return self.field(x, require.floating(u, "the value of inputs").astype(x.dtype))
 
 
-def _at_start(rhs: RightHandSide, start: Any, x: Float[Array, " n"]) -> Float[Array, " n"]:
+def _initial_velocity(rhs: RightHandSide, start: Any, x: Float[Array, " n"]) -> Float[Array, " n"]:
     """f(x, u) with the inputs u of the first time, `start`."""
     return rhs(jnp.zeros_like(start), x, start)
 
