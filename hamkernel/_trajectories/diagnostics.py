@@ -19,7 +19,7 @@ from hamkernel._runs.sensors import Timing
 from hamkernel._runs.table import Diagnostic, Diagnostics
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.friction import damped_coordinates, frictions
-from hamkernel._trajectories.search import MissingForce
+from hamkernel._trajectories.search import LARGE_GAIN, MissingForce
 from hamkernel._trajectories.whiteness import Whiteness
 
 # The change of a field, relative to its size, at which iterations end. It may leave residuals of as
@@ -400,7 +400,7 @@ def _force(fit: FitQuality) -> Diagnostic:
     return Diagnostic(
         "missing force",
         f"log p + {missing.gain:.0f}{shown}",
-        "log p + 10",
+        f"log p + {LARGE_GAIN}",
         not missing.is_there or (fit.share < NEGLIGIBLE and fit.white.is_enough),
         f"the runs are likelier with {missing_force(fit)}"
         if missing.is_there
@@ -546,28 +546,49 @@ def _numbers(values: Float[np.ndarray, " n"]) -> str:
     return "(" + ", ".join(f"{v:.2g}" for v in values) + ")"
 
 
-def check_identifiable(runs: Runs, mean: Callable[[Array], Array] | None) -> None:
-    """Raise unless a mean of the points (x, u) determines each coordinate that no run measured."""
-    never = ~np.any([np.isfinite(np.asarray(x)).any(axis=0) for x in runs.states], axis=0)
-    if not never.any():
+def check_identifiable(
+    K: AbstractMatrixKernel, runs: Runs, mean: Callable[[Array], Array] | None
+) -> None:
+    """Raise unless the coordinates that no run measured are determined.
+
+    A mean of the points (x, u) must say how they move the others, and K must not change it: a K
+    that changes the velocities of both kinds of coordinates can represent the system in other
+    coordinates p -> g(q, p) as well, and follows the runs equally in each of them.
+    """
+    measured = np.any([np.isfinite(x).any(axis=0) for x in runs.host_arrays()[1]], axis=0)
+    if measured.all():
         return
-    names = runs.coordinate_names
-    which = ", ".join(names[c] for c in np.flatnonzero(never))
+    names = np.array(runs.coordinate_names)[~measured]
+    never = f"coordinate {', '.join(names)} was measured in no run"
     if mean is None:
         raise ValueError(
-            f"coordinate {which} was measured in no run. From the others alone it is known only up "
+            f"{never}. From the others alone it is known only up "
             "to any change of coordinates, p -> g(q, p), so there is nothing to learn it from. "
             "Say how it moves the others: mean=lambda x: jnp.array([x[1] / m, 0.0]) for q̇ = p/m "
             "and K a kernel for the rest, such as hk.Symplectic(hk.Select(k, 0)) for ṗ = -U'(q). "
             "Or log it."
         )
-    d = runs.dimension + runs.input_count
-    points = np.random.default_rng(0).standard_normal((8, d))
+    n = len(measured)
+    points = np.random.default_rng(0).standard_normal((8, n + runs.input_count))
     with require.traceable("mean"):
         D = np.asarray(jax.vmap(jax.jacfwd(mean))(jnp.asarray(points)))  # (8, n, d)
-    blind = [c for c in np.flatnonzero(never) if not np.abs(D[:, ~never, c]).max() > 0]
-    if blind:
+    slopes = np.abs(D[:, measured, :n]).max(axis=(0, 1), initial=0.0)
+    blind = np.flatnonzero(~measured & ~(slopes > 0))  # also where a slope is NaN
+    if len(blind):
         raise ValueError(
-            f"coordinate {names[blind[0]]} was measured in no run, and the velocities of the mean "
-            "do not depend on it: give a mean that says how it moves the others, such as q̇ = p/m."
+            f"coordinate {runs.coordinate_names[blind[0]]} was measured in no run, and the "
+            "velocities of the mean do not depend on it: give a mean that says how it moves the "
+            "others, such as q̇ = p/m."
+        )
+    points[:, n:] = 0.0  # another p cannot stand for an input, but for its slope
+    variances = np.asarray(jax.vmap(lambda x: jnp.diag(K(x, x)))(jnp.asarray(points)))
+    is_changed = np.nanmax(variances, axis=0) > 0
+    if is_changed[measured].any() and is_changed[~measured].any():
+        positions = tuple(np.flatnonzero(measured).tolist())
+        raise ValueError(
+            f"{never}, and K also changes how it moves the "
+            "others: then it is known only up to any change of coordinates, p -> g(q, p), and so "
+            "are the field and its energy. If the masses are known, K is for the forces alone: "
+            f"hk.Symplectic(hk.Select(k, {positions})), k a kernel of {len(positions)} "
+            f"coordinate{'s' * (len(positions) > 1)}."
         )

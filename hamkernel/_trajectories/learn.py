@@ -188,7 +188,7 @@ def learn(
     max_steps = require.count(iterations, "iterations")
     K = _unknown_masses(K, runs.dimension) if masses else K
     drift = known_part(K, mean, runs.dimension, jnp.float64)
-    _check_identifiable(K, runs, drift)
+    check_identifiable(K, runs, drift)
     if are_learned_from_rows(K) and process is None:
         return learn_laws(K, runs, mean if mean is None else as_pytree(mean), sigma, again)
     bar = _bar(progress, total=2 + max_steps)
@@ -450,32 +450,6 @@ def _check_types(K: Any, runs: Any, mean: Any, noise: Any) -> None:
         raise TypeError(
             f"mean is a {type(mean).__name__}; a callable x (n,) -> (n,) is needed, such as "
             "hk.kinetic(mass)."
-        )
-
-
-def _check_identifiable(K: AbstractMatrixKernel, runs: Runs, drift: Any) -> None:
-    """Raise unless coordinates that no run measured are determined, and not up to a change of them.
-
-    If K changes the velocities of both kinds of coordinates, it can represent the system in other
-    coordinates p -> g(q, p) as well, and follows the runs equally in each of them.
-    """
-    check_identifiable(runs, drift)
-    measured = np.any([np.isfinite(x).any(axis=0) for x in runs.host_arrays()[1]], axis=0)
-    if measured.all():
-        return
-    points = np.random.default_rng(0).standard_normal((8, runs.dimension + runs.input_count))
-    points[:, runs.dimension :] = 0.0  # another p cannot stand for an input, but for its slope
-    variances = np.asarray(jax.vmap(lambda x: jnp.diag(K(x, x)))(jnp.asarray(points)))
-    is_changed = np.nanmax(variances, axis=0)[: len(measured)] > 0
-    if is_changed[measured].any() and is_changed[~measured].any():
-        names = ", ".join(np.array(runs.coordinate_names)[~measured])
-        positions = tuple(np.flatnonzero(measured).tolist())
-        raise ValueError(
-            f"coordinate {names} was measured in no run, and K also changes how it moves the "
-            "others: then it is known only up to any change of coordinates, p -> g(q, p), and so "
-            "are the field and its energy. If the masses are known, K is for the forces alone: "
-            f"hk.Symplectic(hk.Select(k, {positions})), k a kernel of {len(positions)} "
-            f"coordinate{'s' * (len(positions) > 1)}."
         )
 
 

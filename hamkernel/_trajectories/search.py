@@ -302,6 +302,9 @@ def landmark_gain(
     return float(few - many), part
 
 
+LARGE_GAIN = 10  # of log p: the odds are e¹⁰ to one
+
+
 class MissingForce(NamedTuple):
     """A force that the kernel lacks, or may lack.
 
@@ -316,8 +319,8 @@ class MissingForce(NamedTuple):
 
     @property
     def is_there(self) -> bool:
-        """Whether the runs are e¹⁰ times as likely with the force."""
-        return self.gain > 10
+        """Whether the gain is large."""
+        return self.gain > LARGE_GAIN
 
 
 def missing_friction(

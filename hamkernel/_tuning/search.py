@@ -238,13 +238,14 @@ def _take(runs: MinimiserRun, which: Any) -> MinimiserRun:
 
 def _put(runs: MinimiserRun, which: Any, moved: MinimiserRun) -> MinimiserRun:
     """The runs with `moved` in the places `which`."""
-    arrays, static = eqx.partition(runs, eqx.is_array)
-    arrays = jax.tree.map(np.array, arrays)
-    for array, part in zip(
-        *map(jax.tree.leaves, (arrays, eqx.filter(moved, eqx.is_array))), strict=True
-    ):
+
+    def put(array: np.ndarray, part: np.ndarray) -> np.ndarray:
+        array = array.copy()
         array[which] = part
-    return eqx.combine(arrays, static)
+        return array
+
+    arrays, static = eqx.partition(runs, eqx.is_array)
+    return eqx.combine(jax.tree.map(put, arrays, eqx.filter(moved, eqx.is_array)), static)
 
 
 def _concatenate(first: MinimiserRun, second: MinimiserRun) -> MinimiserRun:
