@@ -337,7 +337,7 @@ def test_the_lag_of_inputs_and_their_gain_are_found():
     inputs = [torque(ts, phase)[:, None] for phase in phases]
     runs = hk.Runs([ts] * 4, states, inputs, between="auto", delay="fit")
     found = hk.learn(K, runs)
-    assert f"m=1 {found.runs.between}, delay=0.0" in repr(found)
+    assert f"m=1 {found.runs.between}, delay=0.0" in repr(found.runs)
     lag = found.runs.delay + (0.05 if found.runs.between == "held" else 0.0)
     assert abs(lag - delay) < 0.01
     gain = found.field.input_matrix(jnp.array([0.3, 0.2]))

@@ -401,7 +401,7 @@ def _force(fit: FitQuality) -> Diagnostic:
         "missing force",
         f"log p + {missing.gain:.0f}{shown}",
         f"log p + {LARGE_GAIN}",
-        not missing.is_there or (fit.share < NEGLIGIBLE and fit.white.is_enough),
+        not missing.is_there or missing.share < NEGLIGIBLE,
         f"the runs are likelier with {missing_force(fit)}"
         if missing.is_there
         else "no force is missing",
