@@ -303,18 +303,16 @@ def condense(t, x, path, slope, block: float):
 def _refine(t, x, counts, scatter, lengthscale: float):
     """The run with its long intervals cut by times at which nothing was measured.
 
-    Three Gauss nodes do not resolve the field along a third of a swing, and Gauss-Newton steps then
-    increase the loss. The longest interval also sets the number of Runge-Kutta steps for all
-    intervals. Evenly sampled runs are not cut.
+    Gauss-Newton steps increase the loss where one interval is linearised over much of a swing. The
+    longest interval also sets the number of Runge-Kutta steps for all intervals.
 
-    On positions of three orbits, each at 60 uneven times up to half a turn apart, `learn` found
-    process noise that is not there, and the field had an error of 1.2 % along the motion. With cuts
-    and the steps of `likelier` the error is .3 % (`tests/test_learn.py`).
+    On positions of three orbits, each at 60 uneven times up to half a turn apart, three seeds, the
+    field has an error of .26 to .33 % along the motion. With parts of .35 lengthscales it was 7.6 %
+    and refused (`tests/test_learn.py`).
     """
     spans = np.diff(t)
-    usual = np.median(spans)
-    # One radian: Gauss nodes, of order six, are exact to 1e-4/2⁶ there. Even runs are not cut.
-    parts = np.ceil(spans / max(0.35 * lengthscale, 1.5 * usual))
+    # .54 radians: a swing has twelve such parts.
+    parts = np.ceil(spans / (0.2 * lengthscale))
     parts = np.clip(parts, 1, 16).astype(int)  # inside a long pause nothing is known
     at = np.append(0, np.cumsum(parts))
     fine = np.interp(np.arange(at[-1] + 1), at, t)

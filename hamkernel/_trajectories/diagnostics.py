@@ -551,9 +551,9 @@ def check_identifiable(
 ) -> None:
     """Raise unless the coordinates that no run measured are determined.
 
-    A mean of the points (x, u) must say how they move the others, and K must not change it: a K
-    that changes the velocities of both kinds of coordinates can represent the system in other
-    coordinates p -> g(q, p) as well, and follows the runs equally in each of them.
+    A mean of the points (x, u) must say how they move the others, and K must not change how. A K
+    that changes the velocities of both kinds of coordinates represents the system in coordinates
+    p -> g(q, p) as well. The runs then fit each of them equally.
     """
     measured = np.any([np.isfinite(x).any(axis=0) for x in runs.host_arrays()[1]], axis=0)
     if measured.all():
