@@ -151,6 +151,43 @@ def test_runs_that_can_be_followed_without_their_friction_ask_for_it(kernel, usa
     assert ["hk.Friction()" in said for said in heard] == [True] * (not usable), heard
 
 
+def counts_of_animals(rng):
+    """Predators and prey on three orbits, whose logarithms are Hamiltonian."""
+    t = np.linspace(0, 12, 121)
+    for x0 in ([1.5, 1.0], [2.0, 1.0], [1.0, 0.6]):
+        path = solve_ivp(
+            lambda _, x: [x[0] * (1 - x[1]), x[1] * (x[0] - 1)],
+            (0, 12), x0, t_eval=t, rtol=1e-8,
+        ).y.T  # fmt: skip
+        yield t, path * np.exp(0.02 * rng.standard_normal(path.shape))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("coordinates", "usable"), [(np.asarray, False), (np.log, True)])
+def test_a_field_outside_the_structure_is_asked_for(coordinates, usable):
+    # A divergence-free field passes three orbits that never cross; its free runs follow them.
+    times, states = zip(*counts_of_animals(np.random.default_rng(0)), strict=True)
+    runs = hk.Runs(times, [coordinates(x) for x in states])
+    learned, heard = learn_and_listen(K, runs)
+    assert learned.converged == usable, learned.diagnostics
+    assert ("missing force" in learned.diagnostics.failing) != usable
+    assert ["outside the structure" in said for said in heard] == [True] * (not usable), heard
+
+
+@pytest.mark.slow
+def test_correlated_errors_of_sensors_are_no_missing_force():
+    times, states = pendulum(runs=3, noise=0.0)
+    rng = np.random.default_rng(0)
+    for x in states:
+        error = np.zeros(2)
+        for row in x:
+            error = 0.8 * error + 0.6 * rng.standard_normal(2)
+            row += 0.02 * error
+    learned, _ = learn_and_listen(K, hk.Runs(times, states))
+    assert learned.converged, learned.diagnostics
+    assert learned.diagnostics["missing force"].passes
+
+
 def test_a_sentence_of_the_table_has_the_name_of_the_column():
     fit = SimpleNamespace(names=("angle", "speed"), noise=np.array([0.1, 0.9]), scale=np.ones(2))
     row = _noise_against_motion(fit)

@@ -6,6 +6,7 @@ sample of windows, and the first of the landmarks.
 
 from typing import Any, Literal, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,7 +21,7 @@ from hamkernel._solvers.triangle import regression_loss
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.custom_operator import Structured
 from hamkernel._structures.friction import Friction, frictions, with_rest_speed
-from hamkernel._trajectories.kalman import whiten
+from hamkernel._trajectories.kalman import innovations, whiten, whitened_rows
 from hamkernel._trajectories.likelihood import (
     ClosedForm,
     Condensed,
@@ -30,6 +31,7 @@ from hamkernel._trajectories.likelihood import (
 )
 from hamkernel._trajectories.model import KernelRows, Model, landmark_whitening
 from hamkernel._trajectories.segments import LinearisedSegments, windows
+from hamkernel._trajectories.whiteness import whiteness
 from hamkernel._tuning.minimiser import inside_box, run_in_box
 from hamkernel._tuning.space import gram_trace, hyperparameters
 
@@ -346,7 +348,7 @@ def missing_friction(
         return MissingForce()
     both = Friction(force / fastest, 1e-6 * force) + Friction(1e-6 * force / fastest, force)
     more = with_rest_speed(both, jnp.asarray(X), n)
-    return _missing(model, more, S, rows, start_deviation, X, force)
+    return _missing(model, more, S, rows, start_deviation, X, Y, _momenta(n))
 
 
 def missing_inertia(
@@ -379,16 +381,59 @@ def missing_inertia(
     size, positions = force / (3 * fastest**2), tuple(range(n // 2))
     lengths = Gaussian(np.maximum(data.scale[: n // 2], 1e-3 * data.scale[: n // 2].max()))
     cubic = Select(_cubic, tuple(range(n // 2, n)))
-    more = Structured(size**2 * (Select(lengths, positions) * cubic), _momentum_projection)
-    return _missing(model, more, S, rows, start_deviation, X, force)
+    units = _momenta(n)
+    more = Structured(size**2 * (Select(lengths, positions) * cubic), _Diagonal(1 / units))
+    return _missing(model, more, S, rows, start_deviation, X, Y, units)
+
+
+def missing_structure(
+    model: Model,
+    S,
+    rows: LinearisedSegments,
+    start_deviation,
+    data: Preprocessed,
+) -> MissingForce:
+    """A field outside the structure: a gradient in scaled coordinates, beside the drift.
+
+    Any field in the plane is the sum of a Hamiltonian one and such a gradient. The gradient is a
+    third as large as the motion and smooth over two standard deviations. None is missing for
+    families, and where innovations are no whiter with the gradient: then it stands for sensors
+    whose errors are correlated.
+
+    Of three runs of counts of predators and prey, whose logarithms alone are Hamiltonian, four
+    seeds, the gain is 88 to 91 with noise of 2 %, and 20 to 31 with 5 %
+    (`tests/benchmarks/verdicts.py "counts of animals"`). Of pendula with white noise it is −53 to
+    −25. With errors correlated by .8 it was 17 in one of ten logs, and the p of the whiteness rose
+    from 2e-81 to 7e-51.
+    """
+    X, Y = sample_points(data)
+    rate = np.sqrt(np.mean(Y**2, axis=0))
+    # q̇ = p/m, without process noise, has no other force.
+    is_moved = np.isfinite(np.asarray(model.log_process)) & (rate > 0)
+    if model.kernel.input_name == "parameters" or not is_moved.any():
+        return MissingForce()
+    lengths, rates = 2 * data.scale, np.where(is_moved, rate, 0.0)
+    more = Structured(Gaussian(lengths), _Diagonal(0.3 * rates * lengths))
+    units = np.where(is_moved, rate, np.inf)
+    return _missing(model, more, S, rows, start_deviation, X, Y, units, whitens=True)
 
 
 def _cubic(v: Float[Array, " m"], w: Float[Array, " m"]) -> Float[Array, ""]:
     return jnp.dot(v, w) ** 3
 
 
-def _momentum_projection(x: Float[Array, " n"]) -> Float[Array, "n n"]:
-    return jnp.diag((jnp.arange(len(x)) >= len(x) // 2).astype(x.dtype))
+class _Diagonal(eqx.Module):
+    """The operator x -> diag(values)."""
+
+    values: Float[np.ndarray, " n"]
+
+    def __call__(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
+        return jnp.diag(jnp.asarray(self.values, x.dtype))
+
+
+def _momenta(n: int) -> Float[np.ndarray, " n"]:
+    """Units in which forces on momenta count, and nothing else does."""
+    return np.where(np.arange(n) >= n // 2, 1.0, np.inf)
 
 
 def _missing(
@@ -398,13 +443,16 @@ def _missing(
     rows: LinearisedSegments,
     start_deviation,
     X: Float[np.ndarray, "N d"],
-    rate: float,
+    Y: Float[np.ndarray, "N n"],
+    units: Float[np.ndarray, " n"],
+    whitens: bool = False,
 ) -> MissingForce:
     """The force of `more` beside the kernel of states, with less noise if that is likelier.
 
     Process noise, or without it sensor noise, had to explain what `more` would, and process noise
-    alone may be a tenth or a hundredth. X are points along the runs, and `rate` is the RMS rate of
-    the momenta there.
+    alone may be a tenth or a hundredth. X are points along the runs, Y the velocities there, and
+    `units` those in which the force is compared with Y. If `whitens`, a force counts only if the
+    innovations are white with it.
     """
     K, n = model.kernel, rows.residual.shape[-1]
     S, rows = search_sample(jnp.asarray(S), rows)
@@ -421,10 +469,13 @@ def _missing(
     missing = MissingForce(loss - least)
     if not missing.is_there:
         return missing
+    made = whitened_rows(larger, S, rows, start_deviation) if whitens else None
+    if made and whiteness(innovations(made, rows), np.asarray(rows.counts)).is_refuted:
+        return MissingForce()
     A = closed_form(larger, S, rows, start_deviation).coefficients
     # Inputs are columns of the points, and do not change the force.
-    force = placed_product(more, jnp.asarray(X[:, :n]), S[:, :n], A)[:, n // 2 :]
-    return missing._replace(share=float(np.sqrt(np.mean(np.asarray(force) ** 2)) / rate))
+    force = np.asarray(placed_product(more, jnp.asarray(X[:, :n]), S[:, :n], A))
+    return missing._replace(share=float(np.linalg.norm(force / units) / np.linalg.norm(Y / units)))
 
 
 def bounds_and_design(

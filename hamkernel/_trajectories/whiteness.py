@@ -5,6 +5,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+# Bands are wider below p = .05, which one good log in twenty has. One in a thousand may be refused.
+FALSE_ALARMS = 1e-3
+
 
 class Whiteness(NamedTuple):
     """The correlation of innovations from sample to sample.
@@ -32,6 +35,11 @@ class Whiteness(NamedTuple):
         deviations then still hold 90 % instead of 95 %.
         """
         return self.probability >= 0.05 or self.peak < 1.44
+
+    @property
+    def is_refuted(self) -> bool:
+        """Whether next to no white innovations are as correlated."""
+        return not self.is_enough and self.probability <= FALSE_ALARMS
 
     @property
     def widening(self) -> float:

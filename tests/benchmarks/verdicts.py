@@ -56,6 +56,11 @@ def populations(x):
     return np.array([1 - np.exp(x[1]), np.exp(x[0]) - 1])
 
 
+def counts(x):
+    """Predators and prey themselves."""
+    return np.array([x[0] * (1 - x[1]), x[1] * (x[0] - 1)])
+
+
 def path(f, start, ts):
     options = {"t_eval": ts, "rtol": 1e-10, "atol": 1e-10}
     return solve_ivp(lambda _, x: f(x), (ts[0], ts[-1]), np.array(start, float), **options).y.T
@@ -85,6 +90,7 @@ def logs(rng):
     animals = noisy(rng, populations, [[0.5, 0], [1, 0], [0, 0.8]], long, 0.03)
     rubbing = noisy(rng, dry_friction, [[2, 0], [3, 1], [-4, 0]], T, 0.01)
     growing = noisy(rng, spiral, [[0.2, 0], [0.3, 0.1]], long, 0.01)
+    hunted = noisy(rng, counts, [[1.5, 1.0], [2.0, 1.0], [1.0, 0.6]], long, 0.02)
     rare = np.linspace(0, 60, 30)
     aliased = noisy(rng, pendulum, STARTS, rare, 0.01)
     noise = list(rng.standard_normal((2, 61, 2)))
@@ -103,6 +109,7 @@ def logs(rng):
         ("bad: limit cycle", plain, T, cycling, van_der_pol, TEST, 1),
         ("bad: limit cycle, friction", friction, T, cycling, van_der_pol, TEST, 1),
         ("bad: growing spiral", plain, long, growing, spiral, [0.25, 0.0], 1),
+        ("bad: counts of animals", plain, long, hunted, counts, [1.7, 1.0], 1),
         ("bad: two samples a swing", plain, rare, aliased, pendulum, TEST, 1),
         ("bad: noise", plain, T, noise, None, TEST, 1),
         ("bad: random walk", plain, T, walk, None, TEST, 1),
