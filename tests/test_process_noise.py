@@ -522,6 +522,7 @@ def test_friction_of_joints_is_spoken_of_where_there_may_be_links(n, said, gaine
         driven=False,
         friction=MissingForce(gained),
         inertia=MissingForce(),
+        structure=MissingForce(),
         has_momenta=True,
         has_friction=has_friction,
     )
