@@ -7,6 +7,8 @@ import os
 import pathlib
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from hamkernel import _require as require
 from hamkernel._trajectories.lagrangian import LearnedLagrangian
 from hamkernel._trajectories.learned import Learned
@@ -31,13 +33,14 @@ img { max-width: 100%; }
 
 
 def script(file: str, learned: Learned | LearnedLagrangian, is_beside: bool = False) -> str:
-    """Ten lines that load the result in `file` and simulate its field.
+    """Ten lines that load the result in `file` and simulate its first run, with its inputs.
 
     Args:
         file: the file, or its name where `is_beside`.
         learned: the result.
         is_beside: whether the lines are a script that lies in the folder of the file.
     """
+    runs = learned.runs
     lines = [
         *["from pathlib import Path"] * is_beside,
         "import jax",
@@ -45,17 +48,20 @@ def script(file: str, learned: Learned | LearnedLagrangian, is_beside: bool = Fa
         "import jax.numpy as jnp",
         "import hamkernel as hk",
         f"learned = hk.load({f'Path(__file__).with_name({file!r})' if is_beside else repr(file)})",
-        "x0 = learned.states[0][0]  # the start of the first run; any state will do",
-        "ts = jnp.linspace(0.0, learned.runs.times[0][-1] - learned.runs.times[0][0], 401)",
+        "x0, ts = learned.states[0][0], learned.runs.times[0]  # any state and times will do",
     ]
-    call = "hk.simulate(learned.field, x0, ts)"
-    if learned.runs.input_count:
-        is_family = learned.runs.parameters is not None
-        zeros = f"jnp.zeros({learned.runs.input_count})"
-        value = "learned.runs.parameters[0]" if is_family else zeros
-        lines.append(f"u = {value}  # what is applied")
-        call = "hk.simulate(learned.field, x0, ts, inputs=lambda t: u)"
-    return "\n".join([*lines, f"print({call}.ys)"]) + "\n"
+    inputs = ""
+    if runs.parameters is not None:
+        lines.append("theta = learned.runs.parameters[0]  # of the first run")
+        inputs = ", inputs=lambda t: theta"
+    elif runs.inputs is not None and runs.input_times is not None:
+        lines.append("u = learned.runs.inputs[0]  # what was applied in the first run")
+        if runs.delay or not np.array_equal(runs.input_times[0], runs.times[0]):
+            at = f"ts - {runs.delay}, learned.runs.input_times[0]"
+            lines.append(f"u = jax.vmap(lambda c: jnp.interp({at}, c), 1, 1)(u)  # at the times ts")
+        between = "held" if runs.between == "held" else "linear"
+        inputs = f', inputs=u, between="{between}"'
+    return "\n".join([*lines, f"print(hk.simulate(learned.field, x0, ts{inputs}).ys)"]) + "\n"
 
 
 def report(

@@ -89,6 +89,26 @@ def test_the_ten_lines_load_and_simulate(learned, tmp_path, capsys):
     assert "[" in capsys.readouterr().out
 
 
+def test_the_script_applies_the_inputs_of_the_log(monkeypatch):
+    t, own = np.linspace(0, 2, 21), np.linspace(-1, 3, 41)
+    states = np.column_stack([np.cos(t), -np.sin(t)])
+    for inputs, delay in ((np.sin(t), 0.0), ((own, np.sin(own)), 0.25)):
+        runs = hk.Runs([t], [states], [inputs], between="linear", delay=delay)
+        stub, seen = SimpleNamespace(runs=runs, states=[states], field=None), {}
+        monkeypatch.setattr(hk, "load", lambda file, stub=stub: stub)
+
+        def simulate(field, x0, ts, seen=seen, **options):
+            seen.update(options, x0=x0, ts=ts)
+            return SimpleNamespace(ys=0.0)
+
+        monkeypatch.setattr(hk, "simulate", simulate)
+        text = script("learned.hk", stub)
+        assert len(text.splitlines()) <= 10
+        exec(compile(text, "simulate.py", "exec"), {})
+        assert seen["between"] == "linear"
+        np.testing.assert_allclose(seen["inputs"][:, 0], np.sin(seen["ts"] - delay), atol=2e-3)
+
+
 def test_the_script_loads_the_file_beside_it(learned, tmp_path, monkeypatch):
     """Whatever the folder is from which it is run."""
     text, loaded = script("learned.hk", learned, is_beside=True), []
