@@ -443,6 +443,15 @@ def gram_rounding(trace: Float[Array, "..."]) -> Float[Array, "..."]:
 
 
 @precise_jit
+def size_of_terms(
+    K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
+) -> Float[Array, ""]:
+    """‖Σⱼ |K(x, zⱼ) aⱼ|‖, the size of f(x) if its terms did not cancel."""
+    K = drop_symmetry(K)
+    terms = jax.vmap(lambda z, a: K.expansion(x, z[None], a[None]))(Z, A)
+    return jnp.linalg.norm(jnp.sum(jnp.abs(terms), axis=0))
+
+
 def field_rounding(
     K: AbstractMatrixKernel,
     x: Float[Array, " n"],
@@ -456,9 +465,7 @@ def field_rounding(
     If the ridge is small, the terms are large and of both signs, and each rounds to ε of its size.
     The error is clipped at `limit`, since it grows without bound where f(x) tends to zero.
     """
-    K = drop_symmetry(K)
-    terms = jax.vmap(lambda z, a: K.expansion(x, z[None], a[None]))(Z, A)
-    size = jnp.linalg.norm(jnp.sum(jnp.abs(terms), axis=0))
+    size = size_of_terms(K, x, Z, A)
     tiny = jnp.finfo(x.dtype).tiny
     share = jnp.finfo(x.dtype).eps * size / jnp.maximum(jnp.linalg.norm(velocity), tiny)
     return jax.lax.stop_gradient(jnp.minimum(share, limit).astype(x.dtype))

@@ -15,7 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float, Int, Num
 from hamkernel import _require as require
 from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import AbstractJoinedField
-from hamkernel._gram import field_rounding
+from hamkernel._gram import field_rounding, size_of_terms
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._machine import compiled_without_emitters, full_precision, precise_jit
 from hamkernel._structures.laws import outside
@@ -91,6 +91,10 @@ def simulate(
             forward mode through the default adjoint.
         RuntimeError: the solve failed: too many steps, the implicit equations of a step did not
             converge, or the state overflowed. Usually a smaller `dt` helps.
+
+    Warns:
+        UserWarning: the path of a fitted field is far from the points that the field was learned
+            from.
     """
     with require.eager(x0):
         x0 = _initial_state(x0)
@@ -123,6 +127,7 @@ def simulate(
         solution = eqx.tree_at(lambda s: s.stats, solution, stats)
     if require.is_concrete(field, solution.ys):
         warning = outside(getattr(field, "kernel", None), solution.ys)
+        warning = warning or _leaves_the_data(rhs, start, solution)
         if warning:
             require.warn(warning)
     if not throw:
@@ -321,15 +326,60 @@ def _rounding(field: KernelField, x: Float[Array, " n"]) -> Float[Array, ""]:
     return field_rounding(field.kernel, x, field.points, field.coefficients, field(x), 1e-6)
 
 
+def _learned_at(rhs: RightHandSide, start: Any, x: Float[Array, " n"]) -> tuple[Any, Array]:
+    """The field of the points, and the point of the state x with the inputs of the first time."""
+    if isinstance(rhs.field, AbstractJoinedField) and rhs.inputs is not None:
+        return rhs.field.whole, rhs.field.join(x, rhs.inputs(start))
+    return rhs.field, x
+
+
+# A Gaussian falls to a hundredth at three lengthscales.
+_FADED = 0.01
+_LOOKED_AT = 16  # states of the path, and points of the field
+
+
+def _leaves_the_data(rhs: RightHandSide, start: Any, solution: diffrax.Solution) -> str:
+    """A sentence if the kernel has faded where the path goes, else "".
+
+    The terms of the field at states of the path are compared with those at its own points.
+    """
+    learned = _learned_at(rhs, start, solution.ys[0])[0]
+    if not isinstance(learned, KernelField):
+        return ""
+    ts, ys, n = np.asarray(solution.ts), solution.ys, solution.ys.shape[1]
+    at, of = (np.linspace(0, len(X) - 1, _LOOKED_AT).astype(int) for X in (ys, learned.points))
+    X = jnp.concatenate([ys[at], learned.points[of, :n].astype(ys.dtype)])
+    along, usual = np.split(np.asarray(_sizes(rhs, start, learned, X)), 2)
+    faded = along < _FADED * np.median(usual)
+    if not faded.any():
+        return ""
+    return (
+        f"at time {ts[at][faded][0]:.4g} the path is far from the points that the field was learned "
+        f"from. Its kernels are less than {_FADED} of their size there, and the field is its prior "
+        "mean. Learn from runs that go there, or start nearer."
+    )
+
+
+@precise_jit
+def _sizes(
+    rhs: RightHandSide, start: Any, learned: KernelField, X: Float[Array, "N n"]
+) -> Float[Array, " N"]:
+    """The sizes of the terms of the field at the states X."""
+
+    def size(x):
+        point = _learned_at(rhs, start, x)[1]
+        return size_of_terms(learned.kernel, point, learned.points, learned.coefficients)
+
+    return jax.lax.map(size, X)
+
+
 def _tolerances(
     rhs: RightHandSide, start: Any, x0: Float[Array, " n"], rtol: Any, atol: Any
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """The relative and the absolute tolerance; the defaults are not below the rounding of f."""
     default = jnp.asarray(1e-10 if x0.dtype == jnp.float64 else 1e-5, x0.dtype)
     if rtol is None or atol is None:
-        learned, point = rhs.field, x0
-        if isinstance(learned, AbstractJoinedField) and rhs.inputs is not None:
-            learned, point = learned.whole, learned.join(x0, rhs.inputs(start))
+        learned, point = _learned_at(rhs, start, x0)
         if isinstance(learned, KernelField):
             # At an equilibrium f is zero and has no digits; the limit 1e-6 still gives states a
             # few digits.

@@ -477,3 +477,28 @@ def test_each_tolerance_is_its_own():
 
     assert steps(atol=1e-2) < steps(atol=1e-12)
     assert steps(rtol=1e-2, atol=1e-9) < steps(rtol=1e-12, atol=1e-9)
+
+
+def swings(X):
+    return jax.vmap(lambda x: jnp.array([x[1], -jnp.sin(x[0])]))(X)
+
+
+@pytest.mark.parametrize("has_inputs", [False, True])
+def test_paths_far_from_the_data_are_said(has_inputs):
+    X = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (30, 2)))
+    K, U, options = Symplectic(Gaussian(1.0)), None, {}
+    if has_inputs:
+        K = hk.Controlled(K, inputs=hk.InputMatrix(1.0, acts_on=(1,)))
+        U, options = jnp.sin(jnp.arange(30.0))[:, None], {"inputs": lambda t: jnp.zeros(1)}
+    field, ts = hk.fit(K, X, swings(X), inputs=U), jnp.linspace(0, 1, 5)
+    for near in (0.5, 1.5):
+        simulate(field, jnp.array([near, 0.0]), ts, **options)
+    with pytest.warns(UserWarning, match="at time 0 the path is far from the points"):
+        simulate(field, jnp.array([9.0, 0.0]), ts, **options)
+
+
+def test_turns_of_an_angle_are_not_far_from_the_data():
+    X = jnp.asarray(np.random.default_rng(0).uniform([-3, -1], [3, 1], (30, 2)))
+    k = hk.Select(hk.Periodic(2 * np.pi), 0) * hk.Select(Gaussian(2.0), 1)
+    field = hk.fit(Symplectic(k), X, swings(X))
+    simulate(field, jnp.array([40.0, 0.5]), jnp.linspace(0, 1, 5))
