@@ -127,7 +127,7 @@ def simulate(
         solution = eqx.tree_at(lambda s: s.stats, solution, stats)
     if require.is_concrete(field, solution.ys):
         warning = outside(getattr(field, "kernel", None), solution.ys)
-        warning = warning or _leaves_the_data(rhs, start, solution)
+        warning = warning or _leaves_the_data(rhs, start, caller_times, solution.ys)
         if warning:
             require.warn(warning)
     if not throw:
@@ -338,25 +338,25 @@ _FADED = 0.01
 _LOOKED_AT = 16  # states of the path, and points of the field
 
 
-def _leaves_the_data(rhs: RightHandSide, start: Any, solution: diffrax.Solution) -> str:
+def _leaves_the_data(rhs: RightHandSide, start: Any, ts: Any, ys: Any) -> str:
     """A sentence if the kernel has faded where the path goes, else "".
 
     The terms of the field at states of the path are compared with those at its own points.
     """
-    learned = _learned_at(rhs, start, solution.ys[0])[0]
+    learned = _learned_at(rhs, start, ys[0])[0]
     if not isinstance(learned, KernelField):
         return ""
-    ts, ys, n = np.asarray(solution.ts), solution.ys, solution.ys.shape[1]
     at, of = (np.linspace(0, len(X) - 1, _LOOKED_AT).astype(int) for X in (ys, learned.points))
-    X = jnp.concatenate([ys[at], learned.points[of, :n].astype(ys.dtype)])
+    X = jnp.concatenate([ys[at], learned.points[of, : ys.shape[1]].astype(ys.dtype)])
     along, usual = np.split(np.asarray(_sizes(rhs, start, learned, X)), 2)
     faded = along < _FADED * np.median(usual)
     if not faded.any():
         return ""
+    first = np.asarray(ts)[at][faded][0]
     return (
-        f"at time {ts[at][faded][0]:.4g} the path is far from the points that the field was learned "
-        f"from. Its kernels are less than {_FADED} of their size there, and the field is its prior "
-        "mean. Learn from runs that go there, or start nearer."
+        f"at time {first:.4g} the path is far from the points that the field was learned from. Its "
+        f"kernels are less than {_FADED} of their size there, and the field is its prior mean. "
+        "Learn from runs that go there, or start nearer."
     )
 
 

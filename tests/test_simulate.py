@@ -486,15 +486,15 @@ def swings(X):
 @pytest.mark.parametrize("has_inputs", [False, True])
 def test_paths_far_from_the_data_are_said(has_inputs):
     X = jnp.asarray(np.random.default_rng(0).uniform(-1, 1, (30, 2)))
-    K, U, options = Symplectic(Gaussian(1.0)), None, {}
+    K, U, inputs = Symplectic(Gaussian(1.0)), None, None
     if has_inputs:
         K = hk.Controlled(K, inputs=hk.InputMatrix(1.0, acts_on=(1,)))
-        U, options = jnp.sin(jnp.arange(30.0))[:, None], {"inputs": lambda t: jnp.zeros(1)}
+        U, inputs = jnp.sin(jnp.arange(30.0))[:, None], lambda t: jnp.zeros(1)
     field, ts = hk.fit(K, X, swings(X), inputs=U), jnp.linspace(0, 1, 5)
     for near in (0.5, 1.5):
-        simulate(field, jnp.array([near, 0.0]), ts, **options)
+        simulate(field, jnp.array([near, 0.0]), ts, inputs=inputs)
     with pytest.warns(UserWarning, match="at time 0 the path is far from the points"):
-        simulate(field, jnp.array([9.0, 0.0]), ts, **options)
+        simulate(field, jnp.array([9.0, 0.0]), ts, inputs=inputs)
 
 
 def test_turns_of_an_angle_are_not_far_from_the_data():
