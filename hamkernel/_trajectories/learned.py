@@ -93,6 +93,8 @@ class Learned(Shown, eqx.Module):
             (T, n); 0 without process noise.
         history: the iterations, one entry for each.
         converged: whether the field may be used: no row of `diagnostics` that decides falls short.
+            Runs that never cross, such as one orbit, cannot refute a structure: a run between them
+            tests the field, `score`.
         diagnostics: a table with one row for each question: do the iterations settle, does noise
             explain most of the motion, are residuals white, is friction missing, and others;
             `.failing` has the names of the rows that fall short.
