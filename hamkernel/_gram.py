@@ -442,7 +442,6 @@ def gram_rounding(trace: Float[Array, "..."]) -> Float[Array, "..."]:
     return jnp.finfo(trace.dtype).eps * trace
 
 
-@precise_jit
 def size_of_terms(
     K: AbstractMatrixKernel, x: Float[Array, " n"], Z: Float[Array, "M n"], A: Float[Array, "M n"]
 ) -> Float[Array, ""]:
@@ -452,6 +451,7 @@ def size_of_terms(
     return jnp.linalg.norm(jnp.sum(jnp.abs(terms), axis=0))
 
 
+@precise_jit
 def field_rounding(
     K: AbstractMatrixKernel,
     x: Float[Array, " n"],

@@ -33,17 +33,16 @@ _SWING = 5.0  # samples in a swing: with fewer noise and motion cannot be told a
 # 1.3 % off (`tests/benchmarks/capacity.py chain`). Three runs that lose energy and never cross can
 # be followed without friction: dry friction that is missing left .006, see `_LOSSY`.
 _CLOSE = 0.1
-# The same error, below which free runs follow the log. With noise of .4 of the motion, right fields
-# have .26 to .44. White noise in the growth of predators and prey leaves .23 to 1
-# (`tests/test_verdicts.py`).
+# The same error, below which free runs follow the log. Sensor noise of s of the motion leaves about
+# s of right fields, and from s = .5 on the noise decides.
 FOLLOWED = 0.5
 _FEW = 10  # degrees of freedom, from which σ is known to a fifth
 # The share of the forces above which a missing one decides. Friction of the share s takes 2πs of
 # the energy of an oscillator in each swing: a tenth.
 _LOSSY = 0.1 / (2 * np.pi)
-
 # The same of a force outside the structure, which may be no friction. Counts of predators and prey,
-# whose logarithms alone are Hamiltonian, have .30 to .44 (`tests/benchmarks/verdicts.py`).
+# whose logarithms alone are Hamiltonian, have .30 to .34 in eight logs like that of
+# `tests/benchmarks/verdicts.py "counts of animals"`.
 _FOREIGN = 0.1
 
 

@@ -18,8 +18,8 @@ from hamkernel._trajectories.search import missing_friction, missing_inertia, mi
 from hamkernel._trajectories.segments import Piece
 from hamkernel._trajectories.whiteness import whiteness
 
-# The p of whiteness below which we ask for missing forces. Where dry friction was missing, p was
-# 9e-18 to .11 in 13 logs, with noise of 1 % of the motion.
+# The p of whiteness below which we ask for missing forces. In 13 logs like that of
+# `tests/benchmarks/verdicts.py "dry friction"`, which lack friction, p was 9e-18 to .1.
 _SUSPICIOUS = 0.3
 
 
@@ -161,8 +161,8 @@ def _core(residuals: list[np.ndarray]) -> Float[np.ndarray, " n"]:
 def _free_run(end: End, kept: Float[np.ndarray, " R"], swing: float) -> float:
     """The error of free runs over two swings, relative to the error of a constant.
 
-    If this ratio is not small, we take the smallest ratio over two, one and half a swing: no
-    field predicts a pendulum that is balanced upright for a whole swing. For a real one, with a
+    From a ratio of `FOLLOWED` on, we take the smallest over two, one and half a swing: no field
+    predicts a pendulum that is balanced upright for a whole swing. For a real one, with a
     field that is right to .05 rad after a second, the ratios are 2.5, 1.4 and .89. On three
     simulated logs of animals in weather, which no field predicts, they are 1.02 to 1.5
     (`tests/test_verdicts.py`).

@@ -397,13 +397,14 @@ def missing_structure(
 
     Any field in the plane is the sum of a Hamiltonian one and such a gradient. The gradient is a
     third as large as the motion and smooth over two standard deviations. None is missing for
-    families, and where innovations are no whiter with the gradient: then it stands for sensors
-    whose errors are correlated.
+    families, and where the innovations are not white with the gradient: then the gradient stands
+    for sensors whose errors are correlated.
 
     Of three runs of counts of predators and prey, whose logarithms alone are Hamiltonian, four
     seeds, the gain is 88 to 91 with noise of 2 %, and 20 to 31 with 5 %
-    (`tests/benchmarks/verdicts.py "counts of animals"`). Of pendula with white noise it is −53 to
-    −25. With errors correlated by .8 it was 17 in one of ten logs, and the p of the whiteness rose
+    (`tests/benchmarks/verdicts.py "counts of animals"`). A gradient as large as the motion and
+    smooth over one deviation had −25 to 14 with 5 %. Of pendula with white noise the gain is −26 to
+    −17. With errors correlated by .8 it was 17 in one of five logs, and the p of the whiteness rose
     from 2e-81 to 7e-51.
     """
     X, Y = sample_points(data)
@@ -412,8 +413,8 @@ def missing_structure(
     is_moved = np.isfinite(np.asarray(model.log_process)) & (rate > 0)
     if model.kernel.input_name == "parameters" or not is_moved.any():
         return MissingForce()
-    lengths, rates = 2 * data.scale, np.where(is_moved, rate, 0.0)
-    more = Structured(Gaussian(lengths), _Diagonal(0.3 * rates * lengths))
+    lengths = 2 * data.scale
+    more = Structured(Gaussian(lengths), _Diagonal(0.3 * lengths * rate * is_moved))
     units = np.where(is_moved, rate, np.inf)
     return _missing(model, more, S, rows, start_deviation, X, Y, units, whitens=True)
 
