@@ -356,6 +356,11 @@ def full_precision(function: Callable[P, T]) -> Callable[P, T]:
     return precise
 
 
+def entry_point(function: Callable[P, T]) -> Callable[P, T]:
+    """`function` on the device of its data, with one thread of BLAS, in full precision."""
+    return follow_data(one_blas_thread(full_precision(function)))
+
+
 class EqualToItself:
     """A base of PyTrees with arrays, so that `jax.jit` takes the object and its methods.
 

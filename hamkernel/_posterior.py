@@ -24,13 +24,7 @@ from hamkernel._fields.joined import AbstractJoinedField, FamilyField, known_of,
 from hamkernel._gram import components
 from hamkernel._kernels.base import Invariance, Scaled
 from hamkernel._kernels.symmetry import drop_symmetry
-from hamkernel._machine import (
-    EqualToItself,
-    follow_data,
-    full_precision,
-    one_blas_thread,
-    precise_jit,
-)
+from hamkernel._machine import EqualToItself, entry_point, full_precision, precise_jit
 from hamkernel._observations.blocks import AbstractBlock, Values
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import inputs_of, observations
@@ -49,9 +43,7 @@ from hamkernel._solvers.problem import (
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
-@follow_data
-@one_blas_thread
-@full_precision
+@entry_point
 def condition(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
@@ -245,9 +237,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         """
         return jnp.stack([root(variance) for variance in jnp.diagonal(self.covariance(x, u))])
 
-    @follow_data
-    @one_blas_thread
-    @full_precision
+    @entry_point
     def evaluate(
         self, X: Num[ArrayLike, "N n"], U: Num[ArrayLike, "N m"] | None = None
     ) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
@@ -378,9 +368,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         conditional = self.conditional.update(new)
         return Posterior(conditional, learned_field(conditional.field, mean))
 
-    @follow_data
-    @one_blas_thread
-    @full_precision
+    @entry_point
     def sample(
         self,
         key: Key[Array, ""] | UInt32[Array, "..."],

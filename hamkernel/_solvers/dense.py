@@ -41,7 +41,7 @@ from hamkernel._solvers.factors import (
     solution,
 )
 from hamkernel._solvers.low_rank import Prior, prior_draws
-from hamkernel._solvers.problem import AbstractConditional, AbstractSolver, Problem
+from hamkernel._solvers.problem import AbstractConditional, AbstractSolver, Problem, check_field
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
@@ -251,16 +251,10 @@ def _refuse_failure(
             "that is not positive definite or not finite: hk.check_kernel(k, X) finds out."
         )
 
-    def learned_arrays(f):
-        return f.coefficients, f.residual, f.norm, f.value_coefficients
-
     # The relative error of the fitted values was 1 to 10 times ‖y − (G + σ²I)c‖/‖y‖, at every
     # accuracy.
     failed = ~(require.host_array(relative_residual) <= 1e-2)
-    if throw and require.is_concrete(failed):  # the field need not be taken apart
-        return require.value(field, failed, message, RuntimeError)
-    values = require.value(learned_arrays(field), failed, message, RuntimeError, throw)
-    return eqx.tree_at(learned_arrays, field, values, is_leaf=lambda leaf: leaf is None)
+    return check_field(field, failed, message, throw)
 
 
 class Cholesky(AbstractSolver[KernelField]):

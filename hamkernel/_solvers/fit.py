@@ -16,10 +16,8 @@ from hamkernel._fields.joined import ControlledField, FamilyField, learned_field
 from hamkernel._fields.lagrangian import LagrangianField
 from hamkernel._machine import (
     dense_bytes,
-    follow_data,
-    full_precision,
+    entry_point,
     memory_bytes,
-    one_blas_thread,
     row_sharding,
     to_caller_sharding,
 )
@@ -109,9 +107,7 @@ def fit(
 ) -> LearnedField: ...
 
 
-@follow_data
-@one_blas_thread
-@full_precision
+@entry_point
 def fit(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
