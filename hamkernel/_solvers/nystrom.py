@@ -271,8 +271,8 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
 @precise_jit  # so that T is bit by bit that of `_landmark_fit`
 def _start(K, sample, regularization, landmarks, tolerance):
     T = whitening(K, landmarks)
-    own = {"landmarks": landmarks, "trace": jnp.zeros((), T.dtype), "tolerance": tolerance}
-    return start_fit(LandmarkFit, Columns(K, landmarks), T, sample, regularization, own)
+    fields = {"landmarks": landmarks, "trace": jnp.zeros((), T.dtype), "tolerance": tolerance}
+    return start_fit(LandmarkFit, Columns(K, landmarks), T, sample, regularization, **fields)
 
 
 @precise_jit

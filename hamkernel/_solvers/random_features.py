@@ -100,8 +100,8 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"], Abstra
         span = self.span(K, sample.points.shape[1], sample.targets.dtype)
         one = jnp.eye(span.features.columns, dtype=sample.targets.dtype)
         # 4096 points set the basis of the sums, the default number of candidates of `Nystrom`.
-        subset, own = thin(K, sample, 4096), {"features": span.features}
-        return start_fit(FeatureFit, span, one, subset, regularization, own)
+        subset, basis = thin(K, sample, 4096), span.features
+        return start_fit(FeatureFit, span, one, subset, regularization, features=basis)
 
 
 @precise_jit

@@ -280,7 +280,7 @@ def start_fit(
     W: Float[Array, "r r"],
     sample: Measurements,
     regularization: Float[Array, ""],
-    own: dict[str, Any],
+    **fields: Any,
 ) -> Fit:
     """The fit to no data yet, whose sums are in the basis that a sample and W define.
 
@@ -290,11 +290,11 @@ def start_fit(
         W: a matrix, shape (r, r).
         sample: representative rows.
         regularization: λ.
-        own: the fields that this class has besides those of the base class.
+        fields: the fields that this class has besides those of the base class.
     """
     sums = first_sums(functions.normal_equations(sample, W), W, sample.count, regularization)
     none, n = jnp.zeros((), int), sample.dimension
-    fit = kind(functions.kernel, sums, (), none, regularization, n, **own)
+    fit = kind(functions.kernel, sums, (), none, regularization, n, **fields)
     return dataclasses.replace(fit, compensation=fit._totals)
 
 
