@@ -512,6 +512,11 @@ def velocity(field: Any, x: Any, name: str = "field") -> jax.ShapeDtypeStruct:
     return out
 
 
+def takes_two(function: Any) -> bool:
+    """Whether a function needs two arguments; a second one with a default does not count."""
+    return signature_mismatch(function, 0) is not None and not signature_mismatch(function, 0, 0)
+
+
 def signature_mismatch(function: Any, *arguments: Any) -> str | None:
     """The parameters of `function`, as text, if it cannot take these arguments; else None."""
     with suppress(ValueError):  # raised for a builtin without a signature

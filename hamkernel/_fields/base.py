@@ -388,18 +388,10 @@ def known_part(K: AbstractMatrixKernel, mean: Any, n: int, dtype: Any) -> Any:
     if mean is None:
         return None if matrix is None else KnownPart(None, matrix, K.input_count, of_inputs=False)
     x = jnp.zeros(n, dtype)
-    of_inputs = _takes_inputs(mean, x)
+    of_inputs = getattr(mean, "takes_inputs", False) or require.takes_two(mean)
     at_zero = AtInputs(mean, jnp.zeros(K.input_count, dtype)) if of_inputs else mean
     require.velocity(at_zero, x, "mean")
     return KnownPart(as_pytree(mean), matrix, K.input_count, of_inputs)
-
-
-def _takes_inputs(mean: Any, x: Float[Array, " n"]) -> bool:
-    """Whether the mean takes x and u; a second argument with a default does not count."""
-    if getattr(mean, "takes_inputs", False):
-        return True
-    alone, both = (require.signature_mismatch(mean, *args) for args in ((x,), (x, x)))
-    return callable(mean) and alone is not None and both is None
 
 
 def potential_of(field: Callable[..., Any], kernel: AbstractMatrixKernel) -> Scalar:

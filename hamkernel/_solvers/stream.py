@@ -37,13 +37,16 @@ from hamkernel._machine import (
     row_sharding,
     shard,
 )
-from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
+from hamkernel._observations.kinds import (
+    AbstractObservations,
+    Equilibria,
+    inputs_or_parameters,
+)
 from hamkernel._observations.measurements import (
     Measurements,
     measurements_of,
     observations,
     place,
-    sampled_points,
 )
 from hamkernel._show import call, text
 from hamkernel._solvers.least_squares import Sums, first_sums, solve_sums
@@ -397,15 +400,13 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
                 `RandomFeatures`, has no known spectral density.
         """
         K = matrix_kernel(K)
+        data_inputs = inputs_or_parameters(inputs, parameters)
         if isinstance(sample, AbstractObservations):
-            K, rows = measurements_of(
-                K, place(observations(sample, None, inputs_or_parameters(inputs, parameters)))
-            )
-            _refuse_energies(rows)
+            data = observations(sample, None, data_inputs)
         else:
-            sample = require.finite(require.points(sample, "sample"), "sample")
-            K, points = sampled_points(K, sample, inputs_or_parameters(inputs, parameters))
-            rows = rows_at(K, points)
+            data = Equilibria(require.points(sample, "sample"), data_inputs)
+        K, rows = measurements_of(K, place(data))
+        _refuse_energies(rows)
         K.check_dimension(rows.points.shape[1])
         K = complete(K, rows.points, rows.dimension)
         require.warn_of_float32(rows.targets)

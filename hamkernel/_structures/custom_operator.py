@@ -1,7 +1,6 @@
 """Fields B(x)∇H with the caller's operator B, and Poisson systems, whose B is antisymmetric."""
 
 import abc
-import inspect
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -133,21 +132,8 @@ def Structured(kernel: Any, operator: Callable[..., Any]) -> AbstractStructure:
         field = hk.fit(hk.Structured(hk.Gaussian(1.0), flow), X, Y)
     """
     function = _operator_function(operator, "Structured", "operator")
-    made_by: Any = StructuredByOperator if _takes_potential(operator) else StructuredByMatrix
+    made_by: Any = StructuredByOperator if require.takes_two(operator) else StructuredByMatrix
     return made_by(as_scalar_kernel(kernel), function)
-
-
-def _takes_potential(operator: Callable[..., Any]) -> bool:
-    """Whether a function has two arguments without defaults, (u, x), and not one, x."""
-    try:
-        arguments = inspect.signature(operator).parameters.values()
-    except (TypeError, ValueError):  # functions of C
-        return False
-    needed = [a for a in arguments if a.default is a.empty and a.kind in _BY_POSITION]
-    return len(needed) == 2
-
-
-_BY_POSITION = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 
 
 class Poisson(AbstractCustomOperator):
