@@ -100,12 +100,8 @@ class GramOperator(lx.AbstractLinearOperator):
         Raises:
             ValueError: the vector is not of shape (M, n). TypeError: it is complex.
         """
-        columns = self.in_structure().shape
-        if jnp.shape(vector) != columns:
-            raise ValueError(
-                f"the vector has shape {jnp.shape(vector)}; one coefficient for each column of "
-                f"the Gram, shape {columns}, is needed."
-            )
+        needed = "one coefficient for each column of the Gram"
+        require.shape(vector, "the vector", needed, self.in_structure().shape)
         vector = require.floating(vector, "the vector")
         return _sharded_product(self.kernel, self.X, self.columns, vector, self.X_rows, self.Z_rows)
 

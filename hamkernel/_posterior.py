@@ -353,11 +353,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         """
         data_inputs = inputs_or_parameters(inputs, parameters, self.conditional.field.kernel)
         data, old = observations(X, Y, data_inputs, part=True), self.conditional.rows
-        if data.dimension != old.dimension:
-            raise ValueError(
-                f"the new data have {data.dimension} coordinates and the posterior "
-                f"{old.dimension}: both must be of one system."
-            )
+        require.one_system("the new data have", data.dimension, "the posterior", old.dimension)
         mean = known_of(self.field)
         new = new_rows(self.conditional.field.kernel, data, old, mean)
         if new.targets.dtype != old.targets.dtype:
@@ -407,11 +403,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         if region is None:
             region = _range_of(rows.points[:, :n], None)
         corners = require.floating(region, "region").astype(dtype)
-        if corners.shape != (2, n):
-            raise ValueError(
-                f"region has shape {corners.shape}; the lowest and the highest corner of a box, "
-                f"shape (2, {n}), are needed."
-            )
+        require.shape(corners, "region", "a box, its lowest and its highest corner", (2, n))
         low, high = require.host_array(corners)
         bad = ~((high > low) & (abs(low) < np.inf) & (abs(high) < np.inf))
         message = "region must be finite, its first row the lower corner in every coordinate."

@@ -292,8 +292,7 @@ def positive(x: Any, name: str, cure: str = "") -> Array:
 def positive_scalar(x: ArrayLike, name: str, cure: str = "") -> Float[Array, ""]:
     """`x` as a positive float array of shape ()."""
     array = floating(x, name)
-    if array.shape:
-        raise ValueError(f"{name} has shape {array.shape}; one number is needed.")
+    shape(array, name, "one number", ())
     return positive(array, name, cure)
 
 
@@ -333,6 +332,21 @@ def key(key: Any) -> Key[Array, ""]:
     return key
 
 
+def shape(array: Any, name: str, needed: str, *shapes: tuple[int, ...], cure: str = "") -> None:
+    """ValueError unless the array has one of the shapes; `needed` says in words what it holds."""
+    if jnp.shape(array) not in shapes:
+        wanted = f"{needed}, shape {' or '.join(map(str, shapes))}, is needed."
+        raise ValueError(f"{name} has shape {jnp.shape(array)}; {wanted} {cure}".rstrip())
+
+
+def one_system(subject: str, n: int, reference: str, m: int) -> None:
+    """ValueError unless states with n and with m coordinates may be those of one system."""
+    if n != m:
+        raise ValueError(
+            f"{subject} {n} coordinates and {reference} {m}: both must be states of one system."
+        )
+
+
 def one_dtype(X: Array, Z: Array) -> tuple[Array, Array]:
     """Both arrays in the wider of their dtypes, also under strict promotion."""
     dtype = np.promote_types(X.dtype, Z.dtype)
@@ -342,11 +356,7 @@ def one_dtype(X: Array, Z: Array) -> tuple[Array, Array]:
 
 def one_space(X: Array, Z: Array) -> tuple[Array, Array]:
     """Both arrays in one dtype; ValueError if their numbers of coordinates differ."""
-    if X.shape[1] != Z.shape[1]:
-        raise ValueError(
-            f"X has {X.shape[1]} coordinates and Z has {Z.shape[1]}: both must be states of one "
-            "system, shapes (N, n) and (M, n)."
-        )
+    one_system("X has", X.shape[1], "Z has", Z.shape[1])
     return one_dtype(X, Z)
 
 
@@ -374,11 +384,8 @@ def points(X: ArrayLike, name: str = "X") -> Float[Array, "N n"]:
 def point(x: ArrayLike, n: int, name: str = "x") -> Float[Array, " n"]:
     """One state of `n` coordinates; the error for several states points to `jax.vmap`."""
     array = floating(x, name)
-    if array.shape != (n,):
-        hint = " Use `jax.vmap(...)` for a batch of states." if array.ndim > 1 else ""
-        raise ValueError(
-            f"{name} has shape {array.shape}; one state of shape ({n},) is needed.{hint}"
-        )
+    cure = "Use `jax.vmap(...)` for a batch of states." if array.ndim > 1 else ""
+    shape(array, name, "one state", (n,), cure=cure)
     return array
 
 

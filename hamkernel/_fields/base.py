@@ -116,11 +116,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         """
         self._check_single()
         X = require.points(X, "X").astype(self.offset.dtype)
-        if X.shape[1] != self.dimension:
-            raise ValueError(
-                f"X has {X.shape[1]} coordinates and the field {self.dimension}: states of shape "
-                f"(N, {self.dimension}) are needed."
-            )
+        require.one_system("X has", X.shape[1], "the field", self.dimension)
         learned = self._velocities(X)
         return learned if self.mean is None else learned + map_states(self.mean, X)
 
@@ -148,11 +144,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         """
         velocities = self.evaluate(*(X,) if U is None else (X, U))
         measured = require.points(Y, "Y").astype(velocities.dtype)
-        if measured.shape != velocities.shape:
-            raise ValueError(
-                f"Y has shape {measured.shape}; one velocity for each state in X, shape "
-                f"{velocities.shape}, is needed."
-            )
+        require.shape(measured, "Y", "one velocity for each state in X", velocities.shape)
         spread = measured - jnp.nanmean(measured, axis=0, keepdims=True)
         return 1 - jnp.nansum((measured - velocities) ** 2) / jnp.nansum(spread**2)
 
@@ -281,8 +273,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
                 the value no finite number.
         """
         self._check_single()
-        if jnp.shape(value) != ():
-            raise ValueError(f"value has shape {jnp.shape(value)}; one number is needed.")
+        require.shape(value, "value", "one number", ())
         anchor = require.floating(value, "value").astype(self.offset.dtype)
         x0 = require.point(x0, self.dimension, "x0")
         offset = anchor - self.unanchored_potential(x0)

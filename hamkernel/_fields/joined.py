@@ -296,11 +296,7 @@ class FamilyField(AbstractJoinedField):
         K: Any = self.kernel
         p = K.input_count
         theta = _column(require.floating(theta, "θ"), 0, p)
-        if theta.shape != (p,):
-            raise ValueError(
-                f"θ has shape {theta.shape}; the parameters of one member, shape ({p},), are "
-                "needed."
-            )
+        require.shape(theta, "θ", "the θ of one member", (p,))
         theta = require.finite(theta, "θ").astype(self.offset.dtype)
         terms = tuple(
             fix_inputs(

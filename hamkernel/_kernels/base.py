@@ -470,12 +470,8 @@ class UserKernel(AbstractScalarKernel):
         with require.traceable(f"the kernel {_name(self.fn)}"):
             value = self.fn(x, z)
         value = require.floating(value, f"the value of the kernel {_name(self.fn)}")
-        if value.shape:
-            raise ValueError(
-                f"the kernel {_name(self.fn)} returned an array of shape {value.shape} for "
-                f"two points of shape {jnp.shape(x)}; a scalar is needed. Write the kernel for "
-                "one pair of points, k(x, z) -> (): the library adds the vmap."
-            )
+        cure = "Write the kernel for one pair of points: the library adds the vmap."
+        require.shape(value, f"the value of the kernel {_name(self.fn)}", "a scalar", (), cure=cure)
         # Parameters of the kernel may be more precise than the data.
         return value.astype(require.floating(x, "the point").dtype)
 

@@ -218,13 +218,8 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
         The choice stops when the tolerance is met or `max_points` is reached.
         """
         if self.points is not None:
-            d = rows.blocks[0].points.shape[1]
-            if self.points.shape[1] != d:
-                m = self.points.shape[1]
-                raise ValueError(
-                    f"the landmarks, `points` of Nystrom, have {m} coordinates and X {d}: both "
-                    "must be states of one system."
-                )
+            landmarks, d = "the landmarks, `points` of Nystrom, have", rows.points.shape[1]
+            require.one_system(landmarks, self.points.shape[1], "X", d)
             points = self.points.astype(rows.targets.dtype)
             return given_landmarks(K, landmarks_of(components(K, points)))
         key = jax.random.key(0) if self.key is None else self.key

@@ -226,11 +226,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
 
     def _check(self, dtype: jnp.dtype | None, dimension: int) -> None:
         """ValueError for another number of coordinates, TypeError for a dtype of more digits."""
-        if dimension != self.dimension:
-            raise ValueError(
-                f"the data have {dimension} coordinates and the fit {self.dimension}: both must be "
-                "states of one system."
-            )
+        require.one_system("the data have", dimension, "the fit", self.dimension)
         if dtype is not None and np.promote_types(dtype, self.dtype) != self.dtype:
             raise TypeError(
                 f"the data are {dtype} and the fit {self.dtype}, the dtype of the sample of "

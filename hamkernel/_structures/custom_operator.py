@@ -47,14 +47,10 @@ class AbstractCustomOperator(AbstractPotentialKernel):
     def _matrix(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
         """B(x), in the dtype of x."""
         value, n = getattr(self, self.role)(x), len(x)
-        name = f"{self.role} of {self.name}"
-        value = require.floating(value, f"the value of the {name}")
-        if value.shape != (n, n):
-            raise ValueError(
-                f"the {name} returned shape {value.shape} for a state of shape ({n},); an "
-                f"array of shape ({n}, {n}) is needed, such as jnp.array([[...], [...]]). Write it "
-                f"for one state of {n} coordinates."
-            )
+        name = f"the value of the {self.role} of {self.name}"
+        value = require.floating(value, name)
+        cure = "Write it for one state, and return jnp.array([[...], [...]])."
+        require.shape(value, name, "a matrix for each state", (n, n), cure=cure)
         return value.astype(x.dtype)
 
     def check_dimension(self, n: int) -> None:

@@ -41,13 +41,9 @@ class StructuredByOperator(AbstractStructure):
     def _apply(self, u: Potential, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """(L u)(x), in the dtype of x."""
         value = self.operator(u, x)
-        if jnp.shape(value) != x.shape:
-            raise ValueError(
-                f"the operator of Structured returned shape {jnp.shape(value)} for a state of shape"
-                f" {x.shape}; the field at that state, of the same shape, is needed, such as "
-                "operator = lambda u, x: jax.grad(u)(x)."
-            )
-        return require.floating(value, "the operator of Structured").astype(x.dtype)
+        name, cure = "the value of the operator of Structured", "Such as jax.grad(u)(x)."
+        require.shape(value, name, "the field at one state", x.shape, cure=cure)
+        return require.floating(value, name).astype(x.dtype)
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
         return u @ self.expansion(x, z[None], v[None])
