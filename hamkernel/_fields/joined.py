@@ -197,8 +197,6 @@ class ControlledField(AbstractJoinedField):
         whole: the field of the points (x, u), of dimension n + m.
     """
 
-    whole: KernelField | FeatureField
-
     @property
     def inputs(self) -> Float[Array, "M m"]:
         """uⱼ at the points, shape (M, m)."""
@@ -263,8 +261,6 @@ class FamilyField(AbstractJoinedField):
     Attributes:
         whole: the field of the points (x, θ), of dimension n + p.
     """
-
-    whole: KernelField | FeatureField
 
     @property
     def parameters(self) -> Float[Array, "M p"]:

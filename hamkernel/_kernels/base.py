@@ -222,8 +222,9 @@ class AbstractScalarKernel(eqx.Module):
 
     @property
     def has_amplitude(self) -> bool:
-        """Whether a trained factor multiplies all of k; a factor that is None is not trained."""
-        return False
+        """Whether a trained factor multiplies all of k; by default, all of the kernel inside k."""
+        inner = getattr(self, "kernel", None)
+        return isinstance(inner, AbstractScalarKernel) and inner.has_amplitude
 
     def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
         """The lower and upper bound of the array `name`, as stored, for `tune`.
@@ -442,6 +443,7 @@ class Scaled(AbstractScalarKernel):
 
     @property
     def has_amplitude(self) -> bool:
+        # A factor that is None is not trained.
         return self.log_scale is not None or self.kernel.has_amplitude
 
 

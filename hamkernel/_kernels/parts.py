@@ -192,10 +192,6 @@ class Shared(AbstractScalarKernel):
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
         return (frozenset(range(getattr(self.parts, "positions", n))),)
 
-    @property
-    def has_amplitude(self) -> bool:
-        return self.kernel.has_amplitude
-
     def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N d"]:
         return self.spread(X, 16 * _CENTRES)
 

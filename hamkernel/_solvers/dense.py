@@ -48,9 +48,6 @@ from hamkernel._structures.base import AbstractMatrixKernel
 class DenseConditional(AbstractConditional):
     """The posterior from the Cholesky factor of A; `representer` is c = A⁻¹y."""
 
-    field: KernelField
-    rows: Measurements
-    ridge: Float[Array, ""]
     factor: DenseFactor
     representer: Float[Array, " D"]
 

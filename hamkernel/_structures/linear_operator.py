@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, Point, Points
+from hamkernel._kernels.base import Invariance, Point, Points
 from hamkernel._machine import precise_jit
 from hamkernel._show import call, text
 from hamkernel._structures.structure import AbstractStructure
@@ -27,7 +27,6 @@ class StructuredByOperator(AbstractStructure):
     So an operator of order p takes derivatives of k of order 2p.
     """
 
-    kernel: AbstractScalarKernel
     operator: Callable[[Potential, Float[Array, " n"]], Any]
 
     field_parity: ClassVar[int] = 0
