@@ -150,19 +150,15 @@ def floating(x: Any, name: str) -> Array:
     elif not isinstance(x, jax.Array):
         x = _plain(x, name)
     with eager(x):
-        return _floating(x, name)
-
-
-def _floating(x: Any, name: str) -> Array:
-    try:
-        array = x if isinstance(x, jax.Array) else jnp.asarray(x)
-    except (TypeError, ValueError) as error:
-        raise _no_numbers(x, name) from error
-    if jnp.issubdtype(array.dtype, jnp.floating):
-        # No weak type: a Python float must not recompile.
-        return array.astype(array.dtype) if array.weak_type else array
-    if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
-        return array.astype(float)
+        try:
+            array = x if isinstance(x, jax.Array) else jnp.asarray(x)
+        except (TypeError, ValueError) as error:
+            raise _no_numbers(x, name) from error
+        if jnp.issubdtype(array.dtype, jnp.floating):
+            # No weak type: a Python float must not recompile.
+            return array.astype(array.dtype) if array.weak_type else array
+        if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
+            return array.astype(float)
     raise _no_numbers(array, name)
 
 
