@@ -292,7 +292,7 @@ class FamilyField(AbstractJoinedField):
         K: Any = self.kernel
         p = K.input_count
         theta = _column(require.floating(theta, "θ"), 0, p)
-        require.shape(theta, "θ", "the θ of one member", (p,))
+        require.shape(theta, "θ has", "the θ of one member", (p,))
         theta = require.finite(theta, "θ").astype(self.offset.dtype)
         terms = tuple(
             fix_inputs(

@@ -473,7 +473,8 @@ class UserKernel(AbstractScalarKernel):
             value = self.fn(x, z)
         value = require.floating(value, f"the value of the kernel {_name(self.fn)}")
         cure = "Write the kernel for one pair of points: the library adds the vmap."
-        require.shape(value, f"the value of the kernel {_name(self.fn)}", "a scalar", (), cure=cure)
+        subject = f"the kernel {_name(self.fn)} returned an array of"
+        require.shape(value, subject, "a scalar", (), cure=cure)
         # Parameters of the kernel may be more precise than the data.
         return value.astype(require.floating(x, "the point").dtype)
 

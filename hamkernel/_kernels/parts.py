@@ -151,7 +151,9 @@ class Shared(AbstractScalarKernel):
         point = jnp.atleast_1d(require.floating(r, "r"))
         point = getattr(self.parts, "coordinate", lambda r: r)(point)
         d = len((self.centres or ((0.0,),))[0])
-        require.shape(point, "r", "one point", (d,), cure="Use jax.vmap(field.law)(r) for many.")
+        require.shape(
+            point, "r has", "one point", (d,), cure="Use jax.vmap(field.law)(r) for many."
+        )
         return point
 
     def law(self, point: Float[Array, " d"]) -> Float[Array, " m"]:

@@ -47,10 +47,10 @@ class AbstractCustomOperator(AbstractPotentialKernel):
     def _matrix(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
         """B(x), in the dtype of x."""
         value, n = getattr(self, self.role)(x), len(x)
-        name = f"the value of the {self.role} of {self.name}"
-        value = require.floating(value, name)
+        name = f"the {self.role} of {self.name}"
+        value = require.floating(value, f"the value of {name}")
         cure = "Write it for one state, and return jnp.array([[...], [...]])."
-        require.shape(value, name, "a matrix for each state", (n, n), cure=cure)
+        require.shape(value, f"{name} returned", "a matrix for each state", (n, n), cure=cure)
         return value.astype(x.dtype)
 
     def check_dimension(self, n: int) -> None:

@@ -40,8 +40,8 @@ class StructuredByOperator(AbstractStructure):
     def _apply(self, u: Potential, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """(L u)(x), in the dtype of x."""
         value = self.operator(u, x)
-        name, cure = "the value of the operator of Structured", "Such as jax.grad(u)(x)."
-        require.shape(value, name, "the field at one state", x.shape, cure=cure)
+        name, cure = "the operator of Structured", "It is, for example, jax.grad(u)(x)."
+        require.shape(value, f"{name} returned", "the field at one state", x.shape, cure=cure)
         return require.floating(value, name).astype(x.dtype)
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
