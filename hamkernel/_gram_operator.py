@@ -101,7 +101,7 @@ class GramOperator(lx.AbstractLinearOperator):
             ValueError: the vector is not of shape (M, n). TypeError: it is complex.
         """
         needed = "one coefficient for each column of the Gram"
-        require.shape(vector, "the vector", needed, self.in_structure().shape)
+        require.shape(vector, "the vector has", needed, self.in_structure().shape)
         vector = require.floating(vector, "the vector")
         return _sharded_product(self.kernel, self.X, self.columns, vector, self.X_rows, self.Z_rows)
 

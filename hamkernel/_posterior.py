@@ -403,7 +403,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         if region is None:
             region = _range_of(rows.points[:, :n], None)
         corners = require.floating(region, "region").astype(dtype)
-        require.shape(corners, "region", "a box, its lowest and its highest corner", (2, n))
+        require.shape(corners, "region has", "a box, its lowest and its highest corner,", (2, n))
         low, high = require.host_array(corners)
         bad = ~((high > low) & (abs(low) < np.inf) & (abs(high) < np.inf))
         message = "region must be finite, its first row the lower corner in every coordinate."

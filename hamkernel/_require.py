@@ -150,19 +150,15 @@ def floating(x: Any, name: str) -> Array:
     elif not isinstance(x, jax.Array):
         x = _plain(x, name)
     with eager(x):
-        return _floating(x, name)
-
-
-def _floating(x: Any, name: str) -> Array:
-    try:
-        array = x if isinstance(x, jax.Array) else jnp.asarray(x)
-    except (TypeError, ValueError) as error:
-        raise _no_numbers(x, name) from error
-    if jnp.issubdtype(array.dtype, jnp.floating):
-        # No weak type: a Python float must not recompile.
-        return array.astype(array.dtype) if array.weak_type else array
-    if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
-        return array.astype(float)
+        try:
+            array = x if isinstance(x, jax.Array) else jnp.asarray(x)
+        except (TypeError, ValueError) as error:
+            raise _no_numbers(x, name) from error
+        if jnp.issubdtype(array.dtype, jnp.floating):
+            # No weak type: a Python float must not recompile.
+            return array.astype(array.dtype) if array.weak_type else array
+        if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
+            return array.astype(float)
     raise _no_numbers(array, name)
 
 
@@ -292,7 +288,7 @@ def positive(x: Any, name: str, cure: str = "") -> Array:
 def positive_scalar(x: ArrayLike, name: str, cure: str = "") -> Float[Array, ""]:
     """`x` as a positive float array of shape ()."""
     array = floating(x, name)
-    shape(array, name, "one number", ())
+    shape(array, f"{name} has", "one number", ())
     return positive(array, name, cure)
 
 
@@ -332,11 +328,14 @@ def key(key: Any) -> Key[Array, ""]:
     return key
 
 
-def shape(array: Any, name: str, needed: str, *shapes: tuple[int, ...], cure: str = "") -> None:
-    """ValueError unless the array has one of the shapes; `needed` says in words what it holds."""
+def shape(array: Any, subject: str, needed: str, *shapes: tuple[int, ...], cure: str = "") -> None:
+    """ValueError unless the array has one of the shapes, such as `shape(x, "x has", "one state")`.
+
+    `needed` says in words what the array holds.
+    """
     if jnp.shape(array) not in shapes:
-        wanted = f"{needed}, shape {' or '.join(map(str, shapes))}, is needed."
-        raise ValueError(f"{name} has shape {jnp.shape(array)}; {wanted} {cure}".rstrip())
+        wanted = f"{needed} of shape {' or '.join(map(str, shapes))} is needed."
+        raise ValueError(f"{subject} shape {jnp.shape(array)}; {wanted} {cure}".rstrip())
 
 
 def one_system(subject: str, n: int, reference: str, m: int) -> None:
@@ -385,7 +384,7 @@ def point(x: ArrayLike, n: int, name: str = "x") -> Float[Array, " n"]:
     """One state of `n` coordinates; the error for several states points to `jax.vmap`."""
     array = floating(x, name)
     cure = "Use `jax.vmap(...)` for a batch of states." if array.ndim > 1 else ""
-    shape(array, name, "one state", (n,), cure=cure)
+    shape(array, f"{name} has", "one state", (n,), cure=cure)
     return array
 
 

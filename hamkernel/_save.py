@@ -110,7 +110,8 @@ def save(
             "field from there, and save it outside."
         )
     spread = not all(map(_is_here, jax.tree.leaves(field)))
-    field = jax.tree.map(_gather, field)
+    gather = multihost_utils.process_allgather  # all rows on every process
+    field = jax.tree.map(lambda x: x if _is_here(x) else gather(x, tiled=True), field)
     described = description(field, [], "field")
     try:
         evaluable = _evaluable(field)
@@ -273,11 +274,6 @@ def _is_here(leaf: Any) -> bool:
     """Whether this process has the whole array."""
     is_array = isinstance(leaf, jax.Array)
     return not is_array or leaf.is_fully_addressable or leaf.is_fully_replicated
-
-
-def _gather(leaf: Any) -> Any:
-    """The whole array on this process, if its rows are spread over several processes."""
-    return leaf if _is_here(leaf) else multihost_utils.process_allgather(leaf, tiled=True)
 
 
 def _library_version() -> str:

@@ -144,7 +144,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         """
         velocities = self.evaluate(*(X,) if U is None else (X, U))
         measured = require.points(Y, "Y").astype(velocities.dtype)
-        require.shape(measured, "Y", "one velocity for each state in X", velocities.shape)
+        require.shape(measured, "Y has", "one velocity for each state in X", velocities.shape)
         spread = measured - jnp.nanmean(measured, axis=0, keepdims=True)
         return 1 - jnp.nansum((measured - velocities) ** 2) / jnp.nansum(spread**2)
 
@@ -273,7 +273,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
                 the value no finite number.
         """
         self._check_single()
-        require.shape(value, "value", "one number", ())
+        require.shape(value, "value has", "one number", ())
         anchor = require.floating(value, "value").astype(self.offset.dtype)
         x0 = require.point(x0, self.dimension, "x0")
         offset = anchor - self.unanchored_potential(x0)

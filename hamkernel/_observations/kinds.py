@@ -268,7 +268,7 @@ class Energies(AbstractObservations):
         noise: ArrayLike | None = None,
     ):
         X, E = require.points(X, "X"), require.floating(E, "E")
-        require.shape(E, "E", "one energy for each state in X", X.shape[:1])
+        require.shape(E, "E has", "one energy for each state in X", X.shape[:1])
         X, E = require.one_dtype(X, E)
         require.single_or_double(X.dtype, "X and E have")
         self.X, self.E = require.finite(X, "X"), require.finite(E, "E")
@@ -414,6 +414,6 @@ def _noise(noise: Any, shapes: list[tuple[int, ...]], X: Array) -> Array | None:
     if noise is None:
         return None
     array = require.floating(noise, "noise")
-    require.shape(array, "noise", "a relative standard deviation", *shapes)
+    require.shape(array, "noise has", "a relative standard deviation", *shapes)
     cure = "It is a standard deviation; for exact measurements take a small one, such as 1e-3."
     return require.positive(array, "noise", cure).astype(X.dtype)

@@ -228,7 +228,7 @@ def check_low_rank(
 class AbstractFunctions(eqx.Module):
     """Functions φ_1 … φ_r and the rows of observations of them."""
 
-    kernel: eqx.AbstractVar[AbstractMatrixKernel]
+    kernel: AbstractMatrixKernel
 
     @abc.abstractmethod
     def rows_of(self, block: AbstractBlock) -> Float[Array, "d r"]:
@@ -255,7 +255,6 @@ class AbstractFunctions(eqx.Module):
 class Columns(AbstractFunctions):
     """The columns K(·, s) of landmarks."""
 
-    kernel: AbstractMatrixKernel
     landmarks: Landmarks
 
     def rows_of(self, block: AbstractBlock) -> Float[Array, "d r"]:
@@ -320,7 +319,6 @@ def landmark_field(
 class LandmarkSpan(AbstractSpan):
     """The columns K(·, s) of landmarks, orthonormalised by T with T Tᵀ = G_SS⁻¹."""
 
-    kernel: AbstractMatrixKernel
     landmarks: Landmarks
     T: Float[Array, "r r"]
 
@@ -360,7 +358,6 @@ def _landmark_draws(span: LandmarkSpan, weights, prior: Prior) -> KernelField:
 class FeatureSpan(AbstractSpan):
     """Random Fourier features, whose kernel is Σ φφᵀ itself."""
 
-    kernel: AbstractMatrixKernel
     features: AbstractFeatures
     dimension: int = eqx.field(static=True)
 
@@ -422,9 +419,6 @@ class LandmarkBasis(AbstractBasis):
 class LowRankConditional(AbstractConditional):
     """The posterior from R with RᵀR = FᵀF + σ²I; the mean weights are w = R⁻¹ `rotated`."""
 
-    field: AbstractField
-    rows: Measurements
-    ridge: Float[Array, ""]
     span: AbstractSpan
     R: Float[Array, "r r"]
     rotated: Float[Array, " r"]

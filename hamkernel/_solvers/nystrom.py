@@ -121,9 +121,7 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         return *super()._totals, self.trace
 
     def _totals_of(self, rows: Measurements, spread: RowSharding | None) -> tuple[Any, ...]:
-        K, states = self.kernel, rows.states
-        new_trace = trace_of_rows(K, rows) if states is None else trace(K, states[0], spread)
-        return *super()._totals_of(rows, spread), new_trace
+        return *super()._totals_of(rows, spread), trace_of_rows(self.kernel, rows, spread)
 
     def _field(self, c, norm, residual, residual_norm, regularization, ridge) -> KernelField:
         truncation = truncation_of(self.trace, trace_of_sums(self.sums), ridge)

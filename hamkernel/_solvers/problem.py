@@ -181,9 +181,9 @@ class AbstractConditional(eqx.Module):
         ridge: σ² = Nλ, the variance of the noise of a row, shape ().
     """
 
-    field: eqx.AbstractVar[AbstractField]
-    rows: eqx.AbstractVar[Measurements]
-    ridge: eqx.AbstractVar[Float[Array, ""]]
+    field: AbstractField
+    rows: Measurements
+    ridge: Float[Array, ""]
 
     @abc.abstractmethod
     def covariance(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:

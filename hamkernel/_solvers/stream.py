@@ -101,8 +101,9 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
                 "the fit is in float64 and this process, which receives it, computes in float32: "
                 "set JAX_ENABLE_X64=1 in the environment of every worker."
             )
-        for name, value in state.items():
-            object.__setattr__(self, name, jax.tree.map(_to_jax, value))
+        arrays, rest = eqx.partition(state, lambda leaf: isinstance(leaf, np.ndarray))
+        for name, value in eqx.combine(jax.tree.map(jnp.asarray, arrays), rest).items():
+            object.__setattr__(self, name, value)
 
     @property
     def dtype(self) -> jnp.dtype:
@@ -309,10 +310,6 @@ def _solve(fit: Any, count: Int[Array, ""], regularization: Float[Array, ""]) ->
 @precise_jit
 def _with_rows(fit, rows, spread):
     return _plus(fit, fit._totals_of(rows, spread), None, rows.count)
-
-
-def _to_jax(leaf: Any) -> Any:
-    return jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf
 
 
 def _differ(first: Any, second: Any) -> Bool[ArrayLike, ""]:

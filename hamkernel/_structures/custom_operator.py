@@ -12,7 +12,7 @@ from equinox import AbstractClassVar
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
+from hamkernel._kernels.base import Invariance, as_scalar_kernel
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._show import call, text
 from hamkernel._structures.linear_operator import StructuredByOperator
@@ -47,10 +47,10 @@ class AbstractCustomOperator(AbstractPotentialKernel):
     def _matrix(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
         """B(x), in the dtype of x."""
         value, n = getattr(self, self.role)(x), len(x)
-        name = f"the value of the {self.role} of {self.name}"
-        value = require.floating(value, name)
+        name = f"the {self.role} of {self.name}"
+        value = require.floating(value, f"the value of {name}")
         cure = "Write it for one state, and return jnp.array([[...], [...]])."
-        require.shape(value, name, "a matrix for each state", (n, n), cure=cure)
+        require.shape(value, f"{name} returned", "a matrix for each state", (n, n), cure=cure)
         return value.astype(x.dtype)
 
     def check_dimension(self, n: int) -> None:
@@ -76,7 +76,6 @@ class AbstractCustomOperator(AbstractPotentialKernel):
 class StructuredByMatrix(AbstractCustomOperator):
     """K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ: fields f = B(x)∇H for an operator B of the caller."""
 
-    kernel: AbstractScalarKernel
     operator: Operator
 
     role: ClassVar[str] = "operator"
@@ -155,7 +154,6 @@ class Poisson(AbstractCustomOperator):
     Source: Hu, Ortega & Yin (2024), arXiv 2403.10070 and 2504.13396.
     """
 
-    kernel: AbstractScalarKernel
     tensor: Operator
 
     role: ClassVar[str] = "tensor"

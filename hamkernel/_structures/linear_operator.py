@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, Point, Points
+from hamkernel._kernels.base import Invariance, Point, Points
 from hamkernel._machine import precise_jit
 from hamkernel._show import call, text
 from hamkernel._structures.structure import AbstractStructure
@@ -27,7 +27,6 @@ class StructuredByOperator(AbstractStructure):
     So an operator of order p takes derivatives of k of order 2p.
     """
 
-    kernel: AbstractScalarKernel
     operator: Callable[[Potential, Float[Array, " n"]], Any]
 
     field_parity: ClassVar[int] = 0
@@ -41,8 +40,8 @@ class StructuredByOperator(AbstractStructure):
     def _apply(self, u: Potential, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """(L u)(x), in the dtype of x."""
         value = self.operator(u, x)
-        name, cure = "the value of the operator of Structured", "Such as jax.grad(u)(x)."
-        require.shape(value, name, "the field at one state", x.shape, cure=cure)
+        name, cure = "the operator of Structured", "It is, for example, jax.grad(u)(x)."
+        require.shape(value, f"{name} returned", "the field at one state", x.shape, cure=cure)
         return require.floating(value, name).astype(x.dtype)
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:

@@ -64,7 +64,7 @@ class SearchCriterion(eqx.Module):
             value = self.fn(K, rows, regularization, *extra)
         value, square = value if self.logarithmic else (value, None)
         value = require.floating(value, "the value of the objective")
-        require.shape(value, "the value of the objective", "one number", ())
+        require.shape(value, "the objective returned", "one number", ())
         return value, square
 
     def with_options(self, **keywords: Any) -> "SearchCriterion":
