@@ -160,23 +160,23 @@ def held_out(
 def _held_out_forward(system, y, partition):
     factor, a, _, is_trusted = _factor_and_solve(system, y)
     C = factor.inverse()
-    r, blocks = jnp.zeros_like(a), []
+    r, solvers = jnp.zeros_like(a), []
     for group in partition.groups:
         C, r = jax.lax.optimization_barrier((C, r))  # not side by side
-        blocks.append(C.blocks(group))
-        r = group.scatter(blocks[-1].solve(group.gather(a)), into=r)
+        solvers.append(C.block_solver(group))
+        r = group.scatter(solvers[-1](group.gather(a)), into=r)
     ok = is_trusted & jnp.isfinite(r).all()
     value = jax.tree.map(lambda array: jnp.where(ok, array, jnp.full_like(array, jnp.inf)), (r, a))
-    return value, (C, a, blocks, r, ok)
+    return value, (C, a, solvers, r, ok)
 
 
 @full_precision
 def _held_out_backward(partition, saved, bars):
-    C, a, blocks, r, ok = saved
+    C, a, solvers, r, ok = saved
     r_bar, a_bar = bars
     V, bar = [], r_bar
-    for group, fold_blocks in zip(partition.groups, blocks, strict=True):
-        V.append(fold_blocks.solve(group.gather(bar)))
+    for group, solve in zip(partition.groups, solvers, strict=True):
+        V.append(solve(group.gather(bar)))
         bar = jax.lax.optimization_barrier((bar, V[-1]))[0]
     R = [group.gather(r) for group in partition.groups]
     return _or_zero(ok, C.vjp_of_folds(a, partition.groups, V, R, (r_bar, a_bar)))

@@ -258,8 +258,12 @@ def rows_between(
     )
 
 
-def trace_of_rows(K: AbstractMatrixKernel, rows: Measurements) -> Float[Array, ""]:
+def trace_of_rows(
+    K: AbstractMatrixKernel, rows: Measurements, spread: RowSharding | None = None
+) -> Float[Array, ""]:
     """The trace of the Gram of all rows, before the contrast of the energies."""
+    if rows.states is not None:
+        return trace(K, rows.states[0], spread)
     return sum((_trace(K, block) for block in rows.blocks), jnp.zeros((), rows.targets.dtype))
 
 

@@ -9,6 +9,7 @@ arithmetic.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -22,10 +23,10 @@ from hamkernel._machine import (
     RowSharding,
     follow_data,
     full_precision,
+    map_devices,
     precise_jit,
     row_sharding,
     shard,
-    sum_of_columns,
     to_caller_sharding,
 )
 from hamkernel._show import describe
@@ -99,12 +100,8 @@ class GramOperator(lx.AbstractLinearOperator):
         Raises:
             ValueError: the vector is not of shape (M, n). TypeError: it is complex.
         """
-        columns = self.in_structure().shape
-        if jnp.shape(vector) != columns:
-            raise ValueError(
-                f"the vector has shape {jnp.shape(vector)}; one coefficient for each column of "
-                f"the Gram, shape {columns}, is needed."
-            )
+        needed = "one coefficient for each column of the Gram"
+        require.shape(vector, "the vector has", needed, self.in_structure().shape)
         vector = require.floating(vector, "the vector")
         return _sharded_product(self.kernel, self.X, self.columns, vector, self.X_rows, self.Z_rows)
 
@@ -139,8 +136,35 @@ def product(
     X_rows: RowSharding | None = None,
     Z_rows: RowSharding | None = None,
 ) -> Float[Array, "N n"]:
-    """The fields Σⱼ K(xᵢ, zⱼ) aⱼ for all i, tile by tile, on the devices that hold the rows."""
-    return sum_of_columns(_product_by_tiles, K, X, Z, A, X_rows, Z_rows)
+    """The fields Σⱼ K(xᵢ, zⱼ) aⱼ for all i, tile by tile, on the devices that hold the rows.
+
+    If both X and Z are sharded, the rows of Z and A travel around the ring of devices.
+
+    Raises:
+        ValueError: X and Z are sharded differently.
+    """
+    part: Callable[..., Float[Array, "N n"]] = _product_by_tiles
+    if Z_rows is None:
+        return map_devices(X_rows, lambda w, x: part(w[0], x, *w[1:]), (K, Z, A), X, joined=True)
+    if X_rows is None:
+        return map_devices(Z_rows, lambda w, z, a: part(*w, z, a), (K, X), Z, A, joined=False)
+    if (X_rows.mesh, X_rows.axes) != (Z_rows.mesh, Z_rows.axes):
+        raise ValueError(
+            f"X and Z are sharded over devices differently: {X_rows.caller} and {Z_rows.caller}. "
+            "Put both on one mesh and the same axes, or one of them on every device."
+        )
+    ring = [(i, (i + 1) % X_rows.count) for i in range(X_rows.count)]
+
+    def around(K, X, Z, A):
+        def step(carry, _):
+            total, columns = carry
+            total = total + part(K, X, *columns)
+            return (total, jax.lax.ppermute(columns, X_rows.axes, ring)), None
+
+        start = jnp.zeros_like(X), (Z, A)
+        return jax.lax.scan(step, start, length=X_rows.count)[0][0]
+
+    return map_devices(X_rows, around, K, X, Z, A, joined=True)
 
 
 def placed_product(

@@ -171,43 +171,6 @@ def map_devices(
     return mapped(arrays, *parts)
 
 
-def sum_of_columns(
-    product: Callable[..., Float[Array, "N n"]],
-    K: Any,
-    X: Float[Array, "N n"],
-    Z: Float[Array, "M n"],
-    A: Float[Array, "M n"],
-    X_rows: RowSharding | None,
-    Z_rows: RowSharding | None,
-) -> Float[Array, "N n"]:
-    """`product(K, X, Z, A)`, a sum over the rows of Z and A, for sharded rows of X, Z or both.
-
-    Raises:
-        ValueError: X and Z are sharded differently.
-    """
-    if Z_rows is None:
-        return map_devices(X_rows, lambda w, x: product(w[0], x, *w[1:]), (K, Z, A), X, joined=True)
-    if X_rows is None:
-        return map_devices(Z_rows, lambda w, z, a: product(*w, z, a), (K, X), Z, A, joined=False)
-    if (X_rows.mesh, X_rows.axes) != (Z_rows.mesh, Z_rows.axes):
-        raise ValueError(
-            f"X and Z are sharded over devices differently: {X_rows.caller} and {Z_rows.caller}. "
-            "Put both on one mesh and the same axes, or one of them on every device."
-        )
-    ring = [(i, (i + 1) % X_rows.count) for i in range(X_rows.count)]
-
-    def around(K, x, z, a):
-        def step(carry, _):
-            total, columns = carry
-            total = total + product(K, x, *columns)
-            return (total, jax.lax.ppermute(columns, X_rows.axes, ring)), None
-
-        start = jnp.zeros_like(x), (z, a)
-        return jax.lax.scan(step, start, length=X_rows.count)[0][0]
-
-    return map_devices(X_rows, around, K, X, Z, A, joined=True)
-
-
 _CGROUP_LIMIT = Path("/sys/fs/cgroup/memory.max")
 
 
@@ -354,6 +317,11 @@ def full_precision(function: Callable[P, T]) -> Callable[P, T]:
             return function(*args, **kwargs)
 
     return precise
+
+
+def entry_point(function: Callable[P, T]) -> Callable[P, T]:
+    """`function` on the device of its data, with one thread of BLAS, in full precision."""
+    return follow_data(one_blas_thread(full_precision(function)))
 
 
 class EqualToItself:

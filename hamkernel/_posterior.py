@@ -24,13 +24,7 @@ from hamkernel._fields.joined import AbstractJoinedField, FamilyField, known_of,
 from hamkernel._gram import components
 from hamkernel._kernels.base import Invariance, Scaled
 from hamkernel._kernels.symmetry import drop_symmetry
-from hamkernel._machine import (
-    EqualToItself,
-    follow_data,
-    full_precision,
-    one_blas_thread,
-    precise_jit,
-)
+from hamkernel._machine import EqualToItself, entry_point, full_precision, precise_jit
 from hamkernel._observations.blocks import AbstractBlock, Values
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import inputs_of, observations
@@ -49,9 +43,7 @@ from hamkernel._solvers.problem import (
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
-@follow_data
-@one_blas_thread
-@full_precision
+@entry_point
 def condition(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
@@ -245,9 +237,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         """
         return jnp.stack([root(variance) for variance in jnp.diagonal(self.covariance(x, u))])
 
-    @follow_data
-    @one_blas_thread
-    @full_precision
+    @entry_point
     def evaluate(
         self, X: Num[ArrayLike, "N n"], U: Num[ArrayLike, "N m"] | None = None
     ) -> tuple[Float[Array, "N n"], Float[Array, "N n"]]:
@@ -363,11 +353,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         """
         data_inputs = inputs_or_parameters(inputs, parameters, self.conditional.field.kernel)
         data, old = observations(X, Y, data_inputs, part=True), self.conditional.rows
-        if data.dimension != old.dimension:
-            raise ValueError(
-                f"the new data have {data.dimension} coordinates and the posterior "
-                f"{old.dimension}: both must be of one system."
-            )
+        require.one_system("the new data have", data.dimension, "the posterior", old.dimension)
         mean = known_of(self.field)
         new = new_rows(self.conditional.field.kernel, data, old, mean)
         if new.targets.dtype != old.targets.dtype:
@@ -378,9 +364,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         conditional = self.conditional.update(new)
         return Posterior(conditional, learned_field(conditional.field, mean))
 
-    @follow_data
-    @one_blas_thread
-    @full_precision
+    @entry_point
     def sample(
         self,
         key: Key[Array, ""] | UInt32[Array, "..."],
@@ -419,11 +403,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         if region is None:
             region = _range_of(rows.points[:, :n], None)
         corners = require.floating(region, "region").astype(dtype)
-        if corners.shape != (2, n):
-            raise ValueError(
-                f"region has shape {corners.shape}; the lowest and the highest corner of a box, "
-                f"shape (2, {n}), are needed."
-            )
+        require.shape(corners, "region has", "a box, its lowest and its highest corner,", (2, n))
         low, high = require.host_array(corners)
         bad = ~((high > low) & (abs(low) < np.inf) & (abs(high) < np.inf))
         message = "region must be finite, its first row the lower corner in every coordinate."

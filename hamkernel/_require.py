@@ -150,19 +150,15 @@ def floating(x: Any, name: str) -> Array:
     elif not isinstance(x, jax.Array):
         x = _plain(x, name)
     with eager(x):
-        return _floating(x, name)
-
-
-def _floating(x: Any, name: str) -> Array:
-    try:
-        array = x if isinstance(x, jax.Array) else jnp.asarray(x)
-    except (TypeError, ValueError) as error:
-        raise _no_numbers(x, name) from error
-    if jnp.issubdtype(array.dtype, jnp.floating):
-        # No weak type: a Python float must not recompile.
-        return array.astype(array.dtype) if array.weak_type else array
-    if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
-        return array.astype(float)
+        try:
+            array = x if isinstance(x, jax.Array) else jnp.asarray(x)
+        except (TypeError, ValueError) as error:
+            raise _no_numbers(x, name) from error
+        if jnp.issubdtype(array.dtype, jnp.floating):
+            # No weak type: a Python float must not recompile.
+            return array.astype(array.dtype) if array.weak_type else array
+        if jnp.issubdtype(array.dtype, jnp.integer) or array.dtype == jnp.bool_:
+            return array.astype(float)
     raise _no_numbers(array, name)
 
 
@@ -292,8 +288,7 @@ def positive(x: Any, name: str, cure: str = "") -> Array:
 def positive_scalar(x: ArrayLike, name: str, cure: str = "") -> Float[Array, ""]:
     """`x` as a positive float array of shape ()."""
     array = floating(x, name)
-    if array.shape:
-        raise ValueError(f"{name} has shape {array.shape}; one number is needed.")
+    shape(array, f"{name} has", "one number", ())
     return positive(array, name, cure)
 
 
@@ -333,6 +328,24 @@ def key(key: Any) -> Key[Array, ""]:
     return key
 
 
+def shape(array: Any, subject: str, needed: str, *shapes: tuple[int, ...], cure: str = "") -> None:
+    """ValueError unless the array has one of the shapes, such as `shape(x, "x has", "one state")`.
+
+    `needed` says in words what the array holds.
+    """
+    if jnp.shape(array) not in shapes:
+        wanted = f"{needed} of shape {' or '.join(map(str, shapes))} is needed."
+        raise ValueError(f"{subject} shape {jnp.shape(array)}; {wanted} {cure}".rstrip())
+
+
+def one_system(subject: str, n: int, reference: str, m: int) -> None:
+    """ValueError unless states with n and with m coordinates may be those of one system."""
+    if n != m:
+        raise ValueError(
+            f"{subject} {n} coordinates and {reference} {m}: both must be states of one system."
+        )
+
+
 def one_dtype(X: Array, Z: Array) -> tuple[Array, Array]:
     """Both arrays in the wider of their dtypes, also under strict promotion."""
     dtype = np.promote_types(X.dtype, Z.dtype)
@@ -342,11 +355,7 @@ def one_dtype(X: Array, Z: Array) -> tuple[Array, Array]:
 
 def one_space(X: Array, Z: Array) -> tuple[Array, Array]:
     """Both arrays in one dtype; ValueError if their numbers of coordinates differ."""
-    if X.shape[1] != Z.shape[1]:
-        raise ValueError(
-            f"X has {X.shape[1]} coordinates and Z has {Z.shape[1]}: both must be states of one "
-            "system, shapes (N, n) and (M, n)."
-        )
+    one_system("X has", X.shape[1], "Z has", Z.shape[1])
     return one_dtype(X, Z)
 
 
@@ -374,11 +383,8 @@ def points(X: ArrayLike, name: str = "X") -> Float[Array, "N n"]:
 def point(x: ArrayLike, n: int, name: str = "x") -> Float[Array, " n"]:
     """One state of `n` coordinates; the error for several states points to `jax.vmap`."""
     array = floating(x, name)
-    if array.shape != (n,):
-        hint = " Use `jax.vmap(...)` for a batch of states." if array.ndim > 1 else ""
-        raise ValueError(
-            f"{name} has shape {array.shape}; one state of shape ({n},) is needed.{hint}"
-        )
+    cure = "Use `jax.vmap(...)` for a batch of states." if array.ndim > 1 else ""
+    shape(array, f"{name} has", "one state", (n,), cure=cure)
     return array
 
 
@@ -510,6 +516,11 @@ def velocity(field: Any, x: Any, name: str = "field") -> jax.ShapeDtypeStruct:
             "coordinate is needed. Was it made for states of another dimension?"
         )
     return out
+
+
+def takes_two(function: Any) -> bool:
+    """Whether a function needs two arguments; a second one with a default does not count."""
+    return signature_mismatch(function, 0) is not None and not signature_mismatch(function, 0, 0)
 
 
 def signature_mismatch(function: Any, *arguments: Any) -> str | None:

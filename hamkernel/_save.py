@@ -31,7 +31,7 @@ import os
 import pathlib
 import re
 import uuid
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import equinox as eqx
@@ -110,7 +110,8 @@ def save(
             "field from there, and save it outside."
         )
     spread = not all(map(_is_here, jax.tree.leaves(field)))
-    field = jax.tree.map(_gather, field)
+    gather = multihost_utils.process_allgather  # all rows on every process
+    field = jax.tree.map(lambda x: x if _is_here(x) else gather(x, tiled=True), field)
     described = description(field, [], "field")
     try:
         evaluable = _evaluable(field)
@@ -273,11 +274,6 @@ def _is_here(leaf: Any) -> bool:
     """Whether this process has the whole array."""
     is_array = isinstance(leaf, jax.Array)
     return not is_array or leaf.is_fully_addressable or leaf.is_fully_replicated
-
-
-def _gather(leaf: Any) -> Any:
-    """The whole array on this process, if its rows are spread over several processes."""
-    return leaf if _is_here(leaf) else multihost_utils.process_allgather(leaf, tiled=True)
 
 
 def _library_version() -> str:
@@ -449,38 +445,31 @@ def skeleton(node: Node, codes: list[Any], where: str, supplied: Supplied) -> An
 
 def _difference(saved: Node, supplied: Node, where: str) -> str | None:
     """The first difference of two descriptions, in words; parts that are None may differ."""
-    match saved, supplied:
-        case {"class": name, **nodes}, {"class": other, **others} if name == other:
-            pairs = [(nodes[key], others[key], f"{where}.{key}") for key in nodes]
-        case [*nodes], [*others] if len(nodes) == len(others):
-            both = enumerate(zip(nodes, others, strict=True))
-            pairs = [(*pair, f"{where}[{i}]") for i, pair in both]
-        case {"code": _, "leaves": first}, {"code": _, "leaves": second} if first == second:
-            return None  # code of whatever name
-        case {"array": _, "shape": _}, {"array": _, "shape": _}:
-            keys = ("array", "shape")  # whether of NumPy or of JAX
-            if all(saved[key] == supplied[key] for key in keys):
-                return None
-            return _mismatch(saved, supplied, where)
-        case _ if supplied is None or (type(saved) is type(supplied) and saved == supplied):
-            return None
-        case _:
-            return _mismatch(saved, supplied, where)
-    return next(filter(None, (_difference(*pair) for pair in pairs)), None)
+    supplied_entries = dict(_entries(supplied, where))
+    for place, entry in _entries(saved, where):
+        here = supplied_entries.get(place, "null")
+        if here not in (entry, "null"):
+            return f"{place} is {entry} in the file and {here} here: not the one saved"
+    return None
 
 
-def _mismatch(saved: Node, supplied: Node, where: str) -> str:
-    here = f"{_summary(saved)} in the file and {_summary(supplied)} here"
-    return f"{where} is {here}: not the one saved"
-
-
-def _summary(node: Node) -> str:
+def _entries(node: Node, where: str) -> Iterator[tuple[str, str]]:
+    """The places in a description, with what they hold; code may have any name."""
     match node:
-        case {"class": str(name)} | {"function": str(name)}:
-            return name
+        case {"class": str(name), **nodes}:
+            yield where, name
+            for key, child in nodes.items():
+                yield from _entries(child, f"{where}.{key}")
         case list():
-            return f"{len(node)} terms"
-    return json.dumps(node)
+            yield where, f"{len(node)} terms"
+            for i, child in enumerate(node):
+                yield from _entries(child, f"{where}[{i}]")
+        case {"code": _, "leaves": content} | {"function": content}:
+            yield where, json.dumps(content)
+        case {"array": dtype, "shape": shape}:  # of NumPy or of JAX
+            yield where, f"an array {dtype} of shape {shape}"
+        case _:
+            yield where, json.dumps(node)
 
 
 # The file.

@@ -17,13 +17,7 @@ from jaxtyping import Array, ArrayLike, Float, Num
 from hamkernel._closed_forms import Folds, Partition, free_residuals, held_out, log_density
 from hamkernel._fields.base import Mean
 from hamkernel._gram import between_all, forward_differentiated, gram_of_rows, plus_ridge
-from hamkernel._machine import (
-    follow_data,
-    full_precision,
-    one_blas_thread,
-    precise_jit,
-    refuse_beyond_memory,
-)
+from hamkernel._machine import entry_point, precise_jit, refuse_beyond_memory
 from hamkernel._observations.blocks import AbstractBlock, Combinations
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.measurements import Measurements
@@ -34,9 +28,7 @@ from hamkernel._solvers.problem import AbstractSolver, check_solver, make_proble
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
-@follow_data
-@one_blas_thread
-@full_precision
+@entry_point
 def cross_validation_loss(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
@@ -87,9 +79,7 @@ def cross_validation_loss(
     return partition_loss(K, rows, regularization, partition_of_rows(rows, folds), basis)
 
 
-@follow_data
-@one_blas_thread
-@full_precision
+@entry_point
 def cross_validation_residuals(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
@@ -117,9 +107,7 @@ def cross_validation_residuals(
     return rows.to_units(residuals)
 
 
-@follow_data
-@one_blas_thread
-@full_precision
+@entry_point
 def generalized_cross_validation(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,
@@ -162,9 +150,7 @@ def generalized_cross_validation(
     )
 
 
-@follow_data
-@one_blas_thread
-@full_precision
+@entry_point
 def log_marginal_likelihood(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,

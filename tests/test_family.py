@@ -322,7 +322,7 @@ def test_a_family_asks_for_its_parameters_and_says_where_its_energy_is(fields):
     with pytest.raises(ValueError, match=r"needs its parameters.*field.at\(θ\)"):
         field(x)
     np.testing.assert_array_equal(field.at(0.5)(x), field.at([0.5])(x))
-    with pytest.raises(ValueError, match=r"shape \(1,\), are needed"):
+    with pytest.raises(ValueError, match=r"shape \(1,\) is needed"):
         field.at([0.5, 0.6])
     for ask in (lambda: field.hamiltonian(x), lambda: field.potential(x)):
         with pytest.raises(AttributeError, match=r"field.at\(θ\).hamiltonian"):

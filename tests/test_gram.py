@@ -253,7 +253,7 @@ K = hk.Symplectic(hk.Gaussian())
         (
             lambda: hk.gram(hk.Symplectic(lambda x, z: x * z), states()),
             ValueError,
-            "a scalar is needed",
+            r"a scalar of shape \(\) is needed",
         ),
         (
             lambda: hk.gram(K, np.zeros((200_000, 4))),

@@ -77,7 +77,7 @@ def test_what_cannot_be_is_refused():
         fit(hk.Gaussian(1.0), lambda u, x: jax.grad(u)(x) * u(x))
     with pytest.raises(ValueError, match="not linear in u"):
         fit(hk.Gaussian(1.0), lambda u, x: jax.grad(u)(x) + x)
-    with pytest.raises(ValueError, match=r"returned shape \(\) for a state of shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"returned shape \(\); .*of shape \(2,\)"):
         fit(hk.Gaussian(1.0), lambda u, x: u(x))
     with pytest.raises(ValueError, match=r"too few derivatives|too rough"):
         fit(hk.Matern(1.5), lambda u, x: jax.hessian(u)(x) @ jnp.ones(2))

@@ -335,7 +335,10 @@ def test_what_cannot_be_said_is_refused():
 @pytest.mark.parametrize(
     ("region", "message"),
     [
-        (np.zeros((2, 3)), r"shape \(2, 3\); the lowest and the highest corner .* \(2, 2\)"),
+        (
+            np.zeros((2, 3)),
+            r"shape \(2, 3\); a box, its lowest and its highest corner, .* \(2, 2\)",
+        ),
         (np.zeros(2), r"region has shape \(2,\)"),
         (REGION[::-1], "first row the lower corner"),
         (np.array([[0.0, 0.0], [np.inf, 1.0]]), "region must be finite"),

@@ -13,7 +13,6 @@ import hamkernel as hk
 from hamkernel._gram import gram_of_rows
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of, measurements_of_states
-from hamkernel._solvers.low_rank import WaveBasis
 from hamkernel._tuning.minimiser import BoxBFGS, init, inside_box, minimise, run_in_box
 from hamkernel._tuning.objective import SearchObjective, criterion_of, parts_of
 from hamkernel._tuning.search import box_distance, choose_starts, design
@@ -194,7 +193,7 @@ def test_the_subset_has_its_share_of_every_fold():
 @pytest.mark.slow
 def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free():
     few, states, ridge = jnp.asarray(Y[:6]), jnp.asarray(X[:6]), jnp.asarray(1e-3)
-    waves = WaveBasis(jax.random.key(0), 3)
+    waves = hk.RandomFeatures(3, jax.random.key(0))
     features, gram = waves.span(K, 2, states.dtype).rows_of(Components(states)), hk.gram(K, states)
     rows = measurements_of_states(states, few)
     F, G = (np.asarray(each).reshape(12, -1) for each in (features, gram))

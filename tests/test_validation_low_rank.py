@@ -12,7 +12,7 @@ import hamkernel as hk
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of, measurements_of_states
 from hamkernel._solvers.landmarks import given_landmarks, landmarks_of
-from hamkernel._solvers.low_rank import LandmarkBasis, WaveBasis
+from hamkernel._solvers.low_rank import LandmarkBasis
 from hamkernel._validation import (
     features_of_rows,
     generalized_loss,
@@ -39,7 +39,7 @@ X, Y = map(jnp.asarray, data())
 ROWS = measurements_of_states(X, Y)
 BASES = {
     "landmarks": LandmarkBasis(landmarks_of(Components(X[::5]))),
-    "waves": WaveBasis(jax.random.key(3), 7),
+    "waves": hk.RandomFeatures(7, jax.random.key(3)),
 }
 FOLDS = {
     "loo": "loo",
@@ -142,7 +142,7 @@ ENERGIES_TOGETHER = np.repeat([0, 1, 2, 3, 4], [6, 4, 10, 3, 2])  # of 14 + 6 + 
 )
 def test_held_out_observations_are_those_of_refits_with_a_constant_of_their_own(waves, folds):
     rows, K = of_every_kind(), hk.Symplectic(1.3 * hk.Gaussian(1.2))
-    basis, partition = WaveBasis(jax.random.key(0), waves), partition_of_rows(rows, folds)
+    basis, partition = hk.RandomFeatures(waves, jax.random.key(0)), partition_of_rows(rows, folds)
     ridge, y = rows.count * (1 - 1 / 5) * RIDGE, np.asarray(rows.targets)
     F = np.asarray(features_of_rows(K, rows, basis))
     # The energies have one more column, whose weight costs nothing.

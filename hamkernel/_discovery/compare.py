@@ -27,7 +27,7 @@ from hamkernel._kernels.built_in import Gaussian
 from hamkernel._machine import full_precision, one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.measurements import Measurements, observations
-from hamkernel._show import html_table, printable
+from hamkernel._show import Shown
 from hamkernel._solvers.problem import make_problem
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.structure import DivergenceFree, Separable
@@ -77,8 +77,8 @@ class Candidate(NamedTuple):
     hyperparameters: dict[str, Any]
 
 
-@dataclasses.dataclass(frozen=True)
-class Comparison:
+@dataclasses.dataclass(frozen=True, repr=False)
+class Comparison(Shown):
     """The candidates by score, and the answers that they give; it prints as a report.
 
     Attributes:
@@ -101,28 +101,16 @@ class Comparison:
         """The candidate with the largest score."""
         return self.table[0]
 
-    def __repr__(self) -> str:
-        lines = [f"Which physics do these {self.rows} values obey?", ""]
-        for key, question in QUESTIONS.items():
-            lines.append(f"  {question:18s}{self.answers[key]:12s}{self.reasons[key]}")
-        width = max(len(row.name) for row in self.table)
-        lines += ["", f"  {'candidate':{width}s}  difference  log likelihood  numbers"]
+    def _summary(self) -> tuple[str, list[tuple[str, str]]]:
+        findings = [
+            (question, f"{self.answers[key]:12s}{self.reasons[key]}")
+            for key, question in QUESTIONS.items()
+        ]
+        findings += [("", ""), ("candidate", "difference  log likelihood  numbers")]
         for row in self.table:
             numbers = f"{row.difference:10.1f}  {row.log_likelihood:14.1f}  {row.parameters:7d}"
-            lines.append(f"  {row.name:{width}s}  {numbers}")
-        return printable("\n".join(lines))
-
-    def _repr_html_(self) -> str:
-        answers = [(q, self.answers[key], self.reasons[key]) for key, q in QUESTIONS.items()]
-        scores = [
-            (row.name, f"{row.difference:.1f}", f"{row.log_likelihood:.1f}", str(row.parameters))
-            for row in self.table
-        ]
-        head = ("candidate", "difference", "log likelihood", "numbers")
-        return (
-            f"<b>Which physics do these {self.rows} values obey?</b>"
-            f"{html_table(answers)}{html_table(scores, head)}"
-        )
+            findings.append((row.name, numbers))
+        return f"Which physics do these {self.rows} values obey?", findings
 
 
 @full_precision

@@ -195,9 +195,12 @@ def _check_symmetry(K: Any, names: list[str], functions: list[Any], rows: Any) -
     if any(mean is None for mean in symmetry_means) or isinstance(K, UnknownMasses):
         return
     groups = [mean.group(n) for mean in symmetry_means if mean is not None]
-    shared = [
-        g for g in groups[0] if all(any(_is_same_map(g, h) for h in group) for group in groups)
-    ]
+
+    def contains(group, g):
+        same = [h for h in group if h.character == g.character]
+        return any(np.abs(h.matrix - g.matrix).max() < SYMMETRY_RTOL for h in same)
+
+    shared = [g for g in groups[0] if all(contains(group, g) for group in groups)]
     X = rows.points[:, :n]
     bad = []
     for name, fn in zip(names, functions, strict=True):
@@ -215,10 +218,6 @@ def _check_symmetry(K: Any, names: list[str], functions: list[Any], rows: Any) -
             "the kernel has a symmetry of the potential that "
             f"{_join_names(bad)} {do} not have: leave {them} out, or learn without the symmetry."
         )
-
-
-def _is_same_map(g: Any, h: Any) -> bool:
-    return g.character == h.character and np.abs(g.matrix - h.matrix).max() < SYMMETRY_RTOL
 
 
 def _regression(

@@ -116,11 +116,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         """
         self._check_single()
         X = require.points(X, "X").astype(self.offset.dtype)
-        if X.shape[1] != self.dimension:
-            raise ValueError(
-                f"X has {X.shape[1]} coordinates and the field {self.dimension}: states of shape "
-                f"(N, {self.dimension}) are needed."
-            )
+        require.one_system("X has", X.shape[1], "the field", self.dimension)
         learned = self._velocities(X)
         return learned if self.mean is None else learned + map_states(self.mean, X)
 
@@ -148,11 +144,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         """
         velocities = self.evaluate(*(X,) if U is None else (X, U))
         measured = require.points(Y, "Y").astype(velocities.dtype)
-        if measured.shape != velocities.shape:
-            raise ValueError(
-                f"Y has shape {measured.shape}; one velocity for each state in X, shape "
-                f"{velocities.shape}, is needed."
-            )
+        require.shape(measured, "Y has", "one velocity for each state in X", velocities.shape)
         spread = measured - jnp.nanmean(measured, axis=0, keepdims=True)
         return 1 - jnp.nansum((measured - velocities) ** 2) / jnp.nansum(spread**2)
 
@@ -281,8 +273,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
                 the value no finite number.
         """
         self._check_single()
-        if jnp.shape(value) != ():
-            raise ValueError(f"value has shape {jnp.shape(value)}; one number is needed.")
+        require.shape(value, "value has", "one number", ())
         anchor = require.floating(value, "value").astype(self.offset.dtype)
         x0 = require.point(x0, self.dimension, "x0")
         offset = anchor - self.unanchored_potential(x0)
@@ -388,18 +379,10 @@ def known_part(K: AbstractMatrixKernel, mean: Any, n: int, dtype: Any) -> Any:
     if mean is None:
         return None if matrix is None else KnownPart(None, matrix, K.input_count, of_inputs=False)
     x = jnp.zeros(n, dtype)
-    of_inputs = _takes_inputs(mean, x)
+    of_inputs = getattr(mean, "takes_inputs", False) or require.takes_two(mean)
     at_zero = AtInputs(mean, jnp.zeros(K.input_count, dtype)) if of_inputs else mean
     require.velocity(at_zero, x, "mean")
     return KnownPart(as_pytree(mean), matrix, K.input_count, of_inputs)
-
-
-def _takes_inputs(mean: Any, x: Float[Array, " n"]) -> bool:
-    """Whether the mean takes x and u; a second argument with a default does not count."""
-    if getattr(mean, "takes_inputs", False):
-        return True
-    alone, both = (require.signature_mismatch(mean, *args) for args in ((x,), (x, x)))
-    return callable(mean) and alone is not None and both is None
 
 
 def potential_of(field: Callable[..., Any], kernel: AbstractMatrixKernel) -> Scalar:

@@ -197,8 +197,6 @@ class ControlledField(AbstractJoinedField):
         whole: the field of the points (x, u), of dimension n + m.
     """
 
-    whole: KernelField | FeatureField
-
     @property
     def inputs(self) -> Float[Array, "M m"]:
         """uⱼ at the points, shape (M, m)."""
@@ -264,8 +262,6 @@ class FamilyField(AbstractJoinedField):
         whole: the field of the points (x, θ), of dimension n + p.
     """
 
-    whole: KernelField | FeatureField
-
     @property
     def parameters(self) -> Float[Array, "M p"]:
         """θⱼ at the points, shape (M, p)."""
@@ -296,11 +292,7 @@ class FamilyField(AbstractJoinedField):
         K: Any = self.kernel
         p = K.input_count
         theta = _column(require.floating(theta, "θ"), 0, p)
-        if theta.shape != (p,):
-            raise ValueError(
-                f"θ has shape {theta.shape}; the parameters of one member, shape ({p},), are "
-                "needed."
-            )
+        require.shape(theta, "θ has", "the θ of one member", (p,))
         theta = require.finite(theta, "θ").astype(self.offset.dtype)
         terms = tuple(
             fix_inputs(

@@ -222,8 +222,9 @@ class AbstractScalarKernel(eqx.Module):
 
     @property
     def has_amplitude(self) -> bool:
-        """Whether a trained factor multiplies all of k; a factor that is None is not trained."""
-        return False
+        """Whether a trained factor multiplies all of k; by default, all of the kernel inside k."""
+        inner = getattr(self, "kernel", None)
+        return isinstance(inner, AbstractScalarKernel) and inner.has_amplitude
 
     def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
         """The lower and upper bound of the array `name`, as stored, for `tune`.
@@ -443,6 +444,7 @@ class Scaled(AbstractScalarKernel):
 
     @property
     def has_amplitude(self) -> bool:
+        # A factor that is None is not trained.
         return self.log_scale is not None or self.kernel.has_amplitude
 
 
@@ -471,12 +473,9 @@ class UserKernel(AbstractScalarKernel):
         with require.traceable(f"the kernel {_name(self.fn)}"):
             value = self.fn(x, z)
         value = require.floating(value, f"the value of the kernel {_name(self.fn)}")
-        if value.shape:
-            raise ValueError(
-                f"the kernel {_name(self.fn)} returned an array of shape {value.shape} for "
-                f"two points of shape {jnp.shape(x)}; a scalar is needed. Write the kernel for "
-                "one pair of points, k(x, z) -> (): the library adds the vmap."
-            )
+        cure = "Write the kernel for one pair of points: the library adds the vmap."
+        subject = f"the kernel {_name(self.fn)} returned an array of"
+        require.shape(value, subject, "a scalar", (), cure=cure)
         # Parameters of the kernel may be more precise than the data.
         return value.astype(require.floating(x, "the point").dtype)
 

@@ -202,11 +202,9 @@ class Shared(AbstractScalarKernel):
         point = jnp.atleast_1d(require.floating(r, "r"))
         point = getattr(self.parts, "coordinate", lambda r: r)(point)
         d = len((self.centres or ((0.0,),))[0])
-        if point.shape != (d,):
-            raise ValueError(
-                f"r has shape {point.shape} and the law takes one point of shape ({d},); "
-                "jax.vmap(field.law)(r) for many."
-            )
+        require.shape(
+            point, "r has", "one point", (d,), cure="Use jax.vmap(field.law)(r) for many."
+        )
         return point
 
     def law(self, point: Float[Array, " d"]) -> Float[Array, " m"]:
@@ -246,10 +244,6 @@ class Shared(AbstractScalarKernel):
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
         return (frozenset(range(getattr(self.parts, "positions", n))),)
-
-    @property
-    def has_amplitude(self) -> bool:
-        return self.kernel.has_amplitude
 
     def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N d"]:
         return self.spread(X, 16 * _CENTRES)

@@ -272,10 +272,6 @@ class Symmetrised(AbstractScalarKernel):
         return tuple(Spectrum(s.frequencies, s.weights, self.parity) for s in inner)
 
     @property
-    def has_amplitude(self) -> bool:
-        return self.kernel.has_amplitude
-
-    @property
     def invariance(self) -> Invariance:
         return Invariance.REFLECTION & self.kernel.invariance
 

@@ -116,10 +116,6 @@ class Warp(AbstractScalarKernel):
         is_symmetric = image is not None and self.kernel.is_unchanged_by(image)
         return is_symmetric or super().is_unchanged_by(S)
 
-    @property
-    def has_amplitude(self) -> bool:
-        return self.kernel.has_amplitude
-
     def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
         return np.asarray(jax.vmap(self.warp)(jnp.asarray(X)))
 
@@ -188,10 +184,6 @@ class Select(AbstractScalarKernel):
             return jnp.zeros((len(frequencies), n), dtype).at[:, columns].set(frequencies)
 
         return tuple(Spectrum(embed(s.frequencies), s.weights, s.parity) for s in inner)
-
-    @property
-    def has_amplitude(self) -> bool:
-        return self.kernel.has_amplitude
 
     def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
         return X[:, list(self.dims)]

@@ -47,13 +47,13 @@ class AbstractBlock(eqx.Module):
         return jnp.ones(self.size, self.points.dtype) if self.noise is None else self.noise
 
     @property
-    @abc.abstractmethod
     def count(self) -> int:
         """The number of observations in this block; N is the sum over the blocks."""
+        return self.size
 
-    @abc.abstractmethod
     def labels(self) -> Int[np.ndarray, " D"]:
         """The index of the observation of each row, from 0 to `count` − 1."""
+        return np.arange(self.count)
 
     @abc.abstractmethod
     def rows(self, values: Float[Array, "P *rest"]) -> Float[Array, "D *below"]:
@@ -131,7 +131,7 @@ class Components(AbstractBlock):
     def merge(self, following: AbstractBlock) -> "Components | None":
         if not isinstance(following, Components) or self.outputs != following.outputs:
             return None
-        kept = noise = None
+        kept = None
         sizes = [math.prod(block.values_shape) for block in (self, following)]
         if self.kept is not None or following.kept is not None:
             first_kept, second_kept = (
@@ -139,11 +139,8 @@ class Components(AbstractBlock):
                 for b, size in zip((self, following), sizes, strict=True)
             )
             kept = jnp.concatenate([first_kept, second_kept + sizes[0]])
-        if self.noise is not None or following.noise is not None:
-            noise = jnp.concatenate([self.scale, following.scale])
-        return Components(
-            jnp.concatenate([self.points, following.points]), kept, noise, self.outputs
-        )
+        points = jnp.concatenate([self.points, following.points])
+        return Components(points, kept, _join_noise(self, following), self.outputs)
 
     def with_points(self, points: Float[Array, "P d"]) -> "Components":
         return Components(points, outputs=self.outputs)
@@ -186,13 +183,6 @@ class Combinations(AbstractBlock):
     @property
     def noise(self) -> None:
         return None
-
-    @property
-    def count(self) -> int:
-        return self.size
-
-    def labels(self) -> Int[np.ndarray, " SR"]:
-        return np.arange(self.count)
 
     def rows(self, values: Float[Array, "SQ n *rest"]) -> Float[Array, "SR *rest"]:
         rest = values.shape[2:]
@@ -247,13 +237,6 @@ class Values(AbstractBlock):
     def size(self) -> int:
         return len(self.points)
 
-    @property
-    def count(self) -> int:
-        return self.size
-
-    def labels(self) -> Int[np.ndarray, " E"]:
-        return np.arange(len(self.points))
-
     def rows(self, values: Float[Array, "E *rest"]) -> Float[Array, "E *rest"]:
         return values if self.noise is None else values / _broadcast_noise(self.noise, values)
 
@@ -263,10 +246,8 @@ class Values(AbstractBlock):
     def merge(self, following: AbstractBlock) -> "Values | None":
         if not isinstance(following, Values):
             return None
-        noise = None
-        if self.noise is not None or following.noise is not None:
-            noise = jnp.concatenate([self.scale, following.scale])
-        return Values(jnp.concatenate([self.points, following.points]), noise, self.outputs)
+        points = jnp.concatenate([self.points, following.points])
+        return Values(points, _join_noise(self, following), self.outputs)
 
     def with_points(self, points: Float[Array, "E d"]) -> "Values":
         return Values(points, outputs=self.outputs)
@@ -293,6 +274,13 @@ def merge(blocks: Iterable[AbstractBlock]) -> tuple[AbstractBlock, ...]:
         both = groups[-1].merge(block) if groups else None
         groups = [*groups[:-1], both] if both is not None else [*groups, block]
     return tuple(groups)
+
+
+def _join_noise(first: AbstractBlock, second: AbstractBlock) -> Float[Array, " D"] | None:
+    """The noise of the rows of both blocks; None if all of it is 1."""
+    if first.noise is None and second.noise is None:
+        return None
+    return jnp.concatenate([first.scale, second.scale])
 
 
 def _broadcast_noise(noise: Float[Array, " D"], rows: Float[Array, "D *rest"]) -> Array:

@@ -220,7 +220,7 @@ class Velocities(AbstractObservations):
         self.inputs = inputs_at(self.X, inputs, parameters)
         self.kept = None if kept is None else jnp.asarray(kept)
         N, n = self.X.shape
-        self.noise = _noise(noise, [(), (n,), (N, n)], "(), (n,) or (N, n)", self.X)
+        self.noise = _noise(noise, [(), (n,), (N, n)], self.X)
 
     @property
     def dimension(self) -> int:
@@ -268,15 +268,11 @@ class Energies(AbstractObservations):
         noise: ArrayLike | None = None,
     ):
         X, E = require.points(X, "X"), require.floating(E, "E")
-        if E.shape != X.shape[:1]:
-            raise ValueError(
-                f"E has shape {E.shape}; one energy for each of the {len(X)} states in X is "
-                f"needed, shape ({len(X)},)."
-            )
+        require.shape(E, "E has", "one energy for each state in X", X.shape[:1])
         X, E = require.one_dtype(X, E)
         require.single_or_double(X.dtype, "X and E have")
         self.X, self.E = require.finite(X, "X"), require.finite(E, "E")
-        self.noise = _noise(noise, [(), E.shape], "() or (N,)", self.X)
+        self.noise = _noise(noise, [(), E.shape], self.X)
 
     @property
     def dimension(self) -> int:
@@ -413,15 +409,11 @@ class Functionals(AbstractObservations):
         yield rows, self.targets
 
 
-def _noise(noise: Any, shapes: list[tuple[int, ...]], needed: str, X: Array) -> Array | None:
+def _noise(noise: Any, shapes: list[tuple[int, ...]], X: Array) -> Array | None:
     """The relative standard deviations, of one of these shapes, in the dtype of X."""
     if noise is None:
         return None
     array = require.floating(noise, "noise")
-    if array.shape not in shapes:
-        raise ValueError(
-            f"noise has shape {array.shape}; relative standard deviations of shape {needed} are "
-            f"needed, here {' or '.join(map(str, shapes))}."
-        )
+    require.shape(array, "noise has", "a relative standard deviation", *shapes)
     cure = "It is a standard deviation; for exact measurements take a small one, such as 1e-3."
     return require.positive(array, "noise", cure).astype(X.dtype)

@@ -10,13 +10,13 @@ where F = G_XS T is applied as a product with the Gram and never stored. If trac
 condition number is at most 1 + τ and the number of iterations does not depend on N.
 """
 
-import abc
 from collections.abc import Callable
 from typing import ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int
 
 from hamkernel import _require as require
@@ -24,21 +24,19 @@ from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import KernelField, kernel_field
 from hamkernel._gram import gram_rounding, stop_gradients, trace
 from hamkernel._gram_operator import product
-from hamkernel._machine import RowSharding, precise_jit, row_sharding, shard, to_caller_sharding
-from hamkernel._observations.measurements import Measurements
+from hamkernel._machine import precise_jit, row_sharding, shard
 from hamkernel._solvers.dense import gram_product, norm_of, relative_error
 from hamkernel._solvers.landmarks import whitening
 from hamkernel._solvers.least_squares import normal
 from hamkernel._solvers.low_rank import (
     Columns,
-    check_solution,
+    check_low_rank,
     factor,
     landmark_span,
     truncation_of,
 )
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._solvers.problem import AbstractSolver
-from hamkernel._structures.base import AbstractMatrixKernel
 
 
 class _Solution(NamedTuple):
@@ -105,7 +103,7 @@ class ConjugateGradient(AbstractSolver[KernelField]):
         X, spread = rows.points, row_sharding(rows.points)
         landmarks = self.preconditioner.landmarks(K, rows, problem.regularization)
         limits = self._tolerance(rows.targets.dtype), self.max_iterations
-        prepare: Callable[..., tuple[AbstractProducts, Array]]
+        prepare: Callable[..., tuple[Products, Array]]
         if problem.states is None:
             prepare, args, y = _prepare_rows, (K, rows, ridge, landmarks), rows.y
         else:
@@ -115,10 +113,21 @@ class ConjugateGradient(AbstractSolver[KernelField]):
             result = _solve_with_bar(_prepare(prepare, args), y, ridge, *limits)
         else:
             result = _solve(prepare, args, y, ridge, *limits)
-        (c, residual, norm), info = self._check_convergence(K, X, ridge, landmarks, result, throw)
-        residual = to_caller_sharding(spread, rows.residual(residual.reshape(-1)))
-        representer = rows.coefficients(c.reshape(-1))
-        return kernel_field(K, representer, residual, norm, problem.regularization, info)
+        (c, residual, norm), iterations, relative_residual, truncation = result
+        info = SolverInfo(
+            "ConjugateGradient",
+            landmarks=landmarks.count,
+            rank=landmarks.kept.sum(),
+            truncation=truncation,
+            iterations=iterations,
+            relative_residual=relative_residual,
+        )
+        residual, representer = (
+            rows.residual(residual.reshape(-1)),
+            rows.coefficients(c.reshape(-1)),
+        )
+        field = kernel_field(K, representer, residual, norm, problem.regularization, info)
+        return self._check_convergence(field, X, ridge, throw)
 
     def _tolerance(self, dtype: jnp.dtype) -> Float[Array, ""]:
         tolerance = self.tolerance
@@ -126,10 +135,13 @@ class ConjugateGradient(AbstractSolver[KernelField]):
         # As an array: every new Python float would compile a new program.
         return jnp.asarray(default if tolerance is None else tolerance, dtype)
 
-    def _check_convergence(self, K, X, ridge, landmarks, result: _Solution, throw: bool):
-        """(coefficients, residual, norm) and the `SolverInfo`; RuntimeError without convergence."""
-        learned, iterations, relative_residual, truncation = result
-        tolerance = self._tolerance(X.dtype)
+    def _check_convergence(self, field: KernelField, X, ridge, throw: bool) -> KernelField:
+        """The field; RuntimeError without convergence, or NaN without `throw`."""
+        info, tolerance = field.info, self._tolerance(X.dtype)
+        iterations, relative_residual = info.iterations, info.relative_residual
+        truncation = info.truncation
+        assert iterations is not None
+        assert relative_residual is not None
 
         def message() -> str:
             reached = ""
@@ -137,10 +149,9 @@ class ConjugateGradient(AbstractSolver[KernelField]):
                 reached = (
                     f" after {int(iterations)} iterations: the relative residual is "
                     f"{float(relative_residual):.1e} and the tolerance {tolerance:.1e} "
-                    f"({int(landmarks.count)} landmarks, truncation "
-                    f"{float(truncation):.1e})"
+                    f"({info.landmarks} landmarks, truncation {truncation:.1e})"
                 )
-                rounding = float(gram_rounding(trace(K, X, row_sharding(X))))
+                rounding = float(gram_rounding(trace(field.kernel, X, row_sharding(X))))
                 # On 87 points of an orbit the iterations converged for a ridge of 3e4 times the
                 # rounding, not for 3e2, where Cholesky left a residual of 4e-12.
                 if ridge < 1e4 * rounding:
@@ -164,62 +175,22 @@ class ConjugateGradient(AbstractSolver[KernelField]):
             )
 
         failed = ~(require.host_array(relative_residual) <= require.host_array(tolerance))
-        info = SolverInfo(
-            "ConjugateGradient",
-            landmarks=landmarks.count,
-            rank=landmarks.kept.sum(),
-            truncation=truncation,
-            iterations=iterations,
-            relative_residual=relative_residual,
-        )
-        return check_solution(learned, landmarks, truncation, failed, message, throw), info
+        return check_low_rank(field, throw, failed, message)
 
 
-class AbstractProducts(eqx.Module):
+class Products(NamedTuple):
     """Products with the Gram and with the inverse of the low-rank Gram that preconditions.
 
     The preconditioner changes the number of iterations, not the solution, so we do not
     differentiate the preconditioner.
+
+    Attributes:
+        gram: c -> G c.
+        precondition: c -> (I + Ĝ/ρ)⁻¹ c.
     """
 
-    @abc.abstractmethod
-    def gram(self, c: Array) -> Array:
-        """G c."""
-
-    @abc.abstractmethod
-    def precondition(self, c: Array) -> Array:
-        """(I + Ĝ/ρ)⁻¹ c."""
-
-
-class _VelocityProducts(AbstractProducts):
-    kernel: AbstractMatrixKernel
-    X: Float[Array, "N d"]
-    T: Float[Array, "r r"]
-    R: Float[Array, "r r"]
-    fixed: tuple  # the kernel, the states and the landmarks of the preconditioner
-    spread: RowSharding | None = eqx.field(static=True)
-
-    def gram(self, c):
-        return product(self.kernel, self.X, self.X, c, self.spread, self.spread)
-
-    def precondition(self, c):
-        K, X, S = self.fixed
-        moment = self.T.T @ product(K, S, X, c, None, self.spread).reshape(-1)
-        w = jax.scipy.linalg.cho_solve((self.R, True), moment)
-        return c - product(K, X, S, (self.T @ w).reshape(len(S), -1), self.spread)
-
-
-class _RowProducts(AbstractProducts):
-    kernel: AbstractMatrixKernel
-    rows: Measurements
-    F: Float[Array, "D r"]
-    R: Float[Array, "r r"]
-
-    def gram(self, c):
-        return gram_product(self.kernel, self.rows, c)  # the rows of the field of c
-
-    def precondition(self, c):
-        return c - self.F @ jax.scipy.linalg.cho_solve((self.R, True), self.F.T @ c)
+    gram: Callable[[Array], Array]
+    precondition: Callable[[Array], Array]
 
 
 def _prepare_velocities(K, X, ridge, landmarks, spread):
@@ -227,8 +198,16 @@ def _prepare_velocities(K, X, ridge, landmarks, spread):
     K_, X_, ridge_, marks = stop_gradients((K, X, ridge, landmarks))
     T, nothing = whitening(K_, marks), jnp.zeros((len(X), K.outputs(X.shape[1])), X.dtype)
     square = normal(Columns(K_, marks), T, X_, nothing, spread).square
-    products = _VelocityProducts(K, X, T, factor(square, ridge_), (K_, X_, marks.points), spread)
-    return products, truncation_of(trace(K_, X_, spread), jnp.trace(square), ridge_)
+    inverse = Partial(_precondition_velocities, K_, X_, marks.points, T, factor(square, ridge_))
+    gram = Partial(product, K, X, X, X_rows=spread, Z_rows=spread)
+    truncation = truncation_of(trace(K_, X_, spread), jnp.trace(square), ridge_)
+    return Products(gram, Partial(inverse, spread=spread)), truncation
+
+
+def _precondition_velocities(K, X, S, T, R, c, spread):
+    moment = T.T @ product(K, S, X, c, None, spread).reshape(-1)
+    w = jax.scipy.linalg.cho_solve((R, True), moment)
+    return c - product(K, X, S, (T @ w).reshape(len(S), -1), spread)
 
 
 def _prepare_rows(K, rows, ridge, landmarks):
@@ -238,7 +217,12 @@ def _prepare_rows(K, rows, ridge, landmarks):
     all_rows = span.all_rows(rows_)
     F = rows_.contrast(all_rows)
     truncation = span.truncation(rows_, all_rows, ridge_)
-    return _RowProducts(K, rows, F, factor(F.T @ F, ridge_)), truncation
+    inverse = Partial(_precondition_rows, F, factor(F.T @ F, ridge_))
+    return Products(Partial(gram_product, K, rows), inverse), truncation
+
+
+def _precondition_rows(F, R, c):
+    return c - F @ jax.scipy.linalg.cho_solve((R, True), F.T @ c)
 
 
 _prepare = precise_jit(lambda prepare, args: prepare(*args))
@@ -260,14 +244,14 @@ class _Iterate(NamedTuple):
 
 
 @precise_jit
-def _first_iterate(products: AbstractProducts, y) -> _Iterate:
+def _first_iterate(products: Products, y) -> _Iterate:
     z = products.precondition(y)
     start, none, size = jnp.zeros_like(y), jnp.zeros((), int), relative_error(y, y)
     return _Iterate(start, y, z, jnp.sum(y * z), size, jnp.zeros_like(size), none)
 
 
 @precise_jit
-def _next(products: AbstractProducts, y, ridge, state: _Iterate) -> _Iterate:
+def _next(products: Products, y, ridge, state: _Iterate) -> _Iterate:
     p = state.direction
     image = p + products.gram(p) / ridge
     step = state.square / jnp.sum(p * image)
@@ -319,7 +303,7 @@ def _solve_with_bar(prepared, y, ridge, tolerance, max_iterations) -> _Solution:
 
 
 @precise_jit
-def _solution_of(products: AbstractProducts, truncation, y, ridge, c, steps) -> _Solution:
+def _solution_of(products: Products, truncation, y, ridge, c, steps) -> _Solution:
     # c = ρa, so f(X) = Ga = Gc/ρ and ‖f‖² = aᵀGa = c·f(X)/ρ. With the residual r = y − c − f(X) of
     # the system, aᵀr = cᵀr/ρ estimates the error of ‖f‖², as in `norm_of`.
     values = products.gram(c) / ridge

@@ -41,16 +41,13 @@ from hamkernel._solvers.factors import (
     solution,
 )
 from hamkernel._solvers.low_rank import Prior, prior_draws
-from hamkernel._solvers.problem import AbstractConditional, AbstractSolver, Problem
+from hamkernel._solvers.problem import AbstractConditional, AbstractSolver, Problem, check_field
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
 class DenseConditional(AbstractConditional):
     """The posterior from the Cholesky factor of A; `representer` is c = A⁻¹y."""
 
-    field: KernelField
-    rows: Measurements
-    ridge: Float[Array, ""]
     factor: DenseFactor
     representer: Float[Array, " D"]
 
@@ -66,9 +63,8 @@ class DenseConditional(AbstractConditional):
     def update(self, new: Measurements) -> "DenseConditional":
         factor, c, field = _extend(self, new)
         rows = self.rows.append(new)
-        return DenseConditional(
-            _refuse_failure(field, jnp.sum(0 * c), rows.count), rows, self.ridge, factor, c
-        )
+        field = _refuse_failure(field, require.not_finite(c).any(), rows.count)
+        return DenseConditional(field, rows, self.ridge, factor, c)
 
     def draws(self, key: Key[Array, ""], count: int, region: Float[Array, "2 n"]) -> KernelField:
         before, noise = jax.random.split(key)
@@ -95,25 +91,29 @@ def _is_in_place(problem: Problem) -> bool:
     return not fits and problem.states is not None and require.is_concrete(problem)
 
 
-def _check_memory(problem: Problem) -> None:
-    """Refuse a dense fit whose matrices do not fit in memory."""
-    D, dtype = problem.rows.size, problem.rows.targets.dtype
+def _solve(problem: Problem, throw: bool, progress: bool, keep: bool) -> Any:
+    """Solve A c = y. Returns (factor, or None unless to `keep`, c, field).
+
+    Raises:
+        ValueError: the matrices do not fit in memory. RuntimeError, with `throw`: the factorisation
+            failed.
+    """
+    K, rows, regularization = problem.kernel, problem.rows, problem.regularization
+    D, dtype = rows.size, rows.targets.dtype
     cure = (
         "Use solver=hk.ConjugateGradient(), which is exact and has no error bars, or "
         "solver=hk.Nystrom(), which is faster and approximate to a stated tolerance."
     )
     refuse_beyond_memory(f"a dense fit of {D} rows", D, D, dtype, copies(problem), cure)
-
-
-def _solve(problem: Problem, progress: bool, keep: bool) -> Any:
-    """Solve A c = y. Returns (factor, or None unless to `keep`, c, field, relative residual)."""
-    K, rows, regularization = problem.kernel, problem.rows, problem.regularization
-    _check_memory(problem)
-    if not _is_in_place(problem):
-        return _solve_in_memory(K, rows, regularization, keep)
-    factor = factor_in_place(*_assemble(K, rows, problem.ridge, progress))
-    result: Any = _solve_with_factor(K, rows, regularization, factor)
-    return factor, *result
+    if _is_in_place(problem):
+        factor = factor_in_place(*_assemble(K, rows, problem.ridge, progress))
+        c, field = _solve_with_factor(K, rows, regularization, factor)
+    else:
+        factor, c, field = _solve_in_memory(K, rows, regularization, keep)
+    # The relative error of the fitted values was 1 to 10 times ‖y − (G + σ²I)c‖/‖y‖, at every
+    # accuracy.
+    failed = ~(require.host_array(field.info.relative_residual) <= 1e-2)
+    return factor, c, _refuse_failure(field, failed, rows.count, throw)
 
 
 def _assemble(K, rows: Measurements, ridge, progress: bool):
@@ -136,23 +136,23 @@ _slab = precise_jit(strips_of_gram, donate="all-except-first")
 def _solve_in_memory(K, rows: Measurements, regularization, keep: bool):
     ridge = rows.count * regularization
     factor, c = solution(regularized_gram(K, rows, ridge), rows.y)
-    return factor if keep else None, *_field_and_residual(K, rows, regularization, c)
+    return factor if keep else None, c, _field_of(K, rows, regularization, c)
 
 
 @precise_jit
 def _solve_with_factor(K, rows: Measurements, regularization, factor: DenseFactor):
-    return _field_and_residual(K, rows, regularization, factor.solve(rows.y))
+    c = factor.solve(rows.y)
+    return c, _field_of(K, rows, regularization, c)
 
 
-def _field_and_residual(K, rows: Measurements, regularization, c):
-    """The coefficients c, their field, and the relative residual ‖y − (G + σ²I)c‖/‖y‖."""
+def _field_of(K, rows: Measurements, regularization, c) -> KernelField:
+    """The field of the coefficients c, with the relative residual ‖y − (G + σ²I)c‖/‖y‖."""
     y, ridge = rows.y, rows.count * regularization
     values = gram_product(K, rows, c)  # without the Gram, which the factor has overwritten
     relative_residual = relative_error(y - values - ridge * c, y)
     residual, norm = rows.residual(ridge * c), norm_of(c @ values, c @ (y - values - ridge * c))
     info = SolverInfo("Cholesky", relative_residual=relative_residual)
-    field = kernel_field(K, rows.coefficients(c), residual, norm, regularization, info)
-    return c, field, relative_residual
+    return kernel_field(K, rows.coefficients(c), residual, norm, regularization, info)
 
 
 def norm_of(square: Float[Array, ""], error: Float[Array, ""]) -> Float[Array, ""]:
@@ -230,37 +230,26 @@ def gram_product(
     return rows.contrast(rows.evaluate(field._velocities, potential))
 
 
-def _refuse_failure(
-    field: KernelField, relative_residual: Array, N: int, throw: bool = True
-) -> KernelField:
-    """The field; RuntimeError, or NaN without `throw`, if the factorisation failed."""
-    regularization = field.regularization
+def _refuse_failure(field: KernelField, failed: Any, N: int, throw: bool = True) -> KernelField:
+    """The field; RuntimeError, or NaN without `throw`, if the factorisation `failed`."""
+    regularization, relative_residual = field.regularization, field.info.relative_residual
 
     def message() -> str:
         is_known = require.is_concrete(regularization, relative_residual)
         number = f" = {N * float(regularization):.3g}" if is_known else ""
         share = ""
-        if is_known and jnp.isfinite(relative_residual):
+        if is_known and relative_residual is not None and jnp.isfinite(relative_residual):
             share = f" (its solution leaves a relative residual of {relative_residual:.2g})"
         return (
             f"the Gram plus the ridge N * regularization{number} is not positive definite to "
-            f"rounding in {relative_residual.dtype}{share}. Likely causes, in order: the "
+            f"rounding in {regularization.dtype}{share}. Likely causes, in order: the "
             "regularization is too small for this Gram (points that coincide or lie close together "
             "for the lengthscale make it singular): raise it; noise levels that are too different; "
             "float32 where float64 is needed: jax.config.update('jax_enable_x64', True); a kernel "
             "that is not positive definite or not finite: hk.check_kernel(k, X) finds out."
         )
 
-    def learned_arrays(f):
-        return f.coefficients, f.residual, f.norm, f.value_coefficients
-
-    # The relative error of the fitted values was 1 to 10 times ‖y − (G + σ²I)c‖/‖y‖, at every
-    # accuracy.
-    failed = ~(require.host_array(relative_residual) <= 1e-2)
-    if throw and require.is_concrete(failed):  # the field need not be taken apart
-        return require.value(field, failed, message, RuntimeError)
-    values = require.value(learned_arrays(field), failed, message, RuntimeError, throw)
-    return eqx.tree_at(learned_arrays, field, values, is_leaf=lambda leaf: leaf is None)
+    return check_field(field, failed, message, throw)
 
 
 class Cholesky(AbstractSolver[KernelField]):
@@ -275,11 +264,9 @@ class Cholesky(AbstractSolver[KernelField]):
     """
 
     def fit(self, problem, throw=True, progress=False) -> KernelField:
-        _, _, field, relative_residual = _solve(problem.to_one_device(), progress, keep=False)
-        return _refuse_failure(field, relative_residual, problem.rows.count, throw)
+        return _solve(problem.to_one_device(), throw, progress, keep=False)[2]
 
     def condition(self, problem, throw=True, progress=False) -> DenseConditional:
         problem = problem.to_one_device()
-        factor, c, field, relative_residual = _solve(problem, progress, keep=True)
-        field = _refuse_failure(field, relative_residual, problem.rows.count, throw)
+        factor, c, field = _solve(problem, throw, progress, keep=True)
         return DenseConditional(field, problem.rows, problem.ridge, factor, c)

@@ -37,6 +37,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import sequential_vmap
+from jax.tree_util import Partial
 from jaxtyping import Array, Bool, Float, Int
 
 from hamkernel._machine import full_precision, precise_jit
@@ -77,20 +78,16 @@ class Group:
 System = TypeVar("System", bound="AbstractSystem")
 
 
-class AbstractBlocks(eqx.Module):
-    """The blocks C_SS of some folds S, factored."""
-
-    @abc.abstractmethod
-    def solve(self, b: Float[Array, "F s"]) -> Float[Array, "F s"]:
-        """(C_SS)⁻¹ b_S for each fold."""
+# b (F, s) -> (C_SS)⁻¹ b_S for each fold S of a group: a PyTree.
+BlockSolver = Callable[[Float[Array, "F s"]], Float[Array, "F s"]]
 
 
 class AbstractInverse(eqx.Module, Generic[System]):
     """C = A⁻¹, with the cotangents of A that the losses need."""
 
     @abc.abstractmethod
-    def blocks(self, group: Group) -> AbstractBlocks:
-        """The diagonal blocks C_SS of the folds S of a group."""
+    def block_solver(self, group: Group) -> BlockSolver:
+        """The solver of the diagonal blocks C_SS of the folds S of a group."""
 
     @abc.abstractmethod
     def vjp(
@@ -172,16 +169,13 @@ class AbstractSystem(eqx.Module):
         """The factor of A."""
 
 
-class CholeskyBlocks(AbstractBlocks):
-    """Diagonal blocks C_SS, each with its lower Cholesky factor."""
+def cholesky_solver(blocks: Float[Array, "F s s"]) -> BlockSolver:
+    """The solver of diagonal blocks, from the Cholesky factor of each of them."""
+    return Partial(_solve_blocks, jax.lax.linalg.cholesky(blocks, symmetrize_input=False))
 
-    lower: Float[Array, "F s s"]
 
-    def __init__(self, blocks: Float[Array, "F s s"]):
-        self.lower = jax.lax.linalg.cholesky(blocks, symmetrize_input=False)
-
-    def solve(self, b: Float[Array, "F s"]) -> Float[Array, "F s"]:
-        return jax.scipy.linalg.cho_solve((self.lower, True), b[..., None])[..., 0]
+def _solve_blocks(lower: Float[Array, "F s s"], b: Float[Array, "F s"]) -> Float[Array, "F s"]:
+    return jax.scipy.linalg.cho_solve((lower, True), b[..., None])[..., 0]
 
 
 # The number of rows of R that `factor_in_place` computes at once. The temporaries are four blocks
@@ -388,8 +382,8 @@ class DenseInverse(AbstractInverse[DenseSystem]):
     C: Float[Array, "D D"]
     constant: Float[Array, " D"] | None = None
 
-    def blocks(self, group: Group) -> CholeskyBlocks:
-        return CholeskyBlocks(group.diagonal_blocks(self.C))
+    def block_solver(self, group: Group) -> BlockSolver:
+        return cholesky_solver(group.diagonal_blocks(self.C))
 
     def vjp(self, u, w, inverse=None, square=None) -> DenseSystem:
         A_bar = u[:, None] * w[None, :]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, overload
+from typing import Any, TypedDict, Unpack, overload
 
 import jax
 from jaxtyping import ArrayLike, Num
@@ -16,10 +16,8 @@ from hamkernel._fields.joined import ControlledField, FamilyField, learned_field
 from hamkernel._fields.lagrangian import LagrangianField
 from hamkernel._machine import (
     dense_bytes,
-    follow_data,
-    full_precision,
+    entry_point,
     memory_bytes,
-    one_blas_thread,
     row_sharding,
     to_caller_sharding,
 )
@@ -52,6 +50,16 @@ def fit(
 ) -> LagrangianField: ...
 
 
+class FitOptions(TypedDict, total=False):
+    """The arguments of `fit` on which the type of the field does not depend."""
+
+    mean: Mean | None
+    throw: bool
+    inputs: Num[ArrayLike, "N m"] | None
+    parameters: Num[ArrayLike, "N p"] | None
+    progress: bool
+
+
 @overload
 def fit(
     K: Controlled,
@@ -60,11 +68,7 @@ def fit(
     regularization: ArrayLike = 1e-4,
     *,
     solver: AbstractSolver | None = None,
-    mean: Mean | None = None,
-    throw: bool = True,
-    inputs: Num[ArrayLike, "N m"] | None = None,
-    parameters: Num[ArrayLike, "N p"] | None = None,
-    progress: bool = False,
+    **options: Unpack[FitOptions],
 ) -> ControlledField: ...
 @overload
 def fit(
@@ -74,10 +78,7 @@ def fit(
     regularization: ArrayLike = 1e-4,
     *,
     solver: AbstractSolver | None = None,
-    mean: Mean | None = None,
-    throw: bool = True,
-    parameters: Num[ArrayLike, "N p"] | None = None,
-    progress: bool = False,
+    **options: Unpack[FitOptions],
 ) -> FamilyField: ...
 @overload
 def fit(
@@ -87,11 +88,7 @@ def fit(
     regularization: ArrayLike = 1e-4,
     *,
     solver: None = None,
-    mean: Mean | None = None,
-    throw: bool = True,
-    inputs: Num[ArrayLike, "N m"] | None = None,
-    parameters: Num[ArrayLike, "N p"] | None = None,
-    progress: bool = False,
+    **options: Unpack[FitOptions],
 ) -> KernelField: ...
 @overload
 def fit(
@@ -101,17 +98,11 @@ def fit(
     regularization: ArrayLike = 1e-4,
     *,
     solver: AbstractSolver[LearnedField],
-    mean: Mean | None = None,
-    throw: bool = True,
-    inputs: Num[ArrayLike, "N m"] | None = None,
-    parameters: Num[ArrayLike, "N p"] | None = None,
-    progress: bool = False,
+    **options: Unpack[FitOptions],
 ) -> LearnedField: ...
 
 
-@follow_data
-@one_blas_thread
-@full_precision
+@entry_point
 def fit(
     K: AbstractMatrixKernel,
     X: Num[ArrayLike, "N n"] | AbstractObservations,

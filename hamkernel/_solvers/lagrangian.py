@@ -174,9 +174,7 @@ def ridge_solution(
     return F[:r, :r], solve_triangular(F[:r, :r], F[:r, r])
 
 
-@precise_jit
-def _anchored_solution(features, B, y) -> tuple[Array, Array]:
-    return ridge_solution(*with_anchor(features, B, y))
+_anchored_solution = precise_jit(lambda *rows: ridge_solution(*with_anchor(*rows)))
 
 
 def missing_friction(

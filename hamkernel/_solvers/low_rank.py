@@ -33,7 +33,7 @@ Wilson, Borovitskiy, Terenin, Mostowsky & Deisenroth (2020), arXiv 2002.09309.
 import abc
 import dataclasses
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -51,7 +51,7 @@ from hamkernel._observations.blocks import AbstractBlock
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmarks import Landmarks, choose_landmarks, given_landmarks, whitening
 from hamkernel._solvers.least_squares import Normal, normal
-from hamkernel._solvers.problem import AbstractConditional
+from hamkernel._solvers.problem import AbstractConditional, Field, check_field
 from hamkernel._solvers.triangle import append_rows, no_rows
 from hamkernel._structures.base import AbstractMatrixKernel
 
@@ -175,9 +175,6 @@ def _draw_prior(K, landmarks: Landmarks, key, count: int) -> Prior:
     return Prior(K, S, ((w - g @ T) @ T.T).reshape(count, m, n), waves, weights)
 
 
-Arrays = TypeVar("Arrays")
-
-
 def factor(square: Float[Array, "r r"], ridge: Float[Array, ""]) -> Float[Array, "r r"]:
     """The lower Cholesky factor of FᵀF + ridge I; NaN where the ridge is below rounding."""
     return jnp.linalg.cholesky(plus_ridge(square, ridge))
@@ -195,44 +192,43 @@ def truncation_of(
     return jnp.maximum(difference, jnp.zeros_like(difference)) / ridge
 
 
-def check_solution(
-    learned: Arrays,
-    landmarks: Landmarks,
-    truncation: Float[Array, ""] | None,
-    failed: Bool[ArrayLike, ""],
-    message: str | Callable[[], str],
+def check_low_rank(
+    field: Field,
     throw: bool,
-) -> Arrays:
-    """The arrays `learned`; a RuntimeError with `message` if the solve `failed`.
+    failed: Bool[ArrayLike, ""] | None = None,
+    message: str | Callable[[], str] = "",
+) -> Field:
+    """The field; RuntimeError with `message`, or NaN without `throw`, if its solve `failed`.
 
-    A fit without landmarks counts as failed, unless the Gram, and with it the field, is zero.
+    If `failed` is None, a field with a norm that is not finite failed. A fit without landmarks
+    counts as failed, unless the Gram, and with it the field, is zero.
     """
-    if truncation is None:
-        return require.value(learned, failed, message, RuntimeError, throw)
-    none = require.host_array(landmarks.count) == 0
-    failed = failed | (none & (require.host_array(truncation) != 0))
-    learned = require.value(learned, failed, message, RuntimeError, throw)
+    info = field.info
+    if failed is None:
+        failed = require.not_finite(field.norm)
+        assert failed is not None
+        message = (
+            "the low-rank system plus the ridge N * regularization is not positive definite to "
+            f"rounding in {field.norm.dtype}. Likely causes, in order: the regularization is too "
+            "small: raise it; float32 where float64 is needed: jax.config.update("
+            "'jax_enable_x64', True); a kernel that is not positive definite or not finite: "
+            "hk.check_kernel(k, X) finds out."
+        )
+    if info.truncation is None or info.landmarks is None:
+        return check_field(field, failed, message, throw)
+    truncation, none = require.host_array(info.truncation), require.host_array(info.landmarks) == 0
+    field = check_field(field, failed | (none & (truncation != 0)), message, throw)
     indefinite = (
         "the low-rank Gram of the landmarks is larger than the Gram itself, so the kernel is not "
         "positive definite: hk.check_kernel(k, X) finds out."
     )
-    return require.value(learned, require.not_finite(truncation), indefinite, RuntimeError, throw)
-
-
-def singular_message(dtype: jnp.dtype) -> str:
-    """The error text of a failed factorisation of the low-rank system."""
-    return (
-        f"the low-rank system plus the ridge N * regularization is not positive definite to "
-        f"rounding in {dtype}. Likely causes, in order: the regularization is too small: raise "
-        "it; float32 where float64 is needed: jax.config.update('jax_enable_x64', True); a kernel "
-        "that is not positive definite or not finite: hk.check_kernel(k, X) finds out."
-    )
+    return check_field(field, require.not_finite(info.truncation), indefinite, throw)
 
 
 class AbstractFunctions(eqx.Module):
     """Functions φ_1 … φ_r and the rows of observations of them."""
 
-    kernel: eqx.AbstractVar[AbstractMatrixKernel]
+    kernel: AbstractMatrixKernel
 
     @abc.abstractmethod
     def rows_of(self, block: AbstractBlock) -> Float[Array, "d r"]:
@@ -259,7 +255,6 @@ class AbstractFunctions(eqx.Module):
 class Columns(AbstractFunctions):
     """The columns K(·, s) of landmarks."""
 
-    kernel: AbstractMatrixKernel
     landmarks: Landmarks
 
     def rows_of(self, block: AbstractBlock) -> Float[Array, "d r"]:
@@ -284,8 +279,7 @@ class AbstractSpan(AbstractFunctions):
         self,
         w: Float[Array, " r"],
         residual: Array,
-        ridge: Array,
-        N: int,
+        regularization: Float[Array, ""],
         truncation: Float[Array, ""] | None,
     ) -> AbstractField:
         """The field Σ_r w_r φ_r."""
@@ -325,7 +319,6 @@ def landmark_field(
 class LandmarkSpan(AbstractSpan):
     """The columns K(·, s) of landmarks, orthonormalised by T with T Tᵀ = G_SS⁻¹."""
 
-    kernel: AbstractMatrixKernel
     landmarks: Landmarks
     T: Float[Array, "r r"]
 
@@ -338,9 +331,11 @@ class LandmarkSpan(AbstractSpan):
     def truncation(self, rows, F, ridge) -> Float[Array, ""]:
         return truncation_of(trace_of_rows(self.kernel, rows), jnp.sum(F**2), ridge)
 
-    def field(self, w, residual, ridge, N, truncation) -> KernelField:
-        c, norm = self.T @ w, root(w @ w)
-        return landmark_field(self.kernel, self.landmarks, ridge / N, c, residual, norm, truncation)
+    def field(self, w, residual, regularization, truncation) -> KernelField:
+        c, norm = self.T @ w, root(w @ w)  # ‖f‖² = αᵀ G_SS α = ‖w‖²
+        return landmark_field(
+            self.kernel, self.landmarks, regularization, c, residual, norm, truncation
+        )
 
     def draws(self, weights, rows, key, region) -> KernelField:
         everywhere = jnp.concatenate([self.landmarks.rows.points, rows.points])
@@ -363,7 +358,6 @@ def _landmark_draws(span: LandmarkSpan, weights, prior: Prior) -> KernelField:
 class FeatureSpan(AbstractSpan):
     """Random Fourier features, whose kernel is Σ φφᵀ itself."""
 
-    kernel: AbstractMatrixKernel
     features: AbstractFeatures
     dimension: int = eqx.field(static=True)
 
@@ -380,11 +374,14 @@ class FeatureSpan(AbstractSpan):
     def truncation(self, rows, F, ridge) -> None:
         return None
 
-    def field(self, w, residual, ridge, N, truncation) -> FeatureField:
-        residual_norm = jnp.linalg.norm(residual)
+    def field(
+        self, w, residual, regularization, truncation=None, residual_norm=None
+    ) -> FeatureField:
+        if residual.ndim == 1:  # of other rows than velocities, which the field does not keep
+            residual_norm = jnp.linalg.norm(residual)
+            residual = jnp.zeros((0, self.dimension), w.dtype)
         info = SolverInfo("RandomFeatures", rank=jnp.asarray(len(w)), residual_norm=residual_norm)
-        kept_residual = residual if residual.ndim == 2 else jnp.zeros((0, self.dimension), w.dtype)
-        return feature_field(self.kernel, self.features, w, kept_residual, ridge / N, info)
+        return feature_field(self.kernel, self.features, w, residual, regularization, info)
 
     def draws(self, weights, rows, key, region) -> FeatureField:
         def one(w):
@@ -406,16 +403,6 @@ class AbstractBasis(eqx.Module):
         """The span of K at points of n coordinates."""
 
 
-class WaveBasis(AbstractBasis):
-    """Random Fourier features of one random key; the frequencies scale with the kernel."""
-
-    key: Key[Array, ""]
-    count: int = eqx.field(static=True)
-
-    def span(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> FeatureSpan:
-        return FeatureSpan(K, features(K, n, self.count, self.key, dtype), n)
-
-
 class LandmarkBasis(AbstractBasis):
     """The kernel's columns of fixed landmarks."""
 
@@ -432,9 +419,6 @@ class LandmarkBasis(AbstractBasis):
 class LowRankConditional(AbstractConditional):
     """The posterior from R with RᵀR = FᵀF + σ²I; the mean weights are w = R⁻¹ `rotated`."""
 
-    field: AbstractField
-    rows: Measurements
-    ridge: Float[Array, ""]
     span: AbstractSpan
     R: Float[Array, "r r"]
     rotated: Float[Array, " r"]
@@ -489,16 +473,7 @@ def low_rank_conditional(
         RuntimeError: the least squares have no solution to rounding.
     """
     conditional = _low_rank_conditional(span, rows, rows.count * regularization)
-    field = conditional.field
-    cause = singular_message(field.offset.dtype)
-    arrays, rest = eqx.partition(field, eqx.is_inexact_array)
-    failed = require.not_finite(field.norm)
-    if isinstance(span, LandmarkSpan):
-        truncation = field.info.truncation
-        arrays = check_solution(arrays, span.landmarks, truncation, failed, cause, throw)
-    else:
-        arrays = require.value(arrays, failed, cause, RuntimeError, throw)
-    return eqx.tree_at(lambda c: c.field, conditional, eqx.combine(arrays, rest))
+    return dataclasses.replace(conditional, field=check_low_rank(conditional.field, throw))
 
 
 @precise_jit
@@ -513,5 +488,5 @@ def _conditional(span, rows, ridge, triangle):
     w, F = solve_triangular(R, rotated), span.all_rows(rows)
     residual = rows.y - rows.contrast(F @ w)
     truncation = span.truncation(rows, F, ridge)
-    field = span.field(w, rows.residual(residual), ridge, rows.count, truncation)
+    field = span.field(w, rows.residual(residual), ridge / rows.count, truncation)
     return LowRankConditional(field, rows, ridge, span, R, rotated)

@@ -21,19 +21,20 @@ Source: Yamamoto, Nakatsukasa, Yanagisawa & Fukaya (2015), ETNA 44, on the secon
 
 import jax
 import jax.numpy as jnp
+from jax.tree_util import Partial
 from jaxtyping import Array, Float
 
 from hamkernel._gram import plus_ridge
 from hamkernel._machine import full_precision
 from hamkernel._solvers.factors import (
-    AbstractBlocks,
     AbstractFactor,
     AbstractInverse,
     AbstractSystem,
-    CholeskyBlocks,
+    BlockSolver,
     Group,
     backward,
     cholesky,
+    cholesky_solver,
     forward,
 )
 
@@ -122,12 +123,14 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
     def inverse(self) -> "LowRankFactor":
         return self
 
-    def blocks(self, group: Group) -> AbstractBlocks:
+    def block_solver(self, group: Group) -> BlockSolver:
         rows = group.gather(self.Q)  # (F, s, r)
-        if rows.shape[1] > rows.shape[2]:
-            return _ManyRows(rows, self.ridge)
+        if rows.shape[1] > rows.shape[2]:  # then the factors (F, r, r) are smaller
+            one = jnp.eye(rows.shape[2], dtype=rows.dtype)
+            factors = jax.lax.map(lambda fold_rows: cholesky(one - fold_rows.T @ fold_rows), rows)
+            return Partial(_solve_many_rows, rows, factors, self.ridge)
         one = jnp.eye(rows.shape[1], dtype=rows.dtype)
-        return CholeskyBlocks((one[None] - rows @ rows.transpose(0, 2, 1)) / self.ridge)
+        return cholesky_solver((one[None] - rows @ rows.transpose(0, 2, 1)) / self.ridge)
 
     def vjp(self, u, w, inverse=None, square=None) -> LowRankSystem:
         # Ā = u wᵀ + α C + β C² with α = `inverse`, β = `square`. From dA = dΦ Φᵀ + Φ dΦᵀ + dδ I,
@@ -183,25 +186,15 @@ class LowRankFactor(AbstractFactor[LowRankSystem], AbstractInverse[LowRankSystem
         return LowRankSystem(rows, ridge, jnp.zeros_like(self.Q[:, 0]) if has_constant else None)
 
 
-class _ManyRows(AbstractBlocks):
-    """The blocks (I − Q_S Q_Sᵀ)/δ of folds with more rows than features, solved one by one."""
+def _solve_many_rows(rows, factors, ridge, b: Float[Array, "F s"]) -> Float[Array, "F s"]:
+    """((I − Q_S Q_Sᵀ)/δ)⁻¹ b_S of folds with more rows than features, one by one."""
 
-    rows: Float[Array, "F s r"]
-    ridge: Float[Array, ""]
-    factors: Float[Array, "F r r"]  # no more numbers than the rows have
+    def solve(fold):
+        fold_rows, R, b = fold
+        moment = backward(R, forward(R, (fold_rows.T @ b)[:, None]))[:, 0]
+        return ridge * (b + fold_rows @ moment)
 
-    def __init__(self, rows: Float[Array, "F s r"], ridge: Float[Array, ""]):
-        one = jnp.eye(rows.shape[2], dtype=rows.dtype)
-        self.rows, self.ridge = rows, ridge
-        self.factors = jax.lax.map(lambda fold_rows: cholesky(one - fold_rows.T @ fold_rows), rows)
-
-    def solve(self, b: Float[Array, "F s"]) -> Float[Array, "F s"]:
-        def one(fold):
-            fold_rows, R, b = fold
-            moment = backward(R, forward(R, (fold_rows.T @ b)[:, None]))[:, 0]
-            return self.ridge * (b + fold_rows @ moment)
-
-        return jax.lax.map(one, (self.rows, self.factors, b))
+    return jax.lax.map(solve, (rows, factors, b))
 
 
 def _right_solve(

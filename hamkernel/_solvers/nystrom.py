@@ -13,19 +13,19 @@ A stream has no second pass and therefore no residual; for the accuracy of its s
 """
 
 import numbers
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float, Int, Key, Num, UInt32
+from jaxtyping import Array, ArrayLike, Float, Key, Num, UInt32
 
 from hamkernel import _require as require
-from hamkernel._fields.base import root
+from hamkernel._fields.base import AbstractField
 from hamkernel._fields.expansions import KernelField
 from hamkernel._gram import components, trace, trace_of_rows
 from hamkernel._gram_operator import product
-from hamkernel._machine import RowSharding, precise_jit, row_sharding, shard, to_caller_sharding
+from hamkernel._machine import RowSharding, precise_jit, row_sharding, shard
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmarks import (
     Landmarks,
@@ -35,54 +35,21 @@ from hamkernel._solvers.landmarks import (
     landmarks_of,
     whitening,
 )
-from hamkernel._solvers.least_squares import (
-    Normal,
-    Sums,
-    first_sums,
-    normal,
-    solve_sums,
-    trace_of_sums,
-)
+from hamkernel._solvers.least_squares import normal, trace_of_sums
 from hamkernel._solvers.low_rank import (
     Columns,
     LandmarkBasis,
+    LandmarkSpan,
     LowRankConditional,
-    check_solution,
+    check_low_rank,
     factor,
     landmark_field,
     landmark_span,
     low_rank_conditional,
-    singular_message,
     truncation_of,
 )
-from hamkernel._solvers.stream import (
-    AbstractStreamingFit,
-    AbstractStreamingSolver,
-    thin,
-)
+from hamkernel._solvers.stream import AbstractStreamingFit, AbstractStreamingSolver, start_fit, thin
 from hamkernel._structures.base import AbstractMatrixKernel
-
-
-class Solution(NamedTuple):
-    coefficients: Float[Array, " r"]
-    residual: Float[Array, "N n"]
-    norm: Float[Array, ""]
-    truncation: Float[Array, ""]
-    residual_norm: Float[Array, ""] | None = None
-
-
-def _check_field(
-    K, landmarks, solution, regularization, tolerance, cure, throw=True
-) -> KernelField:
-    """The field of a solution; UserWarning if the landmarks do not reach the tolerance."""
-    dtype = landmarks.points.dtype
-    failed = require.not_finite(solution.coefficients).any()
-    solution = check_solution(
-        solution, landmarks, solution.truncation, failed, singular_message(dtype), throw
-    )
-    warn_if_truncated(solution.truncation, landmarks.count, tolerance, cure)
-    return landmark_field(K, landmarks, regularization, *solution)
-
 
 REMEDY = (
     "Raise max_points, the tolerance or the regularization; let landmarks be chosen from more "
@@ -90,11 +57,15 @@ REMEDY = (
 )
 
 
-def warn_if_truncated(truncation, count, tolerance, cure):
-    if not require.is_concrete(truncation, count):
+def warn_if_truncated(field: AbstractField, tolerance: float, cure: str = REMEDY) -> None:
+    """Warn if the truncation is more than twice the tolerance.
+
+    The landmarks reach the tolerance on the candidates, a random part of the data. On all the data
+    the truncation may be larger.
+    """
+    truncation = field.info.truncation
+    if truncation is None or not require.is_concrete(truncation):
         return
-    # The landmarks reach the tolerance on the candidates, a random part of the data. On all the
-    # data the truncation may be larger.
     if truncation > 2 * tolerance:
         if truncation.dtype == jnp.float32:
             cure = (
@@ -102,9 +73,9 @@ def warn_if_truncated(truncation, count, tolerance, cure):
                 f"jax.config.update('jax_enable_x64', True). {cure}"
             )
         require.warn(
-            f"{int(count)} landmarks leave trace(G - Ĝ)/(N λ) = {float(truncation):.2g}, more than "
-            f"the tolerance {tolerance:.2g}. The field is the best one on these landmarks, but may "
-            f"be far from the exact fit. {cure} for a rough kernel or many dimensions take "
+            f"{field.info.landmarks} landmarks leave trace(G - Ĝ)/(N λ) = {truncation:.2g}, more "
+            f"than the tolerance {tolerance:.2g}. The field is the best one on these landmarks, "
+            f"but may be far from the exact fit. {cure} for a rough kernel or many dimensions take "
             "hk.ConjugateGradient(), which is exact."
         )
 
@@ -134,14 +105,8 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
         tolerance: the tolerance of the solver, for the warning.
     """
 
-    kernel: AbstractMatrixKernel
     landmarks: Landmarks
-    sums: Sums
     trace: Float[Array, ""]
-    compensation: tuple[Normal, Float[Array, ""]]
-    count: Int[Array, ""]
-    regularization: Float[Array, ""]
-    dimension: int = eqx.field(static=True)
     tolerance: float = eqx.field(static=True)
 
     def _columns(self) -> tuple[str, Any, Any]:
@@ -153,54 +118,32 @@ class LandmarkFit(AbstractStreamingFit[KernelField]):
 
     @property
     def _totals(self) -> tuple[Any, ...]:
-        return self.sums.normal_equations, self.trace
+        return *super()._totals, self.trace
 
     def _totals_of(self, rows: Measurements, spread: RowSharding | None) -> tuple[Any, ...]:
-        K, states = self.kernel, rows.states
-        new_trace = trace_of_rows(K, rows) if states is None else trace(K, states[0], spread)
-        return *super()._totals_of(rows, spread), new_trace
+        return *super()._totals_of(rows, spread), trace_of_rows(self.kernel, rows, spread)
 
-    def _solve(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> KernelField:
-        solution = _landmark_solution(self, count, regularization)
+    def _field(self, c, norm, residual, residual_norm, regularization, ridge) -> KernelField:
+        truncation = truncation_of(self.trace, trace_of_sums(self.sums), ridge)
+        return landmark_field(
+            self.kernel,
+            self.landmarks,
+            regularization,
+            c,
+            residual,
+            norm,
+            truncation,
+            residual_norm,
+        )
+
+    def _check_field(self, field: KernelField) -> KernelField:
         cure = (
             "Start anew with landmarks from a sample that looks like the data so far, and a "
             "max_points that suffices; or ask for a larger regularization;"
         )
-        return _check_field(
-            self.kernel, self.landmarks, solution, regularization, self.tolerance, cure
-        )
-
-
-@precise_jit
-def start_fit(K, sample, regularization, landmarks, tolerance):
-    T = whitening(K, landmarks)
-    equations = Columns(K, landmarks).normal_equations(sample, T)
-    sums = first_sums(equations, T, sample.count, regularization)
-    nothing = jnp.zeros((), T.dtype)
-    return LandmarkFit(
-        kernel=K,
-        landmarks=landmarks,
-        sums=sums,
-        trace=nothing,
-        compensation=(sums.normal_equations, nothing),
-        count=jnp.zeros((), int),
-        regularization=regularization,
-        dimension=sample.dimension,
-        tolerance=tolerance,
-    )
-
-
-@precise_jit
-def _landmark_solution(fit, count, regularization):
-    ridge = count.astype(regularization.dtype) * regularization
-    weights, norm, residual_norm = solve_sums(fit.sums, ridge)
-    return Solution(
-        coefficients=weights,
-        residual=jnp.zeros((0, fit.dimension), weights.dtype),
-        norm=norm,
-        truncation=truncation_of(fit.trace, trace_of_sums(fit.sums), ridge),
-        residual_norm=residual_norm,
-    )
+        field = check_low_rank(field, throw=True)
+        warn_if_truncated(field, self.tolerance, cure)
+        return field
 
 
 class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
@@ -273,13 +216,8 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
         The choice stops when the tolerance is met or `max_points` is reached.
         """
         if self.points is not None:
-            d = rows.blocks[0].points.shape[1]
-            if self.points.shape[1] != d:
-                m = self.points.shape[1]
-                raise ValueError(
-                    f"the landmarks, `points` of Nystrom, have {m} coordinates and X {d}: both "
-                    "must be states of one system."
-                )
+            landmarks, d = "the landmarks, `points` of Nystrom, have", rows.points.shape[1]
+            require.one_system(landmarks, self.points.shape[1], "X", d)
             points = self.points.astype(rows.targets.dtype)
             return given_landmarks(K, landmarks_of(components(K, points)))
         key = jax.random.key(0) if self.key is None else self.key
@@ -304,23 +242,30 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
         landmarks = self.landmarks(K, problem.rows, regularization)
         spread = row_sharding(X)
         X, Y = shard(spread, X), shard(spread, Y)
-        solution = _landmark_fit(K, X, Y, regularization, landmarks, spread)
-        solution = solution._replace(residual=to_caller_sharding(spread, solution.residual))
-        return _check_field(K, landmarks, solution, regularization, self.tolerance, REMEDY, throw)
+        field = _landmark_fit(K, X, Y, regularization, landmarks, spread)
+        field = check_low_rank(field, throw)
+        warn_if_truncated(field, self.tolerance)
+        return field
 
     def condition(self, problem, throw=True, progress=False) -> LowRankConditional:
         problem = problem.to_one_device()
         K, rows, regularization = problem.kernel, problem.rows, problem.regularization
-        landmarks = self.landmarks(K, rows, regularization)
-        conditional = low_rank_conditional(landmark_span(K, landmarks), rows, regularization, throw)
-        truncation = conditional.field.info.truncation
-        warn_if_truncated(truncation, landmarks.count, self.tolerance, REMEDY)
+        span = landmark_span(K, self.landmarks(K, rows, regularization))
+        conditional = low_rank_conditional(span, rows, regularization, throw)
+        warn_if_truncated(conditional.field, self.tolerance)
         return conditional
 
     def _start_fit(self, K, sample, regularization) -> LandmarkFit:
         landmarks = self.landmarks(K, sample, regularization)
         subset = thin(K, sample, self.candidates)
-        return start_fit(K, subset, regularization, landmarks, self.tolerance)
+        return _start(K, subset, regularization, landmarks, self.tolerance)
+
+
+@precise_jit  # so that T is bit by bit that of `_landmark_fit`
+def _start(K, sample, regularization, landmarks, tolerance):
+    T = whitening(K, landmarks)
+    fields = {"landmarks": landmarks, "trace": jnp.zeros((), T.dtype), "tolerance": tolerance}
+    return start_fit(LandmarkFit, Columns(K, landmarks), T, sample, regularization, **fields)
 
 
 @precise_jit
@@ -342,5 +287,4 @@ def _landmark_fit(K, X, Y, regularization, landmarks, spread):
     A = (T @ w).reshape(len(S), -1)  # (m, n)
     w, residual = step(w, Y - product(K, X, S, A, spread))
     truncation = truncation_of(trace(K, X, spread), jnp.trace(total.square), ridge)
-    # ‖f‖² = αᵀ G_SS α = ‖w‖²
-    return Solution(T @ w, residual, root(w @ w), truncation)
+    return LandmarkSpan(K, landmarks, T).field(w, residual, regularization, truncation)

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import abc
 import dataclasses
+from collections.abc import Callable
 from typing import Any, ClassVar, Generic, TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Key
+from jaxtyping import Array, ArrayLike, Bool, Float, Key
 
 from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField, KnownPart, known_part, map_states, potential_of
@@ -180,9 +181,9 @@ class AbstractConditional(eqx.Module):
         ridge: σ² = Nλ, the variance of the noise of a row, shape ().
     """
 
-    field: eqx.AbstractVar[AbstractField]
-    rows: eqx.AbstractVar[Measurements]
-    ridge: eqx.AbstractVar[Float[Array, ""]]
+    field: AbstractField
+    rows: Measurements
+    ridge: Float[Array, ""]
 
     @abc.abstractmethod
     def covariance(self, left: AbstractBlock, right: AbstractBlock) -> Float[Array, "d e"]:
@@ -244,6 +245,29 @@ class AbstractSolver(eqx.Module, Generic[LearnedField]):
             TypeError: the solver keeps no factor.
         """
         raise TypeError(self.no_factor)
+
+
+Field = TypeVar("Field", bound=AbstractField)
+
+
+def check_field(
+    field: Field,
+    failed: Bool[ArrayLike, ""],
+    message: str | Callable[[], str],
+    throw: bool = True,
+) -> Field:
+    """The field; RuntimeError with `message`, or NaN without `throw`, if its solve `failed`."""
+    if throw and require.is_concrete(failed):  # the field need not be taken apart
+        return require.value(field, failed, message, RuntimeError)
+
+    def learned_arrays(f: Any) -> list[Array]:
+        return [getattr(f, name) for name in _LEARNED if getattr(f, name, None) is not None]
+
+    values = require.value(learned_arrays(field), failed, message, RuntimeError, throw)
+    return eqx.tree_at(learned_arrays, field, values)
+
+
+_LEARNED = ("coefficients", "value_coefficients", "weights", "residual", "norm")
 
 
 def check_solver(solver: Any) -> None:

@@ -4,37 +4,26 @@ from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key, UInt32
+from jaxtyping import Array, Float, Key, UInt32
 
 from hamkernel import _require as require
 from hamkernel._features import AbstractFeatures, features
-from hamkernel._fields.base import SolverInfo
-from hamkernel._fields.expansions import FeatureField, feature_field
-from hamkernel._machine import (
-    precise_jit,
-    refuse_beyond_memory,
-    row_sharding,
-    shard,
-    to_caller_sharding,
-)
+from hamkernel._fields.expansions import FeatureField
+from hamkernel._machine import precise_jit, refuse_beyond_memory, row_sharding, shard
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.least_squares import Normal, Sums, first_sums, ridge_regression, solve_sums
+from hamkernel._solvers.least_squares import ridge_regression
 from hamkernel._solvers.low_rank import (
+    AbstractBasis,
     FeatureSpan,
     LowRankConditional,
-    WaveBasis,
+    check_low_rank,
     low_rank_conditional,
-    singular_message,
 )
-from hamkernel._solvers.stream import (
-    AbstractStreamingFit,
-    AbstractStreamingSolver,
-    thin,
-)
+from hamkernel._solvers.stream import AbstractStreamingFit, AbstractStreamingSolver, start_fit, thin
 from hamkernel._structures.base import AbstractMatrixKernel
 
 
-class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
+class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"], AbstractBasis):
     """The solver of ridge regression in r random Fourier features.
 
     The structure of the field is exact for every count. The kernel is approximate, with an error of
@@ -72,31 +61,15 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
 
     def low_rank_basis(
         self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
-    ) -> WaveBasis:
-        return WaveBasis(self.key, self.count)
+    ) -> "RandomFeatures":
+        return self
 
-    def fit(self, problem, throw=True, progress=False) -> FeatureField:
-        if problem.states is None:
-            field: Any = self.condition(problem, throw).field
-            return field
-        spread = row_sharding(problem.rows.points)
-        X, Y = (shard(spread, array) for array in problem.states)
-        field = _feature_fit(problem.kernel, self, X, Y, problem.regularization, spread)
-        field = _check_field(field, throw)
-        if spread is None:
-            return field
-        residual = to_caller_sharding(spread, field.residual)
-        return eqx.tree_at(lambda f: f.residual, field, residual)
+    def span(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> FeatureSpan:
+        """The features of K at points of n coordinates; their frequencies scale with the kernel.
 
-    def condition(self, problem, throw=True, progress=False) -> LowRankConditional:
-        problem = problem.to_one_device()
-        K, rows, regularization = problem.kernel, problem.rows, problem.regularization
-        basis = self._features(K, rows.points.shape[1], rows.targets.dtype)
-        span = FeatureSpan(K, basis, rows.dimension)
-        return low_rank_conditional(span, rows, regularization, throw)
-
-    def _features(self, K: AbstractMatrixKernel, n: int, dtype: jnp.dtype) -> AbstractFeatures:
-        """The features of K for points of n coordinates; ValueError if a fit exceeds the memory."""
+        Raises:
+            ValueError: a fit exceeds the memory.
+        """
 
         def features_of(K, key):
             return features(K, n, self.count, key, dtype)
@@ -106,38 +79,36 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"]):
         # Eight matrices of r² numbers: the triangle (1), the tile of 3r rows below it (3), and
         # their QR factorisation (4).
         refuse_beyond_memory(what, r, r, dtype, 8, cure)
-        return features_of(K, self.key)
+        return FeatureSpan(K, features_of(K, self.key), K.outputs(n))
+
+    def fit(self, problem, throw=True, progress=False) -> FeatureField:
+        if problem.states is None:
+            field: Any = self.condition(problem, throw).field
+            return field
+        spread = row_sharding(problem.rows.points)
+        X, Y = (shard(spread, array) for array in problem.states)
+        field = _feature_fit(problem.kernel, self, X, Y, problem.regularization, spread)
+        return check_low_rank(field, throw)
+
+    def condition(self, problem, throw=True, progress=False) -> LowRankConditional:
+        problem = problem.to_one_device()
+        K, rows, regularization = problem.kernel, problem.rows, problem.regularization
+        span = self.span(K, rows.points.shape[1], rows.targets.dtype)
+        return low_rank_conditional(span, rows, regularization, throw)
 
     def _start_fit(self, K, sample, regularization) -> "FeatureFit":
-        basis = self._features(K, sample.points.shape[1], sample.targets.dtype)
+        span = self.span(K, sample.points.shape[1], sample.targets.dtype)
+        one = jnp.eye(span.features.columns, dtype=sample.targets.dtype)
         # 4096 points set the basis of the sums, the default number of candidates of `Nystrom`.
-        return _start(K, basis, thin(K, sample, 4096), regularization)
+        subset, basis = thin(K, sample, 4096), span.features
+        return start_fit(FeatureFit, span, one, subset, regularization, features=basis)
 
 
 @precise_jit
 def _feature_fit(K, solver, X, Y, regularization, spread):
-    basis = solver._features(K, X.shape[1], X.dtype)
-    ridge = len(X) * regularization
-    weights, residual = ridge_regression(basis, basis.columns, X, Y, ridge, spread)
-    return _field_of_weights(K, basis, weights, residual, regularization)
-
-
-def _field_of_weights(K, basis, w, residual, regularization, residual_norm=None):
-    rank = jnp.asarray(len(w))
-    info = SolverInfo("RandomFeatures", rank=rank, residual_norm=residual_norm)
-    return feature_field(K, basis, w, residual, regularization, info)
-
-
-def _check_field(field: FeatureField, throw: bool = True) -> FeatureField:
-    """The field; RuntimeError, or NaN without `throw`, if the least squares have no solution."""
-
-    def learned_arrays(f: FeatureField):
-        return f.weights, f.residual, f.norm
-
-    failed = require.not_finite(field.weights)
-    cause = singular_message(field.weights.dtype)
-    values = require.value(learned_arrays(field), failed, cause, RuntimeError, throw)
-    return eqx.tree_at(learned_arrays, field, values)
+    span, ridge = solver.span(K, X.shape[1], X.dtype), len(X) * regularization
+    weights, residual = ridge_regression(span.features, span.features.columns, X, Y, ridge, spread)
+    return span.field(weights, residual, regularization)
 
 
 class FeatureFit(AbstractStreamingFit[FeatureField]):
@@ -160,13 +131,7 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
         dimension: n, the number of coordinates of a state.
     """
 
-    kernel: AbstractMatrixKernel
     features: AbstractFeatures
-    sums: Sums
-    compensation: tuple[Normal]
-    count: Int[Array, ""]
-    regularization: Float[Array, ""]
-    dimension: int = eqx.field(static=True)
 
     def _columns(self) -> tuple[str, Any, Any]:
         return "features", len(self.sums.basis), self.features
@@ -175,35 +140,8 @@ class FeatureFit(AbstractStreamingFit[FeatureField]):
     def _functions(self) -> FeatureSpan:
         return FeatureSpan(self.kernel, self.features, self.dimension)
 
-    @property
-    def _totals(self) -> tuple[Any, ...]:
-        return (self.sums.normal_equations,)
+    def _field(self, w, norm, residual, residual_norm, regularization, ridge) -> FeatureField:
+        return self._functions.field(w, residual, regularization, residual_norm=residual_norm)
 
-    def _solve(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> FeatureField:
-        return _check_field(_feature_solution(self, count, regularization))
-
-
-@precise_jit
-def _start(K, basis, sample, regularization):
-    one = jnp.eye(basis.columns, dtype=sample.targets.dtype)
-    span = FeatureSpan(K, basis, sample.dimension)
-    sums = first_sums(span.normal_equations(sample, one), one, sample.count, regularization)
-    return FeatureFit(
-        kernel=K,
-        features=basis,
-        sums=sums,
-        compensation=(sums.normal_equations,),
-        count=jnp.zeros((), int),
-        regularization=regularization,
-        dimension=sample.dimension,
-    )
-
-
-@precise_jit
-def _feature_solution(fit, count, regularization):
-    ridge = count.astype(regularization.dtype) * regularization
-    weights, _, residual_norm = solve_sums(fit.sums, ridge)
-    unseen = jnp.zeros((0, fit.dimension), weights.dtype)
-    return _field_of_weights(
-        fit.kernel, fit.features, weights, unseen, regularization, residual_norm
-    )
+    def _check_field(self, field: FeatureField) -> FeatureField:
+        return check_low_rank(field, throw=True)

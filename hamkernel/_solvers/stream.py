@@ -12,6 +12,7 @@ depend on the order in which a distributed engine adds the chunks.
 
 import abc
 import contextlib
+import dataclasses
 import itertools
 import reprlib
 from collections.abc import Iterable, Iterator
@@ -29,23 +30,26 @@ from hamkernel._fields.joined import learned_field
 from hamkernel._gram import components
 from hamkernel._machine import (
     RowSharding,
+    entry_point,
     follow_data,
     full_precision,
-    one_blas_thread,
     precise_jit,
     row_sharding,
     shard,
 )
-from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
+from hamkernel._observations.kinds import (
+    AbstractObservations,
+    Equilibria,
+    inputs_or_parameters,
+)
 from hamkernel._observations.measurements import (
     Measurements,
     measurements_of,
     observations,
     place,
-    sampled_points,
 )
 from hamkernel._show import call, text
-from hamkernel._solvers.least_squares import Sums
+from hamkernel._solvers.least_squares import Sums, first_sums, solve_sums
 from hamkernel._solvers.low_rank import AbstractFunctions
 from hamkernel._solvers.problem import AbstractSolver, LearnedField, subtract_known
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
@@ -73,12 +77,12 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
     parts begin with copies of one `start`. `hk.save` and `hk.load` store a fit.
     """
 
-    kernel: eqx.AbstractVar[AbstractMatrixKernel]
-    sums: eqx.AbstractVar[Sums]
-    compensation: eqx.AbstractVar[Any]
-    count: eqx.AbstractVar[Int[Array, ""]]
-    regularization: eqx.AbstractVar[Float[Array, ""]]
-    dimension: eqx.AbstractVar[int]
+    kernel: AbstractMatrixKernel
+    sums: Sums
+    compensation: tuple[Any, ...]
+    count: Int[Array, ""]
+    regularization: Float[Array, ""]
+    dimension: int = eqx.field(static=True)
 
     def __repr__(self) -> str:
         name, size, _ = self._columns()
@@ -97,8 +101,9 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
                 "the fit is in float64 and this process, which receives it, computes in float32: "
                 "set JAX_ENABLE_X64=1 in the environment of every worker."
             )
-        for name, value in state.items():
-            object.__setattr__(self, name, jax.tree.map(_to_jax, value))
+        arrays, rest = eqx.partition(state, lambda leaf: isinstance(leaf, np.ndarray))
+        for name, value in eqx.combine(jax.tree.map(jnp.asarray, arrays), rest).items():
+            object.__setattr__(self, name, value)
 
     @property
     def dtype(self) -> jnp.dtype:
@@ -106,9 +111,9 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         return self.regularization.dtype
 
     @property
-    @abc.abstractmethod
     def _totals(self) -> tuple[Any, ...]:
         """The accumulated sums. `add` changes these leaves and `count`, nothing else."""
+        return (self.sums.normal_equations,)
 
     @abc.abstractmethod
     def _columns(self) -> tuple[str, Any, Any]:
@@ -139,8 +144,20 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         return (self._functions.normal_equations(rows, self.sums.basis, spread),)
 
     @abc.abstractmethod
-    def _solve(self, count: Int[Array, ""], regularization: Float[Array, ""]) -> LearnedField:
-        """The field for a checked λ and a positive number of points."""
+    def _field(
+        self,
+        w: Float[Array, " r"],
+        norm: Float[Array, ""],
+        residual: Float[Array, "0 n"],
+        residual_norm: Float[Array, ""],
+        regularization: Float[Array, ""],
+        ridge: Float[Array, ""],
+    ) -> LearnedField:
+        """The field with the weights w of the functions."""
+
+    @abc.abstractmethod
+    def _check_field(self, field: Any) -> LearnedField:
+        """The field; RuntimeError if the solve failed."""
 
     @follow_data
     @full_precision
@@ -210,11 +227,7 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
 
     def _check(self, dtype: jnp.dtype | None, dimension: int) -> None:
         """ValueError for another number of coordinates, TypeError for a dtype of more digits."""
-        if dimension != self.dimension:
-            raise ValueError(
-                f"the data have {dimension} coordinates and the fit {self.dimension}: both must be "
-                "states of one system."
-            )
+        require.one_system("the data have", dimension, "the fit", self.dimension)
         if dtype is not None and np.promote_types(dtype, self.dtype) != self.dtype:
             raise TypeError(
                 f"the data are {dtype} and the fit {self.dtype}, the dtype of the sample of "
@@ -235,11 +248,10 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         fit = eqx.tree_at(lambda f: f._totals, self, nothing)
         fit = eqx.tree_at(lambda f: f.sums.normal_equations.moment, fit, replace_fn=jnp.ones_like)
         one = jnp.ones((), self.dtype)
-        return learned_field(fit._solve(jnp.ones_like(self.count), one), self._known_part)
+        field = fit._check_field(_solve(fit, jnp.ones_like(self.count), one))
+        return learned_field(field, self._known_part)
 
-    @follow_data
-    @one_blas_thread
-    @full_precision
+    @entry_point
     def field(self, regularization: ArrayLike | None = None) -> Any:
         """The field learned from all data added so far, in O(r³) time without the data.
 
@@ -257,16 +269,47 @@ class AbstractStreamingFit(eqx.Module, Generic[LearnedField]):
         count = require.value(
             self.count, none, "no data yet: add(X, Y) before asking for the field."
         )
-        return learned_field(self._solve(count, regularization), self._known_part)
+        field = self._check_field(_solve(self, count, regularization))
+        return learned_field(field, self._known_part)
+
+
+@precise_jit
+def start_fit(
+    kind: type[Fit],
+    functions: AbstractFunctions,
+    W: Float[Array, "r r"],
+    sample: Measurements,
+    regularization: Float[Array, ""],
+    **fields: Any,
+) -> Fit:
+    """The fit to no data yet, whose sums are in the basis that a sample and W define.
+
+    Args:
+        kind: the class of the fit.
+        functions: the functions that, times W, make the rows.
+        W: a matrix, shape (r, r).
+        sample: representative rows.
+        regularization: λ.
+        fields: the fields that this class has besides those of the base class.
+    """
+    sums = first_sums(functions.normal_equations(sample, W), W, sample.count, regularization)
+    none, n = jnp.zeros((), int), sample.dimension
+    fit = kind(functions.kernel, sums, (), none, regularization, n, **fields)
+    return dataclasses.replace(fit, compensation=fit._totals)
+
+
+@precise_jit
+def _solve(fit: Any, count: Int[Array, ""], regularization: Float[Array, ""]) -> Any:
+    """The field for a positive number of points and λ, not yet checked."""
+    ridge = count.astype(regularization.dtype) * regularization
+    w, norm, residual_norm = solve_sums(fit.sums, ridge)
+    unknown = jnp.zeros((0, fit.dimension), w.dtype)
+    return fit._field(w, norm, unknown, residual_norm, regularization, ridge)
 
 
 @precise_jit
 def _with_rows(fit, rows, spread):
     return _plus(fit, fit._totals_of(rows, spread), None, rows.count)
-
-
-def _to_jax(leaf: Any) -> Any:
-    return jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf
 
 
 def _differ(first: Any, second: Any) -> Bool[ArrayLike, ""]:
@@ -350,23 +393,19 @@ class AbstractStreamingSolver(AbstractSolver[LearnedField], Generic[LearnedField
                 `RandomFeatures`, has no known spectral density.
         """
         K = matrix_kernel(K)
+        data_inputs = inputs_or_parameters(inputs, parameters)
         if isinstance(sample, AbstractObservations):
-            K, rows = measurements_of(
-                K, place(observations(sample, None, inputs_or_parameters(inputs, parameters)))
-            )
-            _refuse_energies(rows)
+            data = observations(sample, None, data_inputs)
         else:
-            sample = require.finite(require.points(sample, "sample"), "sample")
-            K, points = sampled_points(K, sample, inputs_or_parameters(inputs, parameters))
-            rows = rows_at(K, points)
+            data = Equilibria(require.points(sample, "sample"), data_inputs)
+        K, rows = measurements_of(K, place(data))
+        _refuse_energies(rows)
         K.check_dimension(rows.points.shape[1])
         K = complete(K, rows.points, rows.dimension)
         require.warn_of_float32(rows.targets)
         return self._start_fit(K, rows, require.ridge(regularization, rows.targets.dtype))
 
-    @follow_data
-    @one_blas_thread
-    @full_precision
+    @entry_point
     def fit_chunks(
         self,
         K: AbstractMatrixKernel,

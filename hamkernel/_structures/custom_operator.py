@@ -1,7 +1,6 @@
 """Fields B(x)∇H with the caller's operator B, and Poisson systems, whose B is antisymmetric."""
 
 import abc
-import inspect
 from collections.abc import Callable
 from typing import Any, ClassVar
 
@@ -13,7 +12,7 @@ from equinox import AbstractClassVar
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, as_scalar_kernel
+from hamkernel._kernels.base import Invariance, as_scalar_kernel
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._show import call, text
 from hamkernel._structures.linear_operator import StructuredByOperator
@@ -48,14 +47,10 @@ class AbstractCustomOperator(AbstractPotentialKernel):
     def _matrix(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
         """B(x), in the dtype of x."""
         value, n = getattr(self, self.role)(x), len(x)
-        name = f"{self.role} of {self.name}"
-        value = require.floating(value, f"the value of the {name}")
-        if value.shape != (n, n):
-            raise ValueError(
-                f"the {name} returned shape {value.shape} for a state of shape ({n},); an "
-                f"array of shape ({n}, {n}) is needed, such as jnp.array([[...], [...]]). Write it "
-                f"for one state of {n} coordinates."
-            )
+        name = f"the {self.role} of {self.name}"
+        value = require.floating(value, f"the value of {name}")
+        cure = "Write it for one state, and return jnp.array([[...], [...]])."
+        require.shape(value, f"{name} returned", "a matrix for each state", (n, n), cure=cure)
         return value.astype(x.dtype)
 
     def check_dimension(self, n: int) -> None:
@@ -81,7 +76,6 @@ class AbstractCustomOperator(AbstractPotentialKernel):
 class StructuredByMatrix(AbstractCustomOperator):
     """K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ: fields f = B(x)∇H for an operator B of the caller."""
 
-    kernel: AbstractScalarKernel
     operator: Operator
 
     role: ClassVar[str] = "operator"
@@ -133,21 +127,8 @@ def Structured(kernel: Any, operator: Callable[..., Any]) -> AbstractStructure:
         field = hk.fit(hk.Structured(hk.Gaussian(1.0), flow), X, Y)
     """
     function = _operator_function(operator, "Structured", "operator")
-    made_by: Any = StructuredByOperator if _takes_potential(operator) else StructuredByMatrix
+    made_by: Any = StructuredByOperator if require.takes_two(operator) else StructuredByMatrix
     return made_by(as_scalar_kernel(kernel), function)
-
-
-def _takes_potential(operator: Callable[..., Any]) -> bool:
-    """Whether a function has two arguments without defaults, (u, x), and not one, x."""
-    try:
-        arguments = inspect.signature(operator).parameters.values()
-    except (TypeError, ValueError):  # functions of C
-        return False
-    needed = [a for a in arguments if a.default is a.empty and a.kind in _BY_POSITION]
-    return len(needed) == 2
-
-
-_BY_POSITION = (inspect.Parameter.POSITIONAL_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
 
 
 class Poisson(AbstractCustomOperator):
@@ -173,7 +154,6 @@ class Poisson(AbstractCustomOperator):
     Source: Hu, Ortega & Yin (2024), arXiv 2403.10070 and 2504.13396.
     """
 
-    kernel: AbstractScalarKernel
     tensor: Operator
 
     role: ClassVar[str] = "tensor"

@@ -88,7 +88,6 @@ class PortHamiltonian(AbstractPotentialKernel):
         process Beckers et al. (2022).
     """
 
-    kernel: AbstractScalarKernel
     log_friction: Float[Array, "..."]
     damped: tuple[int, ...] | None = eqx.field(static=True)
 

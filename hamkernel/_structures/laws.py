@@ -23,7 +23,8 @@ def undetermined_terms(K: Any, n: int) -> tuple[str, ...]:
     The linear function r_j as a law gives the potential Σ_p c_p φ_pj(x). Combinations of such
     functions, and of constants, are undetermined if their fields are zero at random states.
     """
-    terms: list[Any] = [t for t in (K.terms if isinstance(K, Sum) else (K,)) if _has_potential(t)]
+    all_terms: tuple[Any, ...] = K.terms if isinstance(K, Sum) else (K,)
+    terms = [term for term in all_terms if isinstance(term, AbstractPotentialKernel)]
     laws = [(term, law) for term in terms for law in shared_laws(term.kernel)]
     X, columns, names = np.random.default_rng(0).normal(size=(8, n)), [], []
     many, i = sum(law.law_count for _, law in laws) > 1, 0
@@ -44,10 +45,6 @@ def undetermined_terms(K: Any, n: int) -> tuple[str, ...]:
         text = " and ".join(name if one else f"{s:.3g} times {name}" for s, name in parts)
         said.append(f"{text} {'changes' if one else 'together change'} no velocity")
     return tuple(said)
-
-
-def _has_potential(K: Any) -> bool:
-    return isinstance(K, AbstractPotentialKernel)
 
 
 @precise_jit

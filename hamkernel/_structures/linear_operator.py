@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._kernels.base import AbstractScalarKernel, Invariance, Point, Points
+from hamkernel._kernels.base import Invariance, Point, Points
 from hamkernel._machine import precise_jit
 from hamkernel._show import call, text
 from hamkernel._structures.structure import AbstractStructure
@@ -27,7 +27,6 @@ class StructuredByOperator(AbstractStructure):
     So an operator of order p takes derivatives of k of order 2p.
     """
 
-    kernel: AbstractScalarKernel
     operator: Callable[[Potential, Float[Array, " n"]], Any]
 
     field_parity: ClassVar[int] = 0
@@ -41,13 +40,9 @@ class StructuredByOperator(AbstractStructure):
     def _apply(self, u: Potential, x: Float[Array, " n"]) -> Float[Array, " n"]:
         """(L u)(x), in the dtype of x."""
         value = self.operator(u, x)
-        if jnp.shape(value) != x.shape:
-            raise ValueError(
-                f"the operator of Structured returned shape {jnp.shape(value)} for a state of shape"
-                f" {x.shape}; the field at that state, of the same shape, is needed, such as "
-                "operator = lambda u, x: jax.grad(u)(x)."
-            )
-        return require.floating(value, "the operator of Structured").astype(x.dtype)
+        name, cure = "the operator of Structured", "It is, for example, jax.grad(u)(x)."
+        require.shape(value, f"{name} returned", "the field at one state", x.shape, cure=cure)
+        return require.floating(value, name).astype(x.dtype)
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
         return u @ self.expansion(x, z[None], v[None])

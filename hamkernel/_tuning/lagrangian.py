@@ -15,7 +15,7 @@ from hamkernel._solvers.lagrangian import TorqueData, known_entries, strong_rows
 from hamkernel._solvers.triangle import regression_loss
 from hamkernel._structures.lagrangian import Lagrangian, LagrangianFeatures
 from hamkernel._tuning.minimiser import best_in_box, inside_box
-from hamkernel._tuning.space import Hyperparameter, boxes_of
+from hamkernel._tuning.space import Hyperparameter, boxes_of, with_leaves
 
 
 class Sizes(NamedTuple):
@@ -100,7 +100,7 @@ def likeliest(
     dtype = features.centres.dtype
     space = jnp.asarray(design, dtype), jnp.asarray(low, dtype), jnp.asarray(high, dtype)
     h, loss, converged, count = _search(features, rows, space, steps)
-    kernel = _with_leaves(K, h[: len(leaves)])
+    kernel = with_leaves(K, h[: len(leaves)])
     share = (np.asarray(h) - low) / (high - low)
     at_edge = (share < 0.01) | (share > 0.99)
     spans, values, first_entry = {}, {}, 0
@@ -126,18 +126,12 @@ def _search(features, rows, space, steps):
     m, (design, low, high) = features.count, space
 
     def loss(h):
-        shown = features.with_kernel(_with_leaves(features.kernel, h[:-m]))
+        shown = features.with_kernel(with_leaves(features.kernel, h[:-m]))
         B, y, lost = rows(shown, jnp.exp(h[-m:]))
         return regression_loss(*with_anchor(shown, B, y)) + lost
 
     run = best_in_box(loss, design, low, high, jnp.full_like(low, 0.3), steps)
     return inside_box(run.best.u, low, high), run.best.value, run.converged, run.steps
-
-
-def _with_leaves(K: Lagrangian, leaves: Float[Array, " p"]) -> Lagrangian:
-    params, static = eqx.partition(K, eqx.is_inexact_array)
-    flat, unravel = ravel_pytree(params)
-    return eqx.combine(unravel(leaves.astype(flat.dtype)), static)
 
 
 def _boxes(K: Lagrangian, centres: np.ndarray, sizes: Sizes) -> list[Hyperparameter]:

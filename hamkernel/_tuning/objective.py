@@ -64,10 +64,7 @@ class SearchCriterion(eqx.Module):
             value = self.fn(K, rows, regularization, *extra)
         value, square = value if self.logarithmic else (value, None)
         value = require.floating(value, "the value of the objective")
-        if jnp.shape(value) != ():
-            raise ValueError(
-                f"the objective returned shape {jnp.shape(value)}; one number, shape (), is needed."
-            )
+        require.shape(value, "the objective returned", "one number", ())
         return value, square
 
     def with_options(self, **keywords: Any) -> "SearchCriterion":

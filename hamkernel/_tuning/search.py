@@ -231,9 +231,14 @@ def _sort(runs: MinimiserRun) -> MinimiserRun:
     return _take(runs, np.argsort(runs.best.value, kind="stable"))
 
 
+def _map(function: Callable[..., Any], *runs: MinimiserRun) -> MinimiserRun:
+    """Runs whose arrays are `function` of the arrays of all the `runs`."""
+    static = eqx.filter(runs[0], eqx.is_array, inverse=True)
+    return eqx.combine(jax.tree.map(function, *(eqx.filter(r, eqx.is_array) for r in runs)), static)
+
+
 def _take(runs: MinimiserRun, which: Any) -> MinimiserRun:
-    arrays, static = eqx.partition(runs, eqx.is_array)
-    return eqx.combine(jax.tree.map(lambda a: a[which], arrays), static)
+    return _map(lambda array: array[which], runs)
 
 
 def _put(runs: MinimiserRun, which: Any, moved: MinimiserRun) -> MinimiserRun:
@@ -244,16 +249,11 @@ def _put(runs: MinimiserRun, which: Any, moved: MinimiserRun) -> MinimiserRun:
         array[which] = part
         return array
 
-    arrays, static = eqx.partition(runs, eqx.is_array)
-    return eqx.combine(jax.tree.map(put, arrays, eqx.filter(moved, eqx.is_array)), static)
+    return _map(put, runs, moved)
 
 
 def _concatenate(first: MinimiserRun, second: MinimiserRun) -> MinimiserRun:
-    arrays, static = eqx.partition(first, eqx.is_array)
-    second_arrays = eqx.filter(second, eqx.is_array)
-    return eqx.combine(
-        jax.tree.map(lambda a, b: np.append(a, b, axis=0), arrays, second_arrays), static
-    )
+    return _map(lambda a, b: np.append(a, b, axis=0), first, second)
 
 
 class Part:
@@ -301,7 +301,7 @@ class Part:
         """Runs at points where the function has not been evaluated yet."""
         padded = np.resize(us, (self._widths[1], us.shape[1])).astype(jnp.result_type(float))
         runs = _init(self.objective, minimiser, padded)
-        return _take(jax.tree.map(_as_numpy, runs), slice(len(us)))
+        return _take(_map(np.asarray, runs), slice(len(us)))
 
     def minimise(
         self, minimiser: optx.AbstractMinimiser, runs: MinimiserRun, steps: int
@@ -316,16 +316,12 @@ class Part:
         padded = padded._replace(active=padded.active & (np.arange(width) < count))
         began = time.perf_counter()
         moved = _minimise(self.objective, minimiser, padded, padded.steps + steps, side_by_side)
-        moved = _take(jax.tree.map(_as_numpy, moved), slice(count))
+        moved = _take(_map(np.asarray, moved), slice(count))
         if self._compiled:
             taken = int(moved.steps.sum() - before)
             self.seconds = min(self.seconds, (time.perf_counter() - began) / max(taken, 1))
         self._compiled = True
         return moved
-
-
-def _as_numpy(leaf: Any) -> Any:
-    return np.asarray(leaf) if eqx.is_array(leaf) else leaf
 
 
 # On a GPU the first search of 300 points took 78 s with trials of products and 15.5 s without them.

@@ -98,6 +98,13 @@ def constants(K: AbstractMatrixKernel) -> dict[str, float]:
     return values
 
 
+def with_leaves(K: Any, leaves: Float[Array, " p"]) -> Any:
+    """The kernel K with these numbers as its trainable leaves."""
+    params, static = eqx.partition(K, eqx.is_inexact_array)
+    flat, unravel = ravel_pytree(params)
+    return eqx.combine(unravel(leaves.astype(flat.dtype)), static)
+
+
 gram_trace = precise_jit(trace)
 
 
@@ -300,13 +307,10 @@ class SearchSpace(eqx.Module):
         self, u: Float[Array, " P"]
     ) -> tuple[AbstractMatrixKernel, Float[Array, ""], Float[Array, ""]]:
         """The kernel and λ at u, and tr(G)/N of this kernel."""
-        n_leaves = len(self.start) - 1
         all_entries = jnp.zeros_like(self.start).at[jnp.asarray(self.free)].set(u)
         is_free = np.isin(np.arange(len(self.start)), self.free)
         h = jnp.where(is_free, inside_box(all_entries, self.low, self.high), self.start)
-        params, static = eqx.partition(self.kernel, eqx.is_inexact_array)
-        flat, unravel = ravel_pytree(params)
-        kernel = eqx.combine(unravel(h[:n_leaves].astype(flat.dtype)), static)
+        kernel = with_leaves(self.kernel, h[:-1])
         size = self.size_of_gram(kernel)
         if not is_free[-1]:
             return kernel, self.regularization, size

@@ -26,7 +26,7 @@ from hamkernel import _require as require
 from hamkernel._closed_forms import Folds
 from hamkernel._features import is_of_parts
 from hamkernel._fields.base import AbstractField, Mean
-from hamkernel._machine import follow_data, full_precision, one_blas_thread, precise_jit
+from hamkernel._machine import entry_point, precise_jit
 from hamkernel._observations.kinds import AbstractObservations, inputs_or_parameters
 from hamkernel._observations.measurements import observations
 from hamkernel._posterior import Posterior, posterior_of_problem
@@ -94,6 +94,7 @@ class Tuned(Shown, eqx.Module):
             return self.regularization * len(cast(Any, self.field).residual)
         return self.problem.ridge
 
+    @entry_point
     def posterior(self, solver: AbstractSolver | None = None) -> Posterior:
         """`hk.condition` on the same data, with the tuned kernel and λ.
 
@@ -111,7 +112,7 @@ class Tuned(Shown, eqx.Module):
                 "the field of a Lagrangian keeps its posterior: take its bands, "
                 "tuned.field.mass_matrix_deviation(q), .gravity_deviation(q), …"
             )
-        return _posterior(self.problem, solver)
+        return posterior_of_problem(self.problem, solver)
 
     def _summary(self) -> tuple[str, list[tuple[str, str]]]:
         outcome = "converged" if bool(self.converged) else "did not converge"
@@ -132,12 +133,7 @@ class Tuned(Shown, eqx.Module):
         return head, rows
 
 
-_posterior = one_blas_thread(full_precision(posterior_of_problem))
-
-
-@follow_data
-@one_blas_thread
-@full_precision
+@entry_point
 def tune(
     K: AbstractMatrixKernel | Lagrangian,
     X: Num[ArrayLike, "N n"] | AbstractObservations,

@@ -33,7 +33,7 @@ from hamkernel._closed_forms import Partition
 from hamkernel._observations.blocks import Components
 from hamkernel._observations.measurements import measurements_of_states
 from hamkernel._solvers.landmarks import landmarks_of
-from hamkernel._solvers.low_rank import LandmarkBasis, WaveBasis
+from hamkernel._solvers.low_rank import LandmarkBasis
 from hamkernel._solvers.triangle import cholesky_triangle, householder_triangle
 from hamkernel._validation import (
     generalized_loss,
@@ -164,7 +164,7 @@ def bases(problem: Problem, K) -> dict[str, Any]:
     found: dict[str, Any] = {"dense": None}
     found["landmarks"] = LandmarkBasis(landmarks_of(Components(X[:: max(1, 2 * len(X) // 8)])))
     if problem.name.startswith(("Gaussian", "Matern", "odd")):
-        found["waves"] = WaveBasis(jax.random.key(0), 2 * n)
+        found["waves"] = hk.RandomFeatures(2 * n, jax.random.key(0))
     return found
 
 
