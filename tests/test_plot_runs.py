@@ -51,7 +51,7 @@ def test_a_smoothed_run_shows_samples_curve_and_two_standard_deviations(runs):
     band = runs.smoothing()
     assert [ax.get_ylabel() for ax in panels] == ["$q$ [rad]", "$p$"]
     assert panels[1].get_xlabel() == "time $t$ [s]"
-    assert panels[0].get_title() == "run 1"
+    assert panels[0].get_title(loc="left") == "run 1"
     for c, ax in enumerate(panels):
         np.testing.assert_array_equal(line(ax, "measured")[:, 1], runs.states[1][:, c])
         curve = line(ax, "smoothed")
@@ -99,8 +99,9 @@ def test_a_fitted_run_shows_samples_curve_and_residuals(runs):
     learned = learned_of(runs)
     panels = plot.fitted(learned, names=("angle", "momentum"))
     assert [row[0].get_ylabel() for row in panels] == ["angle", "momentum"]
-    assert panels[0][0].get_title() == "run 0, 100% kept"
-    assert plot.fitted(learned, -1)[0][0].get_title() == "run 1, 50% kept"
+    assert panels[0][0].get_title(loc="left") == "run 0, 100 % of it used"
+    second = plot.fitted(learned, -1)[0][0]
+    assert second.get_title(loc="left") == "run 1, 50 % of it used"
     for c, (left, right) in enumerate(panels):
         np.testing.assert_array_equal(line(left, "measured")[:, 1], runs.states[0][:, c])
         curve = line(left, "fitted")  # from each state along the field
@@ -109,7 +110,8 @@ def test_a_fitted_run_shows_samples_curve_and_residuals(runs):
         np.testing.assert_allclose(curve[:, 1], truth, atol=1e-6)
         (points,) = [each for each in right.lines if each.get_marker() == "o"]
         np.testing.assert_allclose(np.asarray(points.get_ydata()), learned.residuals[0][:, c])
-        assert right.get_title() == f"root mean square {float(learned.misfit[0, c]):.2f}"
+        size = f"root mean square {float(learned.misfit[0, c]):.2f}"
+        assert right.get_title() == f"{size}, grey: ±2"
 
 
 @pytest.mark.parametrize("between", ["held", "linear"])

@@ -264,6 +264,7 @@ def band(
     ylabel: str = "",
     unit: str | None = None,
     title: str | None = None,
+    show_legend: bool = True,
 ) -> Axes:
     """Draw a mean with the bands that contain the truth with a probability of 50 and 90 %.
 
@@ -278,6 +279,7 @@ def band(
         ylabel: the name of the mean.
         unit: the unit of the mean.
         title: the title of the axes.
+        show_legend: whether to name the bands, the mean and the true values.
 
     Raises:
         ValueError: shapes are not all (T,), or a deviation is negative.
@@ -293,7 +295,7 @@ def band(
     # A share of a normal variable, the standard deviations that hold it, and its shade.
     for share, width, shade in ((0.9, 1.645, 0.18), (0.5, 0.674, 0.38)):
         reach = width * deviation
-        name = f"{share:.0%}"
+        name = f"{100 * share:.0f} % band"
         ax.fill_between(
             ts, mean - reach, mean + reach, color=color, alpha=shade, linewidth=0, label=name
         )
@@ -302,7 +304,8 @@ def band(
         ax.plot(ts, values, color=COLORS["true"], linewidth=1.2, linestyle="--", label="true")
     ax.set(xlabel=xlabel, ylabel=with_unit(ylabel, unit), title=title or "")
     ax.set_xlim(ts.min(), ts.max())
-    legend(ax)
+    if show_legend:
+        legend(ax)
     return ax
 
 

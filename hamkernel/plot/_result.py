@@ -121,6 +121,8 @@ def machine(learned: LearnedLagrangian, run: int = 0) -> Figure:
         for ax in (left, middle, right):
             ax.grid(True, color="0.92", linewidth=0.6)
     rows[0, 0].set_title(f"run {run}", fontsize="small")
+    for ax, name in ((rows[0, 1], "inertia"), (rows[0, 2], "gravity")):
+        ax.set_title(f"{name}, ± 2 standard deviations", fontsize="small")
     rows[-1, 0].set_xlabel("time $t$")
     legend(rows[0, 0])
     return figure
@@ -169,13 +171,14 @@ def _force(ax: Axes, learned: Learned, posterior: Any) -> None:
     q = np.linspace(visited.min(), visited.max(), _STATES)
     states = np.stack([q, np.zeros(_STATES)], axis=1)
     means, deviations = map(np.asarray, posterior.evaluate(states, *_inputs(learned, _STATES)))
-    band(q, means[:, 1], deviations[:, 1], ax=ax, xlabel=_labels(learned)[0])
+    band(q, means[:, 1], deviations[:, 1], ax=ax, xlabel=_labels(learned)[0], show_legend=False)
     ax.locator_params(axis="x", nbins=6)
     ax.axhline(0.0, color="0.7", linewidth=0.8, zorder=1)
-    ax.plot(
-        visited, np.zeros_like(visited), "|", color=DATA, ms=7, transform=ax.get_xaxis_transform()
-    )
-    ax.set(ylabel=r"$\dot{p}$", title=f"force at rest, known to {np.max(deviations[:, 1]):.2g}")
+    marks = {"color": DATA, "ms": 7, "linestyle": "none", "label": "fitted positions"}
+    ax.plot(visited, np.zeros_like(visited), "|", transform=ax.get_xaxis_transform(), **marks)
+    largest = np.max(deviations[:, 1])
+    ax.set(ylabel=r"$\dot{p}$", title=f"force at rest, standard deviation up to {largest:.2g}")
+    legend(ax)
     ax.title.set_fontsize("small")
 
 
@@ -221,9 +224,7 @@ def _uncertainty(ax: Axes, learned: Learned, posterior: Any) -> None:
     shares = 100 * deviations / np.where(speeds > 0, speeds, 1.0)
     ax.boxplot(shares, whis=(5, 95), showfliers=False, medianprops={"color": BLUE})
     ax.set_xticks(range(1, n + 1), _labels(learned))
-    ax.set(
-        ylabel="deviation / speed", yscale="log", title="uncertainty of the field along the runs"
-    )
+    ax.set(ylabel="standard deviation / speed", yscale="log", title="uncertainty along the runs")
     ax.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     ax.yaxis.set_major_formatter("{x:g} %")
     ax.yaxis.set_minor_locator(NullLocator())
@@ -238,7 +239,7 @@ def _free_run(ax: Axes, learned: Learned, held_out: Runs) -> None:
     ax.plot(t, x, "o", label="measured", **style)
     ax.plot(t, np.asarray(score.predictions[0])[:, 0], color=BLUE, linewidth=1.4, label="free run")
     first = min(score.first, max(len(t) // 2, 1)) - 1
-    ax.axvspan(t[0], t[first], color="0.9", linewidth=0, label="seen", zorder=0)
+    ax.axvspan(t[0], t[first], color="0.9", linewidth=0, label="start fitted here", zorder=0)
     ax.set(xlabel="time $t$", ylabel=_labels(learned)[0])
     ax.set_title(f"held out: error {float(score.rmse[0]):.3g} after the first samples")
     ax.title.set_fontsize("small")

@@ -299,13 +299,13 @@ def fitted(
         right.axhline(0.0, color="0.6", linewidth=0.8)
         right.plot(ts, residuals[:, c], "o", color=COLORS["true"], ms=3, clip_on=False)
         _set_time_axis(right, ts, r"residual / $\sigma$")
-        said = f"root mean square {misfit[c]:.2f}" if np.isfinite(misfit[c]) else "never measured"
-        right.set_title(said, fontsize="small")
+        size = f"root mean square {misfit[c]:.2f}, grey: ±{_SIGMAS:g}"
+        right.set_title(size if np.isfinite(misfit[c]) else "never measured", fontsize="small")
         if np.isfinite(misfit[c]):
             far = max(1.6 * _SIGMAS, 1.1 * np.nanmax(np.abs(residuals[:, c])))
             right.set_ylim(-far, far)
     if title is None:
-        title = f"run {run}, {float(learned.kept[run]):.0%} kept"
+        title = f"run {run}, {100 * float(learned.kept[run]):.0f} % of it used"
     _set_titles(panels[:, 0], title, time_unit)
     panels[-1, 1].set_xlabel(with_unit("time $t$", time_unit))
     return tuple((left, right) for left, right in panels)
@@ -362,7 +362,9 @@ def _set_time_axis(panel: Axes, ts: np.ndarray, label: str) -> None:
 
 
 def _set_titles(panels: np.ndarray, title: str, time_unit: str | None) -> tuple[Axes, ...]:
-    panels[0].set_title(title)
+    panels[0].set_title(title, loc="left", fontsize="medium")
     panels[-1].set_xlabel(with_unit("time $t$", time_unit))
-    legend(panels[0])
+    # Above the panel: samples and curve of a log may fill all of it.
+    above = {"loc": "lower right", "bbox_to_anchor": (1.0, 1.0), "ncols": 3, "frameon": False}
+    legend(panels[0], **above, borderaxespad=0.1)
     return tuple(panels)
