@@ -178,14 +178,14 @@ def _over_group(waves: PartWaves, mean: Symmetrised) -> PartWaves:
 def laws_of(waves: Any) -> list[tuple[PartWaves, slice]]:
     """The laws among some features, with the positions of their weights."""
     terms = waves.terms if isinstance(waves, JointWaves) else (waves,)
-    found, start = [], 0
+    laws, start = [], 0
     for term in terms:
         stop = start + len(term.amplitudes)
         if isinstance(term, PartWaves):
             ends = np.linspace(start, stop, term.kernel.law_count + 1).astype(int).tolist()
-            found += [(term, slice(*both)) for both in itertools.pairwise(ends)]
+            laws += [(term, slice(*both)) for both in itertools.pairwise(ends)]
         start = stop
-    return found
+    return laws
 
 
 def is_of_parts(K: AbstractMatrixKernel) -> bool:
