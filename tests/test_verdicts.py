@@ -175,6 +175,21 @@ def test_a_field_outside_the_structure_is_asked_for(coordinates, usable):
 
 
 @pytest.mark.slow
+def test_a_limit_cycle_is_refused_though_a_wrong_field_follows_its_runs():
+    # Free runs follow the three runs to .06 of a constant; an unseen one is off by 1.4 deviations.
+    t, rng, states = np.linspace(0, 6, 61), np.random.default_rng(3), []
+    for start in ([0.5, 0.0], [2.5, 0.0], [-1.0, 2.0]):
+        options = {"t_eval": t, "rtol": 1e-10, "atol": 1e-10}
+        cycle = lambda _, x: [x[1], (1 - x[0] ** 2) * x[1] - x[0]]  # noqa: E731
+        x = solve_ivp(cycle, (0, 6), start, **options).y.T
+        states.append(x + 0.02 * x.std(axis=0) * rng.standard_normal(x.shape))
+    K = hk.PortHamiltonian(hk.Gaussian(1.0), friction=0.1)
+    learned, _ = learn_and_listen(K, hk.Runs([t] * 3, states))
+    assert not learned.converged, learned.diagnostics
+    assert "missing force" in learned.diagnostics.failing
+
+
+@pytest.mark.slow
 def test_correlated_errors_of_sensors_are_no_missing_force():
     times, states = pendulum(runs=3, noise=0.0)
     rng = np.random.default_rng(0)

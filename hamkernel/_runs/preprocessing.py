@@ -418,9 +418,14 @@ def sample_points(
 
 
 def time_of_swing(data: Preprocessed) -> float:
-    """2π times the median over coordinates of deviation over speed: the period of a sine."""
+    """2π times deviation over speed, the period of a sine, of the median coordinate.
+
+    Of two medians we take the shorter. An angle that turns wanders, and its deviation grows with
+    the log: of a real pendulum that swings up it gave 12.6 s, and the velocity 2.1 s.
+    """
     speed = np.sqrt(np.mean(sample_points(data)[1] ** 2, axis=0))
-    return float(2 * np.pi * np.median(data.scale / np.maximum(speed, np.finfo(float).tiny)))
+    periods = 2 * np.pi * data.scale / np.maximum(speed, np.finfo(float).tiny)
+    return float(np.quantile(periods, 0.5, method="lower"))
 
 
 def first_landmarks(d: int) -> int:
