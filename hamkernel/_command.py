@@ -45,7 +45,9 @@ def parser() -> argparse.ArgumentParser:
         help="the columns of the state: all positions, then all momenta; or the positions alone "
         "with --mass and one mass for each",
     )
-    options.add_argument("--inputs", nargs="+", default=[], help="the columns of what was applied")
+    options.add_argument(
+        "--inputs", nargs="+", default=[], help="the columns of the inputs, such as torques"
+    )
     options.add_argument(
         "--between",
         choices=[*get_args(Between), "auto"],
@@ -57,9 +59,14 @@ def parser() -> argparse.ArgumentParser:
         "--mass",
         type=float,
         nargs="+",
-        help="the known masses, one or one each; what is left to learn is the potential U(q)",
+        help="the known masses, one number or one for each position; the potential U(q) is learned",
     )
-    options.add_argument("--noise", type=float, nargs="+", help="the known noise, one or one each")
+    options.add_argument(
+        "--noise",
+        type=float,
+        nargs="+",
+        help="the known standard deviation of the noise, one number or one for each state",
+    )
     options.add_argument("--out", default="results", help="folder for the files (%(default)s)")
     return options
 
@@ -72,12 +79,15 @@ def columns(path: str, names: list[str]) -> Float[np.ndarray, "T k"]:
     it, such as one of units. Between semicolons a comma is a decimal point.
 
     Raises:
-        ValueError: the file has no such column, no rows, or a cell that is no number. OSError: the
-            file cannot be read.
+        ValueError: the file is no CSV file, or has no such column, no rows, or a cell that is no
+            number. OSError: the file cannot be read.
     """
     text, widest = _text(path), []
     for mark in ",;\t":
-        rows = [*csv.reader(io.StringIO(text, newline=""), delimiter=mark)]
+        try:
+            rows = [*csv.reader(io.StringIO(text, newline=""), delimiter=mark)]
+        except csv.Error as error:
+            raise ValueError(f"{path} is no CSV file: {error}.") from error
         headers = [[name.strip() for name in row] for row in rows]
         first = next((i for i, row in enumerate(headers) if {*names} <= {*row}), None)
         if first is not None:
@@ -106,6 +116,8 @@ def columns(path: str, names: list[str]) -> Float[np.ndarray, "T k"]:
 
 def _text(path: str) -> str:
     """The text of a file in UTF-8, in UTF-16 with its mark, or in the Latin-1 of older programs."""
+    if not pathlib.Path(path).exists():
+        raise FileNotFoundError(f"there is no file {path}.")
     content = pathlib.Path(path).read_bytes()
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return content.decode("utf-16")
@@ -128,8 +140,8 @@ def kernel(
 ) -> AbstractMatrixKernel:
     """The kernel of the options: an energy, friction if asked for, and inputs that push momenta.
 
-    If the masses are known, the kernel has the potential of the positions alone. An unknown energy
-    of the momenta as well would leave momenta that are not measured free up to a constant.
+    If the masses are known, the kernel has the potential of the positions alone. An unknown kinetic
+    energy as well would leave momenta that were not measured undetermined up to a constant.
     """
     k = 1.0 * Gaussian(np.ones(state_count))
     if has_mass:
@@ -144,7 +156,7 @@ def kernel(
 
 
 def run(arguments: list[str], show: Callable[[str], None]) -> None:
-    """Learn, score and write the files; what happens is shown in words, warnings too.
+    """Learn, score and write the files. `show` prints progress and warnings, in plain sentences.
 
     Raises:
         SystemExit: an option or a file does not fit, with a sentence.
@@ -164,8 +176,8 @@ def _run(arguments: list[str], show: Callable[[str], None]) -> None:
         count = len(asked.states)
         if count % 2 and asked.mass is None:
             raise ValueError(
-                f"--states names {count} columns: all positions and then all momenta are needed, "
-                "or the positions alone with --mass."
+                f"--states names {count} column{'s' * (count > 1)}: all positions and then all "
+                "momenta are needed, or the positions alone with --mass."
             )
         masses = len(asked.mass or [])
         if masses not in (0, 1, count, count / 2):
@@ -188,7 +200,7 @@ def _run(arguments: list[str], show: Callable[[str], None]) -> None:
 
 
 def _score(learned: Learned, show: Callable[[str], None]) -> Score | None:
-    """The score on the last fifth of each run; None where the runs are too short for one."""
+    """The score on the last fifth of each run; None if the runs are too short."""
     try:
         score = learned.score()
     except ValueError as error:
@@ -200,8 +212,13 @@ def _score(learned: Learned, show: Callable[[str], None]) -> Score | None:
 
 def _runs(asked: argparse.Namespace) -> Runs:
     """The runs of the files, one each, with the names of their columns."""
-    k = 1 + len(asked.states)
-    tables = [columns(file, [asked.time, *asked.states, *asked.inputs]) for file in asked.files]
+    names, k = [asked.time, *asked.states, *asked.inputs], 1 + len(asked.states)
+    twice = [name for name in dict.fromkeys(names) if names.count(name) > 1]
+    if twice:
+        raise ValueError(
+            f"the column {twice[0]!r} is named twice: times, states and inputs must be different."
+        )
+    tables = [columns(file, names) for file in asked.files]
     states = [unstructured_to_structured(x[:, 1:k], names=asked.states) for x in tables]
     inputs = None
     if asked.inputs:

@@ -134,6 +134,11 @@ def test_columns_are_read_by_name_and_what_is_wrong_is_named(tmp_path):
     file.write_text("", encoding="utf-8")
     with pytest.raises(ValueError, match="no column 'q'; it is empty"):
         columns(file, ["q"])
+    file.write_text("<" * 200_000, encoding="utf-8")
+    with pytest.raises(ValueError, match="is no CSV file: field larger"):
+        columns(file, ["q"])
+    with pytest.raises(FileNotFoundError, match="there is no file"):
+        columns(str(tmp_path / "nope.csv"), ["q"])
     for rows in ("t,q\n", "t,q\ns,V\n"):
         file.write_text(rows, encoding="utf-8")
         with pytest.raises(ValueError, match="no rows"):
@@ -160,13 +165,15 @@ def test_the_command_refuses_with_a_sentence(tmp_path, capsys):
     file = tmp_path / "run.csv"
     file.write_text("t,q\n0,1\n1,2\n2,1\n", encoding="utf-8")
     masses = ["--states", "q", "--mass", "1", "2"]
-    for options in (["--states", "q"], ["--states", "q", "p"], masses):
+    twice = ["--states", "q", "t"]
+    for options in (["--states", "q"], ["--states", "q", "p"], masses, twice):
         with pytest.raises(SystemExit):
             run([str(file), "--time", "t", *options], print)
     said = capsys.readouterr().err
     assert "positions alone with --mass" in said
     assert "no column 'p'" in said
     assert "--mass names 2 masses and --states 1 columns" in said
+    assert "the column 't' is named twice" in said
     assert kernel(4, 1, friction=True).inputs.acts_on == (2, 3)
 
 

@@ -107,66 +107,69 @@ def learn(
 ) -> Any:
     """Learn a field from noisy states at times, without velocities.
 
-    Each interval between two samples is linearised about the current path, which is the smoothed
-    one at first. A Kalman filter makes its rows independent, and the field follows from them in
-    closed form; kernel and noise maximise the marginal likelihood. A smoother then gives the next
-    path, until log p rises by less than ½. The first pass has no process noise. Where it does not
-    settle, or more of it would pay, a second pass looks for its intensity, and the likelier of the
-    two is returned.
+    `learn` models the states x(t) of each run as a solution of ẋ = f(x, u) + w, measured with
+    Gaussian noise, and f as a Gaussian process with the kernel K. It starts from a smoothed path
+    and iterates. Each iteration linearises every interval between two samples about the current
+    path; a Kalman filter makes the rows independent, so that the field follows in closed form. The
+    hyperparameters and the noise maximise the marginal likelihood p, and a Kalman smoother gives
+    the next path. The iteration ends when log p rises by less than ½.
 
-    Laws that many parts share, K made of `hk.Shared`, are found without iterations, from any number
-    of coordinates on: by two solves with weak rows, ∫ φ f dt along a smoothed path, whose cost is
-    linear in n. There `solver` and `iterations` have no effect, and innovations are NaN.
+    The first pass has no process noise w. If it does not settle, or if w would raise log p by
+    more than the price of its hyperparameters, a second pass estimates the intensity of w, and
+    `learn` returns the likelier of the two.
+
+    If K is made of `hk.Shared`, `learn` solves twice for the laws, without iterations, in any
+    number of coordinates. It uses weak rows, ∫ φ f dt along a smoothed path, whose cost is linear
+    in n. `solver` and `iterations` then have no effect, and innovations are NaN.
 
     Args:
-        K: a `Lagrangian`, see there, with which a `LearnedLagrangian` is learned from positions, or
-            (q, v), and torques as inputs, and of the arguments below only `noise` has a meaning; or
-            a matrix-valued kernel. Its hyperparameters are the first guess. A structure without an
-            amplitude gets one, `Symplectic(k)` becomes `Symplectic(1.0 * k)`. Runs with inputs need
-            a `Controlled` one, and runs with parameters a `Family`.
-        runs: the log; see `Runs`, which also says how inputs go on between samples.
+        K: a matrix-valued kernel, whose hyperparameters are the first guess. `learn` gives a
+            structure without an amplitude one: `Symplectic(k)` becomes `Symplectic(1.0 * k)`. Runs
+            with inputs need a `Controlled` kernel, and runs with parameters a `Family`. Or a
+            `Lagrangian`: `learn` then returns a `LearnedLagrangian`, from positions q, or (q, v),
+            with torques as inputs, and of the arguments below only `noise` has a meaning.
+        runs: the log; see `Runs`, which also says what inputs do between samples.
         mean: a known part of the field, x (n,) -> (n,), or with inputs x, u -> (n,) too; K learns
             the rest.
-        noise: the standard deviation of the sensor noise, in units of the states, a number or one
-            for each coordinate, shape (n,), if it is known; then a field that does not explain the
-            runs is detected. If None, it is estimated.
+        noise: the standard deviation of the sensor noise, if you know it, in units of the states:
+            a number, or one for each coordinate, shape (n,). `learn` can then detect that a field
+            does not explain the runs. If None, it estimates the noise.
         solver: `hk.Nystrom(max_points=…)` sets the number of landmarks, points of the paths that
-            carry the field. If None, learning begins with 48 for n = 2 and 80 for n = 4, inputs
-            counted as coordinates. Their number is doubled while the marginal likelihood grows by
-            more than its error and a solve takes a second or two, or up to ten seconds where the
-            landmarks cause half of the remaining variance. A warning says where the runs ask for
-            more.
-        process_noise: the intensity q of white noise w in ẋ = f(x, u) + w, in units of the states
-            over √time, a number or one for each coordinate, shape (n,): what stiction, timing or a
-            flexible part move besides the field. 0 where the structure is the whole truth. If None,
-            it is looked for where something says that the structure is not, and kept where the
-            marginal likelihood pays for it. Where w is more than three deviations of the rest, as
-            where a hand pushed the system, it has a deviation of its own there. Rollouts over parts
-            of the log that were left out may prefer a share of what is found: on a real pendulum
-            half of it misses by .057 rad for .105 (`tests/benchmarks/real_logs.py`).
-        mass: the known masses, one number or one for each position, shape (m,) or (m, m): the mean
-            is `hk.kinetic(mass)`, and K learns the forces, such as `Symplectic(Select(k, 0))`. Runs
-            of the m positions alone get momenta that were not measured; a number is enough where
-            there is one position.
-        masses: whether states are (q, q̇) with unknown masses instead of (q, p). Their ratios are
-            then learned, `learned.kernel.masses`; see `UnknownMasses`, whose kernel K becomes.
-            With inputs they are those of the drift, `learned.kernel.drift.masses`.
-        iterations: at most as many; 4 or 5 are the rule.
+            carry the field. If None, `learn` begins with 48 for n = 2 and 80 for n = 4, inputs
+            counted as coordinates. It doubles this number while the marginal likelihood grows by
+            more than its error and a solve takes a second or two, or up to ten seconds if the
+            landmarks cause half of the remaining variance. A warning says if the runs need more.
+        process_noise: the intensity q of the white noise w, in units of the states over √time: a
+            number, or one for each coordinate, shape (n,). The noise w stands for motion that the
+            field lacks, from stiction, timing or a flexible part. 0 states that the structure is
+            the whole truth. If None, `learn` estimates q if the structure alone does not explain
+            the runs, and keeps it if the marginal likelihood rises enough. Intervals in which w is
+            above three standard deviations, as when a hand pushes the system, get a variance of
+            their own. A smaller q than the estimate may predict better: on a real pendulum half of
+            it has an error of .057 rad, and the estimate .105 (`tests/benchmarks/real_logs.py`).
+        mass: the known masses, one number or one for each position, shape (m,) or (m, m). The mean
+            is then `hk.kinetic(mass)`, and K learns the forces, such as `Symplectic(Select(k, 0))`.
+            Runs of the m positions alone get momenta that were not measured.
+        masses: whether states are (q, q̇) with unknown masses instead of (q, p). `learn` then finds
+            the ratios of the masses, `learned.kernel.masses`, and K becomes an `UnknownMasses`.
+            With inputs the masses are those of the drift, `learned.kernel.drift.masses`.
+        iterations: the largest number of iterations; 4 or 5 are usual.
         progress: whether to show a progress bar (tqdm); if None, from ten seconds on.
 
     Returns:
         A `Learned`: the field, its kernel, the noise, the fitted states, and how well they fit.
-        Runs of other lengths, in the same powers of two, do not compile anew.
+        Runs whose lengths have the same next power of two do not compile again.
 
     Raises:
         TypeError: the runs have inputs and K takes none, or the other way round; K is not
-            matrix-valued, `runs` no Runs, or `solver` no Nystrom. ValueError: n is not one that the
-            structure allows; the inputs cannot be told from the drift; the noise is not positive; a
-            coordinate was never measured and no mean says how it moves the others; doubles are not
-            enabled.
+            matrix-valued, `runs` no Runs, or `solver` no Nystrom. ValueError: the structure does
+            not allow this n; the data do not separate the inputs from the drift; the noise is not
+            positive; a coordinate was never measured and no mean says how it moves the others;
+            float64 is not enabled.
 
     Warns:
-        UserWarning: once, where a row of `learned.diagnostics` falls short, with its meaning.
+        UserWarning: at most once. It names the rows of `learned.diagnostics` that fall short, with
+            their meaning.
     """
     _check_types(K, runs, mean, noise)
     if isinstance(K, Lagrangian):

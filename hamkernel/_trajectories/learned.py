@@ -92,20 +92,20 @@ class Learned(Shown, eqx.Module):
         disturbance: the mean of w from each sample to the next, given all samples, for each run,
             (T, n); 0 without process noise.
         history: the iterations, one entry for each.
-        converged: whether the field may be used: no row of `diagnostics` that decides falls short.
-            Runs that never cross, such as one orbit, cannot refute a structure: a run between them
-            tests the field, `score`.
+        converged: whether the field may be used: True unless a row of `diagnostics` that decides
+            falls short. Runs that never cross, such as one orbit, cannot refute a structure; test
+            the field on a run between them, with `score`.
         diagnostics: a table with one row for each question: do the iterations settle, does noise
             explain most of the motion, are residuals white, is friction missing, and others;
             `.failing` has the names of the rows that fall short.
-        runs: the runs that were given.
+        runs: the runs of the caller.
         observations: linear functionals of the field with independent noise of variance one, which
             contain all information of the runs near the fitted paths; unknown starts are projected
             out. `hk.fit(kernel, observations, regularization=regularization)` is the exact fit, and
             `field` its approximation on landmarks. None if there were too few samples.
         mean: the known part of the field, if one was given.
         evidence: the rows along the paths with their likeliest model; see `log_evidence`, `gain`.
-        again: `learn` with its other arguments, a function of the runs.
+        again: a function of the runs that calls `learn` with the same other arguments.
     """
 
     field: Any
@@ -195,9 +195,9 @@ class Learned(Shown, eqx.Module):
     def sample_disturbance(
         self, key: Key[Array, ""], ts: Float[ArrayLike, " T"]
     ) -> Float[Array, "T n"]:
-        """Draw w at the times ts, held until the next: normal, of deviation q/√h over a step h.
+        """Draw the process noise w: normal, with standard deviation q/√h, constant over a step h.
 
-        With it free runs have honest bands, those of the field and of what the structure lacks:
+        Simulations with w have bands that include the model error as well as that of the field:
 
             fields = learned.posterior.sample(key, 64, region)
             w = jax.vmap(lambda k: learned.sample_disturbance(k, ts))(jax.random.split(key, 64))
@@ -205,7 +205,7 @@ class Learned(Shown, eqx.Module):
                 lambda f, w: hk.simulate(lambda x, w: f(x) + w, x0, ts, inputs=w).ys
             )(fields, w)
 
-        With inputs u join them: `lambda x, s: f(x, s[:m]) + s[m:]` and
+        With inputs u (T, m) join both: `lambda x, s: f(x, s[:m]) + s[m:]` and
         `inputs=jnp.concatenate([u, w], axis=1)`.
 
         Args:
@@ -222,28 +222,28 @@ class Learned(Shown, eqx.Module):
 
     @property
     def log_evidence(self) -> float:
-        """The logarithm of the marginal likelihood of the runs about the paths, but for a constant.
+        """The log marginal likelihood of the runs along the fitted paths, up to a constant.
 
-        The constant is the same for every kernel, mean, `between=` and `delay=` with which the same
-        samples were learned from: whichever has the largest explains them best. A difference below
-        ½ log N for each more hyperparameter, N samples, says nothing.
+        Compare results from the same samples: the constant is the same for every kernel, mean,
+        `between=` and `delay=`, and the largest value explains the samples best. A model with r
+        more hyperparameters needs an advantage of more than r/2 · log N, for N samples.
         """
         return self.evidence.log_p
 
     @full_precision
     def gain(self, part: AbstractMatrixKernel) -> float:
-        """By how much `log_evidence` rises if the drift may have `part` too, at least 0.
+        """The rise of `log_evidence` if `part` is added to the drift, at least 0.
 
             learned.gain(hk.Friction())              # is there friction?
-            learned.gain(hk.Symplectic(hk.Gaussian()))  # a force of the velocities, too?
+            learned.gain(hk.Symplectic(hk.Gaussian()))  # forces that depend on velocities?
 
-        Hyperparameters of all parts are searched again, along the same paths, which takes about as
-        long as one iteration of `learn`. ½ log N for each hyperparameter of `part` is its price: a
-        smaller gain says that the runs do not ask for it.
+        `gain` searches the hyperparameters of all parts again, along the same paths, in about the
+        time of one iteration of `learn`. A gain below ½ log N for each hyperparameter of `part`,
+        N the number of samples, means that the runs do not need the part.
 
         Args:
-            part: a matrix-valued kernel for states of as many coordinates. Where the field has
-                inputs it stands beside the drift.
+            part: a matrix-valued kernel for states with the same number of coordinates. In a field
+                with inputs the part is added to the drift.
 
         Raises:
             TypeError: `part` is no matrix-valued kernel. ValueError: its dimension is another, or
@@ -253,19 +253,20 @@ class Learned(Shown, eqx.Module):
 
     @full_precision
     def score(self, runs: Runs | None = None, *, first: int = 10, draws: int = 64) -> Score:
-        """How well free runs follow runs, beside a linear model and the last value.
+        """Compare free runs of the field with runs, beside a linear model and the last value.
 
             print(learned.score(hk.Runs(times, states)))
 
-        Each free run begins at the state that fits the first few samples of its run best, and sees
-        no sample after them.
+        Each free run begins at the state that fits the first few samples of its run best, and uses
+        no later sample.
 
         Args:
-            runs: runs that were not learned from; of positions alone, if need be. If None, the last
-                fifth of each run is held out, the rest is learned from again, which takes as long
-                as learning did, and the field of the rest is scored.
-            first: how many samples a free run knows; of runs with fewer than twice as many, half.
-            draws: how many fields of the posterior the bands of `coverage` come from; 0 for none.
+            runs: runs that were not used to learn, positions alone if need be. If None, `score`
+                holds out the last fifth of each run, learns again from the rest, in the time that
+                learning took, and scores the new field.
+            first: the number of samples that a free run knows; half of the run if it is shorter
+                than 2 `first`.
+            draws: the number of fields drawn from the posterior for `coverage`; 0 for no bands.
 
         Returns:
             A `Score`.
@@ -315,13 +316,13 @@ class Learned(Shown, eqx.Module):
         return compute_score(self, runs, first, posterior, draws)
 
     def plot(self, run: int = 0, held_out: Runs | None = None) -> Any:
-        """One figure: fit, residuals in units of the noise, law with its band, free run.
+        """Draw one figure: fit, residuals in units of the noise, force with its band, free run.
 
-        It is that of `hk.plot.result`.
+        The figure is the result of `hk.plot.result`.
 
         Args:
-            run: the run above, counted from 0, or from the end if negative.
-            held_out: runs that were not learned from, of which a free run is drawn.
+            run: the run in the upper half, counted from 0, or from the end if negative.
+            held_out: runs that were not used to learn; the figure shows a free run of the first.
 
         Returns:
             The Matplotlib figure.

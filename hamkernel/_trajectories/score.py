@@ -25,7 +25,7 @@ _STEPS = 12  # of Levenberg and Marquardt; starts at smoothed states usually nee
 
 
 class Score(Shown, eqx.Module):
-    """How well free runs of a learned field follow runs, with two baselines.
+    """The errors of free runs of a learned field, beside two baselines.
 
     A free run begins at the state that fits the first few samples best, and uses no later sample.
     The root mean squares are over the later samples. Both baselines use the same first samples:
@@ -36,17 +36,17 @@ class Score(Shown, eqx.Module):
     Attributes:
         rmse: the root mean square of predicted − measured, in units of the states, shape (n,); NaN
             where nothing was measured.
-        persistence: the root mean square if the last known sample stays, shape (n,).
-        linear: the root mean square of the linear model, shape (n,).
-        lead: by how many of its standard errors the mean of (error/scale)² of the linear model is
-            above that of the field, shape (). Below 2 the samples do not tell the two apart.
-        coverage: the share of samples inside the 95 % band of the posterior, with both kinds of
-            noise, shape (); NaN where no band was asked for. Honest bands hold about .95.
+        persistence: the same root mean square for the last known sample, shape (n,).
+        linear: the same root mean square for the linear model, shape (n,).
+        lead: the advantage of the field over the linear model, shape (): the difference of their
+            means of (error/scale)², in standard errors. Below 2 the samples do not decide.
+        coverage: the share of samples inside the 95 % band of the posterior, sensor noise and
+            process noise included, shape (); NaN without bands. Correct bands contain about .95.
         predictions: the free run of each run at its times, shape (T, n).
         times: the times of each run, shape (T,).
         errors: predicted − measured, (T, n), NaN where nothing was measured or it was known.
         scale: the standard deviations of the coordinates in the learned runs, shape (n,).
-        first: how many samples each free run knows.
+        first: the number of samples that each free run knows.
     """
 
     rmse: Float[Array, " n"]
