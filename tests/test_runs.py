@@ -45,6 +45,13 @@ def changed(run, change):
     return times, states
 
 
+def test_times_among_the_states_are_refused():
+    table = np.column_stack([TIMES[0], STATES[0]])
+    with pytest.raises(ValueError, match=r"column 0 of the states holds the times.*table\[:, 1:\]"):
+        hk.Runs(table[:, 0], table)
+    assert hk.Runs(table[:, 0], table[:, 1:]).dimension == 2
+
+
 def test_runs_keep_what_came():
     runs = hk.Runs(TIMES, STATES, inputs=[x[::-1, :1] for x in STATES])
     assert len(runs) == 3

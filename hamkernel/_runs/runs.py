@@ -230,6 +230,7 @@ class Runs(eqx.Module):
             self.input_names = _names(of_values, self.inputs, "inputs")
         self.parameters = None if parameters is None else _members(parameters, len(times), inputs)
         _check_coordinates(self.states)
+        self._refuse_times()
         for row in self.check():
             if not row.passes:
                 require.warn(f"{row.meaning}. {row.advice}")
@@ -403,6 +404,16 @@ class Runs(eqx.Module):
         for field in dataclasses.fields(self):
             object.__setattr__(new, field.name, changes.get(field.name, getattr(self, field.name)))
         return new
+
+    def _refuse_times(self) -> None:
+        """Raise if a column of the states holds the times, as in `Runs(table[:, 0], table)`."""
+        for c, name in enumerate(self.coordinate_names):
+            pairs = zip(self.states, self.times, strict=True)
+            if all(np.array_equal(x[:, c], t) for x, t in pairs):
+                raise ValueError(
+                    f"column {name} of the states holds the times: give the states alone, such as "
+                    "table[:, 1:] or frame[['q', 'p']]."
+                )
 
     def _check_measured(self) -> None:
         for c in range(self.dimension):
