@@ -14,12 +14,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Key
+from jaxtyping import Array, Float, Int, Key
 
 from hamkernel._kernels.base import AbstractScalarKernel, ScalarSum, Scaled, Spectrum
 from hamkernel._kernels.parts import GroupParts, Shared
 from hamkernel._kernels.symmetry import Symmetrised, symmetry_removed
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
+from hamkernel._structures.friction import Friction, damped_coordinates
 from hamkernel._structures.joined import Controlled, KnownMatrix
 from hamkernel._structures.structure import AbstractPotentialKernel, DivergenceFree, Separable
 
@@ -189,11 +190,12 @@ def laws_of(waves: Any) -> list[tuple[PartWaves, slice]]:
 
 
 def is_of_parts(K: AbstractMatrixKernel) -> bool:
-    """Whether all of K is made from `Shared` laws, so that its features are exact."""
+    """Whether K is made from `Shared` laws, with friction or without: its features are exact."""
     if isinstance(K, Controlled):
         return is_of_parts(K.drift) and isinstance(K.inputs, KnownMatrix)
     if isinstance(K, Sum):
-        return all(map(is_of_parts, K.terms))
+        others = [term for term in K.terms if not isinstance(term, Friction)]
+        return bool(others) and all(map(is_of_parts, others))
     return isinstance(K, AbstractPotentialKernel) and part_waves(K.kernel) is not None
 
 
@@ -253,6 +255,26 @@ class PotentialFeatures(AbstractFeatures):
 
     def laws(self) -> list[tuple[PartWaves, slice]]:
         return laws_of(self.waves)
+
+
+class FrictionFeatures(AbstractFeatures):
+    """φ = F(x_i) e_i for each damped coordinate i; exact."""
+
+    friction: Friction
+    dimension: int = eqx.field(static=True)
+
+    @property
+    def columns(self) -> int:
+        return len(self._coordinates())
+
+    def _coordinates(self) -> Int[np.ndarray, " r"]:
+        return np.asarray(damped_coordinates(self.friction.damped, self.dimension))
+
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
+        return jnp.diag(self.friction.curve(x))[:, self._coordinates()]
+
+    def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        return self.rows(x) @ w
 
 
 class DivergenceFreeFeatures(AbstractFeatures):
@@ -405,6 +427,8 @@ def features(
         keys = jax.random.split(key, len(K.terms))
         pairs = zip(K.terms, keys, strict=True)
         return SumFeatures(tuple(features(term, n, count, key, dtype) for term, key in pairs))
+    if isinstance(K, Friction):
+        return FrictionFeatures(K, n)
     if not isinstance(K, Separable | DivergenceFree | AbstractPotentialKernel):
         raise TypeError(
             f"RandomFeatures does not know the structure {type(K).__name__}. Use Symplectic, "
