@@ -194,8 +194,8 @@ def is_of_parts(K: AbstractMatrixKernel) -> bool:
     if isinstance(K, Controlled):
         return is_of_parts(K.drift) and isinstance(K.inputs, KnownMatrix)
     if isinstance(K, Sum):
-        others = [term for term in K.terms if not isinstance(term, Friction)]
-        return bool(others) and all(map(is_of_parts, others))
+        potentials = [term for term in K.terms if not isinstance(term, Friction)]
+        return bool(potentials) and all(map(is_of_parts, potentials))
     return isinstance(K, AbstractPotentialKernel) and part_waves(K.kernel) is not None
 
 
@@ -258,20 +258,21 @@ class PotentialFeatures(AbstractFeatures):
 
 
 class FrictionFeatures(AbstractFeatures):
-    """φ = F(x_i) e_i for each damped coordinate i; exact."""
+    """φ = F(x_i) e_i for each damped coordinate i, with the curve F of `Friction`; exact."""
 
     friction: Friction
     dimension: int = eqx.field(static=True)
 
     @property
     def columns(self) -> int:
-        return len(self._coordinates())
+        return len(self._damped)
 
-    def _coordinates(self) -> Int[np.ndarray, " r"]:
+    @property
+    def _damped(self) -> Int[np.ndarray, " r"]:
         return np.asarray(damped_coordinates(self.friction.damped, self.dimension))
 
     def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
-        return jnp.diag(self.friction.curve(x))[:, self._coordinates()]
+        return jnp.diag(self.friction.curve(x))[:, self._damped]
 
     def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
         return self.rows(x) @ w

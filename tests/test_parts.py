@@ -61,6 +61,24 @@ def test_the_kernel_is_the_double_sum():
     np.testing.assert_allclose(hk.Shared(inner, parts, centres)(x, z), wanted, rtol=1e-4)
 
 
+def test_friction_beside_a_law_is_found_with_the_law():
+    X, Y = states(12, noise=0.01)
+    Y[:, 10:] -= 0.3 * X[:, 10:]
+    J = K + hk.Friction(viscous=0.5, coulomb=1e-3)
+    posterior = hk.condition(J, X, Y, 1e-4 / 12, mean=hk.kinetic(1.0))
+    r = np.linspace(0.4, 3.0, 40)
+    law = np.array([posterior.field.law(s, 1.0) for s in r])
+    band = np.array([posterior.law_deviation(s, 1.0) for s in r])
+    np.testing.assert_allclose(law, spring(r) - spring(1.0), atol=0.02)
+    assert 0 < band.max() < 0.02
+    # The dense posterior, of the kernel alone, has the same bands of the field.
+    dense = hk.condition(J, X, Y, 1e-4 / 12, mean=hk.kinetic(1.0), solver=hk.Cholesky())
+    x = X[0] + 0.1
+    np.testing.assert_allclose(posterior.deviation(x), dense.deviation(x), rtol=1e-3, atol=1e-6)
+    damped = jax.jacfwd(posterior.field)(jnp.asarray(x))[10:, 10:]
+    np.testing.assert_allclose(np.diag(damped), -0.3, atol=0.02)
+
+
 def test_weights_and_points_may_be_of_any_kind():
     def parts(x):
         return jnp.stack([x[:2], x[2:]]), jnp.array([2.0, -1.0])

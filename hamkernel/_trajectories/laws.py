@@ -37,6 +37,7 @@ from hamkernel._solvers.lagrangian import ridge_solution
 from hamkernel._solvers.triangle import columns_used, regression_loss
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import complete, shared_laws
+from hamkernel._structures.friction import frictions
 from hamkernel._trajectories.diagnostics import FitQuality, diagnostics_of_rows
 from hamkernel._trajectories.evidence import EvidenceOfRows
 from hamkernel._trajectories.free_run import Stretches, relative_error, stretches
@@ -329,8 +330,11 @@ def _box(model: LawModel, X, rows: Rows):
 
 
 def are_learned_from_rows(K: AbstractMatrixKernel) -> bool:
-    """Whether all of K is made from laws that many parts share, for states alone."""
-    return is_of_parts(K) and not K.takes_inputs
+    """Whether all of K is made from laws that many parts share, for states alone.
+
+    Friction beside the laws is learned by iterations: its weak rows were not measured.
+    """
+    return is_of_parts(K) and not (K.takes_inputs or frictions(K))
 
 
 def learn_laws(
