@@ -265,14 +265,14 @@ class FrictionFeatures(AbstractFeatures):
 
     @property
     def columns(self) -> int:
-        return len(self._damped)
+        return len(self._coordinates)
 
     @property
-    def _damped(self) -> Int[np.ndarray, " r"]:
+    def _coordinates(self) -> Int[np.ndarray, " r"]:
         return np.asarray(damped_coordinates(self.friction.damped, self.dimension))
 
     def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
-        return jnp.diag(self.friction.curve(x))[:, self._damped]
+        return jnp.diag(self.friction.curve(x))[:, self._coordinates]
 
     def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
         return self.rows(x) @ w
