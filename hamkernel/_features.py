@@ -7,6 +7,7 @@ Source: Smith & Egeland (2024), arXiv 2404.07703, for the odd symplectic case.
 """
 
 import abc
+import itertools
 from typing import Any
 
 import equinox as eqx
@@ -16,8 +17,8 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from hamkernel._kernels.base import AbstractScalarKernel, ScalarSum, Scaled, Spectrum
-from hamkernel._kernels.parts import Shared
-from hamkernel._kernels.symmetry import symmetry_removed
+from hamkernel._kernels.parts import GroupParts, Shared
+from hamkernel._kernels.symmetry import Symmetrised, symmetry_removed
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.joined import Controlled, KnownMatrix
 from hamkernel._structures.structure import AbstractPotentialKernel, DivergenceFree, Separable
@@ -53,20 +54,20 @@ class Waves(eqx.Module):
 
 
 class PartWaves(eqx.Module):
-    """The features of a law that many parts share, times a factor; they are exact, not random."""
+    """The features of laws that many parts share, times a factor; they are exact, not random."""
 
     kernel: Shared
     scale: Float[Array, ""]
 
     @property
     def amplitudes(self) -> Float[Array, " w"]:
-        return jnp.ones(len(self.kernel.centres or ()))  # in `values`, for one law
+        return jnp.ones(self.kernel.columns)  # the amplitude of a law is in `values`
 
     def values(self, x: Float[Array, " n"]) -> Float[Array, " w"]:
         return jnp.sqrt(self.scale).astype(x.dtype) * self.kernel.features(x)
 
     def law_values(self, r: Float[Array, "..."]) -> Float[Array, " w"]:
-        """The features of the law itself at r."""
+        """The features of one of the laws at r."""
         r = self.kernel.point(r)
         return jnp.sqrt(self.scale).astype(r.dtype) * self.kernel.law(r)
 
@@ -145,27 +146,46 @@ def waves_of(
     )
 
 
-def part_waves(k: AbstractScalarKernel, scale: Any = 1.0) -> PartWaves | JointWaves | None:
-    """The features of `Shared` kernels, their multiples and sums; None for any other kernel."""
+def part_waves(k: AbstractScalarKernel) -> PartWaves | JointWaves | None:
+    """The features of `Shared` kernels, their multiples, means and sums; None for others."""
+    terms = part_terms(k)
+    if None in terms:
+        return None
+    return terms[0] if len(terms) == 1 else JointWaves(tuple(terms))
+
+
+def part_terms(k: AbstractScalarKernel, scale: Any = 1.0) -> list[PartWaves | None]:
+    """The features of each `Shared` term of a kernel, and None for each other term."""
     if isinstance(k, Shared):
-        return PartWaves(k, jnp.asarray(scale))
+        return [PartWaves(k, jnp.asarray(scale))]
     if isinstance(k, Scaled):
-        return part_waves(k.kernel, scale * k.scale)
+        return part_terms(k.kernel, scale * k.scale)
     if isinstance(k, ScalarSum):
-        terms = tuple(part_waves(term, scale) for term in k.terms)
-        return None if None in terms else JointWaves(terms)
-    return None
+        return [waves for term in k.terms for waves in part_terms(term, scale)]
+    if isinstance(k, Symmetrised):
+        return [waves and _over_group(waves, k) for waves in part_terms(k.kernel, scale)]
+    return [None]
+
+
+def _over_group(waves: PartWaves, mean: Symmetrised) -> PartWaves:
+    """The features of the mean over the group of another mean."""
+    law = waves.kernel
+    parts = GroupParts(law.parts, mean.maps, mean.characters)
+    centres = None if law.centres is None else np.asarray(law.centres)
+    return PartWaves(Shared(law.kernel, parts, centres, law.laws), waves.scale)
 
 
 def laws_of(waves: Any) -> list[tuple[PartWaves, slice]]:
     """The laws among some features, with the positions of their weights."""
     terms = waves.terms if isinstance(waves, JointWaves) else (waves,)
-    starts = np.cumsum([0, *(len(term.amplitudes) for term in terms)])
-    return [
-        (term, slice(int(start), int(stop)))
-        for term, start, stop in zip(terms, starts[:-1], starts[1:], strict=True)
-        if isinstance(term, PartWaves)
-    ]
+    laws, start = [], 0
+    for term in terms:
+        stop = start + len(term.amplitudes)
+        if isinstance(term, PartWaves):
+            ends = np.linspace(start, stop, term.kernel.law_count + 1).astype(int).tolist()
+            laws += [(term, slice(*both)) for both in itertools.pairwise(ends)]
+        start = stop
+    return laws
 
 
 def is_of_parts(K: AbstractMatrixKernel) -> bool:

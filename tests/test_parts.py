@@ -110,6 +110,29 @@ def test_gradients_of_the_features_are_those_of_jax():
     np.testing.assert_allclose(G, J @ mixed @ J.T, rtol=1e-6, atol=1e-8)
 
 
+def test_parts_may_obey_several_laws_with_one_kernel():
+    """The kernel is the sum of one `Shared` for each law, here of three pairs and of two laws."""
+    k, C = hk.Gaussian(0.8), np.linspace(0.1, 4, 12)
+    both = hk.Shared(k, hk.pairs(3, 1), C, laws=(0, 1, 0))
+    apart = [lambda x: hk.pairs(3, 1)(x)[np.array([0, 2])], hk.pairs(3, 1, among=(0, 2))]
+    terms = sum((hk.Shared(k, parts, C) for parts in apart[1:]), hk.Shared(k, apart[0], C))
+    x, z = RNG.normal(size=(2, 3))
+    np.testing.assert_allclose(both(x, z), terms(x, z))
+    exact = hk.Shared(k, hk.pairs(3, 1), laws=[0, 1, 0])(x, z)
+    np.testing.assert_allclose(exact, terms(x, z), rtol=1e-4)
+    features = [hk.Shared(k, parts, C).features(jnp.asarray(x)) for parts in apart]
+    np.testing.assert_allclose(both.features(x), np.concatenate(features))
+    np.testing.assert_allclose(both.gradients(x), jax.jacrev(both.features)(x).T, atol=1e-9)
+    w = RNG.normal(size=both.columns)
+    np.testing.assert_allclose(both.slope(x, jnp.asarray(w)), both.gradients(x) @ w, atol=1e-9)
+    assert len(undetermined_terms(hk.CurlFree(both), 3)) == 2
+    with pytest.raises(ValueError, match="laws of 3 parts, and there are 6: give"):
+        hk.Shared(k, hk.pairs(4, 1), laws=(0, 1, 0))(jnp.ones(4), jnp.ones(4))
+    for laws in ((0, 2), (), (0.0, 1.0), ((0, 1),)):
+        with pytest.raises(ValueError, match="without gaps"):
+            hk.Shared(k, hk.pairs(3, 1), laws=laws)
+
+
 def test_memory_does_not_grow_with_states_parts_and_centres():
     shared = hk.Shared(hk.Gaussian(0.8), hk.pairs(200, 2), np.linspace(0.1, 4, 64))
     X = jnp.asarray(RNG.normal(size=(20, 400)))
@@ -226,6 +249,61 @@ def test_a_shared_law_is_tuned_saved_and_read_back(learned, tmp_path):
     hk.save(tmp_path / "field", tuned.field)
     again = hk.load(tmp_path / "field")
     np.testing.assert_array_equal(again.law(1.3, 1.0), tuned.field.law(1.3, 1.0))
+
+
+def test_a_law_is_found_in_kernels_with_a_symmetry_and_beside_other_terms():
+    """A law of all images of a state; before, such fields said that they had no law."""
+    k, reflected = hk.Gaussian(1.5), -np.eye(8)
+    law = 100.0 * hk.Shared(k, hk.pairs(4, 2))
+    Q = RNG.normal(size=(15, 8))
+    r = jnp.linspace(0.5, 2.5, 9)
+    F = np.stack([forces(q.reshape(4, 2)).ravel() for q in Q])
+    wanted = -(spring(r) - spring(1.0))  # the potential of the force field ∇u
+    for K in (
+        hk.Odd(hk.CurlFree(law)),
+        hk.CurlFree(hk.Invariant(law, [reflected])),
+        hk.CurlFree(law + 1e-6 * hk.Gaussian(2.0)),
+    ):
+        field = hk.fit(K, Q, F, 1e-8)
+        found = jax.vmap(lambda r, f=field: f.law(r, 1.0))(r)
+        np.testing.assert_allclose(found, wanted, atol=0.02)
+    posterior = hk.condition(hk.Odd(hk.CurlFree(law)), Q, F, 1e-6)
+    plain = hk.condition(hk.CurlFree(law), Q, F, 1e-6)
+    np.testing.assert_allclose(
+        posterior.law_deviation(2.0, 1.0), plain.law_deviation(2.0, 1.0), rtol=1e-3
+    )
+
+
+@pytest.mark.slow
+def test_a_graph_of_springs_is_found_edge_by_edge():
+    """Four particles, of whose six pairs three have a spring of stiffness 1."""
+    rng = np.random.default_rng(0)
+    has_spring = np.array([1, 0, 1, 0, 0, 1])
+    first, second = np.triu_indices(4, 1)
+    A = np.zeros((4, 4))
+    A[first, second] = A[second, first] = has_spring
+    values, modes = np.linalg.eigh(np.diag(A.sum(axis=1)) - A)
+    w = np.sqrt(np.maximum(values, 0.0))
+    t, runs = 0.05 * np.arange(161), []
+    for _ in range(2):
+        q, p = modes.T @ rng.normal(size=(4, 2)), modes.T @ rng.normal(size=(4, 2))
+        phase = np.outer(t, w)[:, :, None]
+        s = np.where(w[None, :, None] > 1e-6, w[None, :, None], 1.0)
+        drift = np.where(w[None, :, None] > 1e-6, np.sin(phase) / s, t[:, None, None])
+        path = q[None] * np.cos(phase) + p[None] * drift
+        speed = p[None] * np.cos(phase) - q[None] * w[None, :, None] * np.sin(phase)
+        x = np.concatenate([(modes @ a).reshape(len(t), 8) for a in (path, speed)], axis=1)
+        runs.append(x + 0.01 * rng.normal(size=x.shape))
+    k, pairs, runs = hk.Gaussian(2.0), hk.pairs(4, 2), hk.Runs(t, runs)
+    learned = hk.learn(hk.Symplectic(hk.Shared(k, pairs, laws=range(6))), runs, mass=1.0)
+    assert learned.converged, learned.diagnostics
+    r = jnp.linspace(0.7, 2.0, 9)
+    for i, is_spring in enumerate(has_spring):
+        law = jax.vmap(lambda r, i=i: learned.field.law(r, 1.0, which=i))(r)
+        np.testing.assert_allclose(law, is_spring * 0.5 * (r**2 - 1), atol=0.02)
+    with pytest.warns(UserWarning, match="do not use this field"):  # negative control: one law
+        one = hk.learn(hk.Symplectic(hk.Shared(k, pairs)), runs, mass=1.0)
+    assert learned.log_evidence > one.log_evidence + 100
 
 
 @pytest.mark.slow

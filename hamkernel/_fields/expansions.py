@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hamkernel._features import AbstractFeatures, SumFeatures, laws_of, part_waves
+from hamkernel._features import AbstractFeatures, SumFeatures, laws_of, part_terms
 from hamkernel._fields.base import AbstractField, SolverInfo, map_states, root
 from hamkernel._gram import subtract_centre
 from hamkernel._gram_operator import placed_product
@@ -78,11 +78,11 @@ class KernelField(AbstractField):
         for term in K.terms if isinstance(K, Sum) else (K,):
             if not isinstance(term, AbstractPotentialKernel):
                 continue
-            shared = part_waves(term.kernel)
-            for waves, _ in [] if shared is None else laws_of(shared):
+            for waves in filter(None, part_terms(term.kernel)):
                 directions = jax.vmap(term.apply_transpose)(self.points, self.coefficients)
                 slopes = jax.lax.map(waves.gradients, self.points)
-                laws.append((waves, jnp.einsum("jnm,jn->m", slopes, directions)))
+                weights = jnp.einsum("jnm,jn->m", slopes, directions)
+                laws += [(waves, weights[place]) for _, place in laws_of(waves)]
         return laws
 
     def _term(self, kernel: Sum, position: int) -> "KernelField":

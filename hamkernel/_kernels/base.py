@@ -300,7 +300,8 @@ class ScalarSum(AbstractScalarKernel):
             d or Descriptor(lambda x: x, k) for d, k in zip(descriptors, self.terms, strict=True)
         ]
         point = jax.ShapeDtypeStruct((n,), jnp.result_type(float))
-        lengths = tuple(jax.eval_shape(d.map, point).size for d in completed)
+        # JAX looks functions up by equality, and methods of traced kernels cannot be compared.
+        lengths = tuple(jax.eval_shape(lambda x, d=d: d.map(x), point).size for d in completed)
 
         def jacobian(x):
             return jnp.concatenate(

@@ -10,7 +10,8 @@ and a ~ N(0, I), so that u(x) = Φ(x)·a with
 
     Φ(x) = L⁻¹ Σ_p c_p k(C, φ_p(x)),   ∂Φ_j/∂x = Σ_p c_p Dφ_p(x)ᵀ ∇k(φ_p(x), ·),
 
-and a system of any size has m unknowns.
+and a system of any size has m unknowns. If the parts obey L laws with one kernel, each law has m
+features of its own, those of the sum over its parts.
 """
 
 from collections.abc import Callable, Sequence
@@ -22,7 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
 from jax.scipy.linalg import solve_triangular
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from hamkernel import _require as require
 from hamkernel._kernels.base import (
@@ -33,10 +34,12 @@ from hamkernel._kernels.base import (
     one_point,
 )
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._kernels.symmetry import LinearMap, close_group
 from hamkernel._show import call, describe, text
 
 _AT_ONCE = 2**16  # parts times centres that are computed at once: arrays of 512 KB
 _CENTRES = 64  # a law of one variable: lengthscales from a thirtieth of the range on
+_FEWEST_CENTRES, _FEATURES = 20, 320  # of each of many laws, and of all of them together
 
 
 class Shared(AbstractScalarKernel):
@@ -50,24 +53,38 @@ class Shared(AbstractScalarKernel):
     linear term may move from one law to another (see `field.undetermined`). Outside the values of φ
     in the data the law is unknown, and `posterior.law_deviation` is large.
 
+    Parts may obey several laws with one kernel. Which particles are joined by springs, for example,
+    shows in the laws of the ten pairs of five particles, `field.law(r, r0, which)`:
+
+        K = hk.Symplectic(hk.Shared(k, hk.pairs(particles=5, dim=2), laws=range(10)))
+
     Args:
         kernel: the kernel k of w, on points of the parts, (d,).
         parts: x (n,) -> points (P, d), or (points, weights c) with weights (P,); `hk.pairs`,
             `hk.neighbours`, `hk.sites`, or a function of your own.
         centres: points of the parts, (m, d), whose k(·, c) span w. If None, a fit takes up to 64
-            points spread over the parts of the data.
+            points spread over the parts of the data, and fewer if there are many laws.
+        laws: the law of each part, counted from 0, (P,); one law of all parts if None.
 
     Raises:
-        TypeError: `kernel` is no scalar kernel or `parts` no function. ValueError, when called:
-            `parts` returns something else.
+        TypeError: `kernel` is no scalar kernel or `parts` no function. ValueError: `laws` are not
+            the numbers 0, 1, …; when called, `parts` returns something else, or another number of
+            parts than `laws` are of.
     """
 
     kernel: AbstractScalarKernel
     parts: Callable[..., Any]
     # Python numbers, since arrays of a kernel are trained.
     centres: tuple[tuple[float, ...], ...] | None = eqx.field(static=True)
+    laws: tuple[int, ...] | None = eqx.field(static=True)
 
-    def __init__(self, kernel: Any, parts: Callable[..., Any], centres: ArrayLike | None = None):
+    def __init__(
+        self,
+        kernel: Any,
+        parts: Callable[..., Any],
+        centres: ArrayLike | None = None,
+        laws: Sequence[int] | Int[np.ndarray, " P"] | None = None,
+    ):
         if not callable(parts) or isinstance(parts, AbstractScalarKernel):
             raise TypeError(
                 "Shared needs a kernel and then a function x -> points (P, d), such as "
@@ -80,9 +97,11 @@ class Shared(AbstractScalarKernel):
             points = np.asarray(centres, float)
             points = points[:, None] if points.ndim == 1 else points
             self.centres = tuple(tuple(map(float, point)) for point in points)
+        self.laws = None if laws is None else _law_numbers(laws)
 
     def __repr__(self) -> str:
         said = [] if self.centres is None else [f"centres={len(self.centres)}"]
+        said += [] if self.laws is None else [f"laws={self.law_count}"]
         return call("Shared", [repr(self.kernel), text(self.parts), *said])
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
@@ -90,7 +109,18 @@ class Shared(AbstractScalarKernel):
             return self.features(x) @ self.features(z)
         (X, a), (Z, b) = self.parts_at(x), self.parts_at(z)
         rows = jax.vmap(jax.vmap(self.kernel, (None, 0)), (0, None))(X, Z)
-        return a @ rows @ b
+        laws = self.part_laws(len(X))
+        return a @ jnp.where(laws[:, None] == laws[None], rows, 0.0) @ b
+
+    @property
+    def law_count(self) -> int:
+        """L, the number of laws."""
+        return 1 if self.laws is None else max(self.laws) + 1
+
+    @property
+    def columns(self) -> int:
+        """The number of features, m for each law."""
+        return self.law_count * len(self.centres or ())
 
     def parts_at(self, x: Float[Array, " n"]) -> "Parts":
         """The points and the weights of the parts of one state."""
@@ -106,38 +136,59 @@ class Shared(AbstractScalarKernel):
             )
         points = require.floating(points, "the parts of Shared").astype(x.dtype)
         weights = require.floating(weights, "the weights of Shared").astype(x.dtype)
+        copies = self.parts.copies(len(x)) if isinstance(self.parts, GroupParts) else 1
+        if self.laws is not None and len(points) != copies * len(self.laws):
+            raise ValueError(
+                f"laws= has the laws of {len(self.laws)} parts, and there are "
+                f"{len(points) // copies}: give a number for each part."
+            )
         return Parts(points, jnp.broadcast_to(weights, points.shape[:1]))
 
-    def features(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
+    def part_laws(self, parts: int) -> Int[np.ndarray, " P"]:
+        """The law of each part."""
+        return np.resize(np.asarray(self.laws or (0,)), parts)  # again for each image of a group
+
+    def features(self, x: Float[Array, " n"]) -> Float[Array, " r"]:
         """Φ(x), with k_S(x, z) = Φ(x)·Φ(z)."""
         points, weights = self.parts_at(x)
+        laws = self.part_laws(len(points))
 
         def feature(c):
-            return weights @ jax.vmap(self.kernel, (0, None))(points, c)
+            values = weights * jax.vmap(self.kernel, (0, None))(points, c)
+            return jax.ops.segment_sum(values, laws, self.law_count)
 
-        return self._whiten(self._over_centres(feature, len(points), x.dtype))
+        return self._whiten(self._over_centres(feature, len(points), x.dtype)).T.ravel()
 
-    def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n m"]:
+    def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
         """The gradients of the features, by one reverse derivative of the parts for each."""
         (points, weights), back = jax.vjp(self.parts_at, x)
+        laws = self.part_laws(len(points))
+        of_law = jnp.asarray(laws[None] == np.arange(self.law_count)[:, None], x.dtype)
 
         def gradient(c):
             value, slope = jax.vmap(jax.value_and_grad(self.kernel), (0, None))(points, c)
-            return back(Parts(weights[:, None] * slope, value))[0]
+            slope = weights[:, None] * slope
+            return jax.vmap(lambda on: back(Parts(on[:, None] * slope, on * value))[0])(of_law)
 
-        return self._whiten(self._over_centres(gradient, len(points), x.dtype)).T
+        rows = self._over_centres(gradient, len(points) * self.law_count, x.dtype)
+        whitened = self._whiten(rows.reshape(len(rows), -1)).reshape(rows.shape)
+        return jnp.moveaxis(whitened, 2, 0).swapaxes(1, 2).reshape(len(x), -1)
 
-    def slope(self, x: Float[Array, " n"], w: Float[Array, " m"]) -> Float[Array, " n"]:
+    def slope(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
         """`gradients(x) @ w`, by one reverse derivative of the parts."""
         (points, weights), back = jax.vjp(self.parts_at, x)
-        C = self._points(x.dtype)
+        C, laws = self._points(x.dtype), self.part_laws(len(points))
+        w = w.reshape(self.law_count, -1).T
         coefficients = solve_triangular(self._factor(x.dtype), w, lower=True, trans="T")
 
-        def law(r):
-            return jax.vmap(self.kernel, (None, 0))(r, C) @ coefficients
+        def law(r, which):
+            return jax.vmap(self.kernel, (None, 0))(r, C) @ coefficients[:, which]
+
+        def value_and_slope(part):
+            return jax.value_and_grad(law)(*part)
 
         at_once = max(1, _AT_ONCE // len(C))
-        value, slope = jax.lax.map(jax.value_and_grad(law), points, batch_size=at_once)
+        value, slope = jax.lax.map(value_and_slope, (points, laws), batch_size=at_once)
         return back(Parts(weights[:, None] * slope, value))[0]
 
     def _over_centres(self, fn: Callable[..., Array], parts: int, dtype: Any) -> Array:
@@ -157,7 +208,7 @@ class Shared(AbstractScalarKernel):
         return point
 
     def law(self, point: Float[Array, " d"]) -> Float[Array, " m"]:
-        """L⁻¹ k(C, point), the features of w at one point of the parts."""
+        """L⁻¹ k(C, point), the features of a law w at one point of the parts."""
         return self._whiten(self._columns(point[None])[0])
 
     def missing(self, point: Float[Array, " d"], origin: Float[Array, " d"]) -> Float[Array, ""]:
@@ -219,7 +270,19 @@ class Shared(AbstractScalarKernel):
 
     def with_centres(self, X: Float[np.ndarray, "N n"]) -> "Shared":
         """This kernel with centres over the parts of the states X."""
-        return Shared(self.kernel, self.parts, self.spread(X, _CENTRES))
+        count = int(np.clip(_FEATURES // self.law_count, _FEWEST_CENTRES, _CENTRES))
+        return Shared(self.kernel, self.parts, self.spread(X, count), self.laws)
+
+
+def _law_numbers(laws: Any) -> tuple[int, ...]:
+    """The laws of parts, checked: all numbers from 0 on."""
+    numbers = np.asarray(list(laws))
+    is_whole = numbers.ndim == 1 and len(numbers) > 0 and numbers.dtype.kind in "iu"
+    if not is_whole or set(numbers.tolist()) != set(range(int(numbers.max()) + 1)):
+        raise ValueError(
+            f"laws must have the number of the law of each part, 0, 1, … without gaps; got {laws}."
+        )
+    return tuple(numbers.tolist())
 
 
 def root_at(k: AbstractScalarKernel, C: Float[Array, "m d"]) -> Float[Array, "m m"]:
@@ -247,6 +310,34 @@ class Parts(NamedTuple):
 
     points: Float[Array, "P d"]
     weights: Float[Array, " P"]
+
+
+class GroupParts(eqx.Module):
+    """The parts of all images gx of a state, with the weights χ(g) c/|G|.
+
+    The kernel of Σ_g χ(g) u(gx)/|G| is that of u with these parts.
+    """
+
+    parts: Callable[..., Any]
+    maps: tuple[LinearMap, ...] = eqx.field(static=True)
+    characters: tuple[float, ...] = eqx.field(static=True)
+
+    def __call__(self, x: Float[Array, " n"]) -> tuple[Float[Array, "P d"], Float[Array, " P"]]:
+        group, points, weights = close_group(self.maps, self.characters, len(x)), [], []
+        for g in group:
+            result = self.parts(g.matrix @ x)
+            X, c = result if isinstance(result, tuple) else (result, 1.0)
+            points.append(X)
+            weights.append(jnp.broadcast_to(g.character * c / len(group), len(X)))
+        return jnp.concatenate(points), jnp.concatenate(weights)
+
+    def copies(self, n: int) -> int:
+        """|G|, the number of images of a state of n coordinates."""
+        return len(close_group(self.maps, self.characters, n))
+
+    def coordinate(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
+        """The coordinate of the law at r, as without the group."""
+        return getattr(self.parts, "coordinate", lambda r: r)(r)
 
 
 class InnerProduct(AbstractScalarKernel):
@@ -306,6 +397,7 @@ def pairs(
     """The distances of all pairs of particles, x -> (P, 1), for `hk.Shared`.
 
     States are (q, p), or q alone, with q the positions of the first particle, of the second, ….
+    Pairs are in the order (0, 1), (0, 2), …, (1, 2), ….
 
     Args:
         particles: the number of particles.

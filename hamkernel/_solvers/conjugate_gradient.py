@@ -198,10 +198,11 @@ def _prepare_velocities(K, X, ridge, landmarks, spread):
     K_, X_, ridge_, marks = stop_gradients((K, X, ridge, landmarks))
     T, nothing = whitening(K_, marks), jnp.zeros((len(X), K.outputs(X.shape[1])), X.dtype)
     square = normal(Columns(K_, marks), T, X_, nothing, spread).square
-    inverse = Partial(_precondition_velocities, K_, X_, marks.points, T, factor(square, ridge_))
+    fixed = K_, X_, marks.points, T, factor(square, ridge_)
+    inverse = Partial(_precondition_velocities, *fixed, spread=spread)
     gram = Partial(product, K, X, X, X_rows=spread, Z_rows=spread)
     truncation = truncation_of(trace(K_, X_, spread), jnp.trace(square), ridge_)
-    return Products(gram, Partial(inverse, spread=spread)), truncation
+    return Products(gram, inverse), truncation
 
 
 def _precondition_velocities(K, X, S, T, R, c, spread):

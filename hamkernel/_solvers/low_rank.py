@@ -438,7 +438,7 @@ class LowRankConditional(AbstractConditional):
             raise AttributeError("the posterior has no law: its kernel is no hk.Shared(k, parts).")
         waves, place = laws[which]
         r, r0 = require.floating(r, "r"), require.floating(r0, "r0")
-        return _law_variance(self.R, self.ridge, waves, place.start, r, r0)
+        return _law_variance(self.R, self.ridge, waves, jnp.asarray(place.start), r, r0)
 
     def update(self, new: Measurements) -> "LowRankConditional":
         rows = self.rows.append(new)
@@ -456,9 +456,9 @@ class LowRankConditional(AbstractConditional):
 
 
 @precise_jit
-def _law_variance(R, ridge, waves, start: int, r, r0) -> Float[Array, ""]:
+def _law_variance(R, ridge, waves, start, r, r0) -> Float[Array, ""]:
     features = (waves.law_values(r) - waves.law_values(r0)).astype(R.dtype)
-    difference = jnp.zeros_like(R[0]).at[start : start + len(features)].set(features)
+    difference = jax.lax.dynamic_update_slice(jnp.zeros_like(R[0]), features, (start,))
     rest = waves.kernel.missing(waves.kernel.point(r), waves.kernel.point(r0)).astype(R.dtype)
     whitened = solve_triangular(R, difference, trans="T")
     return ridge * whitened @ whitened + waves.scale.astype(R.dtype) * rest

@@ -52,6 +52,12 @@ def append_rows(
     return triangle(jnp.concatenate([above, jnp.column_stack([rows, y])]))
 
 
+def columns_used(R: Float[Array, "r r"]) -> Float[Array, ""]:
+    """How many numbers the rows determine: tr Φ(ΦᵀΦ + I)⁻¹Φᵀ = r − ‖R⁻¹‖², RᵀR = ΦᵀΦ + I."""
+    inverse = solve_triangular(R, jnp.eye(len(R), dtype=R.dtype))
+    return len(R) - jnp.sum(inverse**2)
+
+
 def householder_triangle(S: Float[Array, "m k"]) -> Float[Array, "k k"]:
     """R by Householder's QR."""
     return jnp.linalg.qr(S, mode="r")

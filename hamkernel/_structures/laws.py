@@ -27,13 +27,17 @@ def undetermined_terms(K: Any, n: int) -> tuple[str, ...]:
     terms = [term for term in all_terms if isinstance(term, AbstractPotentialKernel)]
     laws = [(term, law) for term in terms for law in shared_laws(term.kernel)]
     X, columns, names = np.random.default_rng(0).normal(size=(8, n)), [], []
-    for i, (term, law) in enumerate(laws):
+    many, i = sum(law.law_count for _, law in laws) > 1, 0
+    for term, law in laws:
         fields = np.asarray(_linear_fields(term, law, jnp.asarray(X)))
-        fields = fields.reshape(-1, fields.shape[2]).T
-        columns += list(fields / (np.abs(fields).max() or 1.0))
-        coordinates = ["r"] if len(fields) == 2 else [f"r[{j}]" for j in range(len(fields) - 1)]
-        place = f"law {i}" if len(laws) > 1 else "the law"
-        names += [f"{name} added to {place}" for name in ("a constant", *coordinates)]
+        fields = np.moveaxis(fields.reshape(-1, *fields.shape[2:]), 0, 2)  # (L, 1 + d, N n)
+        columns += list((fields / (np.abs(fields).max() or 1.0)).reshape(-1, fields.shape[2]))
+        d = fields.shape[1] - 1
+        coordinates = ["r"] if d == 1 else [f"r[{j}]" for j in range(d)]
+        for _ in range(law.law_count):
+            place = f"law {i}" if many else "the law"
+            names += [f"{name} added to {place}" for name in ("a constant", *coordinates)]
+            i += 1
     said = []
     for shares in _null_vectors(np.array(columns).T) if columns else ():
         parts = [(s, name) for s, name in zip(shares, names, strict=True) if s]
@@ -44,14 +48,20 @@ def undetermined_terms(K: Any, n: int) -> tuple[str, ...]:
 
 
 @precise_jit
-def _linear_fields(K: Any, law: Shared, X: Float[Array, "N n"]) -> Float[Array, "N n k"]:
+def _linear_fields(K: Any, law: Shared, X: Float[Array, "N n"]) -> Float[Array, "N n L k"]:
     """The fields of a constant and of the coordinates as laws."""
 
     def potentials(x):
         points, weights = law.parts_at(x)
-        return jnp.append(weights.sum(), weights @ points)
+        terms = weights[:, None] * jnp.column_stack([jnp.ones_like(weights), points])
+        return jax.ops.segment_sum(terms, law.part_laws(len(points)), law.law_count)
 
-    return jax.lax.map(lambda x: K.apply(x, jax.jacrev(potentials)(x).T), X)
+    def fields(x):
+        slopes = jax.jacrev(potentials)(x)
+        applied = K.apply(x, slopes.reshape(-1, len(x)).T)
+        return applied.reshape(len(applied), *slopes.shape[:2])
+
+    return jax.lax.map(fields, X)
 
 
 def _null_vectors(M: Float[np.ndarray, "R Q"]) -> Float[np.ndarray, "d Q"]:

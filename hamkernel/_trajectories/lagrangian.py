@@ -31,6 +31,7 @@ from hamkernel._solvers.lagrangian import (
     ridge_solution,
     with_anchor,
 )
+from hamkernel._solvers.triangle import columns_used
 from hamkernel._structures.lagrangian import (
     Lagrangian,
     LagrangianFeatures,
@@ -261,9 +262,7 @@ def _diagnostics(
     # A sinusoid of period 2π/ω has the lengthscale 2.7/ω.
     swing = 2.3 * smoothing.lengthscale / smoothing.pieces.spacing
     rows = len(field.residual) * field.features.count
-    # tr (BᵀB (BᵀB + I)⁻¹) = r − ‖R⁻¹‖² in the norm of Frobenius.
-    inverse = np.linalg.inv(np.asarray(field.triangle))
-    used = len(field.coefficients) - float(np.sum(inverse**2))
+    used = float(columns_used(field.triangle))
     return Diagnostics(
         (
             _mass_matrix(field),

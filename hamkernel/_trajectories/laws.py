@@ -34,7 +34,7 @@ from hamkernel._runs.weak import (
     whiten,
 )
 from hamkernel._solvers.lagrangian import ridge_solution
-from hamkernel._solvers.triangle import regression_loss
+from hamkernel._solvers.triangle import columns_used, regression_loss
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import complete, shared_laws
 from hamkernel._trajectories.diagnostics import FitQuality, diagnostics_of_rows
@@ -192,9 +192,10 @@ def _factors(rows: Rows, field: Any, deviation):
 
 
 @precise_jit
-def _weights_of(model: LawModel, rows: Rows, L) -> Float[Array, " m"]:
-    """The mean of the weights of the features."""
-    return ridge_solution(*_rows_over_noise(model, rows, L))[1]
+def _solve(model: LawModel, rows: Rows, L) -> tuple[Float[Array, " m"], Float[Array, ""]]:
+    """The mean of the weights of the features, and how many numbers the rows determine."""
+    R, weights = ridge_solution(*_rows_over_noise(model, rows, L))
+    return weights, columns_used(R)
 
 
 @precise_jit
@@ -228,6 +229,7 @@ class Found(NamedTuple):
         noise: σ of each coordinate, shape (n,); NaN where nothing was measured.
         losses: −log p of both solves.
         count: the number of rows.
+        used: how many numbers they determine.
     """
 
     model: LawModel
@@ -236,6 +238,7 @@ class Found(NamedTuple):
     noise: Float[np.ndarray, " n"]
     losses: tuple[float, float]
     count: int
+    used: float
 
 
 def find_laws(K: AbstractMatrixKernel, runs: Runs, mean: Any, noise: Any) -> Found:
@@ -265,11 +268,12 @@ def find_laws(K: AbstractMatrixKernel, runs: Runs, mean: Any, noise: Any) -> Fou
         model, design = model.with_flat(h), design.at[0].set(h)
         losses.append(float(loss))
         if field:
-            w = _weights_of(model, rows, L)
+            w, _ = _solve(model, rows, L)
             L = _factors(rows, _FieldOfWeights(_features_of(model.kernel, n), w), deviation)
     points, weights, targets = _compress(model, rows, L)
     observations = Functionals(points[None], weights[None], targets[None])
-    return Found(model, observations, states, sigma, (losses[0], losses[1]), rows.count)
+    used = float(_solve(model, rows, L)[1])
+    return Found(model, observations, states, sigma, (losses[0], losses[1]), rows.count, used)
 
 
 class _FieldOfWeights(eqx.Module):
@@ -292,7 +296,7 @@ def _part(K: AbstractMatrixKernel, rows: Rows) -> np.ndarray:
     B, P = rows.pieces.path.shape[:2]
     x = jax.eval_shape(rows.state, rows.pieces.path[0, 0])
     parts = sum(
-        jax.eval_shape(law.parts_at, x).weights.shape[0] * len(law.centres or ())
+        jax.eval_shape(lambda x, law=law: law.parts_at(x), x).weights.shape[0] * law.columns
         for law in shared_laws(K)
     )
     count = int(np.clip(_SEARCHED // max(parts * P, 1), 1, B))
@@ -404,7 +408,7 @@ def _quality(
     logs = [_Log(t, x, np.zeros((len(t) - 1, 2, 0))) for t, x in zip(times, measured, strict=True)]
     part = stretches(logs, states, int(np.clip(2 * swing, 4, 64)))
     part = Stretches(*(item[:: max(len(part.starts) // 8, 1)] for item in part))
-    free = float(solution.count - len(solution.observations.targets))
+    free = solution.count - solution.used
     scatter = float(jnp.exp(solution.model.log_scatter))
     return FitQuality(
         names=runs.coordinate_names,
