@@ -32,13 +32,13 @@ def forces(q):
     return out
 
 
-def states(count, particles=5, noise=0.0):
-    q = RNG.normal(size=(count, particles, 2))
-    p = RNG.normal(size=(count, particles, 2))
+def states(count, particles=5, noise=0.0, rng=RNG):
+    q = rng.normal(size=(count, particles, 2))
+    p = rng.normal(size=(count, particles, 2))
     X = np.concatenate([q.reshape(count, -1), p.reshape(count, -1)], axis=1)
     F = np.stack([forces(each) for each in q]).reshape(count, -1)
     Y = np.concatenate([p.reshape(count, -1), F], axis=1)
-    return X, Y + noise * RNG.normal(size=Y.shape)
+    return X, Y + noise * rng.normal(size=Y.shape)
 
 
 K = hk.Symplectic(100.0 * hk.Shared(hk.Gaussian(1.0), hk.pairs(particles=5, dim=2)))
@@ -62,7 +62,7 @@ def test_the_kernel_is_the_double_sum():
 
 
 def test_friction_beside_a_law_is_found_with_the_law():
-    X, Y = states(12, noise=0.01)
+    X, Y = states(12, noise=0.01, rng=np.random.default_rng(1))
     Y[:, 10:] -= 0.3 * X[:, 10:]
     J = K + hk.Friction(viscous=0.5, coulomb=1e-3)
     posterior = hk.condition(J, X, Y, 1e-4 / 12, mean=hk.kinetic(1.0))
