@@ -162,8 +162,9 @@ class Runs(eqx.Module):
     Dataset of xarray.
 
     Raises:
-        ValueError: shapes do not fit, a run has one sample only, times do not increase, an entry is
-            infinite, an input is NaN, inputs do not span the states, or `between` is unknown.
+        ValueError: shapes do not fit, a run has one sample only, times do not increase, a column of
+            the states holds the times, an entry is infinite, an input is NaN, inputs do not span
+            the states, or `between` is unknown.
             TypeError: something is not an array of real numbers.
 
     Warns:

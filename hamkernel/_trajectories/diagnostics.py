@@ -28,8 +28,9 @@ from hamkernel._trajectories.whiteness import FALSE_ALARMS, Whiteness
 SETTLED = 1e-4
 _SWING = 5.0  # samples in a swing: with fewer noise and motion cannot be told apart
 # The error of free runs over that of a constant, below which correlated residuals do not decide.
-# Where viscous friction is missing it is .56, of a spiral that grows .57, of a limit cycle .91 to 1
-# (`tests/benchmarks/verdicts.py`). It is .01 where few landmarks leave a field of eight coordinates
+# Where viscous friction is missing it is .35 and .37, of a spiral that grows .34, of limit cycles
+# .73 to 1, and .04 of one that a wrong field follows (`tests/benchmarks/verdicts.py`, seeds 0 and
+# 1). It is .01 where few landmarks leave a field of eight coordinates
 # 1.3 % off (`tests/benchmarks/capacity.py chain`). Three runs that lose energy and never cross can
 # be followed without friction: dry friction that is missing left .006, see `_LOSSY`.
 _CLOSE = 0.1
