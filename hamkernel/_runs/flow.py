@@ -52,7 +52,7 @@ def field_values(field: Expansion, X: Float[Array, "N d"]) -> Float[Array, "N n"
 def with_tangent(
     field: Callable[[Array], Array], s: Float[Array, " d"], n: int
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """f and ∂f/∂x at a point s = (x, u), where x has n coordinates."""
+    """The velocity f and ∂f/∂x at a point s = (x, u), where x has n coordinates."""
     u = s[n:]
 
     def twice(x):

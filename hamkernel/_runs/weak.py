@@ -393,5 +393,5 @@ def whiten(factors: Float[Array, "B R R"], rows: Float[Array, "B W m *r"]) -> Fl
 
 
 def log_scale(factors: Float[Array, "B R R"]) -> Float[Array, ""]:
-    """log det of the Cholesky factors: the sum of the logarithms of their diagonals."""
+    """The sum of the logarithms of the diagonals of the Cholesky factors."""
     return jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)).sum()
