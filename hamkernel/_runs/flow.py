@@ -219,7 +219,7 @@ class Segments(NamedTuple):
         measured: the states, zero where nothing was measured, shape (S, L + 1, n).
         counts: the number of samples in each mean, 0 where nothing was measured, the same shape.
         scatter: the sum of the squared deviations of these samples from their mean, the same shape.
-        starts: first guesses of the initial states, shape (S, n).
+        starts: prior means of the initial states, shape (S, n).
         inputs: the inputs at both ends of each interval, shape (S, L, 2, m); m = 0 without inputs.
     """
 
