@@ -284,7 +284,8 @@ class GaussLegendre4(AbstractGauss):
     """Gauss collocation with two stages, c = 1/2 ∓ √3/6.
 
     The method has order 4, is symplectic for every Hamiltonian and symmetric, and conserves every
-    quadratic invariant. `AbstractGauss` has the formula, `ImplicitMidpoint` arguments and errors.
+    quadratic invariant. For the formula see `AbstractGauss`, for arguments and errors see
+    `ImplicitMidpoint`.
 
     Source: HLW, II.1.3 (table 1.1) and VI.4.
     """
@@ -299,7 +300,8 @@ class GaussLegendre6(AbstractGauss):
     """Gauss collocation with three stages, c = 1/2, 1/2 ∓ √15/10.
 
     The method has order 6, is symplectic for every Hamiltonian and symmetric, and conserves every
-    quadratic invariant. `AbstractGauss` has the formula, `ImplicitMidpoint` arguments and errors.
+    quadratic invariant. For the formula see `AbstractGauss`, for arguments and errors see
+    `ImplicitMidpoint`.
 
     Source: HLW, II.1.3 (table 1.1) and VI.4.
     """
