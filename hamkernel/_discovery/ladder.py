@@ -83,8 +83,8 @@ class Rung(AbstractMatrixKernel):
         if n > 2:
             C = C + d * ((D * S).sum(axis=1)[:, None, None] - (D * S)[..., None]) * one[None]
 
-        # The barrier makes XLA compute the components of Ba and BSa, arrays (N, M), only once. Fused
-        # into each entry of the blocks, they took eight times as long.
+        # The barrier makes XLA compute the components of Ba and BSa, arrays (N, M), only once.
+        # Fused into each entry of the blocks, they took eight times as long.
         @jax.checkpoint
         def term(w, D, S, C):
             differences = [x[:, None] - z[None] for x, z in zip(X.T, S[:, None] * Z.T, strict=True)]

@@ -302,7 +302,7 @@ def charged_particle(
     Args:
         magnetic_field: e·B, the charge times the field: one number for motion in a plane normal to
             the field, n = 4; three numbers for motion in space, n = 6; or a function of the
-            position q that returns these. Numbers are fixed; `tune` tunes the arrays of an Equinox
+            position q that returns these. Numbers are fixed; `tune` trains the arrays of an Equinox
             module.
 
     Returns:
