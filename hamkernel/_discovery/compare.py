@@ -229,23 +229,23 @@ def _data(X: Any, Y: Any) -> tuple[AbstractObservations, Any]:
     if not isinstance(X, Learned):
         return observations(X, Y), None
     if Y is not None:
-        raise TypeError("what learn returned is all of the data: hk.compare(learned).")
+        raise TypeError("the result of learn contains the data, so give no Y: hk.compare(learned).")
     if X.observations is None:
-        raise ValueError("no run had enough samples to say anything of the field.")
+        raise ValueError("no run had enough samples to learn a field: add longer runs.")
     if X.mean is not None:
         raise ValueError(
-            "a part of this field was known, the mean, and the rest of it obeys laws of its own: "
-            "learn without a mean to ask which physics the whole obeys."
+            "a part of this field was known, the mean, and compare would judge the rest alone: "
+            "learn without a mean to ask which physics the complete field obeys."
         )
     if X.kernel.takes_inputs:
         raise TypeError(
-            f"compare asks about fields of the state alone, and this one is of a "
-            f"{type(X.kernel).__name__}: compare runs without inputs, of one system."
+            f"compare asks about fields of the state alone, and the kernel of this field is a "
+            f"{type(X.kernel).__name__}: compare runs of one system, without inputs."
         )
     if not isinstance(X.kernel, Separable) or claims(X.kernel, np.ones(X.runs.dimension)):
         require.warn(
-            f"these runs were learned with {type(X.kernel).__name__}, and what they say then leans "
-            "to it. Learn them with the weakest kernel, hk.Separable(k), and compare on that."
+            f"these runs were learned with {type(X.kernel).__name__}, which biases the answers. "
+            "Learn them with the weakest kernel, hk.Separable(k), and compare the result."
         )
     return X.observations, X.regularization
 

@@ -159,10 +159,9 @@ def close_group(
                 group.append(new)
             if len(group) > 64:  # the point group of the cube has 48
                 raise ValueError(
-                    "the maps generate more than 64 others, so they do not close to a finite "
-                    "group of use here. A rotation must be by 2π over a whole number, given with "
-                    "all digits; a shear or a stretch never closes, and a continuous symmetry "
-                    "cannot be averaged over so."
+                    "the maps generate more than 64 others, and this library averages over at most "
+                    "64. A rotation must be by 2π over a whole number, given with all digits. "
+                    "Shears, stretches and continuous symmetries generate infinite groups."
                 )
     return tuple(group)
 
