@@ -1,7 +1,7 @@
 """`condition`: the Gaussian process of a field given data.
 
-A priori f ~ GP(mean, K), and the rows of the data have independent noise of variance σ² = Nλ times
-their squared relative noise. Given the data, f is Gaussian again. Let c(x) be the covariances of
+The prior is f ~ GP(mean, K). The rows of the data have independent noise, whose variance is σ² = Nλ
+times their squared relative noise. The posterior is Gaussian too. Let c(x) be the covariances of
 the rows with f(x), or with a difference of H. Then
 
     Cov[f(x), f(z) | y] = K(x, z) − c(x)ᵀ A⁻¹ c(z),     A = G + σ²I.
@@ -59,33 +59,34 @@ def condition(
 ) -> Posterior:
     """Condition the Gaussian process GP(mean, K) on data: `fit` with error bars.
 
-    The posterior mean is the field of `fit`. Deviations are proportional to the amplitude of K and
-    depend on λ, so tune both by the marginal likelihood first:
+    The posterior mean is the field of `fit`. The variances are proportional to the amplitude of K
+    and depend on λ, so tune both by the marginal likelihood first:
 
         tuned = hk.tune(hk.Symplectic(1.0 * k), X, Y, objective="marginal_likelihood")
         posterior = hk.condition(tuned.kernel, X, Y, tuned.regularization)
 
-    The hyperparameters are treated as known, so error bars are somewhat too small, more so for
-    orbits than for H.
+    The posterior treats the hyperparameters as known. Error bars are therefore somewhat too small,
+    more so for orbits than for H.
 
     Args:
         K: a matrix-valued kernel, with an amplitude: `2.0 * k`.
-        X: states, shape (N, n); or observations, and then there is no Y.
+        X: states, shape (N, n); or observations, without Y.
         Y: velocities, shape (N, n).
-        regularization: λ > 0; Nλ is the variance of the noise of a row of relative noise 1.
-        solver: `Cholesky()` if None, which is exact; or a low-rank solver. With `Nystrom(…)` and
-            few landmarks the field is approximate, and far from the landmarks the deviation is
-            the prior deviation. With `RandomFeatures(…)` the features define the prior.
+        regularization: λ > 0; Nλ is the noise variance of a row of relative noise 1.
+        solver: `Cholesky()`, which is exact, if None; or a low-rank solver. With `Nystrom(…)` and
+            few landmarks the field is approximate; far from the landmarks the deviation is the
+            prior deviation. With `RandomFeatures(…)` the features define the prior.
         mean: the known part of the field, x (n,) -> (n,), as in `fit`.
-        throw: whether a failed solve raises; if False, the numbers of the field are NaN.
+        throw: whether a failed solve raises an error; if False, the numbers of the field are NaN.
         inputs: u at each state, for a `Controlled` kernel, shape (N, m). Predictions then need the
-            inputs as well, `posterior.deviation(x, u)`.
+            inputs too, `posterior.deviation(x, u)`.
         parameters: θ at each state, for a `Family`, shape (N, p): `posterior.deviation(x, θ)`. The
             deviation grows to the prior deviation outside the range of θ.
         progress: show a progress bar of the blocks of `Cholesky`, as in `fit`.
 
     Returns:
-        The posterior. O(D³) time and O(D²) memory for D rows, with a solver of rank r O(D r²).
+        The posterior. The cost is O(D³) time and O(D²) memory for D rows; a solver of rank r takes
+        O(D r²) time.
 
     Raises:
         TypeError: the solver is `ConjugateGradient`, which keeps no factor; or as in `fit`.
@@ -117,7 +118,8 @@ def posterior_of_problem(
 class Posterior(Shown, EqualToItself, eqx.Module):
     """A field learned from data, with its uncertainty; made by `condition`.
 
-    A PyTree. Its methods take one state and work under jit, vmap and, with respect to states, grad.
+    A posterior is a PyTree. Its methods take one state and work under jit, vmap, and grad with
+    respect to states.
 
     Attributes:
         conditional: the Gaussian process conditioned on the data, minus the prior mean.
@@ -162,11 +164,11 @@ class Posterior(Shown, EqualToItself, eqx.Module):
 
     @property
     def chi_squared(self) -> Float[Array, ""]:
-        """χ² = yᵀA⁻¹y/D, y the D rows minus the prior mean, A = G + NλI, shape ().
+        """χ² = yᵀA⁻¹y/D for the D rows y minus the prior mean, A = G + NλI, shape ().
 
-        χ² is near 1 if Nλ is the variance of the noise and the kernel has the right amplitude and
-        lengthscales. Deviations of the posterior do not depend on y: if χ² is much larger than 1,
-        they are too small, and if χ² is much smaller, too large. Then pass the kernel and λ of
+        χ² is near 1 if Nλ is the noise variance and the kernel has the right amplitude and
+        lengthscales. If χ² is much larger than 1, the deviations of the posterior are too small; if
+        it is much smaller, too large. Then pass the kernel and λ of
         `hk.tune(…, objective="marginal_likelihood")`.
         """
         conditional, rows = self.conditional, self.conditional.rows
@@ -183,21 +185,21 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         x2: Num[ArrayLike, " n"] | None = None,
         u2: Num[ArrayLike, " m"] | None = None,
     ) -> Float[Array, "n n"]:
-        """The covariance of f(x) with itself or with f(x₂), given the data, in squared units of Y.
+        """The posterior covariance of f(x) and f(x₂), in squared units of Y, shape (n, n).
 
-        K(x, x₂) − K(x, X) A⁻¹ K(X, x₂): entry (i, j) is the covariance of the component i of f at x
-        and the component j of f at x₂ (default x).
+        K(x, x₂) − K(x, X) A⁻¹ K(X, x₂): entry (i, j) is the covariance of component i of f at x and
+        component j of f at x₂.
 
         Args:
             x: one state, shape (n,).
-            u: its inputs, shape (m,), where the field has inputs, zeros for the drift; or θ of a
-                member of a family.
-            x2: the other state, shape (n,); by keyword.
-            u2: the inputs of the other state, where the field has inputs.
+            u: the inputs at x, shape (m,), if the field has inputs; zeros for the drift. For a
+                family, the θ of a member.
+            x2: another state, shape (n,), by keyword; x if None.
+            u2: the inputs at x₂, if the field has inputs.
 
         Raises:
-            ValueError: x is no single state of this dimension, or u is missing. TypeError: the
-                field has no inputs, or u2 comes without x2.
+            ValueError: x is no single state of this dimension, or u is missing.
+            TypeError: u came and the field has no inputs, or u2 came without x2.
         """
         if x2 is None and u2 is not None:
             raise TypeError(
@@ -222,18 +224,18 @@ class Posterior(Shown, EqualToItself, eqx.Module):
     def deviation(
         self, x: Num[ArrayLike, " n"], u: Num[ArrayLike, " m"] | None = None
     ) -> Float[Array, " n"]:
-        """The standard deviation of each component of f(x) or f(x, u), in units of Y.
+        """The standard deviation of each component of f(x) or f(x, u), in units of Y, shape (n,).
 
-        This is the deviation of the field. A new measurement adds noise of variance Nλ.
+        The deviation of a new measurement also contains its noise, of variance Nλ.
 
         Args:
             x: one state, shape (n,).
-            u: its inputs, shape (m,), where the field has inputs, zeros for the drift; or θ of a
-                member of a family.
+            u: the inputs at x, shape (m,), if the field has inputs; zeros for the drift. For a
+                family, the θ of a member.
 
         Raises:
-            ValueError: x is no single state of this dimension, or u is missing. TypeError: the
-                field has no inputs.
+            ValueError: x is no single state of this dimension, or u is missing.
+            TypeError: u came and the field has no inputs.
         """
         return jnp.stack([root(variance) for variance in jnp.diagonal(self.covariance(x, u))])
 
@@ -245,13 +247,14 @@ class Posterior(Shown, EqualToItself, eqx.Module):
 
         Args:
             X: states, shape (N, n).
-            U: their inputs, or parameters of a family, shape (N, m), where the field has them.
+            U: inputs or parameters at each state, shape (N, m), if the field has them.
 
         Returns:
-            Means and deviations, (N, n) each, as of `field` and `deviation`.
+            The means of `field` and the deviations of `deviation`, shape (N, n) each.
 
         Raises:
-            ValueError: a shape does not fit, or U is missing. TypeError: the field has no inputs.
+            ValueError: a shape does not fit, or U is missing.
+            TypeError: U came and the field has no inputs.
         """
         if isinstance(self.field, AbstractJoinedField):
             means = self.field.evaluate(X, U)
@@ -260,7 +263,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         else:
             raise TypeError("U came and the field has no inputs: write posterior.evaluate(X).")
         states = (jnp.asarray(X, means.dtype), *(() if U is None else (jnp.asarray(U),)))
-        # A state takes D n numbers for D rows: of 64 states and 3000 rows, 3 MB for n = 2.
+        # A state takes D n numbers for D rows: 3 MB for 64 states and 3000 rows with n = 2.
         return means, jax.lax.map(lambda s: self.deviation(*s), states, batch_size=64)
 
     @full_precision
@@ -270,7 +273,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         """The standard deviation of w(r) − w(r₀) for a law w of `hk.Shared`, shape ().
 
         The deviation includes the prior outside the span of the centres of the law. Far from all
-        values of r in the data it is the prior deviation.
+        values of r in the data it equals the prior deviation.
 
         Args:
             r: an argument of the law, as in `field.law`.
@@ -278,9 +281,9 @@ class Posterior(Shown, EqualToItself, eqx.Module):
             which: the position of the law, if there are several.
 
         Raises:
-            AttributeError: no part of the kernel is `Shared`. TypeError: the posterior is not
-                expressed in features: not all terms of the kernel are `Shared`, and the solver was
-                not `RandomFeatures`.
+            AttributeError: no part of the kernel is `Shared`.
+            TypeError: the posterior has no features, because a term of the kernel is not `Shared`
+                and the solver was not `RandomFeatures`.
         """
         conditional = self.conditional
         if not isinstance(conditional, LowRankConditional):
@@ -297,9 +300,9 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         x0: Num[ArrayLike, " n"],
         theta: Num[ArrayLike, " p"] | None = None,
     ) -> Float[Array, ""]:
-        """The standard deviation of H(x) − H(x₀), or of the difference of another potential.
+        """The standard deviation of H(x) − H(x₀), or of the difference of another potential, ().
 
-        For a field with inputs H belongs to the drift, and for a family to one member.
+        H is the potential of the drift if the field has inputs, and of one member of a family.
 
         Args:
             x: one state, shape (n,).
@@ -308,7 +311,8 @@ class Posterior(Shown, EqualToItself, eqx.Module):
 
         Raises:
             AttributeError: the structure, or the mean, has no potential (with the reason).
-            ValueError: a state does not fit.
+            ValueError: a state does not fit, or θ of a family is missing.
+            TypeError: θ came and the field is no family.
         """
         field, K = self.field, self.conditional.field.kernel
         if isinstance(field, FamilyField):
@@ -319,7 +323,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         else:
             if theta is not None:
                 raise TypeError("the field is no family: leave out theta.")
-            _ = field.potential  # raises where there is none
+            _ = field.potential  # raises an error if there is none
             states = jnp.stack([field._state(x), field._state(x0)])
             n, m = states.shape[1], inputs_of(K)
             points = jnp.pad(states, ((0, 0), (0, m))) if m else states
@@ -336,20 +340,21 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         inputs: Num[ArrayLike, "M m"] | None = None,
         parameters: Num[ArrayLike, "M p"] | None = None,
     ) -> Posterior:
-        """The posterior given more data: equal to conditioning on all the data, but cheaper.
+        """The posterior given additional data: as `condition` on all the data, but cheaper.
 
         The noise variance σ² = Nλ stays, so λ becomes σ² divided by the number of all observations.
-        O(D² M) time for M new rows.
+        M new rows take O(D² M) time.
 
         Args:
-            X: states, shape (M, n), or observations, and then there is no Y.
+            X: states, shape (M, n); or observations, without Y.
             Y: velocities, shape (M, n).
             inputs: u at each state, for a `Controlled` kernel, shape (M, m).
             parameters: θ at each state, for a `Family`, shape (M, p).
 
         Raises:
-            ValueError: the new data have another n, or their shapes do not fit. RuntimeError: the
-                new rows are so close to the old rows that the factorisation fails.
+            ValueError: the new data have another n, or their shapes do not fit.
+            TypeError: the new data have another dtype.
+            RuntimeError: the new rows are so close to the old rows that the factorisation fails.
         """
         data_inputs = inputs_or_parameters(inputs, parameters, self.conditional.field.kernel)
         data, old = observations(X, Y, data_inputs, part=True), self.conditional.rows
@@ -371,18 +376,18 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         count: int,
         region: Num[ArrayLike, "2 n"] | None = None,
     ) -> AbstractField:
-        """Draw whole fields that agree with the data, each with its own Hamiltonian.
+        """Draw fields from the posterior, each with its own Hamiltonian.
 
-        The fields are one PyTree whose arrays have a leading axis, for `jax.vmap`:
+        The draws are one PyTree whose arrays have a leading axis, for `jax.vmap`:
 
             fields = posterior.sample(jax.random.key(0), 64)
             orbits = jax.vmap(lambda f: hk.simulate(f, x0, ts).ys)(fields)
 
         In the region and at the data, the draws have the mean and covariance of the posterior. Far
-        outside, draws have errors of a few per cent for the kernels that `RandomFeatures` takes,
-        and too little spread for other kernels. Choose a region that the orbits do not leave. Draws
-        of fields with inputs contain the drift and G and are affine in u; the region bounds the
-        states, not u.
+        outside, the draws have errors of a few per cent if `RandomFeatures` accepts the kernel, and
+        too little spread otherwise. Choose a region that the orbits do not leave. Draws of a field
+        with inputs contain the drift and G, and are affine in u. The region bounds the states, not
+        u.
 
         Args:
             key: the random key.
@@ -394,8 +399,9 @@ class Posterior(Shown, EqualToItself, eqx.Module):
             Fields of the type of `field`. The norm of a draw is not finite.
 
         Raises:
-            ValueError: the region has another shape or a side without length, or count is no
-                positive number. TypeError: key is no key of JAX.
+            ValueError: the region has another shape or a side of length zero, or count is no
+                positive number.
+            TypeError: key is no key of JAX.
         """
         key, count = require.key(key), require.count(count, "count")
         rows = self.conditional.rows
@@ -420,7 +426,7 @@ class Posterior(Shown, EqualToItself, eqx.Module):
         return jax.vmap(one)(draws)
 
 
-# Without jit the operations are hundreds of small programs, which took 4 s to compile.
+# We compile the whole function: its hundreds of operations, each compiled alone, took 4 s.
 @precise_jit
 def _covariance(
     conditional: AbstractConditional, left: AbstractBlock, right: AbstractBlock | None = None
@@ -429,9 +435,9 @@ def _covariance(
 
 
 def _range_of(U: Float[Array, "N m"], centre: float | None) -> Float[Array, "2 m"]:
-    """The corners of the smallest box that contains the parameters, or a box around a centre.
+    """The corners of a box that contains all U: the smallest if `centre` is None, else around 0.
 
-    A box around zero contains all inputs, and has the half-width 1 if all inputs are 0.
+    The box around 0 has the half-width max |U| in each coordinate, and 1 if all U are 0.
     """
     if centre is None:
         return jnp.stack([U.min(axis=0), U.max(axis=0)])
@@ -443,7 +449,7 @@ _variance_at = precise_jit(lambda k, x: k(x, x))
 
 
 def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
-    """Warn if k(x, x) = 1 to the last digit, as in built-in kernels without an amplitude."""
+    """Warn if k(x, x) = 1 exactly, as for built-in kernels without an amplitude."""
     if not require.is_concrete(K, X):
         return
     origin = np.zeros(K.outputs(X.shape[1]), X.dtype)
@@ -453,7 +459,7 @@ def _warn_of_amplitude(K: AbstractMatrixKernel, X: Float[Array, "P n"]) -> None:
         if one:
             scaled = "the amplitude" if isinstance(k, Scaled) else f"1.0 * {k!r}"
             require.warn(
-                f"the amplitude of {k!r} is exactly 1, its value before tuning, and deviations are "
+                f"the amplitude of {k!r} is exactly 1, its value before tuning, and variances are "
                 f"proportional to the amplitude. Tune {scaled} by "
                 "hk.tune(..., objective='marginal_likelihood')."
             )

@@ -73,13 +73,13 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
     def residual_norm(self) -> Float[Array, ""]:
         """‖y − f(X)‖ over all the training data, in units of Y, shape ().
 
-        The norm is known also after a fit to a stream, which keeps no residuals.
+        A fit to a stream keeps this norm, but no residuals.
         """
         norm_of_stream = self.info.residual_norm
         return jnp.linalg.norm(self.residual) if norm_of_stream is None else norm_of_stream
 
     def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
-        """The velocity f(x), including the mean."""
+        """The velocity f(x), including the prior mean."""
         x = self._state(x)
         learned = self._velocity(x)
         if self.mean is None:
@@ -88,11 +88,11 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
 
     @abc.abstractmethod
     def _velocity(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The velocity without the mean."""
+        """The velocity without the prior mean."""
 
     @full_precision
     def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """The potential without `offset`: its constant is arbitrary."""
+        """The potential without `offset`, so that its constant is arbitrary."""
         self.kernel.check_potential()
         x = self._state(x)
         learned = self._learned_potential(x)
@@ -102,11 +102,11 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
 
     @abc.abstractmethod
     def _learned_potential(self, x: Float[Array, " n"]) -> Float[Array, ""]:
-        """The potential without the mean."""
+        """The potential without the prior mean."""
 
     @follow_data
     def evaluate(self, X: Num[ArrayLike, "N n"]) -> Float[Array, "N n"]:
-        """The velocities at many states, as `jax.vmap(field)(X)` but in bounded memory.
+        """The velocities at many states, shape (N, n): `jax.vmap(field)(X)` in bounded memory.
 
         Args:
             X: states, shape (N, n).
@@ -122,7 +122,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
 
     @abc.abstractmethod
     def _velocities(self, X: Float[Array, "N n"]) -> Float[Array, "N n"]:
-        """The velocities at checked states, without the mean."""
+        """The velocities at many checked states, without the prior mean."""
 
     def score(
         self,
@@ -132,12 +132,12 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
     ) -> Float[Array, ""]:
         """R² = 1 − Σ‖yᵢ − f(xᵢ)‖²/Σ‖yᵢ − ȳ‖² on held-out velocities yᵢ, shape ().
 
-        R² is 1 for a perfect field, 0 for the mean ȳ, and negative for a field worse than ȳ.
+        R² is 1 for a perfect field, 0 for the constant field ȳ, and negative for a worse field.
 
         Args:
             X: states, shape (N, n).
             Y: measured velocities, shape (N, n); NaN where a component was not measured.
-            U: inputs or parameters, shape (N, m), where the field has them.
+            U: inputs or parameters, shape (N, m), if the field has them.
 
         Raises:
             ValueError: a shape does not fit.
@@ -151,9 +151,10 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
     def part(self: Field, which: int | str) -> Field:
         """The field of one term of a sum of kernels, by position or name.
 
-        The parts add up to the field minus its mean, and the squares of their norms add up to the
+        The parts add up to the field minus its prior mean, and the squares of their norms to the
         square of its norm. A part does not inherit the anchor of the field. `residual` and `info`
-        belong to the complete fit.
+        belong to the complete fit. If the kernel is not a sum, part 0 is the field itself, with its
+        mean and anchor.
 
         Raises:
             KeyError: there is no such part (with the choices).
@@ -167,11 +168,11 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
 
     @abc.abstractmethod
     def _term(self: Field, kernel: Sum, position: int) -> Field:
-        """`part` where the kernel is a sum."""
+        """The field of one term of the sum `kernel`."""
 
     @property
     def potential(self) -> Scalar:
-        """The function u with f = B∇u, x (n,) -> (), with the constant set by `anchored`.
+        """The potential u with f = B∇u, x (n,) -> (); `anchored` sets its constant.
 
         Raises:
             AttributeError: the structure has no potential (with the reason).
@@ -185,8 +186,8 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
     def hamiltonian(self) -> Scalar:
         """The learned Hamiltonian H with f = B∇H, x (n,) -> (); B = J, J − R, Π(x) or your own.
 
-        Velocities determine H up to a constant: see `anchored`. H need not be conserved: see
-        `dissipation`.
+        Velocities determine H up to a constant, which `anchored` sets. H need not be conserved (see
+        `dissipation`).
 
         Raises:
             AttributeError: the field is not Hamiltonian by construction (with the reason).
@@ -204,16 +205,17 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
     def law(self, r: Num[ArrayLike, "..."], r0: Any = None, which: int = 0) -> Float[Array, ""]:
         """The law w of `hk.Shared` at r, such as a pair potential at a distance, shape ().
 
-        The data do not determine the constant of w: with `r0` the result is w(r) − w(r₀).
+        The data do not determine the constant of w. With `r0` the result is w(r) − w(r₀).
 
         Args:
-            r: a distance as `hk.pairs` measures it, a difference as `hk.neighbours` does, or one
-                point of your own parts, shape (d,); `jax.vmap(field.law)(r)` for many.
+            r: a distance of `hk.pairs`, a difference of `hk.neighbours`, or one point of your own
+                parts, shape (d,). Use `jax.vmap(field.law)(r)` for many.
             r0: an argument at which the law is zero; None for the constant of the smallest norm.
             which: the position of the law in the kernel, if there are several.
 
         Raises:
-            AttributeError: no part of the kernel is `Shared`. IndexError: there is no such law.
+            AttributeError: no part of the kernel is `Shared`.
+            IndexError: there is no such law.
         """
         laws = self._laws()
         if not laws:
@@ -221,7 +223,7 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
                 "the field has no law: no term of its kernel is hk.Shared(k, parts). For the "
                 "potential of the whole field use field.potential(x)."
             )
-        # Compiled, since JAX would compile each operation of jax.vmap(field.law)(r) by itself.
+        # `_law_at` is compiled: JAX would else compile each operation of jax.vmap(field.law)(r).
         zero = None if r0 is None else require.floating(r0, "r0")
         return _law_at(*laws[which], require.floating(r, "r"), zero)
 
@@ -229,8 +231,8 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
     def undetermined(self) -> tuple[str, ...]:
         """The changes of the laws of `hk.Shared` that change no velocity, a sentence for each.
 
-        A constant in a law changes no velocity. Nor does a linear term if the sum over its parts is
-        constant, or equals the sum over the parts of another law.
+        A constant in a law changes no velocity. Neither does a linear term if its sum over the
+        parts is constant, or equals the sum over the parts of another law.
         """
         return undetermined_terms(self.kernel, self.dimension)
 
@@ -245,7 +247,8 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
         operator of your own.
 
         Raises:
-            AttributeError: the field has no Hamiltonian. ValueError: x is no state (n,).
+            AttributeError: the field has no Hamiltonian.
+            ValueError: x is no state (n,).
         """
         slope = jax.grad(self.hamiltonian)(self._state(x))
         return self.kernel.dissipated_power(self._state(x), slope)
@@ -266,11 +269,11 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
 
         Args:
             x0: a state, shape (n,), for example the equilibrium.
-            value: the potential there, in units of energy.
+            value: u(x₀), in units of energy.
 
         Raises:
-            AttributeError: the structure has no potential. ValueError: x0 is no finite state, or
-                the value no finite number.
+            AttributeError: the structure has no potential.
+            ValueError: x0 is no finite state, or the value no finite number.
         """
         self._check_single()
         require.shape(value, "value has", "one number", ())
@@ -287,10 +290,10 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
 
     @property
     def is_separable(self) -> bool:
-        """Whether H(q, p) = T(p) + U(q) follows from the kernel, as explicit integrators need.
+        """Whether the kernel implies H(q, p) = T(p) + U(q), which explicit integrators need.
 
-        True for a symplectic kernel whose scalar kernels are sums of `Select`s, each on q alone
-        or on p alone, if the mean is zero or has an attribute `is_separable` that is true.
+        True for a symplectic kernel whose scalar kernels are sums of `Select`s, each on q alone or
+        on p alone. The prior mean must be zero, or have an attribute `is_separable` that is true.
         """
         if self.mean is not None and not getattr(self.mean, "is_separable", False):
             return False
@@ -327,12 +330,12 @@ class FieldSum(eqx.Module):
 
 
 class KnownPart(eqx.Module):
-    """The known part of a field of points (x, u): a prior mean of x or (x, u), plus a known G u."""
+    """The known part of a field of points (x, u): the prior mean plus G u for a known matrix G."""
 
     mean: Callable[..., Any] | None
     matrix: KnownMatrix | None
     count: int = eqx.field(static=True)
-    of_inputs: bool = eqx.field(static=True)  # whether the mean is one of x and u
+    of_inputs: bool = eqx.field(static=True)  # whether the mean is a function of x and u
 
     def __call__(self, s: Float[Array, " d"]) -> Float[Array, " n"]:
         x, u = s[: -self.count], s[-self.count :]
@@ -346,7 +349,7 @@ class KnownPart(eqx.Module):
 
 
 class AtInputs(eqx.Module):
-    """The function x -> f(x, u) for one u."""
+    """The function x -> f(x, u) for a fixed u."""
 
     field: Callable[..., Any]
     u: Float[Array, " m"]
@@ -360,7 +363,7 @@ def known_part(K: AbstractMatrixKernel, mean: Any, n: int, dtype: Any) -> Any:
 
     Args:
         K: the kernel.
-        mean: x (n,) -> (n,); of a controlled kernel it may be x, u -> (n,) too.
+        mean: x (n,) -> (n,); for a joined kernel also x, u -> (n,).
         n: the number of coordinates of a state.
         dtype: the dtype of the states.
 
@@ -386,7 +389,11 @@ def known_part(K: AbstractMatrixKernel, mean: Any, n: int, dtype: Any) -> Any:
 
 
 def potential_of(field: Callable[..., Any], kernel: AbstractMatrixKernel) -> Scalar:
-    """The potential u with `field` = B∇u for the B of `kernel`; AttributeError if none is known."""
+    """The potential u with `field` = B∇u for the B of `kernel`.
+
+    Raises:
+        AttributeError: no potential is known (with the reason).
+    """
     if isinstance(field, FieldSum):
         parts = [potential_of(term, kernel) for term in field.terms]
         return lambda x: sum((part(x) for part in parts[1:]), start=parts[0](x))
@@ -416,35 +423,34 @@ def potential_of(field: Callable[..., Any], kernel: AbstractMatrixKernel) -> Sca
 
 
 def map_states(fn: Callable[..., Any], X: Float[Array, "N n"]) -> Float[Array, "N *out"]:
-    """fn(x) at many states, in bounded memory, in their dtype."""
+    """The values fn(x) at the states X, in bounded memory, in the dtype of X."""
     return jax.lax.map(lambda x: jnp.asarray(fn(x)).astype(X.dtype), X, batch_size=sizes().states)
 
 
 def root(square: Float[Array, ""]) -> Float[Array, ""]:
-    """√square; zero, with zero derivative, for `square` ≤ 0, from rounding or data of zeros."""
+    """√square; zero with zero derivative if `square` ≤ 0, by rounding or for data of zeros."""
     nothing = square <= 0
     return jnp.where(nothing, 0.0, jnp.sqrt(jnp.where(nothing, jnp.ones_like(square), square)))
 
 
 def _potential_of(field, x):
-    # The field is an argument, so that the arrays of a potential are leaves and not constants.
+    # The field is an argument, so that its arrays are leaves of the potential and not constants.
     return field.unanchored_potential(x) + field.offset
 
 
 class SolverInfo(eqx.Module):
-    """The outcome of a solver. An attribute that does not apply to the solver is None.
+    """The outcome of a solver. Attributes that do not apply to the solver are None.
 
     Attributes:
         solver: the name of the solver.
         landmarks: the number of points that carry the field, shape ().
-        rank: the rank of the low-rank Gram Ĝ of the fit or of the preconditioner, shape ().
+        rank: the rank of the low-rank Gram Ĝ of the solver or of its preconditioner, shape ().
         truncation: trace(G − Ĝ)/(Nλ) for the low-rank Gram Ĝ of the training data, shape (). The
             fitted values with Ĝ and with G differ by at most this fraction of the residual.
-        residual_norm: ‖y − f(X)‖ of a stream, whose residual is not kept, good to 1e-8 of ‖y‖,
-            shape ().
+        residual_norm: ‖y − f(X)‖ after a fit to a stream, to 1e-8 of ‖y‖, shape ().
         iterations: the number of iterations of conjugate gradients, shape ().
-        relative_residual: ‖y − (G + NλI)a‖/‖y‖ of the coefficients, computed at the end, shape ().
-            Far from the training data the relative error of a field was up to 250 times larger.
+        relative_residual: ‖y − (G + NλI)a‖/‖y‖ of the final coefficients a, shape (). Far from the
+            training data the relative error of a field can be 250 times larger.
     """
 
     solver: str = eqx.field(static=True)

@@ -1,4 +1,4 @@
-"""The fields that solvers return: sums of a kernel, Σⱼ K(x, zⱼ) aⱼ, or of features, Σ_r w_r φ_r."""
+"""The fields that solvers return: sums of kernels, Σⱼ K(x, zⱼ) aⱼ, or of features, Σ_r w_r φ_r."""
 
 import dataclasses
 from collections.abc import Callable
@@ -21,23 +21,23 @@ from hamkernel._structures.structure import AbstractPotentialKernel
 class KernelField(AbstractField):
     """f(x) = Σⱼ K(x, zⱼ) aⱼ, the minimiser of the regularised least squares.
 
-    With energies the potential has the further terms Σₑ bₑ k(·, sₑ). A prior mean is added.
-    Evaluating f or its potential costs O(M n) for M points.
+    If the data contain energies, the potential also has the terms Σₑ bₑ k(·, sₑ). A prior mean is
+    added. Evaluating f or its potential costs O(M n) for M points.
 
     Attributes:
         kernel: K.
         points: zⱼ, shape (M, n): the data, or the landmarks of a low-rank solver.
         coefficients: aⱼ, shape (M, n).
-        residual: yᵢ − f(xᵢ) at the training data, shape (N, n). For other observations than
-            complete velocities one residual for each row, in the units of the row, shape (M,).
-            After a fit to a stream, whose data are not kept, empty, shape (0, n).
-        norm: the norm of f minus its mean in the RKHS of K, shape ().
+        residual: yᵢ − f(xᵢ) at the training data, shape (N, n). For observations other than
+            complete velocities, one residual for each row, in the units of the row, shape (D,).
+            After a fit to a stream, empty, shape (0, n).
+        norm: the norm of f minus its prior mean in the RKHS of K, shape ().
         regularization: the λ of the fit, shape ().
-        offset: the constant in the potential, shape ().
+        offset: the constant of the potential, shape ().
         info: the outcome of the solver.
         value_points: sₑ, shape (E, n); None without energies.
         value_coefficients: bₑ, shape (E,); None without energies.
-        mean: the prior mean, x (n,) -> (n,), which is added; None if it is zero.
+        mean: the prior mean, x (n,) -> (n,); None if it is zero.
     """
 
     kernel: AbstractMatrixKernel
@@ -69,7 +69,7 @@ class KernelField(AbstractField):
         return self._add_values(potential, _value_potential, x)
 
     def _add_values(self, field: Array, contribution: Callable[..., Array], x: Array) -> Array:
-        """`field`, plus `contribution(K, x, s, b)` if there are energies."""
+        """The sum `field + contribution(K, x, s, b)` if there are energies; else `field`."""
         S, b = self.value_points, self.value_coefficients
         return field if S is None or b is None else field + contribution(self.kernel, x, S, b)
 
@@ -87,9 +87,10 @@ class KernelField(AbstractField):
 
     def _term(self, kernel: Sum, position: int) -> "KernelField":
         term, Z, A = kernel.terms[position], self.points, self.coefficients
-        # ‖f‖² = aᵀG_aa a + 2aᵀG_ab b + bᵀG_bb b, a the coefficients of K(·, z), b of k(·, s). With
-        # coefficients 2a the potential at the points S is u(S) = 2G_ba a + G_bb b, so b·u(S) is the
-        # sum of the last two terms.
+        # Let a be the coefficients of K(·, z) and b those of k(·, s). Then
+        #     ‖f‖² = aᵀG_aa a + 2 aᵀG_ab b + bᵀG_bb b.
+        # With 2a in place of a the potential is u(S) = 2 G_ba a + G_bb b, so b·u(S) is the sum of
+        # the last two terms.
         square = jnp.sum(A * placed_product(term, Z, Z, A))
         bare = dataclasses.replace(self, kernel=term, offset=jnp.zeros_like(self.offset), mean=None)
         S, b = self.value_points, self.value_coefficients
@@ -101,14 +102,14 @@ class KernelField(AbstractField):
 
 @precise_jit
 def _expansion(K: AbstractMatrixKernel, x: Point, Z: Points, A: Points) -> Point:
-    """f(x) = Σⱼ K(x, zⱼ) aⱼ through the potential, without (n, n) blocks."""
+    """The field Σⱼ K(x, zⱼ) aⱼ at x, from the potential, without (n, n) blocks."""
     x, Z = subtract_centre(K, x, Z)
     return K.expansion(x, Z, A)
 
 
 @precise_jit
 def _potential(K: AbstractMatrixKernel, x: Point, Z: Points, A: Points) -> Float[Array, ""]:
-    """The potential of `_expansion`."""
+    """The potential of the field `_expansion`."""
     x, Z = subtract_centre(K, x, Z)
     return K.potential(x, Z, A)
 
@@ -117,7 +118,7 @@ def _potential(K: AbstractMatrixKernel, x: Point, Z: Points, A: Points) -> Float
 def _value_potential(
     K: AbstractMatrixKernel, x: Float[Array, " n"], S: Float[Array, "E n"], b: Float[Array, " E"]
 ) -> Float[Array, ""]:
-    """Σₑ bₑ k(x, sₑ)."""
+    """The potential Σₑ bₑ k(x, sₑ)."""
     x, S = subtract_centre(K, x, S)
     return b @ jax.vmap(K.potential_covariance, in_axes=(None, 0))(x, S)
 
@@ -126,10 +127,10 @@ def _value_potential(
 def _value_field(
     K: AbstractMatrixKernel, x: Float[Array, " n"], S: Float[Array, "E n"], b: Float[Array, " E"]
 ) -> Float[Array, " n"]:
-    """The field of `_value_potential`.
+    """The field of the potential Σₑ bₑ k(x, sₑ).
 
-    The component along v is Cov(vᵀf(x), Σ bₑ u(sₑ)) = Σ bₑ (potential of K(·, x)v at sₑ). The
-    component is linear in v, so its gradient with respect to v is the field, without use of B.
+    The component along v is Cov(vᵀf(x), Σₑ bₑ u(sₑ)) = Σₑ bₑ (potential of K(·, x)v at sₑ). The
+    component is linear in v, so its gradient with respect to v is the field. We need no B.
     """
     x, S = subtract_centre(K, x, S)
 
@@ -167,23 +168,24 @@ def kernel_field(
 
 
 class FeatureField(AbstractField):
-    """f(x) = Σ_r w_r φ_r(x), φ_r random features with the structure of the kernel.
+    """f(x) = Σ_r w_r φ_r(x), where the features φ_r have the structure of the kernel.
 
-    The structure is exact: f = B∇u of the potential u(x) = Σ_r (α_r cos ω_r·x + β_r sin ω_r·x).
-    Evaluating f or its potential costs O(r n), whatever the number of data.
+    The features are random, or those of `hk.Shared` laws. The structure is exact: with random
+    features f = B∇u for the potential u(x) = Σ_r (α_r cos ω_r·x + β_r sin ω_r·x). Evaluating f or
+    its potential costs O(r n), independent of the number of data.
 
     Attributes:
         kernel: K, which the features approximate.
-        features: φ, with frequencies and amplitudes; `F = field.features(X)`, shape (N, n, r),
-            holds φ_r(xᵢ), so `jnp.einsum("iar,jbr->iajb", F, F)` is the Gram of the approximation.
+        features: φ. `F = field.features(X)`, shape (N, n, r), holds φ_r(xᵢ), and
+            `jnp.einsum("iar,jbr->iajb", F, F)` is the Gram of the approximate kernel.
         weights: w, shape (r,).
-        residual: yᵢ − f(xᵢ) at the training data, shape (N, n). After a fit to a stream, whose data
-            are not kept, empty, shape (0, n).
+        residual: yᵢ − f(xᵢ) at the training data, shape (N, n). After a fit to a stream, empty,
+            shape (0, n).
         norm: ‖w‖, the norm of f in the RKHS of the approximate kernel, shape ().
         regularization: the λ of the fit, shape ().
-        offset: the constant in the potential, shape ().
+        offset: the constant of the potential, shape ().
         info: the outcome of the solver.
-        mean: the prior mean, x (n,) -> (n,), which is added; None if it is zero.
+        mean: the prior mean, x (n,) -> (n,); None if it is zero.
     """
 
     kernel: AbstractMatrixKernel

@@ -1,4 +1,4 @@
-"""Learned fields of joined points (x, u): with inputs, and of a family of systems."""
+"""Learned fields of joined points (x, u): fields with inputs, and families of systems."""
 
 import abc
 import dataclasses
@@ -30,7 +30,7 @@ from hamkernel._structures.joined import AbstractJoinedKernel
 
 
 def _column(u: Array, ndim: int, m: int) -> Array:
-    """U in the shape (…, 1), if m = 1 and there is one number for each state."""
+    """The inputs u; in the shape (…, 1) if m = 1 and u has one number for each state."""
     return u[..., None] if u.ndim == ndim and m == 1 else u
 
 
@@ -59,12 +59,12 @@ class AbstractJoinedField(AbstractField):
 
     @property
     def points(self) -> Float[Array, "M n"]:
-        """The states zⱼ that carry the field, shape (M, n); random features have none."""
+        """The states zⱼ of the kernel sum, shape (M, n); random features have none."""
         return self._expansion.points[..., : self.dimension]
 
     @property
     def coefficients(self) -> Float[Array, "M n"]:
-        """aⱼ, shape (M, n)."""
+        """The coefficients aⱼ of the kernel sum, shape (M, n)."""
         return self._expansion.coefficients
 
     @property
@@ -80,7 +80,7 @@ class AbstractJoinedField(AbstractField):
 
     @property
     def norm(self) -> Float[Array, ""]:
-        """The norm of f minus its known part, in the RKHS of K, shape ()."""
+        """The norm of f minus its known part in the RKHS of K, shape ()."""
         return self.whole.norm
 
     @property
@@ -90,7 +90,7 @@ class AbstractJoinedField(AbstractField):
 
     @property
     def offset(self) -> Float[Array, ""]:
-        """The constant in the potential, shape ()."""
+        """The constant of the potential, shape ()."""
         return self.whole.offset
 
     @property
@@ -112,13 +112,13 @@ class AbstractJoinedField(AbstractField):
 
     @property
     def takes_inputs(self) -> bool:
-        """True: a velocity needs u as well. `hk.simulate` reads this."""
+        """True: a velocity needs u too. `hk.simulate` reads this attribute."""
         return True
 
     def __call__(
         self, x: Num[ArrayLike, " n"], u: Num[ArrayLike, " m"] | None = None
     ) -> Float[Array, " n"]:
-        """The velocity f(x, u).
+        """The velocity f(x, u), shape (n,).
 
         Raises:
             ValueError: u is missing, or x or u has another shape.
@@ -128,7 +128,7 @@ class AbstractJoinedField(AbstractField):
         return learned if mean is None else learned + mean(s).astype(learned.dtype)
 
     def join(self, x: Any, u: Any) -> Float[Array, " d"]:
-        """The point (x, u).
+        """The joined point (x, u), shape (n + m,).
 
         Raises:
             ValueError: u is missing, or x or u has another shape.
@@ -156,10 +156,10 @@ class AbstractJoinedField(AbstractField):
     def evaluate(
         self, X: Num[ArrayLike, "N n"], U: Num[ArrayLike, "N m"] | None = None
     ) -> Float[Array, "N n"]:
-        """The velocities at many states with their u, shapes (N, n) and (N, m).
+        """The velocities, shape (N, n), at states (N, n) with inputs or parameters (N, m).
 
         Raises:
-            ValueError: the u are missing, or a shape does not fit.
+            ValueError: U is missing, or a shape does not fit.
         """
         self._check_single()
         X = require.points(X, "X").astype(self.offset.dtype)
@@ -179,7 +179,7 @@ class AbstractJoinedField(AbstractField):
         return learned if mean is None else learned + map_states(mean, S).reshape(len(S), n)
 
     def part(self, which: int | str) -> "AbstractJoinedField":
-        """KeyError: a field of x alone has parts, a joint field has none."""
+        """KeyError: only a field of x alone has parts."""
         raise KeyError(f"no part {which!r}: the parts are those of {self._example}.part(…).")
 
     def _term(self, kernel: Sum, position: int) -> "AbstractJoinedField":
@@ -190,8 +190,8 @@ class ControlledField(AbstractJoinedField):
     """f(x, u) = f(x) + G(x) u, one state (n,) and its inputs (m,) per call.
 
     The potential, the Hamiltonian and the dissipation belong to the drift f(x); `residual`, `norm`,
-    `regularization` and `info` belong to f(x, u). A prior mean may be any function of x and u; the
-    drift is then f(x, 0), and the input matrix ∂f/∂u at u = 0.
+    `regularization` and `info` belong to f(x, u). A prior mean may be any function of x and u. The
+    drift is then f(x, 0), and the input matrix is ∂f/∂u at u = 0.
 
     Attributes:
         whole: the field of the points (x, u), of dimension n + m.
@@ -199,7 +199,7 @@ class ControlledField(AbstractJoinedField):
 
     @property
     def inputs(self) -> Float[Array, "M m"]:
-        """uⱼ at the points, shape (M, m)."""
+        """The inputs uⱼ at `points`, shape (M, m)."""
         return self._expansion.points[..., self.dimension :]
 
     @property
@@ -221,13 +221,13 @@ class ControlledField(AbstractJoinedField):
 
     @property
     def drift(self) -> KernelField | FeatureField:
-        """f, a field of its own: `field.drift(x)`, `field.drift.hamiltonian(x)`."""
+        """The drift f as a field: `field.drift(x)`, `field.drift.hamiltonian(x)`."""
         return fix_inputs(self.whole, self.dimension, None)
 
     def input_matrix(self, x: Num[ArrayLike, " n"]) -> Float[Array, "n m"]:
         """The input matrix G(x), shape (n, m)."""
         x = self._state(x)
-        # Forward mode drops all terms without u, so this costs as much as G(x) alone.
+        # Forward mode drops all terms without u, so the cost is that of G(x) alone.
         return jax.jacfwd(lambda u: self(x, u))(jnp.zeros(self.kernel.input_count, x.dtype))
 
     @property
@@ -264,7 +264,7 @@ class FamilyField(AbstractJoinedField):
 
     @property
     def parameters(self) -> Float[Array, "M p"]:
-        """θⱼ at the points, shape (M, p)."""
+        """The parameters θⱼ at `points`, shape (M, p)."""
         return self._expansion.points[..., self.dimension :]
 
     @property
@@ -279,8 +279,8 @@ class FamilyField(AbstractJoinedField):
     def at(self, theta: Num[ArrayLike, " p"]) -> "KernelField | MemberField":
         """The member with the parameters θ, an ordinary field of K.
 
-        The residual of the member is empty, since the data belong to all members; λ and `info`
-        belong to the fit. New values of θ do not recompile.
+        The residual of the member is empty, since the data belong to all members. λ and `info`
+        belong to the fit. JAX does not recompile for new values of θ.
 
         Args:
             theta: θ, shape (p,).
@@ -314,7 +314,7 @@ class FamilyField(AbstractJoinedField):
         )
 
     def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """AttributeError, as `potential`."""
+        """AttributeError: each member has a potential of its own."""
         return self.potential(x)
 
     @property
@@ -335,13 +335,13 @@ class FamilyField(AbstractJoinedField):
 class MemberField(AbstractField):
     """The member of a family with several terms, Σᵢ Σⱼ kᵢ(θ, θⱼ) Kᵢ(x, zⱼ) aⱼ.
 
-    The terms share their points; each term has its own coefficients. `norm` is (Σᵢ ‖fᵢ‖²)^½.
+    The terms share their points. Each term has its own coefficients.
 
     Attributes:
         kernel: the sum of the Kᵢ.
         terms: the field of each Kᵢ.
-        offset: the constant in the potential, shape ().
-        mean: the prior mean at θ, x (n,) -> (n,), which is added; None if it is zero.
+        offset: the constant of the potential, shape ().
+        mean: the prior mean at θ, x (n,) -> (n,); None if it is zero.
     """
 
     kernel: Sum
@@ -355,7 +355,7 @@ class MemberField(AbstractField):
 
     @property
     def points(self) -> Float[Array, "M n"]:
-        """zⱼ, shape (M, n)."""
+        """The points zⱼ of all terms, shape (M, n)."""
         return self.terms[0].points
 
     @property
@@ -365,7 +365,7 @@ class MemberField(AbstractField):
 
     @property
     def norm(self) -> Float[Array, ""]:
-        """(Σᵢ ‖fᵢ‖²)^½, shape ()."""
+        """The norm (Σᵢ ‖fᵢ‖²)^½ of the terms, shape ()."""
         return root(sum((t.norm**2 for t in self.terms[1:]), start=self.terms[0].norm ** 2))
 
     @property
@@ -392,7 +392,7 @@ class MemberField(AbstractField):
 
 
 def fix_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
-    """A field or a mean of points (x, u) at one u, as a function of x.
+    """The field or mean `part` of points (x, u) at a fixed u, as a function of x.
 
     If u is None, the result is the drift of a `Controlled` kernel, at u = 0.
     """
@@ -440,7 +440,7 @@ def fix_inputs(part: Any, n: int, u: Float[Array, " m"] | None) -> Any:
 
 
 def learned_field(field: Any, mean: Any) -> Any:
-    """The field of a solver plus the known part, a function of (x, u) for a joined kernel."""
+    """The field of a solver plus the known part; a function of (x, u) for a joined kernel."""
     if mean is not None:
         field = dataclasses.replace(field, mean=mean)
     if not isinstance(field.kernel, AbstractJoinedKernel):

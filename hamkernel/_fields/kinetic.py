@@ -27,7 +27,7 @@ class Kinetic(eqx.Module):
         """The velocity (M⁻¹p, 0) of the state x = (q, p), shape (n,).
 
         Raises:
-            ValueError: x is no state of as many positions as there are masses.
+            ValueError: x is not one state with one position for each mass.
         """
         velocity = self._velocity(self._state(x))
         return jnp.concatenate([velocity, jnp.zeros_like(velocity)])
@@ -36,7 +36,7 @@ class Kinetic(eqx.Module):
         """The energy ½ pᵀM⁻¹p of the state x, shape ().
 
         Raises:
-            ValueError: x is no state of as many positions as there are masses.
+            ValueError: x is not one state with one position for each mass.
         """
         x = self._state(x)
         return 0.5 * x[len(x) // 2 :] @ self._velocity(x)
@@ -60,7 +60,7 @@ class Kinetic(eqx.Module):
 
 
 def kinetic(mass: ArrayLike) -> Kinetic:
-    """The prior mean (M⁻¹p, 0) of a system with known masses M; the kernel then learns the forces.
+    """The prior mean (M⁻¹p, 0) for known masses M; the kernel then learns the forces.
 
         hk.learn(K, hk.Runs(times, states), mean=hk.kinetic(mass=1.0))
 
@@ -75,8 +75,9 @@ def kinetic(mass: ArrayLike) -> Kinetic:
         A function x (n,) -> (n,) with the method `hamiltonian(x)`, n = 2m.
 
     Raises:
-        ValueError: the shape is none of these; a mass is not positive; or the matrix is not
-            symmetric positive definite. TypeError: `mass` holds no real numbers.
+        ValueError: the shape is none of these, a mass is not positive, or the matrix is not
+            symmetric positive definite.
+        TypeError: `mass` holds no real numbers.
     """
     mass_array = require.floating(mass, "mass")
     if mass_array.ndim == 2 and mass_array.shape[0] == mass_array.shape[1]:

@@ -18,22 +18,23 @@ from hamkernel._structures.lagrangian import Lagrangian, LagrangianFeatures
 class LagrangianField(Shown, EqualToItself, eqx.Module):
     """Learned Lagrangian mechanics, M(q) a + C(q, v) v + ∂V/∂q + friction(v) = τ.
 
-    Made by `fit` and `learn` with a `Lagrangian`. `field(x, u)` is ẋ = (v, a) for the state
-    x = (q, v) and the torques u, so `hk.simulate(field, x0, ts, inputs=u)` simulates the machine. A
-    call raises a RuntimeError if M(q) is not positive definite.
+    `fit` and `learn` return this field for a `Lagrangian` kernel. `field(x, u)` is ẋ = (v, a) for
+    the state x = (q, v) and the torques u, so `hk.simulate(field, x0, ts, inputs=u)` simulates the
+    machine. A call raises a RuntimeError if M(q) is not positive definite.
 
     The field contains its posterior: methods that end in `_deviation` return standard deviations.
 
     Attributes:
         features: the features of L and of friction, with the kernel.
         coefficients: the coefficients of the kernels at the centres, then of friction, shape (r,).
-        triangle: R with RᵀR = BᵀB + I, B the rows of the torques over their noise, shape (r, r).
+        triangle: R with RᵀR = BᵀB + I, where B are the feature rows of the torques divided by their
+            noise, shape (r, r).
         noise: the standard deviation of the torque of each joint, shape (m,).
         residual: measured minus learned torques, shape (N, m); after `learn`, means over windows.
-        least_inertia: the smallest eigenvalue of M at the state of the data where it is least
-            certain to be positive: λ − 2σ is smallest there, with σ its standard deviation.
-        least_inertia_deviation: σ there, shape ().
-        least_direction: its eigenvector, shape (m,).
+        least_inertia: the smallest eigenvalue λ of M, with standard deviation σ, at the state of
+            the data with the smallest λ − 2σ, shape ().
+        least_inertia_deviation: σ at this state, shape ().
+        least_direction: the eigenvector of λ, shape (m,).
     """
 
     features: LagrangianFeatures
@@ -58,22 +59,22 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
 
     @property
     def kernel(self) -> Lagrangian:
-        """The kernel that the field was learned with."""
+        """The kernel of the fit."""
         return self.features.kernel
 
     @property
     def dimension(self) -> int:
-        """N = 2m, the number of coordinates of a state (q, v)."""
+        """The number n = 2m of coordinates of a state (q, v)."""
         return 2 * self.features.count
 
     @property
     def is_identified(self) -> bool:
-        """Whether M is positive definite at all states of the data by two standard deviations."""
+        """Whether all eigenvalues of M exceed two standard deviations at all states of the data."""
         return bool(self.least_inertia > 2 * self.least_inertia_deviation)
 
     @property
     def refusal(self) -> str:
-        """Why `hk.simulate` does not run this field; "" where M is identified."""
+        """The reason why `hk.simulate` refuses this field; "" if M is identified."""
         if not require.is_concrete(self.least_inertia) or self.is_identified:
             return ""
         joint = int(np.argmax(np.abs(np.asarray(self.least_direction))))
@@ -88,12 +89,13 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
 
     @full_precision
     def __call__(self, x: Num[ArrayLike, " n"], u: ArrayLike | None = None) -> Float[Array, " n"]:
-        """The velocity (v, a) of the state x under the torques u, zero if None.
+        """The velocity (v, a) of the state x under the torques u, zero if None, shape (n,).
 
-        Where gains are unknown, u is what was logged, and the torques are `gains` times u.
+        If gains are unknown, u are the logged inputs, and the torques are `gains` times u.
 
         Raises:
-            ValueError: x or u has another shape. RuntimeError: M(q) is not positive definite.
+            ValueError: x or u has another shape.
+            RuntimeError: M(q) is not positive definite.
         """
         x = self._state(x)
         q, v = jnp.split(x, 2)
@@ -113,12 +115,12 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
 
     @property
     def gains(self) -> Float[Array, " m"]:
-        """The torques over the inputs, found for `unknown_gains` and 1 for other joints, (m,)."""
+        """The ratio torque/input of each joint: learned for `unknown_gains`, else 1, shape (m,)."""
         return self._fill_joints(1.0, self.features.gain_features() @ self.coefficients)
 
     @property
     def gains_deviation(self) -> Float[Array, " m"]:
-        """The standard deviation of each gain, 0 where it is known, shape (m,)."""
+        """The standard deviation of each gain, 0 for known gains, shape (m,)."""
         return self._fill_joints(0.0, jnp.sqrt(self._variance(self.features.gain_features())))
 
     def _fill_joints(self, value: float, unknown: Float[Array, " g"]) -> Float[Array, " m"]:
@@ -127,7 +129,7 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
 
     @full_precision
     def mass_matrix(self, q: Num[ArrayLike, " m"]) -> Float[Array, "m m"]:
-        """M(q), symmetric, shape (m, m)."""
+        """The symmetric mass matrix M(q), shape (m, m)."""
         return self.features.mass_matrix_features(self._position(q)) @ self.coefficients
 
     @full_precision
@@ -140,17 +142,17 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
 
     @full_precision
     def potential(self, q: Num[ArrayLike, " m"]) -> Float[Array, ""]:
-        """V(q), known up to a constant, shape ()."""
+        """The potential V(q), up to a constant, shape ()."""
         return self.features.potential_features(self._position(q)) @ self.coefficients
 
     @full_precision
     def gravity(self, q: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
-        """∂V/∂q, the torques that hold the machine at rest at q, shape (m,)."""
+        """The torques ∂V/∂q that hold the machine at rest at q, shape (m,)."""
         return jax.grad(self.potential)(self._position(q))
 
     @full_precision
     def gravity_deviation(self, q: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
-        """The standard deviation of each entry of the gravity, shape (m,)."""
+        """The standard deviation of each entry of `gravity`, shape (m,)."""
         q, k = self._position(q), self.kernel.potential
         rows = jax.jacfwd(self.features.potential_features)(q).T
         mixed = jax.jacfwd(jax.jacrev(lambda a, b: self._missing(k, a, b)), argnums=1)(q, q)
@@ -160,14 +162,14 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
     def energy_deviation(
         self, x: Num[ArrayLike, " n"], x0: Num[ArrayLike, " n"]
     ) -> Float[Array, ""]:
-        """The standard deviation of the difference of the energies at the states x and x0."""
+        """The standard deviation of H(x) − H(x₀), shape ()."""
 
         def row(x):
             q, v = jnp.split(self._state(x), 2)
             kinetic = jnp.einsum("i,j,ijr->r", v, v, self.features.mass_matrix_features(q)) / 2
             return kinetic + self.features.potential_features(q)
 
-        # T + V has the prior covariance of L = T − V, since T and V are independent.
+        # T and V are independent a priori, so T + V has the prior covariance of L = T − V.
         missing = self._missing_lagrangian
         here, there = self._state(x), self._state(x0)
         rest = missing(here, here) + missing(there, there) - 2 * missing(here, there)
@@ -177,7 +179,7 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
     def torque_deviation(
         self, q: Num[ArrayLike, " m"], v: Num[ArrayLike, " m"], a: Num[ArrayLike, " m"]
     ) -> Float[Array, " m"]:
-        """The standard deviation of each torque of `inverse_dynamics`, without noise, (m,)."""
+        """The standard deviation of each torque of `inverse_dynamics`, noise excluded, (m,)."""
         m, a = self.features.count, self._position(a, "a")
         x = jnp.concatenate([self._position(q), self._position(v, "v")])
 
@@ -197,7 +199,7 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
 
     @full_precision
     def friction(self, v: Num[ArrayLike, " m"]) -> Float[Array, " m"]:
-        """The friction of the joints at the velocities v, shape (m,)."""
+        """The friction torques of the joints at the velocities v, shape (m,)."""
         return self.features.friction_features(self._position(v, "v")) @ self.coefficients
 
     @full_precision
@@ -222,26 +224,26 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
     def inverse_dynamics(
         self, q: Num[ArrayLike, " m"], v: Num[ArrayLike, " m"], a: Num[ArrayLike, " m"]
     ) -> Float[Array, " m"]:
-        """The torques τ = M(q) a + Coriolis forces + ∂V/∂q + friction, shape (m,).
+        """The torques τ = M(q) a + C(q, v) v + ∂V/∂q + friction(v), shape (m,).
 
-        Where gains are unknown, the inputs are these torques over `gains`.
+        If gains are unknown, the inputs are these torques divided by `gains`.
         """
         x = jnp.concatenate([self._position(q), self._position(v, "v")])
         return self.features.torque_features(x, self._position(a, "a")) @ self.coefficients
 
     @full_precision
     def rest_torques(self, x: Num[ArrayLike, " n"]) -> Float[Array, " m"]:
-        """The torques with which the state x = (q, v) has no acceleration, shape (m,)."""
+        """The torques at which the state x = (q, v) has no acceleration, shape (m,)."""
         q, v = jnp.split(self._state(x), 2)
         return self.inverse_dynamics(q, v, jnp.zeros_like(v))
 
     @property
     def offset(self) -> Float[Array, ""]:
-        """0, the constant of the potential, as fields of a Hamiltonian have one."""
+        """The constant of the potential: 0. Other fields have this attribute too."""
         return jnp.zeros_like(self.least_inertia)
 
     def _variance(self, rows: Float[Array, "*k r"]) -> Float[Array, "*k"]:
-        """The posterior variance of rows in kernels, in the span of the centres."""
+        """The posterior variance of linear forms of the kernels, in the span of the centres."""
         done = self.features.whiten(rows).reshape(-1, rows.shape[-1])
         whitened = solve_triangular(self.triangle, done.T, trans="T")
         return jnp.sum(whitened**2, axis=0).reshape(rows.shape[:-1])
@@ -256,7 +258,7 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
         return jnp.maximum(missing, 0.0) if q is q2 else missing
 
     def _missing_lagrangian(self, x: Array, z: Array) -> Float[Array, ""]:
-        """The prior covariance of L at two states that the centres do not carry."""
+        """The prior covariance of L at two states, outside the span of the centres."""
         (q, v), (q2, w) = jnp.split(x, 2), jnp.split(z, 2)
         K, missing = self.kernel, self._missing
         return missing(K.potential, q, q2) + (v @ w) ** 2 * missing(K.inertia, q, q2)
@@ -276,7 +278,7 @@ def lagrangian_field(
     residual: Float[Array, "N m"],
     X: Float[Array, "N n"],
 ) -> LagrangianField:
-    """The field of these weights, with the smallest eigenvalue of M over the states X."""
+    """The field of the weights, with the smallest eigenvalue of M over the states X."""
     none = jnp.zeros((), weights.dtype), jnp.zeros((), weights.dtype), jnp.zeros_like(noise)
     coefficients = features.kernel_coefficients(weights)
     field = LagrangianField(features, coefficients, triangle, noise, residual, *none)
@@ -290,10 +292,10 @@ def _least_inertia(field: LagrangianField, Q: Float[Array, "N m"]) -> tuple[Arra
         values, vectors = jnp.linalg.eigh(field.mass_matrix(q))
         e = vectors[:, 0]
         row = jnp.einsum("i,j,ijr->r", e, e, field.features.mass_matrix_features(q))
-        missing = 4 * field._missing(field.kernel.inertia, q, q)  # ½M has the covariance k_M
+        missing = 4 * field._missing(field.kernel.inertia, q, q)  # Var ½eᵀMe = k_M(q, q)
         return values[0], jnp.sqrt(field._variance(row) + missing), e
 
-    # 64 positions at a time: with 400 features, the arrays take 200 KB.
+    # We take 64 positions at a time: with 400 features the arrays take 200 KB.
     value, deviation, e = jax.lax.map(least_eigenvalue, Q, batch_size=64)
     at = jnp.argmin(value - 2 * deviation)
     return value[at], deviation[at], e[at]

@@ -1,9 +1,9 @@
 """Scalar kernels on one pair of points, k(x, z) -> (), and their algebra.
 
-A kernel is written once, for one pair of points. `jax.vmap` makes the Gram matrix, and automatic
-differentiation every structured kernel. Write a kernel with *products* of its arguments: `x @ z`
-under two vmaps becomes one matrix product, while `jnp.sum((x - z) ** 2)` becomes an (N, M, n) array
-and runs many times slower.
+You write a kernel once, for one pair of points. `jax.vmap` makes the Gram, and automatic
+differentiation makes every structured kernel. Write kernels with *products* of their arguments:
+`x @ z` under two vmaps becomes one matrix product, while `jnp.sum((x - z) ** 2)` becomes an
+(N, M, n) array and runs many times slower.
 """
 
 import abc
@@ -30,7 +30,7 @@ Bounds = tuple[ArrayLike, ArrayLike]  # the lower and the upper bound of a hyper
 
 
 def one_point(x: ArrayLike) -> Float[Array, " n"]:
-    """`x` as a float array; a batch would silently give a wrong number."""
+    """`x` as a float array of shape (n,). We refuse a batch, which would give a wrong number."""
     x = require.floating(x, "the point")
     if x.ndim != 1:
         raise ValueError(
@@ -41,7 +41,7 @@ def one_point(x: ArrayLike) -> Float[Array, " n"]:
 
 
 def divide(x: Point, scale: Float[Array, "..."], name: str = "lengthscale") -> Point:
-    """x/scale in the dtype of x, for one point; the scale is a number, or one per coordinate."""
+    """x/scale in the dtype of x, for one point and a scale of shape () or (n,)."""
     x = one_point(x)
     if scale.ndim and scale.shape != x.shape:
         raise ValueError(
@@ -52,7 +52,7 @@ def divide(x: Point, scale: Float[Array, "..."], name: str = "lengthscale") -> P
 
 
 def log_per_coordinate(value: ArrayLike, name: str, cure: str = "") -> Float[Array, "..."]:
-    """The logarithm of a positive hyperparameter, one number or one per coordinate."""
+    """The logarithm of a positive hyperparameter, shape () or (n,)."""
     array = require.positive(value, name, cure)
     if array.ndim > 1:
         raise ValueError(f"{name} has shape {array.shape}; it must be a number or a vector (n,).")
@@ -60,9 +60,9 @@ def log_per_coordinate(value: ArrayLike, name: str, cure: str = "") -> Float[Arr
 
 
 def bounds_by_value(name: str, leaf: Any) -> Bounds:
-    """Bounds around the value of a hyperparameter whose meaning is unknown, as stored.
+    """Bounds around the stored value of a hyperparameter whose meaning is unknown.
 
-    A logarithm may move by three decades, any other number by ten times its size and at least 10.
+    A logarithm may change by three decades, any other number by ten times its size and at least 10.
     """
     value = np.asarray(leaf)
     reach = np.log(1e3) if name.startswith("log_") else 10 * np.maximum(1.0, np.abs(value))
@@ -72,10 +72,10 @@ def bounds_by_value(name: str, leaf: Any) -> Bounds:
 def bounds_of_length(
     leaf: Any, X: Float[np.ndarray, "N n"], spacings: float, extents: float
 ) -> Bounds:
-    """Bounds of the logarithm of a length, `spacings` spacings and `extents` extents of the data.
+    """Bounds of the logarithm of a length: `spacings` spacings and `extents` extents of the data.
 
-    The spacing of N points in an extent L counts as L / N, a fair lower bound in any dimension:
-    points on a few trajectories lie close together along them. An extent of 0 counts as 1.
+    We take the spacing of N points in an extent L as L/N, in any dimension, since points on a few
+    trajectories lie close together along them. An extent of 0 counts as 1.
     """
     ranges = np.ptp(X, axis=0)
     extent = ranges if leaf.ndim > 0 else np.asarray(np.linalg.norm(ranges))
@@ -84,10 +84,10 @@ def bounds_of_length(
 
 
 class Invariance(enum.Flag):
-    """The symmetries that a kernel declares; they decide which cheap forms are allowed.
+    """The symmetries that a kernel declares, which allow cheaper formulas.
 
-    REFLECTION: k(−x, −z) = k(x, z). TRANSLATION: k(x + c, z + c) = k(x, z), which for a
-    symmetric real kernel implies REFLECTION. A sum or product has what all its terms have.
+    REFLECTION: k(−x, −z) = k(x, z). TRANSLATION: k(x + c, z + c) = k(x, z), which for a symmetric
+    real kernel implies REFLECTION. A sum or product has the symmetries that all its terms have.
     """
 
     NONE = 0
@@ -102,13 +102,13 @@ def _identity(x: Float[Array, " n"]) -> Float[Array, "n n"]:
 class Descriptor(NamedTuple):
     """A map d of points and a kernel κ of its values, k(x, z) = κ(d(x), d(z)).
 
-    The derivatives of k follow from the derivatives of κ and the Jacobian of d, which is computed
-    once for each point.
+    The derivatives of k follow from the derivatives of κ and the Jacobian of d. We compute this
+    Jacobian once for each point.
 
     Attributes:
         map: d.
         kernel: κ.
-        directions: the directions along which a field differentiates at a point, side by side.
+        directions: x -> the matrix whose columns are the directions of differentiation at x.
         jacobian: the Jacobian of d; None for automatic differentiation in forward mode.
         point_data: a function c(x) such that k, for every κ, depends on x through c(x) alone; None
             if c is d.
@@ -123,7 +123,7 @@ class Descriptor(NamedTuple):
     def value_and_jacobian(
         self, x: Float[Array, " n"]
     ) -> tuple[Float[Array, " m"], Float[Array, "m n"]]:
-        """d(x), and its derivatives along the directions."""
+        """The value d(x) and the derivatives of d along the directions."""
         jacobian = self.jacobian or jax.jacfwd(self.map)
         return self.map(x), jacobian(x) @ self.directions(x)
 
@@ -131,18 +131,19 @@ class Descriptor(NamedTuple):
 class Spectrum(eqx.Module):
     """Draws from a spectral measure: k(x, z) ≈ Σ_r c_r cos(ω_r·(x − z)), or its even or odd part.
 
-    Bochner: k(x, z) = κ(x − z) is the mean of cos(ω·(x − z)) over the spectral measure of k. The
-    sum over F frequencies drawn from the measure has a relative error of order F^(−1/2).
+    By Bochner's theorem k(x, z) = κ(x − z) is the mean of cos(ω·(x − z)) over the spectral measure
+    of k. A sum over F frequencies drawn from the measure has a relative error of order F^(−1/2).
 
-    Frequencies are smooth functions of the hyperparameters and of base samples that depend on the
-    key alone, so fits are differentiable and losses comparable between steps. Two hyperparameters
-    change the law of the base samples: α of a rational quadratic kernel, and the lengthscale of a
-    periodic one. Their derivatives are right in the mean over keys, but not for one key.
+    The frequencies are smooth functions of the hyperparameters and of base samples, which depend on
+    the key alone. Fits are therefore differentiable, and losses comparable between steps. Two
+    hyperparameters change the distribution of the base samples: α of a rational quadratic kernel,
+    and the lengthscale of a periodic one. Their derivatives are right in the mean over keys, but
+    not for one key.
 
     Attributes:
         frequencies: ω_r in radians per unit of the states, shape (F, n).
         weights: c_r > 0, shape (F,); their sum is k(x, x) of the shift-invariant kernel.
-        parity: +1 for the even part, −1 for the odd part, 0 for all.
+        parity: +1 for the even part, −1 for the odd part, 0 for k itself.
 
     Source: Rahimi & Recht (2007).
     """
@@ -158,34 +159,34 @@ Spectra = tuple[Spectrum, ...]  # one for each term
 class AbstractScalarKernel(eqx.Module):
     """A positive definite function k(x, z) -> () of two points of shape (n,).
 
-    Every inexact array leaf is an unconstrained real and is trained by `hamkernel.tune`;
-    a positive hyperparameter θ is stored as `log_θ` and read through the property `θ`.
+    Every inexact array leaf is an unconstrained real, and `hamkernel.tune` trains it. A positive
+    hyperparameter θ is stored as `log_θ`; the property `θ` returns its value.
     """
 
     def __repr__(self) -> str:
         return describe(self, positional=("kernel",))
 
     def __hash__(self) -> int:
-        # Arrays have no hash. Equal kernels have equal structure, so this one fits `==`.
+        # Arrays have no hash. Equal kernels have equal structure, so we hash the structure.
         return hash(jax.tree.structure(self))
 
     @abc.abstractmethod
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
-        """k(x, z) for one pair of points."""
+        """The value k(x, z) for one pair of points, shape ()."""
 
     @property
     def invariance(self) -> Invariance:
-        """The transformations of both arguments that leave k unchanged, as far as is known."""
+        """The known transformations of both arguments that leave k unchanged."""
         return Invariance.NONE
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
-        """For each term of an additive kernel, the coordinates that it may depend on."""
+        """The coordinates that each term of an additive kernel may depend on."""
         return (frozenset(range(n)),)
 
     def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
         """Whether k(Sx, Sz) = k(x, z) is known for ALL values of the hyperparameters.
 
-        Lengthscales that happen to be equal today say nothing, for training changes them.
+        Lengthscales that happen to be equal do not count, since training changes them.
         """
         identity = np.eye(len(S))
         if np.array_equal(S, identity):
@@ -193,20 +194,20 @@ class AbstractScalarKernel(eqx.Module):
         return np.array_equal(S, -identity) and Invariance.REFLECTION in self.invariance
 
     def summands(self, reflection: bool) -> "tuple[AbstractScalarKernel, ...]":
-        """The inner kernels in which k is linear; a mean over linear maps may act on them instead.
+        """The inner kernels in which k is linear, so that a mean over linear maps may act on them.
 
-        `reflection` says that x -> −x is the only map.
+        If `reflection` is true, x -> −x is the only map.
         """
         return ()
 
     def through_descriptor(self, n: int) -> Descriptor | None:
-        """The descriptor through which k sees points of n coordinates, if it has one."""
+        """The descriptor of k on points of n coordinates; None if k has none."""
         return None
 
     def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
         """`count` random frequencies for each term of the kernel on n coordinates.
 
-        Terms are what remains when products of sums are expanded.
+        The terms are those of the kernel with all products of sums expanded.
 
         Raises:
             TypeError: no spectral density of the kernel is known, or it is not shift-invariant.
@@ -222,7 +223,7 @@ class AbstractScalarKernel(eqx.Module):
 
     @property
     def has_amplitude(self) -> bool:
-        """Whether a trained factor multiplies all of k; by default, all of the kernel inside k."""
+        """Whether a trained factor multiplies all of k; by default as `self.kernel`."""
         inner = getattr(self, "kernel", None)
         return isinstance(inner, AbstractScalarKernel) and inner.has_amplitude
 
@@ -231,13 +232,13 @@ class AbstractScalarKernel(eqx.Module):
 
         Args:
             name: an attribute, such as `log_lengthscale`.
-            X: the data in the coordinates that k sees.
-            amplitude: a plausible factor of k, which gives fields the size of the velocities.
+            X: the data in the coordinates of the arguments of k.
+            amplitude: the factor of k that gives fields of the size of the velocities.
         """
         return bounds_by_value(name, getattr(self, name))
 
     def transform_inputs(self, X: Float[np.ndarray, "N n"]) -> Float[np.ndarray, "N m"]:
-        """The data in the coordinates that the inner kernels see."""
+        """The data in the coordinates of the arguments of the inner kernels."""
         return X
 
     def __add__(self, other: Any) -> "ScalarSum":
@@ -292,7 +293,7 @@ class ScalarSum(AbstractScalarKernel):
         return self.terms
 
     def through_descriptor(self, n: int) -> Descriptor | None:
-        """All descriptors side by side, and the point itself for terms that have none."""
+        """The descriptors of all terms, concatenated; a term without one has the point itself."""
         descriptors = [k.through_descriptor(n) for k in self.terms]
         if not any(descriptors):
             return None
@@ -300,7 +301,7 @@ class ScalarSum(AbstractScalarKernel):
             d or Descriptor(lambda x: x, k) for d, k in zip(descriptors, self.terms, strict=True)
         ]
         point = jax.ShapeDtypeStruct((n,), jnp.result_type(float))
-        # JAX looks functions up by equality, and methods of traced kernels cannot be compared.
+        # We pass lambdas: JAX compares functions, and methods of traced kernels have no `==`.
         lengths = tuple(jax.eval_shape(lambda x, d=d: d.map(x), point).size for d in completed)
 
         def jacobian(x):
@@ -324,7 +325,7 @@ class ScalarSum(AbstractScalarKernel):
 
 
 class _SideBySide(AbstractScalarKernel):
-    """Σᵢ kᵢ(xᵢ, zᵢ) of the pieces xᵢ of a point, one after the other."""
+    """The kernel Σᵢ kᵢ(xᵢ, zᵢ), where x is the concatenation of the pieces xᵢ."""
 
     terms: tuple[AbstractScalarKernel, ...]
     lengths: tuple[int, ...] = eqx.field(static=True)
@@ -360,7 +361,7 @@ class ScalarProduct(AbstractScalarKernel):
         return all(k.is_unchanged_by(S) for k in self.terms)
 
     def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
-        """The measure of a product is the convolution: frequencies add."""
+        """Sums of the frequencies of the factors: the measure of a product is the convolution."""
         factors = _term_spectra(self, n, count, key, dtype)
         if any(s.parity for factor in factors for s in factor):
             raise TypeError(
@@ -388,7 +389,7 @@ def _term_spectra(
 
 
 def common_invariance(terms: Iterable[Any]) -> Invariance:
-    """The symmetries that all of the kernels have, scalar or matrix-valued."""
+    """The symmetries that all scalar or matrix-valued kernels in `terms` have."""
     common = Invariance.TRANSLATION
     for kernel in terms:
         common &= kernel.invariance
@@ -444,7 +445,7 @@ class Scaled(AbstractScalarKernel):
 
     @property
     def has_amplitude(self) -> bool:
-        # A factor that is None is not trained.
+        # `tune` does not train a factor that is None.
         return self.log_scale is not None or self.kernel.has_amplitude
 
 
@@ -455,8 +456,8 @@ def _as_factor(kernel: AbstractScalarKernel) -> str:
 class UserKernel(AbstractScalarKernel):
     """Any callable (x, z) -> scalar: a function, an Equinox module, another library's kernel.
 
-    Array leaves of a module are trained like hyperparameters of the built-in kernels. We assume
-    that the callable depends on every coordinate and has no invariance.
+    `tune` trains the array leaves of a module like hyperparameters of the built-in kernels. We
+    assume that the callable depends on every coordinate and has no invariance.
     """
 
     fn: Callable[..., Any]
@@ -465,8 +466,8 @@ class UserKernel(AbstractScalarKernel):
         self.fn = as_pytree(pair_function(fn))
 
     def __repr__(self) -> str:
-        fn = getattr(self.fn, "__self__", self.fn)  # the kernel of tinygp that has the method
-        bare = type(fn).__repr__ is eqx.Module.__repr__  # which shows no values
+        fn = getattr(self.fn, "__self__", self.fn)  # the tinygp kernel of a bound `evaluate`
+        bare = type(fn).__repr__ is eqx.Module.__repr__  # this repr shows no values
         return describe(fn) if bare else text(fn)
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
@@ -483,7 +484,7 @@ class UserKernel(AbstractScalarKernel):
 def pair_function(fn: Callable[..., Any]) -> Callable[..., Any]:
     """The function of one pair of points: `fn`, or the method `evaluate` of a tinygp kernel.
 
-    A call of a tinygp kernel returns a Gram.
+    A tinygp kernel returns a Gram when called, so we do not call the kernel itself.
     """
     families = {cls.__module__.partition(".")[0] for cls in type(fn).__mro__}
     return getattr(fn, "evaluate", fn) if "tinygp" in families else fn
@@ -495,7 +496,7 @@ def _name(fn: Callable[..., Any]) -> str:
 
 
 def as_scalar_kernel(k: Any) -> AbstractScalarKernel:
-    """`k` itself if it is one of ours, else the callable wrapped as a `UserKernel`.
+    """`k` itself if it is an `AbstractScalarKernel`; else a `UserKernel` with this callable.
 
     Raises:
         TypeError: `k` is not callable, or is a matrix-valued kernel.

@@ -1,9 +1,11 @@
-"""The built-in kernels: of the scaled distance, k = φ(s) with s = ‖(x − z)/ℓ‖², and of products.
+"""The built-in kernels: radial kernels k = φ(s) with s = ‖(x − z)/ℓ‖², and functions of products.
 
 The diagonal of a Gram pairs every point with itself, so the second derivatives of k at x = z must
-be exact. They are exact if φ is a function of s, the SQUARED distance, in which a smooth kernel is
-smooth: ∂x ∂zᵀ k = −2φ′(s) I/ℓ² − 4φ″(s) ddᵀ with d = (x − z)/ℓ². A kernel written with the
-distance √s gives NaN at x = z, or, after the usual repairs, a wrong block.
+be exact. A smooth kernel is a smooth function φ of the SQUARED distance s, and
+
+    ∂x ∂zᵀ k = −2φ′(s) I/ℓ² − 4φ″(s) ddᵀ,     d = (x − z)/ℓ².
+
+A kernel written with the distance √s gives NaN at x = z, or a wrong block after the usual repairs.
 """
 
 import abc
@@ -35,12 +37,12 @@ from hamkernel._machine import orthonormal
 def squared_distance(x: Float[Array, " n"], z: Float[Array, " n"], cut: bool) -> Float[Array, ""]:
     """‖x − z‖² as x·x + z·z − 2 x·z, which under two vmaps is one matrix product.
 
-    The factor −2 stands outside, so that the derivative of exp(−s/2) needs no extra pass over all
+    We put the factor −2 outside, so that the derivative of exp(−s/2) needs no extra pass over all
     pairs.
 
-    With `cut`, a value below the rounding error of the product form is set to zero. On the diagonal
-    of the Gram one unit in the last place would be a distance of 1e-8, to which Matérn-3/2 is
-    sensitive. The derivatives are not cut.
+    With `cut` we set values below the rounding error of this formula to zero, but keep their
+    derivatives. On the diagonal of the Gram one unit in the last place is a distance of 1e-8, to
+    which Matérn-3/2 is sensitive.
     """
     halves = x @ x / 2 + z @ z / 2
     s = -2 * (x @ z - halves)
@@ -53,16 +55,16 @@ def squared_distance(x: Float[Array, " n"], z: Float[Array, " n"], cut: bool) ->
 def orthogonal_normal(
     key: Key[Array, ""], count: int, n: int, dtype: Any
 ) -> Float[Array, "count n"]:
-    """Standard normal vectors in blocks of n with orthogonal directions, otherwise independent.
+    """Standard normal vectors, orthogonal within each block of n and otherwise independent.
 
-    Orthogonality reduces the variance of means over a block; the error on the paper's pendulum is
-    smaller by a quarter.
+    Orthogonality reduces the variance of means over a block. On the paper's pendulum it reduces the
+    error by a quarter.
 
     Source: Yu et al. (2016), "Orthogonal random features".
     """
     directions, lengths = jax.random.split(key)
     blocks = -(-count // n)
-    # With a positive diagonal of U the directions are uniform.
+    # The upper triangular factor has a positive diagonal, so the directions are uniform.
     Q, _ = orthonormal(jax.random.normal(directions, (blocks, n, n), dtype))
     rows = Q.reshape(blocks * n, n)[:count]
     return rows * jnp.linalg.norm(jax.random.normal(lengths, (count, n), dtype), axis=1)[:, None]
@@ -75,29 +77,28 @@ def log_length(lengthscale: ArrayLike) -> Float[Array, "..."]:
 
 
 class AbstractRadialKernel(AbstractScalarKernel):
-    """k(x, z) = φ(‖(x − z)/ℓ‖²), ℓ a number or one lengthscale per coordinate."""
+    """A kernel k(x, z) = φ(‖(x − z)/ℓ‖²), with one lengthscale ℓ or one for each coordinate."""
 
     log_lengthscale: eqx.AbstractVar[Float[Array, "..."]]
-    # Whether φ is sensitive to the rounding of s at zero, so that the rounding must be cut off. The
-    # cut takes a quarter of the time of a product with the Gram.
+    # Whether φ is sensitive to rounding of s near zero, so that `squared_distance` must cut it off.
+    # The cut takes a quarter of the time of a product with the Gram.
     cuts_rounding: eqx.AbstractClassVar[bool]
 
     @abc.abstractmethod
     def profile(self, s: Float[Array, ""]) -> Float[Array, ""]:
-        """φ(s), smooth at s = 0 as often as the kernel may be differentiated."""
+        """The profile φ(s), with as many derivatives at s = 0 as the kernel has."""
 
     @abc.abstractmethod
     def widths(self, key: Key[Array, ""], count: int, dtype: Any) -> Float[Array, "count 1"] | None:
-        """Random √w for which φ(s) is the mean of exp(−w s/2); None where w is 1.
+        """Random √w such that φ(s) is the mean of exp(−w s/2); None for w = 1.
 
-        Such a φ is a mixture of Gaussians.
+        Every such φ is a mixture of Gaussians.
         """
 
     def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
-        """Normal vectors divided by ℓ, each multiplied by a random width √w."""
-        # φ(s) is the mean of exp(−w s/2) over w with s = ‖(x − z)/ℓ‖², and exp(−w s/2) the mean of
-        # cos(ω·(x − z)) over ω = √w ζ/ℓ with ζ ~ N(0, I): Bochner's theorem for a mixture of
-        # Gaussians.
+        """Frequencies √w ζ/ℓ with normal vectors ζ and random widths √w."""
+        # With s = ‖(x − z)/ℓ‖², φ(s) is the mean of exp(−w s/2) over w. Each exp(−w s/2) is the
+        # mean of cos(ω·(x − z)) over ω = √w ζ/ℓ, ζ ~ N(0, I).
         normal, mixture = jax.random.split(key)
         widths = self.widths(mixture, count, dtype)
         base = orthogonal_normal(key if widths is None else normal, count, n, dtype)
@@ -114,7 +115,7 @@ class AbstractRadialKernel(AbstractScalarKernel):
         return self.profile(squared_distance(x, z, cut=self.cuts_rounding))
 
     def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
-        """A lengthscale far below the spacing or above the extent changes nothing but rounding."""
+        """Bounds of .3 spacings and 30 extents. Beyond them a lengthscale only changes rounding."""
         if name == "log_lengthscale":
             return bounds_of_length(self.log_lengthscale, X, 0.3, 30.0)
         return super().bounds(name, X, amplitude)
@@ -124,7 +125,7 @@ class AbstractRadialKernel(AbstractScalarKernel):
         return Invariance.TRANSLATION
 
     def is_unchanged_by(self, S: Float[np.ndarray, "n n"]) -> bool:
-        """A lengthscale for each coordinate allows changes of sign, one for all every rotation."""
+        """Whether S is orthogonal; with one lengthscale for each coordinate, also diagonal."""
         return is_orthogonal(S) and (self.log_lengthscale.ndim == 0 or is_diagonal(S))
 
 
@@ -169,8 +170,8 @@ class Matern(AbstractRadialKernel):
             half-integer; a lengthscale is not positive and finite.
 
     Products with more than 1000 points, as in `field.evaluate` and `gram_operator`, have NaN second
-    derivatives in reverse mode, as in `jax.hessian`, at points that coincide. Forward mode,
-    `jax.jacfwd(jax.jacfwd(f))`, is right.
+    derivatives in reverse mode, as in `jax.hessian`, if two points coincide. Use forward mode,
+    `jax.jacfwd(jax.jacfwd(f))`.
 
     Source: Rasmussen & Williams (2006), eq. 4.16.
     """
@@ -195,7 +196,7 @@ class Matern(AbstractRadialKernel):
         return _matern(round(self.nu - 0.5), 2 * self.nu * s)
 
     def widths(self, key: Key[Array, ""], count: int, dtype: Any) -> Float[Array, "count 1"]:
-        """√(2ν/χ²): the frequencies are Student's t with 2ν degrees of freedom."""
+        """√w = √(2ν/χ²), so that frequencies have Student's t distribution with 2ν degrees."""
         half_square = jax.random.gamma(key, self.nu, (count, 1), dtype)  # χ²_{2ν}/2
         return jnp.sqrt(self.nu / half_square)
 
@@ -203,12 +204,13 @@ class Matern(AbstractRadialKernel):
 # Let ψ_p(t) be the Matérn function of order p + 1/2 at r = √t. The identity
 # d/dr [r^ν K_ν(r)] = −r^ν K_{ν−1}(r) (DLMF 10.29.4) gives
 #     ψ_p′(t) = −ψ_{p−1}(t) / (4p − 2).
-# So a custom_jvp that calls itself is exact to every order and never divides by the distance. Only
-# ψ_0 = e^(−r) has a derivative that grows like 1/r. This derivative multiplies components of x − z,
-# which vanish faster, so the value 0 at r = 0 gives the limit of the product.
+# A custom_jvp that calls itself is therefore exact to every order and never divides by the
+# distance. Only ψ_0 = e^(−r) has a derivative that grows like 1/r. It multiplies components of
+# x − z, which vanish faster, so we may set it to 0 at r = 0.
 @functools.partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _matern(p: int, t: Float[Array, ""]) -> Float[Array, ""]:
-    far = -1.2 * math.log(float(jnp.finfo(t.dtype).tiny))  # e^(−r) is zero, the polynomial finite
+    # Beyond `far` e^(−r) underflows to zero; at `far` the polynomial is still finite.
+    far = -1.2 * math.log(float(jnp.finfo(t.dtype).tiny))
     r = jnp.sqrt(jnp.clip(t, 0.0, far**2))
     polynomial = jnp.zeros_like(t)
     # p!/(2p)! Σᵢ (p + i)!/(i! (p − i)!) (2r)^(p − i), Rasmussen & Williams (2006), eq. 4.16, where
@@ -227,7 +229,7 @@ def _matern_jvp(p, primals, tangents):
 
 
 def _rough_slope(t: Float[Array, ""]) -> Float[Array, ""]:
-    """d/dt e^(−√t) = −e^(−√t)/(2√t), and 0 in place of −∞ at t = 0."""
+    """The derivative d/dt e^(−√t) = −e^(−√t)/(2√t), with 0 in place of −∞ at t = 0."""
     apart = t > 0
     r = jnp.sqrt(jnp.where(apart, t, jnp.ones_like(t)))
     return jnp.where(apart, -jnp.exp(-r) / (2 * r), jnp.zeros_like(t))
@@ -236,7 +238,7 @@ def _rough_slope(t: Float[Array, ""]) -> Float[Array, ""]:
 class RationalQuadratic(AbstractRadialKernel):
     """The rational quadratic kernel, k(x, z) = (1 + ‖(x − z)/ℓ‖²/(2α))^(−α).
 
-    A mixture of Gaussians of many lengthscales; α → ∞ gives the Gaussian.
+    This is a mixture of Gaussian kernels of many lengthscales. For α → ∞ it is the Gaussian.
 
     Args:
         alpha: α > 0, dimensionless.
@@ -250,7 +252,7 @@ class RationalQuadratic(AbstractRadialKernel):
 
     log_alpha: Float[Array, ""]
     log_lengthscale: Float[Array, "..."]
-    cuts_rounding: ClassVar[bool] = True  # or a small α makes it log of a negative
+    cuts_rounding: ClassVar[bool] = True  # for small α a negative s gives log of a negative
 
     def __init__(self, alpha: ArrayLike = 1.0, lengthscale: ArrayLike = 1.0):
         self.log_alpha = jnp.log(require.positive_scalar(alpha, "alpha"))
@@ -265,10 +267,9 @@ class RationalQuadratic(AbstractRadialKernel):
         return jnp.exp(-alpha * jnp.log1p(s / (2 * alpha)))
 
     def widths(self, key: Key[Array, ""], count: int, dtype: Any) -> Float[Array, "count 1"]:
-        """√(g/α) with g ~ Gamma(α): φ(s) is the mean of exp(−(g/α) s/2)."""
+        """√w = √(g/α) with g ~ Gamma(α): φ(s) is the mean of exp(−(g/α) s/2)."""
         alpha = self.alpha.astype(dtype)
-        # The logarithm is drawn: for small α the sample itself underflows, and √ has no derivative
-        # at 0.
+        # We draw log g: for small α the sample g underflows to 0, where √ has no derivative.
         log_g = jax.random.loggamma(key, alpha, (count, 1), dtype)
         return jnp.exp((log_g - jnp.log(alpha)) / 2)
 
@@ -276,16 +277,17 @@ class RationalQuadratic(AbstractRadialKernel):
 class Polynomial(AbstractScalarKernel):
     """The polynomial kernel, k(x, z) = (x·z + c)^d.
 
-    The potentials are the polynomials of degree ≤ d, so a Hamiltonian of degree d is learned
-    exactly. The kernel is not shift-invariant: choose coordinates with a meaningful origin.
+    The potentials are the polynomials of degree ≤ d, so the kernel can represent a Hamiltonian of
+    degree d exactly. The kernel is not shift-invariant: choose coordinates with a meaningful
+    origin.
 
     Args:
         degree: d ≥ 1, an integer; fixed, not trained.
         offset: c > 0, in squared units of the states.
 
     Raises:
-        ValueError: `degree` or `offset` is not positive, or `offset` not finite. TypeError:
-            `degree` is no integer.
+        ValueError: `degree` or `offset` is not positive, or `offset` not finite.
+        TypeError: `degree` is no integer.
 
     Source: Rasmussen & Williams (2006), section 4.2.2.
     """
@@ -320,12 +322,12 @@ class Polynomial(AbstractScalarKernel):
 class Periodic(AbstractScalarKernel):
     """The periodic kernel, k(x, z) = exp(−2 Σₐ sin²(π(xₐ − zₐ)/Tₐ)/ℓₐ²).
 
-    This is the Gaussian kernel on the circle: sin² of half an angle is a quarter of the squared
-    chord between (cos, sin) pairs, so the sum is a dot product of features.
+    This is the Gaussian kernel of the points (cos, sin) on circles: sin² of half an angle is a
+    quarter of the squared chord.
 
     Args:
-        period: T > 0 in the units of the states; a number, or an array (n,). `tune` trains T like
-            every hyperparameter. If T is known, such as 2π, pass `tune(..., frozen="period")`.
+        period: T > 0 in the units of the states; a number, or an array (n,). `tune` trains T too.
+            If T is known, such as 2π, pass `tune(..., frozen="period")`.
         lengthscale: ℓ > 0, dimensionless; a number, or an array (n,).
 
     Raises:
@@ -369,7 +371,8 @@ class Periodic(AbstractScalarKernel):
 
     def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
         if name == "log_lengthscale":
-            # On a circle of radius 1. Below 1/64 random features need too long a Fourier series.
+            # Lengths on a circle of radius 1. Below 1/64 the Fourier series of `spectra` is too
+            # long.
             return np.log(max(0.6 / len(X), 1 / 64)), np.log(60.0)
         return bounds_of_length(self.log_period, X, 2.0, 10.0)
 
@@ -377,9 +380,9 @@ class Periodic(AbstractScalarKernel):
         """Harmonics 2πj/T with the probabilities of the Fourier series of the kernel.
 
         exp((cos θ − 1)/ℓ²) = Σ_j p_j cos jθ with p_j = exp(−1/ℓ²) I_j(1/ℓ²). We compute the p_j by
-        a discrete Fourier transform of M = 1024 samples, whose aliasing is below rounding for
-        ℓ ≥ 1/64. An integer j has no derivative in ℓ; the weights p_j(ℓ)/p_j have the value 1 and
-        the derivative of the measure.
+        a discrete Fourier transform of M = 1024 samples; for ℓ ≥ 1/64 its aliasing is below
+        rounding. The integers j have no derivative in ℓ. The weights p_j(ℓ)/p_j therefore have the
+        value 1 and the derivative of the measure.
         """
         lengthscale, M = self.lengthscale.astype(dtype), 1024
         lengthscale = require.value(
@@ -394,8 +397,7 @@ class Periodic(AbstractScalarKernel):
         probability = jnp.fft.fftshift(jnp.fft.fft(samples).real, axes=1) / M  # j ≥ −M/2
         fixed = jax.lax.stop_gradient(probability)
         cumulative = jnp.cumsum(fixed, axis=1)
-        # The smallest sample is not zero: zero would draw a harmonic whose probability underflows,
-        # and lead to 0/0.
+        # A sample of zero would draw a harmonic whose probability underflows, and lead to 0/0.
         uniform = jax.random.uniform(key, (n, count), dtype, minval=jnp.finfo(dtype).tiny)
         index = jax.vmap(jnp.searchsorted)(cumulative, uniform * cumulative[:, -1:])  # (n, F)
         ratio = jnp.take_along_axis(probability, index, 1) / jnp.take_along_axis(fixed, index, 1)
@@ -405,7 +407,7 @@ class Periodic(AbstractScalarKernel):
 
 
 class Constant(AbstractScalarKernel):
-    """k(x, z) = 1: functions that are one number."""
+    """The constant kernel, k(x, z) = 1. Its functions are the constants."""
 
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, ""]:
         return jnp.ones((), one_point(x).dtype)
@@ -418,5 +420,5 @@ class Constant(AbstractScalarKernel):
         return (frozenset(),)
 
     def spectra(self, n: int, count: int, key: Key[Array, ""], dtype: Any) -> tuple[Spectrum, ...]:
-        """The one frequency 0, exactly."""
+        """The single frequency 0, which is exact."""
         return (Spectrum(jnp.zeros((1, n), dtype), jnp.ones(1, dtype), parity=1),)

@@ -1,11 +1,11 @@
 """`check_kernel`: whether a scalar kernel can be differentiated once in each argument.
 
-Structured kernels are made of blocks M(x, z) = ∂x ∂zᵀ k(x, z), and every point meets itself on the
-diagonal of the Gram. A kernel written with the distance ‖x − z‖ has a removable singularity there,
-which automatic differentiation does not remove: M(x, x) comes out as NaN, as zero or of rank one,
-and no error is raised. So we compare M(x, x) with M(x, x + h) at steps h that halve from the spread
-of the data down to rounding. For a sound kernel M(x, x) agrees with M(x, x + h) at one step or
-more, among the steps at which k changes by more than rounding and M by little.
+Structured kernels consist of blocks M(x, z) = ∂x ∂zᵀ k(x, z), and the diagonal of the Gram has the
+blocks M(x, x). A kernel written with the distance ‖x − z‖ has a removable singularity at x = z.
+Automatic differentiation does not remove it: M(x, x) is NaN, zero or of rank one, without an error.
+We therefore compare M(x, x) with M(x, x + h) at steps h that halve from the spread of the data down
+to rounding. We use the steps at which k changes by more than rounding and M by little. A kernel is
+sound if M(x, x) agrees with M(x, x + h) at one of these steps or more.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _CURE = (
 
 
 class _Pairs(NamedTuple):
-    """k, ∂x k and M on a batch of pairs, in float64; derivatives in units of the points."""
+    """The values k, ∂x k and M of a batch of pairs, in float64, per unit of the points."""
 
     k: np.ndarray  # (...)
     gradient: np.ndarray  # (..., n)
@@ -39,7 +39,7 @@ class _Pairs(NamedTuple):
 @one_blas_thread
 @full_precision
 def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
-    """Raise if the scalar kernel `k` is unfit for the structured kernels; return None if sound.
+    """Raise an error if the scalar kernel `k` is unfit for structured kernels; else return None.
 
     The faults, in the order of the checks:
 
@@ -47,19 +47,20 @@ def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     2. The block M(x, x) = ∂x ∂zᵀ k is not the limit of M(x, x + h), or has no limit because the
        kernel is too rough.
     3. A derivative is not finite.
-    4. k(x, z) ≠ k(z, x).
-    5. The Gram of k or of M has a negative eigenvalue.
+    4. All blocks M are zero.
+    5. k(x, z) ≠ k(z, x).
+    6. The Gram of k or of M has a negative eigenvalue.
 
     A kernel that passes is sound at these points.
 
     Args:
-        k: a kernel of this library or any callable (x, z) → scalar on two points of shape (n,). For
-            a tinygp kernel the method `evaluate` is checked.
+        k: a kernel of this library or any callable (x, z) → scalar on two points of shape (n,). Of
+            a tinygp kernel we check the method `evaluate`.
         points: representative states, shape (N, n). Their spread sets the largest h. Their dtype
             sets the tolerances: an eigenvalue counts as negative below −ε^(2/3) of the trace.
 
     Raises:
-        ValueError: the first fault found, with its cause, its numbers and its cure.
+        ValueError: the first fault, with its cause, its numbers and its cure.
         TypeError: `points` are not real numbers, or `k` is not callable or is matrix-valued.
     """
     if not require.is_concrete(k, points):
@@ -76,7 +77,7 @@ def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
     unit = np.where(spread > 0, spread, np.where(size > 0, size, 1.0))
     here, Z = X[subset], _neighbours(X[subset[near]], unit, size, eps)
     moved = here * (1 + 4 * eps * np.cos(np.pi * np.indices(here.shape).sum(axis=0)))
-    moved = moved.astype(X.dtype)  # some units in the last place show how far k and M round
+    moved = moved.astype(X.dtype)  # points moved by a few units in the last place show the rounding
     pairs = (here[:, None], here[None]), (moved[:, None], moved[None])
     gram, rounded, between, beyond = _derivatives_of_pairs(
         k, unit, *pairs, (here[near][:, None, None], Z), (Z, Z)
@@ -103,7 +104,7 @@ def check_kernel(k: Callable[..., Any], points: Num[ArrayLike, "N n"]) -> None:
 
 
 def _check_signature(k: Callable, X: Array) -> float:
-    """The machine epsilon of `k` at `X`; ValueError unless k is one differentiable real number."""
+    """The machine epsilon of k and X; a ValueError unless k is one differentiable real number."""
     x = X[0]
     try:
         out = jax.eval_shape(k, x, x)
@@ -136,7 +137,7 @@ def _even_indices(size: int, count: int) -> np.ndarray:
 
 
 def _neighbours(X: np.ndarray, unit: np.ndarray, size: np.ndarray, eps: float) -> np.ndarray:
-    """X + h in two oblique directions, for h halved from the spread to rounding: (P, 2, J, n)."""
+    """The points X + h for two oblique directions and J halvings of h, shape (P, 2, J, n)."""
     halvings = np.arange(max(3.0, -np.log2(2 * eps * max(1.0, (size / unit).max()))))
     oblique = 1 + 0.3 * np.cos(np.arange(1, len(unit) + 1))
     directions = unit * np.stack([oblique, oblique * (-1.0) ** np.arange(1, len(unit) + 1)])
@@ -145,13 +146,13 @@ def _neighbours(X: np.ndarray, unit: np.ndarray, size: np.ndarray, eps: float) -
 
 
 def _derivatives_of_pairs(k: Callable, unit: np.ndarray, *pairs) -> list[_Pairs]:
-    """K and its derivatives on batches of pairs that broadcast to (..., n), in one compilation."""
+    """The values and derivatives of k on batches of pairs (..., n), in one compilation."""
     n = len(unit)
     wide = [np.broadcast_arrays(*pair) for pair in pairs]
     X, Z = (np.concatenate([pair[side].reshape(-1, n) for pair in wide]) for side in (0, 1))
-    # Small batches save memory and avoid github.com/jax-ml/jax/issues/39103. The program is not
-    # optimised: where x/ℓ − z/ℓ becomes a fused multiply-add, its rounding error takes the place of
-    # the distance.
+    # Small batches save memory and avoid github.com/jax-ml/jax/issues/39103. We switch XLA's
+    # optimisation off: it may turn x/ℓ − z/ℓ into a fused multiply-add, which returns a rounding
+    # error instead of the distance.
     values = jax.jit(
         lambda X, Z: jax.lax.map(
             lambda p: (k(*p), jax.grad(k)(*p), _mixed_derivative(k)(*p)),
@@ -176,7 +177,7 @@ def _derivatives_of_pairs(k: Callable, unit: np.ndarray, *pairs) -> list[_Pairs]
 
 
 def _size(blocks: np.ndarray) -> np.ndarray:
-    """The largest entry of each block; NaN and inf count as no entry."""
+    """The largest absolute entry of each block, without NaN and inf."""
     return np.abs(np.where(np.isfinite(blocks), blocks, 0.0)).max(axis=(-2, -1))
 
 
@@ -191,14 +192,14 @@ def _check_limits(diagonal: _Pairs, between: _Pairs, beyond: _Pairs, index, unit
     moved = np.abs(moved) / np.where(total > 0, total, 1.0)  # (P, 2, J)
     finite: Any = np.isfinite(between.block).all(axis=(-2, -1))
     size = _size(between.block)
-    # `near`: neighbours at which k changes by more than rounding and M by little. The M of
+    # `near` are the neighbours at which k changes by more than rounding and M by little. The M of
     # Matérn-3/2 changes by 3 √moved.
     near = finite & (moved > 8 * eps) & (moved <= eps**0.5 / 8)
     larger = np.maximum.accumulate(np.where(finite & (moved <= 0.01), size, 0.0), axis=2)
     scale = np.maximum(np.maximum(size, larger), _size(diagonal.block)[:, None, None])
     scale = np.maximum(scale, 0.1 * scale.max(axis=(0, 1)))  # blocks may vanish at some points
-    # The limit may lie beyond the smallest step. Matérn-3/2 tends to it linearly, so two successive
-    # steps are extrapolated too.
+    # M may not reach its limit at the smallest step. For Matérn-3/2 it converges linearly, so we
+    # also extrapolate from two successive steps.
     before = np.concatenate([between.block[:, :, :1], between.block[:, :, :-1]], axis=2)
     here: Any = diagonal.block[:, None, None]
     misses = [_size(tends - here) for tends in (between.block, 2 * between.block - before)]
@@ -208,10 +209,10 @@ def _check_limits(diagonal: _Pairs, between: _Pairs, beyond: _Pairs, index, unit
     grows: Any = (size[..., 1:] > 1.2 * size[..., :-1]) & finite[..., 1:] & finite[..., :-1]
     grows &= (moved <= 0.1 * np.where(finite, moved, 0).max(axis=2, keepdims=True))[..., :-1]
     for p, i in enumerate(index):
-        # Only the blocks of a kernel of the distance keep growing over 10 halvings of h, a factor
-        # of 1000. Blocks of a sound kernel with a second, smaller scale grow over two or three.
-        # Blocks of a sound kernel at near neighbours differ from M(x, x) by 3 √(√ε/8) = .02 in
-        # float32; an M(x, x) that is twice too large differs from its neighbours by .5.
+        # Only blocks of a kernel that is too rough keep growing over 10 halvings of h, a factor of
+        # 1000. Blocks of a sound kernel with a second, smaller scale grow over two or three. In
+        # float32, blocks of a sound kernel at near neighbours differ from M(x, x) by
+        # 3 √(√ε/8) = .02. An M(x, x) that is twice too large differs from its neighbours by .5.
         steady = max(_longest(row) for row in grows[p]) >= 10
         rows = zip(near[p], differs[p], strict=True)
         wrong = any(row.any() and off[row].min() > 0.3 for row, off in rows)
@@ -225,7 +226,7 @@ def _check_limits(diagonal: _Pairs, between: _Pairs, beyond: _Pairs, index, unit
 
 
 def _longest(row: np.ndarray) -> int:
-    """The length of the longest run of True."""
+    """The length of the longest run of True in the row."""
     breaks = np.flatnonzero(~np.concatenate([[False], row, [False]]))
     return int(np.diff(breaks).max()) - 1
 
@@ -278,7 +279,7 @@ def _refuse_infinite(values: np.ndarray, subset: np.ndarray, what: str) -> None:
 
 
 def _check_gram(name: str, G: np.ndarray, noisy: np.ndarray, eps: float) -> None:
-    """ValueError where G is not symmetric, or has an eigenvalue below what rounding allows."""
+    """Raise a ValueError if G is not symmetric, or has a negative eigenvalue beyond rounding."""
     scale = np.abs(G).max()
     if not scale:
         return

@@ -1,4 +1,4 @@
-"""Functions as PyTrees, so that JAX sees the arrays that they hold."""
+"""Functions as PyTrees whose leaves are the arrays that the functions contain."""
 
 import functools
 import types
@@ -15,7 +15,7 @@ from hamkernel._show import call, text
 
 
 def as_pytree(fn: Callable[..., Any]) -> Callable[..., Any]:
-    """`fn` as a PyTree without functions as leaves, which `jax.jit` and `jax.grad` refuse."""
+    """`fn` as a PyTree of which no leaf is a function; `jax.jit` and `jax.grad` refuse these."""
     if not jax.tree_util.all_leaves([fn]):
         return jax.tree.map(_no_leaf, fn)
     if isinstance(fn, functools.partial):
@@ -26,13 +26,13 @@ def as_pytree(fn: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _no_leaf(leaf: Any) -> Any:
-    """The leaf, or a PyTree without leaves in place of a function such as an activation."""
+    """The leaf; a function, such as an activation, becomes a PyTree without leaves."""
     is_function = callable(leaf) and not eqx.is_array_like(leaf)
     return jax.tree_util.Partial(leaf) if is_function else leaf
 
 
 class Bound(eqx.Module):
-    """A `functools.partial` with its arrays as leaves and the rest static."""
+    """A `functools.partial` whose arrays are leaves; its other arguments are static."""
 
     func: Callable[..., Any]
     arrays: tuple[Array | None, ...]
@@ -70,12 +70,13 @@ class Bound(eqx.Module):
 
 
 class Closure(eqx.Module):
-    """A function with the traced values of its closure as leaves.
+    """A function whose leaves are the traced values in its closure.
 
-    A custom derivative rule sees its arguments only, so the traced values must be leaves of one.
+    A custom derivative rule differentiates with respect to its arguments only, so each traced value
+    must be a leaf of an argument.
     """
 
-    func: Any = eqx.field(static=True)  # with nothing in the cells of `traced`
+    func: Any = eqx.field(static=True)  # with empty cells in place of `traced`
     traced: dict[int, Any]
 
     def __init__(self, fn: types.FunctionType):
@@ -102,7 +103,7 @@ class Closure(eqx.Module):
 def _holds_traced(value: Any, outer: tuple[Any, ...] = ()) -> bool:
     """Whether a PyTree has traced leaves, or a function closes over such a PyTree or function.
 
-    A function that closes over itself does not count, since its cells cannot be copied.
+    False for a function that closes over itself, since we cannot copy its cells.
     """
     if isinstance(value, functools.partial):
         return any(

@@ -1,17 +1,18 @@
 """Laws that many parts share: u(x) = Σ_p c_p w(φ_p(x)) with one unknown function w.
 
-The value of u at x is the sum of values of w at the points φ_p(x), and a derivative of u along v
-the sum of derivatives of w along Dφ_p(x) v. If w ~ GP(0, k), then u has the kernel
+The value of u at x is a weighted sum of values of w at the points φ_p(x). The derivative of u along
+v is the same sum of derivatives of w along Dφ_p(x) v. If w ~ GP(0, k), then u has the kernel
 
     k_S(x, z) = Σ_pq c_p c_q k(φ_p(x), φ_q(z)).
 
-In the span of centres c_1 … c_m in the space of the parts, w(r) = k(r, C) L⁻ᵀ a with L Lᵀ = k(C, C)
-and a ~ N(0, I), so that u(x) = Φ(x)·a with
+Let C be m centres in the space of the parts. In their span w(r) = k(r, C) L⁻ᵀ a with
+L Lᵀ = k(C, C) and a ~ N(0, I). Then u(x) = Φ(x)·a with
 
-    Φ(x) = L⁻¹ Σ_p c_p k(C, φ_p(x)),   ∂Φ_j/∂x = Σ_p c_p Dφ_p(x)ᵀ ∇k(φ_p(x), ·),
+    Φ(x) = L⁻¹ Σ_p c_p k(C, φ_p(x)),   ∂Φ/∂x = L⁻¹ Σ_p c_p ∂₂k(C, φ_p(x)) Dφ_p(x)
 
-and a system of any size has m unknowns. If the parts obey L laws with one kernel, each law has m
-features of its own, those of the sum over its parts.
+for constant weights c_p, with ∂₂ the derivative in the second argument. A system of any size thus
+has m unknowns. If the parts obey several laws with one kernel, each law has m features of its own,
+summed over its parts.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,9 +38,9 @@ from hamkernel._kernels.functions import as_pytree
 from hamkernel._kernels.symmetry import LinearMap, close_group
 from hamkernel._show import call, describe, text
 
-_AT_ONCE = 2**16  # parts times centres that are computed at once: arrays of 512 KB
-_CENTRES = 64  # a law of one variable: lengthscales from a thirtieth of the range on
-_FEWEST_CENTRES, _FEATURES = 20, 320  # of each of many laws, and of all of them together
+_AT_ONCE = 2**16  # parts times centres of one batch: arrays of 512 KB
+_CENTRES = 64  # centres of a law; with one variable they resolve a thirtieth of the range
+_FEWEST_CENTRES, _FEATURES = 20, 320  # if there are many laws: of each law, and of all laws
 
 
 class Shared(AbstractScalarKernel):
@@ -49,12 +50,12 @@ class Shared(AbstractScalarKernel):
         field = hk.fit(K, X, Y, 1e-6, mean=hk.kinetic(mass=1.0))
         V = jax.vmap(field.law)(r)  # the pair potential, up to a constant
 
-    A constant in w moves nothing, so `field.law` is known up to a constant. With several laws, a
-    linear term may move from one law to another (see `field.undetermined`). Outside the values of φ
-    in the data the law is unknown, and `posterior.law_deviation` is large.
+    A constant in w changes no velocity, so `field.law` is known up to a constant. If there are
+    several laws, a linear term may move from one law to another (see `field.undetermined`). Outside
+    the values of φ in the data the law is unknown, and `posterior.law_deviation` is large.
 
-    Parts may obey several laws with one kernel. Which particles are joined by springs, for example,
-    shows in the laws of the ten pairs of five particles, `field.law(r, r0, which)`:
+    Parts may obey several laws with one kernel. With one law for each of the ten pairs of five
+    particles, for example, `field.law(r, r0, which)` shows which particles springs connect:
 
         K = hk.Symplectic(hk.Shared(k, hk.pairs(particles=5, dim=2), laws=range(10)))
 
@@ -62,19 +63,19 @@ class Shared(AbstractScalarKernel):
         kernel: the kernel k of w, on points of the parts, (d,).
         parts: x (n,) -> points (P, d), or (points, weights c) with weights (P,); `hk.pairs`,
             `hk.neighbours`, `hk.sites`, or a function of your own.
-        centres: points of the parts, (m, d), whose k(·, c) span w. If None, a fit takes up to 64
-            points spread over the parts of the data, and fewer if there are many laws.
-        laws: the law of each part, counted from 0, (P,); one law of all parts if None.
+        centres: points c of the parts, shape (m, d), such that the k(·, c) span w. If None, a fit
+            takes up to 64 points spread over the parts of the data, and fewer for many laws.
+        laws: the number of the law of each part, from 0, shape (P,); if None, one law for all.
 
     Raises:
-        TypeError: `kernel` is no scalar kernel or `parts` no function. ValueError: `laws` are not
-            the numbers 0, 1, …; when called, `parts` returns something else, or another number of
-            parts than `laws` are of.
+        TypeError: `kernel` is no scalar kernel or `parts` no function.
+        ValueError: `laws` are not the numbers 0, 1, … without gaps. When called, `parts` returns
+            other shapes, or `laws` has another length.
     """
 
     kernel: AbstractScalarKernel
     parts: Callable[..., Any]
-    # Python numbers, since arrays of a kernel are trained.
+    # Python numbers, since `tune` trains the arrays of a kernel.
     centres: tuple[tuple[float, ...], ...] | None = eqx.field(static=True)
     laws: tuple[int, ...] | None = eqx.field(static=True)
 
@@ -114,7 +115,7 @@ class Shared(AbstractScalarKernel):
 
     @property
     def law_count(self) -> int:
-        """L, the number of laws."""
+        """The number of laws."""
         return 1 if self.laws is None else max(self.laws) + 1
 
     @property
@@ -146,10 +147,10 @@ class Shared(AbstractScalarKernel):
 
     def part_laws(self, parts: int) -> Int[np.ndarray, " P"]:
         """The law of each part."""
-        return np.resize(np.asarray(self.laws or (0,)), parts)  # again for each image of a group
+        return np.resize(np.asarray(self.laws or (0,)), parts)  # repeated for each image of a group
 
     def features(self, x: Float[Array, " n"]) -> Float[Array, " r"]:
-        """Φ(x), with k_S(x, z) = Φ(x)·Φ(z)."""
+        """The features Φ(x), with k_S(x, z) = Φ(x)·Φ(z)."""
         points, weights = self.parts_at(x)
         laws = self.part_laws(len(points))
 
@@ -160,7 +161,7 @@ class Shared(AbstractScalarKernel):
         return self._whiten(self._over_centres(feature, len(points), x.dtype)).T.ravel()
 
     def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
-        """The gradients of the features, by one reverse derivative of the parts for each."""
+        """The gradients of the features, with one reverse derivative of the parts for each."""
         (points, weights), back = jax.vjp(self.parts_at, x)
         laws = self.part_laws(len(points))
         of_law = jnp.asarray(laws[None] == np.arange(self.law_count)[:, None], x.dtype)
@@ -175,7 +176,7 @@ class Shared(AbstractScalarKernel):
         return jnp.moveaxis(whitened, 2, 0).swapaxes(1, 2).reshape(len(x), -1)
 
     def slope(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
-        """`gradients(x) @ w`, by one reverse derivative of the parts."""
+        """The product `gradients(x) @ w`, with one reverse derivative of the parts."""
         (points, weights), back = jax.vjp(self.parts_at, x)
         C, laws = self._points(x.dtype), self.part_laws(len(points))
         w = w.reshape(self.law_count, -1).T
@@ -192,13 +193,13 @@ class Shared(AbstractScalarKernel):
         return back(Parts(weights[:, None] * slope, value))[0]
 
     def _over_centres(self, fn: Callable[..., Array], parts: int, dtype: Any) -> Array:
-        """`fn` at each centre, so many at once that memory does not grow with parts × centres."""
-        # A checkpoint keeps the memory of the reverse derivative as small.
+        """The values of `fn` at the centres, in batches whose memory is bounded."""
+        # The checkpoint bounds the memory of the reverse derivative too.
         at_once = int(np.clip(_AT_ONCE // parts, 1, len(self.centres or ())))
         return jax.lax.map(jax.checkpoint(fn), self._points(dtype), batch_size=at_once)
 
     def point(self, r: ArrayLike) -> Float[Array, " d"]:
-        """The point of the parts for an argument r of the law, such as log r for a distance r."""
+        """The argument of the kernel for an argument r of the law, such as log r for a distance."""
         point = jnp.atleast_1d(require.floating(r, "r"))
         point = getattr(self.parts, "coordinate", lambda r: r)(point)
         d = len((self.centres or ((0.0,),))[0])
@@ -208,7 +209,7 @@ class Shared(AbstractScalarKernel):
         return point
 
     def law(self, point: Float[Array, " d"]) -> Float[Array, " m"]:
-        """L⁻¹ k(C, point), the features of a law w at one point of the parts."""
+        """The features L⁻¹ k(C, point) of a law w at one point of the parts."""
         return self._whiten(self._columns(point[None])[0])
 
     def missing(self, point: Float[Array, " d"], origin: Float[Array, " d"]) -> Float[Array, ""]:
@@ -249,7 +250,11 @@ class Shared(AbstractScalarKernel):
         return self.spread(X, 16 * _CENTRES)
 
     def spread(self, X: Float[np.ndarray, "N n"], limit: int) -> Float[np.ndarray, "m d"]:
-        """Up to `limit` points of the parts of X, each the farthest from all before it."""
+        """Up to `limit` points of the parts of X, spread over their range.
+
+        On a line we take the points nearest to an even grid. Otherwise each point is the farthest
+        from all points before it.
+        """
         rows = jnp.asarray(X[np.linspace(0, len(X) - 1, min(len(X), 256)).astype(int)])
         parts = np.asarray(jax.lax.map(lambda x: self.parts_at(x).points, rows))
         points = parts.reshape(-1, parts.shape[-1])
@@ -261,7 +266,7 @@ class Shared(AbstractScalarKernel):
             )
         unit = points / np.where(high > low, high - low, 1.0)
         if points.shape[1] == 1 and len(points) > limit:
-            # On a line: the points nearest to an even grid over the range.
+            # The points nearest to an even grid over the range.
             order = np.argsort(points[:, 0])
             wanted = np.linspace(low[0], high[0], limit)
             at = np.searchsorted(points[order, 0], wanted).clip(0, len(points) - 1)
@@ -269,13 +274,13 @@ class Shared(AbstractScalarKernel):
         return points[far_apart(unit, limit)]
 
     def with_centres(self, X: Float[np.ndarray, "N n"]) -> "Shared":
-        """This kernel with centres over the parts of the states X."""
+        """The same kernel with centres among the parts of the states X."""
         count = int(np.clip(_FEATURES // self.law_count, _FEWEST_CENTRES, _CENTRES))
         return Shared(self.kernel, self.parts, self.spread(X, count), self.laws)
 
 
 def _law_numbers(laws: Any) -> tuple[int, ...]:
-    """The laws of parts, checked: all numbers from 0 on."""
+    """The checked numbers of the laws of the parts, 0, 1, … without gaps."""
     numbers = np.asarray(list(laws))
     is_whole = numbers.ndim == 1 and len(numbers) > 0 and numbers.dtype.kind in "iu"
     if not is_whole or set(numbers.tolist()) != set(range(int(numbers.max()) + 1)):
@@ -286,10 +291,10 @@ def _law_numbers(laws: Any) -> tuple[int, ...]:
 
 
 def root_at(k: AbstractScalarKernel, C: Float[Array, "m d"]) -> Float[Array, "m m"]:
-    """L with L Lᵀ = k(C, C)."""
+    """The Cholesky factor L of k(C, C)."""
     G = jax.vmap(jax.vmap(k, (None, 0)), (0, None))(C, C)
-    # A hundred times the rounding error keeps the Cholesky factor finite if centres nearly
-    # coincide. For 64 centres it is 1e-12 of the mean of the diagonal.
+    # We add a hundred times the rounding error to the diagonal, which keeps the factor finite if
+    # centres nearly coincide. For 64 centres that is 1e-12 of the mean of the diagonal.
     rounding = 100 * jnp.finfo(G.dtype).eps * len(G) * jnp.diagonal(G).mean()
     return jnp.linalg.cholesky(G + rounding * jnp.eye(len(G), dtype=G.dtype))
 
@@ -315,7 +320,7 @@ class Parts(NamedTuple):
 class GroupParts(eqx.Module):
     """The parts of all images gx of a state, with the weights χ(g) c/|G|.
 
-    The kernel of Σ_g χ(g) u(gx)/|G| is that of u with these parts.
+    `Shared` with these parts is the kernel of the mean Σ_g χ(g) u(gx)/|G|.
     """
 
     parts: Callable[..., Any]
@@ -332,23 +337,23 @@ class GroupParts(eqx.Module):
         return jnp.concatenate(points), jnp.concatenate(weights)
 
     def copies(self, n: int) -> int:
-        """|G|, the number of images of a state of n coordinates."""
+        """The number |G| of images of a state of n coordinates."""
         return len(close_group(self.maps, self.characters, n))
 
     def coordinate(self, r: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The coordinate of the law at r, as without the group."""
+        """The coordinate of the law at r, the same as without the group."""
         return getattr(self.parts, "coordinate", lambda r: r)(r)
 
 
 class InnerProduct(AbstractScalarKernel):
-    """k(d, e) = d·e, of features."""
+    """The kernel k(d, e) = d·e of features d and e."""
 
     def __call__(self, x: Point, z: Point) -> Float[Array, ""]:
         return x @ z
 
 
 class _Pairs(eqx.Module):
-    """Distances of pairs of particles; made by `pairs`."""
+    """The distances of pairs of particles; made by `pairs`."""
 
     first: tuple[int, ...] = eqx.field(static=True)
     second: tuple[int, ...] = eqx.field(static=True)
@@ -383,7 +388,7 @@ class _Pairs(eqx.Module):
         return {"distance": lambda r: r, "log": jnp.log, "inverse": lambda r: 1 / r}[self.of](r)
 
     def distance(self, coordinate: Float[Array, "..."]) -> Float[Array, "..."]:
-        """The distance of a coordinate."""
+        """The distance r that has this coordinate."""
         return jnp.exp(coordinate) if self.of == "log" else self.coordinate(coordinate)
 
 
@@ -402,15 +407,16 @@ def pairs(
     Args:
         particles: the number of particles.
         dim: the dimension of space.
-        box: the side of a periodic box, with the nearest image; None without one.
-        of: the coordinate of the law: "distance" r; "log" or "inverse" for laws that vary by
+        box: the side of a periodic box, in which a distance is to the nearest image; None without.
+        of: the coordinate of the law: "distance" r; or "log" or "inverse" for laws that vary by
             many orders of magnitude, such as Lennard-Jones or gravity.
-        among: particles between which the law acts; or two groups, and the law acts between a
-            particle of one and a particle of the other; all if None. For species, add one `Shared`
-            for each pair of species.
+        among: the particles between which the law acts, all if None. If two groups, the law acts
+            between a particle of one and a particle of the other. For species, add one `Shared` for
+            each pair of species.
 
     Raises:
-        ValueError: a number is not positive, `of` is unknown, or a particle is not there.
+        ValueError: a number is not positive, `of` is unknown, or `among` has no pair or a particle
+            that does not exist.
     """
     particles, dim = require.count(particles, "particles"), require.count(dim, "dim")
     if of not in ("distance", "log", "inverse"):
@@ -461,7 +467,7 @@ def neighbours(sites: int, periodic: bool = False) -> Callable[..., Array]:
 
     Args:
         sites: the number of sites; states are (q, p), or q alone.
-        periodic: whether the first follows the last.
+        periodic: whether the first site follows the last, which adds the difference q₁ − q_last.
 
     Raises:
         ValueError: there are fewer than two sites.
@@ -472,7 +478,7 @@ def neighbours(sites: int, periodic: bool = False) -> Callable[..., Array]:
 
 
 def sites(count: int) -> Callable[..., Array]:
-    """The positions qᵢ of sites, x -> (P, 1), for a law of each site, for `hk.Shared`.
+    """The positions qᵢ of sites, x -> (P, 1), for a law that acts on each site, for `hk.Shared`.
 
     Args:
         count: the number of sites; states are (q, p), or q alone.

@@ -1,7 +1,7 @@
 """Finite groups of linear maps of the states, and scalar kernels averaged over them.
 
-A map is a function (n,) -> (n,) or an (n, n) array, kept as nested tuples so that kernels stay
-hashable. The group is closed once the dimension is known.
+A map is a function (n,) -> (n,) or an (n, n) array. We keep arrays as nested tuples, so that
+kernels stay hashable, and generate the group once the dimension is known.
 """
 
 import functools
@@ -27,10 +27,12 @@ from hamkernel._kernels.base import (
 from hamkernel._kernels.transforms import Warp
 from hamkernel._show import call, text
 
-# A function, or the rows of a matrix.
+# A function (n,) -> (n,), or the rows of a matrix.
 LinearMap = Callable[[Array], Array] | tuple[tuple[float, ...], ...]
 
-_SAME_MAP = 1e-8  # far above the rounding of 64 products, far below the steps of a group of 64
+# Two maps are equal to this tolerance, far above the rounding of 64 products and far below the
+# distance of two elements of a group of 64.
+_SAME_MAP = 1e-8
 
 
 def identity(x: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -50,13 +52,13 @@ def time_reversal(x: Float[Array, " n"]) -> Float[Array, " n"]:
 
 
 class Element(NamedTuple):
-    """One map of a group, and the sign χ by which functions change under it."""
+    """A map S of a group and its sign χ: functions obey u(Sx) = χ u(x)."""
 
     matrix: Float[np.ndarray, "n n"]
     character: float
 
     def __call__(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """S x, without a product where S only changes signs."""
+        """The image S x, without a matrix product if S only changes signs."""
         signs = np.diagonal(self.matrix)
         if np.array_equal(self.matrix, np.diag(signs)):
             if (signs == 1).all():
@@ -66,11 +68,11 @@ class Element(NamedTuple):
 
 
 def linear_maps(maps: Any) -> tuple[LinearMap, ...]:
-    """The generators of a group, a list of arrays and functions.
+    """The generators of a group, from an array, a function, or a list of these.
 
     Raises:
-        TypeError: `maps` is no list of maps. ValueError: a matrix is not square, finite and
-            invertible.
+        TypeError: `maps` is neither a map nor a list of maps.
+        ValueError: a matrix is not square and finite.
     """
     single = callable(maps) or getattr(maps, "ndim", None) == 2
     generators: Any = [maps] if single else maps
@@ -85,7 +87,7 @@ def linear_maps(maps: Any) -> tuple[LinearMap, ...]:
 
 def _matrix_rows(matrix: Any) -> tuple[tuple[float, ...], ...]:
     require.floating(matrix, "a map")
-    array = np.asarray(matrix, float)  # all digits, also where JAX would keep those of float32
+    array = np.asarray(matrix, float)  # all digits, even if JAX uses float32
     if array.ndim != 2 or array.shape[0] != array.shape[1] or not np.isfinite(array).all():
         raise ValueError(
             f"a map has shape {array.shape}; a finite matrix (n, n) or a linear function x -> S @ x"
@@ -111,7 +113,7 @@ def matrix_of(linear_map: LinearMap, n: int) -> Float[np.ndarray, "n n"]:
     with jax.ensure_compile_time_eval():
         basis = np.eye(n)
         columns = [np.asarray(linear_map(jnp.asarray(e)), float) for e in basis]
-        probe = np.cos(1.0 + np.arange(n))  # a state without symmetry
+        probe = np.cos(1.0 + np.arange(n))  # a generic state
         image = np.asarray(linear_map(jnp.asarray(probe)), float)
     if any(column.shape != (n,) for column in columns):
         raise ValueError(
@@ -131,8 +133,8 @@ def close_group(
     """The group that the maps generate on states of n coordinates, the identity first.
 
     Raises:
-        ValueError: a map is not invertible; there are more than 64 elements; or one of them comes
-            with both signs, so that zero is the only function with the symmetry.
+        ValueError: a map is not invertible, there are more than 64 elements, or an element has both
+            signs, so that zero is the only function with the symmetry.
     """
     generators = [
         Element(_clean(matrix_of(g, n)), sign) for g, sign in zip(maps, characters, strict=True)
@@ -155,35 +157,34 @@ def close_group(
                 )
             if not equal:
                 group.append(new)
-            if len(group) > 64:  # the largest point group of space, that of the cube, has 48
+            if len(group) > 64:  # the point group of the cube has 48
                 raise ValueError(
-                    "the maps generate more than 64 others, so they do not close to a finite "
-                    "group of use here. A rotation must be by 2π over a whole number, given with "
-                    "all digits; a shear or a stretch never closes, and a continuous symmetry "
-                    "cannot be averaged over so."
+                    "the maps generate more than 64 others, and this library averages over at most "
+                    "64. A rotation must be by 2π over a whole number, given with all digits. "
+                    "Shears, stretches and continuous symmetries generate infinite groups."
                 )
     return tuple(group)
 
 
 def _clean(matrix: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
-    """The matrix, in which entries within rounding of an integer are replaced by the integer."""
+    """The matrix, with entries within rounding of an integer replaced by this integer."""
     integers = np.round(matrix)
     return np.where(np.abs(matrix - integers) < 1e-14, integers, matrix) + 0.0
 
 
 def pairs(group: tuple[Element, ...], one_sided: bool) -> list[tuple[Element, Element, float]]:
-    """The g, h and χ(g)χ(h) of the terms χ(g) χ(h) k(gx, hz) of a mean over the group."""
+    """The triples (g, h, χ(g)χ(h)) of the terms χ(g) χ(h) k(gx, hz) of a mean over the group."""
     first = group[:1] if one_sided else group
     return [(g, h, g.character * h.character) for g, h in itertools.product(first, group)]
 
 
 def is_orthogonal(S: Float[np.ndarray, "n n"]) -> bool:
-    """Whether S keeps distances and dot products."""
+    """Whether S is orthogonal, so that it keeps distances and dot products."""
     return bool(np.abs(S @ S.T - np.eye(len(S))).max() < _SAME_MAP)
 
 
 def is_diagonal(S: Float[np.ndarray, "n n"]) -> bool:
-    """Whether S takes every coordinate to a multiple of itself."""
+    """Whether S is diagonal."""
     return bool(np.abs(S - np.diag(np.diagonal(S))).max() < _SAME_MAP)
 
 
@@ -199,16 +200,16 @@ class Symmetrised(AbstractScalarKernel):
     """The mean of k over a finite group of linear maps.
 
     k_G(x, z) is the mean over g and h of χ(g) χ(h) k(gx, hz), and its functions obey
-    u(gx) = χ(g) u(x). This mean over both arguments is symmetric and positive for EVERY k. Where
-    k(gx, gz) = k(x, z) one side is enough, k_G(x, z) = mean over g of χ(g) k(x, gz). For other k
-    the one-sided mean is not even symmetric.
+    u(gx) = χ(g) u(x). This mean over both arguments is symmetric and positive for EVERY k. If
+    k(gx, gz) = k(x, z), it equals the one-sided mean over g of χ(g) k(x, gz). For other k the
+    one-sided mean is not even symmetric.
 
     Args:
         kernel: the scalar kernel k.
         maps: linear maps that generate the group, functions (n,) -> (n,) or the rows of matrices.
         characters: χ(g) = ±1 for each map.
-        one_sided: whether k(gx, gz) = k(x, z) for all g; None to find out once the dimension is
-            known.
+        one_sided: whether k(gx, gz) = k(x, z) for all g; if None, we ask `k.is_unchanged_by` once
+            the dimension is known.
 
     Source: Krejník & Tyutin (2012) for the odd kernel k(x, z) − k(−x, z); the two-sided mean is
     the projection of the feature map onto the functions with the symmetry.
@@ -239,7 +240,7 @@ class Symmetrised(AbstractScalarKernel):
         return close_group(self.maps, self.characters, n)
 
     def through_descriptor(self, n: int) -> Descriptor | None:
-        """The mean over permutations of the entries of a warp; None if the maps do not permute."""
+        """The mean over permutations of the entries of a warp; None if the warp has none."""
         if not isinstance(self.kernel, Warp):
             return None
         images = [self.kernel.image(matrix_of(g, n)) for g in self.maps]
@@ -256,7 +257,7 @@ class Symmetrised(AbstractScalarKernel):
 
     @property
     def parity(self) -> int | None:
-        """±1 with u(−x) = ±u(x), where the group is {1, −1}; None for other groups."""
+        """The sign in u(−x) = ±u(x) if the group is {1, −1}; None for other groups."""
         if set(self.maps) != {identity, reflection}:
             return None
         return int(self.characters[self.maps.index(reflection)])
@@ -277,7 +278,7 @@ class Symmetrised(AbstractScalarKernel):
 
     def supports(self, n: int) -> tuple[frozenset[int], ...]:
         inner = self.kernel.supports(n)
-        if self.parity is not None:  # whose maps mix no coordinates
+        if self.parity is not None:  # the maps do not mix coordinates
             return inner
         group = self.group(n)
         return tuple(
@@ -289,10 +290,10 @@ class Symmetrised(AbstractScalarKernel):
 
 
 def drop_symmetry(tree: Tree) -> Tree:
-    """The kernel, or any PyTree, in which each mean over a group is replaced by its scalar kernel.
+    """The PyTree with each mean over a group replaced by its scalar kernel.
 
-    The values of the result have the size of the terms of the mean, which determines the rounding
-    errors: for a long lengthscale (k(x, z) − k(−x, z))/2 is the small difference of large numbers.
+    The values of the result have the size of the terms of the mean, which determines rounding
+    errors: for a long lengthscale (k(x, z) − k(−x, z))/2 is a small difference of large numbers.
     """
 
     def is_mean(node: object) -> bool:
@@ -312,13 +313,13 @@ def _name_of(linear_map: LinearMap) -> str:
 def symmetrise(
     kernel: AbstractScalarKernel, maps: tuple[LinearMap, ...], characters: tuple[float, ...]
 ) -> AbstractScalarKernel:
-    """The kernel of the functions u(gx) = χ(g) u(x) of the RKHS of `kernel`, g in the maps.
+    """The kernel of the functions u in the RKHS of `kernel` with u(gx) = χ(g) u(x) for the maps g.
 
-    A sum is symmetrised term by term, so that its terms stay visible; a kernel with a symmetry
-    gets the group of both.
+    We symmetrise a sum term by term, so that its terms stay visible. A kernel with a symmetry gets
+    the group of all maps.
 
     Raises:
-        ValueError: a map has the other sign already, so that only zero is left.
+        ValueError: a map already has the other sign, so that zero is the only function.
     """
     reflects = set(maps) <= {identity, reflection}
     if kernel.summands(reflects):
@@ -342,8 +343,8 @@ def symmetrise(
 def _with_closed_group(kernel: Symmetrised) -> Symmetrised:
     """The kernel, after a check that its group is finite.
 
-    The check needs the dimension, which a matrix has. If all maps are functions, the first point
-    makes the check.
+    The check needs the dimension, which we read from a matrix. If all maps are functions, the first
+    call of the kernel makes the check.
     """
     matrices = [g for g in kernel.maps if not callable(g)]
     if matrices:
@@ -357,16 +358,16 @@ def with_parity(kernel: AbstractScalarKernel, parity: int) -> AbstractScalarKern
     The group is {1, −1}.
 
     Raises:
-        ValueError: a term has the other parity already, so that only zero is left of it.
+        ValueError: a term already has the other parity, so that zero is its only function.
     """
     return symmetrise(kernel, (identity, reflection), (1.0, float(parity)))
 
 
 class Unsymmetrised(NamedTuple):
-    """A scalar kernel k without its symmetry, and the means over a group from which it came."""
+    """A scalar kernel k without its symmetry, and the means over a group that we removed."""
 
     kernel: AbstractScalarKernel
-    means: tuple[Symmetrised, ...]  # over one group; the terms of a sum have one each
+    means: tuple[Symmetrised, ...]  # over one group, one mean for each term of a sum
 
     @property
     def parity(self) -> int | None:
@@ -380,7 +381,7 @@ class Unsymmetrised(NamedTuple):
 
 
 def symmetry_removed(kernel: AbstractScalarKernel) -> Unsymmetrised | None:
-    """The k and the group with `kernel` = `symmetrise(k, …)`, or None.
+    """The k and the group with `kernel` = `symmetrise(k, …)`; None if there are none.
 
     If every mean is one-sided, `kernel` is the mean over h of χ(h) k(x, hz).
     """
@@ -402,7 +403,7 @@ def symmetry_removed(kernel: AbstractScalarKernel) -> Unsymmetrised | None:
 
 
 def symmetries(kernel: AbstractScalarKernel) -> Iterator[Symmetrised]:
-    """All means over groups in a kernel, in the coordinates of the states."""
+    """All means over groups in a kernel that act on the coordinates of the states."""
     if isinstance(kernel, Symmetrised):
         yield kernel
     terms = kernel.terms if isinstance(kernel, ScalarProduct) else kernel.summands(False)

@@ -1,4 +1,4 @@
-"""Scalar kernels on transformed points: warped, and on some of the coordinates."""
+"""Scalar kernels of transformed points: `Warp`, and `Select` for some of the coordinates."""
 
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -27,17 +27,18 @@ class Warp(AbstractScalarKernel):
 
     Args:
         kernel: a scalar kernel on the warped coordinates, shape (m,).
-        fn: a smooth map (n,) -> (m,), written with jax.numpy; the array leaves of an Equinox
-            module are trained. Define `fn` once: JAX treats a new lambda as a new function and
-            compiles again. A fit refuses data at which `fn` or its derivative is not finite, such
-            as inverse distances of two atoms in one place; a field is NaN at such states.
+        fn: a smooth map (n,) -> (m,), written with jax.numpy. `tune` trains the array leaves of an
+            Equinox module. Define `fn` once: JAX treats a new lambda as a new function and compiles
+            again. A fit refuses data at which `fn` or its derivative is not finite, such as inverse
+            distances of two atoms in one place; a field is NaN at such states.
         equivariant: whether the maps of a symmetry only permute the entries of `fn`, as a
             permutation of like atoms permutes the distances between atoms. `Invariant` then takes
             its mean in the warped coordinates, over |G| terms instead of |G|².
 
     Raises:
-        TypeError: `kernel` is not a scalar kernel, or `fn` not a function. ValueError, when called:
-            `fn` does not return a vector, or is said to be equivariant and is not.
+        TypeError: `kernel` is not a scalar kernel, or `fn` not a function.
+        ValueError: when called, if `fn` does not return a vector, or is not equivariant as
+            declared.
 
     Example: `Warp(Gaussian(1.0), lambda x: jnp.array([jnp.cos(x[0]), jnp.sin(x[0]), x[1]]))`
     for a state (angle, momentum) on a cylinder. `CurlFree(Warp(Matern(2.5, 10.0), fn))` with the
@@ -74,7 +75,7 @@ class Warp(AbstractScalarKernel):
         return Descriptor(self.warp, self.kernel)
 
     def warp(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
-        """fn(x), as a vector."""
+        """The vector fn(x)."""
         x = one_point(x)
         with require.traceable("the map of Warp"):
             warped = self.fn(x)
@@ -84,18 +85,18 @@ class Warp(AbstractScalarKernel):
                 f"the map of Warp returned shape {jnp.shape(warped)} for a point of shape "
                 f"{jnp.shape(x)}; a vector (m,) is needed. Return, for example, jnp.array([...])."
             )
-        # The map's parameters may be more precise than the data.
+        # Parameters of the map may be more precise than the data.
         return require.floating(warped, "the value of the map of Warp").astype(x.dtype)
 
     def image(self, S: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "m m"] | None:
-        """The permutation P with fn(Sx) = P fn(x); None if the map is not said to be equivariant.
+        """The permutation P with fn(Sx) = P fn(x); None if the map is not declared equivariant.
 
         Raises:
             ValueError: there is no such permutation.
         """
         if not self.equivariant or not require.is_concrete(self.fn):
             return None
-        # Entries of an analytic map that agree at four points of no symmetry agree everywhere.
+        # Entries of an analytic map that agree at four generic points agree everywhere.
         probes = np.cos(1.0 + np.arange(4.0 * len(S))).reshape(4, -1)
         with jax.ensure_compile_time_eval():
             here, there = (self.transform_inputs(points).T for points in (probes, probes @ S.T))
@@ -121,7 +122,7 @@ class Warp(AbstractScalarKernel):
 
 
 class Select(AbstractScalarKernel):
-    """k(x[dims], z[dims]): a kernel on some of the coordinates.
+    """A kernel on some of the coordinates, k(x[dims], z[dims]).
 
     `Select(k, (0, 1)) + Select(k, (2, 3))` is the kernel of H(q, p) = U(q) + T(p) for two
     degrees of freedom.
@@ -131,8 +132,9 @@ class Select(AbstractScalarKernel):
         dims: distinct coordinates, integers ≥ 0.
 
     Raises:
-        TypeError: `kernel` is not a scalar kernel. ValueError: `dims` are no distinct integers ≥ 0;
-            or, when called, the points have fewer coordinates.
+        TypeError: `kernel` is not a scalar kernel.
+        ValueError: `dims` are no distinct integers ≥ 0, or, when called, the points have fewer
+            coordinates.
     """
 
     kernel: AbstractScalarKernel
@@ -152,7 +154,7 @@ class Select(AbstractScalarKernel):
                 f"Select has coordinates {self.dims} and the point has {len(x)}: "
                 "coordinates are counted from 0."
             )
-        # Slices, not a gather: their derivative is a pad, which XLA fuses into its neighbours.
+        # We use slices, not a gather: their derivative is a pad, which XLA can fuse.
         first, last = self.dims[0], self.dims[-1]
         if self.dims == tuple(range(first, last + 1)):
             return x[first : last + 1]

@@ -1,6 +1,6 @@
-"""The flow of a field and its tangent, along intervals between samples.
+"""The flow of a field and its tangent over the intervals between samples.
 
-Every interval has three Gauss nodes, at which the field is evaluated later.
+Each interval has three Gauss nodes, where `learn` later evaluates the field.
 """
 
 from collections.abc import Callable
@@ -19,15 +19,17 @@ from hamkernel._structures.friction import damped_coordinates, frictions
 
 # Gauss-Legendre nodes and weights on [0, 1]: exact for polynomials of degree 5.
 NODES, WEIGHTS = np.add(np.polynomial.legendre.leggauss(3), [[1.0], [0.0]]) / 2
-# Of the classical method of Runge and Kutta: how far along the last slope each stage lies, and its
-# weight in the step.
+# The classical Runge-Kutta method: for each stage, the distance along the previous slope at which
+# it evaluates the field, and its weight in the step.
 _RUNGE_KUTTA = np.array([[0, 1 / 6], [1 / 2, 1 / 3], [1 / 2, 1 / 3], [1, 1 / 6]])
 _PIECES = np.diff(np.concatenate([[0.0], NODES, [1.0]]))
-_MOST_STEPS = 64  # between two nodes: 75 radians a sample, where 3 are what sampling can resolve
+# Steps between two nodes, at most. They suffice for ‖∂f/∂x‖ h = 64 · .15/.39 = 25 in an interval h;
+# sampling resolves a motion up to about 3.
+_MOST_STEPS = 64
 
 
 class Expansion(eqx.Module):
-    """f(x) = mean(x) + Σⱼ K(x, sⱼ) aⱼ; with inputs x and sⱼ are points (x, u)."""
+    """f(x) = mean(x) + Σⱼ K(x, sⱼ) aⱼ. If there are inputs, x and sⱼ are points (x, u)."""
 
     kernel: AbstractMatrixKernel
     points: Float[Array, "m d"]
@@ -43,14 +45,14 @@ class Expansion(eqx.Module):
 
 @compiled_by_size
 def field_values(field: Expansion, X: Float[Array, "N d"]) -> Float[Array, "N n"]:
-    """The field at many points."""
+    """The values of the field at the points X."""
     return jax.vmap(field)(X)
 
 
 def with_tangent(
     field: Callable[[Array], Array], s: Float[Array, " d"], n: int
 ) -> tuple[Float[Array, " n"], Float[Array, "n n"]]:
-    """The values f and ∂f/∂x at a point s = (x, u) with n coordinates of x."""
+    """The velocity f and ∂f/∂x at a point s = (x, u), where x has n coordinates."""
     u = s[n:]
 
     def twice(x):
@@ -62,13 +64,13 @@ def with_tangent(
 
 
 class Path(NamedTuple):
-    """A path on S segments of L intervals, and how it depends on where it starts.
+    """A path on S segments of L intervals, and the tangents of its flow.
 
     Attributes:
         x: states at the samples, shape (S, L + 1, n).
         nodes: points at the Gauss nodes, (x, u) with inputs, shape (S, L, 3, d).
-        to_end: the tangent from the nodes of an interval to its end, shape (S, L, 3, n, n).
-        across: the tangent across an interval, shape (S, L, n, n).
+        to_end: ∂x(end)/∂x(node) for the nodes of each interval, shape (S, L, 3, n, n).
+        across: ∂x(end)/∂x(start) of each interval, shape (S, L, n, n).
     """
 
     x: Float[Array, "S L+1 n"]
@@ -91,13 +93,12 @@ def stiffness(
 ) -> float:
     """The .95 quantile of ‖∂f/∂x‖ at the points X, in standard deviations of the coordinates.
 
-    Dry friction is steep where a momentum changes its sign, but few points are there. So we add the
-    rate .05 ‖ṗ‖/ε for the rest speed ε of each friction: with this rate `steps_for` makes steps in
-    which the momentum changes by at most three ε.
+    Dry friction is steep where a momentum changes its sign, but few points lie there. The result is
+    therefore at least .05 |ṗ|/ε, where ε is the rest speed of a friction and |ṗ| the root mean
+    square of the damped ṗ. At this rate a step of `steps_for` changes the momentum by about 3 ε.
 
-    Without the added rate errors of the path bent the field. For a pendulum that sticks, with q
-    alone at 50 Hz, the error of U′ was 1.8 and 1.1 % on two of eight logs. With it the error is .04
-    and .10 %, as with steps of a third (`tests/benchmarks/model_error.py friction`).
+    Without this bound the error of U′ was 1.8 % for a pendulum that sticks, with q measured at
+    50 Hz; with the bound it is .04 % (`tests/benchmarks/model_error.py friction`).
     """
     n = len(scale)
     f, norms = map(np.asarray, _with_norms(field, *jax.device_put((X, scale))))
@@ -111,22 +112,27 @@ def stiffness(
 
 
 def steps_for(spans: Float[np.ndarray, "S L"], stiffness: float) -> Int[np.ndarray, " L"]:
-    """Runge-Kutta steps between two nodes, for intervals of these lengths and this ‖Df‖."""
+    """The number of Runge-Kutta steps between two nodes, for each of the L intervals.
+
+    Args:
+        spans: the lengths of the intervals of all segments; the longest of the S segments counts.
+        stiffness: ‖∂f/∂x‖.
+    """
     return np.clip(np.nan_to_num(_count_steps(spans, stiffness), nan=1.0), 1, _MOST_STEPS).astype(
         int
     )
 
 
 def is_too_stiff(spans: Float[np.ndarray, "S L"], stiffness: float) -> bool:
-    """Whether a field needs more steps than `steps_for` allows in half of these intervals.
+    """Whether the field needs more steps than `steps_for` allows in half of the intervals.
 
-    Such a field moves by more than its range between two samples: it fits noise.
+    Such a field crosses its own range between two samples: it fits the noise.
     """
     return bool(np.median(_count_steps(spans[spans > 0][None], stiffness)) > _MOST_STEPS)
 
 
 def _count_steps(spans: Float[np.ndarray, "S L"], stiffness: float) -> Float[np.ndarray, " L"]:
-    # A step of order four with ‖Df‖ dt = 0.15 is wrong by 0.15⁵/120 = 6e-7 of the change.
+    # A step of order four with ‖∂f/∂x‖ dt = .15 has a relative error of .15⁵/120 = 6e-7.
     return np.ceil(spans.max(axis=0) * _PIECES.max() * stiffness / 0.15)
 
 
@@ -140,9 +146,9 @@ def integrate(
 ) -> Path:
     """The path of each segment from its start, and its tangents.
 
-    The path is not finite from the time at which the field is not. If the time runs from 0 to 1 in
-    an interval of length h, the point (x, u) has the velocity (h f, u₁ − u₀), where u₀ and u₁ are
-    the inputs at both ends.
+    In an interval of length h with inputs u₀ and u₁ at its ends, the rescaled time runs from 0 to 1
+    and the point (x, u) has the velocity (h f, u₁ − u₀). If the field becomes NaN or infinite, so
+    does the path from there on.
     """
     n = starts.shape[1]
 
@@ -154,7 +160,7 @@ def integrate(
             return jnp.concatenate([h * f, rise]), h * D @ V
 
         def step(_, at):
-            # A loop over stages, since four copies of ∂f/∂x took twice as long to compile.
+            # We scan over the stages: four copies of ∂f/∂x took twice as long to compile.
             def stage(carry, coefficients):
                 (move, turn), total = carry
                 reach, weight = coefficients[0], coefficients[1]
@@ -175,7 +181,7 @@ def integrate(
 
         start = jnp.concatenate([x, ends[0]])
         end, (nodes, V) = jax.lax.scan(part, start, jnp.asarray(_PIECES, x.dtype))
-        to_end = [V[3]]  # products from the end, so that nothing is inverted
+        to_end = [V[3]]  # products from the end, which need no inverse
         for tangent in (V[2], V[1], V[0]):
             to_end.append(to_end[-1] @ tangent)
         return end[:n], (end[:n], nodes[:3], jnp.stack(to_end[2::-1]), to_end[3])
@@ -189,7 +195,7 @@ def integrate(
 
 
 def jacobians(mean, nodes: Float[Array, "S L 3 d"], n: int) -> Float[Array, "S L n n"]:
-    """∂m/∂x of the mean in each interval, averaged over its nodes."""
+    """The average of ∂m/∂x over each interval, for the prior mean m."""
     if mean is None:
         return jnp.zeros((*nodes.shape[:2], n, n), nodes.dtype)
     D = jax.vmap(jax.vmap(jax.vmap(lambda s: with_tangent(mean, s, n)[1])))(nodes)
@@ -199,7 +205,7 @@ def jacobians(mean, nodes: Float[Array, "S L 3 d"], n: int) -> Float[Array, "S L
 def means(
     mean, nodes: Float[Array, "S L 3 d"], slopes: Float[Array, "S L 3 n"]
 ) -> Float[Array, "S L 3 n"]:
-    """The prior mean at the nodes, in the shape of their slopes."""
+    """The prior mean at the nodes; zeros if there is none."""
     if mean is None:
         return jnp.zeros_like(slopes)
     return jax.vmap(jax.vmap(jax.vmap(mean)))(nodes).astype(nodes.dtype)
@@ -210,11 +216,11 @@ class Segments(NamedTuple):
 
     Attributes:
         spans: the lengths of the intervals, shape (S, L).
-        measured: the states, zero where nothing was seen, shape (S, L + 1, n).
-        counts: how many samples an entry stands for, 0 where nothing was seen, the same shape.
-        scatter: the sum of squares of those samples about the entry, the same shape.
-        starts: where the segments may begin, shape (S, n).
-        inputs: at both ends of each interval, shape (S, L, 2, m); m is 0 where there are none.
+        measured: the states, zero where nothing was measured, shape (S, L + 1, n).
+        counts: the number of samples in each mean, 0 where nothing was measured, the same shape.
+        scatter: the sum of the squared deviations of these samples from their mean, the same shape.
+        starts: prior means of the initial states, shape (S, n).
+        inputs: the inputs at both ends of each interval, shape (S, L, 2, m); m = 0 without inputs.
     """
 
     spans: Float[Array, "S L"]

@@ -1,9 +1,9 @@
-"""Preprocessing of runs: they are condensed, smoothed and completed before a field is learned.
+"""Preprocessing of runs: `learn` condenses, smooths and completes them before it fits a field.
 
-Samples that are much closer in time than the motion needs are averaged in blocks. A block becomes
-one sample in its middle: the smoothed path there plus the mean of the residuals in the block. Its
-noise is σ/√count, and its bias is of second order in the error of the smoothed path. We keep the
-scatter of the block about its mean, since the scatter determines σ.
+If the sampling interval is much shorter than the motion needs, we average samples in blocks. A
+block becomes one sample in its middle: the smoothed path there plus the mean residual of the block.
+Its noise is σ/√count, and its bias is of second order in the error of the smoothed path. We keep
+the scatter of the residuals about their mean, since the scatter determines σ.
 """
 
 import functools
@@ -21,22 +21,23 @@ from hamkernel._runs.flow import NODES, with_tangent
 from hamkernel._runs.runs import Between, Runs, inputs_at_nodes, inputs_at_samples
 from hamkernel._runs.smoothing import Coordinate, interpolate, processes, smooth_runs
 
-# Rows times columns² of a solve: 1e10 take 1 to 2 s. If the residuals ask for more landmarks, a
-# solve may take 5e10, up to 10 s (`tests/benchmarks/capacity.py`):
+# rows · columns² of a solve: 1e10 takes 1 to 2 s. If the residuals ask for more landmarks, a solve
+# may take 5e10, up to 10 s (`tests/benchmarks/capacity.py`):
 #     20 runs of 50 samples, n = 8:  128 landmarks, field error .0145; 256 (6.5 s), 512, 768: .0105
 #     400 runs, double pendulum:     160 landmarks, rollout error .033; 640: .0056
 _WORK, _MOST_WORK = 1e10, 5e10
-_POINTS = 1024  # from which boxes are taken, and landmarks if there are not more intervals
+# Points of the paths from which we take search boxes, and landmarks if there are fewer intervals.
+_POINTS = 1024
 
 
 class PreprocessedRun(NamedTuple):
-    """One run, condensed.
+    """One condensed run.
 
     Attributes:
         times: the times since the first sample, shape (T,).
         states: means of samples, NaN where nothing was measured, shape (T, n).
         counts: the number of samples in each mean, shape (T, n).
-        scatter: the sum of the squared distances of these samples from their mean, shape (T, n).
+        scatter: the sum of the squared deviations of these samples from their mean, shape (T, n).
         path: smoothed states at the times, without NaN, shape (T, n).
         nodes: smoothed states at the Gauss nodes of each interval, shape (T − 1, 3, n).
         slopes: smoothed velocities at the nodes, shape (T − 1, 3, n).
@@ -57,7 +58,7 @@ class PreprocessedRun(NamedTuple):
         return float(self.times[-1] - self.times[0])
 
     def part(self, samples: slice) -> "PreprocessedRun":
-        """The samples of a slice, and the intervals between them."""
+        """The samples of a slice and the intervals between them."""
         first, stop, _ = samples.indices(len(self.times))
         at, between = slice(first, stop), slice(first, stop - 1)
         return PreprocessedRun(
@@ -72,13 +73,13 @@ class PreprocessedRun(NamedTuple):
 
 
 class Preprocessed(NamedTuple):
-    """All runs, with the processes of their coordinates.
+    """All preprocessed runs.
 
     Attributes:
         runs: the condensed runs.
-        noise: the noise of each coordinate found by smoothing, NaN where nothing was measured.
-        scale: the standard deviation of each coordinate, shape (n,).
-        usable: which runs look like the others, shape (R,).
+        noise: the noise that smoothing found in each coordinate; NaN if it was never measured.
+        scale: the standard deviation of each coordinate along the paths, 1 if constant, shape (n,).
+        usable: whether each run resembles the others, shape (R,).
     """
 
     runs: list[PreprocessedRun]
@@ -88,9 +89,12 @@ class Preprocessed(NamedTuple):
 
 
 def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocessed:
-    """Condense, smooth and complete the runs; `mean` fills in coordinates that no run measured.
+    """Condense, smooth and complete the runs.
 
-    If there are inputs, `mean` is a function of the points (x, u).
+    Args:
+        runs: the logged runs.
+        mean: the prior mean, which determines coordinates that were not measured; if there are
+            inputs, a function of the points (x, u).
     """
     times, states = runs.host_arrays()
     times, states = [t - t[0] for t in times], [_thin_rests(x) for x in states]
@@ -98,9 +102,8 @@ def preprocess(runs: Runs, mean: Callable[[Array], Array] | None) -> Preprocesse
     counts = [np.isfinite(x).astype(float) for x in states]
     scatter = [np.zeros_like(x) for x in states]
     lengths = [c.lengthscale for c in fitted_processes if np.isfinite(c.process.log_amplitude)]
-    # A pendulum of frequency ω has a lengthscale near 2.7/ω, so a tenth of it is 23 samples a
-    # swing; three Gauss nodes in such an interval are exact to 1e-8, and samples at 5 Hz of a
-    # pendulum of period 2.6 are left as they are.
+    # A pendulum of frequency ω has a lengthscale near 2.7/ω, so blocks of a tenth of it are 23 a
+    # swing. Three Gauss nodes in such an interval are exact to 1e-8.
     block = 0.1 * min(lengths, default=np.inf)
     if any(2 * np.median(np.diff(t)) < block for t in times):
         paths = smooth_runs(fitted_processes, times, states)
@@ -131,10 +134,10 @@ _REST = 10  # more equal states than this are a rest
 
 
 def _thin_rests(x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T n"]:
-    """The states of a run, with NaN inside each stretch of equal states.
+    """The states of a run, with NaN inside each stretch of more than ten equal states.
 
-    At rest a quantised sensor repeats one error. Such a stretch measures the noise once, and not
-    once a sample: with one run in four at rest, σ was estimated as √(3/4) of its true value.
+    At rest a quantised sensor repeats one error, so the whole stretch measures the noise only once.
+    With one run in four at rest, we estimated σ as √(3/4) of its true value.
     """
     same = (np.diff(x, axis=0) == 0) | np.isnan(x).all(axis=0)
     ends = np.flatnonzero(np.concatenate([[True], ~same.all(axis=1), [True]]))
@@ -148,17 +151,17 @@ def _thin_rests(x: Float[np.ndarray, "T n"]) -> Float[np.ndarray, "T n"]:
 def averaging_time(
     coordinates: list[Coordinate], times, deviation: Float[np.ndarray, "R T n"]
 ) -> float:
-    """The averaging time of smoothing: the time of σ²/Var x(t) samples, least over coordinates.
+    """The averaging time of the smoother: σ²/Var x(t) sampling intervals, least over coordinates.
 
-    In a longer block the smoothed path follows the noise, and the mean of the block is less exact
-    than σ/√count. We measured the ratio of the squared error to σ²/count on nine logs of a driven
-    pendulum at 50 Hz:
+    In a longer block the smoothed path follows the noise, and the mean of the block is less
+    accurate than σ/√count. The ratio of the squared error to σ²/count, on nine logs of a driven
+    pendulum at 50 Hz, is
 
         block / averaging time   1.6   1.1   0.8   0.5
         ratio                    1.88  1.20  1.07  1.00
 
-    With the longest blocks, 10 of 20 clean logs instead of one seemed to have process noise or did
-    not converge.
+    With the longest blocks, learning reported process noise or did not converge on 10 of 20 clean
+    logs, instead of on one.
 
     Args:
         coordinates: the processes of the coordinates.
@@ -176,7 +179,7 @@ def averaging_time(
 
 
 def _shortest_block(duration: float, n: int, inputs: int) -> float:
-    """The shortest block with an affordable number of rows.
+    """The shortest block for which a solve is affordable.
 
     Data without noise need this bound, since their averaging time is zero.
     """
@@ -185,7 +188,7 @@ def _shortest_block(duration: float, n: int, inputs: int) -> float:
 
 
 def with_inputs(data: Preprocessed, runs: Runs) -> Preprocessed:
-    """The same runs with the inputs of `runs`, whose `between` or `delay` may differ."""
+    """The preprocessed runs with the inputs of `runs`, whose `between` or `delay` may differ."""
     return data._replace(
         runs=[
             run._replace(
@@ -225,21 +228,21 @@ def decide(
 
 
 def _spacing(runs: Runs) -> float:
-    """The median spacing of the inputs, or of the states where these are further apart."""
+    """The median sampling interval of the states or of the inputs, whichever is longer."""
     assert runs.input_times is not None
     clocks = [*runs.times], [*runs.input_times]
     return max(float(np.median(np.concatenate([np.diff(t) for t in ts]))) for ts in clocks)
 
 
 def _least(loss: Callable[[float], float], spacing: float) -> None:
-    """Evaluate the loss near its minimum: downhill in whole spacings from 0, then by parabolas.
+    """Evaluate the loss downhill from 0 in steps of `spacing`, then at the vertices of parabolas.
 
-    −log p is nearly quadratic in the delay, so a parabola through three points finds its minimum. A
-    second and a third parabola through closer points refine the minimum.
+    −log p is nearly quadratic in the delay, so the vertex of a parabola through three points is
+    near its minimum. A second and a third parabola use points at closer distances.
     """
     losses = {d: loss(d) for d in (-spacing, 0.0, spacing)}
     while (best := min(losses, key=losses.__getitem__)) in (min(losses), max(losses)):
-        if abs(best) > 20 * spacing:  # a delay of a whole swing is no delay
+        if abs(best) > 20 * spacing:  # about a whole swing, so no delay
             return
         losses[best + np.sign(best) * spacing] = loss(best + np.sign(best) * spacing)
     for reach in (spacing, spacing / 4, spacing / 16):
@@ -253,11 +256,11 @@ def _least(loss: Callable[[float], float], spacing: float) -> None:
 
 
 def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:
-    """The processes of the coordinates, and which runs resemble the others.
+    """The processes of the coordinates, and whether each run resembles the others.
 
-    The distance of a run from its smoothed path is in standard deviations of the states. A run is
-    left out if its distance is more than five times the median and more than 1e-3: the smoother is
-    only that exact on runs without noise, and least so on the fastest run.
+    We leave a run out if its root mean square distance from its smoothed path, in standard
+    deviations of the states, is above 1e-3 and above five times the median of all runs. On runs
+    without noise the smoother is only accurate to about 1e-3. Of fewer than three runs we keep all.
     """
     coordinates = processes(times, states)
     if len(times) < 3:
@@ -281,7 +284,7 @@ def _robust_processes(times, states) -> tuple[list[Coordinate], np.ndarray]:
 
 
 def condense(t, x, path, slope, block: float):
-    """Times, means, counts and scatter of blocks of samples; a block spans at most `block`."""
+    """Times, means, counts and scatter of blocks of samples; a block spans less than `block`."""
     edges = [0]
     for i in range(1, len(t)):
         if t[i] - t[edges[-1]] >= block:
@@ -301,19 +304,18 @@ def condense(t, x, path, slope, block: float):
 
 
 def _refine(t, x, counts, scatter, lengthscale: float):
-    """The run with its long intervals cut by times at which nothing was measured.
+    """The run with its long intervals split at times without measurements.
 
-    Gauss-Newton steps increase the loss where one interval is linearised over much of a swing. The
-    longest interval also sets the number of Runge-Kutta steps for all intervals.
+    If one interval spans much of a swing, its linearisation is poor and Gauss-Newton steps increase
+    the loss. The longest interval also sets the number of Runge-Kutta steps of all intervals.
 
-    On positions of three orbits, each at 60 uneven times up to half a turn apart, three seeds, the
-    field has an error of .26 to .33 % along the motion. With parts of .35 lengthscales it was 7.6 %
-    and refused (`tests/test_learn.py`).
+    For positions of three orbits at uneven times, up to half a turn apart, the field error is at
+    most .33 %. With parts of .35 lengthscales it was 7.6 % (`tests/test_learn.py`).
     """
     spans = np.diff(t)
-    # .54 radians: a swing has twelve such parts.
+    # .2 · 2.7 = .54 radians: a swing has twelve such parts.
     parts = np.ceil(spans / (0.2 * lengthscale))
-    parts = np.clip(parts, 1, 16).astype(int)  # inside a long pause nothing is known
+    parts = np.clip(parts, 1, 16).astype(int)  # in a long gap more parts would add no information
     at = np.append(0, np.cumsum(parts))
     fine = np.interp(np.arange(at[-1] + 1), at, t)
     fine[at] = t
@@ -327,7 +329,7 @@ def _refine(t, x, counts, scatter, lengthscale: float):
 
 
 def _add_paths(coordinates, times, states, counts, scatter, inputs) -> list[PreprocessedRun]:
-    """The runs with the smoothed path at the samples and at the nodes between them."""
+    """The runs with their smoothed paths at the samples and at the Gauss nodes."""
     grids, filled = [], []
     for t, x in zip(times, states, strict=True):
         inside = t[:-1, None] + np.diff(t)[:, None] * NODES[None]
@@ -348,15 +350,15 @@ def _add_paths(coordinates, times, states, counts, scatter, inputs) -> list[Prep
 
 
 def _complete(run: PreprocessedRun, mean: Callable[[Array], Array] | None) -> PreprocessedRun:
-    """The run with values for unmeasured coordinates, found from the velocities of the others.
+    """The run with values of the unmeasured coordinates, from the velocities of the others.
 
-    If the mean has q̇ = p/m, then p = m q̇. In general Newton's method finds the coordinates for
-    which the mean equals the measured velocities.
+    Newton's method finds the coordinates for which the mean equals the measured velocities. For a
+    mean with q̇ = p/m they are p = m q̇. Without a mean they are zero.
     """
     missing = ~np.isfinite(run.states).any(axis=0)
     if not missing.any():
         return run
-    if mean is None:  # other runs measured them, and the fit finds where this run started
+    if mean is None:  # other runs measured them; the fit finds the initial state of this run
         return run._replace(
             path=np.nan_to_num(run.path),
             nodes=np.nan_to_num(run.nodes),
@@ -387,8 +389,8 @@ def _solved_for(mean, X, U, slopes, missing):
             f, D = with_tangent(mean, jnp.concatenate([x, u]), len(x))
             D = jnp.where(on[None, :] & ~on[:, None], D, 0.0)
             wrong = jnp.where(on, 0.0, slope - f)
-            # We scale each coordinate so that all move the others equally. A coordinate that moves
-            # none of the others keeps its value.
+            # We scale the columns of D to norm one. A coordinate with a zero column, on which no
+            # measured velocity depends, keeps its value.
             unit = jnp.linalg.norm(D, axis=0)
             unit = jnp.where(unit > 0, unit, jnp.ones_like(unit))
             D = D / unit[None]
@@ -403,10 +405,10 @@ def _solved_for(mean, X, U, slopes, missing):
 def sample_points(
     data: Preprocessed, count: int = _POINTS
 ) -> tuple[Float[np.ndarray, "N d"], Float[np.ndarray, "N n"]]:
-    """`count` points x, or (x, u) with inputs, of the smoothed runs, and the velocities there.
+    """`count` points x of the smoothed runs, or (x, u) with inputs, and the velocities there.
 
-    The count does not depend on the length of the runs, so that other lengths do not compile anew;
-    short runs repeat some of their points.
+    The count does not depend on the length of the runs, so XLA compiles once for all lengths. Short
+    runs repeat some of their points.
     """
     n = len(data.scale)
     runs = [run for run, use in zip(data.runs, data.usable, strict=True) if use]
@@ -418,10 +420,11 @@ def sample_points(
 
 
 def time_of_swing(data: Preprocessed) -> float:
-    """2π times deviation over speed, the period of a sine, of the median coordinate.
+    """The time 2π · deviation / speed of the median coordinate: the period of a sinusoid.
 
-    Of two medians we take the shorter. An angle that turns wanders, and its deviation grows with
-    the log: of a real pendulum that swings up it gave 12.6 s, and the velocity 2.1 s.
+    Of two medians we take the shorter. The deviation of an angle that makes full turns grows with
+    the length of the log: for a real pendulum that swings up the angle gave 12.6 s, and the
+    velocity 2.1 s.
     """
     speed = np.sqrt(np.mean(sample_points(data)[1] ** 2, axis=0))
     periods = 2 * np.pi * data.scale / np.maximum(speed, np.finfo(float).tiny)
@@ -430,14 +433,14 @@ def time_of_swing(data: Preprocessed) -> float:
 
 def first_landmarks(d: int) -> int:
     """The number of landmarks with which learning begins, for points of d coordinates."""
-    # 45 for two coordinates and 80 for four were as good as all on ten runs of 10 s.
+    # On ten runs of 10 s, 45 for two coordinates and 80 for four were as accurate as all points.
     return {1: 24, 2: 48, 3: 64, 4: 80}.get(d, 128)
 
 
 def seconds_of_iteration(data: Preprocessed, count: int) -> float:
     """The seconds of an iteration with `count` landmarks: 2 rows · columns² operations.
 
-    One core of 2025 makes 1e10 operations a second: 19e9 took 1.6 s.
+    One core of 2025 does about 1e10 operations a second.
     """
     n = len(data.scale)
     rows = n * sum(len(run.times) for run in data.runs)
@@ -449,9 +452,9 @@ def landmarks(
 ) -> tuple[Float[np.ndarray, "m d"], int, int, bool]:
     """Landmarks: points of the paths, each farthest from the earlier ones in standard deviations.
 
-    The choice does not depend on hyperparameters, which are not known yet. There are at most as
-    many landmarks as intervals, since the samples at the ends of an interval determine one mean of
-    the field.
+    The choice does not depend on hyperparameters, which are not known yet. There are no more
+    landmarks than intervals, since the samples at the ends of an interval determine one mean of the
+    field; but there are at least `first_landmarks(d)`.
 
     Args:
         data: the runs.
@@ -459,14 +462,15 @@ def landmarks(
 
     Returns:
         The landmarks, the number to begin with, the number for which a solve is quick, and whether
-        the latter is less than the number of intervals.
+        this quick number is less than the number of intervals.
     """
     n, used = len(data.scale), zip(data.runs, data.usable, strict=True)
     intervals = max(sum(len(run.times) - 1 for run, use in used if use), 1)
     affordable = (np.array([_WORK, _MOST_WORK]) / (n * intervals)) ** 0.5 // n
     X, _ = sample_points(data, max(_POINTS, min(intervals, 2 * int(affordable[1]))))
     first = first_landmarks(X.shape[1])
-    # Learning doubles the number: a last step to a few more would cost a compilation and a solve.
+    # Learning doubles the number, so the limit is a doubling too: a few more landmarks would cost
+    # one more compilation and solve.
     affordable = first * 2 ** np.log2(np.maximum(affordable / first, 1)).astype(int)
     quick, limit = np.maximum(first, np.minimum(intervals, affordable)).tolist()
     if count is not None:

@@ -1,20 +1,20 @@
-"""`Runs`: what was logged, checked at once, and the inputs between its samples.
+"""`Runs`: logged runs, their checks, and the inputs between their samples.
 
-In each interval the input is a line, given by its two ends, shape (…, 2, m); a held input is a
-constant one. Where samples were averaged an interval spans many samples of the log, and smooth
-inputs bend within it: the line is then the best one in the mean square, which keeps the impulse
-∫u dt and its first moment exactly.
+In each interval the input is a line, given by its values at the two ends, shape (…, 2, m). The line
+of a held input is constant. If samples were averaged, an interval spans many samples of the log,
+and the input bends inside it. The line is then the least-squares fit to the input, which has the
+same impulse ∫u dt and the same first moment.
 
-"smooth" is the natural quintic spline through the samples. Its error for a sinusoid is
+"smooth" is the natural quintic spline through the samples. Interpolation errors for a sinusoid are
 
     samples a period    4      6       12
     quintic spline      2e-3   1.3e-4  1.5e-6
     cubic spline        .08    .016    .001
     lines               .31    .14     .03
 
-Band-limited interpolation Σ u_j sinc(t/h − j) is exact for an infinite sinusoid, but it needs even
-times. The inputs before the first sample and after the last one are unknown. The error from them
-falls over k samples as 1/k for band-limited interpolation, and as .43ᵏ for the quintic spline.
+Band-limited interpolation Σ u_j sinc(t/h − j) is exact for an infinite sinusoid, but needs even
+times. The inputs beyond the first and the last sample are unknown. The resulting error falls over k
+samples as 1/k for band-limited interpolation, and as .43ᵏ for the quintic spline.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def spline(
     Through two samples the spline is a line. The unit of time is the median spacing, so that values
     and fourth derivatives have similar sizes in the matrix of the spline.
     """
-    from scipy.interpolate import make_interp_spline  # so that importing does not load it
+    from scipy.interpolate import make_interp_spline  # here, so that hamkernel imports faster
 
     unit, free = np.median(np.diff(t)), [(d, np.zeros(u.shape[1])) for d in (3, 4)]
     degree, ends = (5, (free, free)) if len(t) > 2 else (1, None)
@@ -68,7 +68,7 @@ def values(
     at: Float[np.ndarray, " P"],
     between: Between,
 ) -> Float[np.ndarray, "P m"]:
-    """The inputs at other times; before the first sample and after the last they are constant."""
+    """The inputs at the times `at`; constant before the first sample and after the last."""
     at = np.clip(at, t[0], t[-1])
     if between == "smooth":
         return spline(t, u, at)
@@ -86,11 +86,11 @@ def lines_in_intervals(
     at: Float[np.ndarray, " R"],
     between: Between,
 ) -> Float[np.ndarray, "R-1 2 m"]:
-    """The line that fits the input best in each interval of the times `at`, by its two ends.
+    """The least-squares line of the input in each interval of the times `at`, by its two ends.
 
     For u(σ) with −1 ≤ σ ≤ 1 the line is m₀ + 3 m₁ σ, with the moments m₀ = ½∫u dσ and m₁ = ½∫uσ dσ.
-    We integrate over the pieces between all times; four Gauss nodes are exact for a quintic
-    times σ.
+    We integrate over each piece between two times of `t` or `at` with four Gauss nodes, which are
+    exact for a quintic times σ.
     """
     grid = np.union1d(t, at)
     grid = grid[(grid >= at[0]) & (grid <= at[-1])]
@@ -111,7 +111,7 @@ def lines_in_intervals(
 
 
 def inputs_at_samples(ends: Float[np.ndarray, "intervals 2 m"]) -> Float[np.ndarray, "R m"]:
-    """The inputs at the ends of the intervals; the mean of both sides where they jump."""
+    """The inputs at the ends of the intervals; at a jump, the mean of both sides."""
     before, after = (
         np.concatenate([ends[:1, 0], ends[:, 1]]),
         np.concatenate([ends[:, 0], ends[-1:, 1]]),
@@ -122,7 +122,7 @@ def inputs_at_samples(ends: Float[np.ndarray, "intervals 2 m"]) -> Float[np.ndar
 def inputs_at_nodes(
     ends: Float[Array | np.ndarray, "*S 2 m"],
 ) -> Float[Array | np.ndarray, "*S 3 m"]:
-    """The inputs at the Gauss nodes."""
+    """The inputs at the three Gauss nodes of each interval."""
     shares = NODES.reshape((1,) * (ends.ndim - 2) + (3, 1))
     first, last = ends[..., :1, :], ends[..., 1:, :]
     return first + shares * (last - first)
@@ -131,16 +131,16 @@ def inputs_at_nodes(
 class Runs(eqx.Module):
     """Logged runs of one system: states at times, with noise, gaps and uneven steps.
 
-    Runs are kept as given, in doubles of NumPy; none is resampled. NaN means not measured: a whole
-    coordinate, such as the momenta of a log of positions, or single entries. Masked entries of
-    NumPy and missing ones of pandas and polars are NaN. Names of columns are kept, in `names` and
-    `input_names`, for what is printed and drawn. `check()` is a table of what sensors and
-    controllers may have left in the log.
+    `Runs` keeps the data as NumPy arrays of doubles, and resamples nothing. NaN means not measured,
+    for single entries or for a whole coordinate, such as the momenta of a log of positions. Masked
+    entries of NumPy and missing ones of pandas and polars become NaN. The names of columns stay in
+    `names` and `input_names`, for printing and plotting. `check()` returns a table of the faults
+    that sensors and controllers may have left in the log.
 
     Args:
-        times: for each run the times of its samples, shape (T,), strictly increasing; or the
-            sampling interval, one number, with which runs begin at 0. Times (T,) of states
-            (R, T, n) are those of all R runs.
+        times: for each run the times of its samples, shape (T,), strictly increasing. One number is
+            the sampling interval of all runs, which then begin at 0. One array (T,) beside states
+            (R, T, n) holds the times of all R runs.
         states: for each run the states, shape (T, n), or (T,) for one coordinate. Angles must be
             continuous: `np.unwrap`.
         inputs: for each run the inputs u, for `learn` with a `Controlled` kernel. An array has the
@@ -150,22 +150,23 @@ class Runs(eqx.Module):
         between: the inputs between two samples. "held": constant until the next sample, as the
             command of a digital controller. "linear": for a measured force. "smooth": the quintic
             spline, for an input with 4 to 20 samples a period. "auto": `learn` takes the likeliest
-            of the three, see `learned.runs`. If held inputs are taken for linear, they come half a
-            sample early.
+            of the three, see `learned.runs`. To treat held inputs as linear advances them by half a
+            sampling interval.
         parameters: for each run the θ of its system, shape (p,), for `learn` with a `Family`; None
             if all runs are of one system.
-        delay: by how much later than logged an input acts, in the unit of the times: at time t it
-            is u(t − delay). Or "fit", with which `learn` finds it.
+        delay: the time after which an input acts, in the unit of the times: u(t − delay) acts at
+            time t. If "fit", `learn` finds the delay.
 
-    A single run may be given as bare arrays or lists of numbers, (T,) and (T, n). In the place of
-    an array (T, n) there may be a mapping of names to columns (T,), such as a dictionary or a
-    Dataset of xarray.
+    A single run may be given as bare arrays or lists of numbers, (T,) and (T, n). Instead of an
+    array (T, n) you may pass a mapping of names to columns (T,), such as a dictionary or a Dataset
+    of xarray.
 
     Raises:
-        ValueError: shapes do not fit, a run has one sample only, times do not increase, a column of
-            the states holds the times, an entry is infinite, an input is NaN, inputs do not span
-            the states, or `between` is unknown.
-            TypeError: something is not an array of real numbers.
+        ValueError: shapes do not fit, a run has one sample only or no measurement, times do not
+            increase, a column of the states holds the times, or an entry is infinite. An input is
+            NaN, or inputs do not span the states. `between` is unknown.
+        TypeError: something is not an array of real numbers, or there are both inputs and
+            parameters.
 
     Warns:
         UserWarning: once for each kind of fault. Faults of states are impossible samples, outages,
@@ -258,11 +259,11 @@ class Runs(eqx.Module):
     def check(self) -> Diagnostics:
         """A table of the faults that sensors and controllers may have left in the log.
 
-        Each kind of fault has a row: samples that are no measurements, wrapped angles, gaps,
-        coordinates that never move, clipped and dead sensors, repeated and interpolated samples.
-        With inputs there are rows for constant inputs, dependent inputs and feedback. A row has a
-        value, its limit, its meaning and advice; `.failing` names the rows that fall short. `Runs`
-        has warned of these.
+        Each kind of fault has a row: impossible samples, outages, wrapped angles, gaps, constant
+        coordinates, clipped and dead sensors, repeated and interpolated samples. With inputs there
+        are rows for constant inputs, dependent inputs and feedback. A row has a value, its limit,
+        its meaning and advice. `.failing` names the rows that fail; the constructor has warned of
+        them.
         """
         times, states = self.host_arrays()
         inputs = [np.asarray(u, float) for u in self.inputs or ()]
@@ -280,7 +281,7 @@ class Runs(eqx.Module):
 
     @property
     def impossible(self) -> tuple[Int[np.ndarray, " k"], ...]:
-        """The samples of each run that are no measurements, such as −9999 or a row of zeros."""
+        """The indices of impossible samples in each run, such as −9999 or a row of zeros."""
         return tuple(np.flatnonzero(impossible_samples(x)) for x in self.host_arrays()[1])
 
     @property
@@ -293,12 +294,13 @@ class Runs(eqx.Module):
     ) -> tuple[Float[Array, "N n"], Float[Array, "N n"], Int[Array, " N"]]:
         """Smoothed states X, their velocities Y and run labels, for `hk.fit` and `hk.tune`.
 
-        Every coordinate is a Gaussian process in time (Matérn-7/2). Its lengthscale, amplitude and
+        Each coordinate is a Gaussian process in time (Matérn-7/2). Its lengthscale, amplitude and
         noise maximise the marginal likelihood of all runs. The cost is linear in the number of
         samples. `hk.learn` is more accurate, since it needs no velocities.
 
         Returns:
-            X and Y, shape (N, n), N all samples of all runs, and labels (N,), 0, 1, … by run.
+            X and Y, shape (N, n), for all N samples of all runs, and labels 0, 1, … of the runs,
+            shape (N,).
 
         Raises:
             ValueError: a coordinate was never measured.
@@ -316,13 +318,14 @@ class Runs(eqx.Module):
     def smoothing(self, between: int = 0) -> Smoothing:
         """The smoothed states with their standard deviations, as `hk.plot.smoothing` draws them.
 
-        The processes in time are those of `velocities`.
+        The Gaussian processes in time are those of `velocities`.
 
         Args:
             between: the number of additional times between two samples.
 
         Raises:
-            ValueError: `between` is negative. TypeError: it is no integer.
+            ValueError: `between` is negative.
+            TypeError: `between` is not an integer.
         """
         between = operator.index(between)
         if between < 0:
@@ -342,20 +345,20 @@ class Runs(eqx.Module):
 
     @property
     def input_count(self) -> int:
-        """The number m of inputs or parameters; 0 where there are none."""
+        """The number of inputs or of parameters; 0 if there are none."""
         arrays = self.inputs or self.parameters
         return arrays[0].shape[-1] if arrays else 0
 
     @property
     def is_decided(self) -> bool:
-        """Whether `between` and `delay` are both given rather than left to `learn`."""
+        """Whether the caller chose both `between` and `delay`, so that `learn` need not."""
         return self.inputs is None or (self.between != "auto" and self.delay != "fit")
 
     def input_lines(self, run: int, at: Float[np.ndarray, " R"]) -> Float[np.ndarray, "R-1 2 m"]:
-        """The line that fits the inputs best in each interval of the times `at`, by its two ends.
+        """The least-squares line of the inputs in each interval of the times `at`, by its two ends.
 
-        The parameters of a run are its inputs at all times. Inputs with between="auto" are taken
-        for linear, and inputs with delay="fit" have no delay.
+        The parameters of a run are its inputs at all times. We treat between="auto" as "linear",
+        and delay="fit" as 0.
         """
         if self.parameters is not None:
             return np.tile(np.asarray(self.parameters[run], float), (len(at) - 1, 2, 1))
@@ -395,7 +398,7 @@ class Runs(eqx.Module):
         )
 
     def with_momenta(self) -> "Runs":
-        """Runs of positions as runs of states (q, p), with momenta that were not measured."""
+        """Runs of states (q, p) from runs of positions; the momenta are NaN."""
         states = tuple(np.concatenate([x, np.full_like(x, np.nan)], axis=1) for x in self.states)
         names = self.names and (*self.names, *(f"p of {name}" for name in self.names))
         return self._with(states=states, names=names)
@@ -421,18 +424,18 @@ class Runs(eqx.Module):
             if not any(np.isfinite(np.asarray(x)[:, c]).any() for x in self.states):
                 raise ValueError(
                     f"coordinate {self.coordinate_names[c]} was measured in no run, so it has no "
-                    "velocities. hk.learn(K, runs, mean=f) finds it where f says how it moves the "
-                    "others, as q̇ = p/m does."
+                    "velocities. hk.learn(K, runs, mean=f) finds it if the velocity of another "
+                    "coordinate in f depends on it, as in q̇ = p/m."
                 )
 
 
 def _as_list(values: Any) -> Any:
-    """The values of an iterator as a list, tables of mappings of columns; else `values`."""
+    """The values: an iterator becomes a list, and a mapping of columns a structured array."""
     return _named_columns(list(values) if isinstance(values, Iterator) else values)
 
 
 def _named_columns(values: Any) -> Any:
-    """A structured array for a mapping of columns, also inside of a list; else `values`."""
+    """A structured array for each mapping of columns, also inside a list; else `values`."""
     if isinstance(values, list | tuple) and any(isinstance(entry, Mapping) for entry in values):
         return type(values)(map(_named_columns, values))
     if not isinstance(values, Mapping) or not values:
@@ -447,7 +450,7 @@ def _named_columns(values: Any) -> Any:
 
 
 def _depth(values: Any) -> int | None:
-    """The number of axes of an array, a frame, or nested lists; None if it is none of them."""
+    """The number of axes of an array, a frame, or nested lists; None for anything else."""
     if hasattr(values, "shape"):
         return len(values.shape)
     if isinstance(values, list | tuple):
@@ -456,7 +459,7 @@ def _depth(values: Any) -> int | None:
 
 
 def _is_one_run(times: Any, states: Any) -> bool:
-    """Whether these are the times and states of one run."""
+    """Whether `times` and `states` are of one run."""
     t, x = _depth(times), _depth(states)
     if x is None or x > 2:
         return False
@@ -479,7 +482,7 @@ def _are_of_all_runs(times: Any, states: Any) -> bool:
 
 
 def _entries(values: Any, name: str) -> list[Any]:
-    """One entry a run."""
+    """A list with one entry a run."""
     is_frame = hasattr(values, "columns") or hasattr(values, "data_vars")
     if isinstance(values, Iterable) and not isinstance(values, str | bytes | dict) and not is_frame:
         return list(values)
@@ -490,7 +493,7 @@ def _entries(values: Any, name: str) -> list[Any]:
 
 
 def _names(entries: Sequence[Any], arrays: Sequence[np.ndarray], of: str) -> tuple[str, ...] | None:
-    """The names of the columns, which all runs must have in one order; None if there are none."""
+    """The names of the columns, the same in all runs; else None. Another order raises an error."""
     names = [_column_names(x, a.shape[1]) for x, a in zip(entries, arrays, strict=True)]
     for run, columns in enumerate(names):
         if columns and names[0] and columns != names[0] and sorted(columns) == sorted(names[0]):
@@ -521,7 +524,7 @@ def _name_list(names: tuple[str, ...] | None) -> str:
 
 
 def _sample_times(times: Any, states: Any) -> Any:
-    """The times of samples at a sampling interval, from 0 on; other times as they are."""
+    """The times of samples from 0 on, if `times` is a sampling interval; else `times`."""
     if _depth(times) != 0:
         return times
     interval = float(require.doubles(times, "the sampling interval"))
@@ -610,8 +613,8 @@ def _rows(x: Any, t: np.ndarray, run: int, name: str) -> Float[np.ndarray, "T n"
             hint = f" Rows of one flat list: np.reshape(values, ({len(t)}, {len(x) // len(t)}))."
         elif name == "inputs" and x.ndim == 2:
             hint = (
-                " Where inputs have times of their own, give pairs, inputs=[(times, u), …]; where "
-                "the last command is missing, repeat it."
+                " If inputs have times of their own, give pairs, inputs=[(times, u), …]. If the "
+                "last command is missing, repeat it."
             )
         raise ValueError(
             f"{name}[{run}] has shape {x.shape} and times[{run}] has shape {t.shape}; one row a "
@@ -651,7 +654,7 @@ def _signal(
     input_times = _times(u[0], run, "inputs")
     values = _rows(u[1], input_times, run, "inputs")
     spacing = float(np.median(np.diff(np.asarray(input_times))))
-    # A held command lasts until the next one, which comes a spacing after the last that was logged.
+    # A held command lasts until the next one, so one more spacing after the last command is known.
     for name, missing, end in (
         ("begin", input_times[0] - t[0], (input_times[0], t[0])),
         ("end", t[-1] - input_times[-1], (input_times[-1], t[-1])),
@@ -659,8 +662,8 @@ def _signal(
         if missing > 1.001 * spacing:
             raise ValueError(
                 f"the inputs of run {run} {name} at {float(end[0]):g} and its states at "
-                f"{float(end[1]):g}: what was applied must be known over the whole run. Cut the "
-                "states, or repeat the command that was held."
+                f"{float(end[1]):g}: the inputs must be known over the whole run. Cut the states, "
+                "or repeat the command that was held."
             )
     return input_times, values
 
@@ -685,6 +688,6 @@ def _check_inputs(inputs: tuple[np.ndarray, ...]) -> None:
         if np.isnan(np.asarray(u)).any():
             raise ValueError(
                 f"inputs[{run}] contains NaN at sample {np.argwhere(np.isnan(np.asarray(u)))[0][0]}"
-                ": what was applied must be known at every sample. Repeat the command that was held"
+                ": the inputs must be known at every sample. Repeat the command that was held"
                 ", interpolate, or cut the run there."
             )

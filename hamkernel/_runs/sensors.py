@@ -1,4 +1,4 @@
-"""Faults that sensors and controllers leave in a log, each a row of the table of `Runs.check`."""
+"""Faults that sensors and controllers leave in a log: the rows of the table of `Runs.check`."""
 
 import itertools
 import warnings
@@ -32,7 +32,7 @@ class Log(NamedTuple):
 
 
 def faults(log: Log) -> Diagnostics:
-    """The table of a log: one row for each kind of fault."""
+    """The table of faults of a log, one row for each kind."""
     rows = [_impossible(log), _outages(log), _wraps(log), _gaps(log), _constant(log)]
     rows += _sensors(log)
     if log.inputs:
@@ -43,14 +43,14 @@ def faults(log: Log) -> Diagnostics:
 def _row(
     name: str, faults_found: Sequence[str], limit: str, meaning: str, advice: str
 ) -> Diagnostic:
-    """A row of the table, which passes if no faults were found."""
+    """A row of the table. It passes if `faults_found` is empty."""
     if not faults_found:
         return Diagnostic(name, "none", limit, True, "nothing of it in this log")
     return Diagnostic(name, _list(faults_found), limit, False, meaning, advice)
 
 
 def _impossible(log: Log) -> Diagnostic:
-    """Samples that are no measurements."""
+    """The row of samples that a logger wrote in place of a measurement."""
     where = [np.flatnonzero(impossible_samples(x)) for x in log.states]
     count = sum(map(len, where))
     run = next((r for r, rows in enumerate(where) if len(rows)), 0)
@@ -60,14 +60,14 @@ def _impossible(log: Log) -> Diagnostic:
         [f"{count}, {first}"] * bool(count),
         "20 deviations, or a row of zeros",
         f"{count} {'sample is' if count == 1 else 'samples are'} impossible beside "
-        f"{'its' if count == 1 else 'their'} neighbours, {first}: what a logger writes for a lost "
-        "measurement, such as -9999, 65535 or zeros",
+        f"{'its' if count == 1 else 'their'} neighbours, {first}: a logger may have written -9999, "
+        "65535 or zeros for a lost measurement",
         "Write NaN there; runs.impossible has the indices, by run.",
     )
 
 
 def _wraps(log: Log) -> Diagnostic:
-    """Angles and counts that jump by a full turn."""
+    """The row of angles and encoder counts that jump by a full turn."""
     where: dict[float, list[str]] = {}
     lost = False
     for run, (t, x) in enumerate(zip(log.times, log.states, strict=True)):
@@ -96,7 +96,7 @@ def _wraps(log: Log) -> Diagnostic:
 
 
 def _gaps(log: Log) -> Diagnostic:
-    """Long intervals without a sample."""
+    """The row of long intervals without a sample."""
     faults_found = []
     for run, dt in enumerate(map(np.diff, log.times)):
         if len(dt) > 2 and dt.max() > 10 * np.median(dt):
@@ -114,7 +114,7 @@ def _gaps(log: Log) -> Diagnostic:
 
 
 def _constant(log: Log) -> Diagnostic:
-    """Coordinates that never move."""
+    """The row of coordinates that never move."""
     faults_found = []
     for name, column in zip(log.names, np.concatenate(log.states).T, strict=True):
         column = column[np.isfinite(column)]
@@ -129,11 +129,11 @@ def _constant(log: Log) -> Diagnostic:
     )
 
 
-_QUANTA = 4.0  # if a coordinate moves by more resolution steps than this, a repeat is no rounding
+_QUANTA = 4.0  # a coordinate that moves by more resolution steps does not repeat by rounding
 
 
 def _sensors(log: Log) -> list[Diagnostic]:
-    """Coordinates that look clipped, dead, repeated or interpolated."""
+    """The rows of coordinates that look clipped, dead, repeated or interpolated."""
     scale = np.array(
         [np.nanstd(x) if np.isfinite(x).any() else 0 for x in np.concatenate(log.states).T]
     )
@@ -150,7 +150,7 @@ def _sensors(log: Log) -> list[Diagnostic]:
         if max(flat.values()) >= 2:
             clipped += [f"{name} at {value:.4g}" for value, count in flat.items() if count]
             continue
-        # A real log of a motor repeats a quarter of the positions, and can be learned from.
+        # A real log of a motor repeats a quarter of the positions, and is still useful.
         share = _repeats(steps)
         if share > 0.3 and np.median(moving) > _QUANTA * quantum:
             repeated.append(f"{name} ({share:.0%})")
@@ -158,7 +158,7 @@ def _sensors(log: Log) -> list[Diagnostic]:
         share = _straight(log.times, columns)
         ratios = moving / quantum
         is_digital = np.abs(ratios - np.round(ratios)).max() < 0.01
-        if share > 0.4 and not is_digital:  # every other sample interpolated makes .5
+        if share > 0.4 and not is_digital:  # .5 if every other sample was interpolated
             drawn.append(f"{name} ({share:.0%})")
         for r, x in enumerate(columns):
             stretch = _stuck(x, np.delete(log.states[r] / unit, c, axis=1))
@@ -169,7 +169,7 @@ def _sensors(log: Log) -> list[Diagnostic]:
 
 
 def _outages(log: Log) -> Diagnostic:
-    """Stretches in which all coordinates keep one value, between motions."""
+    """The row of stretches in which all coordinates keep one value, between motions."""
     places = []
     for r, (t, x) in enumerate(zip(log.times, log.states, strict=True)):
         for first, stop in _outages_of(x[:, np.isfinite(x).any(axis=0)]):
@@ -179,16 +179,17 @@ def _outages(log: Log) -> Diagnostic:
         places,
         "twice the largest step",
         f"the log seems to stand still in {_list(places)}: all coordinates keep one value there, "
-        "and then jump by more than twice of what they move in a step elsewhere",
+        "and then jump by more than twice their largest step elsewhere",
         "Write NaN for these samples.",
     )
 
 
 def _outages_of(x: Float[np.ndarray, "T n"]) -> list[tuple[int, int]]:
-    """The first and last rows of outages: three equal rows or more, from motion to a jump.
+    """The first and last rows of outages: three equal rows or more, between motion and a jump.
 
-    If the largest speed was held for three samples, the next step is three times the largest. A
-    body that comes to rest and is then struck arrives by steps of its resolution.
+    If the system moves on at its largest speed while three samples are lost, the log then jumps by
+    three of its largest steps. A body that comes to rest and is then struck is no outage: its last
+    steps before the rest are as small as the resolution of the sensor.
     """
     steps = np.abs(np.diff(x, axis=0))
     equal = (steps == 0).all(axis=1)
@@ -222,7 +223,7 @@ def _sensor_rows(
             "two plateaus",
             f"a sensor seems clipped: coordinate {_list(clipped)} stays at its outermost value and "
             "arrives there at speed",
-            "Write NaN for these samples; the field then says where it went.",
+            "Write NaN for these samples; learning then finds the motion there.",
         ),
         _row(
             "dead sensors",
@@ -236,9 +237,9 @@ def _sensor_rows(
             "repeated samples",
             repeated,
             "30%",
-            f"repeated samples: coordinate {_list(repeated)} is often exactly the sample before, "
-            "and else goes on by many steps of its resolution. The log was written faster than the "
-            "sensor measures, so times are late and the noise looks smaller than it is",
+            f"repeated samples: coordinate {_list(repeated)} often equals the previous sample, and "
+            "otherwise changes by many steps of its resolution. The logger ran faster than the "
+            "sensor, so times are late and the noise looks smaller than it is",
             "Keep the first of equal samples and write NaN for the others.",
         ),
         _row(
@@ -246,15 +247,15 @@ def _sensor_rows(
             drawn,
             "40%",
             f"interpolated samples: coordinate {_list(drawn)} lies on straight lines between some "
-            "of its samples. What was interpolated is no measurement, and the noise looks smaller "
+            "of its samples. Interpolated samples are no measurements, and the noise looks smaller "
             "than it is",
-            "Give the samples at their own times, hk.Runs does not need equal ones.",
+            "Give the samples at their own times: hk.Runs takes unequal sampling intervals.",
         ),
     ]
 
 
 def _repeats(steps: Sequence[Float[np.ndarray, " _"]]) -> float:
-    """The share of samples that repeat the one before, without stretches at rest.
+    """The share of samples equal to the sample before, without stretches at rest.
 
     A stretch of equal values is a rest if it is a whole run, or more than ten times as long as the
     median stretch.
@@ -270,10 +271,10 @@ def _repeats(steps: Sequence[Float[np.ndarray, " _"]]) -> float:
 
 
 def _straight(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> float:
-    """The share of samples on the line of their neighbours, among those whose neighbours differ.
+    """The share of samples on the line through their neighbours, where the neighbours differ.
 
-    The share is zero if fewer than ten samples lie off their line, as in free motion with a few
-    collisions, and if the angle was wrapped.
+    The share is 0 if the angle is wrapped. It is also 0 if fewer than ten samples lie off their
+    line, as in free motion with a few collisions.
     """
     off = [np.zeros(0)]
     for t, x in zip(times, columns, strict=True):
@@ -288,7 +289,7 @@ def _straight(times: Sequence[np.ndarray], columns: Sequence[np.ndarray]) -> flo
 
 
 def _plateaus(x: Float[np.ndarray, " T"], value: float, quantum: float) -> int:
-    """The number of plateaus: x arrives at speed at this outermost value and stays three samples.
+    """The number of plateaus: x arrives fast at its outermost value and stays three samples.
 
     A smooth maximum can also round to one value k times. Such a parabola falls by less than
     ((k + 2)/k)² resolution steps at the next sample, 2.8 for k = 3.
@@ -304,10 +305,11 @@ def _plateaus(x: Float[np.ndarray, " T"], value: float, quantum: float) -> int:
 
 
 def _stuck(x: Float[np.ndarray, " T"], rest: Float[np.ndarray, "T rest"]):
-    """The longest stretch of equal values in which another coordinate moves by more than one.
+    """The longest stretch of equal values (first, last), if the sensor was stuck there; else None.
 
-    A sensor that was stuck jumps to where the system is. A coarse encoder at a turning point moves
-    on by one step, the least difference of its values, and is not stuck.
+    A sensor was stuck for six samples or more if another coordinate moves by more than one standard
+    deviation meanwhile, and the sensor jumps before or after. A coarse encoder at a turning point
+    changes by one step, the least difference of its values, and is not stuck.
     """
     edges = np.flatnonzero(np.diff(np.concatenate([[False], x[1:] == x[:-1], [False]]).astype(int)))
     if not edges.size or not rest.size:
@@ -325,10 +327,10 @@ def _stuck(x: Float[np.ndarray, " T"], rest: Float[np.ndarray, "T rest"]):
 
 
 def _inputs(log: Log) -> list[Diagnostic]:
-    """Inputs that never change, and inputs with a combination that hardly changes.
+    """The rows of constant inputs, and of inputs with a combination that hardly changes.
 
-    The inputs are scaled to variance one. A combination with a variance below .01 has a gain whose
-    error is ten times as large as with independent inputs.
+    We scale the inputs to variance one. If the variance of a combination is below .01, the error of
+    its gain is more than ten times as large as with independent inputs.
     """
     U = np.concatenate(log.inputs)
     none = np.ptp(U, axis=0) == 0
@@ -344,8 +346,8 @@ def _inputs(log: Log) -> list[Diagnostic]:
             "constant inputs",
             still,
             "some change",
-            f"constant in all runs: input {_list(still)}. What it does cannot be told from the "
-            f"drift, {unless}",
+            f"constant in all runs: input {_list(still)}. The data cannot distinguish its effect "
+            f"from the drift, {unless}",
             "Leave it out, or log runs in which it varies.",
         ),
         _row(
@@ -353,28 +355,28 @@ def _inputs(log: Log) -> list[Diagnostic]:
             alike,
             "1% of the variance",
             f"inputs {_list(alike)} depend on one another: a combination of them has less than 1 % "
-            f"of their variance. Their gains cannot be told apart, {unless}",
+            f"of their variance. The data cannot distinguish their gains, {unless}",
             "Leave out inputs that repeat others, or vary each on its own.",
         ),
     ]
 
 
 def _feedback(log: Log) -> Diagnostic:
-    """Inputs that are a smooth function of the states."""
+    """The row of inputs that are a smooth function of the states."""
     share = _free_of_states(np.concatenate(log.states), np.concatenate(log.applied))
     many = len(log.input_names) > 1
     error = 1 / np.sqrt(max(share, 1e-12))
     return Diagnostic(
         "feedback",
         f"{share:.2g} of the variance is free of the states",
-        "0.1",  # where the error of a gain is √10 times that under independent inputs
+        "0.1",  # here the error of a gain is √10 times as large as with an independent input
         share >= 0.1,
         "the inputs vary by themselves"
         if share >= 0.1
         else f"{'a combination of the inputs' if many else 'the input'} is a function of the "
-        f"states but for {share:.2g} of its variance: feedback without excitation. Gain and drift "
-        f"are then told apart by what is left alone, and their errors are {error:.2g} times those "
-        "under an independent input",
+        f"states but for {share:.2g} of its variance: feedback without excitation. Only this "
+        f"remainder distinguishes gain and drift, and their errors are {error:.2g} times as large "
+        "as with an independent input",
         "Add a known disturbance to the command, log other gains of the controller, or give the "
         "input matrix, hk.Controlled(K, inputs=[[0.0], [1.0]]).",
     )
@@ -383,7 +385,8 @@ def _feedback(log: Log) -> Diagnostic:
 def _free_of_states(X: Float[np.ndarray, "N n"], U: Float[np.ndarray, "N m"]) -> float:
     """The share of the variance of U that no cubic polynomial of X explains.
 
-    Of all combinations of the inputs we return the smallest share; 1 if there are too few data.
+    This is the smallest share of all linear combinations of the inputs. It is 1 if there are too
+    few data, or if the inputs are constant or dependent.
     """
     X = X[:, np.isfinite(X).any(axis=0)]
     use = np.isfinite(X).all(axis=1)
@@ -410,12 +413,12 @@ def _free_of_states(X: Float[np.ndarray, "N n"], U: Float[np.ndarray, "N m"]) ->
 
 
 class Timing(NamedTuple):
-    """The growth of residuals r with the speed v, which wrong times cause: E r² = σ² + τ²v².
+    """The growth of residuals r with the speed v: E r² = σ² + τ²v² if the times have errors.
 
     Attributes:
         score: the score test of τ = 0, N(0, 1) if the times are right.
-        off: τ, the standard deviation of the times.
-        share: the largest share of τ²v² in the variance of a coordinate.
+        off: τ, the standard deviation of the errors of the times.
+        share: the largest share of τ²v² in the variance of the residuals of a coordinate.
     """
 
     score: float
@@ -424,18 +427,23 @@ class Timing(NamedTuple):
 
     @property
     def is_off(self) -> bool:
-        """Whether the times are wrong, and cause a fifth of the variance of a coordinate.
+        """Whether the times have errors that cause a fifth of the residuals of a coordinate.
 
         Ten clean logs of a pendulum, 4 runs of 80 samples each, have scores of −1 to .6. Three logs
-        with noise of .02 and times off by .02 have scores of 12 to 16 and τ of .018 to .024.
+        with noise of .02 and errors of the times of .02 have scores of 12 to 16.
         """
         return self.score > 3 and self.share > 0.2
 
 
 def timing(times: list[np.ndarray], residuals: list[np.ndarray], paths: list[np.ndarray]) -> Timing:
-    """The growth of residuals with the speed along the paths; NaN where nothing was measured.
+    """The growth of the residuals with the speed along the paths.
 
-    Speeds are compared within each run, since the noise may be larger in a run that is faster.
+    We compare speeds within each run only, since a faster run may have larger noise.
+
+    Args:
+        times: the times of each run, shape (T,).
+        residuals: the residuals, shape (T, n); NaN where nothing was measured.
+        paths: the states along the paths, shape (T, n).
     """
     scores, weights, growths, ratios = [], [], [], []
     for c in range(paths[0].shape[1]):
@@ -460,20 +468,20 @@ def timing(times: list[np.ndarray], residuals: list[np.ndarray], paths: list[np.
     return Timing(sum(scores) / len(scores) ** 0.5, growth**0.5, growth * max(ratios))
 
 
-# Where angles and encoder counts are wrapped: radians, degrees, and 12 and 16 bits.
+# Periods of wrapped angles and encoder counts: radians, degrees, and 12 and 16 bits.
 _PERIODS = (2 * np.pi, 360.0, 4096.0, 65536.0)
 
 
 def wrapped_period(t: Float[np.ndarray, " T"], x: Float[np.ndarray, " T"]) -> float:
-    """The period at which x is wrapped; 0.0 if it is not.
+    """The period at which x is wrapped; 0.0 if x is not wrapped.
 
     A wrapped x has steps of about the period, and all its other steps are less than a third of the
-    period. In units other than radians x must also fill the period and no more.
+    period. In units other than radians the range of x must also be .8 to 1 periods.
     """
     t, x = t[np.isfinite(x)], x[np.isfinite(x)]
     near = np.diff(t) <= 3 * np.median(np.diff(t)) if len(t) > 1 else slice(0)
     for period in _PERIODS:
-        step = np.abs(np.diff(x))[near] / period  # across a gap a momentum may go as far
+        step = np.abs(np.diff(x))[near] / period  # a momentum may change as much across a gap
         beyond = np.abs(step - 1)
         full = beyond < 1 / 3
         if not full.any() or (period > 7 and not 0.8 < np.ptp(x) / period <= 1.0):
@@ -485,15 +493,16 @@ def wrapped_period(t: Float[np.ndarray, " T"], x: Float[np.ndarray, " T"]) -> fl
 
 
 def impossible_samples(x: Float[np.ndarray, "T n"]) -> Bool[np.ndarray, " T"]:
-    """The rows of one run that cannot belong to the motion of the other rows.
+    """Whether each row of one run is impossible beside its neighbours.
 
     Let d be the distance of a sample from the mean of its two neighbours, and σ the standard
     deviation of d, estimated by the median so that one row in eight may be wrong. A row is
     impossible if in one coordinate the neighbours agree to d/5 and one of two conditions holds.
-    - d > 20 σ, and the row is outside the range of the others by twice that range, such as −9999,
-      65535 or 1e30.
-    - d > 6 σ, and the row is all zeros, which loggers write for a lost packet. Then all rows of
-      zeros are impossible whose neighbours are not.
+    - d > 20 σ, and the sample lies outside the 10 % and 90 % quantiles by more than twice their
+      difference, such as −9999, 65535 or 1e30.
+    - d > 6 σ, and the row, of two coordinates or more, is all zeros, which loggers write for a lost
+      packet. Then all rows of zeros are impossible whose neighbours are not zeros.
+    The first and the last row have one neighbour, and only the first condition applies.
     """
     bad = np.zeros(len(x), bool)
     if len(x) < 5:
@@ -506,7 +515,7 @@ def impossible_samples(x: Float[np.ndarray, "T n"]) -> Bool[np.ndarray, " T"]:
         low, high = (np.nanquantile(x, q, axis=0) for q in (0.1, 0.9))
         beyond = (x < low - 2 * (high - low)) | (x > high + 2 * (high - low))
         bad[1:-1] = (alone & (d > 20 * sigma) & beyond[1:-1]).any(axis=1)
-        for end, inner in ((0, 1), (-1, -2)):  # with one neighbour
+        for end, inner in ((0, 1), (-1, -2)):
             bad[end] = (beyond[end] & (np.abs(x[end] - x[inner]) > 20 * sigma)).any()
         zero = (x == 0).all(axis=1) & (x.shape[1] > 1)
         if (zero[1:-1] & (alone & (d > 6 * sigma)).any(axis=1)).any():
@@ -516,19 +525,19 @@ def impossible_samples(x: Float[np.ndarray, "T n"]) -> Bool[np.ndarray, " T"]:
 
 
 def is_on_a_curve(states: Sequence[Float[np.ndarray, "T n"]], noise: np.ndarray) -> bool:
-    """Whether the momentum is one function of the position in the data of all runs, for n = 2.
+    """Whether the momentum is a function of the position in the data of all runs, for n = 2.
 
-    We fit a cubic to the momenta and test the share of their variance that remains, after we
-    subtract the noise of both sensors. The share is 0 for a capacitor that discharges, 1.6e-3 for a
-    tank, and 9e-3 for a pendulum on a quarter of a swing. It is 1 for a pendulum that turns over
-    quickly, whose momenta vary by a tenth (`tests/test_process_noise.py`).
+    We fit p as a cubic of q. The share of the variance of p in the residual, after we subtract the
+    noise of both sensors, must be below 2e-3. It is 1.6e-3 for a tank, and 9e-3 for a pendulum on a
+    quarter of a swing (`tests/test_process_noise.py`).
     """
     X = np.concatenate(states)
     X = X[np.isfinite(X).all(axis=1)]
     if X.shape[1] != 2 or len(X) < 10:
         return False
     off = np.abs(X - np.median(X, axis=0))
-    X = X[(off <= 15 * np.median(off, axis=0)).all(axis=1)]  # ten deviations: no measurements
+    # Rows beyond 15 median deviations, ten standard deviations, are no measurements.
+    X = X[(off <= 15 * np.median(off, axis=0)).all(axis=1)]
     q, p = (X - X.mean(axis=0)).T
     cubic = np.polynomial.polynomial.polyvander(q / max(q.std(), 1e-300), 3)
     rest = p - cubic @ np.linalg.lstsq(cubic, p, rcond=None)[0]

@@ -2,16 +2,18 @@
 
 The kernel is Matérn-7/2, and a Kalman filter makes the cost linear in the number of samples.
 
-With u = λ t and λ = √7/ℓ the process and its first three derivatives in u obey a linear equation
-driven by white noise, (d/du + 1)⁴ x = w. Between two samples
+With u = λ t and λ = √7/ℓ, the process and its first three derivatives in u obey a linear equation
+driven by white noise, (d/du + 1)⁴ x = w. Between two samples the state has the transition matrix A
+and the covariance P,
 
-    A(u) = exp(−u) Σ_{j<4} (N u)ʲ/j!,      P ← P∞ + A (P − P∞) Aᵀ,
+    A(u) = exp(−u) Σ_{j<4} (N u)ʲ/j!,      P ← P∞ + A (P − P∞) Aᵀ.
 
-N the companion matrix plus the identity, which is nilpotent: both are exact for any spacing.
+N is the companion matrix plus the identity and is nilpotent, so both formulas are exact for any
+sampling interval.
 
-We smooth by Bryson & Frazier's recursion, backward in the adjoint (l, L): x = m − P l and
-Cov = P − P L P. The recursion inverts no predicted covariance, which is singular to rounding if
-samples are close, and needs no special case for padding, zero time steps or missing measurements.
+We smooth by the recursion of Bryson & Frazier, backward in the adjoint (l, L): x = m − P l and
+Cov = P − P L P. The recursion does not invert the predicted covariance, which is nearly singular if
+samples are close. It needs no special case for padding, zero time steps or missing measurements.
 
 Source: Hartikainen & Särkkä (2010), "Kalman filtering and smoothing solutions to temporal Gaussian
 process regression models"; Bierman (1973) for the smoother.
@@ -38,7 +40,7 @@ class Padded(NamedTuple):
         times: the times since the first sample of each run, shape (R, T).
         states: the samples; zero where nothing was measured, shape (R, T, n).
         measured: whether each entry of a state was measured, shape (R, T, n).
-        lengths: the number of samples of each run; 0 for a run that is padding.
+        lengths: the number of samples of each run, 0 for padding, shape (R,).
     """
 
     times: Float[np.ndarray, "R T"]
@@ -53,7 +55,7 @@ def power_of_two(count: int) -> int:
 
 
 def pad(times: Sequence[np.ndarray], states: Sequence[np.ndarray]) -> Padded:
-    """Runs of any lengths as arrays; T is a power of two, at least 8."""
+    """Runs of any lengths as arrays; R and T are powers of two, and T is at least 8."""
     R = power_of_two(len(times))
     T = max(power_of_two(max(len(t) for t in times)), 8)
     n = states[0].shape[1]
@@ -80,7 +82,8 @@ def cut(
     return pieces_t, pieces_x
 
 
-# Moments ∫ω^(2j) S(ω) dω of the spectral density (1 + ω²)⁻⁴, of mass one, are 1, 1/5, 1/5, 1.
+# The moments ∫ω^(2j) S(ω) dω of the spectral density S ∝ (1 + ω²)⁻⁴, of mass one, are 1, 1/5, 1/5
+# and 1 for j = 0, …, 3.
 _STATIONARY = np.array(
     [[1, 0, -0.2, 0], [0, 0.2, 0, -0.2], [-0.2, 0, 0.2, 0], [0, -0.2, 0, 1]], float
 )
@@ -89,7 +92,7 @@ _powers = np.stack([np.linalg.matrix_power(_nilpotent, j) / f for j, f in enumer
 
 
 class Process(NamedTuple):
-    """The logs of the standard deviation of the signal, of the rate λ, and of the noise."""
+    """The logarithms of the standard deviation of the signal, the rate λ, and the noise."""
 
     log_amplitude: Float[Array, ""]
     log_rate: Float[Array, ""]
@@ -97,7 +100,7 @@ class Process(NamedTuple):
 
 
 class Smoothed(NamedTuple):
-    """The process given the samples, at their times.
+    """The posterior of one process at the times of its samples.
 
     Attributes:
         value: x(t), shape (T,).
@@ -123,9 +126,9 @@ def _stationary(process: Process) -> Float[Array, "4 4"]:
 
 
 def _filter(process: Process, steps, y, measured, slopes: Any = None):
-    """The forward pass: arrays for the backward pass at each time, and the log likelihood.
+    """The forward pass: arrays for the backward pass, and the terms of −2 log p, at each time.
 
-    `steps` are the times since the sample before, 0 for the first. `slopes` are samples of the
+    `steps` are the times since the previous sample, 0 for the first. `slopes` are samples of the
     derivative, a mask of the measured ones, and the logarithm of their noise. The backward pass
     does not use `slopes`.
     """
@@ -178,19 +181,19 @@ def negative_log_likelihood(
 def smooth(
     process: Process, steps: Float[Array, " T"], y: Float[Array, " T"], measured: Bool[Array, " T"]
 ) -> Smoothed:
-    """The process given one run: values and derivatives at all its times, measured or not.
+    """The posterior of the process given one run, at all its times, measured or not.
 
     Args:
         process: the hyperparameters.
-        steps: the time since the sample before, 0 for the first.
+        steps: the time since the previous sample, 0 for the first.
         y: the samples.
-        measured: which of them were measured.
+        measured: whether each sample was measured.
     """
     m, P, S, error, A, _ = _filter(process, steps, y, measured)
 
     # Let J be −log p(this sample and the later ones | m), l = ∂J/∂m and L = ∂²J/∂m². A sample maps
-    # m to C m + … and adds error²/(2S) to J, an interval maps m to A m, and the chain rule gives l
-    # and L backward in time. E[x | y] = m − P l and Cov[x | y] = P − P L P, as in `kalman.py`.
+    # m to C m + … and adds error²/(2S) to J. An interval maps m to A m. The chain rule gives l and
+    # L backward in time. Then E[x | y] = m − P l and Cov[x | y] = P − P L P, as in `kalman.py`.
     def step(carry, at):
         l, L = carry  # noqa: E741 - the adjoint, after the sample
         m, P, S, error, A, there = at
@@ -212,10 +215,12 @@ def smooth(
 
 
 class Coordinate(NamedTuple):
-    """A process of one coordinate in the units of the states.
+    """The process of one coordinate, in the units of the states.
 
-    `measured` is False if the coordinate was never measured. `slope_noise` is the noise of samples
-    of its derivative, NaN if there are none.
+    Attributes:
+        process: the hyperparameters.
+        measured: whether the coordinate was ever measured.
+        slope_noise: the noise of samples of its derivative; NaN if there are none.
     """
 
     process: Process
@@ -250,16 +255,19 @@ def processes(
     groups: Sequence[np.ndarray] | None = None,
     slopes: Sequence[np.ndarray] | None = None,
 ) -> list[Coordinate]:
-    """The hyperparameters of each coordinate, by the marginal likelihood of all runs.
+    """The hyperparameters of each coordinate, which maximise the marginal likelihood of all runs.
 
-    Coordinates of one of the `groups`, as indices, share one process; if None, each coordinate has
-    its own. `slopes` are samples of the derivatives.
+    Args:
+        times: the times of each run, shape (T,).
+        states: the states of each run, shape (T, n); NaN where nothing was measured.
+        groups: indices of the coordinates that share one process; if None, each has its own.
+        slopes: samples of the derivatives, shapes (T, n), NaN where nothing was measured; or None.
     """
     states, n = subtract_means(states)[0], states[0].shape[1]
     slopes = [np.full(x.shape, np.nan) for x in states] if slopes is None else slopes
     both = [np.concatenate(pair, axis=1) for pair in zip(states, slopes, strict=True)]
-    # Pieces of 256 samples are filtered in parallel, at most 64 of them: 100 000 samples then cost
-    # as much as 16 000.
+    # We filter at most 64 pieces of 256 samples in parallel, so the cost stops growing at 16 000
+    # samples.
     pieces_t, pieces_x = cut(times, both, 256)
     if len(pieces_t) > 64:
         chosen = np.linspace(0, len(pieces_t) - 1, 64).round().astype(int)
@@ -274,7 +282,7 @@ def processes(
             a[:, :, c] for c in (g, n + g) for a in (pieces.states, pieces.measured)
         ]
         arrays = [a.swapaxes(1, 2).reshape(-1, a.shape[1]) for a in arrays]
-        # At most 512 rows, 64 pieces of eight coordinates, are enough for a few numbers.
+        # At most 512 rows, 64 pieces of eight coordinates, determine the few hyperparameters.
         part = np.unique(np.linspace(0, len(arrays[0]) - 1, 512).round().astype(int))
         arrays = [a[part] for a in (np.repeat(steps, len(g), 0), *arrays)]
         dt, x, measured, v, measured_slope = arrays
@@ -289,8 +297,8 @@ def _process(steps, y, measured, v, measured_slope, longest: float, spacing: flo
     if not scale > 0:  # never measured, or constant
         nothing = Process(*(jnp.asarray(v) for v in (-np.inf, -np.log(longest), -np.inf)))
         return Coordinate(nothing, bool(measured.any()))
-    # A swing a hundred times as long as the data looks like a line; one faster than half a sample,
-    # like noise. The noise is at least the rounding of the states.
+    # Bounds of (amplitude, rate, noise) in units of the data. A rate below .03/longest looks like a
+    # line in the data, and a rate above 3/spacing like noise. The noise is at least the rounding.
     low, high = [0.3, 0.03 / longest, 1e-7], [1e3, 3.0 / spacing, 2.0]
     slopes = None
     if measured_slope.any():
@@ -325,7 +333,7 @@ def _fit_process(steps, y, measured, slopes, low, high) -> Float[Array, " h"]:
     ]
     count = jnp.maximum(measured.sum(), 1).astype(y.dtype)
     sizes = [jnp.full_like(count, 0.2), jnp.full_like(count, 0.1), 1 / jnp.sqrt(2 * count)]
-    if slopes is not None:  # the same share of the slopes
+    if slopes is not None:  # in the grid the slopes have the same relative noise
         columns, sizes = [*columns, columns[2] + high[3] - high[2]], [*sizes, sizes[2]]
     design, sizes = jnp.stack(columns, axis=1), jnp.stack(sizes)
     run = best_in_box(loss, design, low, high, sizes, 40, batch_size=12)
@@ -338,7 +346,7 @@ def _smooth_each(process: Process, steps, y, measured: Bool[Array, "R T"]) -> Sm
 
 
 class Paths(NamedTuple):
-    """Smoothed runs, each entry of shape (R, T, n), in the units of the states and times."""
+    """Smoothed runs: arrays of shape (R, T, n), in the units of the states and times."""
 
     value: Float[np.ndarray, "R T n"]
     slope: Float[np.ndarray, "R T n"]
@@ -350,9 +358,9 @@ class Paths(NamedTuple):
 def smooth_runs(
     coordinates: list[Coordinate], times: Sequence[np.ndarray], states: Sequence[np.ndarray]
 ) -> Paths:
-    """The smoothed paths of all runs at all their times, padded; also where nothing was measured.
+    """The smoothed paths of all runs at all their times, measured or not, with padding.
 
-    A coordinate that was never measured is NaN; a constant coordinate stays constant.
+    A coordinate that was never measured is NaN. A constant coordinate stays constant.
     """
     states, means = subtract_means(states)
     runs = pad(times, states)
@@ -380,8 +388,8 @@ class Smoothing(eqx.Module):
 
     Attributes:
         times: the times of each run, shape (P,): its samples, and times between them.
-        states: the smoothed states there, shape (P, n); NaN where never measured.
-        deviation: the standard deviation of each coordinate, the sensor noise left out, (P, n).
+        states: the smoothed states, shape (P, n); NaN for coordinates that were never measured.
+        deviation: the posterior standard deviation without the sensor noise, shape (P, n).
         noise: the standard deviation of the sensor noise of each coordinate, shape (n,).
     """
 
@@ -395,7 +403,7 @@ class Smoothing(eqx.Module):
 
 
 def smoothing(times: Sequence[np.ndarray], states: Sequence[np.ndarray], between: int) -> Smoothing:
-    """The smoothed runs at their samples and at `between` times between each two."""
+    """The smoothed runs at their samples and at `between` times between two samples."""
     coordinates = processes(times, states)
     grids, wide = [], []
     for t, x in zip(times, states, strict=True):

@@ -1,4 +1,4 @@
-"""Tables of diagnostics: what was found, its limit, what it means, and what to do."""
+"""Tables of diagnostics: a value, its limit, its meaning, and advice."""
 
 import dataclasses
 import html
@@ -10,7 +10,7 @@ from hamkernel._show import printable
 
 
 class Diagnostic(NamedTuple):
-    """The answer to one question about a learned field, or about a log.
+    """One row: the answer to one question about a learned field, or about a log.
 
     Attributes:
         name: the question, in a word or two.
@@ -18,8 +18,8 @@ class Diagnostic(NamedTuple):
         limit: the limit of the value.
         passes: whether the value is within the limit.
         meaning: the meaning of the value, in one sentence.
-        advice: the thing to do, in one sentence; "" where there is nothing to do.
-        decides: whether a field that fails here must not be used.
+        advice: the remedy, in one sentence; "" if none is needed.
+        decides: whether a field that fails this row must not be used.
     """
 
     name: str
@@ -35,8 +35,8 @@ class Diagnostic(NamedTuple):
 class Diagnostics:
     """A table with one row for each question about a learned field, or about a log.
 
-    `diagnostics["noise"]` is the row of that name, `print(diagnostics)` the table, and a notebook
-    shows it in HTML.
+    `diagnostics["noise"]` returns the row of that name, `print(diagnostics)` prints the table, and
+    a notebook shows the table in HTML.
 
     Attributes:
         rows: the rows, each a `Diagnostic`.
@@ -46,17 +46,17 @@ class Diagnostics:
 
     @property
     def failing(self) -> tuple[str, ...]:
-        """The names of the rows that fall short."""
+        """The names of the rows that fail."""
         return tuple(row.name for row in self.rows if not row.passes)
 
     @property
     def is_usable(self) -> bool:
-        """Whether no row that decides falls short."""
+        """Whether every row with `decides` passes."""
         return all(row.passes or not row.decides for row in self.rows)
 
     @property
     def warning(self) -> str:
-        """The rows that fall short, in a line or two; "" where none does."""
+        """The rows that fail, in a line or two; "" if none does."""
         short = [row for row in self.rows if not row.passes]
         if not short:
             return ""

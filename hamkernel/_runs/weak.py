@@ -1,17 +1,17 @@
-"""Weak rows: a law of motion tested against functions of compact support, along smoothed runs.
+"""Weak rows: a law of motion, integrated against test functions along smoothed runs.
 
-A law d/dt a(z) + b(z) = c with a and b linear in its weights becomes
+A law d/dt a(z) + b(z) = c, with a and b linear in its weights, becomes
 
     ∫ (φ b − φ̇ a) dt = ∫ φ c dt,      φ(t) = (1 − s²)⁵, s = (t − t₀)/T, in −1 < s < 1,
 
-in which nothing is differentiated twice in time. The channels of a run, its positions or all its
-coordinates, are the Gaussian processes in time of `smoothing`. So the samples determine the path z
-of the channels, with their slopes if the law needs these, and the covariance S of its errors.
+which contains no second time derivative. The channels of a run are its positions or all its
+coordinates. Each channel is a Gaussian process in time, as in `smoothing`. The samples therefore
+determine the path z of the channels, with slopes if the law needs them, and the covariance S of its
+errors.
 
-Runs are cut into pieces with windows that overlap by half. Let D be the derivative of the rows of a
-piece with respect to the path. Their errors then have the covariance D S Dᵀ, to first order. D
-depends on the law, so a law is solved for twice: first with the part of D that is known, and then
-with all of it.
+We cut runs into pieces with windows that overlap by half. Let D be the derivative of the rows of a
+piece with respect to the path. To first order the errors of the rows have the covariance D S Dᵀ.
+Since D depends on the law, callers solve twice: first with the known part of D, then with all of D.
 """
 
 from collections.abc import Callable
@@ -27,16 +27,16 @@ from hamkernel._runs.preprocessing import condense
 from hamkernel._runs.runs import Runs
 from hamkernel._runs.smoothing import Coordinate, Process, power_of_two, processes, smooth_runs
 
-# In a window. By the trapezoidal rule ∫ (φ b − φ̇ a) dt of a sinusoid with b = ȧ and 2.2 rad in a
-# window is then wrong by 2e-6 of its size, and with (1 − s²)³ by 7e-5.
+# Nodes in a window. For a sinusoid with b = ȧ and 2.2 rad in a window, the trapezoidal rule for
+# ∫ (φ b − φ̇ a) dt then has a relative error of 2e-6; with (1 − s²)³ it would be 7e-5.
 _NODES = 24
-_WINDOWS = 10  # in a piece, whose covariances are matrices of 2 · 133 nodes
-_ROWS = 2048  # in a piece, at most: their Cholesky factor takes .3 s
-_MARGIN = 1.5  # lengthscales of samples beyond a piece, after which they say nothing more of it
+_WINDOWS = 10  # windows in a piece, at most: S is then a matrix of 2 · 133 rows
+_ROWS = 2048  # rows in a piece, at most: their Cholesky factor takes .3 s
+_MARGIN = 1.5  # lengthscales beyond a piece in which samples still inform its path
 # Samples in a lengthscale, at most. Means over ℓ/60 flatten a sinusoid of period 2.3 ℓ by 1e-4.
 _SAMPLES = 60
-_FEWEST = 13  # samples of the longest run
-_TOGETHER = 256  # samples smoothed at once: a factor of 512 rows takes 5 ms
+_FEWEST = 13  # samples that the longest run needs
+_TOGETHER = 256  # samples smoothed at once: the Cholesky factor of 512 rows takes 5 ms
 
 Law = Callable[[Float[Array, " z"]], tuple[Float[Array, "m *r"], Float[Array, "m *r"]]]
 
@@ -45,10 +45,10 @@ class Channels(NamedTuple):
     """The C channels of each run, with samples of their slopes if there are any.
 
     Attributes:
-        values: their samples, shape (T, C), NaN where nothing was measured.
-        slopes: samples of their derivatives, likewise.
-        groups: channels that are alike and have one process, as indices.
-        has_slopes: whether the path contains the slopes.
+        values: samples of the channels, shape (T, C), NaN where nothing was measured.
+        slopes: samples of their derivatives, shape (T, C), NaN where nothing was measured.
+        groups: indices of the channels that share one process.
+        has_slopes: whether the law needs the slopes, so that the path contains them.
         noise: the standard deviations of values and of slopes, shape (2, C); None if unknown.
         width: the width of the windows, in lengthscales of the smoothed channels.
     """
@@ -58,8 +58,9 @@ class Channels(NamedTuple):
     groups: list[Int[np.ndarray, " g"]]
     has_slopes: bool = True
     noise: Float[np.ndarray, "2 C"] | None = None
-    # Of a two-link arm at 100 Hz, with noise 1e-3 rad, M was off by .22, .09 and .10 % with windows
-    # (1 − s²)³ of .35, .7 and 1.2; (1 − s²)⁵ of 1.2 times their width has the same variance.
+    # For a two-link arm at 100 Hz with noise 1e-3 rad, the error of M was .22, .09 and .10 % with
+    # windows (1 − s²)³ of width .35, .7 and 1.2; (1 − s²)⁵ of 1.2 times the width has the same
+    # variance.
     width: float = 1.0
 
 
@@ -68,10 +69,10 @@ class Pieces(NamedTuple):
 
     Attributes:
         path: smoothed channels at the nodes, and then their slopes if the law needs them, shape
-            (B, P, Z).
+            (B, P, Z), Z = C or 2C.
         roots: E with E Eᵀ the covariance of the errors of a channel at the nodes, and then of its
-            slope, shape (B, G, Q, k).
-        owner: which of the roots belongs to each channel, shape (C,).
+            slope, shape (B, G, Q, k), Q = P or 2P.
+        owner: the index of the root of each channel, shape (C,).
         values: φ dt of each window at the nodes, shape (W, P).
         slopes: φ̇ dt, shape (W, P).
         overlap: ∫ φ_r φ_s dt, shape (W, W).
@@ -91,21 +92,21 @@ class Pieces(NamedTuple):
     spacing: float
 
     def states(self) -> Float[np.ndarray, "N Z"]:
-        """The smoothed states at all nodes of windows inside the runs."""
+        """The path at all nodes of the windows inside the runs."""
         near = np.abs(self.values) > 0
         used = np.einsum("bw,wp->bp", self.inside, near) > 0
         return self.path[used]
 
 
 class Smoothed(NamedTuple):
-    """The pieces, with what the smoother found.
+    """The pieces, and the results of the smoother.
 
     Attributes:
         pieces: the pieces.
         noise: the standard deviations of the noise of values and of slopes, shape (2, C), NaN where
             nothing was measured.
-        states: the smoothed channels and their slopes at the samples of each run, (T, 2C).
-        lengthscale: the shortest of the channels in time.
+        states: the smoothed channels and their slopes at the samples of each run, shape (T, 2C).
+        lengthscale: the shortest lengthscale of the channels, in units of time.
     """
 
     pieces: Pieces
@@ -115,14 +116,14 @@ class Smoothed(NamedTuple):
 
 
 def smoothed_pieces(runs: Runs, channels: Channels) -> Smoothed:
-    """The runs in pieces; no window is longer than the median run.
+    """The runs cut into pieces. No window is longer than the median run.
 
     Args:
         runs: the runs, whose inputs are c.
         channels: the channels of these runs.
 
     Raises:
-        ValueError: no run has 13 samples, or a channel does not move.
+        ValueError: no run has 13 samples, or a channel is constant or was never measured.
     """
     times, C = runs.host_arrays()[0], channels.values[0].shape[1]
     if max(map(len, times)) < _FEWEST:
@@ -140,7 +141,8 @@ def smoothed_pieces(runs: Runs, channels: Channels) -> Smoothed:
     phi, slope = _bump((np.arange(P)[None] - centres[:, None]) / half)
     path, roots, inside, targets = [], [], [], []
     for r, (t, duration) in enumerate(zip(times, durations, strict=True)):
-        # Windows of two pieces do not overlap: their errors are apart. 1e-9 is for rounding.
+        # Windows of two pieces do not overlap, so we treat their errors as independent. 1e-9 allows
+        # for rounding.
         count = (duration / step - 2 * half + 1e-9) // (half * (W + 1)) + 1
         for i in range(int(count)):
             at = t[0] + step * (half * (W + 1) * i + np.arange(P))
@@ -149,7 +151,7 @@ def smoothed_pieces(runs: Runs, channels: Channels) -> Smoothed:
             roots.append(errors)
             inside.append(at[centres + half] <= t[-1] + 1e-9 * step)
             targets.append(_integrals(runs, r, at, centres, half * step, C))
-    # A power of two, so that other data do not compile anew.
+    # We pad to a power of two, so that XLA does not recompile for other data.
     k = power_of_two(max(E.shape[1] for piece in roots for E in piece))
     is_inside = np.array(inside)
     pieces = Pieces(
@@ -173,15 +175,15 @@ def smoothed_pieces(runs: Runs, channels: Channels) -> Smoothed:
 
 
 class _Samples(NamedTuple):
-    """Samples of the channels and of their slopes, averaged where they are fast.
+    """Samples of the channels and of their slopes, averaged if the sampling is fast.
 
     Attributes:
         times: the times of each run, shape (T,).
         both: the samples, NaN where nothing was measured, shape (T, 2, C).
-        counts: how many samples each is the mean of.
+        counts: the number of samples in each mean, shape (T, 2, C).
         coordinates: the process of each channel.
-        noise: the standard deviations of the noise of a sample, shape (2, C).
-        sets: channels that have one process and were measured at the same times.
+        noise: the standard deviations of the noise of one sample, shape (2, C).
+        sets: indices of the channels with one process that were measured at the same times.
         length: the shortest lengthscale.
     """
 
@@ -196,7 +198,11 @@ class _Samples(NamedTuple):
     def path(
         self, r: int, at: Float[np.ndarray, " P"], orders: int = 0
     ) -> tuple[Float[np.ndarray, "P Z"], list[Float[np.ndarray, "Q k"]]]:
-        """Channels and slopes of run r, and roots of the covariance of so many orders of a set."""
+        """Channels and slopes of run r at the times `at`, and a root of the covariance of each set.
+
+        The covariance is of the values if `orders` is 1, and of values and slopes if it is 2. There
+        are no roots if `orders` is 0.
+        """
         t, reach = self.times[r], _MARGIN * self.length
         near = (t >= at[0] - reach) & (t <= at[-1] + reach)
         C, Q = len(self.coordinates), orders * len(at)
@@ -211,7 +217,7 @@ class _Samples(NamedTuple):
 
 
 def _samples(times: list[np.ndarray], channels: Channels) -> _Samples:
-    """The samples, means over 60 in a lengthscale if there are more."""
+    """The samples; if a lengthscale has many more than 60, means over ℓ/60."""
     coordinates, noise = _processes(times, channels)
     length = min(c.lengthscale for c in coordinates)
     both = [np.stack(pair, axis=1) for pair in zip(channels.values, channels.slopes, strict=True)]
@@ -233,7 +239,7 @@ def _samples(times: list[np.ndarray], channels: Channels) -> _Samples:
 
 
 def _processes(times, channels: Channels) -> tuple[list[Coordinate], Float[np.ndarray, "2 C"]]:
-    """The process of each channel, and the noise of its values and slopes."""
+    """The process of each channel, and the noise of values and slopes."""
     coordinates = processes(times, channels.values, channels.groups, channels.slopes)
     for c, coordinate in enumerate(coordinates):
         if not np.isfinite(coordinate.process.log_amplitude):
@@ -250,13 +256,13 @@ def _processes(times, channels: Channels) -> tuple[list[Coordinate], Float[np.nd
 
 
 def _bump(s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """φ = (1 − s²)⁵ and dφ/ds inside of −1 < s < 1, else 0."""
+    """φ = (1 − s²)⁵ and dφ/ds for −1 < s < 1; 0 outside."""
     rest = np.maximum(1 - s**2, 0.0)
     return rest**5, -10 * s * rest**4
 
 
 def _integrals(runs, r: int, at, centres, half_width: float, m: int) -> Float[np.ndarray, "W m"]:
-    """∫ φ u dt of the inputs u of run r, exactly for inputs that are lines between nodes."""
+    """∫ φ u dt of the inputs u of run r, as lines between the nodes `at`."""
     lines = runs.input_lines(r, at)
     if lines.shape[2] == 0:
         return np.zeros((len(centres), m))
@@ -270,7 +276,7 @@ def _integrals(runs, r: int, at, centres, half_width: float, m: int) -> Float[np
 
 
 def _covariances(process: Process, gaps: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """K, dk/dt and −d²k/dt² of the Matérn-7/2 process at times `gaps` apart."""
+    """k, dk/dt and −d²k/dt² of the Matérn-7/2 process at the time differences `gaps`."""
     variance, rate = np.exp(2 * float(process.log_amplitude)), np.exp(float(process.log_rate))
     u = rate * np.abs(gaps)
     decay = variance * np.exp(-u)
@@ -287,11 +293,12 @@ def _posterior_path(
     at: Float[np.ndarray, " P"],
     has_errors: bool = True,
 ) -> tuple[Float[np.ndarray, "Q c"], Float[np.ndarray, "Q Q"] | None]:
-    """The means of channels and of their slopes at the times `at`, and the covariance of both.
+    """The posterior means of channels and slopes at the times `at`, and their covariance.
 
-    All channels were measured at the same times. `variance` is that of the noise of each sample.
+    All c channels were measured at the same times, so they have one covariance; None without
+    `has_errors`. `variance` is the noise variance of each sample.
     """
-    from scipy.linalg import cho_factor, cho_solve  # so that importing does not load it
+    from scipy.linalg import cho_factor, cho_solve  # here, so that hamkernel imports faster
 
     is_value, is_slope = np.isfinite(x[:, :, 0]).T
     y = x[is_value, 0]
@@ -313,7 +320,7 @@ def _posterior_path(
 
 
 def _root(S: Float[np.ndarray, "Q Q"]) -> Float[np.ndarray, "Q k"]:
-    """E with E Eᵀ = S but for a millionth of the correlations."""
+    """E with E Eᵀ ≈ S, without 1e-6 of the trace of the correlation matrix."""
     unit = np.sqrt(np.maximum(np.diagonal(S), np.finfo(float).tiny))
     squares, V = np.linalg.eigh(S / unit[:, None] / unit[None])
     squares, V = np.maximum(squares[::-1], 0.0), V[:, ::-1]
@@ -322,9 +329,9 @@ def _root(S: Float[np.ndarray, "Q Q"]) -> Float[np.ndarray, "Q k"]:
 
 
 def weak_rows(law: Law, pieces: Pieces) -> Float[Array, "B W m *r"]:
-    """∫ (φ b − φ̇ a) dt of the features (a, b) of a law, for each window."""
+    """∫ (φ b − φ̇ a) dt for each window; the law returns the features (a, b) at a point z."""
 
-    @jax.checkpoint  # else the slopes of all nodes are kept for the derivatives
+    @jax.checkpoint  # else reverse mode stores the derivatives at all nodes
     def piece_result(path):
         a, b = jax.vmap(law)(path)
         values = jnp.einsum("wp,pi...->wi...", pieces.values, b)
@@ -336,7 +343,7 @@ def weak_rows(law: Law, pieces: Pieces) -> Float[Array, "B W m *r"]:
 
 
 def path_covariance(law: Law, pieces: Pieces) -> Float[Array, "B R R"]:
-    """D S Dᵀ of the rows of each piece, R = W m, for a law (m,) with known weights."""
+    """D S Dᵀ of the R = W m rows of each piece, for a law with known weights and m components."""
     C, Z = len(pieces.owner), pieces.path.shape[2]
 
     def piece_result(piece):
@@ -365,8 +372,8 @@ def factors(
 ) -> Float[Array, "B R R"]:
     """The Cholesky factors of the covariance of the rows of each piece.
 
-    Both the path and a white c, with these deviations at each sample, contribute. The identity for
-    windows outside of the runs.
+    Errors of the path and white noise of c contribute. `deviation` is the standard deviation of c
+    at each sample. The rows of windows outside the runs have the identity.
     """
     white = jnp.asarray(pieces.overlap) * pieces.spacing
     white = jnp.kron(white, jnp.diag(jnp.square(deviation)))
@@ -377,7 +384,7 @@ def factors(
 
 
 def whiten(factors: Float[Array, "B R R"], rows: Float[Array, "B W m *r"]) -> Float[Array, "N *r"]:
-    """Rows with independent errors of variance one."""
+    """The rows divided by the Cholesky factors, so that their errors are independent N(0, 1)."""
     B, R, _ = factors.shape
     done = jax.lax.map(
         lambda both: solve_triangular(*both, lower=True), (factors, rows.reshape(B, R, -1))
@@ -386,5 +393,5 @@ def whiten(factors: Float[Array, "B R R"], rows: Float[Array, "B W m *r"]) -> Fl
 
 
 def log_scale(factors: Float[Array, "B R R"]) -> Float[Array, ""]:
-    """The sum of the logarithms of the deviations that `whiten` divides rows by."""
+    """The sum of the logarithms of the diagonals of the Cholesky factors."""
     return jnp.log(jnp.diagonal(factors, axis1=1, axis2=2)).sum()

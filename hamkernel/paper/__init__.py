@@ -1,17 +1,19 @@
 """The experiments of Smith & Egeland (2023), end to end, over many noise seeds.
 
 `python -m hamkernel` runs `reproduce`, then `retune`, and prints their reports. An `Experiment`
-is data alone: the system, how it is sampled, the kernels and what the paper publishes. `datasets`
-draws the data of many seeds, `evaluate` fits and tests one kernel on all of them in one compiled
-program, `compare` tunes it on each by the paper's grid search and by `hamkernel.tune`.
+contains data only: the system, its sampling, the kernels and the published numbers. `datasets`
+draws the data of many seeds. `evaluate` fits and tests one kernel on all of them in one compiled
+program. `compare` tunes a kernel on each data set, by the paper's grid search and by
+`hamkernel.tune`.
 
-The paper leaves three things open, so they are run side by side or stated with the results:
+The paper leaves three choices open:
 
-- Its text solves (G + NλI) a = y, its tables fit (G + λI) a = y. `READINGS` has both.
-- Its text gives the pendulum the mass 0.5, its tables fit 1. Both are experiments here.
-- It does not give the box of the odd error. `Experiment.box` is the box of the portraits.
+- The text of the paper solves (G + NλI) a = y, the tables agree with (G + λI) a = y. `READINGS` has
+  both.
+- The text gives the pendulum the mass 0.5, the tables agree with 1. We run both experiments.
+- The paper does not give the box of the odd error. We take `Experiment.box`, that of the portraits.
 
-Everything here needs float64: `jax.config.update("jax_enable_x64", True)` before arrays are made.
+This module needs float64: call `jax.config.update("jax_enable_x64", True)` before you make arrays.
 """
 
 from hamkernel.paper._experiments import (

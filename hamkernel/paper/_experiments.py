@@ -1,8 +1,8 @@
 """The experiments of the paper with its published numbers, their tests, and their tuning.
 
-The paper minimises the k-fold cross-validation error over σ and λ by a grid search, and gives
-neither k nor the grid: here k = 5 and `GRID`, which holds all values that it reports. The search
-refits for every fold, in one compiled program per data set, which is kinder to it than a loop.
+The paper minimises the k-fold cross-validation error over σ and λ by a grid search, but gives
+neither k nor the grid. We take k = 5 and `GRID`, whose range contains all published values. The
+search refits for every fold, in one compiled program per data set, which is faster than a loop.
 """
 
 import dataclasses
@@ -30,7 +30,7 @@ from hamkernel._structures.structure import Separable, Symplectic
 from hamkernel._tuning.tune import tune
 from hamkernel.systems import AbstractHamiltonianSystem, HarmonicOscillator, Pendulum, sample
 
-# The regularization for which the ridge of `fit`, N · regularization, is the ridge that is meant.
+# The regularization λ_fit of `fit` in each reading of the paper's λ; the ridge of `fit` is N λ_fit.
 READINGS: Mapping[str, Callable[[float, int], float]] = {
     "lambda": lambda regularization, N: regularization / N,
     "N*lambda": lambda regularization, N: regularization,
@@ -45,7 +45,7 @@ STRUCTURES: Mapping[str, Callable[[Gaussian], AbstractMatrixKernel]] = {
 
 @dataclasses.dataclass(frozen=True)
 class Model:
-    """A structure on a Gaussian, with the hyperparameters that the paper found for it.
+    """A structure on a Gaussian kernel, with the hyperparameters of the paper.
 
     Attributes:
         structure: a key of `STRUCTURES`.
@@ -65,7 +65,7 @@ class Model:
 
 @dataclasses.dataclass(frozen=True)
 class Published:
-    """Tables I and II of the paper for one system: each came from a single noise seed."""
+    """The numbers of tables I and II of the paper for one system, from a single noise seed."""
 
     odd_error_mean: float
     odd_error_variance: float
@@ -77,21 +77,21 @@ class Published:
 
 @dataclasses.dataclass(frozen=True)
 class Experiment:
-    """A system, the data taken from it, the models learned and their test.
+    """A system, its data, the models and their test.
 
     Attributes:
         title: the name in reports.
         system: the true system.
         initial_states: the initial states of the trajectories in the data.
-        step: time between two data points [s].
-        count: data points on each trajectory.
-        noise: standard deviation on states and velocities.
+        step: the sampling interval [s].
+        count: the number of data points on each trajectory.
+        noise: the standard deviation of the noise on states and velocities.
         test_state: the initial state of the test trajectory.
         horizon: the duration of the test trajectory [s].
-        box: (q limits, p limits) of the portraits; its right half is sampled for the odd error.
+        box: (q limits, p limits) of the portraits; the odd error is sampled in its right half.
         units: the units of q and p.
         models: the models by name.
-        published: the paper's tables.
+        published: the numbers of the paper.
     """
 
     title: str
@@ -109,15 +109,15 @@ class Experiment:
 
     @property
     def size(self) -> int:
-        """N, the number of data points."""
+        """The number N of data points."""
         return len(self.initial_states) * self.count
 
 
 def experiments() -> dict[str, Experiment]:
     """Return the paper's experiments by name, the pendulum with both masses.
 
-    Source: Smith & Egeland (2023), section Experiments. The symplectic kernel without the odd
-        symmetry is not evaluated there; it takes σ and λ of the odd symplectic one.
+    Source: Smith & Egeland (2023), section Experiments. The paper does not evaluate the symplectic
+        kernel without the odd symmetry; we give it σ and λ of the odd symplectic kernel.
     """
     oscillator = Experiment(
         title="Harmonic oscillator",
@@ -169,13 +169,13 @@ class Outcome(eqx.Module):
     Attributes:
         ts: times of the test trajectory [s], shape (T,).
         true: the test trajectory of the true system, shape (T, n).
-        true_orbits: from the initial states of the data, over the longer time of the phase
-            portraits, shape (B, P, n).
+        true_orbits: orbits of the true system from the initial states of the data, over the longer
+            time of the phase portraits, shape (B, P, n).
         learned: the test trajectory of each learned field, shape (S, T, n).
-        error: its distance from the true one, shape (S, T).
+        error: the distance ‖learned − true‖, shape (S, T).
         quantities: numbers by name, each of shape (S,).
-        field: the one learned from the first seed; its `points` are the states measured.
-        orbits: `true_orbits` with this field.
+        field: the field learned from the first seed; its `points` are the measured states.
+        orbits: the orbits of this field from the same initial states, shape (B, P, n).
     """
 
     ts: Float[Array, " T"]
@@ -191,11 +191,11 @@ class Outcome(eqx.Module):
 def datasets(
     experiment: Experiment, keys: Key[Array, " S"]
 ) -> tuple[Float[Array, "S N n"], Float[Array, "S N n"]]:
-    """Return states and velocities for each noise key, trajectory after trajectory.
+    """Return states and velocities for each noise key, shape (S, N, n), by trajectory.
 
     Args:
         experiment: the system and its sampling.
-        keys: one key per seed.
+        keys: one key for each seed, shape (S,).
     """
     ts = experiment.step * jnp.arange(experiment.count, dtype=float)
     x0 = jnp.asarray(experiment.initial_states)
@@ -230,8 +230,8 @@ def evaluate(
 
     Args:
         experiment: the system and its test.
-        kernel: the matrix-valued kernel; where `regularization` has the shape (S,), one for each
-            data set, as leaves with a leading axis S.
+        kernel: the matrix-valued kernel. If `regularization` has the shape (S,), a batch of kernels
+            whose leaves have a leading axis S, one for each data set.
         X: states, shape (S, N, n), of `datasets`.
         Y: velocities, shape (S, N, n).
         regularization: the λ of `fit`, shape () for all data sets or (S,).
@@ -245,7 +245,7 @@ def evaluate(
     # As many points as in the paper, the same for every kernel and seed.
     uniform = jax.random.uniform(jax.random.key(2023), (10_000, 2))
     step = experiment.horizon / _TIMES
-    # The orbits in the portraits run for 2.25 horizons of the test: two turns.
+    # The orbits of the portraits last 2.25 test horizons, about two turns.
     ts = step * jnp.arange(round(2.25 * _TIMES) + 1, dtype=X.dtype)
     starts = jnp.asarray([experiment.test_state, *experiment.initial_states])
     accuracy = jnp.asarray(tolerance, X.dtype)
@@ -277,7 +277,7 @@ def _batch_of_fits(kernels_and_data) -> KernelField:
 
 
 def _pad(fields: KernelField) -> KernelField:
-    """The same fields with points that carry no weight, so that all experiments are one program."""
+    """The same fields, padded with points of weight zero, so that XLA compiles one program."""
     extra = -fields.points.shape[1] % 24
 
     def longer(a: Float[Array, "S N n"]) -> Float[Array, "S M n"]:
@@ -288,12 +288,12 @@ def _pad(fields: KernelField) -> KernelField:
 
 
 def _map_batches(fn: Callable, seeds):
-    """The PyTree fn(seeds), with 20 of the S seeds on the leading axis at a time."""
+    """The PyTree fn(seeds), computed for 20 of the S seeds on the leading axis at a time."""
     S = len(jax.tree.leaves(seeds)[0])
     batch = min(20, S)
     parts = []
     for start in range(0, S, batch):
-        # The last batch is filled up with the last seed, so that no other size is compiled.
+        # We fill the last batch up with the last seed, so that all batches have one size.
         rows = np.minimum(np.arange(start, start + batch), S - 1)
         parts.append(fn(jax.tree.map(lambda a, rows=rows: a[rows], seeds)))
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:S], *parts)
@@ -315,16 +315,16 @@ def _test_trajectories(
     ts: Float[Array, " P"],
     tolerance: Float[Array, ""],
 ) -> Float[Array, "B P n"]:
-    # Nothing is differentiated here, and a plain loop compiles faster than one with checkpoints.
+    # We need no gradients, and a loop without checkpoints compiles faster.
     options: Any = dict(rtol=tolerance, atol=tolerance, adjoint=diffrax.ForwardMode())
     return jax.vmap(lambda x0: cast(Array, simulate(field, x0, ts, **options).ys))(starts)
 
 
 @eqx.filter_jit
 def _tests(fields: KernelField, ts, true, points, tolerance):
-    """Trajectories (S, B, P, n), error (S, T) and quantities of S fields.
+    """The trajectories (S, B, P, n), error (S, T) and quantities of S fields.
 
-    `true` (B, P, n) begins with the trajectory of the test; the others are orbits.
+    The first row of `true` (B, P, n) is the test trajectory; the other rows are orbits.
     """
     test = slice(_TIMES + 1)
 
@@ -346,7 +346,7 @@ def _tests(fields: KernelField, ts, true, points, tolerance):
         return _moments("odd_error", jnp.linalg.norm(total, axis=1))
 
     learned, error, quantities = jax.vmap(one)(fields)
-    # One seed after the other: all at once, the many points would not fit into the caches.
+    # We take one seed after the other: the points of all seeds do not fit into the caches.
     return learned, error, quantities | jax.lax.map(odd_error, fields)
 
 
@@ -366,9 +366,9 @@ class Choice(NamedTuple):
     Attributes:
         lengthscale: σ, shape (S,).
         regularization: λ of `fit`, whose ridge is Nλ, shape (S,).
-        loss: the cross-validation loss there, shape (S,).
-        seconds: how long the search took, warm, shape (S,).
-        quantities: the tests of the fields, of `Outcome`; each of shape (S,).
+        loss: the cross-validation loss of this choice, shape (S,).
+        seconds: the time of the search without compilation, shape (S,).
+        quantities: the `quantities` of `Outcome`, each of shape (S,).
     """
 
     lengthscale: np.ndarray
@@ -379,7 +379,7 @@ class Choice(NamedTuple):
 
 
 class Comparison(NamedTuple):
-    """Grid search and gradient on the same data.
+    """The results of grid search and gradient on the same data.
 
     Attributes:
         grid: the choice of the grid search.
@@ -398,7 +398,7 @@ def compare(
     X: Float[Array, "S N n"],
     Y: Float[Array, "S N n"],
 ) -> Comparison:
-    """Tune one structure on every data set by both methods, and test what they chose.
+    """Tune one structure on every data set by both methods, and test the tuned kernels.
 
     Args:
         experiment: the system and its test.
@@ -415,8 +415,8 @@ def compare(
         kernels = [make(Gaussian(end.lengthscale)) for end in ends]
         kernels = jax.tree.map(lambda *leaves: jnp.stack(leaves), *kernels)
         lengthscale, regularization, loss = np.array(ends).T
-        # In the flat limit (σ -> ∞, λ -> 0) a field has rounding errors of about 1e-9, and the
-        # integrator took 100 times as many steps with a smaller tolerance.
+        # In the flat limit (σ -> ∞, λ -> 0) a field has rounding errors of about 1e-9. With a
+        # smaller tolerance the integrator took 100 times as many steps.
         outcome = evaluate(experiment, kernels, X, Y, regularization, tolerance=1e-6)
         return Choice(lengthscale, regularization, loss, seconds, outcome.quantities)
 
@@ -441,7 +441,7 @@ def _time(run, X, Y) -> tuple[list, np.ndarray]:
 
 
 class _SearchEnd(NamedTuple):
-    """The end of one search."""
+    """The hyperparameters at the end of one search, and their loss."""
 
     lengthscale: float
     regularization: float
@@ -460,7 +460,7 @@ def _least_loss(surface: np.ndarray) -> _SearchEnd:
 
 def _search_by_gradient(make, x, y) -> _SearchEnd:
     tuned = tune(make(Gaussian(1.0)), x, y, 1e-3, FOLDS)
-    # The only hyperparameter of these kernels, which is stored as a logarithm.
+    # The only hyperparameter of these kernels is log σ.
     (leaf,) = jax.tree.leaves(eqx.filter(tuned.kernel, eqx.is_inexact_array))
     return _SearchEnd(float(np.exp(leaf)), float(tuned.regularization), float(tuned.loss))
 
@@ -474,9 +474,10 @@ def grid_losses(
     Y: Float[Array, "N n"],
     partition: Partition,
 ) -> Float[Array, "A B"]:
-    """Return the cross-validation loss over a grid of (σ, λ), by a refit for every fold.
+    """Return the cross-validation loss over a grid of (σ, λ), by a refit for each of the F folds.
 
-    Each refit has the ridge (N − N/F) λ of `cross_validation_loss`; NaN where one fails.
+    Each refit has the ridge (N − N/F) λ, as in `cross_validation_loss`. A loss is NaN if a refit
+    fails.
     """
     N, n = X.shape
     points = partition.folds
@@ -495,8 +496,9 @@ def grid_losses(
             ridge = (N - N / len(points)) * regularization
             return jnp.mean(jnp.stack([fold_loss(G, ridge, fold) for fold in points]))
 
-        # One ridge after the other: on two cores jaxlib 0.10.2 stalls forever if several
-        # independent batches of factorisations, such as those of the folds, run at once.
+        # Workaround for a deadlock in jaxlib 0.10.2 on two cores: several independent batches of
+        # factorisations, such as those of the folds, must not run at once. We take one ridge after
+        # the other.
         return jax.lax.map(loss, ridges)
 
     return jax.lax.map(row, lengthscales)

@@ -12,7 +12,7 @@ from hamkernel.paper._experiments import GRID, Comparison, Experiment, Outcome, 
 
 Models = Mapping[str, Outcome]
 
-_DPI = 150  # 1200 pixels over 8 inches: sharp at the 800 of a README
+_DPI = 150  # 1200 pixels over 8 inches, sharp at the 800 pixels of a README
 
 
 def paper_figures(
@@ -21,9 +21,9 @@ def paper_figures(
     """Write the figures of each experiment and reading; return their paths.
 
     Args:
-        outcomes: by experiment, reading and model.
+        outcomes: the outcomes by experiment, reading and model.
         out: an existing folder.
-        progress: show a progress bar where the standard error is a terminal.
+        progress: show a progress bar if the standard error is a terminal.
     """
     every = experiments()
     runs = [
@@ -47,7 +47,7 @@ def tuning_figure(
     """Write the loss of one experiment over its hyperparameters; return the path.
 
     Args:
-        comparisons: by experiment and model.
+        comparisons: the comparisons by experiment and model.
         out: an existing folder.
     """
     name = "pendulum_m1"
@@ -74,7 +74,7 @@ def tuning(experiment: Experiment, comparison: Comparison) -> Figure:
 def portraits(experiment: Experiment, reading: str, models: Models) -> Figure:
     """Return stream lines and trajectories of the true system, data and learned fields.
 
-    As figures 1 and 2 of the paper, with noise seed 0.
+    The panels are those of figures 1 and 2 of the paper, with noise seed 0.
     """
     separable = models["separable"]
     panels = [

@@ -1,4 +1,4 @@
-"""All experiments, readings and kernels: results as numbers, and as tables beside the paper's."""
+"""All experiments, readings and kernels: their numbers, and tables beside those of the paper."""
 
 import json
 import pathlib
@@ -63,7 +63,7 @@ def report(results: Results, experiments: Experiments, seeds: int) -> str:
 
 
 def _published_values(results: Results) -> Results:
-    """The results with the paper's hyperparameters alone."""
+    """The results without the reading "tuned": the paper's hyperparameters only."""
     return {
         name: {reading: readings[reading] for reading in READINGS if reading in readings}
         for name, readings in results.items()
@@ -160,7 +160,7 @@ def _hamiltonian_table(results: Results, experiments: Experiments) -> str:
     rows = []
     for name, experiment in experiments.items():
         published, readings = experiment.published, results[name]
-        # The true Hamiltonian does not depend on reading or kernel: any of them has it.
+        # The true Hamiltonian does not depend on reading or kernel, so we take the first.
         quantities = next(iter(next(iter(readings.values())).values()))
         ours = {quantity: spread["median"] for quantity, spread in quantities.items()}
         rows += [
@@ -206,7 +206,7 @@ def _trajectory_table(results: Results, experiments: Experiments) -> str:
 def _model_rows(
     readings: Mapping[str, Mapping[str, Mapping[str, dict[str, float]]]], quantities: Sequence[str]
 ) -> Iterable[Row]:
-    """One row for each reading and model that has the quantities."""
+    """The rows of a table, one for each reading and model that has the quantities."""
     for reading, models in readings.items():
         label = reading
         for model, values in models.items():
@@ -232,7 +232,7 @@ def _format(x: float) -> str:
 
 
 def _table(title: str, header: Row, rows: Sequence[Row]) -> str:
-    """Aligned columns; a row of one cell is a heading."""
+    """The table with aligned columns; a row of one cell is a heading."""
     widths = [
         max(len(row[i]) for row in [header, *rows] if len(row) > 1) for i in range(len(header))
     ]
@@ -292,21 +292,22 @@ def reproduce(
     Noise seed i is `jax.random.key(i)`, i = 0 … seeds − 1, the same for all kernels and readings.
 
     Args:
-        out: folder for the files, made if it is missing. The layout of `results.json` is that of
+        out: the folder for the files, made if it is missing. `results.json` has the layout of
             `summarise`.
-        seeds: number of noise seeds, ≥ 1.
-        progress: show a progress bar where the standard error is a terminal.
-        show: called with the report once it is complete, before the figures are drawn.
+        seeds: the number of noise seeds, ≥ 1.
+        progress: show a progress bar if the standard error is a terminal.
+        show: a function that is called with the complete report, before the figures are drawn.
 
     Returns:
-        The report, for printing, and the files written.
+        The report, for printing, and the paths of the files.
 
     Raises:
-        ValueError: seeds < 1. OSError: the folder cannot be made. RuntimeError: JAX is not in
-            float64, or a fit failed.
+        ValueError: seeds < 1.
+        OSError: the folder cannot be made.
+        RuntimeError: JAX is not in float64, or a fit failed.
     """
     path = pathlib.Path(out) / "results.json"
-    # The folder is made first, so that an error is raised before the work.
+    # We make the folder first, so that an error comes before the work.
     path.parent.mkdir(parents=True, exist_ok=True)
     outcomes = _outcomes(_datasets_of_seeds(seeds), progress)
     results = summarise(outcomes)
@@ -314,7 +315,7 @@ def reproduce(
     text = report(results, experiments(), seeds)
     if show is not None:
         show(text)
-    # Matplotlib loads once the numbers are saved.
+    # We import Matplotlib after the numbers are saved.
     from hamkernel.paper._figures import paper_figures
 
     return text, [path, *paper_figures(outcomes, path.parent, progress)]
@@ -329,25 +330,26 @@ def retune(
 ) -> tuple[str, list[pathlib.Path]]:
     """Tune the hyperparameters on the data of `reproduce`, by grid search and by gradient.
 
-    At most the first 20 seeds are used. `results.json` gains the reading "tuned".
+    `retune` uses at most the first 20 seeds, and adds the reading "tuned" to `results.json`.
 
     Args:
-        out: folder that `reproduce` wrote its results to.
-        seeds: number of noise seeds, ≥ 1.
-        progress: show a progress bar where the standard error is a terminal.
-        show: called with the report once it is complete, before the figures are drawn.
+        out: the folder with the results of `reproduce`.
+        seeds: the number of noise seeds, ≥ 1.
+        progress: show a progress bar if the standard error is a terminal.
+        show: a function that is called with the complete report, before the figure is drawn.
 
     Returns:
-        The report, for printing, and the files written.
+        The report, for printing, and the paths of the files.
 
     Raises:
-        FileNotFoundError: `reproduce` has not been run. ValueError: seeds < 1. RuntimeError: JAX
-            is not in float64, or a fit failed.
+        FileNotFoundError: the folder has no `results.json` of `reproduce`.
+        ValueError: seeds < 1.
+        RuntimeError: JAX is not in float64, or a fit failed.
     """
     path = pathlib.Path(out) / "results.json"
     if not path.exists():
         raise FileNotFoundError(f"no {path}: run hamkernel.paper.reproduce({str(out)!r}) first.")
-    # The median of 20 seeds has a standard error of 1.25 σ/√20, 0.28 of their deviation σ.
+    # The median of 20 seeds has a standard error of 1.25 σ/√20 = .28 σ, σ their deviation.
     seeds = min(seeds, 20)
     comparisons = _comparisons(_datasets_of_seeds(seeds), progress)
     results = json.loads(path.read_text())
@@ -407,10 +409,10 @@ def _comparisons(data: Data, progress: bool) -> Comparisons:
 
 
 def summarise(outcomes: Mapping[str, Mapping[str, Mapping[str, Outcome]]]) -> Results:
-    """Return median, 10 % and 90 % quantile over the seeds of every quantity.
+    """Return the median, 10 % and 90 % quantile over the seeds of every quantity.
 
     Args:
-        outcomes: by experiment, reading and model.
+        outcomes: the outcomes by experiment, reading and model.
 
     Returns:
         `[experiment][reading][model][quantity]["median" | "p10" | "p90"]`. `retune` adds a reading

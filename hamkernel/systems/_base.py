@@ -1,4 +1,4 @@
-"""The base of all systems, damping and inputs added to any of them, and their noisy data."""
+"""The base classes of systems, damping and inputs for any system, and noisy data."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Function = TypeVar("Function", bound=Callable[[Array], Array])
 
 
 class AbstractHamiltonianSystem(eqx.Module):
-    """A Hamiltonian H(x), and the field J∇H that follows from it.
+    """A system with the Hamiltonian H(x) and the field J∇H.
 
     A final class with H = T(p) + U(q) sets `is_separable = True`, which explicit symplectic
     integrators require.
@@ -65,7 +65,7 @@ def _velocity(system: AbstractHamiltonianSystem, x: Float[Array, " n"]) -> Float
 
 
 def cast_arrays(field: Function, dtype: jnp.dtype) -> Function:
-    """`field` with its real arrays in the dtype of the states; a plain function has none."""
+    """`field` with its real arrays cast to `dtype`; a plain function is unchanged."""
 
     def cast_leaf(leaf):
         real = eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jnp.floating)
@@ -77,13 +77,13 @@ def cast_arrays(field: Function, dtype: jnp.dtype) -> Function:
 def cast_state(
     system: Function, x: Num[ArrayLike, " n"], n: int
 ) -> tuple[Function, Float[Array, " n"]]:
-    """`system` in the dtype of x, and x, which must be one state of n coordinates."""
+    """`system` in the dtype of x, and x, checked to be one state of n coordinates."""
     x = require.point(x, n)
     return cast_arrays(system, x.dtype), x
 
 
 def require_shape(x: Array, name: str, *shapes: tuple[int, ...]) -> Array:
-    """`x`, whose shape must be one of `shapes`."""
+    """`x`, checked to have one of the `shapes`."""
     if x.shape not in shapes:
         needed = " or ".join(map(str, shapes))
         raise ValueError(f"{name} has shape {x.shape}; shape {needed} is needed.")
@@ -97,7 +97,7 @@ def log_parameter(x: Numbers, name: str, *shapes: tuple[int, ...]) -> Array:
 
 
 def positive_parameter(name: str, doc: str) -> Any:
-    """The property that reads the positive parameter stored as the logarithm `log_<name>`."""
+    """The property exp(log_<name>) for a positive parameter stored as a logarithm."""
     return property(lambda system: jnp.exp(getattr(system, f"log_{name}")), doc=doc)
 
 
@@ -117,7 +117,7 @@ def count_of(x: Numbers, name: str) -> int:
 
 
 def squared_distances(positions: Float[Array, "bodies 2"]) -> tuple[np.ndarray, np.ndarray, Array]:
-    """Indices i < j of all pairs, and |r_i − r_j|² of each; a body never meets itself."""
+    """The indices i < j of all pairs of bodies, and |r_i − r_j|² of each pair."""
     i, j = np.triu_indices(positions.shape[0], k=1)
     return i, j, jnp.sum((positions[i] - positions[j]) ** 2, axis=1)
 
@@ -126,19 +126,20 @@ VectorField = Callable[[Any], Float[Array, " n"]]
 
 
 class Damped(eqx.Module):
-    """A system with friction: ẋ = f(x) − R∇H, R diagonal and constant.
+    """A system with friction: ẋ = f(x) − R∇H, where R is diagonal and constant.
 
-    With damping of the momenta ṗ = … − r ∂H/∂p = … − r q̇, viscous friction. dH/dt = −∇HᵀR∇H.
+    If the momenta are damped, ṗ = … − r ∂H/∂p = … − r q̇ is viscous friction. The energy obeys
+    dH/dt = −∇HᵀR∇H.
 
     Args:
-        system: one of this module, or any field with a `hamiltonian`.
+        system: a system of this module, or any field with a `hamiltonian`.
         damping: r > 0, one number, or one for each damped coordinate.
-        damped: the coordinates with friction, from 0; the momenta, the second half, if None.
+        damped: the coordinates with friction, from 0; if None, the momenta, the second half.
 
     Raises:
         ValueError: the damping is not positive or has the wrong shape; `damped` are not
-            coordinates, or, when called, not those of the state. TypeError: the system has no
-            Hamiltonian.
+            coordinates; or, when called, the state has fewer coordinates.
+        TypeError: the system has no Hamiltonian.
 
     Example: `hk.systems.Damped(hk.systems.Pendulum(), 0.1)`.
     """
@@ -167,7 +168,7 @@ class Damped(eqx.Module):
         return self.system.hamiltonian(x)
 
     def dissipation(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """Return the power lost, ∇HᵀR∇H ≥ 0, shape ()."""
+        """Return the dissipated power ∇HᵀR∇H ≥ 0, shape ()."""
         x = require.floating(x, "x")
         slope = jax.grad(cast_arrays(self, x.dtype).hamiltonian)(x)
         return jnp.sum(self._resistance(x) * slope**2)
@@ -203,13 +204,13 @@ class Driven(eqx.Module):
     `hk.simulate(system, x0, ts, inputs=u)` integrates it.
 
     Args:
-        system: any field x (n,) -> (n,), such as one of this module.
-        inputs: G, an array (n, m), or a function x -> (n, m); if None that of the system's motors,
-            which `CartPole` and `Acrobot` know.
+        system: any field x (n,) -> (n,), such as a system of this module.
+        inputs: G, an array (n, m), or a function x -> (n, m). If None, the attribute
+            `system.actuation`, which `CartPole` and `Acrobot` have.
 
     Raises:
-        TypeError: `system` is not a function, or knows of no motors. ValueError: G is not a matrix,
-            or, when called, x or u does not fit it.
+        TypeError: `system` is not a function, or G is None and `system` has no `actuation`.
+        ValueError: G is not a matrix, or, when called, x or u does not fit G.
 
     Example: a torque on a pendulum with friction,
         `hk.systems.Driven(hk.systems.Damped(hk.systems.Pendulum()), [[0.0], [1.0]])`.
@@ -248,7 +249,7 @@ class Driven(eqx.Module):
 
     @property
     def takes_inputs(self) -> bool:
-        """Whether a velocity needs u as well; `hk.simulate` reads this."""
+        """True: a velocity needs u too. `hk.simulate` reads this attribute."""
         return True
 
     def input_matrix(self, x: Num[ArrayLike, " n"]) -> Float[Array, "n m"]:
@@ -298,16 +299,17 @@ def sample(
 
         X = x(t) + state_noise · ξ,   Y = f(x(t)) + velocity_noise · η,   ξ, η ~ N(0, I)
 
-    The velocities belong to the true states x(t), not to the noisy ones. Trajectories are
-    integrated by an adaptive Runge-Kutta method of order 8, in steps whose estimated error is
-    below 1e-10 in float64 and about 1e-6 in float32, relative and absolute: choose units in which
-    states are not tiny. Differentiable in reverse mode with respect to `system`, `x0` and the noise
-    levels.
+    The velocities belong to the true states x(t), not to the noisy ones. An adaptive Runge-Kutta
+    method of order 8 integrates the trajectories. The estimated error of a step is at most 1e-10 in
+    float64 and about 1e-6 in float32, relative and absolute, so choose units in which states are
+    not tiny. The result is differentiable in reverse mode with respect to `system`, `x0` and the
+    noise levels.
 
     Args:
-        system: any traceable field, (n,) -> (n,); one of this module, a learned one, a function.
-        x0: states at time ts[0], shape (B, n), or (n,) for a single trajectory. Its dtype is that
-            of the integration and the results; the arrays of `system` are cast to it.
+        system: any traceable field, (n,) -> (n,): a system of this module, a learned field, or a
+            function.
+        x0: states at time ts[0], shape (B, n), or (n,) for a single trajectory. The integration and
+            the results have its dtype; `sample` casts the arrays of `system` to it.
         ts: times, shape (T,), strictly increasing.
         state_noise: standard deviation of the noise on X, shape () or (n,), in units of the state.
         velocity_noise: standard deviation of the noise on Y, shape () or (n,), per unit of time.
@@ -319,8 +321,8 @@ def sample(
         them as `X.reshape(-1, n)` and `Y.reshape(-1, n)`.
 
     Raises:
-        ValueError: a shape is wrong; x0 or ts is not finite; ts does not increase; a noise level
-            is negative or not finite; there is noise but no key, or more than one.
+        ValueError: a shape is wrong; x0 or ts is not finite; ts does not increase; a noise level is
+            negative or not finite; there is noise but no key, or more than one key.
         TypeError: `system` does not map one JAX array to another; x0 has less precision than
             float32; the key is not a JAX key.
         RuntimeError: a trajectory diverged or needed too many steps.
@@ -386,7 +388,7 @@ def _failure(failed: Array) -> str:
 def _trajectories(
     field: Callable[[Array], Array], states: Float[Array, "B n"], ts: Float[Array, " T"]
 ) -> tuple[Float[Array, "B T n"], Float[Array, "B T n"]]:
-    """True states and velocities at the times ts; not finite where the integration failed."""
+    """The true states and velocities at the times ts; not finite if the integration failed."""
 
     def velocity(x):
         return field(x).astype(x.dtype)
@@ -397,8 +399,7 @@ def _trajectories(
         if ts.size == 1:
             return x0[None]
         tolerance = max(1e-10, 10 * float(jnp.finfo(x0.dtype).eps))
-        # One step for each of ts, and far more than a smooth trajectory needs besides: a few dozen
-        # per swing of a pendulum.
+        # One step for each of ts, and 65536 more: a swing of a pendulum needs a few dozen.
         bounds = {"rtol": tolerance, "atol": tolerance, "max_steps": 2**16 + ts.size}
         return cast(Array, simulate(velocity, x0, ts, **bounds, throw=False).ys)
 

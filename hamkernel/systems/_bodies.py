@@ -1,4 +1,4 @@
-"""Bodies that attract each other, vortices, and systems ẋ = Π(x)∇H whose Π is not J."""
+"""Bodies that attract each other, vortices, and systems ẋ = Π(x)∇H with Π ≠ J."""
 
 import abc
 from typing import ClassVar
@@ -71,8 +71,8 @@ class NBody(AbstractHamiltonianSystem):
     H = Σᵢ |pᵢ|²/(2mᵢ) − G Σ_{i<j} mᵢmⱼ/|qᵢ − qⱼ|
 
     The state holds all positions, then all momenta, body by body: q = (x₁, y₁, x₂, y₂, …) [m],
-    p = (m₁ẋ₁, m₁ẏ₁, …) [kg m/s]. With two masses it is the two-body problem in 8 dimensions.
-    Where two bodies meet the energy is −inf and the field NaN.
+    p = (m₁ẋ₁, m₁ẏ₁, …) [kg m/s]. Two masses make the two-body problem in 8 dimensions. If two
+    bodies meet, the energy is −inf and the field NaN.
 
     Args:
         masses: mᵢ > 0, shape (bodies,), two or more [kg].
@@ -120,19 +120,20 @@ class PointVortices(AbstractHamiltonianSystem):
 
         H = −(1/2π) Σ_{i<j} ΓᵢΓⱼ log rᵢⱼ.
 
-    Plane positions are thus canonical only up to the factors Γᵢ, which may be negative. With
-    sᵢ = sign Γᵢ the state
+    The positions in the plane are thus canonical up to the factors Γᵢ, which may be negative. The
+    state
 
-        qᵢ = √|Γᵢ| xᵢ,   pᵢ = sᵢ√|Γᵢ| yᵢ
+        qᵢ = √|Γᵢ| xᵢ,   pᵢ = sᵢ√|Γᵢ| yᵢ,   sᵢ = sign Γᵢ
 
-    absorbs them. By the chain rule ∂H/∂yᵢ = sᵢ√|Γᵢ| ∂H/∂pᵢ and ∂H/∂xᵢ = √|Γᵢ| ∂H/∂qᵢ, so
+    absorbs these factors. By the chain rule ∂H/∂yᵢ = sᵢ√|Γᵢ| ∂H/∂pᵢ and ∂H/∂xᵢ = √|Γᵢ| ∂H/∂qᵢ, so
 
         q̇ᵢ = √|Γᵢ| ẋᵢ = (√|Γᵢ|/Γᵢ) sᵢ√|Γᵢ| ∂H/∂pᵢ = ∂H/∂pᵢ,
         ṗᵢ = sᵢ√|Γᵢ| ẏᵢ = −(sᵢ√|Γᵢ|/Γᵢ) √|Γᵢ| ∂H/∂qᵢ = −∂H/∂qᵢ,
 
-    since Γᵢ = sᵢ|Γᵢ|: ẋ = J∇H for any nonzero circulations. `state` and `positions` map between the
-    plane [m] and the state [m²/√s]. H [m⁴/s²] is the energy per density, up to a constant. Where
-    two vortices meet it is infinite and the field NaN.
+    since Γᵢ = sᵢ|Γᵢ|. Hence ẋ = J∇H for any nonzero circulations. `state` and `positions` map
+    between the plane [m] and the state [m²/√s]. H [m⁴/s²] is the energy divided by the density of
+    the fluid, per unit of depth, up to a constant. If two vortices meet, H is infinite and the
+    field NaN.
 
     Args:
         circulations: Γᵢ ≠ 0, shape (vortices,), two or more [m²/s]; positive turns
@@ -178,7 +179,7 @@ class PointVortices(AbstractHamiltonianSystem):
     def positions(self, x: Num[ArrayLike, " n"]) -> Float[Array, "vortices 2"]:
         """Return the points (xᵢ, yᵢ) of the plane, shape (vortices, 2), of one state.
 
-        It is linear, so it takes velocities ẋ to velocities in the plane as well.
+        The map is linear, so it also takes velocities ẋ to velocities in the plane.
 
         Raises:
             ValueError: x is not one state of shape (2·vortices,).
@@ -197,7 +198,7 @@ class PointVortices(AbstractHamiltonianSystem):
 
 
 class AbstractPoissonSystem(eqx.Module):
-    """A Hamiltonian H(x) and an antisymmetric Π(x), and the field Π∇H that follows from them."""
+    """A system with the Hamiltonian H(x), the antisymmetric tensor Π(x) and the field Π∇H."""
 
     @abc.abstractmethod
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
@@ -205,7 +206,7 @@ class AbstractPoissonSystem(eqx.Module):
 
     @abc.abstractmethod
     def tensor(self, x: Num[ArrayLike, " n"]) -> Float[Array, "n n"]:
-        """Return Π(x), antisymmetric, shape (n, n)."""
+        """Return the antisymmetric Π(x), shape (n, n)."""
 
     def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
         """Return the velocity Π(x)∇H(x) of one state, by automatic differentiation.
@@ -306,7 +307,7 @@ class LotkaVolterra(AbstractPoissonSystem):
         self.log_reproduction = log_parameter(reproduction, "reproduction")
 
     def hamiltonian(self, x: Num[ArrayLike, "2"]) -> Float[Array, ""]:
-        """Return H(x, y), shape (); NaN where a population is negative."""
+        """Return H(x, y), shape (); NaN if a population is negative."""
         self, (prey, predators) = cast_state(self, x, 2)
         of_prey = self.reproduction * prey - self.death * jnp.log(prey)
         return of_prey + self.predation * predators - self.growth * jnp.log(predators)
@@ -319,8 +320,8 @@ class LotkaVolterra(AbstractPoissonSystem):
 class ChargedParticle(AbstractPoissonSystem):
     """A charge in a plane, held by a spring, in a magnetic field normal to the plane: n = 4.
 
-    q̇ = p/m, ṗ = −κq + (b/m)(p₂, −p₁) with H = |p|²/(2m) + κ|q|²/2, p = mq̇ the KINETIC momentum.
-    Without a spring it circles at the angular frequency b/m.
+    q̇ = p/m, ṗ = −κq + (b/m)(p₂, −p₁) with H = |p|²/(2m) + κ|q|²/2 and the KINETIC momentum p = mq̇.
+    Without a spring the charge circles at the angular frequency b/m.
 
     Args:
         mass: m > 0 [kg].
@@ -352,6 +353,6 @@ class ChargedParticle(AbstractPoissonSystem):
         return jnp.sum(p**2) / (2 * self.mass) + self.stiffness * jnp.sum(q**2) / 2
 
     def tensor(self, x: Num[ArrayLike, "4"]) -> Float[Array, "4 4"]:
-        """Return Π = [[0, I], [−I, F]], F v = v × B."""
+        """Return Π = [[0, I], [−I, F]] with F = [[0, b], [−b, 0]], shape (4, 4)."""
         self, x = cast_state(self, x, 4)
         return charged_particle(lambda q: self.magnetic_field)(x)

@@ -1,4 +1,4 @@
-"""Masses on springs, pendulums and linkages: Hamiltonian systems with J∇H."""
+"""Masses on springs, pendulums and linkages: Hamiltonian systems ẋ = J∇H."""
 
 from typing import ClassVar
 
@@ -132,8 +132,8 @@ class Duffing(AbstractHamiltonianSystem):
 class HenonHeiles(AbstractHamiltonianSystem):
     """A star in a galaxy's plane: H = |p|²/2 + |q|²/2 + λ(q₁²q₂ − q₂³/3), n = 4.
 
-    Dimensionless. Motion that starts near the origin stays bounded for H < 1/(6λ²), and turns
-    from mostly regular to mostly chaotic as H nears that value.
+    All quantities are dimensionless. Motion that starts near the origin stays bounded if
+    H < 1/(6λ²). As H approaches 1/(6λ²), the motion changes from mostly regular to mostly chaotic.
 
     Args:
         coupling: λ of either sign; 1 in the paper, 0 for two free oscillators.
@@ -304,8 +304,8 @@ class Acrobot(AbstractHamiltonianSystem):
     M₁₁ = I₁ + I₂ + m₁c₁² + m₂(l² + c₂² + 2lc₂ cos q₂),  M₁₂ = I₂ + m₂(c₂² + lc₂ cos q₂),
     M₂₂ = I₂ + m₂c₂²
 
-    q₁ is the angle of the first link from hanging and q₂ that of the second from the first [rad];
-    p = M(q) q̇ [kg m²/s]. The length of the second link matters through c₂ and I₂ alone.
+    q₁ is the angle of the first link from hanging, and q₂ the angle of the second link from the
+    first [rad]. p = M(q) q̇ [kg m²/s]. The length of the second link enters through c₂ and I₂ only.
 
     Args:
         masses: (m₁, m₂), positive [kg].
@@ -319,8 +319,8 @@ class Acrobot(AbstractHamiltonianSystem):
 
     Example: `hk.systems.Driven(hk.systems.Acrobot())`, whose u is the torque [N m], shape (1,).
 
-    Source: Spong (1995), IEEE Control Systems 15; the parameters are those of Sutton & Barto,
-        Reinforcement Learning (1998).
+    Source: Spong (1995), IEEE Control Systems 15; the parameters, other than g, are those of Sutton
+        & Barto, Reinforcement Learning (1998).
     """
 
     actuation: ClassVar[tuple[tuple[float, ...], ...]] = ((0.0,), (0.0,), (0.0,), (1.0,))
@@ -364,5 +364,5 @@ class Acrobot(AbstractHamiltonianSystem):
 
 
 def _kinetic(p: Float[Array, "2"], a: Array, b: Array, c: Array) -> Float[Array, ""]:
-    """½ pᵀ [[a, b], [b, c]]⁻¹ p."""
+    """The kinetic energy ½ pᵀ [[a, b], [b, c]]⁻¹ p."""
     return (c * p[0] ** 2 - 2 * b * p[0] * p[1] + a * p[1] ** 2) / (2 * (a * c - b**2))
