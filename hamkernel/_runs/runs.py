@@ -613,8 +613,8 @@ def _rows(x: Any, t: np.ndarray, run: int, name: str) -> Float[np.ndarray, "T n"
             hint = f" Rows of one flat list: np.reshape(values, ({len(t)}, {len(x) // len(t)}))."
         elif name == "inputs" and x.ndim == 2:
             hint = (
-                " If inputs have times of their own, give pairs, inputs=[(times, u), …]. If the "
-                "last command is missing, repeat it."
+                " Where inputs have times of their own, give pairs, inputs=[(times, u), …]; where "
+                "the last command is missing, repeat it."
             )
         raise ValueError(
             f"{name}[{run}] has shape {x.shape} and times[{run}] has shape {t.shape}; one row a "
