@@ -108,9 +108,7 @@ def strong(rng, count=100, noise=0.0, kernels=None, tune=False):
     return field, states(rng, 200)
 
 
-def weak(
-    rng, velocities=False, friction=(0.0, 0.0), motors=(1.0, 1.0), count=4, inertia=hk.Gaussian(2.0)
-):
+def weak(rng, velocities=False, friction=(0.0, 0.0), motors=(1.0, 1.0), count=4, inertia=None):
     """The field of some runs, and where to judge it."""
     times, paths, u = logs(rng, friction, motors, count)
     noise = np.array([1e-3, 1e-3, 1e-2, 1e-2])
@@ -119,7 +117,9 @@ def weak(
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of a torque that is always zero
         runs = hk.Runs(times, seen, inputs=u, between="linear")
-    K = hk.Lagrangian(hk.Gaussian(2.0), inertia, (0, 1), friction=bool(any(friction)))
+    K = hk.Lagrangian(
+        hk.Gaussian(2.0), inertia or hk.Gaussian(2.0), (0, 1), friction=bool(any(friction))
+    )
     X, u = np.concatenate(paths)[::20], np.concatenate(u)[::20]
     rest = [torque(x[:2], x[2:], np.zeros(2), *friction) for x in X]
     A = np.array([np.linalg.solve(mass(x[:2]), t - r) for x, t, r in zip(X, u, rest, strict=True)])
