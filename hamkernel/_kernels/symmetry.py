@@ -159,9 +159,10 @@ def close_group(
                 group.append(new)
             if len(group) > 64:  # the point group of the cube has 48
                 raise ValueError(
-                    "the maps generate more than 64 others, and this library averages over at most "
-                    "64. A rotation must be by 2π over a whole number, given with all digits. "
-                    "Shears, stretches and continuous symmetries generate infinite groups."
+                    "the maps generate more than 64 others, so they do not close to a finite group "
+                    "that this library averages over. A rotation must be by 2π over a whole "
+                    "number, given with all digits. Shears, stretches and continuous symmetries "
+                    "generate infinite groups."
                 )
     return tuple(group)
 
