@@ -54,11 +54,11 @@ from hamkernel._runs.table import Diagnostic, Diagnostics
 from hamkernel._solvers.problem import Problem
 from hamkernel._solvers.stream import AbstractStreamingFit
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._trajectories.lagrangian import LearnedLagrangian
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.model import Model
 from hamkernel._trajectories.segments import LinearisedSegments
 from hamkernel._tuning.tune import Tuned
+from hamkernel._weak.lagrangian import LearnedLagrangian
 
 _VERSION = 2  # of the format; version 1, before the first release, was a NumPy archive
 _FIRST_LINE = "hamkernel field, version {}, sha256 {}"

@@ -12,8 +12,8 @@ from scipy.integrate import solve_ivp
 
 import hamkernel as hk
 from hamkernel._report import script
-from hamkernel._runs import weak
 from hamkernel._runs.smoothing import Process, smooth
+from hamkernel._weak import rows as weak
 
 PROCESS = Process(jnp.log(1.3), jnp.log(2.0), jnp.log(0.1))
 
