@@ -179,7 +179,7 @@ class OneInput(eqx.Module):
 
 
 class RightHandSide(eqx.Module):
-    """The field f(t, x, args) for Diffrax. If there are inputs, u is taken at `args` + t."""
+    """The field f(t, x, args) for Diffrax. If there are inputs, it takes u at `args` + t."""
 
     field: Any  # x -> velocity; or x, u -> velocity
     inputs: Callable[[Array], Any] | None

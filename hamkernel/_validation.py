@@ -51,12 +51,12 @@ def cross_validation_loss(
         X: states, shape (N, n); or observations, without Y.
         Y: measured velocities, shape (N, n).
         regularization: λ > 0.
-        folds: a number of folds, which are consecutive points and nearly equal in size; "loo" for
-            one point per fold; or a label for each point, shape (N,), such as the name of its run,
-            to hold out one run at a time. A fold contains complete points, since the other
-            components of a point would reveal a held-out component. Labels must be concrete under
-            jit. For observations N counts all points, energies and functionals, in their order. If
-            a fold contains all energies, we compare them up to their constant.
+        folds: the number of folds, of consecutive points and nearly equal size. Or "loo" for one
+            point per fold. Or a label for each point, shape (N,), such as the name of its run, to
+            hold out one run at a time. A fold contains complete points, since the other components
+            of a point would reveal a held-out component. Labels must be concrete under jit. For
+            observations N counts all points, energies and functionals, in their order. If a fold
+            contains all energies, we compare them up to their constant.
         mean: the known part of the field, as in `fit`.
         solver: a low-rank solver, for the loss of its fit as in `tune`; None for the exact loss.
         inputs: u at each state for a `Controlled` kernel, shape (N, m).

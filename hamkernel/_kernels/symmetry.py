@@ -293,8 +293,8 @@ class Symmetrised(AbstractScalarKernel):
 def drop_symmetry(tree: Tree) -> Tree:
     """The PyTree with each mean over a group replaced by its scalar kernel.
 
-    The values of the result have the size of the terms of the mean, which determines rounding
-    errors: for a long lengthscale (k(x, z) − k(−x, z))/2 is a small difference of large numbers.
+    The values of the result are as large as the terms of the mean, which determine its rounding
+    errors. For a long lengthscale (k(x, z) − k(−x, z))/2 is a small difference of large numbers.
     """
 
     def is_mean(node: object) -> bool:

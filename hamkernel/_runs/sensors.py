@@ -386,7 +386,7 @@ def _free_of_states(X: Float[np.ndarray, "N n"], U: Float[np.ndarray, "N m"]) ->
     """The share of the variance of U that no cubic polynomial of X explains.
 
     This is the smallest share of all linear combinations of the inputs. It is 1 if there are too
-    few data, or if the inputs are constant or dependent.
+    few data, if all inputs are constant, or if inputs depend on one another.
     """
     X = X[:, np.isfinite(X).any(axis=0)]
     use = np.isfinite(X).all(axis=1)
@@ -502,7 +502,8 @@ def impossible_samples(x: Float[np.ndarray, "T n"]) -> Bool[np.ndarray, " T"]:
       difference, such as −9999, 65535 or 1e30.
     - d > 6 σ, and the row, of two coordinates or more, is all zeros, which loggers write for a lost
       packet. Then all rows of zeros are impossible whose neighbours are not zeros.
-    The first and the last row have one neighbour, and only the first condition applies.
+    The first and the last row have one neighbour. In the first condition they must differ from it
+    by more than 20 σ.
     """
     bad = np.zeros(len(x), bool)
     if len(x) < 5:

@@ -300,10 +300,10 @@ def charged_particle(
     """The tensor of a charge in a magnetic field: q̇ = ∂H/∂p, ṗ = −∂H/∂q + ∂H/∂p × B.
 
     Args:
-        magnetic_field: e·B, the charge times the field: one number for motion in a plane normal to
-            the field, n = 4; three numbers for motion in space, n = 6; or a function of the
-            position q that returns these. Numbers are fixed; `tune` trains the arrays of an Equinox
-            module.
+        magnetic_field: e·B, the charge times the field. One number for motion in a plane normal to
+            the field, n = 4; three numbers for motion in space, n = 6. Or a function of the
+            position q that returns these numbers. Numbers are fixed; `tune` trains the arrays of an
+            Equinox module.
 
     Returns:
         Π, for `hk.Poisson(k, hk.poisson.charged_particle(2.0))`. p is the KINETIC momentum mq̇.
