@@ -54,6 +54,7 @@ from hamkernel._kernels.built_in import Gaussian, Matern, Periodic, Polynomial, 
 from hamkernel._kernels.check import check_kernel
 from hamkernel._kernels.parts import Shared, neighbours, pairs, sites
 from hamkernel._kernels.transforms import Select, Warp
+from hamkernel._learn import learn
 from hamkernel._observations.kinds import Energies, Equilibria, Functionals, Velocities
 from hamkernel._posterior import Posterior, condition
 from hamkernel._report import report
@@ -72,8 +73,6 @@ from hamkernel._structures.joined import Controlled, InputMatrix
 from hamkernel._structures.lagrangian import Lagrangian
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
-from hamkernel._trajectories.lagrangian import LearnedLagrangian
-from hamkernel._trajectories.learn import learn
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.score import Score
 from hamkernel._tuning.tune import Tuned, tune
@@ -83,6 +82,7 @@ from hamkernel._validation import (
     generalized_cross_validation,
     log_marginal_likelihood,
 )
+from hamkernel._weak.lagrangian import LearnedLagrangian
 
 if TYPE_CHECKING:
     from hamkernel import paper, plot

@@ -1,6 +1,6 @@
 """Random Fourier features of structured kernels.
 
-The potential u is a sum of waves and f = B∇u, so the structure is exact for every number of
+The potential u is a sum of waves and f = B∇u, so the structure is exact for any number of
 frequencies. Only the kernel is approximate.
 
 Source: Smith & Egeland (2024), arXiv 2404.07703, for the odd symplectic case.
@@ -26,7 +26,7 @@ from hamkernel._structures.structure import AbstractPotentialKernel, DivergenceF
 
 
 class Waves(eqx.Module):
-    """amplitude·cos(ω·x) for the first `cosines` waves, amplitude·sin(ω·x) for the others."""
+    """The waves a cos(ω·x), the first `cosines` of them, and a sin(ω·x), with amplitudes a."""
 
     frequencies: Float[Array, "w n"]
     amplitudes: Float[Array, " w"]
@@ -50,25 +50,25 @@ class Waves(eqx.Module):
         return self.frequencies.T * (self.amplitudes * slopes)[None]
 
     def slope(self, x: Float[Array, " n"], w: Float[Array, " w"]) -> Float[Array, " n"]:
-        """The gradient of the sum with weights w."""
+        """The gradient of the sum of waves with weights w."""
         return self.gradients(x) @ w
 
 
 class PartWaves(eqx.Module):
-    """The features of laws that many parts share, times a factor; they are exact, not random."""
+    """The features of a `Shared` kernel times a factor `scale`; they are exact, not random."""
 
     kernel: Shared
     scale: Float[Array, ""]
 
     @property
     def amplitudes(self) -> Float[Array, " w"]:
-        return jnp.ones(self.kernel.columns)  # the amplitude of a law is in `values`
+        return jnp.ones(self.kernel.columns)  # `values` contains the amplitude of a law
 
     def values(self, x: Float[Array, " n"]) -> Float[Array, " w"]:
         return jnp.sqrt(self.scale).astype(x.dtype) * self.kernel.features(x)
 
     def law_values(self, r: Float[Array, "..."]) -> Float[Array, " w"]:
-        """The features of one of the laws at r."""
+        """The features of one law at r."""
         r = self.kernel.point(r)
         return jnp.sqrt(self.scale).astype(r.dtype) * self.kernel.law(r)
 
@@ -80,7 +80,7 @@ class PartWaves(eqx.Module):
 
 
 class JointWaves(eqx.Module):
-    """The features of a sum of scalar kernels, one after the other."""
+    """The features of a sum of scalar kernels: the features of all terms, concatenated."""
 
     terms: tuple[Any, ...]
 
@@ -101,7 +101,7 @@ class JointWaves(eqx.Module):
 
 
 class GroupWaves(eqx.Module):
-    """Means of waves over a finite group, Σ_g χ(g) wave(g x)/|G|: features of the mean kernel."""
+    """The means Σ_g χ(g) wave(gx)/|G| of waves over a finite group, for the mean of a kernel."""
 
     waves: Waves
     matrices: Float[Array, "G n n"]
@@ -125,19 +125,19 @@ class GroupWaves(eqx.Module):
         return self.gradients(x) @ w
 
     def _constants(self) -> tuple[Float[Array, "G n n"], Float[Array, " G"]]:
-        """The group, which is not differentiated."""
+        """The matrices and characters of the group, without derivatives."""
         return jax.lax.stop_gradient((self.matrices, self.characters))
 
 
 def waves_of(
     k: AbstractScalarKernel, n: int, count: int, key: Key[Array, ""], dtype: Any
 ) -> "Basis":
-    """Waves with the spectrum of a scalar kernel, and with its symmetry."""
+    """The features of a scalar kernel: waves with its spectrum and symmetry, or `Shared` laws."""
     shared = part_waves(k)
     if shared is not None:
         return shared
     unsymmetrised = symmetry_removed(k)
-    if unsymmetrised is None or unsymmetrised.parity is not None:  # a `Spectrum` has the parity
+    if unsymmetrised is None or unsymmetrised.parity is not None:  # `spectra` knows the parity
         return Waves(k.spectra(n, count, key, dtype))
     group = unsymmetrised.group(n)
     return GroupWaves(
@@ -169,7 +169,7 @@ def part_terms(k: AbstractScalarKernel, scale: Any = 1.0) -> list[PartWaves | No
 
 
 def _over_group(waves: PartWaves, mean: Symmetrised) -> PartWaves:
-    """The features of the mean over the group of another mean."""
+    """The features of the mean of `waves` over the group of `mean`."""
     law = waves.kernel
     parts = GroupParts(law.parts, mean.maps, mean.characters)
     centres = None if law.centres is None else np.asarray(law.centres)
@@ -177,7 +177,7 @@ def _over_group(waves: PartWaves, mean: Symmetrised) -> PartWaves:
 
 
 def laws_of(waves: Any) -> list[tuple[PartWaves, slice]]:
-    """The laws among some features, with the positions of their weights."""
+    """The `Shared` laws among the features, with the positions of their weights."""
     terms = waves.terms if isinstance(waves, JointWaves) else (waves,)
     laws, start = [], 0
     for term in terms:
@@ -190,7 +190,7 @@ def laws_of(waves: Any) -> list[tuple[PartWaves, slice]]:
 
 
 def is_of_parts(K: AbstractMatrixKernel) -> bool:
-    """Whether K is made from `Shared` laws, with friction or without: its features are exact."""
+    """Whether all terms of K are `Shared` laws or friction, so that its features are exact."""
     if isinstance(K, Controlled):
         return is_of_parts(K.drift) and isinstance(K.inputs, KnownMatrix)
     if isinstance(K, Sum):
@@ -203,39 +203,39 @@ Basis = Waves | GroupWaves | PartWaves | JointWaves
 
 
 class AbstractFeatures(eqx.Module):
-    """Fields φ_r whose weighted sums approximate those of a structured kernel.
+    """Features φ_r of a structured kernel: Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z).
 
-    Σ_r φ_r(x) φ_r(z)ᵀ ≈ K(x, z), and each φ_r has the structure of K exactly.
+    Each φ_r is a field with exactly the structure of K.
     """
 
     @property
     @abc.abstractmethod
     def columns(self) -> int:
-        """r, the number of features."""
+        """The number r of features."""
 
     @abc.abstractmethod
     def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
-        """The features φ_r(x), side by side."""
+        """The matrix with the columns φ_r(x)."""
 
     @abc.abstractmethod
     def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
-        """Σ_r w_r φ_r(x), without the rows."""
+        """The field Σ_r w_r φ_r(x), computed without the matrix `rows`."""
 
     def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
         """The potential of `field`; AttributeError if there is none."""
         raise AttributeError(f"{type(self).__name__} have no potential.")
 
     def laws(self) -> list[tuple[PartWaves, slice]]:
-        """The laws that many parts share, with the positions of their weights."""
+        """The `Shared` laws, with the positions of their weights."""
         return []
 
     def __call__(self, X: Float[Array, "t n"]) -> Float[Array, "t n r"]:
-        # One state at a time for `Shared` laws: a state has many parts, and the laws many centres.
+        # With `Shared` laws one state at a time: parts times centres take much memory.
         return jax.lax.map(self.rows, X) if self.laws() else jax.vmap(self.rows)(X)
 
 
 class PotentialFeatures(AbstractFeatures):
-    """φ = B∇(wave)."""
+    """The features φ = B∇(wave) of a structure B∇u."""
 
     structure: AbstractPotentialKernel
     waves: Basis
@@ -258,7 +258,7 @@ class PotentialFeatures(AbstractFeatures):
 
 
 class FrictionFeatures(AbstractFeatures):
-    """φ = F(x_i) e_i for each damped coordinate i, with the curve F of `Friction`; exact."""
+    """The exact features φ = F(x_i) e_i of `Friction`, for each damped coordinate i."""
 
     friction: Friction
     dimension: int = eqx.field(static=True)
@@ -279,7 +279,7 @@ class FrictionFeatures(AbstractFeatures):
 
 
 class DivergenceFreeFeatures(AbstractFeatures):
-    """φ = e_a ∂_b(wave) − e_b ∂_a(wave) for each pair a < b: an antisymmetric matrix potential."""
+    """The features φ = e_a ∂_b(wave) − e_b ∂_a(wave) of `DivergenceFree`, for each pair a < b."""
 
     waves: Basis
     dimension: int = eqx.field(static=True)
@@ -289,8 +289,9 @@ class DivergenceFreeFeatures(AbstractFeatures):
         return len(self.waves.amplitudes) * self.dimension * (self.dimension - 1) // 2
 
     def _pairs(self) -> Float[Array, "n P n"]:
-        # Σ_{a<b} φφᵀ has M_bb at (a, a) for every b ≠ a, that is tr M − M_aa, and −M_ba at (a, b),
-        # with M = ∂x ∂zᵀ k of the waves: tr(M) I − Mᵀ, the kernel of `DivergenceFree`.
+        # Let M = ∂x ∂zᵀ k of the waves. The entry (a, a) of Σ_{a<b} φφᵀ is Σ_{b≠a} M_bb, that is
+        # tr M − M_aa, and the entry (a, b) is −M_ba. So Σ φφᵀ = tr(M) I − Mᵀ, as in
+        # `DivergenceFree`.
         a, b = np.triu_indices(self.dimension, 1)
         pairs = np.zeros((self.dimension, len(a), self.dimension))
         pairs[a, np.arange(len(a)), b] = 1.0
@@ -308,7 +309,7 @@ class DivergenceFreeFeatures(AbstractFeatures):
 
 
 class SeparableFeatures(AbstractFeatures):
-    """φ = e_a (wave) for each component a."""
+    """The features φ = e_a (wave) of `Separable`, for each component a."""
 
     waves: Basis
     dimension: int = eqx.field(static=True)
@@ -325,13 +326,13 @@ class SeparableFeatures(AbstractFeatures):
 
 
 class ControlledFeatures(AbstractFeatures):
-    """φ(x) of the drift, and uⱼ e_a (wave)(x) for each input j and each coordinate a.
+    """The features of the drift, and uⱼ e_a (wave)(x) for each input j and each coordinate a.
 
     Attributes:
         drift: the features of the drift.
         waves: the features of the input matrix; None if the matrix is known.
-        acts_on: the coordinates that inputs change.
-        count: m, the number of inputs; points are (x, u).
+        acts_on: the coordinates on which inputs act.
+        count: the number m of inputs; points are (x, u).
     """
 
     drift: AbstractFeatures
@@ -370,7 +371,7 @@ class ControlledFeatures(AbstractFeatures):
 
 
 class SumFeatures(AbstractFeatures):
-    """The features of all terms, one after the other."""
+    """The features of a sum of kernels: the features of all terms, concatenated."""
 
     terms: tuple[AbstractFeatures, ...]
 
@@ -409,7 +410,7 @@ class SumFeatures(AbstractFeatures):
 def features(
     K: AbstractMatrixKernel, n: int, count: int, key: Key[Array, ""], dtype: Any
 ) -> AbstractFeatures:
-    """Random Fourier features of a structured kernel.
+    """The features of a structured kernel: random Fourier features, or those of `Shared` laws.
 
     Args:
         K: a structure, or a sum of structures, on shift-invariant scalar kernels.
@@ -419,9 +420,9 @@ def features(
         dtype: the dtype of the features.
 
     Raises:
-        TypeError: a kernel without a known spectral density, or an unknown structure.
+        TypeError: a scalar kernel has no known spectral density, or the structure is unknown.
     """
-    # We dispatch on the type of K, so that a structure need not know of random features.
+    # We dispatch on the type of K, so that structures do not depend on features.
     if isinstance(K, Controlled):
         return _controlled_features(K, n, count, key, dtype)
     if isinstance(K, Sum):

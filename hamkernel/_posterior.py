@@ -59,8 +59,8 @@ def condition(
 ) -> Posterior:
     """Condition the Gaussian process GP(mean, K) on data: `fit` with error bars.
 
-    The posterior mean is the field of `fit`. The variances are proportional to the amplitude of K
-    and depend on λ, so tune both by the marginal likelihood first:
+    The posterior mean is the field of `fit`. To scale K and λ by one factor changes no field, but
+    scales all variances. So tune both by the marginal likelihood first:
 
         tuned = hk.tune(hk.Symplectic(1.0 * k), X, Y, objective="marginal_likelihood")
         posterior = hk.condition(tuned.kernel, X, Y, tuned.regularization)

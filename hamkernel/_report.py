@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hamkernel import _require as require
-from hamkernel._trajectories.lagrangian import LearnedLagrangian
 from hamkernel._trajectories.learned import Learned
+from hamkernel._weak.lagrangian import LearnedLagrangian
 
 if TYPE_CHECKING:
     from hamkernel._runs.runs import Runs

@@ -1,9 +1,10 @@
-"""`save` and `load`: a field or a result in one file. Reading a file runs no code from it.
+"""`save` and `load`: a field or a result in one file. `load` runs no code from the file.
 
-A file is a line with the version of the format and the SHA-256 of the rest, a line of JSON that
-describes the object, and its arrays as Equinox writes the leaves of a PyTree, one after another in
-NumPy's `.npy` format. The digest reveals a cut or changed file before anything is parsed. It does
-not authenticate: whoever changes a file can change its digest, so `load` checks all that it parses.
+A file has three parts. The first line has the version of the format and the SHA-256 of the rest.
+The second line describes the object in JSON. Then follow the arrays of the object, as Equinox
+writes the leaves of a PyTree in NumPy's `.npy` format. The digest reveals a cut or changed file
+before `load` parses it. It does not authenticate: whoever changes a file can change its digest, so
+`load` checks all that it parses.
 
 The description has these nodes:
 
@@ -11,11 +12,11 @@ The description has these nodes:
     {"array": "float64", "shape": […]}   an array, without its entries; of NumPy if "numpy": true
     {"dict": {name: …}}                  a dictionary
     {"function": name}                   one of the functions in `_MAPS`
-    {"code": name, "leaves": […]}        code of the caller's, which only the caller can give
+    {"code": name, "leaves": […]}        code of the caller, which the caller must pass to `load`
     […]  0.5  "text"  true  null         a tuple, and plain values
 
-A name is looked up among the classes that this library has loaded: nothing is imported,
-evaluated or called by name.
+`load` looks names up among the classes that this library has loaded. It imports, evaluates and
+calls nothing by name.
 """
 
 from __future__ import annotations
@@ -53,13 +54,13 @@ from hamkernel._runs.table import Diagnostic, Diagnostics
 from hamkernel._solvers.problem import Problem
 from hamkernel._solvers.stream import AbstractStreamingFit
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._trajectories.lagrangian import LearnedLagrangian
 from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.model import Model
 from hamkernel._trajectories.segments import LinearisedSegments
 from hamkernel._tuning.tune import Tuned
+from hamkernel._weak.lagrangian import LearnedLagrangian
 
-_VERSION = 2  # of the format; 1 was an archive of NumPy's, before the first release
+_VERSION = 2  # of the format; version 1, before the first release, was a NumPy archive
 _FIRST_LINE = "hamkernel field, version {}, sha256 {}"
 
 
@@ -75,26 +76,26 @@ def save(
 ) -> None:
     """Write a learned field to one file: kernel, hyperparameters, data, coefficients, version.
 
-    Results are written whole: `learned` with its runs, noise, diagnostics and history, so that
-    `hk.load(path).posterior` and `.score(runs)` work; `tuned`; and a posterior with its factor. A
-    fit to which chunks are added goes on with the next one after `load`.
+    `save` writes results completely: `learned` with its runs, noise, diagnostics and history, so
+    that `hk.load(path).posterior` and `.score(runs)` work; `tuned`; and a posterior with its
+    factor. You can add further chunks to a streaming fit after `load`.
 
-    The file at `path` is replaced in one step, so that no reader ever sees half of it. Code of
-    your own (kernels, maps of a `Warp`, a mean) is not written, only its arrays are: see `load`.
+    `save` replaces the file at `path` in one step, so that no reader ever sees half of it. Of your
+    own code (kernels, maps of a `Warp`, a mean) it writes only the arrays: see `load`.
 
-    If the rows of the field are spread over several processes, all of them must make the call, and
-    the first process writes the file before any of them goes on.
+    If the rows of the field are sharded over several processes, all of them must call `save`. The
+    first process writes the file before any of them continues.
 
     Args:
-        path: the file. The name is taken as it is.
+        path: the file. `save` adds no suffix.
         field: the result of `fit`, `learn`, `tune` or `condition`, or the `LandmarkFit` or
             `FeatureFit` of a solver's `start`.
 
     Raises:
-        TypeError: `field` is none of these, or holds something that cannot be stored.
-        ValueError: the call is inside `jax.jit`, where there are no numbers yet; the field is not
-            finite.
-        OSError: the file cannot be written; an older one at `path` is left as it was.
+        TypeError: `field` is none of these, or contains an object that cannot be stored.
+        ValueError: the call is inside `jax.jit`, `grad` or `vmap`, where there are no numbers yet;
+            `field` is a batch of fields, or not finite.
+        OSError: the file cannot be written; an older file at `path` is unchanged.
     """
     if isinstance(field, str | os.PathLike):
         raise TypeError("save takes the path first, hk.save(path, field).")
@@ -115,7 +116,7 @@ def save(
     described = description(field, [], "field")
     try:
         evaluable = _evaluable(field)
-    except Exception as error:  # a kernel of the caller's may raise anything
+    except Exception as error:  # a kernel of the caller may raise any error
         raise ValueError(
             "save writes one field that can be evaluated, and this one cannot (of a batch made by "
             f"jax.vmap save each field): {error}"
@@ -137,7 +138,7 @@ def save(
     try:
         if jax.process_index() == 0:
             _write_at_once(pathlib.Path(path), seal(content.getvalue()))
-    finally:  # else the others would wait for ever for one that could not write
+    finally:  # else the other processes would wait for ever after an error
         multihost_utils.sync_global_devices("hamkernel.save")
 
 
@@ -146,26 +147,27 @@ def load(
     kernel: AbstractMatrixKernel | None = None,
     mean: Callable[..., Any] | None = None,
 ) -> Any:
-    """Read what `save` wrote: the same arrays bit by bit, so the same values of f.
+    """Read a file of `save`: the arrays are equal bit by bit, so f has the same values.
 
-    Nothing in the file is executed. Built-in kernels restore by themselves. For a kernel of your
-    own the file has the arrays but not the code: pass the kernel as `fit` or `learn` got it. Its
-    hyperparameters may have any values, and those of the file are put in.
+    `load` executes nothing in the file. It restores built-in kernels. For a kernel of your own the
+    file has the arrays but not the code: pass the kernel that you passed to `fit` or `learn`, with
+    any hyperparameters. `load` takes the hyperparameters from the file.
 
     Args:
         path: the file.
         kernel: the matrix-valued kernel, needed if a part of it is your own code.
-        mean: the prior mean, needed if it is your own code; a learned field and one of
-            `hk.systems` are in the file.
+        mean: the prior mean, needed if it is your own code. The file contains a mean that is a
+            learned field or a system of `hk.systems`.
 
     Returns:
         An object of the class that was saved.
 
     Raises:
-        ValueError: the file is no such file, cut off, changed, of another version, or in float64
-            while JAX is not; or `kernel` is missing or is not the one that was saved, which a
-            velocity in the file tells.
-        TypeError: `kernel` is not matrix-valued. OSError: the file cannot be read.
+        ValueError: `save` did not write the file, or it is cut off, changed, of another version, or
+            in float64 while JAX is not. Or `kernel` is missing, or is not the saved kernel: a
+            velocity in the file differs.
+        TypeError: `kernel` is not matrix-valued.
+        OSError: the file cannot be read.
 
     Example: `field = hk.load("pendulum", kernel=hk.Symplectic(hk.Warp(hk.Gaussian(), fn)))`
     """
@@ -192,7 +194,7 @@ def load(
         results = Learned.__name__, LearnedLagrangian.__name__
         as_fitted = node["class"] not in results  # learn adds amplitudes and masses
         like = skeleton(node, [], "field", _supplied_parts(kernel, mean, as_fitted))
-        with jax.ensure_compile_time_eval():  # a constant of what JAX traces around this call
+        with jax.ensure_compile_time_eval():  # arrays, also if JAX traces the caller
             field = eqx.tree_deserialise_leaves(content, like)
         if content.read():
             raise ValueError("it has arrays that belong to nothing")
@@ -203,7 +205,7 @@ def load(
             f"{source}: {error}. Pass the {name} that was given to fit, with any "
             f"hyperparameters: hk.load(path, {name}=...)."
         ) from error
-    except Exception as error:  # a kernel of the caller's may raise anything
+    except Exception as error:  # a kernel of the caller may raise any error
         with_supplied = " with what was given" if is_supplied else ""
         raise ValueError(
             f"{source} is not a valid file of hamkernel.save{with_supplied}: {error}"
@@ -225,18 +227,18 @@ def _state_function(field: Any) -> Callable[[Array], Array]:
     if isinstance(field, AbstractJoinedField):
         u = jnp.ones(field.kernel.input_count, field.offset.dtype)
         return lambda x: field(x, u)
-    if isinstance(field, LagrangianField):  # which may have no acceleration
+    if isinstance(field, LagrangianField):  # M may be singular, so we take no acceleration
         return lambda x: jnp.concatenate([field.momentum(x), field.rest_torques(x)])
     return field
 
 
 def _evaluable(saved: Any) -> AbstractField:
-    """The field of a saved object, with which `_probe` makes its check.
+    """The field of a saved object, which `_probe` evaluates.
 
-    For a fit to chunks we take the sum of its columns, which needs no data. An error is raised if
-    the parts do not fit each other, such as lengthscales and coordinates of different numbers.
+    For a streaming fit we take the sum of its columns, which needs no data. If the parts do not
+    fit each other, such as the numbers of lengthscales and coordinates, an error comes.
     """
-    is_stream = isinstance(saved, AbstractStreamingFit)  # whose columns need no data
+    is_stream = isinstance(saved, AbstractStreamingFit)
     field = saved.sum_of_columns() if is_stream else getattr(saved, "field", saved)
     state = jax.ShapeDtypeStruct((field.dimension,), field.offset.dtype)
     if field.offset.shape or jax.eval_shape(_state_function(field), state).shape != state.shape:
@@ -245,8 +247,9 @@ def _evaluable(saved: Any) -> AbstractField:
 
 
 def _probe(field: AbstractField) -> list[list[float]]:
-    """A state and the velocity there, by which `load` checks a kernel that the caller supplies."""
-    n = field.dimension  # without points, as for features: no two particles in one place
+    """A state and its velocity, with which `load` checks a kernel that the caller supplies."""
+    # Features have no points. We then take a state in which no two particles coincide.
+    n = field.dimension
     points = np.asarray(getattr(field, "points", np.cos(1.0 + np.arange(n))[None]))[:64]
     velocities = np.asarray(jax.vmap(_state_function(field))(jnp.asarray(points)))
     if not np.isfinite(velocities).all():
@@ -261,7 +264,7 @@ def _probe(field: AbstractField) -> list[list[float]]:
 def _check_probe(field: AbstractField, probe: Any, source: str) -> None:
     state, saved = np.asarray(probe, float)
     velocity = np.asarray(_state_function(field)(jnp.asarray(state)))
-    # Computed elsewhere, fields of large coefficients round at 1e-5.
+    # On another machine fields with large coefficients differ by 1e-5.
     if not np.linalg.norm(velocity - saved) <= 1e-3 * np.linalg.norm(saved):
         raise ValueError(
             f"with this kernel the field in {source} has the velocity {velocity} at the state "
@@ -271,7 +274,7 @@ def _check_probe(field: AbstractField, probe: Any, source: str) -> None:
 
 
 def _is_here(leaf: Any) -> bool:
-    """Whether this process has the whole array."""
+    """Whether this process has the complete array."""
     is_array = isinstance(leaf, jax.Array)
     return not is_array or leaf.is_fully_addressable or leaf.is_fully_replicated
 
@@ -310,26 +313,26 @@ Supplied = Mapping[str, tuple[Node, list[Any]]]
 
 
 class _Mismatch(ValueError):
-    """The caller's kernel or mean is not the saved one, or some of its code is missing."""
+    """An error: the caller's kernel or mean is not the saved one, or code is missing."""
 
 
 def _supplied_parts(kernel: Any, mean: Any, as_fitted: bool) -> Supplied:
-    """The parts of a field that the caller supplied: for each a description or None, and its code.
+    """The supplied parts of a field: for each name a description or None, and the code.
 
-    `learn` adds amplitudes and masses to the caller's kernel. Then `as_fitted` is false: we take
-    only the code of the caller's kernel, and the saved velocity reveals a wrong kernel.
+    `learn` adds amplitudes and masses to the caller's kernel. In this case `as_fitted` is false: we
+    take only the code of the caller's kernel, and the saved velocity reveals a wrong kernel.
     """
     of_kernel, of_mean = [], []
     node = None if kernel is None else description(kernel, of_kernel, "field.kernel")
     node = node if as_fitted else None
-    if mean is not None:  # which may be a term of the mean of the field
+    if mean is not None:  # the code only: it may be one term of the mean of the field
         description(as_pytree(mean), of_mean, "field.mean")
-    # Features hold the kernel again.
+    # Features contain the kernel a second time.
     return {"kernel": (node, of_kernel), "features": (None, of_kernel), "mean": (None, of_mean)}
 
 
 def _ours(cls: type) -> bool:
-    """Whether a file may name the class; `Bound` and `Closure` only carry code of the caller's."""
+    """Whether a file may name the class. `Bound` and `Closure` hold code of the caller."""
     is_module = issubclass(cls, eqx.Module) and cls.__module__.startswith(_ROOMS)
     return cls in _RECORDS or (is_module and cls not in (Bound, Closure))
 
@@ -352,10 +355,10 @@ def _classes() -> dict[str, type]:
 
 
 def description(value: Any, codes: list[Any], where: str) -> Node:
-    """The JSON of `value`; code of the caller's is appended to `codes`, in order.
+    """The JSON of `value`. We append code of the caller to `codes`, in order.
 
     Raises:
-        TypeError: something in it cannot be stored; `where` is its name.
+        TypeError: a part of `value` cannot be stored. The message begins with its name `where`.
     """
     cls = type(value)
     if _ours(cls):
@@ -389,16 +392,17 @@ def description(value: Any, codes: list[Any], where: str) -> Node:
 
 
 def skeleton(node: Node, codes: list[Any], where: str, supplied: Supplied) -> Any:
-    """The object of a description, with shapes for arrays, and the caller's code in its places.
+    """The object of a description, with shapes in place of arrays, and with the caller's code.
 
     Args:
         node: the description.
-        codes: the code below, in order; it is used up.
+        codes: the code in this object, in order; we remove the code that we use.
         where: the name of the object.
-        supplied: descriptions and code of the parts of a field that the caller has supplied.
+        supplied: descriptions and code of the parts that the caller has supplied.
 
     Raises:
-        _Mismatch: the caller's kernel or mean is another. ValueError: `node` is no description.
+        _Mismatch: the caller's kernel or mean differs from the saved one.
+        ValueError: `node` is no description.
     """
     match node:
         case {"class": str(name), **nodes}:
@@ -418,12 +422,12 @@ def skeleton(node: Node, codes: list[Any], where: str, supplied: Supplied) -> An
                 parts[key] = skeleton(child, inside[0], path, inside[1])
             if issubclass(cls, tuple):
                 return cls(**parts)
-            made = object.__new__(cls)  # past __init__, which takes no logarithms
+            made = object.__new__(cls)  # without __init__, since the fields are logarithms
             for key, part in parts.items():
                 object.__setattr__(made, key, part)
             return made
         case {"array": str(dtype), "shape": [*shape], "numpy": True}:
-            return np.broadcast_to(np.zeros((), dtype), shape)  # which takes no memory
+            return np.broadcast_to(np.zeros((), dtype), shape)  # takes no memory
         case {"array": str(dtype), "shape": [*shape]}:
             return jax.ShapeDtypeStruct(tuple(shape), np.dtype(dtype))
         case {"dict": dict(items)}:
@@ -454,7 +458,7 @@ def _difference(saved: Node, supplied: Node, where: str) -> str | None:
 
 
 def _entries(node: Node, where: str) -> Iterator[tuple[str, str]]:
-    """The places in a description, with what they hold; code may have any name."""
+    """The places in a description with their contents; the name of code does not count."""
     match node:
         case {"class": str(name), **nodes}:
             yield where, name
@@ -476,7 +480,7 @@ def _entries(node: Node, where: str) -> Iterator[tuple[str, str]]:
 
 
 def seal(content: bytes) -> bytes:
-    """The bytes of a file: its first line, with the version and the digest, and the content."""
+    """The bytes of a file: the first line with version and digest, then the content."""
     digest = hashlib.sha256(content).hexdigest()
     return _FIRST_LINE.format(_VERSION, digest).encode() + b"\n" + content
 
@@ -506,7 +510,7 @@ def _open(content: bytes, source: str) -> bytes:
 
 
 def _write_at_once(path: pathlib.Path, content: bytes) -> None:
-    """Write all of the file or nothing: a new one takes the place of the old one at once."""
+    """Write a new file and replace the old one in one step, so that no file is half written."""
     if path.is_dir():
         raise IsADirectoryError(f"{path} is a folder; save needs the name of a file.")
     if not path.parent.is_dir():

@@ -1,4 +1,4 @@
-"""Trajectories of any vector field, by Diffrax: `hk.simulate`."""
+"""`simulate`: trajectories of any vector field, by Diffrax."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from hamkernel._symplectic import AbstractSymplecticSolver, EqualSteps, step_cou
 
 Interpolation = Literal["held", "linear"]
 
-# The bound of a loop with an unknown number of steps: some seconds for a cheap field.
+# The largest number of steps if it is not known in advance: a few seconds for a cheap field.
 _MAX_STEPS = 2**20
 _RESULTS: Any = diffrax.RESULTS
 
@@ -47,12 +47,12 @@ def simulate(
 ) -> diffrax.Solution:
     """Integrate ẋ = f(x) from x0 at time ts[0], and return the states at the times ts.
 
-    Without `dt` the step adapts to the tolerances. With `dt` every interval [ts[i], ts[i+1]] is cut
-    into the fewest equal steps of at most `dt`, so each saved state is the end of a step and none
-    is interpolated. Symplectic solvers need `dt`: their energy error stays bounded because every
-    step is the same map, and an adaptive step changes the map. With equally spaced `ts` all steps
-    have one size. With unequal spacing the size changes between intervals, by at most dt over the
-    spacing, but never with the state.
+    Without `dt` the step adapts to the tolerances. With `dt` we cut every interval
+    [ts[i], ts[i+1]] into the fewest equal steps of at most `dt`, so each saved state is the end of
+    a step. Symplectic solvers need `dt`: their energy error stays bounded because every step is the
+    same map, and an adaptive step changes the map. With equally spaced `ts` all steps have one
+    size. With unequal spacing the size changes between intervals, by a fraction of at most
+    dt/spacing, but never with the state.
 
     Args:
         field: x (n,) ↦ ẋ (n,), a function or a PyTree such as a fitted field or a system.
@@ -73,7 +73,7 @@ def simulate(
         progress: show a progress bar (tqdm); with `dt` it moves at every saved time.
         adjoint: the method by which Diffrax differentiates. None is reverse mode. For `jax.jvp` and
             `jax.jacfwd` pass `diffrax.ForwardMode()`, for `jax.hessian` `diffrax.DirectAdjoint()`.
-        throw: raise if the solve fails. If False, look at `.result`.
+        throw: whether a failed solve raises an error. If False, look at `.result`.
         inputs: u of a field (x, u) ↦ ẋ: a function t ↦ (m,) of the time of ts, or samples (T, m) at
             ts. For explicit time pass `inputs=lambda t: jnp.array([t])`.
         between: whether samples of inputs are "held" until the next sample, or "linear".
@@ -87,14 +87,15 @@ def simulate(
             is not known to be separable, and the solver splits H. Inputs are missing, have another
             shape, or come with a symplectic solver.
         TypeError: `field` does not map a JAX array to another of the same dtype; `solver` or
-            `adjoint` is no object of Diffrax; x0 has less precision than float32; or JAX takes
-            forward mode through the default adjoint.
+            `adjoint` is no object of Diffrax; x0 has less precision than float32; or you use
+            forward mode with the default adjoint.
         RuntimeError: the solve failed: too many steps, the implicit equations of a step did not
-            converge, or the state overflowed. Usually a smaller `dt` helps.
+            converge, or the state overflowed. Usually a smaller `dt` helps. Or the data do not
+            identify the mass matrix of a `LagrangianField`.
 
     Warns:
-        UserWarning: the path of a fitted field is far from the points that the field was learned
-            from.
+        UserWarning: the path of a fitted field leaves the data, or the arguments of a `Shared` law
+            leave the range of the data.
     """
     with require.eager(x0):
         x0 = _initial_state(x0)
@@ -121,7 +122,7 @@ def simulate(
         steps = _equal_steps(solver, ts, dt, adjoint, max_steps)
     solution = _integrate(rhs, steps, ts, x0, start, adjoint, progress)
     solution, failed = _restore_times(solution, caller_times.astype(x0.dtype))
-    if steps.counts is not None:  # Diffrax counted the intervals around the equal steps
+    if steps.counts is not None:  # Diffrax counted the intervals, not the equal steps
         total = jnp.asarray(require.host_array(steps.counts).sum())
         stats = {**solution.stats, "num_steps": total, "num_accepted_steps": total}
         solution = eqx.tree_at(lambda s: s.stats, solution, stats)
@@ -152,7 +153,7 @@ def _initial_state(x0: ArrayLike) -> Float[Array, " n"]:
 
 
 class Samples(eqx.Module):
-    """The inputs u(t) from samples at times ts: the last sample before t, or interpolated."""
+    """The inputs u(t) from samples at the times ts, held or linearly interpolated."""
 
     ts: Float[Array, " T"]
     values: Float[Array, "T m"]
@@ -169,7 +170,7 @@ class Samples(eqx.Module):
 
 
 class OneInput(eqx.Module):
-    """u(t) of shape (1,) from a function that returns a number."""
+    """The input u(t), shape (1,), from a function that returns a number."""
 
     function: Callable[[Array], Any]
 
@@ -178,12 +179,12 @@ class OneInput(eqx.Module):
 
 
 class RightHandSide(eqx.Module):
-    """The field f(t, x, args) as Diffrax calls it; with inputs, `args` is the time at t = 0."""
+    """The field f(t, x, args) for Diffrax. If there are inputs, it takes u at `args` + t."""
 
     field: Any  # x -> velocity; or x, u -> velocity
     inputs: Callable[[Array], Any] | None
-    # Whether u keeps its value at t = 0 over a whole step; otherwise the last stage of a step
-    # would use the next sample.
+    # Whether u keeps its value at t = 0 for a whole interval, so that the last stage of its last
+    # step does not use the next sample.
     held: bool = eqx.field(static=True)
 
     @property
@@ -199,11 +200,11 @@ class RightHandSide(eqx.Module):
 
 
 def _initial_velocity(rhs: RightHandSide, start: Any, x: Float[Array, " n"]) -> Float[Array, " n"]:
-    """f(x, u) with the inputs u of the first time, `start`."""
+    """The velocity f(x, u) with the inputs u at the first time, `start`."""
     return rhs(jnp.zeros_like(start), x, start)
 
 
-_FilterJit: Any = type(eqx.filter_jit(abs))  # Equinox does not name it
+_FilterJit: Any = type(eqx.filter_jit(abs))  # a private class of Equinox
 
 
 def _right_hand_side(
@@ -214,10 +215,10 @@ def _right_hand_side(
     between: Interpolation,
     constant_steps: bool,
 ) -> tuple[RightHandSide, Float[Array, ""] | None]:
-    """The field with its inputs, and the time of the inputs at ts[0] = 0, for `args`."""
-    # The function inside `jax.jit` may have attributes such as `is_separable`, and the loop is
-    # compiled anyway. We do not unwrap `functools.wraps`, since its function may be a different
-    # field.
+    """The field with its inputs, and the time of the inputs at the start, for `args`."""
+    # We unwrap `jax.jit`: the function inside may have attributes such as `is_separable`, and
+    # Diffrax compiles the loop anyway. We do not unwrap `functools.wraps`, since its function may
+    # be a different field.
     while isinstance(field, (jax.stages.Wrapped, _FilterJit)):
         field = field.__wrapped__
     if getattr(field, "refusal", ""):
@@ -239,14 +240,14 @@ def _right_hand_side(
             "x and its inputs u: a field of a Controlled kernel, hk.systems.Driven(system, G), or "
             "a function of yours. To simulate it without inputs, leave them out."
         )
-    # Functions are called with the caller's time; the times of samples count from the start.
+    # We call functions with the caller's time. The times of samples count from the start.
     start = first.astype(ts.dtype) if callable(inputs) else jnp.zeros((), ts.dtype)
     held = constant_steps and between == "held" and not callable(inputs)
     return RightHandSide(field, _inputs(inputs, ts, between), held), start
 
 
 def _inputs(inputs: Any, ts: Float[Array, " T"], between: Interpolation) -> Callable[[Array], Any]:
-    """The inputs u as a function of the time; samples are at the times ts."""
+    """The inputs u as a function of time, from a function or from samples at the times ts."""
     if between not in ("held", "linear"):
         raise ValueError(f"between must be 'held' or 'linear'; got {between!r}.")
     if callable(inputs):
@@ -291,7 +292,7 @@ def _check_field(field: Callable[[Array], Array], x0: Float[Array, " n"]) -> Non
 
 
 class _Steps(NamedTuple):
-    """The steps in Diffrax's terms, and their number in each interval if it is known."""
+    """The arguments of Diffrax that set the steps, and the number of steps in each interval."""
 
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController
@@ -307,9 +308,9 @@ def _adaptive_steps(
     max_steps: int | None,
     jumps: bool,
 ) -> _Steps:
-    """Steps of these tolerances, rtol and atol; with `jumps` the field jumps at the saved times."""
-    # Steps end on ts. The interpolant of Dopri8 has a lower order: it broke the conservation of
-    # energy by 1e-7, and the steps themselves by 1e-10.
+    """Adaptive steps with the tolerances (rtol, atol); with `jumps` the field jumps at each ts."""
+    # We end steps on ts: the interpolant of Dopri8 has a lower order. It changed the energy by
+    # 1e-7, the steps themselves by 1e-10.
     controller = diffrax.ClipStepSizeController(
         diffrax.PIDController(*tolerances),
         step_ts=ts,
@@ -327,21 +328,21 @@ def _rounding(field: KernelField, x: Float[Array, " n"]) -> Float[Array, ""]:
 
 
 def _learned_at(rhs: RightHandSide, start: Any, x: Float[Array, " n"]) -> tuple[Any, Array]:
-    """The field of the points, and the point of the state x with the inputs of the first time."""
+    """The field of joined points, and the point of the state x with the inputs at the start."""
     if isinstance(rhs.field, AbstractJoinedField) and rhs.inputs is not None:
         return rhs.field.whole, rhs.field.join(x, rhs.inputs(start))
     return rhs.field, x
 
 
-# A Gaussian falls to a hundredth at three lengthscales.
+# A Gaussian kernel is .01 at three lengthscales.
 _FADED = 0.01
-_LOOKED_AT = 16  # states of the path, and points of the field
+_LOOKED_AT = 16  # states of the path, and points of the field, that we compare
 
 
 def _leaves_the_data(rhs: RightHandSide, start: Any, ts: Any, ys: Any) -> str:
-    """A sentence if the kernel has faded where the path goes, else "".
+    """A warning if the kernel sum of the field is nearly zero on the path; else "".
 
-    The terms of the field at states of the path are compared with those at its own points.
+    We compare the size of the terms of the field at states of the path and at its own points.
     """
     learned = _learned_at(rhs, start, ys[0])[0]
     if not isinstance(learned, KernelField):
@@ -376,19 +377,19 @@ def _sizes(
 def _tolerances(
     rhs: RightHandSide, start: Any, x0: Float[Array, " n"], rtol: Any, atol: Any
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """The relative and the absolute tolerance; the defaults are not below the rounding of f."""
+    """The relative and absolute tolerance. The defaults are at least the rounding error of f."""
     default = jnp.asarray(1e-10 if x0.dtype == jnp.float64 else 1e-5, x0.dtype)
     if rtol is None or atol is None:
         learned, point = _learned_at(rhs, start, x0)
         if isinstance(learned, KernelField):
-            # At an equilibrium f is zero and has no digits; the limit 1e-6 still gives states a
-            # few digits.
+            # At an equilibrium f is zero and its relative rounding error infinite; so we limit the
+            # tolerance to 1e-6.
             default = jnp.maximum(default, _rounding(learned, point))
 
     def tolerance(name: str, value: Any) -> Float[Array, ""]:
         if value is None:
             return default
-        with require.eager(value):  # as an array: every new Python number would compile anew
+        with require.eager(value):  # an array, since JAX compiles for each new Python number
             return require.positive_scalar(value, name).astype(default.dtype)
 
     return tolerance("rtol", rtol), tolerance("atol", atol)
@@ -413,7 +414,7 @@ def _equal_steps(
 
 
 def _bound(counts: Int[Array, " intervals"], max_steps: int | None) -> int:
-    """A bound of the number of steps in a save interval; a default if the counts are traced."""
+    """A bound on the number of steps in an interval of ts; a default if the counts are traced."""
     if not require.is_concrete(counts):
         return max_steps or _MAX_STEPS
     numbers = np.asarray(counts)
@@ -434,7 +435,7 @@ def _bound(counts: Int[Array, " intervals"], max_steps: int | None) -> int:
 
 
 def _check_solver(solver: Any, dt: Any, rtol: Any, atol: Any, has_inputs: bool) -> None:
-    """ValueError or TypeError for an object that is no solver, or options it cannot use."""
+    """Raise an error if `solver` is no solver, or cannot use the options."""
     name = solver.__name__ if isinstance(solver, type) else type(solver).__name__
     symplectic = isinstance(solver, AbstractSymplecticSolver)
     if isinstance(solver, type) or not isinstance(solver, diffrax.AbstractSolver):
@@ -480,7 +481,7 @@ def _integrate(
     adjoint: diffrax.AbstractAdjoint,
     progress: bool,
 ) -> diffrax.Solution:
-    """The solution, complete or not."""
+    """The solution of Diffrax; if the solve fails, it is incomplete."""
     try:
         return _solve(
             diffrax.ODETerm(rhs),
@@ -511,8 +512,8 @@ def _integrate(
 def _restore_times(solution: Any, ts: Float[Array, " T"]) -> tuple[Any, Bool[Array, ""]]:
     """The solution at the caller's times, and whether it failed.
 
-    Times that the solve did not reach stay infinite. A state that is not finite is a failure:
-    adaptive steps reject such states, and constant steps continue with them.
+    Times that the solve did not reach stay infinite. A state that is not finite counts as a failure
+    too, since constant steps continue with such states.
     """
     reached_end = solution.result == _RESULTS.successful
     overflowed = reached_end & ~jnp.isfinite(solution.ys).all()

@@ -1,18 +1,17 @@
 """Symplectic integrators as Diffrax solvers, and steps of one size between saved times.
 
 A one-step map x₁ = Ψ_h(x₀) is symplectic if (∂Ψ)ᵀ J ∂Ψ = J. Up to terms exponentially small in 1/h,
-such a map follows the flow of a nearby Hamiltonian H + O(hᵖ), so the error in H stays bounded
-instead of growing (HLW, IX.8). This holds for one fixed map, and therefore for a CONSTANT step. A
-step chosen from the state makes a different map at every state, and destroys the property (HLW,
-VIII.1).
+such a map follows the flow of a nearby Hamiltonian H + O(hᵖ), so the error in H stays bounded (HLW,
+IX.8). This holds for one fixed map, and therefore for a CONSTANT step. An adaptive step is another
+map at every state, and the error in H grows (HLW, VIII.1).
 
 Two families, both with x = (q, p) in one array of shape (n,):
 
 - Gauss collocation solves implicit equations and is symplectic for every Hamiltonian.
 - Splitting is explicit, and needs H = T(p) + U(q).
 
-Diffrax owns the loop over steps, the output and the gradients; Optimistix the implicit equations
-and their derivative by the implicit function theorem.
+Diffrax runs the loop over steps, saves the output and differentiates. Optimistix solves the
+implicit equations, and differentiates them by the implicit function theorem.
 
 Source: "HLW" below is Hairer, Lubich & Wanner, Geometric Numerical Integration, 2nd ed. (2006).
 """
@@ -51,7 +50,7 @@ class Step(eqx.Module):
             )
         self.terms, self.args = terms, args
         self.t0, self.t1, self.y0 = jnp.asarray(t0), jnp.asarray(t1), jnp.asarray(y0)
-        # The control carries the direction of time; its dtype may be narrower than the state's.
+        # The sign of h is the direction of time. The times may have fewer digits than the state.
         self.h = jnp.asarray(terms.contr(t0, t1), self.y0.dtype)
 
     def field(self, t: Any, y: Float[Array, " n"]) -> Float[Array, " n"]:
@@ -64,7 +63,7 @@ class Step(eqx.Module):
 class AbstractSymplecticSolver(diffrax.AbstractSolver):
     """A Diffrax solver whose step is a symplectic map for every constant step size.
 
-    It gives no error estimate, so Diffrax refuses it together with an adaptive step size.
+    The solver gives no error estimate, so Diffrax refuses to combine it with an adaptive step size.
     """
 
     term_structure: ClassVar = diffrax.AbstractTerm
@@ -72,9 +71,9 @@ class AbstractSymplecticSolver(diffrax.AbstractSolver):
 
     @property
     def interpolation_cls(self):  # pyright: ignore[reportIncompatibleVariableOverride]
-        """Between steps, as `SaveAt(ts=...)` asks: linear at order 2, else cubic Hermite.
+        """The interpolation between steps, for `SaveAt(ts=...)`: linear at order 2, else cubic.
 
-        Neither is symplectic; make steps onto the times of interest, as `simulate` does.
+        Neither is symplectic. End steps at the times of interest, as `simulate` does.
         """
         if self.nominal_order == 2:
             return diffrax.LocalLinearInterpolation
@@ -90,7 +89,7 @@ class AbstractSymplecticSolver(diffrax.AbstractSolver):
 
     def _dense_info(self, step: Step, y1: Float[Array, " n"]) -> dict[str, Array]:
         info = {"y0": step.y0, "y1": y1}
-        if self.nominal_order > 2:  # XLA drops these two evaluations where nothing is interpolated.
+        if self.nominal_order > 2:  # XLA drops these two evaluations if no state is interpolated.
             info["k0"] = step.h * step.field(step.t0, step.y0)
             info["k1"] = step.h * step.field(step.t1, y1)
         return info
@@ -102,17 +101,19 @@ class AbstractSymplecticSolver(diffrax.AbstractSolver):
 class FixedPointToRounding(optx.AbstractFixedPointSolver):
     """Iterate y ← f(y) until the increments are rounding errors.
 
-    The iteration stops in one of three cases. The increment is at most `rtol · max|y| + atol`, by
-    default zero. Or it is below √eps · max|y| and has had no new minimum for three iterations: the
-    rounding of f has ended the descent. Or it is below ∛eps · max|y|, or below
-    `options["rounding"]`, and has had no new minimum for nine iterations. The first of these two
-    bounds serves kernel sums with coefficients of 1e11, as from noise-free data, which round
-    earlier; the second serves equilibria, where f consists of rounding errors alone.
+    The iteration stops in one of three cases.
 
-    Any tolerance, even eps, leaves an error of one sign in every step, and H drifts. In 3e6 steps
-    of the midpoint rule the energy of an oscillator changed by 1.6e-11 with a tolerance of eps and
-    by less than 1e-12 with zero, in the same time. For small steps of a non-stiff field the
-    iteration is cheaper than Newton's method.
+    1. The increment is at most `rtol · max|y| + atol`, by default zero.
+    2. The increment is below √eps · max|y| and has had no new minimum for three iterations.
+    3. The increment is below ∛eps · max|y| or `options["rounding"]`, and has had no new minimum for
+       nine iterations. The first bound is for kernel sums with coefficients of 1e11, as from
+       noise-free data, whose rounding errors are larger. The second is for equilibria, where f
+       consists of rounding errors.
+
+    Any tolerance, even eps, leaves an error of the same sign in every step, and H drifts. In 3e6
+    steps of the midpoint rule the energy of an oscillator changed by 1.6e-11 with a tolerance of
+    eps, and by less than 1e-12 with zero, at the same cost. For small steps of a non-stiff field
+    the iteration is cheaper than Newton's method.
 
     Source: HLW, VIII.6; Hairer, McLachlan & Razakarivony (2008), BIT 48, 231-243.
     """
@@ -121,7 +122,7 @@ class FixedPointToRounding(optx.AbstractFixedPointSolver):
     atol: float = 0.0
     norm: Callable[[Any], Scalar] = optx.max_norm
 
-    # The increments of an oscillation shrink only every second iteration, so two are not enough.
+    # The increments for an oscillator shrink only every second iteration, so we wait for three.
     patience: ClassVar[int] = 3
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):
@@ -159,20 +160,20 @@ class FixedPointToRounding(optx.AbstractFixedPointSolver):
 
 
 class GaussTableau(NamedTuple):
-    """Butcher coefficients of s-stage Gauss collocation, and the extrapolation of its slopes."""
+    """The Butcher coefficients of s-stage Gauss collocation, and an extrapolation of slopes."""
 
     a: np.ndarray  # (s, s)
     share: np.ndarray  # (s, s): a_ij / b_j
     b: np.ndarray  # (s,)
     c: np.ndarray  # (s,)
-    ahead: np.ndarray  # (s, s): slopes of one step ↦ guess for the next
+    ahead: np.ndarray  # (s, s): slopes of one step ↦ first guess for the next step
 
 
 def _gauss(stages: int) -> GaussTableau:
-    """Collocation at the zeros c of the shifted Legendre polynomial (HLW II.1.3).
+    """The tableau of collocation at the zeros c of the shifted Legendre polynomial (HLW II.1.3).
 
-    With ℓ_j the Lagrange polynomials at c: a_ij = ∫₀^{c_i} ℓ_j, b_j = ∫₀¹ ℓ_j. The polynomial
-    through the slopes of a step, evaluated at 1 + c, starts the iteration of the next (VIII.6.1).
+    With the Lagrange polynomials ℓ_j at c, a_ij = ∫₀^{c_i} ℓ_j and b_j = ∫₀¹ ℓ_j. The first guess
+    for the next step is the polynomial through the slopes of this step, at 1 + c (VIII.6.1).
     """
     nodes, weights = np.polynomial.legendre.leggauss(stages)
     c, b = (nodes + 1) / 2, weights / 2
@@ -188,14 +189,14 @@ def _gauss(stages: int) -> GaussTableau:
 class AbstractGauss(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
     """Gauss collocation: k_i = f(t + c_i h, x + h Σ_j a_ij k_j), x₁ = x + h Σ_i b_i k_i.
 
-    Order 2s with s stages. Symplectic because b_i a_ij + b_j a_ji = b_i b_j (HLW VI.4), and
-    symmetric, Ψ_h⁻¹ = Ψ_{−h}, because the nodes are (V.2). The state carried between steps is the
-    last slopes, from which the next are guessed.
+    The order is 2s with s stages. The map is symplectic because b_i a_ij + b_j a_ji = b_i b_j
+    (HLW VI.4), and symmetric, Ψ_h⁻¹ = Ψ_{−h}, because the nodes are symmetric (V.2). The solver
+    state is the slopes of the last step, from which we guess the next.
 
-    Rounded coefficients violate the equation b_i a_ij + b_j a_ji = b_i b_j, and H drifts by a part
-    of eps in every step. We therefore round m_ij = a_ij/b_j instead, with increments l_i = h b_i
-    k_i and stages x + Σ_j m_ij l_j. The equation becomes m_ij + m_ji = 1, which holds exactly in
-    floating point for any rounding of b.
+    Rounded coefficients violate the equation b_i a_ij + b_j a_ji = b_i b_j, and H drifts by a
+    fraction of eps in every step. We therefore round m_ij = a_ij/b_j instead, with increments
+    l_i = h b_i k_i and stages x + Σ_j m_ij l_j. The equation becomes m_ij + m_ji = 1, which holds
+    exactly in floating point for any rounding of b.
 
     Source: HLW; the increments are those of Antoñana, Makazaga & Murua (2017), Numer. Algorithms
         76, 861-880.
@@ -209,7 +210,7 @@ class AbstractGauss(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
         integrator: Any = type(self)
         usual, names = integrator(), [field.name for field in dataclasses.fields(self)]
         values = [(name, getattr(self, name), getattr(usual, name)) for name in names]
-        # Equal rather than identical, which a default is no longer after pickling.
+        # We compare by value, since after pickling a default is no longer the same object.
         changed = [f"{name}={v!r}" for name, v, u in values if eqx.tree_equal(v, u) is not True]
         return f"{type(self).__name__}({', '.join(changed)})"
 
@@ -226,9 +227,9 @@ class AbstractGauss(AbstractSymplecticSolver, diffrax.AbstractImplicitSolver):
         step = Step(terms, t0, t1, y0, args)
         tableau = jax.tree.map(lambda x: jnp.asarray(x, step.y0.dtype), self.tableau)
         weights = step.h * tableau.b
-        # One of each pair is in [1/2, 2], where 1 − m is exact in every precision.
+        # One of m_ij and m_ji is in [1/2, 2], where 1 − m is exact in every precision.
         share = jnp.where(tableau.share < 0.5, 1 - tableau.share.T, tableau.share)
-        # Increments below √eps of the state that do not shrink are rounding errors.
+        # Increments below √eps max|x|/h that do not shrink are rounding errors.
         rounding = float(jnp.finfo(step.y0.dtype).eps) ** 0.5 * jnp.abs(step.y0 / step.h).max()
         solution = optx.fixed_point(
             _stage_slopes,
@@ -248,7 +249,7 @@ def _stage_slopes(
     k: Float[Array, "s n"],
     inputs: tuple[Step, Float[Array, " s"], Float[Array, "s s"], Float[Array, " s"]],
 ) -> Float[Array, "s n"]:
-    """The map with the slopes k of the stages as its fixed point."""
+    """The map of slopes whose fixed point is the slopes k of the stages."""
     step, times, share, weights = inputs
     return jax.vmap(step.field)(times, step.y0[None] + share @ (weights[:, None] * k))
 
@@ -256,14 +257,15 @@ def _stage_slopes(
 class ImplicitMidpoint(AbstractGauss):
     """Implicit midpoint rule, x₁ = x + h f((x + x₁)/2): Gauss collocation with one stage.
 
-    Order 2; symplectic for every Hamiltonian; symmetric, so time-reversible where the field is; it
-    conserves every quadratic invariant exactly (up to rounding). One evaluation per iteration.
+    The rule has order 2 and is symplectic for every Hamiltonian. It is symmetric, and therefore
+    time-reversible if the field is. It conserves every quadratic invariant up to rounding. An
+    iteration takes one evaluation of f.
 
     Args:
-        root_finder: how the implicit equation is solved: an `optimistix` fixed-point solver or root
-            finder. The default needs h‖Df‖/2 well below 1; `optimistix.Newton(rtol, atol)` with
-            tolerances near rounding takes larger steps of stiffer fields.
-        root_find_max_steps: iterations after which a step is given up and the solve fails.
+        root_finder: an `optimistix` fixed-point solver or root finder for the implicit equation.
+            The default needs h‖Df‖/2 well below 1. `optimistix.Newton(rtol, atol)` with tolerances
+            near rounding allows larger steps of stiffer fields.
+        root_find_max_steps: the largest number of iterations of a step; beyond it the solve fails.
 
     Raises:
         ValueError: the state is not one array of shape (n,).
@@ -281,8 +283,9 @@ class ImplicitMidpoint(AbstractGauss):
 class GaussLegendre4(AbstractGauss):
     """Gauss collocation with two stages, c = 1/2 ∓ √3/6.
 
-    Order 4; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. For
-    the formula see `AbstractGauss`, for arguments and errors see `ImplicitMidpoint`.
+    The method has order 4, is symplectic for every Hamiltonian and symmetric, and conserves every
+    quadratic invariant. For the formula see `AbstractGauss`, for arguments and errors see
+    `ImplicitMidpoint`.
 
     Source: HLW, II.1.3 (table 1.1) and VI.4.
     """
@@ -296,8 +299,9 @@ class GaussLegendre4(AbstractGauss):
 class GaussLegendre6(AbstractGauss):
     """Gauss collocation with three stages, c = 1/2, 1/2 ∓ √15/10.
 
-    Order 6; symplectic for every Hamiltonian; symmetric; conserves every quadratic invariant. For
-    the formula see `AbstractGauss`, for arguments and errors see `ImplicitMidpoint`.
+    The method has order 6, is symplectic for every Hamiltonian and symmetric, and conserves every
+    quadratic invariant. For the formula see `AbstractGauss`, for arguments and errors see
+    `ImplicitMidpoint`.
 
     Source: HLW, II.1.3 (table 1.1) and VI.4.
     """
@@ -312,23 +316,23 @@ class GaussLegendre6(AbstractGauss):
 
 
 def is_separable(terms: Any) -> bool:
-    """Whether the field of a Diffrax term claims that H = T(p) + U(q)."""
+    """Whether the field of a Diffrax term declares H = T(p) + U(q)."""
     while not hasattr(terms, "vector_field") and hasattr(terms, "term"):
         terms = terms.term  # Diffrax wraps the user's term to set the direction of time.
     return bool(getattr(getattr(terms, "vector_field", None), "is_separable", False))
 
 
 class AbstractSplitting(AbstractSymplecticSolver):
-    """Kick, drift, kick with h replaced by w_1 h, …, w_s h in turn (w = `weights`, Σ w = 1).
+    """Kick–drift–kick substeps of sizes w₁h, …, w_s h, with w = `weights`, Σ w = 1.
 
-    One such substep of size h, where q̇ = f_q depends on p alone and ṗ = f_p on q alone:
+    A substep of size h, where q̇ = f_q depends only on p and ṗ = f_p only on q, is
 
-        p½ = p + h/2 f_p(q),   q₁ = q + h f_q(p½),   p₁ = p½ + h/2 f_p(q₁)
+        p½ = p + h/2 f_p(q),   q₁ = q + h f_q(p½),   p₁ = p½ + h/2 f_p(q₁).
 
-    For any other field this map is not symplectic, not even of order 2, and its output does not
-    show that. The field must therefore have an attribute `is_separable` that is True, or the caller
-    must pass `assume_separable=True`. f is evaluated twice in every substep. The state carried
-    between steps is f_p(q₁), with which the next step begins.
+    For any other field this map is neither symplectic nor of order 2, and the output does not show
+    it. The field must therefore have an attribute `is_separable` that is True, or the caller must
+    pass `assume_separable=True`. A substep evaluates f twice. The solver state is f_p(q₁), with
+    which the next step begins.
     """
 
     weights: AbstractClassVar[tuple[float, ...]]
@@ -381,11 +385,11 @@ class AbstractSplitting(AbstractSymplecticSolver):
 class StormerVerlet(AbstractSplitting):
     """Störmer–Verlet (leapfrog, velocity Verlet): the kick–drift–kick of `AbstractSplitting`.
 
-    Order 2; symplectic if H = T(p) + U(q); symmetric, so time-reversible where the field is;
-    explicit, two evaluations per step.
+    The method has order 2 and is symplectic if H = T(p) + U(q). It is symmetric, and therefore
+    time-reversible if the field is. It is explicit, with two evaluations per step.
 
     Args:
-        assume_separable: take the caller's word for H = T(p) + U(q). False: the field must have an
+        assume_separable: whether to assume H = T(p) + U(q). If False, the field must have an
             attribute `is_separable` that is True.
 
     Raises:
@@ -402,9 +406,9 @@ class StormerVerlet(AbstractSplitting):
 class Yoshida4(AbstractSplitting):
     """Yoshida's triple jump: three `StormerVerlet` steps of sizes γh, (1 − 2γ)h, γh.
 
-    γ = 1/(2 − 2^{1/3}) ≈ 1.35, so the middle step runs backwards. Order 4; symplectic if
-    H = T(p) + U(q); symmetric; explicit, six evaluations per step. For arguments and errors see
-    `StormerVerlet`.
+    γ = 1/(2 − 2^{1/3}) ≈ 1.35, so the middle step runs backwards. The method has order 4, is
+    symplectic if H = T(p) + U(q), symmetric, and explicit with six evaluations per step. For
+    arguments and errors see `StormerVerlet`.
 
     Source: Yoshida (1990), Phys. Lett. A 150, 262–268; HLW, II.4 (example 4.2).
     """
@@ -417,12 +421,12 @@ class Yoshida4(AbstractSplitting):
 
 
 class EqualSteps(diffrax.AbstractSolver):
-    """One long step made of ⌈(t1 − t0)/dt⌉ equal steps of another solver.
+    """One long step that consists of ⌈(t1 − t0)/dt⌉ equal steps of another solver.
 
-    With `diffrax.StepTo(ts)` every time in `ts` is the end of a step, so nothing is interpolated,
-    and only the saved points take memory. The steps between two times have one size, at most `dt`,
-    independent of the state. Each long step starts at time 0, so that a small step does not vanish
-    in the rounding of a large time; `args` holds the true start time for fields with inputs.
+    With `diffrax.StepTo(ts)` every time in `ts` is the end of a step, so Diffrax interpolates
+    nothing and stores only the saved points. The steps between two times have one size, at most
+    `dt`, independent of the state. Each long step starts at time 0, so that a small step does not
+    vanish in the rounding of a large time. For fields with inputs, `args` is the true start time.
     """
 
     solver: diffrax.AbstractSolver
@@ -434,11 +438,11 @@ class EqualSteps(diffrax.AbstractSolver):
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
 
     def order(self, terms: Any) -> int | None:
-        """Return the order of the solver that makes the steps."""
+        """Return the order of the inner solver."""
         return self.solver.order(terms)
 
     def init(self, terms: Any, t0: Any, t1: Any, y0: Any, args: Any) -> None:
-        """Return no state: every long step begins afresh."""
+        """Return None: a long step needs nothing from the previous one."""
 
     def func(self, terms: Any, t0: Any, y0: Any, args: Any) -> Any:
         """Return the vector field at one point."""
@@ -456,13 +460,13 @@ class EqualSteps(diffrax.AbstractSolver):
             span,
             span / equal_steps(span, self.dt),
             y0,
-            # With inputs, the time of the caller at which the time of this step is zero.
+            # With inputs: the caller's time at the start of this long step.
             None if args is None else args + t0,
             adjoint=self.adjoint,
             max_steps=self.max_steps,
             throw=False,
         )
-        # Infinite if the steps did not reach t1, as in Diffrax.
+        # If the steps did not reach t1, we return infinity, as Diffrax does.
         reached = solution.result == diffrax.RESULTS.successful
         y1 = jax.tree.map(lambda y: jnp.where(reached, y[-1], jnp.inf), solution.ys)
         return y1, None, {"y0": y0, "y1": y1}, None, solution.result
@@ -475,9 +479,9 @@ def step_counts(ts: Float[Array, " T"], dt: Float[Array, ""]) -> Int[Array, " T-
 
 
 def equal_steps(span: Float[Array, "..."], dt: Float[Array, ""]) -> Float[Array, "..."]:
-    """The number of equal steps of at most `dt` that fill `span`: whole, at least 1.
+    """The number of equal steps of at most `dt` that fill `span`, an integer ≥ 1.
 
-    The slack is √eps, so that a span of 10 dt plus rounding errors takes 10 steps and not 11.
+    A step may exceed `dt` by a factor 1 + √eps, so that 10 dt plus rounding errors take 10 steps.
     """
     slack = 1 - float(jnp.finfo(span.dtype).eps) ** 0.5
     return jnp.maximum(jnp.ceil(span / jnp.asarray(dt, span.dtype) * slack), 1)

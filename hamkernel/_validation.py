@@ -1,8 +1,8 @@
 """Validation losses in closed form, each for the cost of one factorisation.
 
 The public functions check their arguments and make the rows of the observations. The functions of
-rows, below, are the same losses, for the dense fit or, with a `basis`, for the low-rank fit. Their
-residuals are in units of the relative noise of a row.
+rows compute the same losses, for the dense fit or, with a `basis`, for the low-rank fit. Their
+residuals are divided by the relative noise of the row.
 """
 
 from __future__ import annotations
@@ -44,35 +44,34 @@ def cross_validation_loss(
     """The cross-validation loss: the mean over folds of the mean squared error of a held-out fold.
 
     (1/F) Σ_S (1/(|S| n)) Σ_{i ∈ S} ‖yᵢ − f₋S(xᵢ)‖², with f₋S the fit without the fold S. The loss
-    is exact: equal to a refit without each of the F folds, with the ridge (N − N/F) λ, the same for
-    all folds.
+    equals that of a refit without each of the F folds, with the ridge (N − N/F) λ for all folds.
 
     Args:
         K: a matrix-valued kernel.
-        X: states, shape (N, n); or observations, and then there is no Y.
+        X: states, shape (N, n); or observations, without Y.
         Y: measured velocities, shape (N, n).
         regularization: λ > 0.
-        folds: a number of folds, made of consecutive points and of nearly equal size; "loo" for one
-            point per fold; or a label for each point, shape (N,), such as the name of its run, to
+        folds: the number of folds, of consecutive points and nearly equal size. Or "loo" for one
+            point per fold. Or a label for each point, shape (N,), such as the name of its run, to
             hold out one run at a time. A fold contains complete points, since the other components
             of a point would reveal a held-out component. Labels must be concrete under jit. For
-            observations N counts all points, energies and functionals, in their order. A fold with
-            all energies is compared up to their constant.
+            observations N counts all points, energies and functionals, in their order. If a fold
+            contains all energies, we compare them up to their constant.
         mean: the known part of the field, as in `fit`.
         solver: a low-rank solver, for the loss of its fit as in `tune`; None for the exact loss.
         inputs: u at each state for a `Controlled` kernel, shape (N, m).
         parameters: θ at each state for a `Family`, shape (N, p).
 
     Returns:
-        The loss, shape (), in squared units of Y, or of rows over their relative noise; inf if
-        G + NλI is not positive definite to rounding. O((N n)³) time and three matrices of (N n)²
-        numbers, also for the gradient. The loss is differentiable in reverse mode only:
+        The loss, shape (), in squared units of Y, or of rows divided by their relative noise; inf
+        if G + NλI is not positive definite to rounding. Loss and gradient take O((N n)³) time and
+        three matrices of (N n)² numbers. The loss is differentiable in reverse mode only:
         `jax.jacrev(jax.grad(loss))` is the Hessian. It works under vmap, and compiles once for each
         shape and partition.
 
     Raises:
-        TypeError: K is not matrix-valued. ValueError: bad data, folds, or regularization, or
-            matrices that do not fit in memory.
+        TypeError: K is not matrix-valued.
+        ValueError: data, folds or regularization are invalid, or matrices do not fit in memory.
     """
     checked = _check_problem(K, X, Y, regularization, mean, solver, inputs, parameters)
     K, rows, regularization, basis = checked
@@ -94,12 +93,13 @@ def cross_validation_residuals(
 ) -> Float[Array, "N n"]:
     """The held-out residuals yᵢ − f₋S(xᵢ), with f₋S the fit without the fold S of the point i.
 
-    The mean over folds of their mean square is the cross-validation loss. For arguments and errors
-    see `cross_validation_loss`.
+    The cross-validation loss is the mean over folds of the mean square of these residuals. For
+    arguments and errors see `cross_validation_loss`.
 
     Returns:
-        Shape (N, n), in units of Y; for observations one residual for each row, shape (M,), in the
-        units of the row. inf if G + NλI is not positive definite to rounding.
+        The residuals, shape (N, n), in units of Y. For observations one residual for each row,
+        shape (D,), in the units of the row. All are inf if G + NλI is not positive definite to
+        rounding.
     """
     checked = _check_problem(K, X, Y, regularization, mean, solver, inputs, parameters)
     K, rows, regularization, basis = checked
@@ -122,8 +122,8 @@ def generalized_cross_validation(
     """The generalised cross-validation loss, (‖y − Sy‖²/D) / (tr(I − S)/D)² = D ‖a‖² / (tr A⁻¹)².
 
     S = G A⁻¹ is the smoother of the fit, A = G + NλI, a = A⁻¹y, and D = N n the number of rows. The
-    loss is the leave-one-out loss with every leverage replaced by their mean. It needs no folds,
-    does not depend on the order of the data, and assumes independent noise.
+    loss is the leave-one-out loss with every leverage replaced by the mean leverage. It needs no
+    folds, does not depend on the order of the data, and assumes independent noise.
 
     Args:
         K: a matrix-valued kernel.
@@ -140,8 +140,8 @@ def generalized_cross_validation(
         available as for `cross_validation_loss`.
 
     Raises:
-        TypeError: K is not matrix-valued. ValueError: bad data or regularization, or a matrix
-            that does not fit in memory.
+        TypeError: K is not matrix-valued.
+        ValueError: data or regularization are invalid, or matrices do not fit in memory.
 
     Source: Golub, Heath & Wahba (1979), Technometrics 21.
     """
@@ -162,12 +162,13 @@ def log_marginal_likelihood(
     inputs: Num[ArrayLike, "N m"] | None = None,
     parameters: Num[ArrayLike, "N p"] | None = None,
 ) -> Float[Array, ""]:
-    """The log density of Y under f ~ GP(0, K) and independent noise of variance Nλ.
+    """The log density of Y under f ~ GP(mean, K) and independent noise of variance Nλ.
 
-    log p(Y) = −½ yᵀA⁻¹y − ½ log det A − ½ N n log 2π with A = G + NλI. This is the best objective
-    of `tune` if the true field resembles a draw of the prior; otherwise cross-validation is safer.
-    With `Warp(k, fn)` fields may have no component along some directions, such as translations of a
-    molecule. The result is then the density of the components of Y along all other directions.
+    log p(Y) = −½ yᵀA⁻¹y − ½ log det A − ½ N n log 2π with A = G + NλI and y = Y − mean(X). This is
+    the best objective of `tune` if the true field resembles a draw from the prior. Otherwise
+    cross-validation is safer. With `Warp(k, fn)` fields may have no component along some
+    directions, such as translations of a molecule. The result is then the density of the components
+    of Y along all other directions.
 
     Args:
         K: a matrix-valued kernel.
@@ -184,8 +185,8 @@ def log_marginal_likelihood(
         `cross_validation_loss`.
 
     Raises:
-        TypeError: K is not matrix-valued. ValueError: bad data or regularization, or a matrix
-            that does not fit in memory.
+        TypeError: K is not matrix-valued.
+        ValueError: data or regularization are invalid, or matrices do not fit in memory.
 
     Source: Rasmussen & Williams (2006), eq. 2.30.
     """
@@ -204,12 +205,12 @@ def _check_problem(
     checked = problem.kernel, problem.rows, problem.regularization
     basis = None if solver is None else solver.low_rank_basis(*checked)
     if basis is None:
-        check_memory(problem.rows, 3)  # matrices of the size of the Gram, with the gradient
+        check_memory(problem.rows, 3)  # three matrices of the size of the Gram, with the gradient
     return *checked, basis
 
 
 def check_memory(rows: Measurements, copies: int) -> None:
-    """Refuse a dense loss that does not fit in memory."""
+    """Raise a ValueError if the matrices of a dense loss do not fit in memory."""
     M = len(rows.targets)
     cure = (
         "Use hk.tune(..., solver=hk.Nystrom()) or solver=hk.RandomFeatures(count, key), whose loss "
@@ -227,11 +228,11 @@ def partition_of_rows(rows: Measurements, folds: Folds) -> Partition:
     return Partition(len(rows.targets), labels[rows.labels()])
 
 
-# Some losses also return ‖a‖², with which `tune` bounds the rounding errors of a field.
+# Losses with the ending `_and_square` also return ‖a‖², from which `tune` bounds rounding errors.
 
 
 def partition_loss(K, rows: Measurements, regularization, partition: Partition, basis=None):
-    """`cross_validation_loss`: the mean over folds of the mean over their rows."""
+    """The loss of `cross_validation_loss`: the mean over folds of the mean over their rows."""
     return partition_loss_and_square(K, rows, regularization, partition, basis)[0]
 
 
@@ -245,15 +246,15 @@ def partition_loss_and_square(
 
 @precise_jit
 def held_out_rows(K, rows: Measurements, regularization, partition: Partition, basis=None):
-    """The residual of each row under the fit without its fold, in units of its noise, and A⁻¹y.
+    """The residual of each row under the fit without its fold, over its relative noise, and A⁻¹y.
 
-    If a fold holds all energies, its residuals are computed up to the best constant.
+    If a fold contains all energies, we compute their residuals up to the best constant.
     """
     energies, F = rows.energies, len(partition.folds)
     ridge = (rows.count - rows.count / F) * regularization
     y, p = rows.targets, rows.constant
     contrasted = any(len(energies) and np.isin(energies, fold).all() for fold in partition.folds)
-    if contrasted:  # no other fold determines the constant, so contrasts are held out
+    if contrasted:  # no other fold determines the constant, so we hold out contrasts
         y, p = rows.y, None
         partition = Partition(rows.size, np.delete(partition.labels, energies[0]))
     features = None if basis is None else features_of_rows(K, rows, basis, contrasted)
@@ -274,9 +275,9 @@ def _dense_held_out(G, ridge, y, p, rows: Measurements, partition: Partition):
     A = plus_ridge(G, ridge)
     if p is None:
         return held_out(DenseSystem(A), y, partition)
-    # Let U = diag(units), A′ = UAU and y′ = Uy. Then C′ = U⁻¹CU⁻¹ and a′ = C′y′ = U⁻¹a, so r′_S =
-    # (C′_SS)⁻¹a′_S = U r_S. In these units the direction Up of the constant is the same for all
-    # energies, p ∝ 1/s and U = diag(s), so Up does not depend on the noise and needs no derivative.
+    # Let U = diag(units), A′ = UAU and y′ = Uy. Then C′ = U⁻¹CU⁻¹ and a′ = C′y′ = U⁻¹a, so
+    # r′_S = (C′_SS)⁻¹a′_S = U r_S. With p ∝ 1/s and U = diag(s) all energies have the same entry of
+    # Up. This direction of the constant does not depend on the noise, and needs no derivative.
     units = jnp.where(p == 0, jnp.ones_like(p), rows.scale)
     equal = jnp.where(p == 0, p, len(rows.energies) ** -0.5)
     system = DenseSystem(units[:, None] * A * units[None], equal)
@@ -285,13 +286,13 @@ def _dense_held_out(G, ridge, y, p, rows: Measurements, partition: Partition):
 
 
 def generalized_loss(K, rows: Measurements, regularization, basis=None, least_free=0.0):
-    """The loss `generalized_cross_validation`, of rows."""
+    """The loss of `generalized_cross_validation`."""
     return generalized_loss_and_square(K, rows, regularization, basis, least_free)[0]
 
 
 @precise_jit
 def generalized_loss_and_square(K, rows: Measurements, regularization, basis=None, least_free=0.0):
-    # The loss is infinite if the share of free residuals, tr(I − S)/D, is below `least_free`.
+    # The loss is infinite if tr(I − S)/D, the fraction of free residuals, is below `least_free`.
     ridge = rows.count * regularization
     squares, trace = free_residuals(_contrasted_system(K, rows, ridge, basis), rows.y)
     enough = ridge * trace >= least_free * rows.size  # tr(I − S) = ridge tr A⁻¹
@@ -302,17 +303,18 @@ def generalized_loss_and_square(K, rows: Measurements, regularization, basis=Non
 def log_likelihood(K, rows: Measurements, regularization, basis=None, projected=None):
     """The log marginal likelihood of rows, with a flat prior for the constant of energies.
 
-    `projected` is `project_silent_directions(K, rows)`, if it is known already.
+    `projected` is the result of `project_silent_directions(K, rows)`; None to compute it.
     """
     # Rows are y_r = (measurement)_r / s_r, so log p(measurements) = log p(y) − Σ log s_r. The
     # constant of the energies enters y along s⁻¹ = ‖s⁻¹‖ p. A flat prior for the constant
     # integrates the density over this direction: log p(y) = log N(Ty; 0, TATᵀ) − log ‖s⁻¹‖ with the
     # contrasts Ty, and log ‖s⁻¹‖ = ½ log Σ_e s_e⁻² (restricted likelihood: Harville (1974),
-    # Biometrika 61; Rasmussen & Williams (2006), eq. 2.45). The k silent directions are zeros of
-    # variance ρ = Nλ in y, whose density −½ k log 2πρ is removed again.
+    # Biometrika 61; Rasmussen & Williams (2006), eq. 2.45). The k silent directions of y are zeros
+    # of variance ρ = Nλ. We subtract their log density −½ k log 2πρ.
     ridge = rows.count * regularization
     y, silent = project_silent_directions(K, rows) if projected is None else projected
-    y, silent, ridge = jax.lax.optimization_barrier((y, silent, ridge))  # no LAPACK side by side
+    # The barrier keeps two LAPACK calls from running at once, see `_solvers/factors.py`.
+    y, silent, ridge = jax.lax.optimization_barrier((y, silent, ridge))
     density = log_density(_contrasted_system(K, rows, ridge, basis), y)
     density = density + 0.5 * silent * jnp.log(2 * jnp.pi * ridge)
     density = density - jnp.sum(jnp.log(rows.scale))
@@ -324,12 +326,13 @@ def log_likelihood(K, rows: Measurements, regularization, basis=None, projected=
 def project_silent_directions(
     K: AbstractMatrixKernel, rows: Measurements
 ) -> tuple[Float[Array, " D"], Float[Array, ""]]:
-    """Project the targets on the directions in which fields of K point; also count the others.
+    """The targets, projected on the directions of fields of K, and the number of other directions.
 
-    A field with a kernel of a descriptor d points along the rows of the Jacobian of d. Forces from
-    a potential of distances have no component along the other, silent directions, six for each
-    molecule. The likelihood would take these zeros for measurements without noise and drive λ to
-    its bound. Each silent direction is an eigenvector of A with the eigenvalue Nλ.
+    If K has a descriptor d, its fields point along the rows of the Jacobian of d. The other
+    directions are silent. Forces from a potential of distances, for example, have six silent
+    directions for each molecule. The likelihood would treat the zeros there as measurements without
+    noise and drive λ to its bound. Each silent direction is an eigenvector of A with the eigenvalue
+    Nλ.
     """
     y, none = rows.y, jnp.zeros((), rows.targets.dtype)
     if rows.states is None:
@@ -343,10 +346,10 @@ def project_silent_directions(
         x, v = pair
         J = jax.jacfwd(descriptor.point_data or descriptor.map)(x)  # (m, n)
         J = J @ descriptor.directions(x)
-        J = jax.lax.stop_gradient(J)  # constant, for a map of constant rank
+        J = jax.lax.stop_gradient(J)  # the projection is constant for a map of constant rank
         squares, V = jnp.linalg.eigh(J.T @ J)
-        # Zero eigenvalues are ε of the largest after rounding; a descriptor resolves more than
-        # ε^(1/3) of its largest singular value, whose square is ε^(2/3).
+        # Zero eigenvalues are rounded to ε times the largest. A visible direction has more than
+        # ε^(1/3) of the largest singular value, whose square is ε^(2/3).
         is_visible = squares > jnp.finfo(x.dtype).eps ** (2 / 3) * squares[-1]
         return V @ jnp.where(is_visible, V.T @ v, jnp.zeros_like(v)), jnp.sum(~is_visible)
 
@@ -355,13 +358,13 @@ def project_silent_directions(
 
 
 def _contrasted_system(K, rows: Measurements, ridge, basis: AbstractBasis | None) -> AbstractSystem:
-    """The system of the contrasts, which do not depend on the constant of the energies."""
+    """The system of the contrasts of the rows, which do not contain the constant of energies."""
     if basis is not None:
         return LowRankSystem(features_of_rows(K, rows, basis, contrasted=True), ridge)
     return DenseSystem(plus_ridge(gram_matrix(K, rows, contrasted=True), ridge))
 
 
-# The Gram and the features of the rows, cheap to differentiate with respect to K.
+# The Gram and the features of the rows, with cheap derivatives with respect to K.
 
 
 def features_of_rows(
@@ -396,8 +399,8 @@ def gram_matrix(
 def _rows_by_points(K, block: AbstractBlock, data, make_rows) -> Float[Array, "d e"]:
     """The matrix `make_rows(K, data)(block)`, with one row for each row of the block.
 
-    The matrix is made point by point, so that derivatives hold one point at a time. For
-    `Combinations`, which have more points than rows, the matrix is made at once.
+    We compute the matrix point by point, so that derivatives need the memory of one point. For
+    `Combinations`, which have more points than rows, we compute it at once.
     """
     if isinstance(block, Combinations):
         return forward_differentiated(

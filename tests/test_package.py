@@ -34,6 +34,8 @@ ROOMS = [
     {"_tuning"},
     {"_runs"},
     {"_trajectories"},
+    {"_weak"},
+    {"_learn"},
     {"_discovery"},
     {"_symplectic"},
     {"_simulate"},

@@ -7,12 +7,13 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
+from benchmarks.lagrangian import logs, mass
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
 from hamkernel._report import script
-from hamkernel._runs import weak
 from hamkernel._runs.smoothing import Process, smooth
+from hamkernel._weak import rows as weak
 
 PROCESS = Process(jnp.log(1.3), jnp.log(2.0), jnp.log(0.1))
 
@@ -189,6 +190,22 @@ def test_friction_that_is_missing_is_named_and_found():
     field = hk.learn(hk.Lagrangian(ONE.potential, ONE.inertia, (0,), friction=True), runs).field
     np.testing.assert_allclose(field.mass_matrix(np.zeros(1)), 2.0, rtol=0.01)
     np.testing.assert_allclose(field.friction(np.ones(1)), 0.8 + 0.6, rtol=0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [1, 3])
+def test_two_runs_of_an_arm_are_not_explained_by_noise_alone(seed):
+    """Both searches ended at M = 0 while no start had long kernels with large amplitudes."""
+    rng = np.random.default_rng(seed)
+    times, paths, torques = logs(rng, count=2)
+    seen = [x[:, :2] + 1e-3 * rng.normal(size=(len(x), 2)) for x in paths]
+    K = hk.Lagrangian(hk.Gaussian(2.0), hk.Gaussian(2.0), (0, 1))
+    learned = hk.learn(K, hk.Runs(times, seen, inputs=torques, between="linear"))
+    assert learned.converged
+    Q = np.concatenate([x[::25, :2] for x in logs(np.random.default_rng(9), count=2)[1]])
+    found = np.asarray(jax.vmap(learned.field.mass_matrix)(jnp.asarray(Q)))
+    wanted = np.array([mass(q) for q in Q])
+    assert np.sqrt(np.mean((found - wanted) ** 2) / np.mean(wanted**2)) < 0.01  # .005 and .004
 
 
 @pytest.mark.slow

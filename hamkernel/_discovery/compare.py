@@ -5,11 +5,11 @@ trained numbers and D rows its score is
 
     log p(rows) − ½ P log D,
 
-the evidence with the price of its hyperparameters (Schwarz 1978). The answer to a question compares
-the best candidate with the answer yes and the best candidate with the answer no. The ladder
-therefore contains every combination of its steps. Otherwise a candidate could lose one question
-because it lacks the answer to another. A candidate with friction is compared with the candidate
-that lacks only the friction.
+the Bayesian information criterion (Schwarz 1978), whose second term is the price of the
+hyperparameters. To answer a question we compare the best candidate with the answer yes and the best
+candidate with the answer no. The ladder therefore contains every combination of its steps.
+Otherwise a candidate could lose one question because it lacks the answer to another. For friction
+we compare the best candidate with friction and the candidate that lacks only the friction.
 """
 
 import dataclasses
@@ -38,8 +38,8 @@ from hamkernel._tuning.space import RIDGE, SearchSpace, named_values, velocity_r
 from hamkernel._tuning.tune import SEARCH_COPIES, check_finite_loss, decode, warn_of_constants
 from hamkernel._validation import check_memory
 
-# A factor of e⁵ = 148 in the evidence. In the prototype no confident answer was wrong at 5, and
-# up to 5 % at 3; see `tests/benchmarks/comparison.py`.
+# A factor of e⁵ = 148 in the evidence. At 5 no confident answer of the prototype was wrong, at 3 up
+# to 5 % (`tests/benchmarks/comparison.py`).
 THRESHOLD = 5.0
 
 QUESTIONS = {
@@ -56,11 +56,11 @@ class Candidate(NamedTuple):
 
     Attributes:
         name: the name of the candidate.
-        claims: the questions that its structure answers with yes.
+        claims: the questions to which the answer of its structure is yes.
         score: log p − ½ P log D.
         difference: the score minus the best score, at most 0.
         log_likelihood: log p of the rows at the tuned hyperparameters.
-        parameters: P, the count of trained numbers, λ among them.
+        parameters: P, the number of trained numbers, including λ.
         kernel: the tuned kernel.
         regularization: the tuned λ.
         hyperparameters: the tuned values by name.
@@ -79,7 +79,7 @@ class Candidate(NamedTuple):
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Comparison(Shown):
-    """The candidates by score, and the answers that they give; it prints as a report.
+    """The candidates by score, and the answers to the questions, as a report.
 
     Attributes:
         table: the candidates, the best first.
@@ -124,47 +124,51 @@ def compare(
 ) -> Comparison:
     """Compare structures by their evidence, and answer which physics the data obey.
 
-    Is there an energy, in the coordinates (q, p) of the states? Friction? Is the field odd,
-    f(−x) = −f(x)? Is the motion reversible, H(q, −p) = H(q, p)? Is H = T(p) + U(q)? An answer is
-    "yes" or "no" if the scores differ by more than 5, a factor of 148 in the evidence, else
-    "undecided". It is "not tested" if the data cannot decide:
+    Is there an energy H(q, p)? Is there friction? Is the field odd, f(−x) = −f(x)? Is the motion
+    reversible, H(q, −p) = H(q, p)? Is H = T(p) + U(q)? An answer is "yes" or "no" if the scores
+    differ by more than 5, a factor of 148 in the evidence; else "undecided". The answer is "not
+    tested" in two cases:
 
     - A symmetry, if less than a tenth of the points have another point within a standard deviation
       of their image.
-    - Friction, reversibility and T + U, if there is no energy. Reversibility concerns the motion
-      without friction; with friction the answer is no.
+    - Friction, reversibility and T + U, if there is no energy.
 
-    The answer to friction is also "no" if the best friction is within one deviation of zero.
+    If the scores do not decide on friction, the answer is "no" if the best friction is within one
+    deviation of zero. If there is friction, the answer to reversibility is "no".
 
-    Do not smooth noisy runs to velocities for this: a third of the confident answers was then
+    Do not pass velocities from smoothed noisy runs: a third of the confident answers was then
     wrong. Learn once, with the weakest kernel, and compare on the result:
 
         hk.compare(hk.learn(hk.Separable(k), runs))
 
-    In two dimensions divergence-free fields are those with an energy: they are no candidate there.
+    In two dimensions every divergence-free field has an energy, so it is no candidate.
 
     Args:
-        X: states, shape (N, n); observations, and then there is no Y; or what `learn` returned.
+        X: states, shape (N, n); observations, without Y; or the result of `learn`.
         Y: velocities, shape (N, n).
         candidates: kernels by name, in place of the ladder of all structures and symmetries with
             Gaussian kernels. Their claims follow from their structure.
         starts: the number of starts of each search, see `tune`. With two, one of 20 data sets of
             runs got a wrong answer: half of its searches ended at lengthscales below the sampling
             interval, where the kernel fits the noise.
-        progress: show a progress bar where the standard error is a terminal.
+        progress: show a progress bar if the standard error is a terminal.
 
     Returns:
-        The table and the answers. The first call for data of a shape compiles three searches for
-        all of the ladder; the next takes as long as 13 to 17 searches.
+        The table and the answers. The ladder has 15 candidates for n = 2, 17 for larger even n, and
+        6 for odd n ≥ 3. The first call for a shape of the data compiles at most three searches.
 
     Raises:
-        TypeError: a candidate is no structured kernel, or takes inputs or parameters. ValueError:
-            a candidate cannot hold for these states, there are fewer than two, `learned` has a
-            mean or a structure of its own, or bad data, as in `fit`.
+        TypeError: a candidate is no structured kernel, or takes inputs or parameters; or `learned`
+            has inputs or parameters.
+        ValueError: a candidate cannot hold for these states, there are fewer than two, `learned`
+            has a mean or no observations, or the data are invalid, as in `fit`.
+
+    Warns:
+        UserWarning: `learned` has a structure, which biases the answers.
 
     Source: Schwarz (1978), Annals of Statistics 6, for the score.
     """
-    from tqdm import tqdm  # so that importing the package does not load it
+    from tqdm import tqdm  # here, so that hamkernel imports faster
 
     require.no_tracers("hk.compare", "Call it outside.", X, Y, candidates)
     data, ridge = _data(X, Y)
@@ -197,12 +201,12 @@ def compare(
 def _maximise_evidence(
     K: AbstractMatrixKernel, rows: Measurements, ridge: Float[Array, ""], starts: int
 ) -> tuple[AbstractMatrixKernel, Float[Array, ""], float]:
-    """The kernel and λ of the highest marginal likelihood, and log p there."""
+    """The kernel and λ that maximise the marginal likelihood, and log p at the maximum."""
     rms = velocity_rms(K, rows)
     space = SearchSpace(K, rows.points, rms, ridge, (), {})
     criterion = criterion_of("marginal_likelihood", rows.count, 2)
-    # The search of `tune`, with a design of 32 points instead of up to 256, since the first point
-    # already has the size of the data.
+    # This is the search of `tune`, with 32 instead of up to 256 points in the design, since the
+    # first point already has the scale of the data.
     search = Search(
         space,
         criterion,
@@ -221,27 +225,27 @@ def _maximise_evidence(
 
 
 def _data(X: Any, Y: Any) -> tuple[AbstractObservations, Any]:
-    """The observations, and λ if `learn` has found it."""
+    """The observations, and λ if they come from `learn`."""
     if not isinstance(X, Learned):
         return observations(X, Y), None
     if Y is not None:
-        raise TypeError("what learn returned is all of the data: hk.compare(learned).")
+        raise TypeError("the result of learn contains the data, so give no Y: hk.compare(learned).")
     if X.observations is None:
-        raise ValueError("no run had enough samples to say anything of the field.")
+        raise ValueError("no run had enough samples to learn a field: add longer runs.")
     if X.mean is not None:
         raise ValueError(
-            "a part of this field was known, the mean, and the rest of it obeys laws of its own: "
-            "learn without a mean to ask which physics the whole obeys."
+            "a part of this field was known, the mean, and compare would judge the rest alone: "
+            "learn without a mean to ask which physics the complete field obeys."
         )
     if X.kernel.takes_inputs:
         raise TypeError(
-            f"compare asks about fields of the state alone, and this one is of a "
-            f"{type(X.kernel).__name__}: compare runs without inputs, of one system."
+            f"compare asks about fields of the state alone, and the kernel of this field is a "
+            f"{type(X.kernel).__name__}: compare runs of one system, without inputs."
         )
     if not isinstance(X.kernel, Separable) or claims(X.kernel, np.ones(X.runs.dimension)):
         require.warn(
-            f"these runs were learned with {type(X.kernel).__name__}, and what they say then leans "
-            "to it. Learn them with the weakest kernel, hk.Separable(k), and compare on that."
+            f"these runs were learned with {type(X.kernel).__name__}, which biases the answers. "
+            "Learn them with the weakest kernel, hk.Separable(k), and compare the result."
         )
     return X.observations, X.regularization
 
@@ -249,7 +253,7 @@ def _data(X: Any, Y: Any) -> tuple[AbstractObservations, Any]:
 def _check_candidates(
     candidates: Any, n: int, points: Float[np.ndarray, "P n"]
 ) -> dict[str, AbstractMatrixKernel]:
-    """The caller's candidates; ValueError if one cannot hold for these states."""
+    """The caller's candidates; an error if one cannot hold for these states."""
     if not isinstance(candidates, Mapping) or len(candidates) < 2:
         raise ValueError(
             'candidates must be at least two kernels by name, {"H": hk.Symplectic(k), '
@@ -276,7 +280,7 @@ def _check_candidates(
 
 
 def claims(K: AbstractMatrixKernel, scale: Float[np.ndarray, " n"]) -> frozenset[str]:
-    """The questions that every field of K answers with yes."""
+    """The questions to which the answer is yes for every field of K."""
     n, m = len(scale), len(scale) // 2
     x, z = jnp.asarray(np.random.default_rng(0).normal(size=(2, n)) * scale)
     block = K(x, z)
@@ -285,7 +289,7 @@ def claims(K: AbstractMatrixKernel, scale: Float[np.ndarray, " n"]) -> frozenset
         """Whether f(Sx) = ± S f(x) for S = diag(signs)."""
         S = jnp.asarray(signs, block.dtype)
         wrong = jnp.linalg.norm(K(S * x, z) - character * S[:, None] * block)
-        return bool(wrong < 1e-4 * jnp.linalg.norm(block))  # rounding, in single precision too
+        return bool(wrong < 1e-4 * jnp.linalg.norm(block))  # above the rounding of float32
 
     answers = set()
     if is_unchanged(-np.ones(n), 1.0):
@@ -359,8 +363,8 @@ def _answer(table: tuple[Candidate, ...], points: Float[np.ndarray, "P n"], D: i
 def _frictionless_rival(damped: Candidate, among: list[Candidate]) -> Candidate | None:
     """The candidate that lacks only the friction; None if there is none.
 
-    No candidate has friction and an H that is even in p. A candidate without friction may thus be
-    better for its reversibility alone, so we compare with the one that claims least.
+    No candidate with friction has an H that is even in p. A candidate without friction may
+    therefore be better only because it is reversible, so we take the one with the fewest claims.
     """
     same = [row for row in among if row.claims - {"reversible"} == damped.claims - {"friction"}]
     return min(same, key=lambda row: len(row.claims), default=None)
@@ -369,8 +373,8 @@ def _frictionless_rival(damped: Candidate, among: list[Candidate]) -> Candidate 
 def _is_seen(points: Float[np.ndarray, "P n"], signs: Float[np.ndarray, " n"]) -> bool:
     """Whether a tenth of the images of the points have a point within a standard deviation.
 
-    Without this test Lotka-Volterra, whose states are positive and say nothing of −x, was called
-    odd 9 times of 10.
+    The states of Lotka-Volterra are positive and contain no information about −x. Without this test
+    `compare` called the field odd for 9 of 10 data sets.
     """
     Z = points / np.where(points.std(axis=0) > 0, points.std(axis=0), 1.0)
     near = [np.linalg.norm(Z - image, axis=1).min() < 1.0 for image in Z * signs]

@@ -1,4 +1,4 @@
-"""A formula of the potential, as a field and as text."""
+"""`Formula`: a formula of the potential, as a field and as text."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from hamkernel._structures.structure import AbstractPotentialKernel
 
 
 class Formula(EqualToItself, eqx.Module):
-    """u(x) = Σ θ_k φ_k(x), the potential as a formula; made by `readout`.
+    """The formula u(x) = Σ θ_k φ_k(x) of a potential; made by `readout`.
 
     A formula is a field and a PyTree: `formula(x)` is the velocity B∇u at one state, so
-    `hk.simulate(formula, x0, ts)` works. `formula.potential(x)` is u, and for structures with an
-    energy so is `formula.hamiltonian(x)`.
+    `hk.simulate(formula, x0, ts)` works. `formula.potential(x)` is u. If the structure has an
+    energy, `formula.hamiltonian(x)` is u too.
 
     Attributes:
         terms: the names of the selected functions, in the order of the dictionary.
         coefficients: θ, shape (k,).
-        deviations: the standard deviations of θ, shape (k,), which include the noise and the
-            selection of the terms. Hyperparameters of the kernel, such as friction, count as known.
-        misfit: the root mean square of the residuals over √(Nλ), the standard deviation of the
-            noise, shape (). It is about one if the formula explains the data as well as the kernel,
-            and larger if a term is missing.
+        deviations: the standard deviations of θ, shape (k,), from the noise and the selection of
+            the terms. Hyperparameters of the kernel, such as friction, count as known.
+        misfit: s/√(Nλ), shape (), with the residual variance s² of the formula and the noise
+            variance Nλ of the kernel. The misfit is about one if the formula explains the data as
+            well as the kernel, and larger if a term is missing.
         probability: the posterior probability of these terms among all subsets, shape ().
         rows: the number of rows.
         functions: the φ_k of the terms.
-        kernel: the kernel, whose B makes velocities from gradients.
-        mean: the known part of the field, to which B∇u is added; None if there is none.
+        kernel: the kernel, which defines B.
+        mean: the known part of the field, which is added to B∇u; None if there is none.
     """
 
     terms: tuple[str, ...] = eqx.field(static=True)
@@ -73,9 +73,9 @@ class Formula(EqualToItself, eqx.Module):
     def latex(self) -> str:
         r"""The formula in LaTeX, such as `H = 0.5002(12)\,p^{2} - 0.981(4)\,\cos(q)`.
 
-        A coefficient comes with its deviation in units of the last digit. The names of the terms
-        are written as Python and translated: powers, products, indices and common functions. A name
-        that contains a backslash is taken as LaTeX.
+        A coefficient comes with its deviation in units of the last digit. We translate the names of
+        the terms from Python: powers, products, indices and common functions. A name that contains
+        a backslash stays as it is.
         """
         total = ""
         for name, value, deviation in self._triples():
@@ -100,14 +100,14 @@ class Formula(EqualToItself, eqx.Module):
         return theta @ jnp.stack(values)
 
     def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
-        """The velocity B(x)∇u(x), including the mean, without inputs."""
+        """The velocity B(x)∇u(x) plus the mean, without inputs."""
         x = require.floating(x, "x")
         velocity = operator_of(self.kernel)(x, jax.grad(self._formula)(x))
         return velocity if self.mean is None else velocity + self.mean(x).astype(velocity.dtype)
 
     @full_precision
     def potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """The potential u(x), including the mean.
+        """The potential u(x) plus that of the mean.
 
         Raises:
             AttributeError: the mean has no potential of this structure.
@@ -117,7 +117,7 @@ class Formula(EqualToItself, eqx.Module):
         return value if self.mean is None else value + potential_of(self.mean, self.kernel)(x)
 
     def hamiltonian(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
-        """The energy H(x), including the mean.
+        """The energy H(x) plus that of the mean.
 
         Raises:
             AttributeError: the structure has no energy, or the mean has none.
@@ -130,7 +130,7 @@ class Formula(EqualToItself, eqx.Module):
 
 
 def operator_of(K: AbstractMatrixKernel) -> Callable[[Array, Array], Array]:
-    """(x, v) -> B(x) v."""
+    """The function (x, v) -> B(x) v of a kernel of fields B∇u."""
     K = K.state_kernel
     if isinstance(K, Sum):  # a sum with a potential has one operator for all terms
         return operator_of(K.terms[0])
@@ -146,12 +146,12 @@ def operator_of(K: AbstractMatrixKernel) -> Callable[[Array, Array], Array]:
 
 
 def _with_deviation(value: float, deviation: float) -> str:
-    """`0.981(4)`: a positive number with its deviation in units of the last digit shown."""
+    """A positive number with its deviation in units of the last digit, such as `0.981(4)`."""
     if not (deviation > 0 and math.isfinite(deviation)) or deviation < 1e-12 * value:
         return f"{value:.6g}"
     power = math.floor(math.log10(deviation))
     digits = round(deviation / 10.0**power)
-    if digits < 3:  # 0.981(12), and not 0.98(1), which is off by half
+    if digits < 3:  # 0.981(12), since 0.98(1) would round the deviation too much
         power, digits = power - 1, round(deviation / 10.0 ** (power - 1))
     if power > 0:
         return f"{round(value, -power):.0f}({digits * 10**power})"
@@ -159,7 +159,7 @@ def _with_deviation(value: float, deviation: float) -> str:
 
 
 def _latex(name: str) -> str:
-    """A name written as Python, in LaTeX."""
+    """The LaTeX of a name in Python."""
     if "\\" in name:
         return name
     name = re.sub(r"\*\*\s*\(([^()]*)\)|\*\*\s*(-?[\w.]+)", lambda m: f"^{{{m[1] or m[2]}}}", name)

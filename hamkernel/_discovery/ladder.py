@@ -1,9 +1,9 @@
 """The ladder of structures and symmetries for `compare`.
 
-With one kernel type per step, a first comparison took 96 s, 90 s of them to compile 15 searches. A
-`Rung` is a kernel for any step of the ladder: its arrays choose between structures and symmetries.
-One compiled search then serves all steps with the same numbers of parts and images, and there are
-three such searches.
+With one kernel type per step, the first comparison took 96 s, of which JAX compiled 15 searches for
+90 s. A `Rung` is a kernel for any step of the ladder: its arrays choose between structures and
+symmetries. One compiled search then serves all steps with the same numbers of parts and images.
+There are three such searches.
 """
 
 from typing import ClassVar, NamedTuple
@@ -31,22 +31,21 @@ NO_FRICTION = -200.0  # the logarithm of zero friction: e⁻²⁰⁰ vanishes in
 
 
 class Rung(AbstractMatrixKernel):
-    """The kernel Σᵢ Σ_g w_ig K_ig(x, z), K_ig of a structure from the Gaussian kernel of x and gz.
+    """The kernel Σᵢ Σ_g w_ig K_ig(x, z) of a step, with a structure chosen by numbers.
 
-    Each part i depends on some of the coordinates, and each g changes signs. With
-    k = aᵢ exp(−‖(x − gz)/ℓ‖²/2) and M = ∂x ∂zᵀ k, the structure is
+    Each part i depends on some of the coordinates, and each image g changes signs. With
+    k = aᵢ exp(−‖(x − gz)/ℓ‖²/2) and M = ∂x ∂zᵀ k,
 
-        s k I + d (tr(M) I − Mᵀ) + B M Bᵀ,    B = c I + h (J − R).
+        K_ig = s k I + d (tr(M) I − Mᵀ) + B M Bᵀ,    B = c I + h (J − R).
 
     Attributes:
         log_variances: the log variance of a component of the field, for each part. The variance of
-            a potential that changes over ℓ is ℓ² times as large, for the geometric mean of the ℓ of
-            the part.
-        log_lengthscales: ℓ, one for each coordinate.
-        log_friction: the diagonal of R on the momenta.
+            a potential is ℓ² times as large, with the geometric mean ℓ of the part's lengthscales.
+        log_lengthscales: log ℓ for each coordinate.
+        log_friction: the logarithm of the diagonal of R on the momenta.
         masks: 1 if the part depends on the coordinate, else 0.
-        weights: w_ig up to the sum of their sizes, which is 1 for each part.
-        structure: (s, d, c, h), one of which is 1.
+        weights: the w_ig, which we divide by Σ_g |w_ig|.
+        structure: (s, d, c, h), one of which is 1 and the others 0.
     """
 
     log_variances: Float[Array, " parts"]
@@ -74,18 +73,18 @@ class Rung(AbstractMatrixKernel):
         S = jnp.tile(jnp.asarray(_signs(n, images), dtype), (parts, 1))
         one = jnp.eye(n, dtype=dtype)
         B = c * one + h * self._hamiltonian_operator(n).astype(dtype)
-        # Let k = w exp(−½(x − Sz)ᵀD(x − Sz)), D and S diagonal, and a = D(x − Sz). Then ∂x k = −k
-        # a, ∂z k = k Sa and ∂x_i a_j = D_ij, ∂z_j a_i = −(DS)_ij, so
+        # Let k = w exp(−½(x − Sz)ᵀD(x − Sz)) with D and S diagonal, and a = D(x − Sz). Then
+        # ∂x k = −k a, ∂z k = k Sa, ∂x_i a_j = D_ij and ∂z_j a_i = −(DS)_ij, so
         #     M = ∂x ∂zᵀ k = k (DS − a(Sa)ᵀ),     B M Bᵀ = k (B DS Bᵀ − (Ba)(BSa)ᵀ),
         #     tr(M) I − Mᵀ = k ((tr DS − a·Sa) I − DS + (Sa)aᵀ).
-        # C holds the terms that are the same at all points: s I + B DS Bᵀ + d (tr(DS) I − DS). No
-        # step has d = 1 for n ≤ 2.
+        # C = s I + B DS Bᵀ + d (tr(DS) I − DS) is the same for all pairs. No step has d = 1 for
+        # n ≤ 2.
         C = s * one[None] + jnp.einsum("ac,tc,bc->tab", B, D * S, B)
         if n > 2:
             C = C + d * ((D * S).sum(axis=1)[:, None, None] - (D * S)[..., None]) * one[None]
 
-        # The components of Ba and BSa are separate arrays (N, M), computed once and kept. If XLA
-        # fused them into each entry of the blocks, they took eight times as long.
+        # The barrier makes XLA compute the components of Ba and BSa, arrays (N, M), only once.
+        # Fused into each entry of the blocks, they took eight times as long.
         @jax.checkpoint
         def term(w, D, S, C):
             differences = [x[:, None] - z[None] for x, z in zip(X.T, S[:, None] * Z.T, strict=True)]
@@ -123,7 +122,7 @@ class Rung(AbstractMatrixKernel):
         return canonical(one) - jnp.exp(self.log_friction) * one.at[:m].set(0)
 
     def amplitudes(self) -> Float[Array, " parts"]:
-        """The amplitudes aᵢ."""
+        """The amplitudes aᵢ of the parts."""
         masks = self.masks.astype(self.log_lengthscales.dtype)
         squares = 2 * (masks @ self.log_lengthscales) / masks.sum(axis=1)
         of_fields = self.structure[0] > 0
@@ -170,7 +169,7 @@ class LadderStep(NamedTuple):
     """One step of the ladder.
 
     Attributes:
-        structure: the class of the kernel; with friction `Symplectic` stands for `PortHamiltonian`.
+        structure: the class of the kernel; `Symplectic` with friction means `PortHamiltonian`.
         apart: whether H = T(p) + U(q).
         friction: whether there is friction on the momenta.
         mirror: whether f(−x) = −f(x).
@@ -185,7 +184,7 @@ class LadderStep(NamedTuple):
 
     @property
     def claims(self) -> frozenset[str]:
-        """The questions to which all fields of the step say yes, as in `compare.claims`."""
+        """The questions to which the answer is yes for all fields, as in `compare.claims`."""
         answers = {"mirror"} if self.mirror else set()
         if self.structure is Symplectic:
             answers.add("energy")
@@ -196,7 +195,7 @@ class LadderStep(NamedTuple):
         return frozenset(answers)
 
     def rung(self, scale: Float[np.ndarray, " n"], speed: float) -> Rung:
-        """The kernel of the step, with first values for fields of size `speed` over 2 `scale`.
+        """The kernel of the step, with lengthscales 2 `scale` and fields of size `speed`.
 
         Args:
             scale: the standard deviation of each coordinate; 0 counts as 1.
@@ -205,7 +204,7 @@ class LadderStep(NamedTuple):
         n = len(scale)
         momenta = np.repeat([0, 1], [n // 2, n - n // 2])
         even = int(self.mirror) * (-1 if self.structure is Separable else 1)
-        if self.apart:  # T(p) and U(q); seen from T backward motion is the mirror image
+        if self.apart:  # T(p) and U(q); for T, time reversal is the mirror image
             masks = [momenta, 1 - momenta]
             weights = [[1, self.mirror or self.reversible], [1, even]]
         else:
@@ -223,7 +222,7 @@ class LadderStep(NamedTuple):
         )
 
     def kernel(self, rung: Rung) -> AbstractMatrixKernel:
-        """The structured kernel with the numbers of the rung."""
+        """The structured kernel with the hyperparameters of the rung."""
         n, length = len(rung.log_lengthscales), jnp.exp(rung.log_lengthscales)
         terms = []
         for mask, amplitude in zip(np.asarray(rung.masks), rung.amplitudes(), strict=True):
@@ -238,7 +237,7 @@ class LadderStep(NamedTuple):
 
 
 def ladder(n: int) -> dict[str, LadderStep]:
-    """Structures by name, the weakest first, with the products of their steps."""
+    """The steps by name, the weakest structure first, in all combinations."""
     steps = {"any field": LadderStep(Separable), "gradient": LadderStep(CurlFree)}
     if n > 2:
         steps["divergence-free"] = LadderStep(DivergenceFree)

@@ -1,24 +1,24 @@
 """`readout`: a formula of the potential, Σ θ_k φ_k, from a dictionary of functions φ_k.
 
 The whitened rows of the measurements are y_r = L_r f + ε_r with independent noise of one variance.
-For f = B∇u with u = Σ θ_k φ_k they are a linear regression,
+If f = B∇u with u = Σ θ_k φ_k, they are a linear regression
 
-    y = Φθ + ε,    Φ_rk = L_r [B ∇φ_k],    θ = (ΦᵀΦ)⁻¹ Φᵀ y,    Cov θ = s² (ΦᵀΦ)⁻¹,
+    y = Φθ + ε,    Φ_rk = L_r [B ∇φ_k],    θ = (ΦᵀΦ)⁻¹ Φᵀ y,    Cov θ = s² (ΦᵀΦ)⁻¹
 
 on the measurements themselves. A regression on the values of a posterior mean would count the prior
-twice. A prototype of such a regression found the terms of a pendulum in 0 to 10 % of data sets; the
-regression on measurements finds them in all 30 of `tests/benchmarks/readout.py`.
+twice. It found the terms of a pendulum in at most 10 % of data sets. The regression on measurements
+finds them in all 30 data sets of `tests/benchmarks/readout.py`.
 
-Selection. For a subset S of k of the D functions, with residual sum of squares RSS_S in R rows of
-unknown noise, the Bayesian information criterion with a uniform prior over the size of the subset
-(Chen & Chen 2008) is
+Selection. Let S be a subset of k of the D functions, with the residual sum of squares RSS_S in R
+rows of unknown noise. The Bayesian information criterion with a uniform prior over the size of the
+subset (Chen & Chen 2008) is
 
     R log RSS_S + k log R + 2 log C(D, k),
 
-and exp(−½ score) is proportional to the posterior probability of S. We compare all subsets, since
-backward elimination found the terms in only 10 to 40 % of data sets. The variance of a coefficient
-is an average over the subsets with their probabilities w (Hoeting et al. 1999), Σ_S w_S (Var_S θ_k
-+ (θ_k,S − θ_k)²), so the deviations include the uncertainty of the selection.
+and exp(−½ score) is proportional to the posterior probability w_S of S. We compare all subsets,
+since backward elimination found the terms in only 10 to 40 % of data sets. The variance of a
+coefficient is the average Σ_S w_S (Var_S θ_k + (θ_k,S − θ_k)²) over the subsets (Hoeting et al.
+1999), which includes the uncertainty of the selection.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import CurlFree
 from hamkernel._trajectories.learned import Learned
 
-# The relative difference of a function and its image under a symmetry, between the size of rounding
-# errors and that of a wrong sign.
+# The largest relative difference of a function and its image under a symmetry, above rounding
+# errors and below a wrong sign.
 SYMMETRY_RTOL = 1e-6
 
 
@@ -59,31 +59,32 @@ def readout(
     terms: Mapping[str, Callable[[Float[Array, " n"]], Any]],
     most: int = 4,
 ) -> Formula:
-    """Read a formula of the potential off the data, Σ θ_k φ_k with few terms of a dictionary.
+    """A formula Σ θ_k φ_k of the potential, with a few terms of a dictionary, from the data.
 
         learned = hk.learn(hk.Symplectic(hk.Gaussian(1.0)), runs)
         terms = {"p**2": lambda x: x[1] ** 2, "cos(q)": lambda x: jnp.cos(x[0]), …}
         formula = hk.readout(learned, terms)    # H = 0.5002(12) p**2 - 0.981(4) cos(q)
 
-    The coefficients are the least squares θ = (ΦᵀΦ)⁻¹Φᵀy of the measurements, Φ_rk = L_r[B∇φ_k],
-    with the operator B of the structure; the kernel k has no part in them. All subsets of up to
-    `most` terms are compared by the Bayesian information criterion, and the best is returned.
+    The coefficients are the least-squares solution θ = (ΦᵀΦ)⁻¹Φᵀy of the measurements,
+    Φ_rk = L_r[B∇φ_k], with the operator B of the structure. They do not depend on the scalar
+    kernel. `readout` compares all subsets of up to `most` terms by the Bayesian information
+    criterion, and returns the best.
 
-    The parameters inside the kernel count as known: the friction of `PortHamiltonian`, the masses
-    of `UnknownMasses`, a mean. For a field with inputs, G(x)u stays a Gaussian process, and the
-    formula describes the drift. With a symmetric kernel (`Odd`, `Reversible`, `Invariant`) all
-    terms must have the symmetry.
+    The parameters of the structure and the prior mean count as known, such as the friction of
+    `PortHamiltonian` and the masses of `UnknownMasses`. For a field with inputs, G(x)u stays a
+    Gaussian process, and the formula describes the drift. With a symmetric kernel (`Odd`,
+    `Reversible`, `Invariant`) all terms must have the symmetry.
 
     Args:
         learned: the result of `hk.learn`, or a posterior of `hk.condition`. Learn or tune with a
-            kernel as flexible as the data need: the formula inherits the noise and the paths.
+            kernel as flexible as the data need: the formula uses its noise and its paths.
         terms: names and functions φ: x (n,) -> (), written with jax.numpy. A constant is no term,
             since velocities do not depend on it.
         most: the largest number of terms in the formula.
 
     Returns:
         A `Formula`, with `.terms`, `.coefficients`, `.deviations`, `.misfit`, and `.latex()`. D
-        terms need C(D, 1) + … + C(D, most) small least squares: 17 terms take 0.1 s.
+        terms need C(D, 1) + … + C(D, most) small least-squares solves: 17 terms take 0.1 s.
 
     Warns:
         UserWarning: the residuals of the formula are more than twice the noise.
@@ -207,7 +208,7 @@ def _check_symmetry(K: Any, names: list[str], functions: list[Any], rows: Any) -
         values = np.asarray(jax.vmap(fn)(X))
         for g in shared:
             change = np.asarray(jax.vmap(fn)(jax.vmap(g)(X))) - g.character * values
-            # H is known up to a constant, which an odd potential has as well.
+            # H is known up to a constant, so an odd potential may have a constant too.
             constant = change.mean() if g.character < 0 else 0.0
             if not np.abs(change - constant).max() <= SYMMETRY_RTOL * np.abs(values).max():
                 bad.append(name)
@@ -223,11 +224,11 @@ def _check_symmetry(K: Any, names: list[str], functions: list[Any], rows: Any) -
 def _regression(
     K: Any, rows: Any, ridge: Float[Array, ""], functions: list[Any]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The targets y, the columns Φ, and the sizes of the terms of their entries.
+    """The targets y, the columns Φ, and the size of the terms in the entries of each column.
 
-    The noise of all rows has the variance `ridge`. With an unknown input matrix the rows of G(x)u
-    have the covariance C, and we multiply the rows by L⁻¹ with LLᵀ = I + C/ridge: generalised least
-    squares, with G integrated out.
+    The noise of all rows has the variance `ridge`. If the input matrix is unknown, the rows of
+    G(x)u have the covariance C. We then multiply y and Φ by L⁻¹ with LLᵀ = I + C/ridge, which is
+    generalised least squares with G integrated out.
     """
     fields, potentials = _dictionary_functions(operator_of(K), tuple(functions), rows.dimension)
     columns, typical = [], []
@@ -249,8 +250,8 @@ def _regression(
 def _dictionary_functions(operator: Any, functions: tuple[Any, ...], n: int) -> tuple[Any, Any]:
     """Functions of points: the fields (P, n, D) or potentials (P, D), and the sizes of their terms.
 
-    The sizes (D,) are the maxima of Σ_b |B_ab| |∂_b φ|. If a field B∇φ consists of rounding errors
-    alone, as for a Casimir φ, it is small compared to its size.
+    The sizes (D,) are the maxima of Σ_b |B_ab| |∂_b φ|. A field B∇φ that consists only of rounding
+    errors, as for a Casimir φ, is small compared to its size.
     """
 
     def slopes(x):
@@ -321,7 +322,7 @@ def _join_names(names: list[str]) -> str:
 
 
 class _Selection(NamedTuple):
-    """The best subset: coefficients, standard deviations, s², and probability."""
+    """The best subset, with coefficients, standard deviations, s², and posterior probability."""
 
     subset: tuple[int, ...]
     coefficients: np.ndarray
@@ -333,9 +334,9 @@ class _Selection(NamedTuple):
 def _select(columns: np.ndarray, y: np.ndarray, limit: int) -> _Selection:
     """The best of all subsets of up to `limit` columns.
 
-    [Φ, y] = QT is computed once, and for each subset a QR of the D + 1 rows of T, whose last
-    diagonal entry is the norm of the residual. Without normal equations, nearly dependent columns
-    lose digits like their condition number and not like its square.
+    We compute [Φ, y] = QT once, and for each subset a QR of the D + 1 rows of T, whose last
+    diagonal entry is the norm of the residual. We avoid normal equations, so nearly dependent
+    columns lose digits like their condition number and not like its square.
     """
     R, D = columns.shape
     limit = min(limit, R - 1)
@@ -347,7 +348,7 @@ def _select(columns: np.ndarray, y: np.ndarray, limit: int) -> _Selection:
         )
     sizes = np.linalg.norm(columns, axis=0)
     T = np.asarray(np.linalg.qr(np.column_stack([columns / sizes, y]), mode="r"))
-    # Residuals below the rounding of y cannot be compared.
+    # We cannot compare residuals below the rounding of y.
     floor = (np.finfo(float).eps * np.linalg.norm(y)) ** 2 * R
     scores, batches = [], []
     for k in range(1, limit + 1):
@@ -387,8 +388,8 @@ def _select(columns: np.ndarray, y: np.ndarray, limit: int) -> _Selection:
 def _least_squares(T: np.ndarray, subsets: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The coefficients (c, k), the diagonals of (ΦᵀΦ)⁻¹ (c, k), and residual squares (c,).
 
-    For each subset QR of [Φ_S, y] gives [[R, Qᵀy], [0, ρ]]: θ = R⁻¹Qᵀy, (ΦᵀΦ)⁻¹ = R⁻¹R⁻ᵀ and the
-    residual square ρ².
+    For each subset the triangle of a QR of [Φ_S, y] is [[R, Qᵀy], [0, ρ]]. Then θ = R⁻¹Qᵀy,
+    (ΦᵀΦ)⁻¹ = R⁻¹R⁻ᵀ, and the residual sum of squares is ρ².
     """
     c, k = subsets.shape
     y = np.broadcast_to(T[:, -1:], (c, len(T), 1))

@@ -292,8 +292,8 @@ class AbstractField(Shown, EqualToItself, eqx.Module):
     def is_separable(self) -> bool:
         """Whether the kernel implies H(q, p) = T(p) + U(q), which explicit integrators need.
 
-        True for a symplectic kernel whose scalar kernels are sums of `Select`s, each on q alone or
-        on p alone. The prior mean must be zero, or have an attribute `is_separable` that is true.
+        True for a symplectic kernel whose scalar kernels are sums of `Select`s, each of which takes
+        only q or only p. The prior mean must be zero, or have a true attribute `is_separable`.
         """
         if self.mean is not None and not getattr(self.mean, "is_separable", False):
             return False

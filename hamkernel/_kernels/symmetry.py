@@ -159,10 +159,10 @@ def close_group(
                 group.append(new)
             if len(group) > 64:  # the point group of the cube has 48
                 raise ValueError(
-                    "the maps generate more than 64 others, so they do not close to a finite "
-                    "group of use here. A rotation must be by 2π over a whole number, given with "
-                    "all digits; a shear or a stretch never closes, and a continuous symmetry "
-                    "cannot be averaged over so."
+                    "the maps generate more than 64 others, so they do not close to a finite group "
+                    "that this library averages over. A rotation must be by 2π over a whole "
+                    "number, given with all digits. Shears, stretches and continuous symmetries "
+                    "generate infinite groups."
                 )
     return tuple(group)
 
@@ -293,8 +293,8 @@ class Symmetrised(AbstractScalarKernel):
 def drop_symmetry(tree: Tree) -> Tree:
     """The PyTree with each mean over a group replaced by its scalar kernel.
 
-    The values of the result have the size of the terms of the mean, which determines rounding
-    errors: for a long lengthscale (k(x, z) − k(−x, z))/2 is a small difference of large numbers.
+    The values of the result are as large as the terms of the mean, which determine its rounding
+    errors. For a long lengthscale (k(x, z) − k(−x, z))/2 is a small difference of large numbers.
     """
 
     def is_mean(node: object) -> bool:

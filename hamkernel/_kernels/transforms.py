@@ -30,7 +30,7 @@ class Warp(AbstractScalarKernel):
         fn: a smooth map (n,) -> (m,), written with jax.numpy. `tune` trains the array leaves of an
             Equinox module. Define `fn` once: JAX treats a new lambda as a new function and compiles
             again. A fit refuses data at which `fn` or its derivative is not finite, such as inverse
-            distances of two atoms in one place; a field is NaN at such states.
+            distances of two atoms in one place. A field is NaN at such states.
         equivariant: whether the maps of a symmetry only permute the entries of `fn`, as a
             permutation of like atoms permutes the distances between atoms. `Invariant` then takes
             its mean in the warped coordinates, over |G| terms instead of |G|².

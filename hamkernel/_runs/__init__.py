@@ -1,1 +1,1 @@
-"""Logged runs: states at times, their checks, their smoothed paths, and rows of both."""
+"""Logged runs: states at times, their checks and their smoothed paths."""

@@ -93,9 +93,9 @@ def stiffness(
 ) -> float:
     """The .95 quantile of ‖∂f/∂x‖ at the points X, in standard deviations of the coordinates.
 
-    Dry friction is steep where a momentum changes its sign, but few points lie there. The result is
-    therefore at least .05 |ṗ|/ε, where ε is the rest speed of a friction and |ṗ| the root mean
-    square of the damped ṗ. At this rate a step of `steps_for` changes the momentum by about 3 ε.
+    Dry friction is steep near p = 0, but few points lie near p = 0. The result is therefore at
+    least .05 |ṗ|/ε, with the rest speed ε of the friction and the root mean square |ṗ| of the
+    damped ṗ. At this rate a step of `steps_for` changes the momentum by about 3 ε.
 
     Without this bound the error of U′ was 1.8 % for a pendulum that sticks, with q measured at
     50 Hz; with the bound it is .04 % (`tests/benchmarks/model_error.py friction`).
@@ -146,9 +146,9 @@ def integrate(
 ) -> Path:
     """The path of each segment from its start, and its tangents.
 
-    In an interval of length h with inputs u₀ and u₁ at its ends, the rescaled time runs from 0 to 1
-    and the point (x, u) has the velocity (h f, u₁ − u₀). If the field becomes NaN or infinite, so
-    does the path from there on.
+    Let an interval have the length h and the inputs u₀ and u₁ at its ends. In a time that runs from
+    0 to 1 the point (x, u) then has the velocity (h f, u₁ − u₀). If the field is NaN or infinite at
+    some time, the path is NaN or infinite from then on.
     """
     n = starts.shape[1]
 

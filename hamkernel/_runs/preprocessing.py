@@ -452,9 +452,9 @@ def landmarks(
 ) -> tuple[Float[np.ndarray, "m d"], int, int, bool]:
     """Landmarks: points of the paths, each farthest from the earlier ones in standard deviations.
 
-    The choice does not depend on hyperparameters, which are not known yet. There are no more
-    landmarks than intervals, since the samples at the ends of an interval determine one mean of the
-    field; but there are at least `first_landmarks(d)`.
+    The choice does not depend on hyperparameters, which are not known yet. The samples at the ends
+    of an interval determine one mean of the field, so there are no more landmarks than intervals,
+    unless `first_landmarks(d)` is larger.
 
     Args:
         data: the runs.

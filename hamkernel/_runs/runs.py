@@ -424,8 +424,8 @@ class Runs(eqx.Module):
             if not any(np.isfinite(np.asarray(x)[:, c]).any() for x in self.states):
                 raise ValueError(
                     f"coordinate {self.coordinate_names[c]} was measured in no run, so it has no "
-                    "velocities. hk.learn(K, runs, mean=f) finds it where f says how it moves the "
-                    "others, as q̇ = p/m does."
+                    "velocities. hk.learn(K, runs, mean=f) finds it if the velocity of another "
+                    "coordinate in f depends on it, as in q̇ = p/m."
                 )
 
 
@@ -662,8 +662,8 @@ def _signal(
         if missing > 1.001 * spacing:
             raise ValueError(
                 f"the inputs of run {run} {name} at {float(end[0]):g} and its states at "
-                f"{float(end[1]):g}: what was applied must be known over the whole run. Cut the "
-                "states, or repeat the command that was held."
+                f"{float(end[1]):g}: the inputs must be known over the whole run. Cut the states, "
+                "or repeat the command that was held."
             )
     return input_times, values
 
@@ -688,6 +688,6 @@ def _check_inputs(inputs: tuple[np.ndarray, ...]) -> None:
         if np.isnan(np.asarray(u)).any():
             raise ValueError(
                 f"inputs[{run}] contains NaN at sample {np.argwhere(np.isnan(np.asarray(u)))[0][0]}"
-                ": what was applied must be known at every sample. Repeat the command that was held"
+                ": the inputs must be known at every sample. Repeat the command that was held"
                 ", interpolate, or cut the run there."
             )

@@ -60,8 +60,8 @@ def _impossible(log: Log) -> Diagnostic:
         [f"{count}, {first}"] * bool(count),
         "20 deviations, or a row of zeros",
         f"{count} {'sample is' if count == 1 else 'samples are'} impossible beside "
-        f"{'its' if count == 1 else 'their'} neighbours, {first}: what a logger writes for a lost "
-        "measurement, such as -9999, 65535 or zeros",
+        f"{'its' if count == 1 else 'their'} neighbours, {first}: a logger may have written -9999, "
+        "65535 or zeros for a lost measurement",
         "Write NaN there; runs.impossible has the indices, by run.",
     )
 
@@ -179,7 +179,7 @@ def _outages(log: Log) -> Diagnostic:
         places,
         "twice the largest step",
         f"the log seems to stand still in {_list(places)}: all coordinates keep one value there, "
-        "and then jump by more than twice of what they move in a step elsewhere",
+        "and then jump by more than twice their largest step elsewhere",
         "Write NaN for these samples.",
     )
 
@@ -223,7 +223,7 @@ def _sensor_rows(
             "two plateaus",
             f"a sensor seems clipped: coordinate {_list(clipped)} stays at its outermost value and "
             "arrives there at speed",
-            "Write NaN for these samples; the field then says where it went.",
+            "Write NaN for these samples; learning then finds the motion there.",
         ),
         _row(
             "dead sensors",
@@ -237,9 +237,9 @@ def _sensor_rows(
             "repeated samples",
             repeated,
             "30%",
-            f"repeated samples: coordinate {_list(repeated)} is often exactly the sample before, "
-            "and else goes on by many steps of its resolution. The log was written faster than the "
-            "sensor measures, so times are late and the noise looks smaller than it is",
+            f"repeated samples: coordinate {_list(repeated)} often equals the previous sample, and "
+            "otherwise changes by many steps of its resolution. The logger ran faster than the "
+            "sensor, so times are late and the noise looks smaller than it is",
             "Keep the first of equal samples and write NaN for the others.",
         ),
         _row(
@@ -247,9 +247,9 @@ def _sensor_rows(
             drawn,
             "40%",
             f"interpolated samples: coordinate {_list(drawn)} lies on straight lines between some "
-            "of its samples. What was interpolated is no measurement, and the noise looks smaller "
+            "of its samples. Interpolated samples are no measurements, and the noise looks smaller "
             "than it is",
-            "Give the samples at their own times, hk.Runs does not need equal ones.",
+            "Give the samples at their own times: hk.Runs takes unequal sampling intervals.",
         ),
     ]
 
@@ -346,8 +346,8 @@ def _inputs(log: Log) -> list[Diagnostic]:
             "constant inputs",
             still,
             "some change",
-            f"constant in all runs: input {_list(still)}. What it does cannot be told from the "
-            f"drift, {unless}",
+            f"constant in all runs: input {_list(still)}. The data cannot distinguish its effect "
+            f"from the drift, {unless}",
             "Leave it out, or log runs in which it varies.",
         ),
         _row(
@@ -355,7 +355,7 @@ def _inputs(log: Log) -> list[Diagnostic]:
             alike,
             "1% of the variance",
             f"inputs {_list(alike)} depend on one another: a combination of them has less than 1 % "
-            f"of their variance. Their gains cannot be told apart, {unless}",
+            f"of their variance. The data cannot distinguish their gains, {unless}",
             "Leave out inputs that repeat others, or vary each on its own.",
         ),
     ]
@@ -374,9 +374,9 @@ def _feedback(log: Log) -> Diagnostic:
         "the inputs vary by themselves"
         if share >= 0.1
         else f"{'a combination of the inputs' if many else 'the input'} is a function of the "
-        f"states but for {share:.2g} of its variance: feedback without excitation. Gain and drift "
-        f"are then told apart by what is left alone, and their errors are {error:.2g} times those "
-        "under an independent input",
+        f"states but for {share:.2g} of its variance: feedback without excitation. Only this "
+        f"remainder distinguishes gain and drift, and their errors are {error:.2g} times as large "
+        "as with an independent input",
         "Add a known disturbance to the command, log other gains of the controller, or give the "
         "input matrix, hk.Controlled(K, inputs=[[0.0], [1.0]]).",
     )
@@ -386,7 +386,7 @@ def _free_of_states(X: Float[np.ndarray, "N n"], U: Float[np.ndarray, "N m"]) ->
     """The share of the variance of U that no cubic polynomial of X explains.
 
     This is the smallest share of all linear combinations of the inputs. It is 1 if there are too
-    few data, or if the inputs are constant or dependent.
+    few data, if all inputs are constant, or if inputs depend on one another.
     """
     X = X[:, np.isfinite(X).any(axis=0)]
     use = np.isfinite(X).all(axis=1)
@@ -502,7 +502,8 @@ def impossible_samples(x: Float[np.ndarray, "T n"]) -> Bool[np.ndarray, " T"]:
       difference, such as −9999, 65535 or 1e30.
     - d > 6 σ, and the row, of two coordinates or more, is all zeros, which loggers write for a lost
       packet. Then all rows of zeros are impossible whose neighbours are not zeros.
-    The first and the last row have one neighbour, and only the first condition applies.
+    The first and the last row have one neighbour. In the first condition they must differ from it
+    by more than 20 σ.
     """
     bad = np.zeros(len(x), bool)
     if len(x) < 5:

@@ -1,6 +1,6 @@
 """The base of matrix-valued kernels, their sums, and their symmetries: odd, even, reversible, any.
 
-A symmetry is imposed on the SCALAR kernel inside a structure, which is averaged over the group. If
+To impose a symmetry we average the SCALAR kernel inside a structure over the group. If
 B(Sx) = ± S B(x) Sᵀ, a potential with u(Sx) = u(x) gives a field with f(Sx) = ± S f(x).
 """
 
@@ -39,12 +39,12 @@ class AbstractMatrixKernel(eqx.Module):
     """A positive definite kernel K(x, z) -> (n, n) of fields ℝⁿ -> ℝⁿ."""
 
     matrix_valued: ClassVar[bool] = True
-    takes_inputs: ClassVar[bool] = False  # whether its points are (x, u)
+    takes_inputs: ClassVar[bool] = False  # whether the points are (x, u)
     input_name: ClassVar[str] = "inputs"  # the name of u in `fit`; "parameters" for a family
     # Whether derivatives of the Gram are cheaper in reverse mode, as for some closed forms.
     differentiated_backward: ClassVar[bool] = False
-    symplectic: eqx.AbstractVar[bool]  # whether flows keep dq ∧ dp, as those of J∇H do
-    no_potential: eqx.AbstractVar[str | None]  # why fields have no potential; None if they have one
+    symplectic: eqx.AbstractVar[bool]  # whether flows conserve dq ∧ dp, as flows of J∇H do
+    no_potential: eqx.AbstractVar[str | None]  # the reason why fields have no potential, or None
 
     @property
     def has_hamiltonian(self) -> bool:
@@ -60,19 +60,19 @@ class AbstractMatrixKernel(eqx.Module):
         return describe(self)
 
     def __hash__(self) -> int:
-        # Arrays have no hash. Equal kernels have equal structure, so this one fits `==`.
+        # Arrays have no hash. Equal kernels have equal structure, so we hash the structure.
         return hash(jax.tree.structure(self))
 
     @abc.abstractmethod
     def form(self, x: Point, u: Point, z: Point, v: Point) -> Float[Array, ""]:
-        """uᵀ K(x, z) v for one pair of points."""
+        """The form uᵀ K(x, z) v for one pair of points, shape ()."""
 
     @full_precision
     def __call__(self, x: Float[Array, " n"], z: Float[Array, " n"]) -> Float[Array, "n n"]:
-        """The block K(x, z) for one pair of points.
+        """The block K(x, z) for one pair of points, shape (n, n).
 
         Raises:
-            ValueError: x or z is no single point, or n is not one that the structure allows.
+            ValueError: x or z is no single point, or the structure does not allow this n.
         """
         x, z = require.one_space(one_point(x)[None], one_point(z)[None])
         x, z = x[0], z[0]
@@ -83,26 +83,26 @@ class AbstractMatrixKernel(eqx.Module):
 
     @abc.abstractmethod
     def expansion(self, x: Point, Z: Points, A: Points) -> Point:
-        """Σⱼ K(x, zⱼ) aⱼ, without the blocks."""
+        """The field Σⱼ K(x, zⱼ) aⱼ at x, computed without the blocks."""
 
     def directions(self, Z: Points, A: Points) -> Points:
-        """The directions vⱼ along which `expansion` differentiates at zⱼ, if it does so; else A."""
+        """The directions vⱼ along which `expansion` differentiates at zⱼ; A if it does not."""
         return A
 
     def along(self, x: Point, Z: Points, V: Points) -> Point:
-        """`expansion` with `directions` in the place of A."""
+        """The field `expansion(x, Z, A)` for V = `directions(Z, A)`."""
         return self.expansion(x, Z, V)
 
     def potential(self, x: Point, Z: Points, A: Points) -> Float[Array, ""]:
-        """The potential of `expansion`; AttributeError if there is none."""
+        """The potential of the field `expansion`; an AttributeError if there is none."""
         raise AttributeError(self.no_potential)
 
     def potential_covariance(self, x: Point, z: Point) -> Float[Array, ""]:
-        """The kernel of the potential, of which K is B ∂x∂zᵀ(·) Bᵀ; AttributeError if none."""
+        """The kernel k of the potential, with K = B ∂x∂zᵀk Bᵀ; an AttributeError if none."""
         raise AttributeError(self.no_potential)
 
     def check_potential(self) -> None:
-        """AttributeError, with the reason, if the fields have no potential."""
+        """Raise an AttributeError with the reason if the fields have no potential."""
         if self.no_potential:
             raise AttributeError(self.no_potential)
 
@@ -111,20 +111,20 @@ class AbstractMatrixKernel(eqx.Module):
         raise AttributeError(self.no_potential)
 
     def check_dimension(self, n: int) -> None:
-        """ValueError if fields on ℝⁿ cannot have this structure; by default all can."""
+        """Raise a ValueError if fields on ℝⁿ cannot have this structure; by default all can."""
 
     def check_points(self, X: Float[Array, "N d"]) -> None:
-        """ValueError if the structure cannot hold at these points; their values may be traced."""
+        """Raise a ValueError if the structure cannot hold at the points X, which may be traced."""
         self.check_dimension(X.shape[1])
 
     def centre(self, Z: Float[Array, "M d"]) -> Float[Array, " d"] | None:
-        """The mean of Z if K(x − c, z − c) = K(x, z) for all c, else None."""
+        """The mean of Z if K(x − c, z − c) = K(x, z) for all c; else None."""
         return Z.mean(axis=0) if Invariance.TRANSLATION in self.invariance else None
 
     def blocks(
         self, X: Float[Array, "N n"], Z: Float[Array, "M n"]
     ) -> Float[Array, "N n M n"] | None:
-        """The Gram, where K has a closed form for many points at once; else None."""
+        """The Gram if K has a closed form for many points at once; else None."""
         return None
 
     def through_descriptor(self, n: int) -> Descriptor | None:
@@ -133,7 +133,7 @@ class AbstractMatrixKernel(eqx.Module):
 
     @property
     def state_kernel(self) -> "AbstractMatrixKernel":
-        """The kernel of fields of x alone: this one, unless its points are (x, u)."""
+        """The kernel of fields of x alone: K itself, unless its points are (x, u)."""
         return self
 
     def with_states(self, K: "AbstractMatrixKernel") -> "AbstractMatrixKernel":
@@ -145,7 +145,7 @@ class AbstractMatrixKernel(eqx.Module):
         return inputs
 
     def shares_potential(self, kernel: "AbstractMatrixKernel") -> bool:
-        """Whether the fields of both kernels are made from a potential by the same operator."""
+        """Whether both kernels apply the same operator to a potential."""
         return False
 
     @abc.abstractmethod
@@ -154,7 +154,7 @@ class AbstractMatrixKernel(eqx.Module):
 
     @abc.abstractmethod
     def average_over(self, maps: tuple[LinearMap, ...]) -> "AbstractMatrixKernel":
-        """The kernel of the fields whose potential is invariant under these maps."""
+        """The kernel of the fields whose potential is invariant under the maps."""
 
     def bounds(self, name: str, X: Float[np.ndarray, "N d"], amplitude: float) -> Bounds:
         """The lower and upper bound of the array `name`, as `AbstractScalarKernel.bounds`."""
@@ -167,7 +167,7 @@ class AbstractMatrixKernel(eqx.Module):
     @property
     @abc.abstractmethod
     def scalar_kernels(self) -> tuple[AbstractScalarKernel, ...]:
-        """The scalar kernels inside the structure."""
+        """All scalar kernels inside the structure."""
 
     @property
     @abc.abstractmethod
@@ -176,7 +176,7 @@ class AbstractMatrixKernel(eqx.Module):
 
     def __add__(self, other: Any) -> "Sum":
         if not isinstance(other, AbstractMatrixKernel) or other.takes_inputs:
-            return NotImplemented  # a kernel of joined points defines the sum
+            return NotImplemented  # kernels of joined points define their sums
         return Sum(self, other)
 
     def __mul__(self, other: Any) -> Any:
@@ -192,7 +192,7 @@ class AbstractMatrixKernel(eqx.Module):
 
 
 def nodes_of(kind: type, tree: Any) -> list[Any]:
-    """The objects of a type within a PyTree."""
+    """The objects of the type `kind` within a PyTree."""
 
     def is_node(node: Any) -> bool:
         return isinstance(node, kind)
@@ -201,7 +201,7 @@ def nodes_of(kind: type, tree: Any) -> list[Any]:
 
 
 def total(values: list[Array]) -> Array:
-    """The sum of the values of the terms of a kernel, of which there is at least one."""
+    """The sum of at least one value, without a start of zero."""
     return functools.reduce(operator.add, values)
 
 
@@ -212,12 +212,13 @@ class Sum(AbstractMatrixKernel):
     `field.part(1)` or `field.part("rest")` is one part alone.
 
     Args:
-        terms: matrix-valued kernels; a sum among them is taken apart.
-        named: the same with names.
+        terms: matrix-valued kernels. A sum among them contributes its terms.
+        named: matrix-valued kernels with names.
 
     Raises:
-        TypeError: a term is no matrix-valued kernel. ValueError: there is no term, two have one
-            name, or one is called regularization, as λ is.
+        TypeError: a term is no matrix-valued kernel, or takes inputs or parameters.
+        ValueError: there is no term, two terms have the same name, or one has the name
+            regularization, which belongs to λ.
     """
 
     terms: tuple[AbstractMatrixKernel, ...]
@@ -324,7 +325,7 @@ class Sum(AbstractMatrixKernel):
         return common_invariance(self.terms)
 
     def part(self, which: int | str) -> AbstractMatrixKernel:
-        """The term with this position or name; KeyError, with the choices, if there is none."""
+        """The term with this position or name; a KeyError with the choices if there is none."""
         return self.terms[self.position(which)]
 
     def position(self, which: int | str) -> int:
@@ -347,7 +348,7 @@ def matrix_kernel(
     what: str = "K, the first argument,",
     example: str = "hk.Symplectic(k), hk.CurlFree(k), hk.DivergenceFree(k) or hk.Separable(k)",
 ) -> AbstractMatrixKernel:
-    """K, if it is matrix-valued; else a TypeError that says how to make one."""
+    """The kernel K if it is matrix-valued; else a TypeError that says how to make one."""
     if isinstance(K, AbstractMatrixKernel):
         return K
     cure = f"Give a scalar kernel its structure first: {example}."
@@ -359,9 +360,9 @@ def matrix_kernel(
 def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
     """The kernel of the odd fields with the structure of K, f(−x) = −f(x).
 
-    A field B∇u is odd if u is even, so the SCALAR kernel k inside is replaced by its even part. The
+    A field B∇u is odd if u is even, so we replace the SCALAR kernel k inside by its even part. The
     symmetry is exact for every k. Evaluating costs twice as much as K if the library knows that
-    k(−x, −z) = k(x, z), else four times. A sum is symmetrised term by term.
+    k(−x, −z) = k(x, z), else four times. In a sum `Odd` applies to each term.
 
     Args:
         K: a structured kernel whose B does not depend on x.
@@ -377,7 +378,7 @@ def Odd(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
 def Even(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
     """The kernel of the even fields with the structure of K, f(−x) = f(x).
 
-    A field B∇u is even if u is odd, u(−x) = −u(x). Costs and arguments are those of `Odd`.
+    A field B∇u is even if u is odd, u(−x) = −u(x). The costs are those of `Odd`.
 
     Args:
         K: a structured kernel whose B does not depend on x.
@@ -389,12 +390,13 @@ def Even(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
 
 
 def Reversible(K: AbstractMatrixKernel) -> AbstractMatrixKernel:
-    """The kernel of the reversible fields J∇H, H(q, −p) = H(q, p), whose motions may run backwards.
+    """The kernel of the reversible fields J∇H with H(q, −p) = H(q, p).
 
-    With S = diag(I, −I), f(Sx) = −S f(x). Every H = T(p) + U(q) with an even T is reversible;
-    systems with friction, in magnetic fields and in rotating frames are not. Evaluating costs twice
-    as much as K if the library knows that k(Sx, Sz) = k(x, z), else four times.
-    `Reversible(Odd(K))` has both symmetries, a group of four maps.
+    With S = diag(I, −I) they obey f(Sx) = −S f(x): the time-reversed motion solves the same
+    equation. Every H = T(p) + U(q) with an even T is reversible. Systems with friction, in magnetic
+    fields and in rotating frames are not. Evaluating costs twice as much as K if the library knows
+    that k(Sx, Sz) = k(x, z), else four times. `Reversible(Odd(K))` has both symmetries, a group of
+    four maps.
 
     Args:
         K: `Symplectic(k)`, `Odd(Symplectic(k))`, `Even(Symplectic(k))`, or a sum of these.
@@ -424,15 +426,15 @@ def Invariant(k: Any, maps: Any) -> Any:
     """The kernel of the functions with H(Sx) = H(x) for a finite group G of linear maps S.
 
     The kernel is the mean (1/|G|²) Σ k(gx, hz) over both arguments, which is right for every k. If
-    the library knows that k(Sx, Sz) = k(x, z), the mean over one argument is enough, and costs |G|
+    the library knows that k(Sx, Sz) = k(x, z), it takes the mean over one argument, which costs |G|
     times as much as k instead of |G|² times. This holds for orthogonal S with one lengthscale for
     all coordinates, and for S that only change signs.
 
     Inside `Symplectic`, a map with SᵀJS = J gives fields f(Sx) = S f(x), and a map with SᵀJS = −J
-    reversible fields, f(Sx) = −S f(x). Other maps raise a ValueError.
+    reversible fields f(Sx) = −S f(x). Other maps raise a ValueError.
 
     Args:
-        k: a scalar kernel, or a structure, inside which the scalar kernels are averaged.
+        k: a scalar kernel, or a structure, whose scalar kernels we average.
         maps: generators of the group, (n, n) arrays or linear functions x -> S x. The group may
             have up to 64 elements.
 
@@ -440,9 +442,9 @@ def Invariant(k: Any, maps: Any) -> Any:
         A scalar kernel; a structure if `k` is a structure.
 
     Raises:
-        TypeError: `k` is no kernel, or `maps` no list of maps. ValueError: a matrix is not square;
-            or, when called, a map is not linear or of another dimension, the group does not close,
-            or the structure does not allow the map.
+        TypeError: `k` is no kernel, or `maps` no list of maps.
+        ValueError: a matrix is not square; or, when called, a map is not linear or of another
+            dimension, the group does not close, or the structure does not allow the map.
 
     Example: `hk.Symplectic(hk.Invariant(hk.Gaussian(1.0), [rotation, mirror]))`.
     """

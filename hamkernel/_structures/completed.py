@@ -1,4 +1,4 @@
-"""Attributes of kernels that come from the data: rest speeds of `Friction`, centres of `Shared`."""
+"""`complete`: the attributes of kernels that the data determine, in `Friction` and `Shared`."""
 
 from typing import Any
 
@@ -14,7 +14,7 @@ from hamkernel._structures.friction import with_rest_speed
 
 
 def complete(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> Any:
-    """K with a rest speed in every `Friction`, and centres in every `Shared`, from the states X."""
+    """The kernel K with the rest speeds of `Friction` and the centres of `Shared`, from data X."""
     K = with_rest_speed(K, X, n)
     if all(shared.centres is not None for shared in shared_laws(K)):
         return K
@@ -37,7 +37,7 @@ def shared_laws(K: Any) -> list[Shared]:
 
 
 def has_constant_parts(K: AbstractMatrixKernel) -> bool:
-    """Whether every scalar kernel of K has `Shared` laws, and no map to the parts is trained."""
+    """Whether every scalar kernel of K has `Shared` laws, and no map to the parts is trainable."""
     laws = [shared_laws(k) for k in K.scalar_kernels]
     parts = [shared.parts for laws_of_kernel in laws for shared in laws_of_kernel]
     return all(laws) and not any(map(eqx.is_inexact_array, jax.tree.leaves(parts)))

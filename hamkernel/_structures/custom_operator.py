@@ -29,14 +29,14 @@ class AbstractCustomOperator(AbstractPotentialKernel):
     """A structure whose B(x) is the caller's function, stored in the attribute named by `role`."""
 
     role: AbstractClassVar[str]
-    name: AbstractClassVar[str]  # by which users know the structure
+    name: AbstractClassVar[str]  # the public name of the structure
 
     operator_invariance: ClassVar[Invariance] = Invariance.NONE
     symplectic: ClassVar[bool] = False
     has_hamiltonian: ClassVar[bool] = True
 
     def _check_values(self, matrices: Float[np.ndarray, "N n n"], X: Float[Array, "N n"]) -> None:
-        """ValueError unless B(x) has the property that the structure needs, at these points."""
+        """Raise a ValueError unless B at the points X has the property of the structure."""
 
     def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
         return self._matrix(x) @ v
@@ -45,7 +45,7 @@ class AbstractCustomOperator(AbstractPotentialKernel):
         return v @ self._matrix(x)
 
     def _matrix(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-        """B(x), in the dtype of x."""
+        """The matrix B(x) in the dtype of x."""
         value, n = getattr(self, self.role)(x), len(x)
         name = f"the {self.role} of {self.name}"
         value = require.floating(value, f"the value of {name}")
@@ -70,7 +70,7 @@ class AbstractCustomOperator(AbstractPotentialKernel):
                 f"X[{int(bad.argmax())}]: it must be defined at every state of the data."
             )
         self._check_values(matrices, X)
-        check_symmetries(self, X[:16])  # at a single point B may happen to be zero
+        check_symmetries(self, X[:16])  # more than one point, since B may be zero at one
 
 
 class StructuredByMatrix(AbstractCustomOperator):
@@ -92,7 +92,7 @@ def Structured(kernel: Any, operator: Callable[..., Any]) -> AbstractStructure:
         operator(x) -> (n, n)        f(x) = B(x)∇u(x),    K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ
         operator(u, x) -> (n,)       f(x) = (L u)(x),     K(x, z) = L_x L_z k(x, z)
 
-    The rest of the library works with both forms: `tune` tunes the arrays in the operator, and
+    The rest of the library works with both forms: `tune` trains the arrays in the operator, and
     `save` stores them. `load` needs the kernel again, since the file does not contain its code.
     Fields B(x)∇u have `.hamiltonian(x)` and `.dissipation(x)` = −∇HᵀB∇H, and are faster. Fields L u
     have `.potential(x)`.
@@ -101,13 +101,13 @@ def Structured(kernel: Any, operator: Callable[..., Any]) -> AbstractStructure:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
         operator: a function written with jax.numpy. With one argument it is B, with two L. In L, u
             is a function (n,) -> () that `jax.grad`, `jax.hessian` and so on differentiate, to any
-            order p for which k has 2p derivatives; the value must be linear in u. The array leaves
-            of an Equinox module are trained; store positive numbers as `log_…`.
+            order p for which k has 2p derivatives. The value must be linear in u. `tune` trains the
+            array leaves of an Equinox module; store positive numbers as `log_…`.
 
     Raises:
-        TypeError: `kernel` is not a scalar kernel, or `operator` not a function. ValueError, with
-            data: the operator returns another shape, or is not finite at the data; L is not linear
-            in u; or k is too rough for L.
+        TypeError: `kernel` is not a scalar kernel, or `operator` not a function.
+        ValueError: with data, if the operator returns another shape, or is not finite at the data;
+            if L is not linear in u; or if k is too rough for L.
 
     Example: friction that grows with the height of a pendulum, and the flow of a vorticity,
 
@@ -135,21 +135,21 @@ class Poisson(AbstractCustomOperator):
     """K(x, z) = Π(x) [∂x ∂zᵀ k(x, z)] Π(z)ᵀ: Poisson systems f = Π(x)∇H, Π antisymmetric.
 
     n may be even or odd. Every field conserves H, dH/dt = ∇HᵀΠ∇H = 0, and the Casimirs C with
-    Π(x)∇C = 0. `field.hamiltonian(x)` is H, known up to functions of the Casimirs. Π need not
-    satisfy the Jacobi identity.
+    Π(x)∇C = 0. `field.hamiltonian(x)` is H, which is known up to functions of the Casimirs. Π need
+    not satisfy the Jacobi identity.
 
     `hk.poisson` has the tensors `rigid_body` (n = 3), `lotka_volterra` (n = 2), and
-    `charged_particle(B)` (n = 4 or 6). If H is harder to learn than f, `Separable` is better: the H
-    of Lotka-Volterra contains logarithms of the populations, its f does not.
+    `charged_particle(B)` (n = 4 or 6). If H is harder to learn than f, use `Separable`: for
+    Lotka-Volterra, for example, H contains logarithms of the populations and f does not.
 
     Args:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
-        tensor: Π, a function x (n,) -> (n, n) written with jax.numpy. The array leaves of an
-            Equinox module are trained.
+        tensor: Π, a function x (n,) -> (n, n) written with jax.numpy. `tune` trains the array
+            leaves of an Equinox module.
 
     Raises:
-        TypeError: `kernel` is not a scalar kernel, or `tensor` not a function. ValueError, with
-            data: Π is not an (n, n) array, or not antisymmetric at the data.
+        TypeError: `kernel` is not a scalar kernel, or `tensor` not a function.
+        ValueError: with data, if Π is not an (n, n) array, or not antisymmetric at the data.
 
     Source: Hu, Ortega & Yin (2024), arXiv 2403.10070 and 2504.13396.
     """
@@ -167,7 +167,7 @@ class Poisson(AbstractCustomOperator):
     def _check_values(self, matrices, X) -> None:
         size = np.abs(matrices).max(axis=(1, 2))
         symmetric = np.abs(matrices + np.swapaxes(matrices, 1, 2)).max(axis=(1, 2)) / 2
-        # The symmetric part is 1e-7 of Π by rounding in float32, and 1 if a sign is wrong.
+        # By rounding in float32 the symmetric part is 1e-7 of Π. If a sign is wrong, it is 1.
         worst = int(np.argmax(symmetric - 1e-6 * size))
         if symmetric[worst] > 1e-6 * size[worst]:
             raise ValueError(
@@ -200,7 +200,7 @@ class _AbstractTensor(eqx.Module):
 
     @abc.abstractmethod
     def _value(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-        """Π(x) at one state."""
+        """The matrix Π(x) at one state."""
 
     def __call__(self, *x: Float[Array, " n"]) -> Float[Array, "n n"]:
         if len(x) != 1 or jnp.ndim(x[0]) == 0:
@@ -212,9 +212,10 @@ class _AbstractTensor(eqx.Module):
 
 
 class RigidBodyTensor(_AbstractTensor):
-    """Π(L) v = L × v: the free rigid body, L̇ = L × ∇H(L), L the angular momentum in the body.
+    """The tensor Π(L) v = L × v of the free rigid body, L̇ = L × ∇H(L), n = 3.
 
-    n = 3. The Casimir is |L|². ∇H is the angular velocity.
+    L is the angular momentum in the frame of the body, and ∇H the angular velocity. |L|² is a
+    Casimir.
     """
 
     def __repr__(self) -> str:
@@ -225,10 +226,10 @@ class RigidBodyTensor(_AbstractTensor):
 
 
 class LotkaVolterraTensor(_AbstractTensor):
-    """Π(x, y) = [[0, −xy], [xy, 0]]: prey x and predators y, n = 2.
+    """The tensor Π(x, y) = [[0, −xy], [xy, 0]] of prey x and predators y, n = 2.
 
-    H = δx − γ log x + βy − α log y gives ẋ = αx − βxy and ẏ = δxy − γy. In the logarithms of the
-    populations Π is −J, and H is far easier to learn.
+    H = δx − γ log x + βy − α log y gives ẋ = αx − βxy and ẏ = δxy − γy. With the logarithms of the
+    populations as states, Π is −J, and H is easier to learn.
     """
 
     def __repr__(self) -> str:
@@ -242,13 +243,14 @@ class LotkaVolterraTensor(_AbstractTensor):
 
 
 class ChargedParticleTensor(_AbstractTensor):
-    """Π(q, p) = [[0, I], [−I, F(q)]], F v = v × B: a charge in a magnetic field B, as e·B.
+    """The tensor Π(q, p) = [[0, I], [−I, F(q)]] of a charge in a magnetic field, F v = v × B.
 
-    p is the kinetic momentum mq̇, so that H = |p|²/(2m) + U(q) contains no vector potential.
+    B is the charge times the field. p is the kinetic momentum mq̇, so H = |p|²/(2m) + U(q) contains
+    no vector potential.
     """
 
-    field: Any  # numbers, which are static, or a function of q
-    constant: tuple[float, ...] | None = eqx.field(static=True)
+    field: Any  # B as a function of q; None if B is constant
+    constant: tuple[float, ...] | None = eqx.field(static=True)  # the components of a constant B
 
     def __repr__(self) -> str:
         return call(
@@ -298,17 +300,17 @@ def charged_particle(
     """The tensor of a charge in a magnetic field: q̇ = ∂H/∂p, ṗ = −∂H/∂q + ∂H/∂p × B.
 
     Args:
-        magnetic_field: e·B, the charge times the field: one number for motion in a plane normal to
-            the field, n = 4; three numbers for motion in space, n = 6; or a function of the
-            position q that returns these. Numbers are fixed; `tune` tunes the arrays of an Equinox
-            module.
+        magnetic_field: e·B, the charge times the field. One number for motion in a plane normal to
+            the field, n = 4; three numbers for motion in space, n = 6. Or a function of the
+            position q that returns these numbers. Numbers are fixed; `tune` trains the arrays of an
+            Equinox module.
 
     Returns:
         Π, for `hk.Poisson(k, hk.poisson.charged_particle(2.0))`. p is the KINETIC momentum mq̇.
 
     Raises:
-        ValueError: the field has another number of components, or is not finite. TypeError: JAX
-            traces the field, as in `hk.Poisson(k, charged_particle)` without a call.
+        ValueError: the field has another number of components, or is not finite.
+        TypeError: JAX traces the field, as in `hk.Poisson(k, charged_particle)` without a call.
 
     Source: Littlejohn (1979), J. Math. Phys. 20, 2445, eq. (5).
     """

@@ -30,7 +30,7 @@ from hamkernel._structures.joined import AbstractJoinedKernel, JointPoint, Joint
 
 
 class AbstractFamily(AbstractJoinedKernel):
-    """Σᵢ kᵢ(θ, ϑ) Kᵢ(x, z), with one term or several."""
+    """The kernel Σᵢ kᵢ(θ, ϑ) Kᵢ(x, z) of a family, with one term or several."""
 
     input_name: ClassVar[str] = "parameters"
     inner: ClassVar[str] = "the members: Family"
@@ -44,7 +44,7 @@ class AbstractFamily(AbstractJoinedKernel):
         return Sum(first, *rest) if rest else first
 
     def with_states(self, K: AbstractMatrixKernel) -> "AbstractFamily":
-        """ValueError: a family has a kernel of states in each of its terms."""
+        """ValueError: a family has a state kernel in each term, so we cannot replace one."""
         raise ValueError(
             "the kernel of the members cannot be replaced in a family: name it inside, as in "
             "hk.Family(hk.UnknownMasses(K, masses), k)."
@@ -56,7 +56,7 @@ class AbstractFamily(AbstractJoinedKernel):
         return self.state_kernel.conserves
 
     def check_identified(self, U: Float[np.ndarray, "N p"]) -> None:
-        """ValueError for a coordinate of θ that is the same at all points."""
+        """Raise a ValueError if a coordinate of θ is the same at all points."""
         fixed = np.flatnonzero((U == U[:1]).all(axis=0))
         if fixed.size == U.shape[1]:
             raise ValueError(
@@ -125,7 +125,7 @@ class Family(AbstractFamily):
 
     The parameters θ, shape (p,), distinguish the members: a length, a load, the coefficients of a
     potential, the time. Pass the θ of each point: `hk.fit(hk.Family(K, k), X, Y, λ, parameters=Θ)`
-    with Θ of shape (N, p). The result is `field(x, θ)`; `field.at(θ)` is one member, an ordinary
+    with Θ of shape (N, p). The result is `field(x, θ)`. `field.at(θ)` is one member, an ordinary
     field of K.
 
     The terms of a sum may depend on θ in different ways, H = T(p) + U(q; θ):
@@ -136,20 +136,20 @@ class Family(AbstractFamily):
     If both terms depend on θ, give each its own k. With one k for T + U the error of an unmeasured
     pendulum was .0051, with two .0039 (`tests/benchmarks/families.py`).
 
-    Between measured members a family interpolates, and is better than a separate model for each
-    member. Outside the range of measured θ it is no better than separate models, and the deviation
-    of `hk.condition` grows to the prior deviation over a lengthscale of k. The deviation is too
-    small if the field changes faster with θ there than among the measured members, as 1/θ² does
-    towards zero. Choose a θ in which the field changes evenly.
+    Between measured members a family interpolates, and is more accurate than a separate model for
+    each member. Outside the range of measured θ it is no better than separate models, and the
+    deviation of `hk.condition` grows to the prior deviation over a lengthscale of k. This deviation
+    is too small if the field changes faster with θ outside the range than inside, as 1/θ² does
+    towards zero. Choose a θ with which the field changes at a uniform rate.
 
     For a drive of known frequency use `Controlled` with u = (cos ωt, sin ωt) instead, since the
-    drive is linear in u.
+    field is linear in u.
 
     Args:
         member: K, the structured kernel of each member.
         parameters: k, a scalar kernel of θ, without an amplitude, since K has one. The range of θ
             is a good first lengthscale. If None, all members are the same.
-        count: p; if None, `fit` takes p from the data.
+        count: the number p of parameters; if None, `fit` takes p from the data.
 
     Raises:
         TypeError: `member` is not matrix-valued, or takes inputs or parameters; or `parameters` is
@@ -182,13 +182,13 @@ class Family(AbstractFamily):
         return (self,)
 
     def coefficients_at(self, u: Float[Array, " p"], U: Float[Array, "M p"], A: Points) -> Points:
-        """The coefficients a_j k(θ, θ_j)."""
+        """The coefficients aⱼ k(θ, θⱼ) of the member θ."""
         return A * jax.vmap(self.parameters, in_axes=(None, 0))(u, U)[:, None]
 
     def child_inputs(
         self, child: Any, X: Float[np.ndarray, "N d"], amplitude: float
     ) -> tuple[Float[np.ndarray, "N _"], float]:
-        """K is evaluated at states and k at parameters.
+        """The data of K are states, the data of k are parameters.
 
         Only the product of their amplitudes is identified, so k gets none if K has one.
         """
@@ -200,7 +200,7 @@ class Family(AbstractFamily):
 
 
 class FamilySum(AbstractFamily):
-    """Σᵢ kᵢ(θ, ϑ) Kᵢ(x, z): families that add up, made by `+`."""
+    """The sum Σᵢ kᵢ(θ, ϑ) Kᵢ(x, z) of families; made by `+`."""
 
     terms: tuple["Family", ...]
     count: int | None = eqx.field(static=True)
@@ -220,10 +220,10 @@ class FamilySum(AbstractFamily):
     def child_inputs(
         self, child: Any, X: Float[np.ndarray, "N d"], amplitude: float
     ) -> tuple[Float[np.ndarray, "N d"], float]:
-        """The joined points themselves, since the terms are kernels of joined points."""
+        """The joined points, since the terms are kernels of joined points."""
         return X, amplitude
 
 
 def _family_terms(K: AbstractMatrixKernel) -> tuple["Family", ...]:
-    """The terms of a family; any other kernel is a family whose members are all the same."""
+    """The terms of a family. Any other kernel becomes a family of equal members."""
     return K.terms if isinstance(K, AbstractFamily) else (Family(K),)

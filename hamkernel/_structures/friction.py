@@ -24,28 +24,28 @@ from hamkernel._kernels.symmetry import LinearMap
 from hamkernel._structures.base import AbstractMatrixKernel, nodes_of
 from hamkernel._structures.structure import AbstractPotentialKernel, canonical, check_even
 
-# The default rest speed, over the root mean square of the momenta. Measured for a real pendulum
-# (`tests/benchmarks/real_logs.py`), with the error of rollouts in which the pendulum comes to rest.
+# The default rest speed, as a fraction of the root mean square of the momenta. For a real pendulum
+# (`tests/benchmarks/real_logs.py`), the error of rollouts in which the pendulum comes to rest is
 #
 #     fraction     .03      .006     .003     .001
 #     log p       6892     6911     6917     6917
 #     error        .16      .11      .11      .12 rad
 #
-# Measured for a drive (`tests/benchmarks/machines.py`), with the error of free runs.
+# For a drive (`tests/benchmarks/machines.py`) the error of free runs is
 #
 #     fraction     .03      .01      .003
 #     log p     13 586   13 770   13 858
 #     error        3.3      3.2      2.3 mm
 #
-# A simulated minute of a sticking pendulum takes 17 ms with .003, and 6 ms with .01. A trained rest
-# speed absorbs other effects than friction: on the real pendulum it rose from a hundredth to a
-# fifth of the largest speed, and the error of rollouts under another controller from .13 to .5 rad.
+# A simulated minute of a sticking pendulum takes 17 ms with .003, and 6 ms with .01. We do not
+# train the rest speed, since it then absorbs other effects: on the real pendulum the error of
+# rollouts under another controller rose from .13 to .5 rad.
 REST_SPEED_FRACTION = 0.003
-DEFAULT_REST_SPEED = 0.1  # without data
+DEFAULT_REST_SPEED = 0.1  # if there are no data
 
 
 def damped_coordinates(damped: tuple[int, ...] | None, n: int) -> tuple[int, ...]:
-    """The coordinates with friction, of a state of n coordinates; the momenta if `damped` is None.
+    """The coordinates with friction in a state of n coordinates; the momenta if `damped` is None.
 
     Raises:
         ValueError: `damped` names a coordinate that does not exist.
@@ -61,25 +61,26 @@ def damped_coordinates(damped: tuple[int, ...] | None, n: int) -> tuple[int, ...
 class PortHamiltonian(AbstractPotentialKernel):
     """K(x, z) = (J − R) [∂x ∂zᵀ k(x, z)] (J − R)ᵀ: fields f = (J − R)∇H with friction R ≥ 0.
 
-    R is diagonal and constant, positive on the damped coordinates and zero on the others. With
-    damped momenta, q̇ = ∂H/∂p and ṗ = −∂H/∂q − r ∂H/∂p = −∂H/∂q − r q̇, viscous friction. Along the
-    flow dH/dt = −∇HᵀR∇H = −`field.dissipation(x)`.
+    R is diagonal and constant, positive on the damped coordinates and zero on the others. If the
+    momenta are damped, q̇ = ∂H/∂p and ṗ = −∂H/∂q − r ∂H/∂p = −∂H/∂q − r q̇, viscous friction. Along
+    the flow dH/dt = −∇HᵀR∇H = −`field.dissipation(x)`.
 
     The friction r is a hyperparameter: every objective of `tune` finds r, and `frozen="friction"`
-    keeps r fixed. Friction on p is unique if ∂²H/∂p² is invertible. In a nearly linear system only
-    the sum of the frictions on q and p can be identified. If r rests on the lower end of its
-    box (`tuned.at_bounds`), the data show no friction.
+    keeps r fixed. Friction on p is unique if ∂²H/∂p² is invertible. In a nearly linear system the
+    data determine only the sum of the frictions on q and p. If r is at the lower end of its bounds
+    (`tuned.at_bounds`), the data show no friction.
 
     Args:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
-        friction: r > 0, a number for all damped coordinates or one for each, in units of the
-            momentum over those of the position, for damped momenta (mass per time).
+        friction: r > 0, a number for all damped coordinates or one for each. For damped momenta its
+            unit is momentum/position (mass per time).
         damped: the coordinates with friction, counted from 0; the momenta if None.
 
     Raises:
-        TypeError: `kernel` is not a scalar kernel. ValueError: the friction is not positive, or has
-            another shape; `damped` are no coordinates; or, with data, n is odd, or `damped` names a
-            coordinate that does not exist.
+        TypeError: `kernel` is not a scalar kernel.
+        ValueError: the friction is not positive, or has another shape; `damped` are no coordinates;
+            or, with data, n is odd, `damped` names a coordinate that does not exist, or H does not
+            depend on a damped coordinate.
 
     Example: `hk.tune(hk.PortHamiltonian(1.0 * hk.Gaussian(1.0), friction=0.1), X, Y,
         objective="marginal_likelihood").kernel.friction`.
@@ -126,11 +127,11 @@ class PortHamiltonian(AbstractPotentialKernel):
         return -canonical(v) - self._damping(v)
 
     def dissipated_power(self, x: Point, slope: Point) -> Float[Array, ""]:
-        """The dissipated power ∇HᵀR∇H, a sum of squares."""
+        """The dissipated power ∇HᵀR∇H ≥ 0, for ∇H = `slope`."""
         return jnp.sum(self.resistance(len(x)).astype(x.dtype) * slope**2)
 
     def resistance(self, n: int) -> Float[Array, " n"]:
-        """The diagonal of R."""
+        """The diagonal of R, shape (n,)."""
         zero = jnp.zeros(n, self.log_friction.dtype)
         return zero.at[np.asarray(damped_coordinates(self.damped, n))].set(self.friction)
 
@@ -139,15 +140,17 @@ class PortHamiltonian(AbstractPotentialKernel):
         return r.reshape(-1, *(1,) * (v.ndim - 1)) * v
 
     def operator_at(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-        # Frictions that are trained separately get different generic values: the square roots of
-        # 2, 3, 4, …
+        # Separately trained frictions get different generic values: √2, √3, √4, …
         apart = jnp.sqrt(jnp.arange(2.0, 2 + self.log_friction.size)).astype(x.dtype)
         stand_in = jnp.log(apart.reshape(self.log_friction.shape))
         general = eqx.tree_at(lambda K: K.log_friction, self, stand_in)
         return general.apply(x, jnp.eye(len(x), dtype=x.dtype))
 
     def bounds(self, name: str, X: Float[np.ndarray, "N n"], amplitude: float) -> Bounds:
-        """Bounds for log r: an oscillation of extents (Δq, Δp) in X is critical near r = Δp/Δq."""
+        """Bounds of log r around log Δp/Δq, for extents (Δq, Δp) of the data.
+
+        For an oscillator Δp/Δq = √(km), half of the critical friction.
+        """
         n = X.shape[1]
         damped = np.asarray(damped_coordinates(self.damped, n))
         extent = np.ptp(X, axis=0)
@@ -155,9 +158,8 @@ class PortHamiltonian(AbstractPotentialKernel):
         critical = np.log(extent[damped] / extent[(damped + n // 2) % n])
         if self.log_friction.ndim == 0:
             critical = critical.mean()
-        # Bounds of the damping ratio, r over the critical friction: at 1e-5 an oscillation loses
-        # 6e-5 of its amplitude in a period, far less than data can resolve; at 30 the motion
-        # creeps.
+        # At r = 1e-5 √(km) an oscillation loses the fraction π·1e-5 = 3e-5 of its amplitude in a
+        # period, far less than data can resolve. At r = 30 √(km) the motion creeps.
         return critical + np.log(1e-5), critical + np.log(30.0)
 
     def check_dimension(self, n: int) -> None:
@@ -181,21 +183,21 @@ class PortHamiltonian(AbstractPotentialKernel):
 class Friction(AbstractMatrixKernel):
     """K_ii(x, z) = F(xᵢ) F(zᵢ): forces −a F(v) on the momenta, a ~ N(0, 1), for a sum of kernels.
 
-    F(v) = d v + c tanh(v/ε) + s exp(−(v/w)²) tanh(v/ε): viscous, dry (Coulomb) and Stribeck
+    F(v) = d v + c tanh(v/ε) + s exp(−(v/w)²) tanh(v/ε) is viscous, dry (Coulomb) and Stribeck
     friction, with d, c, s and w > 0 as hyperparameters. F is odd and has the sign of v, so a force
-    with a > 0 removes energy at every speed, inside and outside the data. The fit finds a; a < 0
-    means that the force drives the motion.
+    with a > 0 removes energy at every speed, inside and outside the data. The fit finds a. If
+    a < 0, the force drives the motion.
 
     Add this kernel to the kernel of the energy, `Sum(energy=Symplectic(k), friction=Friction())`.
     The energy is then `field.part("energy").hamiltonian`. Its kernel need not depend on the
-    momenta: if q̇ = p/m is the prior mean, `Symplectic(Select(k, 0))` is enough. If the curve is too
+    momenta: if q̇ = p/m is the prior mean, use `Symplectic(Select(k, 0))`. If the curve is too
     simple, add a smooth term such as `Odd(CurlFree(Select(k, 1)))`, which vanishes away from the
     data.
 
-    The friction of a joint between links depends on the velocity of the joint, not on one momentum:
-    (M(q)⁻¹p)ᵢ, or the difference of two such velocities. The friction is −∂D/∂v = −M(q) ∂D/∂p with
-    Rayleigh's function D(v) = ½ d v² + c ε log cosh v/ε. Use a structure with the operator −M(q)
-    and one product kernel for each term of D:
+    The friction of a joint between links depends on the velocity of the joint, not on one momentum.
+    This velocity is (M(q)⁻¹p)ᵢ, or the difference of two such components. The friction is
+    −∂D/∂v = −M(q) ∂D/∂p with Rayleigh's function D(v) = ½ d v² + c ε log cosh v/ε. Use a structure
+    with the operator −M(q) and one product kernel for each term of D:
 
         def terms(x):  # v: the velocities of the joints at x = (q, p)
             v = velocities(x)
@@ -208,15 +210,16 @@ class Friction(AbstractMatrixKernel):
         joints = hk.Structured(1.0 * hk.Warp(lambda a, b: a @ b, terms), operator)
 
     Args:
-        viscous: the first guess of d, in units of the momentum's rate over the momentum.
+        viscous: the first guess of d, in 1/time.
         coulomb: the first guess of c, a force.
-        stribeck: the first guess of s, the force by which sticking exceeds sliding; None for none.
+        stribeck: the first guess of s, the difference of static and sliding friction; None for
+            none.
         rest_speed: ε > 0, the momentum below which dry friction fades to zero, so that the force is
-            smooth; not trained. If None, fits and `learn` take .003 of the root mean square of the
-            momenta (the kernel of the result has the number), and other functions .1. Under
-            `jax.jit` a number is needed. A smaller ε costs a simulation more steps. A system that
-            should stick creeps at a speed of about ε, and error bars do not account for the creep
-            (`tests/benchmarks/model_error.py friction`).
+            smooth; not trained. If None, fits and `learn` take .003 of the smallest root mean
+            square of the damped momenta (the kernel of the result has the number), and other
+            functions .1. Under `jax.jit` a number is needed. A smaller ε costs a simulation more
+            steps. A system that should stick creeps at a speed of about ε, and error bars do not
+            account for the creep (`tests/benchmarks/model_error.py friction`).
         stribeck_speed: the first guess of w, the momentum above which the joint slides.
         damped: the coordinates with friction, counted from 0; the momenta if None.
 
@@ -225,7 +228,7 @@ class Friction(AbstractMatrixKernel):
     Raises:
         ValueError: a guess is not positive and finite; `damped` are no coordinates; or, with data,
             n is odd and `damped` is None, or `damped` names a coordinate that does not exist.
-            TypeError: a guess is no number.
+        TypeError: a guess is no number.
 
     Example: `hk.Sum(energy=hk.Symplectic(hk.Select(k, 0)), friction=hk.Friction(0.1, 1.0))`.
 
@@ -281,13 +284,13 @@ class Friction(AbstractMatrixKernel):
         return None if self.log_stribeck_speed is None else jnp.exp(self.log_stribeck_speed)
 
     def curve(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """The force F for the damped coordinates of a state, zero for the others."""
+        """The curve F at the damped coordinates of a state; 0 at the others, shape (n,)."""
         damped = np.asarray(damped_coordinates(self.damped, len(x)))
         rest_speed = DEFAULT_REST_SPEED if self.rest_speed is None else self.rest_speed
         return jnp.zeros_like(x).at[damped].set(sum(self.terms(x[damped], rest_speed)))
 
     def terms(self, v: Float[Array, " m"], rest_speed: ArrayLike) -> list[Float[Array, " m"]]:
-        """The viscous, the dry and, if there is one, the Stribeck force at the speeds v."""
+        """The viscous, the dry and, if `stribeck` is set, the Stribeck force at the speeds v."""
         stick = jnp.tanh(v / rest_speed)
         forces = [self.viscous.astype(v.dtype) * v, self.coulomb.astype(v.dtype) * stick]
         if self.stribeck is not None and self.stribeck_speed is not None:
@@ -315,7 +318,7 @@ class Friction(AbstractMatrixKernel):
         force = 0.5 * np.log(amplitude)
         if name == "log_viscous":
             force = force - np.log(fastest)
-        # Three decades on both sides of a force that explains the velocities.
+        # Three decades on both sides of the force that explains the velocities.
         return force - np.log(1e3), force + np.log(1e3)
 
     def check_dimension(self, n: int) -> None:
@@ -358,9 +361,10 @@ def frictions(K: AbstractMatrixKernel) -> list[Friction]:
 
 
 def with_rest_speed(K: AbstractMatrixKernel, X: Float[Array, "N d"], n: int) -> Any:
-    """K with a rest speed in every `Friction`, from the states X[:, :n].
+    """The kernel K with a rest speed in every `Friction`, from the states X[:, :n].
 
-    The slowest momentum that moves sets the rest speed. Systems at rest get .1.
+    The damped coordinate with the smallest nonzero root mean square sets the rest speed. If all are
+    zero, the rest speed is .1.
     """
     if all(part.rest_speed is not None for part in frictions(K)):
         return K

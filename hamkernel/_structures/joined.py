@@ -1,10 +1,10 @@
 """Kernels of joined points (x, u): a state x together with its inputs or parameters u.
 
-u holds the inputs of `Controlled`, or the parameters of a member of a `Family`. Points have n + m
-coordinates and fields n components; other modules ask a kernel for its `outputs`.
+u contains the inputs of `Controlled`, or the parameters of a member of a `Family`. Points have
+n + m coordinates and fields n components; `outputs` returns n.
 
-Fields with inputs are f(x, u) = f(x) + G(x) u. With independent priors of the drift f and of the
-input matrix G the kernel of two joined points is
+Fields with inputs are f(x, u) = f(x) + G(x) u. If the drift f and the input matrix G have
+independent priors, the kernel of two joined points is
 
     K((x, u), (x′, u′)) = K_f(x, x′) + Σᵢⱼ uᵢ u′ⱼ K_g,ij(x, x′),        shape (n, n).
 """
@@ -41,14 +41,14 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
     """A kernel of points (x, u), u of shape (m,).
 
     Attributes:
-        count: m; None until the data determine m.
+        count: the number m; None until the data determine m.
         inner: the name, in error messages, of the part that may have a symmetry.
     """
 
     count: eqx.AbstractVar[int | None]
     inner: eqx.AbstractClassVar[str]
 
-    symplectic: ClassVar[bool] = False  # a flow moves the states alone
+    symplectic: ClassVar[bool] = False  # a flow changes only x
     takes_inputs: ClassVar[bool] = True
 
     @property
@@ -62,7 +62,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
 
     @abc.abstractmethod
     def check_identified(self, U: Float[np.ndarray, "N m"]) -> None:
-        """ValueError if data with these u cannot determine the dependence of the field on u."""
+        """Raise a ValueError if data with the inputs U do not determine how f depends on u."""
 
     @property
     def known_matrix(self) -> Any:
@@ -72,7 +72,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
     def coefficients_at(self, u: Float[Array, " m"], U: Float[Array, "M m"], A: Points) -> Points:
         """The coefficients b with Σⱼ K((x, u), (zⱼ, uⱼ)) aⱼ = Σⱼ K_states(x, zⱼ) bⱼ.
 
-        For `Controlled` this is the expansion of the drift, at u = 0, so b = a.
+        For `Controlled` we take the drift, u = 0, so b = a.
         """
         return A
 
@@ -97,7 +97,7 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
 
     @property
     def input_count(self) -> int:
-        """The number m; ValueError as long as it is unknown."""
+        """The number m of inputs or parameters; a ValueError if m is not known yet."""
         if self.count is None:
             raise ValueError(
                 f"the number of {self.input_name} of this {type(self).__name__} kernel is not "
@@ -107,22 +107,22 @@ class AbstractJoinedKernel(AbstractMatrixKernel):
         return self.count
 
     def split(self, s: Any) -> tuple[Any, Any]:
-        """X and U of joined points, or x and u of one."""
+        """The pair (X, U) of joined points, or (x, u) of one point."""
         n = self.outputs(s.shape[-1])
         return s[..., :n], s[..., n:]
 
     def child_inputs(
         self, child: Any, X: Float[np.ndarray, "N d"], amplitude: float
     ) -> tuple[Float[np.ndarray, "N _"], float]:
-        """The data in the coordinates of a part of this kernel, and its plausible amplitude.
+        """The data in the coordinates of the part `child`, and a plausible amplitude of this part.
 
-        Both set the bounds of the hyperparameters of the part. By default the coordinates of a part
-        are the states.
+        Both set the bounds of the hyperparameters of the part. By default its coordinates are the
+        states.
         """
         return self.split(X)[0], amplitude
 
     def check_dimension(self, n: int) -> None:
-        """`n` counts the coordinates of u, too."""
+        """Raise a ValueError if points (x, u) of n coordinates cannot have this structure."""
         if self.outputs(n) < 1:
             raise ValueError(
                 f"points (x, u) with {self.input_count} {self.input_name} have no coordinates left."
@@ -155,16 +155,16 @@ class InputMatrix(eqx.Module):
     """The prior of an unknown input matrix G(x), shape (n, m), for `Controlled`.
 
     The entries in the rows `acts_on` are independent functions in the RKHS of one scalar kernel.
-    The other rows are zero: a torque, for example, changes momenta and not positions.
+    The other rows are zero: a torque, for example, acts on momenta and not on positions.
 
     Args:
         kernel: a scalar kernel, for a G that depends on the state; or a positive number, the prior
             variance of the entries of a constant G, in squared units of velocity per input.
-        acts_on: the coordinates that inputs change, counted from 0; all if None.
+        acts_on: the coordinates on which inputs act, counted from 0; all if None.
 
     Raises:
-        TypeError: `kernel` is neither a kernel nor a number. ValueError: the variance is not
-            positive, or `acts_on` are no coordinates.
+        TypeError: `kernel` is neither a kernel nor a number.
+        ValueError: the variance is not positive, or `acts_on` are no coordinates.
 
     Example: `hk.Controlled(K, inputs=hk.InputMatrix(hk.Gaussian(2.0), acts_on=(1,)))`.
     """
@@ -184,7 +184,7 @@ class InputMatrix(eqx.Module):
         return describe(self, positional=("kernel",))
 
     def rows(self, n: int, dtype: Any) -> Float[Array, " n"]:
-        """A vector with 1 for the nonzero rows of G and 0 for the others."""
+        """The vector with 1 for the nonzero rows of G and 0 for the others."""
         if self.acts_on is None:
             return jnp.ones(n, dtype)
         return jnp.zeros(n, dtype).at[np.asarray(self.acts_on)].set(1.0)
@@ -200,19 +200,19 @@ class KnownMatrix(eqx.Module):
 
     @property
     def matrix(self) -> np.ndarray:
-        """G, shape (n, m)."""
+        """The matrix G, shape (n, m)."""
         return np.asarray(self.entries)
 
 
 class Controlled(AbstractJoinedKernel):
-    """Fields with inputs: f(x, u) = f(x) + G(x) u, f in the RKHS of K.
+    """The kernel of fields with inputs, f(x, u) = f(x) + G(x) u, with f in the RKHS of K.
 
     Pass the inputs of each point to `fit`, `tune` and the losses: `hk.fit(K, X, Y, λ, inputs=U)`
     with U of shape (N, m). The result is `field(x, u)`. `field.drift(x)` is f, an ordinary field of
     K with its Hamiltonian, and `field.input_matrix(x)` is G.
 
-    For a field that depends on time, take u = t, or u = (cos ωt, sin ωt): the field is then
-    f(x) + G(x) u(t), and `hk.simulate(field, x0, ts, inputs=lambda t: jnp.array([t]))` simulates.
+    For a field that depends on time, take u = t, or u = (cos ωt, sin ωt). The field is then
+    f(x) + G(x) u(t); simulate it by `hk.simulate(field, x0, ts, inputs=lambda t: jnp.array([t]))`.
 
     Vary every input: the data cannot distinguish a constant input from the drift, and `fit` refuses
     a constant input unless G is known.
@@ -220,11 +220,12 @@ class Controlled(AbstractJoinedKernel):
     Args:
         drift: K, the structured kernel of f.
         inputs: an `InputMatrix`, if G is unknown; or a known constant G, an array (n, m).
-        count: m, the number of inputs; if None, `fit` takes m from the data.
+        count: the number m of inputs; if None, `fit` takes m from the data.
 
     Raises:
         TypeError: `drift` is not matrix-valued, or `inputs` is neither an `InputMatrix` nor an
-            array. ValueError: a known G is no finite matrix.
+            array.
+        ValueError: a known G is no finite matrix.
 
     Example: `hk.Controlled(hk.PortHamiltonian(k), inputs=hk.InputMatrix(1.0, acts_on=(1,)))`.
 
@@ -277,7 +278,7 @@ class Controlled(AbstractJoinedKernel):
         return False
 
     def check_identified(self, U: Float[np.ndarray, "N m"]) -> None:
-        """ValueError if a linear combination of the inputs is the same at all points."""
+        """Raise a ValueError if a combination of the inputs is the same at all points."""
         if self.known_matrix is not None:
             return
         rank = int(np.linalg.matrix_rank(U - U.mean(axis=0)))
@@ -321,7 +322,7 @@ class Controlled(AbstractJoinedKernel):
         return jnp.concatenate([centre, jnp.zeros_like(inputs[0])])
 
     def check_dimension(self, n: int) -> None:
-        """`n` counts the inputs, too."""
+        """Raise a ValueError if points (x, u) of n coordinates cannot have this structure."""
         super().check_dimension(n)
         n = self.outputs(n)
         if isinstance(self.inputs, KnownMatrix):

@@ -1,4 +1,4 @@
-"""Sentences about `Shared` laws: which changes no data determine, and which states are new."""
+"""Sentences about `Shared` laws: undetermined changes, and states outside the data."""
 
 from typing import Any
 
@@ -13,15 +13,15 @@ from hamkernel._structures.base import Sum
 from hamkernel._structures.completed import shared_laws
 from hamkernel._structures.structure import AbstractPotentialKernel
 
-_NULL_TOLERANCE = 1e-5  # of the largest singular value, above the rounding of float32
-_RANGE_MARGIN = 0.05  # of the range of the data, which is estimated from 256 states
+_NULL_TOLERANCE = 1e-5  # relative to the largest singular value, above the rounding of float32
+_RANGE_MARGIN = 0.05  # as a fraction of the range of the data, which we estimate from 256 states
 
 
 def undetermined_terms(K: Any, n: int) -> tuple[str, ...]:
     """The changes of the laws within K that change no field, a sentence for each.
 
-    The linear function r_j as a law gives the potential Σ_p c_p φ_pj(x). Combinations of such
-    functions, and of constants, are undetermined if their fields are zero at random states.
+    A linear law w(r) = r_j gives the potential Σ_p c_p φ_pj(x). A combination of linear and
+    constant laws is undetermined if its field is zero at random states.
     """
     all_terms: tuple[Any, ...] = K.terms if isinstance(K, Sum) else (K,)
     terms = [term for term in all_terms if isinstance(term, AbstractPotentialKernel)]
@@ -49,7 +49,7 @@ def undetermined_terms(K: Any, n: int) -> tuple[str, ...]:
 
 @precise_jit
 def _linear_fields(K: Any, law: Shared, X: Float[Array, "N n"]) -> Float[Array, "N n L k"]:
-    """The fields of a constant and of the coordinates as laws."""
+    """The fields of each law if it is 1, and if it is one of the coordinates."""
 
     def potentials(x):
         points, weights = law.parts_at(x)
@@ -83,9 +83,9 @@ def _null_vectors(M: Float[np.ndarray, "R Q"]) -> Float[np.ndarray, "d Q"]:
 
 
 def outside(K: Any, X: Float[Array, "T n"]) -> str:
-    """A sentence if parts of the states X lie outside the range of the data, else "".
+    """A sentence if parts of the states X lie outside the range of the data; else "".
 
-    For distances the check concerns only distances below the smallest in the data.
+    For distances we check only for distances below the smallest in the data.
     """
     for law in shared_laws(K) if K is not None else ():
         if law.centres is None:

@@ -1,4 +1,4 @@
-"""Fields L u with the caller's linear operator L, of any order of differentiation."""
+"""Fields L u with a linear differential operator L of the caller, of any order."""
 
 from collections.abc import Callable
 from typing import Any, ClassVar
@@ -18,13 +18,13 @@ Potential = Callable[[Float[Array, " n"]], Float[Array, ""]]
 
 
 class StructuredByOperator(AbstractStructure):
-    """K(x, z) = L_x L_z k(x, z): fields f = L u, L a linear operator on functions u.
+    """K(x, z) = L_x L_z k(x, z): fields f = L u for a linear operator L on functions u.
 
-    The operator is applied to k twice, in z and then in x:
+    We apply the operator to k twice, in z and then in x:
 
         vᵀ(L_z k)(x) = v · operator(z ↦ k(x, z), z),    K(x, z) v = operator(x ↦ vᵀ(L_z k)(x), x).
 
-    So an operator of order p takes derivatives of k of order 2p.
+    An operator of order p therefore takes derivatives of k of order 2p.
     """
 
     operator: Callable[[Potential, Float[Array, " n"]], Any]
@@ -38,7 +38,7 @@ class StructuredByOperator(AbstractStructure):
         return call("Structured", [repr(self.kernel), text(self.operator)])
 
     def _apply(self, u: Potential, x: Float[Array, " n"]) -> Float[Array, " n"]:
-        """(L u)(x), in the dtype of x."""
+        """The value (L u)(x) in the dtype of x."""
         value = self.operator(u, x)
         name, cure = "the operator of Structured", "It is, for example, jax.grad(u)(x)."
         require.shape(value, f"{name} returned", "the field at one state", x.shape, cure=cure)
@@ -48,7 +48,7 @@ class StructuredByOperator(AbstractStructure):
         return u @ self.expansion(x, z[None], v[None])
 
     def potential(self, x: Point, Z: Points, A: Points) -> Float[Array, ""]:
-        def covariance(z, a):  # of u(x) and a·f(z)
+        def covariance(z, a):  # Cov(u(x), a·f(z))
             return a @ self._apply(lambda z: self.kernel(x, z), z)
 
         return jax.vmap(covariance)(Z, A).sum()
@@ -98,11 +98,10 @@ class StructuredByOperator(AbstractStructure):
 
 @precise_jit
 def _values(K: StructuredByOperator, X: Float[Array, "N n"]) -> tuple[Array, Array, Array, Array]:
-    """For each point: the error of linearity, its scale, K(x, x), and |K(x, x + h) − K(x, x)|.
+    """The error of linearity, its scale, K(x, x), and |K(x, x + h) − K(x, x)|, for each point.
 
-    h is a ten-thousandth of the spread of the states. Over the length h a kernel changes by
-    (h/l)² = 1e-4 if its lengthscale is a hundredth of the spread, and by its size if it is too
-    rough.
+    h is 1e-4 standard deviations of the states. If the lengthscale l is a hundredth of them, a
+    smooth kernel changes by (h/l)² = 1e-4 over h. A kernel that is too rough changes by its size.
     """
     h = 1e-4 * jnp.std(X, axis=0)
 

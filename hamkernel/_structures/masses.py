@@ -1,4 +1,4 @@
-"""States (q, q̇) instead of (q, p), with unknown masses."""
+"""`UnknownMasses`: kernels of states (q, q̇) instead of (q, p), with unknown masses."""
 
 from typing import Any, ClassVar
 
@@ -23,13 +23,13 @@ class UnknownMasses(AbstractMatrixKernel):
     M = L D Lᵀ with a unit lower triangle L. The first entry of M is 1, since scaling H and M
     together changes no motion; `field.hamiltonian(y)` is H in this unit.
 
-    Let q̈ = −M⁻¹∇U(q). Every M that makes M ∂q̈/∂q symmetric at all q explains the motion, so the
-    ratio of two masses is identified only if the motion of one depends on the other. A full matrix
-    needs nonlinear forces: a linear oscillation is explained by every M for which its modes are
-    orthogonal.
+    Let q̈ = −M⁻¹∇U(q). Every M for which M ∂q̈/∂q is symmetric at all q explains the motion. The
+    ratio of two masses is therefore identified only if the motion of one depends on the other. A
+    full matrix needs nonlinear forces: every M for which the modes are orthogonal explains a linear
+    oscillation.
 
-    As the drift of `Controlled`, G contains accelerations, M⁻¹ times the forces. If M is full, a
-    force on one coordinate therefore accelerates several.
+    If this kernel is the drift of `Controlled`, G contains accelerations, M⁻¹ times the forces. If
+    M is full, a force on one coordinate accelerates several.
 
     Args:
         kernel: K, a matrix-valued kernel, such as `Symplectic(k)`.
@@ -37,19 +37,19 @@ class UnknownMasses(AbstractMatrixKernel):
             (m, m) for a full symmetric positive definite M. The unit does not matter.
 
     Raises:
-        TypeError: K is not matrix-valued, or is `Controlled`. ValueError: a mass is not positive
-            and finite; a matrix is not symmetric and positive definite; or there is only one degree
-            of freedom.
+        TypeError: K is not matrix-valued, or takes inputs or parameters.
+        ValueError: a mass is not positive and finite; a matrix is not symmetric and positive
+            definite; or there is only one degree of freedom.
 
     Example: `hk.tune(hk.UnknownMasses(hk.Symplectic(k), [1.0, 1.0]), X, Y)`, or
     `hk.learn(hk.UnknownMasses(hk.Symplectic(k), np.eye(2)), runs)`.
     """
 
     kernel: AbstractMatrixKernel
-    log_masses: Float[Array, " m-1"]  # the diagonal of D, over its first entry
+    log_masses: Float[Array, " m-1"]  # log D_aa/D_11 for a ≥ 2
     coupling: Float[Array, " c"] | None  # the m(m − 1)/2 entries of L below its diagonal, by row
 
-    symplectic: ClassVar[bool] = False  # dq ∧ dp is kept, dq ∧ dq̇ is not
+    symplectic: ClassVar[bool] = False  # flows conserve dq ∧ dp, not dq ∧ dq̇
 
     def __init__(self, kernel: AbstractMatrixKernel, masses: ArrayLike):
         self.kernel = matrix_kernel(kernel, "the kernel of UnknownMasses", "Symplectic(k)")
@@ -77,7 +77,7 @@ class UnknownMasses(AbstractMatrixKernel):
 
     @property
     def masses(self) -> Float[Array, " m"] | Float[Array, "m m"]:
-        """The masses over the first one, shape (m,), or M over its first entry, (m, m)."""
+        """The masses divided by the first mass, shape (m,), or M divided by M₁₁, shape (m, m)."""
         D = self._diagonal
         if self.coupling is None:
             return D
@@ -86,24 +86,24 @@ class UnknownMasses(AbstractMatrixKernel):
 
     @property
     def _diagonal(self) -> Float[Array, " m"]:
-        """D, whose first entry is 1."""
+        """The diagonal of D, whose first entry is 1."""
         return jnp.exp(jnp.pad(self.log_masses, (1, 0)))
 
     def _triangle(self, dtype: Any) -> Float[Array, "m m"]:
-        """L."""
+        """The unit lower triangle L."""
         m = len(self.log_masses) + 1
         below = jnp.asarray(self.coupling, dtype)
         return jnp.eye(m, dtype=dtype).at[jnp.tril_indices(m, -1)].set(below)
 
     def to_momenta(self, y: Float[Array, "... n"]) -> Float[Array, "... n"]:
-        """S y, for one state or many."""
+        """The states S y = (q, M q̇), for one state or many."""
         q, v = jnp.split(y, 2, axis=-1)
         M = self.masses.astype(y.dtype)
         p = v * M.reshape((1,) * (v.ndim - 1) + M.shape) if M.ndim == 1 else v @ M
         return jnp.concatenate([q, p], axis=-1)
 
     def to_velocities(self, x: Float[Array, "... n"]) -> Float[Array, "... n"]:
-        """S⁻¹ x = S⁻ᵀ x, for one state or many."""
+        """The states S⁻¹ x = S⁻ᵀ x = (q, M⁻¹ p), for one state or many."""
         q, p = jnp.split(x, 2, axis=-1)
         M = self.masses.astype(x.dtype)
         if M.ndim == 1:
@@ -179,7 +179,7 @@ class UnknownMasses(AbstractMatrixKernel):
 
 
 def _factors(M: Array) -> tuple[Float[Array, " m"], Float[Array, " c"]]:
-    """D, and the entries of L below its diagonal, with M = L D Lᵀ."""
+    """The diagonal of D and the entries of L below its diagonal, with M = L D Lᵀ."""
     guess = np.asarray(M)
     if not np.isfinite(guess).all() or np.abs(guess - guess.T).max() > 1e-6 * np.abs(guess).max():
         raise ValueError(

@@ -1,15 +1,15 @@
 """Matrix-valued kernels whose fields obey a structure, from any scalar kernel.
 
-A structure is a linear operator applied to a scalar potential, f = B(x) ∇u(x). If u lives in the
-RKHS of k, then f lives in the RKHS of
+A structure is a linear operator applied to a scalar potential, f = B(x) ∇u(x). If u is in the RKHS
+of k, then f is in the RKHS of
 
-    K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ          shape (n, n),
+    K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ          shape (n, n).
 
-and automatic differentiation builds K from any k: uᵀK(x, z)v is the derivative of k along B(x)ᵀu in
-the first argument and along B(z)ᵀv in the second. With representer coefficients aⱼ at points zⱼ
-the potential is u(x) = Σⱼ ∂z k(x, zⱼ)·B(zⱼ)ᵀaⱼ, one forward derivative of a row of scalars. The
-field is B times the gradient of u, so no (n, n) block is formed. The paper's −∇∇ᵀg(x − z) is the
-case k(x, z) = g(x − z); the mixed derivative is positive for every k.
+Automatic differentiation builds K from any k: uᵀK(x, z)v is the derivative of k along B(x)ᵀu in the
+first argument and along B(z)ᵀv in the second. Given coefficients aⱼ at points zⱼ, the potential is
+u(x) = Σⱼ ∂z k(x, zⱼ)·B(zⱼ)ᵀaⱼ, one forward derivative of a row of scalars. The field is B times the
+gradient of u, so we form no (n, n) block. The paper's −∇∇ᵀg(x − z) is the case
+k(x, z) = g(x − z). The mixed derivative is positive definite for every k.
 """
 
 import abc
@@ -48,11 +48,11 @@ from hamkernel._structures.base import AbstractMatrixKernel, nodes_of
 
 
 class AbstractStructure(AbstractMatrixKernel):
-    """A structure made from one scalar kernel k."""
+    """A structure with one scalar kernel k."""
 
     kernel: AbstractScalarKernel = eqx.field(converter=as_scalar_kernel)
-    # 1 if the fields have the parity of the potential, −1 if they have the opposite parity, 0 if
-    # unknown, for an operator of the caller.
+    # 1 if the fields have the parity of the potential, −1 if they have the opposite parity, 0 for
+    # an operator of the caller, whose parity is unknown.
     field_parity: eqx.AbstractClassVar[int]
     # The symmetry of the operator: TRANSLATION if B is constant, REFLECTION if B(−x) = B(x).
     operator_invariance: eqx.AbstractClassVar[Invariance]
@@ -96,7 +96,7 @@ class AbstractStructure(AbstractMatrixKernel):
         return eqx.tree_at(lambda K: K.kernel, self, kernel)
 
     def shares_potential(self, kernel: AbstractMatrixKernel) -> bool:
-        """Whether both have the same operator; operators with trained arrays count as unequal."""
+        """Whether both kernels have the same operator; False if an operator has trained arrays."""
         if type(self) is not type(kernel):
             return False
         (arrays, tree), (other_arrays, other_tree) = (
@@ -116,7 +116,7 @@ class AbstractStructure(AbstractMatrixKernel):
 def _warps(
     k: AbstractScalarKernel, X: Float[np.ndarray, "N n"]
 ) -> Iterator[tuple[Warp, Float[np.ndarray, "N m"]]]:
-    """Each `Warp` within k, including k itself, with its points."""
+    """Each `Warp` within k, including k itself, with its arguments for the data X."""
     if isinstance(k, Warp):
         yield k, X
 
@@ -152,8 +152,8 @@ def row(k: AbstractScalarKernel, x: Point, Z: Points) -> Float[Array, " M"]:
 def mixed_derivative(k: AbstractScalarKernel, x, u, z, v) -> Float[Array, ""]:
     """The mixed derivative uᵀ [∂x ∂zᵀ k(x, z)] v, in forward mode for both arguments.
 
-    For k(x, z) = φ(s) it is φ″(s) ds(u) ds(v) + φ′(s) dds(u, v). Factors that depend on one point,
-    or on a pair of points, are computed once, so an entry of a Gram costs a few multiplications.
+    For k(x, z) = φ(s) this derivative is φ″(s) ds(u) ds(v) + φ′(s) dds(u, v). XLA computes factors
+    of one point, or of a pair of points, once, so an entry of a Gram costs a few multiplications.
     """
 
     def slope(x):
@@ -163,8 +163,8 @@ def mixed_derivative(k: AbstractScalarKernel, x, u, z, v) -> Float[Array, ""]:
 
 
 def _operators(K: Any, X: Float[Array, "N n"]) -> Float[np.ndarray, "N n n"]:
-    # Compiled code takes 0.05 ms instead of 2 ms. Under tracing, a compiled call would be traced
-    # although B is known.
+    # Compiled code takes 0.05 ms instead of 2 ms. Under tracing we do not call compiled code, since
+    # JAX would trace the call although B is known.
     evaluate = _compiled_operators_at if require.is_concrete(K, X) else _operators_at
     return np.asarray(evaluate(K, X))
 
@@ -177,7 +177,7 @@ _compiled_operators_at = precise_jit(_operators_at)
 
 
 def check_symmetries(K: Any, X: Float[Array | np.ndarray, "N n"]) -> None:
-    """ValueError unless B(Sx) = ± S B(x) Sᵀ for the maps S of the kernel, at these points."""
+    """Raise a ValueError unless B(Sx) = ± S B(x) Sᵀ for the maps S of the kernel, at points X."""
     n = X.shape[1]
     constant = Invariance.TRANSLATION in K.operator_invariance
     maps = dict.fromkeys(S_map for mean in symmetries(K.kernel) for S_map in mean.maps)
@@ -193,7 +193,7 @@ def check_symmetries(K: Any, X: Float[Array | np.ndarray, "N n"]) -> None:
             moved = jnp.asarray(np.asarray(X) @ S.T, X.dtype)
             moved_operators = operators if constant else _operators(K, moved)
             image = S @ operators @ S.T
-            tolerance = 1e-5 * np.abs(operators).max()  # maps may come in float32
+            tolerance = 1e-5 * np.abs(operators).max()  # maps may have the rounding of float32
             if min(np.abs(moved_operators + sign * image).max() for sign in (1, -1)) > tolerance:
                 raise ValueError(
                     f"a map of the symmetry is not one of the fields of {type(K).__name__}: with "
@@ -207,7 +207,7 @@ def check_symmetries(K: Any, X: Float[Array | np.ndarray, "N n"]) -> None:
 class AbstractPotentialKernel(AbstractStructure):
     """K(x, z) = B(x) [∂x ∂zᵀ k(x, z)] B(z)ᵀ: fields f = B ∇u of a potential u.
 
-    A final class adds B and the symmetry of B; everything else is defined here.
+    A final class defines B and the symmetry of B; this class defines the rest.
     """
 
     field_parity: ClassVar[int] = -1
@@ -215,11 +215,11 @@ class AbstractPotentialKernel(AbstractStructure):
 
     @abc.abstractmethod
     def apply(self, x: Float[Array, " n"], v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-        """B(x) v, of a vector (n,) or of each column of a matrix (n, m)."""
+        """The product B(x) v with a vector (n,), or with each column of a matrix (n, m)."""
 
     @abc.abstractmethod
     def apply_transpose(self, x: Float[Array, " n"], v: Float[Array, " n"]) -> Float[Array, " n"]:
-        """B(x)ᵀ v."""
+        """The product B(x)ᵀ v."""
 
     def form(self, x: Array, u: Array, z: Array, v: Array) -> Float[Array, ""]:
         return mixed_derivative(
@@ -260,9 +260,9 @@ class AbstractPotentialKernel(AbstractStructure):
         return -slope @ self.apply(x, slope)
 
     def operator_at(self, x: Float[Array, " n"]) -> Float[Array, "n n"]:
-        """B(x) with generic values in place of the trained parameters.
+        """The matrix B(x) with generic values in place of the trained parameters.
 
-        A symmetry found for these values holds for all values.
+        A symmetry that holds for these values holds for all values.
         """
         return self.apply(x, jnp.eye(len(x), dtype=x.dtype))
 
@@ -296,7 +296,7 @@ class CurlFree(AbstractPotentialKernel):
 
 
 def check_even(n: int, whose: str) -> None:
-    """ValueError where states cannot be (q, p)."""
+    """Raise a ValueError if n is odd, so that states cannot be (q, p)."""
     if n % 2:
         raise ValueError(
             f"{whose} needs states x = (q, p) of even dimension, got n = {n}. "
@@ -308,7 +308,7 @@ def check_even(n: int, whose: str) -> None:
 
 
 def canonical(v: Float[Array, "n ..."]) -> Float[Array, "n ..."]:
-    """J v."""
+    """The product J v."""
     dq, dp = jnp.split(v, 2)
     return jnp.concatenate([dp, -dq])
 
@@ -322,7 +322,8 @@ class Symplectic(AbstractPotentialKernel):
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
 
     Raises:
-        TypeError: `kernel` is not a scalar kernel. ValueError, with data: n is odd.
+        TypeError: `kernel` is not a scalar kernel.
+        ValueError: with data, if n is odd.
 
     Source: Smith & Egeland (2023), section 4; Boffi, Tu & Slotine (2022).
     """
@@ -373,15 +374,16 @@ class Separable(AbstractStructure):
 class DivergenceFree(AbstractStructure):
     """K(x, z) = tr(M) I − Mᵀ with M = ∂x ∂zᵀ k(x, z): fields with div f = 0, n ≥ 2.
 
-    The fields are f_a = Σ_b ∂_b Ψ_ab with an antisymmetric matrix potential Ψ, whose entries above
-    the diagonal are independent functions in the RKHS of k. For n = 2, K = J M Jᵀ, the kernel of
-    `Symplectic`.
+    The fields are f_a = Σ_b ∂_b Ψ_ab with an antisymmetric matrix potential Ψ. The entries of Ψ
+    above the diagonal are independent functions in the RKHS of k. For n = 2, K = J M Jᵀ is the
+    kernel of `Symplectic`.
 
     Args:
         kernel: the scalar kernel k: one of the library, or any callable (x, z) -> ().
 
     Raises:
-        TypeError: `kernel` is not a scalar kernel. ValueError, with data: n is 1.
+        TypeError: `kernel` is not a scalar kernel.
+        ValueError: with data, if n is 1.
 
     Source: Fuselier (2006). For n = 3, f is the curl of a vector potential.
     """
@@ -437,15 +439,15 @@ class DivergenceFree(AbstractStructure):
 def expand_group(
     K: AbstractMatrixKernel, Z: Float[Array, "M n"], A: Float[Array, "M n"]
 ) -> tuple[AbstractMatrixKernel, Float[Array, "L n"], Float[Array, "L n"]]:
-    """The kernel without its group, with the images of the points and of their directions.
+    """The kernel without its group, and the images of the points and of their directions.
 
-    The result has the same sum Σⱼ K(x, zⱼ) aⱼ in `along`. For a one-sided mean k_G of k,
+    `along` with the result returns the same sum Σⱼ K(x, zⱼ) aⱼ. For a one-sided mean k_G of k,
 
         Σⱼ ∂_vⱼ k_G(x, zⱼ) = Σⱼ Σ_h χ(h)/|G| ∂_(h vⱼ) k(x, h zⱼ).
 
-    In a sum over many pairs more points are cheaper than more terms for each pair, which fill the
-    registers. K and Z are returned unchanged if K has no group or a two-sided mean, or if its
-    operator belongs to the caller.
+    In a sum over many pairs, more points are cheaper than more terms for each pair, which fill the
+    registers. K and Z are unchanged if K has no group or a two-sided mean, or if the operator
+    belongs to the caller.
     """
     V, n = K.directions(Z, A), Z.shape[1]
     if not isinstance(K, AbstractStructure) or K.field_parity == 0:
@@ -454,7 +456,7 @@ def expand_group(
     if mean is None or not mean.is_one_sided(n):
         return K, Z, V
     group = mean.group(n)
-    moves = K.field_parity < 0  # else values are added up, and not slopes along V
+    moves = K.field_parity < 0  # a sum of derivatives along V; otherwise a sum of values
     images = [h.character * (jax.vmap(h)(V) if moves else V) for h in group]
     K = eqx.tree_at(lambda K: K.kernel, K, mean.kernel)
     points = jnp.concatenate([jax.vmap(h)(Z) for h in group])

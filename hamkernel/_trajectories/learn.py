@@ -1,27 +1,21 @@
-"""`learn`: from noisy states at times to a field."""
+"""`learn_field`: from noisy states at times to a field, by iterations."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
-from typing import Any, NamedTuple, overload
+from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._fields.base import SolverInfo, known_part
+from hamkernel._fields.base import SolverInfo
 from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import learned_field
-from hamkernel._fields.kinetic import Kinetic, kinetic
 from hamkernel._gram_operator import placed_product
 from hamkernel._kernels.functions import as_pytree
-from hamkernel._machine import follow_data, full_precision, one_blas_thread
-from hamkernel._observations.kinds import inputs_or_parameters
-from hamkernel._observations.measurements import sampled_points
 from hamkernel._runs.flow import Expansion, field_values
 from hamkernel._runs.preprocessing import (
     Preprocessed,
@@ -34,11 +28,9 @@ from hamkernel._runs.preprocessing import (
 from hamkernel._runs.runs import Runs
 from hamkernel._runs.smoothing import interpolate, power_of_two
 from hamkernel._solvers.nystrom import Nystrom
-from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
+from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import complete
-from hamkernel._structures.lagrangian import Lagrangian
-from hamkernel._structures.masses import UnknownMasses
-from hamkernel._trajectories.diagnostics import check_identifiable, diagnostics
+from hamkernel._trajectories.diagnostics import diagnostics
 from hamkernel._trajectories.evidence import Evidence
 from hamkernel._trajectories.iteration import (
     Current,
@@ -53,10 +45,8 @@ from hamkernel._trajectories.iteration import (
     iterate,
 )
 from hamkernel._trajectories.kalman import as_observations
-from hamkernel._trajectories.lagrangian import LearnedLagrangian, learn_lagrangian
-from hamkernel._trajectories.laws import are_learned_from_rows, learn_laws
 from hamkernel._trajectories.learned import Learned, empty, misfits
-from hamkernel._trajectories.model import Model, with_amplitude
+from hamkernel._trajectories.model import Model
 from hamkernel._trajectories.quality import (
     chi_squared,
     disturbances,
@@ -73,127 +63,32 @@ from hamkernel._trajectories.search import (
 from hamkernel._trajectories.segments import LONG, equal_pieces
 
 
-@overload
-def learn(K: Lagrangian, runs: Runs, *, noise: ArrayLike | None = None) -> LearnedLagrangian: ...
-@overload
-def learn(
+def learn_field(
     K: AbstractMatrixKernel,
     runs: Runs,
-    mean: Callable[..., Array] | None = None,
-    noise: ArrayLike | None = None,
-    solver: Nystrom | None = None,
-    *,
-    process_noise: ArrayLike | None = None,
-    mass: ArrayLike | None = None,
-    masses: bool = False,
-    iterations: int = 8,
-    progress: bool | None = None,
-) -> Learned: ...
-@follow_data
-@one_blas_thread
-@full_precision
-def learn(
-    K: AbstractMatrixKernel | Lagrangian,
-    runs: Runs,
-    mean: Callable[..., Array] | None = None,
-    noise: ArrayLike | None = None,
-    solver: Nystrom | None = None,
-    *,
-    process_noise: ArrayLike | None = None,
-    mass: ArrayLike | None = None,
-    masses: bool = False,
-    iterations: int = 8,
-    progress: bool | None = None,
-) -> Any:
-    """Learn a field from noisy states at times, without velocities.
-
-    `learn` models the states x(t) of each run as a solution of ẋ = f(x, u) + w, measured with
-    Gaussian noise, and f as a Gaussian process with the kernel K. It starts from a smoothed path
-    and iterates. Each iteration linearises every interval between two samples about the current
-    path; a Kalman filter makes the rows independent, so that the field follows in closed form. The
-    hyperparameters and the noise maximise the marginal likelihood p, and a Kalman smoother gives
-    the next path. The iteration ends when log p rises by less than ½.
-
-    The first pass has no process noise w. If it does not settle, or if w would raise log p by
-    more than the price of its hyperparameters, a second pass estimates the intensity of w, and
-    `learn` returns the likelier of the two.
-
-    If K is made of `hk.Shared`, `learn` solves twice for the laws, without iterations, in any
-    number of coordinates. It uses weak rows, ∫ φ f dt along a smoothed path, whose cost is linear
-    in n. `solver` and `iterations` then have no effect, and innovations are NaN.
+    mean: Callable[..., Array] | None,
+    drift: Any,
+    sigma: Float[np.ndarray, " n"] | None,
+    process: Float[np.ndarray, " n"] | None,
+    solver: Nystrom | None,
+    max_steps: int,
+    progress: bool | None,
+    again: Callable[[Runs], Learned],
+) -> Learned:
+    """The field of these runs by iterations; see `hk.learn`.
 
     Args:
-        K: a matrix-valued kernel, whose hyperparameters are the first guess. `learn` gives a
-            structure without an amplitude one: `Symplectic(k)` becomes `Symplectic(1.0 * k)`. Runs
-            with inputs need a `Controlled` kernel, and runs with parameters a `Family`. Or a
-            `Lagrangian`: `learn` then returns a `LearnedLagrangian`, from positions q, or (q, v),
-            with torques as inputs, and of the arguments below only `noise` has a meaning.
-        runs: the log; see `Runs`, which also says what inputs do between samples.
-        mean: a known part of the field, x (n,) -> (n,), or with inputs x, u -> (n,) too; K learns
-            the rest.
-        noise: the standard deviation of the sensor noise, if you know it, in units of the states:
-            a number, or one for each coordinate, shape (n,). `learn` can then detect that a field
-            does not explain the runs. If None, it estimates the noise.
-        solver: `hk.Nystrom(max_points=…)` sets the number of landmarks, points of the paths that
-            carry the field. If None, `learn` begins with 48 for n = 2 and 80 for n = 4, inputs
-            counted as coordinates. It doubles this number while the marginal likelihood grows by
-            more than its error and a solve takes a second or two, or up to ten seconds if the
-            landmarks cause half of the remaining variance. A warning says if the runs need more.
-        process_noise: the intensity q of the white noise w, in units of the states over √time: a
-            number, or one for each coordinate, shape (n,). The noise w stands for motion that the
-            field lacks, from stiction, timing or a flexible part. 0 states that the structure is
-            the whole truth. If None, `learn` estimates q if the structure alone does not explain
-            the runs, and keeps it if the marginal likelihood rises enough. Intervals in which w is
-            above three standard deviations, as when a hand pushes the system, get a variance of
-            their own. A smaller q than the estimate may predict better: on a real pendulum half of
-            it has an error of .057 rad, and the estimate .105 (`tests/benchmarks/real_logs.py`).
-        mass: the known masses, one number or one for each position, shape (m,) or (m, m). The mean
-            is then `hk.kinetic(mass)`, and K learns the forces, such as `Symplectic(Select(k, 0))`.
-            Runs of the m positions alone get momenta that were not measured.
-        masses: whether states are (q, q̇) with unknown masses instead of (q, p). `learn` then finds
-            the ratios of the masses, `learned.kernel.masses`, and K becomes an `UnknownMasses`.
-            With inputs the masses are those of the drift, `learned.kernel.drift.masses`.
-        iterations: the largest number of iterations; 4 or 5 are usual.
-        progress: whether to show a progress bar (tqdm); if None, from ten seconds on.
-
-    Returns:
-        A `Learned`: the field, its kernel, the noise, the fitted states, and how well they fit.
-        Runs whose lengths have the same next power of two do not compile again.
-
-    Raises:
-        TypeError: the runs have inputs and K takes none, or the other way round; K is not
-            matrix-valued, `runs` no Runs, or `solver` no Nystrom. ValueError: the structure does
-            not allow this n; the data do not separate the inputs from the drift; the noise is not
-            positive; a coordinate was never measured and no mean says how it moves the others;
-            float64 is not enabled.
-
-    Warns:
-        UserWarning: at most once. It names the rows of `learned.diagnostics` that fall short, with
-            their meaning.
+        K: the kernel, with amplitudes and its number of inputs.
+        runs: the runs.
+        mean: the mean of the caller.
+        drift: the known part of the field, `known_part` of the mean.
+        sigma: the noise of the caller, shape (n,), or None.
+        process: the process noise of the caller, shape (n,), or None.
+        solver: the solver of the caller, or None.
+        max_steps: the largest number of iterations.
+        progress: whether to show a progress bar; see `hk.learn`.
+        again: `hk.learn` with all arguments but the runs.
     """
-    _check_types(K, runs, mean, noise)
-    if isinstance(K, Lagrangian):
-        unused = {"mean": mean, "solver": solver, "process_noise": process_noise, "mass": mass}
-        return learn_lagrangian(K, runs, noise, unused | {"masses": masses})
-    again = LearnAgain(
-        kernel=matrix_kernel(K),
-        mean=mean if mean is None else as_pytree(mean),
-        noise=noise,
-        solver=solver,
-        process_noise=process_noise,
-        masses=masses,
-        mass=mass,
-        iterations=iterations,
-    )
-    if mass is not None:
-        mean, runs = _kinetic_mean(mass, mean, runs)
-    K, sigma, process = _check(with_amplitude(matrix_kernel(K)), runs, noise, process_noise, solver)
-    max_steps = require.count(iterations, "iterations")
-    K = _unknown_masses(K, runs.dimension) if masses else K
-    drift = known_part(K, mean, runs.dimension, jnp.float64)
-    check_identifiable(K, runs, drift)
-    if are_learned_from_rows(K) and process is None:
-        return learn_laws(K, runs, mean if mean is None else as_pytree(mean), sigma, again)
     bar = _bar(progress, total=2 + max_steps)
     data = preprocess(runs, drift)
     bar.update()
@@ -218,24 +113,6 @@ def learn(
         end = choose_end(end, iterate(task, now, max_steps, bar), ends_of_part)
     bar.close()
     return _result(runs, mean, end, first, process, sigma is not None, again)
-
-
-class LearnAgain(eqx.Module):
-    """`learn` with the arguments of an earlier call, for other runs."""
-
-    kernel: AbstractMatrixKernel
-    mean: Any
-    noise: Any
-    solver: Nystrom | None
-    process_noise: Any
-    masses: bool
-    mass: Any
-    iterations: int
-
-    def __call__(self, runs: Runs) -> Learned:
-        """The field of these runs."""
-        options = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
-        return learn(options.pop("kernel"), runs, progress=False, **options)
 
 
 class _Start(NamedTuple):
@@ -319,17 +196,6 @@ def _bar(progress: bool | None, total: int) -> Any:
     return tqdm(desc="learning", total=total, disable=progress is False, delay=wait)
 
 
-def _kinetic_mean(mass: Any, mean: Any, runs: Any) -> tuple[Kinetic, Any]:
-    """The mean of known masses, and runs of positions and momenta."""
-    if mean is not None:
-        raise TypeError("mass= is a mean, hk.kinetic(mass): give one of mass and mean.")
-    mean = kinetic(mass)
-    positions = mean.mass.shape[0] if mean.mass.ndim else 1
-    if isinstance(runs, Runs) and runs.dimension == positions:
-        runs = runs.with_momenta()
-    return mean, runs
-
-
 def _first_noise(data: Preprocessed) -> Float[np.ndarray, " n"]:
     """The noise of each coordinate that the smoother estimates, at least 1e-6 of the states."""
     noise = np.where(np.isfinite(data.noise), data.noise, data.scale)
@@ -343,7 +209,7 @@ def _result(
     first: End,
     given_process: np.ndarray | None,
     is_noise_given: bool,
-    again: LearnAgain,
+    again: Callable[[Runs], Learned],
 ) -> Learned:
     """The result; warns where it must.
 
@@ -438,106 +304,3 @@ def _field(expansion: Expansion, regularization: Float[Array, ""]) -> Any:
         mean=None,
     )
     return learned_field(field, expansion.mean)
-
-
-def _check_types(K: Any, runs: Any, mean: Any, noise: Any) -> None:
-    """Refuse traced arguments, arrays in place of runs, and arguments in another order."""
-    require.no_tracers("hk.learn", "Call it outside; hk.fit works inside.", K, runs, mean, noise)
-    if not isinstance(runs, Runs):
-        raise TypeError(
-            "learn takes hk.Runs(times, states) after the kernel, hk.learn(K, runs); got "
-            f"{type(K).__name__} and {type(runs).__name__}. For states with velocities take hk.fit "
-            "or hk.tune."
-        )
-    if mean is not None and not callable(mean):
-        raise TypeError(
-            f"mean is a {type(mean).__name__}; a callable x (n,) -> (n,) is needed, such as "
-            "hk.kinetic(mass)."
-        )
-
-
-def _check(
-    K: AbstractMatrixKernel, runs: Any, noise: Any, process_noise: Any, solver: Any
-) -> tuple[AbstractMatrixKernel, np.ndarray | None, np.ndarray | None]:
-    """The kernel with its number of inputs, and both noises of the caller, (n,) or None."""
-    if not (solver is None or isinstance(solver, Nystrom)):
-        raise TypeError(f"the solver of learn is hk.Nystrom(max_points=…) or None; got {solver!r}.")
-    n = runs.dimension
-    extra = runs.inputs if runs.parameters is None else runs.parameters
-    if K.takes_inputs and extra is not None:
-        # This refuses the one in the place of the other.
-        inputs_or_parameters(runs.inputs, runs.parameters, K)
-    if K.takes_inputs and extra is None:
-        needed = {
-            "inputs": "what was applied: hk.Runs(times, states, inputs), for each run u at its "
-            "times, shape (T, m).",
-            "parameters": "to know of which system each run is: hk.Runs(times, states, "
-            "parameters=[(0.5,), (0.8,), …]), for each run θ of shape (p,).",
-        }
-        raise TypeError(f"a {type(K).__name__} kernel needs {needed[K.input_name]}")
-    if runs.parameters is not None and not K.takes_inputs:
-        raise TypeError(
-            f"the runs have parameters and {type(K).__name__} takes none: say how systems are "
-            "alike, hk.Family(K, hk.Gaussian(1.0)), or leave parameters out of Runs."
-        )
-    if runs.inputs is not None and not K.takes_inputs:
-        raise TypeError(
-            f"the runs have inputs and {type(K).__name__} takes none: say how they act, "
-            "hk.Controlled(K, inputs=hk.InputMatrix(1.0, acts_on=(1,))). To ignore what was applied"
-            ", leave inputs out of Runs."
-        )
-    if extra is None:
-        K.check_dimension(n)
-    else:
-        U = jnp.concatenate([jnp.atleast_2d(u) for u in extra])
-        K, _ = sampled_points(K, jnp.zeros((len(U), n), U.dtype), U)
-    if jax.dtypes.canonicalize_dtype(float) != jnp.float64:
-        raise ValueError(
-            "learn needs doubles, since paths and their tangents are compared over many steps: "
-            "jax.config.update('jax_enable_x64', True) first."
-        )
-    return K, *_noises(noise, process_noise, n)
-
-
-def _noises(
-    noise: Any, process_noise: Any, n: int
-) -> tuple[Float[np.ndarray, " n"] | None, Float[np.ndarray, " n"] | None]:
-    """Both noises of each coordinate; None where the caller gave none."""
-    sigma = process = None
-    if noise is not None:
-        sigma = _per_coordinate(
-            require.positive(noise, "noise", "Leave it out to have it found from the runs."),
-            n,
-            "noise",
-        )
-    if process_noise is not None:
-        process = _per_coordinate(
-            require.floating(process_noise, "process_noise"), n, "process_noise"
-        )
-        if not (np.isfinite(process).all() and (process >= 0).all()):
-            raise ValueError(
-                f"process_noise must be 0 or more, got {process_noise}: 0 where the structure is "
-                "the whole truth, None to have it found."
-            )
-    return sigma, process
-
-
-def _per_coordinate(value: Any, n: int, name: str) -> Float[np.ndarray, " n"]:
-    value = np.asarray(value, float)
-    if value.shape not in ((), (n,)):
-        raise ValueError(f"{name} has shape {value.shape}; a number or shape ({n},) is needed.")
-    return np.broadcast_to(value, (n,))
-
-
-def _unknown_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
-    """K for states (q, q̇) of n coordinates, all masses equal at first."""
-    if n == 2:
-        raise ValueError(
-            "masses=True with one degree of freedom: every mass explains the same motion and is "
-            "only a unit of the energy, so there is nothing to find. Leave it out; (q, q̇) is "
-            "(q, p) of a mass of one."
-        )
-    inner = K.state_kernel
-    return K.with_states(
-        inner if isinstance(inner, UnknownMasses) else UnknownMasses(inner, jnp.ones(n // 2))
-    )

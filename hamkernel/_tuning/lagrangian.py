@@ -89,9 +89,14 @@ def likeliest(
     is_amplitude = np.array([n.endswith(".scale") for n in names])
     middle = (low + high)[: len(leaves)] / 2
     if deviation is None:
-        longer = leaves + np.where(is_length, np.log(3.0), 0.0)
-        kernels = [leaves, longer]
+        lengths = np.where(is_length, 1.0, 0.0)
+        kernels = [leaves, leaves + np.log(3.0) * lengths]
         kernels += [np.where(is_amplitude, middle, k) for k in kernels]
+        # Harmonics of rigid bodies are long kernels with the slope (2) or the curvature (4) of the
+        # data. Without these two starts the searches for two arms of four, seen for two runs of
+        # 5 s, ended at M = 0.
+        flat = leaves + np.log(10.0) * lengths
+        kernels += [np.where(is_amplitude, middle + k * np.log(10.0), flat) for k in (2, 4)]
         first = [np.full(m, share * sizes.error) for share in (0.3, 0.03, 0.003)]
     else:  # the kernel is good, and the path explains errors that the torques had to
         kernels, first = [leaves], [deviation * share for share in np.geomspace(1, 1e-3, 12)]

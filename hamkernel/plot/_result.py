@@ -20,8 +20,8 @@ from hamkernel.plot._time import fitted, index_of_run
 
 if TYPE_CHECKING:
     from hamkernel._runs.runs import Runs
-    from hamkernel._trajectories.lagrangian import LearnedLagrangian
     from hamkernel._trajectories.learned import Learned
+    from hamkernel._weak.lagrangian import LearnedLagrangian
 
 _STATES = 120  # at which a law is drawn
 _PATH = 400  # states of a path at which deviations are drawn

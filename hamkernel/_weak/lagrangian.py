@@ -13,16 +13,6 @@ from hamkernel import _require as require
 from hamkernel._fields.lagrangian import LagrangianField, lagrangian_field
 from hamkernel._machine import compiled_by_size, precise_jit
 from hamkernel._runs.runs import Runs
-from hamkernel._runs.weak import (
-    Channels,
-    Pieces,
-    factors,
-    log_scale,
-    path_covariance,
-    smoothed_pieces,
-    weak_rows,
-    whiten,
-)
 from hamkernel._show import Shown, text
 from hamkernel._solvers.lagrangian import (
     check_machine,
@@ -40,6 +30,16 @@ from hamkernel._structures.lagrangian import (
 from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics
 from hamkernel._trajectories.learned import learned_from
 from hamkernel._tuning.lagrangian import Sizes, likeliest, torque_size
+from hamkernel._weak.rows import (
+    Channels,
+    Pieces,
+    factors,
+    log_scale,
+    path_covariance,
+    smoothed_pieces,
+    weak_rows,
+    whiten,
+)
 
 
 class LearnedLagrangian(Shown, eqx.Module):

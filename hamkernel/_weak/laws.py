@@ -1,6 +1,6 @@
 """Laws that many parts share, learned from noisy runs by two solves with weak rows.
 
-Of each coordinate whose velocity the laws change there is a row for each window, see `weak.py`. The
+Of each coordinate whose velocity the laws change there is a row for each window, see `rows.py`. The
 unknowns are the weights of the features of the laws, few in a system of any size, so that a solve
 is linear in the number of coordinates. Kernel and scatter maximise the likelihood.
 """
@@ -24,15 +24,6 @@ from hamkernel._machine import precise_jit
 from hamkernel._observations.kinds import Functionals
 from hamkernel._posterior import condition
 from hamkernel._runs.runs import Runs
-from hamkernel._runs.weak import (
-    Channels,
-    Pieces,
-    factors,
-    path_covariance,
-    smoothed_pieces,
-    weak_rows,
-    whiten,
-)
 from hamkernel._solvers.lagrangian import ridge_solution
 from hamkernel._solvers.triangle import columns_used, regression_loss
 from hamkernel._structures.base import AbstractMatrixKernel
@@ -45,6 +36,15 @@ from hamkernel._trajectories.learned import Iteration, Learned, misfits
 from hamkernel._trajectories.whiteness import Whiteness
 from hamkernel._tuning.minimiser import best_in_box, inside_box
 from hamkernel._tuning.space import hyperparameters
+from hamkernel._weak.rows import (
+    Channels,
+    Pieces,
+    factors,
+    path_covariance,
+    smoothed_pieces,
+    weak_rows,
+    whiten,
+)
 
 _SEARCHED = 4_000_000  # states times parts times centres of a loss: .1 s
 # In lengthscales. With windows of 1.0 a run of six particles on springs, of four lengthscales, has
