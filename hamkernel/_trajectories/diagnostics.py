@@ -318,8 +318,8 @@ def _whiteness(fit: FitQuality) -> Diagnostic:
     white, c = fit.white, int(np.argmax(np.abs(fit.white.neighbours)))
     passes = not white.is_refuted
     causes = "what the process noise stands for, which is a force and not white"
-    is_small_force = fit.is_disturbed and fit.share < _SMALL and fit.free_run < FOLLOWED
-    if not fit.is_disturbed:
+    is_small_force = 0 < fit.share < _SMALL and fit.free_run < FOLLOWED
+    if fit.share == 0:
         causes = missing_force(fit)
     if fit.between:
         causes = f"inputs go on otherwise, between='{fit.between}' is likelier; {causes}"

@@ -259,7 +259,7 @@ def fitted(
     flow of the field joins the states, also across gaps. On the right are the residuals
     (measured − fitted)/σ; about one in twenty lies outside the grey band of ±2. A wave in the
     residuals means that the structure misses part of the motion; a single outlier means that the
-    sample is wrong. A coordinate that was never measured has no residuals.
+    sample is wrong. A coordinate that was never measured has no panel on the right.
 
     Args:
         learned: the result of `hk.learn`.
@@ -295,15 +295,17 @@ def fitted(
         left.plot(grid, path[:, c], color=BLUE, linewidth=1.4, label="fitted")
         _draw_samples(left, learned.runs, run, c)
         _set_time_axis(left, ts, labels[c])
+        if not np.isfinite(misfit[c]):
+            right.set_axis_off()
+            continue
         right.axhspan(-_SIGMAS, _SIGMAS, color="0.9", linewidth=0)
         right.axhline(0.0, color="0.6", linewidth=0.8)
         right.plot(ts, residuals[:, c], "o", color=COLORS["true"], ms=3, clip_on=False)
         _set_time_axis(right, ts, r"residual / $\sigma$")
+        far = max(1.6 * _SIGMAS, 1.1 * np.nanmax(np.abs(residuals[:, c])))
+        right.set_ylim(-far, far)
         size = f"root mean square {misfit[c]:.2f}, grey: ±{_SIGMAS:g}"
-        right.set_title(size if np.isfinite(misfit[c]) else "never measured", fontsize="small")
-        if np.isfinite(misfit[c]):
-            far = max(1.6 * _SIGMAS, 1.1 * np.nanmax(np.abs(residuals[:, c])))
-            right.set_ylim(-far, far)
+        right.set_title(size, fontsize="small")
     if title is None:
         title = f"run {run}, {100 * float(learned.kept[run]):.0f} % of it used"
     _set_titles(panels[:, 0], title, time_unit)
