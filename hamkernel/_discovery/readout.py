@@ -114,8 +114,8 @@ def readout(
     if misfit > 2.0:  # three quarters of the residuals are then not noise
         require.warn(
             f"the formula leaves {misfit:.3g} times the noise of the fit. Likely causes: a term is "
-            f"missing from the dictionary; more than {limit} terms are needed (most=…); the "
-            "regularization λ was not tuned and is too small, since Nλ is the variance of the noise."
+            f"missing from the dictionary; more than {limit} terms are needed (most=…); λ was not "
+            "tuned and is too small, since Nλ is the variance of the noise."
         )
     dtype = rows.targets.dtype
     return Formula(
