@@ -301,6 +301,8 @@ _ROOMS = tuple(
         "_tuning.tune",
         "_runs.",
         "_trajectories.",
+        "_weak.",
+        "_learn",
         "systems.",
     )
 )
