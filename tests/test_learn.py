@@ -330,6 +330,7 @@ def test_runs_of_other_lengths_do_not_compile_anew(learned, caplog):
     assert field_error(found.field, true) < 0.06
 
 
+@pytest.mark.slow
 def test_one_row_that_is_no_measurement_spoils_no_field():
     times, states, true = logs()
     states[1][20] = -9999.0

@@ -38,6 +38,7 @@ def learned(friction=0.0):
         return hk.learn(K, logs(friction, 0), progress=False)
 
 
+@pytest.mark.slow
 def test_a_free_run_is_scipys_from_scipys_start():
     field, runs, first = learned().field, logs(0.0, 1, count=1), 8
     score = learned().score(runs, first=first)

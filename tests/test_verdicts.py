@@ -68,7 +68,7 @@ def test_a_good_log_is_silent_and_usable():
     np.testing.assert_allclose(learned.noise, 0.02, rtol=0.2)
 
 
-@pytest.mark.slow  # but for one like it in test_learn.py
+@pytest.mark.slow
 @pytest.mark.parametrize("value", [-9999.0, 1e6])
 def test_one_row_that_is_no_measurement_is_named_and_spoils_no_field(value):
     times, states = pendulum()
