@@ -134,6 +134,12 @@ def test_columns_are_read_by_name_and_what_is_wrong_is_named(tmp_path):
     file.write_text("", encoding="utf-8")
     with pytest.raises(ValueError, match="no column 'q'; it is empty"):
         columns(file, ["q"])
+    file.write_text("0,1\n1,2\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="no column 'q'; the first line must have the names"):
+        columns(file, ["q"])
+    file.write_text("t,q,q\n0,1,2\n", encoding="utf-8")
+    with pytest.raises(ValueError, match="has 2 columns named 'q'"):
+        columns(file, ["t", "q"])
     file.write_text("<" * 200_000, encoding="utf-8")
     with pytest.raises(ValueError, match="is no CSV file: field larger"):
         columns(file, ["q"])

@@ -86,9 +86,9 @@ def test_a_score_without_runs_holds_out_the_last_fifth():
     assert float(jnp.max(score.rmse / score.scale)) < 0.05
 
 
-def of_errors(own, still, linear, lead=9.0):
-    t = jnp.arange(4.0)
-    errors = jnp.array([[np.nan], [0.1], [0.2], [0.4]])
+def of_errors(own, still, linear, lead=9.0, count=12):
+    t = jnp.arange(float(count))
+    errors = jnp.array([[np.nan], [0.1], [0.2]] + [[0.4]] * (count - 3))
     own, still, linear = (jnp.array([each]) for each in (own, still, linear))
     return Score(
         rmse=own,
@@ -120,6 +120,11 @@ def test_the_verdict_is_one_sentence(own, still, linear, said):
     assert "last sample stays" in repr(score)
 
 
+def test_a_few_numbers_are_no_verdict():
+    assert "compared with 9 numbers, too few" in of_errors(0.1, 1.0, 0.7, count=10).text
+    assert "too few" not in of_errors(0.1, 1.0, 0.7, count=11).text
+
+
 def test_a_difference_within_its_error_is_no_verdict():
     rng = np.random.default_rng(0)
     noise, shift = rng.normal(size=(3, 40, 2)), 0.1 * rng.normal(size=(3, 40, 2))
@@ -131,7 +136,7 @@ def test_a_difference_within_its_error_is_no_verdict():
 def test_the_horizon_ends_before_the_first_larger_error():
     score = of_errors(0.1, 1.0, 0.7)
     times = [float(score.horizon(bound)[0]) for bound in (0.05, 0.15, 0.3, 1.0)]
-    assert times == [0.0, 1.0, 2.0, 3.0]
+    assert times == [0.0, 1.0, 2.0, 11.0]
     with pytest.raises(ValueError, match="positive"):
         score.horizon(-1.0)
 

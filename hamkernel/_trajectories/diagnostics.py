@@ -159,6 +159,7 @@ def diagnostics(
         _samples_per_swing(fit),
         _timing(fit),
         _curve(fit),
+        orbits(K, len(fit.kept), len(fit.scale)),
         lengthscales(K, fit.scale, fit.names),
         rest_speed(K, X, len(fit.scale)),
     ]
@@ -508,6 +509,25 @@ def _curve(fit: FitQuality) -> Diagnostic | None:
         "like this, such as heat or a capacitor that discharges, and has no Hamiltonian: learn the "
         "rate of the position alone, hk.learn(hk.CurlFree(k), runs) with n = 1.",
         decides=True,
+    )
+
+
+def orbits(K: AbstractMatrixKernel, runs: int, n: int) -> Diagnostic | None:
+    """What one run says of a conservative field in the plane: the field along one level of H.
+
+    The kernel is the only source of the field at other energies. It is not if H is a sum of
+    functions of q and of p, since one orbit passes all smaller values of both.
+    """
+    seen = [support for k in K.scalar_kernels for support in k.supports(n)]
+    if n != 2 or runs > 1 or K.takes_inputs or not K.conserves or max(map(len, seen)) < 2:
+        return None
+    return Diagnostic(
+        "orbits",
+        "one",
+        "",
+        True,
+        "one run is one orbit; elsewhere the field and its bands rest on the kernel",
+        "Log runs from other starts.",
     )
 
 

@@ -143,6 +143,7 @@ class Learned(Shown, eqx.Module):
             ("process noise", text(self.process_noise) if noisy else "none"),
         ]
         rows += [(name, table[name].value) for name in ("iterations", "free run") if name in table]
+        rows += [("orbits", table["orbits"].meaning)] if "orbits" in table else []
         short = [f"{name}: {table[name].meaning}" for name in self.diagnostics.failing]
         rows += [("falls short", line) for line in short or ["nothing"]]
         rows.append(("next", ".plot(), .score(), .diagnostics, hk.simulate(learned.field, x0, ts)"))

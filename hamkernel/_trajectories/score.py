@@ -21,6 +21,7 @@ from hamkernel._show import Shown
 from hamkernel._show import text as number
 from hamkernel._trajectories.free_run import Stretches, pad_stretches, predictions
 
+_FEW = 10  # numbers, from which a standard deviation is known to a fifth
 _STEPS = 12  # of Levenberg and Marquardt; starts at smoothed states usually need 4
 
 
@@ -67,6 +68,12 @@ class Score(Shown, eqx.Module):
             float(jnp.sqrt(jnp.nanmean((rmse / self.scale) ** 2)))
             for rmse in (self.rmse, self.persistence, self.linear)
         )
+        count = sum(int((~jnp.isnan(e)).sum()) for e in self.errors)
+        if count < _FEW:
+            return (
+                f"was compared with {count} numbers, too few to judge it: off by "
+                f"{number(self.rmse)}, a linear model by {number(self.linear)}"
+            )
         if not error < still:
             return (
                 f"is worse than saying that nothing moves: off by {number(self.rmse)}, where the "

@@ -89,7 +89,11 @@ class Tuned(Shown, eqx.Module):
 
     @property
     def noise_variance(self) -> Float[Array, ""]:
-        """Nλ, the variance of the noise of a row of relative noise 1, in squared units of Y."""
+        """Nλ, the variance of the noise of a row of relative noise 1.
+
+        It is in squared units of Y if the kernel has an amplitude that `tune` found, as
+        `1.0 * hk.Gaussian(1.0)`; without one, in units of the field of a kernel of amplitude 1.
+        """
         if self.problem is None:
             return self.regularization * len(cast(Any, self.field).residual)
         return self.problem.ridge
@@ -122,8 +126,12 @@ class Tuned(Shown, eqx.Module):
         rows = [
             ("kernel", text(self.kernel)),
             ("found", values),
-            ("noise", f"{text(jnp.sqrt(self.noise_variance))} of a row, the root of N lambda"),
         ]
+        # Without an amplitude in the kernel, N lambda is in units of the field's own size.
+        if self.problem is None or all(k.has_amplitude for k in self.kernel.scalar_kernels):
+            rows.append(
+                ("noise", f"{text(jnp.sqrt(self.noise_variance))} of a row, the root of N lambda")
+            )
         if self.at_bounds:
             rows.append(
                 ("at bounds", f"{', '.join(self.at_bounds)}: the data prefer values beyond")
