@@ -203,6 +203,34 @@ def test_correlated_errors_of_sensors_are_no_missing_force():
     assert learned.diagnostics["missing force"].passes
 
 
+def double_pendulum():
+    """Five runs of 4 s, with angles of .5 rad and momenta of 3 N m s, by SciPy."""
+    rng, t, g = np.random.default_rng(3), 0.04 * np.arange(101), 9.81
+
+    def rates(_, x):
+        (q, p), c = (x[:2], x[2:]), np.cos(x[0] - x[1])
+        v = np.linalg.solve([[2.0, c], [c, 1.0]], p)
+        s = -v[0] * v[1] * np.sin(x[0] - x[1])
+        return [*v, -2 * g * np.sin(q[0]) + s, -g * np.sin(q[1]) - s]
+
+    states, noise = [], np.array([0.005, 0.005, 0.02, 0.02])
+    for _ in range(5):
+        x0 = np.append(rng.uniform(-1.2, 1.2, 2), np.zeros(2))
+        path = solve_ivp(rates, (0, 4), x0, t_eval=t, rtol=1e-9, atol=1e-9).y.T
+        states.append(path + noise * rng.standard_normal(path.shape))
+    return hk.Runs([t] * 5, states)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("lengthscale", "is_named"), [(2.0, True), ([1.5, 1.5, 5.0, 5.0], False)])
+def test_a_lengthscale_for_each_coordinate_is_asked_for(lengthscale, is_named):
+    K = hk.Odd(hk.Symplectic(hk.Gaussian(lengthscale)))
+    learned, heard = learn_and_listen(K, double_pendulum())
+    assert len(heard) == is_named
+    assert ("whiteness" in learned.diagnostics.failing) == is_named
+    assert ("one lengthscale" in learned.diagnostics["whiteness"].advice) == is_named
+
+
 def test_a_sentence_of_the_table_has_the_name_of_the_column():
     fit = SimpleNamespace(names=("angle", "speed"), noise=np.array([0.1, 0.9]), scale=np.ones(2))
     row = _noise_against_motion(fit)
