@@ -519,13 +519,14 @@ def _curve(fit: FitQuality) -> Diagnostic | None:
 
 
 def orbits(K: AbstractMatrixKernel, runs: int, n: int) -> Diagnostic | None:
-    """What one run says of a conservative field in the plane: the field along one level of H.
+    """Whether the data are one orbit: one run of a conservative field in the plane.
 
-    The kernel is the only source of the field at other energies. It is not if H is a sum of
-    functions of q and of p, since one orbit passes all smaller values of both.
+    One run determines the field along one level of H, and the kernel alone says how it goes on at
+    other energies. If H is a sum of functions of q and of p, one run determines H for all smaller
+    values of both.
     """
-    seen = [support for k in K.scalar_kernels for support in k.supports(n)]
-    if n != 2 or runs > 1 or K.takes_inputs or not K.conserves or max(map(len, seen)) < 2:
+    supports = [support for k in K.scalar_kernels for support in k.supports(n)]
+    if n != 2 or runs > 1 or K.takes_inputs or not K.conserves or max(map(len, supports)) < 2:
         return None
     return Diagnostic(
         "orbits",
