@@ -201,6 +201,16 @@ def text(value: Any) -> str:
     return repr(value) if name is None else name
 
 
+def numbers(value: Any) -> str:
+    """`text` of one number for each coordinate; of more than 16 coordinates the range alone."""
+    if not (eqx.is_array(value) and np.ndim(value) == 1 and np.size(value) > 16):
+        return text(value)
+    if not _is_short(value[:16]):  # while JAX traces, or on other machines
+        return text(value)
+    low, high = (_number(float(end(np.asarray(value)))) for end in (np.nanmin, np.nanmax))
+    return f"{low} to {high} in {np.size(value)} coordinates"
+
+
 def has_arrays(tree: Any) -> bool:
     """Whether all leaves are arrays, rather than None or bool as `jax.tree.map` may leave them."""
     return all(map(eqx.is_array, jax.tree.leaves(tree, is_leaf=lambda leaf: leaf is None)))

@@ -2,6 +2,7 @@
 
 # pyright: reportArgumentType=false
 
+import dataclasses
 import functools
 import warnings
 
@@ -120,6 +121,21 @@ def test_the_verdict_is_one_sentence(own, still, linear, said):
     assert "last sample stays" in repr(score)
 
 
+def test_noise_of_one_sensor_does_not_hide_another_coordinate():
+    score = of_errors(0.1, 1.0, 0.7)
+    errors = {"rmse": [0.01, 1.9], "linear": [0.4, 2.4], "persistence": [0.5, 3.5]}
+    errors = {name: jnp.array(values) for name, values in errors.items()}
+    both = dataclasses.replace(score, scale=jnp.ones(2), **errors)
+    assert both.text.endswith("1.28 times better than a linear model, and 40 times in coordinate 0")
+
+
+def test_many_coordinates_are_printed_as_a_range():
+    score = of_errors(0.1, 1.0, 0.7)
+    rmse = jnp.linspace(0.1, 0.5, 20)
+    more = dict.fromkeys(("linear", "persistence", "scale"), jnp.ones(20))
+    assert "0.1 to 0.5 in 20 coordinates" in repr(dataclasses.replace(score, rmse=rmse, **more))
+
+
 def test_a_few_numbers_are_no_verdict():
     assert "compared with 9 numbers, too few" in of_errors(0.1, 1.0, 0.7, count=10).text
     assert "too few" not in of_errors(0.1, 1.0, 0.7, count=11).text
@@ -130,7 +146,9 @@ def test_a_difference_within_its_error_is_no_verdict():
     noise, shift = rng.normal(size=(3, 40, 2)), 0.1 * rng.normal(size=(3, 40, 2))
     assert abs(_lead(noise**2, (noise + 0.1 * shift) ** 2)) < 2
     assert _lead(noise**2, (noise + 2.0) ** 2) > 2
-    assert "as closely as a linear model ([0.9] for [0.7])" in of_errors(0.9, 2.0, 0.7, 1.0).text
+    assert (
+        "do not tell it from a linear model ([0.9] for [0.7])" in of_errors(0.9, 2.0, 0.7, 1.0).text
+    )
 
 
 def test_the_horizon_ends_before_the_first_larger_error():

@@ -18,7 +18,7 @@ from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._posterior import Posterior, condition
 from hamkernel._runs.runs import Runs
 from hamkernel._runs.table import Diagnostics
-from hamkernel._show import Shown, describe, has_arrays, text
+from hamkernel._show import Shown, describe, has_arrays, numbers, text
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel
 from hamkernel._structures.friction import Friction, damped_coordinates
@@ -139,8 +139,8 @@ class Learned(Shown, eqx.Module):
         rows = [
             ("kernel", text(self.kernel)),
             *(_coefficients(self.field, self.runs.coordinate_names) if is_known else ()),
-            ("noise", text(self.noise)),
-            ("process noise", text(self.process_noise) if noisy else "none"),
+            ("noise", numbers(self.noise)),
+            ("process noise", numbers(self.process_noise) if noisy else "none"),
         ]
         rows += [(name, table[name].value) for name in ("iterations", "free run") if name in table]
         rows += [("orbits", table["orbits"].meaning)] if "orbits" in table else []

@@ -18,7 +18,7 @@ from hamkernel._runs.flow import integrate, steps_for, stiffness
 from hamkernel._runs.preprocessing import preprocess, sample_points
 from hamkernel._runs.runs import Runs
 from hamkernel._show import Shown
-from hamkernel._show import text as number
+from hamkernel._show import numbers as number
 from hamkernel._trajectories.free_run import Stretches, pad_stretches, predictions
 
 _FEW = 10  # numbers, from which a standard deviation is known to a fifth
@@ -81,15 +81,20 @@ class Score(Shown, eqx.Module):
             )
         if abs(float(self.lead)) < 2:
             return (
-                f"follows the runs as closely as a linear model ({number(self.rmse)} for "
-                f"{number(self.linear)})"
+                "follows the runs, and these samples do not tell it from a linear model "
+                f"({number(self.rmse)} for {number(self.linear)})"
             )
         if not error < linear:
             return f"is worse than a linear model ({number(self.rmse)} for {number(self.linear)})"
         if not np.isfinite(linear):
             return f"follows the runs to {number(self.rmse)}; a linear model leaves every bound"
-        return (
-            f"follows the runs {linear / max(error, 1e-300):.3g} times better than a linear model"
+        ratio = linear / max(error, 1e-300)
+        by_coordinate = np.asarray(self.linear) / np.maximum(np.asarray(self.rmse), 1e-300)
+        best = int(np.nanargmax(by_coordinate))
+        # Noise of one sensor may hide how well another coordinate is predicted.
+        more = f", and {by_coordinate[best]:.3g} times in coordinate {best}"
+        return f"follows the runs {ratio:.3g} times better than a linear model" + (
+            more if by_coordinate[best] > 3 * ratio else ""
         )
 
     def horizon(self, error: ArrayLike) -> Float[Array, " R"]:
