@@ -95,8 +95,12 @@ def columns(path: str, names: list[str]) -> Float[np.ndarray, "T k"]:
         widest = max(widest, *headers, [], key=lambda row: sum(x[:1].isalpha() for x in row))
     else:
         missing = next((name for name in names if name not in widest), names[0])
-        said = "the first line must have the names of columns" if text.strip() else "it is empty"
-        said = f"its columns are {', '.join(widest)}" if widest else said
+        if widest:
+            said = f"its columns are {', '.join(widest)}"
+        else:
+            said = (
+                "the first line must have the names of columns" if text.strip() else "it is empty"
+            )
         raise ValueError(f"{path} has no column {missing!r}; {said}.")
     header = headers[first]
     if twice := [name for name in names if header.count(name) > 1]:

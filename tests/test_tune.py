@@ -1,5 +1,6 @@
 """`tune`: what it trains, keeps, reports and refuses; losses against explicit refits in NumPy."""
 
+import dataclasses
 import functools
 import warnings
 from typing import Any
@@ -87,6 +88,13 @@ SIMPLE = hk.Symplectic(hk.Gaussian(1.0))
 def simple():
     """The plainest kernel with everything by default, on `scattered()`."""
     return hk.tune(SIMPLE, *scattered())
+
+
+def test_noise_is_printed_only_beside_an_amplitude(simple):
+    """Without an amplitude the root of N lambda is not in units of Y."""
+    assert "N lambda" not in repr(simple)
+    scaled = dataclasses.replace(simple, kernel=hk.Symplectic(1.0 * hk.Gaussian(1.0)))
+    assert "of a row, the root of N lambda" in repr(scaled)
 
 
 @pytest.fixture(scope="module")

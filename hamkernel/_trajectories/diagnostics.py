@@ -45,7 +45,7 @@ _SMALL = 0.03
 # pendulum, with angles of .5 and momenta of 3: log p rises by 576 and the field error falls from 7
 # to 2 % (`tests/test_verdicts.py`).
 _APART = 3.0
-_FEW = 10  # degrees of freedom, from which σ is known to a fifth
+FEW = 10  # degrees of freedom, from which σ is known to a fifth
 # The share of the forces above which a missing one decides. Friction of the share s takes 2πs of
 # the energy of an oscillator in each swing: a tenth.
 _LOSSY = 0.1 / (2 * np.pi)
@@ -273,11 +273,11 @@ def _outliers(fit: FitQuality) -> Diagnostic | None:
 
 def degrees_of_freedom(fit: FitQuality) -> Diagnostic:
     """Whether there is enough to find the noise from: σ is known to 1/√(2ν)."""
-    few = not fit.is_noise_known and fit.remaining < _FEW
+    few = not fit.is_noise_known and fit.remaining < FEW
     return Diagnostic(
         "degrees of freedom",
         f"{max(fit.remaining, 0.0):.1f}",
-        f"{_FEW}",
+        f"{FEW}",
         not few,
         f"the runs leave {max(fit.remaining, 0.0):.1f} degrees of freedom"
         + (": noise and field are a guess" if few else ""),
@@ -526,7 +526,8 @@ def orbits(K: AbstractMatrixKernel, runs: int, n: int) -> Diagnostic | None:
     values of both.
     """
     supports = [support for k in K.scalar_kernels for support in k.supports(n)]
-    if n != 2 or runs > 1 or K.takes_inputs or not K.conserves or max(map(len, supports)) < 2:
+    sees_both = any(len(support) > 1 for support in supports)
+    if n != 2 or runs > 1 or K.takes_inputs or not (K.conserves and sees_both):
         return None
     return Diagnostic(
         "orbits",

@@ -19,9 +19,9 @@ from hamkernel._runs.preprocessing import preprocess, sample_points
 from hamkernel._runs.runs import Runs
 from hamkernel._show import Shown
 from hamkernel._show import numbers as number
+from hamkernel._trajectories.diagnostics import FEW
 from hamkernel._trajectories.free_run import Stretches, pad_stretches, predictions
 
-_FEW = 10  # numbers, from which a standard deviation is known to a fifth
 _STEPS = 12  # of Levenberg and Marquardt; starts at smoothed states usually need 4
 
 
@@ -69,7 +69,7 @@ class Score(Shown, eqx.Module):
             for rmse in (self.rmse, self.persistence, self.linear)
         )
         count = sum(int((~jnp.isnan(e)).sum()) for e in self.errors)
-        if count < _FEW:
+        if count < FEW:
             return (
                 f"was compared with {count} numbers, too few to judge it: off by "
                 f"{number(self.rmse)}, a linear model by {number(self.linear)}"
