@@ -48,13 +48,13 @@ from hamkernel._fields.joined import AbstractJoinedField
 from hamkernel._fields.lagrangian import LagrangianField
 from hamkernel._kernels.functions import Bound, Closure, as_pytree
 from hamkernel._kernels.symmetry import identity, reflection, time_reversal
+from hamkernel._learned.result import Learned
 from hamkernel._observations.measurements import Measurements
 from hamkernel._posterior import Posterior
 from hamkernel._runs.table import Diagnostic, Diagnostics
 from hamkernel._solvers.problem import Problem
 from hamkernel._solvers.stream import AbstractStreamingFit
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.model import Model
 from hamkernel._trajectories.segments import LinearisedSegments
 from hamkernel._tuning.tune import Tuned
@@ -300,6 +300,7 @@ _ROOMS = tuple(
         "_posterior",
         "_tuning.tune",
         "_runs.",
+        "_learned.",
         "_trajectories.",
         "_weak.",
         "_learn",

@@ -40,13 +40,13 @@ from hamkernel._fields.joined import fix_inputs, known_of
 from hamkernel._gram import gram_of_rows
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._kernels.symmetry import symmetry_removed
+from hamkernel._learned.result import Learned
 from hamkernel._machine import full_precision
 from hamkernel._posterior import Posterior
 from hamkernel._solvers.problem import make_problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import CurlFree
-from hamkernel._trajectories.learned import Learned
 
 # The largest relative difference of a function and its image under a symmetry, above rounding
 # errors and below a wrong sign.

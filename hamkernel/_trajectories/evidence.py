@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hamkernel._learned.result import AbstractEvidence
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import complete
 from hamkernel._trajectories.likelihood import closed_form
@@ -25,7 +25,7 @@ _RANGE = np.log(1e4)
 _STEPS = 25  # of BFGS, as in each iteration of learning
 
 
-class Evidence(eqx.Module):
+class Evidence(AbstractEvidence):
     """The rows along the paths that were learned, with the model under which they are likeliest.
 
     Attributes:
@@ -46,7 +46,6 @@ class Evidence(eqx.Module):
 
     @property
     def log_p(self) -> float:
-        """The log marginal likelihood of the rows, up to a constant that no kernel changes."""
         return -self._loss(self.model)
 
     def gain(self, part: AbstractMatrixKernel) -> float:
@@ -77,20 +76,3 @@ class Evidence(eqx.Module):
 
     def _loss(self, model: Model) -> float:
         return float(closed_form(model, self.points, self.rows, self.start_deviation).loss)
-
-
-class EvidenceOfRows(eqx.Module):
-    """The evidence of weak rows, see `laws.py`.
-
-    Attributes:
-        log_p: the log marginal likelihood of the rows, up to a constant that no kernel changes.
-    """
-
-    log_p: float
-
-    def gain(self, part: AbstractMatrixKernel) -> float:
-        raise TypeError(
-            "gain compares fields along iterated paths, and laws that many parts share are learned "
-            "from weak rows: learn again with the part in the kernel, hk.learn(K + part, runs), "
-            "and compare log_evidence."
-        )

@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from hamkernel._gram_operator import placed_product
 from hamkernel._kernels.built_in import Gaussian
 from hamkernel._kernels.transforms import Select
+from hamkernel._learned.diagnostics import MissingForce
 from hamkernel._machine import compiled_by_size
 from hamkernel._runs.preprocessing import Preprocessed, sample_points
 from hamkernel._solvers.triangle import regression_loss
@@ -301,27 +302,6 @@ def landmark_gain(
         for points, flat in ((S, less[:1]), (exact(part)[0], less))
     )
     return float(few - many), part
-
-
-LARGE_GAIN = 10  # of log p: the odds are e¹⁰ to one
-
-
-class MissingForce(NamedTuple):
-    """A force that the kernel lacks, or may lack.
-
-    Attributes:
-        gain: by how much the force raises log p; 0 where nothing asked.
-        share: the RMS of the force over that of the rates of the momenta, along the runs; 0 where
-            the gain is small.
-    """
-
-    gain: float = 0.0
-    share: float = 0.0
-
-    @property
-    def is_there(self) -> bool:
-        """Whether the gain is large."""
-        return self.gain > LARGE_GAIN
 
 
 def missing_friction(
