@@ -242,7 +242,7 @@ def _evaluable(saved: Any) -> AbstractField:
     field = saved.sum_of_columns() if is_stream else getattr(saved, "field", saved)
     state = jax.ShapeDtypeStruct((field.dimension,), field.offset.dtype)
     if field.offset.shape or jax.eval_shape(_state_function(field), state).shape != state.shape:
-        raise ValueError("its arrays have an axis more than those of one field.")
+        raise ValueError("its arrays have one axis more than the arrays of one field.")
     return field
 
 
@@ -254,8 +254,8 @@ def _probe(field: AbstractField) -> list[list[float]]:
     velocities = np.asarray(jax.vmap(_state_function(field))(jnp.asarray(points)))
     if not np.isfinite(velocities).all():
         raise ValueError(
-            "the field is NaN or infinite at its own points, as one is from a fit that failed with "
-            "throw=False: there is nothing to save."
+            "the field is NaN or infinite at its own points, as after a fit with throw=False that "
+            "failed: there is nothing to save."
         )
     fastest = np.linalg.norm(velocities, axis=1).argmax()  # at an equilibrium all kernels agree
     return [points[fastest].tolist(), velocities[fastest].tolist()]

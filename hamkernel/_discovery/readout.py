@@ -285,7 +285,7 @@ def _check_columns(
     if bad:
         raise ValueError(
             f"{_join_names(bad)} is not finite at some of the states, or has no derivative there: "
-            "leave it out, or write it so that it has."
+            "leave it out, or write it so that both exist there."
         )
     R, D = columns.shape
     if D >= R:

@@ -274,7 +274,7 @@ def _outliers(fit: FitQuality) -> Diagnostic | None:
     c = int(np.nanargmin(core))
     return Diagnostic(
         "outliers",
-        f"{core[c]:.2g} of the noise in the middle half",
+        f"robust deviation {core[c]:.2g} of the noise",
         "0.5",
         bool(core[c] > 0.5),
         "most residuals are as large as the noise that was found"
@@ -338,6 +338,7 @@ def _whiteness(fit: FitQuality, K: AbstractMatrixKernel) -> Diagnostic:
     """Whether the residuals of the prediction are independent from sample to sample."""
     white, c = fit.white, int(np.argmax(np.abs(fit.white.neighbours)))
     passes = not white.is_refuted
+    wider = f", bands {white.widening**0.5:.2g} times wider" if white.widening > 1 else ""
     causes = "what the process noise stands for, which is a force and not white"
     is_small_force = 0 < fit.share < _SMALL and fit.free_run < FOLLOWED
     if fit.share == 0:
@@ -350,8 +351,8 @@ def _whiteness(fit: FitQuality, K: AbstractMatrixKernel) -> Diagnostic:
         causes = f"inputs that act at other times than logged (delay='fit'); {causes}"
     return Diagnostic(
         "whiteness",
-        f"p = {white.probability:.2g}, bands wider by {white.widening**0.5:.2g}",
-        f"p = {FALSE_ALARMS}, or 1.2",
+        f"p = {white.probability:.2g}{wider}",
+        f"p = {FALSE_ALARMS}, or 1.2 times",
         passes,
         f"the innovations are {'' if passes else 'not '}white: the correlation of "
         f"neighbours is {white.neighbours[c]:.2f} in coordinate {fit.names[c]}",
@@ -504,8 +505,8 @@ def _timing(fit: FitQuality) -> Diagnostic | None:
         return None
     return Diagnostic(
         "timing",
-        f"off by {fit.timing.off:.2g}",
-        "a fifth of the variance",
+        f"{fit.timing.share:.0%} of the variance",
+        "20%",
         not fit.timing.is_off,
         "residuals are larger where the states move faster, as if times were off by "
         f"{fit.timing.off:.2g}"
