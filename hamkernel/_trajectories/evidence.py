@@ -14,6 +14,7 @@ from hamkernel._trajectories.model import Model, with_amplitude
 from hamkernel._trajectories.search import (
     LEAST_NOISE,
     Bounds,
+    log_shares_of_noise,
     losses,
     maximise_likelihood,
     search_sample,
@@ -51,8 +52,7 @@ class Evidence(AbstractEvidence):
     def gain(self, part: AbstractMatrixKernel) -> float:
         """The gain in log p from `part` as one more term of the drift.
 
-        We search all hyperparameters again, from their learned values and from a tenth and a
-        hundredth of the noise, since the noise had to explain the effect of `part`.
+        We search all hyperparameters again, from their learned values and from less noise.
         """
         n, K = len(self.scale), self.model.kernel
         part = complete(with_amplitude(part), self.points, n)
@@ -62,8 +62,9 @@ class Evidence(AbstractEvidence):
         free = np.concatenate([np.ones(len(flat) - 2 * n, bool), self.is_free])
         low, high = flat - _RANGE, flat + _RANGE
         low[-2 * n : -n] = np.minimum(flat[-2 * n : -n], np.log(LEAST_NOISE * self.scale))
-        design = np.tile(flat, (3, 1))
-        design[:, -2 * n :] += np.log([[1.0], [0.1], [0.01]]) * self.is_free
+        less = log_shares_of_noise(n) * self.is_free
+        design = np.tile(flat, (len(less), 1))
+        design[:, -2 * n :] += less
         design = np.maximum(design, low)
         points, rows = search_sample(self.points, self.rows)
         values = losses(larger, jnp.asarray(design), points, rows, self.start_deviation)

@@ -304,6 +304,18 @@ def landmark_gain(
     return float(few - many), part
 
 
+def log_shares_of_noise(n: int) -> Float[np.ndarray, "5 k"]:
+    """Logarithms of the shares of sensor and process noise beside which a larger kernel is tried.
+
+    Process noise, or without it sensor noise, had to explain what the smaller kernel cannot.
+
+    Returns:
+        A row for each try, sensor noise first, shape (5, 2n).
+    """
+    shares = [[1.0, 1.0], [1.0, 0.1], [1.0, 0.01], [0.1, 0.1], [0.01, 0.01]]
+    return np.repeat(np.log(shares), n, axis=1)
+
+
 def missing_friction(
     model: Model,
     S,
@@ -313,9 +325,8 @@ def missing_friction(
 ) -> MissingForce:
     """Viscous and dry friction of the momenta beside the drift.
 
-    Kernels stay. Process noise, or without it sensor noise, had to explain what friction would, and
-    may be a tenth or a hundredth with either. Forces as large as all of the motion are as good as
-    free in the closed form. None is missing where the kernel has friction, or is that of a family.
+    Kernels stay. Forces as large as all of the motion are as good as free in the closed form. None
+    is missing where the kernel has friction, or is that of a family.
 
     The gain of four runs of positions of a pendulum, 80 samples each, with viscous friction of .1
     and .03 is 75 and 33 beside the process noise found; with white pushes and no friction −9 to −6.
@@ -427,17 +438,16 @@ def _missing(
 ) -> MissingForce:
     """The force of `more` beside the kernel of states, with less noise if that is likelier.
 
-    Process noise, or without it sensor noise, had to explain what `more` would, and process noise
-    alone may be a tenth or a hundredth. X are points along the runs, Y the velocities there, and
+    X are points along the runs, Y the velocities there, and
     `units` those in which the force is compared with Y.
     """
     K, n = model.kernel, rows.residual.shape[-1]
     S, rows = search_sample(jnp.asarray(S), rows)
-    shares = np.array([[1.0, 1.0], [1.0, 0.1], [1.0, 0.01], [0.1, 0.1], [0.01, 0.01]])
+    less = log_shares_of_noise(n)
 
     def likeliest(model: Model) -> tuple[float, Model]:
-        design = np.tile(np.asarray(model.flat), (len(shares), 1))
-        design[:, -2 * n :] += np.repeat(np.log(shares), n, axis=1)  # sensor noise first
+        design = np.tile(np.asarray(model.flat), (len(less), 1))
+        design[:, -2 * n :] += less
         values = losses(model, design, S, rows, start_deviation)
         return float(values.min()), model.unflatten(design[int(np.argmin(values))])
 
