@@ -20,6 +20,10 @@ from jaxtyping import Array, Float, Int
 from hamkernel import _require as require
 from hamkernel._features import AbstractFeatures, features, is_of_parts
 from hamkernel._fields.kinetic import Kinetic
+from hamkernel._learned.diagnostics import FitQuality, diagnostics_of_rows
+from hamkernel._learned.free_run import Stretches, relative_error, stretches
+from hamkernel._learned.result import AbstractEvidence, Iteration, Learned, misfits
+from hamkernel._learned.whiteness import Whiteness
 from hamkernel._machine import precise_jit
 from hamkernel._observations.kinds import Functionals
 from hamkernel._posterior import condition
@@ -29,11 +33,6 @@ from hamkernel._solvers.triangle import columns_used, regression_loss
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import complete, shared_laws
 from hamkernel._structures.friction import frictions
-from hamkernel._trajectories.diagnostics import FitQuality, diagnostics_of_rows
-from hamkernel._trajectories.evidence import EvidenceOfRows
-from hamkernel._trajectories.free_run import Stretches, relative_error, stretches
-from hamkernel._trajectories.learned import Iteration, Learned, misfits
-from hamkernel._trajectories.whiteness import Whiteness
 from hamkernel._tuning.minimiser import best_in_box, inside_box
 from hamkernel._tuning.space import hyperparameters
 from hamkernel._weak.rows import (
@@ -53,6 +52,23 @@ _WIDTH = 0.5
 _STEPS = 40  # of BFGS
 # Of a force, as a share of it, so that rows of exact samples have a covariance.
 _EXACT = 1e-6
+
+
+class EvidenceOfRows(AbstractEvidence):
+    """The evidence of weak rows: −log p is `loss`, up to a constant."""
+
+    loss: float
+
+    @property
+    def log_p(self) -> float:
+        return -self.loss
+
+    def gain(self, part: AbstractMatrixKernel) -> float:
+        raise TypeError(
+            "gain compares fields along iterated paths, and laws that many parts share are learned "
+            "from weak rows: learn again with the part in the kernel, hk.learn(K + part, runs), "
+            "and compare log_evidence."
+        )
 
 
 class States(eqx.Module):
@@ -380,7 +396,7 @@ def learn_laws(
         runs=runs,
         observations=solution.observations,
         mean=mean,
-        evidence=EvidenceOfRows(-solution.losses[1]),
+        evidence=EvidenceOfRows(solution.losses[1]),
         again=again,
     )
 
