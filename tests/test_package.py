@@ -33,6 +33,7 @@ ROOMS = [
     {"_validation"},
     {"_tuning"},
     {"_runs"},
+    {"_learned"},
     {"_trajectories"},
     {"_weak"},
     {"_learn"},

@@ -10,14 +10,18 @@ where F = G_XS T is applied as a product with the Gram and never stored. If trac
 condition number is at most 1 + τ and the number of iterations does not depend on N.
 """
 
-from collections.abc import Callable
-from typing import ClassVar, NamedTuple
+import contextlib
+import math
+from collections.abc import Callable, Iterator
+from typing import Any, ClassVar, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import lineax as lx
+import numpy as np
 from jax.tree_util import Partial
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from hamkernel import _require as require
 from hamkernel._fields.base import SolverInfo
@@ -103,16 +107,15 @@ class ConjugateGradient(AbstractSolver[KernelField]):
         X, spread = rows.points, row_sharding(rows.points)
         landmarks = self.preconditioner.landmarks(K, rows, problem.regularization)
         limits = self._tolerance(rows.targets.dtype), self.max_iterations
+        is_shown = progress and require.is_concrete(K, rows, ridge)
         prepare: Callable[..., tuple[Products, Array]]
         if problem.states is None:
             prepare, args, y = _prepare_rows, (K, rows, ridge, landmarks), rows.y
         else:
             X, y = (shard(spread, array) for array in problem.states)
             prepare, args = _prepare_velocities, (K, X, ridge, landmarks, spread)
-        if progress and require.is_concrete(K, rows, ridge):
-            result = _solve_with_bar(_prepare(prepare, args), y, ridge, *limits)
-        else:
-            result = _solve(prepare, args, y, ridge, *limits)
+        with _progress_bar(is_shown, self.max_iterations):
+            result = _solve(prepare, args, y, ridge, *limits, is_shown)
         (c, residual, norm), iterations, relative_residual, truncation = result
         info = SolverInfo(
             "ConjugateGradient",
@@ -226,88 +229,61 @@ def _precondition_rows(F, R, c):
     return c - F @ jax.scipy.linalg.cho_solve((R, True), F.T @ c)
 
 
-_prepare = precise_jit(lambda prepare, args: prepare(*args))
+_bars: list[Any] = []  # the progress bars of the running solves; the last one moves
 
 
-class _Iterate(NamedTuple):
-    c: Array
-    residual: Array
-    direction: Array
-    square: Float[Array, ""]  # rᵀM r of the residual, M the preconditioner
-    relative_residual: Float[Array, ""]  # ‖r‖/‖y‖
-    relative_change: Float[Array, ""]  # of c in the last step, over ‖y‖
-    steps: Int[Array, ""]
+@contextlib.contextmanager
+def _progress_bar(is_shown: bool, max_iterations: int) -> Iterator[None]:
+    """Show a progress bar that `_advance` moves until all residuals have been computed."""
+    if not is_shown:
+        yield
+        return
+    from tqdm import tqdm  # so that importing the package does not load it
 
-    def goes_on(self, tolerance, max_iterations) -> Bool[Array, ""]:
-        # Half of the tolerance allows for the rounding errors of the recursion for the residual.
-        error = jnp.maximum(self.relative_residual, self.relative_change)
-        return (error > 0.5 * tolerance) & (self.steps < max_iterations)
-
-
-@precise_jit
-def _first_iterate(products: Products, y) -> _Iterate:
-    z = products.precondition(y)
-    start, none, size = jnp.zeros_like(y), jnp.zeros((), int), relative_error(y, y)
-    return _Iterate(start, y, z, jnp.sum(y * z), size, jnp.zeros_like(size), none)
+    # One more than the iterations: the residual of c = 0 comes first.
+    with tqdm(total=max_iterations + 1, desc="conjugate gradients", disable=None) as bar:
+        _bars.append(bar)
+        try:
+            yield
+            jax.effects_barrier()
+        finally:
+            _bars.remove(bar)
 
 
-@precise_jit
-def _next(products: Products, y, ridge, state: _Iterate) -> _Iterate:
-    p = state.direction
-    image = p + products.gram(p) / ridge
-    step = state.square / jnp.sum(p * image)
-    residual = state.residual - step * image
-    z = products.precondition(residual)
-    square = jnp.sum(residual * z)
-    return _Iterate(
-        c=state.c + step * p,
-        residual=residual,
-        direction=z + square / state.square * p,
-        square=square,
-        relative_residual=relative_error(residual, y),
-        relative_change=relative_error(step * p, y),
-        steps=state.steps + 1,
-    )
+def _advance(relative_residual: Float[np.ndarray, ""]) -> None:
+    for bar in _bars[-1:]:
+        bar.set_postfix_str(f"residual {float(relative_residual):.1e}", refresh=False)
+        bar.update()
 
 
 @precise_jit
-def _solve(prepare, args, y, ridge, tolerance, max_iterations) -> _Solution:
+def _solve(prepare, args, y, ridge, tolerance, max_iterations, progress=False) -> _Solution:
     """The solution of (I + G/ridge) c = y; its derivatives solve with the same system."""
     products, truncation = prepare(*args)
 
-    def solve(_, y):
-        last = jax.lax.while_loop(
-            lambda state: state.goes_on(tolerance, max_iterations),
-            lambda state: _next(products, y, ridge, state),
-            _first_iterate(products, y),
-        )
-        return last.c, last.steps
+    # lineax calls a step singular if pᵀAp ≤ 100 D ε rᵀMr, for D numbers in y and the preconditioner
+    # M. Since A ≥ M⁻¹, the left side is at least rᵀMr, which is too little for D > 84 000 in
+    # float32. A scale s of M changes no iterate; it multiplies the left side by s², the right by s.
+    scale = 2.0 ** math.ceil(math.log2(1 + 200 * y.size * jnp.finfo(y.dtype).eps))
 
-    c, steps = jax.lax.custom_linear_solve(
-        lambda c: c + products.gram(c) / ridge, y, solve, symmetric=True, has_aux=True
-    )
-    return _solution_of(products, truncation, y, ridge, c, steps)
+    def precondition(residual):  # called once for the residual of each iterate
+        if progress:
+            jax.debug.callback(_advance, relative_error(residual, y))
+        return scale * products.precondition(residual)
 
-
-def _solve_with_bar(prepared, y, ridge, tolerance, max_iterations) -> _Solution:
-    """`_solve` outside any trace, with a progress bar; Ctrl-C stops between two iterations."""
-    from tqdm import tqdm  # so that importing the package does not load it
-
-    products, truncation = prepared
-    state = _first_iterate(products, y)
-    with tqdm(total=max_iterations, desc="conjugate gradients", disable=None) as bar:
-        while state.goes_on(tolerance, max_iterations):
-            state = _next(products, y, ridge, state)
-            bar.set_postfix_str(f"residual {float(state.relative_residual):.1e}", refresh=False)
-            bar.update()
-    return _solution_of(products, truncation, y, ridge, state.c, state.steps)
-
-
-@precise_jit
-def _solution_of(products: Products, truncation, y, ridge, c, steps) -> _Solution:
+    structure, tag = jax.eval_shape(lambda: y), lx.positive_semidefinite_tag
+    system = lx.FunctionLinearOperator(lambda c: c + products.gram(c) / ridge, structure, tag)
+    inverse = lx.FunctionLinearOperator(precondition, structure, tag)
+    # Half of the tolerance allows for the rounding errors of the recursion for the residual.
+    size = jnp.linalg.norm(jax.lax.stop_gradient(y))
+    solver = lx.CG(0.0, tolerance / 2 * size, jnp.linalg.norm, None, max_iterations)
+    options = {"preconditioner": inverse}
+    solution = lx.linear_solve(system, y, solver, options=options, throw=False)
+    c = solution.value
     # c = ρa, so f(X) = Ga = Gc/ρ and ‖f‖² = aᵀGa = c·f(X)/ρ. With the residual r = y − c − f(X) of
     # the system, aᵀr = cᵀr/ρ estimates the error of ‖f‖², as in `norm_of`.
     values = products.gram(c) / ridge
     norm = norm_of(jnp.sum(c * values) / ridge, jnp.sum(c * (y - c - values)) / ridge)
     learned = c / ridge, y - values, norm
-    return _Solution(learned, steps, relative_error(y - c - values, y), truncation)
+    iterations, error = solution.stats["num_steps"], relative_error(y - c - values, y)
+    return _Solution(learned, iterations, error, truncation)

@@ -149,7 +149,7 @@ def fit(
             field(x, θ), and `field.at(θ)` is an ordinary field.
         progress: show a progress bar if the standard error is a terminal: for the iterations of
             `ConjugateGradient`, with their residuals, and for the blocks of `Cholesky` from 6000
-            rows on. Ctrl-C stops the fit between two iterations or blocks.
+            rows on. Ctrl-C stops a fit by `Cholesky` between two blocks.
         accelerations: for a `Lagrangian`, the accelerations, shape (N, m). X holds the states
             (q, v), shape (N, 2m), and Y the torques, shape (N, m).
 

@@ -24,6 +24,10 @@ from hamkernel._fields.kinetic import Kinetic, kinetic_of_velocities
 from hamkernel._kernels.base import AbstractScalarKernel, ScalarSum
 from hamkernel._kernels.built_in import Matern
 from hamkernel._kernels.parts import Laws, Shared, alike
+from hamkernel._learned.diagnostics import FitQuality, diagnostics_of_rows
+from hamkernel._learned.free_run import Stretches, relative_error, stretches
+from hamkernel._learned.result import AbstractEvidence, Iteration, Learned, misfits
+from hamkernel._learned.whiteness import Whiteness
 from hamkernel._machine import compiled_by_size, compiled_without_emitters, precise_jit
 from hamkernel._observations.kinds import Functionals
 from hamkernel._posterior import condition
@@ -34,11 +38,6 @@ from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import complete, has_constant_parts
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import AbstractPotentialKernel
-from hamkernel._trajectories.diagnostics import FitQuality, diagnostics_of_rows
-from hamkernel._trajectories.evidence import EvidenceOfRows
-from hamkernel._trajectories.free_run import Stretches, relative_error, stretches
-from hamkernel._trajectories.learned import Iteration, Learned, misfits
-from hamkernel._trajectories.whiteness import Whiteness
 from hamkernel._tuning.minimiser import best_in_box, inside_box
 from hamkernel._tuning.space import hyperparameters
 from hamkernel._weak.rows import (
@@ -60,6 +59,23 @@ _STEPS = 300
 _RUNGE_KUTTA = np.array([0, 0.5, 0.5, 1]), np.array([1, 2, 2, 1]) / 6
 # Of a force, as a share of it, so that rows of exact samples have a covariance.
 _EXACT = 1e-6
+
+
+class EvidenceOfRows(AbstractEvidence):
+    """The evidence of weak rows: −log p is `loss`, up to a constant."""
+
+    loss: float
+
+    @property
+    def log_p(self) -> float:
+        return -self.loss
+
+    def gain(self, part: AbstractMatrixKernel) -> float:
+        raise TypeError(
+            "gain compares fields along iterated paths, and laws that many parts share are learned "
+            "from weak rows: learn again with the part in the kernel, hk.learn(K + part, runs), "
+            "and compare log_evidence."
+        )
 
 
 class States(eqx.Module):
@@ -472,7 +488,7 @@ def learn_laws(
         runs=runs,
         observations=solution.observations,
         mean=mean,
-        evidence=EvidenceOfRows(-solution.losses[1]),
+        evidence=EvidenceOfRows(solution.losses[1]),
         again=again,
     )
 
