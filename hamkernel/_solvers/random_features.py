@@ -11,7 +11,7 @@ from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.expansions import FeatureField
 from hamkernel._machine import precise_jit, refuse_beyond_memory, row_sharding, shard
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.least_squares import ridge_regression
+from hamkernel._solvers.least_squares import SAMPLE, ridge_regression
 from hamkernel._solvers.low_rank import (
     AbstractBasis,
     FeatureSpan,
@@ -28,9 +28,9 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"], Abstra
 
     The structure of the field is exact for every count. The kernel is approximate, with an error of
     order count^(−1/2), or smaller for fields that the features can represent. A fit takes O(N n r²)
-    time and O(r²) memory beside the data, by a QR of tiles of rows. The scalar kernels must be
-    shift-invariant: Gaussian, Matern, RationalQuadratic and Periodic, and their sums, products,
-    multiples and Select. Every structure and parity is allowed.
+    time and O(r²) memory beside the data. The scalar kernels must be shift-invariant: Gaussian,
+    Matern, RationalQuadratic and Periodic, and their sums, products, multiples and Select. Every
+    structure and parity is allowed.
 
     How to choose: start with 500 frequencies in the plane. Short lengthscales and rough kernels
     need more: with Matern(1.5) the error falls slowly, since the fourth moment of the frequencies
@@ -76,8 +76,8 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"], Abstra
 
         r = eqx.filter_eval_shape(features_of, K, self.key).columns
         what, cure = f"a fit with count = {self.count}", "Take fewer features."
-        # Eight matrices of r² numbers: the triangle (1), the tile of 3r rows below it (3), and
-        # their QR factorisation (4).
+        # Eight matrices of r² numbers: the sums of the sample and of all rows, the triangle, the
+        # basis, the factor, and the temporaries of these products.
         refuse_beyond_memory(what, r, r, dtype, 8, cure)
         return FeatureSpan(K, features_of(K, self.key), K.outputs(n))
 
@@ -99,8 +99,7 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"], Abstra
     def _start_fit(self, K, sample, regularization) -> "FeatureFit":
         span = self.span(K, sample.points.shape[1], sample.targets.dtype)
         one = jnp.eye(span.features.columns, dtype=sample.targets.dtype)
-        # 4096 points set the basis of the sums, the default number of candidates of `Nystrom`.
-        subset, basis = thin(K, sample, 4096), span.features
+        subset, basis = thin(K, sample, SAMPLE), span.features
         return start_fit(FeatureFit, span, one, subset, regularization, features=basis)
 
 
