@@ -345,7 +345,7 @@ def test_a_small_ridge_keeps_the_digits_that_normal_equations_lose(key):
     X, Y = data(200, 2)
     basis = features(hk.Symplectic(hk.Gaussian(4.0)), 2, 40, key, X.dtype)
     ridge = 1e-12
-    w, _ = ridge_regression(basis, basis.columns, X, Y, jnp.asarray(ridge))
+    w, *_ = ridge_regression(basis, jnp.eye(basis.columns), X, Y, jnp.asarray(ridge))
     rows, target = np.asarray(basis(X)).reshape(X.size, -1), np.asarray(Y).ravel()
     U, s, Vt = np.linalg.svd(rows, full_matrices=False)
     expected = Vt.T @ (s / (s**2 + ridge) * (U.T @ target))
@@ -573,19 +573,20 @@ def test_data_and_ridge_may_change_after_the_fit(key):
 
 
 def test_ridge_regression_in_many_tiles_is_least_squares_in_numpy():
-    rng = np.random.default_rng(0)
-    # The scales of the columns, and rows that the sample of every third point does not resemble.
+    rng, ridge = np.random.default_rng(0), 1e-9
+    # Columns of different scales, and rows that the sample, every tenth point, does not resemble.
     A = rng.normal(size=(10_000, 6)) * np.logspace(0, -5, 6)
-    A[1::3] *= np.logspace(0, 3, 6)
-    y, ridge = rng.normal(size=(10_000, 1)), 1e-9
+    A[1::10] *= np.logspace(0, 3, 6)
+    W, y = rng.normal(size=(6, 6)), rng.normal(size=(10_000, 1))
     rows, index = jnp.asarray(A)[:, None, :], jnp.arange(10_000)[:, None]
-    w, residual = ridge_regression(
-        lambda X: rows[X[:, 0]], 6, index, jnp.asarray(y), jnp.asarray(ridge)
+    w, residual, trace = ridge_regression(
+        lambda X: rows[X[:, 0]], jnp.asarray(W), index, jnp.asarray(y), jnp.asarray(ridge)
     )
-    below = np.concatenate([A, np.sqrt(ridge) * np.eye(6)])
+    below = np.concatenate([A @ W, np.sqrt(ridge) * np.eye(6)])
     expected = np.linalg.lstsq(below, np.append(y, np.zeros(6)))[0]
     np.testing.assert_allclose(w, expected, rtol=SOLVE)
-    np.testing.assert_allclose(residual, y - A @ expected[:, None], atol=ROUNDING)
+    np.testing.assert_allclose(residual, y - A @ W @ expected[:, None], atol=ROUNDING)
+    np.testing.assert_allclose(trace, np.sum((A @ W) ** 2), rtol=ROUNDING)
 
 
 @pytest.mark.few(1)

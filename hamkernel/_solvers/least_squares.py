@@ -35,57 +35,59 @@ from hamkernel._sizes import sizes
 # the r fields at point i.
 Design = Callable[[Float[Array, "t n"]], Float[Array, "t n r"]]
 
-# The number of points whose sums set the basis, evenly spaced among all points.
-SAMPLE = 4096
-
 
 def ridge_regression(
     design: Design,
-    columns: int,
+    W: Float[Array, "r r"],
     X: Float[Array, "N n"],
     Y: Float[Array, "N n"],
     ridge: Float[Array, ""],
     spread: RowSharding | None = None,
-) -> tuple[Float[Array, " r"], Float[Array, "N n"]]:
-    """The minimiser w of ‖Y − Φw‖² + ridge ‖w‖², and the residual Y − Φw.
+) -> tuple[Float[Array, " r"], Float[Array, "N n"], Float[Array, ""]]:
+    """The minimiser w of ‖Y − Φw‖² + ridge ‖w‖² for Φ = design(X) W, Y − Φw, and tr ΦᵀΦ.
 
-    O(N n r²) time and O(r² + N n) memory. Differentiable to every order with respect to the data,
-    the ridge and the arrays in `design`, which must be a PyTree.
+    O(N n r²) time and O(r² + N n) memory. w and the residual are differentiable to every order with
+    respect to the data, the ridge, W, and the arrays in `design`, which must be a PyTree.
 
     Args:
-        design: the rows Φ, (t, n) -> (t, n, r).
-        columns: r.
+        design: (t, n) -> (t, n, r).
+        W: a matrix, for instance the identity.
         X: points.
         Y: targets.
         ridge: δ > 0.
         spread: the sharding of points and targets; None if they lie on one device.
     """
-    fixed, *data, fixed_ridge = stop_gradients((design, X, Y, ridge))
-    sample = [array[:: -(-len(X) // SAMPLE)] for array in data]
+    fixed, fixed_W, fixed_X, fixed_Y, fixed_ridge = stop_gradients((design, W, X, Y, ridge))
+    # Evenly spaced points. With n rows each, the sample has more rows than columns.
+    step = -(-len(X) // max(1024, len(W)))
+    some_X, some_Y = fixed_X[::step], fixed_Y[::step]
     if spread is not None:
-        sample = [spread.replicate(array) for array in sample]
-    one, count = jnp.eye(columns, dtype=Y.dtype), len(sample[0])
-    first = normal(fixed, one, *sample)
+        some_X, some_Y = spread.replicate(some_X), spread.replicate(some_Y)
+    first, count = normal(fixed, fixed_W, some_X, some_Y), len(some_X)
     # The shift keeps the first Cholesky factorisation possible where λ is below rounding. The rows
     # of ΦR⁻¹ then have a condition of up to (λ + shift)/λ.
     shift = gram_rounding(jnp.trace(first.square) / count).astype(Y.dtype)
-    sums = first_sums(first, one, count, fixed_ridge / len(X) + shift)
-    sums = dataclasses.replace(sums, normal_equations=normal(fixed, sums.basis, *data, spread))
-    L = sums.factor(fixed_ridge)
+    sums = first_sums(first, fixed_W, count, fixed_ridge / len(X) + shift)
+    total = normal(fixed, sums.basis, fixed_X, fixed_Y, spread)
+    sums = dataclasses.replace(sums, normal_equations=total)
+    R, L = sums.triangle, sums.factor(fixed_ridge)
+    w = solve_triangular(R, cho_solve((L, True), sums.normal_equations.moment))
 
     # One step of iterative refinement, w + H⁻¹(Φᵀ(y − Φw) − δw) with H = ΦᵀΦ + δI. The result is
     # H⁻¹Φᵀy for every w. Its derivatives are therefore exact although w and the factor of H are
     # held constant.
+    def correlations(w, Y):
+        return W.T @ _correlations(design, X, Y, W @ w, spread)
+
     def times_H(v):
-        return ridge * v - _correlations(design, X, jnp.zeros_like(Y), v, spread)
+        return ridge * v - correlations(v, jnp.zeros_like(Y))
 
     def times_inverse(_, v):
-        return sums.basis @ cho_solve((L, True), sums.basis.T @ v)
+        return solve_triangular(R, cho_solve((L, True), solve_triangular(R, v, trans="T")))
 
-    w = sums.basis @ cho_solve((L, True), sums.normal_equations.moment)
-    slope = _correlations(design, X, Y, w, spread) - ridge * w
+    slope = correlations(w, Y) - ridge * w
     w = w + jax.lax.custom_linear_solve(times_H, slope, times_inverse, symmetric=True)
-    return w, residual(design, X, Y, w, spread)
+    return w, residual(design, X, Y, W @ w, spread), trace_of_sums(sums)
 
 
 def residual(

@@ -11,7 +11,7 @@ from hamkernel._features import AbstractFeatures, features
 from hamkernel._fields.expansions import FeatureField
 from hamkernel._machine import precise_jit, refuse_beyond_memory, row_sharding, shard
 from hamkernel._observations.measurements import Measurements
-from hamkernel._solvers.least_squares import SAMPLE, ridge_regression
+from hamkernel._solvers.least_squares import ridge_regression
 from hamkernel._solvers.low_rank import (
     AbstractBasis,
     FeatureSpan,
@@ -99,14 +99,16 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"], Abstra
     def _start_fit(self, K, sample, regularization) -> "FeatureFit":
         span = self.span(K, sample.points.shape[1], sample.targets.dtype)
         one = jnp.eye(span.features.columns, dtype=sample.targets.dtype)
-        subset, basis = thin(K, sample, SAMPLE), span.features
+        # 4096 points set the basis of the sums, the default number of candidates of `Nystrom`.
+        subset, basis = thin(K, sample, 4096), span.features
         return start_fit(FeatureFit, span, one, subset, regularization, features=basis)
 
 
 @precise_jit
 def _feature_fit(K, solver, X, Y, regularization, spread):
     span, ridge = solver.span(K, X.shape[1], X.dtype), len(X) * regularization
-    weights, residual = ridge_regression(span.features, span.features.columns, X, Y, ridge, spread)
+    one = jnp.eye(span.features.columns, dtype=X.dtype)
+    weights, residual, _ = ridge_regression(span.features, one, X, Y, ridge, spread)
     return span.field(weights, residual, regularization)
 
 
