@@ -58,7 +58,7 @@ def ridge_regression(
         spread: the sharding of points and targets; None if they lie on one device.
     """
     fixed, fixed_W, fixed_X, fixed_Y, fixed_ridge = stop_gradients((design, W, X, Y, ridge))
-    # Evenly spaced points. With n rows each, the sample has more rows than columns.
+    # Evenly spaced points. With n rows each, the sample has at least as many rows as columns.
     step = -(-len(X) // max(1024, len(W)))
     some_X, some_Y = fixed_X[::step], fixed_Y[::step]
     if spread is not None:
