@@ -14,7 +14,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._fields.base import known_part
-from hamkernel._fields.kinetic import Kinetic, kinetic
+from hamkernel._fields.kinetic import Kinetic, kinetic, kinetic_of_velocities
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._learned.result import Learned
 from hamkernel._machine import follow_data, full_precision, one_blas_thread
@@ -143,11 +143,16 @@ def learn(
     if isinstance(K, Lagrangian):
         unused = {"mean": mean, "solver": solver, "process_noise": process_noise, "mass": mass}
         return learn_lagrangian(K, runs, noise, unused | {"masses": masses}, again)
+    if mass is not None and masses:
+        raise TypeError("masses=True finds the masses, and mass= states them: give one of the two.")
     if mass is not None:
         mean, runs = _kinetic_mean(mass, mean, runs)
     K, sigma, process = _check(with_amplitude(matrix_kernel(K)), runs, noise, process_noise, solver)
     max_steps = require.count(iterations, "iterations")
-    K = _unknown_masses(K, runs.dimension) if masses else K
+    if masses:
+        K = _unknown_masses(K, runs.dimension)
+        if mean is None and are_learned_from_rows(K) and _are_forces(K, runs.dimension):
+            mean = kinetic_of_velocities(jnp.ones(runs.dimension // 2))
     drift = known_part(K, mean, runs.dimension, jnp.float64)
     _check_identifiable(K, runs, drift)
     if are_learned_from_rows(K) and process is None:
@@ -271,6 +276,11 @@ def _per_coordinate(value: Any, n: int, name: str) -> Float[np.ndarray, " n"]:
     if value.shape not in ((), (n,)):
         raise ValueError(f"{name} has shape {value.shape}; a number or shape ({n},) is needed.")
     return np.broadcast_to(value, (n,))
+
+
+def _are_forces(K: AbstractMatrixKernel, n: int) -> bool:
+    """Whether no scalar kernel of K depends on a momentum."""
+    return all(max(s) < n // 2 for k in K.scalar_kernels for s in k.supports(n))
 
 
 def _unknown_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
