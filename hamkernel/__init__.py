@@ -22,7 +22,10 @@ from the ones above:
     _closed_forms held-out residuals and the likelihood, from any factor of G + ridge I
     _validation   validation losses, each by one factorisation
     _tuning       hyperparameters, by gradients
-    _trajectories from logged runs to a field
+    _runs         logs: their faults, smoothing, and flows along them
+    _learned      results of learning, their diagnostics and scores: may the field be used?
+    _trajectories, _weak, _learn
+                  from logs to a field, by iterations or by weak rows
     _discovery    a formula for the potential, and tests of which physics the data obey
     _symplectic, _simulate
                   symplectic integrators, and trajectories of any field
@@ -55,6 +58,8 @@ from hamkernel._kernels.check import check_kernel
 from hamkernel._kernels.parts import Shared, neighbours, pairs, sites
 from hamkernel._kernels.transforms import Select, Warp
 from hamkernel._learn import learn
+from hamkernel._learned.result import Learned
+from hamkernel._learned.score import Score
 from hamkernel._observations.kinds import Energies, Equilibria, Functionals, Velocities
 from hamkernel._posterior import Posterior, condition
 from hamkernel._report import report
@@ -73,8 +78,6 @@ from hamkernel._structures.joined import Controlled, InputMatrix
 from hamkernel._structures.lagrangian import Lagrangian
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import CurlFree, DivergenceFree, Separable, Symplectic
-from hamkernel._trajectories.learned import Learned
-from hamkernel._trajectories.score import Score
 from hamkernel._tuning.tune import Tuned, tune
 from hamkernel._validation import (
     cross_validation_loss,

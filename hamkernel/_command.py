@@ -18,6 +18,8 @@ from numpy.lib.recfunctions import unstructured_to_structured
 from hamkernel._kernels.built_in import Gaussian
 from hamkernel._kernels.transforms import Select
 from hamkernel._learn import learn
+from hamkernel._learned.result import Learned
+from hamkernel._learned.score import Score
 from hamkernel._report import report, script
 from hamkernel._runs.runs import Between, Runs
 from hamkernel._save import save
@@ -25,8 +27,6 @@ from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.friction import Friction
 from hamkernel._structures.joined import Controlled, InputMatrix
 from hamkernel._structures.structure import Symplectic
-from hamkernel._trajectories.learned import Learned
-from hamkernel._trajectories.score import Score
 
 
 def parser() -> argparse.ArgumentParser:

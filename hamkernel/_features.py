@@ -17,11 +17,12 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from hamkernel._kernels.base import AbstractScalarKernel, ScalarSum, Scaled, Spectrum
-from hamkernel._kernels.parts import GroupParts, Shared
+from hamkernel._kernels.parts import GroupParts, Laws, Shared, alike
 from hamkernel._kernels.symmetry import Symmetrised, symmetry_removed
 from hamkernel._structures.base import AbstractMatrixKernel, Sum
 from hamkernel._structures.friction import Friction, damped_coordinates
 from hamkernel._structures.joined import Controlled, KnownMatrix
+from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import AbstractPotentialKernel, DivergenceFree, Separable
 
 
@@ -76,28 +77,44 @@ class PartWaves(eqx.Module):
         return jnp.sqrt(self.scale).astype(x.dtype) * self.kernel.gradients(x)
 
     def slope(self, x: Float[Array, " n"], w: Float[Array, " w"]) -> Float[Array, " n"]:
-        return jnp.sqrt(self.scale).astype(x.dtype) * self.kernel.slope(x, w)
+        return jnp.sqrt(self.scale).astype(x.dtype) * Laws((self.kernel,)).slope(x, w)
 
 
 class JointWaves(eqx.Module):
-    """The features of a sum of scalar kernels: the features of all terms, concatenated."""
+    """The features of a sum of `Shared` kernels: the features of all terms, concatenated."""
 
-    terms: tuple[Any, ...]
+    terms: tuple[PartWaves, ...]
 
     @property
     def amplitudes(self) -> Float[Array, " w"]:
         return jnp.concatenate([term.amplitudes for term in self.terms])
 
     def values(self, x: Float[Array, " n"]) -> Float[Array, " w"]:
-        return jnp.concatenate([term.values(x) for term in self.terms])
+        groups = self._groups()
+        return jnp.concatenate([laws.features(x) * scales for laws, scales in groups])
 
     def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n w"]:
-        return jnp.concatenate([term.gradients(x) for term in self.terms], axis=1)
+        groups = self._groups()
+        return jnp.concatenate(
+            [laws.gradients(x) * scales[None] for laws, scales in groups], axis=1
+        )
 
     def slope(self, x: Float[Array, " n"], w: Float[Array, " w"]) -> Float[Array, " n"]:
-        ends = np.cumsum([len(term.amplitudes) for term in self.terms])[:-1]
-        pieces = zip(self.terms, jnp.split(w, ends), strict=True)
-        return sum((term.slope(x, weights) for term, weights in pieces), jnp.zeros_like(x))
+        groups = self._groups()
+        ends = np.cumsum([len(scales) for _, scales in groups])[:-1]
+        pieces = zip(groups, jnp.split(w, ends), strict=True)
+        return sum((laws.slope(x, scales * w) for (laws, scales), w in pieces), jnp.zeros_like(x))
+
+    def _groups(self) -> list[tuple[Laws, Float[Array, " w"]]]:
+        """Neighbouring terms whose kernels are alike, with the factors of their features."""
+        groups = [self.terms[at] for at in alike([term.kernel for term in self.terms])]
+        return [
+            (
+                Laws(tuple(term.kernel for term in group)),
+                jnp.concatenate([jnp.sqrt(term.scale) * term.amplitudes for term in group]),
+            )
+            for group in groups
+        ]
 
 
 class GroupWaves(eqx.Module):
@@ -149,8 +166,8 @@ def waves_of(
 
 def part_waves(k: AbstractScalarKernel) -> PartWaves | JointWaves | None:
     """The features of `Shared` kernels, their multiples, means and sums; None for others."""
-    terms = part_terms(k)
-    if None in terms:
+    terms = [waves for waves in part_terms(k) if waves is not None]
+    if len(terms) < len(part_terms(k)):
         return None
     return terms[0] if len(terms) == 1 else JointWaves(tuple(terms))
 
@@ -193,6 +210,8 @@ def is_of_parts(K: AbstractMatrixKernel) -> bool:
     """Whether all terms of K are `Shared` laws or friction, so that its features are exact."""
     if isinstance(K, Controlled):
         return is_of_parts(K.drift) and isinstance(K.inputs, KnownMatrix)
+    if isinstance(K, UnknownMasses):
+        return is_of_parts(K.kernel)
     if isinstance(K, Sum):
         potentials = [term for term in K.terms if not isinstance(term, Friction)]
         return bool(potentials) and all(map(is_of_parts, potentials))
@@ -370,6 +389,29 @@ class ControlledFeatures(AbstractFeatures):
         return self.drift.laws()
 
 
+class MassFeatures(AbstractFeatures):
+    """The features S⁻¹ φ(Sy) of `UnknownMasses`, for the features φ of its kernel."""
+
+    masses: UnknownMasses
+    features: AbstractFeatures
+
+    @property
+    def columns(self) -> int:
+        return self.features.columns
+
+    def rows(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
+        return self.masses.to_velocities(self.features.rows(self.masses.to_momenta(x)).T).T
+
+    def field(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        return self.masses.to_velocities(self.features.field(self.masses.to_momenta(x), w))
+
+    def potential(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, ""]:
+        return self.features.potential(self.masses.to_momenta(x), w)
+
+    def laws(self) -> list[tuple[PartWaves, slice]]:
+        return self.features.laws()
+
+
 class SumFeatures(AbstractFeatures):
     """The features of a sum of kernels: the features of all terms, concatenated."""
 
@@ -431,6 +473,8 @@ def features(
         return SumFeatures(tuple(features(term, n, count, key, dtype) for term, key in pairs))
     if isinstance(K, Friction):
         return FrictionFeatures(K, n)
+    if isinstance(K, UnknownMasses):
+        return MassFeatures(K, features(K.kernel, n, count, key, dtype))
     if not isinstance(K, Separable | DivergenceFree | AbstractPotentialKernel):
         raise TypeError(
             f"RandomFeatures does not know the structure {type(K).__name__}. Use Symplectic, "

@@ -14,8 +14,9 @@ from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
 from hamkernel._fields.base import known_part
-from hamkernel._fields.kinetic import Kinetic, kinetic
+from hamkernel._fields.kinetic import Kinetic, kinetic, kinetic_of_velocities
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._learned.result import Learned
 from hamkernel._machine import follow_data, full_precision, one_blas_thread
 from hamkernel._observations.kinds import inputs_or_parameters
 from hamkernel._observations.measurements import sampled_points
@@ -24,9 +25,7 @@ from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.lagrangian import Lagrangian
 from hamkernel._structures.masses import UnknownMasses
-from hamkernel._trajectories.diagnostics import check_identifiable
 from hamkernel._trajectories.learn import learn_field
-from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.model import with_amplitude
 from hamkernel._weak.lagrangian import LearnedLagrangian, learn_lagrangian
 from hamkernel._weak.laws import are_learned_from_rows, learn_laws
@@ -131,11 +130,8 @@ def learn(
             their meaning.
     """
     _check_types(K, runs, mean, noise)
-    if isinstance(K, Lagrangian):
-        unused = {"mean": mean, "solver": solver, "process_noise": process_noise, "mass": mass}
-        return learn_lagrangian(K, runs, noise, unused | {"masses": masses})
     again = LearnAgain(
-        kernel=matrix_kernel(K),
+        kernel=K if isinstance(K, Lagrangian) else matrix_kernel(K),
         mean=mean if mean is None else as_pytree(mean),
         noise=noise,
         solver=solver,
@@ -144,13 +140,21 @@ def learn(
         mass=mass,
         iterations=iterations,
     )
+    if isinstance(K, Lagrangian):
+        unused = {"mean": mean, "solver": solver, "process_noise": process_noise, "mass": mass}
+        return learn_lagrangian(K, runs, noise, unused | {"masses": masses}, again)
+    if mass is not None and masses:
+        raise TypeError("masses=True finds the masses, and mass= states them: give one of the two.")
     if mass is not None:
         mean, runs = _kinetic_mean(mass, mean, runs)
     K, sigma, process = _check(with_amplitude(matrix_kernel(K)), runs, noise, process_noise, solver)
     max_steps = require.count(iterations, "iterations")
-    K = _unknown_masses(K, runs.dimension) if masses else K
+    if masses:
+        K = _unknown_masses(K, runs.dimension)
+        if mean is None and are_learned_from_rows(K) and _are_forces(K, runs.dimension):
+            mean = kinetic_of_velocities(jnp.ones(runs.dimension // 2))
     drift = known_part(K, mean, runs.dimension, jnp.float64)
-    check_identifiable(K, runs, drift)
+    _check_identifiable(K, runs, drift)
     if are_learned_from_rows(K) and process is None:
         return learn_laws(K, runs, mean if mean is None else as_pytree(mean), sigma, again)
     return learn_field(K, runs, mean, drift, sigma, process, solver, max_steps, progress, again)
@@ -159,7 +163,7 @@ def learn(
 class LearnAgain(eqx.Module):
     """`learn` with the arguments of an earlier call, for other runs."""
 
-    kernel: AbstractMatrixKernel
+    kernel: AbstractMatrixKernel | Lagrangian
     mean: Any
     noise: Any
     solver: Nystrom | None
@@ -168,7 +172,7 @@ class LearnAgain(eqx.Module):
     mass: Any
     iterations: int
 
-    def __call__(self, runs: Runs) -> Learned:
+    def __call__(self, runs: Runs) -> Any:
         """The field of these runs."""
         options = {field.name: getattr(self, field.name) for field in dataclasses.fields(self)}
         return learn(options.pop("kernel"), runs, progress=False, **options)
@@ -274,6 +278,11 @@ def _per_coordinate(value: Any, n: int, name: str) -> Float[np.ndarray, " n"]:
     return np.broadcast_to(value, (n,))
 
 
+def _are_forces(K: AbstractMatrixKernel, n: int) -> bool:
+    """Whether no scalar kernel of K depends on a momentum."""
+    return all(max(s) < n // 2 for k in K.scalar_kernels for s in k.supports(n))
+
+
 def _unknown_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
     """K for states (q, q̇) of n coordinates, all masses equal at first."""
     if n == 2:
@@ -286,3 +295,51 @@ def _unknown_masses(K: AbstractMatrixKernel, n: int) -> AbstractMatrixKernel:
     return K.with_states(
         inner if isinstance(inner, UnknownMasses) else UnknownMasses(inner, jnp.ones(n // 2))
     )
+
+
+def _check_identifiable(
+    K: AbstractMatrixKernel, runs: Runs, mean: Callable[[Array], Array] | None
+) -> None:
+    """Raise unless the coordinates that no run measured are determined.
+
+    A mean of the points (x, u) must say how they move the others, and K must not change how. A K
+    that changes the velocities of both kinds of coordinates represents the system in coordinates
+    p -> g(q, p) as well. The runs then fit each of them equally.
+    """
+    measured = np.any([np.isfinite(x).any(axis=0) for x in runs.host_arrays()[1]], axis=0)
+    if measured.all():
+        return
+    names = np.array(runs.coordinate_names)[~measured]
+    never = f"coordinate {', '.join(names)} was measured in no run"
+    if mean is None:
+        raise ValueError(
+            f"{never}. From the others alone it is known only up "
+            "to any change of coordinates, p -> g(q, p), so there is nothing to learn it from. "
+            "Say how it moves the others: mean=lambda x: jnp.array([x[1] / m, 0.0]) for q̇ = p/m "
+            "and K a kernel for the rest, such as hk.Symplectic(hk.Select(k, 0)) for ṗ = -U'(q). "
+            "Or log it."
+        )
+    n = len(measured)
+    points = np.random.default_rng(0).standard_normal((8, n + runs.input_count))
+    with require.traceable("mean"):
+        D = np.asarray(jax.vmap(jax.jacfwd(mean))(jnp.asarray(points)))  # (8, n, d)
+    slopes = np.abs(D[:, measured, :n]).max(axis=(0, 1), initial=0.0)
+    blind = np.flatnonzero(~measured & ~(slopes > 0))  # also where a slope is NaN
+    if len(blind):
+        raise ValueError(
+            f"coordinate {runs.coordinate_names[blind[0]]} was measured in no run, and the "
+            "velocities of the mean do not depend on it: give a mean that says how it moves the "
+            "others, such as q̇ = p/m."
+        )
+    points[:, n:] = 0.0  # another p cannot stand for an input, but for its slope
+    variances = np.asarray(jax.vmap(lambda x: jnp.diag(K(x, x)))(jnp.asarray(points)))
+    is_changed = np.nanmax(variances, axis=0) > 0
+    if is_changed[measured].any() and is_changed[~measured].any():
+        positions = tuple(np.flatnonzero(measured).tolist())
+        raise ValueError(
+            f"{never}, and K also changes how it moves the "
+            "others: then it is known only up to any change of coordinates, p -> g(q, p), and so "
+            "are the field and its energy. If the masses are known, K is for the forces alone: "
+            f"hk.Symplectic(hk.Select(k, {positions})), k a kernel of {len(positions)} "
+            f"coordinate{'s' * (len(positions) > 1)}."
+        )

@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from hamkernel import _require as require
-from hamkernel._trajectories.learned import Learned
-from hamkernel._weak.lagrangian import LearnedLagrangian
+from hamkernel._learned.result import AbstractLearned
 
 if TYPE_CHECKING:
+    from hamkernel._learned.score import Score
     from hamkernel._runs.runs import Runs
-    from hamkernel._trajectories.score import Score
 
 _STYLE = """
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 60rem; margin: 2rem auto; padding: 0 1rem;
@@ -32,7 +31,7 @@ img { max-width: 100%; }
 """
 
 
-def script(file: str, learned: Learned | LearnedLagrangian, is_beside: bool = False) -> str:
+def script(file: str, learned: AbstractLearned, is_beside: bool = False) -> str:
     """Ten lines that load the result in `file` and simulate its first run, with its inputs.
 
     Args:
@@ -65,7 +64,7 @@ def script(file: str, learned: Learned | LearnedLagrangian, is_beside: bool = Fa
 
 
 def report(
-    learned: Learned | LearnedLagrangian,
+    learned: AbstractLearned,
     path: str | os.PathLike[str],
     score: Score | None = None,
     held_out: Runs | None = None,
@@ -74,8 +73,8 @@ def report(
     """Write one self-contained page of HTML about a learned field, for readers without Python.
 
     It has the verdict, the picture of `learned.plot()`, the table of `learned.diagnostics`, the
-    score, and ten lines that load and simulate the field. A learned Lagrangian has no score, and no
-    free run of `held_out`.
+    score, and ten lines that load and simulate the field. The picture of a machine
+    has no free run of `held_out`.
 
     Args:
         learned: the result of `hk.learn`.
@@ -87,7 +86,7 @@ def report(
     Raises:
         TypeError: `learned` is no result of `hk.learn`. OSError: the file cannot be written.
     """
-    if not isinstance(learned, Learned | LearnedLagrangian):
+    if not isinstance(learned, AbstractLearned):
         raise TypeError(
             "report takes the result of hk.learn and then a path; got a "
             f"{type(learned).__name__} and a {type(path).__name__}."
@@ -124,7 +123,7 @@ def report(
     )
 
 
-def _picture(learned: Learned | LearnedLagrangian, held_out: Runs | None) -> str:
+def _picture(learned: AbstractLearned, held_out: Runs | None) -> str:
     """The picture of the result, inside of HTML."""
     import matplotlib.pyplot as plt
 

@@ -48,13 +48,13 @@ from hamkernel._fields.joined import AbstractJoinedField
 from hamkernel._fields.lagrangian import LagrangianField
 from hamkernel._kernels.functions import Bound, Closure, as_pytree
 from hamkernel._kernels.symmetry import identity, reflection, time_reversal
+from hamkernel._learned.result import Learned
 from hamkernel._observations.measurements import Measurements
 from hamkernel._posterior import Posterior
 from hamkernel._runs.table import Diagnostic, Diagnostics
 from hamkernel._solvers.problem import Problem
 from hamkernel._solvers.stream import AbstractStreamingFit
 from hamkernel._structures.base import AbstractMatrixKernel
-from hamkernel._trajectories.learned import Learned
 from hamkernel._trajectories.model import Model
 from hamkernel._trajectories.segments import LinearisedSegments
 from hamkernel._tuning.tune import Tuned
@@ -242,7 +242,7 @@ def _evaluable(saved: Any) -> AbstractField:
     field = saved.sum_of_columns() if is_stream else getattr(saved, "field", saved)
     state = jax.ShapeDtypeStruct((field.dimension,), field.offset.dtype)
     if field.offset.shape or jax.eval_shape(_state_function(field), state).shape != state.shape:
-        raise ValueError("its arrays have an axis more than those of one field.")
+        raise ValueError("its arrays have one axis more than the arrays of one field.")
     return field
 
 
@@ -254,8 +254,8 @@ def _probe(field: AbstractField) -> list[list[float]]:
     velocities = np.asarray(jax.vmap(_state_function(field))(jnp.asarray(points)))
     if not np.isfinite(velocities).all():
         raise ValueError(
-            "the field is NaN or infinite at its own points, as one is from a fit that failed with "
-            "throw=False: there is nothing to save."
+            "the field is NaN or infinite at its own points, as after a fit with throw=False that "
+            "failed: there is nothing to save."
         )
     fastest = np.linalg.norm(velocities, axis=1).argmax()  # at an equilibrium all kernels agree
     return [points[fastest].tolist(), velocities[fastest].tolist()]
@@ -300,6 +300,7 @@ _ROOMS = tuple(
         "_posterior",
         "_tuning.tune",
         "_runs.",
+        "_learned.",
         "_trajectories.",
         "_weak.",
         "_learn",

@@ -545,8 +545,8 @@ def _reason_of_failure(solution: Any, field: Any, x0: Float[Array, " n"], adapts
     cure = "Take a smaller dt."
     if adapts:
         cure = (
-            "Pass larger tolerances, such as rtol=1e-6, atol=1e-6: a learned field rounds, the "
-            "more the smaller its regularization, and an adaptive step that is asked for more "
-            "digits shrinks without end. Or allow more with max_steps."
+            "Pass larger tolerances, such as rtol=1e-6, atol=1e-6: adaptive steps shrink without "
+            "end below the rounding of a learned field, which grows as its regularization falls. "
+            "Or allow more steps with max_steps."
         )
     return f"The solve failed: {reason} {cure} It may also be that the field has no solution."

@@ -189,6 +189,7 @@ def test_modules_partials_methods_and_jitted_functions_are_accepted():
 # The block at x = z
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("profile", [matern32, matern52])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -200,7 +201,7 @@ def test_matern_through_a_norm_is_nan(profile, scale, dtype):
     assert "squared distance" in message
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("profile", [matern32, matern52])
 @pytest.mark.parametrize("ratio", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

@@ -20,6 +20,7 @@ import scipy.stats
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
+from hamkernel._learned.diagnostics import degrees_of_freedom
 from hamkernel._runs.flow import (
     NODES,
     WEIGHTS,
@@ -29,7 +30,6 @@ from hamkernel._runs.flow import (
     means,
 )
 from hamkernel._runs.preprocessing import preprocess
-from hamkernel._trajectories.diagnostics import degrees_of_freedom
 from hamkernel._trajectories.kalman import as_observations
 from hamkernel._trajectories.likelihood import (
     closed_form,

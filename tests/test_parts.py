@@ -8,9 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 
 import hamkernel as hk
 import hamkernel._features
+from hamkernel._kernels.parts import Laws
 from hamkernel._structures.laws import outside, undetermined_terms
 
 RNG = np.random.default_rng(0)
@@ -121,7 +123,8 @@ def test_gradients_of_the_features_are_those_of_jax():
         shared.gradients(x), jax.jacrev(shared.features)(x).T, rtol=1e-6, atol=1e-9
     )
     w = jnp.asarray(RNG.normal(size=12))
-    np.testing.assert_allclose(shared.slope(x, w), shared.gradients(x) @ w, rtol=1e-9, atol=1e-9)
+    slope = Laws((shared,)).slope(x, w)
+    np.testing.assert_allclose(slope, shared.gradients(x) @ w, rtol=1e-9, atol=1e-9)
     G = hk.gram(hk.Symplectic(shared), x[None], 2 * x[None])[0, :, 0]
     J = np.kron([[0, 1], [-1, 0]], np.eye(8))
     mixed = jax.jacfwd(jax.jacrev(shared, argnums=0), argnums=1)(x, 2 * x)
@@ -142,13 +145,35 @@ def test_parts_may_obey_several_laws_with_one_kernel():
     np.testing.assert_allclose(both.features(x), np.concatenate(features))
     np.testing.assert_allclose(both.gradients(x), jax.jacrev(both.features)(x).T, atol=1e-9)
     w = RNG.normal(size=both.columns)
-    np.testing.assert_allclose(both.slope(x, jnp.asarray(w)), both.gradients(x) @ w, atol=1e-9)
+    slope = Laws((both,)).slope(x, jnp.asarray(w))
+    np.testing.assert_allclose(slope, both.gradients(x) @ w, atol=1e-9)
     assert len(undetermined_terms(hk.CurlFree(both), 3)) == 2
     with pytest.raises(ValueError, match="laws of 3 parts, and there are 6: give"):
         hk.Shared(k, hk.pairs(4, 1), laws=(0, 1, 0))(jnp.ones(4), jnp.ones(4))
     for laws in ((0, 2), (), (0.0, 1.0), ((0, 1),)):
         with pytest.raises(ValueError, match="without gaps"):
             hk.Shared(k, hk.pairs(3, 1), laws=laws)
+
+
+@pytest.mark.slow
+def test_a_sum_of_laws_with_alike_kernels_is_one_program():
+    """Their features are those of each law, one after the other."""
+    C, D, pairs = np.linspace(0.1, 4, 12), np.linspace(0.5, 5, 12), hk.pairs(4, 1)
+    several = hk.Shared(hk.Gaussian(1.1), pairs, D, laws=(0, 1, 0, 1, 1, 0))
+    terms = [
+        2.0 * hk.Shared(hk.Gaussian(0.7), hk.pairs(4, 1, among=(0, 1, 2)), C),
+        0.5 * several,
+        3.0 * hk.Shared(hk.Matern(2.5, 0.8), pairs, C),
+    ]
+    together = hamkernel._features.part_waves(terms[0] + terms[1] + terms[2])
+    alone = [hamkernel._features.part_waves(k) for k in terms]
+    assert [len(laws.terms) for laws, _ in together._groups()] == [2, 1]
+    x, w = jnp.asarray(RNG.normal(size=4)), jnp.asarray(RNG.normal(size=48))
+    values = np.concatenate([waves.values(x) for waves in alone])
+    gradients = np.concatenate([waves.gradients(x) for waves in alone], axis=1)
+    np.testing.assert_allclose(together.values(x), values, atol=1e-10)
+    np.testing.assert_allclose(together.gradients(x), gradients, atol=1e-9)
+    np.testing.assert_allclose(together.slope(x, w), gradients @ w, atol=1e-9)
 
 
 def test_memory_does_not_grow_with_states_parts_and_centres():
@@ -398,3 +423,60 @@ def test_a_law_is_learned_from_noisy_runs(momenta):
         learned.gain(hk.Friction())
     with pytest.raises(ValueError, match=r"mass=np.ones\(12\)"):
         hk.learn(K, hk.Runs([0.04 * np.arange(121)], [noisy[:, :12]]), mass=1.0)
+
+
+def chain_runs(masses, viscous, noise, seed):
+    """A free chain with springs d + d³/2, two runs, as q and q̇."""
+    rng, m, t = np.random.default_rng(seed), len(masses), 0.05 * np.arange(121)
+
+    def rates(_, x):
+        d = np.diff(x[:m])
+        pull = d + 0.5 * d**3
+        force = np.append(pull, 0.0) - np.append(0.0, pull) - viscous * x[m:]
+        return np.concatenate([x[m:], force / masses])
+
+    paths = [
+        solve_ivp(rates, (0, 6), rng.normal(size=2 * m), t_eval=t, rtol=1e-9, atol=1e-9).y.T
+        for _ in range(2)
+    ]
+    return hk.Runs(t, [x + noise * rng.normal(size=x.shape) for x in paths])
+
+
+CHAIN = hk.Shared(hk.Gaussian(2.0), hk.neighbours(4))
+
+
+def _error_of_chain(field):
+    r = jnp.linspace(-1.2, 1.2, 9)
+    law = jax.vmap(lambda r: field.law(r, 0.0))(r)
+    return np.abs(np.asarray(law - (r**2 / 2 + r**4 / 8))).max()
+
+
+@pytest.mark.slow
+def test_friction_is_learned_from_noisy_runs_beside_a_law():
+    K = hk.Sum(energy=hk.Symplectic(CHAIN), friction=hk.Friction())
+    learned = hk.learn(K, chain_runs(np.ones(4), 0.2, 0.005, seed=0), mass=1.0)
+    assert learned.converged, learned.diagnostics
+    assert _error_of_chain(learned.field) < 0.02
+    rubs = learned.field.part("friction")(jnp.ones(8))
+    np.testing.assert_allclose(rubs[4:], -0.2, atol=0.03)
+
+
+@pytest.mark.slow
+def test_masses_are_learned_from_noisy_runs_beside_a_law():
+    masses = np.array([1.0, 2.0, 0.7, 1.5])
+    learned = hk.learn(hk.Symplectic(CHAIN), chain_runs(masses, 0.0, 0.003, seed=1), masses=True)
+    assert learned.converged, learned.diagnostics
+    np.testing.assert_allclose(learned.kernel.masses, masses, rtol=0.02)
+    assert _error_of_chain(learned.field) < 0.02
+    field, x = learned.field, learned.states[0][30]
+    slope = jax.grad(field.hamiltonian)(x)
+    np.testing.assert_allclose(slope[4:], learned.kernel.masses * x[4:])  # ½ q̇ᵀMq̇
+    np.testing.assert_allclose(slope @ field(x), 0.0, atol=1e-7)  # the energy is conserved
+
+
+def test_masses_that_are_known_and_unknown_and_friction_without_momenta_are_refused():
+    runs = chain_runs(np.ones(4), 0.0, 0.01, seed=0)
+    with pytest.raises(TypeError, match="give one of the two"):
+        hk.learn(hk.Symplectic(CHAIN), runs, mass=1.0, masses=True)
+    with pytest.raises(ValueError, match=r"add hk.Friction\(\) to hk.Symplectic"):
+        hk.learn(hk.PortHamiltonian(CHAIN, friction=0.1), runs, mass=1.0)

@@ -20,10 +20,11 @@ from scipy.integrate import solve_ivp
 from test_learn import PENDULUM, damped, field_error, logs, moved_by_momenta, moved_by_momentum
 
 import hamkernel as hk
+from hamkernel._learned.diagnostics import lengthscales, missing_force
+from hamkernel._learned.diagnostics import rest_speed as rest_speed_row
+from hamkernel._learned.whiteness import autocorrelations, ljung_box, whiteness
 from hamkernel._runs.flow import WEIGHTS
 from hamkernel._runs.sensors import is_on_a_curve, timing
-from hamkernel._trajectories.diagnostics import lengthscales, missing_force
-from hamkernel._trajectories.diagnostics import rest_speed as rest_speed_row
 from hamkernel._trajectories.iteration import iterate, likelier
 from hamkernel._trajectories.kalman import as_observations, innovations, smoothed_path, whiten
 from hamkernel._trajectories.model import Model, WhitenedRows, landmark_whitening
@@ -34,7 +35,6 @@ from hamkernel._trajectories.search import (
     missing_inertia,
 )
 from hamkernel._trajectories.segments import LinearisedSegments
-from hamkernel._trajectories.whiteness import autocorrelations, ljung_box, whiteness
 
 # The filter.
 

@@ -16,8 +16,8 @@ import pytest
 
 import hamkernel as hk
 from hamkernel._command import columns, kernel, run
+from hamkernel._learned.result import _coefficients
 from hamkernel._report import script
-from hamkernel._trajectories.learned import _coefficients
 
 
 @pytest.fixture(autouse=True)

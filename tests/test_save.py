@@ -415,7 +415,7 @@ def test_a_batch_of_fields_is_refused_before_it_is_lost(tmp_path):
     X, Y = jnp.eye(4), jnp.ones((3, 4, 4))
     K = hk.Symplectic(hk.Gaussian())
     batch = jax.vmap(lambda Y: hk.fit(K, X, Y, 1e-3))(Y)
-    with pytest.raises(ValueError, match=r"save each field.*an axis more"):
+    with pytest.raises(ValueError, match=r"save each field.*one axis more"):
         hk.save(tmp_path / "batch", batch)
     assert not (tmp_path / "batch").exists()
 

@@ -14,7 +14,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import least_squares
 
 import hamkernel as hk
-from hamkernel._trajectories.score import Score, _lead
+from hamkernel._learned.score import Score, _lead
 
 K = hk.Symplectic(hk.Gaussian(1.0))
 

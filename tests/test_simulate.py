@@ -2,8 +2,6 @@
 
 import functools
 import math
-import subprocess
-import sys
 import warnings
 from typing import Any
 
@@ -425,11 +423,6 @@ def test_progress_shows_a_bar_and_changes_nothing(options, capsys):
     jax.effects_barrier()
     assert "100.00%" in capsys.readouterr().err
     np.testing.assert_array_equal(loud.ys, quiet.ys)
-
-
-def test_diffrax_loads_only_when_a_simulation_runs():
-    code = "import hamkernel, sys; hamkernel.systems; assert 'diffrax' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 @pytest.mark.parametrize("options", [{}, {"solver": GaussLegendre4(), "dt": 0.01}])

@@ -292,5 +292,5 @@ def test_other_refusals():
     ):
         with pytest.raises(ValueError, match="takes no symmetry but Odd and Even"):
             make()
-    with pytest.raises(ValueError, match="no function but zero"):
+    with pytest.raises(ValueError, match="only the zero function"):
         hk.Invariant(hk.Even(hk.Symplectic(G)), [-np.eye(4)])  # H odd and even

@@ -11,8 +11,8 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import hamkernel as hk
+from hamkernel._learned.diagnostics import _noise_against_motion
 from hamkernel._runs.table import Diagnostic, Diagnostics
-from hamkernel._trajectories.diagnostics import _noise_against_motion
 
 K = hk.Symplectic(hk.Gaussian(1.0))
 FRICTION = hk.Sum(energy=hk.Symplectic(hk.Gaussian(1.0)), friction=hk.Friction())

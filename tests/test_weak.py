@@ -181,6 +181,29 @@ def test_a_motor_on_a_pendulum_is_learned_from_its_angle(motor):
 
 
 @pytest.mark.slow
+def test_free_runs_of_a_motor_are_scored_beside_a_linear_model(motor):
+    ts = np.arange(101) / 50
+    new = swings(count=2, seed=4).part([slice(0, 101)] * 2)
+    score = motor.score(new)
+    exact = [
+        solve_ivp(
+            lambda t, x, u=u: [x[1], (np.interp(t, ts, u[:101, 0]) - 20 * np.sin(x[0])) / 2],
+            (0, 2),
+            np.asarray(found[0]),
+            t_eval=ts,
+            rtol=1e-9,
+            atol=1e-9,
+        ).y.T
+        for u, found in zip(new.inputs, score.predictions, strict=True)
+    ]
+    np.testing.assert_allclose(score.predictions, exact, atol=0.02)
+    assert score.rmse[0] < 5e-3 < score.linear[0]
+    assert np.isnan(score.rmse[1])  # velocities were not measured
+    assert np.isnan(score.coverage)
+    assert "times better than a linear model" in score.text
+
+
+@pytest.mark.slow
 def test_friction_that_is_missing_is_named_and_found():
     runs = swings(viscous=0.8, dry=0.6, seed=1)
     with pytest.warns(UserWarning, match="friction in joint 0"):

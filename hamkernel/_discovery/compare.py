@@ -24,6 +24,7 @@ from jaxtyping import Array, ArrayLike, Float, Num
 from hamkernel import _require as require
 from hamkernel._discovery.ladder import Rung, ladder
 from hamkernel._kernels.built_in import Gaussian
+from hamkernel._learned.result import Learned
 from hamkernel._machine import full_precision, one_blas_thread
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._observations.measurements import Measurements, observations
@@ -31,7 +32,6 @@ from hamkernel._show import Shown
 from hamkernel._solvers.problem import make_problem
 from hamkernel._structures.base import AbstractMatrixKernel, matrix_kernel
 from hamkernel._structures.structure import DivergenceFree, Separable
-from hamkernel._trajectories.learned import Learned
 from hamkernel._tuning.objective import criterion_of
 from hamkernel._tuning.search import Search, best
 from hamkernel._tuning.space import RIDGE, SearchSpace, named_values, velocity_rms

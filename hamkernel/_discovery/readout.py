@@ -40,13 +40,13 @@ from hamkernel._fields.joined import fix_inputs, known_of
 from hamkernel._gram import gram_of_rows
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._kernels.symmetry import symmetry_removed
+from hamkernel._learned.result import Learned
 from hamkernel._machine import full_precision
 from hamkernel._posterior import Posterior
 from hamkernel._solvers.problem import make_problem
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.masses import UnknownMasses
 from hamkernel._structures.structure import CurlFree
-from hamkernel._trajectories.learned import Learned
 
 # The largest relative difference of a function and its image under a symmetry, above rounding
 # errors and below a wrong sign.
@@ -285,7 +285,7 @@ def _check_columns(
     if bad:
         raise ValueError(
             f"{_join_names(bad)} is not finite at some of the states, or has no derivative there: "
-            "leave it out, or write it so that it has."
+            "leave it out, or write it so that both exist there."
         )
     R, D = columns.shape
     if D >= R:

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int, Num
 
 from hamkernel import _require as require
+from hamkernel._fields.kinetic import Kinetic
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._machine import EqualToItself, follow_data, full_precision, precise_jit
 from hamkernel._show import Shown, describe, has_arrays, text
@@ -400,8 +401,9 @@ def potential_of(field: Callable[..., Any], kernel: AbstractMatrixKernel) -> Sca
     if isinstance(field, AbstractField):
         if Sum(kernel, field.kernel).no_potential is None:
             return field.potential
-    elif kernel.symplectic and callable(getattr(field, "hamiltonian", None)):
-        return field.hamiltonian  # type: ignore[attr-defined]
+    elif callable(getattr(field, "hamiltonian", None)):
+        if kernel.symplectic or (isinstance(field, Kinetic) and field.is_of_velocities):
+            return field.hamiltonian  # type: ignore[attr-defined]
     name = getattr(getattr(field, "func", field), "__name__", type(field).__name__)
     structure = type(kernel).__name__
     if isinstance(field, AbstractField):

@@ -18,10 +18,12 @@ class Kinetic(eqx.Module):
 
     Attributes:
         mass: M, shape (), (m,) or (m, m).
+        is_of_velocities: whether states are (q, q̇) instead of (q, p); the field is then (q̇, 0).
     """
 
     is_separable: ClassVar[bool] = True
     mass: Float[Array, "..."]
+    is_of_velocities: bool = eqx.field(static=True, default=False)
 
     def __call__(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
         """The velocity (M⁻¹p, 0) of the state x = (q, p), shape (n,).
@@ -39,7 +41,8 @@ class Kinetic(eqx.Module):
             ValueError: x is not one state with one position for each mass.
         """
         x = self._state(x)
-        return 0.5 * x[len(x) // 2 :] @ self._velocity(x)
+        v, mass = self._velocity(x), self.mass.astype(x.dtype)
+        return 0.5 * v @ (mass @ v if mass.ndim == 2 else mass * v)
 
     def _state(self, x: Num[ArrayLike, " n"]) -> Float[Array, " n"]:
         x = require.floating(x, "x")
@@ -53,10 +56,17 @@ class Kinetic(eqx.Module):
 
     def _velocity(self, x: Float[Array, " n"]) -> Float[Array, " m"]:
         p, mass = x[x.shape[0] // 2 :], self.mass.astype(x.dtype)
+        if self.is_of_velocities:
+            return p
         return jnp.linalg.solve(mass, p) if mass.ndim == 2 else p / mass
 
     def __repr__(self) -> str:
         return describe(self)
+
+
+def kinetic_of_velocities(mass: Float[Array, "..."]) -> Kinetic:
+    """The prior mean (q̇, 0) of states (q, q̇), with the kinetic energy ½ q̇ᵀMq̇."""
+    return Kinetic(mass, is_of_velocities=True)
 
 
 def kinetic(mass: ArrayLike) -> Kinetic:

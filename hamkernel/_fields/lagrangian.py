@@ -97,21 +97,24 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
             ValueError: x or u has another shape.
             RuntimeError: M(q) is not positive definite.
         """
-        x = self._state(x)
-        q, v = jnp.split(x, 2)
-        torques = jnp.zeros_like(v) if u is None else self.gains * self._position(u, "u")
-        M = self.mass_matrix(q)
-        positive = jnp.linalg.eigvalsh(M)[0] > 0
-        rest = self.rest_torques(x)
-        a = require.value(
-            jnp.linalg.solve(M, torques - rest),
-            ~positive,
+        velocity, is_positive = self._velocity(x, u)
+        return require.value(
+            velocity,
+            ~is_positive,
             "the mass matrix is not positive definite at this state, so there is no acceleration: "
             "the data do not identify M there. Compare field.least_inertia with "
             "field.least_inertia_deviation. Add motions, friction=True, or a longer lengthscale.",
             RuntimeError,
         )
-        return jnp.concatenate([v, a])
+
+    def _velocity(self, x: ArrayLike, u: ArrayLike | None) -> tuple[Float[Array, " n"], Array]:
+        """(v, a), and whether M(q) is positive definite, without which there is no a."""
+        x = self._state(x)
+        q, v = jnp.split(x, 2)
+        torques = jnp.zeros_like(v) if u is None else self.gains * self._position(u, "u")
+        M = self.mass_matrix(q)
+        a = jnp.linalg.solve(M, torques - self.rest_torques(x))
+        return jnp.concatenate([v, a]), jnp.linalg.eigvalsh(M)[0] > 0
 
     @property
     def gains(self) -> Float[Array, " m"]:
@@ -268,6 +271,17 @@ class LagrangianField(Shown, EqualToItself, eqx.Module):
 
     def _position(self, q: ArrayLike, name: str = "q") -> Float[Array, " m"]:
         return require.point(q, self.features.count, name).astype(self.coefficients.dtype)
+
+
+class MachineOfPoints(eqx.Module):
+    """A machine as a function of the points (x, u), NaN where M(q) is not positive definite."""
+
+    machine: LagrangianField
+
+    def __call__(self, s: Float[Array, " d"]) -> Float[Array, " n"]:
+        n = self.machine.dimension
+        velocity, is_positive = self.machine._velocity(s[:n], s[n:] if len(s) > n else None)
+        return jnp.where(is_positive, velocity, jnp.nan)
 
 
 def lagrangian_field(

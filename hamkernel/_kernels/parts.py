@@ -15,6 +15,7 @@ has m unknowns. If the parts obey several laws with one kernel, each law has m f
 summed over its parts.
 """
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import Any, Literal, NamedTuple
 
@@ -36,6 +37,7 @@ from hamkernel._kernels.base import (
 )
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._kernels.symmetry import LinearMap, close_group
+from hamkernel._machine import compiled_by_size
 from hamkernel._show import call, describe, text
 
 _AT_ONCE = 2**16  # parts times centres of one batch: arrays of 512 KB
@@ -151,52 +153,11 @@ class Shared(AbstractScalarKernel):
 
     def features(self, x: Float[Array, " n"]) -> Float[Array, " r"]:
         """The features Φ(x), with k_S(x, z) = Φ(x)·Φ(z)."""
-        points, weights = self.parts_at(x)
-        laws = self.part_laws(len(points))
-
-        def feature(c):
-            values = weights * jax.vmap(self.kernel, (0, None))(points, c)
-            return jax.ops.segment_sum(values, laws, self.law_count)
-
-        return self._whiten(self._over_centres(feature, len(points), x.dtype)).T.ravel()
+        return Laws((self,)).features(x)
 
     def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
-        """The gradients of the features, with one reverse derivative of the parts for each."""
-        (points, weights), back = jax.vjp(self.parts_at, x)
-        laws = self.part_laws(len(points))
-        of_law = jnp.asarray(laws[None] == np.arange(self.law_count)[:, None], x.dtype)
-
-        def gradient(c):
-            value, slope = jax.vmap(jax.value_and_grad(self.kernel), (0, None))(points, c)
-            slope = weights[:, None] * slope
-            return jax.vmap(lambda on: back(Parts(on[:, None] * slope, on * value))[0])(of_law)
-
-        rows = self._over_centres(gradient, len(points) * self.law_count, x.dtype)
-        whitened = self._whiten(rows.reshape(len(rows), -1)).reshape(rows.shape)
-        return jnp.moveaxis(whitened, 2, 0).swapaxes(1, 2).reshape(len(x), -1)
-
-    def slope(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
-        """The product `gradients(x) @ w`, with one reverse derivative of the parts."""
-        (points, weights), back = jax.vjp(self.parts_at, x)
-        C, laws = self._points(x.dtype), self.part_laws(len(points))
-        w = w.reshape(self.law_count, -1).T
-        coefficients = solve_triangular(self._factor(x.dtype), w, lower=True, trans="T")
-
-        def law(r, which):
-            return jax.vmap(self.kernel, (None, 0))(r, C) @ coefficients[:, which]
-
-        def value_and_slope(part):
-            return jax.value_and_grad(law)(*part)
-
-        at_once = max(1, _AT_ONCE // len(C))
-        value, slope = jax.lax.map(value_and_slope, (points, laws), batch_size=at_once)
-        return back(Parts(weights[:, None] * slope, value))[0]
-
-    def _over_centres(self, fn: Callable[..., Array], parts: int, dtype: Any) -> Array:
-        """The values of `fn` at the centres, in batches whose memory is bounded."""
-        # The checkpoint bounds the memory of the reverse derivative too.
-        at_once = int(np.clip(_AT_ONCE // parts, 1, len(self.centres or ())))
-        return jax.lax.map(jax.checkpoint(fn), self._points(dtype), batch_size=at_once)
+        """The gradients of the features."""
+        return Laws((self,)).gradients(x)
 
     def point(self, r: ArrayLike) -> Float[Array, " d"]:
         """The argument of the kernel for an argument r of the law, such as log r for a distance."""
@@ -210,7 +171,9 @@ class Shared(AbstractScalarKernel):
 
     def law(self, point: Float[Array, " d"]) -> Float[Array, " m"]:
         """The features L⁻¹ k(C, point) of a law w at one point of the parts."""
-        return self._whiten(self._columns(point[None])[0])
+        C = self._points(point.dtype)
+        values = jax.vmap(self.kernel, (None, 0))(point, C)
+        return solve_triangular(root_at(self.kernel, C), values, lower=True)
 
     def missing(self, point: Float[Array, " d"], origin: Float[Array, " d"]) -> Float[Array, ""]:
         """The prior variance of w(point) − w(origin) outside the span of the centres."""
@@ -222,16 +185,6 @@ class Shared(AbstractScalarKernel):
     def _points(self, dtype: Any) -> Float[Array, "m d"]:
         assert self.centres is not None
         return jnp.asarray(np.asarray(self.centres), dtype)
-
-    def _columns(self, points: Float[Array, "P d"]) -> Float[Array, "P m"]:
-        C = self._points(points.dtype)
-        return jax.vmap(jax.vmap(self.kernel, (None, 0)), (0, None))(points, C)
-
-    def _whiten(self, rows: Float[Array, "m ..."]) -> Float[Array, "m ..."]:
-        return solve_triangular(self._factor(rows.dtype), rows, lower=True)
-
-    def _factor(self, dtype: Any) -> Float[Array, "m m"]:
-        return root_at(self.kernel, self._points(dtype))
 
     def through_descriptor(self, n: int) -> Descriptor | None:
         if self.centres is None:
@@ -252,11 +205,11 @@ class Shared(AbstractScalarKernel):
     def spread(self, X: Float[np.ndarray, "N n"], limit: int) -> Float[np.ndarray, "m d"]:
         """Up to `limit` points of the parts of X, spread over their range.
 
-        On a line we take the points nearest to an even grid. Otherwise each point is the farthest
-        from all points before it.
+        On a line the points are an even grid. Otherwise each point is the farthest from all points
+        before it.
         """
         rows = jnp.asarray(X[np.linspace(0, len(X) - 1, min(len(X), 256)).astype(int)])
-        parts = np.asarray(jax.lax.map(lambda x: self.parts_at(x).points, rows))
+        parts = np.asarray(_points_of_parts(self, rows))
         points = parts.reshape(-1, parts.shape[-1])
         low, high = points.min(axis=0), points.max(axis=0)
         if not (np.isfinite(low).all() and np.isfinite(high).all()):
@@ -266,17 +219,141 @@ class Shared(AbstractScalarKernel):
             )
         unit = points / np.where(high > low, high - low, 1.0)
         if points.shape[1] == 1 and len(points) > limit:
-            # The points nearest to an even grid over the range.
-            order = np.argsort(points[:, 0])
-            wanted = np.linspace(low[0], high[0], limit)
-            at = np.searchsorted(points[order, 0], wanted).clip(0, len(points) - 1)
-            return np.unique(points[order[at]], axis=0)
+            return np.unique(np.linspace(low, high, limit), axis=0)
         return points[far_apart(unit, limit)]
 
     def with_centres(self, X: Float[np.ndarray, "N n"]) -> "Shared":
         """The same kernel with centres among the parts of the states X."""
         count = int(np.clip(_FEATURES // self.law_count, _FEWEST_CENTRES, _CENTRES))
         return Shared(self.kernel, self.parts, self.spread(X, count), self.laws)
+
+
+@compiled_by_size
+def _points_of_parts(law: Shared, X: Float[Array, "N n"]) -> Float[Array, "N P d"]:
+    return jax.lax.map(lambda x: law.parts_at(x).points, X)
+
+
+class Laws(eqx.Module):
+    """`Shared` kernels of one structure, see `alike`, whose features one program evaluates.
+
+    The features are in the order of the kernels, of their laws, and of their centres.
+    """
+
+    terms: tuple[Shared, ...]
+
+    def features(self, x: Float[Array, " n"]) -> Float[Array, " r"]:
+        """The features Φ(x), with k_S(x, z) = Φ(x)·Φ(z)."""
+        (points, weights), owner, laws = self._join([term.parts_at(x) for term in self.terms])
+
+        def feature(c):
+            values = jax.vmap(lambda r, t: self._kernel(t)(r, c[t]))(points, owner)
+            return jax.ops.segment_sum(weights * values, laws, self._law_count)
+
+        return self._whiten(self._over_centres(feature, len(points), x.dtype)).ravel()
+
+    def gradients(self, x: Float[Array, " n"]) -> Float[Array, "n r"]:
+        """The gradients of the features, with one reverse derivative of the parts for each."""
+        by_term, vjps = zip(*(jax.vjp(term.parts_at, x) for term in self.terms), strict=True)
+        (points, weights), owner, laws = self._join(by_term)
+        of_law = jnp.asarray(laws[None] == np.arange(self._law_count)[:, None], x.dtype)
+
+        def gradient(c):
+            value, slope = jax.vmap(lambda r, t: jax.value_and_grad(self._kernel(t))(r, c[t]))(
+                points, owner
+            )
+            slope, rows, part, law = weights[:, None] * slope, [], 0, 0
+            for term, parts, vjp in zip(self.terms, by_term, vjps, strict=True):
+                at = slice(part, part := part + len(parts.weights))
+                masks = of_law[law : (law := law + term.law_count), at]
+                cotangents = Parts(masks[:, :, None] * slope[None, at], masks * value[None, at])
+                rows.append(jax.vmap(lambda cotangent, vjp=vjp: vjp(cotangent)[0])(cotangents))
+            return jnp.concatenate(rows)
+
+        rows = self._over_centres(gradient, len(points) * self._law_count, x.dtype)
+        return self._whiten(rows).reshape(-1, len(x)).T
+
+    def slope(self, x: Float[Array, " n"], w: Float[Array, " r"]) -> Float[Array, " n"]:
+        """The product `gradients(x) @ w`, with one reverse derivative of the parts."""
+        by_term, vjp = jax.vjp(lambda x: [term.parts_at(x) for term in self.terms], x)
+        (points, weights), owner, laws = self._join(by_term)
+        C = self._centres(x.dtype)
+        w = w.reshape(self._law_count, -1)
+        coefficients = jax.lax.map(
+            lambda both: solve_triangular(*both, lower=True, trans="T"), (self.roots(x.dtype), w)
+        )
+
+        def value_and_slope(part):
+            r, t, law = part
+            columns = jax.vmap(self._kernel(t), (None, 0))
+            return jax.value_and_grad(lambda r: columns(r, C[:, t]) @ coefficients[law])(r)
+
+        at_once = max(1, _AT_ONCE // len(C))
+        value, slope = jax.lax.map(value_and_slope, (points, owner, laws), batch_size=at_once)
+        slope = weights[:, None] * slope
+        ends = np.cumsum([len(parts.weights) for parts in by_term])[:-1]
+        pieces = zip(jnp.split(slope, ends), jnp.split(value, ends), strict=True)
+        return vjp([Parts(*both) for both in pieces])[0]
+
+    @property
+    def _law_count(self) -> int:
+        return sum(term.law_count for term in self.terms)
+
+    def _join(self, by_term: Sequence["Parts"]) -> tuple["Parts", np.ndarray, np.ndarray]:
+        """All parts, and the term and the law of each."""
+        counts, first = [len(parts.weights) for parts in by_term], 0
+        laws = []
+        for term, count in zip(self.terms, counts, strict=True):
+            laws.append(first + term.part_laws(count))
+            first += term.law_count
+        parts = jax.tree.map(lambda *arrays: jnp.concatenate(arrays), *by_term)
+        return parts, np.repeat(np.arange(len(counts)), counts), np.concatenate(laws)
+
+    def _kernel(self, t: Int[ArrayLike, ""]) -> Any:
+        """The kernel of term t."""
+        if len(self.terms) == 1:
+            return self.terms[0].kernel
+        arrays, static = zip(
+            *(eqx.partition(term.kernel, eqx.is_array) for term in self.terms), strict=True
+        )
+        return eqx.combine(jax.tree.map(lambda *a: jnp.stack(a)[t], *arrays), static[0])
+
+    def _centres(self, dtype: Any) -> Float[Array, "m t d"]:
+        return jnp.asarray(np.stack([np.asarray(term.centres) for term in self.terms], 1), dtype)
+
+    def roots(self, dtype: Any) -> Float[Array, "l m m"]:
+        """The factor L of k(C, C) of each law."""
+        C, terms = self._centres(dtype), np.arange(len(self.terms))
+        roots = jax.lax.map(lambda t: root_at(self._kernel(t), C[:, t]), terms)
+        return roots[np.repeat(terms, [term.law_count for term in self.terms])]
+
+    def _over_centres(self, fn: Callable[..., Array], parts: int, dtype: Any) -> Array:
+        """The values of `fn` at the centres, in batches whose memory is bounded."""
+        # The checkpoint bounds the memory of the reverse derivative too.
+        C = self._centres(dtype)
+        at_once = int(np.clip(_AT_ONCE // parts, 1, len(C)))
+        return jax.lax.map(jax.checkpoint(fn), C, batch_size=at_once)
+
+    def _whiten(self, rows: Float[Array, "m l *n"]) -> Float[Array, "l m *n"]:
+        """L⁻¹ times the rows of each law."""
+        columns = jnp.moveaxis(rows, 1, 0)
+        solved = jax.lax.map(
+            lambda both: solve_triangular(*both, lower=True),
+            (self.roots(rows.dtype), columns.reshape(*columns.shape[:2], -1)),
+        )
+        return solved.reshape(columns.shape)
+
+
+def alike(terms: Sequence[Shared]) -> list[slice]:
+    """Runs of neighbouring terms whose kernels differ in their hyperparameters alone."""
+
+    def structure(term: Shared) -> Any:
+        leaves, tree = jax.tree.flatten(term.kernel)
+        shapes = [leaf.shape if eqx.is_array(leaf) else leaf for leaf in leaves]
+        return tree, shapes, np.asarray(term.centres).shape
+
+    groups = [list(group) for _, group in itertools.groupby(terms, structure)]
+    ends = np.cumsum([0, *map(len, groups)]).tolist()
+    return [slice(*both) for both in itertools.pairwise(ends)]
 
 
 def _law_numbers(laws: Any) -> tuple[int, ...]:

@@ -152,8 +152,8 @@ def close_group(
             equal = [e for e in group if np.abs(e.matrix - new.matrix).max() < _SAME_MAP]
             if equal and equal[0].character != new.character:
                 raise ValueError(
-                    "no function but zero has all these symmetries: a product of the maps is the "
-                    "identity, or another product, and would change the sign. Choose fewer."
+                    "only the zero function has all these symmetries: two products of the maps are "
+                    "the same map, with opposite signs. Choose fewer symmetries."
                 )
             if not equal:
                 group.append(new)

@@ -80,7 +80,7 @@ class Path(NamedTuple):
 
 
 @compiled_by_size
-def _with_norms(field: Expansion, X: Float[Array, "N d"], scale: Float[Array, " n"]):
+def _with_norms(field: Any, X: Float[Array, "N d"], scale: Float[Array, " n"]):
     def one(s):
         f, D = with_tangent(field, s, len(scale))
         return f, jnp.linalg.norm(D * scale[None] / scale[:, None])
@@ -89,7 +89,7 @@ def _with_norms(field: Expansion, X: Float[Array, "N d"], scale: Float[Array, " 
 
 
 def stiffness(
-    field: Expansion, X: Float[np.ndarray, "N d"], scale: Float[np.ndarray, " n"]
+    field: Callable[[Array], Array], X: Float[np.ndarray, "N d"], scale: Float[np.ndarray, " n"]
 ) -> float:
     """The .95 quantile of ‖∂f/∂x‖ at the points X, in standard deviations of the coordinates.
 
@@ -104,7 +104,8 @@ def stiffness(
     f, norms = map(np.asarray, _with_norms(field, *jax.device_put((X, scale))))
     rates = [float(np.nanquantile(np.where(np.isfinite(norms), norms, 0.0), 0.95))]
     f = f[np.isfinite(f).all(axis=1)]
-    for part in frictions(field.kernel) if len(f) else ():
+    kernel: Any = getattr(field, "kernel", None)
+    for part in frictions(kernel) if kernel is not None and len(f) else ():
         forces = f[:, list(damped_coordinates(part.damped, n))]
         if part.rest_speed is not None:
             rates.append(0.05 * float(np.sqrt(np.mean(forces**2))) / part.rest_speed)

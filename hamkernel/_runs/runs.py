@@ -606,19 +606,19 @@ def _rows(x: Any, t: np.ndarray, run: int, name: str) -> Float[np.ndarray, "T n"
     x = require.doubles(x, f"{name}[{run}]")
     x = x[:, None] if x.ndim == 1 and len(x) == len(t) else x
     if x.ndim != 2 or len(x) != len(t) or x.shape[1] == 0:
-        hint = ""
+        hint, columns = "", "n" if name == "states" else "m"
         if x.ndim == 2 and x.shape[1] == len(t):
             hint = f" It seems transposed: {name}[{run}].T."
         elif x.ndim == 1 and len(x) and len(x) % len(t) == 0:
             hint = f" Rows of one flat list: np.reshape(values, ({len(t)}, {len(x) // len(t)}))."
         elif name == "inputs" and x.ndim == 2:
             hint = (
-                " Where inputs have times of their own, give pairs, inputs=[(times, u), …]; where "
-                "the last command is missing, repeat it."
+                " Inputs with times of their own are pairs, inputs=[(times, u), …]. If only the "
+                "last input is missing, repeat the one before."
             )
         raise ValueError(
-            f"{name}[{run}] has shape {x.shape} and times[{run}] has shape {t.shape}; one row a "
-            f"sample, shape ({len(t)}, {'n' if name == 'states' else 'm'}), is needed.{hint}"
+            f"{name}[{run}] has shape {x.shape} and times[{run}] has shape {t.shape}; the shape "
+            f"must be ({len(t)}, {columns}), one row for each sample.{hint}"
         )
     if np.isinf(np.asarray(x)).any():
         raise ValueError(f"{name}[{run}] contains inf. Write NaN for what was not measured.")

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hamkernel._learned.result import AbstractEvidence
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import complete
 from hamkernel._trajectories.likelihood import closed_form
@@ -14,6 +14,7 @@ from hamkernel._trajectories.model import Model, with_amplitude
 from hamkernel._trajectories.search import (
     LEAST_NOISE,
     Bounds,
+    log_shares_of_noise,
     losses,
     maximise_likelihood,
     search_sample,
@@ -25,7 +26,7 @@ _RANGE = np.log(1e4)
 _STEPS = 25  # of BFGS, as in each iteration of learning
 
 
-class Evidence(eqx.Module):
+class Evidence(AbstractEvidence):
     """The rows along the paths that were learned, with the model under which they are likeliest.
 
     Attributes:
@@ -46,14 +47,12 @@ class Evidence(eqx.Module):
 
     @property
     def log_p(self) -> float:
-        """The log marginal likelihood of the rows, up to a constant that no kernel changes."""
         return -self._loss(self.model)
 
     def gain(self, part: AbstractMatrixKernel) -> float:
         """The gain in log p from `part` as one more term of the drift.
 
-        We search all hyperparameters again, from their learned values and from a tenth and a
-        hundredth of the noise, since the noise had to explain the effect of `part`.
+        We search all hyperparameters again, from their learned values and from less noise.
         """
         n, K = len(self.scale), self.model.kernel
         part = complete(with_amplitude(part), self.points, n)
@@ -63,8 +62,9 @@ class Evidence(eqx.Module):
         free = np.concatenate([np.ones(len(flat) - 2 * n, bool), self.is_free])
         low, high = flat - _RANGE, flat + _RANGE
         low[-2 * n : -n] = np.minimum(flat[-2 * n : -n], np.log(LEAST_NOISE * self.scale))
-        design = np.tile(flat, (3, 1))
-        design[:, -2 * n :] += np.log([[1.0], [0.1], [0.01]]) * self.is_free
+        less = log_shares_of_noise(n) * self.is_free
+        design = np.tile(flat, (len(less), 1))
+        design[:, -2 * n :] += less
         design = np.maximum(design, low)
         points, rows = search_sample(self.points, self.rows)
         values = losses(larger, jnp.asarray(design), points, rows, self.start_deviation)
@@ -77,20 +77,3 @@ class Evidence(eqx.Module):
 
     def _loss(self, model: Model) -> float:
         return float(closed_form(model, self.points, self.rows, self.start_deviation).loss)
-
-
-class EvidenceOfRows(eqx.Module):
-    """The evidence of weak rows, see `laws.py`.
-
-    Attributes:
-        log_p: the log marginal likelihood of the rows, up to a constant that no kernel changes.
-    """
-
-    log_p: float
-
-    def gain(self, part: AbstractMatrixKernel) -> float:
-        raise TypeError(
-            "gain compares fields along iterated paths, and laws that many parts share are learned "
-            "from weak rows: learn again with the part in the kernel, hk.learn(K + part, runs), "
-            "and compare log_evidence."
-        )

@@ -12,6 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from hamkernel._learned.diagnostics import NEGLIGIBLE, SETTLED
+from hamkernel._learned.free_run import Stretches, error_over_constant, stretches_of_swings
+from hamkernel._learned.result import Iteration
+from hamkernel._learned.whiteness import whiteness
 from hamkernel._machine import compiled_by_size, precise_jit
 from hamkernel._runs.flow import (
     Expansion,
@@ -22,8 +26,6 @@ from hamkernel._runs.flow import (
     stiffness,
 )
 from hamkernel._runs.preprocessing import Preprocessed, sample_points, time_of_swing
-from hamkernel._trajectories.diagnostics import NEGLIGIBLE, SETTLED
-from hamkernel._trajectories.free_run import Stretches, error_over_constant, stretches_of_swings
 from hamkernel._trajectories.kalman import (
     SmoothedPath,
     innovations,
@@ -32,7 +34,6 @@ from hamkernel._trajectories.kalman import (
     smoothed_path,
     whitened_rows,
 )
-from hamkernel._trajectories.learned import Iteration
 from hamkernel._trajectories.likelihood import ClosedForm, closed_form
 from hamkernel._trajectories.model import Model, landmark_whitening
 from hamkernel._trajectories.search import (
@@ -54,7 +55,6 @@ from hamkernel._trajectories.segments import (
     make_segments,
     replace_pieces,
 )
-from hamkernel._trajectories.whiteness import whiteness
 
 _SEARCH = 25  # steps of BFGS, which go on in the next iteration
 

@@ -16,6 +16,8 @@ from hamkernel._fields.expansions import KernelField
 from hamkernel._fields.joined import learned_field
 from hamkernel._gram_operator import placed_product
 from hamkernel._kernels.functions import as_pytree
+from hamkernel._learned.diagnostics import diagnostics
+from hamkernel._learned.result import Learned, empty, misfits
 from hamkernel._runs.flow import Expansion, field_values
 from hamkernel._runs.preprocessing import (
     Preprocessed,
@@ -30,7 +32,6 @@ from hamkernel._runs.smoothing import interpolate, power_of_two
 from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import complete
-from hamkernel._trajectories.diagnostics import diagnostics
 from hamkernel._trajectories.evidence import Evidence
 from hamkernel._trajectories.iteration import (
     Current,
@@ -45,7 +46,6 @@ from hamkernel._trajectories.iteration import (
     iterate,
 )
 from hamkernel._trajectories.kalman import as_observations
-from hamkernel._trajectories.learned import Learned, empty, misfits
 from hamkernel._trajectories.model import Model
 from hamkernel._trajectories.quality import (
     chi_squared,

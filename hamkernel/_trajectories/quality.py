@@ -6,6 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hamkernel._learned.diagnostics import FOLLOWED, FitQuality
+from hamkernel._learned.free_run import error_over_constant, stretches_of_swings
+from hamkernel._learned.whiteness import whiteness
 from hamkernel._runs.preprocessing import (
     PreprocessedRun,
     decide,
@@ -15,13 +18,10 @@ from hamkernel._runs.preprocessing import (
 from hamkernel._runs.runs import Runs
 from hamkernel._runs.sensors import is_on_a_curve, timing
 from hamkernel._structures.friction import frictions
-from hamkernel._trajectories.diagnostics import FOLLOWED, FitQuality
-from hamkernel._trajectories.free_run import error_over_constant, stretches_of_swings
 from hamkernel._trajectories.iteration import End, asks_for_landmarks, initial_loss, noisy_counts
 from hamkernel._trajectories.kalman import smoothed_path
 from hamkernel._trajectories.search import missing_friction, missing_inertia, missing_structure
 from hamkernel._trajectories.segments import Piece
-from hamkernel._trajectories.whiteness import whiteness
 
 # The p of whiteness below which we ask for missing forces. In 13 logs like that of
 # `tests/benchmarks/verdicts.py "dry friction"`, which lack friction, p was 9e-18 to .1.

@@ -15,6 +15,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from hamkernel._gram_operator import placed_product
 from hamkernel._kernels.built_in import Gaussian
 from hamkernel._kernels.transforms import Select
+from hamkernel._learned.diagnostics import MissingForce
 from hamkernel._machine import compiled_by_size
 from hamkernel._runs.preprocessing import Preprocessed, sample_points
 from hamkernel._solvers.triangle import regression_loss
@@ -303,25 +304,16 @@ def landmark_gain(
     return float(few - many), part
 
 
-LARGE_GAIN = 10  # of log p: the odds are e¹⁰ to one
+def log_shares_of_noise(n: int) -> Float[np.ndarray, "5 k"]:
+    """Logarithms of the shares of sensor and process noise beside which a larger kernel is tried.
 
+    Process noise, or without it sensor noise, had to explain what the smaller kernel cannot.
 
-class MissingForce(NamedTuple):
-    """A force that the kernel lacks, or may lack.
-
-    Attributes:
-        gain: by how much the force raises log p; 0 where nothing asked.
-        share: the RMS of the force over that of the rates of the momenta, along the runs; 0 where
-            the gain is small.
+    Returns:
+        A row for each try, sensor noise first, shape (5, 2n).
     """
-
-    gain: float = 0.0
-    share: float = 0.0
-
-    @property
-    def is_there(self) -> bool:
-        """Whether the gain is large."""
-        return self.gain > LARGE_GAIN
+    shares = [[1.0, 1.0], [1.0, 0.1], [1.0, 0.01], [0.1, 0.1], [0.01, 0.01]]
+    return np.repeat(np.log(shares), n, axis=1)
 
 
 def missing_friction(
@@ -333,9 +325,8 @@ def missing_friction(
 ) -> MissingForce:
     """Viscous and dry friction of the momenta beside the drift.
 
-    Kernels stay. Process noise, or without it sensor noise, had to explain what friction would, and
-    may be a tenth or a hundredth with either. Forces as large as all of the motion are as good as
-    free in the closed form. None is missing where the kernel has friction, or is that of a family.
+    Kernels stay. Forces as large as all of the motion are as good as free in the closed form. None
+    is missing where the kernel has friction, or is that of a family.
 
     The gain of four runs of positions of a pendulum, 80 samples each, with viscous friction of .1
     and .03 is 75 and 33 beside the process noise found; with white pushes and no friction −9 to −6.
@@ -447,17 +438,16 @@ def _missing(
 ) -> MissingForce:
     """The force of `more` beside the kernel of states, with less noise if that is likelier.
 
-    Process noise, or without it sensor noise, had to explain what `more` would, and process noise
-    alone may be a tenth or a hundredth. X are points along the runs, Y the velocities there, and
+    X are points along the runs, Y the velocities there, and
     `units` those in which the force is compared with Y.
     """
     K, n = model.kernel, rows.residual.shape[-1]
     S, rows = search_sample(jnp.asarray(S), rows)
-    shares = np.array([[1.0, 1.0], [1.0, 0.1], [1.0, 0.01], [0.1, 0.1], [0.01, 0.01]])
+    less = log_shares_of_noise(n)
 
     def likeliest(model: Model) -> tuple[float, Model]:
-        design = np.tile(np.asarray(model.flat), (len(shares), 1))
-        design[:, -2 * n :] += np.repeat(np.log(shares), n, axis=1)  # sensor noise first
+        design = np.tile(np.asarray(model.flat), (len(less), 1))
+        design[:, -2 * n :] += less
         values = losses(model, design, S, rows, start_deviation)
         return float(values.min()), model.unflatten(design[int(np.argmin(values))])
 

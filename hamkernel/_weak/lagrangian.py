@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -10,10 +11,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
-from hamkernel._fields.lagrangian import LagrangianField, lagrangian_field
+from hamkernel._fields.lagrangian import LagrangianField, MachineOfPoints, lagrangian_field
+from hamkernel._learned.result import AbstractLearned
+from hamkernel._learned.score import Score, compute_score
 from hamkernel._machine import compiled_by_size, precise_jit
+from hamkernel._runs.preprocessing import preprocess
 from hamkernel._runs.runs import Runs
-from hamkernel._show import Shown, text
+from hamkernel._runs.table import Diagnostic, Diagnostics
+from hamkernel._show import text
 from hamkernel._solvers.lagrangian import (
     check_machine,
     missing_friction,
@@ -27,8 +32,6 @@ from hamkernel._structures.lagrangian import (
     LagrangianFeatures,
     lagrangian_features,
 )
-from hamkernel._trajectories.diagnostics import Diagnostic, Diagnostics
-from hamkernel._trajectories.learned import learned_from
 from hamkernel._tuning.lagrangian import Sizes, likeliest, torque_size
 from hamkernel._weak.rows import (
     Channels,
@@ -42,7 +45,7 @@ from hamkernel._weak.rows import (
 )
 
 
-class LearnedLagrangian(Shown, eqx.Module):
+class LearnedLagrangian(AbstractLearned):
     """The machine that `learn` found with a `Lagrangian`.
 
     Attributes:
@@ -57,6 +60,7 @@ class LearnedLagrangian(Shown, eqx.Module):
         diagnostics: a table with one row for each question; `.failing` has the names of the rows
             that fall short.
         runs: the runs that were given.
+        again: a function of the runs that calls `learn` with the same other arguments.
     """
 
     field: LagrangianField
@@ -68,17 +72,26 @@ class LearnedLagrangian(Shown, eqx.Module):
     converged: bool = eqx.field(static=True)
     diagnostics: Diagnostics = eqx.field(static=True)
     runs: Runs
+    again: Callable[[Runs], LearnedLagrangian]
 
     def _summary(self) -> tuple[str, list[tuple[str, str]]]:
-        table = self.diagnostics
-        short = [f"{name}: {table[name].meaning}" for name in table.failing]
-        return learned_from(self), [
+        return self._headline, [
             ("kernel", text(self.kernel)),
             ("noise", text(self.noise)),
             ("torque noise", text(self.torque_noise)),
-            *(("falls short", line) for line in short or ["nothing"]),
-            ("next", ".plot(), .field.mass_matrix(q), .field.mass_matrix_deviation(q)"),
+            *self._shortfalls,
+            ("next", ".plot(), .score(), .field.mass_matrix(q), .field.mass_matrix_deviation(q)"),
         ]
+
+    def _score(self, runs: Runs, first: int, draws: int) -> Score:
+        mean = Kinematics(self.field.features.count)
+        learned_runs = self.runs
+        if learned_runs.dimension < self.field.dimension:
+            learned_runs = learned_runs.with_momenta()
+        noise = np.full(self.field.dimension, np.nan)
+        noise[: len(self.noise)] = self.noise
+        field, data = MachineOfPoints(self.field), preprocess(learned_runs, mean)
+        return compute_score(field, mean, data, runs, first, noise, np.zeros_like(noise))
 
     def plot(self, run: int = 0) -> Any:
         """One figure: the positions of one run with their smoothed paths, gravity and inertia.
@@ -101,7 +114,23 @@ class LearnedLagrangian(Shown, eqx.Module):
         return self.field
 
 
-def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, unused: dict[str, Any]) -> Any:
+class Kinematics(eqx.Module):
+    """q̇ = v of the points (q, v, u), and v̇ = 0: the known part of the motion of `count` joints."""
+
+    count: int
+
+    def __call__(self, s: Float[Array, " d"]) -> Float[Array, " n"]:
+        v = s[self.count : 2 * self.count]
+        return jnp.concatenate([v, jnp.zeros_like(v)])
+
+
+def learn_lagrangian(
+    K: Lagrangian,
+    runs: Runs,
+    noise: Any,
+    unused: dict[str, Any],
+    again: Callable[[Runs], LearnedLagrangian],
+) -> LearnedLagrangian:
     """The machine from runs of positions, or of (q, v), with torques as inputs; see `learn`.
 
     Args:
@@ -109,6 +138,7 @@ def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, unused: dict[str, An
         runs: the runs.
         noise: the standard deviations of the coordinates, if they are known.
         unused: arguments of `learn` that say nothing of a Lagrangian.
+        again: `learn` with all arguments but the runs.
     """
     m, noise = _check(K, runs, noise, unused)
     states = runs.host_arrays()[1]
@@ -153,6 +183,7 @@ def learn_lagrangian(K: Lagrangian, runs: Runs, noise: Any, unused: dict[str, An
         converged=table.is_usable,
         diagnostics=table,
         runs=runs,
+        again=again,
     )
 
 

@@ -348,20 +348,20 @@ def path_covariance(law: Law, pieces: Pieces) -> Float[Array, "B R R"]:
 
     def piece_result(piece):
         path, roots = piece
-
-        def slopes(index):
-            tangent = jnp.zeros(Z, path.dtype).at[index].set(1.0)
-            a, b = jax.vmap(lambda z: jax.jvp(law, (z,), (tangent,))[1])(path)
-            D = jnp.einsum("wp,pi->wip", pieces.values, b)
-            return D - jnp.einsum("wp,pi->wip", pieces.slopes, a)
+        # One node at a time: its derivatives have the kernels of a law in common.
+        slopes_a, slopes_b = jax.lax.map(jax.jacfwd(law), path)  # (P, m, Z)
 
         def add(total, c):
-            D = jnp.concatenate([slopes(c + shift) for shift in range(0, Z, C)], axis=2)
+            D = [
+                jnp.einsum("wp,pi->wip", pieces.values, slopes_b[:, :, c + shift])
+                - jnp.einsum("wp,pi->wip", pieces.slopes, slopes_a[:, :, c + shift])
+                for shift in range(0, Z, C)
+            ]
+            D = jnp.concatenate(D, axis=2)
             E = D.reshape(-1, D.shape[2]) @ roots[jnp.asarray(pieces.owner)[c]]
             return total + E @ E.T, None
 
-        m = jax.eval_shape(law, path[0])[1].shape[0]
-        R = len(pieces.values) * m
+        R = len(pieces.values) * slopes_a.shape[1]
         return jax.lax.scan(add, jnp.zeros((R, R), path.dtype), jnp.arange(C))[0]
 
     return jax.lax.map(piece_result, (jnp.asarray(pieces.path), jnp.asarray(pieces.roots)))

@@ -19,8 +19,8 @@ from hamkernel.plot._style import BLUE, COLORS, DATA, coordinate, legend
 from hamkernel.plot._time import fitted, index_of_run
 
 if TYPE_CHECKING:
+    from hamkernel._learned.result import Learned
     from hamkernel._runs.runs import Runs
-    from hamkernel._trajectories.learned import Learned
     from hamkernel._weak.lagrangian import LearnedLagrangian
 
 _STATES = 120  # at which a law is drawn

@@ -27,8 +27,8 @@ from hamkernel.plot._style import (
 )
 
 if TYPE_CHECKING:
+    from hamkernel._learned.result import Learned
     from hamkernel._runs.runs import Runs
-    from hamkernel._trajectories.learned import Learned
 
 # Each (T,), or (S, T) for several seeds.
 Series = ArrayLike | Mapping[str, ArrayLike]

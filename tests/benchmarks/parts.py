@@ -1,6 +1,7 @@
 """One law that many parts share: how well a few states of a large system determine it.
 
-    python tests/benchmarks/parts.py [lennard 10 30 100 | chain 512 | bodies 2 3 | springs 5]
+    python tests/benchmarks/parts.py [lennard 10 30 100 | chain 512 | bodies 2 3 | springs 5 |
+                                      film 30 | species 10 | masses 5 | damped 8]
 
 - `lennard`: particles in a plane on a jittered lattice, 20 states with momenta, noise of 1 on the
   velocities (the rms force is near 17), the masses known. Lengthscale, amplitude and noise maximise
@@ -181,12 +182,126 @@ def springs(particles, seed):
         )
 
 
+def particles_run(rng, masses, slope, count, dt=0.01):
+    """Times and states (q, q̇) of particles on a jittered lattice, with momenta N(0, 1)."""
+    n, side = len(masses), int(np.ceil(np.sqrt(len(masses))))
+    lattice = 1.15 * np.stack(np.meshgrid(*[np.arange(side)] * 2), -1).reshape(-1, 2)[:n]
+    q, p = lattice + 0.06 * rng.standard_normal((n, 2)), rng.standard_normal((n, 2))
+
+    def rates(t, x):
+        return np.append(x[2 * n :], pair_forces(x[: 2 * n].reshape(n, 2), slope) / mass)
+
+    mass, times = np.repeat(masses, 2), dt * np.arange(count)
+    start = np.append(q.ravel(), p.ravel() / mass)
+    x = solve_ivp(rates, (0, times[-1]), start, "DOP853", times, rtol=1e-9, atol=1e-9).y.T
+    return times, x
+
+
+def wells(depth, size):
+    """4 depth ((size/r)¹² − (size/r)⁶), and its slope."""
+
+    def law(r):
+        return 4 * depth * ((size / r) ** 12 - (size / r) ** 6)
+
+    return law, lambda r: 4 * depth * (6 * (size / r) ** 6 - 12 * (size / r) ** 12) / r
+
+
+def errors_of_law(learned, which, truth, r, r0):
+    """The rms error and band of a law less its value at r0, and the share inside 1 and 2 bands."""
+    r, posterior = jnp.asarray(r), learned.posterior
+    law = jax.vmap(partial(learned.field.law, r0=r0, which=which))(r)
+    band = np.asarray(jax.vmap(partial(posterior.law_deviation, r0=r0, which=which))(r))
+    off = np.abs(np.asarray(law) - (truth(np.asarray(r)) - truth(r0)))
+    inside = [np.mean(off <= k * band + 1e-12) for k in (1, 2)]
+    rms = [np.sqrt(np.mean(x**2)) for x in (off, band)]
+    return f"law {which} rms {rms[0]:.4f} band {rms[1]:.4f} inside {inside[0]:.2f} {inside[1]:.2f}"
+
+
+def show_learned(name, size, seed, learned, begun, *said):
+    state = "usable" if learned.converged else "refused"
+    seconds = time.process_time() - begun
+    print(f"{name} {size:4d} seed {seed}", *said, f"{state} {seconds:5.0f} s", flush=True)
+
+
+def film(particles, seed):
+    rng, (law, slope) = np.random.default_rng(seed), wells(1.0, 1.0)
+    times, x = particles_run(rng, np.ones(particles), slope, 101)
+    noisy = hk.Runs(times, x + 0.01 * rng.standard_normal(x.shape))
+    begun = time.process_time()
+    shared = hk.Shared(hk.Matern(2.5), hk.pairs(particles, 2, of="inverse"))
+    learned = hk.learn(hk.Symplectic(shared), noisy, mass=1.0)
+    said = errors_of_law(learned, 0, law, np.linspace(0.97, 3, 60), 2.0)
+    show_learned("film", particles, seed, learned, begun, said)
+
+
+def species(particles, seed):
+    rng, kind = np.random.default_rng(seed), np.arange(particles) % 2
+    depth, size = np.array([[1, 1.5], [1.5, 0.5]]), np.array([[1, 0.9], [0.9, 0.88]])
+    _, slope = wells(depth[kind][:, kind], size[kind][:, kind])
+    times, x = particles_run(rng, np.ones(particles), slope, 201)
+    noisy = hk.Runs(times, x + 0.01 * rng.standard_normal(x.shape))
+    begun = time.process_time()
+    a, b = (np.flatnonzero(kind == k) for k in (0, 1))
+    laws = [
+        1.0 * hk.Shared(hk.Matern(2.5), hk.pairs(particles, 2, of="inverse", among=group))
+        for group in (a, (a, b), b)
+    ]
+    learned = hk.learn(hk.Symplectic(laws[0] + laws[1] + laws[2]), noisy, mass=1.0)
+    q, said = x[:, : 2 * particles].reshape(-1, particles, 2), []
+    r = np.linalg.norm(q[:, :, None] - q[:, None], axis=-1) + 9 * np.eye(particles)
+    for which, (i, j) in enumerate([(0, 0), (0, 1), (1, 1)]):
+        of_kinds = (kind[:, None] == i) & (kind[None] == j)
+        visited = np.linspace(r[:, of_kinds].min(), 2.5 * size[i, j], 50)
+        law, _ = wells(depth[i, j], size[i, j])
+        said.append(errors_of_law(learned, which, law, visited, 2.0))
+    show_learned("species", particles, seed, learned, begun, *said)
+
+
+def masses(particles, seed):
+    rng, (law, slope) = np.random.default_rng(seed), wells(1.0, 1.0)
+    mass = np.append(1.0, rng.uniform(0.5, 3.0, particles - 1))
+    times, x = particles_run(rng, mass, slope, 201)
+    noisy = hk.Runs(times, x + 0.003 * rng.standard_normal(x.shape))
+    begun = time.process_time()
+    shared = hk.Shared(hk.Matern(2.5), hk.pairs(particles, 2, of="inverse"))
+    learned = hk.learn(hk.Symplectic(shared), noisy, masses=True)
+    off = np.asarray(learned.kernel.masses) / np.repeat(mass, 2) - 1
+    said = f"masses rms {np.sqrt(np.mean(off**2)):.4f} worst {np.abs(off).max():.4f}"
+    laws = errors_of_law(learned, 0, law, np.linspace(1.0, 2.5, 60), 2.0)
+    show_learned("masses", particles, seed, learned, begun, said, laws)
+
+
+def damped(sites, seed):
+    rng, times, runs = np.random.default_rng(seed), 0.05 * np.arange(161), []
+
+    def rates(t, x):
+        d = np.diff(x[:sites])
+        pull = d + 0.5 * d**3
+        force = np.append(pull, 0.0) - np.append(0.0, pull) - 0.15 * x[sites:]
+        return np.concatenate([x[sites:], force])
+
+    for _ in range(2):
+        start = rng.standard_normal(2 * sites)
+        x = solve_ivp(rates, (0, 8), start, t_eval=times, rtol=1e-9, atol=1e-9).y.T
+        runs.append(x + 0.01 * rng.standard_normal(x.shape))
+    begun = time.process_time()
+    energy = hk.Symplectic(hk.Shared(hk.Gaussian(2.0), hk.neighbours(sites)))
+    K = hk.Sum(energy=energy, friction=hk.Friction())
+    learned = hk.learn(K, hk.Runs(times, runs), mass=1.0)
+    rubs = np.asarray(learned.field.part("friction")(jnp.ones(2 * sites)))[sites:]
+    said = errors_of_law(learned, 0, lambda r: r**2 / 2 + r**4 / 8, np.linspace(-1.5, 1.5, 41), 0.0)
+    show_learned(
+        "damped", sites, seed, learned, begun, said, f"friction {np.abs(rubs + 0.15).max():.4f}"
+    )
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("task", nargs="*", default=["bodies", "2", "3"])
     parser.add_argument("--seeds", type=int, default=3)
     asked = parser.parse_args()
-    task = {"lennard": lennard, "chain": chain, "bodies": bodies, "springs": springs}[asked.task[0]]
+    tasks = lennard, chain, bodies, springs, film, species, masses, damped
+    task = {task.__name__: task for task in tasks}[asked.task[0]]
     for size in asked.task[1:]:
         for seed in range(asked.seeds):
             task(int(size), seed)

@@ -1,10 +1,11 @@
-"""`Learned`: what `learn` returns."""
+"""Results of `learn`: `Learned`, and what it shares with a learned machine."""
 
 from __future__ import annotations
 
+import abc
 import warnings
 from collections.abc import Callable
-from typing import Any
+from typing import Any, Self
 
 import equinox as eqx
 import jax
@@ -13,9 +14,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Key
 
 from hamkernel import _require as require
+from hamkernel._fields.base import known_part
+from hamkernel._learned.score import Score, compute_score
 from hamkernel._machine import full_precision
 from hamkernel._observations.kinds import AbstractObservations
 from hamkernel._posterior import Posterior, condition
+from hamkernel._runs.preprocessing import preprocess
 from hamkernel._runs.runs import Runs
 from hamkernel._runs.table import Diagnostics
 from hamkernel._show import Shown, describe, has_arrays, numbers, text
@@ -23,8 +27,6 @@ from hamkernel._solvers.nystrom import Nystrom
 from hamkernel._structures.base import AbstractMatrixKernel, Sum, matrix_kernel
 from hamkernel._structures.friction import Friction, damped_coordinates
 from hamkernel._structures.joined import InputMatrix
-from hamkernel._trajectories.evidence import Evidence, EvidenceOfRows
-from hamkernel._trajectories.score import Score, compute_score
 
 
 class Iteration(eqx.Module):
@@ -54,7 +56,121 @@ class Iteration(eqx.Module):
         return describe(self)
 
 
-class Learned(Shown, eqx.Module):
+class AbstractEvidence(eqx.Module):
+    """The evidence of learned runs."""
+
+    @property
+    @abc.abstractmethod
+    def log_p(self) -> float:
+        """The log marginal likelihood of the rows, up to a constant that no kernel changes."""
+
+    @abc.abstractmethod
+    def gain(self, part: AbstractMatrixKernel) -> float:
+        """The gain in log p from `part` as one more term of the drift."""
+
+
+class AbstractLearned(Shown, eqx.Module):
+    """A result of `learn`.
+
+    Attributes:
+        noise: the standard deviation of the sensor noise of each coordinate.
+        states: the fitted path of each run at its times, shape (T, n).
+        converged: whether the field may be used.
+        diagnostics: a table with one row for each question.
+        runs: the runs of the caller.
+        again: a function of runs that calls `learn` with the same other arguments.
+    """
+
+    noise: eqx.AbstractVar[Float[Array, " k"]]
+    states: eqx.AbstractVar[tuple[Float[Array, "T n"], ...]]
+    converged: eqx.AbstractVar[bool]
+    diagnostics: eqx.AbstractVar[Diagnostics]
+    runs: eqx.AbstractVar[Runs]
+    again: eqx.AbstractVar[Callable[[Runs], Self]]
+
+    @property
+    def _headline(self) -> str:
+        """The size of the data, and whether to use the field."""
+        count, is_known = len(self.states), has_arrays(self.states)
+        samples = sum(len(x) for x in self.states) if is_known else "unknown"
+        of = f"{type(self).__name__} from {count} run{'s' * (count != 1)}, {samples} samples"
+        return f"{of}: {'usable' if self.converged else 'do not use this field'}"
+
+    @property
+    def _shortfalls(self) -> list[tuple[str, str]]:
+        """The rows of diagnostics that fall short, as printed."""
+        short = [f"{name}: {self.diagnostics[name].meaning}" for name in self.diagnostics.failing]
+        return [("falls short", line) for line in short or ["nothing"]]
+
+    @abc.abstractmethod
+    def plot(self, run: int = 0) -> Any:
+        """One figure of one run, as a Matplotlib figure."""
+
+    @full_precision
+    def score(self, runs: Runs | None = None, *, first: int = 10, draws: int = 64) -> Score:
+        """Compare free runs of the field with runs, beside a linear model and the last value.
+
+            print(learned.score(hk.Runs(times, states)))
+
+        Each free run begins at the state that fits the first few samples of its run best, and uses
+        no later sample.
+
+        Args:
+            runs: runs that were not used to learn, positions alone if need be. If None, `score`
+                holds out the last fifth of each run, learns again from the rest, in the time that
+                learning took, and scores the new field.
+            first: the number of samples that a free run knows; half of the run if it is shorter
+                than 2 `first`.
+            draws: the number of fields drawn from the posterior for `coverage`; 0 for no bands.
+
+        Returns:
+            A `Score`.
+
+        Raises:
+            TypeError: `runs` are no `Runs`, or have inputs or parameters where the learned ones
+                have none, or the other way round. ValueError: their dimension is another; no run
+                has ten samples, of which a fifth could be held out.
+        """
+        first, draws = require.count(first, "first"), require.count(draws, "draws", least=0)
+        if runs is None:
+            lengths = [len(t) for t in self.runs.times]
+            if max(lengths) < 10:
+                raise ValueError(
+                    "no run has ten samples, of which the last fifth could be held out: pass runs "
+                    "that were not learned from, learned.score(runs)."
+                )
+            cuts = [T - T // 5 if T >= 10 else T for T in lengths]
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore")  # learning from all samples gave the same warnings
+                rest = self.again(self.runs.part([slice(0, cut) for cut in cuts]))
+            last = self.runs.part([slice(cut, None) for cut in cuts])
+            return rest.score(last, first=first, draws=draws)
+        if not isinstance(runs, Runs):
+            raise TypeError(f"score takes hk.Runs(times, states); got a {type(runs).__name__}.")
+        for name in ("inputs", "parameters"):
+            if (getattr(runs, name) is None) != (getattr(self.runs, name) is None):
+                has, lacks = (
+                    ("the learned", "these")
+                    if getattr(runs, name) is None
+                    else ("these", "the learned")
+                )
+                raise TypeError(f"{has} runs have {name} and {lacks} have none; both need them.")
+        n = self.states[0].shape[1]
+        if 2 * runs.dimension == n:
+            runs = runs.with_momenta()
+        if (runs.dimension, runs.input_count) != (n, self.runs.input_count):
+            raise ValueError(
+                f"the runs have {runs.dimension} coordinates and {runs.input_count} inputs; the "
+                f"learned ones have {n} and {self.runs.input_count}."
+            )
+        return self._score(runs, first, draws)
+
+    @abc.abstractmethod
+    def _score(self, runs: Runs, first: int, draws: int) -> Score:
+        """The score on runs with the coordinates and inputs of the learned ones."""
+
+
+class Learned(AbstractLearned):
     """The field that `learn` found, with the paths, the noise and the diagnostics.
 
     Attributes:
@@ -129,7 +245,7 @@ class Learned(Shown, eqx.Module):
     runs: Runs
     observations: AbstractObservations | None
     mean: Any
-    evidence: Evidence | EvidenceOfRows
+    evidence: AbstractEvidence
     again: Callable[..., Learned]
 
     def _summary(self) -> tuple[str, list[tuple[str, str]]]:
@@ -144,10 +260,9 @@ class Learned(Shown, eqx.Module):
         ]
         rows += [(name, table[name].value) for name in ("iterations", "free run") if name in table]
         rows += [("orbits", table["orbits"].meaning)] if "orbits" in table else []
-        short = [f"{name}: {table[name].meaning}" for name in self.diagnostics.failing]
-        rows += [("falls short", line) for line in short or ["nothing"]]
+        rows += self._shortfalls
         rows.append(("next", ".plot(), .score(), .diagnostics, hk.simulate(learned.field, x0, ts)"))
-        return learned_from(self), rows
+        return self._headline, rows
 
     def _repr_html_(self) -> str:
         import hamkernel  # the door to pictures, which load Matplotlib
@@ -252,69 +367,18 @@ class Learned(Shown, eqx.Module):
         """
         return self.evidence.gain(matrix_kernel(part))
 
-    @full_precision
-    def score(self, runs: Runs | None = None, *, first: int = 10, draws: int = 64) -> Score:
-        """Compare free runs of the field with runs, beside a linear model and the last value.
-
-            print(learned.score(hk.Runs(times, states)))
-
-        Each free run begins at the state that fits the first few samples of its run best, and uses
-        no later sample.
-
-        Args:
-            runs: runs that were not used to learn, positions alone if need be. If None, `score`
-                holds out the last fifth of each run, learns again from the rest, in the time that
-                learning took, and scores the new field.
-            first: the number of samples that a free run knows; half of the run if it is shorter
-                than 2 `first`.
-            draws: the number of fields drawn from the posterior for `coverage`; 0 for no bands.
-
-        Returns:
-            A `Score`.
-
-        Raises:
-            TypeError: `runs` are no `Runs`, or have inputs or parameters where the learned ones
-                have none, or the other way round. ValueError: their dimension is another; no run
-                has ten samples, of which a fifth could be held out.
-        """
-        first, draws = require.count(first, "first"), require.count(draws, "draws", least=0)
-        if runs is None:
-            lengths = [len(t) for t in self.runs.times]
-            if max(lengths) < 10:
-                raise ValueError(
-                    "no run has ten samples, of which the last fifth could be held out: pass runs "
-                    "that were not learned from, learned.score(runs)."
-                )
-            cuts = [T - T // 5 if T >= 10 else T for T in lengths]
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # learning from all samples gave the same warnings
-                rest = self.again(self.runs.part([slice(0, cut) for cut in cuts]))
-            last = self.runs.part([slice(cut, None) for cut in cuts])
-            return rest.score(last, first=first, draws=draws)
-        if not isinstance(runs, Runs):
-            raise TypeError(f"score takes hk.Runs(times, states); got a {type(runs).__name__}.")
-        for name in ("inputs", "parameters"):
-            if (getattr(runs, name) is None) != (getattr(self.runs, name) is None):
-                has, lacks = (
-                    ("the learned", "these")
-                    if getattr(runs, name) is None
-                    else ("these", "the learned")
-                )
-                raise TypeError(f"{has} runs have {name} and {lacks} have none; both need them.")
-        if 2 * runs.dimension == self.runs.dimension:
-            runs = runs.with_momenta()
-        if (runs.dimension, runs.input_count) != (self.runs.dimension, self.runs.input_count):
-            raise ValueError(
-                f"the runs have {runs.dimension} coordinates and {runs.input_count} inputs; the "
-                f"learned ones have {self.runs.dimension} and {self.runs.input_count}."
-            )
-        posterior = None
+    def _score(self, runs: Runs, first: int, draws: int) -> Score:
+        mean = known_part(self.kernel, self.mean, runs.dimension, jnp.float64)
+        field = getattr(self.field, "whole", self.field)  # of the points (x, u) with inputs
+        sample = None
         if draws and self.observations is not None:
             with warnings.catch_warnings():
                 # Whether the landmarks are enough is a row of `diagnostics`.
                 warnings.simplefilter("ignore")
-                posterior = self._posterior(on_landmarks=True)
-        return compute_score(self, runs, first, posterior, draws)
+                sample = self._posterior(on_landmarks=True).sample
+        data = preprocess(self.runs, mean)
+        noise, process = np.asarray(self.noise), np.asarray(self.process_noise)
+        return compute_score(field, mean, data, runs, first, noise, process, sample, draws)
 
     def plot(self, run: int = 0, held_out: Runs | None = None) -> Any:
         """Draw one figure: fit, residuals in units of the noise, force with its band, free run.
@@ -360,14 +424,6 @@ def _coefficients(field: Any, names: tuple[str, ...]) -> list[tuple[str, str]]:
         said = [f"{text(line)} on coordinate {name}" for line, name in lines if line.any()]
         rows.append(("input matrix", ", ".join(said)))
     return rows
-
-
-def learned_from(learned: Any) -> str:
-    """The first line of a result: the size of the data, and whether to use the field."""
-    count, is_known = len(learned.states), has_arrays(learned.states)
-    samples = sum(len(x) for x in learned.states) if is_known else "unknown"
-    of = f"{type(learned).__name__} from {count} run{'s' * (count != 1)}, {samples} samples"
-    return f"{of}: {'usable' if learned.converged else 'do not use this field'}"
 
 
 def misfits(runs: Runs, states: list[np.ndarray], noise: np.ndarray) -> np.ndarray:

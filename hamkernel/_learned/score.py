@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,16 +12,14 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from hamkernel import _require as require
-from hamkernel._fields.base import known_part
+from hamkernel._learned.diagnostics import FEW
+from hamkernel._learned.free_run import Stretches, pad_stretches, predictions
 from hamkernel._machine import precise_jit
-from hamkernel._posterior import Posterior
 from hamkernel._runs.flow import integrate, steps_for, stiffness
-from hamkernel._runs.preprocessing import preprocess, sample_points
+from hamkernel._runs.preprocessing import Preprocessed, preprocess, sample_points
 from hamkernel._runs.runs import Runs
 from hamkernel._show import Shown
 from hamkernel._show import numbers as number
-from hamkernel._trajectories.diagnostics import FEW
-from hamkernel._trajectories.free_run import Stretches, pad_stretches, predictions
 
 _STEPS = 12  # of Levenberg and Marquardt; starts at smoothed states usually need 4
 
@@ -132,7 +131,6 @@ class _Linear(eqx.Module):
 
     matrix: Float[Array, "n d"]
     constant: Float[Array, " n"]
-    kernel: None = None
 
     def __call__(self, s: Float[Array, " d"]) -> Float[Array, " n"]:
         return self.matrix @ s + self.constant
@@ -149,17 +147,33 @@ class _Disturbed(eqx.Module):
 
 
 def compute_score(
-    learned: Any, runs: Runs, first: int, posterior: Posterior | None, draws: int
+    field: Callable[[Array], Array],
+    mean: Callable[[Array], Array] | None,
+    training: Preprocessed,
+    runs: Runs,
+    first: int,
+    noise: Float[np.ndarray, " n"],
+    process_noise: Float[np.ndarray, " n"],
+    sample: Callable[..., Any] | None = None,
+    draws: int = 0,
 ) -> Score:
-    """The score of a learned field on `runs`; see `Learned.score`."""
-    mean = known_part(learned.kernel, learned.mean, runs.dimension, jnp.float64)
-    training = preprocess(learned.runs, mean)
+    """The score of a field on `runs`; see `AbstractLearned.score`.
+
+    Args:
+        field: the velocities of the points (x, u).
+        mean: the known part of the field, which determines coordinates that were not measured.
+        training: the runs from which the field was learned.
+        runs: the runs to predict.
+        first: the number of samples that each free run knows.
+        noise: the standard deviation of the sensor noise, NaN where nothing was measured.
+        process_noise: the intensity of the process noise.
+        sample: the fields drawn from the posterior, as `Posterior.sample`; None for no bands.
+        draws: the number of these fields.
+    """
     scale = training.scale
-    noise = np.asarray(learned.noise)
     deviation = np.maximum(np.where(np.isfinite(noise), noise, scale), 1e-6 * scale)
     part = _as_stretches(runs, [run.path[0] for run in preprocess(runs, mean).runs])
     known_counts = [min(first, max(len(t) // 2, 1)) for t in runs.host_arrays()[0]]
-    field = getattr(learned.field, "whole", learned.field)  # of the points (x, u) with inputs
 
     def free(field: Any) -> tuple[_Starts, np.ndarray]:
         starts = _fit_starts(field, part, known_counts, deviation, scale)
@@ -172,8 +186,8 @@ def compute_score(
     judged = np.where(later[..., None], measured, np.nan)
     last = np.stack([_last(y[:k]) for y, k in zip(measured, known_counts, strict=True)])[:, None]
     coverage = np.nan
-    if posterior is not None:
-        bands = _draws(learned, posterior, part, starts, scale, draws)
+    if sample is not None:
+        bands = _draws(field, sample, training, part, starts, noise, process_noise, draws)
         low, high = np.quantile(bands, [0.025, 0.975], axis=0)
         inside = (low <= judged) & (judged <= high)
         coverage = float(inside[np.isfinite(judged)].mean())
@@ -301,30 +315,31 @@ def _stiffness(field: Any, part: Stretches, scale: Float[np.ndarray, " n"]) -> f
 
 
 def _draws(
-    learned: Any,
-    posterior: Posterior,
+    field: Any,
+    sample: Callable[..., Any],
+    training: Preprocessed,
     part: Stretches,
     starts: _Starts,
-    scale: Float[np.ndarray, " n"],
+    noise: Float[np.ndarray, " n"],
+    process_noise: Float[np.ndarray, " n"],
     draws: int,
-) -> np.ndarray:
-    """Free runs of draws of the posterior with both kinds of noise, shape (draws, S, L, n)."""
+) -> Float[np.ndarray, "draws S L n"]:
+    """Free runs of draws of the posterior with both kinds of noise."""
     n, (S, L) = part.starts.shape[1], part.spans.shape
-    everywhere = np.concatenate([*map(np.asarray, learned.states), starts.states])
+    everywhere = np.concatenate([*(run.path for run in training.runs), starts.states])
     low, high = everywhere.min(axis=0), everywhere.max(axis=0)
     margin = 0.2 * np.where(high > low, high - low, 1.0)
     of_field, of_start, of_w, of_noise = jax.random.split(jax.random.key(0), 4)
     region = np.stack([low - margin, high + margin])
-    fields = posterior.sample(of_field, draws, region)
+    fields = sample(of_field, draws, region)
     lengths = np.maximum(part.spans, np.finfo(float).tiny)[None, ..., None]
-    w = np.asarray(jax.random.normal(of_w, (draws, S, L, n))) * np.asarray(learned.process_noise)
+    w = np.asarray(jax.random.normal(of_w, (draws, S, L, n))) * process_noise
     w = np.where(lengths > 1e-300, w / np.sqrt(lengths), 0.0)
     z = np.asarray(jax.random.normal(of_start, (draws, S, n)))
     x = starts.states + np.einsum("sij,dsj->dsi", starts.roots, z)
     inputs = np.broadcast_to(part.inputs, (draws, *part.inputs.shape))
     inputs = np.concatenate([inputs, np.repeat(w[:, :, :, None], 2, axis=3)], axis=-1)
-    field = getattr(learned.field, "whole", learned.field)
-    steps = jnp.asarray(steps_for(part.spans, _stiffness(field, part, scale)))
+    steps = jnp.asarray(steps_for(part.spans, _stiffness(field, part, training.scale)))
     spans, d = jnp.asarray(part.spans), n + part.inputs.shape[-1]
 
     @precise_jit
@@ -334,6 +349,5 @@ def _draws(
         return integrate(_Disturbed(joint_field, d), x, spans, steps, inputs).x[:, 1:]
 
     out = np.asarray(run(fields, jnp.asarray(x), jnp.asarray(inputs)))
-    noise = np.nan_to_num(np.asarray(learned.noise))
     out = np.where(np.isfinite(out), out, np.inf)
-    return out + noise * np.asarray(jax.random.normal(of_noise, out.shape))
+    return out + np.nan_to_num(noise) * np.asarray(jax.random.normal(of_noise, out.shape))

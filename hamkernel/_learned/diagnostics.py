@@ -3,24 +3,19 @@
 Each function below answers one question about a `FitQuality` and returns a `Diagnostic`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.tree_util import keystr, tree_flatten_with_path
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
-from hamkernel import _require as require
 from hamkernel._kernels.transforms import Select, Warp
-from hamkernel._runs.runs import Runs
+from hamkernel._learned.whiteness import FALSE_ALARMS, Whiteness
 from hamkernel._runs.sensors import Timing
 from hamkernel._runs.table import Diagnostic, Diagnostics
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.friction import damped_coordinates, frictions
-from hamkernel._trajectories.search import LARGE_GAIN, MissingForce
-from hamkernel._trajectories.whiteness import FALSE_ALARMS, Whiteness
 
 # The change of a field, relative to its size, at which iterations end. It may leave residuals of as
 # much of the states: 40 runs of a double pendulum without noise end with some of 1e-5, 2.4 times
@@ -53,6 +48,27 @@ _LOSSY = 0.1 / (2 * np.pi)
 # whose logarithms alone are Hamiltonian, have .30 to .34 in eight logs, limit cycles .38 to .45 in
 # three (`tests/benchmarks/verdicts.py`), and sensors whose errors are correlated .03 to .12.
 _FOREIGN = 0.2
+
+
+LARGE_GAIN = 10  # of log p: the odds are e¹⁰ to one
+
+
+class MissingForce(NamedTuple):
+    """A force that the kernel lacks, or may lack.
+
+    Attributes:
+        gain: by how much the force raises log p; 0 where nothing asked.
+        share: the RMS of the force over that of the rates of the momenta, along the runs; 0 where
+            the gain is small.
+    """
+
+    gain: float = 0.0
+    share: float = 0.0
+
+    @property
+    def is_there(self) -> bool:
+        """Whether the gain is large."""
+        return self.gain > LARGE_GAIN
 
 
 class FitQuality(NamedTuple):
@@ -258,7 +274,7 @@ def _outliers(fit: FitQuality) -> Diagnostic | None:
     c = int(np.nanargmin(core))
     return Diagnostic(
         "outliers",
-        f"{core[c]:.2g} of the noise in the middle half",
+        f"robust deviation {core[c]:.2g} of the noise",
         "0.5",
         bool(core[c] > 0.5),
         "most residuals are as large as the noise that was found"
@@ -322,6 +338,7 @@ def _whiteness(fit: FitQuality, K: AbstractMatrixKernel) -> Diagnostic:
     """Whether the residuals of the prediction are independent from sample to sample."""
     white, c = fit.white, int(np.argmax(np.abs(fit.white.neighbours)))
     passes = not white.is_refuted
+    wider = f", bands {white.widening**0.5:.2g} times wider" if white.widening > 1 else ""
     causes = "what the process noise stands for, which is a force and not white"
     is_small_force = 0 < fit.share < _SMALL and fit.free_run < FOLLOWED
     if fit.share == 0:
@@ -334,8 +351,8 @@ def _whiteness(fit: FitQuality, K: AbstractMatrixKernel) -> Diagnostic:
         causes = f"inputs that act at other times than logged (delay='fit'); {causes}"
     return Diagnostic(
         "whiteness",
-        f"p = {white.probability:.2g}, bands wider by {white.widening**0.5:.2g}",
-        f"p = {FALSE_ALARMS}, or 1.2",
+        f"p = {white.probability:.2g}{wider}",
+        f"p = {FALSE_ALARMS}, or 1.2 times",
         passes,
         f"the innovations are {'' if passes else 'not '}white: the correlation of "
         f"neighbours is {white.neighbours[c]:.2f} in coordinate {fit.names[c]}",
@@ -488,8 +505,8 @@ def _timing(fit: FitQuality) -> Diagnostic | None:
         return None
     return Diagnostic(
         "timing",
-        f"off by {fit.timing.off:.2g}",
-        "a fifth of the variance",
+        f"{fit.timing.share:.0%} of the variance",
+        "20%",
         not fit.timing.is_off,
         "residuals are larger where the states move faster, as if times were off by "
         f"{fit.timing.off:.2g}"
@@ -598,51 +615,3 @@ def rest_speed(K: AbstractMatrixKernel, X: Float[np.ndarray, "N d"], n: int) -> 
 
 def _numbers(values: Float[np.ndarray, " n"]) -> str:
     return "(" + ", ".join(f"{v:.2g}" for v in values) + ")"
-
-
-def check_identifiable(
-    K: AbstractMatrixKernel, runs: Runs, mean: Callable[[Array], Array] | None
-) -> None:
-    """Raise unless the coordinates that no run measured are determined.
-
-    A mean of the points (x, u) must say how they move the others, and K must not change how. A K
-    that changes the velocities of both kinds of coordinates represents the system in coordinates
-    p -> g(q, p) as well. The runs then fit each of them equally.
-    """
-    measured = np.any([np.isfinite(x).any(axis=0) for x in runs.host_arrays()[1]], axis=0)
-    if measured.all():
-        return
-    names = np.array(runs.coordinate_names)[~measured]
-    never = f"coordinate {', '.join(names)} was measured in no run"
-    if mean is None:
-        raise ValueError(
-            f"{never}. From the others alone it is known only up "
-            "to any change of coordinates, p -> g(q, p), so there is nothing to learn it from. "
-            "Say how it moves the others: mean=lambda x: jnp.array([x[1] / m, 0.0]) for q̇ = p/m "
-            "and K a kernel for the rest, such as hk.Symplectic(hk.Select(k, 0)) for ṗ = -U'(q). "
-            "Or log it."
-        )
-    n = len(measured)
-    points = np.random.default_rng(0).standard_normal((8, n + runs.input_count))
-    with require.traceable("mean"):
-        D = np.asarray(jax.vmap(jax.jacfwd(mean))(jnp.asarray(points)))  # (8, n, d)
-    slopes = np.abs(D[:, measured, :n]).max(axis=(0, 1), initial=0.0)
-    blind = np.flatnonzero(~measured & ~(slopes > 0))  # also where a slope is NaN
-    if len(blind):
-        raise ValueError(
-            f"coordinate {runs.coordinate_names[blind[0]]} was measured in no run, and the "
-            "velocities of the mean do not depend on it: give a mean that says how it moves the "
-            "others, such as q̇ = p/m."
-        )
-    points[:, n:] = 0.0  # another p cannot stand for an input, but for its slope
-    variances = np.asarray(jax.vmap(lambda x: jnp.diag(K(x, x)))(jnp.asarray(points)))
-    is_changed = np.nanmax(variances, axis=0) > 0
-    if is_changed[measured].any() and is_changed[~measured].any():
-        positions = tuple(np.flatnonzero(measured).tolist())
-        raise ValueError(
-            f"{never}, and K also changes how it moves the "
-            "others: then it is known only up to any change of coordinates, p -> g(q, p), and so "
-            "are the field and its energy. If the masses are known, K is for the forces alone: "
-            f"hk.Symplectic(hk.Select(k, {positions})), k a kernel of {len(positions)} "
-            f"coordinate{'s' * (len(positions) > 1)}."
-        )

@@ -1,0 +1,1 @@
+"""Results of `learn`, and whether they may be used."""
