@@ -32,24 +32,6 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
-_new_context = mlir.make_ir_context
-_context = _new_context()
-
-
-def _one_context():
-    """For each program JAX makes a new context of MLIR: an eighth of the CPU time, and memory.
-
-    A program that is compiled while another is lowered has a context of its own.
-    """
-    try:
-        is_lowering = ir.Context.current is not None
-    except ValueError:  # of older versions, where there is none
-        is_lowering = False
-    return _new_context() if is_lowering else _context
-
-
-mlir.make_ir_context = _one_context
-
 
 @pytest.hookimpl(tryfirst=True)  # before pytest deselects what is slow
 def pytest_collection_modifyitems(items):
