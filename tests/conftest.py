@@ -24,8 +24,6 @@ os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "false")
 import jax
 import numpy as np
 import pytest
-from jax._src.interpreters import mlir
-from jaxlib.mlir import ir
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 jax.config.update("jax_enable_x64", True)
