@@ -55,10 +55,6 @@ class RowSharding:
         """The array with all rows on every device."""
         return jax.device_put(array, NamedSharding(self.mesh, PartitionSpec()))
 
-    def sum(self, tree: Any) -> Any:
-        """The sum over the devices, for functions that run on each of them."""
-        return jax.lax.psum(tree, self.axes)
-
 
 def row_sharding(array: Array) -> RowSharding | None:
     """The sharding of the rows of `array`; None if it lies on one device or is traced.
@@ -138,7 +134,6 @@ def map_devices(
     replicated: Any,
     *parts: Array,
     joined: bool,
-    reduce: Callable[[RowSharding, Any], Any] = RowSharding.sum,
 ) -> Any:
     """`function(replicated, *parts)`, evaluated by each device for its own rows of the parts.
 
@@ -147,9 +142,7 @@ def map_devices(
         function: (replicated, *parts) -> a PyTree of arrays.
         replicated: a PyTree, the same on all devices.
         parts: arrays with rows.
-        joined: whether the results are rows, which are concatenated; otherwise they are reduced.
-        reduce: maps the results of all devices to one result, the same on all of them; the default
-            is the sum.
+        joined: whether the results are rows, which are concatenated; otherwise they are summed.
     """
     if rows is None:
         return function(replicated, *parts)
@@ -157,7 +150,7 @@ def map_devices(
 
     def result_of_device(arrays, *parts):
         result = function(eqx.combine(arrays, static), *parts)
-        return result if joined else reduce(rows, result)
+        return result if joined else jax.lax.psum(result, rows.axes)
 
     # `check_vma=False`: tracking would require every loop, also in a user's kernel, to state
     # whether its start differs between devices. Derivatives are right either way.

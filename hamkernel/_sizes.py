@@ -27,8 +27,6 @@ class Sizes(NamedTuple):
         states: states at which a field is evaluated at once.
         trace_points: points whose diagonal blocks of the Gram are computed at once.
         design_entries: entries of a tile of features whose normal equations are added up.
-        triangle_entries: entries of a tile of features that is appended to a triangle; a tile has
-            at least three times as many rows as columns.
         strip_entries: entries of a strip of rows of the Gram.
         rows_in_place: the number of rows from which the Gram is factored in its own memory; None
             to do so only if a separate factor would not fit in memory.
@@ -38,7 +36,6 @@ class Sizes(NamedTuple):
     states: int
     trace_points: int
     design_entries: int
-    triangle_entries: int
     strip_entries: int
     rows_in_place: int | None
 
@@ -50,8 +47,6 @@ class Sizes(NamedTuple):
 # - trace_points: the blocks of 1024 points of a Gaussian stay in the cache. A million points take
 #   16 ms, and 90 ms with 4096 points at once.
 # - design_entries: 2²⁰ numbers, 8 MB, stay in the cache.
-# - triangle_entries: 0, so a tile has three times as many rows as columns. With 2²⁰ a fit of 100,
-#   250 and 500 random features took 28, 14 and 12 % longer.
 # - strip_entries: some kernels hold 40 numbers for each entry, 160 MB.
 # - rows_in_place: the Gram of 6000 rows takes 288 MB.
 _CPU = Sizes(
@@ -59,7 +54,6 @@ _CPU = Sizes(
     states=1024,
     trace_points=1024,
     design_entries=2**20,
-    triangle_entries=0,
     strip_entries=500_000,
     rows_in_place=6000,
 )
@@ -69,8 +63,6 @@ _CPU = Sizes(
 #   with 4000 and 175 ms with 10 000.
 # - states: evaluating a field of 24 points at a million states took 14.1 ms in batches of 1024, and
 #   .92 ms with 2¹⁷ at once; 2²⁰ at once are no faster.
-# - triangle_entries: 250 random features of 100 000 points took 391 ms with QR and three times as
-#   many rows as columns, and 53 ms with products and 2²⁴ entries.
 # - strip_entries: a fit of 8000 rows took 15.5 ms with 500 000, 13.8 ms with 2²² and 12.8 ms with
 #   2²⁴; with 40 numbers for each entry, 2²⁴ entries would take 5 GB.
 # - rows_in_place: 16 000 rows took 107 ms in place and 54 ms otherwise, so only memory decides.
@@ -81,7 +73,6 @@ _GPU = Sizes(
     states=2**17,
     trace_points=2**17,
     design_entries=2**24,
-    triangle_entries=2**24,
     strip_entries=2**22,
     rows_in_place=None,
 )

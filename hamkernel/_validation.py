@@ -281,7 +281,8 @@ def _dense_held_out(G, ridge, y, p, rows: Measurements, partition: Partition):
     units = jnp.where(p == 0, jnp.ones_like(p), rows.scale)
     equal = jnp.where(p == 0, p, len(rows.energies) ** -0.5)
     system = DenseSystem(units[:, None] * A * units[None], equal)
-    result: Any = held_out(system, units * y, partition)
+    y = units * y
+    result: Any = held_out(system, y - equal * (equal @ y), partition)
     return result[0] / units, units * result[1]
 
 

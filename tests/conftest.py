@@ -24,31 +24,11 @@ os.environ.setdefault("JAX_ENABLE_COMPILATION_CACHE", "false")
 import jax
 import numpy as np
 import pytest
-from jax._src.interpreters import mlir
-from jax._src.lib.mlir import ir
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
-
-_new_context = mlir.make_ir_context
-_context = _new_context()
-
-
-def _one_context():
-    """For each program JAX makes a new context of MLIR: an eighth of the CPU time, and memory.
-
-    A program that is compiled while another is lowered has a context of its own.
-    """
-    try:
-        is_lowering = ir.Context.current is not None
-    except ValueError:  # of older versions, where there is none
-        is_lowering = False
-    return _new_context() if is_lowering else _context
-
-
-mlir.make_ir_context = _one_context
 
 
 @pytest.hookimpl(tryfirst=True)  # before pytest deselects what is slow
@@ -85,11 +65,12 @@ def fast_compilation() -> dict[str, str]:
 def _few_compiled_programs():
     """Each compiled program maps memory, and Linux has a limit of 65,530 maps: drop them in time.
 
-    Dropped after each module, a sixth of the CPU time compiles programs of modules before.
+    Dropped after each module, a sixth of the CPU time compiles programs of modules before. Ours
+    have 2,000 maps and 300 MB each.
     """
     yield
     maps = pathlib.Path("/proc/self/maps")
-    if not maps.exists() or maps.read_bytes().count(b"\n") > 20_000:
+    if not maps.exists() or maps.read_bytes().count(b"\n") > 12_000:
         jax.clear_caches()
 
 

@@ -110,8 +110,12 @@ NOT_STATIONARY = {
 def test_sound_kernels_pass_at_every_lengthscale_amplitude_and_dimension(name, dtype):
     # In float32 the product form loses the distance itself beyond a thousand lengthscales.
     seed = 0
-    for lengthscale in (1e-3, 0.1, 1e3):
-        for amplitude, n in ((1e-6, 1), (1e6, 2), (1.0, 4), (1e3, 6)):
+    for lengthscale, of_each in (
+        (1e-3, ((1e-6, 1), (1e6, 2))),
+        (0.1, ((1.0, 4), (1e3, 6))),
+        (1e3, ((1e6, 2), (1e-6, 4))),
+    ):
+        for amplitude, n in of_each:
             seed += 1
             if dtype == np.float32 and lengthscale < 0.01 and "products" in name:
                 continue
@@ -122,7 +126,7 @@ def test_sound_kernels_pass_at_every_lengthscale_amplitude_and_dimension(name, d
             assert check_kernel(k, cloud(seed, n=n).astype(dtype)) is None
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", NOT_STATIONARY)
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_kernels_that_are_not_stationary_pass(name, dtype):
@@ -181,7 +185,7 @@ def test_modules_partials_methods_and_jitted_functions_are_accepted():
         jax.jit(SOUND["Gaussian"]),
         module.__call__,
     ):
-        check_kernel(k, cloud())
+        check_kernel(k, cloud(N=3))
     bad = functools.partial(lambda a, x, z: a * matern52(safe_norm(x, z)), 2.0)
     assert "zero block" in refusal(jax.jit(bad), cloud())
 
@@ -189,6 +193,7 @@ def test_modules_partials_methods_and_jitted_functions_are_accepted():
 # The block at x = z
 
 
+@pytest.mark.few(4)
 @pytest.mark.parametrize("profile", [matern32, matern52])
 @pytest.mark.parametrize("scale", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -200,7 +205,7 @@ def test_matern_through_a_norm_is_nan(profile, scale, dtype):
     assert "squared distance" in message
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(2)
 @pytest.mark.parametrize("profile", [matern32, matern52])
 @pytest.mark.parametrize("ratio", [1e-3, 1.0, 1e3])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
@@ -251,7 +256,7 @@ def test_too_large_a_block_is_refused_though_the_gram_stays_positive():
     assert "wrong block" in refusal(lambda x, z: profile(squared(x, z)), cloud())
 
 
-@pytest.mark.few(4)
+@pytest.mark.few(3)
 @pytest.mark.parametrize("norm", [naive_norm, safe_norm])
 @pytest.mark.parametrize("n", [1, 2, 4])
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

@@ -45,6 +45,7 @@ def by_hand(k, X, B=None):
     return blocks.transpose(0, 2, 1, 3)
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("inner", [hk.Gaussian(1.3), 2.0 * hk.Matern(2.5, 0.9)])
 def test_the_gram_of_a_warp_is_that_of_its_second_derivatives(inner, key):
     X = jax.random.normal(key, (5, 2))

@@ -17,7 +17,7 @@ import hamkernel as hk
 from hamkernel import FeatureField, RandomFeatures
 from hamkernel._features import features
 from hamkernel._machine import orthonormal
-from hamkernel._solvers.least_squares import ridge_regression, triangle_of_design
+from hamkernel._solvers.least_squares import ridge_regression
 from hamkernel.paper import datasets, experiments
 
 STRUCTURE = 1e-9  # relative; what sums of a thousand rounded terms leave of an exact zero
@@ -345,7 +345,7 @@ def test_a_small_ridge_keeps_the_digits_that_normal_equations_lose(key):
     X, Y = data(200, 2)
     basis = features(hk.Symplectic(hk.Gaussian(4.0)), 2, 40, key, X.dtype)
     ridge = 1e-12
-    w, _ = ridge_regression(basis, basis.columns, X, Y, jnp.asarray(ridge))
+    w, *_ = ridge_regression(basis, jnp.eye(basis.columns), X, Y, jnp.asarray(ridge))
     rows, target = np.asarray(basis(X)).reshape(X.size, -1), np.asarray(Y).ravel()
     U, s, Vt = np.linalg.svd(rows, full_matrices=False)
     expected = Vt.T @ (s / (s**2 + ridge) * (U.T @ target))
@@ -572,22 +572,21 @@ def test_data_and_ridge_may_change_after_the_fit(key):
     np.testing.assert_allclose(after(X[0]), rows[0] @ w, atol=SOLVE)
 
 
-def test_the_triangle_of_many_tiles_is_least_squares_in_numpy():
-    rng = np.random.default_rng(0)
-    A, y, ridge = rng.normal(size=(3000, 6)), rng.normal(size=(3000, 1)), 10.0
-    rows = jnp.asarray(A)[:, None, :]
-    index = jnp.arange(3000)[:, None]
-    factor = np.asarray(
-        triangle_of_design(lambda X: rows[X[:, 0]], 6, index, jnp.asarray(y), jnp.asarray(ridge))
+def test_ridge_regression_in_many_tiles_is_least_squares_in_numpy():
+    rng, ridge = np.random.default_rng(0), 1e-9
+    # Columns of different scales, and rows that the sample, every tenth point, does not resemble.
+    A = rng.normal(size=(10_000, 6)) * np.logspace(0, -5, 6)
+    A[1::10] *= np.logspace(0, 3, 6)
+    W, y = rng.normal(size=(6, 6)), rng.normal(size=(10_000, 1))
+    rows, index = jnp.asarray(A)[:, None, :], jnp.arange(10_000)[:, None]
+    w, residual, trace = ridge_regression(
+        lambda X: rows[X[:, 0]], jnp.asarray(W), index, jnp.asarray(y), jnp.asarray(ridge)
     )
-    np.testing.assert_array_equal(factor, np.triu(factor))
-    below = np.concatenate([A, np.sqrt(ridge) * np.eye(6)])
-    target = np.append(y, np.zeros(6))
-    expected, square, *_ = np.linalg.lstsq(below, target)
-    np.testing.assert_allclose(
-        np.linalg.solve(factor[:6, :6], factor[:6, 6]), expected, atol=ROUNDING
-    )
-    np.testing.assert_allclose(abs(factor[6, 6]), np.sqrt(square[0]), rtol=ROUNDING)
+    below = np.concatenate([A @ W, np.sqrt(ridge) * np.eye(6)])
+    expected = np.linalg.lstsq(below, np.append(y, np.zeros(6)))[0]
+    np.testing.assert_allclose(w, expected, rtol=SOLVE)
+    np.testing.assert_allclose(residual, y - A @ W @ expected[:, None], atol=ROUNDING)
+    np.testing.assert_allclose(trace, np.sum((A @ W) ** 2), rtol=ROUNDING)
 
 
 @pytest.mark.few(1)

@@ -117,12 +117,6 @@ def test_potentials_work_where_the_field_is_traced():
     assert jnp.isfinite(jax.jit(jax.grad(fit_and_ask))(Y)).all()
 
 
-def test_a_field_can_be_exported():
-    field, x = fitted(hk.Symplectic), states(1)[0]
-    exported = jax.export.export(jax.jit(field))(jax.ShapeDtypeStruct(x.shape, x.dtype))
-    np.testing.assert_allclose(exported.call(x), field(x), atol=ROUNDING)
-
-
 # Potentials.
 
 

@@ -53,7 +53,7 @@ def smallest(G):
     return np.linalg.eigvalsh((G + G.T) / 2).min() / np.trace(G)
 
 
-@pytest.mark.few(16)
+@pytest.mark.few(8)
 @pytest.mark.parametrize(
     ("structure", "case"),
     [
@@ -136,6 +136,7 @@ def test_a_rough_kernel_does_not_feel_the_rounding_of_the_distance_of_a_point_fr
     np.testing.assert_allclose(own - 3 / 1.2**2 * np.eye(4), 0.0, atol=SYMMETRY)
 
 
+@pytest.mark.few(2)
 @pytest.mark.parametrize("name", ["gaussian", "matern2.5", "periodic"])
 def test_shift_invariant_kernels_do_not_feel_the_origin(name):
     K, X = hk.Symplectic(BY_NAME[name].make(4)), states()

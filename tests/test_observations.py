@@ -370,7 +370,7 @@ def kinetic(x):
 
 MEANS = {
     "system": hk.systems.HarmonicOscillator(),
-    "field": hk.fit(MODEL, *pendulum_data(6, 7), 1e-3),
+    "field": hk.fit(MODEL, *pendulum_data(8, 7), 1e-3),
     "function": kinetic,
 }
 

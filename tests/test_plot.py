@@ -1,7 +1,5 @@
 """Pictures: what is drawn, with which labels and colours, read back from the axes."""
 
-import subprocess
-import sys
 from typing import Any
 
 import jax.numpy as jnp
@@ -50,11 +48,6 @@ def change_of_radius(ax):
     lines = stream.get_segments()
     assert len(lines) > 10
     return [np.ptp(np.linalg.norm(points, axis=1)) for points in lines]
-
-
-def test_importing_the_package_loads_no_matplotlib():
-    code = "import sys, hamkernel; sys.exit('matplotlib' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 def test_every_function_draws_on_the_axes_given():

@@ -1,5 +1,6 @@
 """Where `tune` looks: the box of each hyperparameter, the subset of points, the starts."""
 
+import dataclasses
 from typing import Any
 
 import equinox as eqx
@@ -207,7 +208,7 @@ def test_generalised_cross_validation_judges_only_fits_that_leave_residuals_free
         assert judged(generalized_loss(K, rows, ridge, None, dense + more))
     criterion = criterion_of("generalized_cross_validation", 6, 5)
     assert criterion.loss(K, rows, jnp.asarray(1e-12))[0] == np.inf
-    assert criterion.with_options(basis=waves).loss(K, rows, jnp.asarray(1.0))[0] < np.inf
+    assert dataclasses.replace(criterion, basis=waves).loss(K, rows, jnp.asarray(1.0))[0] < np.inf
 
 
 def test_the_ridge_of_a_subset_is_that_of_all_points():
@@ -363,7 +364,7 @@ def whole(kernel, Y, bounds=None):
     """The objective of the search on all of X."""
     rows, typical = measurements_of_states(jnp.asarray(X), jnp.asarray(Y)), speed(Y)
     given = SearchSpace(kernel, rows.points, typical, jnp.asarray(1e-3), (), bounds or {})
-    criterion = criterion_of("cross_validation", N, 5).restrict(rows, np.arange(N))
+    criterion = criterion_of("cross_validation", N, 5).restrict(kernel, rows, np.arange(N))
     return SearchObjective(given, criterion, rows, *map(jnp.asarray, (1.0, typical, 1.0)))
 
 

@@ -2,8 +2,6 @@
 
 import functools
 import math
-import subprocess
-import sys
 import warnings
 from typing import Any
 
@@ -252,7 +250,7 @@ def test_flow_map_by_forward_mode_is_symplectic():
     np.testing.assert_allclose(np.linalg.det(jax.jit(jax.jacfwd(end))(START)), 1.0, atol=1e-12)
 
 
-@pytest.mark.few(2)
+@pytest.mark.few(1)
 @pytest.mark.parametrize("options", [{}, {"solver": diffrax.Heun(), "dt": 0.1}])
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.hessian])
 def test_forward_mode_through_the_default_adjoint_says_which_to_pass(derivative, options):
@@ -322,9 +320,10 @@ def test_a_compiled_field_is_the_field():
     K = hk.Symplectic(hk.Select(hk.Gaussian(), 0) + hk.Select(hk.Gaussian(), 1))
     X = np.random.default_rng(0).normal(size=(2, 10, 2))
     field = hk.fit(K, X[0], X[1], 1e-2)
-    ys = states(field, START, TIMES, StormerVerlet(), dt=0.1)
+    ys = states(field, START, TIMES[:2], StormerVerlet(), dt=0.1)
     for compiled in (jax.jit(field), eqx.filter_jit(field)):
-        np.testing.assert_array_equal(ys, states(compiled, START, TIMES, StormerVerlet(), dt=0.1))
+        again = states(compiled, START, TIMES[:2], StormerVerlet(), dt=0.1)
+        np.testing.assert_array_equal(again, ys)
 
 
 @pytest.mark.parametrize(
@@ -427,11 +426,7 @@ def test_progress_shows_a_bar_and_changes_nothing(options, capsys):
     np.testing.assert_array_equal(loud.ys, quiet.ys)
 
 
-def test_diffrax_loads_only_when_a_simulation_runs():
-    code = "import hamkernel, sys; hamkernel.systems; assert 'diffrax' not in sys.modules"
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
+@pytest.mark.few(1)
 @pytest.mark.parametrize("options", [{}, {"solver": GaussLegendre4(), "dt": 0.01}])
 def test_float32_stays_float32_and_late_times_are_as_exact_as_early_ones(options):
     # The field does not depend on time. Near 1e5 neighbouring float32 are 0.008 apart, about the

@@ -1,6 +1,3 @@
-import subprocess
-import sys
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -661,22 +658,6 @@ def test_trajectories_without_an_end_are_errors_that_name_the_row():
     jitted = eqx.filter_jit(systems.sample)
     with pytest.raises(RuntimeError, match="could not be integrated"):
         jitted(lambda x: x**2, np.array([1.0]), np.array([0.0, 2.0]))
-
-
-@pytest.mark.slow
-def test_diffrax_loads_only_when_a_trajectory_is_integrated():
-    program = """
-import sys, jax, numpy as np
-from hamkernel import systems
-system = systems.Pendulum()
-system(np.array([1.0, 0.0]))
-assert "diffrax" not in sys.modules, "too early"
-jax.jit(lambda x: systems.sample(system, x, np.array([0.0, 1.0])))(np.array([1.0, 0.0]))
-assert "diffrax" in sys.modules, "never"
-systems.sample(system, np.array([1.0, 0.0]), np.array([0.0, 1.0]))
-"""
-    run = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
-    assert run.returncode == 0, run.stderr
 
 
 @pytest.mark.parametrize(

@@ -15,12 +15,11 @@ C_<j,j from C itself, was wrong by a factor of 1e14 at condition 1e13.
 
 **An unknown constant** along p, ‖p‖ = 1, is estimated together with the field. Then C = A⁻¹ becomes
 
-    C = A⁻¹ − A⁻¹p (pᵀA⁻¹p)⁻¹ pᵀA⁻¹ = Tᵀ (T A Tᵀ)⁻¹ T,
+    C = A⁻¹ − A⁻¹p (pᵀA⁻¹p)⁻¹ pᵀA⁻¹,
 
-where the rows of T are an orthonormal basis of the complement of p. dC = −C dA C still holds. So do
-the residuals of held-out rows, (C_SS)⁻¹ (C y)_S, and their derivatives; each fit without a fold
-then estimates the constant again. T is the reflection that maps p to the first axis, without its
-first row.
+the inverse of PAP on the complement of p, with P = I − ppᵀ. dC = −C dA C still holds. So do the
+residuals of held-out rows, (C_SS)⁻¹ (C y)_S, and their derivatives; each fit without a fold then
+estimates the constant again.
 
 Source: Du Croz & Higham (1992), IMA J. Numer. Anal. 12, method 2, on the stability of inversions;
 Dubrule (1983), Mathematical Geology 15, for held-out points with an unknown trend.
@@ -259,20 +258,24 @@ class DenseSystem(AbstractSystem):
     """A as a matrix.
 
     Attributes:
-        matrix: A; if the rows contain an unknown constant, A before the contrast.
-        constant: the direction p of the unknown constant, without negative entries and not
-            differentiated; None if there is none.
+        matrix: A.
+        constant: the direction p of the unknown constant, not differentiated; None if there is
+            none. C has no component along p, so the factor solves only for y without one.
     """
 
     matrix: Float[Array, "D D"]
     constant: Float[Array, " D"] | None = None
 
-    def factor(self) -> "AbstractFactor[DenseSystem]":
+    def factor(self) -> "DenseFactor":
+        A = self.matrix
         if self.constant is None:
-            return dense_factor(self.matrix)
+            return dense_factor(A)
         p = jax.lax.stop_gradient(self.constant)
-        inner = dense_factor(_contrast(p, _contrast(p, self.matrix).T))
-        return ContrastedFactor(inner=inner, constant=p, size=inner.size)
+        A = A - jnp.outer(p, p @ A)
+        A = A - jnp.outer(A @ p, p)
+        scaled = p * jnp.sqrt(jnp.trace(A) / len(A))
+        factor = dense_factor(A + jnp.outer(scaled, scaled))
+        return ProjectedFactor(factor.R, factor.size, p)
 
 
 class DenseFactor(AbstractFactor[DenseSystem]):
@@ -320,6 +323,16 @@ class DenseFactor(AbstractFactor[DenseSystem]):
             U = U.at[j, j].set(diagonal_inverse)
             U = U.at[before, j].set(-(U[before, before] @ R[before, j]) @ diagonal_inverse)
         return U
+
+
+class ProjectedFactor(DenseFactor):
+    """The factor of PAP + τppᵀ, whose inverse is C + ppᵀ/τ, with some τ of the size of A."""
+
+    constant: Float[Array, " D"]
+
+    def inverse(self) -> "DenseInverse":
+        C, p = super().inverse().C, self.constant
+        return DenseInverse(C - jnp.outer(C @ p, p), p)
 
 
 def dense_factor(A: Float[Array, "D D"]) -> DenseFactor:
@@ -377,7 +390,7 @@ def solution(
 
 
 class DenseInverse(AbstractInverse[DenseSystem]):
-    """C = A⁻¹ as a matrix, or Tᵀ(T A Tᵀ)⁻¹T if there is an unknown constant along p."""
+    """C as a matrix."""
 
     C: Float[Array, "D D"]
     constant: Float[Array, " D"] | None = None
@@ -434,48 +447,3 @@ def _blocks(D: int) -> list[slice]:
     """
     starts = np.linspace(0, D, min(-(-D // 128), 8) + 1).astype(int).tolist()
     return [slice(start, stop) for start, stop in itertools.pairwise(starts)]
-
-
-class ContrastedFactor(AbstractFactor[DenseSystem]):
-    """The factor of T A Tᵀ; `solve` applies C = Tᵀ(T A Tᵀ)⁻¹T instead of A⁻¹."""
-
-    inner: DenseFactor
-    constant: Float[Array, " M"]
-    size: Float[Array, ""]
-
-    def solve(self, b: Float[Array, "M *m"]) -> Float[Array, "M *m"]:
-        return _uncontrast(self.constant, self.inner.solve(_contrast(self.constant, b)))
-
-    def solve_with_form(self, y: Float[Array, " M"]) -> tuple[Float[Array, " M"], Float[Array, ""]]:
-        a, square = self.inner.solve_with_form(_contrast(self.constant, y))
-        return _uncontrast(self.constant, a), square
-
-    @property
-    def log_det(self) -> Float[Array, ""]:
-        return self.inner.log_det
-
-    @property
-    def inverse_trace(self) -> Float[Array, ""]:
-        return self.inner.inverse_trace
-
-    def inverse(self) -> DenseInverse:
-        p = self.constant
-        return DenseInverse(_uncontrast(p, _uncontrast(p, self.inner.inverse().C).T), p)
-
-    def is_well_conditioned(self, y: Float[Array, " M"]) -> Bool[Array, ""]:
-        return self.inner.is_well_conditioned(_contrast(self.constant, y))
-
-
-def _contrast(p: Float[Array, " M"], b: Float[Array, "M *m"]) -> Float[Array, "D *m"]:
-    """T b."""
-    return _reflect(p, b)[1:]
-
-
-def _uncontrast(p: Float[Array, " M"], c: Float[Array, "D *m"]) -> Float[Array, "M *m"]:
-    """Tᵀ c."""
-    return _reflect(p, jnp.concatenate([jnp.zeros_like(c[:1]), c]))
-
-
-def _reflect(p: Float[Array, " M"], b: Float[Array, "M *m"]) -> Float[Array, "M *m"]:
-    v = p.at[0].add(1.0)  # the reflection is I − vvᵀ/(1 + p₀)
-    return b - jnp.tensordot(v / (1 + p[0]), v @ b, axes=0)

@@ -1,15 +1,9 @@
 """Regularised least squares in the span of landmarks: O(N r²) time, O(N n + r²) memory.
 
 Let S be the landmarks, T Tᵀ = G_SS⁻¹, and F = G_XS T. The Gram is approximated by Ĝ = F Fᵀ. The
-field Σⱼ K(x, sⱼ) αⱼ with α = T w minimises ‖y − F w‖² + Nλ‖w‖². F is computed tile by tile, and
-only the sums FᵀF and Fᵀy are kept.
-
-FᵀF + NλI has the condition number of G + NλI. (The normal equations in α would have its square, and
-lose twice the digits.) One step of refinement with the residual of the data recovers the digits
-that the sums round off (Björck's corrected seminormal equations).
-
-A stream has no second pass and therefore no residual; for the accuracy of its sums see
-`least_squares.py`.
+field Σⱼ K(x, sⱼ) αⱼ with α = T w minimises ‖y − F w‖² + Nλ‖w‖², the least squares of
+`least_squares.py`. F is computed tile by tile. FᵀF + NλI has the condition number of G + NλI; the
+normal equations in α would have its square.
 """
 
 import numbers
@@ -24,7 +18,6 @@ from hamkernel import _require as require
 from hamkernel._fields.base import AbstractField
 from hamkernel._fields.expansions import KernelField
 from hamkernel._gram import components, trace, trace_of_rows
-from hamkernel._gram_operator import product
 from hamkernel._machine import RowSharding, precise_jit, row_sharding, shard
 from hamkernel._observations.measurements import Measurements
 from hamkernel._solvers.landmarks import (
@@ -35,14 +28,12 @@ from hamkernel._solvers.landmarks import (
     landmarks_of,
     whitening,
 )
-from hamkernel._solvers.least_squares import normal, trace_of_sums
+from hamkernel._solvers.least_squares import ridge_regression, trace_of_sums
 from hamkernel._solvers.low_rank import (
     Columns,
     LandmarkBasis,
-    LandmarkSpan,
     LowRankConditional,
     check_low_rank,
-    factor,
     landmark_field,
     landmark_span,
     low_rank_conditional,
@@ -178,7 +169,7 @@ class Nystrom(AbstractStreamingSolver[KernelField, LandmarkFit]):
     Warns:
         UserWarning: the landmarks do not reach the tolerance.
 
-    Source: Chen, Epperly, Tropp & Webber (2023), arXiv 2207.06503; Björck (1987) for the solve.
+    Source: Chen, Epperly, Tropp & Webber (2023), arXiv 2207.06503.
     """
 
     is_low_rank: ClassVar[bool] = True
@@ -270,21 +261,8 @@ def _start(K, sample, regularization, landmarks, tolerance):
 
 @precise_jit
 def _landmark_fit(K, X, Y, regularization, landmarks, spread):
-    S, ridge = landmarks.points, len(X) * regularization
-    T = whitening(K, landmarks)
-    total = normal(Columns(K, landmarks), T, X, Y, spread)
-    R = factor(total.square, ridge)
-
-    def step(w, residual):
-        """One step of refinement, from w and y − F w."""
-        # minus half of the gradient: Fᵀ(y − Fw) − ρw with F = G_XS T and ρ = Nλ, (r,)
-        slope = T.T @ product(K, S, X, residual, None, spread).reshape(-1) - ridge * w
-        correction = jax.scipy.linalg.cho_solve((R, True), slope)
-        change = product(K, X, S, (T @ correction).reshape(len(S), -1), spread)
-        return w + correction, residual - change
-
-    w = jax.scipy.linalg.cho_solve((R, True), total.moment)
-    A = (T @ w).reshape(len(S), -1)  # (m, n)
-    w, residual = step(w, Y - product(K, X, S, A, spread))
-    truncation = truncation_of(trace(K, X, spread), jnp.trace(total.square), ridge)
-    return LandmarkSpan(K, landmarks, T).field(w, residual, regularization, truncation)
+    span, ridge = landmark_span(K, landmarks), len(X) * regularization
+    columns = Columns(K, landmarks)
+    w, residual, covered = ridge_regression(columns, span.T, X, Y, ridge, spread)
+    truncation = truncation_of(trace(K, X, spread), covered, ridge)
+    return span.field(w, residual, regularization, truncation)

@@ -28,9 +28,9 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"], Abstra
 
     The structure of the field is exact for every count. The kernel is approximate, with an error of
     order count^(−1/2), or smaller for fields that the features can represent. A fit takes O(N n r²)
-    time and O(r²) memory beside the data, by a QR of tiles of rows. The scalar kernels must be
-    shift-invariant: Gaussian, Matern, RationalQuadratic and Periodic, and their sums, products,
-    multiples and Select. Every structure and parity is allowed.
+    time and O(r²) memory beside the data. The scalar kernels must be shift-invariant: Gaussian,
+    Matern, RationalQuadratic and Periodic, and their sums, products, multiples and Select. Every
+    structure and parity is allowed.
 
     How to choose: start with 500 frequencies in the plane. Short lengthscales and rough kernels
     need more: with Matern(1.5) the error falls slowly, since the fourth moment of the frequencies
@@ -76,8 +76,8 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"], Abstra
 
         r = eqx.filter_eval_shape(features_of, K, self.key).columns
         what, cure = f"a fit with count = {self.count}", "Take fewer features."
-        # Eight matrices of r² numbers: the triangle (1), the tile of 3r rows below it (3), and
-        # their QR factorisation (4).
+        # Eight matrices of r² numbers: the sums of the sample and of all rows, the triangle, the
+        # basis, the factor, and the temporaries of these products.
         refuse_beyond_memory(what, r, r, dtype, 8, cure)
         return FeatureSpan(K, features_of(K, self.key), K.outputs(n))
 
@@ -107,7 +107,8 @@ class RandomFeatures(AbstractStreamingSolver[FeatureField, "FeatureFit"], Abstra
 @precise_jit
 def _feature_fit(K, solver, X, Y, regularization, spread):
     span, ridge = solver.span(K, X.shape[1], X.dtype), len(X) * regularization
-    weights, residual = ridge_regression(span.features, span.features.columns, X, Y, ridge, spread)
+    one = jnp.eye(span.features.columns, dtype=X.dtype)
+    weights, residual, _ = ridge_regression(span.features, one, X, Y, ridge, spread)
     return span.field(weights, residual, regularization)
 
 

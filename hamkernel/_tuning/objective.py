@@ -8,7 +8,6 @@ from collections.abc import Callable
 from typing import Any, Literal
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
@@ -18,6 +17,7 @@ from hamkernel._closed_forms import Folds, Partition
 from hamkernel._kernels.functions import as_pytree
 from hamkernel._machine import precise_jit
 from hamkernel._observations.measurements import Measurements
+from hamkernel._solvers.low_rank import AbstractBasis
 from hamkernel._structures.base import AbstractMatrixKernel
 from hamkernel._structures.completed import has_constant_parts
 from hamkernel._tuning.space import SearchSpace
@@ -48,46 +48,62 @@ class SearchCriterion(eqx.Module):
     A loss is minimised on a log scale. A negative log density is divided by half the number of
     rows, which makes it the logarithm of a mean square, too. The caller's objective is minimised
     as it is.
+
+    Attributes:
+        name: the name of the objective; None for the caller's function, which may need all the
+            data.
+        partition: the folds of the observations; of the rows after `restrict`.
+        basis: the basis of a low-rank fit; None for the exact fit.
+        projected: the targets without their silent directions, if these do not depend on u.
+        fn: the caller's function.
+        data: the arguments X and Y of the caller's function.
     """
 
-    fn: Any  # a function, or the `Partial` of one of ours
-    partition: Partition | None = eqx.field(static=True)  # of the observations; see `for_subset`
-    logarithmic: bool = eqx.field(static=True)
-    custom: bool = eqx.field(static=True)  # the caller's, which may need all the data
+    name: Criterion | None = eqx.field(static=True)
+    partition: Partition | None = eqx.field(static=True, default=None)
+    basis: AbstractBasis | None = None
+    projected: Any = None
+    fn: Any = None
+    data: tuple[Any, Any] = (None, None)
+
+    @property
+    def logarithmic(self) -> bool:
+        """Whether a loss is minimised, on a log scale."""
+        return self.name in ("cross_validation", "generalized_cross_validation")
+
+    @property
+    def custom(self) -> bool:
+        """Whether the objective is the caller's function."""
+        return self.name is None
 
     def loss(
         self, K: AbstractMatrixKernel, rows: Measurements, regularization: Float[Array, ""]
     ) -> tuple[Float[Array, ""], Float[Array, ""] | None]:
         """The objective, as `tune` reports it, and ‖a‖² of the fit where a penalty needs it."""
-        extra = () if self.partition is None else (self.partition,)
+        fit = K, rows, regularization
+        if self.partition is not None:
+            return partition_loss_and_square(*fit, self.partition, self.basis)
+        if self.logarithmic:
+            return generalized_loss_and_square(*fit, self.basis, LEAST_FREE)
+        if not self.custom:
+            return -log_likelihood(*fit, self.basis, self.projected), None
         with require.traceable("the objective"):
-            value = self.fn(K, rows, regularization, *extra)
-        value, square = value if self.logarithmic else (value, None)
+            value = self.fn(K, *self.data, regularization)
         value = require.floating(value, "the value of the objective")
         require.shape(value, "the objective returned", "one number", ())
-        return value, square
+        return value, None
 
-    def with_options(self, **keywords: Any) -> "SearchCriterion":
-        """This criterion with arguments of its loss, such as the `basis` of a low-rank fit."""
-        # A Partial of a Partial would be a new function, and compile anew, in each call of `tune`.
-        fn = jax.tree_util.Partial(self.fn.func, **(self.fn.keywords | keywords))
-        return dataclasses.replace(self, fn=fn)
-
-    def with_silent_directions(
-        self, K: AbstractMatrixKernel, rows: Measurements
+    def restrict(
+        self, K: AbstractMatrixKernel, rows: Measurements, chosen: Int[np.ndarray, " _"]
     ) -> "SearchCriterion":
-        """This criterion with the silent directions computed once, if they do not depend on u."""
-        if self.fn.func is not _negative_log_likelihood or not has_constant_parts(K):
-            return self
-        # An eigenvalue problem of n × n for each point.
-        return self.with_options(projected=_project(K, rows))
-
-    def restrict(self, rows: Measurements, chosen: np.ndarray) -> "SearchCriterion":
-        """This criterion for the rows of a subset of the observations."""
-        if self.partition is None:
-            return self
-        partition = partition_of_rows(rows, self.partition.labels[chosen])
-        return dataclasses.replace(self, partition=partition)
+        """This criterion for the rows of the observations `chosen`."""
+        if self.partition is not None:
+            partition = partition_of_rows(rows, self.partition.labels[chosen])
+            return dataclasses.replace(self, partition=partition)
+        if self.name == "marginal_likelihood" and has_constant_parts(K):
+            # Once for all u: an eigenvalue problem of n × n for each point.
+            return dataclasses.replace(self, projected=_project(K, rows))
+        return self
 
 
 class SearchObjective(eqx.Module):
@@ -189,18 +205,12 @@ def criterion_of(
     on a log scale, exactly as the name would be. Any other function is called with the caller's
     data: states and velocities, or observations and None.
     """
-    partial = jax.tree_util.Partial
     if objective == "cross_validation" or objective is cross_validation_loss:
-        partition = Partition(N, folds)
-        return SearchCriterion(
-            partial(partition_loss_and_square), partition, logarithmic=True, custom=False
-        )
+        return SearchCriterion("cross_validation", Partition(N, folds))
     if objective == "generalized_cross_validation" or objective is generalized_cross_validation:
-        fn = partial(generalized_loss_and_square, least_free=LEAST_FREE)
-        return SearchCriterion(fn, None, logarithmic=True, custom=False)
+        return SearchCriterion("generalized_cross_validation")
     if objective == "marginal_likelihood":
-        fn = partial(_negative_log_likelihood)
-        return SearchCriterion(fn, None, logarithmic=False, custom=False)
+        return SearchCriterion("marginal_likelihood")
     if objective is log_marginal_likelihood:
         raise TypeError(
             "log_marginal_likelihood is to be large and an objective is to be small: pass "
@@ -218,16 +228,7 @@ def criterion_of(
             "an objective is called with (K, X, Y, regularization), by position, and returns one "
             f"number; this one takes ({mismatch})."
         )
-    fn = partial(_custom_of_data, as_pytree(objective), data)
-    return SearchCriterion(fn, None, logarithmic=False, custom=True)
-
-
-def _custom_of_data(fn, data, K, rows, regularization):
-    return fn(K, *data, regularization)
+    return SearchCriterion(None, fn=as_pytree(objective), data=data)
 
 
 _project = precise_jit(project_silent_directions)
-
-
-def _negative_log_likelihood(K, rows, regularization, basis=None, projected=None):
-    return -log_likelihood(K, rows, regularization, basis, projected)

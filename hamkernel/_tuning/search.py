@@ -6,6 +6,7 @@ all points. The price of a loss grows with the cube of the number of points, so 
 takes most of the time, although it makes only a few steps from one or two ends.
 """
 
+import dataclasses
 import functools
 import sys
 import time
@@ -36,10 +37,11 @@ _CUBIC_COST_HINT = (
 )
 
 
+@dataclasses.dataclass(frozen=True)
 class Search:
     """A search from several starts, subset by subset.
 
-    Args:
+    Attributes:
         space: the search space.
         criterion: the loss on all observations.
         rows: the rows of all observations, on one device.
@@ -52,27 +54,23 @@ class Search:
             chosen; by default 64 for each direction of the box, and 256 at most.
     """
 
-    def __init__(
-        self,
-        space: SearchSpace,
-        criterion: SearchCriterion,
-        rows: Measurements,
-        rms: float,
-        starts: int,
-        max_steps: int,
-        optimiser: optx.AbstractMinimiser | None,
-        progress: bool,
-        design_size: int | None = None,
-    ):
-        self.space, self.criterion, self.rows, self.rms = space, criterion, rows, rms
-        self.starts, self.max_steps = starts, max_steps
-        self.optimiser, self.progress = optimiser, progress
-        caller_point = np.asarray(space.encode_start(), float)[None]
-        self._points = (
-            caller_point
-            if starts == 1
-            else np.append(caller_point, design(space.directions)[:design_size], axis=0)
-        )
+    space: SearchSpace
+    criterion: SearchCriterion
+    rows: Measurements
+    rms: float
+    starts: int
+    max_steps: int
+    optimiser: optx.AbstractMinimiser | None
+    progress: bool
+    design_size: int | None = None
+
+    @functools.cached_property
+    def _points(self) -> Float[np.ndarray, "count P"]:
+        """The point of the caller's kernel, and those of the design."""
+        caller_point = np.asarray(self.space.encode_start(), float)[None]
+        if self.starts == 1:
+            return caller_point
+        return np.append(caller_point, design(self.space.directions)[: self.design_size], axis=0)
 
     def runs(
         self, low_rank: Callable[[MinimiserRun], SearchCriterion] | None = None
@@ -287,7 +285,7 @@ class Part:
             rows, chosen = rows.subset(chosen)
         self.count = rows.count
         numbers = (jnp.asarray(number, rows.targets.dtype) for number in (N / self.count, rms, 1.0))
-        criterion = criterion.restrict(rows, chosen).with_silent_directions(space.kernel, rows)
+        criterion = criterion.restrict(space.kernel, rows, chosen)
         self.objective = SearchObjective(space, criterion, rows, *numbers)
 
     def set_unit(self, unit: float) -> None:

@@ -306,7 +306,7 @@ def _low_rank_criterion(
     assert solver is not None
     basis = solver.low_rank_basis(problem.kernel, problem.rows, problem.regularization)
     assert basis is not None
-    return criterion.with_options(basis=basis)
+    return dataclasses.replace(criterion, basis=basis)
 
 
 def _criterion_at_best_run(

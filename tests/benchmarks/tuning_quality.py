@@ -90,7 +90,8 @@ def objective_of(K, X, Y) -> SearchObjective:
     """That of the search, on all points."""
     rows, rms = measurements_of_states(X, Y), float(jnp.sqrt(jnp.mean(Y**2)))
     space = SearchSpace(K, X, rms, jnp.asarray(START_RIDGE), (), {})
-    criterion = criterion_of("cross_validation", len(X), FOLDS).restrict(rows, np.arange(len(X)))
+    criterion = criterion_of("cross_validation", len(X), FOLDS)
+    criterion = criterion.restrict(K, rows, np.arange(len(X)))
     return SearchObjective(space, criterion, rows, *map(jnp.asarray, (1.0, rms, 1.0)))
 
 
