@@ -165,8 +165,8 @@ def test_a_sum_of_laws_with_alike_kernels_is_one_program():
         0.5 * several,
         3.0 * hk.Shared(hk.Matern(2.5, 0.8), pairs, C),
     ]
-    together = hamkernel._features.part_waves(terms[0] + terms[1] + terms[2])
-    alone = [hamkernel._features.part_waves(k) for k in terms]
+    together: Any = hamkernel._features.part_waves(terms[0] + terms[1] + terms[2])
+    alone: Any = [hamkernel._features.part_waves(k) for k in terms]
     assert [len(laws.terms) for laws, _ in together._groups()] == [2, 1]
     x, w = jnp.asarray(RNG.normal(size=4)), jnp.asarray(RNG.normal(size=48))
     values = np.concatenate([waves.values(x) for waves in alone])

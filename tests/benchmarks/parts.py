@@ -39,6 +39,7 @@ compilation.
 import argparse
 import time
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -248,7 +249,7 @@ def species(particles, seed):
     times, x = particles_run(rng, np.ones(particles), slope, 201)
     noisy = hk.Runs(times, x + 0.01 * rng.standard_normal(x.shape))
     begun = time.process_time()
-    a, b = (np.flatnonzero(kind == k) for k in (0, 1))
+    a, b = (np.flatnonzero(kind == k).tolist() for k in (0, 1))
     laws = [
         1.0 * hk.Shared(hk.Matern(2.5), hk.pairs(particles, 2, of="inverse", among=group))
         for group in (a, (a, b), b)
@@ -272,7 +273,8 @@ def masses(particles, seed):
     begun = time.process_time()
     shared = hk.Shared(hk.Matern(2.5), hk.pairs(particles, 2, of="inverse"))
     learned = hk.learn(hk.Symplectic(shared), noisy, masses=True)
-    off = np.asarray(learned.kernel.masses) / np.repeat(mass, 2) - 1
+    found: Any = learned.kernel
+    off = np.asarray(found.masses) / np.repeat(mass, 2) - 1
     said = f"masses rms {np.sqrt(np.mean(off**2)):.4f} worst {np.abs(off).max():.4f}"
     laws = errors_of_law(learned, 0, law, np.linspace(1.0, 2.5, 60), 2.0)
     show_learned("masses", particles, seed, learned, begun, said, laws)
