@@ -76,9 +76,10 @@ def learn(
     more than the price of its hyperparameters, a second pass estimates the intensity of w, and
     `learn` returns the likelier of the two.
 
-    If K is made of `hk.Shared`, `learn` solves twice for the laws, without iterations, in any
-    number of coordinates. It uses weak rows, ∫ φ f dt along a smoothed path, whose cost is linear
-    in n. `solver` and `iterations` then have no effect, and innovations are NaN.
+    If K is made of `hk.Shared`, alone or beside `hk.Friction` and unknown masses, `learn` solves
+    twice for the laws, without iterations, in any number of coordinates. It uses weak rows,
+    ∫ φ f dt along a smoothed path, whose cost is linear in n. `solver` and `iterations` then have
+    no effect, and innovations are NaN. With inputs or parameters `learn` iterates.
 
     Args:
         K: a matrix-valued kernel, whose hyperparameters are the first guess. `learn` gives a
@@ -110,7 +111,9 @@ def learn(
             Runs of the m positions alone get momenta that were not measured.
         masses: whether states are (q, q̇) with unknown masses instead of (q, p). `learn` then finds
             the ratios of the masses, `learned.kernel.masses`, and K becomes an `UnknownMasses`.
-            With inputs the masses are those of the drift, `learned.kernel.drift.masses`.
+            With inputs the masses are those of the drift, `learned.kernel.drift.masses`. If K is
+            made of `hk.Shared` laws of positions, the kinetic energy is ½ q̇ᵀMq̇. Laws are in the
+            unit of H, in which the first mass is 1.
         iterations: the largest number of iterations; 4 or 5 are usual.
         progress: whether to show a progress bar (tqdm); if None, from ten seconds on.
 

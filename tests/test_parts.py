@@ -369,6 +369,61 @@ def test_two_species_have_a_law_each():
     np.testing.assert_allclose(field.law(1.5, 1.0, which=1), -0.5 * (1.5**2 - 1), atol=2e-3)
 
 
+def _gram_of_chain(X, Z):
+    """Σ_pq J Dᵀ M D Jᵀ of three sites, M = ∂²k for the differences D x and the Gaussian k."""
+    D = np.zeros((2, 6))
+    D[[0, 1, 0, 1], [0, 1, 1, 2]] = [-1, -1, 1, 1]
+    apart = (X @ D.T)[:, None, :, None] - (Z @ D.T)[None, :, None]
+    M = (1 / 1.5**2 - apart**2 / 1.5**4) * np.exp(-(apart**2) / (2 * 1.5**2))
+    forces = np.einsum("pa,ijpq,qb->iajb", D[:, :3], M, D[:, :3])
+    return np.pad(forces, ((0, 0), (3, 0), (0, 0), (3, 0)))
+
+
+def _normal(a, b, length):
+    return np.exp(-np.sum((a[:, None] - b[None]) ** 2, axis=2) / (2 * length**2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["inputs", "parameters"])
+def test_a_law_beside_inputs_or_in_a_family_has_the_posterior_of_the_closed_form(name):
+    rng, on_momenta = np.random.default_rng(3), np.diag([0, 0, 0, 1.0, 1, 1])
+    (X, Y), x = rng.normal(size=(2, 10, 6)), rng.normal(size=(1, 6))
+    U, u = rng.normal(size=(10, 1)), rng.normal(size=(1, 1))
+    law = hk.Shared(hk.Gaussian(1.5), hk.neighbours(3), np.linspace(-6, 6, 40))
+
+    def covariance(X, Z, U, V):
+        G = _gram_of_chain(X, Z)
+        if name == "parameters":
+            G = G * _normal(U, V, 0.8)[:, None, :, None]
+        else:
+            gains = 0.7 * _normal(X, Z, 2.0) * (U @ V.T)
+            G = G + gains[:, None, :, None] * on_momenta[None, :, None]
+        return G.reshape(G.shape[0] * 6, -1)
+
+    if name == "parameters":
+        K = hk.Family(hk.Symplectic(law), hk.Gaussian(0.8))
+    else:
+        matrix = hk.InputMatrix(0.7 * hk.Gaussian(2.0), acts_on=(3, 4, 5))
+        K = hk.Controlled(hk.Symplectic(law), matrix)
+    G, cross = covariance(X, X, U, U) + 0.1 * np.eye(60), covariance(x, X, u, U)
+    a = np.linalg.solve(G, Y.ravel())
+    posterior = hk.condition(K, X, Y, 0.01, **{name: U})
+    np.testing.assert_allclose(posterior.field(x[0], u[0]), cross @ a, atol=1e-6)
+    variance = covariance(x, x, u, u) - cross @ np.linalg.solve(G, cross.T)
+    deviation = np.sqrt(np.diag(variance).clip(0))
+    np.testing.assert_allclose(posterior.deviation(x[0], u[0]), deviation, atol=1e-6)
+    log_p = -0.5 * (Y.ravel() @ a + np.linalg.slogdet(2 * np.pi * G)[1])
+    found = hk.log_marginal_likelihood(K, X, Y, 0.01, **{name: U})
+    np.testing.assert_allclose(found, log_p, rtol=1e-6)
+    assert len(posterior.field.undetermined) == 1  # a constant
+    if name == "parameters":
+        with pytest.raises(AttributeError, match=r"field.at\(theta\).law"):
+            posterior.field.law(1.0, 0.0)
+        assert np.isfinite(posterior.field.at(u[0]).law(1.0, 0.0))
+    else:
+        assert posterior.field.law(1.0, 0.0) == posterior.field.drift.law(1.0, 0.0)
+
+
 def test_what_is_no_part_is_refused():
     with pytest.raises(TypeError, match="Shared needs a kernel and then a function"):
         hk.Shared(hk.Gaussian(1.0), 3)

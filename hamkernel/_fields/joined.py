@@ -239,6 +239,9 @@ class ControlledField(AbstractJoinedField):
         """
         return self.drift.potential
 
+    def _laws(self) -> list[tuple[Any, Float[Array, " m"]]]:
+        return self.drift._laws()
+
     def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """The potential of the drift, without the constant of `anchored`."""
         return self.drift.unanchored_potential(x)
@@ -312,6 +315,9 @@ class FamilyField(AbstractJoinedField):
             "a family has no one potential: each member has its own, field.at(θ).potential, and "
             "field.at(θ).hamiltonian where the structure has one."
         )
+
+    def _laws(self) -> list[tuple[Any, Float[Array, " m"]]]:
+        raise AttributeError("each system of a family has its own law: field.at(theta).law(r, r0).")
 
     def unanchored_potential(self, x: Num[ArrayLike, " n"]) -> Float[Array, ""]:
         """AttributeError: each member has a potential of its own."""

@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 
 from hamkernel._kernels.parts import Shared
 from hamkernel._machine import precise_jit
-from hamkernel._structures.base import Sum
+from hamkernel._structures.base import nodes_of
 from hamkernel._structures.completed import shared_laws
 from hamkernel._structures.structure import AbstractPotentialKernel
 
@@ -23,8 +23,7 @@ def undetermined_terms(K: Any, n: int) -> tuple[str, ...]:
     A linear law w(r) = r_j gives the potential Σ_p c_p φ_pj(x). A combination of linear and
     constant laws is undetermined if its field is zero at random states.
     """
-    all_terms: tuple[Any, ...] = K.terms if isinstance(K, Sum) else (K,)
-    terms = [term for term in all_terms if isinstance(term, AbstractPotentialKernel)]
+    terms = nodes_of(AbstractPotentialKernel, K)
     laws = [(term, law) for term in terms for law in shared_laws(term.kernel)]
     X, columns, names = np.random.default_rng(0).normal(size=(8, n)), [], []
     many, i = sum(law.law_count for _, law in laws) > 1, 0
