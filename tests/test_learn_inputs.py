@@ -387,7 +387,7 @@ VARIED = np.sin(np.arange(9.0))[:, None]
         (lambda: runs(VARIED, between="cubic"), ValueError, "'smooth' or 'auto'; got 'cubic'"),
         (lambda: runs(VARIED, delay="late"), TypeError, "delay must be a number, or 'fit'"),
         (lambda: runs(VARIED, delay=np.nan), ValueError, "delay must be finite"),
-        (lambda: runs(VARIED[:-1]), ValueError, r"inputs=\[\(times, u\), …\]; where the last"),
+        (lambda: runs(VARIED[:-1]), ValueError, r"inputs=\[\(times, u\), …\]. If only the last"),
         (
             lambda: runs((np.linspace(0, 0.7, 50), np.zeros((50, 1)))),
             ValueError,
