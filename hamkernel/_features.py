@@ -166,10 +166,11 @@ def waves_of(
 
 def part_waves(k: AbstractScalarKernel) -> PartWaves | JointWaves | None:
     """The features of `Shared` kernels, their multiples, means and sums; None for others."""
-    terms = [waves for waves in part_terms(k) if waves is not None]
-    if len(terms) < len(part_terms(k)):
+    terms = part_terms(k)
+    waves = tuple(term for term in terms if term is not None)
+    if len(waves) < len(terms):
         return None
-    return terms[0] if len(terms) == 1 else JointWaves(tuple(terms))
+    return waves[0] if len(waves) == 1 else JointWaves(waves)
 
 
 def part_terms(k: AbstractScalarKernel, scale: Any = 1.0) -> list[PartWaves | None]:

@@ -326,7 +326,10 @@ class DenseFactor(AbstractFactor[DenseSystem]):
 
 
 class ProjectedFactor(DenseFactor):
-    """The factor of PAP + τppᵀ, whose inverse is C + ppᵀ/τ, with some τ of the size of A."""
+    """The factor of PAP + τppᵀ, whose inverse is C + ppᵀ/τ, with some τ of the size of A.
+
+    `log_det` and `inverse_trace` contain τ: likelihoods and generalized losses take contrasts.
+    """
 
     constant: Float[Array, " D"]
 

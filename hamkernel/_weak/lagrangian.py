@@ -11,6 +11,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hamkernel import _require as require
+from hamkernel._fields.base import KnownPart
+from hamkernel._fields.kinetic import kinetic_of_velocities
 from hamkernel._fields.lagrangian import LagrangianField, MachineOfPoints, lagrangian_field
 from hamkernel._learned.result import AbstractLearned
 from hamkernel._learned.score import Score, compute_score
@@ -84,8 +86,10 @@ class LearnedLagrangian(AbstractLearned):
         ]
 
     def _score(self, runs: Runs, first: int, draws: int) -> Score:
-        mean = Kinematics(self.field.features.count)
         learned_runs = self.runs
+        mean: Any = kinetic_of_velocities(jnp.ones(()))  # of states (q, v)
+        if learned_runs.inputs is not None:
+            mean = KnownPart(mean, None, learned_runs.input_count, of_inputs=False)
         if learned_runs.dimension < self.field.dimension:
             learned_runs = learned_runs.with_momenta()
         noise = np.full(self.field.dimension, np.nan)
@@ -112,16 +116,6 @@ class LearnedLagrangian(AbstractLearned):
     def posterior(self) -> LagrangianField:
         """The field, which keeps its factor: its methods `…_deviation` are the bands."""
         return self.field
-
-
-class Kinematics(eqx.Module):
-    """q̇ = v of the points (q, v, u), and v̇ = 0: the known part of the motion of `count` joints."""
-
-    count: int
-
-    def __call__(self, s: Float[Array, " d"]) -> Float[Array, " n"]:
-        v = s[self.count : 2 * self.count]
-        return jnp.concatenate([v, jnp.zeros_like(v)])
 
 
 def learn_lagrangian(
